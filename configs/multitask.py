@@ -1,0 +1,62 @@
+"""Adapt a pretrained miniature pi0 from the Panda arm to the PiPER arm, two tasks together, LoRA-SP.
+
+    python train.py --config configs/multitask.py
+
+Loads the base pretrained on a simulated Franka Panda (assets/), collects PiPER demonstrations with
+the scripted expert, measures the base, trains LoRA-SP adapters on press and pick_place together,
+measures again and writes runs/multitask/report.html. The README has the expected result and time.
+"""
+
+from lorasp_jax.peft import LoRASP
+from lorasp_jax.config import Config, DataConfig, EvaluationConfig, OptimConfig
+
+
+def get_config(scale: str) -> Config:
+    """The experiment at `scale`: smoke (minutes, learns nothing), cpu or accelerator."""
+    return {"smoke": _smoke, "cpu": _cpu, "accelerator": _accelerator}[scale]()
+
+
+def _smoke() -> Config:
+    return Config(
+        name="multitask",
+        scale="smoke",
+        peft=LoRASP(rank=8),
+        size="nano",
+        base="assets/pi0_nano",
+        data=DataConfig(episodes=4, num_envs=8),
+        optim=OptimConfig(steps=4, batch_size=8, warmup_steps=1),
+        evaluation=EvaluationConfig(episodes=8, num_envs=8),
+        log_every=2,
+        checkpoint_every=2,
+    )
+
+
+def _cpu() -> Config:
+    return Config(
+        name="multitask",
+        scale="cpu",
+        peft=LoRASP(rank=32),
+        size="nano",
+        base="assets/pi0_nano",
+        data=DataConfig(episodes=128, num_envs=32),
+        optim=OptimConfig(steps=4000, batch_size=64, learning_rate=2e-3, warmup_steps=100),
+        evaluation=EvaluationConfig(episodes=64, num_envs=32),
+        log_every=20,
+        checkpoint_every=500,
+    )
+
+
+def _accelerator() -> Config:
+    return Config(
+        name="multitask",
+        scale="accelerator",
+        peft=LoRASP(rank=128),
+        size="small",
+        base="assets/pi0_small",
+        data=DataConfig(episodes=512, num_envs=256),
+        optim=OptimConfig(steps=3000, batch_size=512, learning_rate=1e-3, warmup_steps=100),
+        evaluation=EvaluationConfig(episodes=256, num_envs=256),
+        compute_dtype="bfloat16",
+        log_every=100,
+        checkpoint_every=1000,
+    )

@@ -1,0 +1,42 @@
+"""Pretrain the base policies that ship in assets/, from scratch, on Panda demonstrations.
+
+    python train.py --config configs/pretrain.py --size small
+    python train.py --config configs/pretrain.py --size nano --name pretrain_nano
+
+All parameters train (FullFineTuning on every path). The run leaves runs/<name>/base, which is what
+assets/pi0_<size> holds; the model cards there state hardware, time and measured success.
+"""
+
+import dataclasses
+
+from lorasp_jax.peft import FullFineTuning
+from lorasp_jax.config import Config, DataConfig, EvaluationConfig, OptimConfig
+
+
+def get_config(scale: str) -> Config:
+    """The experiment at `scale`; accelerator is the one that makes the shipped bases."""
+    config = Config(
+        name="pretrain_small",
+        scale=scale,
+        peft=FullFineTuning(),
+        size="small",
+        base="",
+        robot="panda",
+        data=DataConfig(episodes=1024, num_envs=256),
+        optim=OptimConfig(steps=12000, batch_size=512, learning_rate=1e-3, warmup_steps=300),
+        evaluation=EvaluationConfig(episodes=256, num_envs=256),
+        compute_dtype="bfloat16" if scale == "accelerator" else "float32",
+        log_every=200,
+        checkpoint_every=2000,
+    )
+    if scale == "accelerator":
+        return config
+    return dataclasses.replace(
+        config,
+        size="nano",
+        data=DataConfig(episodes=4, num_envs=8),
+        optim=OptimConfig(steps=4, batch_size=8, warmup_steps=1),
+        evaluation=EvaluationConfig(episodes=8, num_envs=8),
+        log_every=2,
+        checkpoint_every=2,
+    )

@@ -1,0 +1,14 @@
+"""Batched manipulation environments in MuJoCo MJX with cameras and scripted experts.
+
+    import envs
+    env = envs.make("press", robot="piper", num_envs=64, image_size=64)
+    episodes = envs.collect("press", robot="panda", num_episodes=512, key=jax.random.key(0))
+"""
+
+import envs.robots.panda
+import envs.robots.piper  # noqa: F401  envs.robots.piper.forward_kinematics is public
+from envs.collection import collect, expert_success
+from envs.env import Env, State, make
+from envs.episodes import Episodes
+
+__all__ = ["Env", "Episodes", "State", "collect", "expert_success", "make"]

@@ -1,0 +1,198 @@
+"""Recorded episodes: batched arrays in memory, one .npz file on disk."""
+
+import dataclasses
+import functools
+import json
+import os
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+Array = jax.Array | np.ndarray
+
+_FORMAT = "envs-episodes-1"
+_ARRAYS = ("state", "action", "length", "instruction")
+_FACTS = ("instructions", "task", "robot", "control_dt", "physics_dt", "attempted")
+_IMAGE = "image/"
+
+
+@functools.partial(
+    jax.tree_util.register_dataclass, data_fields=("image", *_ARRAYS), meta_fields=_FACTS
+)
+@dataclasses.dataclass(frozen=True)
+class Episodes:
+    """E episodes of one task and robot, padded to T control steps.
+
+    Attributes:
+        image: camera name -> uint8 `[E, T, H, W, 3]`, before each action.
+        state: f32 `[E, T, J + 1]` measured joint angles [rad] and gripper opening [m], before each
+            action.
+        action: f32 `[E, T, J + 1]` joint targets [rad] and gripper opening [m] commanded.
+        length: int32 `[E]` steps that count, 1 to T; what follows them is padding.
+        instruction: int32 `[E]` index into `instructions`.
+        instructions: phrasings of the task.
+        task: name of the task.
+        robot: name of the robot.
+        control_dt: time between two actions [s].
+        physics_dt: time step of the simulation [s].
+        attempted: episodes tried to get these; the others failed.
+    """
+
+    image: dict[str, Array]
+    state: Array
+    action: Array
+    length: Array
+    instruction: Array
+    instructions: tuple[str, ...]
+    task: str
+    robot: str
+    control_dt: float
+    physics_dt: float
+    attempted: int
+
+    @property
+    def num_episodes(self) -> int:
+        """E."""
+        return self.state.shape[0]
+
+    @property
+    def num_steps(self) -> int:
+        """Control steps that count, over all episodes."""
+        return int(np.sum(self.length))
+
+    def select(self, indices: Sequence[int] | Array) -> Self:
+        """The episodes with these numbers, in this order."""
+        return jax.tree.map(lambda x: x[np.asarray(indices)], self)
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Writes one uncompressed .npz file; an existing file is replaced only when all is written.
+
+        Raises:
+            ValueError: if the arrays do not fit one another.
+        """
+        self.validate()
+        path = Path(path)
+        facts = {name: getattr(self, name) for name in _FACTS}
+        header = json.dumps({"format": _FORMAT, **facts}).encode()
+        arrays = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
+        arrays |= {_IMAGE + name: np.asarray(picture) for name, picture in self.image.items()}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        try:
+            with open(unfinished, "wb") as file:
+                np.savez(file, header=np.frombuffer(header, np.uint8), **arrays)
+            os.replace(unfinished, path)
+        finally:
+            unfinished.unlink(missing_ok=True)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike, *, control_dt: float | None = None) -> Self:
+        """Reads what `save` wrote, into host memory.
+
+        Args:
+            path: the file.
+            control_dt: if given, the control period [s] that the episodes must have.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if the file is damaged, not of this format, or of another control period.
+        """
+        arrays = _read(path)
+        try:
+            facts = json.loads(arrays.pop("header").tobytes())
+            if facts.pop("format") != _FORMAT:
+                raise KeyError("format")
+        except (KeyError, ValueError, AttributeError) as error:
+            raise ValueError(f"{path} is an .npz file, but holds no {_FORMAT} header") from error
+        missing = {*_ARRAYS} - arrays.keys() | {*_FACTS} - facts.keys()
+        if missing:
+            raise ValueError(f"{path} lacks {', '.join(sorted(missing))}")
+        episodes = cls(
+            image={k.removeprefix(_IMAGE): v for k, v in arrays.items() if k.startswith(_IMAGE)},
+            **{name: arrays[name] for name in _ARRAYS},
+            **{name: facts[name] for name in _FACTS}
+            | {"instructions": tuple(facts["instructions"])},
+        )
+        try:
+            episodes.validate()
+        except ValueError as error:
+            raise ValueError(f"{path} is not valid: {error}") from error
+        if control_dt is not None and abs(episodes.control_dt - control_dt) > 1e-9:
+            raise ValueError(
+                f"{path} has control_dt {episodes.control_dt} s, but {control_dt} s is needed"
+            )
+        return episodes
+
+    def validate(self) -> None:
+        """Raises a ValueError if the arrays do not fit one another."""
+        if self.state.ndim != 3 or not self.state.size:
+            raise ValueError(f"state must have shape [E, T, J + 1], not {self.state.shape}")
+        steps = self.state.shape[:2]
+        if self.action.shape != self.state.shape:
+            raise ValueError(
+                f"action must have state's shape {self.state.shape}, not {self.action.shape}"
+            )
+        if not self.image:
+            raise ValueError("image holds no camera, but at least one is needed")
+        for name, picture in self.image.items():
+            if picture.shape[:2] != steps or picture.shape[4:] != (3,) or picture.dtype != np.uint8:
+                raise ValueError(
+                    f"image {name!r} must be uint8 [{steps[0]}, {steps[1]}, H, W, 3], "
+                    f"not {picture.dtype} {list(picture.shape)}"
+                )
+        for name, low, high in (
+            ("length", 1, steps[1]),
+            ("instruction", 0, len(self.instructions) - 1),
+        ):
+            values = np.asarray(getattr(self, name))
+            if values.shape != steps[:1] or not np.issubdtype(values.dtype, np.integer):
+                raise ValueError(
+                    f"{name} must be integers of shape {steps[:1]}, not {values.shape}"
+                )
+            if values.min() < low or values.max() > high:
+                raise ValueError(
+                    f"{name} must lie in {low} to {high}, not {values.min()} to {values.max()}"
+                )
+
+
+def concatenate(parts: Sequence[Episodes]) -> Episodes:
+    """All episodes of several collections of one task and robot, padded to the longest.
+
+    Raises:
+        ValueError: if there are none, or they differ in more than length and number.
+    """
+    if not parts:
+        raise ValueError("there is nothing to concatenate: parts is empty")
+    for name in ("task", "robot", "control_dt", "physics_dt", "instructions"):
+        values = {getattr(part, name) for part in parts}
+        if len(values) > 1:
+            raise ValueError(f"only episodes of one {name} can be joined, not {sorted(values)}")
+    shapes = {tuple(sorted((k, v.shape[2:]) for k, v in part.image.items())) for part in parts}
+    if len(shapes) > 1:
+        raise ValueError(f"only episodes of equal pictures can be joined, not {sorted(shapes)}")
+    steps = max(part.state.shape[1] for part in parts)
+
+    def join(*arrays: Array) -> Array:
+        xp = np if all(isinstance(x, np.ndarray) for x in arrays) else jnp
+        if arrays[0].ndim > 1:
+            pads = [((0, 0), (0, steps - x.shape[1])) + ((0, 0),) * (x.ndim - 2) for x in arrays]
+            arrays = tuple(xp.pad(x, pad) for x, pad in zip(arrays, pads, strict=True))
+        return xp.concatenate(arrays)
+
+    attempted = sum(part.attempted for part in parts)
+    same = [dataclasses.replace(part, attempted=attempted) for part in parts]
+    return jax.tree.map(join, *same)
+
+
+def _read(path: str | os.PathLike) -> dict[str, np.ndarray]:
+    """All arrays of an .npz file."""
+    try:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except (zipfile.BadZipFile, ValueError, EOFError, AttributeError, TypeError) as error:
+        raise ValueError(f"{path} is damaged or not an .npz file of episodes: {error}") from error

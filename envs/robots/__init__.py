@@ -1,0 +1,181 @@
+"""Robot arms as numbers: one file a robot, turned into MJCF and kinematics here.
+
+A robot's joint chain is stated once; its MuJoCo bodies and its analytic kinematics both come from
+that statement, so they cannot disagree. All hands share one tool frame, `tcp`: z points out of the
+hand, y is the axis along which the fingers open, and the finger tips end `TIP_LENGTH` further out.
+That lets the tasks and the expert talk about hands without knowing the robot.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+TIP_LENGTH = 0.012  # m from the tcp to the end of the finger tips, the same on every hand
+_TIP_RADIUS = 0.005  # m, sphere at each finger tip that touches tables, walls and buttons
+
+# The wrist camera sits behind the hand and looks along it, tilted 15 degrees towards the tips
+# (own choice: the tips fill the lower edge of the picture, the object below them its middle).
+_WRIST_CAMERA = (
+    '<camera name="wrist" pos="-.07 0 -.093" xyaxes="0 -1 0 -.9659 0 .2588" fovy="75"/>'
+)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Robot:
+    """One arm with a two-finger gripper; J joints. Positions in m, angles in rad.
+
+    Attributes:
+        name: file name of the robot.
+        chain: [J, 4, 4] fixed transform from link i-1 (base first) to joint i, which turns about z.
+        tool: [4, 4] pose of the tcp in the last link.
+        lower, upper: [J] joint limits [rad].
+        speed: [J] joint speed limits [rad/s].
+        home: [J] start pose [rad]: tcp at (.34, 0, .18) m, tool down with its lean.
+        lean: angle by which the hand leans outwards when it works from above [rad], chosen so that
+            the whole table in front of the robot is within the wrist's limits.
+        stroke: largest gripper opening, both fingers together [m].
+        gripper_speed: largest change of the opening [m/s].
+        stiffness, damping: [J] gains of the position actuators [N m/rad, N m s/rad].
+        armature: reflected motor inertia of every joint [kg m^2].
+        base, links: MJCF geoms carried by the base and by each link, in the link's frame.
+        hand, finger: MJCF geoms of the hand and of the finger at y > 0, in the tcp frame, closed.
+        tip_offset: y of the middle of a closed finger [m].
+    """
+
+    name: str
+    chain: np.ndarray
+    tool: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    speed: np.ndarray
+    home: np.ndarray
+    lean: float
+    stroke: float
+    gripper_speed: float
+    stiffness: np.ndarray
+    damping: np.ndarray
+    armature: float
+    base: str
+    links: tuple[str, ...]
+    hand: str
+    finger: str
+    tip_offset: float
+
+    @property
+    def num_joints(self) -> int:
+        """J, without the gripper."""
+        return len(self.chain)
+
+    @property
+    def action_low(self) -> np.ndarray:
+        """[J + 1] lowest joint targets [rad] and gripper opening [m], float32."""
+        return np.append(self.lower, 0.0).astype(np.float32)
+
+    @property
+    def action_high(self) -> np.ndarray:
+        """[J + 1] highest joint targets [rad] and gripper opening [m], float32."""
+        return np.append(self.upper, self.stroke).astype(np.float32)
+
+    @property
+    def action_speed(self) -> np.ndarray:
+        """[J + 1] fastest change of the commands [rad/s, m/s], float32."""
+        return np.append(self.speed, self.gripper_speed).astype(np.float32)
+
+
+def translation(x: float, y: float, z: float) -> np.ndarray:
+    """[4, 4] transform that moves by (x, y, z) metres."""
+    transform = np.eye(4)
+    transform[:3, 3] = x, y, z
+    return transform
+
+
+def rotation(axis: str, angle: float) -> np.ndarray:
+    """[4, 4] transform that turns by `angle` rad about "x", "y" or "z"."""
+    c, s = np.cos(angle), np.sin(angle)
+    transform = np.eye(4)
+    i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+    transform[[i, i, j, j], [i, j, i, j]] = c, -s, s, c
+    return transform
+
+
+def forward_kinematics(chain: np.ndarray, q: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Poses of all links of a chain of hinges about z.
+
+    Args:
+        chain: [J, 4, 4] as in `Robot.chain`.
+        q: [..., J] joint angles [rad]; its float type is the result's.
+
+    Returns:
+        Positions [..., J, 3] in m and rotations [..., J, 3, 3] of the links in the base frame.
+    """
+    chain = jnp.asarray(chain, q.dtype)
+    position = jnp.zeros((*q.shape[:-1], 3), q.dtype)
+    rot = jnp.broadcast_to(jnp.eye(3, dtype=q.dtype), (*q.shape[:-1], 3, 3))
+    positions, rotations = [], []
+    for i in range(len(chain)):
+        position = position + _multiply(rot, chain[i, :3, 3:])[..., 0]
+        x, y, z = jnp.unstack(_multiply(rot, chain[i, :3, :3]), axis=-1)
+        c, s = jnp.cos(q[..., i, None]), jnp.sin(q[..., i, None])
+        rot = jnp.stack([c * x + s * y, c * y - s * x, z], axis=-1)
+        positions.append(position)
+        rotations.append(rot)
+    return jnp.stack(positions, axis=-2), jnp.stack(rotations, axis=-3)
+
+
+def tool_pose(robot: Robot, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Pose of the tcp and its Jacobian.
+
+    Args:
+        robot: the arm.
+        q: [J] joint angles [rad].
+
+    Returns:
+        Position [3] in m, rotation [3, 3], and geometric Jacobian [6, J]: linear rows, then angular.
+    """
+    positions, rotations = forward_kinematics(robot.chain, q)
+    tool = jnp.asarray(robot.tool, q.dtype)
+    position = positions[-1] + _multiply(rotations[-1], tool[:3, 3:])[:, 0]
+    axes = rotations[:, :, 2]
+    linear = jnp.cross(axes, position - positions)
+    jacobian = jnp.concatenate([linear, axes], axis=-1).T
+    return position, _multiply(rotations[-1], tool[:3, :3]), jacobian
+
+
+def bodies(robot: Robot) -> str:
+    """MJCF of the arm's body tree, base at the world's origin."""
+    xml, closing = f'<body name="base">{robot.base}', "</body>"
+    for i, (fixed, geoms) in enumerate(zip(robot.chain, robot.links, strict=True)):
+        xml += f'<body name="link{i + 1}" {pose(fixed)} gravcomp="1"><joint name="joint{i + 1}" '
+        xml += f'range="{robot.lower[i]} {robot.upper[i]}" armature="{robot.armature}"/>{geoms}'
+        closing += "</body>"
+    xml += f'<body name="hand" {pose(robot.tool)} gravcomp="1"><site name="tcp"/>'
+    xml += _WRIST_CAMERA + robot.hand
+    tip = f'pos="0 {robot.tip_offset} {TIP_LENGTH - _TIP_RADIUS}" size="{_TIP_RADIUS}"'
+    for side, turn in (("left", "1 0 0 0"), ("right", "0 0 0 1")):
+        xml += f'<body name="{side}" quat="{turn}" gravcomp="1"><joint name="{side}" '
+        xml += f'class="finger" range="0 {robot.stroke / 2}"/>{robot.finger}'
+        xml += f'<geom class="tip" {tip}/></body>'
+    return xml + "</body>" + closing
+
+
+def actuators(robot: Robot) -> str:
+    """MJCF of the position servos, joints first, then the left finger (half the opening)."""
+    xml = ""
+    for i, (kp, kv) in enumerate(zip(robot.stiffness, robot.damping, strict=True)):
+        xml += f'<position name="joint{i + 1}" joint="joint{i + 1}" kp="{kp}" kv="{kv}"/>'
+    # kp, kv: own choice that holds a 12 g grape without slip and stays below 20 N at full stroke.
+    return xml + '<position name="gripper" joint="left" kp="400" kv="20"/>'
+
+
+def pose(transform: np.ndarray) -> str:
+    """MJCF attributes `pos` and `xyaxes` of a [4, 4] transform."""
+    numbers = np.round(transform, 12) + 0.0
+    position, x, y = (" ".join(map(str, numbers[:3, i])) for i in (3, 0, 1))
+    return f'pos="{position}" xyaxes="{x} {y}"'
+
+
+def _multiply(a: jax.Array, b: jax.Array) -> jax.Array:
+    # Accelerators multiply in bf16 or TF32 unless told otherwise: millimetres would be lost.
+    return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)

@@ -1,0 +1,93 @@
+"""Pick the grape and place it in the basket: at rest inside, and let go.
+
+Numbers without a source are own choices that work with both arms.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from envs.tasks import Layout, Task, View, Waypoints, route
+
+_RADIUS = 0.015  # m, a large table grape (12 g)
+_INSIDE = 0.052  # m, half the inner width of the basket
+_WALL = 0.003  # m, half the thickness of its walls
+_HEIGHT = 0.045  # m, of its walls
+_GRAPE, _GRAPE_RANGE = (0.36, -0.06), (0.06, 0.10)  # m, of the random position
+_BASKET, _BASKET_RANGE = (0.36, 0.15), (0.035, 0.035)  # m
+
+_BASKET_LOOK = 'type="box" conaffinity="3" rgba=".85 .65 .30 1"'
+_SIDE, _MIDDLE = _INSIDE + _WALL, _HEIGHT / 2
+_LONG = _INSIDE + 2 * _WALL
+# The free joint's damping stops a rolling grape within half a second: 1.4 m r^2 / damping.
+_SCENE = f"""
+<body name="basket" mocap="true">
+  <geom {_BASKET_LOOK} size="{_INSIDE} {_INSIDE} .002" pos="0 0 .002"/>
+  <geom {_BASKET_LOOK} size="{_WALL} {_LONG} {_MIDDLE}" pos="{_SIDE} 0 {_MIDDLE}"/>
+  <geom {_BASKET_LOOK} size="{_WALL} {_LONG} {_MIDDLE}" pos="{-_SIDE} 0 {_MIDDLE}"/>
+  <geom {_BASKET_LOOK} size="{_INSIDE} {_WALL} {_MIDDLE}" pos="0 {_SIDE} {_MIDDLE}"/>
+  <geom {_BASKET_LOOK} size="{_INSIDE} {_WALL} {_MIDDLE}" pos="0 {-_SIDE} {_MIDDLE}"/>
+</body>
+<body name="grape">
+  <joint name="grape" type="free" damping="1e-5"/>
+  <geom type="sphere" size="{_RADIUS}" mass=".012" contype="1" condim="4" friction="1 .02 .001"
+    solref=".01 1" rgba=".45 .10 .60 1"/>
+</body>
+"""
+
+
+def _place(key: jax.Array) -> Layout:
+    grape_key, basket_key = jax.random.split(key)
+
+    def sample(key: jax.Array, centre: tuple, spread: tuple, height: float) -> jax.Array:
+        shift = jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0) * jnp.array(spread)
+        return jnp.append(jnp.array(centre) + shift, height)
+
+    return {
+        "grape": sample(grape_key, _GRAPE, _GRAPE_RANGE, _RADIUS),
+        "basket": sample(basket_key, _BASKET, _BASKET_RANGE, 0.0),
+    }
+
+
+def _check(view: View) -> tuple[jax.Array, dict[str, jax.Array]]:
+    grape = view.position("grape")
+    offset = grape - view.position("basket")
+    inside = jnp.all(jnp.abs(offset[:2]) < _INSIDE) & (offset[2] < _HEIGHT)
+    at_rest = view.speed("grape") < 0.05
+    # A gripper that holds the grape is as wide as it and around it.
+    away = jnp.linalg.norm(grape - view.tcp) > 0.06
+    released = (view.opening > 2 * _RADIUS + 0.005) | away
+    return inside & at_rest & released, {"grape_to_basket": jnp.linalg.norm(offset[:2])}
+
+
+def _waypoints(layout: Layout) -> Waypoints:
+    grape, basket = layout["grape"], layout["basket"]
+    wide, closed = 0.052, 0.008  # m
+    return route(
+        (grape, (0.0, 0.0, 0.080), wide, 1.5, 0.008),
+        (grape, (0.0, 0.0, 0.001), wide, 1.0, 0.0),
+        (grape, (0.0, 0.0, 0.001), closed, 0.7, 0.0),
+        (grape, (0.0, 0.0, 0.100), closed, 0.9, 0.006),
+        (basket, (0.0, 0.0, 0.115), closed, 1.3, 0.006),
+        (basket, (0.0, 0.0, 0.055), closed, 0.7, 0.0),
+        (basket, (0.0, 0.0, 0.055), wide, 0.6, 0.0),
+        (basket, (0.0, 0.0, 0.130), wide, 0.8, 0.006),
+    )
+
+
+TASK = Task(
+    name="pick_place",
+    scene=_SCENE,
+    instructions=(
+        "put the grape in the basket",
+        "place the grape into the basket",
+        "pick up the grape for the basket",
+        "drop the grape in the basket",
+        "move the grape to the basket",
+    ),
+    time_limit=12.0,
+    expert_time=9.0,
+    hold_steps=3,
+    place=_place,
+    check=_check,
+    waypoints=_waypoints,
+)

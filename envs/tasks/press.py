@@ -1,0 +1,72 @@
+"""Press the red button: down past 75 % of its stroke, by the fingers.
+
+Numbers without a source are own choices that work with both arms.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from envs.robots import TIP_LENGTH
+from envs.tasks import Layout, Task, View, Waypoints, route
+
+_STROKE = 0.012  # m
+_TOP = 0.040  # m, height of the cap at rest
+_RADIUS = 0.024  # m, of the cap
+_CENTRE, _RANGE = (0.36, 0.0), (0.04, 0.04)  # m, of the random position
+
+# A spring of 150 N/m: 1.8 N at full stroke, far more than the cap's weight (compensated anyway).
+_SCENE = f"""
+<body name="button" mocap="true">
+  <geom type="cylinder" size=".040 .012" pos="0 0 .012" rgba=".20 .22 .26 1"/>
+  <body name="cap" gravcomp="1">
+    <joint name="button" type="slide" axis="0 0 -1" range="0 {_STROKE}" stiffness="150"
+      damping="2" armature=".01"/>
+    <geom type="cylinder" size="{_RADIUS} .010" pos="0 0 {_TOP - 0.010}" mass=".02"
+      rgba=".90 .10 .08 1"/>
+    <geom class="collider" type="box" size=".02 .02 .010" pos="0 0 {_TOP - 0.010}"
+      conaffinity="2"/>
+  </body>
+</body>
+"""
+
+
+def _place(key: jax.Array) -> Layout:
+    shift = jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0) * jnp.array(_RANGE)
+    return {"button": jnp.append(jnp.array(_CENTRE) + shift, 0.0)}
+
+
+def _check(view: View) -> tuple[jax.Array, dict[str, jax.Array]]:
+    depth = view.joint("button")
+    top = view.position("button") + jnp.array([0.0, 0.0, _TOP]) - depth * jnp.array([0.0, 0.0, 1.0])
+    offset = view.tip - top
+    touching = (jnp.linalg.norm(offset[:2]) < _RADIUS) & (jnp.abs(offset[2]) < 0.01)
+    return (depth > 0.75 * _STROKE) & touching, {"button_depth": depth}
+
+
+def _waypoints(layout: Layout) -> Waypoints:
+    top = layout["button"] + jnp.array([0.0, 0.0, _TOP + TIP_LENGTH])
+    return route(
+        (top, (0.0, 0.0, 0.060), 0.0, 1.8, 0.008),
+        (top, (0.0, 0.0, 0.012), 0.0, 0.9, 0.0),
+        (top, (0.0, 0.0, -0.015), 0.0, 0.7, 0.0),
+        (top, (0.0, 0.0, -0.015), 0.0, 0.6, 0.0),
+    )
+
+
+TASK = Task(
+    name="press",
+    scene=_SCENE,
+    instructions=(
+        "press the red button",
+        "push the button down",
+        "push down the red button",
+        "hit the red button",
+        "press the button on the table",
+    ),
+    time_limit=8.0,
+    expert_time=5.0,
+    hold_steps=1,
+    place=_place,
+    check=_check,
+    waypoints=_waypoints,
+)

@@ -1,0 +1,16 @@
+"""LoRA-SP (Select-Prune, arXiv 2603.07404) for vision-language-action models in JAX.
+
+Axis letters used in every docstring and einsum of this package:
+
+    B batch          T tokens        S key tokens     D width
+    N query heads    K kv heads      H head dim       F mlp width
+    I, O dense in, out               R bank size (maximum rank)
+    L layer          A action dim    C chunk length
+    J joints         W parallel worlds
+"""
+
+from lorasp_jax import dense, peft
+from lorasp_jax.adaptation import adapt, merge, summary
+from lorasp_jax.dense import collect_aux
+
+__all__ = ["adapt", "collect_aux", "dense", "merge", "peft", "summary"]

@@ -1,0 +1,285 @@
+"""Adapting a whole model: attach methods by path rules, split, count, summarise, merge.
+
+A rule is (pattern, method). Patterns are `re.search`ed in "/"-joined paths, and the first rule that
+matches a path governs it, whether it can apply there or not: with [("vision", LoRA()),
+(".*", FullFineTuning())] the vision tower's norms stay frozen. `None` leaves a path alone.
+"""
+
+import difflib
+import functools
+import math
+import re
+import zlib
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+from lorasp_jax.dense import AdapterParam, Dense
+from lorasp_jax.peft import FullFineTuning, Method
+from lorasp_jax.peft.method import Params
+
+Rules = Sequence[tuple[str, Method | None]]
+Row = tuple[str, str, str, str, str, str]
+Model = TypeVar("Model", bound=nnx.Module)
+
+
+class Counts(NamedTuple):
+    """Numbers of parameters."""
+
+    trainable: int
+    total: int
+
+
+class Place(NamedTuple):
+    """Where a layer or parameter hangs in a model: `getattr(parent, name)` is `child`."""
+
+    path: str
+    parent: Any
+    name: str
+    child: Any
+
+
+def adapt(model: Model, rules: Rules, *, rngs: nnx.Rngs) -> Model:
+    """Attaches adapters to dense layers, or frees base weights for full fine-tuning, by path rules.
+
+    Additive methods apply to every `Dense` and `nnx.Linear` (which becomes a `Dense`) at its path,
+    for instance "language/gate_proj". A stacked kernel [L, I, O] gets stacked adapters. The layer's
+    own weights are frozen, and an adapter it already had is replaced.
+    `FullFineTuning` applies to every parameter under the paths it matches, norms, embeddings and
+    biases included, which becomes an fp32 `AdapterParam` in its place.
+
+    Args:
+      model: left untouched; the result shares its frozen arrays.
+      rules: (pattern, method or None) pairs, first match wins.
+      rngs: source of the adapters' keys. A layer's adapter depends on the key and its path alone.
+
+    Returns:
+      The adapted model.
+
+    Raises:
+      ValueError: a rule that governs nothing it applies to (lists near misses), or a layer that an
+        adapter cannot take over.
+    """
+    holder, key = _copy(model), rngs.params()
+    used = _attach_all(holder, rules, key) | _free_all(holder, rules)
+    for i, (pattern, _) in enumerate(rules):
+        if i not in used:
+            raise ValueError(_no_match(pattern, holder))
+    return holder[0]
+
+
+def split(model: nnx.Module) -> tuple[nnx.GraphDef, nnx.State, nnx.State]:
+    """(graphdef, adapters, frozen): the structure, what trains, and everything else.
+
+    `nnx.merge(graphdef, adapters, frozen)` gives the model back, also inside jit and grad.
+    """
+    graphdef, adapters, frozen = nnx.split(_copy(model)[0], AdapterParam, ...)
+    return graphdef, adapters, frozen
+
+
+def count(model: nnx.Module) -> Counts:
+    """How many parameters train, and how many there are; shapes suffice (`nnx.eval_shape`)."""
+    return Counts(_size(nnx.state(model, AdapterParam)), _size(nnx.state(model, nnx.Param)))
+
+
+def methods(model: nnx.Module) -> dict[str, Method]:
+    """Method by path: of each layer with an adapter, and full fine-tuning of each parameter."""
+    found = {}
+    for path, parent, name, _ in _places(nnx.List([model]), AdapterParam):
+        if isinstance(parent, Dense) and name == "adapter":
+            found[path.rpartition("/")[0]] = parent.method
+        else:
+            found[path] = FullFineTuning()
+    return found
+
+
+def merge(model: Model) -> Model:
+    """A model without adapters that computes the same: deltas folded into kernels, all frozen.
+
+    Raises:
+      ValueError: a method whose delta depends on the input.
+    """
+    holder = _copy(model)
+    for place in _places(holder, Dense):
+        layer = place.child
+        if layer.adapter is not None:
+            try:
+                kernel = _merged(layer.method, layer.adapter.get_value(), layer.kernel.get_value())
+            except ValueError as error:
+                raise ValueError(f"cannot merge {place.path}: {error}") from error
+            layer.kernel.set_value(kernel)
+            layer.adapter = None
+        layer.method = None
+    _retype(_places(holder, AdapterParam), nnx.Param)
+    return holder[0]
+
+
+def summary(model: nnx.Module) -> str:
+    """A table of the dense layers and of every other parameter that trains, with totals.
+
+    Columns: path, method, kernel shape, rank, parameters (base and adapter), trainable ones.
+    """
+    holder = nnx.List([model])
+    rows = [("path", "method", "shape", "rank", "parameters", "trainable")]
+    inside = set()
+    for path, _, _, layer in _places(holder, Dense):
+        inside |= {id(v) for v in vars(layer).values() if isinstance(v, nnx.Variable)}
+        rank = getattr(layer.method, "rank", "-")
+        method = layer.method.name if layer.method else "full" if count(layer).trainable else "-"
+        rows.append(_row(path, method, layer.kernel.get_value(), rank, count(layer)))
+    for path, _, _, variable in _places(holder, AdapterParam):
+        if id(variable) not in inside:
+            counts = Counts(variable.get_value().size, variable.get_value().size)
+            rows.append(_row(path, "full", variable.get_value(), "-", counts))
+    trainable, total = count(model)
+    rows.append(("total", "", "", "", f"{total:,}", f"{trainable:,}"))
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = ["  ".join(_align(row, widths)).rstrip() for row in rows]
+    rule = "-" * max(map(len, lines))
+    share = f"{trainable / max(total, 1):.2%} of all parameters train"
+    return "\n".join([lines[0], rule, *lines[1:-1], rule, lines[-1], share])
+
+
+def attach(layer: Dense | nnx.Linear, method: Method, key: jax.Array) -> Dense:
+    """The layer with a fresh adapter and its own weights frozen.
+
+    Args:
+      layer: kernel [..., I, O]; leading axes are layers of a scanned stack. A `Dense` is changed in
+        place, an `nnx.Linear` replaced.
+      method: an additive method.
+      key: typed random key.
+
+    Raises:
+      ValueError: an `nnx.Linear` with a custom matrix product or precision.
+    """
+    if isinstance(layer, nnx.Linear):
+        layer = _as_dense(layer)
+    _retype([p for p in _places(nnx.List([layer]), AdapterParam) if p.name != "adapter"], nnx.Param)
+    layer.method = method
+    shape = layer.kernel.get_value().shape
+    layer.adapter = AdapterParam(_init_params(key, method=method, shape=shape))
+    return layer
+
+
+def _copy(model: nnx.Module) -> nnx.List:
+    """A holder of one copy of the model that shares its arrays, free of what layers kept.
+
+    The holder gives a model that is itself one layer a parent to be replaced in.
+    """
+    model = nnx.clone(model)
+    nnx.pop(model, nnx.Intermediate)
+    return nnx.List([model])
+
+
+def _places(holder: nnx.List, kind: type | tuple[type, ...]) -> list[Place]:
+    """All children of a type, with paths that start below the holder."""
+
+    def walk() -> Iterator[Place]:
+        for path, module in nnx.iter_modules(holder):
+            for name, child in vars(module).items():
+                if isinstance(child, kind):
+                    yield Place("/".join(map(str, (*path, name)[1:])), module, name, child)
+
+    return list(walk())
+
+
+def _governing(rules: Rules, *paths: str) -> int | None:
+    """Index of the first rule that matches one of the paths."""
+    hits = (i for i, (pattern, _) in enumerate(rules) if any(re.search(pattern, p) for p in paths))
+    return next(hits, None)
+
+
+def _attach_all(holder: nnx.List, rules: Rules, key: jax.Array) -> set[int]:
+    """Attaches additive adapters in place; returns the rules that were used."""
+    used = set()
+    for path, parent, name, layer in _places(holder, (Dense, nnx.Linear)):
+        i = _governing(rules, path)
+        method = None if i is None else rules[i][1]
+        if method is not None and not method.trains_base:
+            own_key = jax.random.fold_in(key, zlib.crc32(path.encode()))
+            setattr(parent, name, attach(layer, method, own_key))
+            used.add(i)
+    return used
+
+
+def _free_all(holder: nnx.List, rules: Rules) -> set[int]:
+    """Makes base parameters trainable in place; returns the rules that were used."""
+    used, freed = set(), []
+    for place in _places(holder, nnx.Param):
+        i = _governing(rules, place.path.rpartition("/")[0], place.path)
+        method = None if i is None else rules[i][1]
+        if i is None or (method is not None and not method.trains_base):
+            continue
+        used.add(i)
+        if method is not None and place.name != "adapter":
+            if place.name == "kernel" and getattr(place.parent, "adapter", None) is not None:
+                raise ValueError(f"{place.path} cannot train in full under the layer's adapter.")
+            if isinstance(place.parent, Dense) and place.parent.adapter is None:
+                place.parent.method = method
+            freed.append(place)
+    _retype(freed, AdapterParam)
+    return used
+
+
+def _retype(places: Sequence[Place], kind: type[nnx.Param]) -> None:
+    """Replaces variables by ones of another type, shared ones by one; those that train are fp32."""
+    renewed = {}
+    for _, parent, name, variable in places:
+        if id(variable) not in renewed:
+            value = variable.get_value()
+            if kind is AdapterParam and jnp.issubdtype(value.dtype, jnp.floating):
+                value = value.astype(jnp.float32)
+            renewed[id(variable)] = kind(value, **variable.get_metadata())
+        setattr(parent, name, renewed[id(variable)])
+
+
+def _as_dense(linear: nnx.Linear) -> Dense:
+    """A `Dense` that holds a linear layer's own variables."""
+    if linear.dot_general is not jax.lax.dot_general or linear.precision is not None:
+        raise ValueError("an nnx.Linear with its own dot_general or precision cannot be adapted.")
+    layer = Dense(1, 1, use_bias=linear.bias is not None, dtype=linear.dtype, rngs=nnx.Rngs(0))
+    layer.kernel, layer.bias = linear.kernel, linear.bias
+    return layer
+
+
+@functools.partial(jax.jit, static_argnames=("method", "shape"))
+def _init_params(key: jax.Array, *, method: Method, shape: tuple[int, ...]) -> Params:
+    """Parameters for a kernel [..., I, O]: one draw per leading index."""
+    matrix = jax.ShapeDtypeStruct(shape[-2:], jnp.float32)
+    leading = shape[:-2]
+    if not leading:
+        return method.init(key, matrix)[0]
+    keys = jax.random.split(key, math.prod(leading))
+    params = jax.vmap(lambda one: method.init(one, matrix)[0])(keys)
+    return jax.tree.map(lambda leaf: leaf.reshape(*leading, *leaf.shape[1:]), params)
+
+
+def _merged(method: Method, params: Params, kernel: jax.Array) -> jax.Array:
+    """`method.merge` over a kernel's leading axes."""
+    merge_one = method.merge
+    for _ in kernel.shape[:-2]:
+        merge_one = jax.vmap(merge_one)
+    return merge_one(params, kernel)
+
+
+def _no_match(pattern: str, holder: nnx.List) -> str:
+    paths = [place.path for place in _places(holder, (Dense, nnx.Linear))]
+    close = difflib.get_close_matches(pattern, paths, n=5, cutoff=0.3) or paths[:5]
+    return f"rule {pattern!r} applies to nothing; dense layers here: {', '.join(close) or 'none'}."
+
+
+def _size(tree: Any) -> int:
+    return sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(tree))
+
+
+def _row(path: str, method: str, kernel: Any, rank: Any, counts: Counts) -> Row:
+    shape = "x".join(map(str, kernel.shape))
+    return path, method, shape, str(rank), f"{counts.total:,}", f"{counts.trainable:,}"
+
+
+def _align(row: Row, widths: list[int]) -> list[str]:
+    left, right = zip(row[:3], widths[:3], strict=True), zip(row[3:], widths[3:], strict=True)
+    return [cell.ljust(w) for cell, w in left] + [cell.rjust(w) for cell, w in right]

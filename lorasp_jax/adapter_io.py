@@ -1,0 +1,169 @@
+"""Adapters on disk: a folder with adapter.safetensors (what trains) and adapter.json (what it is).
+
+The JSON holds the method of every adapted path, the identity of the base as the caller states it,
+free metadata, and the checksum that binds it to its tensors. Tensor names are "/"-joined paths; a
+stacked layer's tensors keep their leading layer axes.
+"""
+
+import dataclasses
+import hashlib
+import json
+import os
+import pathlib
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import safetensors.numpy
+from flax import nnx
+
+from lorasp_jax import adaptation, peft
+from lorasp_jax.dense import AdapterParam
+from lorasp_jax.peft import Method
+
+TENSORS, DESCRIPTION = "adapter.safetensors", "adapter.json"
+FORMAT, VERSION = "lorasp_jax adapter", 1
+Settings = dict[str, Any]
+
+
+def save_adapters(
+    folder: str | os.PathLike,
+    model: nnx.Module,
+    *,
+    base: str = "",
+    metadata: Mapping[str, Any] | None = None,
+) -> None:
+    """Writes everything in a model that trains, and nothing of its frozen base.
+
+    Each file is complete before it takes its name; an adapter already in the folder is replaced.
+
+    Args:
+      folder: made if absent.
+      model: an adapted model.
+      base: identity of the frozen base, for instance a hash of its weights.
+      metadata: anything JSON can hold.
+
+    Raises:
+      ValueError: the model has nothing that trains.
+    """
+    adapters = nnx.state(model, AdapterParam)
+    tensors = {name: np.asarray(leaf) for name, leaf in _named(adapters).items()}
+    if not tensors:
+        raise ValueError("the model has no adapters to save.")
+    data = safetensors.numpy.save(tensors)
+    description = {
+        "format": FORMAT,
+        "version": VERSION,
+        "base": base,
+        "sha256": hashlib.sha256(data).hexdigest(),
+        "methods": {path: _settings(m) for path, m in adaptation.methods(model).items()},
+        "metadata": dict(metadata or {}),
+    }
+    folder = pathlib.Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    _write(folder / TENSORS, data)
+    _write(folder / DESCRIPTION, json.dumps(description, indent=2).encode())
+
+
+def load_adapters(
+    folder: str | os.PathLike, model: adaptation.Model, *, base: str | None = None
+) -> adaptation.Model:
+    """The model with the adapters of a folder.
+
+    A model without adapters is adapted as the file says; one that has adapters must have the same.
+
+    Args:
+      folder: written by `save_adapters`.
+      model: left untouched.
+      base: if given, must equal the base that the adapters were saved for.
+
+    Raises:
+      ValueError: missing, damaged or foreign files, another base, or adapters that do not fit.
+    """
+    folder = pathlib.Path(folder)
+    description, tensors = _read(folder)
+    if base is not None and description["base"] != base:
+        raise ValueError(f"{folder} was trained on base {description['base']!r}, not on {base!r}.")
+    wanted = description["methods"]
+    present = {path: _settings(method) for path, method in adaptation.methods(model).items()}
+    if not present:
+        model = _adapt(model, wanted, folder)
+    elif present != wanted:
+        differing = sorted(p for p in present | wanted if present.get(p) != wanted.get(p))
+        raise ValueError(f"{folder} has other adapters than the model, first at {differing[0]!r}.")
+    graphdef, adapters, frozen = adaptation.split(model)
+    return nnx.merge(graphdef, _filled(adapters, tensors, folder), frozen)
+
+
+def _adapt(
+    model: adaptation.Model, wanted: Mapping[str, Settings], folder: pathlib.Path
+) -> adaptation.Model:
+    """The bare model with the adapters that a file lists, by exact paths."""
+    try:
+        methods = {path: _method(settings) for path, settings in wanted.items()}
+        # A parameter trained in full may sit in a layer with an adapter: such rules go first.
+        paths = sorted(methods, key=lambda path: not methods[path].trains_base)
+        rules = [(f"^{re.escape(path)}$", methods[path]) for path in paths]
+        return adaptation.adapt(model, rules, rngs=nnx.Rngs(0))
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{folder} does not fit the model: {error}") from error
+
+
+def _filled(adapters: nnx.State, tensors: Mapping[str, Any], folder: pathlib.Path) -> nnx.State:
+    """The state with every leaf taken from the tensors."""
+    expected = _named(adapters)
+    if differing := sorted(expected.keys() ^ tensors.keys()):
+        raise ValueError(f"{folder} and the model differ in tensors, first {differing[0]!r}.")
+    for name, leaf in expected.items():
+        if tensors[name].shape != leaf.shape:
+            shapes = f"{tensors[name].shape} in {folder}, {leaf.shape} in the model"
+            raise ValueError(f"tensor {name!r} has shape {shapes}.")
+    values = [jnp.asarray(tensors[name], leaf.dtype) for name, leaf in expected.items()]
+    return jax.tree.unflatten(jax.tree.structure(adapters), values)
+
+
+def _named(adapters: nnx.State) -> dict[str, jax.Array]:
+    """Leaves in tree order, by attribute path and place in the parameters."""
+    leaves = jax.tree_util.tree_flatten_with_path(nnx.to_pure_dict(adapters))[0]
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
+
+
+def _settings(method: Method) -> Settings:
+    """A method as JSON: its name and the fields that belong to a saved adapter."""
+    saved = [f.name for f in dataclasses.fields(method) if f.metadata.get("saved", True)]  # pyright: ignore[reportArgumentType]
+    return {"method": method.name, **{name: getattr(method, name) for name in saved}}
+
+
+def _method(settings: Settings) -> Method:
+    fields = {name: value for name, value in settings.items() if name != "method"}
+    return peft.create(settings["method"], **fields)
+
+
+def _write(path: pathlib.Path, data: bytes) -> None:
+    """Writes a whole file or nothing."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_bytes(data)
+    temporary.replace(path)
+
+
+def _read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The description and the tensors, checked against each other."""
+    for name in (DESCRIPTION, TENSORS):
+        if not (folder / name).is_file():
+            raise ValueError(f"{folder} holds no {name}; an adapter is a folder with both files.")
+    data = (folder / TENSORS).read_bytes()
+    try:
+        description = json.loads((folder / DESCRIPTION).read_bytes())
+        known = (description["format"], description["version"]) == (FORMAT, VERSION)
+        complete = isinstance(description["methods"], dict) and "base" in description
+        same = description["sha256"] == hashlib.sha256(data).hexdigest()
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{folder / DESCRIPTION} is damaged or no adapter description.") from error
+    if not (known and complete):
+        raise ValueError(f"{folder / DESCRIPTION} is not a {FORMAT} of version {VERSION}.")
+    if not same:
+        raise ValueError(f"{folder / TENSORS} is damaged or belongs to another {DESCRIPTION}.")
+    return description, safetensors.numpy.load(data)

@@ -1,0 +1,113 @@
+"""What a run is: frozen dataclasses, one instance per experiment file in `configs/`."""
+
+from dataclasses import dataclass, field
+
+from lorasp_jax.peft import Method
+
+SCALES = ("smoke", "cpu", "accelerator")
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """Demonstrations made by the scripted expert."""
+
+    episodes: int = 512
+    """Successful demonstrations per task."""
+    num_envs: int = 256
+    """Worlds simulated at a time while collecting."""
+    action_noise: float = 0.02
+    """Standard deviation of the noise on executed joint targets [rad]; recorded targets are clean."""
+
+
+@dataclass(frozen=True)
+class OptimConfig:
+    """AdamW with linear warm-up and cosine decay."""
+
+    steps: int = 2000
+    """Optimizer steps."""
+    batch_size: int = 512
+    """Windows per step, over all devices."""
+    learning_rate: float = 1e-3
+    """Peak learning rate."""
+    final_learning_rate: float = 1e-5
+    """Learning rate at the last step."""
+    warmup_steps: int = 100
+    """Steps of linear warm-up from zero."""
+    weight_decay: float = 1e-4
+    """Decoupled weight decay."""
+    b2: float = 0.95
+    """Decay of the second moment."""
+    clip_norm: float = 1.0
+    """Largest global gradient norm."""
+    state_noise: float = 0.02
+    """Standard deviation of the noise on normalised robot states while training."""
+
+
+@dataclass(frozen=True)
+class AuxiliaryConfig:
+    """Weights of the auxiliary losses, eq. 14 of arXiv 2603.07404."""
+
+    spectral: float = 1e-2
+    """Weight of the spectral loss 1 - E_k, eq. 13."""
+    balance: float = 1e-3
+    """Weight of the balance loss."""
+    z: float = 1e-3
+    """Weight of the router z-loss."""
+    warmup: float = 0.02
+    """Share of the steps over which the three weights rise linearly from zero."""
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """Closed-loop evaluation in simulation."""
+
+    episodes: int = 256
+    """Episodes per task."""
+    num_envs: int = 256
+    """Worlds simulated at a time."""
+    execute_steps: int = 5
+    """Actions of a chunk that are executed before the policy looks again."""
+    denoise_steps: int = 10
+    """Euler steps of the flow-matching sampler."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """One experiment: robot, tasks, base, adapter method and how to train."""
+
+    name: str
+    """The run's folder is runs/<name>."""
+    scale: str
+    """Which sizes were chosen: smoke, cpu or accelerator."""
+    peft: Method
+    """Adapter method and its settings."""
+    size: str
+    """Backbone size: nano or small."""
+    base: str
+    """Folder of the base weights, or empty to start from random ones."""
+    robot: str = "piper"
+    """Robot the demonstrations are made with and the policy is evaluated on."""
+    tasks: tuple[str, ...] = ("press", "pick_place")
+    """Tasks trained together."""
+    targets: tuple[str, ...] = (".*",)
+    """Regular expressions over layer paths: what the method is attached to."""
+    image_size: int = 64
+    """Height and width of both camera pictures [pixels]."""
+    data: DataConfig = field(default_factory=DataConfig)
+    """Demonstrations."""
+    optim: OptimConfig = field(default_factory=OptimConfig)
+    """Optimizer and schedule."""
+    auxiliary: AuxiliaryConfig = field(default_factory=AuxiliaryConfig)
+    """Auxiliary loss weights."""
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    """Evaluation in simulation."""
+    compute_dtype: str = "float32"
+    """Type of the matrix products: float32 or bfloat16."""
+    fsdp: int = 1
+    """Devices over which large frozen arrays are split; the rest of the mesh is data parallel."""
+    log_every: int = 50
+    """Steps per compiled call, and between log lines."""
+    checkpoint_every: int = 1000
+    """Steps between checkpoints."""
+    seed: int = 0
+    """Seed of every random stream of the run."""

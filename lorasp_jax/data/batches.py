@@ -1,0 +1,107 @@
+"""Windows of demonstrations as training batches, sampled on the device.
+
+All episodes that fit in memory lie there as flat per-step arrays; a batch is a gather. What a step
+trains on is a function of the run's key and the step number alone, so the data position of a run is
+one integer.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.episodes import Episodes
+from lorasp_jax.models.policy import Observation
+from lorasp_jax.models.processing import Processor
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Batch:
+    """What one training step sees.
+
+    Attributes:
+        observation: normalised model input, leading axis B.
+        actions: `[B, C, A]` normalised action chunks in the policy's slots.
+        action_mask: `[B, C, A]` bool, True inside the episode and in the robot's slots.
+    """
+
+    observation: Observation
+    actions: jax.Array
+    action_mask: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Steps:
+    """Every step of every episode, one after the other.
+
+    Attributes:
+        image: camera name -> `[N, H, W, 3]` uint8.
+        state: `[N, J+1]` joints [rad] and gripper opening [m].
+        action: `[N, J+1]` joint targets [rad] and gripper opening [m].
+        end: `[N]` int32, index just past the last step of the same episode.
+        instruction: `[N]` int32, row of the processor's token table.
+    """
+
+    image: dict[str, jax.Array]
+    state: jax.Array
+    action: jax.Array
+    end: jax.Array
+    instruction: jax.Array
+
+
+def flatten(episodes: Sequence[Episodes]) -> Steps:
+    """Concatenate the valid steps of several sets of episodes; instructions are renumbered in order."""
+    parts: list[Steps] = []
+    offset = phrase = 0
+    for group in episodes:
+        length = np.asarray(group.length)
+        valid = np.flatnonzero(np.arange(group.state.shape[1]) < length[:, None])
+
+        def keep(array: jax.Array, valid: np.ndarray = valid) -> jax.Array:
+            return jnp.asarray(array).reshape(-1, *array.shape[2:])[valid]
+
+        parts.append(
+            Steps(
+                image={name: keep(image) for name, image in group.image.items()},
+                state=keep(group.state),
+                action=keep(group.action),
+                end=jnp.asarray(np.repeat(np.cumsum(length), length) + offset, jnp.int32),
+                instruction=jnp.asarray(np.repeat(group.instruction, length) + phrase, jnp.int32),
+            )
+        )
+        offset += int(length.sum())
+        phrase += len(group.instructions)
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+
+
+def sample_batch(
+    key: jax.Array,
+    steps: Steps,
+    processor: Processor,
+    *,
+    batch_size: int,
+    chunk: int,
+    state_noise: float,
+) -> Batch:
+    """Draw `batch_size` windows uniformly over steps; `key` is consumed.
+
+    A chunk that would reach past its episode repeats the last action there, with the mask False.
+    """
+    start_key, noise_key = jax.random.split(key)
+    start = jax.random.randint(start_key, (batch_size,), 0, steps.end.shape[0])
+    window = start[:, None] + jnp.arange(chunk)  # [B, C]
+    last = steps.end[start][:, None] - 1
+    raw = {
+        "image": {name: image[start] for name, image in steps.image.items()},
+        "state": steps.state[start],
+    }
+    observation = processor.encode(raw, steps.instruction[start])
+    actions = processor.normalize_actions(steps.action[jnp.minimum(window, last)])
+    slots = processor.slot_mask  # [A]
+    noise = state_noise * jax.random.normal(noise_key, observation.state.shape) * slots
+    observation = replace(observation, state=observation.state + noise)
+    return Batch(observation, actions, (window <= last)[..., None] & slots)

@@ -1,0 +1,43 @@
+"""Demonstrations of a run: collected once by the scripted expert, then reused from the run's cache."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+
+import envs
+from envs.episodes import Episodes
+from lorasp_jax.config import Config
+
+Progress = Callable[[str, int, int], None]
+"""Called with task, episodes done and episodes wanted."""
+
+
+def demonstrations(config: Config, folder: Path, progress: Progress) -> dict[str, Episodes]:
+    """Episodes of every task of `config`, from `folder`/cache where they are already there."""
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 1), len(config.tasks))
+    return {
+        task: _task_demonstrations(config, folder / "cache" / f"{task}.npz", task, key, progress)
+        for task, key in zip(config.tasks, keys, strict=True)
+    }
+
+
+def _task_demonstrations(
+    config: Config, path: Path, task: str, key: jax.Array, progress: Progress
+) -> Episodes:
+    """Episodes of one task."""
+    if path.exists():
+        return Episodes.load(path)
+    episodes = envs.collect(
+        task,
+        robot=config.robot,
+        num_episodes=config.data.episodes,
+        key=key,
+        image_size=config.image_size,
+        num_envs=config.data.num_envs,
+        action_noise=config.data.action_noise,
+        progress=lambda done, total: progress(task, done, total),
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    episodes.save(path)
+    return episodes

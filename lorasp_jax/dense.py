@@ -1,0 +1,216 @@
+"""The integration point: one functional adapted dense layer and its two shells.
+
+`dense` works on arrays. `Dense` (Flax NNX) and `LinenDense` (Flax Linen) are drop-ins for
+`nnx.Linear` and `nn.Dense`. All reach the same `Method.apply`, the only place that adds a delta.
+
+Called as a drop-in, where `layer(x)` gives `y` alone, a layer keeps what it would report for
+`collect_aux`. With NNX that works wherever the module may be changed: eagerly, or inside a jitted
+function that gets the model as an argument or merges it itself,
+
+    def loss(adapters):
+        model = nnx.merge(graphdef, adapters, frozen)
+        y = model(x)
+        aux = lorasp_jax.collect_aux(model)
+
+A model that `jax.jit` closes over can be called too, but keeps nothing. Code that can handle a
+second result asks for it, `layer(x, return_aux=True)`, and then nothing is stored.
+"""
+
+import contextlib
+from collections.abc import Mapping
+from typing import Any
+
+import flax.errors
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax import nnx
+from flax.typing import Dtype, Initializer
+
+from lorasp_jax.peft import Aux, Method
+from lorasp_jax.peft.method import Params
+
+KEPT = "kept_aux"
+KERNEL_INIT = jax.nn.initializers.lecun_normal()  # of nnx.Linear and nn.Dense too
+
+
+class AdapterParam(nnx.LoRAParam):
+    """What trains, and the only thing that does: an adapter's parameters, or a base weight."""
+
+
+def dense(
+    x: jax.Array,
+    kernel: jax.Array,
+    bias: jax.Array | None = None,
+    params: Params | None = None,
+    method: Method | None = None,
+    *,
+    token_mask: jax.Array | None = None,
+) -> tuple[jax.Array, Aux]:
+    """x @ kernel + bias through an adapter, or plainly without one.
+
+    Args:
+      x: [...tokens, I].
+      kernel: [I, *O]. More than one output axis is one linear map onto all of them.
+      bias: broadcastable to [*O], or None.
+      params: the adapter's parameters for the kernel as a matrix [I, O], or None.
+      method: the adapter's method, given with `params`.
+      token_mask: bool [...tokens]; False (padding) stays out of losses and statistics.
+
+    Returns:
+      y [...tokens, *O] in the type of x, and the adapter's aux.
+
+    Raises:
+      ValueError: x does not end in the kernel's input size.
+    """
+    d_in, *outputs = kernel.shape
+    if x.shape[-1] != d_in:
+        raise ValueError(f"input of width {x.shape[-1]} meets a kernel {tuple(kernel.shape)}.")
+    matrix = kernel.reshape(d_in, -1)
+    if method is None or params is None:
+        y, aux = x @ matrix.astype(x.dtype), Aux()
+    else:
+        y, aux = method.apply(params, x, matrix, token_mask=token_mask)
+    y = y.reshape(*x.shape[:-1], *outputs)
+    return (y if bias is None else y + bias.astype(y.dtype)), aux
+
+
+class Dense(nnx.Module):
+    """A dense layer with an optional adapter, a drop-in for `nnx.Linear`.
+
+    Attributes:
+      kernel: [I, O] (an `AdapterParam` under full fine-tuning). In a model that scans over its
+        depth it carries leading layer axes, and so does the adapter.
+      bias: [O] or None.
+      adapter: `AdapterParam` holding the method's parameters, or None.
+      method: the adapter's method, static.
+    """
+
+    def __init__(
+        self,
+        d_in: int,
+        d_out: int,
+        *,
+        use_bias: bool = True,
+        method: Method | None = None,
+        dtype: Dtype | None = None,
+        param_dtype: Dtype = jnp.float32,
+        kernel_init: Initializer = KERNEL_INIT,
+        rngs: nnx.Rngs,
+    ) -> None:
+        """Draws the weights.
+
+        Args:
+          d_in: I.
+          d_out: O.
+          use_bias: whether to add a bias, zero at first.
+          method: adapter method, or None.
+          dtype: type of the computation; None promotes input and kernel.
+          param_dtype: type of kernel and bias; adapters are always fp32.
+          kernel_init: initializer of the kernel.
+          rngs: source of the random keys.
+        """
+        base = AdapterParam if method is not None and method.trains_base else nnx.Param
+        self.kernel = base(kernel_init(rngs.params(), (d_in, d_out), param_dtype))
+        self.bias = base(jnp.zeros(d_out, param_dtype)) if use_bias else None
+        self.adapter = nnx.data(None)  # may hold a variable later
+        self.method = method
+        self.dtype = dtype
+        if method is not None and not method.trains_base:
+            params, kernel = method.init(rngs.params(), self.kernel.get_value())
+            self.kernel.set_value(kernel)
+            self.adapter = AdapterParam(params)
+
+    def __call__(
+        self, x: jax.Array, *, token_mask: jax.Array | None = None, return_aux: bool = False
+    ) -> Any:
+        """y [...tokens, O], or (y, aux) if asked; see `dense`."""
+        kernel = self.kernel.get_value()
+        bias = None if self.bias is None else self.bias.get_value()
+        params = None if self.adapter is None else self.adapter.get_value()
+        x = x.astype(self.dtype or jnp.promote_types(x.dtype, kernel.dtype))
+        y, aux = dense(x, kernel, bias, params, self.method, token_mask=token_mask)
+        if return_aux:
+            return y, aux
+        if self.adapter is not None:
+            # A module of an outer trace cannot be changed; collect_aux then raises.
+            with contextlib.suppress(flax.errors.TraceContextError):
+                setattr(self, KEPT, nnx.Intermediate(aux))
+        return y
+
+
+class LinenDense(nn.Module):
+    """A dense layer with an optional adapter, a drop-in for `nn.Dense`.
+
+    The kernel and bias are in the collection "params", the adapter's parameters in "adapters": what
+    trains is a collection. Full fine-tuning trains "params" and adds nothing. With "intermediates"
+    mutable, aux is sown there for `collect_aux`.
+
+    Attributes:
+      features: O.
+      use_bias: whether to add a bias.
+      method: adapter method, or None.
+      dtype: type of the computation; None promotes input and kernel.
+      param_dtype: type of kernel and bias; adapters are always fp32.
+      kernel_init: initializer of the kernel.
+    """
+
+    features: int
+    use_bias: bool = True
+    method: Method | None = None
+    dtype: Dtype | None = None
+    param_dtype: Dtype = jnp.float32
+    kernel_init: Initializer = KERNEL_INIT
+
+    @nn.compact
+    def __call__(
+        self, x: jax.Array, *, token_mask: jax.Array | None = None, return_aux: bool = False
+    ) -> Any:
+        """y [...tokens, O], or (y, aux) if asked; see `dense`."""
+        shape = (x.shape[-1], self.features)
+        kernel = self.param("kernel", self.kernel_init, shape, self.param_dtype)
+        bias = None
+        if self.use_bias:
+            bias = self.param("bias", nn.initializers.zeros, (self.features,), self.param_dtype)
+        params = None
+        method = self.method
+        if method is not None and not method.trains_base:
+            init = lambda: method.init(self.make_rng("params"), kernel)[0]  # noqa: E731
+            params = self.variable("adapters", "adapter", init).value
+        x = x.astype(self.dtype or jnp.promote_types(x.dtype, kernel.dtype))
+        y, aux = dense(x, kernel, bias, params, method, token_mask=token_mask)
+        if return_aux:
+            return y, aux
+        if params is not None:
+            self.sow("intermediates", KEPT, aux)
+        return y
+
+
+def collect_aux(model: nnx.Module | Mapping) -> dict[str, Aux]:
+    """What the drop-in layers of a model kept in the last call, by layer path; taken out of it.
+
+    Args:
+      model: an NNX model that was just called, or the variables a Linen model returned from
+        `apply(..., mutable=["intermediates"])`.
+
+    Returns:
+      Aux by "/"-joined path of the layer.
+
+    Raises:
+      ValueError: no adapted layer kept anything.
+    """
+    if isinstance(model, nnx.Module):
+        kept = nnx.to_flat_state(nnx.pop(model, nnx.Intermediate))
+        found = {path[:-1]: v.get_value() for path, v in kept if path[-1] == KEPT}
+    else:
+        flat = jax.tree_util.tree_flatten_with_path(
+            model, is_leaf=lambda node: isinstance(node, Aux)
+        )[0]
+        keys = [([k.key for k in path if hasattr(k, "key")], aux) for path, aux in flat]
+        found = {tuple(p[1:-1]): aux for p, aux in keys if isinstance(aux, Aux) and p[-1] == KEPT}
+    if not found:
+        raise ValueError(
+            "no adapted layer kept anything: call the model first, inside the same traced function "
+            "(NNX) or with mutable=['intermediates'] (Linen)."
+        )
+    return {"/".join(map(str, path)): aux for path, aux in found.items()}

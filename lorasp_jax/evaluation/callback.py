@@ -1,0 +1,147 @@
+"""Success in simulation before and after training, with a video of each task."""
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.progress import Progress
+
+import envs
+from envs.env import Env
+from lorasp_jax import adaptation
+from lorasp_jax.evaluation import video
+from lorasp_jax.evaluation.rollout import Result, evaluate, make_rollout
+from lorasp_jax.models import tokenizer
+from lorasp_jax.models.policy import Policy
+from lorasp_jax.training.loop import Callback, Run
+from lorasp_jax.training.run_folder import write_json
+
+TOWERS = ("vision", "language", "action")
+
+
+class Evaluation(Callback):
+    """Measures every task of a run before the first and after the last step.
+
+    Adapters start at exactly zero, so the policy before the first step is the unadapted base; the
+    two measurements share one compilation, their layouts differ.
+    """
+
+    def __init__(self) -> None:
+        """Nothing is compiled yet."""
+        self._tasks: dict[str, tuple[Env, Callable]] = {}
+
+    def on_start(self, run: Run) -> None:
+        """Measure the base and record it, for a resumed run too."""
+        results = self._measure(run, "before")
+        write_json(run.folder / "before.json", {t: success(r) for t, r in results.items()})
+
+    def on_end(self, run: Run) -> None:
+        """Measure the trained policy and write results.json and the videos."""
+        results = self._measure(run, "after")
+        for task, result in results.items():
+            _film(self._tasks[task][0], result, run.folder / f"rollout_{task}.mp4")
+            first = {name: np.asarray(i[0, 0]) for name, i in run.episodes[task].image.items()}
+            video.write_picture(run.folder / f"cameras_{task}.png", video.side_by_side(first))
+        write_json(run.folder / "results.json", summarise(run, results))
+
+    def _measure(self, run: Run, when: str) -> dict[str, Result]:
+        """Results by task."""
+        config = run.config.evaluation
+        with run.timed("evaluate"), Progress(console=run.console) as progress:
+            results = {}
+            for number, task in enumerate(run.config.tasks):
+                bar = progress.add_task(f"compiling evaluation of {task} ...", total=config.episodes)
+                env, rollout = self._compiled(run, task)
+                key = jax.random.fold_in(jax.random.key(run.config.seed), 10 + 2 * number)
+                results[task] = evaluate(
+                    task_policy(run.policy, env),
+                    env,
+                    jax.random.fold_in(key, ("before", "after").index(when)),
+                    config.episodes,
+                    rollout=rollout,
+                    progress=lambda done, _, bar=bar, task=task: progress.update(
+                        bar, completed=done, description=f"evaluating {task} {when}"
+                    ),
+                )
+                low, high = (100 * bound for bound in results[task].ci95)
+                run.console.print(
+                    f"{task} {when}: {100 * results[task].success:.1f} % success "
+                    f"(95 % interval {low:.0f}-{high:.0f} %) in {config.episodes} episodes"
+                )
+        return results
+
+    def _compiled(self, run: Run, task: str) -> tuple[Env, Callable]:
+        """The environment and jitted rollout of a task, made once."""
+        if task not in self._tasks:
+            config = run.config
+            env = envs.make(
+                task,
+                robot=config.robot,
+                num_envs=min(config.evaluation.num_envs, config.evaluation.episodes),
+                image_size=config.image_size,
+            )
+            rollout = make_rollout(
+                env,
+                execute_steps=config.evaluation.execute_steps,
+                denoise_steps=config.evaluation.denoise_steps,
+            )
+            self._tasks[task] = env, jax.jit(rollout)
+        return self._tasks[task]
+
+
+def task_policy(policy: Policy, env: Env) -> Policy:
+    """The policy with the instructions of one environment in its token table."""
+    ids, valid = tokenizer.encode(env.instructions, policy.model.config.max_tokens)
+    table = {"tokens": jnp.asarray(ids), "token_mask": jnp.asarray(valid)}
+    return Policy(policy.model, dataclasses.replace(policy.processor, **table))
+
+
+def success(result: Result) -> dict[str, Any]:
+    """The part of a result that results.json keeps per task."""
+    return {"success": result.success, "episodes": result.episodes, "ci95": list(result.ci95)}
+
+
+def summarise(run: Run, after: dict[str, Result]) -> dict[str, Any]:
+    """The content of results.json."""
+    before = json.loads((run.folder / "before.json").read_text())
+    layers = _mean([result.active_rank for result in after.values()])
+    modules = {
+        tower: float(np.mean(np.concatenate(list(layers[tower].values()))))
+        for tower in TOWERS
+        if layers.get(tower)
+    }
+    if modules:
+        values = [v for linears in layers.values() for v in linears.values()]
+        modules["mean"] = float(np.mean(np.concatenate(values)))
+    trainable, total = adaptation.count(run.policy.model)
+    return {
+        "scale": run.config.scale,
+        "seconds": {**run.seconds, "total": run.elapsed},
+        "tasks": {
+            task: {"before": before[task], "after": success(result)}
+            for task, result in after.items()
+        },
+        "active_rank": modules,
+        "layer_active_rank": layers,
+        "trainable_parameters": trainable,
+        "total_parameters": total,
+    }
+
+
+def _mean(trees: list[Any]) -> Any:
+    """Mean of equal trees whose leaves are lists of numbers."""
+    is_list = lambda node: isinstance(node, list)  # noqa: E731
+    return jax.tree.map(lambda *v: np.mean(v, axis=0).tolist(), *trees, is_leaf=is_list)
+
+
+def _film(env: Env, result: Result, path: Path) -> None:
+    """Render a recorded episode at film size and write it at the control rate."""
+    camera = dataclasses.replace(env, image_size=video.FILM_SIZE)
+    images = jax.jit(camera.render)(*result.poses)
+    frames = video.side_by_side({name: np.asarray(image) for name, image in images.items()})
+    video.write_video(path, frames, fps=1 / env.control_dt)

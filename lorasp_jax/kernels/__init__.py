@@ -1,0 +1,1 @@
+"""Numerical kernels, each with one plain XLA reference and the same results on every backend."""

@@ -1,0 +1,232 @@
+"""The energy gate of LoRA-SP: the fewest directions whose squared scores reach an energy target.
+
+For scores s >= 0 let E_k be the energy share of the k largest squares (paper eq. 12). The gate
+keeps the smallest k with E_k >= η, ties by lowest index. Each implementation reduces a row to its
+`Boundary`, the last kept (score, index) in that order; the mask then follows elementwise.
+
+- "sort": value sort, cumulative energy, threshold. The reference; its running sum may round across
+  η on a rare row.
+- "bisection": no sort. Binary search on the bits of the threshold, since fp32 numbers >= 0 are
+  ordered as their bit patterns.
+- "pallas": the same search in a Triton kernel, a few rows to a program, scores held in registers.
+
+η is the decimal that was written: 0.9 means 9/10, and E_k >= 9/10 is tested as 10 Σ_k >= 9 Σ, so a
+row that reaches the target exactly is not lost to the rounding of 0.9.
+"""
+
+import decimal
+import fractions
+import functools
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.experimental import pallas as pl
+
+Implementation = Literal["sort", "bisection", "pallas"]
+
+ROWS_PER_PROGRAM = 4
+WARPS_PER_PROGRAM = 4
+
+
+class Boundary(NamedTuple):
+    """The last kept position of each row: keep s > score, and s == score up to `index`."""
+
+    score: jax.Array  # f32 [..., 1]; NaN where nothing is kept
+    index: jax.Array  # int32 [..., 1]
+
+
+class Ratio(NamedTuple):
+    """η as numerator / denominator, in [0, 1], exact in fp32 for decimals of up to 7 digits."""
+
+    numerator: float
+    denominator: float
+
+
+def exact_ratio(energy_target: float) -> Ratio:
+    """Reads η as the decimal it was written as.
+
+    Raises:
+      ValueError: η is not a number in (0, 1].
+    """
+    try:
+        ratio = fractions.Fraction(decimal.Decimal(str(energy_target)))
+    except (decimal.InvalidOperation, ValueError, OverflowError):
+        ratio = fractions.Fraction(0)
+    if not 0 < ratio <= 1:
+        raise ValueError(f"energy_target must lie in (0, 1], got {energy_target!r}.")
+    power = 2 ** ratio.denominator.bit_length()  # scales both without rounding
+    return Ratio(ratio.numerator / power, ratio.denominator / power)
+
+
+def energy_gate(
+    scores: jax.Array, energy_target: float, *, implementation: Implementation | None = None
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Keeps the smallest set of directions whose energy share reaches the target (eq. 12).
+
+    No gradient flows through the mask; `kept_energy` is differentiable in the scores. A row of
+    zeros keeps nothing and has `kept_energy` 1. At η = 1 every positive score is kept.
+
+    Args:
+      scores: [..., R], non-negative and finite; computed in fp32.
+      energy_target: η in (0, 1], a Python number, read as an exact decimal.
+      implementation: how to find the mask; None takes `default_implementation()`.
+
+    Returns:
+      mask bool [..., R], active_rank f32 [...] = k, kept_energy f32 [...] = E_k.
+
+    Raises:
+      ValueError: η outside (0, 1] or an unknown implementation.
+    """
+    ratio = exact_ratio(energy_target)
+    find = _finder(implementation or default_implementation())
+    scores = scores.astype(jnp.float32)
+    constant = jax.lax.stop_gradient(scores)
+    everything = ratio.numerator == ratio.denominator
+    mask = constant > 0 if everything else _mask(constant, find(constant, ratio))
+    return mask, mask.sum(-1).astype(jnp.float32), _kept_energy(scores, mask)
+
+
+def default_implementation() -> Implementation:
+    """Pallas on one NVIDIA GPU, bisection in XLA elsewhere.
+
+    Under a mesh of several devices XLA partitions the bisection over rows; it would gather the
+    scores first for a Pallas call.
+    """
+    single = jax.sharding.get_abstract_mesh().size <= 1
+    return "pallas" if single and jax.default_backend() == "gpu" else "bisection"
+
+
+def _finder(implementation: str) -> Callable[[jax.Array, Ratio], Boundary]:
+    finders = {
+        "sort": _sorted_boundary,
+        "bisection": _bisected_boundary,
+        "pallas": _pallas_boundary,
+    }
+    if implementation not in finders:
+        raise ValueError(f"unknown gate {implementation!r}; valid are {', '.join(finders)}.")
+    return finders[implementation]
+
+
+def _mask(scores: jax.Array, last: Boundary) -> jax.Array:
+    position = jax.lax.broadcasted_iota(jnp.int32, scores.shape, scores.ndim - 1)
+    return (scores > last.score) | ((scores == last.score) & (position <= last.index))
+
+
+def _kept_energy(scores: jax.Array, mask: jax.Array) -> jax.Array:
+    """E_k of eq. (12), f32 [...]; 1 for a row of zeros, with a zero gradient there."""
+    energy = _energy(scores)
+    total = energy.sum(-1)
+    kept = jnp.where(mask, energy, 0).sum(-1)
+    return jnp.where(total > 0, kept / jnp.where(total > 0, total, 1), 1)
+
+
+def _energy(scores: jax.Array) -> jax.Array:
+    """s² of rows scaled by the power of two that brings their maximum into [1/2, 1).
+
+    The scaling is exact, E_k does not depend on it, and squares neither under- nor overflow. For a
+    maximum with exponent field e it is 2^(126 - e), with field 253 - e (at least 1: normal).
+    """
+    largest = jax.lax.stop_gradient(scores).max(-1, keepdims=True)
+    exponent = jax.lax.shift_right_logical(_bits(largest), 23)
+    scale = _float(jax.lax.shift_left(jnp.maximum(253 - exponent, 1), 23))
+    return jnp.square(scores * scale)
+
+
+def _bits(x: jax.Array) -> jax.Array:
+    return jax.lax.bitcast_convert_type(x, jnp.int32)
+
+
+def _float(bits: jax.Array) -> jax.Array:
+    return jax.lax.bitcast_convert_type(bits, jnp.float32)
+
+
+def _bisected_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
+    """Two binary searches: the largest score that reaches the target together with all above it,
+    then the last tie of it that is needed.
+
+    Only elementwise work and row sums: the XLA implementation is also the Pallas kernel's body.
+    """
+    energy = _energy(scores)
+    target = ratio.numerator * energy.sum(-1, keepdims=True)
+
+    def reaches(chosen: jax.Array) -> jax.Array:
+        return ratio.denominator * jnp.where(chosen, energy, 0).sum(-1, keepdims=True) >= target
+
+    zero = jnp.zeros_like(target, jnp.int32)
+    score = _float(_largest(lambda bits: reaches(scores >= _float(bits)), zero, num_bits=31))
+
+    # Ties share one energy; one is kept while the energy before it falls short of the target.
+    above = jnp.where(scores > score, energy, 0).sum(-1, keepdims=True)
+    tied = scores == score
+    each = jnp.where(tied, energy, 0).max(-1, keepdims=True)
+    position = jax.lax.broadcasted_iota(jnp.int32, scores.shape, scores.ndim - 1)
+
+    def falls_short(index: jax.Array) -> jax.Array:
+        before = (tied & (position < index)).astype(jnp.float32).sum(-1, keepdims=True)
+        return ratio.denominator * (above + before * each) < target
+
+    num_bits = (scores.shape[-1] - 1).bit_length()
+    return Boundary(score, _largest(falls_short, zero, num_bits=num_bits))
+
+
+def _largest(
+    holds: Callable[[jax.Array], jax.Array], zero: jax.Array, *, num_bits: int
+) -> jax.Array:
+    """The largest int32 below 2^num_bits for which `holds`, which turns false once and for all."""
+
+    def step(i: jax.Array, found: jax.Array) -> jax.Array:
+        candidate = found | jax.lax.shift_left(jnp.int32(1), num_bits - 1 - i)
+        return jnp.where(holds(candidate), candidate, found)
+
+    return jax.lax.fori_loop(0, num_bits, step, zero)
+
+
+def _sorted_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
+    """Reference: value sort, cumulative energy, threshold; no argsort, nothing scattered back."""
+    rows = scores.reshape(-1, scores.shape[-1])
+    last = jax.vmap(lambda row: _sorted_row_boundary(row, ratio))(rows)
+    return jax.tree.map(lambda leaf: leaf.reshape(*scores.shape[:-1], 1), last)
+
+
+def _sorted_row_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
+    descending = jnp.flip(jnp.sort(scores))
+    energy = _energy(descending)
+    before = jnp.cumsum(jnp.roll(energy.at[-1].set(0), 1))
+    kept = (ratio.denominator * before < ratio.numerator * energy.sum()) & (descending > 0)
+    score = jnp.where(kept.any(), jnp.where(kept, descending, jnp.inf).min(), jnp.nan)
+    tied = scores == score
+    num_ties = kept.sum() - (scores > score).sum()
+    index = (jnp.cumsum(tied) < num_ties).sum()  # tied scores up to here: num_ties of them
+    return Boundary(score, index.astype(jnp.int32))
+
+
+def _pallas_boundary(scores: jax.Array, ratio: Ratio, *, interpret: bool = False) -> Boundary:
+    """The bisection as a Triton kernel; rows and R are padded with zeros, which are never kept."""
+    from jax.experimental.pallas import triton  # absent from builds without NVIDIA support
+
+    rows = scores.reshape(-1, scores.shape[-1])
+    num_rows, rank = rows.shape
+    width = max(pl.next_power_of_2(rank), 2)
+    programs = pl.cdiv(num_rows, ROWS_PER_PROGRAM)
+    rows = jnp.pad(rows, ((0, programs * ROWS_PER_PROGRAM - num_rows), (0, width - rank)))
+
+    column = pl.BlockSpec((ROWS_PER_PROGRAM, 1), lambda i: (i, 0))
+    score, index = pl.pallas_call(
+        functools.partial(_boundary_kernel, ratio=ratio),
+        grid=(programs,),
+        in_specs=[pl.BlockSpec((ROWS_PER_PROGRAM, width), lambda i: (i, 0))],
+        out_specs=[column, column],
+        out_shape=[jax.ShapeDtypeStruct((len(rows), 1), t) for t in (jnp.float32, jnp.int32)],
+        compiler_params=triton.CompilerParams(num_warps=WARPS_PER_PROGRAM, num_stages=1),
+        interpret=interpret,
+        name="energy_gate",
+    )(rows)
+    last = Boundary(score[:num_rows], index[:num_rows])
+    return jax.tree.map(lambda leaf: leaf.reshape(*scores.shape[:-1], 1), last)
+
+
+def _boundary_kernel(scores: Any, score: Any, index: Any, *, ratio: Ratio) -> None:
+    """One program: references to scores [rows, width] in, to the two columns of `Boundary` out."""
+    score[...], index[...] = _bisected_boundary(scores[...], ratio)

@@ -1,0 +1,171 @@
+"""What the backbones share: norms, rotary positions, attention, masks, and the scan over depth."""
+
+import math
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from lorasp_jax.peft import Aux
+
+MASKED = -2.3819763e38
+"""Logit of a forbidden key. Finite, so that a row without any key gets a uniform softmax, not NaN."""
+
+LayerAux = dict[str, Aux]
+Block = TypeVar("Block", bound=nnx.Module)
+
+
+class RMSNorm(nnx.Module):
+    """x / sqrt(mean(x^2) + eps) * (1 + scale) in fp32 (Gemma's form), back in the type of x."""
+
+    def __init__(self, width: int, *, eps: float = 1e-6, param_dtype: Any = jnp.float32) -> None:
+        self.scale = nnx.Param(jnp.zeros((width,), param_dtype))
+        self.eps = eps
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        wide = x.astype(jnp.float32)
+        inverse = jax.lax.rsqrt(jnp.mean(jnp.square(wide), axis=-1, keepdims=True) + self.eps)
+        return (wide * inverse * (1 + self.scale.get_value().astype(jnp.float32))).astype(x.dtype)
+
+
+class LayerNorm(nnx.Module):
+    """(x - mean) / sqrt(variance + eps) * scale + bias in fp32, back in the type of x."""
+
+    def __init__(self, width: int, *, eps: float = 1e-6, param_dtype: Any = jnp.float32) -> None:
+        self.scale = nnx.Param(jnp.ones((width,), param_dtype))
+        self.bias = nnx.Param(jnp.zeros((width,), param_dtype))
+        self.eps = eps
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        wide = x.astype(jnp.float32)
+        wide = wide - jnp.mean(wide, axis=-1, keepdims=True)
+        wide = wide * jax.lax.rsqrt(jnp.mean(jnp.square(wide), axis=-1, keepdims=True) + self.eps)
+        scale, bias = self.scale.get_value(), self.bias.get_value()
+        return (wide * scale.astype(jnp.float32) + bias.astype(jnp.float32)).astype(x.dtype)
+
+
+class Linears:
+    """Calls the dense layers of one module by name and keeps what their adapters report.
+
+    Attributes:
+        aux: report of each layer called so far, by name.
+    """
+
+    def __init__(self, module: nnx.Module, token_mask: jax.Array | None) -> None:
+        self.aux: LayerAux = {}
+        self._module = module
+        self._token_mask = token_mask
+
+    def __call__(self, name: str, x: jax.Array) -> jax.Array:
+        """y of the layer `name` for x `[B, T, I]`."""
+        layer = getattr(self._module, name)
+        y, self.aux[name] = layer(x, token_mask=self._token_mask, return_aux=True)
+        return y
+
+
+def stack(make: Callable[[nnx.Rngs], Block], depth: int, rngs: nnx.Rngs) -> Block:
+    """`depth` independently drawn blocks as one module whose parameters have a leading axis L."""
+    keys = jax.random.split(rngs.params(), depth)
+    return jax.vmap(lambda key: make(nnx.Rngs(params=key)))(keys)
+
+
+def scan_depth(
+    blocks: Block,
+    call: Callable[[Block, jax.Array, Any], tuple[jax.Array, Any]],
+    x: jax.Array,
+    per_layer: Any = None,
+    *,
+    remat: bool = False,
+) -> tuple[jax.Array, Any]:
+    """Run x through stacked blocks.
+
+    Args:
+        blocks: from `stack`.
+        call: (block, x, its slice of `per_layer`) -> (x, what to keep).
+        x: `[B, T, D]`.
+        per_layer: pytree with a leading axis L, or None.
+        remat: compute the inside of a block again in the backward pass instead of storing it.
+
+    Returns:
+        `[B, T, D]`, and what the blocks gave to keep, stacked to `[L, ...]`.
+    """
+    graphdef, state = nnx.split(blocks)
+
+    def layer(x: jax.Array, scanned: tuple[Any, Any]) -> tuple[jax.Array, Any]:
+        return call(nnx.merge(graphdef, scanned[0]), x, scanned[1])
+
+    body = jax.checkpoint(layer, prevent_cse=False) if remat else layer
+    return jax.lax.scan(body, x, (state, per_layer))
+
+
+def positions(valid: jax.Array) -> jax.Array:
+    """`[B, T]` int32 positions that count valid tokens; padding repeats the last one."""
+    return jnp.cumsum(valid, axis=-1, dtype=jnp.int32) - 1
+
+
+def block_mask(
+    query_block: np.ndarray, key_block: np.ndarray, query_valid: jax.Array, key_valid: jax.Array
+) -> jax.Array:
+    """Who sees whom: keys of the same block and of earlier ones, valid tokens only.
+
+    Args:
+        query_block: `[T]` int, number of the block each query token belongs to.
+        key_block: `[S]` int.
+        query_valid: `[B, T]` bool.
+        key_valid: `[B, S]` bool.
+
+    Returns:
+        `[B, T, S]` bool.
+    """
+    order = key_block[None, :] <= query_block[:, None]
+    return order & query_valid[:, :, None] & key_valid[:, None, :]
+
+
+def rope_table(position: jax.Array, head_dim: int) -> tuple[jax.Array, jax.Array]:
+    """Sine and cosine, each f32 `[B, T, 1, H/2]`, of position / 10000^(2i/H) (Su et al., 2104.09864)."""
+    wavelength = 10_000.0 ** (np.arange(0, head_dim, 2, dtype=np.float32) / head_dim)
+    angle = position[:, :, None, None].astype(jnp.float32) / wavelength
+    return jnp.sin(angle), jnp.cos(angle)
+
+
+def rope(x: jax.Array, table: tuple[jax.Array, jax.Array], scale: float = 1.0) -> jax.Array:
+    """Rotate the two halves of each head of x `[B, T, N, H]` in fp32, times `scale`."""
+    sin, cos = table
+    first, second = jnp.split(x.astype(jnp.float32), 2, axis=-1)
+    turned = [first * cos - second * sin, second * cos + first * sin]
+    return (scale * jnp.concatenate(turned, axis=-1)).astype(x.dtype)
+
+
+def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) -> jax.Array:
+    """Grouped-query attention, softmax in fp32.
+
+    Args:
+        q: `[B, T, N, H]`, already scaled.
+        k: `[B, S, K, H]`; each key head serves N / K query heads.
+        v: `[B, S, K, H]`.
+        mask: `[B, T, S]` bool, or None for all pairs.
+
+    Returns:
+        `[B, T, N H]`.
+    """
+    batch, tokens, heads, size = q.shape
+    # With K = 1 no axis of q, weights or result moves in memory.
+    q = q.reshape(batch, tokens, k.shape[2], -1, size)
+    logits = jnp.einsum("BTKGH,BSKH->BKTGS", q, k, preferred_element_type=jnp.float32)
+    if mask is not None:
+        logits = jnp.where(mask[:, None, :, None, :], logits, MASKED)
+    weights = jax.nn.softmax(logits, axis=-1).astype(v.dtype)
+    return jnp.einsum("BKTGS,BSKH->BTKGH", weights, v).reshape(batch, tokens, heads * size)
+
+
+def time_embedding(flow_time: jax.Array, width: int) -> jax.Array:
+    """`[B, width]` f32: sines, then cosines, of `[B]` times at periods from 4e-3 to 4.
+
+    Periods: openpi, src/openpi/models/pi0.py, `create_sinusoidal_pos_embedding`.
+    """
+    period = 4e-3 * (4.0 / 4e-3) ** np.linspace(0, 1, width // 2)
+    angle = flow_time[:, None].astype(jnp.float32) * (2 * math.pi / period).astype(np.float32)
+    return jnp.concatenate([jnp.sin(angle), jnp.cos(angle)], axis=-1)

@@ -1,0 +1,143 @@
+"""Gemma experts (arXiv 2403.08295) that share attention: pi0's mixture of transformers.
+
+An expert's tokens attend to the keys and values that earlier experts left for the same layer. Since
+language tokens never see action tokens, the language expert runs first, whole, and the action expert
+follows with its cache; training and sampling take the same path.
+"""
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+from lorasp_jax.dense import Dense
+from lorasp_jax.models.layers import (
+    LayerAux,
+    Linears,
+    RMSNorm,
+    attention,
+    rope,
+    rope_table,
+    scan_depth,
+    stack,
+)
+from lorasp_jax.models.pi0.config import ExpertConfig, Pi0Config
+
+KeysValues = tuple[jax.Array, jax.Array]
+"""Keys after the rotation and values, each `[B, S, K, H]`, or `[L, B, S, K, H]` for all layers."""
+
+
+class ExpertBlock(nnx.Module):
+    """One Gemma layer: RMS norms, rotary grouped-query attention, GeGLU; no biases."""
+
+    def __init__(self, size: ExpertConfig, config: Pi0Config, *, rngs: nnx.Rngs) -> None:
+        kinds: dict[str, Any] = {
+            "use_bias": False,
+            "dtype": config.dtype,
+            "param_dtype": config.param_dtype,
+            "rngs": rngs,
+        }
+        width, inner = size.width, size.heads * size.head_dim
+        self.head_dim = size.head_dim
+        self.input_layernorm = RMSNorm(width, param_dtype=config.param_dtype)
+        self.q_proj = Dense(width, inner, **kinds)
+        self.k_proj = Dense(width, size.kv_heads * size.head_dim, **kinds)
+        self.v_proj = Dense(width, size.kv_heads * size.head_dim, **kinds)
+        self.o_proj = Dense(inner, width, **kinds)
+        self.post_attention_layernorm = RMSNorm(width, param_dtype=config.param_dtype)
+        self.gate_proj = Dense(width, size.mlp, **kinds)
+        self.up_proj = Dense(width, size.mlp, **kinds)
+        self.down_proj = Dense(size.mlp, width, **kinds)
+
+    def __call__(
+        self,
+        x: jax.Array,
+        table: tuple[jax.Array, jax.Array],
+        mask: jax.Array,
+        cache: KeysValues | None,
+        token_mask: jax.Array,
+    ) -> tuple[jax.Array, tuple[KeysValues, LayerAux]]:
+        """One layer.
+
+        Args:
+            x: `[B, T, D]`.
+            table: rotation of these tokens, from `rope_table`.
+            mask: `[B, T, S + T]` bool over the cache's keys and the own ones, in this order.
+            cache: keys and values of earlier tokens, or None (S = 0).
+            token_mask: `[B, T]` bool, what the adapters count.
+
+        Returns:
+            x, then the own keys and values and the adapters' reports.
+        """
+        linear = Linears(self, token_mask)
+        heads = (*x.shape[:2], -1, self.head_dim)
+        h = self.input_layernorm(x)
+        q, k, v = (linear(name, h).reshape(heads) for name in ("q_proj", "k_proj", "v_proj"))
+        q, k = rope(q, table, scale=self.head_dim**-0.5), rope(k, table)
+        keys, values = k, v
+        if cache is not None:
+            keys = jnp.concatenate([cache[0], k], axis=1)
+            values = jnp.concatenate([cache[1], v], axis=1)
+        x = x + linear("o_proj", attention(q, keys, values, mask))
+        h = self.post_attention_layernorm(x)
+        h = jax.nn.gelu(linear("gate_proj", h), approximate=True) * linear("up_proj", h)
+        return x + linear("down_proj", h), ((k, v), linear.aux)
+
+
+class Expert(nnx.Module):
+    """A stack of Gemma layers with its final norm."""
+
+    def __init__(self, size: ExpertConfig, config: Pi0Config, *, rngs: nnx.Rngs) -> None:
+        self.config = config
+        self.head_dim = size.head_dim
+        self.blocks = stack(lambda rngs: ExpertBlock(size, config, rngs=rngs), size.depth, rngs)
+        self.norm = RMSNorm(size.width, param_dtype=config.param_dtype)
+
+    def __call__(
+        self,
+        x: jax.Array,
+        position: jax.Array,
+        mask: jax.Array,
+        cache: KeysValues | None = None,
+        *,
+        token_mask: jax.Array,
+    ) -> tuple[jax.Array, KeysValues, LayerAux]:
+        """All layers.
+
+        Args:
+            x: `[B, T, D]`.
+            position: `[B, T]` int32.
+            mask: `[B, T, S + T]` bool.
+            cache: keys and values `[L, B, S, K, H]` of earlier tokens, or None (S = 0).
+            token_mask: `[B, T]` bool.
+
+        Returns:
+            `[B, T, D]` after the final norm, the own keys and values `[L, B, T, K, H]`, and the
+            adapters' reports, stacked over layers.
+        """
+        table = rope_table(position, self.head_dim)
+        x, (own, aux) = scan_depth(
+            self.blocks,
+            lambda block, x, cache: block(x, table, mask, cache, token_mask),
+            x.astype(self.config.dtype),
+            cache,
+            remat=self.config.remat,
+        )
+        return self.norm(x), own, aux
+
+
+class LanguageExpert(Expert):
+    """The expert that owns the token embedding."""
+
+    def __init__(self, size: ExpertConfig, config: Pi0Config, *, rngs: nnx.Rngs) -> None:
+        super().__init__(size, config, rngs=rngs)
+        shape = (config.vocabulary, size.width)
+        draw = jax.random.normal(rngs.params(), shape, config.param_dtype)
+        self.embedding = nnx.Param(draw * size.width**-0.5)
+
+    def embed(self, tokens: jax.Array) -> jax.Array:
+        """`[B, T]` int32 -> `[B, T, D]`, scaled by sqrt(D) as Gemma does."""
+        table = self.embedding.get_value()
+        return (table[tokens] * math.sqrt(table.shape[-1])).astype(self.config.dtype)

@@ -1,0 +1,84 @@
+"""SigLIP vision tower (Zhai et al., arXiv 2303.15343) with pi0's projection to the language width."""
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+from lorasp_jax.dense import Dense
+from lorasp_jax.models.layers import LayerAux, LayerNorm, Linears, attention, scan_depth, stack
+from lorasp_jax.models.pi0.config import Pi0Config
+
+
+class VisionBlock(nnx.Module):
+    """Pre-norm transformer layer: x + attention(norm(x)), x + mlp(norm(x)), tanh-GELU, biases."""
+
+    def __init__(self, config: Pi0Config, *, rngs: nnx.Rngs) -> None:
+        width, mlp = config.vision.width, config.vision.mlp
+        kinds = {"dtype": config.dtype, "param_dtype": config.param_dtype, "rngs": rngs}
+        self.heads = config.vision.heads
+        self.layer_norm1 = LayerNorm(width, param_dtype=config.param_dtype)
+        self.q_proj = Dense(width, width, **kinds)
+        self.k_proj = Dense(width, width, **kinds)
+        self.v_proj = Dense(width, width, **kinds)
+        self.out_proj = Dense(width, width, **kinds)
+        self.layer_norm2 = LayerNorm(width, param_dtype=config.param_dtype)
+        self.fc1 = Dense(width, mlp, **kinds)
+        self.fc2 = Dense(mlp, width, **kinds)
+
+    def __call__(self, x: jax.Array, token_mask: jax.Array) -> tuple[jax.Array, LayerAux]:
+        """x `[B, T, D]` -> x `[B, T, D]` and the adapters' reports."""
+        linear = Linears(self, token_mask)
+        heads = (*x.shape[:2], self.heads, -1)
+        h = self.layer_norm1(x)
+        q, k, v = (linear(name, h).reshape(heads) for name in ("q_proj", "k_proj", "v_proj"))
+        x = x + linear("out_proj", attention(q * q.shape[-1] ** -0.5, k, v, None))
+        h = jax.nn.gelu(linear("fc1", self.layer_norm2(x)), approximate=True)
+        return x + linear("fc2", h), linear.aux
+
+
+class SigLIP(nnx.Module):
+    """Pictures to language tokens.
+
+    The patch embedding, a dense layer over flattened patches, equals the usual strided convolution.
+    """
+
+    def __init__(self, config: Pi0Config, *, rngs: nnx.Rngs) -> None:
+        vision, kinds = config.vision, {"param_dtype": config.param_dtype, "rngs": rngs}
+        self.config = config
+        self.patch_embed = Dense(3 * vision.patch**2, vision.width, dtype=jnp.float32, **kinds)
+        shape = (config.image_tokens, vision.width)
+        draw = jax.random.normal(rngs.params(), shape, config.param_dtype)
+        self.position_embedding = nnx.Param(draw * vision.width**-0.5)
+        self.blocks = stack(lambda rngs: VisionBlock(config, rngs=rngs), vision.depth, rngs)
+        self.norm = LayerNorm(vision.width, param_dtype=config.param_dtype)
+        self.head = Dense(vision.width, config.language.width, dtype=config.dtype, **kinds)
+
+    def __call__(self, images: jax.Array, present: jax.Array) -> tuple[jax.Array, LayerAux]:
+        """Encode pictures.
+
+        Args:
+            images: `[B, H, W, 3]` f32 in [-1, 1].
+            present: `[B]` bool, False for a missing camera's placeholder.
+
+        Returns:
+            `[B, T, D]` tokens of the language width, and the adapters' reports.
+        """
+        mask = jnp.broadcast_to(present[:, None], (images.shape[0], self.config.image_tokens))
+        linear = Linears(self, mask)
+        x = linear("patch_embed", patches(images, self.config.vision.patch))
+        x = x + self.position_embedding.get_value().astype(x.dtype)
+        x, aux = scan_depth(
+            self.blocks,
+            lambda block, x, _: block(x, mask),
+            x.astype(self.config.dtype),
+            remat=self.config.remat,
+        )
+        x = linear("head", self.norm(x))
+        return x, {**aux, **linear.aux}
+
+
+def patches(images: jax.Array, size: int) -> jax.Array:
+    """`[B, H, W, 3]` -> `[B, T, size * size * 3]`, patches row by row, each flattened as (y, x, rgb)."""
+    batch, height, width, _ = images.shape
+    grid = images.reshape(batch, height // size, size, width // size, size, 3)
+    return grid.swapaxes(2, 3).reshape(batch, -1, size * size * 3)

@@ -1,0 +1,75 @@
+"""A tiny offline tokenizer for the project's own base weights: WordPiece over manipulation words.
+
+Words outside the list fall into characters, so every printable ASCII text encodes. The position of an
+entry is its id and shipped weights depend on it: entries are never moved or removed, new words take the
+place of the next reserved one.
+"""
+
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+from tokenizers import Tokenizer, models, normalizers, pre_tokenizers
+
+VOCABULARY_SIZE = 320
+"""Rows of the embedding table, reserved ones included."""
+
+_SPECIAL = ("[PAD]", "[UNK]")
+_CHARACTERS = tuple(chr(code) for code in range(33, 127) if not chr(code).isupper())
+_WORDS = tuple(
+    """
+    a an the this that it its and then of
+    to in into on onto onto up down from off out with inside over above under by at for near
+    press push hit tap touch hold click button switch key
+    pick place put drop grab take lift move carry bring lay leave set get grasp pinch
+    grape fruit berry basket bowl box bin container tray
+    open close remove raise uncover pot lid cover pan top handle knob
+    pour tip empty tilt fill cup mug glass block cube contents
+    red green blue yellow purple orange black white grey brown dark light small big round
+    left right front back side middle center table robot arm gripper object please your
+    """.split()
+)
+
+
+def _vocabulary() -> dict[str, int]:
+    known = dict.fromkeys((*_SPECIAL, *_CHARACTERS, *(f"##{c}" for c in _CHARACTERS), *_WORDS))
+    reserved = (f"[RESERVED{i}]" for i in range(VOCABULARY_SIZE - len(known)))
+    return {entry: i for i, entry in enumerate((*known, *reserved))}
+
+
+VOCABULARY = _vocabulary()
+"""Id of every entry; frozen."""
+
+
+@functools.cache
+def _tokenizer() -> Tokenizer:
+    tokenizer = Tokenizer(models.WordPiece(VOCABULARY, unk_token="[UNK]"))
+    tokenizer.normalizer = normalizers.BertNormalizer(lowercase=True)
+    tokenizer.pre_tokenizer = pre_tokenizers.BertPreTokenizer()
+    return tokenizer
+
+
+def encode(texts: Sequence[str], max_tokens: int) -> tuple[np.ndarray, np.ndarray]:
+    """Token ids of P texts, padded on the right with id 0.
+
+    Args:
+        texts: instructions; case does not matter.
+        max_tokens: T.
+
+    Returns:
+        ids `[P, T]` int32, valid `[P, T]` bool.
+
+    Raises:
+        ValueError: a text is empty, needs more than `max_tokens`, or has characters outside ASCII.
+    """
+    ids = np.zeros((len(texts), max_tokens), np.int32)
+    valid = np.zeros((len(texts), max_tokens), bool)
+    for row, text in enumerate(texts):
+        found = _tokenizer().encode(text).ids
+        if not 0 < len(found) <= max_tokens:
+            raise ValueError(f"{text!r} has {len(found)} tokens; valid are 1 to {max_tokens}.")
+        if VOCABULARY["[UNK]"] in found:
+            raise ValueError(f"{text!r} has a character or word that the tiny tokenizer lacks.")
+        ids[row, : len(found)] = found
+        valid[row, : len(found)] = True
+    return ids, valid

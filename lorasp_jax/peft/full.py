@@ -1,0 +1,50 @@
+"""Full fine-tuning as a method: the base weights themselves are what trains."""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from lorasp_jax.peft.method import Aux, Kernel, Method, Params
+
+
+@dataclasses.dataclass(frozen=True)
+class FullFineTuning(Method):
+    """Trains the kernel.
+
+    As a pure method its parameters are {"kernel": [I, O]}. The NNX and Linen shells make no second
+    copy: there the layer's own weights become the trained ones.
+    """
+
+    trains_base: ClassVar[bool] = True
+
+    def init(
+        self, key: jax.Array, kernel: Kernel, *, statistics: Any = None
+    ) -> tuple[Params, Kernel]:
+        """The kernel is its own starting point."""
+        del key, statistics
+        return {"kernel": kernel}, kernel
+
+    def delta(
+        self, params: Params, x: jax.Array, *, token_mask: jax.Array | None = None
+    ) -> tuple[jax.Array, Aux]:
+        """Raises: full fine-tuning is not additive."""
+        del params, x, token_mask
+        raise ValueError("full fine-tuning replaces the kernel and has no delta; use apply.")
+
+    def apply(
+        self,
+        params: Params,
+        x: jax.Array,
+        kernel: jax.Array,
+        *,
+        token_mask: jax.Array | None = None,
+    ) -> tuple[jax.Array, Aux]:
+        """x @ the trained kernel, [...tokens, O]."""
+        del kernel
+        return x @ params["kernel"].astype(x.dtype), Aux(token_mask=token_mask)
+
+    def merge(self, params: Params, kernel: jax.Array) -> jax.Array:
+        """The trained kernel in the base's type."""
+        return jnp.asarray(params["kernel"], kernel.dtype)

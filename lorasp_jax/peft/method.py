@@ -1,0 +1,188 @@
+"""What an adapter method is, and how one is found by its file's name.
+
+A method is a frozen dataclass that is its own configuration. It holds no arrays: `init` makes its
+parameters, a pytree, and the other methods are pure functions of them. It knows no framework; the
+shells for NNX and Linen are in `lorasp_jax.dense`.
+"""
+
+import dataclasses
+import difflib
+import importlib
+import pkgutil
+from collections.abc import Mapping
+from typing import Any, ClassVar, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from lorasp_jax.kernels.low_rank_matmul import low_rank_matmul
+
+PACKAGE = __name__.rpartition(".")[0]
+
+Params: TypeAlias = Any
+Kernel: TypeAlias = jax.Array | jax.ShapeDtypeStruct
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Aux:
+    """What an adapted layer reports beside its output.
+
+    Attributes:
+      active_rank: f32 [...tokens], directions in use; None where a method has no rank.
+      kept_energy: f32 [...tokens], E_k of eq. (12); None without a gate.
+      losses: fp32 scalars by name, already averaged over the valid tokens.
+      token_mask: bool [...tokens], True where a token counts; None means all do.
+    """
+
+    active_rank: jax.Array | None = None
+    kept_energy: jax.Array | None = None
+    losses: Mapping[str, jax.Array] = dataclasses.field(default_factory=dict)
+    token_mask: jax.Array | None = None
+
+    def mean_active_rank(self) -> jax.Array | None:
+        """Active rank averaged over valid tokens (and over layers, if stacked), an f32 scalar."""
+        if self.active_rank is None:
+            return None
+        return masked_mean(self.active_rank, self.token_mask)
+
+
+def masked_mean(values: jax.Array, mask: jax.Array | None) -> jax.Array:
+    """Mean of values [...] over the positions where mask [...] is True; 0 if there are none."""
+    if mask is None:
+        return values.mean()
+    return jnp.where(mask, values, 0).sum() / jnp.maximum(mask.sum(), 1)
+
+
+class Method:
+    """Base of all methods. An additive low-rank one only has `init_params` and `project` to write.
+
+    x is [...tokens, I], a kernel [I, O]; the result has the type of x. Parameters are fp32.
+    """
+
+    trains_base: ClassVar[bool] = False
+    """True if the base weights themselves are what trains."""
+
+    @property
+    def name(self) -> str:
+        """The method's file name, as `create` takes it."""
+        return type(self).__module__.rpartition(".")[2]
+
+    def init(
+        self, key: jax.Array, kernel: Kernel, *, statistics: Any = None
+    ) -> tuple[Params, Kernel]:
+        """Fresh parameters for one kernel, under which the adapted map still equals x @ kernel.
+
+        Args:
+          key: typed random key.
+          kernel: [I, O], or its ShapeDtypeStruct: only shape is read here.
+          statistics: activations' statistics, for initialisations that look at data.
+
+        Returns:
+          The parameters, and the kernel as it came (initialisations that split it return the rest).
+
+        Raises:
+          ValueError: the kernel is not a matrix.
+        """
+        del statistics
+        if len(kernel.shape) != 2:
+            raise ValueError(f"an adapter needs a kernel [I, O], got shape {tuple(kernel.shape)}.")
+        return self.init_params(key, *kernel.shape), kernel
+
+    def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
+        """Fresh parameters for a kernel [d_in, d_out], a pure function of key and shape."""
+        raise NotImplementedError
+
+    def project(
+        self, params: Params, x: jax.Array, token_mask: jax.Array | None
+    ) -> tuple[jax.Array, jax.Array, Aux]:
+        """The two factors of the delta, z [...tokens, R] and u [R, O] in the type of x, and aux."""
+        raise NotImplementedError
+
+    def delta(
+        self, params: Params, x: jax.Array, *, token_mask: jax.Array | None = None
+    ) -> tuple[jax.Array, Aux]:
+        """What the adapter adds to x @ kernel, [...tokens, O].
+
+        Args:
+          params: from `init`.
+          x: [...tokens, I].
+          token_mask: bool [...tokens]; False (padding) stays out of losses and statistics.
+        """
+        z, u, aux = self.project(params, x, token_mask)
+        return z @ u, aux
+
+    def apply(
+        self,
+        params: Params,
+        x: jax.Array,
+        kernel: jax.Array,
+        *,
+        token_mask: jax.Array | None = None,
+    ) -> tuple[jax.Array, Aux]:
+        """The adapted linear map without its bias, [...tokens, O]: x @ kernel + delta, fused.
+
+        No gradient reaches `kernel`; arguments as for `delta`.
+        """
+        z, u, aux = self.project(params, x, token_mask)
+        return low_rank_matmul(x, kernel.astype(x.dtype), z, u), aux
+
+    def penalty(self, params: Params) -> dict[str, jax.Array]:
+        """Losses on the parameters alone, by name."""
+        del params
+        return {}
+
+    def transform(self) -> optax.GradientTransformation | None:
+        """A gradient transformation the method needs, to be chained after the optimizer."""
+        return None
+
+    def merge(self, params: Params, kernel: jax.Array) -> jax.Array:
+        """The kernel [I, O] with the adapter folded in, in the kernel's type.
+
+        Raises:
+          ValueError: the delta depends on the input.
+        """
+        raise NotImplementedError
+
+
+def kaiming_uniform(key: jax.Array, shape: tuple[int, int]) -> jax.Array:
+    """U(±1/√I) for an [I, R] matrix: Kaiming-uniform with a = √5, as in torch and PEFT."""
+    bound = shape[0] ** -0.5
+    return jax.random.uniform(key, shape, jnp.float32, -bound, bound)
+
+
+def names() -> list[str]:
+    """Names of the methods: the files of this package but this one."""
+    here = importlib.import_module(PACKAGE).__path__
+    return sorted(module.name for module in pkgutil.iter_modules(here) if module.name != "method")
+
+
+def find(name: str) -> type[Method]:
+    """The method class in the file `name`.
+
+    Raises:
+      ValueError: there is no such file; lists what exists.
+    """
+    if name not in names():
+        close = difflib.get_close_matches(name, names(), n=1)
+        hint = f" (did you mean {close[0]!r}?)" if close else ""
+        raise ValueError(f"unknown method {name!r}{hint}; valid are {', '.join(names())}.")
+    module = importlib.import_module(f"{PACKAGE}.{name}")
+    classes = [c for c in vars(module).values() if isinstance(c, type) and issubclass(c, Method)]
+    (cls,) = [c for c in classes if c.__module__ == module.__name__]
+    return cls
+
+
+def create(name: str, **fields: Any) -> Method:
+    """The method `name` (a file name: lora, lora_sp, full) with some fields set.
+
+    Raises:
+      ValueError: unknown method, unknown field or a bad value.
+    """
+    cls = find(name)
+    valid = [field.name for field in dataclasses.fields(cls)]  # pyright: ignore[reportArgumentType]
+    for field in fields:
+        if field not in valid:
+            raise ValueError(f"{name} has no field {field!r}; valid are {', '.join(valid)}.")
+    return cls(**fields)

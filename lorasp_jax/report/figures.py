@@ -1,0 +1,112 @@
+"""Figures of one run, as SVG, from `metrics.jsonl` and `results.json`."""
+
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
+COLORS = {"vision": "#4269d0", "language": "#efb118", "action": "#3ca951", "before": "#9498a0"}
+"""One color per tower in every figure; grey for what was there before."""
+
+_STYLE = {
+    "font.size": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.alpha": 0.25,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "lorasp_jax",
+}
+
+Rows = Sequence[dict[str, float]]
+
+
+def success(results: dict[str, Any]) -> str:
+    """Bars of success before and after with their 95 % intervals."""
+    tasks = results["tasks"]
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(6, 1.1 + 0.8 * len(tasks)), layout="constrained")
+        axes = figure.subplots()
+        for row, task in enumerate(tasks):
+            for name, offset, color in (("before", -0.18, "before"), ("after", 0.18, "vision")):
+                value = tasks[task][name]
+                low, high = value["ci95"]
+                rate = value["success"]
+                axes.barh(row + offset, 100 * rate, height=0.32, color=COLORS[color])
+                axes.plot([100 * low, 100 * high], [row + offset] * 2, color="black", lw=1.5)
+                label = f"{name} {100 * rate:.0f} %"
+                axes.annotate(
+                    label, (100 * high, row + offset), xytext=(6, -3), textcoords="offset points"
+                )
+        axes.set_yticks(range(len(tasks)), list(tasks))
+        axes.invert_yaxis()
+        axes.set_xlim(0, 118)
+        axes.set_xticks(range(0, 101, 20))
+        axes.set_xlabel("success [%], line: 95 % Wilson interval")
+        axes.grid(axis="y", visible=False)
+        return _svg(figure)
+
+
+def losses(rows: Rows) -> str:
+    """Task loss and auxiliary losses over the steps."""
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(9, 3), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        _line(left, rows, "task", "#4269d0", "flow matching")
+        left.set_yscale("log")
+        left.set_title("flow-matching loss", loc="left")
+        for name, color in (("spectral", "#ff725c"), ("balance", "#6cc5b0"), ("z", "#a463f2")):
+            _line(right, rows, name, color, name)
+        right.set_title("auxiliary losses, unweighted", loc="left")
+        for axes in (left, right):
+            axes.set_xlabel("step")
+        if right.lines:
+            right.set_yscale("log")
+            right.legend(frameon=False)
+        return _svg(figure)
+
+
+def active_rank(rows: Rows, rank: int) -> str:
+    """Active rank of each tower over training."""
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(9, 3), layout="constrained")
+        axes = figure.subplots()
+        for tower in ("vision", "language", "action"):
+            _line(axes, rows, f"active_rank/{tower}", COLORS[tower], tower)
+        axes.axhline(rank, color="black", lw=1, ls=":")
+        axes.set_ylim(0, 1.06 * rank)
+        axes.set_xlabel("step")
+        axes.set_title(f"mean active rank by tower, bank size {rank} dotted", loc="left")
+        axes.legend(frameon=False, loc="lower left")
+        return _svg(figure)
+
+
+def layer_ranks(layers: dict[str, dict[str, Sequence[float]]], rank: int) -> str:
+    """Active rank of every adapted layer after training, one panel per tower."""
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(9, 3.4), layout="constrained")
+        panels = figure.subplots(1, len(layers), sharey=True, squeeze=False)[0]
+        for axes, (tower, linears) in zip(panels, layers.items(), strict=True):
+            for position, values in enumerate(linears.values()):
+                axes.scatter([position] * len(values), values, color=COLORS[tower], s=14)
+            axes.set_xticks(range(len(linears)), list(linears), rotation=70, ha="right")
+            axes.set_ylim(0, 1.06 * rank)
+            axes.set_title(tower, loc="left")
+        panels[0].set_ylabel("active rank, one dot a layer")
+        return _svg(figure)
+
+
+def _line(axes: Any, rows: Rows, name: str, color: str, label: str) -> None:
+    """Draw one metric where it was recorded."""
+    points = [(row["step"], row[name]) for row in rows if name in row]
+    if points:
+        axes.plot(*zip(*points, strict=True), color=color, label=label, lw=1.5)
+
+
+def _svg(figure: Figure) -> str:
+    """The figure as SVG text."""
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None})
+    return buffer.getvalue()

@@ -1,0 +1,130 @@
+"""One self-contained HTML page per run, made from the files in its folder."""
+
+import base64
+import html
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from lorasp_jax.report import figures
+from lorasp_jax.training.run_folder import read_metrics
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; color: #1b1e23; max-width: 60rem; margin: 2rem auto;
+       padding: 0 1rem; }
+h1 { margin-bottom: 0; } h2 { margin-top: 2.2rem; } .muted { color: #6b7280; }
+table { border-collapse: collapse; } th, td { padding: .25rem .9rem .25rem 0; text-align: left; }
+th { border-bottom: 1px solid #c9ced6; font-weight: 600; }
+td.number { text-align: right; font-variant-numeric: tabular-nums; }
+img, video { max-width: 100%; } figure { display: inline-block; margin: 0 1rem 1rem 0; }
+video, .camera { image-rendering: pixelated; background: #eee; }
+pre { background: #f4f5f7; padding: 1rem; overflow-x: auto; font-size: 13px; }
+"""
+
+
+def write_report(folder: Path) -> Path:
+    """Write `folder`/report.html from its results.json, metrics.jsonl, config.json and videos.
+
+    Raises:
+        FileNotFoundError: the run has not finished, so a file is missing.
+    """
+    results = json.loads((folder / "results.json").read_text())
+    config = json.loads((folder / "config.json").read_text())
+    rows = read_metrics(folder)
+    rank = config["peft"].get("rank")
+    parts = [
+        f"<h1>{html.escape(config['name'])}</h1>",
+        f"<p class=muted>{_subtitle(config, results)}</p>",
+        "<h2>Success before and after</h2>",
+        _image(figures.success(results)),
+        _success_table(results),
+        "<h2>Training</h2>",
+        _image(figures.losses(rows)),
+    ]
+    if any(name.startswith("active_rank/") for name in (rows[-1] if rows else ())):
+        parts += [
+            "<h2>Active rank</h2>",
+            _image(figures.active_rank(rows, rank)),
+            _rank_table(results),
+            _image(figures.layer_ranks(results["layer_active_rank"], rank)),
+        ]
+    parts += [
+        "<h2>What the policy sees and does</h2>",
+        *_media(folder, results["tasks"]),
+        "<h2>Time</h2>",
+        _table(("phase", "seconds"), ((k, f"{v:.1f}") for k, v in results["seconds"].items())),
+        "<h2>Settings</h2>",
+        f"<pre>{html.escape(json.dumps(config, indent=2))}</pre>",
+    ]
+    page = (
+        "<!doctype html><html lang=en><meta charset=utf-8>"
+        f"<title>{html.escape(config['name'])}</title><style>{_STYLE}</style>"
+        + "\n".join(parts)
+        + "</html>\n"
+    )
+    path = folder / "report.html"
+    path.write_text(page)
+    return path
+
+
+def _subtitle(config: dict[str, Any], results: dict[str, Any]) -> str:
+    """One line: method, backbone, robot, parameters."""
+    trainable, total = results["trainable_parameters"], results["total_parameters"]
+    return html.escape(
+        f"{config['peft']['method']} on π0 {config['size']}, robot {config['robot']}: "
+        f"{trainable:,} trainable of {total:,} parameters ({100 * trainable / total:.1f} %), "
+        f"scale {results['scale']}"
+    )
+
+
+def _success_table(results: dict[str, Any]) -> str:
+    """Task, before, after, with intervals."""
+
+    def cell(value: dict[str, Any]) -> str:
+        low, high = value["ci95"]
+        rate = f"{100 * value['success']:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
+        return f"{rate} of {value['episodes']}"
+
+    tasks = results["tasks"].items()
+    rows = ((task, cell(value["before"]), cell(value["after"])) for task, value in tasks)
+    return _table(("task", "before", "after"), rows)
+
+
+def _rank_table(results: dict[str, Any]) -> str:
+    """Active rank by module in closed loop."""
+    ranks = results["active_rank"].items()
+    return _table(("module", "active rank in closed loop"), ((k, f"{v:.1f}") for k, v in ranks))
+
+
+def _table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """An HTML table; every column but the first holds numbers."""
+    head = "".join(f"<th>{html.escape(name)}</th>" for name in header)
+    body = ""
+    for first, *rest in rows:
+        cells = "".join(f"<td class=number>{html.escape(value)}</td>" for value in rest)
+        body += f"<tr><td>{html.escape(first)}</td>{cells}</tr>"
+    return f"<table><tr>{head}</tr>{body}</table>"
+
+
+def _image(svg: str) -> str:
+    """An SVG as an image of its own, so that identifiers of several do not clash."""
+    data = base64.b64encode(svg.encode()).decode()
+    return f'<img alt="figure" src="data:image/svg+xml;base64,{data}">'
+
+
+def _media(folder: Path, tasks: Iterable[str]) -> Iterable[str]:
+    """Video and first camera pictures of every task."""
+    for task in tasks:
+        picture, video = folder / f"cameras_{task}.png", folder / f"rollout_{task}.mp4"
+        shown = base64.b64encode(picture.read_bytes()).decode()
+        played = base64.b64encode(video.read_bytes()).decode()
+        yield (
+            f"<h3>{html.escape(task)}</h3>"
+            f'<figure><img class=camera width=400 alt="side and wrist camera" '
+            f'src="data:image/png;base64,{shown}">'
+            "<figcaption class=muted>side and wrist camera at policy resolution</figcaption></figure>"
+            '<figure><video width=400 controls autoplay loop muted '
+            f'src="data:video/mp4;base64,{played}"></video>'
+            "<figcaption class=muted>one closed-loop episode after adaptation</figcaption></figure>"
+        )

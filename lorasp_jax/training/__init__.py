@@ -1,0 +1,1 @@
+"""Training: mesh, step, optimizer, checkpoints and the loop around them."""

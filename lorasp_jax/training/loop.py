@@ -1,0 +1,196 @@
+"""The training run: build, resume, train, save. Knows neither evaluation nor report."""
+
+import functools
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+from rich.console import Console
+from rich.progress import Progress, ProgressColumn, Task
+from rich.text import Text
+
+from envs.episodes import Episodes
+from lorasp_jax import adaptation, models
+from lorasp_jax.data.batches import Steps, flatten, sample_batch
+from lorasp_jax.models.policy import Policy
+from lorasp_jax.training import mesh as meshes
+from lorasp_jax.training.checkpoint import Checkpoints
+from lorasp_jax.config import Config
+from lorasp_jax.training.interrupt import deferred
+from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
+from lorasp_jax.training.run_folder import MetricsLog
+from lorasp_jax.training.step import TrainState, init_state, train_step
+
+
+class RunError(ValueError):
+    """The run cannot go on; the message says why and what to do, in one sentence."""
+
+
+@dataclass
+class Run:
+    """A run as its callbacks see it.
+
+    Attributes:
+        config: what was asked for.
+        folder: where everything is written.
+        console: where to print.
+        base_hash: hash of the frozen base.
+        episodes: demonstrations by task.
+        policy: the policy as it is now.
+        seconds: time spent by phase.
+    """
+
+    config: Config
+    folder: Path
+    console: Console
+    base_hash: str
+    episodes: dict[str, Episodes] = field(default_factory=dict)
+    policy: Policy = field(init=False)
+    seconds: dict[str, float] = field(default_factory=dict)
+    _start: float = field(default_factory=time.perf_counter)
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the run was made."""
+        return time.perf_counter() - self._start
+
+    @contextmanager
+    def timed(self, phase: str) -> Iterator[None]:
+        """Add the time spent in this block to `seconds[phase]`."""
+        start = time.perf_counter()
+        yield
+        self.seconds[phase] = self.seconds.get(phase, 0.0) + time.perf_counter() - start
+
+
+class Callback:
+    """Hooks into a run; override what is needed."""
+
+    def on_start(self, run: Run) -> None:
+        """Before the first step, with the policy as it comes; not called again on resume."""
+
+    def on_log(self, run: Run, step: int, metrics: dict[str, float]) -> None:
+        """After every logged stretch of steps."""
+
+    def on_end(self, run: Run) -> None:
+        """After the last step, with the trained policy."""
+
+
+def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False) -> None:
+    """Train the adapters of `run.policy` and leave the trained policy there.
+
+    Raises:
+        RunError: the loss is not finite; the last checkpoint before stays.
+        KeyboardInterrupt: a signal asked to stop; the state is saved.
+    """
+    config = run.config
+    optimizer = make_optimizer(config.optim)
+    mesh = meshes.make_mesh(config.fsdp)
+    graphdef, adapters, frozen = adaptation.split(run.policy.model)
+    state = jax.device_put(init_state(adapters, optimizer), meshes.replicated(mesh))
+    frozen = meshes.place_frozen(frozen, mesh)
+    checkpoints = Checkpoints(run.folder, run.base_hash)
+    restored = checkpoints.restore(state) if resume else None
+    if restored is None:
+        for callback in callbacks:
+            callback.on_start(run)
+    state = restored or state
+    steps = flatten(list(run.episodes.values()))
+    steps = jax.device_put(steps, meshes.replicated(mesh))
+    many = _compiled(run, graphdef, optimizer, mesh)
+    try:
+        with run.timed("train"):
+            state = _loop(run, state, functools.partial(many, frozen, steps), checkpoints, callbacks)
+    finally:
+        checkpoints.close()
+    run.policy = Policy(nnx.merge(graphdef, state.adapters, frozen), run.policy.processor)
+    for callback in callbacks:
+        callback.on_end(run)
+
+
+def _compiled(run: Run, graphdef: Any, optimizer: Any, mesh: jax.sharding.Mesh) -> Callable:
+    """The jitted stretch of `log_every` steps: (frozen, steps, state, key, count) -> state, metrics."""
+    optim, processor = run.config.optim, run.policy.processor
+    chunk = run.policy.model.config.chunk
+    weights = auxiliary_weights(run.config.auxiliary, optim.steps)
+    sharding = meshes.batch_sharding(mesh)
+
+    def one(state: TrainState, frozen: Any, steps: Steps, key: jax.Array) -> Any:
+        batch_key, loss_key = jax.random.split(jax.random.fold_in(key, state.step))
+        batch = sample_batch(
+            batch_key,
+            steps,
+            processor,
+            batch_size=optim.batch_size,
+            chunk=chunk,
+            state_noise=optim.state_noise,
+        )
+        batch = jax.lax.with_sharding_constraint(batch, sharding)
+        return train_step(
+            state, frozen, batch, loss_key, graphdef=graphdef, optimizer=optimizer, weights=weights
+        )
+
+    @functools.partial(jax.jit, static_argnames="count", donate_argnames="state")
+    def many(frozen: Any, steps: Steps, state: TrainState, key: jax.Array, count: int) -> Any:
+        state, metrics = jax.lax.scan(
+            lambda state, _: one(state, frozen, steps, key), state, length=count
+        )
+        return state, jax.tree.map(jnp.mean, metrics)
+
+    return many
+
+
+def _loop(
+    run: Run, state: TrainState, many: Callable, checkpoints: Checkpoints, callbacks: Any
+) -> TrainState:
+    """Stretch after stretch until the last step, a signal or a loss that is not finite."""
+    config = run.config
+    key = jax.random.fold_in(jax.random.key(config.seed), 2)
+    log = MetricsLog(run.folder, int(state.step))
+    total, saved = config.optim.steps, int(state.step)
+    columns = (*Progress.get_default_columns(), _Rate(config.optim.batch_size))
+    with deferred() as stop, Progress(*columns, console=run.console) as progress:
+        bar = progress.add_task("compiling train step ...", total=total, completed=saved)
+        while (done := int(state.step)) < total and not stop.requested:
+            count = min(config.log_every, total - done)
+            state, metrics = many(state, key, count)
+            values = {name: float(value) for name, value in metrics.items()}
+            _check_finite(values["loss"], done, done + count, saved)
+            done += count
+            log.write(done, values)
+            progress.update(bar, completed=done, description=f"training, loss {values['task']:.4f}")
+            for callback in callbacks:
+                callback.on_log(run, done, values)
+            if done // config.checkpoint_every > saved // config.checkpoint_every:
+                checkpoints.save(state)
+                saved = done
+        checkpoints.save(state)
+    log.close()
+    if stop.requested and done < total:
+        raise KeyboardInterrupt
+    return state
+
+
+def _check_finite(loss: float, start: int, end: int, saved: int) -> None:
+    """Stop before a state that is not finite is saved."""
+    if not jnp.isfinite(loss):
+        raise RunError(
+            f"the loss became {loss} between steps {start} and {end}: nothing after step {saved} "
+            "was saved; try a lower --optim.learning-rate"
+        )
+
+
+class _Rate(ProgressColumn):
+    """Samples per second."""
+
+    def __init__(self, batch_size: int) -> None:
+        super().__init__()
+        self._batch_size = batch_size
+
+    def render(self, task: Task) -> Text:
+        return Text(f"{(task.speed or 0.0) * self._batch_size:,.0f} samples/s")

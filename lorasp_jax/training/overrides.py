@@ -1,0 +1,128 @@
+"""From the command line to a `Config`: an experiment file, a scale, a method, dotted overrides."""
+
+import argparse
+import contextlib
+import dataclasses
+import difflib
+import importlib.util
+import io
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import tyro
+
+from lorasp_jax import peft
+from lorasp_jax.config import SCALES, Config
+
+
+def parse(arguments: Sequence[str]) -> tuple[Config, bool]:
+    """The config that `arguments` ask for, and whether to resume.
+
+    Raises:
+        ValueError: an unknown config, scale, method or field, or a value that does not fit.
+        SystemExit: help was asked for and printed.
+    """
+    parser = argparse.ArgumentParser(
+        prog="train.py",
+        add_help=False,
+        allow_abbrev=False,
+        epilog="With --config FILE --help, every field of that experiment is listed.",
+    )
+    parser.add_argument("--config", help="experiment file, such as configs/multitask.py")
+    parser.add_argument("--scale", default="auto", help=f"auto, {', '.join(SCALES)}")
+    parser.add_argument("--method", help=f"adapter method: {', '.join(peft.names())}")
+    parser.add_argument("--resume", action="store_true", help="continue the run of this name")
+    known, rest = parser.parse_known_args(arguments)
+    if known.config is None:
+        parser.print_help()
+        if {"-h", "--help"} & set(rest):
+            raise SystemExit(0)
+        raise ValueError("no experiment was named: add --config, such as configs/multitask.py")
+    config = load(Path(known.config), choose_scale(known.scale))
+    if known.method is not None:
+        config = dataclasses.replace(config, peft=_switch(config.peft, known.method))
+    return override(config, rest), known.resume
+
+
+def choose_scale(scale: str) -> str:
+    """The named scale; "auto" is cpu on a CPU backend and accelerator elsewhere."""
+    if scale == "auto":
+        return "cpu" if jax.default_backend() == "cpu" else "accelerator"
+    if scale not in SCALES:
+        raise ValueError(f"unknown scale {scale!r}: it is one of auto, {', '.join(SCALES)}")
+    return scale
+
+
+def load(path: Path, scale: str) -> Config:
+    """What the experiment file's `get_config(scale)` returns."""
+    if not path.is_file():
+        found = ", ".join(str(file) for file in sorted(path.parent.glob("*.py")))
+        raise ValueError(f"there is no config {path}" + (f": found {found}" if found else ""))
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    if spec is None or spec.loader is None:
+        raise ValueError(f"{path} is not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    if not hasattr(module, "get_config"):
+        raise ValueError(f"{path} has no function get_config(scale)")
+    return module.get_config(scale)
+
+
+def override(config: Config, arguments: Sequence[str]) -> Config:
+    """Apply dotted overrides such as `--peft.rank 64 --optim.steps 100`."""
+    fields = ["--" + name for name in _names(config)]
+    for argument in arguments:
+        name = argument.split("=")[0].replace("_", "-")
+        if name.startswith("--") and name not in (*fields, "--help"):
+            close = difflib.get_close_matches(name, fields, n=1, cutoff=0.5)
+            hint = f": did you mean {close[0]}?" if close else f": fields are {' '.join(fields)}"
+            raise ValueError(f"unknown option {name}{hint}")
+    wants_help = bool({"-h", "--help"} & set(arguments))
+    printed = io.StringIO()
+    quiet = contextlib.nullcontext() if wants_help else contextlib.redirect_stderr(printed)
+    try:
+        with quiet:
+            chosen = tyro.cli(_concrete(config), default=config, args=list(arguments))
+    except SystemExit as error:
+        if wants_help:
+            raise
+        raise ValueError(_sentence(printed.getvalue())) from error
+    return Config(**{field.name: getattr(chosen, field.name) for field in dataclasses.fields(Config)})
+
+
+def _sentence(box: str) -> str:
+    """The first paragraph of tyro's framed error message, as one line."""
+    lines = [line.strip(" │") for line in box.splitlines() if line.startswith("│")]
+    rule = next((i for i, line in enumerate(lines) if line.startswith("─")), len(lines))
+    return " ".join(lines[:rule])
+
+
+def _switch(current: peft.Method, name: str) -> peft.Method:
+    """Another method with the rank of the current one, where it has a rank."""
+    method = peft.create(name)
+    if hasattr(method, "rank") and hasattr(current, "rank"):
+        return dataclasses.replace(method, rank=current.rank)  # type: ignore[call-arg]
+    return method
+
+
+def _names(config: Any, prefix: str = "") -> Iterator[str]:
+    """Dotted names of all fields, as options spell them."""
+    for field in dataclasses.fields(config):
+        value, name = getattr(config, field.name), prefix + field.name.replace("_", "-")
+        if dataclasses.is_dataclass(value):
+            yield from _names(value, f"{name}.")
+        else:
+            yield name
+
+
+def _concrete(config: Config) -> type[Config]:
+    """`Config` with `peft` typed as the method that is chosen, so that its fields can be set."""
+    return dataclasses.make_dataclass(
+        "Config",
+        [("peft", type(config.peft), dataclasses.field())],
+        bases=(Config,),
+        frozen=True,
+        kw_only=True,
+    )

@@ -1,0 +1,100 @@
+"""From a config to a run that is ready to train: base, adapters, demonstrations, processor."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from rich.console import Console
+from rich.progress import Progress
+
+import envs
+from envs.episodes import Episodes
+from lorasp_jax import adaptation, models
+from lorasp_jax.config import Config
+from lorasp_jax.data.demonstrations import demonstrations
+from lorasp_jax.models import pi0, tokenizer
+from lorasp_jax.models.policy import Policy
+from lorasp_jax.models.processing import Processor, Statistics, robot_slots
+from lorasp_jax.training.loop import Run
+
+
+def prepare(config: Config, folder: Path, console: Console) -> Run:
+    """Load or create the base, attach the adapters, get the demonstrations.
+
+    Raises:
+        ValueError: an unknown task, robot or size, a base that does not fit, a rule that matches
+            nothing.
+    """
+    for task in config.tasks:  # cheap, so that a wrong name ends the run before anything long
+        envs.make(task, robot=config.robot, image_size=config.image_size)
+    model, base_hash = base_model(config)
+    rngs = nnx.Rngs(jax.random.fold_in(jax.random.key(config.seed), 3))
+    model = adaptation.adapt(model, [(path, config.peft) for path in config.targets], rngs=rngs)
+    counts = adaptation.count(model)
+    console.print(
+        f"scale {config.scale}: {type(config.peft).__name__} on pi0 {config.size}, "
+        f"{counts.trainable:,} of {counts.total:,} parameters train"
+    )
+    run = Run(config, folder, console, base_hash)
+    with run.timed("collect"):
+        run.episodes = _collect(run)
+    run.policy = Policy(model, processor(config, list(run.episodes.values()), model.config))
+    return run
+
+
+def base_model(config: Config) -> tuple[pi0.Pi0, str]:
+    """The frozen base and its hash: loaded from `config.base`, or random where that is empty.
+
+    Raises:
+        ValueError: an unknown size, or a base of another one.
+    """
+    if config.size not in ("nano", "small"):
+        raise ValueError(f"unknown size {config.size!r}: it is one of nano, small")
+    wanted = getattr(pi0.Pi0Config, config.size)()
+    wanted = dataclasses.replace(
+        wanted, image_size=config.image_size, dtype=config.compute_dtype
+    )
+    if config.base:
+        model = models.load(config.base, wanted)
+        return model, models.weights_hash(model)
+    key = jax.random.fold_in(jax.random.key(config.seed), 4)
+    model = wanted.create(nnx.Rngs(key))
+    return model, models.weights_hash(model)
+
+
+def processor(
+    config: Config, episodes: Sequence[Episodes], model_config: pi0.Pi0Config
+) -> Processor:
+    """Statistics of the demonstrations and the token table of all their instructions, in order."""
+    slots = robot_slots(episodes[0].state.shape[-1] - 1)
+    valid = [np.arange(e.state.shape[1]) < np.asarray(e.length)[:, None] for e in episodes]
+
+    def steps(name: str) -> np.ndarray:
+        pairs = zip(episodes, valid, strict=True)
+        return np.concatenate([np.asarray(getattr(e, name))[mask] for e, mask in pairs])
+
+    state, action = steps("state"), steps("action")
+    statistics = Statistics.measure(
+        state, action, np.ones(len(state), bool), slots=slots, dim=model_config.action_dim
+    )
+    phrases = [phrase for group in episodes for phrase in group.instructions]
+    ids, mask = tokenizer.encode(phrases, model_config.max_tokens)
+    return Processor(slots, statistics, jnp.asarray(ids), jnp.asarray(mask), config.image_size)
+
+
+def _collect(run: Run) -> dict[str, Episodes]:
+    """Demonstrations by task, with a bar each."""
+    with Progress(console=run.console) as progress:
+        bars: dict[str, int] = {}
+
+        def report(task: str, done: int, total: int) -> None:
+            if task not in bars:
+                bars[task] = progress.add_task(f"compiling the expert of {task} ...", total=total)
+            text = f"collecting {task}" if done else f"compiling the expert of {task} ..."
+            progress.update(bars[task], completed=done, description=text)  # type: ignore[arg-type]
+
+        return demonstrations(run.config, run.folder, report)

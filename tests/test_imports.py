@@ -1,0 +1,63 @@
+"""Data flows one way: a room imports only rooms above it."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+ROOMS = [
+    "envs",
+    "lorasp_jax.kernels",
+    "lorasp_jax.peft",
+    "lorasp_jax.dense",
+    "lorasp_jax.adaptation",
+    "lorasp_jax.adapter_io",
+    "lorasp_jax.config",
+    "lorasp_jax.models",
+    "lorasp_jax.data",
+    "lorasp_jax.training",
+    "lorasp_jax.evaluation",
+    "lorasp_jax.report",
+]
+SOURCES = [
+    path
+    for top in ("envs", "lorasp_jax")
+    for path in sorted((ROOT / top).rglob("*.py"))
+    if path != ROOT / "lorasp_jax" / "__init__.py"
+]
+
+
+def room(module: str) -> int | None:
+    """Index of the room that `module` lies in; None for a third party's module."""
+    found = [i for i, name in enumerate(ROOMS) if f"{module}.".startswith(f"{name}.")]
+    return found[0] if found else None
+
+
+def imported(path: Path) -> set[str]:
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            assert node.level == 0, f"{path}: relative import"
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_imports_point_up(path: Path):
+    module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+    own = room(module)
+    assert own is not None, f"{module} lies in no room"
+    for name in imported(path):
+        other = room(name)
+        assert other is None or other <= own, f"{module} imports {name}"
+        assert not name.startswith("configs"), f"{module} imports {name}"
+        if own == 0:
+            assert not name.startswith("lorasp_jax"), f"{module} imports {name}"
+
+
+def test_a_wrong_import_would_be_seen():
+    assert room("lorasp_jax.report.html") > room("lorasp_jax.training.step")
+    assert room("jax.numpy") is None

@@ -1,0 +1,69 @@
+"""The command line: one sentence per mistake, typos suggest the right name."""
+
+import re
+
+import pytest
+
+from lorasp_jax.peft import LoRA, LoRASP
+from lorasp_jax.config import Config
+from lorasp_jax.training.overrides import load, override, parse
+
+CONFIG = Config(name="a", scale="cpu", peft=LoRASP(rank=8), size="nano", base="")
+MULTITASK = ["--config", "configs/multitask.py"]
+
+
+def test_dotted_overrides():
+    changed = override(CONFIG, ["--peft.rank", "4", "--optim.steps=7", "--tasks", "press"])
+    assert (changed.peft.rank, changed.optim.steps, changed.tasks) == (4, 7, ("press",))
+    assert type(changed) is Config
+    assert override(CONFIG, []) == CONFIG
+
+
+def test_scale_is_chosen_by_backend_and_can_be_forced():
+    assert parse(MULTITASK)[0].scale == "cpu"
+    assert parse([*MULTITASK, "--scale", "accelerator"])[0].size == "small"
+
+
+def test_method_by_name_keeps_the_rank():
+    config, resume = parse([*MULTITASK, "--method", "lora", "--resume", "--peft.alpha", "7"])
+    assert isinstance(config.peft, LoRA)
+    assert config.peft.rank == parse(MULTITASK)[0].peft.rank
+    assert config.peft.alpha == 7
+    assert resume
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--config", "configs/multitusk.py"], "no config configs/multitusk.py: found .*multitask"),
+        ([], "no experiment was named"),
+        ([*MULTITASK, "--scale", "gpu"], "unknown scale 'gpu': it is one of auto, smoke"),
+        ([*MULTITASK, "--method", "lorra"], "lorra.*lora_sp"),
+        ([*MULTITASK, "--peft.rnk", "4"], "unknown option --peft.rnk: did you mean --peft.rank?"),
+        ([*MULTITASK, "--optim.steps", "many"], "--optim.steps.*'many'"),
+        ([*MULTITASK, "--peft.energy-target", "1.5"], "1.5"),
+        ([*MULTITASK, "--peft.energy-target", "0"], "0"),
+    ],
+)
+def test_mistakes_are_one_sentence(arguments, message, capsys):
+    with pytest.raises(ValueError, match=message) as caught:
+        parse(arguments)
+    text = str(caught.value)
+    assert "\n" not in text
+    assert not re.search("Traceback|╭", text + capsys.readouterr().err)
+
+
+def test_help_lists_every_field(capsys):
+    with pytest.raises(SystemExit) as caught:
+        parse([*MULTITASK, "--help"])
+    assert caught.value.code == 0
+    printed = capsys.readouterr().out
+    for name in ("--peft.energy-target", "--optim.learning-rate", "--evaluation.episodes"):
+        assert name in printed
+
+
+def test_a_file_without_get_config(tmp_path):
+    file = tmp_path / "empty.py"
+    file.write_text("")
+    with pytest.raises(ValueError, match="has no function get_config"):
+        load(file, "cpu")
