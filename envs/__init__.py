@@ -1,8 +1,8 @@
 """Batched manipulation environments in MuJoCo MJX with cameras and scripted experts.
 
-    import envs
-    env = envs.make("press", robot="piper", num_envs=64, image_size=64)
-    episodes = envs.collect("press", robot="panda", num_episodes=512, key=jax.random.key(0))
+import envs
+env = envs.make("press", robot="piper", num_envs=64, image_size=64)
+episodes = envs.collect("press", robot="panda", num_episodes=512, key=jax.random.key(0))
 """
 
 import envs.robots.panda

@@ -1,7 +1,7 @@
 """Expert episodes in bulk: the whole of an episode, pictures included, in one jitted call.
 
-An episode is one scan over control steps in W worlds that records robot states, actions and the poses
-of all geoms and cameras; pictures are rendered from those poses afterwards, in bounded memory.
+An episode is one scan over control steps in W worlds that records robot states, actions and the
+poses of all geoms and cameras; pictures are rendered from those poses in bounded memory.
 """
 
 import dataclasses
@@ -19,8 +19,9 @@ from envs.episodes import Episodes
 
 # Worlds a call, where nobody says otherwise: enough to fill the device, few enough for its memory.
 _NUM_ENVS = {"cpu": 16, "gpu": 256, "tpu": 256}
-# Below this share of successes something is broken, and collecting on would only waste time.
-_LEAST_SUCCESS = 0.5
+# Below this share of successes, once so many attempts were made, something is broken, and going on
+# would only waste time.
+_LEAST_SUCCESS, _PATIENCE = 0.5, 16
 
 
 @jax.tree_util.register_dataclass
@@ -45,7 +46,7 @@ class Rollout:
     instruction: jax.Array
 
 
-def rollout(env: Env, key: jax.Array, action_noise: float = 0.0) -> Rollout:
+def rollout(env: Env, key: jax.Array, action_noise: float | jax.Array = 0.0) -> Rollout:
     """The expert's attempt at fresh random layouts; to be called under jit.
 
     Args:
@@ -113,10 +114,10 @@ def collect(
         image_size=image_size,
         control_dt=control_dt,
     )
-    report = progress or (lambda done, total: None)
     chunks: list[dict[str, Any]] = []
     kept = attempted = 0
-    report(0, num_episodes)
+    if progress:
+        progress(0, num_episodes)
     while kept < num_episodes:
         key, chunk_key = jax.random.split(key)
         chunk, success = _record(env, chunk_key, action_noise)
@@ -125,8 +126,9 @@ def collect(
         attempted += int(wins[-1]) + 1 if kept + len(wins) == num_episodes else env.num_envs
         kept += len(wins)
         chunks.append(jax.tree.map(lambda x, wins=wins: x[wins], chunk))
-        report(kept, num_episodes)
-        if kept < _LEAST_SUCCESS * attempted:
+        if progress:
+            progress(kept, num_episodes)
+        if attempted >= _PATIENCE and kept < _LEAST_SUCCESS * attempted:
             raise RuntimeError(
                 f"the expert solved only {kept} of {attempted} layouts of {task!r} with {robot!r}, "
                 f"at least {_LEAST_SUCCESS:.0%} are expected: check the scene or lower action_noise"
@@ -158,9 +160,7 @@ def expert_success(
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _record(
-    env: Env, key: jax.Array, action_noise: jax.Array
-) -> tuple[dict[str, Any], jax.Array]:
+def _record(env: Env, key: jax.Array, action_noise: jax.Array) -> tuple[dict[str, Any], jax.Array]:
     tries = rollout(env, key, action_noise)
     steps, worlds = tries.action.shape[:2]
     # World-major order, so that an episode's pictures end up next to each other.

@@ -19,50 +19,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs import physics, render, robots
+from envs import physics, render, scene
 from envs.robots import Robot
 from envs.tasks import Task, View
 
-CAMERAS = ("side", "wrist")
-PHYSICS_DT = 0.005  # s
 _TARGET_DT = 0.02  # s, joint targets are interpolated to this rate between two actions
 _HOME_NOISE = 0.03  # rad, half the range of the random start pose around home
 _START_OPENING = 0.04  # m, of the gripper
-
-# Solver settings of the fact sheet's grasping experiments: fewer than 2 iterations do not grasp,
-# elliptic cones cost six times as much. Only spheres, boxes and the table plane ever touch.
-_SCENE = """
-<mujoco>
-  <compiler angle="radian"/>
-  <option timestep="{timestep}" integrator="implicitfast" solver="Newton" iterations="4"
-    ls_iterations="8" cone="pyramidal"><flag eulerdamp="disable"/></option>
-  <default>
-    <geom contype="0" conaffinity="0" condim="3"/>
-    <default class="collider"><geom group="3" rgba="0 0 0 0"/></default>
-    <default class="tip">
-      <geom type="sphere" mass="0" group="3" rgba="0 0 0 0" contype="2" condim="1" priority="1"/>
-    </default>
-    <default class="pad">
-      <geom type="box" conaffinity="1" condim="4" friction="1.5 .02 .001" solref=".01 1"
-        solimp=".95 .99 .001"/>
-    </default>
-    <default class="finger">
-      <joint type="slide" axis="0 1 0" armature=".05" damping="5"/>
-    </default>
-  </default>
-  <worldbody>
-    <light pos=".6 -.5 1.2" dir="-.25 .45 -1"/>
-    <camera name="side" {side} fovy="40"/>
-    <geom name="table" type="plane" size="2 2 .1" conaffinity="3" rgba=".62 .66 .68 1"/>
-    {robot}{task}
-  </worldbody>
-  <actuator>{actuators}</actuator>
-  <equality>
-    <joint joint1="right" joint2="left" polycoef="0 1 0 0 0" solref=".01 1"/>
-  </equality>
-</mujoco>
-"""
-_SIDE_EYE, _SIDE_TARGET = (0.80, -0.42, 0.42), (0.29, 0.02, 0.06)  # m
 
 
 @jax.tree_util.register_dataclass
@@ -87,7 +50,7 @@ class State:
     info: dict[str, Any]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Env:
     """A task for a robot in `num_envs` worlds W. Made by `make`; methods are pure and jitted."""
 
@@ -101,8 +64,8 @@ class Env:
     render_model: Any
     template: Any
 
-    physics_dt = PHYSICS_DT
-    cameras = CAMERAS
+    physics_dt = scene.PHYSICS_DT
+    cameras = scene.CAMERAS
 
     @property
     def num_joints(self) -> int:
@@ -139,7 +102,6 @@ class Env:
         """Fresh worlds: random layout, phrasing and start pose near home, all from `key`."""
         return jax.vmap(self._reset)(jax.random.split(key, self.num_envs))
 
-    @functools.partial(jax.jit, static_argnums=0)
     def step(self, state: State, action: jax.Array) -> State:
         """Simulate one control step.
 
@@ -157,7 +119,8 @@ class Env:
         expected = (self.num_envs, self.num_joints + 1)
         if action.shape != expected:
             raise ValueError(f"action must have shape {expected}, got {action.shape}")
-        return jax.vmap(self._step)(state, action.astype(jnp.float32))
+        # A weakly typed action, such as jnp.zeros' or a sum with a Python number, would compile anew.
+        return self._steps(state, jax.lax.convert_element_type(action, jnp.float32))
 
     @functools.partial(jax.jit, static_argnums=0)
     def observe(self, state: State) -> dict[str, Any]:
@@ -173,10 +136,9 @@ class Env:
             "state": self.proprio(state),
         }
 
-    @functools.partial(jax.jit, static_argnums=0)
     def reset_done(self, state: State, key: jax.Array) -> State:
         """The same worlds, those that are done started afresh."""
-        return _where(state.done, self.reset(key), state)
+        return jax.jit(_where)(state.done, self.reset(key), state)
 
     def proprio(self, state: State) -> jax.Array:
         """Measured joint angles [rad] and gripper opening [m], f32 [W, J + 1]."""
@@ -194,6 +156,10 @@ class Env:
         )
         return {name: pictures[:, i] for i, name in enumerate(self.cameras)}
 
+    @functools.partial(jax.jit, static_argnums=0)
+    def _steps(self, state: State, action: jax.Array) -> State:
+        return jax.vmap(self._step)(state, action)
+
     def _reset(self, key: jax.Array) -> State:
         layout_key, pose_key, instruction_key = jax.random.split(key, 3)
         layout = self.task.place(layout_key)
@@ -204,16 +170,12 @@ class Env:
         qpos = self.template.qpos.at[: self.num_joints + 2].set(
             jnp.concatenate([command[:-1], fingers])
         )
-        mocap_pos = self.template.mocap_pos
         for name, position in layout.items():
             body = self.model.body(name)
-            if body.mocapid[0] >= 0:
-                mocap_pos = mocap_pos.at[body.mocapid[0]].set(position)
-            else:
+            if body.jntnum[0]:  # free; the others are moved in `_placed`
                 start = self.model.jnt_qposadr[body.jntadr[0]]
                 qpos = qpos.at[start : start + 3].set(position)
-        data = self.template.replace(qpos=qpos, mocap_pos=mocap_pos)
-        data = physics.kinematics(self.physics_model, data)
+        data = physics.kinematics(self._placed(layout), self.template.replace(qpos=qpos))
         _, metrics = self.task.check(View(self.model, data))
         number = jax.random.randint(instruction_key, (), 0, len(self.instructions), jnp.int32)
         zero, false = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
@@ -232,9 +194,8 @@ class Env:
         reach = jnp.asarray(self.robot.action_speed) * self.control_dt
         target = jnp.clip(action, self.action_low, self.action_high)
         target = jnp.clip(target, info["command"] - reach, info["command"] + reach)
-        data = physics.advance(
-            self.physics_model, state.data, self._controls(info["command"], target)
-        )
+        controls = self._controls(info["command"], target)
+        data = physics.advance(self._placed(info["layout"]), state.data, controls)
         reached, metrics = self.task.check(View(self.model, data))
         held = jnp.where(reached, info["held"] + 1, 0)
         steps = info["steps"] + 1
@@ -250,13 +211,21 @@ class Env:
         broken = dataclasses.replace(state, done=jnp.ones((), bool))  # at its last good moment
         return _where(state.done, state, _where(finite, after, broken))
 
+    def _placed(self, layout: dict[str, jax.Array]) -> Any:
+        """The physics model of one world: fixed bodies stand where the layout says."""
+        # Mocap bodies would be the usual way, but MJX leaves their children behind.
+        position = self.physics_model.body_pos
+        for name, place in layout.items():
+            position = position.at[self.model.body(name).id].set(place)
+        return self.physics_model.replace(body_pos=position)
+
     def _controls(self, start: jax.Array, end: jax.Array) -> jax.Array:
         """Actuator targets [S, J + 1] of the S physics steps between two commands."""
         moves = round(self.control_dt / _TARGET_DT)
         fraction = jnp.arange(1, moves + 1, dtype=jnp.float32)[:, None] / moves
         targets = start + fraction * (end - start)
         targets = targets.at[:, -1].multiply(0.5)  # each finger makes half of the opening
-        return jnp.repeat(targets, round(_TARGET_DT / PHYSICS_DT), axis=0)
+        return jnp.repeat(targets, round(_TARGET_DT / scene.PHYSICS_DT), axis=0)
 
 
 def make(
@@ -285,8 +254,10 @@ def make(
             raise ValueError(f"{name} must be at least 1, got {value}")
     moves = control_dt / _TARGET_DT
     if round(moves) < 1 or abs(moves - round(moves)) > 1e-6:
-        raise ValueError(f"control_dt must be a positive multiple of {_TARGET_DT} s, got {control_dt}")
-    model = mujoco.MjModel.from_xml_string(scene_xml(found_task, found_robot))
+        raise ValueError(
+            f"control_dt must be a positive multiple of {_TARGET_DT} s, got {control_dt}"
+        )
+    model = mujoco.MjModel.from_xml_string(scene.mjcf(found_task.scene, found_robot))
     return Env(
         task=found_task,
         robot=found_robot,
@@ -295,31 +266,9 @@ def make(
         control_dt=control_dt,
         model=model,
         physics_model=physics.put_model(model),
-        render_model=render.build(model, CAMERAS),
+        render_model=render.build(model, scene.CAMERAS),
         template=physics.make_data(model),
     )
-
-
-def scene_xml(task: Task, robot: Robot) -> str:
-    """MJCF of a task's table with a robot; table, cameras and light are the same for all."""
-    side = robots.pose(_look_at(np.array(_SIDE_EYE), np.array(_SIDE_TARGET)))
-    return _SCENE.format(
-        timestep=PHYSICS_DT,
-        side=side,
-        robot=robots.bodies(robot),
-        task=task.scene,
-        actuators=robots.actuators(robot),
-    )
-
-
-def _look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """[4, 4] pose of a camera, which looks along -z with y up."""
-    z = (eye - target) / np.linalg.norm(eye - target)
-    x = np.cross([0.0, 0.0, 1.0], z)
-    x /= np.linalg.norm(x)
-    camera = robots.translation(*eye)
-    camera[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
-    return camera
 
 
 def _where(condition: jax.Array, yes: Any, no: Any) -> Any:

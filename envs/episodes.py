@@ -7,7 +7,7 @@ import os
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -79,7 +79,7 @@ class Episodes:
         path = Path(path)
         facts = {name: getattr(self, name) for name in _FACTS}
         header = json.dumps({"format": _FORMAT, **facts}).encode()
-        arrays = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
+        arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
         arrays |= {_IMAGE + name: np.asarray(picture) for name, picture in self.image.items()}
         path.parent.mkdir(parents=True, exist_ok=True)
         unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -107,17 +107,15 @@ class Episodes:
             facts = json.loads(arrays.pop("header").tobytes())
             if facts.pop("format") != _FORMAT:
                 raise KeyError("format")
-        except (KeyError, ValueError, AttributeError) as error:
+        except (KeyError, ValueError, TypeError, AttributeError) as error:
             raise ValueError(f"{path} is an .npz file, but holds no {_FORMAT} header") from error
         missing = {*_ARRAYS} - arrays.keys() | {*_FACTS} - facts.keys()
         if missing:
             raise ValueError(f"{path} lacks {', '.join(sorted(missing))}")
-        episodes = cls(
-            image={k.removeprefix(_IMAGE): v for k, v in arrays.items() if k.startswith(_IMAGE)},
-            **{name: arrays[name] for name in _ARRAYS},
-            **{name: facts[name] for name in _FACTS}
-            | {"instructions": tuple(facts["instructions"])},
-        )
+        facts["instructions"] = tuple(facts["instructions"])
+        image: Any = {k.removeprefix(_IMAGE): v for k, v in arrays.items() if k.startswith(_IMAGE)}
+        fields: dict[str, Any] = {name: arrays[name] for name in _ARRAYS}
+        episodes = cls(image=image, **fields, **{name: facts[name] for name in _FACTS})
         try:
             episodes.validate()
         except ValueError as error:

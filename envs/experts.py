@@ -1,8 +1,8 @@
 """The scripted expert of every task and robot.
 
-A plan is made once an episode: inverse kinematics at the task's waypoints, then a minimum-jerk path
-through them in joint space, slowed down where a joint would be too fast. Acting only reads the path,
-so an action is what a policy gives: joint targets and gripper opening one control step ahead.
+A plan is made once an episode: inverse kinematics at the task's waypoints, then a minimum-jerk
+path through them in joint space, slowed down where a joint would be too fast. Acting only reads the
+path: an action is what a policy gives, joint targets and gripper opening one control step ahead.
 """
 
 import dataclasses
@@ -50,7 +50,9 @@ def inverse_kinematics(
     robot: Robot, position: jax.Array, rotation: jax.Array, start: jax.Array
 ) -> jax.Array:
     """Joint angles [J] within the limits that bring the tcp to a pose, found from `start` [J]."""
-    lower, upper, home = (jnp.asarray(x, jnp.float32) for x in (robot.lower, robot.upper, robot.home))
+    lower, upper, home = (
+        jnp.asarray(x, jnp.float32) for x in (robot.lower, robot.upper, robot.home)
+    )
     weight = jnp.array([1.0] * 3 + [_ROTATION_WEIGHT] * 3)
 
     def body(q: jax.Array, _: None) -> tuple[jax.Array, None]:
@@ -68,6 +70,12 @@ def inverse_kinematics(
         return jnp.clip(q + jnp.clip(step, -_MAX_STEP, _MAX_STEP), lower, upper), None
 
     return jax.lax.scan(body, start, None, length=_ITERATIONS)[0]
+
+
+def leaning(robot: Robot, rotations: jax.Array) -> jax.Array:
+    """Tool rotations [..., 3, 3] with the robot's lean: outwards where the tool points down."""
+    # The tcp's x axis points back to the base, y is the fingers' own and stays level.
+    return _dot(rotations, jnp.asarray(rotation("y", -robot.lean)[:3, :3], jnp.float32))
 
 
 def _plan(env: Env, info: dict, key: jax.Array) -> Plan:
@@ -88,9 +96,8 @@ def _knots(robot: Robot, way: Waypoints, positions: jax.Array, start: jax.Array)
         q = inverse_kinematics(robot, *target, q)
         return q, q
 
-    # The tcp's x axis points back to the base, y is the fingers' own and stays level.
-    leaning = _dot(way.rotation, jnp.asarray(rotation("y", -robot.lean)[:3, :3], jnp.float32))
-    joints = jax.lax.scan(body, start[:-1], (positions, leaning))[1]
+    rotations = leaning(robot, way.rotation)
+    joints = jax.lax.scan(body, start[:-1], (positions, rotations))[1]
     return jnp.concatenate([joints, way.opening[:, None]], axis=1)
 
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-Vec = tuple[jax.Array, jax.Array, jax.Array]
+Vec = tuple[jax.Array, ...]  # x, y, z
 
 PLANE, SPHERE, CAPSULE, CYLINDER, BOX = range(5)
 _MISS = 0x7F800000  # the bits of float32 +inf
@@ -32,7 +32,9 @@ class Geoms(NamedTuple):
     axes: jax.Array  # [V, 3, 3] the camera's axes as columns
     eye: jax.Array  # [V, 3] the camera's position
     light: jax.Array  # [V, 3] direction towards the light
+    shrink: jax.Array  # [V, 3] 1 / the half-extents that were scaled to 1 [1/m]
     half: jax.Array  # [V] a capsule's half-length over its radius, else 0
+    kind: jax.Array  # [V] f32, PLANE .. BOX
 
 
 def dot(a: Vec, b: Vec) -> jax.Array:
@@ -47,8 +49,7 @@ def components(vectors: jax.Array) -> Vec:
 
 def ray(axes: jax.Array, x: jax.Array, y: jax.Array) -> Vec:
     """Components of axes @ (x, y, -1); `axes` is `[3, 3, ...]`."""
-    right, up, back = components(jnp.swapaxes(axes, 0, 1))
-    return tuple(right[i] * x + up[i] * y - back[i] for i in range(3))
+    return tuple(axes[i, 0] * x + axes[i, 1] * y - axes[i, 2] for i in range(3))
 
 
 def _enter(hit: jax.Array, t: jax.Array) -> jax.Array:
@@ -186,17 +187,48 @@ def _over_kinds(
     return carry
 
 
-def gradient(point: Vec, kind: jax.Array, half: jax.Array) -> Vec:
-    """A vector along the outward normal at a surface point, in the unit frame and of any length.
+def surface(
+    geoms: Geoms,
+    rgb: jax.Array,
+    x: jax.Array,
+    y: jax.Array,
+    number: jax.Array,
+    depth: jax.Array,
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """What shading needs of the surface points that `nearest` found.
 
     Args:
-        point: surface point in the unit frame, components `[P]`.
-        kind: `[P]` PLANE .. BOX of the geom that owns each point.
-        half: `[P]` a capsule's half-length over its radius, 0 for the other kinds.
+        geoms: V geoms.
+        rgb: `[V, 3]` their colours.
+        x: `[P]` slope of each pixel's ray to the right.
+        y: `[P]` slope upwards.
+        number: `[P]` geom hit.
+        depth: `[P]` finite depth.
+
+    Returns:
+        Colour `[3, P]`; kind `[P]`; cosine `[P]` between normal and direction to the light; cosine
+        `[P]`, at least 0, between normal and the ray reversed, times the ray's length.
     """
+    axes, half, kind = geoms.axes.reshape(-1, 9), geoms.half[:, None], geoms.kind[:, None]
+    columns = (axes, geoms.eye, geoms.light, geoms.shrink, rgb, half, kind)
+    # One gather for everything, pixels along the fastest axis.
+    table = jnp.concatenate(columns, axis=1).T.at[:, number].get(mode="promise_in_bounds")
+    axes, eye, light, shrink, rgb, (half, kind) = jnp.split(table, (9, 12, 15, 18, 21))
+    slope = ray(axes.reshape(3, 3, -1), x, y)
+    point = tuple(o + depth * d for o, d in zip(components(eye), slope, strict=True))
+    outward = _gradient(point, kind, half)
+    world = tuple(g * s for g, s in zip(outward, components(shrink), strict=True))
+    inverse_length = jax.lax.rsqrt(jnp.maximum(dot(world, world), _TINY))
+    to_light = dot(outward, components(light)) * inverse_length
+    to_eye = jnp.maximum(-dot(outward, slope) * inverse_length, 0)
+    return rgb, kind, to_light, to_eye
+
+
+def _gradient(point: Vec, kind: jax.Array, half: jax.Array) -> Vec:
+    """The outward normal at a surface point, in the unit frame and of any length."""
     x, y, z = point
     ax, ay, az = jnp.abs(x), jnp.abs(y), jnp.abs(z)
-    flat_end = az > jnp.sqrt(x * x + y * y)  # on a cylinder's side |z| < 1 = |(x, y)|, on its ends the reverse
+    flat_end = z * z > x * x + y * y  # a cylinder has |z| < 1 = |(x, y)| on its side
     face = jnp.maximum(jnp.maximum(ax, ay), az)
     box, cylinder, plane = kind == BOX, kind == CYLINDER, kind == PLANE
     keep_x = ~plane & ~(box & (ax < face)) & ~(cylinder & flat_end)

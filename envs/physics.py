@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax._src import xla_bridge  # there is no public way to ask whether a backend has started
 
 _IMPL = "jax"  # runs on CPU, GPU and TPU
 _FAST_CPU_FLAG = "--xla_cpu_use_fusion_emitters=false"
@@ -42,7 +43,7 @@ def enable_fast_cpu() -> None:
     flags = os.environ.get("XLA_FLAGS", "")
     if jax.__version_info__ >= (0, 11) or _FAST_CPU_FLAG in flags:
         return  # newer versions need no flag and abort on this one
-    if jax._src.xla_bridge.backends_are_initialized():
+    if xla_bridge.backends_are_initialized():
         if jax.default_backend() == "cpu":
             warnings.warn(
                 f"JAX started before envs.physics.enable_fast_cpu(): simulation on CPU will be "

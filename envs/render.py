@@ -4,15 +4,13 @@ Geoms are sorted by kind when the model is built. One picture takes three steps:
 
 1. one loop a kind over its geoms: how far is the geom along every pixel's ray? Distance and geom
    number share one int32 (the bits of a positive float sort like an integer; the lowest few hold
-   the number), so the loop carries the minimum in a single array and XLA makes one vectorised
-   kernel of each turn. Measured on two CPU cores, a table [geoms, pixels] with argmin is 3 to 5
-   times slower, and a Python loop of chained `where` compiles for half a minute.
+   the number), so the loop carries one array, which XLA makes one vectorised kernel a turn.
+   Measured on two CPU cores, a table [geoms, pixels] with argmin is 3 to 5 times slower.
 2. one gather of the winner's pose, size and colour per pixel, and one normal.
 3. a second loop of the same shape for hard shadows: does another geom lie towards the light?
 
-Light, colours and fields of view are traced (`Look`), so they can differ from world to world.
-Cameras follow MuJoCo: x right, y up, looking along -z, vertical field of view. A camera inside a
-geom looks through it, as with back-face culling.
+Light, colours and fields of view are traced (`Look`): they can differ from world to world.
+Cameras follow MuJoCo (looking along -z, y up); inside a geom they look through it.
 """
 
 import functools
@@ -26,18 +24,18 @@ import mujoco
 import numpy as np
 
 from envs import intersections
-from envs.intersections import BOX, CAPSULE, CYLINDER, PLANE, SPHERE, Geoms, components, dot, ray
+from envs.intersections import BOX, CAPSULE, CYLINDER, PLANE, SPHERE, Geoms, dot, ray
 
-_KIND = {
-    mujoco.mjtGeom.mjGEOM_PLANE: PLANE,
-    mujoco.mjtGeom.mjGEOM_SPHERE: SPHERE,
-    mujoco.mjtGeom.mjGEOM_ELLIPSOID: SPHERE,
-    mujoco.mjtGeom.mjGEOM_CAPSULE: CAPSULE,
-    mujoco.mjtGeom.mjGEOM_CYLINDER: CYLINDER,
-    mujoco.mjtGeom.mjGEOM_BOX: BOX,
+_INFINITE = 1e4  # [m] half-extent drawn where a plane's size is 0, which means infinite
+# MuJoCo geom type -> kind, and which numbers of its size are the half-extents along x, y, z.
+_SHAPES = {
+    int(mujoco.mjtGeom.mjGEOM_PLANE): (PLANE, (0, 1, 2)),
+    int(mujoco.mjtGeom.mjGEOM_SPHERE): (SPHERE, (0, 0, 0)),
+    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): (SPHERE, (0, 1, 2)),
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE): (CAPSULE, (0, 0, 0)),
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER): (CYLINDER, (0, 0, 1)),
+    int(mujoco.mjtGeom.mjGEOM_BOX): (BOX, (0, 1, 2)),
 }
-_KIND = {int(geom_type): kind for geom_type, kind in _KIND.items()}
-_INFINITE = 1e4  # [m] half-extent drawn for a plane of size 0, which MuJoCo takes as infinite
 
 # Pixels rendered together. CPU: the few arrays in use stay in a core's cache (measured at 64 and
 # 128 px). Accelerators: about 200 bytes a pixel are alive, so this is about 1 GiB.
@@ -105,52 +103,38 @@ def build(mj_model: mujoco.MjModel, camera_names: Sequence[str]) -> RenderModel:
         ValueError: if a camera does not exist, a visible geom is not a primitive, or none is left.
     """
     cameras = {mj_model.camera(i).name: i for i in range(mj_model.ncam)}
-    for name in camera_names:
-        if name not in cameras:
-            raise ValueError(f"there is no camera {name!r} in the model, only {sorted(cameras)}")
+    if unknown := set(camera_names) - set(cameras):
+        raise ValueError(f"the model has no camera {unknown}, only {sorted(cameras)}")
     visible = np.flatnonzero((mj_model.geom_rgba[:, 3] > 0) & (mj_model.geom_group < 3)).tolist()
     if not visible:
         raise ValueError("the model has no visible geom (alpha above 0, group below 3)")
+    types, sizes = mj_model.geom_type.tolist(), mj_model.geom_size
     for i in visible:
-        if int(mj_model.geom_type[i]) not in _KIND:
+        if types[i] not in _SHAPES:
             raise ValueError(
                 f"geom {mj_model.geom(i).name or i} cannot be drawn: only planes, spheres, "
                 "ellipsoids, capsules, cylinders and boxes can (group 3 hides a geom)"
             )
-    kind = {i: _KIND[int(mj_model.geom_type[i])] for i in visible}
-    geoms = sorted(visible, key=kind.__getitem__)
-    units = [_unit(int(mj_model.geom_type[i]), *mj_model.geom_size[i].tolist()) for i in geoms]
+    geoms = sorted(visible, key=lambda i: _SHAPES[types[i]][0])
+    kinds = tuple(_SHAPES[types[i]][0] for i in geoms)
+    scale = np.array([sizes[i, _SHAPES[types[i]][1]] for i in geoms], np.float32)
+    scale[scale == 0] = _INFINITE
+    half = np.where(np.array(kinds) == CAPSULE, sizes[geoms, 1] / scale[:, 0], 0)
     return RenderModel(
         look=_own_look(mj_model),
-        scale=np.array([scale for scale, _ in units], np.float32),
-        half=np.array([half for _, half in units], np.float32),
+        scale=scale,
+        half=half.astype(np.float32),
         geoms=tuple(geoms),
-        kinds=tuple(kind[i] for i in geoms),
+        kinds=kinds,
         cameras=tuple(cameras[name] for name in camera_names),
     )
 
 
-def _unit(geom_type: int, x: float, y: float, z: float) -> tuple[tuple[float, ...], float]:
-    """Scale and `half` of a geom from its MuJoCo type and size."""
-    match geom_type:
-        case mujoco.mjtGeom.mjGEOM_PLANE:
-            return (x or _INFINITE, y or _INFINITE, 1.0), 0.0
-        case mujoco.mjtGeom.mjGEOM_SPHERE:
-            return (x, x, x), 0.0
-        case mujoco.mjtGeom.mjGEOM_CAPSULE:
-            return (x, x, x), y / x
-        case mujoco.mjtGeom.mjGEOM_CYLINDER:
-            return (x, x, y), 0.0
-        case _:
-            return (x, y, z), 0.0
-
-
 def _own_look(mj_model: mujoco.MjModel) -> Look:
     """Colours, fields of view and first light of the model; the rest chosen by eye."""
-    light = -mj_model.light_dir[0] if mj_model.nlight else np.array([0.3, -0.4, 0.87])
     values = Look(
         rgba=mj_model.geom_rgba,
-        light=light,
+        light=-mj_model.light_dir[0] if mj_model.nlight else np.array([0.3, -0.4, 0.87]),
         ambient=np.array(0.35),
         headlight=np.array(0.25),
         diffuse=np.array(0.5),
@@ -177,12 +161,10 @@ def render(
 
     Args:
         model: from `build`.
-        geom_xpos: `[G, 3]` positions of all geoms of the MuJoCo model [m].
-        geom_xmat: `[G, 3, 3]` their rotations.
-        cam_xpos: `[N, 3]` positions of all cameras of the MuJoCo model [m].
-        cam_xmat: `[N, 3, 3]` their rotations.
-        height: rows [px].
-        width: columns [px].
+        geom_xpos, geom_xmat: `[G, 3]` positions [m] and `[G, 3, 3]` rotations of all geoms of the
+            MuJoCo model.
+        cam_xpos, cam_xmat: `[N, 3]` and `[N, 3, 3]`, the same of all its cameras.
+        height, width: rows and columns [px].
         look: replaces the model's own look.
     """
     look = model.look if look is None else look
@@ -212,13 +194,13 @@ def render_batch(
     Returns:
         uint8 `[W, K, height, width, 3]`.
     """
-    on_cpu = jax.default_backend() == "cpu"
-    pixels = _PIXELS_ON_CPU if on_cpu else _PIXELS_ON_ACCELERATOR
+    pixels = _PIXELS_ON_CPU if jax.default_backend() == "cpu" else _PIXELS_ON_ACCELERATOR
+    chunk = max(1, min(len(geom_xpos), pixels // (len(model.cameras) * height * width)))
     worlds = ((geom_xpos, geom_xmat, cam_xpos, cam_xmat), look)
     return jax.lax.map(
         lambda world: render(model, *world[0], height=height, width=width, look=world[1]),
         worlds,
-        batch_size=max(1, pixels // (len(model.cameras) * height * width)),
+        batch_size=chunk,
     )
 
 
@@ -232,16 +214,14 @@ def cast(
     *,
     height: int,
     width: int,
-    look: Look | None = None,
 ) -> tuple[jax.Array, jax.Array]:
-    """What each pixel of one world sees; arguments as for `render`.
+    """What each pixel of one world sees, with the model's own look; arguments as for `render`.
 
     Returns:
         Geom number in the MuJoCo model, int32 `[K, height, width]`, -1 for none; and depth along
         the camera's axis [m], f32 `[K, height, width]`, +inf for none. Depth is rounded down by
         less than 2^-16 of itself (up to 127 visible geoms): 15 micrometres at a metre.
     """
-    look = model.look if look is None else look
 
     def seen(view: _View) -> tuple[jax.Array, jax.Array]:
         number, depth = intersections.nearest(view.geoms, model.kinds, view.x, view.y)
@@ -249,7 +229,7 @@ def cast(
         return geom.reshape(height, width), depth.reshape(height, width)
 
     poses = (geom_xpos, geom_xmat, cam_xpos, cam_xmat)
-    return jax.vmap(seen)(_views(model, look, poses, height, width))
+    return jax.vmap(seen)(_views(model, model.look, poses, height, width))
 
 
 class _View(NamedTuple):
@@ -276,19 +256,23 @@ def _views(
     product = functools.partial(jnp.einsum, precision="highest")
     visible, chosen = np.array(model.geoms), np.array(model.cameras)
     to_unit = jnp.swapaxes(geom_xmat[visible], -1, -2) / model.scale[:, :, None]
-    light = product("vij,j->vi", to_unit, look.light / jnp.linalg.norm(look.light))
-    number = jnp.arange(len(visible), dtype=jnp.int32)
+    fixed = {
+        "number": jnp.arange(len(visible), dtype=jnp.int32),
+        "light": product("vij,j->vi", to_unit, look.light / jnp.linalg.norm(look.light)),
+        "shrink": jnp.asarray(1 / model.scale),
+        "half": jnp.asarray(model.half),
+        "kind": jnp.array(model.kinds, jnp.float32),
+    }
     row, column = np.mgrid[:height, :width].astype(np.float32).reshape(2, -1)
 
     def view(position: jax.Array, rotation: jax.Array, fovy: jax.Array) -> _View:
         axes = product("vij,jk->vik", to_unit, rotation)
         eye = product("vij,vj->vi", to_unit, position - geom_xpos[visible])
-        geoms = Geoms(number, axes, eye, light, jnp.asarray(model.half))
-        edge = jnp.tan(jnp.deg2rad(fovy) / 2) / height
-        x, y = edge * (2 * column + 1 - width), edge * (height - 1 - 2 * row)
-        return _View(geoms, position, rotation, x, y)
+        pixel = jnp.tan(jnp.deg2rad(fovy) / 2) / height  # half its edge, one metre away
+        x, y = pixel * (2 * column + 1 - width), pixel * (height - 1 - 2 * row)
+        return _View(Geoms(axes=axes, eye=eye, **fixed), position, rotation, x, y)
 
-    return jax.vmap(view)(cam_xpos[chosen], cam_xmat[chosen], look.fovy[chosen])
+    return jax.vmap(view)(cam_xpos[chosen], cam_xmat[chosen], jnp.asarray(look.fovy)[chosen])
 
 
 def _colour(
@@ -298,7 +282,10 @@ def _colour(
     hit, depth = jnp.isfinite(depth), jnp.where(jnp.isfinite(depth), depth, 0)
     direction = ray(view.rotation, view.x, view.y)
     length = jnp.sqrt(dot(direction, direction))
-    kind, rgb, to_light, to_eye = _surface(model, look, view, number, depth)
+    rgb = jnp.asarray(look.rgba)[np.array(model.geoms), :3]
+    rgb, kind, to_light, to_eye = intersections.surface(
+        view.geoms, rgb, view.x, view.y, number, depth
+    )
     lit = (to_light > 0) & intersections.unshadowed(
         view.geoms, model.kinds, view.x, view.y, number, depth
     )
@@ -310,34 +297,3 @@ def _colour(
     up = jnp.clip(direction[2] / length, 0, 1)
     sky = look.sky[0, :, None] * (1 - up) + look.sky[1, :, None] * up
     return jnp.where(hit, rgb * shade * (1 - look.checker[1] * dark), sky)
-
-
-def _surface(
-    model: RenderModel, look: Look, view: _View, number: jax.Array, depth: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Kind `[P]` and colour `[3, P]` of the geoms hit, and cosines of their normals `[P]`.
-
-    The cosines are with the direction to the light, and with the pixel's ray reversed, times the
-    ray's length.
-    """
-    geoms, shrink = view.geoms, 1 / model.scale
-    columns = (
-        geoms.axes.reshape(-1, 9),
-        geoms.eye,
-        geoms.light,
-        shrink,
-        look.rgba[np.array(model.geoms), :3],
-        geoms.half[:, None],
-        np.array(model.kinds, np.float32)[:, None],
-    )
-    # One gather for everything; rows are properties so that pixels stay the fastest axis.
-    table = jnp.concatenate(columns, axis=1).T[:, number]
-    axes, eye, light, shrink, rgb, (half, kind) = jnp.split(table, (9, 12, 15, 18, 21))
-    slope = ray(axes.reshape(3, 3, -1), view.x, view.y)
-    point = tuple(o + depth * d for o, d in zip(components(eye), slope, strict=True))
-    outward = intersections.gradient(point, kind, half)
-    world = tuple(g * s for g, s in zip(outward, components(shrink), strict=True))
-    inverse_length = jax.lax.rsqrt(jnp.maximum(dot(world, world), 1e-20))
-    to_light = dot(outward, components(light)) * inverse_length
-    to_eye = jnp.maximum(-dot(outward, slope) * inverse_length, 0)
-    return kind, rgb, to_light, to_eye

@@ -6,7 +6,6 @@ matches a path governs it, whether it can apply there or not: with [("vision", L
 """
 
 import difflib
-import functools
 import math
 import re
 import zlib
@@ -17,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax.dense import AdapterParam, Dense
+from lorasp_jax.dense import AdapterAux, AdapterParam, Dense
 from lorasp_jax.peft import FullFineTuning, Method
 from lorasp_jax.peft.method import Params
 
@@ -60,9 +59,14 @@ def adapt(model: Model, rules: Rules, *, rngs: nnx.Rngs) -> Model:
       The adapted model.
 
     Raises:
-      ValueError: a rule that governs nothing it applies to (lists near misses), or a layer that an
-        adapter cannot take over.
+      ValueError: a rule that is no regular expression or governs nothing that it applies to (lists
+        near misses), or a layer that an adapter cannot take over.
     """
+    for pattern, _ in rules:
+        try:
+            re.compile(pattern)
+        except re.error as error:
+            raise ValueError(f"rule {pattern!r} is no regular expression: {error}.") from error
     holder, key = _copy(model), rngs.params()
     used = _attach_all(holder, rules, key) | _free_all(holder, rules)
     for i, (pattern, _) in enumerate(rules):
@@ -125,11 +129,12 @@ def summary(model: nnx.Module) -> str:
     holder = nnx.List([model])
     rows = [("path", "method", "shape", "rank", "parameters", "trainable")]
     inside = set()
-    for path, _, _, layer in _places(holder, Dense):
+    for path, _, _, layer in _places(holder, (Dense, nnx.Linear)):
         inside |= {id(v) for v in vars(layer).values() if isinstance(v, nnx.Variable)}
-        rank = getattr(layer.method, "rank", "-")
-        method = layer.method.name if layer.method else "full" if count(layer).trainable else "-"
-        rows.append(_row(path, method, layer.kernel.get_value(), rank, count(layer)))
+        method, counts = getattr(layer, "method", None), count(layer)
+        name = method.name if method else "full" if counts.trainable else "-"
+        rank = getattr(method, "rank", "-")
+        rows.append(_row(path, name, layer.kernel.get_value(), rank, counts))
     for path, _, _, variable in _places(holder, AdapterParam):
         if id(variable) not in inside:
             counts = Counts(variable.get_value().size, variable.get_value().size)
@@ -160,7 +165,7 @@ def attach(layer: Dense | nnx.Linear, method: Method, key: jax.Array) -> Dense:
     _retype([p for p in _places(nnx.List([layer]), AdapterParam) if p.name != "adapter"], nnx.Param)
     layer.method = method
     shape = layer.kernel.get_value().shape
-    layer.adapter = AdapterParam(_init_params(key, method=method, shape=shape))
+    layer.adapter = AdapterParam(_init_params(key, method, shape))
     return layer
 
 
@@ -170,7 +175,7 @@ def _copy(model: nnx.Module) -> nnx.List:
     The holder gives a model that is itself one layer a parent to be replaced in.
     """
     model = nnx.clone(model)
-    nnx.pop(model, nnx.Intermediate)
+    nnx.pop(model, AdapterAux)
     return nnx.List([model])
 
 
@@ -214,12 +219,13 @@ def _free_all(holder: nnx.List, rules: Rules) -> set[int]:
         if i is None or (method is not None and not method.trains_base):
             continue
         used.add(i)
-        if method is not None and place.name != "adapter":
+        if method is not None and not isinstance(place.child, AdapterParam):
             if place.name == "kernel" and getattr(place.parent, "adapter", None) is not None:
                 raise ValueError(f"{place.path} cannot train in full under the layer's adapter.")
             if isinstance(place.parent, Dense) and place.parent.adapter is None:
                 place.parent.method = method
-            freed.append(place)
+            if jnp.issubdtype(place.child.get_value().dtype, jnp.floating):
+                freed.append(place)
     _retype(freed, AdapterParam)
     return used
 
@@ -230,8 +236,8 @@ def _retype(places: Sequence[Place], kind: type[nnx.Param]) -> None:
     for _, parent, name, variable in places:
         if id(variable) not in renewed:
             value = variable.get_value()
-            if kind is AdapterParam and jnp.issubdtype(value.dtype, jnp.floating):
-                value = value.astype(jnp.float32)
+            if kind is AdapterParam:  # a copy: the train step may donate what trains
+                value = jnp.array(value, jnp.float32, copy=True)
             renewed[id(variable)] = kind(value, **variable.get_metadata())
         setattr(parent, name, renewed[id(variable)])
 
@@ -240,14 +246,17 @@ def _as_dense(linear: nnx.Linear) -> Dense:
     """A `Dense` that holds a linear layer's own variables."""
     if linear.dot_general is not jax.lax.dot_general or linear.precision is not None:
         raise ValueError("an nnx.Linear with its own dot_general or precision cannot be adapted.")
-    layer = Dense(1, 1, use_bias=linear.bias is not None, dtype=linear.dtype, rngs=nnx.Rngs(0))
+    has_bias, zeros = linear.bias is not None, nnx.initializers.zeros
+    layer = Dense(1, 1, use_bias=has_bias, dtype=linear.dtype, kernel_init=zeros, rngs=nnx.Rngs(0))
     layer.kernel, layer.bias = linear.kernel, linear.bias
     return layer
 
 
-@functools.partial(jax.jit, static_argnames=("method", "shape"))
-def _init_params(key: jax.Array, *, method: Method, shape: tuple[int, ...]) -> Params:
-    """Parameters for a kernel [..., I, O]: one draw per leading index."""
+def _init_params(key: jax.Array, method: Method, shape: tuple[int, ...]) -> Params:
+    """Parameters for a kernel [..., I, O]: one draw per leading index.
+
+    Not jitted as a whole: its random draws compile once for each I instead of for each shape.
+    """
     matrix = jax.ShapeDtypeStruct(shape[-2:], jnp.float32)
     leading = shape[:-2]
     if not leading:

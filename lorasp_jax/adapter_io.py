@@ -48,6 +48,7 @@ def save_adapters(
 
     Raises:
       ValueError: the model has nothing that trains.
+      TypeError: metadata that JSON cannot hold.
     """
     adapters = nnx.state(model, AdapterParam)
     tensors = {name: np.asarray(leaf) for name, leaf in _named(adapters).items()}
@@ -62,10 +63,11 @@ def save_adapters(
         "methods": {path: _settings(m) for path, m in adaptation.methods(model).items()},
         "metadata": dict(metadata or {}),
     }
+    text = json.dumps(description, indent=2)  # before anything is written: it may raise
     folder = pathlib.Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     _write(folder / TENSORS, data)
-    _write(folder / DESCRIPTION, json.dumps(description, indent=2).encode())
+    _write(folder / DESCRIPTION, text.encode())
 
 
 def load_adapters(

@@ -15,7 +15,7 @@ class DataConfig:
     """Successful demonstrations per task."""
     num_envs: int = 256
     """Worlds simulated at a time while collecting."""
-    action_noise: float = 0.02
+    action_noise: float = 0.005
     """Standard deviation of the noise on executed joint targets [rad]; recorded targets are clean."""
 
 

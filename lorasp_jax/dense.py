@@ -22,6 +22,7 @@ from typing import Any
 
 import flax.errors
 import flax.linen as nn
+import flax.traverse_util
 import jax
 import jax.numpy as jnp
 from flax import nnx
@@ -36,6 +37,10 @@ KERNEL_INIT = jax.nn.initializers.lecun_normal()  # of nnx.Linear and nn.Dense t
 
 class AdapterParam(nnx.LoRAParam):
     """What trains, and the only thing that does: an adapter's parameters, or a base weight."""
+
+
+class AdapterAux(nnx.Intermediate):
+    """What a drop-in layer kept in its last call."""
 
 
 def dense(
@@ -135,7 +140,7 @@ class Dense(nnx.Module):
         if self.adapter is not None:
             # A module of an outer trace cannot be changed; collect_aux then raises.
             with contextlib.suppress(flax.errors.TraceContextError):
-                setattr(self, KEPT, nnx.Intermediate(aux))
+                setattr(self, KEPT, AdapterAux(aux))
         return y
 
 
@@ -173,17 +178,19 @@ class LinenDense(nn.Module):
         if self.use_bias:
             bias = self.param("bias", nn.initializers.zeros, (self.features,), self.param_dtype)
         params = None
-        method = self.method
-        if method is not None and not method.trains_base:
-            init = lambda: method.init(self.make_rng("params"), kernel)[0]  # noqa: E731
-            params = self.variable("adapters", "adapter", init).value
+        if self.method is not None and not self.method.trains_base:
+            params = self.variable("adapters", "adapter", self._init_adapter, kernel).value
         x = x.astype(self.dtype or jnp.promote_types(x.dtype, kernel.dtype))
-        y, aux = dense(x, kernel, bias, params, method, token_mask=token_mask)
+        y, aux = dense(x, kernel, bias, params, self.method, token_mask=token_mask)
         if return_aux:
             return y, aux
         if params is not None:
             self.sow("intermediates", KEPT, aux)
         return y
+
+    def _init_adapter(self, kernel: jax.Array) -> Params:
+        assert self.method is not None
+        return self.method.init(self.make_rng("params"), kernel)[0]
 
 
 def collect_aux(model: nnx.Module | Mapping) -> dict[str, Aux]:
@@ -200,14 +207,12 @@ def collect_aux(model: nnx.Module | Mapping) -> dict[str, Aux]:
       ValueError: no adapted layer kept anything.
     """
     if isinstance(model, nnx.Module):
-        kept = nnx.to_flat_state(nnx.pop(model, nnx.Intermediate))
-        found = {path[:-1]: v.get_value() for path, v in kept if path[-1] == KEPT}
+        kept = nnx.to_flat_state(nnx.pop(model, AdapterAux))
+        found = {path[:-1]: variable.get_value() for path, variable in kept}
     else:
-        flat = jax.tree_util.tree_flatten_with_path(
-            model, is_leaf=lambda node: isinstance(node, Aux)
-        )[0]
-        keys = [([k.key for k in path if hasattr(k, "key")], aux) for path, aux in flat]
-        found = {tuple(p[1:-1]): aux for p, aux in keys if isinstance(aux, Aux) and p[-1] == KEPT}
+        sown: dict[tuple[str, ...], Any]
+        sown = flax.traverse_util.flatten_dict(model.get("intermediates", {}))  # type: ignore
+        found = {path[:-1]: values[-1] for path, values in sown.items() if path[-1] == KEPT}
     if not found:
         raise ValueError(
             "no adapted layer kept anything: call the model first, inside the same traced function "

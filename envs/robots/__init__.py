@@ -15,11 +15,9 @@ import numpy as np
 TIP_LENGTH = 0.012  # m from the tcp to the end of the finger tips, the same on every hand
 _TIP_RADIUS = 0.005  # m, sphere at each finger tip that touches tables, walls and buttons
 
-# The wrist camera sits behind the hand and looks along it, tilted 15 degrees towards the tips
-# (own choice: the tips fill the lower edge of the picture, the object below them its middle).
-_WRIST_CAMERA = (
-    '<camera name="wrist" pos="-.07 0 -.093" xyaxes="0 -1 0 -.9659 0 .2588" fovy="75"/>'
-)
+# The wrist camera sits on the outer side of the hand and looks along it, tilted 22 degrees towards
+# the tips (own choice: the tips stand in the lower half of the picture, the object above them).
+_WRIST_CAMERA = '<camera name="wrist" pos="-.08 0 -.093" xyaxes="0 -1 0 -.9272 0 .3746" fovy="75"/>'
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -110,13 +108,13 @@ def forward_kinematics(chain: np.ndarray, q: jax.Array) -> tuple[jax.Array, jax.
     Returns:
         Positions [..., J, 3] in m and rotations [..., J, 3, 3] of the links in the base frame.
     """
-    chain = jnp.asarray(chain, q.dtype)
+    fixed = jnp.asarray(chain, q.dtype)
     position = jnp.zeros((*q.shape[:-1], 3), q.dtype)
     rot = jnp.broadcast_to(jnp.eye(3, dtype=q.dtype), (*q.shape[:-1], 3, 3))
     positions, rotations = [], []
-    for i in range(len(chain)):
-        position = position + _multiply(rot, chain[i, :3, 3:])[..., 0]
-        x, y, z = jnp.unstack(_multiply(rot, chain[i, :3, :3]), axis=-1)
+    for i in range(len(fixed)):
+        position = position + _multiply(rot, fixed[i, :3, 3:])[..., 0]
+        x, y, z = jnp.unstack(_multiply(rot, fixed[i, :3, :3]), axis=-1)
         c, s = jnp.cos(q[..., i, None]), jnp.sin(q[..., i, None])
         rot = jnp.stack([c * x + s * y, c * y - s * x, z], axis=-1)
         positions.append(position)
@@ -132,7 +130,7 @@ def tool_pose(robot: Robot, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Arr
         q: [J] joint angles [rad].
 
     Returns:
-        Position [3] in m, rotation [3, 3], and geometric Jacobian [6, J]: linear rows, then angular.
+        Position [3] in m, rotation [3, 3], Jacobian [6, J]: three linear rows, three angular.
     """
     positions, rotations = forward_kinematics(robot.chain, q)
     tool = jnp.asarray(robot.tool, q.dtype)

@@ -23,6 +23,7 @@ _CHAIN = np.stack([robots.translation(*p) @ robots.rotation("x", a) for p, a in 
 
 # Shapes and colours are own choices; masses [kg] are Menagerie's.
 _WHITE, _LIGHT = 'rgba=".93 .93 .93 1"', 'rgba=".70 .72 .75 1"'
+_DARK = 'rgba=".25 .25 .27 1"'
 _LINKS = (
     f'<geom type="capsule" size=".06" fromto="0 0 -.13 0 0 -.02" mass="4.971" {_WHITE}/>',
     f'<geom type="capsule" size=".06" fromto="0 -.02 0 0 -.13 0" mass=".647" {_WHITE}/>',
@@ -56,6 +57,6 @@ ROBOT = robots.Robot(
     base=f'<geom type="capsule" size=".07" fromto="-.05 0 .05 0 0 .13" mass=".63" {_LIGHT}/>',
     links=_LINKS,
     hand=f'<geom type="box" size=".022 .1 .028" pos="0 0 -.067" mass=".73" {_WHITE}/>',
-    finger=f'<geom class="pad" size=".010 .005 .027" pos="0 .005 -.015" mass=".015" {_LIGHT}/>',
+    finger=f'<geom class="pad" size=".010 .005 .027" pos="0 .005 -.015" mass=".015" {_DARK}/>',
     tip_offset=0.005,
 )

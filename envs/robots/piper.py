@@ -1,9 +1,9 @@
 """AgileX PiPER: six joints and a parallel gripper of 70 mm.
 
-Kinematics, limits and speeds are those of the vendor's `piper_sdk` 0.6.2. Masses and servo gains are
-those of MuJoCo Menagerie's `agilex_piper` (commit cd165455), the shells being weighed without their
-motors: joints are gravity-compensated and no dynamic fidelity is claimed. Shapes are primitives laid
-over the kinematic skeleton.
+Kinematics, limits and speeds are those of the vendor's `piper_sdk` 0.6.2. Masses and servo gains
+are those of MuJoCo Menagerie's `agilex_piper` (commit cd165455), the shells being weighed without
+their motors: joints are gravity-compensated and no dynamic fidelity is claimed. Shapes are
+primitives laid over the kinematic skeleton.
 """
 
 import jax

@@ -3,8 +3,8 @@
 A task says what lies on the table and where (`place`), what counts as success (`check`), how people
 ask for it (`instructions`) and how a hand does it (`waypoints`). It knows nothing of robots.
 
-Contact masks of the scenes: objects that are carried have contype 1, finger tips contype 2; whatever
-they may touch has the bit in its conaffinity, and no other pair is ever computed.
+Contact masks of the scenes: objects that are carried have contype 1, finger tips contype 2;
+whatever they may touch has the bit in its conaffinity, and no other pair is ever computed.
 """
 
 import dataclasses
@@ -48,8 +48,8 @@ class View:
     @property
     def tip(self) -> jax.Array:
         """Position [3] of the point between the ends of the finger tips in m."""
-        outwards = self.data.site_xmat[self.model.site("tcp").id][:, 2]
-        return self.tcp + TIP_LENGTH * outwards
+        rotation = self.data.site_xmat[self.model.site("tcp").id].reshape(3, 3)
+        return self.tcp + TIP_LENGTH * rotation[:, 2]
 
     @property
     def opening(self) -> jax.Array:
@@ -83,7 +83,7 @@ class Task:
 
     Attributes:
         name: file name of the task.
-        scene: MJCF of the bodies on the table. Bodies that `place` names are mocap or free.
+        scene: MJCF of the bodies on the table; `place` moves those that are fixed or free.
         instructions: phrasings of the request, at most 8 words each.
         time_limit: seconds after which an episode ends.
         expert_time: seconds the expert is given.

@@ -9,18 +9,18 @@ import jax.numpy as jnp
 from envs.tasks import Layout, Task, View, Waypoints, route
 
 _RADIUS = 0.015  # m, a large table grape (12 g)
-_INSIDE = 0.052  # m, half the inner width of the basket
+_INSIDE = 0.046  # m, half the inner width of the basket
 _WALL = 0.003  # m, half the thickness of its walls
 _HEIGHT = 0.045  # m, of its walls
-_GRAPE, _GRAPE_RANGE = (0.36, -0.06), (0.06, 0.10)  # m, of the random position
-_BASKET, _BASKET_RANGE = (0.36, 0.15), (0.035, 0.035)  # m
+_GRAPE, _GRAPE_RANGE = (0.36, -0.08), (0.06, 0.10)  # m, of the random position
+_BASKET, _BASKET_RANGE = (0.36, 0.155), (0.035, 0.035)  # m
 
 _BASKET_LOOK = 'type="box" conaffinity="3" rgba=".85 .65 .30 1"'
 _SIDE, _MIDDLE = _INSIDE + _WALL, _HEIGHT / 2
 _LONG = _INSIDE + 2 * _WALL
 # The free joint's damping stops a rolling grape within half a second: 1.4 m r^2 / damping.
 _SCENE = f"""
-<body name="basket" mocap="true">
+<body name="basket">
   <geom {_BASKET_LOOK} size="{_INSIDE} {_INSIDE} .002" pos="0 0 .002"/>
   <geom {_BASKET_LOOK} size="{_WALL} {_LONG} {_MIDDLE}" pos="{_SIDE} 0 {_MIDDLE}"/>
   <geom {_BASKET_LOOK} size="{_WALL} {_LONG} {_MIDDLE}" pos="{-_SIDE} 0 {_MIDDLE}"/>

@@ -16,7 +16,7 @@ _CENTRE, _RANGE = (0.36, 0.0), (0.04, 0.04)  # m, of the random position
 
 # A spring of 150 N/m: 1.8 N at full stroke, far more than the cap's weight (compensated anyway).
 _SCENE = f"""
-<body name="button" mocap="true">
+<body name="button">
   <geom type="cylinder" size=".040 .012" pos="0 0 .012" rgba=".20 .22 .26 1"/>
   <body name="cap" gravcomp="1">
     <joint name="button" type="slide" axis="0 0 -1" range="0 {_STROKE}" stiffness="150"
@@ -48,8 +48,8 @@ def _waypoints(layout: Layout) -> Waypoints:
     return route(
         (top, (0.0, 0.0, 0.060), 0.0, 1.8, 0.008),
         (top, (0.0, 0.0, 0.012), 0.0, 0.9, 0.0),
-        (top, (0.0, 0.0, -0.015), 0.0, 0.7, 0.0),
-        (top, (0.0, 0.0, -0.015), 0.0, 0.6, 0.0),
+        (top, (0.0, 0.0, -0.020), 0.0, 0.7, 0.0),
+        (top, (0.0, 0.0, -0.020), 0.0, 0.6, 0.0),
     )
 
 

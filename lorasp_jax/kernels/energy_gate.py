@@ -91,11 +91,12 @@ def energy_gate(
 def default_implementation() -> Implementation:
     """Pallas on one NVIDIA GPU, bisection in XLA elsewhere.
 
-    Under a mesh of several devices XLA partitions the bisection over rows; it would gather the
-    scores first for a Pallas call.
+    Over several devices (of the mesh that is set, or else all there are) XLA partitions the
+    bisection by rows; for a Pallas call it would gather the scores first.
     """
-    single = jax.sharding.get_abstract_mesh().size <= 1
-    return "pallas" if single and jax.default_backend() == "gpu" else "bisection"
+    mesh = jax.sharding.get_abstract_mesh()
+    devices = jax.device_count() if mesh.empty else mesh.size
+    return "pallas" if devices == 1 and jax.default_backend() == "gpu" else "bisection"
 
 
 def _finder(implementation: str) -> Callable[[jax.Array, Ratio], Boundary]:
@@ -115,11 +116,11 @@ def _mask(scores: jax.Array, last: Boundary) -> jax.Array:
 
 
 def _kept_energy(scores: jax.Array, mask: jax.Array) -> jax.Array:
-    """E_k of eq. (12), f32 [...]; 1 for a row of zeros, with a zero gradient there."""
+    """E_k of eq. (12), f32 [...]; 1 for zeros, with a zero gradient there, and NaN for NaN."""
     energy = _energy(scores)
     total = energy.sum(-1)
     kept = jnp.where(mask, energy, 0).sum(-1)
-    return jnp.where(total > 0, kept / jnp.where(total > 0, total, 1), 1)
+    return jnp.where(total == 0, 1, kept / jnp.where(total == 0, 1, total))
 
 
 def _energy(scores: jax.Array) -> jax.Array:

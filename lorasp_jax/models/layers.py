@@ -79,6 +79,7 @@ def scan_depth(
     per_layer: Any = None,
     *,
     remat: bool = False,
+    unroll: bool = False,
 ) -> tuple[jax.Array, Any]:
     """Run x through stacked blocks.
 
@@ -88,6 +89,7 @@ def scan_depth(
         x: `[B, T, D]`.
         per_layer: pytree with a leading axis L, or None.
         remat: compute the inside of a block again in the backward pass instead of storing it.
+        unroll: straight-line code instead of a loop.
 
     Returns:
         `[B, T, D]`, and what the blocks gave to keep, stacked to `[L, ...]`.
@@ -98,7 +100,7 @@ def scan_depth(
         return call(nnx.merge(graphdef, scanned[0]), x, scanned[1])
 
     body = jax.checkpoint(layer, prevent_cse=False) if remat else layer
-    return jax.lax.scan(body, x, (state, per_layer))
+    return jax.lax.scan(body, x, (state, per_layer), unroll=unroll)
 
 
 def positions(valid: jax.Array) -> jax.Array:

@@ -82,23 +82,21 @@ class LoRASP(Method):
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
         """V and the router random, U zero: the delta starts at exactly zero."""
-        v_key, router_key = jax.random.split(key)
-        bank = {
-            "u": jnp.zeros((self.rank, d_out)),
-            "v": kaiming_uniform(v_key, (d_in, self.rank)),
-        }
-        return {"bank": bank, "router": self._init_router(router_key, d_in)}
+        input_key, score_key = jax.random.split(key)
+        # V and W1 both read x and share one distribution: one draw, which compiles once.
+        inputs = kaiming_uniform(input_key, (d_in, self.rank + self.hidden_width))
+        v, w1 = jnp.split(inputs, [self.rank], axis=1)
+        bank = {"u": jnp.zeros((self.rank, d_out)), "v": v}
+        return {"bank": bank, "router": {"w1": w1, **self._init_scores(score_key)}}
 
-    def _init_router(self, key: jax.Array, d_in: int) -> dict[str, jax.Array]:
-        w1_key, w2_key = jax.random.split(key)
-        w1 = kaiming_uniform(w1_key, (d_in, self.hidden_width))
+    def _init_scores(self, key: jax.Array) -> dict[str, jax.Array]:
+        """The router's second layer, and the biases of both."""
+        shape = (self.hidden_width, self.rank)
         if self.router == "softmax":
-            block = self.rank // self.hidden_width
-            return {"w1": w1, "w2": jnp.repeat(jnp.eye(self.hidden_width), block, axis=1)}
+            return {"w2": jnp.repeat(jnp.eye(shape[0]), shape[1] // shape[0], axis=1)}
         return {
-            "w1": w1,
             "b1": jnp.zeros(self.hidden_width),
-            "w2": SCORE_INIT_STD * jax.random.normal(w2_key, (self.hidden_width, self.rank)),
+            "w2": SCORE_INIT_STD * jax.random.normal(key, shape),
             "b2": jnp.full(self.rank, SOFTPLUS_INVERSE_OF_ONE),
         }
 
@@ -111,7 +109,7 @@ class LoRASP(Method):
             scores, self.energy_target, implementation=self.gate
         )
         z = select(x @ params["bank"]["v"].astype(x.dtype), self.scale * scores, mask)
-        valid = active_rank > 0  # rows without any score teach the router nothing
+        valid = (scores != 0).any(-1)  # a row of zeros teaches the router nothing; NaN shows
         if token_mask is not None:
             valid &= token_mask
         losses = {

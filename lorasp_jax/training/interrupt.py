@@ -2,7 +2,7 @@
 
 import contextlib
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import FrameType
 
@@ -43,7 +43,7 @@ def sigterm_as_interrupt() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _handlers(handle: signal._HANDLER) -> Iterator[None]:
+def _handlers(handle: Callable[[int, FrameType | None], None]) -> Iterator[None]:
     """Install `handle` for both signals and put the former handlers back."""
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = [signal.signal(number, handle) for number in numbers]

@@ -92,7 +92,9 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
     optimizer = make_optimizer(config.optim)
     mesh = meshes.make_mesh(config.fsdp)
     graphdef, adapters, frozen = adaptation.split(run.policy.model)
-    state = jax.device_put(init_state(adapters, optimizer), meshes.replicated(mesh))
+    # A copy: every call of the step takes its state's memory over.
+    state = init_state(jax.tree.map(jnp.copy, adapters), optimizer)
+    state = jax.device_put(state, meshes.replicated(mesh))
     frozen = meshes.place_frozen(frozen, mesh)
     checkpoints = Checkpoints(run.folder, run.base_hash)
     restored = checkpoints.restore(state) if resume else None

@@ -6,6 +6,7 @@ import dataclasses
 import difflib
 import importlib.util
 import io
+import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -92,11 +93,11 @@ def override(config: Config, arguments: Sequence[str]) -> Config:
     return Config(**{field.name: getattr(chosen, field.name) for field in dataclasses.fields(Config)})
 
 
-def _sentence(box: str) -> str:
-    """The first paragraph of tyro's framed error message, as one line."""
-    lines = [line.strip(" │") for line in box.splitlines() if line.startswith("│")]
-    rule = next((i for i, line in enumerate(lines) if line.startswith("─")), len(lines))
-    return " ".join(lines[:rule])
+def _sentence(message: str) -> str:
+    """The first paragraph under the heading of tyro's framed error message, as one line."""
+    lines = [line.strip(" │╭╮╰╯─-") for line in message.splitlines()]
+    body = itertools.takewhile(bool, itertools.dropwhile(lambda line: not line, lines[1:]))
+    return " ".join(body)
 
 
 def _switch(current: peft.Method, name: str) -> peft.Method:

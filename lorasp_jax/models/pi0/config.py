@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lorasp_jax.models.tokenizer import VOCABULARY_SIZE
 
@@ -66,6 +66,9 @@ class Pi0Config:
     """Type the parameters are stored in."""
     remat: bool = False
     """Recompute each layer's inside in the backward pass: less memory, a third more work."""
+    unroll: bool = False
+    """Straight-line code instead of a loop over layers: faster for a few small ones on a CPU (which
+    otherwise copies what the loop keeps for the backward pass), at the price of compile time."""
 
     def __post_init__(self) -> None:
         """Checks that the parts fit."""
@@ -95,6 +98,21 @@ class Pi0Config:
         return Pi0(self, rngs=rngs)
 
     @classmethod
+    def from_dict(cls, fields: dict[str, Any]) -> Pi0Config:
+        """The config of `dataclasses.asdict`, also after JSON.
+
+        Raises:
+            TypeError, KeyError: missing or unknown fields.
+        """
+        parts = {
+            "vision": VisionConfig(**fields["vision"]),
+            "language": ExpertConfig(**fields["language"]),
+            "action": ExpertConfig(**fields["action"]),
+            "cameras": tuple(fields["cameras"]),
+        }
+        return cls(**{**fields, **parts})
+
+    @classmethod
     def base(cls) -> Pi0Config:
         """The published pi0, 3,238,048,528 parameters (openpi, models/gemma.py, models/siglip.py)."""
         return cls(
@@ -120,7 +138,7 @@ class Pi0Config:
             cameras=("side", "wrist"),
             image_size=64,
             vocabulary=VOCABULARY_SIZE,
-            max_tokens=12,
+            max_tokens=10,
             chunk=10,
             action_dim=8,
         )
@@ -129,15 +147,16 @@ class Pi0Config:
     def nano(cls) -> Pi0Config:
         """For a CPU: about 1 M parameters, 16 tokens a camera."""
         return cls(
-            vision=VisionConfig(width=96, depth=3, mlp=256, heads=4, patch=16),
-            language=ExpertConfig(64, 4, 192, heads=4, kv_heads=1, head_dim=24),
-            action=ExpertConfig(96, 4, 256, heads=4, kv_heads=1, head_dim=24),
+            vision=VisionConfig(width=96, depth=2, mlp=256, heads=3, patch=16),
+            language=ExpertConfig(96, 3, 192, heads=4, kv_heads=1, head_dim=32),
+            action=ExpertConfig(128, 3, 256, heads=4, kv_heads=1, head_dim=32),
             cameras=("side", "wrist"),
             image_size=64,
             vocabulary=VOCABULARY_SIZE,
-            max_tokens=12,
+            max_tokens=10,
             chunk=10,
             action_dim=8,
+            unroll=True,
         )
 
     @classmethod

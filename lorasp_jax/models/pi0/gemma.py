@@ -124,6 +124,7 @@ class Expert(nnx.Module):
             x.astype(self.config.dtype),
             cache,
             remat=self.config.remat,
+            unroll=self.config.unroll,
         )
         return self.norm(x), own, aux
 

@@ -135,9 +135,7 @@ class Pi0(nnx.Module):
         mask = block_mask(block, seen, valid, jnp.concatenate([prefix.valid, valid], axis=1))
         position = jnp.sum(prefix.valid, axis=1, dtype=jnp.int32)[:, None] + positions(valid)
         counted = jnp.concatenate([valid[:, :1], action_valid], axis=1)
-        out, _, expert_aux = self.action(
-            tokens, position, mask, prefix.cache, token_mask=counted
-        )
+        out, _, expert_aux = self.action(tokens, position, mask, prefix.cache, token_mask=counted)
         linear = Linears(self, action_valid)
         v_t = linear("action_out_proj", out[:, -chunk:].astype(jnp.float32))
         return v_t, {**expert_aux, **aux, **linear.aux}

@@ -72,6 +72,7 @@ class SigLIP(nnx.Module):
             lambda block, x, _: block(x, mask),
             x.astype(self.config.dtype),
             remat=self.config.remat,
+            unroll=self.config.unroll,
         )
         x = linear("head", self.norm(x))
         return x, {**aux, **linear.aux}

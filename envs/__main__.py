@@ -1,0 +1,189 @@
+"""Command line: `python -m envs collect | gallery | play --help`."""
+
+import argparse
+import os
+import pkgutil
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+import envs
+import envs.robots
+import envs.tasks
+from envs import physics, scene
+
+_WORLDS = 4  # tries at once where one episode is wanted: the expert may fail in one
+_FRAMES = 8  # pictures of an episode in the gallery
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs one command; returns the exit code: 0 done, 2 bad input, 130 stopped."""
+    options = _parser().parse_args(arguments)
+    console = Console(stderr=True)
+    physics.enable_fast_cpu()  # before anything starts a JAX backend
+    physics.enable_compilation_cache()
+    try:
+        options.command(options, console)
+    except (ValueError, OSError) as error:
+        console.print(f"error: {error}", style="red", soft_wrap=True, highlight=False)
+        return 2
+    except KeyboardInterrupt:
+        console.print("stopped, nothing was written")
+        return 130
+    return 0
+
+
+def collect(options: argparse.Namespace, console: Console) -> None:
+    """Writes successful expert episodes to one .npz file."""
+    _refuse_existing(options, options.out)
+    episodes = _episodes(options, console, options.task, options.robot, options.num_episodes)
+    episodes.save(options.out)
+    console.print(
+        f"{options.out}: {episodes.num_episodes} episodes of {episodes.attempted} tried, "
+        f"{episodes.num_steps} steps, {options.out.stat().st_size / 1e6:.0f} MB"
+    )
+
+
+def gallery(options: argparse.Namespace, console: Console) -> None:
+    """Writes a strip of pictures along an expert episode for every task, robot and camera."""
+    from PIL import Image
+
+    tasks = [options.task] if options.task else _names(envs.tasks)
+    robots = [options.robot] if options.robot else _names(envs.robots)
+    for task in tasks:
+        for robot in robots:
+            files = {c: options.out / f"{task}_{robot}_{c}.png" for c in scene.CAMERAS}
+            _refuse_existing(options, *files.values())
+            episode = _episodes(options, console, task, robot, 1)
+            moments = np.linspace(0, int(episode.length[0]) - 1, _FRAMES).round().astype(int)
+            options.out.mkdir(parents=True, exist_ok=True)
+            for camera, file in files.items():
+                frames = np.asarray(episode.image[camera][0])[moments]
+                with _replacing(file) as unfinished:
+                    strip = Image.fromarray(np.concatenate(list(frames), axis=1))
+                    strip.save(unfinished, format="png")
+                console.print(str(file))
+
+
+def play(options: argparse.Namespace, console: Console) -> None:
+    """Writes a video of an expert episode, the cameras beside one another."""
+    if options.image_size % 2:
+        raise ValueError(f"a video needs an even --image-size, not {options.image_size}")
+    _refuse_existing(options, options.out)
+    episode = _episodes(options, console, options.task, options.robot, 1)
+    views = [np.asarray(picture[0, : int(episode.length[0])]) for picture in episode.image.values()]
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    with _replacing(options.out) as unfinished:
+        _write_video(unfinished, np.concatenate(views, axis=2), round(1 / episode.control_dt))
+    text = episode.instructions[int(episode.instruction[0])]
+    console.print(f"{options.out}: {len(views[0])} steps, {text!r}")
+
+
+def _write_video(path: Path, frames: np.ndarray, rate: int) -> None:
+    """H.264 in MP4 from uint8 `[T, H, W, 3]` frames, `rate` a second."""
+    import av
+
+    with av.open(str(path), "w", format="mp4") as container:
+        stream = container.add_stream("h264", rate=rate)
+        stream.height, stream.width = frames.shape[1:3]
+        stream.pix_fmt = "yuv420p"
+        for frame in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode())
+
+
+def _episodes(
+    options: argparse.Namespace, console: Console, task: str, robot: str, number: int
+) -> envs.Episodes:
+    """Expert episodes with a progress bar."""
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console) as progress:
+        bar = progress.add_task(f"{task}, {robot}: compiling ...", total=number, rate="")
+
+        def report(done: int, total: int) -> None:
+            if done:
+                rate = f"{done / (progress.tasks[bar].elapsed or 1):.1f} episodes/s"
+                text = f"{task}, {robot}: collecting"
+                progress.update(bar, completed=done, total=total, description=text, rate=rate)
+
+        return envs.collect(
+            task,
+            robot=robot,
+            num_episodes=number,
+            key=jax.random.key(options.seed),
+            image_size=options.image_size,
+            num_envs=options.num_envs,
+            action_noise=options.action_noise,
+            progress=report,
+        )
+
+
+def _names(package: ModuleType) -> list[str]:
+    return sorted(module.name for module in pkgutil.iter_modules(package.__path__))
+
+
+def _refuse_existing(options: argparse.Namespace, *files: Path) -> None:
+    for file in files:
+        if file.exists() and not options.overwrite:
+            raise ValueError(f"{file} exists already: choose another --out or add --overwrite")
+
+
+@contextmanager
+def _replacing(file: Path) -> Iterator[Path]:
+    """A temporary path that takes the file's place when all went well."""
+    unfinished = file.with_name(f".{file.name}.{os.getpid()}.tmp")
+    try:
+        yield unfinished
+        os.replace(unfinished, file)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m envs", description="Scripted expert episodes.")
+    commands = parser.add_subparsers(required=True, metavar="command")
+    for command, size in ((collect, 64), (gallery, 256), (play, 256)):
+        sub = commands.add_parser(
+            command.__name__, help=command.__doc__, description=command.__doc__
+        )
+        sub.set_defaults(command=command, num_envs=_WORLDS, action_noise=0.0)
+        one = command is not gallery
+        every = "" if one else " (default: all)"
+        sub.add_argument("--task", required=one, help=", ".join(_names(envs.tasks)) + every)
+        sub.add_argument("--robot", required=one, help=", ".join(_names(envs.robots)) + every)
+        sub.add_argument("--out", required=True, type=Path, help="file, for gallery a folder")
+        sub.add_argument("--overwrite", action="store_true", help="replace what is there")
+        sub.add_argument("--image-size", type=int, default=size, help="pixels (%(default)s)")
+        sub.add_argument("--seed", type=int, default=0, help="of all randomness (%(default)s)")
+        if command is collect:
+            sub.add_argument("--num-episodes", type=int, default=64, help="(%(default)s)")
+            sub.add_argument("--num-envs", type=int, default=None, help="worlds at once")
+            sub.add_argument("--action-noise", type=float, default=0.0, help="rad (%(default)s)")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,57 @@
+"""Windows: inside one episode, padded and masked past its end."""
+
+import jax
+import numpy as np
+
+from lorasp_jax.data.batches import flatten, sample_batch
+from tests.runs import CONFIG, make_run, random_episodes
+
+
+def test_flatten_keeps_valid_steps_in_order():
+    first, second = random_episodes("a", 0), random_episodes("b", 1)
+    steps = flatten([first, second])
+    assert steps.state.shape == (42, 7)
+    np.testing.assert_array_equal(steps.state[:5], first.state[0, :5])
+    np.testing.assert_array_equal(steps.state[21 + 5 : 21 + 14], second.state[1])
+    np.testing.assert_array_equal(steps.end[[0, 4, 5, 13, 14, 20, 21, 41]], [5, 5, 14, 14, 21, 21, 26, 42])
+    np.testing.assert_array_equal(steps.instruction[[0, 5, 21, 26]], [0, 1, 2, 3])
+    np.testing.assert_array_equal(steps.image["wrist"][6], first.image["wrist"][1, 1])
+
+
+def test_chunks_stay_in_their_episode(tmp_path):
+    run = make_run(tmp_path / "run")
+    steps, table = flatten(list(run.episodes.values())), run.policy.processor
+    batch = sample_batch(
+        jax.random.key(5), steps, table, batch_size=64, chunk=4, state_noise=0.0
+    )
+    assert batch.actions.shape == batch.action_mask.shape == (64, 4, 8)
+    assert not batch.action_mask[..., 6].any()  # PiPER leaves slot 6 empty
+    assert not batch.actions[..., 6].any()
+    normal = np.asarray(table.normalize_actions(steps.action))
+    ends = np.asarray(steps.end)
+    for state, actions, mask in zip(
+        np.asarray(batch.observation.state),
+        np.asarray(batch.actions),
+        np.asarray(batch.action_mask[..., 0]),
+        strict=True,
+    ):
+        start = np.abs(np.asarray(table.encode(_raw(steps), steps.instruction).state) - state)
+        n = int(start.sum(-1).argmin())
+        count = min(4, int(ends[n]) - n)
+        assert mask.sum() == count
+        np.testing.assert_array_equal(actions[:count], normal[n : n + count])
+        np.testing.assert_array_equal(actions[count:], normal[[ends[n] - 1] * (4 - count)])
+
+
+def test_noise_touches_the_robots_slots_only(tmp_path):
+    run = make_run(tmp_path / "run", CONFIG)
+    steps = flatten(list(run.episodes.values()))
+    batch = sample_batch(
+        jax.random.key(0), steps, run.policy.processor, batch_size=8, chunk=4, state_noise=0.5
+    )
+    assert not batch.observation.state[:, 6].any()
+    assert batch.observation.state[:, :6].any()
+
+
+def _raw(steps):
+    return {"image": steps.image, "state": steps.state}

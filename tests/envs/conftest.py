@@ -1,0 +1,55 @@
+"""Scenes and expert episodes that several tests look at; each is compiled once a session."""
+
+import functools
+import pkgutil
+
+import jax
+import numpy as np
+import pytest
+
+import envs
+from envs import robots, tasks
+
+TASKS = sorted(module.name for module in pkgutil.iter_modules(tasks.__path__))
+ROBOTS = sorted(module.name for module in pkgutil.iter_modules(robots.__path__))
+EPISODES = 32
+
+
+def pytest_generate_tests(metafunc):
+    """Every test that asks for a task or a robot sees all there are, unless it says which."""
+    chosen = {mark.args[0] for mark in metafunc.definition.iter_markers("parametrize")}
+    for name, values in (("task_name", TASKS), ("robot_name", ROBOTS)):
+        if name in metafunc.fixturenames and name not in chosen:
+            metafunc.parametrize(name, values)
+
+
+@functools.cache
+def _make(task: str, robot: str, num_envs: int) -> envs.Env:
+    return envs.make(task, robot, num_envs=num_envs, image_size=16)
+
+
+@functools.cache
+def _collect(task: str, robot: str) -> envs.Episodes:
+    key = jax.random.key(7)
+    found = envs.collect(
+        task, robot, num_episodes=EPISODES, num_envs=EPISODES, key=key, image_size=16
+    )
+    return jax.tree.map(np.asarray, found)
+
+
+@pytest.fixture
+def scene(task_name, robot_name) -> envs.Env:
+    """An environment to look at, not to step: it is never compiled."""
+    return _make(task_name, robot_name, 1)
+
+
+@pytest.fixture
+def episodes(task_name, robot_name) -> envs.Episodes:
+    """Successful expert episodes, as numpy arrays."""
+    return _collect(task_name, robot_name)
+
+
+@pytest.fixture(scope="session")
+def env() -> envs.Env:
+    """Four worlds of one task to step."""
+    return _make("press", "piper", 4)

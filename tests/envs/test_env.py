@@ -1,0 +1,202 @@
+"""The environment's contract: errors, determinism, latching, freezing, restarting, lowering."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import envs
+from envs import experts
+
+W = 4
+
+
+@pytest.fixture(scope="module")
+def start(env):
+    return env.reset(jax.random.key(0))
+
+
+@pytest.fixture(scope="module")
+def moved(env, start):
+    return env.step(start, start.info["command"] + 0.05)
+
+
+def assert_equal(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def take(state, worlds):
+    return jax.tree.map(lambda x: x[np.asarray(worlds)], state)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"task": "prss"}, "unknown task 'prss': choose from pick_place, press"),
+        ({"robot": "pipe"}, "unknown robot 'pipe': choose from panda, piper"),
+        ({"num_envs": 0}, "num_envs must be at least 1, got 0"),
+        ({"image_size": 0}, "image_size must be at least 1, got 0"),
+        ({"control_dt": 0.03}, "control_dt must be a positive multiple of 0.02 s, got 0.03"),
+        ({"control_dt": 0.0}, "control_dt must be a positive multiple of 0.02 s, got 0.0"),
+    ],
+)
+def test_bad_arguments(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        envs.make(**{"task": "press", **arguments})
+
+
+def test_wrong_action_shape(env, start):
+    with pytest.raises(ValueError, match=r"action must have shape \(4, 7\), got \(4, 6\)"):
+        env.step(start, jnp.zeros((4, 6)))
+
+
+def test_time(env):
+    assert (env.physics_dt, env.control_dt, env.max_steps) == (0.005, 0.1, 80)
+    assert env.expert_steps <= env.max_steps
+
+
+def test_reset_is_random_and_repeatable(env, start):
+    assert_equal(start, env.reset(jax.random.key(0)))
+    other = env.reset(jax.random.key(1))
+    for a in (start.info["layout"]["button"], start.info["command"]):
+        assert len(np.unique(np.asarray(a), axis=0)) == W
+    assert not np.array_equal(start.info["command"], other.info["command"])
+    assert set(np.asarray(start.info["instruction"])) <= set(range(len(env.instructions)))
+
+
+def test_state_has_one_axis_and_strong_types(start, moved):
+    """A step's output must look like its input, or a second call compiles all anew."""
+
+    def signature(state):
+        leaves = jax.tree_util.tree_leaves_with_path(state)
+        return {jax.tree_util.keystr(path): leaf.aval for path, leaf in leaves}
+
+    assert signature(start) == signature(moved)
+    for name, aval in signature(start).items():
+        assert aval.shape[:1] == (W,), name
+        assert not aval.weak_type, name
+
+
+def test_step_is_repeatable_and_moves_the_robot(env, start, moved):
+    again = env.step(start, start.info["command"] + 0.05)
+    assert_equal(moved, again)
+    change = np.asarray(env.proprio(moved) - env.proprio(start))[:, :6]
+    assert np.all(change > 0.005)
+    assert np.all(moved.info["steps"] == 1)
+    assert not np.any(moved.done)
+
+
+def test_worlds_do_not_touch_each_other(env, start, moved):
+    action = (start.info["command"] + 0.05).at[2:].add(-0.1)
+    assert_equal(take(env.step(start, action), [0, 1]), take(moved, [0, 1]))
+
+
+def test_commands_are_limited(env, start):
+    state = env.step(start, jnp.full((W, 7), 100.0))
+    change = np.asarray(state.info["command"] - start.info["command"])
+    np.testing.assert_allclose(change[:, 0], 0.3, atol=1e-6)  # 3 rad/s for 0.1 s
+    for _ in range(15):
+        state = env.step(state, jnp.full((W, 7), 100.0))
+    np.testing.assert_allclose(state.info["command"], np.tile(env.action_high, (W, 1)), rtol=1e-6)
+
+
+def test_time_limit_latches_and_freezes(env, start):
+    late = dataclasses.replace(
+        start, info=start.info | {"steps": jnp.array([78, 79, 0, 79], jnp.int32)}
+    )
+    state = env.step(late, start.info["command"])
+    assert state.done.tolist() == [False, True, False, True]
+    assert not np.any(state.info["success"])
+    after = env.step(state, start.info["command"] + 0.1)
+    assert_equal(take(after, [1, 3]), take(state, [1, 3]))
+    assert after.done.tolist() == [True, True, False, True]
+    assert after.info["steps"].tolist() == [80, 80, 2, 80]
+    again = env.reset_done(after, jax.random.key(5))
+    assert again.done.tolist() == [False] * W
+    assert again.info["steps"].tolist() == [0, 0, 2, 0]
+    assert_equal(take(again, [2]), take(after, [2]))
+    assert_equal(take(again, [0, 1, 3]), take(env.reset(jax.random.key(5)), [0, 1, 3]))
+
+
+def test_success_latches(env, start):
+    plan = experts.plan(env, start, jax.random.key(1))
+    act = jax.jit(lambda state: experts.act(env, plan, state))
+    state, history = start, []
+    for _ in range(env.expert_steps):
+        state = env.step(state, act(state))
+        history.append(state)
+    success = np.stack([s.info["success"] for s in history])
+    np.testing.assert_array_equal(success, np.stack([s.done for s in history]))
+    np.testing.assert_array_equal(success, np.stack([s.reward for s in history]))
+    assert np.all(success[-1])
+    assert np.all(np.diff(success.astype(int), axis=0) >= 0)
+    first = int(success.any(axis=1).argmax())
+    world = int(success[first].argmax())
+    assert_equal(take(history[first], [world]), take(history[-1], [world]))
+
+
+def test_broken_worlds_are_done(env, start):
+    velocity = start.data.qvel.at[1, 0].set(jnp.nan)
+    state = env.step(
+        dataclasses.replace(start, data=start.data.replace(qvel=velocity)), start.info["command"]
+    )
+    assert state.done.tolist() == [False, True, False, False]
+    assert not np.any(state.info["success"])
+    state = env.step(start, start.info["command"].at[2].set(jnp.nan))
+    assert state.done.tolist() == [False, False, True, False]
+    assert np.all(np.isfinite(env.proprio(state)))
+
+
+def test_observation(env, start):
+    found = env.observe(start)
+    assert found["image"].keys() == set(env.cameras)
+    for picture in found["image"].values():
+        assert picture.shape == (W, 16, 16, 3)
+        assert picture.dtype == jnp.uint8
+        assert picture.std() > 5
+    assert found["state"].dtype == jnp.float32
+    np.testing.assert_allclose(found["state"], start.info["command"], atol=1e-6)
+
+
+def test_lowers_for_every_accelerator(env):
+    def episode(key):
+        state = env.reset(key)
+        plan = experts.plan(env, state, key)
+        state = env.step(state, experts.act(env, plan, state))
+        return env.observe(env.reset_done(state, key))
+
+    traced = jax.jit(episode).trace(jax.random.key(0))
+    for platform in ("cpu", "cuda", "tpu"):
+        text = traced.lower(lowering_platforms=(platform,)).as_text()
+        assert "f64" not in text
+
+
+def test_import_starts_no_backend_and_prints_nothing():
+    code = (
+        "import envs, jax, sys\n"
+        "from jax._src import xla_bridge\n"
+        "sys.exit(xla_bridge.backends_are_initialized())"
+    )
+    root = os.path.dirname(os.path.dirname(envs.__file__))
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, cwd=root, check=True)
+    assert done.stdout == b""
+
+
+@pytest.mark.skipif(jax.__version_info__ >= (0, 11), reason="newer versions need no flag")
+def test_fast_cpu_warns_when_late():
+    code = (
+        "import jax, warnings\n"
+        "from envs import physics\n"
+        "jax.devices()\n"
+        "with warnings.catch_warnings(record=True) as caught:\n"
+        "    physics.enable_fast_cpu()\n"
+        "assert len(caught) == 1 and '15 times slower' in str(caught[0].message), caught"
+    )
+    flags = os.environ | {"XLA_FLAGS": ""}
+    root = os.path.dirname(os.path.dirname(envs.__file__))
+    subprocess.run([sys.executable, "-c", code], cwd=root, env=flags, check=True)

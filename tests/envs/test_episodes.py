@@ -1,0 +1,212 @@
+"""Episodes on disk and in memory, and the command line's manners."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from envs import __main__ as command_line
+from envs.episodes import Episodes, concatenate
+
+
+def make(episodes=3, steps=4, **changes):
+    rng = np.random.default_rng(episodes)
+    size = (episodes, steps)
+    values = {
+        "image": {
+            name: rng.integers(0, 256, (*size, 6, 8, 3), dtype=np.uint8)
+            for name in ("side", "wrist")
+        },
+        "state": rng.normal(size=(*size, 7)).astype(np.float32),
+        "action": rng.normal(size=(*size, 7)).astype(np.float32),
+        "length": np.arange(1, episodes + 1, dtype=np.int32).clip(max=steps),
+        "instruction": np.arange(episodes, dtype=np.int32) % 2,
+        "instructions": ("press the button", "push the red button"),
+        "task": "press",
+        "robot": "piper",
+        "control_dt": 0.1,
+        "physics_dt": 0.005,
+        "attempted": episodes + 1,
+    }
+    return Episodes(**values | changes)
+
+
+def assert_equal(a, b):
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        assert x.dtype == y.dtype
+        np.testing.assert_array_equal(x, y)
+
+
+def rewritten(path, **changes):
+    """The .npz file with some arrays replaced, None removing one."""
+    with np.load(path) as archive:
+        arrays = {name: archive[name] for name in archive.files} | changes
+    np.savez(path, **{name: x for name, x in arrays.items() if x is not None})
+
+
+def test_round_trip(tmp_path):
+    episodes = make()
+    path = tmp_path / "new folder" / "press.npz"
+    jax.tree.map(jax.numpy.asarray, episodes).save(path)  # device arrays too
+    assert_equal(Episodes.load(path, control_dt=0.1), episodes)
+    assert [file.name for file in path.parent.iterdir()] == ["press.npz"]
+    assert episodes.num_episodes == 3
+    assert episodes.num_steps == 1 + 2 + 3
+
+
+def test_every_truncation_is_one_sentence(tmp_path):
+    path = tmp_path / "episodes.npz"
+    make().save(path)
+    whole = path.read_bytes()
+    for size in (0, 1, 100, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:size])
+        with pytest.raises(ValueError, match=r"episodes\.npz is damaged") as caught:
+            Episodes.load(path)
+        assert "\n" not in str(caught.value)
+
+
+def test_flipped_bytes_are_noticed(tmp_path):
+    path = tmp_path / "episodes.npz"
+    make().save(path)
+    whole = bytearray(path.read_bytes())
+    whole[len(whole) // 2] ^= 0xFF
+    path.write_bytes(whole)
+    with pytest.raises(ValueError, match="is damaged"):
+        Episodes.load(path)
+
+
+def test_foreign_files(tmp_path):
+    np.savez(tmp_path / "other.npz", x=np.zeros(3))
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    (tmp_path / "text.npz").write_text("hello")
+    for name, message in (("other", "holds no"), ("array", "damaged"), ("text", "damaged")):
+        suffix = "npy" if name == "array" else "npz"
+        with pytest.raises(ValueError, match=message):
+            Episodes.load(tmp_path / f"{name}.{suffix}")
+    with pytest.raises(FileNotFoundError):
+        Episodes.load(tmp_path / "missing.npz")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"action": None}, "lacks action"),
+        ({"header": None}, "holds no"),
+        ({"header": np.frombuffer(b"[]", np.uint8)}, "holds no"),
+        ({"header": np.frombuffer(b'{"format": "envs-episodes-1"}', np.uint8)}, "lacks attempted"),
+        ({"action": np.zeros((3, 4, 6), np.float32)}, "action must have state's shape"),
+        ({"image/side": np.zeros((3, 4, 6, 8), np.uint8)}, "image 'side' must be uint8"),
+        ({"image/wrist": np.zeros((3, 4, 6, 8, 3), np.float32)}, "image 'wrist' must be uint8"),
+        ({"image/side": None, "image/wrist": None}, "no camera"),
+        ({"length": np.array([1, 5, 2], np.int32)}, "length must lie in 1 to 4"),
+        ({"instruction": np.array([0, 1, 2], np.int32)}, "instruction must lie in 0 to 1"),
+        ({"length": np.array([1, 2, 3], np.float32)}, "length must be integers"),
+    ],
+)
+def test_bad_contents(tmp_path, changes, message):
+    path = tmp_path / "episodes.npz"
+    make().save(path)
+    rewritten(path, **changes)
+    with pytest.raises(ValueError, match=message):
+        Episodes.load(path)
+
+
+def test_other_control_period(tmp_path):
+    make(control_dt=0.05).save(tmp_path / "e.npz")
+    with pytest.raises(ValueError, match=r"control_dt 0\.05 s, but 0\.1 s is needed"):
+        Episodes.load(tmp_path / "e.npz", control_dt=0.1)
+
+
+def test_failed_save_keeps_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "episodes.npz"
+    make().save(path)
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match="length must lie"):
+        dataclasses.replace(make(), length=np.array([9, 9, 9])).save(path)
+
+    def full(file, **arrays):
+        file.write(b"half")
+        raise OSError("no space left")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(OSError, match="no space"):
+        make(2).save(path)
+    assert path.read_bytes() == before
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_select_keeps_order():
+    episodes = make()
+    chosen = episodes.select([2, 0])
+    np.testing.assert_array_equal(chosen.action, episodes.action[[2, 0]])
+    np.testing.assert_array_equal(chosen.image["wrist"], episodes.image["wrist"][[2, 0]])
+    assert chosen.task == "press"
+
+
+def test_concatenate_pads_to_the_longest():
+    short, long = make(2, 3), make(3, 5)
+    both = concatenate([short, long])
+    both.validate()
+    assert both.num_episodes == 5
+    assert both.num_steps == short.num_steps + long.num_steps
+    assert both.attempted == 7
+    np.testing.assert_array_equal(both.image["side"][:2, :3], short.image["side"])
+    assert not both.action[:2, 3:].any()
+    np.testing.assert_array_equal(both.state[2:], long.state)
+    assert isinstance(both.state, np.ndarray)
+
+
+@pytest.mark.parametrize("changes", [{"robot": "panda"}, {"control_dt": 0.2}, {"task": "pour"}])
+def test_concatenate_refuses_mixtures(changes):
+    with pytest.raises(ValueError, match=f"one {next(iter(changes))} can be joined"):
+        concatenate([make(), make(**changes)])
+    with pytest.raises(ValueError, match="empty"):
+        concatenate([])
+
+
+def run(capsys, *arguments):
+    code = command_line.main([str(argument) for argument in arguments])
+    return code, capsys.readouterr().err.strip()
+
+
+def test_command_line_refuses_in_one_sentence(tmp_path, capsys, monkeypatch):
+    for switch in ("enable_fast_cpu", "enable_compilation_cache"):  # these act on the process
+        monkeypatch.setattr(command_line.physics, switch, lambda: None)
+    existing = tmp_path / "episodes.npz"
+    existing.write_text("precious")
+    press = ("--task", "press", "--robot", "piper", "--out")
+    for arguments, message in (
+        (("collect", *press, existing), "exists already"),
+        (("collect", *press, tmp_path / "new.npz", "--num-episodes", 0), "num_episodes"),
+        (("play", *press, tmp_path / "a.mp4", "--image-size", 33), "even --image-size"),
+        (("play", "--task", "dance", "--robot", "piper", "--out", tmp_path / "a.mp4"), "dance"),
+        (("gallery", "--task", "press", "--robot", "r2d2", "--out", tmp_path / "g"), "r2d2"),
+    ):
+        code, error = run(capsys, *arguments)
+        assert code == 2
+        assert message in error
+        assert "Traceback" not in error
+    assert existing.read_text() == "precious"
+    assert [file.name for file in tmp_path.iterdir()] == ["episodes.npz"]
+
+
+def test_command_line_writes_files(tmp_path, capsys, monkeypatch):
+    for switch in ("enable_fast_cpu", "enable_compilation_cache"):
+        monkeypatch.setattr(command_line.physics, switch, lambda: None)
+
+    def collect(task, robot, *, num_episodes, progress, **options):
+        progress(0, num_episodes)
+        progress(num_episodes, num_episodes)
+        return dataclasses.replace(make(num_episodes), task=task, robot=robot)
+
+    monkeypatch.setattr(command_line.envs, "collect", collect)
+    press = ("--task", "press", "--robot", "piper", "--out")
+    for command, out in (("collect", "e.npz"), ("play", "v.mp4"), ("gallery", "g")):
+        code, error = run(capsys, command, *press, tmp_path / out)
+        assert code == 0, error
+    assert Episodes.load(tmp_path / "e.npz").num_episodes == 64
+    assert (tmp_path / "v.mp4").read_bytes()[4:8] == b"ftyp"
+    names = {file.name for file in (tmp_path / "g").iterdir()}
+    assert names == {"press_piper_side.png", "press_piper_wrist.png"}

@@ -1,0 +1,149 @@
+"""Experts solve every task with every robot, smoothly, and what they do is recorded as it was."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import envs
+from envs import collection, experts, robots
+from envs.tasks import tool_down
+
+LAYOUTS = 256
+
+
+def valid(episodes) -> np.ndarray:
+    """bool [E, T], the steps that count."""
+    return np.arange(episodes.state.shape[1]) < episodes.length[:, None]
+
+
+def test_experts_succeed(episodes):
+    assert episodes.num_episodes / episodes.attempted >= 0.95
+
+
+@pytest.mark.slow
+def test_experts_succeed_on_many_layouts(task_name, robot_name):
+    key = jax.random.key(1)
+    success = envs.expert_success(task_name, robot_name, num_episodes=LAYOUTS, key=key)
+    assert success.shape == (LAYOUTS,)
+    assert success.dtype == bool
+    assert success.mean() >= 0.97
+
+
+def test_episodes_are_consistent(episodes, scene):
+    episodes.validate()
+    steps = scene.expert_steps
+    assert episodes.state.shape == (episodes.num_episodes, steps, scene.num_joints + 1)
+    assert episodes.image.keys() == {"side", "wrist"}
+    assert episodes.image["side"].shape[1:] == (steps, 16, 16, 3)
+    assert np.all(episodes.length > 0.4 * steps)
+    assert len(np.unique(episodes.length)) > 5
+    assert len(np.unique(episodes.instruction)) == len(scene.instructions)
+    assert (episodes.task, episodes.robot) == (scene.task.name, scene.robot.name)
+
+
+def test_actions_keep_the_limits(episodes, scene):
+    assert np.all(episodes.action >= scene.action_low - 1e-6)
+    assert np.all(episodes.action <= scene.action_high + 1e-6)
+    speed = np.abs(np.diff(episodes.action, axis=1)) / scene.control_dt
+    assert np.all(speed <= scene.robot.action_speed + 1e-4)
+    measured = np.abs(np.diff(episodes.state[..., :-1], axis=1)) / scene.control_dt
+    assert np.all(measured <= scene.robot.speed)
+
+
+def test_actions_are_smooth(episodes, scene):
+    """Second differences: a jump of the command's speed would show as a large one."""
+    bend = np.abs(np.diff(episodes.action[..., :-1], 2, axis=1))
+    assert bend.max() < 0.1  # rad per step^2
+
+
+def test_state_follows_the_action(episodes):
+    lag = np.abs(episodes.state[:, 1:, :-1] - episodes.action[:, :-1, :-1])
+    assert lag[valid(episodes)[:, 1:]].max() < 0.15  # rad
+
+
+def test_pictures_show_the_episode(episodes):
+    for picture in episodes.image.values():
+        start, middle = picture[:, 0].astype(int), picture[:, 25].astype(int)
+        assert np.all(np.abs(start - middle).max(axis=(1, 2, 3)) > 30)  # the hand moved
+        assert np.abs(start - start[:1]).max() > 30  # layouts differ
+
+
+def test_inverse_kinematics_reaches(scene):
+    robot = scene.robot
+    rng = np.random.default_rng(0)
+    goals = jnp.array(rng.uniform([0.30, -0.18, 0.01], [0.42, 0.18, 0.12], (64, 3)), jnp.float32)
+    rotations = experts.leaning(robot, tool_down(goals))
+    start = jnp.asarray(robot.home, jnp.float32)
+
+    @jax.jit
+    @jax.vmap
+    def solve(goal, rotation):
+        q = experts.inverse_kinematics(robot, goal, rotation, start)
+        return q, *robots.tool_pose(robot, q)[:2]
+
+    q, position, facing = solve(goals, rotations)
+    assert np.all((q >= robot.lower) & (q <= robot.upper))
+    np.testing.assert_allclose(position, goals, atol=2e-3)
+    np.testing.assert_allclose(facing, rotations, atol=0.03)
+
+
+def fake_record(success):
+    """Stands in for `_record`: one step an episode, numbered by world."""
+
+    def record(env, key, action_noise):
+        world = jnp.arange(env.num_envs)
+        numbers = jnp.broadcast_to(world[:, None, None].astype(jnp.float32), (env.num_envs, 1, 7))
+        chunk = {
+            "image": {"side": jnp.zeros((env.num_envs, 1, 2, 2, 3), jnp.uint8)},
+            "state": numbers,
+            "action": numbers,
+            "length": jnp.ones(env.num_envs, jnp.int32),
+            "instruction": jnp.zeros(env.num_envs, jnp.int32),
+        }
+        return chunk, jnp.array(success)
+
+    return record
+
+
+def test_collect_keeps_successes_in_order(monkeypatch):
+    monkeypatch.setattr(collection, "_record", fake_record([True, False, True, True]))
+    calls = []
+    found = envs.collect(
+        "press",
+        num_episodes=5,
+        num_envs=4,
+        key=jax.random.key(0),
+        progress=lambda *numbers: calls.append(numbers),
+    )
+    assert found.state[:, 0, 0].tolist() == [0, 2, 3, 0, 2]
+    assert found.attempted == 7
+    assert calls == [(0, 5), (3, 5), (5, 5)]
+
+
+def test_collect_gives_up_on_a_broken_expert(monkeypatch):
+    monkeypatch.setattr(collection, "_record", fake_record([True, False, False, False]))
+    with pytest.raises(RuntimeError, match="solved only 4 of 16 layouts of 'press' with 'piper'"):
+        envs.collect("press", num_episodes=50, num_envs=4, key=jax.random.key(0))
+
+
+def test_expert_success_counts_whole_and_part_batches(monkeypatch):
+    seen = []
+
+    def attempt(env, key):
+        seen.append(key)
+        return jnp.array([True, True, False])
+
+    monkeypatch.setattr(collection, "_attempt", attempt)
+    success = envs.expert_success("press", num_episodes=5, num_envs=3, key=jax.random.key(0))
+    assert success.tolist() == [True, True, False, True, True]
+    assert len(seen) == 2
+    assert not np.array_equal(jax.random.key_data(seen[0]), jax.random.key_data(seen[1]))
+
+
+@pytest.mark.parametrize("number", [0, -1])
+def test_number_of_episodes_must_be_positive(number):
+    with pytest.raises(ValueError, match="num_episodes must be at least 1"):
+        envs.collect("press", num_episodes=number, key=jax.random.key(0))
+    with pytest.raises(ValueError, match="num_episodes must be at least 1"):
+        envs.expert_success("press", num_episodes=number, key=jax.random.key(0))

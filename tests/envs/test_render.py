@@ -1,0 +1,192 @@
+"""The ray caster against MuJoCo's own rays, and what light and colours may change."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from envs import render
+
+SCENE = """
+<mujoco>
+  <worldbody>
+    <light dir="0 -.6 -1"/>
+    <geom name="table" type="plane" size="0 0 1" rgba=".6 .6 .6 1"/>
+    <geom name="shelf" type="plane" size=".1 .06 1" pos="-.2 .2 .2" euler="10 20 30"/>
+    <geom name="ball" type="sphere" size=".06" pos="0 0 .1" rgba="1 0 0 1"/>
+    <geom name="egg" type="ellipsoid" size=".03 .05 .08" pos=".2 .1 .1" euler="40 10 70"/>
+    <geom name="rod" type="capsule" size=".02 .1" pos="-.2 -.1 .1" euler="50 20 0"/>
+    <geom name="post" type="capsule" size=".03 .05" pos="-.1 .1 .08"/>
+    <geom name="can" type="cylinder" size=".05 .04" pos=".15 -.15 .1" euler="30 40 0"/>
+    <geom name="tin" type="cylinder" size=".04 .03" pos=".05 .2 .03"/>
+    <geom name="brick" type="box" size=".03 .05 .04" pos="0 -.2 .1" euler="20 30 40"/>
+    <geom name="block" type="box" size=".03 .04 .02" pos=".25 -.05 .02"/>
+    <geom name="ghost" type="sphere" size=".1" pos="0 0 .3" rgba="1 1 1 0"/>
+    <geom name="hidden" type="sphere" size=".1" pos="0 0 .3" group="3"/>
+    <camera name="unused" pos="0 0 3"/>
+    <camera name="front" pos="0 -.8 .35" xyaxes="1 0 0 0 .3 .95" fovy="55"/>
+    <camera name="top" pos=".1 .05 .9" xyaxes=".9 .1 0 -.1 .9 .1" fovy="60"/>
+  </worldbody>
+</mujoco>
+"""
+CAMERAS = ("front", "top")
+SIZE = {"height": 48, "width": 64}
+
+
+@pytest.fixture(scope="module")
+def scene():
+    model = mujoco.MjModel.from_xml_string(SCENE)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return model, data
+
+
+@pytest.fixture(scope="module")
+def built(scene):
+    return render.build(scene[0], CAMERAS)
+
+
+@pytest.fixture(scope="module")
+def poses(scene):
+    data = scene[1]
+    arrays = (data.geom_xpos, data.geom_xmat, data.cam_xpos, data.cam_xmat)
+    shapes = ((-1, 3), (-1, 3, 3)) * 2
+    return [jnp.asarray(x.reshape(s), jnp.float32) for x, s in zip(arrays, shapes, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def picture(built, poses):
+    return np.asarray(render.render(built, *poses, look=built.look, **SIZE))
+
+
+def mujoco_rays(model, data, name, height, width):
+    """Geom [height, width] and depth along the camera's axis, by mj_multiRay."""
+    camera = model.camera(name).id
+    x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, height / 2 - np.arange(height) - 0.5)
+    edge = 2 * np.tan(np.deg2rad(model.cam_fovy[camera]) / 2) / height
+    rays = np.stack([x * edge, y * edge, -np.ones_like(x)], -1).reshape(-1, 3)
+    length = np.linalg.norm(rays, axis=1)
+    rays = rays / length[:, None] @ data.cam_xmat[camera].reshape(3, 3).T
+    geom, distance = np.full(len(rays), -1, np.int32), np.full(len(rays), -1.0)
+    groups = np.array([1, 1, 1, 0, 0, 0], np.uint8)
+    mujoco.mj_multiRay(
+        model, data, data.cam_xpos[camera], rays.ravel(), groups, 1, -1, geom, distance, None,
+        len(rays), mujoco.mjMAXVAL,
+    )  # fmt: skip
+    depth = np.where(geom < 0, np.inf, distance / length)
+    return geom.reshape(height, width), depth.reshape(height, width)
+
+
+def test_rays_agree_with_mujoco(scene, built, poses):
+    geom, depth = render.cast(built, *poses, height=128, width=128)
+    assert geom.shape == depth.shape == (2, 128, 128)
+    assert geom.dtype == jnp.int32
+    assert depth.dtype == jnp.float32
+    seen = set()
+    for i, name in enumerate(CAMERAS):
+        expected_geom, expected_depth = mujoco_rays(*scene, name, 128, 128)
+        same = np.asarray(geom[i]) == expected_geom
+        assert same.mean() >= 0.99
+        hit = same & (expected_geom >= 0)
+        np.testing.assert_allclose(np.asarray(depth[i])[hit], expected_depth[hit], atol=1e-3)
+        assert np.all(np.isinf(np.asarray(depth[i])[same & (expected_geom < 0)]))
+        seen |= set(expected_geom.ravel().tolist())
+    assert seen == set(range(10)) | {-1}  # every visible geom, and the sky: nothing passed unseen
+
+
+def pixel(scene, name, point):
+    """Row and column of a world point in a picture of SIZE."""
+    model, data = scene
+    camera = model.camera(name).id
+    x, y, z = data.cam_xmat[camera].reshape(3, 3).T @ (np.array(point) - data.cam_xpos[camera])
+    edge = 2 * np.tan(np.deg2rad(model.cam_fovy[camera]) / 2) / SIZE["height"]
+    return int(SIZE["height"] / 2 + y / z / edge), int(SIZE["width"] / 2 - x / z / edge)
+
+
+def test_shadow_falls_where_the_light_says(scene, built, poses):
+    flat = dataclasses.replace(built.look, checker=jnp.array([0.1, 0.0]))
+    # The ball's centre is 0.1 m above the table, so its shadow is centred 0.15 m to one side.
+    left, right = (pixel(scene, "top", (x, 0.0, 0.0)) for x in (-0.15, 0.15))
+    for slope, dark, bright in ((1.5, left, right), (-1.5, right, left)):
+        light = np.array([slope, 0.0, 1.0], np.float32)
+        look = dataclasses.replace(flat, light=light)
+        top = render.render(built, *poses, look=look, **SIZE)[1].astype(int)
+        assert top[bright].sum() > top[dark].sum() + 100
+
+
+def test_headlight_and_ambient_cast_no_shadow(built, poses):
+    dim = dataclasses.replace(
+        built.look, diffuse=jnp.array(0.0), headlight=jnp.array(0.0), checker=jnp.array([0.1, 0.0])
+    )
+    geom, _ = render.cast(built, *poses, **SIZE)
+    pixels = np.asarray(render.render(built, *poses, look=dim, **SIZE))[np.asarray(geom) == 0]
+    np.testing.assert_array_equal(pixels, np.broadcast_to(pixels[0], pixels.shape))
+    assert pixels[0, 0] == round(0.6 * 0.35 * 255)
+
+
+def test_colour_changes_only_its_geom(built, poses, picture):
+    geom = np.asarray(render.cast(built, *poses, **SIZE)[0])
+    green = built.look.rgba.copy()
+    green[2] = (0, 1, 0, 1)
+    look = dataclasses.replace(built.look, rgba=green)
+    changed = np.any(np.asarray(render.render(built, *poses, look=look, **SIZE)) != picture, -1)
+    np.testing.assert_array_equal(changed, geom == 2)
+
+
+def test_field_of_view_changes_only_its_camera(built, poses, picture):
+    look = dataclasses.replace(built.look, fovy=built.look.fovy + np.array([0, 10, 0], np.float32))
+    pictures = np.asarray(render.render(built, *poses, look=look, **SIZE))
+    assert np.any(pictures[0] != picture[0])
+    np.testing.assert_array_equal(pictures[1], picture[1])
+
+
+def test_batch_equals_single_worlds(built, poses):
+    worlds = 5
+    batch = [jnp.tile(x, (worlds, *[1] * x.ndim)) for x in poses]
+    batch[0] = batch[0].at[:, 2, 0].add(0.01 * jnp.arange(worlds))
+    looks = jax.tree.map(lambda x: jnp.stack([x * 0.8, *[x] * (worlds - 1)]), built.look)
+    pictures = jax.jit(lambda poses, looks: render.render_batch(built, *poses, look=looks, **SIZE))(
+        batch, looks
+    )
+    assert pictures.shape == (worlds, 2, 48, 64, 3)
+    assert pictures.dtype == jnp.uint8
+    for i in range(worlds):
+        look = jax.tree.map(lambda x, i=i: x[i], looks)
+        single = render.render(built, *(x[i] for x in batch), look=look, **SIZE)
+        difference = np.abs(pictures[i].astype(int) - single.astype(int))
+        assert np.mean(difference > 1) < 1e-3  # rounding may move an edge by a pixel
+
+
+def test_own_look_is_the_default(built, poses, picture):
+    np.testing.assert_array_equal(render.render(built, *poses, **SIZE), picture)
+
+
+@pytest.mark.parametrize("platform", ["cpu", "cuda", "tpu"])
+def test_lowers_inside_scan_and_vmap(built, poses, platform):
+    def run(shifts):
+        def body(carry, shift):
+            geoms = poses[0] + shift
+            return carry, jax.vmap(
+                lambda x: render.render(built, x, *poses[1:], height=8, width=8)
+            )(geoms[None])
+
+        return jax.lax.scan(body, None, shifts)[1]
+
+    lowered = jax.jit(run).trace(jnp.zeros(3)).lower(lowering_platforms=(platform,))
+    assert "3x1x2x8x8x3xui8" in lowered.as_text()
+
+
+def test_bad_input_is_named(scene, built, poses):
+    with pytest.raises(ValueError, match=r"no camera {'back'}.*front"):
+        render.build(scene[0], ("front", "back"))
+    with pytest.raises(ValueError, match=r"geom_xpos must have shape \(12, 3\)"):
+        render.render(built, poses[0][:3], *poses[1:], **SIZE)
+    field = """<mujoco><asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset><worldbody>
+      <geom name="hill" type="hfield" hfield="h"/></worldbody></mujoco>"""
+    with pytest.raises(ValueError, match="geom hill cannot be drawn"):
+        render.build(mujoco.MjModel.from_xml_string(field), ())
+    with pytest.raises(ValueError, match="no visible geom"):
+        render.build(mujoco.MjModel.from_xml_string("<mujoco/>"), ())

@@ -1,0 +1,136 @@
+"""What a task promises, and that success means what it says, looked at in MuJoCo's own engine."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from envs import experts
+from envs.tasks import View, tool_down
+
+
+def world(scene, key: int = 0) -> mujoco.MjData:
+    """MuJoCo data of a random layout, robot at home; moves the model's fixed bodies."""
+    data = mujoco.MjData(scene.model)
+    data.qpos[: scene.num_joints] = scene.robot.home
+    for name, position in scene.task.place(jax.random.key(key)).items():
+        body = scene.model.body(name)
+        if body.jntnum[0]:
+            start = scene.model.jnt_qposadr[body.jntadr[0]]
+            data.qpos[start : start + 3] = position
+        else:
+            scene.model.body_pos[body.id] = position
+    mujoco.mj_forward(scene.model, data)
+    return data
+
+
+def succeeds(scene, data) -> bool:
+    mujoco.mj_forward(scene.model, data)
+    return bool(scene.task.check(View(scene.model, data))[0])
+
+
+def reach(scene, data, position, opening: float) -> None:
+    """Puts the tool, pointing down, at a position."""
+    goal = jnp.asarray(position, jnp.float32)
+    start = jnp.asarray(scene.robot.home, jnp.float32)
+    solve = jax.jit(functools.partial(experts.inverse_kinematics, scene.robot))
+    rotation = experts.leaning(scene.robot, tool_down(goal))
+    data.qpos[: scene.num_joints] = solve(goal, rotation, start)
+    data.qpos[scene.num_joints : scene.num_joints + 2] = opening / 2
+
+
+def test_instructions_are_short_and_several(scene):
+    assert len(set(scene.instructions)) >= 4
+    assert all(0 < len(text.split()) <= 8 for text in scene.instructions)
+
+
+def test_layouts_differ_and_are_within_reach(scene):
+    keys = jax.random.split(jax.random.key(0), 256)
+    for place in jax.vmap(scene.task.place)(keys).values():
+        radius = np.linalg.norm(place[:, :2], axis=1)
+        assert 0.25 < radius.min() < radius.max() < 0.48
+        assert np.ptp(place[:, 0]) > 0.05
+        assert np.ptp(place[:, 1]) > 0.05
+
+
+def test_nothing_moves_or_succeeds_by_itself(scene):
+    data = world(scene)
+    before = data.xpos.copy()
+    data.ctrl[: scene.num_joints] = scene.robot.home
+    for _ in range(400):
+        mujoco.mj_step(scene.model, data)
+        assert not scene.task.check(View(scene.model, data))[0]
+    np.testing.assert_allclose(data.xpos, before, atol=3e-3)
+
+
+def test_few_contacts_are_computed(scene):
+    """Every admitted pair costs at every step: only what must touch may."""
+    geoms = scene.model.ngeom
+    con = scene.model.geom_contype, scene.model.geom_conaffinity
+    pairs = sum(
+        bool((con[0][i] & con[1][j]) | (con[0][j] & con[1][i]))
+        for i in range(geoms)
+        for j in range(i)
+    )
+    assert 0 < pairs <= 24
+    colliding = (con[0] > 0) | (con[1] > 0)
+    kinds = {mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_SPHERE}
+    kinds |= {mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CAPSULE}
+    assert set(scene.model.geom_type[colliding]) <= {int(kind) for kind in kinds}
+
+
+@pytest.mark.parametrize("task_name", ["press"])
+class TestPress:
+    def press(self, scene, depth: float, height: float = 0.0, aside: float = 0.0) -> bool:
+        """The button (.040 m high) `depth` down, the closed finger tips `height` above it, `aside` of it."""
+        data = world(scene)
+        button = data.body("button").xpos
+        reach(scene, data, button + np.array([aside, 0, 0.0515 - depth + height]), 0.0)
+        data.joint("button").qpos[0] = depth
+        return succeeds(scene, data)
+
+    def test_pressed_by_the_robot(self, scene):
+        assert self.press(scene, 0.0095)
+
+    def test_not_far_enough(self, scene):
+        assert not self.press(scene, 0.0085)
+
+    def test_not_by_the_robot(self, scene):
+        assert not self.press(scene, 0.0095, height=0.03)
+        assert not self.press(scene, 0.0095, aside=0.05)
+
+
+@pytest.mark.parametrize("task_name", ["pick_place"])
+class TestPickPlace:
+    def drop(self, scene, offset=(0, 0, 0.019), speed: float = 0.0) -> mujoco.MjData:
+        """The grape at an offset [m] from the basket, the robot at home."""
+        data = world(scene)
+        data.joint("grape").qpos[:3] = data.body("basket").xpos + offset
+        data.joint("grape").qvel[0] = speed
+        return data
+
+    def test_at_rest_inside(self, scene):
+        assert succeeds(scene, self.drop(scene))
+        assert succeeds(scene, self.drop(scene, (0.03, -0.03, 0.019)))
+
+    @pytest.mark.parametrize("offset", [(0.08, 0, 0.015), (0, -0.08, 0.015), (0, 0, 0.1)])
+    def test_outside(self, scene, offset):
+        assert not succeeds(scene, self.drop(scene, offset))
+
+    def test_moving(self, scene):
+        assert not succeeds(scene, self.drop(scene, speed=0.1))
+
+    @pytest.mark.parametrize(("opening", "done"), [(0.029, False), (0.05, True)])
+    def test_released(self, scene, opening, done):
+        """In the basket but between the fingers counts only once they have let go."""
+        data = self.drop(scene)
+        reach(scene, data, data.joint("grape").qpos[:3], opening)
+        assert succeeds(scene, data) is done
+
+    def test_retracted_hand_may_close(self, scene):
+        data = self.drop(scene)
+        reach(scene, data, data.joint("grape").qpos[:3] + np.array([0, 0, 0.08]), 0.0)
+        assert succeeds(scene, data)

@@ -1,0 +1,148 @@
+"""The energy gate against exact arithmetic, and its behaviour under JAX's transformations."""
+
+import functools
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lorasp_jax.kernels import energy_gate as gate
+
+GOLDEN = Path(__file__).parent.parent / "golden" / "energy_gate_exact.npz"
+KERNEL = gate._pallas_boundary
+
+
+@pytest.fixture(scope="module")
+def golden():
+    with np.load(GOLDEN) as file:
+        return dict(file)
+
+
+def run_kernel(scores, ratio):
+    """The Triton kernel on a GPU; elsewhere its body in the interpreter."""
+    return KERNEL(scores, ratio, interpret=jax.default_backend() != "gpu")
+
+
+@pytest.fixture
+def interpret(monkeypatch):
+    monkeypatch.setattr(gate, "_pallas_boundary", run_kernel)
+
+
+def scores_like(shape, seed=0):
+    return jax.nn.softplus(2 * jax.random.normal(jax.random.key(seed), shape))
+
+
+@pytest.mark.usefixtures("interpret")
+@pytest.mark.parametrize(
+    ("implementation", "may_miss"), [("bisection", 0), ("pallas", 0), ("sort", 1)]
+)
+@pytest.mark.parametrize("eta", [0.5, 0.7, 0.8, 0.9, 0.99])
+def test_equals_exact_arithmetic(golden, implementation, may_miss, eta):
+    """`k` and `order` were found with big integers; the running sum of "sort" rounds on one row."""
+    row = [round(100 * eta) for eta in (0.5, 0.7, 0.8, 0.9, 0.99, 1)].index(round(100 * eta))
+    k, order = golden["k"][row], golden["order"]
+    run = jax.jit(lambda s: gate.energy_gate(s, eta, implementation=implementation))
+    mask, active_rank, kept_energy = map(np.asarray, run(golden["scores"]))
+    expected = np.argsort(order, axis=1) < k[:, None]
+    assert (mask != expected).any(1).sum() <= may_miss
+    np.testing.assert_array_equal(active_rank, mask.sum(1))
+    some = (k > 0) & (mask == expected).all(1)
+    np.testing.assert_allclose(kept_energy[some], golden["E_k"][row][some], rtol=1e-6)
+
+
+def test_target_of_one_keeps_every_positive_score(golden):
+    run = jax.jit(lambda s: gate.energy_gate(s, 1.0))
+    mask, active_rank, kept_energy = run(golden["scores"])
+    np.testing.assert_array_equal(mask, golden["scores"] > 0)
+    assert (active_rank <= golden["k"][-1]).all()
+    np.testing.assert_array_equal(kept_energy, 1)
+
+
+@pytest.mark.usefixtures("interpret")
+@pytest.mark.parametrize("implementation", ["sort", "bisection", "pallas"])
+def test_special_rows(implementation):
+    rows = np.array([[0] * 4, [3e38] * 4, [0, 0, 0, 2e-38], [1] * 4, [0, 1e-20, 1, 1e-20]])
+    run = jax.jit(lambda s: gate.energy_gate(s, 0.5, implementation=implementation))
+    mask, rank, kept = run(rows.astype(np.float32))
+    expected = [[0, 0, 0, 0], [1, 1, 0, 0], [0, 0, 0, 1], [1, 1, 0, 0], [0, 0, 1, 0]]
+    np.testing.assert_array_equal(mask, np.array(expected, bool))
+    np.testing.assert_array_equal(rank, [0, 2, 1, 2, 1])
+    np.testing.assert_allclose(kept, [1, 0.5, 1, 0.5, 1], rtol=1e-6)
+    assert np.isnan(run(rows.astype(np.float32) + np.float32("nan"))[2]).all()
+
+
+@pytest.mark.parametrize("shape", [(3, 1), (2, 5, 100)])
+def test_pallas_takes_any_shape(shape):
+    scores, ratio = scores_like(shape), gate.exact_ratio(0.9)
+    pallas = jax.jit(jax.vmap(lambda s: run_kernel(s, ratio)))(scores[None])
+    reference = jax.jit(lambda s: gate._bisected_boundary(s, ratio))(scores)
+    np.testing.assert_array_equal(pallas.score[0], reference.score)
+    np.testing.assert_array_equal(pallas.index[0], reference.index)
+
+
+@pytest.mark.parametrize("implementation", ["sort", "bisection"])
+def test_transformations_agree(implementation):
+    @jax.jit
+    def all_ways(scores):
+        run = functools.partial(gate.energy_gate, energy_target=0.9, implementation=implementation)
+        scanned = jax.lax.scan(lambda _, s: (None, run(s)), None, scores)[1]
+        return run(scores), scanned, jax.vmap(run)(scores), jax.checkpoint(run)(scores)
+
+    plain, *others = all_ways(scores_like((4, 6, 33)))
+    for other in others:
+        np.testing.assert_array_equal(other[0], plain[0])
+        np.testing.assert_allclose(other[2], plain[2], rtol=1e-6)
+
+
+def test_gradient_of_the_kept_energy():
+    """d(1 - E)/ds_i = -2 s_i (m_i - E) / sum s², with the mask constant; zero rows give zero."""
+    scores = scores_like((5, 16)).at[0].set(0)
+
+    def loss(scores):
+        mask, _, kept = gate.energy_gate(scores, 0.8)
+        return (1 - kept).sum(), (mask, kept)
+
+    gradient, (mask, kept) = jax.jit(jax.grad(loss, has_aux=True))(scores)
+    total = jnp.sum(scores**2, -1, keepdims=True).at[0].set(1)
+    expected = -2 * scores * (mask - kept[:, None]) / total
+    np.testing.assert_allclose(gradient, expected, atol=1e-7)
+    np.testing.assert_allclose(jnp.sum(scores * gradient, -1), 0, atol=1e-6)  # scale-free
+    np.testing.assert_array_equal(gradient[0], 0)
+
+
+def test_target_is_an_exact_decimal():
+    """Nine of ten equal energies are exactly 9/10, however 0.9 is rounded."""
+    etas = [0.9, np.float32(0.9), 0.900001]
+    ranks = jax.jit(lambda s: [gate.energy_gate(s, eta)[1] for eta in etas])(jnp.ones(10))
+    assert ranks == [9, 9, 10]
+
+
+@pytest.mark.parametrize("eta", [0, -0.1, 1.0001, float("nan"), float("inf"), "much"])
+def test_bad_target(eta):
+    with pytest.raises(ValueError, match=r"energy_target must lie in \(0, 1\]"):
+        gate.energy_gate(jnp.ones(3), eta)
+
+
+def test_unknown_implementation():
+    with pytest.raises(ValueError, match="valid are sort, bisection, pallas"):
+        gate.energy_gate(jnp.ones(3), 0.9, implementation="argsort")
+
+
+@pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
+@pytest.mark.parametrize(
+    ("platform", "kind", "implementation", "call"),
+    [
+        ("cuda", "NVIDIA H200", "pallas", "__gpu$xla.gpu.triton"),
+        ("tpu", "TPU v5e", "bisection", ""),
+        ("cpu", "cpu", "bisection", ""),
+    ],
+)
+def test_lowers_without_the_device(platform, kind, implementation, call):
+    device = jax.sharding.AbstractDevice(device_kind=kind, num_cores=None, platform=platform)
+    mesh = jax.sharding.AbstractMesh((), (), abstract_device=device)
+    run = jax.jit(lambda s: gate.energy_gate(s, 0.9, implementation=implementation))
+    with jax.sharding.use_abstract_mesh(mesh):
+        traced = run.trace(jax.ShapeDtypeStruct((3, 50, 100), jnp.float32))
+        assert call in traced.lower(lowering_platforms=(platform,)).as_text()

@@ -1,0 +1,156 @@
+"""pi0 against numbers recorded from openpi (tests/golden/pi0_tiny, fp32)."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from lorasp_jax import models
+from lorasp_jax.models.layers import block_mask, positions
+from lorasp_jax.models.observation import Observation
+from lorasp_jax.models.pi0 import ExpertConfig, Pi0Config, VisionConfig
+from lorasp_jax.models.pi0.weights import from_openpi
+
+GOLDEN = Path(__file__).parent.parent / "golden" / "pi0_tiny"
+EXPERT = ExpertConfig(width=64, depth=4, mlp=128, heads=8, kv_heads=1, head_dim=16)
+CONFIG = Pi0Config(
+    vision=VisionConfig(width=32, depth=2, mlp=48, heads=2, patch=14),
+    language=EXPERT,
+    action=EXPERT,
+    cameras=("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb"),
+    image_size=56,
+    vocabulary=512,
+    max_tokens=7,
+    chunk=5,
+    action_dim=32,
+)
+
+
+def arrays(name: str) -> dict[str, np.ndarray]:
+    with np.load(GOLDEN / f"{name}.npz") as file:
+        return dict(file)
+
+
+@pytest.fixture(scope="module")
+def model():
+    empty = nnx.eval_shape(lambda: CONFIG.create(nnx.Rngs(0)))
+    return models.set_arrays(empty, from_openpi(arrays("params"), CONFIG))
+
+
+@pytest.fixture(scope="module")
+def inputs():
+    return arrays("inputs")
+
+
+@pytest.fixture(scope="module")
+def expected():
+    return arrays("outputs")
+
+
+@pytest.fixture(scope="module")
+def obs(inputs):
+    def cameras(kind: str) -> dict[str, jax.Array]:
+        return {name: jnp.asarray(inputs[f"{kind}/{name}"]) for name in CONFIG.cameras}
+
+    return Observation(
+        images=cameras("image"),
+        image_masks=cameras("image_mask"),
+        tokens=jnp.asarray(inputs["tokens"]),
+        token_mask=jnp.asarray(inputs["token_mask"]),
+        state=jnp.asarray(inputs["state"]),
+    )
+
+
+def close(found, wanted, atol):
+    np.testing.assert_allclose(np.asarray(found), wanted, rtol=0, atol=atol)
+
+
+def test_prefix(model, obs, expected):
+    tokens, valid, _ = jax.jit(lambda m, o: m.embed_prefix(o))(model, obs)
+    assert np.array_equal(valid, expected["prefix_mask"])
+    close(tokens, expected["prefix_tokens"], 1e-5 * np.abs(expected["prefix_tokens"]).max())
+    prefix, _ = jax.jit(lambda m, o: m.run_prefix(o))(model, obs)
+    rows = expected["prefix_mask"]
+    close(np.asarray(prefix.out)[rows], expected["prefix_out"][rows], 1e-4)
+
+
+def test_suffix_and_velocity(model, obs, inputs, expected):
+    x_t, time = jnp.asarray(expected["x_t"]), jnp.asarray(inputs["time"])
+    tokens, _ = jax.jit(lambda m, o: m.embed_suffix(o, x_t, time))(model, obs)
+    close(tokens, expected["suffix_tokens"], 5e-5)
+    close(jax.jit(lambda m, o: m.velocity(o, x_t, time))(model, obs), expected["v_t"], 1e-4)
+
+
+def test_masks_and_positions(expected):
+    """What `run_prefix` and `run_suffix` hand to the experts, put together, is openpi's one mask."""
+    valid = np.concatenate([expected["prefix_mask"], expected["suffix_mask"]], axis=1)
+    block = np.array([0] * expected["prefix_mask"].shape[1] + [1] + [2] * CONFIG.chunk)
+    assert np.array_equal(block_mask(block, block, valid, valid), expected["attn_mask"])
+    assert np.array_equal(positions(jnp.asarray(valid)), expected["positions"])
+
+
+def test_loss_and_gradients(model, obs, inputs, expected):
+    graphdef, parameters = nnx.split(model)
+
+    def mean_loss(parameters):
+        per_element, _ = nnx.merge(graphdef, parameters).loss(
+            jax.random.key(0),
+            obs,
+            jnp.asarray(inputs["actions"]),
+            noise=jnp.asarray(inputs["noise"]),
+            flow_time=jnp.asarray(inputs["time"]),
+        )
+        return per_element.mean(), per_element.mean(axis=-1)
+
+    (mean, loss), grads = jax.jit(jax.value_and_grad(mean_loss, has_aux=True))(parameters)
+    close(loss, expected["loss"], 1e-4)
+    close(mean, expected["mean_loss"], 1e-4)
+    grads = nnx.to_pure_dict(grads)
+    norm = np.sqrt(sum(np.sum(np.square(g)) for g in jax.tree.leaves(grads)))
+    close(norm, expected["grad_norm_all"], 1e-3 * expected["grad_norm_all"])
+    assert not np.any(grads["language"]["norm"]["scale"])
+
+    vision, language = grads["vision"]["blocks"], grads["language"]["blocks"]
+    keys_values = [language[name]["kernel"] for name in ("k_proj", "v_proj")]
+    found = {
+        "PaliGemma/img/Transformer/encoderblock/MlpBlock_0/Dense_0/kernel": vision["fc1"]["kernel"],
+        "action_time_mlp_in/kernel": grads["action_time_mlp_in"]["kernel"],
+        "PaliGemma/llm/layers/attn/kv_einsum/w": np.stack(keys_values, axis=1)[:, :, None],
+    }
+    for name, grad in found.items():
+        wanted = expected[f"grad/{name}"]
+        close(grad, wanted, 1e-3 * np.abs(wanted).max())
+
+
+def test_sampling(model, obs, inputs, expected):
+    noise = jnp.asarray(inputs["noise"])
+    sample = jax.jit(lambda m, o: m.sample_actions(jax.random.key(0), o, noise=noise))(model, obs)
+    close(sample, expected["sample"], 1e-4)
+
+
+def test_loss_drawn_by_openpi(model, obs, inputs, expected):
+    check = {name: expected[f"compute_loss_check/{name}"] for name in ("noise", "time", "loss")}
+    loss, _ = jax.jit(
+        lambda m, o: m.loss(
+            jax.random.key(0),
+            o,
+            jnp.asarray(inputs["actions"]),
+            noise=jnp.asarray(check["noise"]),
+            flow_time=jnp.asarray(check["time"]),
+        )
+    )(model, obs)
+    close(loss.mean(axis=-1), check["loss"], 3e-4)
+
+
+def test_weights_must_fit():
+    leaves = arrays("params")
+    suffixed = {f"{path}/value": leaf for path, leaf in leaves.items()}
+    assert from_openpi(suffixed, CONFIG).keys() == from_openpi(leaves, CONFIG).keys()
+    with pytest.raises(ValueError, match=r"model lacks: .*lora_a"):
+        from_openpi({**leaves, "PaliGemma/llm/q_einsum/lora_a": np.zeros(3)}, CONFIG)
+    del leaves["PaliGemma/llm/layers/mlp_1/linear"]
+    with pytest.raises(ValueError, match="lack PaliGemma/llm/layers/mlp_1/linear"):
+        from_openpi(leaves, CONFIG)

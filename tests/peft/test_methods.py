@@ -1,0 +1,182 @@
+"""Laws that hold for every adapter method; a new file in `peft/` is found and tested by itself."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lorasp_jax import peft
+
+D_IN, D_OUT, RANK = 6, 10, 12  # a rank above both sides
+INPUT_DEPENDENT = (peft.LoRASP,)  # cannot be merged; every other method must be
+SMALL = {"rank": RANK, "hidden_width": 4, "alpha": 5.0}  # alpha unlike the rank
+
+
+def small(name):
+    fields = {field.name for field in dataclasses.fields(peft.find(name))}
+    return peft.create(name, **{key: value for key, value in SMALL.items() if key in fields})
+
+
+@pytest.fixture(params=peft.names())
+def method(request):
+    return small(request.param)
+
+
+@pytest.fixture
+def kernel():
+    return jax.random.normal(jax.random.key(1), (D_IN, D_OUT))
+
+
+@pytest.fixture
+def x():
+    return jax.random.normal(jax.random.key(2), (2, 5, D_IN))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def apply(method, params, x, kernel):
+    return method.apply(params, x, kernel)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def delta(method, params, x):
+    return method.delta(params, x)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def initial(method, key, kernel):
+    return method.init(key, kernel)[0]
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def trained(method, kernel):
+    """Parameters moved off their start, so that nothing is zero any more."""
+    params, _ = method.init(jax.random.key(3), kernel)
+    leaves, structure = jax.tree.flatten(params)
+    keys = jax.random.split(jax.random.key(4), len(leaves))
+    noise = [0.3 * jax.random.normal(k, leaf.shape) for k, leaf in zip(keys, leaves, strict=True)]
+    return jax.tree.map(jnp.add, params, jax.tree.unflatten(structure, noise))
+
+
+def test_starts_as_the_base(method, kernel, x):
+    params = initial(method, jax.random.key(0), kernel)
+    y, _ = apply(method, params, x, kernel)
+    np.testing.assert_allclose(y, x @ kernel, rtol=1e-5, atol=1e-5)
+    if not method.trains_base:
+        np.testing.assert_array_equal(delta(method, params, x)[0], 0)
+
+
+def test_init_depends_on_key_and_shape_alone(method, kernel):
+    if method.trains_base:
+        pytest.skip("starts at the kernel itself")
+    params = initial(method, jax.random.key(0), kernel)
+    shape = jax.ShapeDtypeStruct(kernel.shape, jnp.bfloat16)
+    again = jax.jit(lambda key: method.init(key, shape)[0])(jax.random.key(0))
+    other = initial(method, jax.random.key(1), kernel)
+
+    def equal(a, b):
+        return all(jax.tree.leaves(jax.tree.map(np.array_equal, a, b)))
+
+    assert equal(params, again)
+    assert not equal(params, other)
+    assert {leaf.dtype for leaf in jax.tree.leaves(params)} == {jnp.dtype("float32")}
+
+
+def test_apply_is_base_plus_delta(method, kernel, x):
+    params = trained(method, kernel)
+    y, aux = apply(method, params, x, kernel)
+    assert y.shape == (2, 5, D_OUT)
+    if not method.trains_base:
+        expected = x @ kernel + delta(method, params, x)[0]
+        np.testing.assert_allclose(y, expected, rtol=1e-5, atol=1e-5)
+    for per_token in (aux.active_rank, aux.kept_energy):
+        assert per_token is None or (per_token.shape, per_token.dtype) == ((2, 5), jnp.float32)
+    assert all(v.shape == () and v.dtype == jnp.float32 for v in aux.losses.values())
+
+
+def test_merge_equals_forward_or_names_the_ways_out(method, kernel, x):
+    params = trained(method, kernel)
+    if isinstance(method, INPUT_DEPENDENT):
+        with pytest.raises(ValueError, match=r"prune .* distill"):
+            method.merge(params, kernel)
+        return
+    merged = method.merge(params, kernel)
+    np.testing.assert_allclose(x @ merged, apply(method, params, x, kernel)[0], atol=1e-4)
+    assert method.merge(params, kernel.astype(jnp.bfloat16)).dtype == jnp.bfloat16
+
+
+def test_keeps_low_precision(method, kernel, x):
+    """bf16 in, bf16 out, over a bf16 base; adapters, statistics and gradients stay fp32."""
+    params = initial(method, jax.random.key(0), kernel)
+
+    def loss(params, x, kernel):
+        y, aux = method.apply(params, x, kernel)
+        assert y.dtype == jnp.bfloat16
+        assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(aux))
+        return y.sum()
+
+    low = (x.astype(jnp.bfloat16), kernel.astype(jnp.bfloat16))
+    gradients = jax.eval_shape(jax.grad(loss), params, *low)
+    assert {leaf.dtype for leaf in jax.tree.leaves(gradients)} == {jnp.dtype("float32")}
+
+
+def test_transformations_agree(method, kernel, x):
+    params = trained(method, kernel)
+
+    def one(params, x):
+        y, aux = method.apply(params, x, kernel)
+        return jnp.sum(y**2) + sum(aux.losses.values()), y
+
+    @jax.jit
+    def all_ways(params, x):
+        gradient = jax.grad(one, has_aux=True)
+        scanned = jax.lax.scan(lambda _, row: (None, gradient(params, row)), None, x)[1]
+        mapped = jax.vmap(gradient, in_axes=(None, 0))(params, x)
+        remade = jax.vmap(jax.grad(jax.checkpoint(one), has_aux=True), (None, 0))(params, x)
+        return scanned, mapped, remade
+
+    scanned, *others = all_ways(params, x)
+    for other in others:
+        for a, b in zip(jax.tree.leaves(scanned), jax.tree.leaves(other), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4 * float(jnp.abs(a).max()))
+    eager, _ = method.apply(params, x, kernel)
+    np.testing.assert_allclose(scanned[1], eager, rtol=1e-4, atol=1e-4)
+
+
+def test_padding_has_no_influence(method, kernel, x):
+    """Losses, gradients and statistics over valid tokens do not see what padding holds."""
+    params = trained(method, kernel)
+    mask = jnp.arange(5)[None] < jnp.array([[3], [4]])
+
+    @jax.jit
+    def run(params, x):
+        def loss(params):
+            y, aux = method.apply(params, x, kernel, token_mask=mask)
+            task = jnp.where(mask[..., None], y, 0).sum()
+            return task + sum(aux.losses.values()), (aux.losses, aux.mean_active_rank())
+
+        return jax.value_and_grad(loss, has_aux=True)(params)
+
+    clean, padded = run(params, x), run(params, jnp.where(mask[..., None], x, 1e3))
+    for a, b in zip(jax.tree.leaves(clean), jax.tree.leaves(padded), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
+
+
+def test_needs_a_matrix(method):
+    if not method.trains_base:
+        with pytest.raises(ValueError, match=r"needs a kernel \[I, O\], got shape \(2, 3, 4\)"):
+            method.init(jax.random.key(0), jnp.zeros((2, 3, 4)))
+
+
+def test_methods_are_found_by_file_name(method):
+    assert peft.create(method.name) == type(method)()
+    assert hash(method) == hash(dataclasses.replace(method))
+
+
+def test_unknown_names():
+    with pytest.raises(ValueError, match=r"did you mean 'lora_sp'.*valid are full, lora, lora_sp"):
+        peft.create("lora_ps")
+    with pytest.raises(ValueError, match="lora has no field 'rnk'; valid are rank, alpha"):
+        peft.create("lora", rnk=4)

@@ -1,0 +1,70 @@
+"""The report: self-contained, from the files of a run folder alone."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from lorasp_jax.evaluation import video
+from lorasp_jax.report.html import write_report
+from lorasp_jax.training.run_folder import MetricsLog, to_json
+from tests.runs import CONFIG
+
+RESULTS = {
+    "scale": "cpu",
+    "seconds": {"collect": 1.0, "train": 2.0, "evaluate": 3.0, "total": 7.0},
+    "tasks": {
+        "press": {
+            "before": {"success": 0.03125, "episodes": 64, "ci95": [0.009, 0.107]},
+            "after": {"success": 0.75, "episodes": 64, "ci95": [0.632, 0.84]},
+        }
+    },
+    "active_rank": {"vision": 4.25, "language": 3.0, "action": 2.0, "mean": 3.1},
+    "layer_active_rank": {"vision": {"fc1": [4.0, 4.5]}, "action": {"q_proj": [2.0]}},
+    "trainable_parameters": 10,
+    "total_parameters": 1000,
+}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    config = to_json(CONFIG)
+    (tmp_path / "config.json").write_text(json.dumps({**config, "name": "<b>run</b>"}))
+    (tmp_path / "results.json").write_text(json.dumps(RESULTS))
+    log = MetricsLog(tmp_path)
+    for step in (2, 4):
+        log.write(step, {"task": 1 / step, "spectral": 0.1, "active_rank/vision": 4.0})
+    log.close()
+    frames = np.random.default_rng(0).integers(0, 255, (4, 32, 64, 3), np.uint8)
+    video.write_picture(tmp_path / "cameras_press.png", frames[0])
+    video.write_video(tmp_path / "rollout_press.mp4", frames, fps=10)
+    return tmp_path
+
+
+def test_report_shows_the_results_and_needs_no_other_file(folder):
+    page = write_report(folder).read_text()
+    assert "75.0 % [63.2, 84.0] of 64" in page
+    assert "3.1 % [0.9, 10.7] of 64" in page
+    assert "10 trainable of 1,000 parameters (1.0 %)" in page
+    assert "&lt;b&gt;run&lt;/b&gt;" in page
+    assert "<b>run" not in page
+    sources = re.findall(r'src="([^"]{5})', page)
+    assert len(sources) == 6
+    assert set(sources) == {"data:"}
+    assert "http" not in re.sub(r'src="[^"]*"', "", page)
+
+
+def test_unfinished_run(folder):
+    (folder / "results.json").unlink()
+    with pytest.raises(FileNotFoundError):
+        write_report(folder)
+
+
+def test_video_can_be_read_back(folder):
+    import av
+
+    with av.open(str(folder / "rollout_press.mp4")) as container:
+        stream = container.streams.video[0]
+        assert (stream.width, stream.height, stream.codec_context.pix_fmt) == (64, 32, "yuv420p")
+        assert sum(1 for _ in container.decode(stream)) == 4

@@ -1,0 +1,65 @@
+"""A run that needs no simulation: random episodes and the dummy backbone."""
+
+import io
+from pathlib import Path
+
+import jax
+import numpy as np
+from flax import nnx
+from rich.console import Console
+
+from envs.episodes import Episodes
+from lorasp_jax import adaptation
+from lorasp_jax.config import Config, OptimConfig
+from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.models.policy import Policy
+from lorasp_jax.peft import LoRASP
+from lorasp_jax.training.loop import Run
+from lorasp_jax.training.setup import processor
+
+CONFIG = Config(
+    name="test",
+    scale="smoke",
+    peft=LoRASP(rank=8, hidden_width=8),
+    size="dummy",
+    base="",
+    image_size=32,
+    optim=OptimConfig(steps=4, batch_size=8, warmup_steps=1),
+    log_every=2,
+    checkpoint_every=2,
+)
+
+
+def random_episodes(task: str, seed: int) -> Episodes:
+    rng = np.random.default_rng(seed)
+    length = np.array([5, 9, 7], np.int32)
+    return Episodes(
+        image={
+            name: rng.integers(0, 255, (3, 9, 32, 32, 3), np.uint8) for name in ("side", "wrist")
+        },
+        state=rng.normal(size=(3, 9, 7)).astype(np.float32),
+        action=rng.normal(size=(3, 9, 7)).astype(np.float32),
+        length=length,
+        instruction=np.array([0, 1, 0], np.int32),
+        instructions=("press the button", "push the button"),
+        task=task,
+        robot="piper",
+        control_dt=0.1,
+        physics_dt=0.005,
+        attempted=3,
+    )
+
+
+def make_run(folder: Path, config: Config = CONFIG) -> Run:
+    folder.mkdir(exist_ok=True)
+    model = Pi0Config.dummy().create(nnx.Rngs(0))
+    model = adaptation.adapt(model, [(".*", config.peft)], rngs=nnx.Rngs(1))
+    run = Run(config, folder, Console(file=io.StringIO()), "hash of the base")
+    run.episodes = {task: random_episodes(task, i) for i, task in enumerate(config.tasks)}
+    run.policy = Policy(model, processor(config, list(run.episodes.values()), model.config))
+    return run
+
+
+def leaves(tree) -> dict[str, np.ndarray]:
+    found = jax.tree_util.tree_leaves_with_path(tree)
+    return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in found}

@@ -1,0 +1,151 @@
+"""The two shells: drop-ins for nnx.Linear and nn.Dense, and what they report."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+import lorasp_jax
+from lorasp_jax.dense import AdapterParam, Dense, LinenDense, dense
+from lorasp_jax.peft import FullFineTuning, LoRASP
+
+METHOD = LoRASP(rank=8, hidden_width=4)
+
+
+class Net(nnx.Module):
+    """A stranger's model: it knows nothing of adapters and wants one result a layer."""
+
+    def __init__(self, method, rngs):
+        self.first = Dense(5, 6, method=method, rngs=rngs)
+        self.last = Dense(6, 3, method=method, use_bias=False, rngs=rngs)
+
+    def __call__(self, x):
+        return self.last(jnp.tanh(self.first(x)))
+
+
+@pytest.fixture(scope="module")
+def x():
+    return jax.random.normal(jax.random.key(0), (4, 5))
+
+
+@pytest.fixture
+def net():
+    return Net(METHOD, nnx.Rngs(0))
+
+
+def test_equals_nnx_linear(x):
+    linear = nnx.Linear(5, 6, bias_init=nnx.initializers.normal(), rngs=nnx.Rngs(1))
+    layer = Dense(5, 6, rngs=nnx.Rngs(0))
+    layer.kernel, layer.bias = linear.kernel, linear.bias
+    np.testing.assert_allclose(layer(x), linear(x), rtol=1e-6)
+    assert Dense(5, 6, rngs=nnx.Rngs(1)).kernel.get_value().std() == pytest.approx(
+        linear.kernel.get_value().std()
+    )
+
+
+def test_linen_equals_nnx(x):
+    linen = LinenDense(6, method=METHOD)
+    variables = jax.jit(linen.init)(jax.random.key(0), x)
+    assert set(variables) == {"params", "adapters"}
+    adapter = variables["adapters"]["adapter"]
+    adapter["bank"]["u"] = jax.random.normal(jax.random.key(1), (8, 6))
+    layer = Dense(5, 6, method=METHOD, rngs=nnx.Rngs(0))
+    layer.kernel.set_value(variables["params"]["kernel"])
+    layer.adapter.set_value(adapter)
+    y, kept = jax.jit(lambda v, x: linen.apply(v, x, mutable=["intermediates"]))(variables, x)
+    np.testing.assert_allclose(y, layer(x), rtol=1e-6)
+    ours, theirs = lorasp_jax.collect_aux(layer)[""], lorasp_jax.collect_aux(kept)[""]
+    np.testing.assert_array_equal(ours.active_rank, theirs.active_rank)
+    bare = nn.Dense(6).apply({"params": variables["params"]}, x)
+    assert jnp.abs(y - bare).max() > 0.1
+
+
+def test_linen_adapts_inside_a_model(x):
+    class Outer(nn.Module):
+        @nn.compact
+        def __call__(self, x):
+            return LinenDense(3, method=METHOD)(LinenDense(6)(x))
+
+    model = Outer()
+    variables = jax.jit(model.init)(jax.random.key(0), x)
+    _, kept = jax.jit(lambda v: model.apply(v, x, mutable=["intermediates"]))(variables)
+    assert set(lorasp_jax.collect_aux(kept)) == {"LinenDense_0"}
+    with pytest.raises(ValueError, match="no adapted layer kept anything"):
+        lorasp_jax.collect_aux({"params": variables["params"]})
+
+
+def test_collect_aux_eagerly_and_once(net, x):
+    net(x)
+    aux = lorasp_jax.collect_aux(net)
+    assert set(aux) == {"first", "last"}
+    assert aux["first"].active_rank.shape == (4,)
+    with pytest.raises(ValueError, match="no adapted layer kept anything"):
+        lorasp_jax.collect_aux(net)
+
+
+def test_collect_aux_under_jit_and_grad(net, x):
+    graphdef, adapters, frozen = nnx.split(net, AdapterParam, ...)
+
+    def loss(adapters):
+        model = nnx.merge(graphdef, adapters, frozen)
+        y = model(x)
+        aux = lorasp_jax.collect_aux(model)
+        return jnp.sum(y**2) + sum(a.losses["balance"] for a in aux.values()), aux
+
+    gradients, aux = jax.jit(jax.grad(loss, has_aux=True))(adapters)
+    assert aux["last"].active_rank.shape == (4,)
+    first = gradients["first"]["adapter"].get_value()
+    assert jnp.abs(first["bank"]["u"]).max() > 0
+    assert jnp.abs(first["router"]["w2"]).max() > 0
+
+
+def test_a_closed_over_model_stays_callable(net, x):
+    np.testing.assert_allclose(jax.jit(net.__call__)(x), net(x), rtol=1e-5)
+    np.testing.assert_allclose(jax.jit(lambda net, x: net(x))(net, x), net(x), rtol=1e-5)
+
+
+def test_returned_aux_is_not_stored(net, x):
+    before = nnx.graphdef(net)
+    y, aux = net.first(x, token_mask=jnp.array([True, True, False, True]), return_aux=True)
+    assert (y.shape, aux.token_mask.sum()) == ((4, 6), 3)
+    assert nnx.graphdef(net) == before
+
+
+def test_full_fine_tuning_trains_the_layer_itself(x):
+    layer = Dense(5, 6, method=FullFineTuning(), rngs=nnx.Rngs(0))
+    graphdef, trained, rest = nnx.split(layer, AdapterParam, ...)
+    assert set(trained) == {"kernel", "bias"}
+    assert not jax.tree.leaves(rest)
+    gradient = jax.grad(lambda t: nnx.merge(graphdef, t, rest)(x).sum())(trained)
+    expected = jnp.broadcast_to(x.sum(0)[:, None], (5, 6))
+    np.testing.assert_allclose(gradient["kernel"].get_value(), expected, rtol=1e-5)
+    linen = LinenDense(6, method=FullFineTuning())
+    assert set(jax.eval_shape(linen.init, jax.random.key(0), x)) == {"params"}
+
+
+def test_kernels_with_several_output_axes(x):
+    """An einsum kernel [I, N, H] is one map onto N·H outputs."""
+    kernel = jax.random.normal(jax.random.key(1), (5, 2, 3))
+    params, _ = METHOD.init(jax.random.key(2), kernel.reshape(5, 6))
+    y, aux = jax.jit(dense, static_argnums=4)(x, kernel, jnp.ones((2, 3)), params, METHOD)
+    np.testing.assert_allclose(y, jnp.einsum("bi,inh->bnh", x, kernel) + 1, rtol=1e-5, atol=1e-5)
+    assert aux.active_rank.shape == (4,)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "kind", "expected"),
+    [(None, jnp.bfloat16, jnp.float32), (jnp.bfloat16, jnp.float32, jnp.bfloat16)],
+)
+def test_compute_type(x, dtype, kind, expected):
+    layer = Dense(5, 6, method=METHOD, dtype=dtype, param_dtype=kind, rngs=nnx.Rngs(0))
+    assert jax.eval_shape(layer, x).dtype == expected
+    assert layer.kernel.get_value().dtype == kind
+    types = {leaf.dtype for leaf in jax.tree.leaves(layer.adapter.get_value())}
+    assert types == {jnp.dtype("float32")}
+
+
+def test_wrong_input_width(net):
+    with pytest.raises(ValueError, match=r"input of width 7 meets a kernel \(5, 6\)"):
+        net(jnp.ones((2, 7)))

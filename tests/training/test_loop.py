@@ -1,0 +1,79 @@
+"""Runs: frozen stays frozen, resume is exact, a loss that is not finite stops."""
+
+import dataclasses
+import os
+import signal
+
+import jax
+import numpy as np
+import pytest
+
+from lorasp_jax import adaptation
+from lorasp_jax.training.loop import Callback, RunError, train
+from lorasp_jax.training.run_folder import read_metrics
+from tests.runs import CONFIG, leaves, make_run
+
+
+class Terminate(Callback):
+    """Sends this process a SIGTERM after step 2, as a scheduler would."""
+
+    def __init__(self):
+        self.started = 0
+
+    def on_start(self, run):
+        self.started += 1
+
+    def on_log(self, run, step, metrics):
+        if step == 2:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+
+def test_resume_is_bit_exact_and_frozen_stays_frozen(tmp_path):
+    whole, halved = make_run(tmp_path / "whole"), make_run(tmp_path / "halved")
+    _, adapters_before, frozen_before = adaptation.split(whole.policy.model)
+    train(whole)
+
+    callback = Terminate()
+    with pytest.raises(KeyboardInterrupt):
+        train(halved, [callback])
+    assert [row["step"] for row in read_metrics(halved.folder)] == [2]
+    train(halved, [callback], resume=True)
+    assert callback.started == 1
+
+    _, adapters, frozen = adaptation.split(whole.policy.model)
+    _, resumed, _ = adaptation.split(halved.policy.model)
+    for name, value in leaves(resumed).items():
+        np.testing.assert_array_equal(value, leaves(adapters)[name], err_msg=name)
+    assert read_metrics(whole.folder) == read_metrics(halved.folder)
+    for name, value in leaves(frozen).items():
+        np.testing.assert_array_equal(value, leaves(frozen_before)[name], err_msg=name)
+    moved = [
+        name for name, v in leaves(adapters).items() if (v != leaves(adapters_before)[name]).any()
+    ]
+    assert len(moved) == len(leaves(adapters))
+
+
+def test_other_base_is_refused(tmp_path):
+    run = make_run(tmp_path / "run")
+    train(run)
+    other = make_run(tmp_path / "run")
+    other.base_hash = "hash of another base"
+    with pytest.raises(ValueError, match="trained on another base"):
+        train(other, resume=True)
+
+
+def test_loss_that_is_not_finite_stops_and_keeps_the_last_checkpoint(tmp_path):
+    optim = dataclasses.replace(CONFIG.optim, learning_rate=float("inf"))
+    config = dataclasses.replace(CONFIG, optim=optim, log_every=1, checkpoint_every=1)
+    run = make_run(tmp_path / "run", config)
+    with pytest.raises(RunError, match=r"nothing after step 1 was saved") as caught:
+        train(run)
+    assert "\n" not in str(caught.value)
+    assert sorted(os.listdir(tmp_path / "run" / "checkpoints")) == ["1"]
+
+
+def test_signal_handlers_are_put_back(tmp_path):
+    before = signal.getsignal(signal.SIGTERM)
+    train(make_run(tmp_path / "run"))
+    assert signal.getsignal(signal.SIGTERM) == before
+    assert jax.device_count() == 8
