@@ -18,7 +18,7 @@ from envs.env import Env, make
 from envs.episodes import Episodes
 
 # Worlds a call, where nobody says otherwise: enough to fill the device, few enough for its memory.
-_NUM_ENVS = {"cpu": 16, "gpu": 256, "tpu": 256}
+_NUM_ENVS = {"cpu": 32, "gpu": 256, "tpu": 256}
 # Below this share of successes, once so many attempts were made, something is broken, and going on
 # would only waste time.
 _LEAST_SUCCESS, _PATIENCE = 0.5, 16

@@ -119,7 +119,7 @@ class Env:
         expected = (self.num_envs, self.num_joints + 1)
         if action.shape != expected:
             raise ValueError(f"action must have shape {expected}, got {action.shape}")
-        # A weakly typed action, such as jnp.zeros' or a sum with a Python number, would compile anew.
+        # A weakly typed action, such as jnp.full(shape, 0.0), would compile all anew.
         return self._steps(state, jax.lax.convert_element_type(action, jnp.float32))
 
     @functools.partial(jax.jit, static_argnums=0)

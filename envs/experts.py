@@ -10,8 +10,9 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
+from envs import robots
 from envs.env import Env, State
-from envs.robots import Robot, rotation, tool_pose
+from envs.robots import Robot, multiply
 from envs.tasks import Waypoints
 
 # Damped least squares as in the facts' proof: damping, weight of rotation [m/rad], longest step.
@@ -56,17 +57,17 @@ def inverse_kinematics(
     weight = jnp.array([1.0] * 3 + [_ROTATION_WEIGHT] * 3)
 
     def body(q: jax.Array, _: None) -> tuple[jax.Array, None]:
-        at, facing, jacobian = tool_pose(robot, q)
-        twist = _dot(rotation, facing.T)
+        at, facing, jacobian = robots.tool_pose(robot, q)
+        twist = multiply(rotation, facing.T)
         turn = 0.5 * jnp.array(
             [twist[2, 1] - twist[1, 2], twist[0, 2] - twist[2, 0], twist[1, 0] - twist[0, 1]]
         )
         jacobian = jacobian * weight[:, None]
         error = jnp.concatenate([position - at, turn]) * weight
         posture = _POSTURE_GAIN * (home - q) * (robot.num_joints > 6)
-        square = _dot(jacobian, jacobian.T) + _DAMPING**2 * jnp.eye(6)
-        solved = jnp.linalg.solve(square, error - _dot(jacobian, posture))
-        step = posture + _dot(jacobian.T, solved)
+        square = multiply(jacobian, jacobian.T) + _DAMPING**2 * jnp.eye(6)
+        solved = jnp.linalg.solve(square, error - multiply(jacobian, posture))
+        step = posture + multiply(jacobian.T, solved)
         return jnp.clip(q + jnp.clip(step, -_MAX_STEP, _MAX_STEP), lower, upper), None
 
     return jax.lax.scan(body, start, None, length=_ITERATIONS)[0]
@@ -75,7 +76,7 @@ def inverse_kinematics(
 def leaning(robot: Robot, rotations: jax.Array) -> jax.Array:
     """Tool rotations [..., 3, 3] with the robot's lean: outwards where the tool points down."""
     # The tcp's x axis points back to the base, y is the fingers' own and stays level.
-    return _dot(rotations, jnp.asarray(rotation("y", -robot.lean)[:3, :3], jnp.float32))
+    return multiply(rotations, jnp.asarray(robots.rotation("y", -robot.lean)[:3, :3], jnp.float32))
 
 
 def _plan(env: Env, info: dict, key: jax.Array) -> Plan:
@@ -106,7 +107,3 @@ def _interpolate(knots: jax.Array, times: jax.Array, seconds: jax.Array) -> jax.
     s = jnp.clip((seconds - times[i]) / (times[i + 1] - times[i]), 0.0, 1.0)
     s = s * s * s * (10.0 - 15.0 * s + 6.0 * s * s)  # minimum jerk
     return knots[i] + s * (knots[i + 1] - knots[i])
-
-
-def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
-    return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)

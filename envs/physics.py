@@ -75,7 +75,8 @@ def make_data(model: mujoco.MjModel) -> Any:
 
 def kinematics(model: Any, data: Any) -> Any:
     """One world with its body, geom, site and camera poses brought up to date with qpos."""
-    return mjx.camlight(model, mjx.com_pos(model, mjx.kinematics(model, data)))
+    with _full_precision():
+        return mjx.camlight(model, mjx.com_pos(model, mjx.kinematics(model, data)))
 
 
 def advance(model: Any, data: Any, controls: jax.Array) -> Any:
@@ -93,4 +94,11 @@ def advance(model: Any, data: Any, controls: jax.Array) -> Any:
     def body(data: Any, control: jax.Array) -> tuple[Any, None]:
         return mjx.step(model, data.replace(ctrl=control)), None
 
-    return kinematics(model, jax.lax.scan(body, data, controls)[0])
+    with _full_precision():
+        data = jax.lax.scan(body, data, controls)[0]
+    return kinematics(model, data)
+
+
+def _full_precision() -> Any:
+    # The default on GPU (TF32) and TPU (bf16) is too coarse for the constraint solver.
+    return jax.default_matmul_precision("highest")

@@ -113,8 +113,8 @@ def forward_kinematics(chain: np.ndarray, q: jax.Array) -> tuple[jax.Array, jax.
     rot = jnp.broadcast_to(jnp.eye(3, dtype=q.dtype), (*q.shape[:-1], 3, 3))
     positions, rotations = [], []
     for i in range(len(fixed)):
-        position = position + _multiply(rot, fixed[i, :3, 3:])[..., 0]
-        x, y, z = jnp.unstack(_multiply(rot, fixed[i, :3, :3]), axis=-1)
+        position = position + multiply(rot, fixed[i, :3, 3:])[..., 0]
+        x, y, z = jnp.unstack(multiply(rot, fixed[i, :3, :3]), axis=-1)
         c, s = jnp.cos(q[..., i, None]), jnp.sin(q[..., i, None])
         rot = jnp.stack([c * x + s * y, c * y - s * x, z], axis=-1)
         positions.append(position)
@@ -134,11 +134,11 @@ def tool_pose(robot: Robot, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Arr
     """
     positions, rotations = forward_kinematics(robot.chain, q)
     tool = jnp.asarray(robot.tool, q.dtype)
-    position = positions[-1] + _multiply(rotations[-1], tool[:3, 3:])[:, 0]
+    position = positions[-1] + multiply(rotations[-1], tool[:3, 3:])[:, 0]
     axes = rotations[:, :, 2]
     linear = jnp.cross(axes, position - positions)
     jacobian = jnp.concatenate([linear, axes], axis=-1).T
-    return position, _multiply(rotations[-1], tool[:3, :3]), jacobian
+    return position, multiply(rotations[-1], tool[:3, :3]), jacobian
 
 
 def bodies(robot: Robot) -> str:
@@ -174,6 +174,6 @@ def pose(transform: np.ndarray) -> str:
     return f'pos="{position}" xyaxes="{x} {y}"'
 
 
-def _multiply(a: jax.Array, b: jax.Array) -> jax.Array:
-    # Accelerators multiply in bf16 or TF32 unless told otherwise: millimetres would be lost.
+def multiply(a: jax.Array, b: jax.Array) -> jax.Array:
+    """a @ b in full precision: accelerators' bf16 or TF32 would lose millimetres."""
     return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)

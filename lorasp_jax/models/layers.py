@@ -12,7 +12,7 @@ from flax import nnx
 from lorasp_jax.peft import Aux
 
 MASKED = -2.3819763e38
-"""Logit of a forbidden key. Finite, so that a row without any key gets a uniform softmax, not NaN."""
+"""Logit of a forbidden key; finite, so a row without any key gets a uniform softmax, not NaN."""
 
 LayerAux = dict[str, Aux]
 Block = TypeVar("Block", bound=nnx.Module)
@@ -26,6 +26,7 @@ class RMSNorm(nnx.Module):
         self.eps = eps
 
     def __call__(self, x: jax.Array) -> jax.Array:
+        """x `[..., D]`."""
         wide = x.astype(jnp.float32)
         inverse = jax.lax.rsqrt(jnp.mean(jnp.square(wide), axis=-1, keepdims=True) + self.eps)
         return (wide * inverse * (1 + self.scale.get_value().astype(jnp.float32))).astype(x.dtype)
@@ -40,6 +41,7 @@ class LayerNorm(nnx.Module):
         self.eps = eps
 
     def __call__(self, x: jax.Array) -> jax.Array:
+        """x `[..., D]`."""
         wide = x.astype(jnp.float32)
         wide = wide - jnp.mean(wide, axis=-1, keepdims=True)
         wide = wide * jax.lax.rsqrt(jnp.mean(jnp.square(wide), axis=-1, keepdims=True) + self.eps)
@@ -123,11 +125,11 @@ def block_mask(
         `[B, T, S]` bool.
     """
     order = key_block[None, :] <= query_block[:, None]
-    return order & query_valid[:, :, None] & key_valid[:, None, :]
+    return jnp.asarray(order) & query_valid[:, :, None] & key_valid[:, None, :]
 
 
 def rope_table(position: jax.Array, head_dim: int) -> tuple[jax.Array, jax.Array]:
-    """Sine and cosine, each f32 `[B, T, 1, H/2]`, of position / 10000^(2i/H) (Su et al., 2104.09864)."""
+    """Sine and cosine, f32 `[B, T, 1, H/2]`, of position / 10000^(2i/H) (arXiv 2104.09864)."""
     wavelength = 10_000.0 ** (np.arange(0, head_dim, 2, dtype=np.float32) / head_dim)
     angle = position[:, :, None, None].astype(jnp.float32) / wavelength
     return jnp.sin(angle), jnp.cos(angle)

@@ -14,7 +14,7 @@ __all__ = ["Observation", "Policy"]
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Policy:
-    """From raw observations to commands. A pytree: pass it through `jax.jit`, `scan` and `device_put`.
+    """From raw observations to commands. A pytree: `jax.jit`, `scan` and `device_put` take it.
 
     Attributes:
         model: backbone with `sample_actions`.

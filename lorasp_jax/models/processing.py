@@ -1,7 +1,7 @@
 """Between a robot and a backbone: pictures, statistics, slots, token table; both ways.
 
-State and action vectors of the backbone have fixed slots: joints from slot 0, the gripper in slot 7,
-unused slots zero.
+State and action vectors of the backbone have fixed slots: joints from slot 0, the gripper in slot
+7, unused slots zero.
 """
 
 import json

@@ -1,8 +1,8 @@
 """A tiny offline tokenizer for the project's own base weights: WordPiece over manipulation words.
 
-Words outside the list fall into characters, so every printable ASCII text encodes. The position of an
-entry is its id and shipped weights depend on it: entries are never moved or removed, new words take the
-place of the next reserved one.
+Words outside the list fall into characters, so every printable ASCII text encodes. The position of
+an entry is its id and shipped weights depend on it: entries are never moved or removed, new words
+take the place of the next reserved one.
 """
 
 import functools
@@ -16,23 +16,22 @@ VOCABULARY_SIZE = 320
 
 _SPECIAL = ("[PAD]", "[UNK]")
 _CHARACTERS = tuple(chr(code) for code in range(33, 127) if not chr(code).isupper())
-_WORDS = tuple(
-    """
-    a an the this that it its and then of
-    to in into on onto onto up down from off out with inside over above under by at for near
-    press push hit tap touch hold click button switch key
-    pick place put drop grab take lift move carry bring lay leave set get grasp pinch
-    grape fruit berry basket bowl box bin container tray
-    open close remove raise uncover pot lid cover pan top handle knob
-    pour tip empty tilt fill cup mug glass block cube contents
-    red green blue yellow purple orange black white grey brown dark light small big round
-    left right front back side middle center table robot arm gripper object please your
-    """.split()
+_WORDS = (
+    "a an the this that it its and then of",
+    "to in into on onto up down from off out with inside over above under by at for near",
+    "press push hit tap touch hold click button switch key",
+    "pick place put drop grab take lift move carry bring lay leave set get grasp pinch",
+    "grape fruit berry basket bowl box bin container tray",
+    "open close remove raise uncover pot lid cover pan top handle knob",
+    "pour tip empty tilt fill cup mug glass block cube contents",
+    "red green blue yellow purple orange black white grey brown dark light small big round",
+    "left right front back side middle center table robot arm gripper object please your",
 )
 
 
 def _vocabulary() -> dict[str, int]:
-    known = dict.fromkeys((*_SPECIAL, *_CHARACTERS, *(f"##{c}" for c in _CHARACTERS), *_WORDS))
+    words = " ".join(_WORDS).split()
+    known = dict.fromkeys((*_SPECIAL, *_CHARACTERS, *(f"##{c}" for c in _CHARACTERS), *words))
     reserved = (f"[RESERVED{i}]" for i in range(VOCABULARY_SIZE - len(known)))
     return {entry: i for i, entry in enumerate((*known, *reserved))}
 

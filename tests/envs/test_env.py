@@ -31,7 +31,7 @@ def assert_equal(a, b):
 
 
 def take(state, worlds):
-    return jax.tree.map(lambda x: x[np.asarray(worlds)], state)
+    return jax.tree.map(lambda x: np.asarray(x)[worlds], state)
 
 
 @pytest.mark.parametrize(

@@ -85,7 +85,7 @@ def test_few_contacts_are_computed(scene):
 @pytest.mark.parametrize("task_name", ["press"])
 class TestPress:
     def press(self, scene, depth: float, height: float = 0.0, aside: float = 0.0) -> bool:
-        """The button (.040 m high) `depth` down, the closed finger tips `height` above it, `aside` of it."""
+        """The button (.040 m high) `depth` down, the tips `height` above it and `aside`."""
         data = world(scene)
         button = data.body("button").xpos
         reach(scene, data, button + np.array([aside, 0, 0.0515 - depth + height]), 0.0)

@@ -181,7 +181,7 @@ def test_reports_are_stacked_and_masked(trained, obs):
 
 
 def test_adapters_train(trained):
-    """U starts at zero: its gradient is not, and all others are. Only U moves the output at first."""
+    """U starts at zero, so at first U alone has a gradient, in every layer."""
     _, _, grads = trained
     leaves = jax.tree_util.tree_leaves_with_path(grads)
     for path, leaf in leaves:

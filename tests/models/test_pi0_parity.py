@@ -68,44 +68,49 @@ def close(found, wanted, atol):
     np.testing.assert_allclose(np.asarray(found), wanted, rtol=0, atol=atol)
 
 
+@pytest.fixture(scope="module")
+def loss_and_grad(model, obs, inputs):
+    """Compiled once: (noise, time) -> ((mean, loss `[B, C]`), gradients)."""
+    graphdef, parameters = nnx.split(model)
+
+    def mean_loss(parameters, noise, time):
+        per_element, _ = nnx.merge(graphdef, parameters).loss(
+            jax.random.key(0), obs, jnp.asarray(inputs["actions"]), noise=noise, flow_time=time
+        )
+        return per_element.mean(), per_element.mean(axis=-1)
+
+    compiled = jax.jit(jax.value_and_grad(mean_loss, has_aux=True))
+    return lambda noise, time: compiled(parameters, jnp.asarray(noise), jnp.asarray(time))
+
+
 def test_prefix(model, obs, expected):
-    tokens, valid, _ = jax.jit(lambda m, o: m.embed_prefix(o))(model, obs)
+    both = jax.jit(lambda model, obs: (model.embed_prefix(obs)[:2], model.run_prefix(obs)[0]))
+    (tokens, valid), prefix = both(model, obs)
     assert np.array_equal(valid, expected["prefix_mask"])
     close(tokens, expected["prefix_tokens"], 1e-5 * np.abs(expected["prefix_tokens"]).max())
-    prefix, _ = jax.jit(lambda m, o: m.run_prefix(o))(model, obs)
     rows = expected["prefix_mask"]
     close(np.asarray(prefix.out)[rows], expected["prefix_out"][rows], 1e-4)
 
 
 def test_suffix_and_velocity(model, obs, inputs, expected):
     x_t, time = jnp.asarray(expected["x_t"]), jnp.asarray(inputs["time"])
-    tokens, _ = jax.jit(lambda m, o: m.embed_suffix(o, x_t, time))(model, obs)
+    tokens, v_t = jax.jit(
+        lambda model: (model.embed_suffix(obs, x_t, time)[0], model.velocity(obs, x_t, time))
+    )(model)
     close(tokens, expected["suffix_tokens"], 5e-5)
-    close(jax.jit(lambda m, o: m.velocity(o, x_t, time))(model, obs), expected["v_t"], 1e-4)
+    close(v_t, expected["v_t"], 1e-4)
 
 
 def test_masks_and_positions(expected):
-    """What `run_prefix` and `run_suffix` hand to the experts, put together, is openpi's one mask."""
+    """Prefix and suffix in one sequence give openpi's mask and positions."""
     valid = np.concatenate([expected["prefix_mask"], expected["suffix_mask"]], axis=1)
     block = np.array([0] * expected["prefix_mask"].shape[1] + [1] + [2] * CONFIG.chunk)
     assert np.array_equal(block_mask(block, block, valid, valid), expected["attn_mask"])
     assert np.array_equal(positions(jnp.asarray(valid)), expected["positions"])
 
 
-def test_loss_and_gradients(model, obs, inputs, expected):
-    graphdef, parameters = nnx.split(model)
-
-    def mean_loss(parameters):
-        per_element, _ = nnx.merge(graphdef, parameters).loss(
-            jax.random.key(0),
-            obs,
-            jnp.asarray(inputs["actions"]),
-            noise=jnp.asarray(inputs["noise"]),
-            flow_time=jnp.asarray(inputs["time"]),
-        )
-        return per_element.mean(), per_element.mean(axis=-1)
-
-    (mean, loss), grads = jax.jit(jax.value_and_grad(mean_loss, has_aux=True))(parameters)
+def test_loss_and_gradients(loss_and_grad, inputs, expected):
+    (mean, loss), grads = loss_and_grad(inputs["noise"], inputs["time"])
     close(loss, expected["loss"], 1e-4)
     close(mean, expected["mean_loss"], 1e-4)
     grads = nnx.to_pure_dict(grads)
@@ -131,18 +136,10 @@ def test_sampling(model, obs, inputs, expected):
     close(sample, expected["sample"], 1e-4)
 
 
-def test_loss_drawn_by_openpi(model, obs, inputs, expected):
+def test_loss_drawn_by_openpi(loss_and_grad, expected):
     check = {name: expected[f"compute_loss_check/{name}"] for name in ("noise", "time", "loss")}
-    loss, _ = jax.jit(
-        lambda m, o: m.loss(
-            jax.random.key(0),
-            o,
-            jnp.asarray(inputs["actions"]),
-            noise=jnp.asarray(check["noise"]),
-            flow_time=jnp.asarray(check["time"]),
-        )
-    )(model, obs)
-    close(loss.mean(axis=-1), check["loss"], 3e-4)
+    (_, loss), _ = loss_and_grad(check["noise"], check["time"])
+    close(loss, check["loss"], 3e-4)
 
 
 def test_weights_must_fit():

@@ -114,7 +114,7 @@ class Pi0Config:
 
     @classmethod
     def base(cls) -> Pi0Config:
-        """The published pi0, 3,238,048,528 parameters (openpi, models/gemma.py, models/siglip.py)."""
+        """The published pi0, 3,238,048,528 parameters (openpi, models/{gemma,siglip}.py)."""
         return cls(
             vision=VisionConfig(width=1152, depth=27, mlp=4304, heads=16, patch=14),
             language=ExpertConfig(2048, 18, 16384, heads=8, kv_heads=1, head_dim=256),

@@ -1,8 +1,8 @@
 """Gemma experts (arXiv 2403.08295) that share attention: pi0's mixture of transformers.
 
-An expert's tokens attend to the keys and values that earlier experts left for the same layer. Since
-language tokens never see action tokens, the language expert runs first, whole, and the action expert
-follows with its cache; training and sampling take the same path.
+An expert's tokens attend to the keys and values that earlier experts left for the same layer.
+Since language tokens never see action tokens, the language expert runs first, whole, and the action
+expert follows with its cache; training and sampling take the same path.
 """
 
 import math

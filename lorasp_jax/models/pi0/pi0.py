@@ -1,7 +1,7 @@
-"""pi0 (Black et al., arXiv 2410.24164): flow matching over action chunks on a vision-language model.
+"""pi0 (Black et al., arXiv 2410.24164): flow matching over actions on a vision-language model.
 
-Tokens fall into three blocks: [pictures, instruction], [state], [noisy actions]; each sees itself and
-the blocks before it. The first is the prefix, the other two the suffix of the action expert.
+Tokens fall into three blocks: [pictures, instruction], [state], [noisy actions]; each sees itself
+and the blocks before it. The first is the prefix, the other two the suffix of the action expert.
 """
 
 from typing import Any, NamedTuple
@@ -141,7 +141,7 @@ class Pi0(nnx.Module):
         return v_t, {**expert_aux, **aux, **linear.aux}
 
     def velocity(self, obs: Observation, x_t: jax.Array, flow_time: jax.Array) -> jax.Array:
-        """The velocity field v_t `[B, C, A]` at x_t `[B, C, A]`, flow_time `[B]` (1 noise, 0 data)."""
+        """Velocity v_t `[B, C, A]` at x_t `[B, C, A]` and flow_time `[B]` (1 noise, 0 data)."""
         prefix, _ = self.run_prefix(obs)
         return self.run_suffix(prefix, obs, x_t, flow_time)[0]
 

@@ -1,4 +1,4 @@
-"""SigLIP vision tower (Zhai et al., arXiv 2303.15343) with pi0's projection to the language width."""
+"""SigLIP vision tower (Zhai et al., arXiv 2303.15343) with pi0's projection to language tokens."""
 
 import jax
 import jax.numpy as jnp
@@ -79,7 +79,7 @@ class SigLIP(nnx.Module):
 
 
 def patches(images: jax.Array, size: int) -> jax.Array:
-    """`[B, H, W, 3]` -> `[B, T, size * size * 3]`, patches row by row, each flattened as (y, x, rgb)."""
+    """`[B, H, W, 3]` -> `[B, T, 3 size^2]`: patches row by row, each flattened as (y, x, rgb)."""
     batch, height, width, _ = images.shape
     grid = images.reshape(batch, height // size, size, width // size, size, 3)
     return grid.swapaxes(2, 3).reshape(batch, -1, size * size * 3)
