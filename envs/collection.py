@@ -114,27 +114,9 @@ def collect(
         image_size=image_size,
         control_dt=control_dt,
     )
-    chunks: list[dict[str, Any]] = []
-    kept = attempted = 0
-    if progress:
-        progress(0, num_episodes)
-    while kept < num_episodes:
-        key, chunk_key = jax.random.split(key)
-        chunk, success = _record(env, chunk_key, action_noise)
-        wins = np.flatnonzero(success)[: num_episodes - kept]
-        # Attempts after the last one that was needed do not count.
-        attempted += int(wins[-1]) + 1 if kept + len(wins) == num_episodes else env.num_envs
-        kept += len(wins)
-        chunks.append(jax.tree.map(lambda x, wins=wins: x[wins], chunk))
-        if progress:
-            progress(kept, num_episodes)
-        if attempted >= _PATIENCE and kept < _LEAST_SUCCESS * attempted:
-            raise RuntimeError(
-                f"the expert solved only {kept} of {attempted} layouts of {task!r} with {robot!r}, "
-                f"at least {_LEAST_SUCCESS:.0%} are expected: check the scene or lower action_noise"
-            )
+    arrays, attempted = _gather(env, num_episodes, key, action_noise, progress or _silent)
     return Episodes(
-        **jax.tree.map(lambda *parts: jnp.concatenate(parts), *chunks),
+        **arrays,
         instructions=env.instructions,
         task=task,
         robot=robot,
@@ -157,6 +139,39 @@ def expert_success(
     calls = -(-num_episodes // env.num_envs)
     results = [_attempt(env, chunk_key) for chunk_key in jax.random.split(key, calls)]
     return jnp.concatenate(results)[:num_episodes]
+
+
+def _gather(
+    env: Env,
+    num_episodes: int,
+    key: jax.Array,
+    action_noise: float,
+    progress: Callable[[int, int], None],
+) -> tuple[dict[str, Any], int]:
+    """Arrays of the first `num_episodes` successes, and how many attempts they took."""
+    chunks: list[dict[str, Any]] = []
+    kept = attempted = 0
+    progress(0, num_episodes)
+    while kept < num_episodes:
+        if attempted >= _PATIENCE and kept < _LEAST_SUCCESS * attempted:
+            raise RuntimeError(
+                f"the expert solved only {kept} of {attempted} layouts of {env.task.name!r} with "
+                f"{env.robot.name!r}, at least {_LEAST_SUCCESS:.0%} are expected: check the scene "
+                "or lower action_noise"
+            )
+        key, chunk_key = jax.random.split(key)
+        chunk, success = _record(env, chunk_key, action_noise)
+        wins = np.flatnonzero(success)[: num_episodes - kept]
+        kept += len(wins)
+        # Attempts after the last one that was needed do not count.
+        attempted += env.num_envs if kept < num_episodes else int(wins[-1]) + 1
+        chunks.append(jax.tree.map(lambda x, wins=wins: x[wins], chunk))
+        progress(kept, num_episodes)
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts), *chunks), attempted
+
+
+def _silent(done: int, total: int) -> None:
+    """The progress callback of nobody."""
 
 
 @functools.partial(jax.jit, static_argnums=0)

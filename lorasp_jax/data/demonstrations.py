@@ -1,6 +1,8 @@
 """Demonstrations of a run: collected once by the scripted expert, then reused from the run's cache."""
 
+import functools
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import jax
@@ -16,14 +18,14 @@ Progress = Callable[[str, int, int], None]
 def demonstrations(config: Config, folder: Path, progress: Progress) -> dict[str, Episodes]:
     """Episodes of every task of `config`, from `folder`/cache where they are already there."""
     keys = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 1), len(config.tasks))
-    return {
-        task: _task_demonstrations(config, folder / "cache" / f"{task}.npz", task, key, progress)
-        for task, key in zip(config.tasks, keys, strict=True)
-    }
+    paths = [folder / "cache" / f"{task}.npz" for task in config.tasks]
+    one = functools.partial(_task_demonstrations, config, progress=progress)
+    with ThreadPoolExecutor() as pool:  # compilation is most of the time and runs side by side
+        return dict(zip(config.tasks, pool.map(one, paths, config.tasks, keys), strict=True))
 
 
 def _task_demonstrations(
-    config: Config, path: Path, task: str, key: jax.Array, progress: Progress
+    config: Config, path: Path, task: str, key: jax.Array, *, progress: Progress
 ) -> Episodes:
     """Episodes of one task."""
     if path.exists():

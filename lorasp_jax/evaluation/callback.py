@@ -1,8 +1,10 @@
 """Success in simulation before and after training, with a video of each task."""
 
 import dataclasses
+import functools
 import json
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -50,30 +52,35 @@ class Evaluation(Callback):
         write_json(run.folder / "results.json", summarise(run, results))
 
     def _measure(self, run: Run, when: str) -> dict[str, Result]:
-        """Results by task."""
-        config = run.config.evaluation
+        """Results by task; compilations run side by side."""
         with run.timed("evaluate"), Progress(console=run.console) as progress:
-            results = {}
-            for number, task in enumerate(run.config.tasks):
-                bar = progress.add_task(f"compiling evaluation of {task} ...", total=config.episodes)
-                env, rollout = self._compiled(run, task)
-                key = jax.random.fold_in(jax.random.key(run.config.seed), 10 + 2 * number)
-                results[task] = evaluate(
-                    task_policy(run.policy, env),
-                    env,
-                    jax.random.fold_in(key, ("before", "after").index(when)),
-                    config.episodes,
-                    rollout=rollout,
-                    progress=lambda done, _, bar=bar, task=task: progress.update(
-                        bar, completed=done, description=f"evaluating {task} {when}"
-                    ),
-                )
-                low, high = (100 * bound for bound in results[task].ci95)
-                run.console.print(
-                    f"{task} {when}: {100 * results[task].success:.1f} % success "
-                    f"(95 % interval {low:.0f}-{high:.0f} %) in {config.episodes} episodes"
-                )
+            one = functools.partial(self._measure_task, run, when, progress)
+            with ThreadPoolExecutor() as pool:
+                results = dict(zip(run.config.tasks, pool.map(one, run.config.tasks), strict=True))
+        for task, result in results.items():
+            low, high = (100 * bound for bound in result.ci95)
+            run.console.print(
+                f"{task} {when}: {100 * result.success:.1f} % success "
+                f"(95 % interval {low:.0f}-{high:.0f} %) in {result.episodes} episodes"
+            )
         return results
+
+    def _measure_task(self, run: Run, when: str, progress: Progress, task: str) -> Result:
+        """The result of one task, with a progress bar."""
+        episodes = run.config.evaluation.episodes
+        bar = progress.add_task(f"compiling evaluation of {task} ...", total=episodes)
+        env, rollout = self._compiled(run, task)
+        number = 2 * run.config.tasks.index(task) + ("before", "after").index(when)
+        return evaluate(
+            task_policy(run.policy, env),
+            env,
+            jax.random.fold_in(jax.random.key(run.config.seed), 10 + number),
+            episodes,
+            rollout=rollout,
+            progress=lambda done, _: progress.update(
+                bar, completed=done, description=f"evaluating {task} {when}"
+            ),
+        )
 
     def _compiled(self, run: Run, task: str) -> tuple[Env, Callable]:
         """The environment and jitted rollout of a task, made once."""

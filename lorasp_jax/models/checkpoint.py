@@ -200,15 +200,17 @@ def _difference(stored: Any, wanted: Any) -> str:
 
 
 def _description(folder: pathlib.Path) -> dict[str, Any]:
+    foreign = f"{folder / CONFIG} is damaged or was not written by this project."
     try:
         found = json.loads((folder / CONFIG).read_bytes())
-        if isinstance(found["config"], dict) and isinstance(found["sha256"], str):
-            return found
+        valid = isinstance(found["config"], dict) and isinstance(found["sha256"], str)
     except FileNotFoundError as error:
         raise ValueError(f"{folder} holds no model: there is no {CONFIG}.") from error
-    except (OSError, ValueError, KeyError, TypeError):
-        pass
-    raise ValueError(f"{folder / CONFIG} is damaged or was not written by this project.")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(foreign) from error
+    if not valid:
+        raise ValueError(foreign)
+    return found
 
 
 def _config(folder: pathlib.Path, description: Mapping[str, Any]) -> Any:

@@ -42,7 +42,8 @@ class Run:
         console: where to print.
         base_hash: hash of the frozen base.
         episodes: demonstrations by task.
-        policy: the policy as it is now.
+        policy: the policy before the first step or after the last; in between, training owns its
+            memory.
         seconds: time spent by phase.
     """
 
@@ -88,26 +89,25 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
         RunError: the loss is not finite; the last checkpoint before stays.
         KeyboardInterrupt: a signal asked to stop; the state is saved.
     """
-    config = run.config
-    optimizer = make_optimizer(config.optim)
-    mesh = meshes.make_mesh(config.fsdp)
+    optimizer = make_optimizer(run.config.optim)
+    mesh = meshes.make_mesh(run.config.fsdp)
     graphdef, adapters, frozen = adaptation.split(run.policy.model)
     # A copy: every call of the step takes its state's memory over.
     state = init_state(jax.tree.map(jnp.copy, adapters), optimizer)
     state = jax.device_put(state, meshes.replicated(mesh))
     frozen = meshes.place_frozen(frozen, mesh)
+    run.policy = Policy(nnx.merge(graphdef, state.adapters, frozen), run.policy.processor)
     checkpoints = Checkpoints(run.folder, run.base_hash)
     restored = checkpoints.restore(state) if resume else None
     if restored is None:
         for callback in callbacks:
             callback.on_start(run)
-    state = restored or state
     steps = flatten(list(run.episodes.values()))
     steps = jax.device_put(steps, meshes.replicated(mesh))
-    many = _compiled(run, graphdef, optimizer, mesh)
+    many = functools.partial(_compiled(run, graphdef, optimizer, mesh), frozen, steps)
     try:
         with run.timed("train"):
-            state = _loop(run, state, functools.partial(many, frozen, steps), checkpoints, callbacks)
+            state = _loop(run, restored or state, many, checkpoints, callbacks)
     finally:
         checkpoints.close()
     run.policy = Policy(nnx.merge(graphdef, state.adapters, frozen), run.policy.processor)
@@ -137,7 +137,13 @@ def _compiled(run: Run, graphdef: Any, optimizer: Any, mesh: jax.sharding.Mesh) 
             state, frozen, batch, loss_key, graphdef=graphdef, optimizer=optimizer, weights=weights
         )
 
-    @functools.partial(jax.jit, static_argnames="count", donate_argnames="state")
+    # The state comes back placed as it went in, so that nothing compiles a second time.
+    @functools.partial(
+        jax.jit,
+        static_argnames="count",
+        donate_argnames="state",
+        out_shardings=meshes.replicated(mesh),
+    )
     def many(frozen: Any, steps: Steps, state: TrainState, key: jax.Array, count: int) -> Any:
         state, metrics = jax.lax.scan(
             lambda state, _: one(state, frozen, steps, key), state, length=count

@@ -36,7 +36,7 @@ def scores_like(shape, seed=0):
 
 @pytest.mark.usefixtures("interpret")
 @pytest.mark.parametrize(
-    ("implementation", "may_miss"), [("bisection", 0), ("pallas", 0), ("sort", 1)]
+    ("implementation", "may_miss"), [("pairwise", 0), ("bisection", 0), ("pallas", 0), ("sort", 1)]
 )
 @pytest.mark.parametrize("eta", [0.5, 0.7, 0.8, 0.9, 0.99])
 def test_equals_exact_arithmetic(golden, implementation, may_miss, eta):
@@ -61,7 +61,7 @@ def test_target_of_one_keeps_every_positive_score(golden):
 
 
 @pytest.mark.usefixtures("interpret")
-@pytest.mark.parametrize("implementation", ["sort", "bisection", "pallas"])
+@pytest.mark.parametrize("implementation", ["pairwise", "sort", "bisection", "pallas"])
 def test_special_rows(implementation):
     rows = np.array([[0] * 4, [3e38] * 4, [0, 0, 0, 2e-38], [1] * 4, [0, 1e-20, 1, 1e-20]])
     run = jax.jit(lambda s: gate.energy_gate(s, 0.5, implementation=implementation))
@@ -82,7 +82,7 @@ def test_pallas_takes_any_shape(shape):
     np.testing.assert_array_equal(pallas.index[0], reference.index)
 
 
-@pytest.mark.parametrize("implementation", ["sort", "bisection"])
+@pytest.mark.parametrize("implementation", ["pairwise", "sort", "bisection"])
 def test_transformations_agree(implementation):
     @jax.jit
     def all_ways(scores):
@@ -126,7 +126,7 @@ def test_bad_target(eta):
 
 
 def test_unknown_implementation():
-    with pytest.raises(ValueError, match="valid are sort, bisection, pallas"):
+    with pytest.raises(ValueError, match="valid are pairwise, sort, bisection, pallas"):
         gate.energy_gate(jnp.ones(3), 0.9, implementation="argsort")
 
 
