@@ -35,13 +35,13 @@ def _cpu() -> Config:
     return Config(
         name="multitask",
         scale="cpu",
-        peft=LoRASP(rank=32),
+        peft=LoRASP(rank=16, hidden_width=16),
         size="nano",
         base="assets/pi0_nano",
         data=DataConfig(episodes=128, num_envs=32),
-        optim=OptimConfig(steps=4000, batch_size=64, learning_rate=2e-3, warmup_steps=100),
+        optim=OptimConfig(steps=2000, batch_size=64, learning_rate=3e-3, warmup_steps=100),
         evaluation=EvaluationConfig(episodes=64, num_envs=32),
-        log_every=20,
+        log_every=50,
         checkpoint_every=500,
     )
 
@@ -54,7 +54,7 @@ def _accelerator() -> Config:
         size="small",
         base="assets/pi0_small",
         data=DataConfig(episodes=512, num_envs=256),
-        optim=OptimConfig(steps=2500, batch_size=256, learning_rate=1e-3, warmup_steps=100),
+        optim=OptimConfig(steps=3000, batch_size=256, learning_rate=1e-3, warmup_steps=100),
         evaluation=EvaluationConfig(episodes=256, num_envs=256),
         compute_dtype="bfloat16",
         log_every=100,

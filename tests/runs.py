@@ -23,6 +23,7 @@ CONFIG = Config(
     peft=LoRASP(rank=8, hidden_width=8),
     size="dummy",
     base="",
+    targets=("patch_embed", "q_proj", "down_proj", "action_out_proj"),
     image_size=32,
     optim=OptimConfig(steps=4, batch_size=8, warmup_steps=1),
     log_every=2,
@@ -53,7 +54,7 @@ def random_episodes(task: str, seed: int) -> Episodes:
 def make_run(folder: Path, config: Config = CONFIG) -> Run:
     folder.mkdir(exist_ok=True)
     model = Pi0Config.dummy().create(nnx.Rngs(0))
-    model = adaptation.adapt(model, [(".*", config.peft)], rngs=nnx.Rngs(1))
+    model = adaptation.adapt(model, [(path, config.peft) for path in config.targets], rngs=nnx.Rngs(1))
     run = Run(config, folder, Console(file=io.StringIO()), "hash of the base")
     run.episodes = {task: random_episodes(task, i) for i, task in enumerate(config.tasks)}
     run.policy = Policy(model, processor(config, list(run.episodes.values()), model.config))

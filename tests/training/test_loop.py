@@ -9,9 +9,17 @@ import numpy as np
 import pytest
 
 from lorasp_jax import adaptation
+from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.loop import Callback, RunError, train
 from lorasp_jax.training.run_folder import read_metrics
 from tests.runs import CONFIG, leaves, make_run
+
+
+@pytest.fixture(autouse=True)
+def one_device(monkeypatch):
+    """Compiles in a quarter of the time; tests of the mesh use all eight."""
+    mesh = meshes.make_mesh(1, jax.devices()[:1])
+    monkeypatch.setattr(meshes, "make_mesh", lambda fsdp: mesh)
 
 
 class Terminate(Callback):
@@ -37,6 +45,7 @@ def test_resume_is_bit_exact_and_frozen_stays_frozen(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         train(halved, [callback])
     assert [row["step"] for row in read_metrics(halved.folder)] == [2]
+    halved = make_run(tmp_path / "halved")  # as a new process would
     train(halved, [callback], resume=True)
     assert callback.started == 1
 
