@@ -54,7 +54,7 @@ def _accelerator() -> Config:
         size="small",
         base="assets/pi0_small",
         data=DataConfig(episodes=512, num_envs=256),
-        optim=OptimConfig(steps=3000, batch_size=256, learning_rate=1e-3, warmup_steps=100),
+        optim=OptimConfig(steps=2500, batch_size=256, learning_rate=1e-3, warmup_steps=100),
         evaluation=EvaluationConfig(episodes=256, num_envs=256),
         compute_dtype="bfloat16",
         log_every=100,
