@@ -1,4 +1,4 @@
-"""Adapt a pretrained miniature pi0 from the Panda arm to the PiPER arm, two tasks together, LoRA-SP.
+"""Adapt a pretrained miniature pi0 from the Panda arm to the PiPER arm: two tasks, LoRA-SP.
 
     python train.py --config configs/multitask.py
 
@@ -7,8 +7,8 @@ the scripted expert, measures the base, trains LoRA-SP adapters on press and pic
 measures again and writes runs/multitask/report.html. The README has the expected result and time.
 """
 
-from lorasp_jax.peft import LoRASP
 from lorasp_jax.config import Config, DataConfig, EvaluationConfig, OptimConfig
+from lorasp_jax.peft import LoRASP
 
 
 def get_config(scale: str) -> Config:

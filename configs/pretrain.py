@@ -9,8 +9,8 @@ assets/pi0_<size> holds; the model cards there state hardware, time and measured
 
 import dataclasses
 
-from lorasp_jax.peft import FullFineTuning
 from lorasp_jax.config import Config, DataConfig, EvaluationConfig, OptimConfig
+from lorasp_jax.peft import FullFineTuning
 
 
 def get_config(scale: str) -> Config:

@@ -105,7 +105,7 @@ def collect(
 
     Raises:
         ValueError: for bad names or numbers.
-        RuntimeError: if the expert fails far too often.
+        ValueError: if the expert fails far too often.
     """
     env = make(
         task,
@@ -154,7 +154,7 @@ def _gather(
     progress(0, num_episodes)
     while kept < num_episodes:
         if attempted >= _PATIENCE and kept < _LEAST_SUCCESS * attempted:
-            raise RuntimeError(
+            raise ValueError(
                 f"the expert solved only {kept} of {attempted} layouts of {env.task.name!r} with "
                 f"{env.robot.name!r}, at least {_LEAST_SUCCESS:.0%} are expected: check the scene "
                 "or lower action_noise"

@@ -1,10 +1,18 @@
 """What a run is: frozen dataclasses, one instance per experiment file in `configs/`."""
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from lorasp_jax.peft import Method
 
 SCALES = ("smoke", "cpu", "accelerator")
+
+
+def _at_least_one(owner: object, *names: str) -> None:
+    """Raise ValueError unless these fields are at least 1."""
+    for name in names:
+        if getattr(owner, name) < 1:
+            raise ValueError(f"{name} must be at least 1, got {getattr(owner, name)}")
 
 
 @dataclass(frozen=True)
@@ -16,7 +24,11 @@ class DataConfig:
     num_envs: int = 256
     """Worlds simulated at a time while collecting."""
     action_noise: float = 0.005
-    """Standard deviation of the noise on executed joint targets [rad]; recorded targets are clean."""
+    """Standard deviation of the noise on executed joint targets [rad]; recorded ones are clean."""
+
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        _at_least_one(self, "episodes", "num_envs")
 
 
 @dataclass(frozen=True)
@@ -41,6 +53,10 @@ class OptimConfig:
     """Largest global gradient norm."""
     state_noise: float = 0.02
     """Standard deviation of the noise on normalised robot states while training."""
+
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        _at_least_one(self, "steps", "batch_size")
 
 
 @dataclass(frozen=True)
@@ -69,6 +85,14 @@ class EvaluationConfig:
     """Actions of a chunk that are executed before the policy looks again."""
     denoise_steps: int = 10
     """Euler steps of the flow-matching sampler."""
+
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        _at_least_one(self, "episodes", "num_envs", "execute_steps", "denoise_steps")
+        if self.episodes % min(self.episodes, self.num_envs):
+            raise ValueError(
+                f"episodes must be a multiple of num_envs, got {self.episodes} and {self.num_envs}"
+            )
 
 
 @dataclass(frozen=True)
@@ -101,7 +125,9 @@ class Config:
     """Auxiliary loss weights."""
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     """Evaluation in simulation."""
-    compute_dtype: str = "float32"
+    control_dt: float = 0.1
+    """Seconds between two actions; demonstrations and base must agree."""
+    compute_dtype: Literal["float32", "bfloat16"] = "float32"
     """Type of the matrix products: float32 or bfloat16."""
     fsdp: int = 1
     """Devices over which large frozen arrays are split; the rest of the mesh is data parallel."""
@@ -111,3 +137,9 @@ class Config:
     """Steps between checkpoints."""
     seed: int = 0
     """Seed of every random stream of the run."""
+
+    def __post_init__(self) -> None:
+        """Checks what no single field shows."""
+        _at_least_one(self, "fsdp", "log_every", "checkpoint_every", "image_size")
+        if not self.tasks or len(set(self.tasks)) < len(self.tasks):
+            raise ValueError(f"tasks must be different and at least one, got {self.tasks}")

@@ -54,7 +54,9 @@ def random_episodes(task: str, seed: int) -> Episodes:
 def make_run(folder: Path, config: Config = CONFIG) -> Run:
     folder.mkdir(exist_ok=True)
     model = Pi0Config.dummy().create(nnx.Rngs(0))
-    model = adaptation.adapt(model, [(path, config.peft) for path in config.targets], rngs=nnx.Rngs(1))
+    model = adaptation.adapt(
+        model, [(path, config.peft) for path in config.targets], rngs=nnx.Rngs(1)
+    )
     run = Run(config, folder, Console(file=io.StringIO()), "hash of the base")
     run.episodes = {task: random_episodes(task, i) for i, task in enumerate(config.tasks)}
     run.policy = Policy(model, processor(config, list(run.episodes.values()), model.config))

@@ -54,7 +54,7 @@ class Steps:
 
 
 def flatten(episodes: Sequence[Episodes]) -> Steps:
-    """Concatenate the valid steps of several sets of episodes; instructions are renumbered in order."""
+    """Concatenate the valid steps of sets of episodes; instructions are renumbered in order."""
     parts: list[Steps] = []
     offset = phrase = 0
     for group in episodes:

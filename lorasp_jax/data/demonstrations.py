@@ -1,9 +1,10 @@
-"""Demonstrations of a run: collected once by the scripted expert, then reused from the run's cache."""
+"""Demonstrations of a run: collected once by the scripted expert, then read from its cache."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -20,8 +21,16 @@ def demonstrations(config: Config, folder: Path, progress: Progress) -> dict[str
     keys = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 1), len(config.tasks))
     paths = [folder / "cache" / f"{task}.npz" for task in config.tasks]
     one = functools.partial(_task_demonstrations, config, progress=progress)
-    with ThreadPoolExecutor() as pool:  # compilation is most of the time and runs side by side
-        return dict(zip(config.tasks, pool.map(one, paths, config.tasks, keys), strict=True))
+    return dict(zip(config.tasks, side_by_side(one, paths, config.tasks, keys), strict=True))
+
+
+def side_by_side(function: Callable, *arguments: Iterable[Any]) -> list[Any]:
+    """`map` in threads, because compilation is most of the time; an interrupt does not wait."""
+    pool = ThreadPoolExecutor()
+    try:
+        return list(pool.map(function, *arguments))
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _task_demonstrations(
@@ -29,13 +38,14 @@ def _task_demonstrations(
 ) -> Episodes:
     """Episodes of one task."""
     if path.exists():
-        return Episodes.load(path)
+        return Episodes.load(path, control_dt=config.control_dt)
     episodes = envs.collect(
         task,
         robot=config.robot,
         num_episodes=config.data.episodes,
         key=key,
         image_size=config.image_size,
+        control_dt=config.control_dt,
         num_envs=config.data.num_envs,
         action_noise=config.data.action_noise,
         progress=lambda done, total: progress(task, done, total),

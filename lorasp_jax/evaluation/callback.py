@@ -4,22 +4,19 @@ import dataclasses
 import functools
 import json
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from rich.progress import Progress
 
 import envs
 from envs.env import Env
 from lorasp_jax import adaptation
+from lorasp_jax.data.demonstrations import side_by_side
 from lorasp_jax.evaluation import video
 from lorasp_jax.evaluation.rollout import Result, evaluate, make_rollout
-from lorasp_jax.models import tokenizer
-from lorasp_jax.models.policy import Policy
 from lorasp_jax.training.loop import Callback, Run
 from lorasp_jax.training.run_folder import write_json
 
@@ -55,8 +52,8 @@ class Evaluation(Callback):
         """Results by task; compilations run side by side."""
         with run.timed("evaluate"), Progress(console=run.console) as progress:
             one = functools.partial(self._measure_task, run, when, progress)
-            with ThreadPoolExecutor() as pool:
-                results = dict(zip(run.config.tasks, pool.map(one, run.config.tasks), strict=True))
+            tasks = run.config.tasks
+            results = dict(zip(tasks, side_by_side(one, tasks), strict=True))
         for task, result in results.items():
             low, high = (100 * bound for bound in result.ci95)
             run.console.print(
@@ -72,7 +69,7 @@ class Evaluation(Callback):
         env, rollout = self._compiled(run, task)
         number = 2 * run.config.tasks.index(task) + ("before", "after").index(when)
         return evaluate(
-            task_policy(run.policy, env),
+            run.policy,
             env,
             jax.random.fold_in(jax.random.key(run.config.seed), 10 + number),
             episodes,
@@ -91,6 +88,7 @@ class Evaluation(Callback):
                 robot=config.robot,
                 num_envs=min(config.evaluation.num_envs, config.evaluation.episodes),
                 image_size=config.image_size,
+                control_dt=config.control_dt,
             )
             rollout = make_rollout(
                 env,
@@ -99,13 +97,6 @@ class Evaluation(Callback):
             )
             self._tasks[task] = env, jax.jit(rollout)
         return self._tasks[task]
-
-
-def task_policy(policy: Policy, env: Env) -> Policy:
-    """The policy with the instructions of one environment in its token table."""
-    ids, valid = tokenizer.encode(env.instructions, policy.model.config.max_tokens)
-    table = {"tokens": jnp.asarray(ids), "token_mask": jnp.asarray(valid)}
-    return Policy(policy.model, dataclasses.replace(policy.processor, **table))
 
 
 def success(result: Result) -> dict[str, Any]:
@@ -128,7 +119,7 @@ def summarise(run: Run, after: dict[str, Result]) -> dict[str, Any]:
     trainable, total = adaptation.count(run.policy.model)
     return {
         "scale": run.config.scale,
-        "seconds": {**run.seconds, "total": run.elapsed},
+        "seconds": run.seconds,
         "tasks": {
             task: {"before": before[task], "after": success(result)}
             for task, result in after.items()

@@ -1,5 +1,6 @@
 """Policy in the loop: look, predict a chunk, execute part of it, look again - all in one jit."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ import numpy as np
 
 from envs.env import Env, State
 from lorasp_jax.evaluation.metrics import wilson_interval
+from lorasp_jax.models import tokenizer
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.peft import Aux
 
@@ -79,6 +81,9 @@ def make_rollout(
         return state, jax.tree.map(lambda x: x[:FILMED_WORLDS], poses)
 
     def look(policy: Policy, state: State, key: jax.Array) -> tuple[State, tuple]:
+        chunk = policy.model.config.chunk
+        if not 1 <= execute_steps <= chunk:
+            raise ValueError(f"execute_steps must be 1 to the chunk, {chunk}, got {execute_steps}")
         actions, aux = policy.sample(
             key,
             env.observe(state),
@@ -97,10 +102,11 @@ def make_rollout(
             functools.partial(look, policy), env.reset(reset_key), keys
         )
         weights = running / jnp.maximum(running.sum(), 1)
+        mean = functools.partial(jnp.tensordot, weights, axes=1, precision="highest")
         return Rollout(
             success=state.info["success"],
             steps=state.info["steps"],
-            active_rank=jax.tree.map(lambda rank: jnp.tensordot(weights, rank, 1), ranks),
+            active_rank=jax.tree.map(mean, ranks),
             poses=jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), poses),
         )
 
@@ -114,12 +120,12 @@ def evaluate(
     num_episodes: int = 256,
     *,
     rollout: Callable[[Policy, jax.Array], Rollout] | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Result:
     """Success of `policy` on the task of `env` in fresh episodes.
 
     Args:
-        policy: its processor's token table holds the instructions of `env`, in their order.
+        policy: for the robot of `env`; it is told the task in the words of `env.instructions`.
         env: where to evaluate; `num_envs` episodes run at a time.
         key: consumed; the same key gives the same layouts.
         num_episodes: a multiple of `env.num_envs`.
@@ -134,11 +140,13 @@ def evaluate(
         raise ValueError(
             f"{num_episodes} episodes are not a positive multiple of the {env.num_envs} worlds"
         )
+    policy = _told(policy, env)
     rollout = rollout or jax.jit(make_rollout(env))
     runs: list[Rollout] = []
     for batch_key in jax.random.split(key, batches):
         runs.append(jax.block_until_ready(rollout(policy, batch_key)))
-        progress(len(runs) * env.num_envs, num_episodes)
+        if progress:
+            progress(len(runs) * env.num_envs, num_episodes)
     successes = int(sum(run.success.sum() for run in runs))
     return Result(
         success=successes / num_episodes,
@@ -152,10 +160,17 @@ def evaluate(
     )
 
 
+def _told(policy: Policy, env: Env) -> Policy:
+    """The policy with the instructions of one environment in its token table."""
+    ids, valid = tokenizer.encode(env.instructions, policy.model.config.max_tokens)
+    table = {"tokens": jnp.asarray(ids), "token_mask": jnp.asarray(valid)}
+    return Policy(policy.model, dataclasses.replace(policy.processor, **table))
+
+
 def _film(run: Rollout) -> Poses:
     """The poses of the first filmed world that succeeded, or of world 0, until it was done."""
     world = int(jnp.argmax(run.success[:FILMED_WORLDS]))
-    return jax.tree.map(lambda x: x[: int(run.steps[world]), world], run.poses)
+    return jax.tree.map(lambda x: x[: max(int(run.steps[world]), 1), world], run.poses)
 
 
 def _ranks(aux: dict[str, dict[str, Aux]], running: jax.Array) -> Ranks:

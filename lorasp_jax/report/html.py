@@ -64,7 +64,7 @@ def write_report(folder: Path) -> Path:
         + "</html>\n"
     )
     path = folder / "report.html"
-    path.write_text(page)
+    path.write_text(page, encoding="utf-8")
     return path
 
 
@@ -123,8 +123,9 @@ def _media(folder: Path, tasks: Iterable[str]) -> Iterable[str]:
             f"<h3>{html.escape(task)}</h3>"
             f'<figure><img class=camera width=400 alt="side and wrist camera" '
             f'src="data:image/png;base64,{shown}">'
-            "<figcaption class=muted>side and wrist camera at policy resolution</figcaption></figure>"
-            '<figure><video width=400 controls autoplay loop muted '
+            "<figcaption class=muted>side and wrist camera at policy resolution</figcaption>"
+            "</figure>"
+            "<figure><video width=400 controls autoplay loop muted "
             f'src="data:video/mp4;base64,{played}"></video>'
             "<figcaption class=muted>one closed-loop episode after adaptation</figcaption></figure>"
         )

@@ -20,9 +20,7 @@ class Checkpoints:
         """Open `folder`/checkpoints for a run on the base identified by `base_hash`."""
         atomic = ocp.options.AtomicityOptions(mode=ocp.options.AtomicityMode.COMMIT_FILE)
         options = ocp.CheckpointManagerOptions(max_to_keep=2, atomicity_options=atomic)
-        self._manager = ocp.CheckpointManager(
-            (folder / "checkpoints").absolute(), options=options
-        )
+        self._manager = ocp.CheckpointManager((folder / "checkpoints").absolute(), options=options)
         self._base_hash = base_hash
 
     def save(self, state: TrainState) -> None:
@@ -39,28 +37,35 @@ class Checkpoints:
         )
 
     def restore(self, like: TrainState) -> TrainState | None:
-        """The newest state, with the structure, types and shardings of `like`; None if there is none.
+        """The newest state with the structure, types and shardings of `like`; None without one.
 
         Raises:
-            ValueError: the checkpoint was made on another base or with other adapters.
+            ValueError: the checkpoint is damaged, or was made on another base.
         """
         step = self._manager.latest_step()
         if step is None:
             return None
-        meta = self._manager.restore(step, args=ocp.args.Composite(meta=ocp.args.JsonRestore()))
-        if meta["meta"]["base_hash"] != self._base_hash:
+        abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, _by_path(like))
+        try:
+            found = self._manager.restore(
+                step,
+                args=ocp.args.Composite(
+                    state=ocp.args.StandardRestore(abstract), meta=ocp.args.JsonRestore()
+                ),
+            )
+        except Exception as error:  # Orbax raises whatever its storage raises
+            raise ValueError(
+                f"the checkpoint at step {step} in {self._manager.directory} cannot be read: "
+                "remove its folder to resume from the one before"
+            ) from error
+        base_hash = found["meta"]["base_hash"]
+        if base_hash != self._base_hash:
             raise ValueError(
                 f"the checkpoint at step {step} was trained on another base: its hash is "
-                f"{meta['meta']['base_hash'][:12]}, this base's is {self._base_hash[:12]}"
+                f"{base_hash[:12]}, this base's is {self._base_hash[:12]}"
             )
-        abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, _by_path(like))
-        restored = self._manager.restore(
-            step, args=ocp.args.Composite(state=ocp.args.StandardRestore(abstract))
-        )
-        paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(like)]
-        return jax.tree.unflatten(
-            jax.tree.structure(like), [restored["state"][path] for path in paths]
-        )
+        names = [jax.tree_util.keystr(p) for p, _ in jax.tree_util.tree_leaves_with_path(like)]
+        return jax.tree.unflatten(jax.tree.structure(like), [found["state"][n] for n in names])
 
     def close(self) -> None:
         """Wait until everything is on disk."""
@@ -69,6 +74,6 @@ class Checkpoints:
 
 
 def _by_path(tree: Any) -> dict[str, jax.Array]:
-    """A flat dictionary from tree path to leaf: the same file layout whatever the containers are."""
+    """A flat dictionary from tree path to leaf: one file layout, whatever the containers are."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(path): leaf for path, leaf in leaves}

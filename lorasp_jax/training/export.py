@@ -1,9 +1,12 @@
 """What a finished run hands on: adapters, or with full fine-tuning a new base."""
 
 import json
+from typing import Any
 
 from lorasp_jax import adaptation, adapter_io, models
 from lorasp_jax.training.loop import Run
+from lorasp_jax.training.run_folder import write_json
+from lorasp_jax.training.setup import TRAINING
 
 
 def write(run: Run) -> None:
@@ -14,6 +17,7 @@ def write(run: Run) -> None:
         models.save(folder, adaptation.merge(run.policy.model))
         statistics = run.policy.processor.statistics.to_json()
         (folder / "statistics.json").write_text(statistics + "\n")
+        write_json(folder / TRAINING, _facts(run))
         return
     adapter_io.save_adapters(
         run.folder,
@@ -21,8 +25,18 @@ def write(run: Run) -> None:
         base=run.base_hash,
         metadata={
             "base": config.base,
-            "robot": config.robot,
-            "tasks": list(config.tasks),
+            **_facts(run),
             "statistics": json.loads(run.policy.processor.statistics.to_json()),
         },
     )
+
+
+def _facts(run: Run) -> dict[str, Any]:
+    """What the weights were trained on."""
+    config, first = run.config, next(iter(run.episodes.values()))
+    return {
+        "robot": config.robot,
+        "tasks": list(config.tasks),
+        "control_dt": first.control_dt,
+        "physics_dt": first.physics_dt,
+    }

@@ -26,6 +26,7 @@ def deferred() -> Iterator[Stop]:
         if stop.requested:
             raise KeyboardInterrupt
         stop.requested = True
+        print("stopping after this stretch of steps; once more stops at once", flush=True)
 
     with _handlers(handle):
         yield stop

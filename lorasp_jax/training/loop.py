@@ -1,9 +1,11 @@
 """The training run: build, resume, train, save. Knows neither evaluation nor report."""
 
+import contextlib
 import functools
+import json
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,15 +18,15 @@ from rich.progress import Progress, ProgressColumn, Task
 from rich.text import Text
 
 from envs.episodes import Episodes
-from lorasp_jax import adaptation, models
+from lorasp_jax import adaptation
+from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Steps, flatten, sample_batch
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.checkpoint import Checkpoints
-from lorasp_jax.config import Config
 from lorasp_jax.training.interrupt import deferred
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
-from lorasp_jax.training.run_folder import MetricsLog
+from lorasp_jax.training.run_folder import MetricsLog, write_json
 from lorasp_jax.training.step import TrainState, init_state, train_step
 
 
@@ -44,29 +46,36 @@ class Run:
         episodes: demonstrations by task.
         policy: the policy before the first step or after the last; in between, training owns its
             memory.
-        seconds: time spent by phase.
+        started: `time.perf_counter()` when this process began.
+        seconds: time spent by phase, and "total", over all processes that worked on this run.
     """
 
     config: Config
     folder: Path
     console: Console
     base_hash: str
+    started: float = field(default_factory=time.perf_counter)
     episodes: dict[str, Episodes] = field(default_factory=dict)
     policy: Policy = field(init=False)
-    seconds: dict[str, float] = field(default_factory=dict)
-    _start: float = field(default_factory=time.perf_counter)
+    seconds: dict[str, float] = field(init=False)
 
-    @property
-    def elapsed(self) -> float:
-        """Seconds since the run was made."""
-        return time.perf_counter() - self._start
+    def __post_init__(self) -> None:
+        """Takes over the time that earlier processes spent."""
+        path = self.folder / "seconds.json"
+        self.seconds = json.loads(path.read_text()) if path.exists() else {"total": 0.0}
+        self._before = self.seconds["total"]
 
-    @contextmanager
+    @contextlib.contextmanager
     def timed(self, phase: str) -> Iterator[None]:
-        """Add the time spent in this block to `seconds[phase]`."""
+        """Add the time spent in this block to `seconds[phase]`, also if it is interrupted."""
         start = time.perf_counter()
-        yield
-        self.seconds[phase] = self.seconds.get(phase, 0.0) + time.perf_counter() - start
+        try:
+            yield
+        finally:
+            now = time.perf_counter()
+            self.seconds[phase] = self.seconds.get(phase, 0.0) + now - start
+            self.seconds["total"] = self._before + now - self.started
+            write_json(self.folder / "seconds.json", self.seconds)
 
 
 class Callback:
@@ -116,7 +125,7 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
 
 
 def _compiled(run: Run, graphdef: Any, optimizer: Any, mesh: jax.sharding.Mesh) -> Callable:
-    """The jitted stretch of `log_every` steps: (frozen, steps, state, key, count) -> state, metrics."""
+    """The jitted stretch of steps: (frozen, steps, state, key, count) -> state, metrics."""
     optim, processor = run.config.optim, run.policy.processor
     chunk = run.policy.model.config.chunk
     weights = auxiliary_weights(run.config.auxiliary, optim.steps)
@@ -159,16 +168,19 @@ def _loop(
     """Stretch after stretch until the last step, a signal or a loss that is not finite."""
     config = run.config
     key = jax.random.fold_in(jax.random.key(config.seed), 2)
-    log = MetricsLog(run.folder, int(state.step))
     total, saved = config.optim.steps, int(state.step)
     columns = (*Progress.get_default_columns(), _Rate(config.optim.batch_size))
-    with deferred() as stop, Progress(*columns, console=run.console) as progress:
+    with (
+        contextlib.closing(MetricsLog(run.folder, int(state.step))) as log,
+        deferred() as stop,
+        Progress(*columns, console=run.console) as progress,
+    ):
         bar = progress.add_task("compiling train step ...", total=total, completed=saved)
         while (done := int(state.step)) < total and not stop.requested:
             count = min(config.log_every, total - done)
             state, metrics = many(state, key, count)
             values = {name: float(value) for name, value in metrics.items()}
-            _check_finite(values["loss"], done, done + count, saved)
+            _check_finite(values, done, done + count, saved)
             done += count
             log.write(done, values)
             progress.update(bar, completed=done, description=f"training, loss {values['task']:.4f}")
@@ -178,19 +190,19 @@ def _loop(
                 checkpoints.save(state)
                 saved = done
         checkpoints.save(state)
-    log.close()
-    if stop.requested and done < total:
+    if stop.requested:
         raise KeyboardInterrupt
     return state
 
 
-def _check_finite(loss: float, start: int, end: int, saved: int) -> None:
+def _check_finite(values: dict[str, float], start: int, end: int, saved: int) -> None:
     """Stop before a state that is not finite is saved."""
-    if not jnp.isfinite(loss):
-        raise RunError(
-            f"the loss became {loss} between steps {start} and {end}: nothing after step {saved} "
-            "was saved; try a lower --optim.learning-rate"
-        )
+    for name in ("loss", "grad_norm", "update_norm"):
+        if not math.isfinite(values[name]):
+            raise RunError(
+                f"the {name} became {values[name]} between steps {start} and {end}: nothing after "
+                f"step {saved} was saved; try a lower --optim.learning-rate"
+            )
 
 
 class _Rate(ProgressColumn):

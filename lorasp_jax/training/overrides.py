@@ -90,7 +90,8 @@ def override(config: Config, arguments: Sequence[str]) -> Config:
         if wants_help:
             raise
         raise ValueError(_sentence(printed.getvalue())) from error
-    return Config(**{field.name: getattr(chosen, field.name) for field in dataclasses.fields(Config)})
+    names = (field.name for field in dataclasses.fields(Config))
+    return Config(**{name: getattr(chosen, name) for name in names})
 
 
 def _sentence(message: str) -> str:

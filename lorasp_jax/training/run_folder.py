@@ -1,4 +1,4 @@
-"""The folder of one run: its resolved config, its logs, and the rule that nothing is overwritten."""
+"""The folder of one run: its config, its logs, and the rule that nothing is overwritten."""
 
 import dataclasses
 import json
@@ -29,13 +29,16 @@ def open_run(config: Config, root: Path, *, resume: bool) -> Path:
     """Create the run's folder, or with `resume` check that it holds this very run.
 
     Raises:
-        ValueError: the folder holds a run and `resume` is off, holds none and `resume` is on, or
-            holds a run with another config.
+        ValueError: the name is not one folder's, the folder holds a run and `resume` is off, holds
+            none and `resume` is on, or holds a run with another config.
     """
+    if config.name in ("", ".", "..") or Path(config.name).name != config.name:
+        raise ValueError(f"--name must be a plain folder name, got {config.name!r}")
     folder = root / config.name
     record = folder / "config.json"
     if not resume:
-        if folder.exists() and any(folder.iterdir()):
+        # A folder with nothing but a config is of a run that failed before it began.
+        if folder.exists() and any(path.name != record.name for path in folder.iterdir()):
             raise ValueError(
                 f"{folder} already holds a run: add --resume to continue it, "
                 "or give this one another --name"
@@ -81,7 +84,9 @@ class MetricsLog:
         """Open the log of the run in `folder`, which continues at `start_step`."""
         self.path = folder / "metrics.jsonl"
         kept = [row for row in read_metrics(folder) if row["step"] <= start_step]
-        self.path.write_text("".join(json.dumps(row) + "\n" for row in kept))
+        temporary = self.path.with_suffix(".tmp")
+        temporary.write_text("".join(json.dumps(row) + "\n" for row in kept))
+        os.replace(temporary, self.path)
         self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=start_step + 1)
 
     def write(self, step: int, values: Mapping[str, float]) -> None:

@@ -1,6 +1,7 @@
 """From a config to a run that is ready to train: base, adapters, demonstrations, processor."""
 
 import dataclasses
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,17 +22,34 @@ from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.processing import Processor, Statistics, robot_slots
 from lorasp_jax.training.loop import Run
 
+TRAINING = "training.json"
+"""File beside base weights: what they were trained on, with the control period."""
 
-def prepare(config: Config, folder: Path, console: Console) -> Run:
+
+def prepare(config: Config, folder: Path, console: Console, started: float) -> Run:
     """Load or create the base, attach the adapters, get the demonstrations.
+
+    What can be wrong with a config is found before anything long begins.
 
     Raises:
         ValueError: an unknown task, robot or size, a base that does not fit, a rule that matches
-            nothing.
+            nothing, a chunk or batch that does not fit.
     """
-    for task in config.tasks:  # cheap, so that a wrong name ends the run before anything long
-        envs.make(task, robot=config.robot, image_size=config.image_size)
+    for task in config.tasks:
+        envs.make(
+            task, robot=config.robot, image_size=config.image_size, control_dt=config.control_dt
+        )
     model, base_hash = base_model(config)
+    if config.evaluation.execute_steps > model.config.chunk:
+        raise ValueError(
+            f"execute_steps must be 1 to the chunk, {model.config.chunk}, "
+            f"got {config.evaluation.execute_steps}"
+        )
+    if config.optim.batch_size % jax.device_count():
+        raise ValueError(
+            f"batch_size must be a multiple of the {jax.device_count()} devices, "
+            f"got {config.optim.batch_size}"
+        )
     rngs = nnx.Rngs(jax.random.fold_in(jax.random.key(config.seed), 3))
     model = adaptation.adapt(model, [(path, config.peft) for path in config.targets], rngs=rngs)
     counts = adaptation.count(model)
@@ -39,7 +57,7 @@ def prepare(config: Config, folder: Path, console: Console) -> Run:
         f"scale {config.scale}: {type(config.peft).__name__} on pi0 {config.size}, "
         f"{counts.trainable:,} of {counts.total:,} parameters train"
     )
-    run = Run(config, folder, console, base_hash)
+    run = Run(config, folder, console, base_hash, started)
     with run.timed("collect"):
         run.episodes = _collect(run)
     run.policy = Policy(model, processor(config, list(run.episodes.values()), model.config))
@@ -55,15 +73,27 @@ def base_model(config: Config) -> tuple[pi0.Pi0, str]:
     if config.size not in ("nano", "small"):
         raise ValueError(f"unknown size {config.size!r}: it is one of nano, small")
     wanted = getattr(pi0.Pi0Config, config.size)()
-    wanted = dataclasses.replace(
-        wanted, image_size=config.image_size, dtype=config.compute_dtype
-    )
+    wanted = dataclasses.replace(wanted, image_size=config.image_size, dtype=config.compute_dtype)
     if config.base:
         model = models.load(config.base, wanted)
+        _check_time(config)
         return model, models.weights_hash(model)
     key = jax.random.fold_in(jax.random.key(config.seed), 4)
     model = wanted.create(nnx.Rngs(key))
     return model, models.weights_hash(model)
+
+
+def _check_time(config: Config) -> None:
+    """Raise ValueError unless the base was trained at this run's control period."""
+    path = Path(config.base) / TRAINING
+    try:
+        found = json.loads(path.read_text())["control_dt"]
+    except (OSError, KeyError, ValueError) as error:
+        raise ValueError(f"{path} does not say the control_dt that the base needs") from error
+    if found != config.control_dt:
+        raise ValueError(
+            f"{config.base} was trained with control_dt {found} s, this run has {config.control_dt}"
+        )
 
 
 def processor(

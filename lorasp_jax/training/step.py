@@ -94,5 +94,5 @@ def train_step(
     (_, metrics), grads = gradient(state.adapters, frozen, graphdef, batch, key, now)
     updates, opt_state = optimizer.update(grads, state.opt_state, state.adapters)
     adapters = optax.apply_updates(state.adapters, updates)
-    metrics["grad_norm"] = optax.tree.norm(grads)
+    metrics |= {"grad_norm": optax.tree.norm(grads), "update_norm": optax.tree.norm(updates)}
     return TrainState(state.step + 1, adapters, opt_state), metrics

@@ -22,9 +22,7 @@ def test_flatten_keeps_valid_steps_in_order():
 def test_chunks_stay_in_their_episode(tmp_path):
     run = make_run(tmp_path / "run")
     steps, table = flatten(list(run.episodes.values())), run.policy.processor
-    batch = sample_batch(
-        jax.random.key(5), steps, table, batch_size=64, chunk=4, state_noise=0.0
-    )
+    batch = sample_batch(jax.random.key(5), steps, table, batch_size=64, chunk=4, state_noise=0.0)
     assert batch.actions.shape == batch.action_mask.shape == (64, 4, 8)
     assert not batch.action_mask[..., 6].any()  # PiPER leaves slot 6 empty
     assert not batch.actions[..., 6].any()

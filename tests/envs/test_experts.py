@@ -123,7 +123,7 @@ def test_collect_keeps_successes_in_order(monkeypatch):
 
 def test_collect_gives_up_on_a_broken_expert(monkeypatch):
     monkeypatch.setattr(collection, "_record", fake_record([True, False, False, False]))
-    with pytest.raises(RuntimeError, match="solved only 4 of 16 layouts of 'press' with 'piper'"):
+    with pytest.raises(ValueError, match="solved only 4 of 16 layouts of 'press' with 'piper'"):
         envs.collect("press", num_episodes=50, num_envs=4, key=jax.random.key(0))
 
 

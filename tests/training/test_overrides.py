@@ -4,8 +4,8 @@ import re
 
 import pytest
 
-from lorasp_jax.peft import LoRA, LoRASP
 from lorasp_jax.config import Config
+from lorasp_jax.peft import LoRA, LoRASP
 from lorasp_jax.training.overrides import load, override, parse
 
 CONFIG = Config(name="a", scale="cpu", peft=LoRASP(rank=8), size="nano", base="")

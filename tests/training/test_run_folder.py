@@ -5,8 +5,8 @@ import json
 
 import pytest
 
-from lorasp_jax.peft import LoRASP
 from lorasp_jax.config import Config
+from lorasp_jax.peft import LoRASP
 from lorasp_jax.training.run_folder import MetricsLog, open_run, read_metrics
 
 CONFIG = Config(name="a", scale="cpu", peft=LoRASP(rank=8), size="nano", base="")

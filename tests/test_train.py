@@ -1,0 +1,84 @@
+"""The command: every kind of bad input is one sentence and exit code 2, and changes nothing."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+import train
+
+ROOT = Path(__file__).parent.parent
+MULTITASK = ["--config", str(ROOT / "configs" / "multitask.py"), "--scale", "smoke"]
+NANO = ["--base", str(ROOT / "assets" / "pi0_nano")]
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def files():
+    return {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--config", "missing.py"], "there is no config missing.py"),
+        ([*MULTITASK, *NANO, "--method", "lorra"], "unknown method 'lorra'"),
+        ([*MULTITASK, *NANO, "--peft.rnk", "3"], "did you mean --peft.rank?"),
+        ([*MULTITASK, *NANO, "--peft.energy-target", "1.5"], "must lie in (0, 1]"),
+        ([*MULTITASK, *NANO, "--robot", "pipper"], "unknown robot 'pipper': choose from panda"),
+        ([*MULTITASK, *NANO, "--tasks", "juggle"], "unknown task 'juggle': choose from pick_place"),
+        ([*MULTITASK, *NANO, "--tasks", "press", "press"], "tasks must be different"),
+        ([*MULTITASK, *NANO, "--size", "large"], "unknown size 'large'"),
+        ([*MULTITASK, *NANO, "--size", "small"], "does not fit the model"),
+        ([*MULTITASK, "--base", "nowhere"], "nowhere"),
+        ([*MULTITASK, *NANO, "--targets", "[a-z]+_prj"], "rule '[a-z]+_prj' applies to nothing"),
+        ([*MULTITASK, *NANO, "--control-dt", "0.2"], "with control_dt 0.1 s, this run has 0.2"),
+        ([*MULTITASK, *NANO, "--evaluation.execute-steps", "11"], "must be 1 to the chunk, 10"),
+        ([*MULTITASK, *NANO, "--evaluation.episodes", "12"], "must be a multiple of num_envs"),
+        ([*MULTITASK, *NANO, "--optim.batch-size", "9"], "multiple of the 8 devices"),
+        ([*MULTITASK, *NANO, "--checkpoint-every", "0"], "must be at least 1, got 0"),
+        ([*MULTITASK, *NANO, "--compute-dtype", "float99"], "float99"),
+        ([*MULTITASK, *NANO, "--name", "../up"], "must be a plain folder name"),
+    ],
+)
+def test_bad_input(arguments, message, capsys):
+    assert train.main(arguments) == 2
+    printed = capsys.readouterr().err
+    assert message in printed
+    assert printed.count("\n") == 1
+    assert "Traceback" not in printed
+    # At most the record of what was asked: the corrected command can take the same name.
+    assert {path.name for path in files()} <= {"config.json"}
+
+
+def test_folder_of_another_run_is_left_alone(capsys):
+    folder = Path("runs/multitask")
+    folder.mkdir(parents=True)
+    (folder / "metrics.jsonl").write_text("precious\n")
+    before = files()
+    assert train.main([*MULTITASK, *NANO]) == 2
+    assert "already holds a run: add --resume" in capsys.readouterr().err
+    assert train.main([*MULTITASK, *NANO, "--resume"]) == 2
+    assert "holds no run to resume" in capsys.readouterr().err
+    assert files() == before
+
+
+def test_base_without_its_control_period(capsys):
+    shutil.copytree(ROOT / "assets" / "pi0_nano", "base")
+    os.remove("base/training.json")
+    assert train.main([*MULTITASK, "--base", "base"]) == 2
+    assert "does not say the control_dt" in capsys.readouterr().err
+
+
+def test_finished_run_is_not_run_again(capsys):
+    assert train.main([*MULTITASK, "--base", "nowhere"]) == 2
+    record = json.loads(Path("runs/multitask/config.json").read_text())
+    assert record["peft"]["method"] == "LoRASP"
+    Path("runs/multitask/report.html").write_text("done")
+    assert train.main([*MULTITASK, "--base", "nowhere", "--resume"]) == 0
+    assert "this run is finished" in capsys.readouterr().out
