@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.episodes import Episodes
+from envs.episodes import Array, Episodes
 from lorasp_jax.models.policy import Observation
 from lorasp_jax.models.processing import Processor
 
@@ -61,7 +61,7 @@ def flatten(episodes: Sequence[Episodes]) -> Steps:
         length = np.asarray(group.length)
         valid = np.flatnonzero(np.arange(group.state.shape[1]) < length[:, None])
 
-        def keep(array: jax.Array, valid: np.ndarray = valid) -> jax.Array:
+        def keep(array: Array, valid: np.ndarray = valid) -> jax.Array:
             return jnp.asarray(array).reshape(-1, *array.shape[2:])[valid]
 
         parts.append(

@@ -182,6 +182,8 @@ def _ranks(aux: dict[str, dict[str, Aux]], running: jax.Array) -> Ranks:
 
     def reduce(linear: Aux) -> jax.Array:
         rank, mask = linear.active_rank, linear.token_mask
+        assert rank is not None
+        assert mask is not None  # the backbones always say which tokens count
         worlds = (*rank.shape[:-2], running.shape[0], -1)
         valid = running[:, None] & jnp.broadcast_to(mask, rank.shape).reshape(worlds)
         total = jnp.where(valid, rank.reshape(worlds), 0.0).sum((-2, -1))

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 COLORS = {"vision": "#4269d0", "language": "#efb118", "action": "#3ca951", "before": "#9498a0"}
 """One color per tower in every figure; grey for what was there before."""
 
-_STYLE = {
+_STYLE: Any = {
     "font.size": 10,
     "axes.spines.top": False,
     "axes.spines.right": False,

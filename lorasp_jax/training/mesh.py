@@ -5,6 +5,7 @@ with `NamedSharding` does the rest. This is what "pmap'd training" means on toda
 (docs.jax.dev/en/latest/migrate_pmap.html).
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -15,7 +16,7 @@ MINIMUM_SHARDED_BYTES = 4 * 2**20
 """Arrays under 4 MiB are replicated, as in openpi, src/openpi/training/sharding.py:48."""
 
 
-def make_mesh(fsdp: int = 1, devices: list[jax.Device] | None = None) -> Mesh:
+def make_mesh(fsdp: int = 1, devices: Sequence[Any] | None = None) -> Mesh:
     """A mesh over `devices` (default: all) with axes ("data", "fsdp").
 
     Raises:

@@ -1,6 +1,5 @@
 """The training step: pure functions from state and batch to state and metrics."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -86,10 +85,10 @@ def train_step(
     *,
     graphdef: Any,
     optimizer: optax.GradientTransformation,
-    weights: dict[str, Callable[[jax.Array], jax.Array]],
+    weights: dict[str, optax.Schedule],
 ) -> tuple[TrainState, Metrics]:
     """One optimizer step on the global batch; `key` is consumed."""
-    now = {name: schedule(state.step) for name, schedule in weights.items()}
+    now = {name: jnp.asarray(schedule(state.step)) for name, schedule in weights.items()}
     gradient = jax.value_and_grad(loss_fn, has_aux=True)
     (_, metrics), grads = gradient(state.adapters, frozen, graphdef, batch, key, now)
     updates, opt_state = optimizer.update(grads, state.opt_state, state.adapters)
