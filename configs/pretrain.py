@@ -1,7 +1,8 @@
 """Pretrain the base policies that ship in assets/, from scratch, on Panda demonstrations.
 
-    python train.py --config configs/pretrain.py --size small
-    python train.py --config configs/pretrain.py --size nano --name pretrain_nano
+    python train.py --config configs/pretrain.py
+    python train.py --config configs/pretrain.py --name pretrain_nano --size nano \\
+        --optim.steps 16000 --optim.learning-rate 2e-3
 
 All parameters train (FullFineTuning on every path). The run leaves runs/<name>/base, which is what
 assets/pi0_<size> holds; the model cards there state hardware, time and measured success.
@@ -23,7 +24,7 @@ def get_config(scale: str) -> Config:
         base="",
         robot="panda",
         data=DataConfig(episodes=1024, num_envs=256),
-        optim=OptimConfig(steps=12000, batch_size=512, learning_rate=1e-3, warmup_steps=300),
+        optim=OptimConfig(steps=8000, batch_size=512, learning_rate=1e-3, warmup_steps=300),
         evaluation=EvaluationConfig(episodes=256, num_envs=256),
         compute_dtype="bfloat16" if scale == "accelerator" else "float32",
         log_every=200,
