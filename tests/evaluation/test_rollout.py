@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import envs
-from lorasp_jax.evaluation.callback import task_policy
-from lorasp_jax.evaluation.rollout import _ranks, evaluate, make_rollout
+from lorasp_jax.evaluation import evaluate, make_rollout
+from lorasp_jax.evaluation.rollout import _ranks, _told
 from lorasp_jax.peft import Aux, LoRASP
 from tests.runs import CONFIG, make_run
 
@@ -19,9 +19,9 @@ def env():
     return envs.make("press", robot="piper", num_envs=2, image_size=32)
 
 
-def policy_with(folder, env, **fields):
+def policy_with(folder, **fields):
     config = dataclasses.replace(CONFIG, peft=LoRASP(rank=8, hidden_width=8, **fields))
-    return task_policy(make_run(folder, config).policy, env)
+    return make_run(folder, config).policy
 
 
 @pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
@@ -34,7 +34,7 @@ def policy_with(folder, env, **fields):
     ],
 )
 def test_lowers_for(platform, kind, gate, env, tmp_path):
-    policy = policy_with(tmp_path / "run", env, gate=gate)
+    policy = _told(policy_with(tmp_path / "run", gate=gate), env)
     device = jax.sharding.AbstractDevice(device_kind=kind, num_cores=None, platform=platform)
     mesh = jax.sharding.AbstractMesh((), (), abstract_device=device)
     shapes = jax.eval_shape(lambda: (policy, jax.random.key(0)))
@@ -45,7 +45,7 @@ def test_lowers_for(platform, kind, gate, env, tmp_path):
 
 
 def test_evaluate_reports_what_happened(env, tmp_path):
-    policy = policy_with(tmp_path / "run", env)
+    policy = policy_with(tmp_path / "run")
     rollout = jax.jit(make_rollout(env, execute_steps=10, denoise_steps=1))
     seen = []
     result = evaluate(
