@@ -55,6 +55,15 @@ def test_report_shows_the_results_and_needs_no_other_file(folder):
     assert "http" not in re.sub(r'src="[^"]*"', "", page)
 
 
+def test_full_fine_tuning_has_no_ranks(folder):
+    config = {**to_json(CONFIG), "peft": {"method": "FullFineTuning"}}
+    (folder / "config.json").write_text(json.dumps(config))
+    results = {**RESULTS, "active_rank": {}, "layer_active_rank": {"vision": {}}}
+    (folder / "results.json").write_text(json.dumps(results))
+    (folder / "metrics.jsonl").write_text(json.dumps({"step": 2, "task": 0.5}) + "\n")
+    assert "Active rank" not in write_report(folder).read_text()
+
+
 def test_unfinished_run(folder):
     (folder / "results.json").unlink()
     with pytest.raises(FileNotFoundError):

@@ -1,0 +1,48 @@
+"""results.json has the fields that readers rely on."""
+
+import json
+
+import pytest
+
+from lorasp_jax.evaluation import Result
+from lorasp_jax.evaluation.callback import success, summarise
+from tests.runs import make_run
+
+RANKS = {"vision": {"fc1": [4.0, 6.0]}, "language": {}, "action": {"q_proj": [1.0]}}
+
+
+def result(rate, ranks):
+    return Result(rate, 64, (rate - 0.1, rate + 0.1), 30.0, ranks, poses=())
+
+
+def test_summary(tmp_path):
+    run = make_run(tmp_path / "run")
+    before = {task: success(result(0.1, {})) for task in run.config.tasks}
+    (run.folder / "before.json").write_text(json.dumps(before))
+    with run.timed("train"):
+        pass
+    after = {"press": result(0.9, RANKS), "pick_place": result(0.5, RANKS)}
+    found = json.loads(json.dumps(summarise(run, after)))
+    assert found["scale"] == "smoke"
+    assert found["tasks"]["press"]["before"] == {
+        "success": 0.1,
+        "episodes": 64,
+        "ci95": [0.0, 0.2],
+    }
+    assert found["tasks"]["pick_place"]["after"]["success"] == 0.5
+    assert found["active_rank"] == {"vision": 5.0, "action": 1.0, "mean": pytest.approx(11 / 3)}
+    assert found["seconds"].keys() == {"train", "total"}
+    assert 0 < found["trainable_parameters"] < found["total_parameters"]
+
+
+def test_time_adds_up_over_processes(tmp_path):
+    run = make_run(tmp_path / "run")
+    with pytest.raises(KeyboardInterrupt), run.timed("train"):
+        raise KeyboardInterrupt
+    (run.folder / "seconds.json").write_text(json.dumps({"train": 100.0, "total": 200.0}))
+    again = make_run(tmp_path / "run")
+    with again.timed("train"):
+        pass
+    recorded = json.loads((run.folder / "seconds.json").read_text())
+    assert 100 < recorded["train"] < 110
+    assert 200 < recorded["total"] < 260

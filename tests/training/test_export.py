@@ -1,0 +1,73 @@
+"""What a run hands on can be loaded again and is the same."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from lorasp_jax import adaptation, adapter_io, models
+from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.models.policy import Policy
+from lorasp_jax.models.processing import Statistics
+from lorasp_jax.peft import FullFineTuning
+from lorasp_jax.training import export, setup
+from tests.runs import CONFIG, leaves, make_run
+
+
+def moved(run):
+    """The run with every trainable number changed, as training would."""
+    graphdef, adapters, frozen = adaptation.split(run.policy.model)
+    keys = iter(jax.random.split(jax.random.key(0), 1000))
+    adapters = jax.tree.map(lambda x: x + 0.1 * jax.random.normal(next(keys), x.shape), adapters)
+    run.policy = Policy(nnx.merge(graphdef, adapters, frozen), run.policy.processor)
+    return run
+
+
+def test_adapters(tmp_path):
+    run = moved(make_run(tmp_path / "run"))
+    export.write(run)
+    assert {path.name for path in run.folder.iterdir()} == {"adapter.safetensors", "adapter.json"}
+    metadata = json.loads((run.folder / "adapter.json").read_text())["metadata"]
+    assert (metadata["robot"], metadata["control_dt"]) == ("piper", 0.1)
+    assert Statistics.from_json(json.dumps(metadata["statistics"]))
+    bare = Pi0Config.dummy().create(nnx.Rngs(0))
+    loaded = adapter_io.load_adapters(run.folder, bare, base=run.base_hash)
+    expected = leaves(adaptation.split(run.policy.model)[1])
+    for name, value in leaves(adaptation.split(loaded)[1]).items():
+        np.testing.assert_array_equal(value, expected[name], err_msg=name)
+    with pytest.raises(ValueError, match="was trained on base"):
+        adapter_io.load_adapters(run.folder, bare, base="another")
+
+
+def test_base(tmp_path):
+    config = dataclasses.replace(CONFIG, peft=FullFineTuning(), targets=(".*",))
+    run = moved(make_run(tmp_path / "run", config))
+    counts = adaptation.count(run.policy.model)
+    assert counts.trainable == counts.total
+    export.write(run)
+    folder = run.folder / "base"
+    loaded = models.load(folder, Pi0Config.dummy())
+    expected = leaves(nnx.state(adaptation.merge(run.policy.model), nnx.Param))
+    for name, value in leaves(nnx.state(loaded, nnx.Param)).items():
+        np.testing.assert_array_equal(value, expected[name].astype(jnp.bfloat16).astype(np.float32))
+    assert json.loads((folder / setup.TRAINING).read_text()) == {
+        "robot": "piper",
+        "tasks": ["press", "pick_place"],
+        "control_dt": 0.1,
+        "physics_dt": 0.005,
+    }
+
+
+@pytest.mark.parametrize("size", ["nano", "small"])
+def test_shipped_bases_load_and_say_what_they_are(size):
+    config = dataclasses.replace(
+        CONFIG, size=size, base=f"assets/pi0_{size}", image_size=64, compute_dtype="bfloat16"
+    )
+    model, base_hash = setup.base_model(config)
+    assert base_hash == models.weights_hash(config.base)
+    assert adaptation.count(model) == (0, {"nano": 1_020_008, "small": 9_877_128}[size])
+    assert model.config.dtype == "bfloat16"
