@@ -39,14 +39,14 @@ def test_lowers_for(platform, kind, gate, env, tmp_path):
     mesh = jax.sharding.AbstractMesh((), (), abstract_device=device)
     shapes = jax.eval_shape(lambda: (policy, jax.random.key(0)))
     with jax.sharding.use_abstract_mesh(mesh):
-        traced = jax.jit(make_rollout(env, execute_steps=5, denoise_steps=2)).trace(*shapes)
+        traced = jax.jit(make_rollout(env, execute_steps=4, denoise_steps=2)).trace(*shapes)
         text = traced.lower(lowering_platforms=(platform,)).as_text()
     assert ("__gpu$xla.gpu.triton" in text) == (gate == "pallas")
 
 
 def test_evaluate_reports_what_happened(env, tmp_path):
     policy = policy_with(tmp_path / "run")
-    rollout = jax.jit(make_rollout(env, execute_steps=10, denoise_steps=1))
+    rollout = jax.jit(make_rollout(env, execute_steps=4, denoise_steps=1))
     seen = []
     result = evaluate(
         policy,
@@ -63,8 +63,9 @@ def test_evaluate_reports_what_happened(env, tmp_path):
     assert set(result.active_rank) == {"vision", "language", "action"}
     assert len(result.active_rank["action"]["q_proj"]) == 2  # layers
     assert len(result.active_rank["vision"]["patch_embed"]) == 1
-    for linears in result.active_rank.values():
-        assert all(1 <= rank <= 8 for layers in linears.values() for rank in layers)
+    ranks = [r for maps in result.active_rank.values() for layers in maps.values() for r in layers]
+    assert min(ranks) >= 1
+    assert max(ranks) <= 8 + 1e-5  # a weighted mean in fp32
     assert result.poses[0].shape[0] <= env.max_steps
     again = evaluate(policy, env, jax.random.key(0), 4, rollout=rollout)
     assert (again.success, again.steps) == (result.success, result.steps)
