@@ -1,11 +1,9 @@
 """Command line: `python -m envs collect | gallery | play --help`."""
 
 import argparse
-import os
 import pkgutil
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 
@@ -26,6 +24,7 @@ import envs
 import envs.robots
 import envs.tasks
 from envs import physics, scene
+from envs.episodes import replacing
 
 _WORLDS = 4  # tries at once where one episode is wanted: the expert may fail in one
 _FRAMES = 8  # pictures of an episode in the gallery
@@ -74,7 +73,7 @@ def gallery(options: argparse.Namespace, console: Console) -> None:
             options.out.mkdir(parents=True, exist_ok=True)
             for camera, file in files.items():
                 frames = np.asarray(episode.image[camera][0])[moments]
-                with _replacing(file) as unfinished:
+                with replacing(file) as unfinished:
                     strip = Image.fromarray(np.concatenate(list(frames), axis=1))
                     strip.save(unfinished, format="png")
                 console.print(str(file))
@@ -88,7 +87,7 @@ def play(options: argparse.Namespace, console: Console) -> None:
     episode = _episodes(options, console, options.task, options.robot, 1)
     views = [np.asarray(picture[0, : int(episode.length[0])]) for picture in episode.image.values()]
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    with _replacing(options.out) as unfinished:
+    with replacing(options.out) as unfinished:
         _write_video(unfinished, np.concatenate(views, axis=2), round(1 / episode.control_dt))
     text = episode.instructions[int(episode.instruction[0])]
     console.print(f"{options.out}: {len(views[0])} steps, {text!r}")
@@ -149,17 +148,6 @@ def _refuse_existing(options: argparse.Namespace, *files: Path) -> None:
     for file in files:
         if file.exists() and not options.overwrite:
             raise ValueError(f"{file} exists already: choose another --out or add --overwrite")
-
-
-@contextmanager
-def _replacing(file: Path) -> Iterator[Path]:
-    """A temporary path that takes the file's place when all went well."""
-    unfinished = file.with_name(f".{file.name}.{os.getpid()}.tmp")
-    try:
-        yield unfinished
-        os.replace(unfinished, file)
-    finally:
-        unfinished.unlink(missing_ok=True)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -104,26 +104,11 @@ def collect(
         Episodes whose arrays stay on the device, padded to the expert's longest time.
 
     Raises:
-        ValueError: for bad names or numbers.
-        ValueError: if the expert fails far too often.
+        ValueError: for bad names or numbers, or if the expert fails far too often.
     """
-    env = make(
-        task,
-        robot,
-        num_envs=_worlds(num_episodes, num_envs),
-        image_size=image_size,
-        control_dt=control_dt,
-    )
-    arrays, attempted = _gather(env, num_episodes, key, action_noise, progress or _silent)
-    return Episodes(
-        **arrays,
-        instructions=env.instructions,
-        task=task,
-        robot=robot,
-        control_dt=control_dt,
-        physics_dt=env.physics_dt,
-        attempted=attempted,
-    )
+    worlds = _worlds(num_episodes, num_envs)
+    env = make(task, robot, num_envs=worlds, image_size=image_size, control_dt=control_dt)
+    return _gather(env, num_episodes, key, action_noise, progress or _silent)
 
 
 def expert_success(
@@ -147,8 +132,8 @@ def _gather(
     key: jax.Array,
     action_noise: float,
     progress: Callable[[int, int], None],
-) -> tuple[dict[str, Any], int]:
-    """Arrays of the first `num_episodes` successes, and how many attempts they took."""
+) -> Episodes:
+    """The first `num_episodes` successes."""
     chunks: list[dict[str, Any]] = []
     kept = attempted = 0
     progress(0, num_episodes)
@@ -167,7 +152,15 @@ def _gather(
         attempted += env.num_envs if kept < num_episodes else int(wins[-1]) + 1
         chunks.append(jax.tree.map(lambda x, wins=wins: x[wins], chunk))
         progress(kept, num_episodes)
-    return jax.tree.map(lambda *parts: jnp.concatenate(parts), *chunks), attempted
+    return Episodes(
+        **jax.tree.map(lambda *parts: jnp.concatenate(parts), *chunks),
+        instructions=env.instructions,
+        task=env.task.name,
+        robot=env.robot.name,
+        control_dt=env.control_dt,
+        physics_dt=env.physics_dt,
+        attempted=attempted,
+    )
 
 
 def _silent(done: int, total: int) -> None:

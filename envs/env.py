@@ -249,14 +249,7 @@ def make(
         ValueError: for an unknown name (the known ones are listed) or a number out of range.
     """
     found_task, found_robot = _find("task", task), _find("robot", robot)
-    for name, value in (("num_envs", num_envs), ("image_size", image_size)):
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
-    moves = control_dt / _TARGET_DT
-    if round(moves) < 1 or abs(moves - round(moves)) > 1e-6:
-        raise ValueError(
-            f"control_dt must be a positive multiple of {_TARGET_DT} s, got {control_dt}"
-        )
+    _check_sizes(num_envs, image_size, control_dt)
     model = mujoco.MjModel.from_xml_string(scene.mjcf(found_task.scene, found_robot))
     return Env(
         task=found_task,
@@ -269,6 +262,18 @@ def make(
         render_model=render.build(model, scene.CAMERAS),
         template=physics.make_data(model),
     )
+
+
+def _check_sizes(num_envs: int, image_size: int, control_dt: float) -> None:
+    """Raise ValueError for a number out of range."""
+    for name, value in (("num_envs", num_envs), ("image_size", image_size)):
+        if value < 1:
+            raise ValueError(f"{name} must be at least 1, got {value}")
+    moves = control_dt / _TARGET_DT
+    if round(moves) < 1 or abs(moves - round(moves)) > 1e-6:
+        raise ValueError(
+            f"control_dt must be a positive multiple of {_TARGET_DT} s, got {control_dt}"
+        )
 
 
 def _where(condition: jax.Array, yes: Any, no: Any) -> Any:

@@ -1,11 +1,12 @@
 """Recorded episodes: batched arrays in memory, one .npz file on disk."""
 
+import contextlib
 import dataclasses
 import functools
 import json
 import os
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -82,13 +83,8 @@ class Episodes:
         arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
         arrays |= {_IMAGE + name: np.asarray(picture) for name, picture in self.image.items()}
         path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-        try:
-            with open(unfinished, "wb") as file:
-                np.savez(file, header=np.frombuffer(header, np.uint8), **arrays)
-            os.replace(unfinished, path)
-        finally:
-            unfinished.unlink(missing_ok=True)
+        with replacing(path) as unfinished, open(unfinished, "wb") as file:
+            np.savez(file, header=np.frombuffer(header, np.uint8), **arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike, *, control_dt: float | None = None) -> Self:
@@ -185,6 +181,17 @@ def concatenate(parts: Sequence[Episodes]) -> Episodes:
     attempted = sum(part.attempted for part in parts)
     same = [dataclasses.replace(part, attempted=attempted) for part in parts]
     return jax.tree.map(join, *same)
+
+
+@contextlib.contextmanager
+def replacing(file: Path) -> Iterator[Path]:
+    """A temporary path that takes the file's place when all went well."""
+    unfinished = file.with_name(f".{file.name}.{os.getpid()}.tmp")
+    try:
+        yield unfinished
+        os.replace(unfinished, file)
+    finally:
+        unfinished.unlink(missing_ok=True)
 
 
 def _read(path: str | os.PathLike) -> dict[str, np.ndarray]:

@@ -126,6 +126,10 @@ def summarise(run: Run, after: dict[str, Result]) -> dict[str, Any]:
         },
         "active_rank": modules,
         "layer_active_rank": layers,
+        "active_rank_histogram": jax.tree.map(
+            lambda *counts: sum(counts).tolist(),
+            *(result.active_rank_histogram for result in after.values()),
+        ),
         "trainable_parameters": trainable,
         "total_parameters": total,
     }

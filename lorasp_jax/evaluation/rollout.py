@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import jax
@@ -10,19 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.env import Env, State
-from lorasp_jax.evaluation.metrics import wilson_interval
+from lorasp_jax import adaptation
+from lorasp_jax.evaluation import metrics
 from lorasp_jax.models import tokenizer
 from lorasp_jax.models.policy import Policy
-from lorasp_jax.peft import Aux
 
 FILMED_WORLDS = 8
 """Worlds whose poses are kept, to choose one of them for the video."""
 
 Poses = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
 """Geom positions and rotations, camera positions and rotations: the arguments of `Env.render`."""
-
-Ranks = dict[str, dict[str, jax.Array]]
-"""Tower -> linear map -> active rank."""
 
 
 @jax.tree_util.register_dataclass
@@ -34,12 +31,15 @@ class Rollout:
         success: `[W]` bool.
         steps: `[W]` int32, control steps until success or the time limit.
         active_rank: `[L]` per linear map, mean over tokens and the looks of worlds not yet done.
+        active_rank_histogram: `[looks, R + 1]` int32 per tower, see `metrics.rank_histogram`; R is
+            the largest bank.
         poses: the first worlds at every control step, leading axes `[time, worlds]`.
     """
 
     success: jax.Array
     steps: jax.Array
-    active_rank: Ranks
+    active_rank: metrics.LayerRanks
+    active_rank_histogram: dict[str, jax.Array]
     poses: Poses
 
 
@@ -53,6 +53,8 @@ class Result:
         ci95: Wilson 95 % interval of the share.
         steps: mean control steps per episode.
         active_rank: one value a layer, per tower and linear map.
+        active_rank_histogram: `[R + 1]` int64 per tower, how many tokens had this active rank, over
+            layers, linear maps and all looks of worlds not yet done; R is the largest bank.
         poses: one filmed episode, a successful one if there is any, leading axis time.
     """
 
@@ -61,6 +63,7 @@ class Result:
     ci95: tuple[float, float]
     steps: float
     active_rank: dict[str, dict[str, list[float]]]
+    active_rank_histogram: dict[str, np.ndarray]
     poses: Poses
 
 
@@ -74,32 +77,14 @@ def make_rollout(
     """
     looks = -(-env.max_steps // execute_steps)
 
-    def act(state: State, action: jax.Array) -> tuple[State, Poses]:
-        state = env.step(state, action)
-        data = state.data
-        poses = (data.geom_xpos, data.geom_xmat, data.cam_xpos, data.cam_xmat)
-        return state, jax.tree.map(lambda x: x[:FILMED_WORLDS], poses)
-
-    def look(policy: Policy, state: State, key: jax.Array) -> tuple[State, tuple]:
+    def rollout(policy: Policy, key: jax.Array) -> Rollout:
         chunk = policy.model.config.chunk
         if not 1 <= execute_steps <= chunk:
             raise ValueError(f"execute_steps must be 1 to the chunk, {chunk}, got {execute_steps}")
-        actions, aux = policy.sample(
-            key,
-            env.observe(state),
-            state.info["instruction"],
-            num_steps=denoise_steps,
-            return_aux=True,
-        )
-        running = ~state.done
-        state, poses = jax.lax.scan(act, state, jnp.moveaxis(actions[:, :execute_steps], 1, 0))
-        return state, (poses, _ranks(aux, running), running.sum())
-
-    def rollout(policy: Policy, key: jax.Array) -> Rollout:
         reset_key, sample_key = jax.random.split(key)
-        keys = jax.random.split(sample_key, looks)
-        state, (poses, ranks, running) = jax.lax.scan(
-            functools.partial(look, policy), env.reset(reset_key), keys
+        look = functools.partial(_look, env, policy, execute_steps, denoise_steps)
+        state, (poses, ranks, histogram, running) = jax.lax.scan(
+            look, env.reset(reset_key), jax.random.split(sample_key, looks)
         )
         weights = running / jnp.maximum(running.sum(), 1)
         mean = functools.partial(jnp.tensordot, weights, axes=1, precision="highest")
@@ -107,6 +92,7 @@ def make_rollout(
             success=state.info["success"],
             steps=state.info["steps"],
             active_rank=jax.tree.map(mean, ranks),
+            active_rank_histogram=histogram,
             poses=jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), poses),
         )
 
@@ -147,14 +133,50 @@ def evaluate(
         runs.append(jax.block_until_ready(rollout(policy, batch_key)))
         if progress:
             progress(len(runs) * env.num_envs, num_episodes)
-    successes = int(sum(run.success.sum() for run in runs))
+    return _result(runs)
+
+
+def _look(
+    env: Env, policy: Policy, execute_steps: int, denoise_steps: int, state: State, key: jax.Array
+) -> tuple[State, tuple]:
+    """Look, predict and execute: the state after it, and what a rollout keeps of it."""
+    actions, aux = policy.sample(
+        key, env.observe(state), state.info["instruction"], num_steps=denoise_steps, return_aux=True
+    )
+    running = ~state.done
+    ranks = metrics.layer_ranks(aux, running)
+    histogram = metrics.rank_histogram(aux, running, _largest_bank(policy))
+
+    def act(state: State, action: jax.Array) -> tuple[State, Poses]:
+        state = env.step(state, action)
+        data = state.data
+        poses = (data.geom_xpos, data.geom_xmat, data.cam_xpos, data.cam_xmat)
+        return state, jax.tree.map(lambda x: x[:FILMED_WORLDS], poses)
+
+    state, poses = jax.lax.scan(act, state, jnp.moveaxis(actions[:, :execute_steps], 1, 0))
+    return state, (poses, ranks, histogram, running.sum())
+
+
+def _largest_bank(policy: Policy) -> int:
+    """R of the widest adapter; 0 if no method has a rank."""
+    methods = adaptation.methods(policy.model).values()
+    return max((getattr(method, "rank", 0) for method in methods), default=0)
+
+
+def _result(runs: Sequence[Rollout]) -> Result:
+    """Batches of episodes as one."""
+    success = np.concatenate([run.success for run in runs])
+    successes, episodes = int(success.sum()), len(success)
+    ranks, histograms = zip(*((r.active_rank, r.active_rank_histogram) for r in runs), strict=True)
     return Result(
-        success=successes / num_episodes,
-        episodes=num_episodes,
-        ci95=wilson_interval(successes, num_episodes),
-        steps=float(np.mean([run.steps.mean() for run in runs])),
-        active_rank=jax.tree.map(
-            lambda *ranks: np.mean(ranks, axis=0).tolist(), *(run.active_rank for run in runs)
+        success=successes / episodes,
+        episodes=episodes,
+        ci95=metrics.wilson_interval(successes, episodes),
+        steps=float(np.mean([run.steps for run in runs])),
+        active_rank=jax.tree.map(lambda *r: np.mean(r, axis=0).tolist(), *ranks),
+        # All looks together are too many tokens for 32 bits.
+        active_rank_histogram=jax.tree.map(
+            lambda *counts: np.sum(counts, axis=(0, 1), dtype=np.int64), *histograms
         ),
         poses=_film(runs[0]),
     )
@@ -171,31 +193,3 @@ def _film(run: Rollout) -> Poses:
     """The poses of the first filmed world that succeeded, or of world 0, until it was done."""
     world = int(jnp.argmax(run.success[:FILMED_WORLDS]))
     return jax.tree.map(lambda x: x[: max(int(run.steps[world]), 1), world], run.poses)
-
-
-def _ranks(aux: dict[str, dict[str, Aux]], running: jax.Array) -> Ranks:
-    """`[L]` active ranks of one look: mean over valid tokens and running worlds.
-
-    A layer reports `[..., W, T]`, several pictures of a world folded into W; the action expert
-    also has a leading axis of denoising steps, over which the mean is taken.
-    """
-
-    def reduce(linear: Aux) -> jax.Array:
-        rank, mask = linear.active_rank, linear.token_mask
-        assert rank is not None
-        assert mask is not None  # the backbones always say which tokens count
-        worlds = (*rank.shape[:-2], running.shape[0], -1)
-        valid = running[:, None] & jnp.broadcast_to(mask, rank.shape).reshape(worlds)
-        total = jnp.where(valid, rank.reshape(worlds), 0.0).sum((-2, -1))
-        return total / jnp.maximum(valid.sum((-2, -1)), 1)
-
-    found = {
-        tower: {name: reduce(a) for name, a in linears.items() if a.active_rank is not None}
-        for tower, linears in aux.items()
-    }
-    if "action" in found:
-        found["action"] = {name: rank.mean(0) for name, rank in found["action"].items()}
-    return {
-        tower: {name: jnp.atleast_1d(rank) for name, rank in ranks.items()}
-        for tower, ranks in found.items()
-    }

@@ -89,7 +89,7 @@ def energy_gate(
     constant = jax.lax.stop_gradient(scores)
     everything = ratio.numerator == ratio.denominator
     mask = constant > 0 if everything else find(constant, ratio)
-    return mask, mask.sum(-1).astype(jnp.float32), _kept_energy(scores, mask)
+    return mask, mask.sum(-1).astype(jnp.float32), kept_energy(scores, mask)
 
 
 def default_implementation(rank: int) -> Implementation:
@@ -140,12 +140,22 @@ def _mask(scores: jax.Array, last: Boundary) -> jax.Array:
     return (scores > last.score) | ((scores == last.score) & (position <= last.index))
 
 
-def _kept_energy(scores: jax.Array, mask: jax.Array) -> jax.Array:
-    """E_k of eq. (12), f32 [...]; 1 for zeros, with a zero gradient there, and NaN for NaN."""
+def kept_energy(scores: jax.Array, mask: jax.Array) -> jax.Array:
+    """E_k of eq. (12) for f32 scores and a mask [..., R], f32 [...].
+
+    1 for a row of zeros, with a zero gradient there, and NaN for NaN.
+    """
     energy = _energy(scores)
     total = energy.sum(-1)
     kept = jnp.where(mask, energy, 0).sum(-1)
     return jnp.where(total == 0, 1, kept / jnp.where(total == 0, 1, total))
+
+
+def energy_share(scores: jax.Array) -> jax.Array:
+    """Share of each direction in its row's energy, for f32 scores [..., R]; 0 in a row of zeros."""
+    energy = _energy(scores)
+    total = energy.sum(-1, keepdims=True)
+    return energy / jnp.where(total == 0, 1, total)
 
 
 def _energy(scores: jax.Array) -> jax.Array:

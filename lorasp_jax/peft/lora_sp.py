@@ -14,14 +14,23 @@ are this project's; each is stated where it is made.
 """
 
 import dataclasses
+import functools
 import math
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from lorasp_jax.kernels.energy_gate import Implementation, energy_gate, exact_ratio
-from lorasp_jax.peft.method import Aux, Method, Params, kaiming_uniform, masked_mean
+from lorasp_jax.kernels.energy_gate import (
+    Implementation,
+    default_implementation,
+    energy_gate,
+    energy_share,
+    exact_ratio,
+    kept_energy,
+)
+from lorasp_jax.kernels.fused_rows import fused_rows
+from lorasp_jax.peft.method import Aux, Method, Params, kaiming_uniform
 
 SOFTPLUS_INVERSE_OF_ONE = math.log(math.e - 1)
 SCORE_INIT_STD = 0.01
@@ -104,21 +113,34 @@ class LoRASP(Method):
         self, params: Params, x: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, jax.Array, Aux]:
         """z = scale Σ(x) V x and u = U of eq. (9), with the gate's statistics and losses."""
-        scores, logits = router_scores(params["router"], x)
-        mask, active_rank, kept_energy = energy_gate(
-            scores, self.energy_target, implementation=self.gate
+        bank, router = params["bank"], dict(params["router"])
+        tokens = x.shape[:-1]
+        both = jnp.concatenate([bank["v"], router.pop("w1")], axis=1).astype(x.dtype)
+        counts = jnp.ones(tokens, bool) if token_mask is None else token_mask
+        z, sums, (active_rank, energy) = self._route(
+            router, (x @ both).reshape(-1, both.shape[1]), counts.reshape(-1, 1)
         )
-        z = select(x @ params["bank"]["v"].astype(x.dtype), self.scale * scores, mask)
-        valid = (scores != 0).any(-1)  # a row of zeros teaches the router nothing; NaN shows
-        if token_mask is not None:
-            valid &= token_mask
         losses = {
-            "spectral": spectral_loss(kept_energy, valid),
-            "balance": balance_loss(scores, mask, valid),
-            "z": z_loss(logits, valid),
+            "spectral": spectral_loss(sums),
+            "balance": balance_loss(sums),
+            "z": z_loss(sums),
         }
-        aux = Aux(active_rank, kept_energy, losses, token_mask)
-        return z, params["bank"]["u"].astype(x.dtype), aux
+        aux = Aux(active_rank.reshape(tokens), energy.reshape(tokens), losses, token_mask)
+        return z.reshape(*tokens, self.rank), bank["u"].astype(x.dtype), aux
+
+    def _route(
+        self, router: dict[str, jax.Array], rows: jax.Array, counts: jax.Array
+    ) -> tuple[jax.Array, "LossSums", list[jax.Array]]:
+        """`route` of x [V W1], [T, R + H], where possible in one kernel."""
+        gate = self.gate or default_implementation(self.rank)
+        widths = (self.rank, self.hidden_width)
+        function = functools.partial(route, energy_target=self.energy_target, scale=self.scale)
+        if gate == "pallas" and self.router == "gelu" and all(map(_fits_triton, widths)):
+            function = functools.partial(function, gate="bisection")
+            return fused_rows(function, router, rows, widths, counts)
+        columns = jnp.split(rows, widths[:1], axis=1)
+        z, sums, _, statistics = function(router, columns, counts, None, gate=gate)
+        return z, sums, statistics
 
     def merge(self, params: Params, kernel: jax.Array) -> jax.Array:
         """Raises: the delta depends on the input."""
@@ -129,21 +151,60 @@ class LoRASP(Method):
         )
 
 
-def router_scores(router: dict[str, jax.Array], x: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _fits_triton(side: int) -> bool:
+    """Whether a side of an array suits Triton's blocks and matrix product."""
+    return side >= 16 and side.bit_count() == 1
+
+
+def route(
+    router: dict[str, jax.Array],
+    columns: list[jax.Array],
+    counts: jax.Array,
+    kept: jax.Array | None,
+    *,
+    energy_target: float,
+    scale: float,
+    gate: Implementation,
+) -> tuple[jax.Array, "LossSums", jax.Array, list[jax.Array]]:
+    """Everything between the two matrix products with the bank, row by row.
+
+    Args:
+      router: w2 [H, R], and b1 [H], b2 [R] or none.
+      columns: V x [n, R] and W1 x [n, H] in one type.
+      counts: bool [n, 1], False for padding.
+      kept: bool [n, R], the gate's mask where it is known already; it has no gradient.
+      energy_target: η.
+      scale: α/R.
+      gate: implementation of the energy gate.
+
+    Returns:
+      z [n, R], the losses' sums over rows, the mask, and f32 [n, 1] each active rank and kept
+      energy.
+    """
+    projected, hidden = columns
+    scores, logits = router_scores(router, hidden)
+    mask = energy_gate(scores, energy_target, implementation=gate)[0] if kept is None else kept
+    energy = kept_energy(scores, mask)[:, None]
+    z = select(projected, scale * scores, mask)
+    active_rank = mask.astype(jnp.float32).sum(-1, keepdims=True)
+    return z, loss_sums(scores, logits, mask, energy, counts), mask, [active_rank, energy]
+
+
+def router_scores(router: dict[str, jax.Array], hidden: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Eq. (10): h = φ(x W1 + b1), s(x) = h W2 + b2 made non-negative.
 
     With biases φ is GELU and softplus makes the scores positive. Without, φ is softmax, whose
     product with a 0/1 matrix is non-negative at the start; ReLU keeps it so.
 
     Args:
-      router: w1 [I, H], w2 [H, R] and b1 [H], b2 [R] or none.
-      x: [..., I]. The first product is in its type, everything after in fp32.
+      router: w2 [H, R] and b1 [H], b2 [R] or none.
+      hidden: x W1, [..., H]; everything from here on is in fp32.
 
     Returns:
       scores f32 [..., R], and the logits the z-loss acts on: the softplus' input [..., R] or the
       softmax' input [..., H].
     """
-    hidden = (x @ router["w1"].astype(x.dtype)).astype(jnp.float32)
+    hidden = hidden.astype(jnp.float32)
     if "b1" not in router:
         return jax.nn.relu(jax.nn.softmax(hidden) @ router["w2"]), hidden
     logits = jax.nn.gelu(hidden + router["b1"]) @ router["w2"] + router["b2"]
@@ -155,39 +216,66 @@ def select(projected: jax.Array, scores: jax.Array, mask: jax.Array) -> jax.Arra
     return projected * jnp.where(mask, scores, 0).astype(projected.dtype)
 
 
-def spectral_loss(kept_energy: jax.Array, valid: jax.Array) -> jax.Array:
-    """Eq. (13): 1 - E_k, averaged over valid tokens."""
-    return masked_mean(1 - kept_energy, valid)
+class LossSums(NamedTuple):
+    """What the auxiliary losses need, summed over the valid rows: f32 [1], kept and share [R]."""
+
+    rows: jax.Array
+    spectral: jax.Array
+    """1 - E_k."""
+    z: jax.Array
+    """Squared mean logit, on the scale of exponentials."""
+    kept: jax.Array
+    """1 for each kept direction; no gradient."""
+    share: jax.Array
+    """Share of the energy."""
 
 
-def balance_loss(scores: jax.Array, mask: jax.Array, valid: jax.Array) -> jax.Array:
+def loss_sums(
+    scores: jax.Array, logits: jax.Array, mask: jax.Array, energy: jax.Array, counts: jax.Array
+) -> LossSums:
+    """The sums for scores and mask [n, R], logits [n, :], kept energy and counts [n, 1].
+
+    A row of zeros is not valid: it teaches the router nothing. NaN shows in the sums.
+    """
+    valid = (scores.max(-1, keepdims=True) != 0) & counts
+    mean_logit = jax.nn.logsumexp(logits, axis=-1, keepdims=True) - math.log(logits.shape[-1])
+
+    def total(values: jax.Array) -> jax.Array:
+        return jnp.where(valid, values, 0).sum(0)
+
+    return LossSums(
+        rows=total(jnp.ones_like(energy)),
+        spectral=total(1 - energy),
+        z=total(jnp.square(mean_logit)),
+        kept=total(mask.astype(jnp.float32)),
+        share=total(energy_share(scores)),
+    )
+
+
+def spectral_loss(sums: LossSums) -> jax.Array:
+    """Eq. (13): 1 - E_k, averaged over valid rows, f32 scalar."""
+    return _mean(sums.spectral, sums)
+
+
+def balance_loss(sums: LossSums) -> jax.Array:
     """Balance term of eq. (14): R Σ_i f_i P_i, 1 where all directions are used alike.
 
     The load-balancing loss of Fedus et al. (arXiv 2101.03961, eq. 4) for k(x) choices a token: f_i
-    is direction i's share of all kept places (no gradient), P_i its mean share of the energy. Both
-    are means over the valid tokens of the whole batch.
-
-    Args:
-      scores: f32 [..., R].
-      mask: bool [..., R], from the gate.
-      valid: bool [...].
+    is direction i's share of all kept places (no gradient), P_i its mean share of the energy.
     """
-    tokens = tuple(range(valid.ndim))
-    count = jnp.maximum(valid.sum(), 1)
-    weight = jnp.where(valid, 1.0, 0.0)[..., None] / count
-    kept = jax.lax.stop_gradient(jnp.sum(weight * mask, axis=tokens))
-    largest = jax.lax.stop_gradient(scores.max(-1, keepdims=True))
-    energy = jnp.square(scores / jnp.where(largest > 0, largest, 1))
-    total = energy.sum(-1, keepdims=True)
-    share = jnp.sum(weight * energy / jnp.where(total > 0, total, 1), axis=tokens)
-    return scores.shape[-1] * jnp.vdot(kept / jnp.maximum(kept.sum(), 1e-9), share)
+    kept = jax.lax.stop_gradient(sums.kept)
+    used = kept / jnp.maximum(kept.sum(), 1)
+    return len(kept) * _mean(jnp.sum(used * sums.share, keepdims=True), sums)
 
 
-def z_loss(logits: jax.Array, valid: jax.Array) -> jax.Array:
-    """z term of eq. (14): (logsumexp(logits) - ln n)², n = logits' width, over valid tokens.
+def z_loss(sums: LossSums) -> jax.Array:
+    """z term of eq. (14): (logsumexp(logits) - ln n)², n = logits' width, over valid rows.
 
     Zoph et al. (arXiv 2202.08906, eq. 5) without the ln n, which would push the logits of a wide
     router down even where they are all zero.
     """
-    log_mean = jax.nn.logsumexp(logits, axis=-1) - math.log(logits.shape[-1])
-    return masked_mean(jnp.square(log_mean), valid)
+    return _mean(sums.z, sums)
+
+
+def _mean(total: jax.Array, sums: LossSums) -> jax.Array:
+    return total[0] / jnp.maximum(sums.rows[0], 1)

@@ -98,6 +98,26 @@ def layer_ranks(layers: dict[str, dict[str, Sequence[float]]], rank: int) -> str
         return _svg(figure)
 
 
+def rank_histogram(histogram: dict[str, Sequence[int]]) -> str:
+    """Share of tokens at each active rank, one panel per tower.
+
+    Args:
+        histogram: tower -> how many tokens had active rank 0, 1, ...
+    """
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(9, 2.8), layout="constrained")
+        panels = figure.subplots(1, len(histogram), sharey=True, squeeze=False)[0]
+        for axes, (tower, counts) in zip(panels, histogram.items(), strict=True):
+            total = max(sum(counts), 1)
+            shares = [100 * count / total for count in counts]
+            axes.bar(range(len(counts)), shares, width=1.0, color=COLORS[tower])
+            axes.set_xlim(-0.5, len(counts) - 0.5)
+            axes.set_xlabel("active rank of a token")
+            axes.set_title(tower, loc="left")
+        panels[0].set_ylabel("tokens [%]")
+        return _svg(figure)
+
+
 def _line(axes: Any, rows: Rows, name: str, color: str, label: str) -> None:
     """Draw one metric where it was recorded."""
     points = [(row["step"], row[name]) for row in rows if name in row]

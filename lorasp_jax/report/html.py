@@ -32,7 +32,6 @@ def write_report(folder: Path) -> Path:
     results = json.loads((folder / "results.json").read_text())
     config = json.loads((folder / "config.json").read_text())
     rows = read_metrics(folder)
-    rank = config["peft"].get("rank")
     parts = [
         f"<h1>{html.escape(config['name'])}</h1>",
         f"<p class=muted>{_subtitle(config, results)}</p>",
@@ -41,15 +40,7 @@ def write_report(folder: Path) -> Path:
         _success_table(results),
         "<h2>Training</h2>",
         _image(figures.losses(rows)),
-    ]
-    if any(name.startswith("active_rank/") for name in (rows[-1] if rows else ())):
-        parts += [
-            "<h2>Active rank</h2>",
-            _image(figures.active_rank(rows, rank)),
-            _rank_table(results),
-            _image(figures.layer_ranks(results["layer_active_rank"], rank)),
-        ]
-    parts += [
+        *_active_rank(results, rows, config["peft"].get("rank")),
         "<h2>What the policy sees and does</h2>",
         *_media(folder, results["tasks"]),
         "<h2>Time</h2>",
@@ -91,10 +82,17 @@ def _success_table(results: dict[str, Any]) -> str:
     return _table(("task", "before", "after"), rows)
 
 
-def _rank_table(results: dict[str, Any]) -> str:
-    """Active rank by module in closed loop."""
-    ranks = results["active_rank"].items()
-    return _table(("module", "active rank in closed loop"), ((k, f"{v:.1f}") for k, v in ranks))
+def _active_rank(results: dict[str, Any], rows: figures.Rows, rank: Any) -> Iterable[str]:
+    """Active rank in training and in closed loop; nothing for a method without one."""
+    if not any(name.startswith("active_rank/") for name in (rows[-1] if rows else ())):
+        return
+    yield "<h2>Active rank</h2>"
+    yield _image(figures.active_rank(rows, rank))
+    modules = ((module, f"{mean:.1f}") for module, mean in results["active_rank"].items())
+    yield _table(("module", "active rank in closed loop"), modules)
+    yield _image(figures.layer_ranks(results["layer_active_rank"], rank))
+    if "active_rank_histogram" in results:
+        yield _image(figures.rank_histogram(results["active_rank_histogram"]))
 
 
 def _table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:

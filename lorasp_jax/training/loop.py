@@ -6,6 +6,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -108,15 +109,17 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
     run.policy = Policy(nnx.merge(graphdef, state.adapters, frozen), run.policy.processor)
     checkpoints = Checkpoints(run.folder, run.base_hash)
     restored = checkpoints.restore(state) if resume else None
-    if restored is None:
-        for callback in callbacks:
-            callback.on_start(run)
     steps = flatten(list(run.episodes.values()))
     steps = jax.device_put(steps, meshes.replicated(mesh))
-    many = functools.partial(_compiled(run, graphdef, optimizer, mesh), frozen, steps)
+    state = restored or state
+    many = _Stretches(_jitted(run, graphdef, optimizer, mesh), frozen, steps)
+    if restored is None:
+        many.compile(state, _stretch(run.config, state))  # beside what the callbacks do
+        for callback in callbacks:
+            callback.on_start(run)
     try:
         with run.timed("train"):
-            state = _loop(run, restored or state, many, checkpoints, callbacks)
+            state = _loop(run, state, many, checkpoints, callbacks)
     finally:
         checkpoints.close()
     run.policy = Policy(nnx.merge(graphdef, state.adapters, frozen), run.policy.processor)
@@ -124,7 +127,7 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
         callback.on_end(run)
 
 
-def _compiled(run: Run, graphdef: Any, optimizer: Any, mesh: jax.sharding.Mesh) -> Callable:
+def _jitted(run: Run, graphdef: Any, optimizer: Any, mesh: jax.sharding.Mesh) -> Callable:
     """The jitted stretch of steps: (frozen, steps, state, key, count) -> state, metrics."""
     optim, processor = run.config.optim, run.policy.processor
     chunk = run.policy.model.config.chunk
@@ -162,6 +165,33 @@ def _compiled(run: Run, graphdef: Any, optimizer: Any, mesh: jax.sharding.Mesh) 
     return many
 
 
+class _Stretches:
+    """Stretches of steps, (state, key, count) -> state, metrics, each length compiled once."""
+
+    def __init__(self, jitted: Callable, frozen: Any, steps: Steps) -> None:
+        self._jitted, self._frozen, self._steps = jitted, frozen, steps
+        self._compiled: dict[int, Future] = {}
+
+    def compile(self, state: TrainState, count: int) -> Future:
+        """Begin to compile in a thread, unless that was done."""
+        if count not in self._compiled:
+            key = jax.random.key(0)
+            lower = lambda: self._jitted.lower(self._frozen, self._steps, state, key, count)  # noqa: E731
+            pool = ThreadPoolExecutor(1)
+            self._compiled[count] = pool.submit(lambda: lower().compile())
+            pool.shutdown(wait=False)
+        return self._compiled[count]
+
+    def __call__(self, state: TrainState, key: jax.Array, count: int) -> tuple[TrainState, Any]:
+        run = self.compile(state, count).result()
+        return run(self._frozen, self._steps, state, key)
+
+
+def _stretch(config: Config, state: TrainState) -> int:
+    """Steps until the next log line or the end."""
+    return min(config.log_every, config.optim.steps - int(state.step))
+
+
 def _loop(
     run: Run, state: TrainState, many: Callable, checkpoints: Checkpoints, callbacks: Any
 ) -> TrainState:
@@ -177,7 +207,7 @@ def _loop(
     ):
         bar = progress.add_task("compiling train step ...", total=total, completed=saved)
         while (done := int(state.step)) < total and not stop.requested:
-            count = min(config.log_every, total - done)
+            count = _stretch(config, state)
             state, metrics = many(state, key, count)
             values = {name: float(value) for name, value in metrics.items()}
             _check_finite(values, done, done + count, saved)

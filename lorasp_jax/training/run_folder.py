@@ -11,6 +11,9 @@ from tensorboardX import SummaryWriter
 
 from lorasp_jax.config import Config
 
+RECORD, CLOCK = "config.json", "seconds.json"
+"""All that a run leaves which failed before it had anything."""
+
 
 def to_json(config: Config) -> dict[str, Any]:
     """The config as plain JSON values, the adapter method with its name."""
@@ -40,30 +43,34 @@ def open_run(config: Config, root: Path, *, resume: bool) -> Path:
     if config.name in ("", ".", "..") or Path(config.name).name != config.name:
         raise ValueError(f"--name must be a plain folder name, got {config.name!r}")
     folder = root / config.name
-    record = folder / "config.json"
-    if not resume:
-        # A folder with nothing but a config is of a run that failed before it began.
-        if folder.exists() and any(path.name != record.name for path in folder.iterdir()):
+    if resume:
+        changed = _differences(_recorded(folder), to_json(config))
+        if changed:
             raise ValueError(
-                f"{folder} already holds a run: add --resume to continue it, "
-                "or give this one another --name"
+                f"{folder} holds a run with other settings ({', '.join(changed)}): resume with the "
+                "settings it was started with, or give this run another --name"
             )
-        folder.mkdir(parents=True, exist_ok=True)
-        write_json(record, to_json(config))
         return folder
+    if folder.exists() and any(path.name not in (RECORD, CLOCK) for path in folder.iterdir()):
+        raise ValueError(
+            f"{folder} already holds a run: add --resume to continue it, "
+            "or give this one another --name"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / CLOCK).unlink(missing_ok=True)
+    write_json(folder / RECORD, to_json(config))
+    return folder
+
+
+def _recorded(folder: Path) -> dict[str, Any]:
+    """The config of the run in `folder`."""
+    record = folder / RECORD
     if not record.exists():
         raise ValueError(f"{folder} holds no run to resume: start it without --resume")
     try:
-        recorded = json.loads(record.read_text())
+        return json.loads(record.read_text())
     except json.JSONDecodeError as error:
         raise ValueError(f"{record} is damaged ({error}): the run cannot be resumed") from error
-    changed = _differences(recorded, to_json(config))
-    if changed:
-        raise ValueError(
-            f"{folder} holds a run with other settings ({', '.join(changed)}): resume with the "
-            "settings it was started with, or give this run another --name"
-        )
-    return folder
 
 
 def _differences(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> list[str]:

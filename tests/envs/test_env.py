@@ -69,6 +69,13 @@ def test_reset_is_random_and_repeatable(env, start):
     assert set(np.asarray(start.info["instruction"])) <= set(range(len(env.instructions)))
 
 
+def test_start_is_near_home(env, start):
+    away = np.abs(np.asarray(start.info["command"])[:, :-1] - env.robot.home)
+    assert 0.01 < away.max() <= 0.03 + 1e-6  # rad
+    np.testing.assert_allclose(start.info["command"][:, -1], 0.04)  # m, gripper open
+    assert np.all(start.data.qvel == 0)
+
+
 def test_state_has_one_axis_and_strong_types(start, moved):
     """A step's output must look like its input, or a second call compiles all anew."""
 
@@ -161,6 +168,16 @@ def test_observation(env, start):
         assert picture.std() > 5
     assert found["state"].dtype == jnp.float32
     np.testing.assert_allclose(found["state"], start.info["command"], atol=1e-6)
+
+
+def test_each_picture_is_of_the_camera_it_is_named_after(env, start):
+    before = env.observe(start)["image"]
+    assert tuple(before) == env.cameras == ("side", "wrist")
+    for name in env.cameras:
+        position = start.data.cam_xpos.at[:, env.model.camera(name).id].add(0.1)
+        moved = dataclasses.replace(start, data=start.data.replace(cam_xpos=position))
+        after = env.observe(moved)["image"]
+        assert {n for n in after if np.any(after[n] != before[n])} == {name}
 
 
 def test_lowers_for_every_accelerator(env):

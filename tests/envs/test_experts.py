@@ -1,5 +1,7 @@
 """Experts solve every task with every robot, smoothly, and what they do is recorded as it was."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -86,6 +88,32 @@ def test_inverse_kinematics_reaches(scene):
     assert np.all((q >= robot.lower) & (q <= robot.upper))
     np.testing.assert_allclose(position, goals, atol=2e-3)
     np.testing.assert_allclose(facing, rotations, atol=0.03)
+
+
+def test_path_rests_at_every_knot_and_holds_the_last():
+    knots, times = jnp.array([[0.0, 0.0], [1.0, -1.0], [1.0, 2.0]]), jnp.array([0.0, 1.0, 3.0])
+    path = jax.vmap(lambda seconds: experts._interpolate(knots, times, seconds))
+    np.testing.assert_allclose(
+        path(jnp.array([0.0, 1.0, 3.0, 99.0])), knots[jnp.array([0, 1, 2, 2])]
+    )
+    speed = np.diff(path(jnp.linspace(0.0, 3.0, 301)), axis=0) / 0.01
+    np.testing.assert_allclose(speed[[0, 99, 100, 299]], 0.0, atol=0.01)
+    # The fastest moment of a minimum-jerk move is 1.875 times its mean speed.
+    np.testing.assert_allclose(np.abs(speed).max(axis=0), [1.875, 1.875 * 3 / 2], rtol=1e-3)
+
+
+def test_hurried_experts_slow_down_to_half_the_speed_limits(env):
+    def hurried(layout):
+        way = env.task.waypoints(layout)
+        return dataclasses.replace(way, seconds=jnp.full_like(way.seconds, 1e-3))
+
+    quick = dataclasses.replace(env, task=dataclasses.replace(env.task, waypoints=hurried))
+    plan = experts.plan(quick, env.reset(jax.random.key(0)), jax.random.key(1))
+    fastest = 1.875 * np.abs(np.diff(plan.knots, axis=1)) / np.diff(plan.times)[..., None]
+    share = fastest / env.robot.action_speed
+    assert np.all(share[..., :-1] <= 0.5 + 1e-4)
+    assert np.all(share[..., -1] <= 1 + 1e-4)
+    assert np.all(share[:, 0].max(axis=-1) > 0.49)  # no slower than it must
 
 
 def fake_record(success):

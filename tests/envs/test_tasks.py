@@ -56,6 +56,36 @@ def test_layouts_differ_and_are_within_reach(scene):
         assert np.ptp(place[:, 1]) > 0.05
 
 
+RANGES = {  # body -> lowest and highest x, y [m]
+    "press": {"button": ((0.32, -0.04), (0.40, 0.04))},
+    "pick_place": {
+        "grape": ((0.30, -0.18), (0.42, 0.02)),
+        "basket": ((0.325, 0.12), (0.395, 0.19)),
+    },
+}
+
+
+def test_layouts_fill_their_range(scene, task_name):
+    layouts = jax.vmap(scene.task.place)(jax.random.split(jax.random.key(1), 2048))
+    assert layouts.keys() == RANGES[task_name].keys()
+    for body, (low, high) in RANGES[task_name].items():
+        place = np.asarray(layouts[body])[:, :2]
+        np.testing.assert_allclose(place.min(axis=0), low, atol=1e-3)
+        np.testing.assert_allclose(place.max(axis=0), high, atol=1e-3)
+        np.testing.assert_allclose(place.mean(axis=0), np.mean([low, high], axis=0), atol=4e-3)
+        assert np.ptp(np.asarray(layouts[body])[:, 2]) == 0
+
+
+def test_every_layout_is_in_the_side_cameras_picture(scene):
+    camera = world(scene).camera("side")
+    edge = np.tan(np.deg2rad(scene.model.camera("side").fovy[0]) / 2)
+    layouts = jax.vmap(scene.task.place)(jax.random.split(jax.random.key(2), 256))
+    for place in layouts.values():
+        x, y, z = camera.xmat.reshape(3, 3).T @ (np.asarray(place) - camera.xpos).T
+        assert np.all(z < 0)
+        assert np.abs(np.stack([x, y]) / z / edge).max() < 0.95  # 1 is the picture's border
+
+
 def test_nothing_moves_or_succeeds_by_itself(scene):
     data = world(scene)
     before = data.xpos.copy()
@@ -111,6 +141,11 @@ class TestPickPlace:
         data.joint("grape").qpos[:3] = data.body("basket").xpos + offset
         data.joint("grape").qvel[0] = speed
         return data
+
+    def test_never_starts_inside(self, scene):
+        layouts = jax.vmap(scene.task.place)(jax.random.split(jax.random.key(3), 1024))
+        gap = np.abs(layouts["grape"] - layouts["basket"])[:, 1]
+        assert gap.min() > 0.05 + 0.015  # basket's wall and grape's radius [m]
 
     def test_at_rest_inside(self, scene):
         assert succeeds(scene, self.drop(scene))

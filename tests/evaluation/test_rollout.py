@@ -9,8 +9,8 @@ import pytest
 
 import envs
 from lorasp_jax.evaluation import evaluate, make_rollout
-from lorasp_jax.evaluation.rollout import _ranks, _told
-from lorasp_jax.peft import Aux, LoRASP
+from lorasp_jax.evaluation.rollout import Rollout, _largest_bank, _result, _told
+from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP
 from tests.runs import CONFIG, make_run
 
 
@@ -66,6 +66,12 @@ def test_evaluate_reports_what_happened(env, tmp_path):
     ranks = [r for maps in result.active_rank.values() for layers in maps.values() for r in layers]
     assert min(ranks) >= 1
     assert max(ranks) <= 8 + 1e-5  # a weighted mean in fp32
+    assert set(result.active_rank_histogram) == set(result.active_rank)
+    for tower, counts in result.active_rank_histogram.items():
+        assert (counts.shape, counts[0]) == ((9,), 0)
+        used = np.flatnonzero(counts)
+        means = np.concatenate(list(result.active_rank[tower].values()))
+        assert used[0] - 1e-5 <= means.min() <= means.max() <= used[-1] + 1e-5
     assert result.poses[0].shape[0] <= env.max_steps
     again = evaluate(policy, env, jax.random.key(0), 4, rollout=rollout)
     assert (again.success, again.steps) == (result.success, result.steps)
@@ -73,16 +79,32 @@ def test_evaluate_reports_what_happened(env, tmp_path):
         evaluate(policy, env, jax.random.key(0), 3, rollout=rollout)
 
 
-def test_ranks_leave_out_padding_and_finished_worlds():
-    rank = jnp.arange(2 * 3 * 4, dtype=jnp.float32).reshape(2, 3, 4)  # [L, W, T]
-    mask = jnp.ones((2, 3, 4), bool).at[:, 1, 2:].set(False)
-    running = jnp.array([False, True, False])
-    steps = jnp.stack([rank, rank + 10])  # [denoising steps, L, W, T]
-    aux = {
-        "vision": {"fc1": Aux(rank, token_mask=mask)},
-        "action": {"fc1": Aux(steps, token_mask=jnp.stack([mask, mask])), "none": Aux()},
-    }
-    found = _ranks(aux, running)
-    np.testing.assert_allclose(found["vision"]["fc1"], [4.5, 16.5])
-    np.testing.assert_allclose(found["action"]["fc1"], [9.5, 21.5])
-    assert "none" not in found["action"]
+def test_methods_without_a_choice(tmp_path):
+    lora = make_run(tmp_path / "lora", dataclasses.replace(CONFIG, peft=LoRA(rank=5))).policy
+    full = make_run(tmp_path / "full", dataclasses.replace(CONFIG, peft=FullFineTuning())).policy
+    assert (_largest_bank(lora), _largest_bank(full)) == (5, 0)
+
+
+def batch(success, steps, counts):
+    """A rollout whose poses say where they come from: world + time / 100."""
+    pose = np.arange(9)[:, None] / 100 + np.arange(len(success))
+    return Rollout(
+        success=jnp.array(success),
+        steps=jnp.array(steps),
+        active_rank={"vision": {"fc1": jnp.array([1.0, 3.0])}},
+        active_rank_histogram={"vision": jnp.array(counts, jnp.int32)},
+        poses=(pose,) * 4,
+    )
+
+
+def test_batches_add_up():
+    many = 2**31 - 1
+    first = batch([False, True, True], [9, 4, 6], [[0, many], [1, many]])
+    second = batch([False, False, False], [9, 9, 9], [[0, 5], [2, 0]])
+    result = _result([first, second])
+    assert (result.success, result.episodes) == (pytest.approx(1 / 3), 6)
+    assert result.steps == pytest.approx(46 / 6)
+    assert result.active_rank == {"vision": {"fc1": [1.0, 3.0]}}
+    assert result.active_rank_histogram["vision"].tolist() == [3, 2 * many + 5]
+    np.testing.assert_allclose(result.poses[0], [1.0, 1.01, 1.02, 1.03])  # until it was done
+    np.testing.assert_allclose(_result([second]).poses[0], np.arange(9) / 100)

@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from lorasp_jax.evaluation import Result
@@ -12,7 +13,8 @@ RANKS = {"vision": {"fc1": [4.0, 6.0]}, "language": {}, "action": {"q_proj": [1.
 
 
 def result(rate, ranks):
-    return Result(rate, 64, (rate - 0.1, rate + 0.1), 30.0, ranks, poses=())
+    counts = {tower: np.array([0, 2, 1]) for tower in ranks}
+    return Result(rate, 64, (rate - 0.1, rate + 0.1), 30.0, ranks, counts, poses=())
 
 
 def test_summary(tmp_path):
@@ -31,6 +33,7 @@ def test_summary(tmp_path):
     }
     assert found["tasks"]["pick_place"]["after"]["success"] == 0.5
     assert found["active_rank"] == {"vision": 5.0, "action": 1.0, "mean": pytest.approx(11 / 3)}
+    assert found["active_rank_histogram"] == {tower: [0, 4, 2] for tower in RANKS}
     assert found["seconds"].keys() == {"train", "total"}
     assert 0 < found["trainable_parameters"] < found["total_parameters"]
 

@@ -57,7 +57,7 @@ def test_target_of_one_keeps_every_positive_score(golden):
     mask, active_rank, kept_energy = run(golden["scores"])
     np.testing.assert_array_equal(mask, golden["scores"] > 0)
     assert (active_rank <= golden["k"][-1]).all()
-    np.testing.assert_array_equal(kept_energy, 1)
+    np.testing.assert_allclose(kept_energy, 1, rtol=1e-6)  # a GPU may add up in two orders
 
 
 @pytest.mark.usefixtures("interpret")

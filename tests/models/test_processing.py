@@ -106,6 +106,35 @@ def test_bad_observations_raise():
         own.encode({"image": {}, "state": state[:, :6]}, jnp.zeros(2, int))
 
 
+def test_cameras_of_any_size_keep_their_names():
+    own = processor(6)
+    shades = {"wrist": ((2, 32, 32, 3), 255), "side": ((2, 8, 16, 3), 0)}
+    raw = {
+        "image": {
+            name: jnp.full(shape, shade, jnp.uint8) for name, (shape, shade) in shades.items()
+        },
+        "state": jnp.zeros((2, 7)),
+    }
+    found = own.encode(raw, jnp.zeros(2, int)).images
+    assert {name: image.shape for name, image in found.items()} == dict.fromkeys(
+        shades, (2, 16, 16, 3)
+    )
+    np.testing.assert_allclose(found["wrist"], 1, atol=1e-6)
+    np.testing.assert_allclose(found["side"], -1, atol=1e-6)
+    grey = {**raw, "image": {"side": raw["image"]["side"][..., 0]}}
+    with pytest.raises(ValueError, match=r"got uint8 \(2, 8, 16\)"):
+        own.encode(grey, jnp.zeros(2, int))
+
+
+def test_unused_slots_reach_no_motor():
+    own = processor(6)
+    chunk = jnp.asarray(RNG.normal(size=(2, 4, DIM)), jnp.float32)
+    np.testing.assert_array_equal(own.decode(chunk), own.decode(chunk.at[..., 6].set(99.0)))
+    moved = own.decode(chunk.at[..., 7].add(1.0)) - own.decode(chunk)
+    assert not moved[..., :6].any()
+    np.testing.assert_allclose(moved[..., 6], own.statistics.action_std[7], rtol=1e-4)
+
+
 def test_pictures_are_centred_on_black():
     wide = resize_with_pad(jnp.ones((1, 8, 16, 3)), 16)[0]
     assert wide.shape == (16, 16, 3)

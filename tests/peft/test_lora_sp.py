@@ -1,6 +1,7 @@
 """LoRA-SP's equations, losses, parameter counts and its identity with LoRA."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +23,18 @@ def initial(method, key=1):
     return jax.jit(lambda key: method.init(key, KERNEL)[0])(jax.random.key(key))
 
 
+def scores_of(router, x):
+    return lora_sp.router_scores(router, x @ router["w1"])
+
+
+def losses_of(scores, kept_energy=1.0, rows=None):
+    """The three losses of rows of scores that are all kept; logits are the scores."""
+    counts = jnp.ones((len(scores), 1), bool) if rows is None else rows
+    energy = jnp.broadcast_to(jnp.asarray(kept_energy).reshape(-1, 1), (len(scores), 1))
+    sums = lora_sp.loss_sums(scores, scores, scores > 0, energy, counts)
+    return lora_sp.spectral_loss(sums), lora_sp.balance_loss(sums), lora_sp.z_loss(sums)
+
+
 @pytest.mark.parametrize(
     ("method", "router"),
     [
@@ -37,7 +50,7 @@ def test_parameter_count(method, router):
 
 
 def test_scores_start_at_one(x):
-    scores, logits = lora_sp.router_scores(initial(LoRASP())["router"], x)
+    scores, logits = scores_of(initial(LoRASP())["router"], x)
     assert (scores.shape, logits.shape) == ((3, 7, 128), (3, 7, 128))
     np.testing.assert_allclose(scores, 1, atol=0.15)
     assert np.std(scores) > 1e-3  # never all equal, or the same last directions would go
@@ -46,9 +59,9 @@ def test_scores_start_at_one(x):
 def test_paper_router_spreads_a_softmax(x):
     """Four softmax values, each the score of a block of 32; non-negative whatever W2 becomes."""
     router = initial(LoRASP.paper())["router"]
-    scores, logits = lora_sp.router_scores(router, x)
+    scores, logits = scores_of(router, x)
     np.testing.assert_allclose(scores, np.repeat(jax.nn.softmax(logits), 32, -1), rtol=1e-6)
-    pushed, _ = lora_sp.router_scores(router | {"w2": router["w2"] - 0.3}, x)
+    pushed, _ = scores_of(router | {"w2": router["w2"] - 0.3}, x)
     assert pushed.min() == 0
 
 
@@ -73,7 +86,7 @@ def test_update_is_u_sigma_v(x):
     params["bank"]["u"] = jax.random.normal(jax.random.key(2), (16, D_OUT))
     params["router"]["w2"] = jax.random.normal(jax.random.key(3), (32, 16))
     delta, aux = jax.jit(method.delta)(params, x)
-    scores, _ = lora_sp.router_scores(params["router"], x)
+    scores, _ = scores_of(params["router"], x)
     mask = np.asarray(jax.jit(lambda s: lora_sp.energy_gate(s, 0.7)[0])(scores))
     u, v = np.asarray(params["bank"]["u"]), np.asarray(params["bank"]["v"])
     token = np.asarray(x)[1, 4]
@@ -89,7 +102,7 @@ def test_pruned_directions_get_no_task_gradient(x):
     params["bank"]["u"] = jnp.ones((16, D_OUT))
 
     def task(shift):
-        scores = lora_sp.router_scores(params["router"], x)[0] + shift
+        scores = scores_of(params["router"], x)[0] + shift
         mask, _, _ = lora_sp.energy_gate(scores, 0.5)
         return lora_sp.select(x @ params["bank"]["v"], scores, mask).sum(), mask
 
@@ -99,16 +112,54 @@ def test_pruned_directions_get_no_task_gradient(x):
 
 def test_losses_of_uniform_and_concentrated_routing():
     """Balance is 1 where all directions are used alike and R where one takes all; z is 0 at 0."""
-    valid = jnp.ones(5, bool)
     even, one = jnp.ones((5, 8)), jnp.eye(8)[jnp.zeros(5, int)]
-    assert lora_sp.balance_loss(even, even > 0, valid) == pytest.approx(1)
-    assert lora_sp.balance_loss(one, one > 0, valid) == pytest.approx(8)
-    spread = jnp.eye(8)[:5]  # each token another direction: balanced over tokens
-    assert lora_sp.balance_loss(spread, spread > 0, valid) == pytest.approx(8 / 5)
-    assert lora_sp.z_loss(jnp.zeros((5, 8)), valid) == pytest.approx(0, abs=1e-6)
-    assert lora_sp.z_loss(jnp.full((5, 8), 3.0), valid) == pytest.approx(9, rel=1e-5)
+    assert losses_of(even)[1] == pytest.approx(1)
+    assert losses_of(one)[1] == pytest.approx(8)
+    assert losses_of(jnp.eye(8)[:5])[1] == pytest.approx(8 / 5)  # balanced over tokens
+    assert losses_of(jnp.full((5, 8), 3.0))[2] == pytest.approx(9, rel=1e-5)
+    assert losses_of(jnp.full((5, 8), 1e-9))[2] == pytest.approx(0, abs=1e-6)
     kept = jnp.array([0.9, 1.0, 0.95, 0.2, 0.1])
-    assert lora_sp.spectral_loss(kept, jnp.arange(5) < 3) == pytest.approx(0.05)
+    spectral, _, _ = losses_of(even, kept, rows=jnp.arange(5)[:, None] < 3)
+    assert spectral == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_one_kernel_equals_the_equations(x, monkeypatch, masked):
+    """The fused chain, run by Triton on a GPU and by its interpreter elsewhere."""
+    interpret = jax.default_backend() != "gpu"
+    kernel = functools.partial(lora_sp.fused_rows, interpret=interpret)
+    monkeypatch.setattr(lora_sp, "fused_rows", kernel)
+    plain = LoRASP(rank=32, hidden_width=16, energy_target=0.7, gate="bisection")
+    params = initial(plain)
+    params["bank"]["u"] = jax.random.normal(jax.random.key(2), (32, D_OUT))
+    params["router"]["w2"] = jax.random.normal(jax.random.key(3), (16, 32))
+    mask = jax.random.bernoulli(jax.random.key(4), 0.6, x.shape[:2]) if masked else None
+
+    def loss(params, x, method):
+        y, aux = method.delta(params, x, token_mask=mask)
+        return jnp.sin(y).sum() + sum(i * v for i, v in enumerate(aux.losses.values())), (y, aux)
+
+    run = jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True), static_argnums=2)
+    with jax.default_matmul_precision("highest"):
+        expected = run(params, x, plain)
+        found = run(params, x, dataclasses.replace(plain, gate="pallas"))
+    assert 1 < found[0][1][1].mean_active_rank() < 31
+    jax.tree.map(
+        lambda f, e: np.testing.assert_allclose(f, e, rtol=1e-4, atol=2e-5), found, expected
+    )
+
+
+@pytest.mark.parametrize("method", [LoRASP(rank=48), LoRASP.paper(rank=64), LoRASP(hidden_width=8)])
+def test_what_triton_cannot_take_keeps_the_gate_alone(x, monkeypatch, method):
+    monkeypatch.setattr(lora_sp, "fused_rows", None)
+    gates = []
+    monkeypatch.setattr(
+        lora_sp,
+        "energy_gate",
+        lambda s, eta, implementation: gates.append(implementation) or (s > 0,),
+    )
+    jax.eval_shape(dataclasses.replace(method, gate="pallas").delta, initial(method), x)
+    assert gates == ["pallas"]
 
 
 def test_rows_without_scores_stay_out(x):

@@ -55,6 +55,12 @@ def test_report_shows_the_results_and_needs_no_other_file(folder):
     assert "http" not in re.sub(r'src="[^"]*"', "", page)
 
 
+def test_histogram_is_drawn_where_it_was_recorded(folder):
+    results = {**RESULTS, "active_rank_histogram": {"vision": [0, 3, 1], "action": [0, 0, 4]}}
+    (folder / "results.json").write_text(json.dumps(results))
+    assert write_report(folder).read_text().count("image/svg") == 5
+
+
 def test_full_fine_tuning_has_no_ranks(folder):
     config = {**to_json(CONFIG), "peft": {"method": "FullFineTuning"}}
     (folder / "config.json").write_text(json.dumps(config))

@@ -10,7 +10,7 @@ import pytest
 
 from lorasp_jax import adaptation
 from lorasp_jax.training import mesh as meshes
-from lorasp_jax.training.loop import Callback, RunError, train
+from lorasp_jax.training.loop import Callback, RunError, _Stretches, train
 from lorasp_jax.training.run_folder import read_metrics
 from tests.runs import CONFIG, leaves, make_run
 
@@ -90,3 +90,24 @@ def test_signal_handlers_are_put_back(tmp_path):
     train(make_run(tmp_path / "run"))
     assert signal.getsignal(signal.SIGTERM) == before
     assert jax.device_count() == 8
+
+
+def test_each_length_of_stretch_compiles_once_and_beside_the_callbacks(tmp_path, monkeypatch):
+    compiled = []
+    begin = _Stretches.compile
+
+    def compile_and_note(self, state, count):
+        compiled.append((count, count in self._compiled))
+        return begin(self, state, count)
+
+    monkeypatch.setattr(_Stretches, "compile", compile_and_note)
+
+    class Look(Callback):
+        def on_start(self, run):
+            assert compiled == [(2, False)]
+
+    optim = dataclasses.replace(CONFIG.optim, steps=5)
+    run = make_run(tmp_path / "run", dataclasses.replace(CONFIG, optim=optim))
+    train(run, [Look()])
+    assert compiled == [(2, False), (2, True), (2, True), (1, False)]
+    assert [row["step"] for row in read_metrics(run.folder)] == [2, 4, 5]

@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from lorasp_jax.config import Config
+from lorasp_jax.config import Config, DataConfig
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.training.run_folder import MetricsLog, open_run, read_metrics
 
@@ -50,3 +50,24 @@ def test_log_continues_like_an_uninterrupted_one(tmp_path):
     log.close()
     assert [row["loss"] for row in read_metrics(tmp_path)] == [2.0, 4.0, -6.0]
     assert list((tmp_path / "tensorboard").iterdir())
+
+
+def test_name_is_free_after_a_run_that_failed_before_it_had_anything(tmp_path):
+    """As with an expert that fails under too much noise."""
+    noisy = dataclasses.replace(CONFIG, data=DataConfig(action_noise=0.1))
+    folder = open_run(noisy, tmp_path, resume=False)
+    (folder / "seconds.json").write_text('{"collect": 9.0, "total": 9.0}')
+    assert open_run(CONFIG, tmp_path, resume=False) == folder
+    assert [path.name for path in folder.iterdir()] == ["config.json"]  # the clock starts anew
+    assert json.loads((folder / "config.json").read_text())["data"]["action_noise"] == 0.005
+
+
+@pytest.mark.parametrize("more", ["cache/pick_place.npz", "before.json"])
+def test_a_run_that_has_something_is_kept(tmp_path, more):
+    folder = open_run(CONFIG, tmp_path, resume=False)
+    (folder / more).parent.mkdir(exist_ok=True)
+    (folder / more).write_text("more")
+    with pytest.raises(ValueError, match="already holds a run: add --resume"):
+        open_run(dataclasses.replace(CONFIG, seed=1), tmp_path, resume=False)
+    assert (folder / more).read_text() == "more"
+    assert json.loads((folder / "config.json").read_text())["seed"] == 0

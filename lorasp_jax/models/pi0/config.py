@@ -67,8 +67,8 @@ class Pi0Config:
     remat: bool = False
     """Recompute each layer's inside in the backward pass: less memory, a third more work."""
     unroll: bool = False
-    """Straight-line code instead of a loop over layers: faster for a few small ones on a CPU (which
-    otherwise copies what the loop keeps for the backward pass), at the price of compile time."""
+    """Straight-line code instead of a loop over layers: faster for a few small ones (a loop copies
+    what the backward pass needs into stacks and out again), at the price of compile time."""
 
     def __post_init__(self) -> None:
         """Checks that the parts fit."""
@@ -141,6 +141,7 @@ class Pi0Config:
             max_tokens=10,
             chunk=10,
             action_dim=8,
+            unroll=True,
         )
 
     @classmethod

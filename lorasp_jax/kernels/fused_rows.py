@@ -1,0 +1,184 @@
+"""A row-wise function as one GPU kernel, its gradient as another.
+
+What an adapter computes between its matrix products is a chain of small steps on each token: a
+nonlinearity, a gate, losses. XLA makes a dozen kernels of it, stores what each leaves for the
+backward pass, and within a scan over depth copies all of that once more. Here the chain is traced
+into one Triton kernel; the backward kernel computes a block's chain again and pulls its cotangents
+back, so that only the chain's input and what the function asks to keep is stored.
+
+The reference is the function itself, applied to all rows at once. LoRA-SP's chain and its gradient
+on an H200 (35k bf16 rows, R = 64, H = 32): 180 us, 500 us in XLA.
+"""
+
+import functools
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.experimental import pallas as pl
+
+ROWS_PER_BLOCK = 16  # the smallest that Triton's matrix product takes
+WARPS_PER_PROGRAM = 4
+PROGRAMS = 512
+"""About how many programs share the rows; each leaves one partial sum."""
+
+Columns = list[jax.Array]
+"""Arrays [n, width] that lie side by side in one [n, sum of widths]."""
+Widths = tuple[int, ...]
+Function = Callable[[Any, Columns, jax.Array, jax.Array | None], tuple]
+Body = Callable[..., tuple[list[Columns], Any]]
+
+
+def fused_rows(
+    function: Function,
+    shared: Any,
+    rows: jax.Array,
+    widths: Widths,
+    counts: jax.Array,
+    *,
+    interpret: bool = False,
+) -> tuple[jax.Array, Any, Columns]:
+    """`function` of all rows in one kernel, its gradient in another.
+
+    Args:
+      function: (shared, columns, counts, kept) -> (output, sums, kept, statistics), for any number
+        n of rows: columns [n, width] each, counts bool [n, 1], output [n, O]; sums is a pytree of
+        arrays that add up over rows, kept, bool [n, K], what its gradient takes as given (None on
+        the way forward), statistics a list of [n, 1] without gradient. It may use what Triton has:
+        sides are powers of two, in a matrix product at least 16.
+      shared: pytree of small fp32 arrays that every row uses.
+      rows: [T, sum of widths].
+      widths: of the columns that `function` takes.
+      counts: bool [T, 1].
+      interpret: run the kernels' bodies without a GPU, slowly.
+
+    Returns:
+      output [T, O], sums, statistics [T, 1]. Gradients reach `shared` and `rows`.
+    """
+    num_rows = len(rows)
+    fill = ((0, -num_rows % ROWS_PER_BLOCK), (0, 0))
+    rows, counts = jnp.pad(rows, fill), jnp.pad(counts, fill).astype(jnp.int8)
+    found: Any = _fused((function, widths, interpret), shared, rows, counts)
+    output, sums, statistics = found
+    return output[:num_rows], sums, [column[:num_rows] for column in statistics]
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _fused(static: tuple, shared: Any, rows: jax.Array, counts: jax.Array) -> tuple:
+    return _forward(static, shared, rows, counts)[0]
+
+
+def _forward(static: tuple, shared: Any, rows: jax.Array, counts: jax.Array) -> tuple:
+    function, widths, interpret = static
+
+    def block(shared: Any, columns: Columns, counts: Columns) -> tuple[list[Columns], Any]:
+        output, sums, kept, statistics = function(shared, columns, counts[0] != 0, None)
+        kept = kept.astype(jnp.int8)  # Triton stores no bool
+        return [[output], [kept], *([column] for column in statistics)], sums
+
+    inputs = [(rows, widths), (counts, (1,))]
+    (output, kept, *statistics), sums = _map_blocks(block, shared, inputs, interpret)
+    return (output, sums, statistics), (shared, rows, counts, kept)
+
+
+def _backward(static: tuple, residuals: tuple, cotangents: tuple) -> tuple:
+    function, widths, interpret = static
+    shared, rows, counts, kept = residuals
+    d_output, d_sums, _ = cotangents
+
+    def block(given: tuple, columns: Columns, *others: Columns) -> tuple[list[Columns], Any]:
+        shared, d_sums = given
+        counts, kept, d_output = (column for (column,) in others)
+
+        def differentiable(shared: Any, columns: Columns) -> tuple:
+            return function(shared, columns, counts != 0, kept != 0)[:2]
+
+        _, pull_back = jax.vjp(differentiable, shared, columns)
+        d_shared, d_columns = pull_back((d_output, d_sums))
+        return [d_columns], d_shared
+
+    inputs = [(rows, widths), *((a, (a.shape[1],)) for a in (counts, kept, d_output))]
+    (d_rows,), d_shared = _map_blocks(block, (shared, d_sums), inputs, interpret)
+    return d_shared, d_rows, None
+
+
+_fused.defvjp(_forward, _backward)
+
+
+def _map_blocks(
+    body: Body, shared: Any, inputs: list[tuple[jax.Array, Widths]], interpret: bool
+) -> tuple[list[jax.Array], Any]:
+    """body(shared, columns of each input) -> (columns of each output, sums), in one kernel.
+
+    Every program takes a stretch of blocks and adds up their sums; XLA adds up the programs'.
+    """
+    from jax.experimental.pallas import triton  # absent from builds without NVIDIA support
+
+    arrays = [array for array, _ in inputs]
+    widths = [widths for _, widths in inputs]
+    blocks = len(arrays[0]) // ROWS_PER_BLOCK
+    most = pl.cdiv(blocks, PROGRAMS)
+    stretch = next(n for n in range(most, 0, -1) if blocks % n == 0)
+    programs = blocks // stretch
+    columns, sums = jax.eval_shape(
+        body,
+        shared,
+        *([_shape(array.dtype, ROWS_PER_BLOCK, width) for width in w] for array, w in inputs),
+    )
+    out_widths = [tuple(column.shape[1] for column in output) for output in columns]
+    rows = [
+        _shape(output[0].dtype, len(arrays[0]), sum(w))
+        for output, w in zip(columns, out_widths, strict=True)
+    ]
+    outputs, partial_sums = pl.pallas_call(
+        functools.partial(_kernel, body, stretch, widths, out_widths),
+        grid=(programs,),
+        out_shape=(rows, jax.tree.map(lambda s: _shape(s.dtype, programs, *s.shape), sums)),
+        compiler_params=triton.CompilerParams(num_warps=WARPS_PER_PROGRAM, num_stages=1),
+        interpret=interpret,
+        name="fused_rows",
+    )(shared, arrays)
+    return outputs, jax.tree.map(lambda s: s.sum(0), partial_sums)
+
+
+def _shape(dtype: Any, *sides: int) -> jax.ShapeDtypeStruct:
+    """An array without content."""
+    return jax.ShapeDtypeStruct(sides, dtype)
+
+
+def _kernel(
+    body: Body,
+    stretch: int,
+    widths: list[Widths],
+    out_widths: list[Widths],
+    shared_refs: Any,
+    input_refs: Any,
+    output_refs: Any,
+    sum_refs: Any,
+) -> None:
+    """One program: `stretch` blocks, one after the other."""
+    shared = jax.tree.map(lambda ref: ref[...], shared_refs)
+    program = pl.program_id(0)
+
+    def block(i: jax.Array, sums: Any) -> Any:
+        at = pl.ds((program * stretch + i) * ROWS_PER_BLOCK, ROWS_PER_BLOCK)
+        loaded = [
+            [ref[at, pl.ds(*place)] for place in _places(w)]
+            for ref, w in zip(input_refs, widths, strict=True)
+        ]
+        outputs, more = body(shared, *loaded)
+        for ref, w, columns in zip(output_refs, out_widths, outputs, strict=True):
+            for place, column in zip(_places(w), columns, strict=True):
+                ref[at, pl.ds(*place)] = column
+        return jax.tree.map(jnp.add, sums, more)
+
+    zeros = jax.tree.map(lambda ref: jnp.zeros(ref.shape[1:], ref.dtype), sum_refs)
+    sums = jax.lax.fori_loop(0, stretch, block, zeros)
+    jax.tree.map(lambda ref, value: ref.__setitem__(program, value), sum_refs, sums)
+
+
+def _places(widths: Widths) -> list[tuple[int, int]]:
+    """(start, width) of columns side by side."""
+    return list(zip(itertools.accumulate(widths[:-1], initial=0), widths, strict=True))

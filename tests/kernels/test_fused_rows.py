@@ -1,0 +1,83 @@
+"""The fused kernel against the function it runs, values and gradients."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lorasp_jax.kernels import fused_rows as kernels
+
+WIDTHS = (32, 16)
+
+
+def gated(shared, columns, counts, kept):
+    """A chain with all that a function may have: two columns, a product, a choice, sums."""
+    left, right = columns
+    mixed = left * jnp.tanh(right.astype(jnp.float32) @ shared["w"] + shared["b"])
+    kept = mixed > 0 if kept is None else kept
+    output = jnp.where(kept, mixed, 0)
+    sums = {
+        "squares": jnp.where(counts, output**2, 0).sum(0),
+        "rows": jnp.where(counts, 1.0, 0).sum(0),
+    }
+    return output, sums, kept, [kept.astype(jnp.float32).sum(-1, keepdims=True)]
+
+
+@pytest.fixture(scope="module")
+def shared():
+    keys = jax.random.split(jax.random.key(0))
+    return {"w": jax.random.normal(keys[0], (16, 32)), "b": jax.random.normal(keys[1], (32,))}
+
+
+def run(fused, shared, rows, counts):
+    """Value, everything returned, and gradients, with or without the kernel."""
+
+    def loss(shared, rows):
+        if fused:
+            interpret = jax.default_backend() != "gpu"
+            found = kernels.fused_rows(gated, shared, rows, WIDTHS, counts, interpret=interpret)
+        else:
+            output, sums, _, statistics = gated(shared, jnp.split(rows, [32], 1), counts, None)
+            found = output, sums, statistics
+        return jnp.sin(found[0]).sum() + (found[1]["squares"] * jnp.arange(32)).sum(), found
+
+    with jax.default_matmul_precision("highest"):
+        return jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True))(shared, rows)
+
+
+def close(found, expected):
+    assert np.linalg.norm(found - expected) <= 1e-5 * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("num_rows", [1, 16, 83])  # less than a block, one, the last one not full
+def test_equals_the_function(shared, num_rows):
+    rows = jax.random.normal(jax.random.key(1), (num_rows, 48))
+    counts = jax.random.bernoulli(jax.random.key(2), 0.7, (num_rows, 1))
+    expected, found = (run(fused, shared, rows, counts) for fused in (False, True))
+    assert jax.tree.map(jnp.shape, found) == jax.tree.map(jnp.shape, expected)
+    jax.tree.map(close, found, expected)
+
+
+def test_programs_share_the_rows(shared, monkeypatch):
+    """Several blocks to a program add up to the same."""
+    rows = jax.random.normal(jax.random.key(1), (16 * 12, 48))
+    counts = jnp.ones((len(rows), 1), bool)
+    one_each = run(True, shared, rows, counts)
+    monkeypatch.setattr(kernels, "PROGRAMS", 5)  # 12 blocks: 3 each is the largest that divides
+    together = run(True, shared, rows, counts)
+    jax.tree.map(close, together, one_each)
+
+
+def test_types_are_those_of_the_function(shared):
+    rows = jnp.ones((20, 48), jnp.bfloat16)
+    (_, (output, _, _)), (_, d_rows) = run(True, shared, rows, jnp.ones((20, 1), bool))
+    assert output.dtype == jnp.float32
+    assert d_rows.dtype == jnp.bfloat16
+
+
+def test_stores_the_rows_and_what_is_kept_alone(shared):
+    rows, counts = jnp.ones((32, 48)), jnp.ones((32, 1), bool)
+    call = lambda rows: kernels.fused_rows(gated, shared, rows, WIDTHS, counts, interpret=True)[0]  # noqa: E731
+    _, pull_back = jax.eval_shape(lambda rows: jax.vjp(call, rows), rows)
+    stored = {leaf.shape for leaf in jax.tree.leaves(pull_back) if leaf.shape}
+    assert stored <= {(32, 48), (32, 32), (32, 1), (16, 32), (32,)}
