@@ -24,7 +24,7 @@ def get_config(scale: str) -> Config:
         base="",
         robot="panda",
         data=DataConfig(episodes=1024, num_envs=256),
-        optim=OptimConfig(steps=8000, batch_size=512, learning_rate=1e-3, warmup_steps=300),
+        optim=OptimConfig(steps=10_000, batch_size=512, learning_rate=1e-3, warmup_steps=300),
         evaluation=EvaluationConfig(episodes=256, num_envs=256),
         compute_dtype="bfloat16" if scale == "accelerator" else "float32",
         log_every=200,

@@ -13,6 +13,13 @@ SHAPES = [(6, 10), (10, 6), (8, 8)]
 RANK = 3
 
 
+@pytest.fixture(autouse=True)
+def full_precision():
+    """A GPU would multiply in TF32."""
+    with jax.default_matmul_precision("highest"):
+        yield
+
+
 def inputs(d_in, d_out, dtype=jnp.float32):
     keys = jax.random.split(jax.random.key(0), 4)
     shapes = [(2, 5, d_in), (d_in, d_out), (2, 5, RANK), (RANK, d_out)]
