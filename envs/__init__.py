@@ -8,7 +8,8 @@ episodes = envs.collect("press", robot="panda", num_episodes=512, key=jax.random
 import envs.robots.panda
 import envs.robots.piper  # noqa: F401  envs.robots.piper.forward_kinematics is public
 from envs.collection import collect, expert_success
-from envs.env import Env, State, make
+from envs.env import Env, State
 from envs.episodes import Episodes
+from envs.making import make
 
 __all__ = ["Env", "Episodes", "State", "collect", "expert_success", "make"]

@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs import experts
-from envs.env import Env, make
+from envs.env import Env
 from envs.episodes import Episodes
+from envs.making import make
 
 # Worlds a call, where nobody says otherwise: enough to fill the device, few enough for its memory.
 _NUM_ENVS = {"cpu": 32, "gpu": 256, "tpu": 256}

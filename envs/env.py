@@ -10,8 +10,7 @@ Nothing is rendered unless `observe` is called, and no world restarts unless `re
 
 import dataclasses
 import functools
-import importlib
-import pkgutil
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -19,11 +18,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs import physics, render, scene
+from envs import actions, physics, render, scene
 from envs.robots import Robot
 from envs.tasks import Task, View
 
-_TARGET_DT = 0.02  # s, joint targets are interpolated to this rate between two actions
+TARGET_DT = 0.02  # s, joint targets are interpolated to this rate between two actions
 _HOME_NOISE = 0.03  # rad, half the range of the random start pose around home
 _START_OPENING = 0.04  # m, of the gripper
 
@@ -40,7 +39,8 @@ class State:
         metrics: f32 [W] each, what the task measures.
         info: success bool [W]; steps int32 [W]; instruction int32 [W], index into
             `env.instructions`; command f32 [W, J + 1], the last targets sent to the robot [rad, m];
-            held int32 [W], consecutive control steps at the goal; layout, body name -> [W, 3] m.
+            held int32 [W], consecutive control steps at the goal; layout, body name -> [W, 4] at
+            reset: x, y, z [m], turn about z [rad].
     """
 
     data: Any
@@ -50,15 +50,35 @@ class State:
     info: dict[str, Any]
 
 
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Trajectory:
+    """What W worlds went through in T control steps.
+
+    Attributes:
+        state: f32 [T, W, J + 1] joints [rad] and gripper opening [m] before each action.
+        action: f32 [T, W, A].
+        reward: f32 [T, W] after it.
+        done: bool [T, W] after it.
+    """
+
+    state: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    done: jax.Array
+
+
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Env:
-    """A task for a robot in `num_envs` worlds W. Made by `make`; methods are pure and jitted."""
+    """A task for a robot in `num_envs` worlds W, made by `envs.make`; methods are pure."""
 
     task: Task
     robot: Robot
     num_envs: int
     image_size: int
+    antialias: int
     control_dt: float
+    actions: actions.Mode
     model: mujoco.MjModel
     physics_model: Any
     render_model: Any
@@ -74,13 +94,13 @@ class Env:
 
     @property
     def action_low(self) -> np.ndarray:
-        """[J + 1] lowest joint targets [rad] and gripper opening [m], float32."""
-        return self.robot.action_low
+        """Lowest action [A], float32; units as in `envs.actions`."""
+        return actions.bounds(self.actions, self.robot, self.control_dt)[0]
 
     @property
     def action_high(self) -> np.ndarray:
-        """[J + 1] highest joint targets [rad] and gripper opening [m], float32."""
-        return self.robot.action_high
+        """Highest action [A], float32."""
+        return actions.bounds(self.actions, self.robot, self.control_dt)[1]
 
     @property
     def instructions(self) -> tuple[str, ...]:
@@ -107,8 +127,9 @@ class Env:
 
         Args:
             state: W worlds.
-            action: [W, J + 1] joint targets [rad] and gripper opening [m]; clipped to
-                `action_low`, `action_high` and to what the robot's speed limits allow.
+            action: [W, A], by default A = J + 1 joint targets [rad] and gripper opening [m]; other
+                conventions in `envs.actions`. Clipped to `action_low`, `action_high` and to what
+                the robot's speed limits allow.
 
         Returns:
             The worlds `control_dt` later. Worlds that were done have not moved.
@@ -116,7 +137,7 @@ class Env:
         Raises:
             ValueError: if the action has another shape.
         """
-        expected = (self.num_envs, self.num_joints + 1)
+        expected = (self.num_envs, len(self.action_low))
         if action.shape != expected:
             raise ValueError(f"action must have shape {expected}, got {action.shape}")
         # A weakly typed action, such as jnp.full(shape, 0.0), would compile all anew.
@@ -136,6 +157,27 @@ class Env:
             "state": self.proprio(state),
         }
 
+    def rollout(
+        self, policy: Callable[[dict[str, Any], jax.Array], jax.Array], key: jax.Array
+    ) -> tuple[State, "Trajectory"]:
+        """Fresh worlds with a policy in the loop until the time limit; may be called under jit.
+
+        Args:
+            policy: (observation, key) -> action [W, A]. The observation is that of `observe`, with
+                `instruction` int32 [W]; pictures that the policy does not read are not rendered.
+            key: all randomness.
+        """
+        reset_key, policy_key = jax.random.split(key)
+
+        def body(state: State, key: jax.Array) -> tuple[State, Trajectory]:
+            seen = self.observe(state) | {"instruction": state.info["instruction"]}
+            action = policy(seen, key)
+            after = self.step(state, action)
+            return after, Trajectory(seen["state"], action, after.reward, after.done)
+
+        keys = jax.random.split(policy_key, self.max_steps)
+        return jax.lax.scan(body, self.reset(reset_key), keys)
+
     def reset_done(self, state: State, key: jax.Array) -> State:
         """The same worlds, those that are done started afresh."""
         return jax.jit(_where)(state.done, self.reset(key), state)
@@ -150,9 +192,9 @@ class Env:
         self, geom_xpos: jax.Array, geom_xmat: jax.Array, cam_xpos: jax.Array, cam_xmat: jax.Array
     ) -> dict[str, jax.Array]:
         """Pictures of N recorded scenes: camera name -> uint8 [N, image_size, image_size, 3]."""
-        size = self.image_size
+        poses, size = (geom_xpos, geom_xmat, cam_xpos, cam_xmat), self.image_size
         pictures = render.render_batch(
-            self.render_model, geom_xpos, geom_xmat, cam_xpos, cam_xmat, height=size, width=size
+            self.render_model, *poses, height=size, width=size, samples=self.antialias
         )
         return {name: pictures[:, i] for i, name in enumerate(self.cameras)}
 
@@ -165,16 +207,17 @@ class Env:
         layout = self.task.place(layout_key)
         noise = jax.random.uniform(pose_key, (self.num_joints,), minval=-1.0, maxval=1.0)
         joints = jnp.asarray(self.robot.home, jnp.float32) + _HOME_NOISE * noise
-        command = jnp.clip(jnp.append(joints, _START_OPENING), self.action_low, self.action_high)
+        low, high = self.robot.action_low, self.robot.action_high
+        command = jnp.clip(jnp.append(joints, _START_OPENING), low, high)
         fingers = jnp.full(2, command[-1] / 2)
         qpos = self.template.qpos.at[: self.num_joints + 2].set(
             jnp.concatenate([command[:-1], fingers])
         )
-        for name, position in layout.items():
+        for name, place in layout.items():
             body = self.model.body(name)
             if body.jntnum[0]:  # free; the others are moved in `_placed`
                 start = self.model.jnt_qposadr[body.jntadr[0]]
-                qpos = qpos.at[start : start + 3].set(position)
+                qpos = qpos.at[start : start + 7].set(_pose(place))
         data = physics.kinematics(self._placed(layout), self.template.replace(qpos=qpos))
         _, metrics = self.task.check(View(self.model, data))
         number = jax.random.randint(instruction_key, (), 0, len(self.instructions), jnp.int32)
@@ -192,7 +235,9 @@ class Env:
     def _step(self, state: State, action: jax.Array) -> State:
         info = state.info
         reach = jnp.asarray(self.robot.action_speed) * self.control_dt
-        target = jnp.clip(action, self.action_low, self.action_high)
+        action = jnp.clip(action, self.action_low, self.action_high)
+        target = actions.to_targets(self.actions, self.robot, info["command"], action)
+        target = jnp.clip(target, self.robot.action_low, self.robot.action_high)
         target = jnp.clip(target, info["command"] - reach, info["command"] + reach)
         controls = self._controls(info["command"], target)
         data = physics.advance(self._placed(info["layout"]), state.data, controls)
@@ -214,66 +259,26 @@ class Env:
     def _placed(self, layout: dict[str, jax.Array]) -> Any:
         """The physics model of one world: fixed bodies stand where the layout says."""
         # Mocap bodies would be the usual way, but MJX leaves their children behind.
-        position = self.physics_model.body_pos
+        position, rotation = self.physics_model.body_pos, self.physics_model.body_quat
         for name, place in layout.items():
-            position = position.at[self.model.body(name).id].set(place)
-        return self.physics_model.replace(body_pos=position)
+            number, pose = self.model.body(name).id, _pose(place)
+            position = position.at[number].set(pose[:3])
+            rotation = rotation.at[number].set(pose[3:])
+        return self.physics_model.replace(body_pos=position, body_quat=rotation)
 
     def _controls(self, start: jax.Array, end: jax.Array) -> jax.Array:
         """Actuator targets [S, J + 1] of the S physics steps between two commands."""
-        moves = round(self.control_dt / _TARGET_DT)
+        moves = round(self.control_dt / TARGET_DT)
         fraction = jnp.arange(1, moves + 1, dtype=jnp.float32)[:, None] / moves
         targets = start + fraction * (end - start)
         targets = targets.at[:, -1].multiply(0.5)  # each finger makes half of the opening
-        return jnp.repeat(targets, round(_TARGET_DT / scene.PHYSICS_DT), axis=0)
+        return jnp.repeat(targets, round(TARGET_DT / scene.PHYSICS_DT), axis=0)
 
 
-def make(
-    task: str,
-    robot: str = "piper",
-    *,
-    num_envs: int = 1,
-    image_size: int = 64,
-    control_dt: float = 0.1,
-) -> Env:
-    """An environment.
-
-    Args:
-        task: name of a file in `envs/tasks`.
-        robot: name of a file in `envs/robots`.
-        num_envs: parallel worlds W.
-        image_size: height and width of the pictures in pixels.
-        control_dt: seconds between two actions, a multiple of 0.02.
-
-    Raises:
-        ValueError: for an unknown name (the known ones are listed) or a number out of range.
-    """
-    found_task, found_robot = _find("task", task), _find("robot", robot)
-    _check_sizes(num_envs, image_size, control_dt)
-    model = mujoco.MjModel.from_xml_string(scene.mjcf(found_task.scene, found_robot))
-    return Env(
-        task=found_task,
-        robot=found_robot,
-        num_envs=num_envs,
-        image_size=image_size,
-        control_dt=control_dt,
-        model=model,
-        physics_model=physics.put_model(model),
-        render_model=render.build(model, scene.CAMERAS),
-        template=physics.make_data(model),
-    )
-
-
-def _check_sizes(num_envs: int, image_size: int, control_dt: float) -> None:
-    """Raise ValueError for a number out of range."""
-    for name, value in (("num_envs", num_envs), ("image_size", image_size)):
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
-    moves = control_dt / _TARGET_DT
-    if round(moves) < 1 or abs(moves - round(moves)) > 1e-6:
-        raise ValueError(
-            f"control_dt must be a positive multiple of {_TARGET_DT} s, got {control_dt}"
-        )
+def _pose(place: jax.Array) -> jax.Array:
+    """Position in m and unit quaternion [7] of a place of a layout."""
+    half = place[3] / 2
+    return jnp.stack([*place[:3], jnp.cos(half), 0.0 * half, 0.0 * half, jnp.sin(half)])
 
 
 def _where(condition: jax.Array, yes: Any, no: Any) -> Any:
@@ -284,11 +289,3 @@ def _where(condition: jax.Array, yes: Any, no: Any) -> Any:
         return jnp.where(condition.reshape(shape), a, b)
 
     return jax.tree.map(choose, yes, no)
-
-
-def _find(kind: str, name: str) -> Any:
-    package = importlib.import_module(f"envs.{kind}s")
-    names = sorted(module.name for module in pkgutil.iter_modules(package.__path__))
-    if name not in names:
-        raise ValueError(f"unknown {kind} {name!r}: choose from {', '.join(names)}")
-    return getattr(importlib.import_module(f"envs.{kind}s.{name}"), kind.upper())

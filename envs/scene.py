@@ -21,7 +21,7 @@ _SCENE = """
       <geom type="sphere" mass="0" group="3" rgba="0 0 0 0" contype="2" condim="1" priority="1"/>
     </default>
     <default class="pad">
-      <geom type="box" conaffinity="1" condim="4" friction="1.5 .02 .001" solref=".01 1"
+      <geom type="box" conaffinity="5" condim="4" friction="1.5 .02 .001" solref=".01 1"
         solimp=".95 .99 .001"/>
     </default>
     <default class="finger">
@@ -31,7 +31,7 @@ _SCENE = """
   <worldbody>
     <light pos=".6 -.5 1.2" dir="-.5 .2 -1"/>
     <camera name="side" {side} fovy="32"/>
-    <geom name="table" type="plane" size="2 2 .1" conaffinity="3" rgba=".62 .66 .68 1"/>
+    <geom name="table" type="plane" size="2 2 .1" conaffinity="11" rgba=".62 .66 .68 1"/>
     {robot}{task}
   </worldbody>
   <actuator>{actuators}</actuator>

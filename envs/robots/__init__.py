@@ -19,6 +19,11 @@ _TIP_RADIUS = 0.005  # m, sphere at each finger tip that touches tables, walls a
 # the tips (own choice: the tips stand in the lower half of the picture, the object above them).
 _WRIST_CAMERA = '<camera name="wrist" pos="-.08 0 -.093" xyaxes="0 -1 0 -.9272 0 .3746" fovy="75"/>'
 
+# Damped least squares as in the facts' proof: damping, weight of rotation [m/rad], longest step.
+_DAMPING, _ROTATION_WEIGHT, _MAX_STEP = 0.03, 0.3, 0.3
+_ITERATIONS = 60
+_POSTURE_GAIN = 0.1  # pull of spare joints towards home, a fraction of the way an iteration
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Robot:
@@ -33,6 +38,8 @@ class Robot:
         home: [J] start pose [rad]: tcp at (.34, 0, .18) m, tool down with its lean.
         lean: angle by which the hand leans outwards when it works from above [rad], chosen so that
             the whole table in front of the robot is within the wrist's limits.
+        tilt_side: where the hand can tilt by a right angle from pointing down: 1 outwards, -1 back
+            towards the base.
         stroke: largest gripper opening, both fingers together [m].
         gripper_speed: largest change of the opening [m/s].
         stiffness, damping: [J] gains of the position actuators [N m/rad, N m s/rad].
@@ -50,6 +57,7 @@ class Robot:
     speed: np.ndarray
     home: np.ndarray
     lean: float
+    tilt_side: int
     stroke: float
     gripper_speed: float
     stiffness: np.ndarray
@@ -139,6 +147,32 @@ def tool_pose(robot: Robot, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Arr
     linear = jnp.cross(axes, position - positions)
     jacobian = jnp.concatenate([linear, axes], axis=-1).T
     return position, multiply(rotations[-1], tool[:3, :3]), jacobian
+
+
+def inverse_kinematics(
+    robot: Robot, position: jax.Array, rotation: jax.Array, start: jax.Array
+) -> jax.Array:
+    """Joint angles [J] within the limits that bring the tcp to a pose, found from `start` [J]."""
+    lower, upper, home = (
+        jnp.asarray(x, jnp.float32) for x in (robot.lower, robot.upper, robot.home)
+    )
+    weight = jnp.array([1.0] * 3 + [_ROTATION_WEIGHT] * 3)
+
+    def body(q: jax.Array, _: None) -> tuple[jax.Array, None]:
+        at, facing, jacobian = tool_pose(robot, q)
+        twist = multiply(rotation, facing.T)
+        turn = 0.5 * jnp.array(
+            [twist[2, 1] - twist[1, 2], twist[0, 2] - twist[2, 0], twist[1, 0] - twist[0, 1]]
+        )
+        jacobian = jacobian * weight[:, None]
+        error = jnp.concatenate([position - at, turn]) * weight
+        posture = _POSTURE_GAIN * (home - q) * (robot.num_joints > 6)
+        square = multiply(jacobian, jacobian.T) + _DAMPING**2 * jnp.eye(6)
+        solved = jnp.linalg.solve(square, error - multiply(jacobian, posture))
+        step = posture + multiply(jacobian.T, solved)
+        return jnp.clip(q + jnp.clip(step, -_MAX_STEP, _MAX_STEP), lower, upper), None
+
+    return jax.lax.scan(body, start, None, length=_ITERATIONS)[0]
 
 
 def bodies(robot: Robot) -> str:

@@ -48,6 +48,7 @@ ROBOT = robots.Robot(
     speed=np.array([2.175] * 4 + [2.61] * 3),  # Franka data sheet [rad/s]
     home=np.array([0.0, -0.354, 0.0, -2.897, 0.0, 2.543, 0.785]),
     lean=0.0,
+    tilt_side=-1,  # joint 6 ends before the tool is level
     stroke=0.08,  # two fingers of 0.04 m
     gripper_speed=0.1,  # Franka hand data sheet: 50 mm/s a finger
     # Menagerie; its passive joint damping (40, then 2) is added to the servo's, both act alike.

@@ -62,6 +62,19 @@ def forward_kinematics(q: jax.Array, *, sdk_offset: bool = False) -> tuple[jax.A
     return robots.forward_kinematics(_SDK_CHAIN if sdk_offset else _CHAIN, q)
 
 
+def from_sdk_zeros(q: jax.Array) -> jax.Array:
+    """This model's joint angles [..., 6] in rad for those that an arm with the SDK's zeros reports.
+
+    The vendor SDK's default zeros (dh_is_offset=1) of joints 2 and 3 lie 2 degrees from ours.
+    """
+    return q + jax.numpy.asarray(_SDK_OFFSET, q.dtype)
+
+
+def to_sdk_zeros(q: jax.Array) -> jax.Array:
+    """What to send to an arm with the SDK's zeros for this model's joint angles [..., 6] in rad."""
+    return q - jax.numpy.asarray(_SDK_OFFSET, q.dtype)
+
+
 # Shapes and colours are own choices; masses [kg] are Menagerie's, link 6 with its gripper .45.
 _DARK, _GREY = 'rgba=".13 .14 .16 1"', 'rgba=".30 .32 .35 1"'
 _LINKS = (
@@ -84,6 +97,7 @@ ROBOT = robots.Robot(
     speed=np.full(6, 3.0),  # piper_sdk, [rad/s]
     home=np.array([0.0, 1.528, -1.248, 0.0, 1.029, 0.0]),
     lean=np.deg2rad(20.0),
+    tilt_side=1,  # joint 5 ends soon after the tool points down
     stroke=0.07,  # piper_sdk, GripperCtrl [m]
     gripper_speed=0.1,  # own choice [m/s]
     stiffness=np.array([80.0, 80.0, 80.0, 40.0, 10.0, 10.0]),

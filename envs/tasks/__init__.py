@@ -3,12 +3,13 @@
 A task says what lies on the table and where (`place`), what counts as success (`check`), how people
 ask for it (`instructions`) and how a hand does it (`waypoints`). It knows nothing of robots.
 
-Contact masks of the scenes: objects that are carried have contype 1, finger tips contype 2;
-whatever they may touch has the bit in its conaffinity, and no other pair is ever computed.
+Contact masks of the scenes, one bit of contype for each part played: 1 objects that are carried,
+2 finger tips, 4 what only finger pads hold, 8 feet that stand on something. Whatever they may touch
+has the bit in its conaffinity, and no other pair is ever computed.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -17,7 +18,8 @@ import mujoco
 
 from envs.robots import TIP_LENGTH
 
-Layout = dict[str, jax.Array]  # body name -> position [3] in m at reset
+Layout = dict[str, jax.Array]
+"""Body name -> where it is at reset: [4], x, y, z in m and the turn about z in rad."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +32,10 @@ class View:
     def position(self, body: str) -> jax.Array:
         """Position [3] of a body in m."""
         return self.data.xpos[self.model.body(body).id]
+
+    def upright(self, body: str) -> jax.Array:
+        """Cosine of the angle between a body's z axis and the vertical."""
+        return self.data.xmat[self.model.body(body).id].reshape(3, 3)[2, 2]
 
     def speed(self, body: str) -> jax.Array:
         """Linear speed of a free body in m/s."""
@@ -62,16 +68,25 @@ class View:
 class Waypoints:
     """Poses the hand goes through one after the other; P of them.
 
+    A robot turns the rotation about the fingers' axis: by its own lean (`Robot.lean`) times `lean`,
+    and by `tilt` to the side that its wrist prefers (`Robot.tilt_side`).
+
     Attributes:
-        position: [P, 3] of the tcp in m.
-        rotation: [P, 3, 3] of the tcp; a robot leans on top of that (`Robot.lean`).
+        position: [P, 3] in m of a point on the hand's axis, `reach` behind the tcp.
+        reach: [P] in m; 0 means the tcp itself. A hand turns about that point.
+        rotation: [P, 3, 3] of the tcp before leaning and tilting.
+        lean: [P] share of the robot's own lean.
+        tilt: [P] in rad.
         opening: [P] of the gripper in m.
         seconds: [P] nominal time to get there from the one before.
         spread: [P] standard deviation of the noise on the position in m, 0 where it matters.
     """
 
     position: jax.Array
+    reach: jax.Array
     rotation: jax.Array
+    lean: jax.Array
+    tilt: jax.Array
     opening: jax.Array
     seconds: jax.Array
     spread: jax.Array
@@ -104,22 +119,66 @@ class Task:
     waypoints: Callable[[Layout], Waypoints]
 
 
+def azimuth(position: jax.Array) -> jax.Array:
+    """Direction [...] in rad in which the base, at the origin, sees positions [..., 3]."""
+    return jnp.arctan2(position[..., 1], position[..., 0])
+
+
 def tool_down(position: jax.Array) -> jax.Array:
     """Rotations [..., 3, 3] of a tcp that points down, fingers opening across the line to the base.
 
     Args:
         position: [..., 3] where the tcp is; the arm's base stands at the origin.
     """
-    yaw = jnp.arctan2(position[..., 1], position[..., 0])
+    yaw = azimuth(position)
     c, s, zero = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw)
     columns = [jnp.stack([-c, -s, zero], -1), jnp.stack([-s, c, zero], -1)]
     down = jnp.broadcast_to(jnp.array([0.0, 0.0, -1.0]), columns[0].shape)
     return jnp.stack([*columns, down], axis=-1)
 
 
-def route(*rows: tuple[jax.Array, tuple[float, float, float], float, float, float]) -> Waypoints:
-    """Waypoints with the tool pointing down, from rows (anchor [3], offset, opening, s, spread)."""
+def route(
+    *rows: tuple[jax.Array, tuple[float, float, float], float, float, float],
+    lean: float = 1.0,
+    reach: float = 0.0,
+    tilt: Sequence[float] = (),
+) -> Waypoints:
+    """Waypoints with the tool pointing down, from rows (anchor, offset, opening, s, spread).
+
+    Args:
+        rows: one a waypoint; an anchor is a place of the layout, or a position [3].
+        lean, reach: as in `Waypoints`, the same for all.
+        tilt: as in `Waypoints`, one a row [rad]; none tilts.
+    """
     anchors, offsets, opening, seconds, spread = zip(*rows, strict=True)
-    position = jnp.stack(anchors) + jnp.array(offsets)
-    numbers = (jnp.array(column, jnp.float32) for column in (opening, seconds, spread))
-    return Waypoints(position, tool_down(position), *numbers)
+    position = jnp.stack(anchors)[:, :3] + jnp.array(offsets)
+    columns = [jnp.array(c, jnp.float32) for c in (opening, seconds, spread)]
+    same = jnp.ones(len(rows))
+    angles = jnp.array(tilt or [0.0] * len(rows), jnp.float32)
+    return Waypoints(position, reach * same, tool_down(position), lean * same, angles, *columns)
+
+
+def scatter(key: jax.Array, centre: tuple, spread: tuple) -> jax.Array:
+    """Random place [4] on the table, uniform within `spread` [m] of `centre` [m], not turned."""
+    shift = jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0) * jnp.array(spread)
+    return jnp.concatenate([jnp.array(centre) + shift, jnp.zeros(2)])
+
+
+def raised(place: jax.Array, height: float) -> jax.Array:
+    """A place [4] moved up by a height in m."""
+    return place.at[2].add(height)
+
+
+def box_walls(inside: float, wall: float, height: float, look: str) -> str:
+    """MJCF of four walls around a square of half-width `inside`, standing at z = 0.
+
+    Args:
+        inside, wall, height: half the inner width, half the walls' thickness, their height [m].
+        look: MJCF attributes of every wall.
+    """
+    side, middle, long = inside + wall, height / 2, inside + 2 * wall
+    return f"""
+  <geom type="box" {look} size="{wall} {long} {middle}" pos="{side} 0 {middle}"/>
+  <geom type="box" {look} size="{wall} {long} {middle}" pos="{-side} 0 {middle}"/>
+  <geom type="box" {look} size="{inside} {wall} {middle}" pos="0 {side} {middle}"/>
+  <geom type="box" {look} size="{inside} {wall} {middle}" pos="0 {-side} {middle}"/>"""

@@ -6,7 +6,7 @@ Numbers without a source are own choices that work with both arms.
 import jax
 import jax.numpy as jnp
 
-from envs.tasks import Layout, Task, View, Waypoints, route
+from envs.tasks import Layout, Task, View, Waypoints, box_walls, raised, route, scatter
 
 _RADIUS = 0.015  # m, a large table grape (12 g)
 _INSIDE = 0.046  # m, half the inner width of the basket
@@ -15,17 +15,12 @@ _HEIGHT = 0.045  # m, of its walls
 _GRAPE, _GRAPE_RANGE = (0.36, -0.08), (0.06, 0.10)  # m, of the random position
 _BASKET, _BASKET_RANGE = (0.36, 0.155), (0.035, 0.035)  # m
 
-_BASKET_LOOK = 'type="box" conaffinity="3" rgba=".85 .65 .30 1"'
-_SIDE, _MIDDLE = _INSIDE + _WALL, _HEIGHT / 2
-_LONG = _INSIDE + 2 * _WALL
+_LOOK = 'conaffinity="3" rgba=".85 .65 .30 1"'
 # The free joint's damping stops a rolling grape within half a second: 1.4 m r^2 / damping.
 _SCENE = f"""
 <body name="basket">
-  <geom {_BASKET_LOOK} size="{_INSIDE} {_INSIDE} .002" pos="0 0 .002"/>
-  <geom {_BASKET_LOOK} size="{_WALL} {_LONG} {_MIDDLE}" pos="{_SIDE} 0 {_MIDDLE}"/>
-  <geom {_BASKET_LOOK} size="{_WALL} {_LONG} {_MIDDLE}" pos="{-_SIDE} 0 {_MIDDLE}"/>
-  <geom {_BASKET_LOOK} size="{_INSIDE} {_WALL} {_MIDDLE}" pos="0 {_SIDE} {_MIDDLE}"/>
-  <geom {_BASKET_LOOK} size="{_INSIDE} {_WALL} {_MIDDLE}" pos="0 {-_SIDE} {_MIDDLE}"/>
+  <geom type="box" {_LOOK} size="{_INSIDE} {_INSIDE} .002" pos="0 0 .002"/>
+  {box_walls(_INSIDE, _WALL, _HEIGHT, _LOOK)}
 </body>
 <body name="grape">
   <joint name="grape" type="free" damping="1e-5"/>
@@ -37,14 +32,9 @@ _SCENE = f"""
 
 def _place(key: jax.Array) -> Layout:
     grape_key, basket_key = jax.random.split(key)
-
-    def sample(key: jax.Array, centre: tuple, spread: tuple, height: float) -> jax.Array:
-        shift = jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0) * jnp.array(spread)
-        return jnp.append(jnp.array(centre) + shift, height)
-
     return {
-        "grape": sample(grape_key, _GRAPE, _GRAPE_RANGE, _RADIUS),
-        "basket": sample(basket_key, _BASKET, _BASKET_RANGE, 0.0),
+        "grape": raised(scatter(grape_key, _GRAPE, _GRAPE_RANGE), _RADIUS),
+        "basket": scatter(basket_key, _BASKET, _BASKET_RANGE),
     }
 
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from envs.robots import TIP_LENGTH
-from envs.tasks import Layout, Task, View, Waypoints, route
+from envs.tasks import Layout, Task, View, Waypoints, raised, route, scatter
 
 _STROKE = 0.012  # m
 _TOP = 0.040  # m, height of the cap at rest
@@ -31,8 +31,7 @@ _SCENE = f"""
 
 
 def _place(key: jax.Array) -> Layout:
-    shift = jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0) * jnp.array(_RANGE)
-    return {"button": jnp.append(jnp.array(_CENTRE) + shift, 0.0)}
+    return {"button": scatter(key, _CENTRE, _RANGE)}
 
 
 def _check(view: View) -> tuple[jax.Array, dict[str, jax.Array]]:
@@ -44,7 +43,7 @@ def _check(view: View) -> tuple[jax.Array, dict[str, jax.Array]]:
 
 
 def _waypoints(layout: Layout) -> Waypoints:
-    top = layout["button"] + jnp.array([0.0, 0.0, _TOP + TIP_LENGTH])
+    top = raised(layout["button"], _TOP + TIP_LENGTH)
     return route(
         (top, (0.0, 0.0, 0.060), 0.0, 1.8, 0.008),
         (top, (0.0, 0.0, 0.012), 0.0, 0.9, 0.0),

@@ -37,7 +37,7 @@ def take(state, worlds):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"task": "prss"}, "unknown task 'prss': choose from pick_place, press"),
+        ({"task": "prss"}, "unknown task 'prss': choose from open_pot, pick_place, pour, press"),
         ({"robot": "pipe"}, "unknown robot 'pipe': choose from panda, piper"),
         ({"num_envs": 0}, "num_envs must be at least 1, got 0"),
         ({"image_size": 0}, "image_size must be at least 1, got 0"),

@@ -9,7 +9,7 @@ import pytest
 
 import envs
 from envs import collection, experts, robots
-from envs.tasks import tool_down
+from envs.tasks import route
 
 LAYOUTS = 256
 
@@ -60,8 +60,9 @@ def test_actions_are_smooth(episodes, scene):
 
 
 def test_state_follows_the_action(episodes):
+    """A servo is late by damping over stiffness, 0.15 s; the expert keeps below 1.5 rad/s."""
     lag = np.abs(episodes.state[:, 1:, :-1] - episodes.action[:, :-1, :-1])
-    assert lag[valid(episodes)[:, 1:]].max() < 0.15  # rad
+    assert lag[valid(episodes)[:, 1:]].max() < 0.25  # rad
 
 
 def test_pictures_show_the_episode(episodes):
@@ -75,13 +76,14 @@ def test_inverse_kinematics_reaches(scene):
     robot = scene.robot
     rng = np.random.default_rng(0)
     goals = jnp.array(rng.uniform([0.30, -0.18, 0.01], [0.42, 0.18, 0.12], (64, 3)), jnp.float32)
-    rotations = experts.leaning(robot, tool_down(goals))
+    way = route(*((goal, (0.0, 0.0, 0.0), 0.0, 1.0, 0.0) for goal in goals))
+    rotations = experts.leaning(robot, way)
     start = jnp.asarray(robot.home, jnp.float32)
 
     @jax.jit
     @jax.vmap
     def solve(goal, rotation):
-        q = experts.inverse_kinematics(robot, goal, rotation, start)
+        q = robots.inverse_kinematics(robot, goal, rotation, start)
         return q, *robots.tool_pose(robot, q)[:2]
 
     q, position, facing = solve(goals, rotations)

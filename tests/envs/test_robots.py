@@ -105,3 +105,12 @@ def test_fingers_follow_the_opening(scene, robot_name):
 
 def pads(model) -> list[int]:
     return [int(model.body(side).geomadr[0]) for side in ("left", "right")]
+
+
+def test_sdk_zeros_are_the_kinematics_other_convention():
+    q = jnp.array([[0.1, 1.2, -1.0, 0.2, 0.5, -0.3]])
+    ours = piper.forward_kinematics(piper.from_sdk_zeros(q))
+    theirs = piper.forward_kinematics(q, sdk_offset=True)
+    for a, b in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6)
+    np.testing.assert_allclose(piper.to_sdk_zeros(piper.from_sdk_zeros(q)), q, atol=1e-6)

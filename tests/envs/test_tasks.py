@@ -8,21 +8,22 @@ import mujoco
 import numpy as np
 import pytest
 
-from envs import experts
-from envs.tasks import View, tool_down
+from envs import experts, robots
+from envs.tasks import View, route
 
 
 def world(scene, key: int = 0) -> mujoco.MjData:
     """MuJoCo data of a random layout, robot at home; moves the model's fixed bodies."""
     data = mujoco.MjData(scene.model)
     data.qpos[: scene.num_joints] = scene.robot.home
-    for name, position in scene.task.place(jax.random.key(key)).items():
+    for name, (*position, yaw) in scene.task.place(jax.random.key(key)).items():
         body = scene.model.body(name)
+        turn = np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)
         if body.jntnum[0]:
             start = scene.model.jnt_qposadr[body.jntadr[0]]
-            data.qpos[start : start + 3] = position
+            data.qpos[start : start + 7] = *position, *turn
         else:
-            scene.model.body_pos[body.id] = position
+            scene.model.body_pos[body.id], scene.model.body_quat[body.id] = position, turn
     mujoco.mj_forward(scene.model, data)
     return data
 
@@ -36,8 +37,8 @@ def reach(scene, data, position, opening: float) -> None:
     """Puts the tool, pointing down, at a position."""
     goal = jnp.asarray(position, jnp.float32)
     start = jnp.asarray(scene.robot.home, jnp.float32)
-    solve = jax.jit(functools.partial(experts.inverse_kinematics, scene.robot))
-    rotation = experts.leaning(scene.robot, tool_down(goal))
+    solve = jax.jit(functools.partial(robots.inverse_kinematics, scene.robot))
+    (rotation,) = experts.leaning(scene.robot, route((goal, (0.0, 0.0, 0.0), 0.0, 1.0, 0.0)))
     data.qpos[: scene.num_joints] = solve(goal, rotation, start)
     data.qpos[scene.num_joints : scene.num_joints + 2] = opening / 2
 
@@ -57,6 +58,12 @@ def test_layouts_differ_and_are_within_reach(scene):
 
 
 RANGES = {  # body -> lowest and highest x, y [m]
+    "open_pot": {"pot": ((0.32, 0.06), (0.40, 0.14)), "lid": ((0.32, 0.06), (0.40, 0.14))},
+    "pour": {
+        "cup": ((0.30, -0.14), (0.36, -0.04)),
+        "block": ((0.30, -0.14), (0.36, -0.04)),
+        "basket": ((0.34, 0.09), (0.40, 0.15)),
+    },
     "press": {"button": ((0.32, -0.04), (0.40, 0.04))},
     "pick_place": {
         "grape": ((0.30, -0.18), (0.42, 0.02)),
@@ -81,7 +88,7 @@ def test_every_layout_is_in_the_side_cameras_picture(scene):
     edge = np.tan(np.deg2rad(scene.model.camera("side").fovy[0]) / 2)
     layouts = jax.vmap(scene.task.place)(jax.random.split(jax.random.key(2), 256))
     for place in layouts.values():
-        x, y, z = camera.xmat.reshape(3, 3).T @ (np.asarray(place) - camera.xpos).T
+        x, y, z = camera.xmat.reshape(3, 3).T @ (np.asarray(place)[:, :3] - camera.xpos).T
         assert np.all(z < 0)
         assert np.abs(np.stack([x, y]) / z / edge).max() < 0.95  # 1 is the picture's border
 
@@ -105,7 +112,7 @@ def test_few_contacts_are_computed(scene):
         for i in range(geoms)
         for j in range(i)
     )
-    assert 0 < pairs <= 24
+    assert 0 < pairs <= 32
     colliding = (con[0] > 0) | (con[1] > 0)
     kinds = {mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_SPHERE}
     kinds |= {mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CAPSULE}
@@ -169,3 +176,64 @@ class TestPickPlace:
         data = self.drop(scene)
         reach(scene, data, data.joint("grape").qpos[:3] + np.array([0, 0, 0.08]), 0.0)
         assert succeeds(scene, data)
+
+
+@pytest.mark.parametrize("task_name", ["open_pot"])
+class TestOpenPot:
+    def put(self, scene, offset, *, speed: float = 0.0, turn=(1, 0, 0, 0)) -> mujoco.MjData:
+        """The lid at an offset [m] from the pot, the robot at home."""
+        data = world(scene)
+        data.joint("lid").qpos[:3] = data.body("pot").xpos + offset
+        data.joint("lid").qpos[3:] = turn
+        data.joint("lid").qvel[1] = speed
+        return data
+
+    def test_beside_the_pot(self, scene):
+        assert succeeds(scene, self.put(scene, (0, -0.17, 0)))
+        assert succeeds(scene, self.put(scene, (0, -0.14, 0)))
+
+    @pytest.mark.parametrize("offset", [(0, 0, 0.055), (0, -0.1, 0), (0, -0.17, 0.05)])
+    def test_on_the_pot_or_leaning_or_held(self, scene, offset):
+        assert not succeeds(scene, self.put(scene, offset))
+
+    def test_not_if_knocked_off(self, scene):
+        """Upside down, or on its edge, or still sliding."""
+        assert not succeeds(scene, self.put(scene, (0, -0.17, 0), turn=(0, 1, 0, 0)))
+        assert not succeeds(scene, self.put(scene, (0, -0.17, 0), turn=(0.9, 0.436, 0, 0)))
+        assert not succeeds(scene, self.put(scene, (0, -0.17, 0), speed=0.1))
+
+    @pytest.mark.parametrize(("opening", "done"), [(0.019, False), (0.05, True)])
+    def test_released(self, scene, opening, done):
+        data = self.put(scene, (0, -0.17, 0))
+        reach(scene, data, data.joint("lid").qpos[:3] + np.array([0, 0, 0.03]), opening)
+        assert succeeds(scene, data) is done
+
+
+@pytest.mark.parametrize("task_name", ["pour"])
+class TestPour:
+    def poured(self, scene, block=(0, 0, 0.014), cup=(0, 0, 0), turn=(1, 0, 0, 0)):
+        """The block at an offset [m] from the basket, the cup from where it stood, turned."""
+        data = world(scene)
+        data.joint("block").qpos[:3] = data.body("basket").xpos + block
+        data.joint("cup").qpos[:3] += cup
+        data.joint("cup").qpos[3:] = turn
+        return data
+
+    def test_block_in_the_basket_and_cup_upright(self, scene):
+        assert succeeds(scene, self.poured(scene))
+        assert succeeds(scene, self.poured(scene, (-0.035, 0.035, 0.014), (0.05, 0.02, 0)))
+
+    @pytest.mark.parametrize("offset", [(0.09, 0, 0.01), (0, 0, 0.1)])
+    def test_block_elsewhere(self, scene, offset):
+        assert not succeeds(scene, self.poured(scene, offset))
+
+    def test_cup_has_to_stand(self, scene):
+        lying = (0.7071, 0, 0.7071, 0)
+        assert not succeeds(scene, self.poured(scene, cup=(0, 0, 0.02), turn=lying))
+        assert not succeeds(scene, self.poured(scene, cup=(0, 0, 0.05)))
+
+    @pytest.mark.parametrize(("opening", "done"), [(0.047, False), (0.066, True)])
+    def test_released(self, scene, opening, done):
+        data = self.poured(scene)
+        reach(scene, data, data.joint("cup").qpos[:3] + np.array([0, 0, 0.033]), opening)
+        assert succeeds(scene, data) is done

@@ -1,0 +1,82 @@
+"""What an action means: one file for every convention, all of them turned into joint targets.
+
+    joint         [J + 1] joint targets [rad], gripper opening [m]
+    delta_joint   [J + 1] change of the joint targets [rad], gripper opening [m]
+    end_effector  [7] change of the tcp's position [m] and its rotation vector [rad], both along the
+                  axes of the base, gripper opening [m]
+
+Changes are relative to the targets that were sent last, not to what was measured, so that servos
+that lag behind do not make an arm creep.
+"""
+
+from typing import Literal, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs import robots
+from envs.robots import Robot, multiply
+
+Mode = Literal["joint", "delta_joint", "end_effector"]
+MODES: tuple[str, ...] = get_args(Mode)
+
+_TOOL_SPEED = np.array([0.5] * 3 + [2.0] * 3, np.float32)  # own choice [m/s, rad/s]
+
+
+def bounds(mode: Mode, robot: Robot, control_dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest action, float32, of a robot that acts every `control_dt` seconds."""
+    if mode == "joint":
+        return robot.action_low, robot.action_high
+    speed = _TOOL_SPEED if mode == "end_effector" else robot.action_speed[:-1]
+    low = np.append(-speed * control_dt, robot.action_low[-1])
+    return low.astype(np.float32), np.append(-low[:-1], robot.action_high[-1]).astype(np.float32)
+
+
+def to_targets(mode: Mode, robot: Robot, command: jax.Array, action: jax.Array) -> jax.Array:
+    """Joint targets and opening [J + 1] of one world's action, given the last targets [J + 1].
+
+    An end-effector action out of reach gives the nearest pose that inverse kinematics finds.
+    """
+    if mode == "joint":
+        return action
+    if mode == "delta_joint":
+        return action.at[:-1].add(command[:-1])
+    position, rotation, _ = robots.tool_pose(robot, command[:-1])
+    goal = position + action[:3], multiply(_turn(action[3:6]), rotation)
+    joints = robots.inverse_kinematics(robot, *goal, command[:-1])
+    return jnp.append(joints, action[6])
+
+
+def from_targets(mode: Mode, robot: Robot, command: jax.Array, targets: jax.Array) -> jax.Array:
+    """The action that sends these targets [J + 1] after the last ones, `to_targets` turned round.
+
+    Joints of an arm with more than six are not determined by an end-effector action.
+    """
+    if mode == "joint":
+        return targets
+    if mode == "delta_joint":
+        return targets.at[:-1].add(-command[:-1])
+    (start, before, _), (end, after, _) = (
+        robots.tool_pose(robot, q[:-1]) for q in (command, targets)
+    )
+    turn = _rotation_vector(multiply(after, before.T))
+    return jnp.concatenate([end - start, turn, targets[-1:]])
+
+
+def _turn(vector: jax.Array) -> jax.Array:
+    """Rotation [3, 3] of a rotation vector [3] (Rodrigues)."""
+    angle = jnp.sqrt(jnp.maximum(jnp.sum(vector * vector), 1e-16))
+    x, y, z = vector / angle
+    zero = jnp.zeros_like(x)
+    cross = jnp.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])
+    return jnp.eye(3) + jnp.sin(angle) * cross + (1 - jnp.cos(angle)) * multiply(cross, cross)
+
+
+def _rotation_vector(rotation: jax.Array) -> jax.Array:
+    """Rotation vector [3] of a rotation [3, 3] by less than half a turn."""
+    r = rotation
+    twice = jnp.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+    sine = jnp.linalg.norm(twice) / 2
+    angle = jnp.arctan2(sine, (jnp.trace(r) - 1) / 2)
+    return twice / 2 * jnp.where(sine > 1e-6, angle / jnp.maximum(sine, 1e-6), 1.0)

@@ -1,0 +1,99 @@
+"""An environment as a Brax environment, for training from states with Brax's wrappers.
+
+env = brax.envs.training.wrap(BraxEnv(envs.make("press")), episode_length=80)
+state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), 4096))
+
+Brax's wrappers take keys of `jax.random.PRNGKey` only, not of `jax.random.key`. The agents in Brax
+0.14.2 call `jax.device_put_replicated`, which JAX 0.10 has removed (google/brax issue 671).
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from envs.env import Env, State
+from envs.tasks import View
+
+try:
+    from brax.envs import base
+except ImportError as error:
+    raise ImportError('envs.interop.brax needs Brax: pip install -e ".[brax]"') from error
+
+
+class BraxEnv(base.Env):
+    """One world of a task behind Brax's interface; Brax's wrappers batch, time and restart it.
+
+    Observations, float32: measured joint angles [rad] and gripper opening [m], position of the tool
+    centre [3] in m, then position [3] in m and unit quaternion [4] of every body that the task
+    places, ordered by name. There are no speeds and no pictures in them: `state.pipeline_state` is
+    the `envs.State` of one world, which has the former and from which `env.observe` makes the
+    latter.
+
+    Actions, [A] in [-1, 1], span `action_low` to `action_high` of the environment inside. The
+    reward is 1 once, when the task is done, so the return of an episode is its success. `done`
+    means success or broken physics. Time is left to Brax: an episode lasts as long as the wrapper
+    says (`env.max_steps` is the task's own limit), and its end is a truncation. Brax's
+    AutoResetWrapper restarts a world as it first was, the layout included.
+
+    Attributes:
+        env: the environment inside, of one world.
+    """
+
+    def __init__(self, env: Env):
+        """Wrap an environment that `envs.make` gave; its number of worlds does not matter."""
+        self.env = dataclasses.replace(env, num_envs=1)
+
+    def reset(self, rng: jax.Array) -> base.State:
+        """One fresh world, all from the key `rng`."""
+        world = self.env.reset(rng)
+        return base.State(reward=world.reward[0], metrics=self._metrics(world), **self._seen(world))
+
+    def step(self, state: base.State, action: jax.Array) -> base.State:
+        """The world one control step later.
+
+        Args:
+            state: one world.
+            action: [A] in [-1, 1]; clipped.
+        """
+        before: Any = state.pipeline_state
+        low, high = jnp.asarray(self.env.action_low), jnp.asarray(self.env.action_high)
+        world = self.env.step(before, (low + (action + 1) / 2 * (high - low))[None])
+        # Brax would take the task's own time limit for a failure. A clock that stands still never
+        # gets there.
+        clock = jnp.zeros_like(world.info["steps"])
+        world = dataclasses.replace(world, info=world.info | {"steps": clock})
+        reward = jnp.where(before.done, 0.0, world.reward)[0]
+        metrics = state.metrics | self._metrics(world)  # wrappers add their own
+        return state.replace(reward=reward, metrics=metrics, **self._seen(world))
+
+    @property
+    def observation_size(self) -> int:
+        """Length of an observation."""
+        return jax.eval_shape(self.reset, jax.random.key(0)).obs.shape[0]
+
+    @property
+    def action_size(self) -> int:
+        """A."""
+        return len(self.env.action_low)
+
+    @property
+    def backend(self) -> str:
+        """The physics engine."""
+        return "mjx"
+
+    def _seen(self, world: State) -> dict[str, Any]:
+        """The fields of Brax's state that say how the world is now."""
+        view = View(self.env.model, jax.tree.map(lambda x: x[0], world.data))
+        parts = [self.env.proprio(world)[0], view.tcp]
+        for name in sorted(world.info["layout"]):
+            parts += [view.position(name), view.data.xquat[view.model.body(name).id]]
+        return {
+            "pipeline_state": world,
+            "obs": jnp.concatenate(parts),
+            "done": world.done[0].astype(jnp.float32),
+        }
+
+    def _metrics(self, world: State) -> dict[str, jax.Array]:
+        return {name: value[0] for name, value in world.metrics.items()}

@@ -1,0 +1,75 @@
+"""Making an environment from the names of a task and a robot, which are those of their files."""
+
+import importlib
+import pkgutil
+from typing import Any
+
+import mujoco
+
+from envs import physics, render, scene
+from envs.actions import MODES, Mode
+from envs.env import TARGET_DT, Env
+
+
+def make(
+    task: str,
+    robot: str = "piper",
+    *,
+    num_envs: int = 1,
+    image_size: int = 64,
+    antialias: int = 1,
+    control_dt: float = 0.1,
+    actions: Mode = "joint",
+) -> Env:
+    """An environment.
+
+    Args:
+        task, robot: names of files in `envs/tasks` and `envs/robots`.
+        num_envs: parallel worlds W.
+        image_size: height and width of the pictures in pixels.
+        antialias: n for smooth edges by n x n rays a pixel, which take n squared times as long.
+        control_dt: seconds between two actions, a multiple of 0.02.
+        actions: what an action means: joint, delta_joint or end_effector, see `envs.actions`.
+
+    Raises:
+        ValueError: for an unknown name (the known ones are listed) or a number out of range.
+    """
+    found_task, found_robot = _find("task", task), _find("robot", robot)
+    _check(num_envs, image_size, antialias, control_dt, actions)
+    model = mujoco.MjModel.from_xml_string(scene.mjcf(found_task.scene, found_robot))
+    return Env(
+        task=found_task,
+        robot=found_robot,
+        num_envs=num_envs,
+        image_size=image_size,
+        antialias=antialias,
+        control_dt=control_dt,
+        actions=actions,
+        model=model,
+        physics_model=physics.put_model(model),
+        render_model=render.build(model, scene.CAMERAS),
+        template=physics.make_data(model),
+    )
+
+
+def _check(num_envs: int, image_size: int, antialias: int, control_dt: float, actions: str) -> None:
+    """Raise ValueError for a number out of range or an unknown meaning of actions."""
+    counts = {"num_envs": num_envs, "image_size": image_size, "antialias": antialias}
+    for name, value in counts.items():
+        if value < 1:
+            raise ValueError(f"{name} must be at least 1, got {value}")
+    moves = control_dt / TARGET_DT
+    if round(moves) < 1 or abs(moves - round(moves)) > 1e-6:
+        raise ValueError(
+            f"control_dt must be a positive multiple of {TARGET_DT} s, got {control_dt}"
+        )
+    if actions not in MODES:
+        raise ValueError(f"unknown actions {actions!r}: choose from {', '.join(MODES)}")
+
+
+def _find(kind: str, name: str) -> Any:
+    package = importlib.import_module(f"envs.{kind}s")
+    names = sorted(module.name for module in pkgutil.iter_modules(package.__path__))
+    if name not in names:
+        raise ValueError(f"unknown {kind} {name!r}: choose from {', '.join(names)}")
+    return getattr(importlib.import_module(f"envs.{kind}s.{name}"), kind.upper())

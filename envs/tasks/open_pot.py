@@ -1,0 +1,91 @@
+"""Open the pot: grasp the lid by its knob, lift it off, put it down beside the pot.
+
+Numbers without a source are own choices that work with both arms.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from envs.tasks import Layout, Task, View, Waypoints, box_walls, raised, route, scatter
+
+_INSIDE, _WALL, _HEIGHT = 0.043, 0.005, 0.055  # m, of the pot: half the inner width, half a wall
+_FOOT = 0.005  # m, radius of the lid's feet, which stand in the middle of the walls
+_KNOB, _KNOB_HEIGHT = 0.010, 0.030  # m, its radius, and its centre above the feet
+_LID = 0.055  # m, radius
+_POT, _POT_RANGE = (0.36, 0.10), (0.04, 0.04)  # m, of the random position
+_BESIDE = 0.175  # m from pot to lid, to the right as the robot sees it
+
+_STEEL, _LOOK = 'rgba=".55 .57 .60 1"', 'conaffinity="10" rgba=".62 .20 .16 1"'
+_RIM = _INSIDE + _WALL
+_FEET = "".join(
+    f'<geom type="sphere" size="{_FOOT}" pos="{x} {y} {_FOOT}" contype="8" condim="4" mass=".005" '
+    f'friction="1 .02 .001" solref=".01 1" {_STEEL}/>'
+    for x, y in ((_RIM, 0), (-_RIM, 0), (0, _RIM), (0, -_RIM))
+)
+# A lid on four spheres rests a hundred times more quietly than one on a flat face.
+_SCENE = f"""
+<body name="pot">
+  <geom type="box" rgba=".62 .20 .16 1" size="{_INSIDE} {_INSIDE} .002" pos="0 0 .002"/>
+  {box_walls(_INSIDE, _WALL, _HEIGHT, _LOOK)}
+</body>
+<body name="lid">
+  <joint name="lid" type="free" damping="1e-4"/>
+  {_FEET}
+  <geom type="cylinder" size="{_LID} .003" pos="0 0 .011" mass=".03" {_STEEL}/>
+  <geom type="cylinder" size=".005 .006" pos="0 0 .018" mass=".002" {_STEEL}/>
+  <geom type="sphere" size="{_KNOB}" pos="0 0 {_KNOB_HEIGHT}" mass=".008" contype="4" condim="4"
+    friction="1 .02 .001" solref=".01 1" rgba=".12 .12 .13 1"/>
+</body>
+"""
+
+
+def _place(key: jax.Array) -> Layout:
+    pot = scatter(key, _POT, _POT_RANGE)
+    return {"pot": pot, "lid": raised(pot, _HEIGHT)}
+
+
+def _check(view: View) -> tuple[jax.Array, dict[str, jax.Array]]:
+    lid = view.position("lid")
+    apart = jnp.linalg.norm((lid - view.position("pot"))[:2])
+    on_table = (lid[2] < 0.01) & (view.upright("lid") > 0.97)
+    beside = apart > _LID + _RIM + _WALL
+    at_rest = view.speed("lid") < 0.05
+    knob = lid + jnp.array([0.0, 0.0, _KNOB_HEIGHT])
+    away = jnp.linalg.norm(knob - view.tcp) > 0.06
+    released = (view.opening > 2 * _KNOB + 0.005) | away
+    return on_table & beside & at_rest & released, {"lid_to_pot": apart}
+
+
+def _waypoints(layout: Layout) -> Waypoints:
+    knob = raised(layout["lid"], _KNOB_HEIGHT + 0.003)[:3]
+    down = knob - jnp.array([0.0, _BESIDE, _HEIGHT - 0.002])
+    wide, closed = 0.050, 0.0  # m
+    return route(
+        (knob, (0.0, 0.0, 0.070), wide, 1.5, 0.008),
+        (knob, (0.0, 0.0, 0.000), wide, 1.0, 0.0),
+        (knob, (0.0, 0.0, 0.000), closed, 0.7, 0.0),
+        (knob, (0.0, 0.0, 0.070), closed, 0.9, 0.006),
+        (down, (0.0, 0.0, 0.090), closed, 1.3, 0.006),
+        (down, (0.0, 0.0, 0.000), closed, 1.0, 0.0),
+        (down, (0.0, 0.0, 0.000), wide, 0.6, 0.0),
+        (down, (0.0, 0.0, 0.080), wide, 0.8, 0.006),
+    )
+
+
+TASK = Task(
+    name="open_pot",
+    scene=_SCENE,
+    instructions=(
+        "open the pot",
+        "take the lid off the pot",
+        "lift the lid and put it down",
+        "remove the lid from the pot",
+        "uncover the pot",
+    ),
+    time_limit=13.0,
+    expert_time=10.0,
+    hold_steps=3,
+    place=_place,
+    check=_check,
+    waypoints=_waypoints,
+)

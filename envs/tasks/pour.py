@@ -1,0 +1,134 @@
+"""Pour the block out of the cup into the basket, and set the cup upright again.
+
+Numbers without a source are own choices that work with both arms.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+
+from envs.tasks import Layout, Task, View, Waypoints, azimuth, box_walls, raised, route, scatter
+
+_BLOCK = 0.010  # m, radius of the sphere that stands for the block where it touches things
+_BOTTOM = 0.014  # m, half the inner width of the cup at its bottom
+_FLARE = math.radians(20.0)  # of the two walls over which the block can leave
+_HEIGHT, _THICK, _FOOT = 0.050, 0.002, 0.004  # m: of the cup, half a wall, a foot's radius
+_SIDE = 0.022  # m from the cup's middle to its upright walls
+_GRIP = 0.033  # m, height at which the cup is held
+_CUP, _CUP_RANGE = (0.33, -0.09), (0.03, 0.05)  # m, of the random position
+_INSIDE, _WALL, _BASKET_HEIGHT = 0.050, 0.003, 0.045  # m, of the basket, as in pick_place
+_BASKET, _BASKET_RANGE = (0.37, 0.12), (0.03, 0.03)  # m
+
+_BLUE, _LOOK = 'rgba=".16 .38 .72 1"', 'conaffinity="1" rgba=".85 .65 .30 1"'
+_RISE = (_HEIGHT - 2 * _FOOT) / 2  # m, half the height of the walls
+_CENTRE = 2 * _FOOT + _RISE
+_OUT = _BOTTOM + _THICK + math.tan(_FLARE) * _RISE
+_TOP = _BOTTOM + math.tan(_FLARE) * 2 * _RISE
+
+
+def _cup() -> str:
+    feet = "".join(
+        f'<geom type="sphere" contype="8" size="{_FOOT}" pos="{x} {y} {_FOOT}" mass=".002" '
+        f"{_BLUE}/>"
+        for x in (-_BOTTOM, _BOTTOM)
+        for y in (-_BOTTOM, _BOTTOM)
+    )
+    wall = f'type="box" conaffinity="1" mass=".005" {_BLUE}'
+    flared = "".join(
+        f'<geom {wall} size="{_THICK} {_SIDE} {_RISE / math.cos(_FLARE)}" '
+        f'pos="{sign * _OUT} 0 {_CENTRE}" euler="0 {sign * _FLARE} 0"/>'
+        for sign in (-1, 1)
+    )
+    sides = "".join(
+        f'<geom {wall} size="{_TOP} {_THICK} {_RISE}" pos="0 {sign * _SIDE} {_CENTRE}" contype="4" '
+        'condim="4" friction="1 .02 .001" solref=".01 1"/>'
+        for sign in (-1, 1)
+    )
+    floor = f'<geom {wall} size="{_BOTTOM} {_SIDE} .002" pos="0 0 {2 * _FOOT - 0.002}"/>'
+    return feet + flared + sides + floor
+
+
+_SCENE = f"""
+<body name="basket">
+  <geom type="box" {_LOOK} size="{_INSIDE} {_INSIDE} .002" pos="0 0 .002"/>
+  {box_walls(_INSIDE, _WALL, _BASKET_HEIGHT, _LOOK)}
+</body>
+<body name="cup"><joint name="cup" type="free" damping="1e-4"/>{_cup()}</body>
+<body name="block">
+  <joint name="block" type="free" damping="1e-5"/>
+  <geom type="sphere" class="collider" size="{_BLOCK}" mass=".01" contype="1" condim="4"
+    friction="1 .02 .001" solref=".01 1"/>
+  <geom type="box" size=".0085 .0085 .0085" mass="0" rgba=".80 .14 .10 1"/>
+</body>
+"""
+
+
+def _place(key: jax.Array) -> Layout:
+    cup_key, basket_key = jax.random.split(key)
+    cup = scatter(cup_key, _CUP, _CUP_RANGE)
+    cup = cup.at[3].set(azimuth(cup))  # its upright walls face the fingers
+    return {
+        "cup": cup,
+        "block": raised(cup, 2 * _FOOT + _BLOCK),
+        "basket": scatter(basket_key, _BASKET, _BASKET_RANGE),
+    }
+
+
+def _check(view: View) -> tuple[jax.Array, dict[str, jax.Array]]:
+    block, cup = view.position("block"), view.position("cup")
+    offset = block - view.position("basket")
+    inside = jnp.all(jnp.abs(offset[:2]) < _INSIDE) & (offset[2] < _BASKET_HEIGHT)
+    standing = (view.upright("cup") > 0.97) & (cup[2] < 0.01)
+    at_rest = (view.speed("block") < 0.05) & (view.speed("cup") < 0.05)
+    grip = cup + jnp.array([0.0, 0.0, _GRIP])
+    away = jnp.linalg.norm(grip - view.tcp) > 0.08
+    released = (view.opening > 2 * (_SIDE + 0.003) + 0.005) | away
+    done = inside & standing & at_rest & released
+    return done, {"block_to_basket": jnp.linalg.norm(offset[:2])}
+
+
+def _waypoints(layout: Layout) -> Waypoints:
+    # The hand turns about a point above the cup's mouth: from there the block falls straight down.
+    reach = _HEIGHT - _GRIP + 0.03
+    cup, basket = (raised(layout[name], _GRIP + reach) for name in ("cup", "basket"))
+    wide, closed = 0.066, 0.030  # m
+    # An arm that cannot point straight down high above the table may lean a little while it moves.
+    carry, level = math.radians(25.0), math.radians(94.0)
+    return route(
+        (cup, (0.0, 0.0, 0.070), wide, 1.5, 0.003),
+        (cup, (0.0, 0.0, 0.000), wide, 1.0, 0.0),
+        (cup, (0.0, 0.0, 0.000), closed, 0.7, 0.0),
+        (cup, (0.0, 0.0, 0.025), closed, 0.5, 0.0),
+        (cup, (0.0, 0.0, 0.080), closed, 0.7, 0.006),
+        (basket, (0.0, 0.0, 0.125), closed, 1.3, 0.006),
+        (basket, (0.0, 0.0, 0.125), closed, 1.0, 0.0),
+        (basket, (0.0, 0.0, 0.125), closed, 0.9, 0.0),
+        (basket, (0.0, 0.0, 0.125), closed, 1.0, 0.0),
+        (cup, (0.0, 0.0, 0.080), closed, 1.3, 0.006),
+        (cup, (0.0, 0.0, 0.001), closed, 1.0, 0.0),
+        (cup, (0.0, 0.0, 0.001), wide, 0.6, 0.0),
+        (cup, (0.0, 0.0, 0.080), wide, 0.8, 0.006),
+        lean=0.0,
+        reach=reach,
+        tilt=(carry, 0, 0, 0, carry, carry, level, level, carry, carry, 0, 0, carry),
+    )
+
+
+TASK = Task(
+    name="pour",
+    scene=_SCENE,
+    instructions=(
+        "pour the block into the basket",
+        "tip the block into the basket",
+        "empty the cup into the basket",
+        "pour the cup over the basket",
+        "tilt the cup above the basket",
+    ),
+    time_limit=20.0,
+    expert_time=17.0,
+    hold_steps=3,
+    place=_place,
+    check=_check,
+    waypoints=_waypoints,
+)

@@ -1,0 +1,95 @@
+"""Conventions of actions: they mean the same motion, and the expert works through all of them."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import envs
+from envs import actions, collection, robots
+
+
+@pytest.fixture
+def robot(robot_name):
+    return getattr(robots, robot_name).ROBOT
+
+
+def command(robot, key):
+    """Targets near home and others a little further on."""
+    draw = jax.random.normal(jax.random.key(key), (2, robot.num_joints))
+    joints = jnp.asarray(robot.home, jnp.float32) + jnp.array([0.05, 0.1])[:, None] * draw
+    return jnp.concatenate([joints, jnp.array([[0.02], [0.04]])], axis=1)
+
+
+@pytest.mark.parametrize("mode", actions.MODES)
+def test_bounds_follow_the_convention(robot, mode):
+    low, high = actions.bounds(mode, robot, 0.1)
+    assert len(low) == len(high) == (7 if mode == "end_effector" else robot.num_joints + 1)
+    assert (low < high).all()
+    assert (low[-1], high[-1]) == (0.0, np.float32(robot.stroke))
+    twice = actions.bounds(mode, robot, 0.2)[1][:-1]
+    np.testing.assert_allclose(twice, high[:-1] * (1 if mode == "joint" else 2), rtol=1e-6)
+
+
+def test_delta_joint_is_a_difference(robot):
+    now, then = command(robot, 0)
+    action = actions.from_targets("delta_joint", robot, now, then)
+    np.testing.assert_allclose(action[:-1], then[:-1] - now[:-1], atol=1e-6)
+    assert action[-1] == then[-1]  # the opening is absolute
+    np.testing.assert_allclose(
+        actions.to_targets("delta_joint", robot, now, action), then, atol=1e-6
+    )
+
+
+def test_end_effector_reaches_the_same_pose(robot):
+    now, then = command(robot, 1)
+    action = actions.from_targets("end_effector", robot, now, then)
+    found = jax.jit(actions.to_targets, static_argnums=(0, 1))("end_effector", robot, now, action)
+    for ours, theirs in zip(
+        robots.tool_pose(robot, found[:-1])[:2], robots.tool_pose(robot, then[:-1])[:2], strict=True
+    ):
+        np.testing.assert_allclose(ours, theirs, atol=3e-3)
+    assert found[-1] == then[-1]
+
+
+def test_end_effector_moves_along_the_axes_of_the_base(robot):
+    now, _ = command(robot, 2)
+    action = jnp.array([0.02, 0.0, -0.01, 0.0, 0.0, 0.2, 0.03])
+    found = actions.to_targets("end_effector", robot, now, action)
+    (start, before, _), (end, after, _) = (robots.tool_pose(robot, q[:-1]) for q in (now, found))
+    np.testing.assert_allclose(end - start, action[:3], atol=2e-3)
+    turn = after @ before.T  # about the vertical
+    np.testing.assert_allclose(turn[:2, :2], [[0.980, -0.199], [0.199, 0.980]], atol=0.01)
+
+
+def test_unknown_convention_is_named():
+    with pytest.raises(ValueError, match="unknown actions 'cartesian': choose from joint, delta"):
+        envs.make("press", actions="cartesian")
+
+
+@pytest.mark.parametrize("mode", ["delta_joint", "end_effector"])
+def test_expert_works_in_every_convention(env, mode):
+    other = dataclasses.replace(env, actions=mode)
+    tries = jax.jit(collection.rollout, static_argnums=0)(other, jax.random.key(0))
+    assert tries.action.shape[-1] == 7
+    low, high = other.action_low, other.action_high
+    assert ((tries.action >= low - 1e-6) & (tries.action <= high + 1e-6)).all()
+    assert tries.success.all()
+
+
+def test_rollout_puts_a_policy_in_the_loop(env):
+    def policy(seen, key):
+        del key
+        assert seen["image"]["side"].shape == (4, 16, 16, 3)
+        assert seen["instruction"].shape == (4,)
+        return seen["state"].at[:, 0].add(0.05)
+
+    last, went = jax.jit(lambda key: env.rollout(policy, key))(jax.random.key(1))
+    assert went.action.shape == went.state.shape == (env.max_steps, 4, 7)
+    np.testing.assert_allclose(went.action[..., 0], went.state[..., 0] + 0.05, atol=1e-6)
+    assert (went.state[20, :, 0] > went.state[0, :, 0] + 0.3).all()
+    assert went.done[-1].all()
+    np.testing.assert_array_equal(last.info["steps"], env.max_steps)
+    assert not went.reward.any()

@@ -1,0 +1,241 @@
+"""The environments behind Gymnasium's and Brax's interfaces, and inside their own wrappers."""
+
+import dataclasses
+import importlib
+import sys
+
+import brax.envs
+import gymnasium.wrappers.vector as wrappers
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode
+
+from envs import experts
+from envs.interop.brax import BraxEnv
+from envs.interop.gymnasium import VectorEnv
+
+W = 4
+B = 2
+
+
+@pytest.fixture
+def vector(env):
+    return VectorEnv(env, pictures=False)
+
+
+@pytest.fixture(scope="module")
+def pressed(env):
+    """An expert through the Gymnasium interface: the first success, and the worlds before it."""
+    vector = VectorEnv(env, pictures=False)
+    vector.reset(seed=0)
+    plan = experts.plan(env, vector.state, jax.random.key(1))
+    act = jax.jit(lambda state: experts.act(env, plan, state))
+    for _ in range(env.expert_steps):
+        before, action = vector.state, np.asarray(act(vector.state))
+        outcome = vector.step(action)
+        if np.any(outcome[2]):
+            return before, action, outcome, vector
+    raise AssertionError("the expert never succeeded")
+
+
+@pytest.fixture(scope="module")
+def wrapped(env):
+    """Brax's usual wrappers around two worlds, with episodes of three steps, jitted."""
+    training = brax.envs.training
+    found = training.EvalWrapper(training.wrap(BraxEnv(env), episode_length=3, action_repeat=1))
+    return found, jax.jit(found.reset), jax.jit(found.step)
+
+
+@pytest.fixture(scope="module")
+def first(wrapped):
+    return wrapped[1](jax.random.split(jax.random.PRNGKey(0), B))
+
+
+def at_step(vector, *steps):
+    """The vector environment with its worlds' clocks set."""
+    info = vector.state.info | {"steps": jnp.array(steps, jnp.int32)}
+    vector.state = dataclasses.replace(vector.state, info=info)
+
+
+def commands(vector):
+    return np.array(vector.state.info["command"])
+
+
+def scaled(env, targets):
+    """Targets as the actions in [-1, 1] that Brax's agents give."""
+    return 2 * (targets - env.action_low) / (env.action_high - env.action_low) - 1
+
+
+@pytest.mark.parametrize("name", ["gymnasium", "brax"])
+def test_a_missing_package_is_one_sentence(name, monkeypatch):
+    for module in [m for m in sys.modules if m.split(".")[0] == name]:
+        monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.delitem(sys.modules, f"envs.interop.{name}")
+    message = rf'^envs.interop.{name} needs {name.title()}: pip install -e "\.\[{name}\]"$'
+    with pytest.raises(ImportError, match=message):
+        importlib.import_module(f"envs.interop.{name}")
+
+
+@pytest.mark.parametrize("pictures", [True, False])
+def test_spaces_hold_what_is_seen(env, pictures):
+    vector = VectorEnv(env, pictures=pictures)
+    assert (vector.num_envs, vector.action_space.shape) == (W, (W, 7))
+    assert vector.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    np.testing.assert_array_equal(vector.single_action_space.high, env.action_high)
+    np.testing.assert_array_equal(vector.single_action_space.low, env.action_low)
+    seen, info = vector.reset(seed=0)
+    assert vector.observation_space.contains(seen)
+    assert ("image" in seen) == pictures
+    np.testing.assert_array_equal(seen["state"], env.proprio(vector.state))
+    assert all(leaf.flags.writeable for leaf in jax.tree.leaves(seen))
+    numbers = np.asarray(vector.state.info["instruction"])
+    assert info["instruction"].tolist() == [env.instructions[i] for i in numbers]
+    assert info["success"].tolist() == [False] * W
+    assert np.all([info["_success"], info["_instruction"]])
+
+
+def test_steps_are_those_of_the_environment(env, vector):
+    vector.reset(seed=0)
+    before, action = vector.state, commands(vector) + 0.05
+    seen, reward, terminated, truncated, _ = vector.step(action)
+    np.testing.assert_array_equal(seen["state"], env.proprio(env.step(before, action)))
+    assert reward.dtype == np.float32
+    for values in (reward, terminated, truncated):
+        assert values.tolist() == [0] * W
+
+
+def test_restarts_come_with_the_next_step(vector):
+    start, _ = vector.reset(seed=0)
+    at_step(vector, 79, 78, 0, 5)
+    action = commands(vector) + 0.05
+    assert vector.step(action)[3].tolist() == [True, False, False, False]
+    seen, reward, terminated, truncated, _ = vector.step(action)
+    assert truncated.tolist() == [False, True, False, False]  # ended while another one restarted
+    assert not np.any(reward)
+    assert not np.any(terminated)
+    assert vector.state.info["steps"].tolist() == [0, 80, 2, 7]
+    np.testing.assert_allclose(seen["state"][0], commands(vector)[0], atol=1e-6)  # at rest
+    assert np.any(seen["state"][0] != start["state"][0])
+    vector.step(action)
+    assert vector.state.info["steps"].tolist() == [1, 0, 3, 8]
+
+
+def test_a_seed_says_it_all(vector):
+    def episode(seed):
+        vector.reset(seed=seed)
+        at_step(vector, 79, 0, 0, 0)
+        action = np.tile(vector.env.action_low, (W, 1))
+        return np.stack([vector.step(action)[0]["state"] for _ in range(3)])
+
+    once = episode(3)
+    np.testing.assert_array_equal(once, episode(3))
+    assert np.all(np.any(once != episode(4), axis=(0, 2)))
+    vector.reset(seed=3)
+    before = commands(vector)
+    vector.reset()
+    assert np.any(commands(vector) != before)
+
+
+def test_broken_worlds_are_truncated(vector):
+    vector.reset(seed=0)
+    action = commands(vector)
+    action[2] = np.nan
+    _, _, terminated, truncated, _ = vector.step(action)
+    assert truncated.tolist() == [False, False, True, False]
+    assert not np.any(terminated)
+
+
+def test_success_terminates(pressed):
+    _, action, (_, reward, terminated, truncated, info), vector = pressed
+    np.testing.assert_array_equal(reward, terminated)
+    np.testing.assert_array_equal(info["success"], terminated)
+    assert not np.any(truncated)
+    _, reward, again, _, info = vector.step(action)
+    for values in (reward, again, info["success"]):
+        assert not np.any(values[terminated])
+
+
+def test_misuse(vector):
+    with pytest.raises(ResetNeeded, match="call reset before the first step"):
+        vector.step(np.zeros((W, 7)))
+    with pytest.raises(ValueError, match="reset takes no options, got reset_mask"):
+        vector.reset(options={"reset_mask": np.ones(W, bool)})
+    vector.reset(seed=0)
+    with pytest.raises(ValueError, match=r"action must have shape \(4, 7\), got \(7,\)"):
+        vector.step(np.zeros(7))
+
+
+def test_gymnasium_wrappers(vector):
+    recorder = wrappers.RecordEpisodeStatistics(vector)
+    recorder.reset(seed=0)
+    at_step(vector, 78, 0, 0, 0)
+    action = commands(vector)
+    infos = [recorder.step(action)[4] for _ in range(2)]
+    assert "episode" not in infos[0]
+    assert infos[1]["episode"]["l"].tolist() == [2, 0, 0, 0]
+    for info in wrappers.DictInfoToList(vector).step(action)[4]:
+        assert info["instruction"] in vector.env.instructions
+
+
+def test_brax_observation(env, wrapped, first):
+    found = wrapped[0]
+    # Joints and gripper, tool centre, pose of the button.
+    assert (found.observation_size, found.action_size, found.backend) == (7 + 3 + 7, 7, "mjx")
+    assert first.obs.shape == (B, found.observation_size)
+    world = first.pipeline_state
+    np.testing.assert_allclose(first.obs[:, :7], world.info["command"][:, 0], atol=1e-6)
+    site = env.model.site("tcp").id
+    np.testing.assert_array_equal(first.obs[:, 7:10], world.data.site_xpos[:, 0, site])
+    place = np.asarray(world.info["layout"]["button"])[:, 0]
+    np.testing.assert_allclose(first.obs[:, 10:13], place[:, :3], atol=1e-6)
+    upright = np.stack([np.cos(place[:, 3] / 2), *np.zeros((2, B)), np.sin(place[:, 3] / 2)], 1)
+    np.testing.assert_allclose(first.obs[:, 13:], upright, atol=1e-6)
+    assert np.any(first.obs[0] != first.obs[1])
+
+
+def test_brax_episodes_end_and_restart(env, wrapped, first):
+    state, targets = first, first.pipeline_state.info["command"][:, 0] + 0.008
+    for count in (1, 2, 3, 1):
+        state = wrapped[2](state, scaled(env, targets))
+        assert state.info["steps"].tolist() == [count] * B
+        assert state.info["truncation"].tolist() == state.done.tolist() == [count == 3] * B
+        assert state.pipeline_state.info["steps"].tolist() == [[0]] * B
+        assert state.metrics["button_depth"].shape == (B,)
+        assert not np.any(state.reward)
+        # The wrapper puts the very first observation back after the end.
+        assert np.array_equal(state.obs, first.obs) == (count == 3)
+    np.testing.assert_allclose(state.pipeline_state.info["command"][:, 0], targets, atol=1e-5)
+
+
+def test_brax_actions_are_clipped(env, wrapped, first):
+    command = np.asarray(first.pipeline_state.info["command"])[:, 0]
+    state = wrapped[2](first, np.full((B, 7), 9.0, np.float32))
+    reach = command + env.robot.action_speed * env.control_dt
+    found = state.pipeline_state.info["command"][:, 0]
+    np.testing.assert_allclose(found, np.minimum(reach, env.action_high), atol=1e-5)
+
+
+def test_brax_success_is_rewarded_once(env, wrapped, first, pressed):
+    before, action, (_, reward, *_), _ = pressed
+    worlds = [int(np.argmax(reward)), int(np.argmin(reward))]
+    assert reward[worlds].tolist() == [1, 0]
+    near = jax.tree.map(lambda x: np.asarray(x)[worlds, None], before)
+    state = wrapped[2](first.replace(pipeline_state=near), scaled(env, action[worlds]))
+    assert state.reward.tolist() == state.done.tolist() == [1, 0]
+    assert state.info["eval_metrics"].episode_metrics["reward"].tolist() == [1, 0]
+    assert not np.any(state.info["truncation"])
+    np.testing.assert_array_equal(state.obs[0], first.obs[0])
+    late = np.array([[True], [False]])
+    ended = dataclasses.replace(near, done=late, reward=late.astype(np.float32))
+    state = wrapped[2](first.replace(pipeline_state=ended), scaled(env, action[worlds]))
+    assert (state.reward.tolist(), state.done.tolist()) == ([0, 0], [1, 0])
+
+
+def test_brax_broken_worlds_are_done(wrapped, first):
+    action = jnp.zeros((B, 7)).at[1].set(jnp.nan)
+    state = wrapped[2](first, action)
+    assert (state.done.tolist(), state.reward.tolist()) == ([0, 1], [0, 0])
+    assert np.all(np.isfinite(state.obs))
