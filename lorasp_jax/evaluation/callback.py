@@ -18,6 +18,7 @@ from lorasp_jax.data.demonstrations import side_by_side
 from lorasp_jax.evaluation import video
 from lorasp_jax.evaluation.rollout import Result, evaluate, make_rollout
 from lorasp_jax.training.loop import Callback, Run
+from lorasp_jax.training.progress import bars
 from lorasp_jax.training.run_folder import write_json
 
 TOWERS = ("vision", "language", "action")
@@ -42,15 +43,18 @@ class Evaluation(Callback):
     def on_end(self, run: Run) -> None:
         """Measure the trained policy and write results.json and the videos."""
         results = self._measure(run, "after")
-        for task, result in results.items():
-            _film(self._tasks[task][0], result, run.folder / f"rollout_{task}.mp4")
-            first = {name: np.asarray(i[0, 0]) for name, i in run.episodes[task].image.items()}
-            video.write_picture(run.folder / f"cameras_{task}.png", video.side_by_side(first))
+        with bars(run.console, "videos") as progress:
+            bar = progress.add_task("rendering videos ...", total=len(results))
+            for task, result in results.items():
+                _film(self._tasks[task][0], result, run.folder / f"rollout_{task}.mp4")
+                first = {name: np.asarray(i[0, 0]) for name, i in run.episodes[task].image.items()}
+                video.write_picture(run.folder / f"cameras_{task}.png", video.side_by_side(first))
+                progress.advance(bar)
         write_json(run.folder / "results.json", summarise(run, results))
 
     def _measure(self, run: Run, when: str) -> dict[str, Result]:
         """Results by task; compilations run side by side."""
-        with run.timed("evaluate"), Progress(console=run.console) as progress:
+        with run.timed("evaluate"), bars(run.console, "episodes") as progress:
             one = functools.partial(self._measure_task, run, when, progress)
             tasks = run.config.tasks
             results = dict(zip(tasks, side_by_side(one, tasks), strict=True))

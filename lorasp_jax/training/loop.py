@@ -15,8 +15,6 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 from rich.console import Console
-from rich.progress import Progress, ProgressColumn, Task
-from rich.text import Text
 
 from envs.episodes import Episodes
 from lorasp_jax import adaptation
@@ -27,6 +25,7 @@ from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.checkpoint import Checkpoints
 from lorasp_jax.training.interrupt import deferred
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
+from lorasp_jax.training.progress import bars
 from lorasp_jax.training.run_folder import MetricsLog, write_json
 from lorasp_jax.training.step import TrainState, init_state, train_step
 
@@ -199,11 +198,10 @@ def _loop(
     config = run.config
     key = jax.random.fold_in(jax.random.key(config.seed), 2)
     total, saved = config.optim.steps, int(state.step)
-    columns = (*Progress.get_default_columns(), _Rate(config.optim.batch_size))
     with (
         contextlib.closing(MetricsLog(run.folder, int(state.step))) as log,
         deferred() as stop,
-        Progress(*columns, console=run.console) as progress,
+        bars(run.console, "samples", per_step=config.optim.batch_size) as progress,
     ):
         bar = progress.add_task("compiling train step ...", total=total, completed=saved)
         while (done := int(state.step)) < total and not stop.requested:
@@ -233,14 +231,3 @@ def _check_finite(values: dict[str, float], start: int, end: int, saved: int) ->
                 f"the {name} became {values[name]} between steps {start} and {end}: nothing after "
                 f"step {saved} was saved; try a lower --optim.learning-rate"
             )
-
-
-class _Rate(ProgressColumn):
-    """Samples per second."""
-
-    def __init__(self, batch_size: int) -> None:
-        super().__init__()
-        self._batch_size = batch_size
-
-    def render(self, task: Task) -> Text:
-        return Text(f"{(task.speed or 0.0) * self._batch_size:,.0f} samples/s")

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import TaskID
 
 import envs
 from envs.episodes import Episodes
@@ -21,6 +21,7 @@ from lorasp_jax.models import pi0, tokenizer
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.processing import Processor, Statistics, robot_slots
 from lorasp_jax.training.loop import Run
+from lorasp_jax.training.progress import bars
 
 TRAINING = "training.json"
 """File beside base weights: what they were trained on, with the control period."""
@@ -118,13 +119,13 @@ def processor(
 
 def _collect(run: Run) -> dict[str, Episodes]:
     """Demonstrations by task, with a bar each."""
-    with Progress(console=run.console) as progress:
-        bars: dict[str, int] = {}
+    with bars(run.console, "episodes") as progress:
+        started: dict[str, TaskID] = {}
 
         def report(task: str, done: int, total: int) -> None:
-            if task not in bars:
-                bars[task] = progress.add_task(f"compiling the expert of {task} ...", total=total)
             text = f"collecting {task}" if done else f"compiling the expert of {task} ..."
-            progress.update(bars[task], completed=done, description=text)  # type: ignore[arg-type]
+            if task not in started:
+                started[task] = progress.add_task(text, total=total)
+            progress.update(started[task], completed=done, description=text)
 
         return demonstrations(run.config, run.folder, report)
