@@ -1,6 +1,7 @@
 """Command line: `python -m envs collect | gallery | play --help`."""
 
 import argparse
+import functools
 import pkgutil
 import sys
 from collections.abc import Sequence
@@ -23,11 +24,11 @@ from rich.progress import (
 import envs
 import envs.robots
 import envs.tasks
-from envs import physics, scene
-from envs.episodes import replacing
+from envs import physics
+from envs.episodes import Episodes, replacing
 
 _WORLDS = 4  # tries at once where one episode is wanted: the expert may fail in one
-_FRAMES = 8  # pictures of an episode in the gallery
+_EVERY, _COLOURS = 2, 128  # of a GIF: control steps to a picture, size of its palette
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -59,24 +60,34 @@ def collect(options: argparse.Namespace, console: Console) -> None:
 
 
 def gallery(options: argparse.Namespace, console: Console) -> None:
-    """Writes a strip of pictures along an expert episode for every task, robot and camera."""
+    """Writes a GIF of an expert episode, all cameras together, for every task and robot."""
     from PIL import Image
 
     tasks = [options.task] if options.task else _names(envs.tasks)
     robots = [options.robot] if options.robot else _names(envs.robots)
     for task in tasks:
         for robot in robots:
-            files = {c: options.out / f"{task}_{robot}_{c}.png" for c in scene.CAMERAS}
-            _refuse_existing(options, *files.values())
+            file = options.out / f"{task}_{robot}.gif"
+            _refuse_existing(options, file)
             episode = _episodes(options, console, task, robot, 1)
-            moments = np.linspace(0, int(episode.length[0]) - 1, _FRAMES).round().astype(int)
+            pictures = [Image.fromarray(view) for view in _views(episode)[::_EVERY]]
+            # One palette for all of it: colours do not flicker, and the file is half the size.
+            palette = pictures[len(pictures) // 2].quantize(_COLOURS)
+            flat = functools.partial(
+                Image.Image.quantize, palette=palette, dither=Image.Dither.NONE
+            )
+            first, *rest = map(flat, pictures)
             options.out.mkdir(parents=True, exist_ok=True)
-            for camera, file in files.items():
-                frames = np.asarray(episode.image[camera][0])[moments]
-                with replacing(file) as unfinished:
-                    strip = Image.fromarray(np.concatenate(list(frames), axis=1))
-                    strip.save(unfinished, format="png")
-                console.print(str(file))
+            with replacing(file) as unfinished:
+                first.save(
+                    unfinished,
+                    format="gif",
+                    save_all=True,
+                    append_images=rest,
+                    duration=round(1000 * _EVERY * episode.control_dt),
+                    loop=0,
+                )
+            console.print(str(file))
 
 
 def play(options: argparse.Namespace, console: Console) -> None:
@@ -85,12 +96,18 @@ def play(options: argparse.Namespace, console: Console) -> None:
         raise ValueError(f"a video needs an even --image-size, not {options.image_size}")
     _refuse_existing(options, options.out)
     episode = _episodes(options, console, options.task, options.robot, 1)
-    views = [np.asarray(picture[0, : int(episode.length[0])]) for picture in episode.image.values()]
+    views = _views(episode)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     with replacing(options.out) as unfinished:
-        _write_video(unfinished, np.concatenate(views, axis=2), round(1 / episode.control_dt))
+        _write_video(unfinished, views, round(1 / episode.control_dt))
     text = episode.instructions[int(episode.instruction[0])]
-    console.print(f"{options.out}: {len(views[0])} steps, {text!r}")
+    console.print(f"{options.out}: {len(views)} steps, {text!r}")
+
+
+def _views(episode: Episodes) -> np.ndarray:
+    """The first episode as seen by all cameras beside one another, uint8 [T, H, K W, 3]."""
+    steps = int(episode.length[0])
+    return np.concatenate([np.asarray(p[0, :steps]) for p in episode.image.values()], axis=2)
 
 
 def _write_video(path: Path, frames: np.ndarray, rate: int) -> None:
@@ -136,6 +153,7 @@ def _episodes(
             image_size=options.image_size,
             num_envs=options.num_envs,
             action_noise=options.action_noise,
+            antialias=options.antialias,
             progress=report,
         )
 
@@ -153,11 +171,11 @@ def _refuse_existing(options: argparse.Namespace, *files: Path) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m envs", description="Scripted expert episodes.")
     commands = parser.add_subparsers(required=True, metavar="command")
-    for command, size in ((collect, 64), (gallery, 256), (play, 256)):
+    for command, size in ((collect, 64), (gallery, 128), (play, 256)):
         sub = commands.add_parser(
             command.__name__, help=command.__doc__, description=command.__doc__
         )
-        sub.set_defaults(command=command, num_envs=_WORLDS, action_noise=0.0)
+        sub.set_defaults(command=command, num_envs=_WORLDS, action_noise=0.0, antialias=2)
         one = command is not gallery
         every = "" if one else " (default: all)"
         sub.add_argument("--task", required=one, help=", ".join(_names(envs.tasks)) + every)
@@ -169,6 +187,7 @@ def _parser() -> argparse.ArgumentParser:
         if command is collect:
             sub.add_argument("--num-episodes", type=int, default=64, help="(%(default)s)")
             sub.add_argument("--num-envs", type=int, default=None, help="worlds at once")
+            sub.add_argument("--antialias", type=int, default=1, help="rays a pixel, squared")
             sub.add_argument("--action-noise", type=float, default=0.0, help="rad (%(default)s)")
     return parser
 

@@ -89,12 +89,13 @@ def collect(
     num_envs: int | None = None,
     control_dt: float = 0.1,
     action_noise: float = 0.0,
+    antialias: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> Episodes:
     """Demonstrations by the scripted expert; only successful ones are kept.
 
     Args:
-        task, robot, image_size, control_dt: as for `envs.make`.
+        task, robot, image_size, control_dt, antialias: as for `envs.make`.
         num_episodes: episodes E to return.
         key: all randomness; the same key gives the same episodes.
         num_envs: worlds W simulated at once; None picks by device.
@@ -107,8 +108,14 @@ def collect(
     Raises:
         ValueError: for bad names or numbers, or if the expert fails far too often.
     """
-    worlds = _worlds(num_episodes, num_envs)
-    env = make(task, robot, num_envs=worlds, image_size=image_size, control_dt=control_dt)
+    env = make(
+        task,
+        robot,
+        num_envs=_worlds(num_episodes, num_envs),
+        image_size=image_size,
+        control_dt=control_dt,
+        antialias=antialias,
+    )
     return _gather(env, num_episodes, key, action_noise, progress or _silent)
 
 

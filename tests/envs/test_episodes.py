@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+from PIL import Image
 
 from envs import __main__ as command_line
 from envs.episodes import Episodes, concatenate
@@ -199,7 +200,8 @@ def test_command_line_writes_files(tmp_path, capsys, monkeypatch):
     def collect(task, robot, *, num_episodes, progress, **options):
         progress(0, num_episodes)
         progress(num_episodes, num_episodes)
-        return dataclasses.replace(make(num_episodes), task=task, robot=robot)
+        length = np.full(num_episodes, 4, np.int32)
+        return make(num_episodes, length=length, task=task, robot=robot)
 
     monkeypatch.setattr(command_line.envs, "collect", collect)
     press = ("--task", "press", "--robot", "piper", "--out")
@@ -208,5 +210,9 @@ def test_command_line_writes_files(tmp_path, capsys, monkeypatch):
         assert code == 0, error
     assert Episodes.load(tmp_path / "e.npz").num_episodes == 64
     assert (tmp_path / "v.mp4").read_bytes()[4:8] == b"ftyp"
-    names = {file.name for file in (tmp_path / "g").iterdir()}
-    assert names == {"press_piper_side.png", "press_piper_wrist.png"}
+    (file,) = (tmp_path / "g").iterdir()
+    assert file.name == "press_piper.gif"
+    with Image.open(file) as picture:
+        assert picture.size == (2 * 8, 6)  # both cameras
+        assert picture.n_frames == 2  # every second step of four
+        assert picture.info["duration"] == 200  # ms

@@ -81,3 +81,11 @@ def test_stores_the_rows_and_what_is_kept_alone(shared):
     _, pull_back = jax.eval_shape(lambda rows: jax.vjp(call, rows), rows)
     stored = {leaf.shape for leaf in jax.tree.leaves(pull_back) if leaf.shape}
     assert stored <= {(32, 48), (32, 32), (32, 1), (16, 32), (32,)}
+
+
+def test_vmap_is_a_loop(shared):
+    rows = jax.random.normal(jax.random.key(1), (3, 40, 48))
+    counts = jax.random.bernoulli(jax.random.key(2), 0.7, (3, 40, 1))
+    found = jax.vmap(lambda rows, counts: run(True, shared, rows, counts))(rows, counts)
+    expected = [run(True, shared, *pair) for pair in zip(rows, counts, strict=True)]
+    jax.tree.map(close, found, jax.tree.map(lambda *leaves: jnp.stack(leaves), *expected))
