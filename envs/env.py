@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs import actions, physics, render, scene
+from envs import actions, distractors, physics, render, scene
 from envs.robots import Robot
 from envs.tasks import Task, View
 
@@ -39,8 +39,9 @@ class State:
         metrics: f32 [W] each, what the task measures.
         info: success bool [W]; steps int32 [W]; instruction int32 [W], index into
             `env.instructions`; command f32 [W, J + 1], the last targets sent to the robot [rad, m];
-            held int32 [W], consecutive control steps at the goal; layout, body name -> [W, 4] at
-            reset: x, y, z [m], turn about z [rad].
+            held int32 [W], consecutive control steps at the goal; broken bool [W], ended at its
+            last good moment because physics was not finite after it; layout, body name -> [W, 4]
+            at reset: x, y, z [m], turn about z [rad].
     """
 
     data: Any
@@ -77,6 +78,7 @@ class Env:
     num_envs: int
     image_size: int
     antialias: int
+    distractors: int
     control_dt: float
     actions: actions.Mode
     model: mujoco.MjModel
@@ -205,6 +207,8 @@ class Env:
     def _reset(self, key: jax.Array) -> State:
         layout_key, pose_key, instruction_key = jax.random.split(key, 3)
         layout = self.task.place(layout_key)
+        others = jax.random.fold_in(layout_key, 1)
+        layout |= distractors.place(others, layout, self.distractors)
         noise = jax.random.uniform(pose_key, (self.num_joints,), minval=-1.0, maxval=1.0)
         joints = jnp.asarray(self.robot.home, jnp.float32) + _HOME_NOISE * noise
         low, high = self.robot.action_low, self.robot.action_high
@@ -228,6 +232,7 @@ class Env:
             "instruction": number,
             "command": command,
             "held": zero,
+            "broken": false,
             "layout": layout,
         }
         return State(data, jnp.zeros((), jnp.float32), false, metrics, info)
@@ -253,7 +258,8 @@ class Env:
             info=info | {"success": success, "steps": steps, "command": target, "held": held},
         )
         finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
-        broken = dataclasses.replace(state, done=jnp.ones((), bool))  # at its last good moment
+        true = jnp.ones((), bool)
+        broken = dataclasses.replace(state, done=true, info=info | {"broken": true})
         return _where(state.done, state, _where(finite, after, broken))
 
     def _placed(self, layout: dict[str, jax.Array]) -> Any:

@@ -6,6 +6,7 @@ from typing import Any
 
 import mujoco
 
+import envs.distractors
 from envs import physics, render, scene
 from envs.actions import MODES, Mode
 from envs.env import TARGET_DT, Env
@@ -20,6 +21,7 @@ def make(
     antialias: int = 1,
     control_dt: float = 0.1,
     actions: Mode = "joint",
+    distractors: int = 0,
 ) -> Env:
     """An environment.
 
@@ -30,13 +32,16 @@ def make(
         antialias: n for smooth edges by n x n rays a pixel, which take n squared times as long.
         control_dt: seconds between two actions, a multiple of 0.02.
         actions: what an action means: joint, delta_joint or end_effector, see `envs.actions`.
+        distractors: other things on the table, up to 4.
 
     Raises:
         ValueError: for an unknown name (the known ones are listed) or a number out of range.
     """
     found_task, found_robot = _find("task", task), _find("robot", robot)
-    _check(num_envs, image_size, antialias, control_dt, actions)
-    model = mujoco.MjModel.from_xml_string(scene.mjcf(found_task.scene, found_robot))
+    _check_counts(num_envs=num_envs, image_size=image_size, antialias=antialias)
+    _check_options(control_dt, actions, distractors)
+    things = found_task.scene + envs.distractors.mjcf(distractors)
+    model = mujoco.MjModel.from_xml_string(scene.mjcf(things, found_robot))
     return Env(
         task=found_task,
         robot=found_robot,
@@ -45,6 +50,7 @@ def make(
         antialias=antialias,
         control_dt=control_dt,
         actions=actions,
+        distractors=distractors,
         model=model,
         physics_model=physics.put_model(model),
         render_model=render.build(model, scene.CAMERAS),
@@ -52,12 +58,13 @@ def make(
     )
 
 
-def _check(num_envs: int, image_size: int, antialias: int, control_dt: float, actions: str) -> None:
-    """Raise ValueError for a number out of range or an unknown meaning of actions."""
-    counts = {"num_envs": num_envs, "image_size": image_size, "antialias": antialias}
+def _check_counts(**counts: int) -> None:
     for name, value in counts.items():
         if value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
+
+
+def _check_options(control_dt: float, actions: str, distractors: int) -> None:
     moves = control_dt / TARGET_DT
     if round(moves) < 1 or abs(moves - round(moves)) > 1e-6:
         raise ValueError(
@@ -65,6 +72,9 @@ def _check(num_envs: int, image_size: int, antialias: int, control_dt: float, ac
         )
     if actions not in MODES:
         raise ValueError(f"unknown actions {actions!r}: choose from {', '.join(MODES)}")
+    most = envs.distractors.MOST
+    if not 0 <= distractors <= most:
+        raise ValueError(f"distractors must be 0 to {most}, got {distractors}")
 
 
 def _find(kind: str, name: str) -> Any:

@@ -154,6 +154,8 @@ def test_broken_worlds_are_done(env, start):
     )
     assert state.done.tolist() == [False, True, False, False]
     assert not np.any(state.info["success"])
+    np.testing.assert_array_equal(state.info["broken"], state.done)
+    assert not env.reset_done(state, jax.random.key(5)).info["broken"].any()
     state = env.step(start, start.info["command"].at[2].set(jnp.nan))
     assert state.done.tolist() == [False, False, True, False]
     assert np.all(np.isfinite(env.proprio(state)))
