@@ -1,7 +1,6 @@
 """Command line: `python -m envs collect | gallery | play --help`."""
 
 import argparse
-import functools
 import pkgutil
 import sys
 from collections.abc import Sequence
@@ -70,13 +69,13 @@ def gallery(options: argparse.Namespace, console: Console) -> None:
             file = options.out / f"{task}_{robot}.gif"
             _refuse_existing(options, file)
             episode = _episodes(options, console, task, robot, 1)
-            pictures = [Image.fromarray(view) for view in _views(episode)[::_EVERY]]
+            views = _views(episode)[::_EVERY]
             # One palette for all of it: colours do not flicker, and the file is half the size.
-            palette = pictures[len(pictures) // 2].quantize(_COLOURS)
-            flat = functools.partial(
-                Image.Image.quantize, palette=palette, dither=Image.Dither.NONE
+            palette = Image.fromarray(np.concatenate(views)).quantize(_COLOURS)
+            none = Image.Dither.NONE
+            first, *rest = (
+                Image.fromarray(v).quantize(palette=palette, dither=none) for v in views
             )
-            first, *rest = map(flat, pictures)
             options.out.mkdir(parents=True, exist_ok=True)
             with replacing(file) as unfinished:
                 first.save(

@@ -31,7 +31,7 @@ def files():
         ([*MULTITASK, *NANO, "--peft.rnk", "3"], "did you mean --peft.rank?"),
         ([*MULTITASK, *NANO, "--peft.energy-target", "1.5"], "must lie in (0, 1]"),
         ([*MULTITASK, *NANO, "--robot", "pipper"], "unknown robot 'pipper': choose from panda"),
-        ([*MULTITASK, *NANO, "--tasks", "juggle"], "unknown task 'juggle': choose from open_pot, pick_place"),
+        ([*MULTITASK, *NANO, "--tasks", "juggle"], "unknown task 'juggle': choose from open_pot"),
         ([*MULTITASK, *NANO, "--tasks", "press", "press"], "tasks must be different"),
         ([*MULTITASK, *NANO, "--size", "large"], "unknown size 'large'"),
         ([*MULTITASK, *NANO, "--size", "small"], "does not fit the model"),
