@@ -27,7 +27,7 @@ from envs import physics
 from envs.episodes import Episodes, replacing
 
 _WORLDS = 4  # tries at once where one episode is wanted: the expert may fail in one
-_EVERY, _COLOURS = 2, 128  # of a GIF: control steps to a picture, size of its palette
+_EVERY, _COLOURS = 2, 256  # of a GIF: control steps to a picture, size of its palette
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -71,7 +71,8 @@ def gallery(options: argparse.Namespace, console: Console) -> None:
             episode = _episodes(options, console, task, robot, 1)
             views = _views(episode)[::_EVERY]
             # One palette for all of it: colours do not flicker, and the file is half the size.
-            palette = Image.fromarray(np.concatenate(views)).quantize(_COLOURS)
+            method = Image.Quantize.MAXCOVERAGE  # small things keep their colour
+            palette = Image.fromarray(np.concatenate(views)).quantize(_COLOURS, method)
             none = Image.Dither.NONE
             first, *rest = (
                 Image.fromarray(v).quantize(palette=palette, dither=none) for v in views
