@@ -10,6 +10,7 @@ import envs.distractors
 from envs import physics, render, scene
 from envs.actions import MODES, Mode
 from envs.env import TARGET_DT, Env
+from envs.robots import Robot
 
 
 def make(
@@ -40,8 +41,6 @@ def make(
     found_task, found_robot = _find("task", task), _find("robot", robot)
     _check_counts(num_envs=num_envs, image_size=image_size, antialias=antialias)
     _check_options(control_dt, actions, distractors)
-    things = found_task.scene + envs.distractors.mjcf(distractors)
-    model = mujoco.MjModel.from_xml_string(scene.mjcf(things, found_robot))
     return Env(
         task=found_task,
         robot=found_robot,
@@ -51,11 +50,19 @@ def make(
         control_dt=control_dt,
         actions=actions,
         distractors=distractors,
-        model=model,
-        physics_model=physics.put_model(model),
-        render_model=render.build(model, scene.CAMERAS),
-        template=physics.make_data(model),
+        **_models(found_task.scene + envs.distractors.mjcf(distractors), found_robot),
     )
+
+
+def _models(things: str, robot: Robot) -> dict[str, Any]:
+    """The scene with these things on the table, for MuJoCo, MJX and the renderer."""
+    model = mujoco.MjModel.from_xml_string(scene.mjcf(things, robot))
+    return {
+        "model": model,
+        "physics_model": physics.put_model(model),
+        "render_model": render.build(model, scene.CAMERAS),
+        "template": physics.make_data(model),
+    }
 
 
 def _check_counts(**counts: int) -> None:
