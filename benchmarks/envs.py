@@ -9,13 +9,14 @@ jit, everything is warmed up twice, the best of three calls counts.
 """
 
 import argparse
+import copy
 import importlib.metadata
 import importlib.util
 import json
 import os
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -36,22 +37,30 @@ C_STEPS = 500  # physics steps to a timed call of the C engine
 PLAYGROUND = "PandaPickCube"
 
 
-def measure(task: str, options: argparse.Namespace, batch: int) -> dict[str, Any]:
-    """One row of the table."""
-    env = envs.make(task, options.robot, num_envs=batch, image_size=options.image_size)
-    state = env.reset(jax.random.key(0))
+def measure(task: str, options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """The rows of one task, one a batch size."""
+    reference = None  # does not depend on the batch
+    for batch in options.batches:
+        env = envs.make(task, options.robot, num_envs=batch, image_size=options.image_size)
+        state = env.reset(jax.random.key(0))
+        reference = reference or mujoco_c(env, state)
+        yield measure_batch(env, state, reference)
+
+
+def measure_batch(env: Env, state: State, reference: float) -> dict[str, Any]:
+    """One row of the table, given the C engine's physics steps/s."""
     blind, compile_seconds, memory = time_steps(env, state, pictures=False)
     seeing, _, _ = time_steps(env, state, pictures=True)
     steps = blind * round(env.control_dt / env.physics_dt)
     return {
-        "task": task,
-        "batch": batch,
+        "task": env.task.name,
+        "batch": env.num_envs,
         "compile [s]": compile_seconds,
         "physics steps/s": steps,
         "control steps/s": blind,
         "with pictures": seeing,
         "memory [MiB]": memory,
-        "over MuJoCo C": steps / mujoco_c(env, state),
+        "over MuJoCo C": steps / reference,
     }
 
 
@@ -90,7 +99,7 @@ def best(call: Callable[[], Any]) -> float:
 def mujoco_c(env: Env, state: State) -> float:
     """Physics steps/s of MuJoCo's C engine from the same start, one thread a core."""
     cores = os.cpu_count() or 1
-    model = env.model
+    model = copy.copy(env.model)
     for name, place in state.info["layout"].items():
         model.body_pos[model.body(name).id] = np.asarray(place[0, :3])
     data = [mujoco.MjData(model) for _ in range(cores)]
@@ -141,9 +150,9 @@ def main() -> None:
     console.print(machine)
     rows = []
     for task in options.tasks:
-        for batch in options.batches:
-            rows.append(measure(task, options, batch))
-            console.print(", ".join(f"{k} {_text(v)}" for k, v in rows[-1].items()))
+        for row in measure(task, options):
+            rows.append(row)
+            console.print(", ".join(f"{k} {_text(v)}" for k, v in row.items()))
     table = Table(*rows[0])
     for row in rows:
         table.add_row(*map(_text, row.values()))

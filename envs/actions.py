@@ -75,8 +75,7 @@ def _turn(vector: jax.Array) -> jax.Array:
 
 def _rotation_vector(rotation: jax.Array) -> jax.Array:
     """Rotation vector [3] of a rotation [3, 3] by less than half a turn."""
-    r = rotation
-    twice = jnp.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
-    sine = jnp.linalg.norm(twice) / 2
-    angle = jnp.arctan2(sine, (jnp.trace(r) - 1) / 2)
-    return twice / 2 * jnp.where(sine > 1e-6, angle / jnp.maximum(sine, 1e-6), 1.0)
+    axis = robots.sine_axis(rotation)
+    sine = jnp.linalg.norm(axis)
+    angle = jnp.arctan2(sine, (jnp.trace(rotation) - 1) / 2)
+    return axis * jnp.where(sine > 1e-6, angle / jnp.maximum(sine, 1e-6), 1.0)

@@ -267,9 +267,10 @@ class Env:
         # Mocap bodies would be the usual way, but MJX leaves their children behind.
         position, rotation = self.physics_model.body_pos, self.physics_model.body_quat
         for name, place in layout.items():
-            number, pose = self.model.body(name).id, _pose(place)
-            position = position.at[number].set(pose[:3])
-            rotation = rotation.at[number].set(pose[3:])
+            body, pose = self.model.body(name), _pose(place)
+            if not body.jntnum[0]:  # free ones have their place in qpos
+                position = position.at[body.id].set(pose[:3])
+                rotation = rotation.at[body.id].set(pose[3:])
         return self.physics_model.replace(body_pos=position, body_quat=rotation)
 
     def _controls(self, start: jax.Array, end: jax.Array) -> jax.Array:

@@ -160,10 +160,7 @@ def inverse_kinematics(
 
     def body(q: jax.Array, _: None) -> tuple[jax.Array, None]:
         at, facing, jacobian = tool_pose(robot, q)
-        twist = multiply(rotation, facing.T)
-        turn = 0.5 * jnp.array(
-            [twist[2, 1] - twist[1, 2], twist[0, 2] - twist[2, 0], twist[1, 0] - twist[0, 1]]
-        )
+        turn = sine_axis(multiply(rotation, facing.T))
         jacobian = jacobian * weight[:, None]
         error = jnp.concatenate([position - at, turn]) * weight
         posture = _POSTURE_GAIN * (home - q) * (robot.num_joints > 6)
@@ -173,6 +170,12 @@ def inverse_kinematics(
         return jnp.clip(q + jnp.clip(step, -_MAX_STEP, _MAX_STEP), lower, upper), None
 
     return jax.lax.scan(body, start, None, length=_ITERATIONS)[0]
+
+
+def sine_axis(rotation: jax.Array) -> jax.Array:
+    """Axis [3] of a rotation [3, 3], as long as the sine of its angle."""
+    r = rotation
+    return 0.5 * jnp.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
 
 
 def bodies(robot: Robot) -> str:

@@ -46,6 +46,22 @@ class View:
         """Position of a hinge [rad] or slide [m]."""
         return self.data.qpos[self.model.joint(name).qposadr[0]]
 
+    def inside(self, body: str, box: str, half_width: float, height: float) -> jax.Array:
+        """Whether a body's position lies in an upright square box that stands at another's."""
+        offset = self.position(body) - self.position(box)
+        return jnp.all(jnp.abs(offset[:2]) < half_width) & (offset[2] < height)
+
+    def apart(self, body: str, other: str) -> jax.Array:
+        """Distance of two bodies along the table in m."""
+        return jnp.linalg.norm((self.position(body) - self.position(other))[:2])
+
+    def released(self, grip: jax.Array, width: float, away: float = 0.06) -> jax.Array:
+        """Whether the hand has let go of what is `width` [m] wide where it is held, at grip [3].
+
+        A gripper that holds it is as wide as it and around it: within `away` [m].
+        """
+        return (self.opening > width + 0.005) | (jnp.linalg.norm(grip - self.tcp) > away)
+
     @property
     def tcp(self) -> jax.Array:
         """Position [3] of the tool centre between the fingers in m."""
@@ -169,15 +185,16 @@ def raised(place: jax.Array, height: float) -> jax.Array:
     return place.at[2].add(height)
 
 
-def box_walls(inside: float, wall: float, height: float, look: str) -> str:
-    """MJCF of four walls around a square of half-width `inside`, standing at z = 0.
+def open_box(inside: float, wall: float, height: float, *, floor: str, walls: str) -> str:
+    """MJCF of a square box without a lid that stands at z = 0.
 
     Args:
         inside, wall, height: half the inner width, half the walls' thickness, their height [m].
-        look: MJCF attributes of every wall.
+        floor, walls: MJCF attributes of the floor (4 mm) and of every wall.
     """
-    side, middle, long = inside + wall, height / 2, inside + 2 * wall
+    look, side, middle, long = walls, inside + wall, height / 2, inside + 2 * wall
     return f"""
+  <geom type="box" {floor} size="{inside} {inside} .002" pos="0 0 .002"/>
   <geom type="box" {look} size="{wall} {long} {middle}" pos="{side} 0 {middle}"/>
   <geom type="box" {look} size="{wall} {long} {middle}" pos="{-side} 0 {middle}"/>
   <geom type="box" {look} size="{inside} {wall} {middle}" pos="0 {side} {middle}"/>

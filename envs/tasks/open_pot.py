@@ -6,7 +6,7 @@ Numbers without a source are own choices that work with both arms.
 import jax
 import jax.numpy as jnp
 
-from envs.tasks import Layout, Task, View, Waypoints, box_walls, raised, route, scatter
+from envs.tasks import Layout, Task, View, Waypoints, open_box, raised, route, scatter
 
 _INSIDE, _WALL, _HEIGHT = 0.043, 0.005, 0.055  # m, of the pot: half the inner width, half a wall
 _FOOT = 0.005  # m, radius of the lid's feet, which stand in the middle of the walls
@@ -15,7 +15,7 @@ _LID = 0.055  # m, radius
 _POT, _POT_RANGE = (0.36, 0.10), (0.04, 0.04)  # m, of the random position
 _BESIDE = 0.175  # m from pot to lid, to the right as the robot sees it
 
-_STEEL, _LOOK = 'rgba=".55 .57 .60 1"', 'conaffinity="10" rgba=".62 .20 .16 1"'
+_STEEL, _RED = 'rgba=".55 .57 .60 1"', 'rgba=".62 .20 .16 1"'
 _RIM = _INSIDE + _WALL
 _FEET = "".join(
     f'<geom type="sphere" size="{_FOOT}" pos="{x} {y} {_FOOT}" contype="8" condim="4" mass=".005" '
@@ -25,8 +25,7 @@ _FEET = "".join(
 # A lid on four spheres rests a hundred times more quietly than one on a flat face.
 _SCENE = f"""
 <body name="pot">
-  <geom type="box" rgba=".62 .20 .16 1" size="{_INSIDE} {_INSIDE} .002" pos="0 0 .002"/>
-  {box_walls(_INSIDE, _WALL, _HEIGHT, _LOOK)}
+  {open_box(_INSIDE, _WALL, _HEIGHT, floor=_RED, walls=f'conaffinity="10" {_RED}')}
 </body>
 <body name="lid">
   <joint name="lid" type="free" damping="1e-4"/>
@@ -46,13 +45,11 @@ def _place(key: jax.Array) -> Layout:
 
 def _check(view: View) -> tuple[jax.Array, dict[str, jax.Array]]:
     lid = view.position("lid")
-    apart = jnp.linalg.norm((lid - view.position("pot"))[:2])
+    apart = view.apart("lid", "pot")
     on_table = (lid[2] < 0.01) & (view.upright("lid") > 0.97)
     beside = apart > _LID + _RIM + _WALL
     at_rest = view.speed("lid") < 0.05
-    knob = lid + jnp.array([0.0, 0.0, _KNOB_HEIGHT])
-    away = jnp.linalg.norm(knob - view.tcp) > 0.06
-    released = (view.opening > 2 * _KNOB + 0.005) | away
+    released = view.released(lid + jnp.array([0.0, 0.0, _KNOB_HEIGHT]), 2 * _KNOB)
     return on_table & beside & at_rest & released, {"lid_to_pot": apart}
 
 

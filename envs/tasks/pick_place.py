@@ -4,9 +4,8 @@ Numbers without a source are own choices that work with both arms.
 """
 
 import jax
-import jax.numpy as jnp
 
-from envs.tasks import Layout, Task, View, Waypoints, box_walls, raised, route, scatter
+from envs.tasks import Layout, Task, View, Waypoints, open_box, raised, route, scatter
 
 _RADIUS = 0.015  # m, a large table grape (12 g)
 _INSIDE = 0.046  # m, half the inner width of the basket
@@ -19,8 +18,7 @@ _LOOK = 'conaffinity="3" rgba=".85 .65 .30 1"'
 # The free joint's damping stops a rolling grape within half a second: 1.4 m r^2 / damping.
 _SCENE = f"""
 <body name="basket">
-  <geom type="box" {_LOOK} size="{_INSIDE} {_INSIDE} .002" pos="0 0 .002"/>
-  {box_walls(_INSIDE, _WALL, _HEIGHT, _LOOK)}
+  {open_box(_INSIDE, _WALL, _HEIGHT, floor=_LOOK, walls=_LOOK)}
 </body>
 <body name="grape">
   <joint name="grape" type="free" damping="1e-5"/>
@@ -39,14 +37,10 @@ def _place(key: jax.Array) -> Layout:
 
 
 def _check(view: View) -> tuple[jax.Array, dict[str, jax.Array]]:
-    grape = view.position("grape")
-    offset = grape - view.position("basket")
-    inside = jnp.all(jnp.abs(offset[:2]) < _INSIDE) & (offset[2] < _HEIGHT)
+    inside = view.inside("grape", "basket", _INSIDE, _HEIGHT)
     at_rest = view.speed("grape") < 0.05
-    # A gripper that holds the grape is as wide as it and around it.
-    away = jnp.linalg.norm(grape - view.tcp) > 0.06
-    released = (view.opening > 2 * _RADIUS + 0.005) | away
-    return inside & at_rest & released, {"grape_to_basket": jnp.linalg.norm(offset[:2])}
+    released = view.released(view.position("grape"), 2 * _RADIUS)
+    return inside & at_rest & released, {"grape_to_basket": view.apart("grape", "basket")}
 
 
 def _waypoints(layout: Layout) -> Waypoints:

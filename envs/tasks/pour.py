@@ -8,7 +8,7 @@ import math
 import jax
 import jax.numpy as jnp
 
-from envs.tasks import Layout, Task, View, Waypoints, azimuth, box_walls, raised, route, scatter
+from envs.tasks import Layout, Task, View, Waypoints, azimuth, open_box, raised, route, scatter
 
 _BLOCK = 0.010  # m, radius of the sphere that stands for the block where it touches things
 _BOTTOM = 0.014  # m, half the inner width of the cup at its bottom
@@ -51,8 +51,7 @@ def _cup() -> str:
 
 _SCENE = f"""
 <body name="basket">
-  <geom type="box" {_LOOK} size="{_INSIDE} {_INSIDE} .002" pos="0 0 .002"/>
-  {box_walls(_INSIDE, _WALL, _BASKET_HEIGHT, _LOOK)}
+  {open_box(_INSIDE, _WALL, _BASKET_HEIGHT, floor=_LOOK, walls=_LOOK)}
 </body>
 <body name="cup"><joint name="cup" type="free" damping="1e-4"/>{_cup()}</body>
 <body name="block">
@@ -76,16 +75,14 @@ def _place(key: jax.Array) -> Layout:
 
 
 def _check(view: View) -> tuple[jax.Array, dict[str, jax.Array]]:
-    block, cup = view.position("block"), view.position("cup")
-    offset = block - view.position("basket")
-    inside = jnp.all(jnp.abs(offset[:2]) < _INSIDE) & (offset[2] < _BASKET_HEIGHT)
+    cup = view.position("cup")
+    inside = view.inside("block", "basket", _INSIDE, _BASKET_HEIGHT)
     standing = (view.upright("cup") > 0.97) & (cup[2] < 0.01)
     at_rest = (view.speed("block") < 0.05) & (view.speed("cup") < 0.05)
     grip = cup + jnp.array([0.0, 0.0, _GRIP])
-    away = jnp.linalg.norm(grip - view.tcp) > 0.08
-    released = (view.opening > 2 * (_SIDE + 0.003) + 0.005) | away
+    released = view.released(grip, 2 * (_SIDE + 0.003), away=0.08)
     done = inside & standing & at_rest & released
-    return done, {"block_to_basket": jnp.linalg.norm(offset[:2])}
+    return done, {"block_to_basket": view.apart("block", "basket")}
 
 
 def _waypoints(layout: Layout) -> Waypoints:

@@ -113,7 +113,7 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
     state = restored or state
     many = _Stretches(_jitted(run, graphdef, optimizer, mesh), frozen, steps)
     if restored is None:
-        many.compile(state, _stretch(run.config, state))  # beside what the callbacks do
+        many.compile(state, _stretch(run.config, int(state.step)))  # beside what the callbacks do
         for callback in callbacks:
             callback.on_start(run)
     try:
@@ -186,9 +186,9 @@ class _Stretches:
         return run(self._frozen, self._steps, state, key)
 
 
-def _stretch(config: Config, state: TrainState) -> int:
+def _stretch(config: Config, done: int) -> int:
     """Steps until the next log line or the end."""
-    return min(config.log_every, config.optim.steps - int(state.step))
+    return min(config.log_every, config.optim.steps - done)
 
 
 def _loop(
@@ -205,7 +205,7 @@ def _loop(
     ):
         bar = progress.add_task("compiling train step ...", total=total, completed=saved)
         while (done := int(state.step)) < total and not stop.requested:
-            count = _stretch(config, state)
+            count = _stretch(config, done)
             state, metrics = many(state, key, count)
             values = {name: float(value) for name, value in metrics.items()}
             _check_finite(values, done, done + count, saved)
