@@ -3,9 +3,10 @@
     python -m benchmarks.envs --batches 256 1024 4096 --json envs.json
 
 For each task and batch: seconds to compile, physics steps/s, control steps/s without and with the
-pictures of both cameras, memory of the compiled program, and the ratio to MuJoCo's C engine with a
-thread a core on the same scene. Actions are noise around the start pose. Inputs are built under
-jit, everything is warmed up twice, the best of three calls counts.
+pictures of both cameras, images/s of the renderer alone (hard shadows, two cameras), memory of the
+compiled program, and the ratio to MuJoCo's C engine with a thread a core on the same scene. Actions
+are noise around the start pose. Inputs are built under jit, everything is warmed up twice, the best
+of three calls counts.
 """
 
 import argparse
@@ -25,15 +26,19 @@ import jax.numpy as jnp
 import mujoco
 import mujoco.rollout
 import numpy as np
+from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 import envs
-from envs import physics
-from envs.env import Env, State
+from envs import physics, render
+from envs.env import Env
+from envs.state import State
 
 CONTROL_STEPS = 10  # to a timed call
 C_STEPS = 500  # physics steps to a timed call of the C engine
+PICTURE_SIZES = (64, 128)  # [px] of the renderer's columns
 PLAYGROUND = "PandaPickCube"
 
 
@@ -59,6 +64,7 @@ def measure_batch(env: Env, state: State, reference: float) -> dict[str, Any]:
         "physics steps/s": steps,
         "control steps/s": blind,
         "with pictures": seeing,
+        **{f"images/s, {n} px": time_pictures(env, state, n) for n in PICTURE_SIZES},
         "memory [MiB]": memory,
         "over MuJoCo C": steps / reference,
     }
@@ -84,6 +90,18 @@ def time_steps(env: Env, state: State, *, pictures: bool) -> tuple[float, float,
     memory = analysis.temp_size_in_bytes / 2**20
     seconds = best(lambda: compiled(state, key))
     return env.num_envs * CONTROL_STEPS / seconds, compile_seconds, memory
+
+
+def time_pictures(env: Env, state: State, size: int) -> float:
+    """Images/s of the renderer alone, all worlds and both cameras, `size` x `size` px."""
+    data = state.data
+    poses = (data.geom_xpos, data.geom_xmat, data.cam_xpos, data.cam_xmat)
+    draw = jax.jit(
+        lambda poses: render.render_batch(
+            env.render_model, *poses, height=size, width=size, samples=env.antialias
+        )
+    )
+    return env.num_envs * len(env.cameras) / best(lambda: draw(poses))
 
 
 def best(call: Callable[[], Any]) -> float:
@@ -153,10 +171,7 @@ def main() -> None:
         for row in measure(task, options):
             rows.append(row)
             console.print(", ".join(f"{k} {_text(v)}" for k, v in row.items()))
-    table = Table(*rows[0])
-    for row in rows:
-        table.add_row(*map(_text, row.values()))
-    console.print(table)
+    print_tables(console, rows)
     found: dict[str, Any] = {"machine": machine, "rows": rows}
     if importlib.util.find_spec("mujoco_playground"):
         found[PLAYGROUND] = {batch: playground(batch) for batch in options.batches}
@@ -167,9 +182,23 @@ def main() -> None:
         options.json.write_text(json.dumps(found, indent=1))
 
 
+def print_tables(console: Console, rows: list[dict[str, Any]]) -> None:
+    """Steps and pictures apart, which fits 80 columns."""
+    images = [name for name in rows[0] if name.startswith("images/s")]
+    steps = [name for name in rows[0] if name not in images]
+    for names in (steps, ["task", "batch", *images]):
+        table = Table(*map(escape, names), box=box.SIMPLE, pad_edge=False)
+        table.columns[0].no_wrap = True
+        for row in rows:
+            table.add_row(*(_text(row[name]) for name in names))
+        console.print(table)
+
+
 def _text(value: Any) -> str:
     if not isinstance(value, float):
         return str(value)
+    if value >= 1e6:
+        return f"{value / 1e6:.2f} M"
     return f"{value:,.3g}" if value < 100 else f"{value:,.0f}"
 
 

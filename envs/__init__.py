@@ -8,8 +8,19 @@ episodes = envs.collect("press", robot="panda", num_episodes=512, key=jax.random
 import envs.robots.panda
 import envs.robots.piper  # noqa: F401  envs.robots.piper.forward_kinematics is public
 from envs.collection import collect, expert_success
-from envs.env import Env, State
+from envs.env import Env
 from envs.episodes import Episodes
 from envs.making import make
+from envs.randomization import Randomization
+from envs.state import State, Trajectory
 
-__all__ = ["Env", "Episodes", "State", "collect", "expert_success", "make"]
+__all__ = [
+    "Env",
+    "Episodes",
+    "Randomization",
+    "State",
+    "Trajectory",
+    "collect",
+    "expert_success",
+    "make",
+]

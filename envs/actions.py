@@ -43,7 +43,7 @@ def to_targets(mode: Mode, robot: Robot, command: jax.Array, action: jax.Array) 
     if mode == "delta_joint":
         return action.at[:-1].add(command[:-1])
     position, rotation, _ = robots.tool_pose(robot, command[:-1])
-    goal = position + action[:3], multiply(_turn(action[3:6]), rotation)
+    goal = position + action[:3], multiply(robots.turn(action[3:6]), rotation)
     joints = robots.inverse_kinematics(robot, *goal, command[:-1])
     return jnp.append(joints, action[6])
 
@@ -62,15 +62,6 @@ def from_targets(mode: Mode, robot: Robot, command: jax.Array, targets: jax.Arra
     )
     turn = _rotation_vector(multiply(after, before.T))
     return jnp.concatenate([end - start, turn, targets[-1:]])
-
-
-def _turn(vector: jax.Array) -> jax.Array:
-    """Rotation [3, 3] of a rotation vector [3] (Rodrigues)."""
-    angle = jnp.sqrt(jnp.maximum(jnp.sum(vector * vector), 1e-16))
-    x, y, z = vector / angle
-    zero = jnp.zeros_like(x)
-    cross = jnp.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])
-    return jnp.eye(3) + jnp.sin(angle) * cross + (1 - jnp.cos(angle)) * multiply(cross, cross)
 
 
 def _rotation_vector(rotation: jax.Array) -> jax.Array:

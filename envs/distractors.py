@@ -19,11 +19,16 @@ _CLEARANCE = 0.10  # m to the middle of everything else, wherever there is room 
 _TRIES = 64
 
 
+def names(count: int) -> list[str]:
+    """Names of the bodies of `count` of them."""
+    return [f"distractor{i}" for i in range(count)]
+
+
 def mjcf(count: int) -> str:
     """MJCF of bodies distractor0, distractor1 ...: fixed, solid for tips and loose objects."""
     return "".join(
-        f'<body name="distractor{i}"><geom {shape} conaffinity="3"/></body>'
-        for i, shape in enumerate(_SHAPES[:count])
+        f'<body name="{name}"><geom {shape} conaffinity="3"/></body>'
+        for name, shape in zip(names(count), _SHAPES[:count], strict=True)
     )
 
 
@@ -34,7 +39,7 @@ def place(key: jax.Array, layout: Layout, count: int) -> Layout:
     """
     taken = jnp.stack([where[:2] for where in layout.values()])
     found: Layout = {}
-    for i, one in enumerate(jax.random.split(key, count)):
+    for name, one in zip(names(count), jax.random.split(key, count), strict=True):
         place_key, turn_key = jax.random.split(one)
         spots = jax.random.uniform(
             place_key, (_TRIES, 2), minval=jnp.array(_LOW), maxval=jnp.array(_HIGH)
@@ -42,6 +47,6 @@ def place(key: jax.Array, layout: Layout, count: int) -> Layout:
         gap = jnp.linalg.norm(spots[:, None] - taken, axis=-1).min(axis=1)
         chosen = spots[jnp.argmax(jnp.minimum(gap, _CLEARANCE))]  # argmax: the first of equals
         turn = jax.random.uniform(turn_key, (), maxval=jnp.pi)
-        found[f"distractor{i}"] = jnp.stack([*chosen, jnp.float32(_SIZE), turn])
+        found[name] = jnp.stack([*chosen, jnp.float32(_SIZE), turn])
         taken = jnp.concatenate([taken, chosen[None]])
     return found

@@ -10,7 +10,7 @@ Nothing is rendered unless `observe` is called, and no world restarts unless `re
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -18,55 +18,21 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs import actions, distractors, physics, render, scene
+from envs import actions, distractors, placing, randomization, scene
+from envs.physics import Changes, Data, Physics
+from envs.randomization import Draw, Randomization
+from envs.render import Look, RenderModel
 from envs.robots import Robot
-from envs.tasks import Task, View
+from envs.state import State, Trajectory, where
+from envs.tasks import Layout, Task, View
+
+Renderer = Callable[[Sequence[jax.Array], Look | None, jax.Array | None], jax.Array]
+"""geom_xpos, geom_xmat, cam_xpos, cam_xmat, looks and sizes of geoms of N worlds -> pictures, uint8
+[N, K, height, width, 3]; None for the model's own."""
 
 TARGET_DT = 0.02  # s, joint targets are interpolated to this rate between two actions
 _HOME_NOISE = 0.03  # rad, half the range of the random start pose around home
 _START_OPENING = 0.04  # m, of the gripper
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class State:
-    """W worlds; every leaf has leading axis W.
-
-    Attributes:
-        data: MJX data, poses up to date.
-        reward: f32 [W], 1 where the task is done successfully.
-        done: bool [W], latched; a done world stands still until `reset_done`.
-        metrics: f32 [W] each, what the task measures.
-        info: success bool [W]; steps int32 [W]; instruction int32 [W], index into
-            `env.instructions`; command f32 [W, J + 1], the last targets sent to the robot [rad, m];
-            held int32 [W], consecutive control steps at the goal; broken bool [W], ended at its
-            last good moment because physics was not finite after it; layout, body name -> [W, 4]
-            at reset: x, y, z [m], turn about z [rad].
-    """
-
-    data: Any
-    reward: jax.Array
-    done: jax.Array
-    metrics: dict[str, jax.Array]
-    info: dict[str, Any]
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Trajectory:
-    """What W worlds went through in T control steps.
-
-    Attributes:
-        state: f32 [T, W, J + 1] joints [rad] and gripper opening [m] before each action.
-        action: f32 [T, W, A].
-        reward: f32 [T, W] after it.
-        done: bool [T, W] after it.
-    """
-
-    state: jax.Array
-    action: jax.Array
-    reward: jax.Array
-    done: jax.Array
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -82,9 +48,9 @@ class Env:
     control_dt: float
     actions: actions.Mode
     model: mujoco.MjModel
-    physics_model: Any
-    render_model: Any
-    template: Any
+    physics: Physics
+    render_model: RenderModel
+    renderer: Renderer
 
     physics_dt = scene.PHYSICS_DT
     cameras = scene.CAMERAS
@@ -119,10 +85,17 @@ class Env:
         """Control steps that the expert is given."""
         return round(self.task.expert_time / self.control_dt)
 
-    @functools.partial(jax.jit, static_argnums=0)
-    def reset(self, key: jax.Array) -> State:
-        """Fresh worlds: random layout, phrasing and start pose near home, all from `key`."""
-        return jax.vmap(self._reset)(jax.random.split(key, self.num_envs))
+    def reset(self, key: jax.Array, ranges: Randomization | None = None) -> State:
+        """Fresh worlds: random layout, phrasing and start pose near home, all from `key`.
+
+        Args:
+            key: all randomness.
+            ranges: what else differs from world to world; None for nothing.
+
+        Raises:
+            ValueError: if the ranges make no sense.
+        """
+        return self._resets(key, randomization.prepared(ranges, self.control_dt))
 
     def step(self, state: State, action: jax.Array) -> State:
         """Simulate one control step.
@@ -154,20 +127,25 @@ class Env:
             measured joint angles [rad] and gripper opening [m].
         """
         data = state.data
+        poses = (data.geom_xpos, data.geom_xmat, data.cam_xpos, data.cam_xmat)
         return {
-            "image": self.render(data.geom_xpos, data.geom_xmat, data.cam_xpos, data.cam_xmat),
+            "image": self.render(*poses, draw=state.info["draw"]),
             "state": self.proprio(state),
         }
 
     def rollout(
-        self, policy: Callable[[dict[str, Any], jax.Array], jax.Array], key: jax.Array
-    ) -> tuple[State, "Trajectory"]:
+        self,
+        policy: Callable[[dict[str, Any], jax.Array], jax.Array],
+        key: jax.Array,
+        ranges: Randomization | None = None,
+    ) -> tuple[State, Trajectory]:
         """Fresh worlds with a policy in the loop until the time limit; may be called under jit.
 
         Args:
             policy: (observation, key) -> action [W, A]. The observation is that of `observe`, with
                 `instruction` int32 [W]; pictures that the policy does not read are not rendered.
             key: all randomness.
+            ranges: as for `reset`.
         """
         reset_key, policy_key = jax.random.split(key)
 
@@ -178,11 +156,13 @@ class Env:
             return after, Trajectory(seen["state"], action, after.reward, after.done)
 
         keys = jax.random.split(policy_key, self.max_steps)
-        return jax.lax.scan(body, self.reset(reset_key), keys)
+        return jax.lax.scan(body, self.reset(reset_key, ranges), keys)
 
-    def reset_done(self, state: State, key: jax.Array) -> State:
-        """The same worlds, those that are done started afresh."""
-        return jax.jit(_where)(state.done, self.reset(key), state)
+    def reset_done(
+        self, state: State, key: jax.Array, ranges: Randomization | None = None
+    ) -> State:
+        """The same worlds, those that are done started afresh, with the ranges of their `reset`."""
+        return jax.jit(where)(state.done, self.reset(key, ranges), state)
 
     def proprio(self, state: State) -> jax.Array:
         """Measured joint angles [rad] and gripper opening [m], f32 [W, J + 1]."""
@@ -191,39 +171,48 @@ class Env:
         return jnp.concatenate([joints, jnp.sum(fingers, axis=1, keepdims=True)], axis=1)
 
     def render(
-        self, geom_xpos: jax.Array, geom_xmat: jax.Array, cam_xpos: jax.Array, cam_xmat: jax.Array
+        self,
+        geom_xpos: jax.Array,
+        geom_xmat: jax.Array,
+        cam_xpos: jax.Array,
+        cam_xmat: jax.Array,
+        *,
+        draw: Draw | None = None,
     ) -> dict[str, jax.Array]:
-        """Pictures of N recorded scenes: camera name -> uint8 [N, image_size, image_size, 3]."""
-        poses, size = (geom_xpos, geom_xmat, cam_xpos, cam_xmat), self.image_size
-        pictures = render.render_batch(
-            self.render_model, *poses, height=size, width=size, samples=self.antialias
-        )
+        """Pictures of N recorded scenes: camera name -> uint8 [N, image_size, image_size, 3].
+
+        Args:
+            geom_xpos, geom_xmat, cam_xpos, cam_xmat: `[N, ...]`, from the data of a state.
+            draw: what the worlds drew, leading axis N, from the info of that state.
+        """
+        look, size = jax.vmap(self._looks)(draw) if draw else (None, None)
+        pictures = self.renderer((geom_xpos, geom_xmat, cam_xpos, cam_xmat), look, size)
         return {name: pictures[:, i] for i, name in enumerate(self.cameras)}
 
     @functools.partial(jax.jit, static_argnums=0)
     def _steps(self, state: State, action: jax.Array) -> State:
         return jax.vmap(self._step)(state, action)
 
-    def _reset(self, key: jax.Array) -> State:
+    @functools.partial(jax.jit, static_argnums=0)
+    def _resets(self, key: jax.Array, ranges: Randomization | None) -> State:
+        keys = jax.random.split(key, self.num_envs)
+        return jax.vmap(functools.partial(self._reset, ranges))(keys)
+
+    def _reset(self, ranges: Randomization | None, key: jax.Array) -> State:
         layout_key, pose_key, instruction_key = jax.random.split(key, 3)
         layout = self.task.place(layout_key)
         others = jax.random.fold_in(layout_key, 1)
         layout |= distractors.place(others, layout, self.distractors)
+        draw = None
+        if ranges:
+            draw_key = jax.random.fold_in(layout_key, 2)
+            draw, layout = randomization.draw(draw_key, ranges, self.model, layout)
         noise = jax.random.uniform(pose_key, (self.num_joints,), minval=-1.0, maxval=1.0)
         joints = jnp.asarray(self.robot.home, jnp.float32) + _HOME_NOISE * noise
         low, high = self.robot.action_low, self.robot.action_high
         command = jnp.clip(jnp.append(joints, _START_OPENING), low, high)
-        fingers = jnp.full(2, command[-1] / 2)
-        qpos = self.template.qpos.at[: self.num_joints + 2].set(
-            jnp.concatenate([command[:-1], fingers])
-        )
-        for name, place in layout.items():
-            body = self.model.body(name)
-            if body.jntnum[0]:  # free; the others are moved in `_placed`
-                start = self.model.jnt_qposadr[body.jntadr[0]]
-                qpos = qpos.at[start : start + 7].set(_pose(place))
-        data = physics.kinematics(self._placed(layout), self.template.replace(qpos=qpos))
-        _, metrics = self.task.check(View(self.model, data))
+        data = self._start(draw, layout, command)
+        _, metrics = self._check(draw, data)
         number = jax.random.randint(instruction_key, (), 0, len(self.instructions), jnp.int32)
         zero, false = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
         info = {
@@ -231,9 +220,11 @@ class Env:
             "steps": zero,
             "instruction": number,
             "command": command,
+            "earlier": command,
             "held": zero,
             "broken": false,
             "layout": layout,
+            "draw": draw,
         }
         return State(data, jnp.zeros((), jnp.float32), false, metrics, info)
 
@@ -244,9 +235,10 @@ class Env:
         target = actions.to_targets(self.actions, self.robot, info["command"], action)
         target = jnp.clip(target, self.robot.action_low, self.robot.action_high)
         target = jnp.clip(target, info["command"] - reach, info["command"] + reach)
-        controls = self._controls(info["command"], target)
-        data = physics.advance(self._placed(info["layout"]), state.data, controls)
-        reached, metrics = self.task.check(View(self.model, data))
+        draw, controls = info["draw"], self._controls(info, target)
+        changes = self._changes(draw, info["layout"])
+        data = self._filmed(draw, self.physics.advance(changes, state.data, controls))
+        reached, metrics = self._check(draw, data)
         held = jnp.where(reached, info["held"] + 1, 0)
         steps = info["steps"] + 1
         success = held >= self.task.hold_steps
@@ -255,44 +247,53 @@ class Env:
             reward=success.astype(jnp.float32),
             done=success | (steps >= self.max_steps),
             metrics=metrics,
-            info=info | {"success": success, "steps": steps, "command": target, "held": held},
+            info=info
+            | {"success": success, "steps": steps, "held": held}
+            | {"command": target, "earlier": info["command"]},
         )
         finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
         true = jnp.ones((), bool)
         broken = dataclasses.replace(state, done=true, info=info | {"broken": true})
-        return _where(state.done, state, _where(finite, after, broken))
+        return where(state.done, state, where(finite, after, broken))
 
-    def _placed(self, layout: dict[str, jax.Array]) -> Any:
-        """The physics model of one world: fixed bodies stand where the layout says."""
-        # Mocap bodies would be the usual way, but MJX leaves their children behind.
-        position, rotation = self.physics_model.body_pos, self.physics_model.body_quat
-        for name, place in layout.items():
-            body, pose = self.model.body(name), _pose(place)
-            if not body.jntnum[0]:  # free ones have their place in qpos
-                position = position.at[body.id].set(pose[:3])
-                rotation = rotation.at[body.id].set(pose[3:])
-        return self.physics_model.replace(body_pos=position, body_quat=rotation)
+    def _start(self, draw: Draw | None, layout: Layout, command: jax.Array) -> Data:
+        """A world at rest, its robot where the command wants it."""
+        joints = jnp.concatenate([command[:-1], jnp.full(2, command[-1] / 2)])
+        qpos = placing.positions(self.model, layout, joints)
+        return self._filmed(draw, self.physics.start(self._changes(draw, layout), qpos))
 
-    def _controls(self, start: jax.Array, end: jax.Array) -> jax.Array:
-        """Actuator targets [S, J + 1] of the S physics steps between two commands."""
-        moves = round(self.control_dt / TARGET_DT)
+    def _changes(self, draw: Draw | None, layout: Layout) -> Changes:
+        """How one world's model differs: what it drew, and where its fixed bodies stand."""
+        changes = randomization.changes(draw, self.model, self._objects) if draw else {}
+        return changes | placing.fixed_bodies(self.model, layout, changes)
+
+    @functools.cached_property
+    def _objects(self) -> np.ndarray:
+        """Which bodies the task and its distractors are made of, bool [bodies]."""
+        names = [*jax.eval_shape(self.task.place, jax.random.key(0))]
+        names += distractors.names(self.distractors)
+        return randomization.belonging(self.model, names)
+
+    def _looks(self, draw: Draw) -> tuple[Look, jax.Array]:
+        """Look of one world, and the sizes of its geoms."""
+        look = randomization.look(draw, self.render_model.look)
+        return look, randomization.geom_sizes(draw, self.model, self._objects)
+
+    def _filmed(self, draw: Draw | None, data: Data) -> Data:
+        return randomization.move_cameras(draw, data) if draw else data
+
+    def _check(self, draw: Draw | None, data: Data) -> tuple[jax.Array, dict[str, jax.Array]]:
+        return self.task.check(View(self.model, data, draw.size if draw else 1.0))
+
+    def _controls(self, info: dict[str, Any], target: jax.Array) -> jax.Array:
+        """Actuator targets [S, J + 1] of the S physics steps to a new command."""
+        moves, repeats = round(self.control_dt / TARGET_DT), round(TARGET_DT / scene.PHYSICS_DT)
+        knots = jnp.stack([info["earlier"], info["command"], target])
         fraction = jnp.arange(1, moves + 1, dtype=jnp.float32)[:, None] / moves
-        targets = start + fraction * (end - start)
-        targets = targets.at[:, -1].multiply(0.5)  # each finger makes half of the opening
-        return jnp.repeat(targets, round(TARGET_DT / scene.PHYSICS_DT), axis=0)
-
-
-def _pose(place: jax.Array) -> jax.Array:
-    """Position in m and unit quaternion [7] of a place of a layout."""
-    half = place[3] / 2
-    return jnp.stack([*place[:3], jnp.cos(half), 0.0 * half, 0.0 * half, jnp.sin(half)])
-
-
-def _where(condition: jax.Array, yes: Any, no: Any) -> Any:
-    """`jnp.where` over two trees; the condition's axes are the leading ones of every leaf."""
-
-    def choose(a: jax.Array, b: jax.Array) -> jax.Array:
-        shape = condition.shape + (1,) * (a.ndim - condition.ndim)
-        return jnp.where(condition.reshape(shape), a, b)
-
-    return jax.tree.map(choose, yes, no)
+        # What is sent during this control step, after what was sent during the last one.
+        path = knots[:-1, None] + fraction * jnp.diff(knots, axis=0)[:, None]
+        path = path.at[..., -1].multiply(0.5)  # each finger makes half of the opening
+        sent = jnp.repeat(path.reshape(2 * moves, -1), repeats, axis=0)
+        steps, draw = moves * repeats, info["draw"]
+        late = jnp.round(draw.latency / scene.PHYSICS_DT).astype(jnp.int32) if draw else 0
+        return jax.lax.dynamic_slice_in_dim(sent, steps - late, steps)

@@ -12,8 +12,9 @@ import jax
 import jax.numpy as jnp
 
 from envs import actions, robots
-from envs.env import Env, State
+from envs.env import Env
 from envs.robots import Robot, multiply
+from envs.state import State
 from envs.tasks import Waypoints
 
 _SPEED_FRACTION = 0.5  # of the robot's joint speed limits that the expert uses
@@ -57,11 +58,14 @@ def leaning(robot: Robot, way: Waypoints) -> jax.Array:
 
 def _plan(env: Env, info: dict, key: jax.Array) -> Plan:
     position_key, time_key = jax.random.split(key)
-    way = env.task.waypoints(info["layout"])
+    size = info["draw"].size if info["draw"] else 1.0
+    # Objects grow from the table up, and so do the heights at which they are held.
+    way = env.task.waypoints({k: v.at[2].divide(size) for k, v in info["layout"].items()})
     noise = jax.random.normal(position_key, way.position.shape) * way.spread[:, None]
     start = info["command"]
     rotations = leaning(env.robot, way)
-    positions = way.position + noise + way.reach[:, None] * rotations[:, :, 2]
+    anchors = way.position.at[:, 2].multiply(size) + noise
+    positions = anchors + way.reach[:, None] * rotations[:, :, 2]
     joints = _joints(env.robot, positions, rotations, start[:-1])
     knots = jnp.concatenate([joints, way.opening[:, None]], axis=1)
     knots = jnp.concatenate([start[None], knots])

@@ -18,22 +18,30 @@ import jax
 import jax.numpy as jnp
 
 Vec = tuple[jax.Array, ...]  # x, y, z
+Matrix = tuple[Vec, ...]  # three rows
 
 PLANE, SPHERE, CAPSULE, CYLINDER, BOX = range(5)
 _MISS = 0x7F800000  # the bits of float32 +inf
 _TINY = 1e-12  # stands in for a zero direction component or squared length in a denominator
 
 
-class Geoms(NamedTuple):
-    """Geoms as one camera sees them, in their unit frames, sorted by kind; leading axis V."""
+class Geom(NamedTuple):
+    """A geom as one camera sees it, in its unit frame.
 
-    number: jax.Array  # [V] int32, 0 to V - 1
-    axes: jax.Array  # [V, 3, 3] the camera's axes as columns
-    eye: jax.Array  # [V, 3] the camera's position
-    light: jax.Array  # [V, 3] direction towards the light
-    shrink: jax.Array  # [V, 3] 1 / the half-extents that were scaled to 1 [1/m]
-    half: jax.Array  # [V] a capsule's half-length over its radius, else 0
-    kind: jax.Array  # [V] f32, PLANE .. BOX
+    Components are scalars; or arrays `[P]`, where each pixel has a geom of its own.
+    """
+
+    axes: Matrix  # rows of the matrix with the camera's axes as columns
+    eye: Vec  # the camera's position
+    light: Vec  # direction towards the light
+    shrink: Vec  # 1 / the half-extents that were scaled to 1 [1/m]
+    rgb: Vec
+    half: jax.Array  # a capsule's half-length over its radius, else 0
+    kind: jax.Array  # f32, PLANE .. BOX
+
+
+Geoms = Callable[[jax.Array], Geom]
+"""int32 number, or numbers `[P]` -> that geom, or the geom of each pixel; sorted by kind."""
 
 
 def dot(a: Vec, b: Vec) -> jax.Array:
@@ -41,14 +49,14 @@ def dot(a: Vec, b: Vec) -> jax.Array:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def components(vectors: jax.Array) -> Vec:
-    """Splits `[3, ...]` into a triple."""
-    return vectors[0], vectors[1], vectors[2]
+def ray(axes: Matrix, x: jax.Array, y: jax.Array) -> Vec:
+    """Components of axes @ (x, y, -1); `axes` are rows."""
+    return tuple(row[0] * x + row[1] * y - row[2] for row in axes)
 
 
-def ray(axes: jax.Array, x: jax.Array, y: jax.Array) -> Vec:
-    """Components of axes @ (x, y, -1); `axes` is `[3, 3, ...]`."""
-    return tuple(axes[i, 0] * x + axes[i, 1] * y - axes[i, 2] for i in range(3))
+def along(origin: Vec, t: jax.Array, direction: Vec) -> Vec:
+    """The point origin + t * direction."""
+    return tuple(o + t * d for o, d in zip(origin, direction, strict=True))
 
 
 def _enter(hit: jax.Array, t: jax.Array) -> jax.Array:
@@ -136,12 +144,13 @@ def nearest(
     """
     low = (1 << len(kinds).bit_length()) - 1
 
-    def closer(enter: Enter, best: jax.Array, geom: Geoms) -> tuple[jax.Array, None]:
-        t = enter(components(geom.eye), ray(geom.axes, x, y), geom.half)
+    def closer(enter: Enter, number: jax.Array, best: jax.Array) -> jax.Array:
+        geom = geoms(number)
+        t = enter(geom.eye, ray(geom.axes, x, y), geom.half)
         bits = jax.lax.bitcast_convert_type(t, jnp.int32)
-        return jnp.minimum(best, (bits & ~low) | geom.number), None
+        return jnp.minimum(best, (bits & ~low) | number)
 
-    best = _over_kinds(closer, jnp.full(x.shape, _MISS, jnp.int32), geoms, kinds, first=PLANE)
+    best = _over_kinds(closer, jnp.full(x.shape, _MISS, jnp.int32), kinds, first=PLANE)
     return best & low, jax.lax.bitcast_convert_type(best & ~low, jnp.float32)
 
 
@@ -155,23 +164,23 @@ def unshadowed(
 ) -> jax.Array:
     """Whether no other geom lies between a surface point and the light, bool `[P]`.
 
-    Arguments are those and the results of `nearest`. A convex geom shades itself where its normal
-    points away from the light, which is the caller's to see; planes cast no shadows.
+    Arguments are those and the results of `nearest`, depth finite. A convex geom shades itself
+    where its normal points away from the light, which is the caller's to see; planes cast no
+    shadows.
     """
 
-    def blocked(enter: Enter, lit: jax.Array, geom: Geoms) -> tuple[jax.Array, None]:
-        slope = ray(geom.axes, x, y)
-        point = tuple(o + depth * d for o, d in zip(components(geom.eye), slope, strict=True))
-        t = enter(point, components(geom.light), geom.half)
-        return lit & ((t == jnp.inf) | (geom.number == number)), None
+    def blocked(enter: Enter, other: jax.Array, lit: jax.Array) -> jax.Array:
+        geom = geoms(other)
+        point = along(geom.eye, depth, ray(geom.axes, x, y))
+        t = enter(point, geom.light, geom.half)
+        return lit & ((t == jnp.inf) | (other == number))
 
-    return _over_kinds(blocked, jnp.isfinite(depth), geoms, kinds, first=SPHERE)
+    return _over_kinds(blocked, jnp.full(x.shape, True), kinds, first=SPHERE)
 
 
 def _over_kinds(
-    body: Callable[[Enter, jax.Array, Geoms], tuple[jax.Array, None]],
+    body: Callable[[Enter, jax.Array, jax.Array], jax.Array],
     carry: jax.Array,
-    geoms: Geoms,
     kinds: tuple[int, ...],
     *,
     first: int,
@@ -179,48 +188,27 @@ def _over_kinds(
     """One loop over the geoms of each kind from `first` on."""
     for kind in sorted(set(kinds)):
         if kind >= first:
-            begin, count = kinds.index(kind), kinds.count(kind)
-            rows = jax.tree.map(lambda v, b=begin, n=count: v[b : b + n], geoms)
+            begin = kinds.index(kind)
             turn = functools.partial(body, ENTER[kind])
-            carry, _ = jax.lax.scan(turn, carry, rows)
+            carry = jax.lax.fori_loop(begin, begin + kinds.count(kind), turn, carry)
     return carry
 
 
 def surface(
-    geoms: Geoms,
-    rgb: jax.Array,
-    x: jax.Array,
-    y: jax.Array,
-    number: jax.Array,
-    depth: jax.Array,
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """What shading needs of the surface points that `nearest` found.
-
-    Args:
-        geoms: V geoms.
-        rgb: `[V, 3]` their colours.
-        x: `[P]` slope of each pixel's ray to the right.
-        y: `[P]` slope upwards.
-        number: `[P]` geom hit.
-        depth: `[P]` finite depth.
+    geom: Geom, x: jax.Array, y: jax.Array, depth: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """What shading needs of the surface points at finite `depth` `[P]` on each pixel's geom.
 
     Returns:
-        Colour `[3, P]`; kind `[P]`; cosine `[P]` between normal and direction to the light; cosine
-        `[P]`, at least 0, between normal and the ray reversed, times the ray's length.
+        Cosine `[P]` between normal and direction to the light; cosine `[P]`, at least 0, between
+        normal and the ray reversed, times the ray's length.
     """
-    axes, half, kind = geoms.axes.reshape(-1, 9), geoms.half[:, None], geoms.kind[:, None]
-    columns = (axes, geoms.eye, geoms.light, geoms.shrink, rgb, half, kind)
-    # One gather for everything, pixels along the fastest axis.
-    table = jnp.concatenate(columns, axis=1).T.at[:, number].get(mode="promise_in_bounds")
-    axes, eye, light, shrink, rgb, (half, kind) = jnp.split(table, (9, 12, 15, 18, 21))
-    slope = ray(axes.reshape(3, 3, -1), x, y)
-    point = tuple(o + depth * d for o, d in zip(components(eye), slope, strict=True))
-    outward = _gradient(point, kind, half)
-    world = tuple(g * s for g, s in zip(outward, components(shrink), strict=True))
+    slope = ray(geom.axes, x, y)
+    outward = _gradient(along(geom.eye, depth, slope), geom.kind, geom.half)
+    world = tuple(g * s for g, s in zip(outward, geom.shrink, strict=True))
     inverse_length = jax.lax.rsqrt(jnp.maximum(dot(world, world), _TINY))
-    to_light = dot(outward, components(light)) * inverse_length
-    to_eye = jnp.maximum(-dot(outward, slope) * inverse_length, 0)
-    return rgb, kind, to_light, to_eye
+    to_light = dot(outward, geom.light) * inverse_length
+    return to_light, jnp.maximum(-dot(outward, slope) * inverse_length, 0)
 
 
 def _gradient(point: Vec, kind: jax.Array, half: jax.Array) -> Vec:

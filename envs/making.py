@@ -1,16 +1,22 @@
 """Making an environment from the names of a task and a robot, which are those of their files."""
 
+import functools
 import importlib
 import pkgutil
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Literal, get_args
 
+import jax
 import mujoco
 
 import envs.distractors
 from envs import physics, render, scene
 from envs.actions import MODES, Mode
-from envs.env import TARGET_DT, Env
-from envs.robots import Robot
+from envs.env import TARGET_DT, Env, Renderer
+from envs.physics import Backend
+
+RendererName = Literal["rays", "warp"]
+RENDERERS: tuple[str, ...] = get_args(RendererName)
 
 
 def make(
@@ -23,6 +29,8 @@ def make(
     control_dt: float = 0.1,
     actions: Mode = "joint",
     distractors: int = 0,
+    backend: Backend | None = None,
+    renderer: RendererName = "rays",
 ) -> Env:
     """An environment.
 
@@ -34,6 +42,9 @@ def make(
         control_dt: seconds between two actions, a multiple of 0.02.
         actions: what an action means: joint, delta_joint or end_effector, see `envs.actions`.
         distractors: other things on the table, up to 4.
+        backend: of the physics, jax or warp; None takes the fastest there is.
+        renderer: rays, the ray caster that runs anywhere, or warp, MuJoCo Warp's, which also draws
+            meshes and textures.
 
     Raises:
         ValueError: for an unknown name (the known ones are listed) or a number out of range.
@@ -41,6 +52,9 @@ def make(
     found_task, found_robot = _find("task", task), _find("robot", robot)
     _check_counts(num_envs=num_envs, image_size=image_size, antialias=antialias)
     _check_options(control_dt, actions, distractors)
+    things = found_task.scene + envs.distractors.mjcf(distractors)
+    model = mujoco.MjModel.from_xml_string(scene.mjcf(things, found_robot))
+    drawn = render.build(model, scene.CAMERAS)
     return Env(
         task=found_task,
         robot=found_robot,
@@ -50,19 +64,39 @@ def make(
         control_dt=control_dt,
         actions=actions,
         distractors=distractors,
-        **_models(found_task.scene + envs.distractors.mjcf(distractors), found_robot),
+        model=model,
+        physics=physics.Physics(model, backend or physics.default_backend()),
+        render_model=drawn,
+        renderer=_renderer(renderer, model, drawn, (num_envs, image_size, antialias)),
     )
 
 
-def _models(things: str, robot: Robot) -> dict[str, Any]:
-    """The scene with these things on the table, for MuJoCo, MJX and the renderer."""
-    model = mujoco.MjModel.from_xml_string(scene.mjcf(things, robot))
-    return {
-        "model": model,
-        "physics_model": physics.put_model(model),
-        "render_model": render.build(model, scene.CAMERAS),
-        "template": physics.make_data(model),
-    }
+def _renderer(
+    name: str, model: mujoco.MjModel, drawn: render.RenderModel, sizes: tuple[int, int, int]
+) -> Renderer:
+    """A renderer by its name, for so many worlds, pixels and samples."""
+    num_envs, image_size, samples = sizes
+    if name == "rays":
+        return functools.partial(_cast, drawn, image_size, samples)
+    if name != "warp":
+        raise ValueError(f"unknown renderer {name!r}: choose from {', '.join(RENDERERS)}")
+    physics.need_warp("renderer")
+    from envs.warp_renderer import WarpRenderer
+
+    return WarpRenderer(model, drawn, num_worlds=num_envs, image_size=image_size, samples=samples)
+
+
+def _cast(
+    drawn: render.RenderModel,
+    side: int,
+    samples: int,
+    poses: Sequence[jax.Array],
+    look: render.Look | None,
+    size: jax.Array | None,
+) -> jax.Array:
+    return render.render_batch(
+        drawn, *poses, height=side, width=side, samples=samples, look=look, size=size
+    )
 
 
 def _check_counts(**counts: int) -> None:

@@ -1,14 +1,18 @@
-"""MuJoCo MJX behind a few functions; the only file that names one of its implementations.
+"""MuJoCo MJX behind one small class; the only file that names one of its implementations.
 
-Worlds are batched by `jax.vmap` over leading axes of the data; the model is shared.
+Worlds are batched by `jax.vmap`. What a world keeps between two steps, `Data`, is the same for all
+implementations: those fields alone that a step reads, and the poses that others look at.
 """
 
 import contextlib
+import dataclasses
+import importlib.util
 import io
 import os
 import sys
 import warnings
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Literal, Self, get_args
 
 import jax
 import jax.numpy as jnp
@@ -16,11 +20,19 @@ import mujoco
 import numpy as np
 from jax._src import xla_bridge  # there is no public way to ask whether a backend has started
 
-_IMPL = "jax"  # runs on CPU, GPU and TPU
+Backend = Literal["jax", "warp"]
+BACKENDS: tuple[str, ...] = get_args(Backend)
+"""jax runs everywhere; warp on NVIDIA, much faster there, and for tests on CPU, slowly."""
+
+MOST_GROWTH = 1.25  # of a geom that differs in size from its model
 _FAST_CPU_FLAG = "--xla_cpu_use_fusion_emitters=false"
 
 
 def _import_mjx() -> Any:
+    if importlib.util.find_spec("warp"):
+        import warp
+
+        warp.config.log_level = warp.LOG_WARNING  # else every kernel that is loaded prints a line
     # MJX prints two lines when the optional warp-lang is missing. Only these are dropped.
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
@@ -62,41 +74,126 @@ def enable_compilation_cache() -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
 
 
-def put_model(model: mujoco.MjModel) -> Any:
-    """The model as MJX arrays, with every array strongly typed."""
-    return mjx.put_model(model, impl=_IMPL)
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Data:
+    """One world, or W worlds with a leading axis; names and units are MuJoCo's.
 
-
-def make_data(model: mujoco.MjModel) -> Any:
-    """Data of one world in the model's reference pose, strongly typed."""
-    data = mjx.make_data(model, impl=_IMPL)
-    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), data)
-
-
-def kinematics(model: Any, data: Any) -> Any:
-    """One world with its body, geom, site and camera poses brought up to date with qpos."""
-    with _full_precision():
-        return mjx.camlight(model, mjx.com_pos(model, mjx.kinematics(model, data)))
-
-
-def advance(model: Any, data: Any, controls: jax.Array) -> Any:
-    """Simulate one world for S physics steps.
-
-    Args:
-        model: what `put_model` gave.
-        data: data of one world.
-        controls: [S, nu] actuator targets, one row a physics step.
-
-    Returns:
-        The data after S steps, all poses up to date.
+    Attributes:
+        qpos, qvel: positions and velocities of all joints.
+        qacc_warmstart: where the constraint solver starts.
+        xpos, xquat, xmat: `[bodies, 3]` in m, `[bodies, 4]`, `[bodies, 3, 3]`, in the world frame.
+        geom_xpos, geom_xmat, site_xpos, site_xmat, cam_xpos, cam_xmat: the same of geoms, sites and
+            cameras.
     """
 
-    def body(data: Any, control: jax.Array) -> tuple[Any, None]:
-        return mjx.step(model, data.replace(ctrl=control)), None
+    qpos: jax.Array
+    qvel: jax.Array
+    qacc_warmstart: jax.Array
+    xpos: jax.Array
+    xquat: jax.Array
+    xmat: jax.Array
+    geom_xpos: jax.Array
+    geom_xmat: jax.Array
+    site_xpos: jax.Array
+    site_xmat: jax.Array
+    cam_xpos: jax.Array
+    cam_xmat: jax.Array
 
-    with _full_precision():
-        data = jax.lax.scan(body, data, controls)[0]
-    return kinematics(model, data)
+    def replace(self, **changes: Any) -> Self:
+        """The same with other values of some fields."""
+        return dataclasses.replace(self, **changes)
+
+
+_MOVING = ("qpos", "qvel", "qacc_warmstart")
+Changes = dict[str, jax.Array]
+"""Fields of the MuJoCo model that differ in one world, by MuJoCo's names."""
+
+
+def default_backend() -> str:
+    """warp on an NVIDIA GPU where warp-lang is installed, else jax."""
+    nvidia = jax.default_backend() == "gpu" and "cuda" in jax.devices()[0].client.platform_version
+    return "warp" if nvidia and importlib.util.find_spec("warp") else "jax"
+
+
+class Physics:
+    """A MuJoCo model that worlds share; functions are pure and for one world each.
+
+    Poses always come from MJX-JAX: they are cheap, and that makes a reset the same everywhere.
+    """
+
+    def __init__(self, model: mujoco.MjModel, backend: str) -> None:
+        """Put a model on the device.
+
+        Raises:
+            ValueError: for an unknown backend, or one that is not installed.
+        """
+        _check_backend(backend)
+        self.backend = backend
+        self._model = mjx.put_model(model, impl="jax")
+        data = mjx.make_data(model, impl="jax")
+        self._data = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), data)  # strongly typed
+        self._simulate = self._mjx_steps
+        if backend == "warp":
+            from envs.warp_physics import WarpSteps
+
+            # MJX-JAX has counted the most contacts and constraints that a world can have.
+            most = {"contacts": max(data._impl.ncon, 1), "rows": data._impl.nefc}
+            self._simulate = WarpSteps(model, growth=MOST_GROWTH, **most)
+
+    def start(self, changes: Changes, qpos: jax.Array) -> Data:
+        """A world at rest at these positions."""
+        zero = jnp.zeros_like(self._data.qvel)
+        return self._posed(changes, [qpos, zero, zero])
+
+    def advance(self, changes: Changes, data: Data, controls: jax.Array) -> Data:
+        """Simulate one world for S physics steps.
+
+        Args:
+            changes: how its model differs.
+            data: where it is.
+            controls: `[S, nu]` actuator targets, one row a physics step.
+
+        Returns:
+            The data after S steps, all poses up to date.
+        """
+        moving = [getattr(data, name) for name in _MOVING]
+        return self._posed(changes, self._simulate(changes, moving, controls))
+
+    def _mjx_steps(
+        self, changes: Changes, moving: Sequence[jax.Array], controls: jax.Array
+    ) -> Sequence[jax.Array]:
+        """The `_MOVING` of a world after S physics steps."""
+        model = self._model.replace(**changes)
+
+        def body(data: Any, control: jax.Array) -> tuple[Any, None]:
+            return mjx.step(model, data.replace(ctrl=control)), None
+
+        data = self._data.replace(**dict(zip(_MOVING, moving, strict=True)))
+        with _full_precision():
+            data = jax.lax.scan(body, data, controls)[0]
+        return [getattr(data, name) for name in _MOVING]
+
+    def _posed(self, changes: Changes, moving: Sequence[jax.Array]) -> Data:
+        """A world with all poses that follow from its joint positions."""
+        model = self._model.replace(**changes)
+        data = self._data.replace(**dict(zip(_MOVING, moving, strict=True)))
+        with _full_precision():
+            data = mjx.camlight(model, mjx.com_pos(model, mjx.kinematics(model, data)))
+        return Data(**{field.name: getattr(data, field.name) for field in dataclasses.fields(Data)})
+
+
+def _check_backend(backend: str) -> None:
+    if backend not in BACKENDS:
+        raise ValueError(f"unknown backend {backend!r}: choose from {', '.join(BACKENDS)}")
+    if backend == "warp":
+        need_warp("backend")
+
+
+def need_warp(option: str) -> None:
+    """Raises a ValueError if warp-lang, which this option asks for, is not installed."""
+    if not importlib.util.find_spec("warp"):
+        raise ValueError(f"{option} 'warp' needs warp-lang: pip install -e '.[warp]'")
 
 
 def _full_precision() -> Any:

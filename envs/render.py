@@ -10,26 +10,26 @@ Geoms are sorted by kind when the model is built. One picture takes three steps:
 3. a second loop of the same shape for hard shadows: does another geom lie towards the light?
 
 `samples` asks for several rays a pixel, for smooth edges; all steps then run once for each.
-Light, colours and fields of view are traced (`Look`): they can differ from world to world.
-Cameras follow MuJoCo (looking along -z, y up); inside a geom they look through it.
+Light, colours, fields of view (`Look`) and sizes of geoms are traced: they can differ from world
+to world. Cameras follow MuJoCo (looking along -z, y up); inside a geom they look through it.
 """
 
 import functools
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs import intersections
-from envs.intersections import PLANE, Geoms, dot, ray
-from envs.render_model import Look, RenderModel, build
+from envs import intersections, shading
+from envs.intersections import Geom, Geoms, Matrix, Vec, dot
+from envs.render_model import Look, RenderModel, build, unit_shapes
+from envs.shading import Raster, View
 
 __all__ = ["Look", "RenderModel", "build", "cast", "render", "render_batch"]
 
 # Pixels rendered together. CPU: the few arrays in use stay in a core's cache (measured at 64 and
-# 128 px). Accelerators: about 200 bytes a pixel are alive, so this is about 1 GiB.
-_PIXELS_ON_CPU, _PIXELS_ON_ACCELERATOR = 2**14, 2**22
+# 128 px). Accelerators: about 120 bytes a pixel are alive, measured, so this is about 1 GiB.
+_PIXELS_ON_CPU, _PIXELS_ON_ACCELERATOR = 2**14, 2**23
 
 
 @functools.partial(jax.jit, static_argnames=("height", "width", "samples"))
@@ -44,6 +44,7 @@ def render(
     width: int,
     samples: int = 1,
     look: Look | None = None,
+    size: jax.Array | np.ndarray | None = None,
 ) -> jax.Array:
     """Pictures of one world, uint8 `[K, height, width, 3]`, in the order of the camera names.
 
@@ -55,15 +56,21 @@ def render(
         height, width: rows and columns [px].
         samples: n for the mean of n x n rays a pixel, evenly spread; n squared times the work.
         look: replaces the model's own look.
+        size: `[G, 3]` replaces the model's own `geom_size` [m].
     """
     look = model.look if look is None else look
+    size = model.size if size is None else size
+    raster = Raster(height, width, samples)
+    geoms, views = seen_by_cameras(
+        model, look, size, (geom_xpos, geom_xmat, cam_xpos, cam_xmat), height
+    )
 
-    def picture(view: _View) -> jax.Array:
-        pixels = (_mean_colour(model, look, view, samples) * 255 + 0.5).astype(jnp.uint8)
-        return pixels.T.reshape(height, width, 3)
+    def picture(geoms: Geom, view: View) -> jax.Array:
+        pixel = jnp.arange(height * width, dtype=jnp.int32)
+        rgb = shading.colours(_table(geoms), model.kinds, view, raster, pixel)
+        return jnp.stack(rgb, axis=-1).reshape(height, width, 3)
 
-    poses = (geom_xpos, geom_xmat, cam_xpos, cam_xmat)
-    return jax.vmap(picture)(_views(model, look, poses, height, width))
+    return jax.vmap(picture)(geoms, views)
 
 
 def render_batch(
@@ -77,18 +84,19 @@ def render_batch(
     width: int,
     samples: int = 1,
     look: Look | None = None,
+    size: jax.Array | np.ndarray | None = None,
 ) -> jax.Array:
-    """`render` over a leading axis W of all arrays (those of `look` too), in bounded memory.
+    """`render` over a leading axis W of all arrays (`look`'s and `size` too), in bounded memory.
 
     Returns:
         uint8 `[W, K, height, width, 3]`.
     """
     pixels = _PIXELS_ON_CPU if jax.default_backend() == "cpu" else _PIXELS_ON_ACCELERATOR
     chunk = max(1, min(len(geom_xpos), pixels // (len(model.cameras) * height * width)))
-    worlds = ((geom_xpos, geom_xmat, cam_xpos, cam_xmat), look)
+    worlds = ((geom_xpos, geom_xmat, cam_xpos, cam_xmat), {"look": look, "size": size})
     return jax.lax.map(
         lambda world: render(
-            model, *world[0], height=height, width=width, samples=samples, look=world[1]
+            model, *world[0], height=height, width=width, samples=samples, **world[1]
         ),
         worlds,
         batch_size=chunk,
@@ -105,6 +113,7 @@ def cast(
     *,
     height: int,
     width: int,
+    size: jax.Array | np.ndarray | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """What each pixel of one world sees, with the model's own look; arguments as for `render`.
 
@@ -115,98 +124,89 @@ def cast(
         precision adds more where a geom is far for its size: measured, 0.1 mm on a sphere of
         radius 4 mm a metre away.
     """
+    size = model.size if size is None else size
+    raster = Raster(height, width, samples=1)
 
-    def seen(view: _View) -> tuple[jax.Array, jax.Array]:
-        number, depth = intersections.nearest(view.geoms, model.kinds, view.x, view.y)
+    def seen(geoms: Geom, view: View) -> tuple[jax.Array, jax.Array]:
+        x, y = shading.slopes(view, raster, jnp.arange(height * width, dtype=jnp.int32))
+        number, depth = intersections.nearest(_table(geoms), model.kinds, x, y)
         geom = jnp.where(jnp.isfinite(depth), jnp.array(model.geoms, jnp.int32)[number], -1)
         return geom.reshape(height, width), depth.reshape(height, width)
 
     poses = (geom_xpos, geom_xmat, cam_xpos, cam_xmat)
-    return jax.vmap(seen)(_views(model, model.look, poses, height, width))
+    return jax.vmap(seen)(*seen_by_cameras(model, model.look, size, poses, height))
 
 
-class _View(NamedTuple):
-    """One camera: the geoms in its frame, its pose, and the slopes of its pixels' rays."""
-
-    geoms: Geoms
-    position: jax.Array  # [3]
-    rotation: jax.Array  # [3, 3]
-    x: jax.Array  # [P]
-    y: jax.Array  # [P]
-    edge: jax.Array  # [] width and height of a pixel in x and y
+def _table(geoms: Geom) -> Geoms:
+    """Geoms by number, from leaves `[V]`: one gather for everything, pixels along the last axis."""
+    table, tree = shading.pack(geoms), jax.tree.structure(geoms)
+    return lambda number: jax.tree.unflatten(
+        tree, list(table.at[:, number].get(mode="promise_in_bounds"))
+    )
 
 
-def _views(
-    model: RenderModel, look: Look, poses: tuple[jax.Array, ...], height: int, width: int
-) -> _View:
-    """The views of the model's cameras, leading axis K."""
+def seen_by_cameras(
+    model: RenderModel,
+    look: Look,
+    size: jax.Array | np.ndarray,
+    poses: tuple[jax.Array, ...],
+    height: int,
+) -> tuple[Geom, View]:
+    """The visible geoms as each of the model's cameras sees them, leaves `[K, V]`; and the
+    cameras, leaves `[K]`.
+    """
     geom_xpos, geom_xmat, cam_xpos, cam_xmat = poses
     for name, given, count in (
         ("geom_xpos", geom_xpos, look.rgba.shape[0]),
         ("cam_xpos", cam_xpos, look.fovy.shape[0]),
+        ("size", size, look.rgba.shape[0]),
     ):
         if given.shape != (count, 3):
             raise ValueError(f"{name} must have shape {(count, 3)}, not {given.shape}")
-    product = functools.partial(jnp.einsum, precision="highest")
     visible, chosen = np.array(model.geoms), np.array(model.cameras)
-    to_unit = jnp.swapaxes(geom_xmat[visible], -1, -2) / model.scale[:, :, None]
-    fixed = {
-        "number": jnp.arange(len(visible), dtype=jnp.int32),
-        "light": product("vij,j->vi", to_unit, look.light / jnp.linalg.norm(look.light)),
-        "shrink": jnp.asarray(1 / model.scale),
-        "half": jnp.asarray(model.half),
-        "kind": jnp.array(model.kinds, jnp.float32),
-    }
-    row, column = np.mgrid[:height, :width].astype(np.float32).reshape(2, -1)
+    scale, half = unit_shapes(model, size)
+    to_unit = _rows(jnp.swapaxes(geom_xmat[visible], -1, -2) / scale[:, :, None])
+    light = _vec(jnp.asarray(look.light) / jnp.linalg.norm(look.light))
+    rgb = jnp.asarray(look.rgba)[visible, :3]
 
-    def view(position: jax.Array, rotation: jax.Array, fovy: jax.Array) -> _View:
-        axes = product("vij,jk->vik", to_unit, rotation)
-        eye = product("vij,vj->vi", to_unit, position - geom_xpos[visible])
-        pixel = jnp.tan(jnp.deg2rad(fovy) / 2) / height  # half its edge, one metre away
-        x, y = pixel * (2 * column + 1 - width), pixel * (height - 1 - 2 * row)
-        return _View(Geoms(axes=axes, eye=eye, **fixed), position, rotation, x, y, 2 * pixel)
+    def view(position: jax.Array, rotation: jax.Array, fovy: jax.Array) -> tuple[Geom, View]:
+        turned = [_product(to_unit, axis) for axis in _rows(rotation.T)]
+        geoms = Geom(
+            axes=tuple(zip(*turned, strict=True)),
+            eye=_product(to_unit, _vec(position - geom_xpos[visible])),
+            light=_product(to_unit, light),
+            shrink=_vec(1 / scale),
+            rgb=_vec(rgb),
+            half=half,
+            kind=jnp.array(model.kinds, jnp.float32),
+        )
+        camera = View(
+            position=_vec(position),
+            rotation=_rows(rotation),
+            pixel=jnp.tan(jnp.deg2rad(fovy) / 2) / height,
+            ambient=jnp.asarray(look.ambient),
+            headlight=jnp.asarray(look.headlight),
+            diffuse=jnp.asarray(look.diffuse),
+            horizon=_vec(look.sky[0]),
+            zenith=_vec(look.sky[1]),
+            square=jnp.asarray(look.checker[0]),
+            contrast=jnp.asarray(look.checker[1]),
+        )
+        return geoms, camera
 
     return jax.vmap(view)(cam_xpos[chosen], cam_xmat[chosen], jnp.asarray(look.fovy)[chosen])
 
 
-def _mean_colour(model: RenderModel, look: Look, view: _View, samples: int) -> jax.Array:
-    """Colour of each pixel, `[3, P]`, 0 to 1: the mean of `samples` x `samples` rays.
-
-    Each ray's colour is clipped to what a screen shows before the mean is taken (there is no gamma
-    to undo), as in a larger picture scaled down: else an overexposed edge would stay jagged.
-    """
-    along = (np.arange(samples, dtype=np.float32) + 0.5) / samples - 0.5
-    shifts = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)  # from its centre [px]
-
-    # One ray a pixel at a time: memory does not grow with the number of rays.
-    def add(total: jax.Array, shift: jax.Array) -> tuple[jax.Array, None]:
-        moved = view._replace(x=view.x + shift[0] * view.edge, y=view.y + shift[1] * view.edge)
-        hit = intersections.nearest(moved.geoms, model.kinds, moved.x, moved.y)
-        return total + jnp.clip(_colour(model, look, moved, *hit), 0, 1), None
-
-    total, _ = jax.lax.scan(add, jnp.zeros((3, len(view.x)), jnp.float32), jnp.asarray(shifts))
-    return total / len(shifts)
+def _vec(vectors: jax.Array) -> Vec:
+    """Splits `[..., 3]` into a triple."""
+    return vectors[..., 0], vectors[..., 1], vectors[..., 2]
 
 
-def _colour(
-    model: RenderModel, look: Look, view: _View, number: jax.Array, depth: jax.Array
-) -> jax.Array:
-    """Colour of each pixel, `[3, P]`, from what its ray hits."""
-    hit, depth = jnp.isfinite(depth), jnp.where(jnp.isfinite(depth), depth, 0)
-    direction = ray(view.rotation, view.x, view.y)
-    length = jnp.sqrt(dot(direction, direction))
-    rgb = jnp.asarray(look.rgba)[np.array(model.geoms), :3]
-    rgb, kind, to_light, to_eye = intersections.surface(
-        view.geoms, rgb, view.x, view.y, number, depth
-    )
-    lit = (to_light > 0) & intersections.unshadowed(
-        view.geoms, model.kinds, view.x, view.y, number, depth
-    )
-    shade = look.ambient + look.headlight * to_eye / length + look.diffuse * to_light * lit
-    squares = [
-        jnp.floor((view.position[i] + depth * direction[i]) / look.checker[0]) for i in range(2)
-    ]
-    dark = (kind == PLANE) & ((squares[0] + squares[1]) % 2 == 1)
-    up = jnp.clip(direction[2] / length, 0, 1)
-    sky = look.sky[0, :, None] * (1 - up) + look.sky[1, :, None] * up
-    return jnp.where(hit, rgb * shade * (1 - look.checker[1] * dark), sky)
+def _rows(matrices: jax.Array) -> Matrix:
+    """Splits `[..., 3, 3]` into a triple of rows."""
+    return _vec(matrices[..., 0, :]), _vec(matrices[..., 1, :]), _vec(matrices[..., 2, :])
+
+
+def _product(rows: Matrix, vector: Vec) -> Vec:
+    """Matrix times vector: in full single precision everywhere, which einsum is not."""
+    return dot(rows[0], vector), dot(rows[1], vector), dot(rows[2], vector)

@@ -5,10 +5,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 from envs.intersections import BOX, CAPSULE, CYLINDER, PLANE, SPHERE
+
+# How pictures look where a model does not say it; chosen by eye. Shares of light, colours of the
+# sky at the horizon and straight up, edge [m] and contrast of the squares on planes.
+AMBIENT, HEADLIGHT, DIFFUSE = 0.35, 0.25, 0.5
+SKY = ((0.80, 0.84, 0.88), (0.45, 0.58, 0.75))
+SQUARE, CONTRAST = 0.1, 0.12
 
 _INFINITE = 1e4  # [m] half-extent drawn where a plane's size is 0, which means infinite
 # MuJoCo geom type -> kind, and which numbers of its size are the half-extents along x, y, z.
@@ -52,8 +59,8 @@ class Look:
 
 @functools.partial(
     jax.tree_util.register_dataclass,
-    data_fields=["look", "scale", "half"],
-    meta_fields=["geoms", "kinds", "cameras"],
+    data_fields=["look", "size"],
+    meta_fields=["geoms", "kinds", "sides", "cameras"],
 )
 @dataclass(frozen=True)
 class RenderModel:
@@ -61,18 +68,18 @@ class RenderModel:
 
     Attributes:
         look: the model's own colours, light and fields of view.
-        scale: `[V, 3]` half-extents that map each visible geom to its unit shape [m].
-        half: `[V]` a capsule's half-length over its radius, else 0.
+        size: `[G, 3]` size of each geom of the MuJoCo model [m].
         geoms: V numbers of the visible geoms in the MuJoCo model.
         kinds: V kinds of `intersections`, ascending.
+        sides: V triples: which numbers of a geom's size are its half-extents along x, y, z.
         cameras: K numbers of the cameras in the MuJoCo model.
     """
 
     look: Look
-    scale: np.ndarray
-    half: np.ndarray
+    size: np.ndarray
     geoms: tuple[int, ...]
     kinds: tuple[int, ...]
+    sides: tuple[tuple[int, int, int], ...]
     cameras: tuple[int, ...]
 
 
@@ -88,7 +95,7 @@ def build(mj_model: mujoco.MjModel, camera_names: Sequence[str]) -> RenderModel:
     visible = np.flatnonzero((mj_model.geom_rgba[:, 3] > 0) & (mj_model.geom_group < 3)).tolist()
     if not visible:
         raise ValueError("the model has no visible geom (alpha above 0, group below 3)")
-    types, sizes = mj_model.geom_type.tolist(), mj_model.geom_size
+    types = mj_model.geom_type.tolist()
     for i in visible:
         if types[i] not in _SHAPES:
             raise ValueError(
@@ -96,30 +103,39 @@ def build(mj_model: mujoco.MjModel, camera_names: Sequence[str]) -> RenderModel:
                 "ellipsoids, capsules, cylinders and boxes can (group 3 hides a geom)"
             )
     geoms = sorted(visible, key=lambda i: _SHAPES[types[i]][0])
-    kinds = tuple(_SHAPES[types[i]][0] for i in geoms)
-    scale = np.array([sizes[i, _SHAPES[types[i]][1]] for i in geoms], np.float32)
-    scale[scale == 0] = _INFINITE
-    half = np.where(np.array(kinds) == CAPSULE, sizes[geoms, 1] / scale[:, 0], 0)
     return RenderModel(
         look=_own_look(mj_model),
-        scale=scale,
-        half=half.astype(np.float32),
+        size=mj_model.geom_size.astype(np.float32),
         geoms=tuple(geoms),
-        kinds=kinds,
+        kinds=tuple(_SHAPES[types[i]][0] for i in geoms),
+        sides=tuple(_SHAPES[types[i]][1] for i in geoms),
         cameras=tuple(cameras[name] for name in camera_names),
     )
 
 
+def unit_shapes(model: RenderModel, size: jax.Array | np.ndarray) -> tuple[jax.Array, jax.Array]:
+    """How visible geoms of sizes `[G, 3]` come from their unit shapes.
+
+    Returns:
+        Half-extents `[V, 3]` that were scaled to 1 [m]; and a capsule's half-length over its
+        radius `[V]`, else 0.
+    """
+    size = jnp.asarray(size)[np.array(model.geoms)]
+    scale = jnp.take_along_axis(size, np.array(model.sides), axis=1)
+    scale = jnp.where(scale == 0, _INFINITE, scale)
+    return scale, jnp.where(np.array(model.kinds) == CAPSULE, size[:, 1] / scale[:, 0], 0)
+
+
 def _own_look(mj_model: mujoco.MjModel) -> Look:
-    """Colours, fields of view and first light of the model; the rest chosen by eye."""
+    """Colours, fields of view and first light of the model; the rest as above."""
     values = Look(
         rgba=mj_model.geom_rgba,
         light=-mj_model.light_dir[0] if mj_model.nlight else np.array([0.3, -0.4, 0.87]),
-        ambient=np.array(0.35),
-        headlight=np.array(0.25),
-        diffuse=np.array(0.5),
-        sky=np.array([[0.80, 0.84, 0.88], [0.45, 0.58, 0.75]]),
-        checker=np.array([0.1, 0.12]),
+        ambient=np.array(AMBIENT),
+        headlight=np.array(HEADLIGHT),
+        diffuse=np.array(DIFFUSE),
+        sky=np.array(SKY),
+        checker=np.array([SQUARE, CONTRAST]),
         fovy=mj_model.cam_fovy,
     )
     return jax.tree.map(lambda x: np.asarray(x, np.float32), values)

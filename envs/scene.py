@@ -3,6 +3,7 @@
 import numpy as np
 
 from envs import robots
+from envs.render_model import AMBIENT, CONTRAST, DIFFUSE, HEADLIGHT, SKY, SQUARE
 
 CAMERAS = ("side", "wrist")
 PHYSICS_DT = 0.005  # s
@@ -28,10 +29,15 @@ _SCENE = """
       <joint type="slide" axis="0 1 0" armature=".05" damping="5"/>
     </default>
   </default>
+  {look}
   <worldbody>
-    <light pos=".6 -.5 1.2" dir="-.5 .2 -1"/>
+    <light directional="true" pos=".6 -.5 1.2" dir="-.5 .2 -1" ambient="0 0 0" specular="0 0 0"
+      diffuse="{diffuse} {diffuse} {diffuse}"/>
+    <light name="lamp" type="point" active="false" castshadow="false" ambient="0 0 0"
+      specular="0 0 0" diffuse="{headlight} {headlight} {headlight}"/>
     <camera name="side" {side} fovy="32"/>
-    <geom name="table" type="plane" size="2 2 .1" conaffinity="11" rgba=".62 .66 .68 1"/>
+    <geom name="table" type="plane" size="{size} {size} .1" conaffinity="11" material="table"
+      rgba="{table}"/>
     {robot}{task}
   </worldbody>
   <actuator>{actuators}</actuator>
@@ -40,6 +46,23 @@ _SCENE = """
   </equality>
 </mujoco>
 """
+# The look of the ray caster for MuJoCo's other renderers. Their headlight shines along the camera's
+# axis; the lamp is for those that can put it where the camera is, as the ray caster does.
+_LOOK = """
+  <visual>
+    <headlight ambient="{ambient} {ambient} {ambient}" specular="0 0 0"
+      diffuse="{headlight} {headlight} {headlight}"/>
+  </visual>
+  <asset>
+    <texture name="sky" type="skybox" builtin="gradient" rgb1="{up}" rgb2="{horizon}" width="64"
+      height="384"/>
+    <texture name="squares" type="2d" builtin="checker" rgb1="{dark} {dark} {dark}" rgb2="1 1 1"
+      width="64" height="64"/>
+    <material name="table" texture="squares" texrepeat="{repeat} {repeat}" specular="0"
+      rgba="{table}"/>
+  </asset>
+"""
+_TABLE, _TABLE_SIZE = ".62 .66 .68 1", 2.0  # colour; half the edge [m]
 _SIDE_EYE, _SIDE_TARGET = (0.76, -0.49, 0.42), (0.34, 0.0, 0.065)  # m
 
 
@@ -51,6 +74,24 @@ def mjcf(objects: str, robot: robots.Robot) -> str:
         robot=robots.bodies(robot),
         task=objects,
         actuators=robots.actuators(robot),
+        look=_look(),
+        headlight=HEADLIGHT,
+        diffuse=DIFFUSE,
+        table=_TABLE,
+        size=_TABLE_SIZE,
+    )
+
+
+def _look() -> str:
+    horizon, up = (" ".join(map(str, colour)) for colour in SKY)
+    return _LOOK.format(
+        ambient=AMBIENT,
+        headlight=HEADLIGHT,
+        horizon=horizon,
+        up=up,
+        dark=1 - CONTRAST,
+        repeat=_TABLE_SIZE / SQUARE,  # the texture is two squares wide
+        table=_TABLE,
     )
 
 

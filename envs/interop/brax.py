@@ -13,7 +13,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from envs.env import Env, State
+from envs.env import Env
+from envs.randomization import Randomization
+from envs.state import State
 from envs.tasks import View
 
 try:
@@ -39,15 +41,22 @@ class BraxEnv(base.Env):
 
     Attributes:
         env: the environment inside, of one world.
+        ranges: how worlds differ.
     """
 
-    def __init__(self, env: Env):
-        """Wrap an environment that `envs.make` gave; its number of worlds does not matter."""
+    def __init__(self, env: Env, *, ranges: Randomization | None = None):
+        """Wrap an environment.
+
+        Args:
+            env: what `envs.make` gave; its number of worlds does not matter.
+            ranges: as for `Env.reset`, for every episode.
+        """
         self.env = dataclasses.replace(env, num_envs=1)
+        self.ranges = ranges
 
     def reset(self, rng: jax.Array) -> base.State:
         """One fresh world, all from the key `rng`."""
-        world = self.env.reset(rng)
+        world = self.env.reset(rng, self.ranges)
         return base.State(reward=world.reward[0], metrics=self._metrics(world), **self._seen(world))
 
     def step(self, state: base.State, action: jax.Array) -> base.State:

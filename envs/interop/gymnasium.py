@@ -12,7 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.env import Env, State
+from envs.env import Env
+from envs.randomization import Randomization
+from envs.state import State
 
 try:
     import gymnasium
@@ -39,19 +41,22 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     Attributes:
         env: the environment inside.
+        ranges: how its worlds differ.
         state: its W worlds, for what the interface hides (metrics, layouts); None before `reset`.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.NEXT_STEP}
 
-    def __init__(self, env: Env, *, pictures: bool = True):
+    def __init__(self, env: Env, *, pictures: bool = True, ranges: Randomization | None = None):
         """Wrap an environment.
 
         Args:
             env: what `envs.make` gave.
             pictures: whether observations hold pictures, which cost more than the physics.
+            ranges: as for `Env.reset`, for every episode.
         """
         self.env = env
+        self.ranges = ranges
         self.state: State | None = None
         self.num_envs = env.num_envs
         self.single_action_space = spaces.Box(env.action_low, env.action_high)
@@ -80,7 +85,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         if options:
             raise ValueError(f"reset takes no options, got {', '.join(options)}")
         super().reset(seed=seed)
-        self.state = state = self.env.reset(self._key())
+        self.state = state = self.env.reset(self._key(), self.ranges)
         return self._observation(state), self._info(state)
 
     def step(
@@ -113,7 +118,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         if not np.any(ended):
             return after
         # Worlds that ended in this very step must still be seen: only the earlier ones restart.
-        fresh = self.env.reset_done(dataclasses.replace(after, done=ended), self._key())
+        ended_only = dataclasses.replace(after, done=ended)
+        fresh = self.env.reset_done(ended_only, self._key(), self.ranges)
         return dataclasses.replace(fresh, done=after.done & ~ended)
 
     def _key(self) -> jax.Array:

@@ -172,6 +172,15 @@ def inverse_kinematics(
     return jax.lax.scan(body, start, None, length=_ITERATIONS)[0]
 
 
+def turn(vector: jax.Array) -> jax.Array:
+    """Rotation [3, 3] of a rotation vector [3] (Rodrigues)."""
+    angle = jnp.sqrt(jnp.maximum(jnp.sum(vector * vector), 1e-16))
+    x, y, z = vector / angle
+    zero = jnp.zeros_like(x)
+    cross = jnp.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])
+    return jnp.eye(3) + jnp.sin(angle) * cross + (1 - jnp.cos(angle)) * multiply(cross, cross)
+
+
 def sine_axis(rotation: jax.Array) -> jax.Array:
     """Axis [3] of a rotation [3, 3], as long as the sine of its angle."""
     r = rotation

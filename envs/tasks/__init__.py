@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from envs.robots import TIP_LENGTH
+from envs.robots import TIP_LENGTH, multiply
 
 Layout = dict[str, jax.Array]
 """Body name -> where it is at reset: [4], x, y, z in m and the turn about z in rad."""
@@ -24,14 +24,19 @@ Layout = dict[str, jax.Array]
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """What a task sees of one simulated world."""
+    """What a task sees of one simulated world, whose objects are `size` times their own size."""
 
     model: mujoco.MjModel
     data: Any
+    size: float | jax.Array = 1.0
 
     def position(self, body: str) -> jax.Array:
         """Position [3] of a body in m."""
         return self.data.xpos[self.model.body(body).id]
+
+    def above(self, body: str, height: float) -> jax.Array:
+        """Point [3] in m, `height` [m] over a body's position where objects have their own size."""
+        return self.position(body) + self.size * jnp.array([0.0, 0.0, height])
 
     def upright(self, body: str) -> jax.Array:
         """Cosine of the angle between a body's z axis and the vertical."""
@@ -47,8 +52,9 @@ class View:
         return self.data.qpos[self.model.joint(name).qposadr[0]]
 
     def inside(self, body: str, box: str, half_width: float, height: float) -> jax.Array:
-        """Whether a body's position lies in an upright square box that stands at another's."""
-        offset = self.position(body) - self.position(box)
+        """Whether a body's position lies in a square box that stands where another body is."""
+        axes = self.data.xmat[self.model.body(box).id].reshape(3, 3)
+        offset = multiply(self.position(body) - self.position(box), axes) / self.size
         return jnp.all(jnp.abs(offset[:2]) < half_width) & (offset[2] < height)
 
     def apart(self, body: str, other: str) -> jax.Array:
@@ -60,7 +66,8 @@ class View:
 
         A gripper that holds it is as wide as it and around it: within `away` [m].
         """
-        return (self.opening > width + 0.005) | (jnp.linalg.norm(grip - self.tcp) > away)
+        wider = self.opening > width * self.size + 0.005
+        return wider | (jnp.linalg.norm(grip - self.tcp) > away)
 
     @property
     def tcp(self) -> jax.Array:

@@ -47,9 +47,9 @@ def _check(view: View) -> tuple[jax.Array, dict[str, jax.Array]]:
     lid = view.position("lid")
     apart = view.apart("lid", "pot")
     on_table = (lid[2] < 0.01) & (view.upright("lid") > 0.97)
-    beside = apart > _LID + _RIM + _WALL
+    beside = apart > (_LID + _RIM + _WALL) * view.size
     at_rest = view.speed("lid") < 0.05
-    released = view.released(lid + jnp.array([0.0, 0.0, _KNOB_HEIGHT]), 2 * _KNOB)
+    released = view.released(view.above("lid", _KNOB_HEIGHT), 2 * _KNOB)
     return on_table & beside & at_rest & released, {"lid_to_pot": apart}
 
 

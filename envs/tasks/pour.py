@@ -6,7 +6,6 @@ Numbers without a source are own choices that work with both arms.
 import math
 
 import jax
-import jax.numpy as jnp
 
 from envs.tasks import Layout, Task, View, Waypoints, azimuth, open_box, raised, route, scatter
 
@@ -79,8 +78,7 @@ def _check(view: View) -> tuple[jax.Array, dict[str, jax.Array]]:
     inside = view.inside("block", "basket", _INSIDE, _BASKET_HEIGHT)
     standing = (view.upright("cup") > 0.97) & (cup[2] < 0.01)
     at_rest = (view.speed("block") < 0.05) & (view.speed("cup") < 0.05)
-    grip = cup + jnp.array([0.0, 0.0, _GRIP])
-    released = view.released(grip, 2 * (_SIDE + 0.003), away=0.08)
+    released = view.released(view.above("cup", _GRIP), 2 * (_SIDE + 0.003), away=0.08)
     done = inside & standing & at_rest & released
     return done, {"block_to_basket": view.apart("block", "basket")}
 

@@ -36,9 +36,8 @@ def _place(key: jax.Array) -> Layout:
 
 def _check(view: View) -> tuple[jax.Array, dict[str, jax.Array]]:
     depth = view.joint("button")
-    top = view.position("button") + jnp.array([0.0, 0.0, _TOP]) - depth * jnp.array([0.0, 0.0, 1.0])
-    offset = view.tip - top
-    touching = (jnp.linalg.norm(offset[:2]) < _RADIUS) & (jnp.abs(offset[2]) < 0.01)
+    offset = view.tip - view.above("button", _TOP) + depth * jnp.array([0.0, 0.0, 1.0])
+    touching = (jnp.linalg.norm(offset[:2]) < _RADIUS * view.size) & (jnp.abs(offset[2]) < 0.01)
     return (depth > 0.75 * _STROKE) & touching, {"button_depth": depth}
 
 

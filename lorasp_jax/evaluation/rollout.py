@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.env import Env, State
+from envs.env import Env
+from envs.state import State
 from lorasp_jax import adaptation
 from lorasp_jax.evaluation import metrics
 from lorasp_jax.models import tokenizer

@@ -1,5 +1,6 @@
 """The ray caster against MuJoCo's own rays, and what light and colours may change."""
 
+import copy
 import dataclasses
 
 import jax
@@ -189,6 +190,21 @@ def test_batch_equals_single_worlds(built, poses):
         assert np.mean(difference > 1) < 1e-3  # rounding may move an edge by a pixel
 
 
+def test_sizes_differ_from_world_to_world(shapes, built, poses):
+    size = np.stack([built.size, built.size * 1.5, built.size])
+    size[2, :, 1] *= 0.5  # half the length of capsules and cylinders, other boxes and ellipsoids
+    batch = [jnp.tile(x, (len(size), *[1] * x.ndim)) for x in poses]
+    pictures = render.render_batch(built, *batch, size=size, **SIZE)
+    for own, found in zip(size, pictures, strict=True):
+        model = copy.copy(shapes[0])
+        model.geom_size[:] = own
+        expected = render.render(render.build(model, CAMERAS), *poses, **SIZE)
+        difference = np.abs(found.astype(int) - expected.astype(int))
+        assert np.mean(difference > 1) < 1e-3  # rounding may move an edge by a pixel
+    assert np.mean(pictures[0] != pictures[1]) > 0.05
+    assert np.mean(pictures[0] != pictures[2]) > 0.02
+
+
 @pytest.mark.parametrize("diffuse", [0.5, 1.5])  # 1.5 overexposes a third of the picture
 def test_samples_equal_a_larger_picture_scaled_down(built, poses, diffuse):
     look = dataclasses.replace(built.look, diffuse=np.float32(diffuse))
@@ -247,6 +263,8 @@ def test_bad_input_is_named(shapes, built, poses):
         render.build(shapes[0], ("front", "back"))
     with pytest.raises(ValueError, match=r"geom_xpos must have shape \(12, 3\)"):
         render.render(built, poses[0][:3], *poses[1:], **SIZE)
+    with pytest.raises(ValueError, match=r"size must have shape \(12, 3\)"):
+        render.render(built, *poses, size=built.size[:3], **SIZE)
     field = """<mujoco><asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset><worldbody>
       <geom name="hill" type="hfield" hfield="h"/></worldbody></mujoco>"""
     with pytest.raises(ValueError, match="geom hill cannot be drawn"):

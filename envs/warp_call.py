@@ -1,0 +1,38 @@
+"""Functions that work on Warp's arrays, called from JAX."""
+
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import warp as wp
+
+
+def device() -> Any:
+    """Warp's name for the device that JAX computes on."""
+    return wp.device_from_jax(jax.devices()[0])
+
+
+def from_jax(function: Callable[..., None], like: Mapping[str, Any], **options: Any) -> Any:
+    """A function of Warp arrays for use under jit.
+
+    On a GPU it is captured as a CUDA graph at its first call, so all memory that outlives a call
+    must be there before; Warp copies the arguments to and from where the graph expects them.
+
+    Args:
+        function: takes arrays one after the other, the outputs last.
+        like: a Warp array of the type of each, by name.
+        options: of `warp.jax_callable`.
+    """
+    kinds = {name: wp.array(dtype=x.dtype, ndim=x.ndim) for name, x in like.items()}
+    # Warp reads from the signature which arrays there are.
+    function.__annotations__ = kinds
+    function.__signature__ = inspect.Signature(
+        [
+            inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=kind)
+            for name, kind in kinds.items()
+        ]
+    )
+    modes = wp.JaxCallableGraphMode
+    mode = modes.NONE if jax.default_backend() == "cpu" else modes.WARP_STAGED
+    return wp.jax_callable(function, graph_mode=mode, vmap_method=None, **options)

@@ -1,0 +1,156 @@
+"""MuJoCo Warp's batch renderer inside jit, for NVIDIA GPUs: meshes and textures, and fast.
+
+It is made to look like the ray caster: the same light, the same squares, the same sky.
+"""
+
+import copy
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import warp as wp
+from mujoco.mjx.third_party import mujoco_warp
+
+from envs import warp_call
+from envs.render_model import Look, RenderModel
+
+_PER_WORLD = ("geom_size", "geom_rgba", "mat_rgba", "cam_fovy")  # fields of the model
+_POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "light_xdir")  # of data
+
+
+class WarpRenderer:
+    """Pictures of `num_worlds` worlds a call; its memory is taken when it is made."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        own: RenderModel,
+        *,
+        num_worlds: int,
+        image_size: int,
+        samples: int,
+    ) -> None:
+        """Prepare a model.
+
+        Args:
+            model: what all worlds share, with a light called lamp.
+            own: the ray caster's view of it, for its cameras and its look.
+            num_worlds: worlds a call.
+            image_size: height and width of the pictures [px].
+            samples: n for n x n rays a pixel.
+        """
+        self._mujoco, self._own = model, own
+        self._num_worlds, self._image_size = num_worlds, image_size
+        with wp.ScopedDevice(warp_call.device()):
+            self._model = mujoco_warp.put_model(_lamplit(model))
+            self._data = mujoco_warp.make_data(model, nworld=num_worlds)
+            self._contexts = [
+                mujoco_warp.create_render_context(
+                    _lamplit(model),
+                    nworld=num_worlds,
+                    cam_res=(image_size, image_size),
+                    render_rgb=True,
+                    render_depth=False,
+                    cam_active=[camera],
+                    use_shadows=True,
+                    shadow_light_fraction=0.0,
+                    render_skybox=True,
+                    use_precomputed_rays=False,  # fields of view differ from world to world
+                    samples_per_pixel=samples,
+                    enable_specular=False,
+                )
+                for camera in own.cameras
+            ]
+        self._render = self._callable()
+
+    def __call__(
+        self, poses: Sequence[jax.Array], look: Look | None, size: jax.Array | None
+    ) -> jax.Array:
+        """Pictures, uint8 `[N, K, height, width, 3]`, as by `render.render_batch`.
+
+        Args:
+            poses: geom_xpos, geom_xmat, cam_xpos, cam_xmat with leading axis N.
+            look: of each world, leading axis N; None for the model's own. Of its light, all three
+                shares must be brighter or darker by one factor; sky and squares keep their own.
+            size: `[N, G, 3]` sizes of geoms; None for the model's own.
+        """
+        number, chunk = len(poses[0]), self._num_worlds
+
+        def every(x: Any) -> jax.Array:
+            return jnp.broadcast_to(jnp.asarray(x), (number, *np.shape(x)))
+
+        look = jax.tree.map(every, self._own.look) if look is None else look
+        size = every(self._own.size) if size is None else size
+        worlds = (tuple(poses), look, size)
+        # A call takes exactly `num_worlds`: the last chunk is filled up with the last world.
+        rest = -number % chunk
+        worlds = jax.tree.map(
+            lambda x: jnp.concatenate([x, jnp.repeat(x[-1:], rest, axis=0)]).reshape(
+                -1, chunk, *x.shape[1:]
+            ),
+            worlds,
+        )
+        pictures = jax.lax.map(lambda world: self._pictures(*world), worlds)
+        return pictures.reshape(-1, *pictures.shape[2:])[:number]
+
+    def _pictures(self, poses: Sequence[jax.Array], look: Look, size: jax.Array) -> jax.Array:
+        """Pictures of one chunk."""
+        geom_xpos, geom_xmat, cam_xpos, cam_xmat = poses
+        worlds, side = self._num_worlds, self._image_size
+        own, light = self._own.look, -look.light
+        direction = (
+            jnp.zeros((worlds, self._mujoco.nlight, 3))
+            .at[:, 0]
+            .set(light / jnp.linalg.norm(light, axis=-1, keepdims=True))
+        )
+        # Each camera has its own lamp, lights being the same for all pixels of a call.
+        place = jnp.repeat(cam_xpos[:, self._own.cameras, None], self._mujoco.nlight, axis=2)
+        per_world = (size, look.rgba, self._material_colours(look), look.fovy)
+        lights = (direction, *jnp.moveaxis(place, 1, 0))
+        packed = self._render(*per_world, geom_xpos, geom_xmat, cam_xpos, cam_xmat, *lights)
+        packed = jnp.stack(packed, axis=1).reshape(worlds, len(packed), side, side)
+        rgb = jnp.stack([(packed >> shift) & 0xFF for shift in (16, 8, 0)], axis=-1)
+        bright = (look.ambient / own.ambient).reshape(-1, 1, 1, 1, 1)
+        return (jnp.clip(rgb * bright, 0, 255) + 0.5).astype(jnp.uint8)
+
+    def _material_colours(self, look: Look) -> jax.Array:
+        """Colours of the materials: those of the geoms that wear them, [worlds, materials, 4]."""
+        colours = jnp.broadcast_to(
+            jnp.asarray(self._mujoco.mat_rgba, jnp.float32),
+            (self._num_worlds, self._mujoco.nmat, 4),
+        )
+        table = self._mujoco.geom("table").id
+        return colours.at[:, self._mujoco.geom_matid[table]].set(look.rgba[:, table])
+
+    def _callable(self) -> Any:
+        """JAX's way into Warp: fields of model and data, a place of the lights for each camera."""
+        model, data = self._model, self._data
+        fields = {name: model for name in _PER_WORLD} | {name: data for name in _POSES}
+        like = {name: getattr(owner, name) for name, owner in fields.items()}
+        places = {f"light_xpos{i}": data.light_xpos for i in range(len(self._contexts))}
+        pixels = {f"rgb{i}": context.rgb_data for i, context in enumerate(self._contexts)}
+
+        def render(*arrays: Any) -> None:
+            given = dict(zip((*like, *places, *pixels), arrays, strict=True))
+            for name, owner in fields.items():
+                setattr(owner, name, given[name])
+            for i, context in enumerate(self._contexts):
+                data.light_xpos, context.rgb_data = given[f"light_xpos{i}"], given[f"rgb{i}"]
+                mujoco_warp.refit_bvh(model, data, context)
+                mujoco_warp.render(model, data, context)
+
+        dims = {name: x.shape for name, x in pixels.items()}
+        return warp_call.from_jax(
+            render, like | places | pixels, num_outputs=len(pixels), output_dims=dims
+        )
+
+
+def _lamplit(model: mujoco.MjModel) -> mujoco.MjModel:
+    """The model with its lamp in place of the headlight, which would shine along the camera."""
+    model = copy.copy(model)
+    model.vis.headlight.diffuse[:] = 0.0
+    model.light_active[model.light("lamp").id] = True
+    return model

@@ -1,0 +1,96 @@
+"""MuJoCo Warp's physics and renderer against MJX-JAX and the ray caster; on CPU, slow but real."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import envs
+from envs import experts, physics
+from envs.randomization import Randomization
+
+pytest.importorskip("warp")
+WORLDS, SIZE = 3, 48
+
+
+def make(task, **options):
+    return envs.make(task, "piper", num_envs=WORLDS, image_size=SIZE, **options)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """The same worlds in both engines."""
+    return [make("pick_place", backend=backend) for backend in ("jax", "warp")]
+
+
+def run(env, ranges, steps):
+    """The expert's way through some control steps."""
+    state = env.reset(jax.random.key(2), ranges)
+    plan = experts.plan(env, state, jax.random.key(3))
+    for _ in range(steps):
+        state = env.step(state, experts.act(env, plan, state))
+    return state
+
+
+def test_the_backend_is_picked_by_the_device(pair, monkeypatch):
+    assert physics.default_backend() == "jax"  # no NVIDIA GPU here
+    assert make("press").physics.backend == "jax"
+    assert pair[1].physics.backend == "warp"
+    gpu = type("Device", (), {"client": type("Client", (), {"platform_version": "cuda 13000"})})
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(jax, "devices", lambda: [gpu])
+    assert physics.default_backend() == "warp"
+    monkeypatch.setattr(physics.importlib.util, "find_spec", lambda name: None)
+    assert physics.default_backend() == "jax"
+
+
+def test_warp_that_is_missing_is_named(monkeypatch):
+    monkeypatch.setattr(physics.importlib.util, "find_spec", lambda name: None)
+    for option in ("backend", "renderer"):
+        with pytest.raises(ValueError, match=rf"{option} 'warp' needs warp-lang: pip install"):
+            make("press", **{option: "warp"})
+
+
+@pytest.mark.parametrize(
+    "ranges",
+    [None, Randomization(size=(0.9, 1.1), mass=(0.5, 2.0), gains=(0.8, 1.2), latency=(0.0, 0.1))],
+)
+def test_both_engines_move_alike(pair, ranges):
+    """35 control steps: the grape is between the fingers at the end."""
+    ours, theirs = (run(env, ranges, 35) for env in pair)
+    joints = slice(0, 8)
+    np.testing.assert_allclose(ours.data.qpos[:, joints], theirs.data.qpos[:, joints], atol=2e-3)
+    grape = pair[0].model.body("grape").id
+    np.testing.assert_allclose(ours.data.xpos[:, grape], theirs.data.xpos[:, grape], atol=2e-3)
+    assert not bool(theirs.info["broken"].any())
+
+
+def test_worlds_of_worlds_are_worlds(pair):
+    """A further vmap, such as Brax's, gives what a batch gives."""
+    env = pair[1]
+    state = env.reset(jax.random.key(0))
+    action = state.info["command"] + 0.02
+    batch = env.step(state, action)
+    nested = jax.tree.map(lambda x: jnp.stack([x, x]), (state, action))
+    twice = jax.vmap(env._steps)(*nested)
+    np.testing.assert_allclose(twice.data.qpos[1], batch.data.qpos, atol=1e-5)
+
+
+@pytest.mark.parametrize("task_name", ["pour"])
+@pytest.mark.parametrize("ranges", [None, Randomization.typical()])
+def test_pictures_match_the_ray_caster(task_name, ranges):
+    """On average within a level of 255; single pixels at edges differ."""
+    ours, theirs = (make(task_name, backend="jax", renderer=r) for r in ("rays", "warp"))
+    state = ours.reset(jax.random.key(1), ranges)
+    for name, picture in ours.observe(state)["image"].items():
+        other = theirs.observe(state)["image"][name]
+        difference = np.abs(np.asarray(picture, int) - np.asarray(other, int))
+        assert difference.mean(axis=(1, 2, 3)).max() < 1.5
+        assert np.mean(difference.max(axis=-1) > 16) < 0.03
+    # Chunks of the context's size, the last one filled up.
+    poses = (state.data.geom_xpos, state.data.geom_xmat, state.data.cam_xpos, state.data.cam_xmat)
+    many = jax.tree.map(lambda x: jnp.concatenate([x, x[:1]]), (poses, state.info["draw"]))
+    pictures = theirs.render(*many[0], draw=many[1])
+    seen = theirs.observe(state)["image"]
+    for name, picture in pictures.items():
+        np.testing.assert_array_equal(picture, jnp.concatenate([seen[name], seen[name][:1]]))
