@@ -105,7 +105,8 @@ class Data:
         return dataclasses.replace(self, **changes)
 
 
-_MOVING = ("qpos", "qvel", "qacc_warmstart")
+MOVING = ("qpos", "qvel", "qacc_warmstart")
+"""The fields of `Data` that steps change; all others follow from them."""
 Changes = dict[str, jax.Array]
 """Fields of the MuJoCo model that differ in one world, by MuJoCo's names."""
 
@@ -157,27 +158,24 @@ class Physics:
         Returns:
             The data after S steps, all poses up to date.
         """
-        moving = [getattr(data, name) for name in _MOVING]
-        return self._posed(changes, self._simulate(changes, moving, controls))
+        return self._posed(changes, self._simulate(changes, data, controls))
 
-    def _mjx_steps(
-        self, changes: Changes, moving: Sequence[jax.Array], controls: jax.Array
-    ) -> Sequence[jax.Array]:
-        """The `_MOVING` of a world after S physics steps."""
+    def _mjx_steps(self, changes: Changes, start: Data, controls: jax.Array) -> Sequence[jax.Array]:
+        """The `MOVING` of a world after S physics steps."""
         model = self._model.replace(**changes)
 
         def body(data: Any, control: jax.Array) -> tuple[Any, None]:
             return mjx.step(model, data.replace(ctrl=control)), None
 
-        data = self._data.replace(**dict(zip(_MOVING, moving, strict=True)))
+        data = self._data.replace(**{name: getattr(start, name) for name in MOVING})
         with _full_precision():
             data = jax.lax.scan(body, data, controls)[0]
-        return [getattr(data, name) for name in _MOVING]
+        return [getattr(data, name) for name in MOVING]
 
     def _posed(self, changes: Changes, moving: Sequence[jax.Array]) -> Data:
         """A world with all poses that follow from its joint positions."""
         model = self._model.replace(**changes)
-        data = self._data.replace(**dict(zip(_MOVING, moving, strict=True)))
+        data = self._data.replace(**dict(zip(MOVING, moving, strict=True)))
         with _full_precision():
             data = mjx.camlight(model, mjx.com_pos(model, mjx.kinematics(model, data)))
         return Data(**{field.name: getattr(data, field.name) for field in dataclasses.fields(Data)})

@@ -16,8 +16,10 @@ import warp as wp
 from mujoco.mjx.third_party import mujoco_warp
 
 from envs import warp_call
+from envs.physics import MOVING, Changes, Data
 
-MOVING = ("qpos", "qvel", "qacc_warmstart")
+# Warp computes where the geoms of fixed bodies are but once, for the model that all worlds share.
+_FIXED = ("geom_xpos", "geom_xmat")
 
 
 class WarpSteps:
@@ -39,13 +41,12 @@ class WarpSteps:
         self._made: dict[tuple[str, int], tuple[Any, Any]] = {}
         self._callables: dict[tuple[str, ...], Any] = {}
 
-    def __call__(
-        self, changes: dict[str, jax.Array], moving: Sequence[jax.Array], controls: jax.Array
-    ) -> Sequence[jax.Array]:
-        """`envs.physics.Physics.advance` for one world: qpos, qvel and qacc_warmstart after it."""
+    def __call__(self, changes: Changes, start: Data, controls: jax.Array) -> Sequence[jax.Array]:
+        """The `MOVING` of one world after S physics steps, as in `envs.physics.Physics.advance`."""
         names = tuple(sorted(changes))
-        arguments = [controls, *(jnp.asarray(changes[n], jnp.float32) for n in names), *moving]
-        results = self._batch(names)(*(x[None] for x in arguments))
+        differing = [jnp.asarray(changes[name], jnp.float32) for name in names]
+        state = [getattr(start, name) for name in (*_FIXED, *MOVING)]
+        results = self._batch(names)(*(x[None] for x in (controls, *differing, *state)))
         return [x[0] for x in results]
 
     def _batch(self, names: tuple[str, ...]) -> Any:
@@ -71,23 +72,28 @@ class WarpSteps:
         return run
 
     def _callable(self, names: tuple[str, ...]) -> Any:
-        """JAX's way into Warp: [S, W, nu] controls, changed fields of the model, `MOVING`."""
+        """JAX's way into Warp: controls [S, W, nu], changed fields, `_FIXED`, `MOVING`."""
         if names not in self._callables:
 
-            def simulate(controls: Any, *arrays: Any) -> None:
-                model, data = self._worlds(controls.shape[1])
+            def simulate(*arrays: Any) -> None:
+                given = dict(zip(like, arrays, strict=True))
+                model, data = self._worlds(given["controls"].shape[1])
                 model = copy.copy(model)
-                for name, array in zip((*names, *MOVING), arrays, strict=True):
-                    setattr(data if name in MOVING else model, name, array)
-                for step in range(controls.shape[0]):
-                    wp.copy(data.ctrl, controls[step])
+                for name in names:
+                    setattr(model, name, given[name])
+                for name in _FIXED:
+                    wp.copy(getattr(data, name), given[name])
+                for name in MOVING:
+                    setattr(data, name, given[name])
+                for step in range(given["controls"].shape[0]):
+                    wp.copy(data.ctrl, given["controls"][step])
                     mujoco_warp.step(model, data)
 
             with wp.ScopedDevice(warp_call.device()):
                 model, data = self._worlds(1)
             like = {"controls": wp.array(dtype=float, ndim=3)}
-            like |= {name: getattr(data if name in MOVING else model, name) for name in names}
-            like |= {name: getattr(data, name) for name in MOVING}
+            like |= {name: getattr(model, name) for name in names}
+            like |= {name: getattr(data, name) for name in (*_FIXED, *MOVING)}
             self._callables[names] = warp_call.from_jax(
                 simulate, like, num_outputs=len(MOVING), in_out_argnames=MOVING
             )

@@ -20,7 +20,7 @@ def make(task, **options):
 @pytest.fixture(scope="module")
 def pair():
     """The same worlds in both engines."""
-    return [make("pick_place", backend=backend) for backend in ("jax", "warp")]
+    return [make("open_pot", backend=backend) for backend in ("jax", "warp")]
 
 
 def run(env, ranges, steps):
@@ -56,12 +56,12 @@ def test_warp_that_is_missing_is_named(monkeypatch):
     [None, Randomization(size=(0.9, 1.1), mass=(0.5, 2.0), gains=(0.8, 1.2), latency=(0.0, 0.1))],
 )
 def test_both_engines_move_alike(pair, ranges):
-    """35 control steps: the grape is between the fingers at the end."""
-    ours, theirs = (run(env, ranges, 35) for env in pair)
-    joints = slice(0, 8)
-    np.testing.assert_allclose(ours.data.qpos[:, joints], theirs.data.qpos[:, joints], atol=2e-3)
-    grape = pair[0].model.body("grape").id
-    np.testing.assert_allclose(ours.data.xpos[:, grape], theirs.data.xpos[:, grape], atol=2e-3)
+    """40 control steps: the lid rests on the pot, most worlds have lifted it at the end."""
+    ours, theirs = (run(env, ranges, 40) for env in pair)
+    lid = pair[0].model.body("lid").id
+    assert np.all(ours.data.xpos[:, lid, 2] > 0.05)
+    np.testing.assert_allclose(ours.data.qpos[:, :8], theirs.data.qpos[:, :8], atol=2e-3)
+    np.testing.assert_allclose(ours.data.xpos[:, lid], theirs.data.xpos[:, lid], atol=3e-3)
     assert not bool(theirs.info["broken"].any())
 
 
