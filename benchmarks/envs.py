@@ -2,27 +2,29 @@
 
     python -m benchmarks.envs --batches 256 1024 4096 --json envs.json
 
-For each task and batch: seconds to compile, physics steps/s, control steps/s without and with the
-pictures of both cameras, images/s of the renderer alone (hard shadows, two cameras), memory of the
-compiled program, and the ratio to MuJoCo's C engine with a thread a core on the same scene. Actions
-are noise around the start pose. Inputs are built under jit, everything is warmed up twice, the best
-of three calls counts.
+For each task, backend and batch: seconds to compile (`--jobs` programs at once), physics steps/s,
+control steps/s without and with ("seeing") the pictures of both cameras, images/s of the ray caster
+alone (hard shadows, two cameras), memory, and the ratio to MuJoCo's C engine with a thread a core
+on the same scene. Actions are noise around the start pose. Inputs are built under jit, everything is
+warmed up twice, the best of three calls counts.
 """
 
 import argparse
 import copy
+import dataclasses
 import importlib.metadata
 import importlib.util
+import itertools
 import json
 import os
 import platform
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import mujoco.rollout
 import numpy as np
@@ -42,54 +44,64 @@ PICTURE_SIZES = (64, 128)  # [px] of the renderer's columns
 PLAYGROUND = "PandaPickCube"
 
 
-def measure(task: str, options: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """The rows of one task, one a batch size."""
-    reference = None  # does not depend on the batch
-    for batch in options.batches:
-        env = envs.make(task, options.robot, num_envs=batch, image_size=options.image_size)
+@dataclasses.dataclass
+class Case:
+    """One row of the table to be: an environment, and the program that steps it."""
+
+    env: Env
+    state: State
+    steps: Any  # (state, key) -> state after CONTROL_STEPS steps
+    compile_seconds: float
+
+    @classmethod
+    def prepare(cls, options: argparse.Namespace, task: str, backend: Any, batch: int) -> Self:
+        """Everything compiled."""
+        env = envs.make(
+            task, options.robot, num_envs=batch, image_size=options.image_size, backend=backend
+        )
         state = env.reset(jax.random.key(0))
-        reference = reference or mujoco_c(env, state)
-        yield measure_batch(env, state, reference)
+        middle = state.info["command"]
 
+        def run(state: State, key: jax.Array) -> State:
+            def body(state: State, key: jax.Array) -> tuple[State, None]:
+                return env.step(state, middle + 0.1 * jax.random.normal(key, middle.shape)), None
 
-def measure_batch(env: Env, state: State, reference: float) -> dict[str, Any]:
-    """One row of the table, given the C engine's physics steps/s."""
-    blind, compile_seconds, memory = time_steps(env, state, pictures=False)
-    seeing, _, _ = time_steps(env, state, pictures=True)
-    steps = blind * round(env.control_dt / env.physics_dt)
-    return {
-        "task": env.task.name,
-        "batch": env.num_envs,
-        "compile [s]": compile_seconds,
-        "physics steps/s": steps,
-        "control steps/s": blind,
-        "with pictures": seeing,
-        **{f"images/s, {n} px": time_pictures(env, state, n) for n in PICTURE_SIZES},
-        "memory [MiB]": memory,
-        "over MuJoCo C": steps / reference,
-    }
+            return jax.lax.scan(body, state, jax.random.split(key, CONTROL_STEPS))[0]
 
+        start = time.perf_counter()
+        steps = jax.jit(run).lower(state, jax.random.key(1)).compile()
+        return cls(env, state, steps, time.perf_counter() - start)
 
-def time_steps(env: Env, state: State, *, pictures: bool) -> tuple[float, float, float]:
-    """Control steps/s of all worlds together, seconds to compile, temporary memory in MiB."""
-    middle = state.info["command"]
+    def measure(self, reference: float) -> dict[str, Any]:
+        """The row, given the C engine's physics steps/s."""
+        env = self.env
+        start = time.perf_counter()
+        jax.block_until_ready(self.steps(self.state, jax.random.key(1)))
+        first = time.perf_counter() - start  # Warp compiles its kernels here
+        blind = best(lambda: self.steps(self.state, jax.random.key(1))) / CONTROL_STEPS
+        looking = best(lambda: env.observe(self.state))
+        physics_steps = env.num_envs * round(env.control_dt / env.physics_dt) / blind
+        return {
+            "task": env.task.name,
+            "backend": env.physics.backend,
+            "batch": env.num_envs,
+            "compile s": self.compile_seconds + first - CONTROL_STEPS * blind,
+            "physics/s": physics_steps,
+            "control/s": env.num_envs / blind,
+            "seeing/s": env.num_envs / (blind + looking),
+            **{f"images/s, {n} px": time_pictures(env, self.state, n) for n in PICTURE_SIZES},
+            "MiB": self.memory(),
+            "over C": physics_steps / reference,
+        }
 
-    def run(state: State, key: jax.Array) -> tuple[State, Any]:
-        def body(state: State, key: jax.Array) -> tuple[State, Any]:
-            state = env.step(state, middle + 0.1 * jax.random.normal(key, middle.shape))
-            # Sums, so that every picture is made and none is kept.
-            return state, jax.tree.map(jnp.sum, env.observe(state)) if pictures else None
+    def memory(self) -> float:
+        """What the program needs beside its arguments, and what Warp has taken, in MiB."""
+        needed: int = self.steps.memory_analysis().temp_size_in_bytes
+        if self.env.physics.backend == "warp" and jax.default_backend() == "gpu":
+            import warp
 
-        return jax.lax.scan(body, state, jax.random.split(key, CONTROL_STEPS))
-
-    key = jax.random.key(1)
-    start = time.perf_counter()
-    compiled = jax.jit(run).lower(state, key).compile()
-    compile_seconds = time.perf_counter() - start
-    analysis: Any = compiled.memory_analysis()
-    memory = analysis.temp_size_in_bytes / 2**20
-    seconds = best(lambda: compiled(state, key))
-    return env.num_envs * CONTROL_STEPS / seconds, compile_seconds, memory
+            needed += warp.get_mempool_used_mem_current(warp.get_device())
+        return needed / 2**20
 
 
 def time_pictures(env: Env, state: State, size: int) -> float:
@@ -151,26 +163,40 @@ def playground(batch: int) -> float:
     return batch * CONTROL_STEPS * round(env.dt / env.sim_dt) / seconds
 
 
+def measure(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """The rows, one a task, backend and batch size."""
+    wanted = itertools.product(options.tasks, options.backends, options.batches)
+    references: dict[str, float] = {}
+    with ThreadPoolExecutor(options.jobs) as pool:
+        for case in list(pool.map(lambda names: Case.prepare(options, *names), wanted)):
+            task = case.env.task.name
+            if task not in references:
+                references[task] = mujoco_c(case.env, case.state)
+            yield case.measure(references[task])
+
+
 def main() -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--tasks", nargs="+", default=["open_pot", "pour", "press", "pick_place"])
     parser.add_argument("--robot", default="piper")
+    parser.add_argument("--backends", nargs="+", help="default: jax, and warp where it is picked")
     parser.add_argument("--batches", nargs="+", type=int, default=[16])
     parser.add_argument("--image-size", type=int, default=64)
+    parser.add_argument("--jobs", type=int, default=1, help="programs to compile at once")
     parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args()
     physics.enable_fast_cpu()
+    options.backends = options.backends or sorted({"jax", physics.default_backend()})
     console = Console()
     versions = {p: importlib.metadata.version(p) for p in ("jax", "mujoco", "mujoco-mjx")}
     machine = f"{jax.devices()[0].device_kind}, {os.cpu_count()} cores, Python "
     machine += f"{platform.python_version()}, {versions}, pictures {options.image_size} px"
     console.print(machine)
     rows = []
-    for task in options.tasks:
-        for row in measure(task, options):
-            rows.append(row)
-            console.print(", ".join(f"{k} {_text(v)}" for k, v in row.items()))
+    for row in measure(options):
+        rows.append(row)
+        console.print(", ".join(f"{k} {_text(v)}" for k, v in row.items()))
     print_tables(console, rows)
     found: dict[str, Any] = {"machine": machine, "rows": rows}
     if importlib.util.find_spec("mujoco_playground"):
@@ -186,7 +212,7 @@ def print_tables(console: Console, rows: list[dict[str, Any]]) -> None:
     """Steps and pictures apart, which fits 80 columns."""
     images = [name for name in rows[0] if name.startswith("images/s")]
     steps = [name for name in rows[0] if name not in images]
-    for names in (steps, ["task", "batch", *images]):
+    for names in (steps, ["task", "backend", "batch", *images]):
         table = Table(*map(escape, names), box=box.SIMPLE, pad_edge=False)
         table.columns[0].no_wrap = True
         for row in rows:

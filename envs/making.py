@@ -2,6 +2,7 @@
 
 import functools
 import importlib
+import os
 import pkgutil
 from collections.abc import Sequence
 from typing import Any, Literal, get_args
@@ -10,10 +11,11 @@ import jax
 import mujoco
 
 import envs.distractors
-from envs import physics, render, scene
+from envs import mjcf, physics, render, scene
 from envs.actions import MODES, Mode
 from envs.env import TARGET_DT, Env, Renderer
 from envs.physics import Backend
+from envs.robots import Robot
 
 RendererName = Literal["rays", "warp"]
 RENDERERS: tuple[str, ...] = get_args(RendererName)
@@ -21,7 +23,7 @@ RENDERERS: tuple[str, ...] = get_args(RendererName)
 
 def make(
     task: str,
-    robot: str = "piper",
+    robot: str | os.PathLike[str] | Robot = "piper",
     *,
     num_envs: int = 1,
     image_size: int = 64,
@@ -35,7 +37,9 @@ def make(
     """An environment.
 
     Args:
-        task, robot: names of files in `envs/tasks` and `envs/robots`.
+        task: name of a file in `envs/tasks`.
+        robot: name of a file in `envs/robots`, path of a user's MJCF file, or what `envs.mjcf.load`
+            made of one.
         num_envs: parallel worlds W.
         image_size: height and width of the pictures in pixels.
         antialias: n for smooth edges by n x n rays a pixel, which take n squared times as long.
@@ -47,13 +51,14 @@ def make(
             meshes and textures.
 
     Raises:
-        ValueError: for an unknown name (the known ones are listed) or a number out of range.
+        ValueError: for an unknown name (the known ones are listed), a robot that lacks something,
+            or a number out of range.
     """
-    found_task, found_robot = _find("task", task), _find("robot", robot)
+    found_task, found_robot = _find("task", task), _find_robot(robot)
     _check_counts(num_envs=num_envs, image_size=image_size, antialias=antialias)
     _check_options(control_dt, actions, distractors)
     things = found_task.scene + envs.distractors.mjcf(distractors)
-    model = mujoco.MjModel.from_xml_string(scene.mjcf(things, found_robot))
+    model = scene.build(things, found_robot)
     drawn = render.build(model, scene.CAMERAS)
     return Env(
         task=found_task,
@@ -116,6 +121,14 @@ def _check_options(control_dt: float, actions: str, distractors: int) -> None:
     most = envs.distractors.MOST
     if not 0 <= distractors <= most:
         raise ValueError(f"distractors must be 0 to {most}, got {distractors}")
+
+
+def _find_robot(robot: str | os.PathLike[str] | Robot) -> Robot:
+    if isinstance(robot, Robot):
+        return robot
+    if os.fspath(robot).endswith(".xml"):
+        return mjcf.load(robot)
+    return _find("robot", os.fspath(robot))
 
 
 def _find(kind: str, name: str) -> Any:

@@ -17,6 +17,7 @@ AMBIENT, HEADLIGHT, DIFFUSE = 0.35, 0.25, 0.5
 SKY = ((0.80, 0.84, 0.88), (0.45, 0.58, 0.75))
 SQUARE, CONTRAST = 0.1, 0.12
 
+STAND_IN_GROUP = 5  # its geoms are drawn in place of meshes
 _INFINITE = 1e4  # [m] half-extent drawn where a plane's size is 0, which means infinite
 # MuJoCo geom type -> kind, and which numbers of its size are the half-extents along x, y, z.
 _SHAPES = {
@@ -86,13 +87,18 @@ class RenderModel:
 def build(mj_model: mujoco.MjModel, camera_names: Sequence[str]) -> RenderModel:
     """Sorts the visible geoms (alpha above 0, group below 3) of a model for rendering.
 
+    Meshes are left out if the model has primitives in their place, in `STAND_IN_GROUP`.
+
     Raises:
         ValueError: if a camera does not exist, a visible geom is not a primitive, or none is left.
     """
     cameras = {mj_model.camera(i).name: i for i in range(mj_model.ncam)}
     if unknown := set(camera_names) - set(cameras):
         raise ValueError(f"the model has no camera {unknown}, only {sorted(cameras)}")
-    visible = np.flatnonzero((mj_model.geom_rgba[:, 3] > 0) & (mj_model.geom_group < 3)).tolist()
+    drawn, stand_ins = is_visible(mj_model), mj_model.geom_group == STAND_IN_GROUP
+    if stand_ins.any():
+        drawn = drawn & (mj_model.geom_type != mujoco.mjtGeom.mjGEOM_MESH) | stand_ins
+    visible = np.flatnonzero(drawn).tolist()
     if not visible:
         raise ValueError("the model has no visible geom (alpha above 0, group below 3)")
     types = mj_model.geom_type.tolist()
@@ -111,6 +117,11 @@ def build(mj_model: mujoco.MjModel, camera_names: Sequence[str]) -> RenderModel:
         sides=tuple(_SHAPES[types[i]][1] for i in geoms),
         cameras=tuple(cameras[name] for name in camera_names),
     )
+
+
+def is_visible(mj_model: mujoco.MjModel) -> np.ndarray:
+    """Which geoms `[G]` of a model are to be seen: alpha above 0, group below 3."""
+    return (mj_model.geom_rgba[:, 3] > 0) & (mj_model.geom_group < 3)
 
 
 def unit_shapes(model: RenderModel, size: jax.Array | np.ndarray) -> tuple[jax.Array, jax.Array]:

@@ -1,9 +1,11 @@
 """The MuJoCo scene of a task: table, cameras and light, the same for every robot and task."""
 
+import mujoco
 import numpy as np
 
 from envs import robots
 from envs.render_model import AMBIENT, CONTRAST, DIFFUSE, HEADLIGHT, SKY, SQUARE
+from envs.robots import Robot
 
 CAMERAS = ("side", "wrist")
 PHYSICS_DT = 0.005  # s
@@ -66,14 +68,22 @@ _TABLE, _TABLE_SIZE = ".62 .66 .68 1", 2.0  # colour; half the edge [m]
 _SIDE_EYE, _SIDE_TARGET = (0.76, -0.49, 0.42), (0.34, 0.0, 0.065)  # m
 
 
-def mjcf(objects: str, robot: robots.Robot) -> str:
-    """MJCF of a robot, base at the origin, at a table z = 0 with a task's objects on it."""
+def build(objects: str, robot: Robot) -> mujoco.MjModel:
+    """The model of a robot, base at the origin, at a table z = 0 with a task's objects on it."""
+    spec = mujoco.MjSpec.from_string(mjcf(objects, robot))
+    robot.body.attach(robot, spec)
+    return spec.compile()
+
+
+def mjcf(objects: str, robot: Robot) -> str:
+    """MJCF of the same, without what only `Robot.body` can attach."""
+    bodies, actuators = robot.body.mjcf(robot)
     return _SCENE.format(
         timestep=PHYSICS_DT,
         side=robots.pose(_look_at(np.array(_SIDE_EYE), np.array(_SIDE_TARGET))),
-        robot=robots.bodies(robot),
+        robot=bodies,
         task=objects,
-        actuators=robots.actuators(robot),
+        actuators=actuators,
         look=_look(),
         headlight=HEADLIGHT,
         diffuse=DIFFUSE,

@@ -43,7 +43,8 @@ class WarpRenderer:
             samples: n for n x n rays a pixel.
         """
         self._mujoco, self._own = model, own
-        self._num_worlds, self._image_size = num_worlds, image_size
+        # Warp's own way to take several rays a pixel cannot vary the field of view.
+        self._num_worlds, self._image_size, self._samples = num_worlds, image_size, samples
         with wp.ScopedDevice(warp_call.device()):
             self._model = mujoco_warp.put_model(_lamplit(model))
             self._data = mujoco_warp.make_data(model, nworld=num_worlds)
@@ -51,7 +52,7 @@ class WarpRenderer:
                 mujoco_warp.create_render_context(
                     _lamplit(model),
                     nworld=num_worlds,
-                    cam_res=(image_size, image_size),
+                    cam_res=(samples * image_size,) * 2,
                     render_rgb=True,
                     render_depth=False,
                     cam_active=[camera],
@@ -59,7 +60,6 @@ class WarpRenderer:
                     shadow_light_fraction=0.0,
                     render_skybox=True,
                     use_precomputed_rays=False,  # fields of view differ from world to world
-                    samples_per_pixel=samples,
                     enable_specular=False,
                 )
                 for camera in own.cameras
@@ -111,8 +111,10 @@ class WarpRenderer:
         per_world = (size, look.rgba, self._material_colours(look), look.fovy)
         lights = (direction, *jnp.moveaxis(place, 1, 0))
         packed = self._render(*per_world, geom_xpos, geom_xmat, cam_xpos, cam_xmat, *lights)
-        packed = jnp.stack(packed, axis=1).reshape(worlds, len(packed), side, side)
+        rays = (side, self._samples) * 2
+        packed = jnp.stack(packed, axis=1).reshape(worlds, len(packed), *rays)
         rgb = jnp.stack([(packed >> shift) & 0xFF for shift in (16, 8, 0)], axis=-1)
+        rgb = jnp.mean(rgb.astype(jnp.float32), axis=(3, 5))
         bright = (look.ambient / own.ambient).reshape(-1, 1, 1, 1, 1)
         return (jnp.clip(rgb * bright, 0, 255) + 0.5).astype(jnp.uint8)
 

@@ -7,22 +7,37 @@ That lets the tasks and the expert talk about hands without knowing the robot.
 """
 
 import dataclasses
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 TIP_LENGTH = 0.012  # m from the tcp to the end of the finger tips, the same on every hand
-_TIP_RADIUS = 0.005  # m, sphere at each finger tip that touches tables, walls and buttons
+TIP_RADIUS = 0.005  # m, sphere at each finger tip that touches tables, walls and buttons
 
 # The wrist camera sits on the outer side of the hand and looks along it, tilted 22 degrees towards
 # the tips (own choice: the tips stand in the lower half of the picture, the object above them).
-_WRIST_CAMERA = '<camera name="wrist" pos="-.08 0 -.093" xyaxes="0 -1 0 -.9272 0 .3746" fovy="75"/>'
+WRIST_POSITION, WRIST_FOVY = (-0.08, 0.0, -0.093), 75.0  # m, deg
+WRIST_AXES = (0.0, -1.0, 0.0, -0.9272, 0.0, 0.3746)  # its x and y, in the frame of the tcp
 
 # Damped least squares as in the facts' proof: damping, weight of rotation [m/rad], longest step.
 _DAMPING, _ROTATION_WEIGHT, _MAX_STEP = 0.03, 0.3, 0.3
 _ITERATIONS = 60
 _POSTURE_GAIN = 0.1  # pull of spare joints towards home, a fraction of the way an iteration
+
+
+class Body(Protocol):
+    """What is simulated of a robot: bodies, joints, geoms, actuators."""
+
+    def mjcf(self, robot: "Robot", /) -> tuple[str, str]:
+        """MJCF of the body tree, base at the world's origin, and of the position servos."""
+        ...
+
+    def attach(self, robot: "Robot", scene: mujoco.MjSpec) -> None:
+        """Adds what is not MJCF to the scene that `mjcf` became a part of."""
+        ...
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -42,11 +57,7 @@ class Robot:
             towards the base.
         stroke: largest gripper opening, both fingers together [m].
         gripper_speed: largest change of the opening [m/s].
-        stiffness, damping: [J] gains of the position actuators [N m/rad, N m s/rad].
-        armature: reflected motor inertia of every joint [kg m^2].
-        base, links: MJCF geoms carried by the base and by each link, in the link's frame.
-        hand, finger: MJCF geoms of the hand and of the finger at y > 0, in the tcp frame, closed.
-        tip_offset: y of the middle of a closed finger [m].
+        body: what is simulated.
     """
 
     name: str
@@ -60,14 +71,7 @@ class Robot:
     tilt_side: int
     stroke: float
     gripper_speed: float
-    stiffness: np.ndarray
-    damping: np.ndarray
-    armature: float
-    base: str
-    links: tuple[str, ...]
-    hand: str
-    finger: str
-    tip_offset: float
+    body: Body
 
     @property
     def num_joints(self) -> int:
@@ -88,6 +92,61 @@ class Robot:
     def action_speed(self) -> np.ndarray:
         """[J + 1] fastest change of the commands [rad/s, m/s], float32."""
         return np.append(self.speed, self.gripper_speed).astype(np.float32)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Primitives:
+    """A body of primitive shapes laid over the joint chain.
+
+    Attributes:
+        stiffness, damping: [J] gains of the position actuators [N m/rad, N m s/rad].
+        armature: reflected motor inertia of every joint [kg m^2].
+        base, links: MJCF geoms carried by the base and by each link, in the link's frame.
+        hand, finger: MJCF geoms of the hand and of the finger at y > 0, in the tcp frame, closed.
+        tip_offset: y of the middle of a closed finger [m].
+    """
+
+    stiffness: np.ndarray
+    damping: np.ndarray
+    armature: float
+    base: str
+    links: tuple[str, ...]
+    hand: str
+    finger: str
+    tip_offset: float
+
+    def mjcf(self, robot: Robot, /) -> tuple[str, str]:
+        """MJCF of the body tree, and of the servos: joints first, then the left finger."""
+        return self._bodies(robot), self._actuators()
+
+    def attach(self, robot: Robot, scene: mujoco.MjSpec) -> None:
+        """Does nothing: all of it is MJCF."""
+
+    def _bodies(self, robot: Robot) -> str:
+        xml, closing = f'<body name="base">{self.base}', "</body>"
+        for i, (fixed, geoms) in enumerate(zip(robot.chain, self.links, strict=True)):
+            xml += f'<body name="link{i + 1}" {pose(fixed)} gravcomp="1">'
+            xml += f'<joint name="joint{i + 1}" range="{robot.lower[i]} {robot.upper[i]}" '
+            xml += f'armature="{self.armature}"/>{geoms}'
+            closing += "</body>"
+        position, axes = (" ".join(map(str, x)) for x in (WRIST_POSITION, WRIST_AXES))
+        xml += f'<body name="hand" {pose(robot.tool)} gravcomp="1"><site name="tcp"/>'
+        xml += f'<camera name="wrist" pos="{position}" xyaxes="{axes}" fovy="{WRIST_FOVY}"/>'
+        xml += self.hand
+        tip = f'pos="0 {self.tip_offset} {TIP_LENGTH - TIP_RADIUS}" size="{TIP_RADIUS}"'
+        for side, turn in (("left", "1 0 0 0"), ("right", "0 0 0 1")):
+            xml += f'<body name="{side}" quat="{turn}" gravcomp="1"><joint name="{side}" '
+            xml += f'class="finger" range="0 {robot.stroke / 2}"/>{self.finger}'
+            xml += f'<geom class="tip" {tip}/></body>'
+        return xml + "</body>" + closing
+
+    def _actuators(self) -> str:
+        xml = ""
+        for i, (kp, kv) in enumerate(zip(self.stiffness, self.damping, strict=True)):
+            xml += f'<position name="joint{i + 1}" joint="joint{i + 1}" kp="{kp}" kv="{kv}"/>'
+        # Half the opening. kp, kv: own choice that holds a 12 g grape without slip and stays below
+        # 20 N at full stroke.
+        return xml + '<position name="gripper" joint="left" kp="400" kv="20"/>'
 
 
 def translation(x: float, y: float, z: float) -> np.ndarray:
@@ -185,32 +244,6 @@ def sine_axis(rotation: jax.Array) -> jax.Array:
     """Axis [3] of a rotation [3, 3], as long as the sine of its angle."""
     r = rotation
     return 0.5 * jnp.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
-
-
-def bodies(robot: Robot) -> str:
-    """MJCF of the arm's body tree, base at the world's origin."""
-    xml, closing = f'<body name="base">{robot.base}', "</body>"
-    for i, (fixed, geoms) in enumerate(zip(robot.chain, robot.links, strict=True)):
-        xml += f'<body name="link{i + 1}" {pose(fixed)} gravcomp="1"><joint name="joint{i + 1}" '
-        xml += f'range="{robot.lower[i]} {robot.upper[i]}" armature="{robot.armature}"/>{geoms}'
-        closing += "</body>"
-    xml += f'<body name="hand" {pose(robot.tool)} gravcomp="1"><site name="tcp"/>'
-    xml += _WRIST_CAMERA + robot.hand
-    tip = f'pos="0 {robot.tip_offset} {TIP_LENGTH - _TIP_RADIUS}" size="{_TIP_RADIUS}"'
-    for side, turn in (("left", "1 0 0 0"), ("right", "0 0 0 1")):
-        xml += f'<body name="{side}" quat="{turn}" gravcomp="1"><joint name="{side}" '
-        xml += f'class="finger" range="0 {robot.stroke / 2}"/>{robot.finger}'
-        xml += f'<geom class="tip" {tip}/></body>'
-    return xml + "</body>" + closing
-
-
-def actuators(robot: Robot) -> str:
-    """MJCF of the position servos, joints first, then the left finger (half the opening)."""
-    xml = ""
-    for i, (kp, kv) in enumerate(zip(robot.stiffness, robot.damping, strict=True)):
-        xml += f'<position name="joint{i + 1}" joint="joint{i + 1}" kp="{kp}" kv="{kv}"/>'
-    # kp, kv: own choice that holds a 12 g grape without slip and stays below 20 N at full stroke.
-    return xml + '<position name="gripper" joint="left" kp="400" kv="20"/>'
 
 
 def pose(transform: np.ndarray) -> str:

@@ -51,13 +51,15 @@ ROBOT = robots.Robot(
     tilt_side=-1,  # joint 6 ends before the tool is level
     stroke=0.08,  # two fingers of 0.04 m
     gripper_speed=0.1,  # Franka hand data sheet: 50 mm/s a finger
-    # Menagerie; its passive joint damping (40, then 2) is added to the servo's, both act alike.
-    stiffness=np.array([1000.0, 1000.0, 750.0, 750.0, 300.0, 300.0, 300.0]),
-    damping=np.array([60.0, 60.0, 44.0, 44.0, 4.0, 4.0, 4.0]),
-    armature=0.1,
-    base=f'<geom type="capsule" size=".07" fromto="-.05 0 .05 0 0 .13" mass=".63" {_LIGHT}/>',
-    links=_LINKS,
-    hand=f'<geom type="box" size=".022 .1 .028" pos="0 0 -.067" mass=".73" {_WHITE}/>',
-    finger=f'<geom class="pad" size=".010 .005 .027" pos="0 .005 -.015" mass=".015" {_DARK}/>',
-    tip_offset=0.005,
+    body=robots.Primitives(
+        # Menagerie; its passive joint damping (40, then 2) is added to the servo's, both act alike.
+        stiffness=np.array([1000.0, 1000.0, 750.0, 750.0, 300.0, 300.0, 300.0]),
+        damping=np.array([60.0, 60.0, 44.0, 44.0, 4.0, 4.0, 4.0]),
+        armature=0.1,
+        base=f'<geom type="capsule" size=".07" fromto="-.05 0 .05 0 0 .13" mass=".63" {_LIGHT}/>',
+        links=_LINKS,
+        hand=f'<geom type="box" size=".022 .1 .028" pos="0 0 -.067" mass=".73" {_WHITE}/>',
+        finger=f'<geom class="pad" size=".010 .005 .027" pos="0 .005 -.015" mass=".015" {_DARK}/>',
+        tip_offset=0.005,
+    ),
 )

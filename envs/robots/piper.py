@@ -100,12 +100,14 @@ ROBOT = robots.Robot(
     tilt_side=1,  # joint 5 ends soon after the tool points down
     stroke=0.07,  # piper_sdk, GripperCtrl [m]
     gripper_speed=0.1,  # own choice [m/s]
-    stiffness=np.array([80.0, 80.0, 80.0, 40.0, 10.0, 10.0]),
-    damping=np.array([5.0, 5.0, 5.0, 5.0, 1.5, 1.5]),
-    armature=0.005,
-    base=f'<geom type="cylinder" size=".055 .045" pos="0 0 .045" mass=".163" {_DARK}/>',
-    links=_LINKS,
-    hand=f'<geom type="box" size=".02 .055 .026" pos="0 0 -.077" mass=".35" {_GREY}/>',
-    finger=f'<geom class="pad" size=".012 .004 .03" pos="0 .004 -.018" mass=".026" {_DARK}/>',
-    tip_offset=0.004,
+    body=robots.Primitives(
+        stiffness=np.array([80.0, 80.0, 80.0, 40.0, 10.0, 10.0]),
+        damping=np.array([5.0, 5.0, 5.0, 5.0, 1.5, 1.5]),
+        armature=0.005,
+        base=f'<geom type="cylinder" size=".055 .045" pos="0 0 .045" mass=".163" {_DARK}/>',
+        links=_LINKS,
+        hand=f'<geom type="box" size=".02 .055 .026" pos="0 0 -.077" mass=".35" {_GREY}/>',
+        finger=f'<geom class="pad" size=".012 .004 .03" pos="0 .004 -.018" mass=".026" {_DARK}/>',
+        tip_offset=0.004,
+    ),
 )

@@ -76,7 +76,7 @@ def test_tool_pose_is_mujocos(scene, robot_name):
 def test_robots_are_complete(scene, robot_name):
     robot = scene.robot
     assert robot.name == robot_name
-    for numbers in (robot.lower, robot.upper, robot.speed, robot.home, robot.stiffness):
+    for numbers in (robot.lower, robot.upper, robot.speed, robot.home, robot.body.stiffness):
         assert numbers.shape == (robot.num_joints,)
     assert np.all(robot.lower < robot.home)
     assert np.all(robot.home < robot.upper)

@@ -1,0 +1,89 @@
+"""A user's own robot, from its MJCF file.
+
+    env = envs.make("press", robot="my_arm.xml")
+    env = envs.make("press", robot=envs.mjcf.load("my_arm.xml", tcp="pinch", speed=1.5))
+
+The file describes an arm: hinges from its base to a hand with two sliding fingers, which are found
+by what they are, not by name, and a position actuator for each hinge and for the fingers. Joints,
+masses, gains, meshes and the pose of the base are kept. What a scene has of its own is not: floor,
+lights, options, keyframes, sensors, tendons, equalities. A camera "wrist" is the wrist camera; an
+arm without one gets that of the robots of this package. Of the arm only the fingers touch things,
+each with a box around the ends of its colliding geoms and a small sphere at the tip, like the
+robots of this package: MJX is slow with meshes.
+"""
+
+import os
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from envs.mjcf import attaching, hands, posing, reading
+from envs.robots import Robot
+
+# Own choices: the speed lies between those of Panda (2.175 to 2.61) and PiPER (3).
+_SPEED, _GRIPPER_SPEED = 2.5, 0.1
+
+
+def load(
+    path: str | os.PathLike[str],
+    *,
+    tcp: str | None = None,
+    speed: float | Sequence[float] = _SPEED,
+    gripper_speed: float = _GRIPPER_SPEED,
+) -> Robot:
+    """A robot for `envs.make`.
+
+    The arm stands where its file puts it; the tasks want its base at the origin and x in front.
+
+    Args:
+        path: the MJCF file.
+        tcp: name of a site whose axes are the hand's: z out of the hand between the fingers, y
+            along which they open. None: the site "tcp" if there is one, else the last joint's axis
+            is the hand's. The tasks' own tcp is put on that z axis, `robots.TIP_LENGTH` before the
+            fingers end.
+        speed: joint speed limit, one for all or one each [rad/s]; MJCF has none.
+        gripper_speed: largest change of the opening [m/s].
+
+    Raises:
+        ValueError: if the file cannot be read, or lacks something that the tasks need: the message
+            says what, and what there is instead.
+    """
+    spec, model = reading.read(path)
+    try:
+        arm = reading.find_arm(model)
+        hand = hands.find(model, arm, tcp)
+        gripper = reading.find_gripper(model, arm, hand.signs)
+        limits = model.jnt_range[arm.joints]
+        robot = Robot(
+            name=str(path),
+            chain=hand.chain,
+            tool=hand.tool,
+            lower=limits[:, 0],
+            upper=limits[:, 1],
+            speed=_positive("speed", speed, len(limits)),
+            home=_guess(model, arm),
+            lean=0.0,
+            tilt_side=1,
+            stroke=hand.stroke,
+            gripper_speed=float(_positive("gripper_speed", gripper_speed, 1)[0]),
+            body=attaching.prepare(spec, model, arm, gripper, hand),
+        )
+        return posing.posed(robot)
+    except ValueError as error:
+        raise ValueError(f"robot {path}: {error}") from None
+
+
+def _positive(name: str, given: float | Sequence[float], count: int) -> np.ndarray:
+    numbers = np.asarray(given, float)
+    if numbers.shape not in ((), (count,)) or not np.all(numbers > 0):
+        raise ValueError(f"{name} must be positive, one number or {count}, got {given}")
+    return np.broadcast_to(numbers, count).copy()
+
+
+def _guess(model: mujoco.MjModel, arm: reading.Arm) -> np.ndarray:
+    """Joint angles [J] near which to look for the start pose: the keyframe "home" or mid-range."""
+    for i in range(model.nkey):
+        if model.key(i).name == "home":
+            return model.key_qpos[i, model.jnt_qposadr[arm.joints]]
+    return model.jnt_range[arm.joints].mean(axis=1)

@@ -1,0 +1,212 @@
+"""Where the hand of a user's robot is, which way it looks, and how its fingers move and touch."""
+
+import itertools
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from envs.mjcf.reading import Arm
+from envs.robots import TIP_LENGTH, TIP_RADIUS
+
+_PARALLEL = 0.99  # least cosine of directions that should be the same
+_CORNERS = np.array(list(itertools.product((-1, 1), repeat=3)))
+
+
+class Pad(NamedTuple):
+    """What a finger touches things with, in the frame of its body [m]."""
+
+    position: np.ndarray  # of a box
+    rotation: np.ndarray
+    size: np.ndarray  # its half-extents
+    tip: np.ndarray  # of the sphere
+
+
+class Hand(NamedTuple):
+    """A hand at the end of its arm.
+
+    A finger's pad is sign * q + shift away from the tcp: half the opening.
+    """
+
+    chain: np.ndarray  # [J, 4, 4] as in `Robot`
+    tool: np.ndarray  # [4, 4]
+    mount: np.ndarray  # [4, 4] pose of the body that carries the fingers in the last link
+    signs: np.ndarray  # [2]
+    shifts: np.ndarray  # [2] m
+    stroke: float  # m
+    pads: list[Pad]
+
+
+def find(model: mujoco.MjModel, arm: Arm, tcp: str | None) -> Hand:
+    """The hand of an arm.
+
+    Args:
+        model: the user's model.
+        arm: its joints.
+        tcp: as in `envs.mjcf.load`.
+
+    Raises:
+        ValueError: if the fingers do not slide along one line or have nothing to touch with, or the
+            site does not exist or does not suit them.
+    """
+    data = mujoco.MjData(model)
+    data.qpos[model.jnt_qposadr[arm.joints]] = 0
+    signs, across = _open(model, data, arm)
+    site = _site(model, tcp)
+    axes = _axes(model, data, arm, across, site)
+    left, right = (_end(_corners(model, data, joint) @ axes) for joint in arm.fingers)
+    gap = left[0, 1] - right[1, 1]
+    if gap < 2 * TIP_RADIUS:
+        raise ValueError(f"the fingers are only {1000 * gap:.0f} mm apart when they are open")
+    pose = _pose(axes @ _centre(data, axes, left, right, site), axes)
+    carrier = model.body_parentid[model.jnt_bodyid[arm.fingers[0]]]
+    frames = [np.eye(4), *(_frame(model, data, joint) for joint in arm.joints)]
+    return Hand(
+        chain=np.stack([np.linalg.solve(a, b) for a, b in itertools.pairwise(frames)]),
+        tool=np.linalg.solve(frames[-1], pose),
+        mount=np.linalg.solve(frames[-1], _pose(data.xpos[carrier], data.xmat[carrier])),
+        signs=signs,
+        shifts=gap / 2 - signs * data.qpos[model.jnt_qposadr[arm.fingers]],
+        stroke=float(gap),
+        pads=[
+            _pad(data, model.jnt_bodyid[joint], pose, box)
+            for joint, box in zip(arm.fingers, (left, right), strict=True)
+        ],
+    )
+
+
+def _open(model: mujoco.MjModel, data: mujoco.MjData, arm: Arm) -> tuple[np.ndarray, np.ndarray]:
+    """Opens the fingers in `data`.
+
+    Returns:
+        Which way [2] each joint opens them, and the direction [3] from the second to the first.
+    """
+    mujoco.mj_kinematics(model, data)
+    line = data.xaxis[arm.fingers[0]]
+    along = data.xaxis[arm.fingers] @ line
+    if abs(along[1]) < _PARALLEL:
+        raise ValueError(f"the fingers slide {_degrees(along[1])} deg apart, not along one line")
+    address = model.jnt_qposadr[arm.fingers]
+    centres = [_corners(model, data, joint).mean(axis=(0, 1)) @ line for joint in arm.fingers]
+
+    def offset(ends: tuple[float, ...]) -> float:
+        first, second = centres + along * (ends - data.qpos[address])
+        return first - second
+
+    ends = max(itertools.product(*model.jnt_range[arm.fingers]), key=lambda e: abs(offset(e)))
+    side = np.sign(offset(ends))
+    data.qpos[address] = ends
+    mujoco.mj_kinematics(model, data)
+    return np.round(side * along * [1, -1]), side * line
+
+
+def _corners(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> np.ndarray:
+    """Corners [N, 8, 3] of the boxes around the N colliding geoms of a finger."""
+    finger, found = model.jnt_bodyid[joint], []
+    for geom in np.flatnonzero(model.geom_contype | model.geom_conaffinity):
+        body = model.geom_bodyid[geom]
+        while body > finger:  # a parent comes before its children
+            body = model.body_parentid[body]
+        if body == finger:
+            centre, half = model.geom_aabb[geom].reshape(2, 3)
+            rotation = data.geom_xmat[geom].reshape(3, 3)
+            found.append(data.geom_xpos[geom] + (centre + half * _CORNERS) @ rotation.T)
+    if not found:
+        raise ValueError(
+            f"finger {model.joint(joint).name} needs a geom that collides; its body "
+            f"{model.body(finger).name} has none with contype or conaffinity"
+        )
+    return np.stack(found)
+
+
+def _site(model: mujoco.MjModel, tcp: str | None) -> str | None:
+    names = [model.site(i).name for i in range(model.nsite)]
+    if tcp is None:
+        return "tcp" if "tcp" in names else None
+    if tcp not in names:
+        raise ValueError(f"there is no site {tcp}; the sites are {', '.join(names) or 'none'}")
+    return tcp
+
+
+def _axes(
+    model: mujoco.MjModel, data: mujoco.MjData, arm: Arm, across: np.ndarray, site: str | None
+) -> np.ndarray:
+    """Axes [3, 3] of the hand in the world; y is `across`."""
+    last = arm.joints[-1]
+    fingers = np.mean([_corners(model, data, f).mean(axis=(0, 1)) for f in arm.fingers], axis=0)
+    reach = fingers - data.xanchor[last]
+    if site:
+        _, y, z = data.site(site).xmat.reshape(3, 3).T
+        if abs(y @ across) < _PARALLEL:
+            raise ValueError(
+                f"the y axis of site {site} is {_degrees(y @ across)} deg off the line "
+                "along which the fingers open"
+            )
+        if z @ reach < 0:
+            raise ValueError(f"the z axis of site {site} must point out of the hand, not into it")
+    else:
+        z = data.xaxis[last] * (1 if data.xaxis[last] @ reach > 0 else -1)
+        if abs(z @ across) > 1 - _PARALLEL:
+            raise ValueError(
+                "a site tcp is needed, z out of the hand and y along which the fingers open: the "
+                "last joint does not turn about the hand's axis"
+            )
+    z = z - (z @ across) * across
+    z /= np.linalg.norm(z)
+    return np.stack([np.cross(across, z), across, z], axis=1)
+
+
+def _end(corners: np.ndarray) -> np.ndarray:
+    """Lowest and highest coordinates [2, 3] of the boxes [N, 8, 3] near the end of a finger."""
+    reach = corners[:, :, 2].max(axis=1)
+    near = corners[reach > reach.max() - 2 * TIP_LENGTH].reshape(-1, 3)
+    return np.stack([near.min(axis=0), near.max(axis=0)])
+
+
+def _centre(
+    data: mujoco.MjData, axes: np.ndarray, left: np.ndarray, right: np.ndarray, site: str | None
+) -> np.ndarray:
+    """The tcp [3] along the hand's axes."""
+    x = np.mean([left[:, 0], right[:, 0]])
+    if site:
+        x = data.site(site).xpos @ axes[:, 0]
+        if not max(left[0, 0], right[0, 0]) < x < min(left[1, 0], right[1, 0]):
+            raise ValueError(f"the z axis of site {site} does not run between the fingers")
+    end = max(left[1, 2], right[1, 2])
+    return np.array([x, (left[0, 1] + right[1, 1]) / 2, end - TIP_LENGTH])
+
+
+def _frame(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> np.ndarray:
+    """Pose [4, 4] of a hinge in the world, turning about its z."""
+    z = data.xaxis[joint]
+    body = data.xmat[model.jnt_bodyid[joint]].reshape(3, 3)
+    x = body[:, np.argmin(np.abs(z @ body))]
+    x = x - (x @ z) * z
+    x /= np.linalg.norm(x)
+    return _pose(data.xanchor[joint], np.stack([x, np.cross(z, x), z], axis=1))
+
+
+def _pose(position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation.reshape(3, 3), position
+    return pose
+
+
+def _pad(data: mujoco.MjData, body: int, pose: np.ndarray, box: np.ndarray) -> Pad:
+    """The pad of a finger's body, from its box [2, 3] along the axes of the tcp's pose [4, 4]."""
+    axes, origin = pose[:3, :3], pose[:3, 3]
+    low, high = box - origin @ axes
+    side = np.sign(low[1] + high[1])
+    inner, outer = sorted((low[1], high[1]), key=abs)
+    thick = max(abs(outer - inner), 2 * TIP_RADIUS)  # what is thin lets things through
+    centre, half = (low + high) / 2, (high - low) / 2
+    centre[1], half[1] = inner + side * thick / 2, thick / 2
+    tip = np.array([0.0, inner + side * TIP_RADIUS, TIP_LENGTH - TIP_RADIUS])
+    turn = data.xmat[body].reshape(3, 3)
+    position, tip = (turn.T @ (axes @ p + origin - data.xpos[body]) for p in (centre, tip))
+    return Pad(position, turn.T @ axes, half, tip)
+
+
+def _degrees(cosine: float) -> float:
+    """The angle between two lines, rounded [deg]."""
+    return round(np.rad2deg(np.arccos(min(abs(cosine), 1.0))))

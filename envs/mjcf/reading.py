@@ -1,0 +1,158 @@
+"""Finding an arm, its hand and its actuators in a MuJoCo model, and saying what is missing."""
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+_HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
+_KINDS = ("free", "ball", "slide", "hinge")
+_ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+
+
+class Arm(NamedTuple):
+    """Numbers in the user's model."""
+
+    root: int  # the base's body
+    joints: list[int]  # hinges from the base to the hand
+    fingers: list[int]  # the two fingers' slides
+    servos: list[int]  # actuators of the hinges
+
+
+class Gripper(NamedTuple):
+    """What pulls both fingers together, as a position servo of half the opening."""
+
+    stiffness: float  # N/m
+    damping: float  # N s/m
+    force: float  # N, infinite where there is no limit
+
+
+def read(path: str | os.PathLike[str]) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
+    """An MJCF file, also compiled.
+
+    Raises:
+        ValueError: if there is none, or MuJoCo does not take it.
+    """
+    if not Path(path).is_file():
+        raise ValueError(f"there is no robot file {path}")
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        # Bodies and geoms keep their numbers.
+        spec.compiler.fusestatic = spec.compiler.discardvisual = False
+        return spec, spec.compile()
+    except ValueError as error:
+        raise ValueError(f"MuJoCo cannot read the robot {path}: {error}") from error
+
+
+def find_arm(model: mujoco.MjModel) -> Arm:
+    """The joints and their servos, each where the tasks need it.
+
+    Raises:
+        ValueError: if one is missing or too many.
+    """
+    fingers = np.flatnonzero(model.jnt_type == _SLIDE).tolist()
+    if len(fingers) != 2:
+        raise ValueError(f"two slide joints are needed for the fingers; {_joints(model)}")
+    hand, other = model.body_parentid[model.jnt_bodyid[fingers]]
+    if hand != other:
+        names = f"{model.body(hand).name} and {model.body(other).name}"
+        raise ValueError(f"both fingers must be on the same body; they are on {names}")
+    root, joints = int(hand), []
+    while root:
+        first = model.body_jntadr[root]
+        joints = [*range(first, first + model.body_jntnum[root]), *joints]
+        base, root = root, int(model.body_parentid[root])
+    if not joints or any(model.jnt_type[joints] != _HINGE):
+        raise ValueError(f"hinges alone must lead from the base to the hand; {_joints(model)}")
+    own = np.flatnonzero(model.body_rootid[model.jnt_bodyid] == base)
+    if others := set(own.tolist()) - {*joints, *fingers}:
+        raise ValueError(f"{_names(model, others)}: neither part of the arm nor one of its fingers")
+    if free := [joint for joint in (*joints, *fingers) if not model.jnt_limited[joint]]:
+        raise ValueError(f"every joint needs a range; {_names(model, free)} have none")
+    return Arm(base, joints, fingers, [_servo(model, joint) for joint in joints])
+
+
+def find_gripper(model: mujoco.MjModel, arm: Arm, signs: np.ndarray) -> Gripper:
+    """The fingers' actuators taken together; they may act on one finger, on both or on a tendon.
+
+    Args:
+        model: the user's model.
+        arm: from `find_arm`.
+        signs: [2] 1 for a finger joint that opens the hand as it grows, else -1.
+
+    Raises:
+        ValueError: if there is none, or it is not a position actuator.
+    """
+    rates = np.zeros(model.nu)  # of each actuator's length, as half the opening grows
+    for joint, sign in zip(arm.fingers, signs, strict=True):
+        rates += sign * _rates(model, joint)
+    acting = np.flatnonzero(rates).tolist()
+    if not acting or not all(_is_servo(model, i) for i in acting):
+        raise ValueError(f"the fingers need a position actuator; {_actuators(model)}")
+    limits = np.where(model.actuator_forcelimited, model.actuator_forcerange[:, 1], np.inf)
+    return Gripper(
+        stiffness=float(-model.actuator_biasprm[acting, 1] @ rates[acting] ** 2),
+        damping=float(-model.actuator_biasprm[acting, 2] @ rates[acting] ** 2),
+        force=float(limits[acting] @ np.abs(rates[acting])),
+    )
+
+
+def _servo(model: mujoco.MjModel, joint: int) -> int:
+    rates = _rates(model, joint)
+    for i in np.flatnonzero(rates).tolist():
+        gain = model.actuator_gainprm[i, 0]
+        # Without force where length, rate times angle, makes up for the control: there they agree.
+        if _is_servo(model, i) and np.isclose(gain, -model.actuator_biasprm[i, 1] * rates[i]):
+            return i
+    raise ValueError(
+        f"joint {_names(model, [joint])} needs a position actuator, whose control is its angle; "
+        f"{_actuators(model)}"
+    )
+
+
+def _rates(model: mujoco.MjModel, joint: int) -> np.ndarray:
+    """How fast the length [nu] of every actuator grows with a joint."""
+    rates = np.zeros(model.nu)
+    for i in range(model.nu):
+        target, gear = model.actuator_trnid[i, 0], model.actuator_gear[i, 0]
+        if model.actuator_trntype[i] in _ON_JOINT:
+            rates[i] = gear * (target == joint)
+        elif model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_TENDON:
+            first = model.tendon_adr[target]
+            wraps = slice(first, first + model.tendon_num[target])
+            on_joint = model.wrap_type[wraps] == mujoco.mjtWrap.mjWRAP_JOINT
+            on_joint &= model.wrap_objid[wraps] == joint
+            rates[i] = gear * np.sum(model.wrap_prm[wraps] * on_joint)
+    return rates
+
+
+def _is_servo(model: mujoco.MjModel, actuator: int) -> bool:
+    return bool(
+        model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
+        and model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
+        and model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE
+        and model.actuator_biasprm[actuator, 1] < 0
+    )
+
+
+def _names(model: mujoco.MjModel, joints: Iterable[int]) -> str:
+    return ", ".join(model.joint(joint).name or f"joint {joint}" for joint in sorted(joints))
+
+
+def _joints(model: mujoco.MjModel) -> str:
+    names = (f"{_names(model, [i])} ({_KINDS[model.jnt_type[i]]})" for i in range(model.njnt))
+    return f"the joints are {', '.join(names) or 'none'}"
+
+
+def _actuators(model: mujoco.MjModel) -> str:
+    names = []
+    for i in range(model.nu):
+        moved = [model.joint(j).name for j in range(model.njnt) if _rates(model, j)[i]]
+        kind = "position" if _is_servo(model, i) else "another kind"
+        names.append(
+            f"{model.actuator(i).name or i} ({kind}, on {' and '.join(moved) or 'no joint'})"
+        )
+    return f"the actuators are {', '.join(names) or 'none'}"

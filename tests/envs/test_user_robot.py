@@ -1,0 +1,186 @@
+"""Robots from a user's own MJCF: what is found in it, and what becomes of it in a scene."""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import envs
+from envs import mjcf, render, robots, scene
+from envs.tasks import press
+from tests.envs.user_arm import HALF, JOINTS, write
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory) -> Path:
+    return write(tmp_path_factory.mktemp("robot"))
+
+
+@pytest.fixture(scope="module")
+def robot(file) -> robots.Robot:
+    return mjcf.load(file, tcp="grip", speed=[1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
+
+
+@pytest.fixture(scope="module")
+def model(robot) -> mujoco.MjModel:
+    return scene.build(press.TASK.scene, robot)
+
+
+def at(model: mujoco.MjModel, q: np.ndarray, opening: float = 0.0) -> mujoco.MjData:
+    data = mujoco.MjData(model)
+    data.qpos[:6], data.qpos[6:8] = q, opening / 2
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def test_kinematics_are_those_of_the_file(file, robot, model):
+    own = mujoco.MjModel.from_xml_path(str(file))
+    data = mujoco.MjData(own)
+    tool_pose = jax.jit(lambda q: robots.tool_pose(robot, q))
+    for q in np.random.default_rng(0).uniform(robot.lower, robot.upper, (20, 6)):
+        for name, angle in zip(JOINTS, q, strict=True):
+            data.joint(name).qpos = angle
+        mujoco.mj_kinematics(own, data)
+        site, z = data.site("grip"), data.site("grip").xmat.reshape(3, 3)[:, 2]
+        position, rotation, _ = tool_pose(jnp.asarray(q, jnp.float32))
+        # The fingers end .05 m from the site, the tcp is 12 mm before that.
+        np.testing.assert_allclose(position, site.xpos + 0.038 * z, atol=2e-6)
+        np.testing.assert_allclose(rotation[:, 2], z, atol=5e-6)
+        ours = at(model, q)
+        np.testing.assert_allclose(position, ours.site("tcp").xpos, atol=2e-6)
+        np.testing.assert_allclose(rotation, ours.site("tcp").xmat.reshape(3, 3), atol=5e-6)
+        np.testing.assert_allclose(data.body("wrist").xpos, ours.body("robot/wrist").xpos)
+
+
+def test_numbers_come_from_the_file(robot):
+    np.testing.assert_allclose(robot.lower, np.deg2rad([-150, -100, 0, -170, -30, -170]))
+    np.testing.assert_allclose(robot.upper, np.deg2rad([150, 100, 160, 170, 130, 170]))
+    np.testing.assert_allclose(robot.speed, [1, 1, 1, 2, 2, 2])
+    assert robot.stroke == pytest.approx(0.08)
+    assert robot.action_low.shape == (7,)
+
+
+def test_start_pose_is_that_of_all_robots(robot, model):
+    data = at(model, robot.home)
+    np.testing.assert_allclose(data.site("tcp").xpos, [0.34, 0, 0.18], atol=1e-3)
+    x, y, z = data.site("tcp").xmat.reshape(3, 3).T
+    assert abs(y[1]) > 0.999
+    assert np.arccos(-z[2]) == pytest.approx(robot.lean, abs=0.01)
+    assert x[0] < 0
+    assert robot.home[2] > 0.5  # as in the keyframe
+
+
+@pytest.mark.parametrize("name", ["piper", "panda"])
+def test_lean_and_tilt_of_known_robots_are_found(name):
+    known = getattr(robots, name).ROBOT
+    turned = known.tool @ robots.rotation("z", np.pi)
+    found = mjcf.posing.posed(dataclasses.replace(known, tool=turned, lean=0.5, tilt_side=0))
+    assert found.lean == pytest.approx(known.lean, abs=0.1)
+    assert found.tilt_side == known.tilt_side
+    np.testing.assert_allclose(found.tool, known.tool, atol=1e-6)
+
+
+def test_scene_has_the_arm_alone(model):
+    names = [model.body(i).name for i in range(model.nbody)]
+    assert names[1:3] == ["base", "robot/base"]
+    assert "button" in names
+    assert not any("ball" in name for name in names)
+    assert (model.nlight, model.opt.timestep, model.opt.cone) == (2, scene.PHYSICS_DT, 0)
+    assert (model.nkey, model.nsensor, model.ntendon, model.neq) == (0, 0, 0, 1)
+    joints = [model.joint(i).name for i in range(8)]
+    assert joints == [*(f"robot/{name}" for name in JOINTS), "left", "right"]
+    np.testing.assert_allclose(model.jnt_range[6:8], [[0, 0.04]] * 2, atol=1e-9)
+    assert model.body("robot/lower").mass == pytest.approx(
+        200 * np.pi * 0.03**2 * (0.2 + 0.04), rel=1e-6
+    )
+
+
+def test_only_fingers_touch(model):
+    touching = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
+    robot = [i for i in touching if model.body(model.geom_bodyid[i]).name in ("robot/a", "robot/b")]
+    masks = [(model.geom_contype[i], model.geom_conaffinity[i]) for i in robot]
+    assert masks == [(0, 5), (2, 0)] * 2  # a pad and a tip each
+    others = {model.body(model.geom_bodyid[i]).name for i in touching} - {"robot/a", "robot/b"}
+    assert others == {"world", "cap"}
+
+
+@pytest.mark.parametrize("opening", [0.0, 0.03, 0.08])
+def test_opening_is_the_room_between_the_pads(robot, model, opening):
+    data = at(model, robot.home, opening)
+    tcp, axes = data.site("tcp").xpos, data.site("tcp").xmat.reshape(3, 3)
+    kinds = model.geom_conaffinity == 5, model.geom_contype == 2
+    pads, tips = ((data.geom_xpos[kind] - tcp) @ axes for kind in kinds)
+    size = model.geom_size[kinds[0]]
+    np.testing.assert_allclose(np.sort(size, axis=0), [[0.01, 0.005, 0.025]] * 2, atol=1e-6)
+    np.testing.assert_allclose(np.abs(pads[:, 1]) - size[:, 1], opening / 2, atol=1e-6)
+    np.testing.assert_allclose((pads + size)[:, 2], robots.TIP_LENGTH, atol=1e-6)
+    assert pads[0, 1] * pads[1, 1] <= 0
+    np.testing.assert_allclose(tips[:, 2], robots.TIP_LENGTH - robots.TIP_RADIUS, atol=1e-6)
+
+
+def test_actuators_hold_what_they_are_told(robot, model):
+    data = at(model, robot.home)
+    data.ctrl[:] = np.append(robot.home, robot.stroke / 2)
+    for _ in range(300):
+        mujoco.mj_step(model, data)
+    np.testing.assert_allclose(data.qpos[:6], robot.home, atol=2e-3)
+    np.testing.assert_allclose(data.qpos[6:8], robot.stroke / 2, atol=1e-3)
+    gripper = model.actuator("gripper")
+    # Half the opening moves the tendon by as much: coefficients .5 and -.5, opposite joints.
+    np.testing.assert_allclose(gripper.gainprm[0], 400)
+    np.testing.assert_allclose(gripper.biasprm[:3], [0, -400, -20])
+    np.testing.assert_allclose(gripper.forcerange, [-15, 15])
+    np.testing.assert_allclose(model.actuator("robot/yaw").gainprm[0], 150)
+
+
+def test_hand_is_found_without_a_site(file, robot):
+    found = mjcf.load(str(file))
+    assert (found.name, found.lean, found.tilt_side) == (str(file), robot.lean, robot.tilt_side)
+    for name in ("chain", "tool", "home"):
+        np.testing.assert_allclose(getattr(found, name), getattr(robot, name), atol=1e-5)
+
+
+def test_own_wrist_camera_is_kept(tmp_path):
+    camera = '<camera name="wrist" pos=".05 0 .1" fovy="33"/><site name="grip"'
+    robot = mjcf.load(write(tmp_path, ('<site name="grip"', camera)))
+    model = scene.build(press.TASK.scene, robot)
+    assert model.camera("wrist").fovy[0] == 33
+    assert model.body(model.camera("wrist").bodyid[0]).name == "robot/flange"
+
+
+def test_ray_caster_draws_something_in_the_place_of_a_mesh(robot, model):
+    mesh = next(i for i in range(model.ngeom) if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_MESH)
+    drawn = render.build(model, ["side", "wrist"])
+    assert mesh not in drawn.geoms
+    (stand_in,) = np.flatnonzero(model.geom_group == 5)
+    assert stand_in in drawn.geoms
+    np.testing.assert_allclose(drawn.look.rgba[stand_in], [0.1, 0.2, 0.9, 1])
+    data = at(model, np.array([0.0, 0.9, 1.2, 0, 0.6, 0]))
+    points = np.random.default_rng(0).uniform(-1.3, 1.3, (4000, 3)) * HALF
+    inside = np.abs(points) < HALF
+    world = data.geom_xpos[mesh] + points @ _mesh_axes(model, data, mesh).T
+    local = (world - data.geom_xpos[stand_in]) @ data.geom_xmat[stand_in].reshape(3, 3)
+    same = np.all(np.abs(local) < model.geom_size[stand_in], axis=1) == inside.all(axis=1)
+    assert same.mean() > 0.97
+
+
+def _mesh_axes(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
+    """Axes in the world of the coordinates in which the mesh was written down."""
+    turn = np.empty(9)
+    mujoco.mju_quat2Mat(turn, model.mesh_quat[model.geom_dataid[geom]])
+    return data.geom_xmat[geom].reshape(3, 3) @ turn.reshape(3, 3).T
+
+
+def test_steps_and_pictures(robot):
+    env = envs.make("press", robot, num_envs=2, image_size=48)
+    start = env.reset(jax.random.key(0))
+    state = env.step(start, start.info["command"].at[:, 0].add(0.05))
+    assert not np.any(state.info["broken"])
+    np.testing.assert_allclose(env.proprio(state)[:, 0] - env.proprio(start)[:, 0], 0.05, atol=0.03)
+    image = env.observe(state)["image"]["side"]
+    blue = (image[..., 2] > 90) & (image[..., 0] < 60)
+    assert 5 < blue[0].sum() < 1000

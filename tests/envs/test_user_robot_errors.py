@@ -1,0 +1,111 @@
+"""What is said of a user's MJCF that lacks something."""
+
+import re
+
+import pytest
+
+import envs
+from envs import mjcf
+from tests.envs.user_arm import write
+
+_NO_BALL = (
+    ('name="yaw" axis="0 0 1" range="-150 150"', 'name="yaw" type="ball" range="0 90"'),
+    ('<position name="yaw" joint="yaw"/>', ""),
+    ('<sensor><jointpos joint="yaw"/></sensor>', ""),
+    ('qpos="1 1 1 1 0 0 0 0', 'qpos="1 1 1 1 0 0 0 1 0 0 0'),
+)
+_MISSING = (
+    (
+        "two slide joints are needed for the fingers; the joints are joint 0 (free), yaw (hinge)",
+        [('<joint name="b" type="slide" axis="0 -1 0"', '<joint name="b" axis="0 -1 0"')],
+    ),
+    (
+        "both fingers must be on the same body; they are on flange and wrist",
+        [('<body name="b"', '</body><body name="b"'), ("      </body>\n    </frame>", "</frame>")],
+    ),
+    ("hinges alone must lead from the base to the hand; the joints are", _NO_BALL),
+    (
+        "knob: neither part of the arm nor one of its fingers",
+        [
+            (
+                '<site name="aside"',
+                '<body><joint name="knob"/><geom size=".01"/></body><site name="aside"',
+            )
+        ],
+    ),
+    (
+        "every joint needs a range; pitch, b have none",
+        [(' range="-30 130"', ""), (' range=".005 .045"', "")],
+    ),
+    (
+        "joint elbow needs a position actuator, whose control is its angle; the actuators are grip",
+        [('<position name="elbow"', '<motor name="elbow"')],
+    ),
+    (
+        "roll (position, on roll), pitch (position, on pitch)",
+        [('joint="roll"/>', 'joint="roll" gear="2"/>')],
+    ),
+    ("joint turn needs a position actuator", [('<position name="turn" joint="turn"/>', "")]),
+    (
+        "the fingers need a position actuator; the actuators are grip (another kind, on a and b)",
+        [
+            (
+                '<position name="grip" tendon="grip" kp="400" kv="20"',
+                '<motor name="grip" tendon="grip"',
+            )
+        ],
+    ),
+    (
+        "finger a needs a geom that collides; its body a has none with contype or conaffinity",
+        [('pos="0 -0.001 .025"', 'pos="0 -0.001 .025" contype="0" conaffinity="0"')],
+    ),
+    (
+        "the fingers slide 90 deg apart, not along one line",
+        [('name="b" type="slide" axis="0 -1 0"', 'name="b" type="slide" axis="1 0 0"')],
+    ),
+    (
+        "the fingers are only 8 mm apart when they are open",
+        [("-.045 -.005", "-.009 -.005"), (".005 .045", ".005 .009")],
+    ),
+    (
+        "a site tcp is needed, z out of the hand and y along which the fingers open",
+        [('name="turn" axis="0 0 -1"', 'name="turn" axis="0 1 0"')],
+    ),
+    ("MuJoCo cannot read the robot", [("</mujoco>", "")]),
+    ("the hand must reach x 0.34 m, y 0 m, z 0.18 m", [('range="0 160"', 'range="0 5"')]),
+)
+
+
+@pytest.mark.parametrize(("message", "edits"), _MISSING)
+def test_what_is_missing_is_named(tmp_path, message, edits):
+    file = write(tmp_path, *edits)
+    with pytest.raises(ValueError, match=re.escape(message)) as raised:
+        mjcf.load(file)
+    assert str(file) in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"tcp": "hook"}, "there is no site hook; the sites are grip, askew, inwards, aside"),
+        ({"tcp": "askew"}, "the y axis of site askew is 60 deg off the line along which"),
+        ({"tcp": "inwards"}, "the z axis of site inwards must point out of the hand"),
+        ({"tcp": "aside"}, "the z axis of site aside does not run between the fingers"),
+        ({"speed": [1.0, 2.0]}, "speed must be positive, one number or 6, got [1.0, 2.0]"),
+        ({"gripper_speed": 0.0}, "gripper_speed must be positive"),
+    ],
+)
+def test_wrong_options_are_named(tmp_path, options, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        mjcf.load(write(tmp_path), **options)
+
+
+def test_missing_file_is_named():
+    with pytest.raises(ValueError, match=r"there is no robot file nowhere\.xml"):
+        envs.make("press", "nowhere.xml")
+
+
+def test_a_reach_that_is_short_is_said(tmp_path):
+    file = write(tmp_path, ('range="-150 150"', 'range="-15 15"'))
+    with pytest.warns(UserWarning, match="misses parts of the table by up to"):
+        mjcf.load(file)
