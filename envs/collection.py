@@ -6,7 +6,7 @@ poses of all geoms and cameras; pictures are rendered from those poses in bounde
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import jax
@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs import experts
+from envs.actions import Mode
 from envs.env import Env
-from envs.episodes import Episodes
+from envs.episodes import Episodes, concatenate
 from envs.making import make
 
 # Worlds a call, where nobody says otherwise: enough to fill the device, few enough for its memory.
@@ -88,22 +89,21 @@ def collect(
     image_size: int = 64,
     num_envs: int | None = None,
     control_dt: float = 0.1,
+    actions: Mode = "joint",
+    distractors: int = 0,
     action_noise: float = 0.0,
     antialias: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> Episodes:
-    """Demonstrations by the scripted expert; only successful ones are kept.
+    """Successful demonstrations by the scripted expert, on the device, padded to its longest time.
 
     Args:
-        task, robot, image_size, control_dt, antialias: as for `envs.make`.
+        task, robot, image_size, control_dt, actions, distractors, antialias: as for `envs.make`.
         num_episodes: episodes E to return.
         key: all randomness; the same key gives the same episodes.
         num_envs: worlds W simulated at once; None picks by device.
         action_noise: see `rollout`.
         progress: called with (episodes so far, num_episodes), first with 0 before compilation.
-
-    Returns:
-        Episodes whose arrays stay on the device, padded to the expert's longest time.
 
     Raises:
         ValueError: for bad names or numbers, or if the expert fails far too often.
@@ -111,12 +111,15 @@ def collect(
     env = make(
         task,
         robot,
-        num_envs=_worlds(num_episodes, num_envs),
+        num_envs=worlds(num_episodes, num_envs),
         image_size=image_size,
         control_dt=control_dt,
+        actions=actions,
+        distractors=distractors,
         antialias=antialias,
     )
-    return _gather(env, num_episodes, key, action_noise, progress or _silent)
+    parts = gather(env, num_episodes, key, action_noise)
+    return concatenate(list(_reported(parts, num_episodes, progress)))
 
 
 def expert_success(
@@ -128,51 +131,89 @@ def expert_success(
     num_envs: int | None = None,
 ) -> jax.Array:
     """Whether the expert solves each of `num_episodes` random layouts, bool [num_episodes]."""
-    env = make(task, robot, num_envs=_worlds(num_episodes, num_envs))
+    env = make(task, robot, num_envs=worlds(num_episodes, num_envs))
     calls = -(-num_episodes // env.num_envs)
     results = [_attempt(env, chunk_key) for chunk_key in jax.random.split(key, calls)]
     return jnp.concatenate(results)[:num_episodes]
 
 
-def _gather(
+def gather(
     env: Env,
     num_episodes: int,
     key: jax.Array,
-    action_noise: float,
-    progress: Callable[[int, int], None],
-) -> Episodes:
-    """The first `num_episodes` successes."""
-    chunks: list[dict[str, Any]] = []
-    kept = attempted = 0
-    progress(0, num_episodes)
+    action_noise: float = 0.0,
+    *,
+    kept: int = 0,
+    attempted: int = 0,
+) -> Iterator[Episodes]:
+    """Yields successes of one call after the other, until there are `num_episodes`.
+
+    Args:
+        env: W worlds, the attempts of one call.
+        num_episodes, key, action_noise: as for `collect`.
+        kept, attempted: num_episodes and attempted of all that was yielded before, to go on as if
+            it had never stopped.
+
+    Raises:
+        ValueError: if the expert fails far too often.
+    """
+    for _ in range(attempted // env.num_envs):
+        key, _ = jax.random.split(key)
+    tried = 0  # since the last success
     while kept < num_episodes:
-        if attempted >= _PATIENCE and kept < _LEAST_SUCCESS * attempted:
-            raise ValueError(
-                f"the expert solved only {kept} of {attempted} layouts of {env.task.name!r} with "
-                f"{env.robot.name!r}, at least {_LEAST_SUCCESS:.0%} are expected: check the scene "
-                "or lower action_noise"
-            )
+        _check_success(env, kept, attempted)
         key, chunk_key = jax.random.split(key)
         chunk, success = _record(env, chunk_key, action_noise)
         wins = np.flatnonzero(success)[: num_episodes - kept]
         kept += len(wins)
         # Attempts after the last one that was needed do not count.
-        attempted += env.num_envs if kept < num_episodes else int(wins[-1]) + 1
-        chunks.append(jax.tree.map(lambda x, wins=wins: x[wins], chunk))
-        progress(kept, num_episodes)
-    return Episodes(
-        **jax.tree.map(lambda *parts: jnp.concatenate(parts), *chunks),
-        instructions=env.instructions,
-        task=env.task.name,
-        robot=env.robot.name,
-        control_dt=env.control_dt,
-        physics_dt=env.physics_dt,
-        attempted=attempted,
-    )
+        tries = env.num_envs if kept < num_episodes else int(wins[-1]) + 1
+        attempted, tried = attempted + tries, tried + tries
+        if len(wins):
+            yield Episodes(
+                **jax.tree.map(lambda x, wins=wins: x[wins], chunk),
+                **_facts(env),
+                attempted=tried,
+            )
+            tried = 0
+
+
+def _facts(env: Env) -> dict[str, Any]:
+    """What `Episodes` say of where they come from."""
+    return {
+        "instructions": env.instructions,
+        "task": env.task.name,
+        "robot": env.robot.name,
+        "control_dt": env.control_dt,
+        "physics_dt": env.physics_dt,
+        "actions": env.actions,
+    }
+
+
+def _reported(
+    parts: Iterable[Episodes], total: int, progress: Callable[[int, int], None] | None
+) -> Iterator[Episodes]:
+    """The same parts, with progress before the first and after each."""
+    report = progress or _silent
+    report(0, total)
+    done = 0
+    for part in parts:
+        done += part.num_episodes
+        report(done, total)
+        yield part
 
 
 def _silent(done: int, total: int) -> None:
     """The progress callback of nobody."""
+
+
+def _check_success(env: Env, kept: int, attempted: int) -> None:
+    if attempted >= _PATIENCE and kept < _LEAST_SUCCESS * attempted:
+        raise ValueError(
+            f"the expert solved only {kept} of {attempted} layouts of {env.task.name!r} with "
+            f"{env.robot.name!r}, at least {_LEAST_SUCCESS:.0%} are expected: check the scene "
+            "or lower action_noise"
+        )
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -197,7 +238,8 @@ def _attempt(env: Env, key: jax.Array) -> jax.Array:
     return rollout(env, key).success
 
 
-def _worlds(num_episodes: int, num_envs: int | None) -> int:
+def worlds(num_episodes: int, num_envs: int | None) -> int:
+    """Worlds at once for so many episodes, where `num_envs` does not say it."""
     if num_episodes < 1:
         raise ValueError(f"num_episodes must be at least 1, got {num_episodes}")
     return num_envs or min(num_episodes, _NUM_ENVS.get(jax.default_backend(), 256))

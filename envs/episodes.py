@@ -14,11 +14,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs.actions import MODES
+
 Array = jax.Array | np.ndarray
 
 _FORMAT = "envs-episodes-1"
+SHARED = ("task", "robot", "control_dt", "physics_dt", "actions", "instructions")
+"""What episodes must have in common to be joined."""
 _ARRAYS = ("state", "action", "length", "instruction")
-_FACTS = ("instructions", "task", "robot", "control_dt", "physics_dt", "attempted")
+_FACTS = (*SHARED, "attempted")
 _IMAGE = "image/"
 
 
@@ -33,7 +37,8 @@ class Episodes:
         image: camera name -> uint8 `[E, T, H, W, 3]`, before each action.
         state: f32 `[E, T, J + 1]` measured joint angles [rad] and gripper opening [m], before each
             action.
-        action: f32 `[E, T, J + 1]` joint targets [rad] and gripper opening [m] commanded.
+        action: f32 `[E, T, A]` commanded; by default A = J + 1 joint targets [rad] and gripper
+            opening [m].
         length: int32 `[E]` steps that count, 1 to T; what follows them is padding.
         instruction: int32 `[E]` index into `instructions`.
         instructions: phrasings of the task.
@@ -42,6 +47,7 @@ class Episodes:
         control_dt: time between two actions [s].
         physics_dt: time step of the simulation [s].
         attempted: episodes tried to get these; the others failed.
+        actions: what an action means, see `envs.actions`.
     """
 
     image: dict[str, Array]
@@ -55,6 +61,7 @@ class Episodes:
     control_dt: float
     physics_dt: float
     attempted: int
+    actions: str = "joint"
 
     @property
     def num_episodes(self) -> int:
@@ -100,7 +107,8 @@ class Episodes:
         """
         arrays = _read(path)
         try:
-            facts = json.loads(arrays.pop("header").tobytes())
+            facts = {"actions": "joint"}  # the only ones there were before it was written down
+            facts |= json.loads(arrays.pop("header").tobytes())
             if facts.pop("format") != _FORMAT:
                 raise KeyError("format")
         except (KeyError, ValueError, TypeError, AttributeError) as error:
@@ -127,10 +135,7 @@ class Episodes:
         if self.state.ndim != 3 or not self.state.size:
             raise ValueError(f"state must have shape [E, T, J + 1], not {self.state.shape}")
         steps = self.state.shape[:2]
-        if self.action.shape != self.state.shape:
-            raise ValueError(
-                f"action must have state's shape {self.state.shape}, not {self.action.shape}"
-            )
+        self._validate_action()
         if not self.image:
             raise ValueError("image holds no camera, but at least one is needed")
         for name, picture in self.image.items():
@@ -153,6 +158,18 @@ class Episodes:
                     f"{name} must lie in {low} to {high}, not {values.min()} to {values.max()}"
                 )
 
+    def _validate_action(self) -> None:
+        if self.actions not in MODES:
+            raise ValueError(f"actions must be one of {', '.join(MODES)}, not {self.actions!r}")
+        expected = (
+            (*self.state.shape[:2], 7) if self.actions == "end_effector" else self.state.shape
+        )
+        if self.action.shape != expected:
+            raise ValueError(f"action must have shape {expected}, not {self.action.shape}")
+        for name in ("state", "action"):
+            if getattr(self, name).dtype != np.float32:
+                raise ValueError(f"{name} must be float32, not {getattr(self, name).dtype}")
+
 
 def concatenate(parts: Sequence[Episodes]) -> Episodes:
     """All episodes of several collections of one task and robot, padded to the longest.
@@ -162,7 +179,7 @@ def concatenate(parts: Sequence[Episodes]) -> Episodes:
     """
     if not parts:
         raise ValueError("there is nothing to concatenate: parts is empty")
-    for name in ("task", "robot", "control_dt", "physics_dt", "instructions"):
+    for name in SHARED:
         values = {getattr(part, name) for part in parts}
         if len(values) > 1:
             raise ValueError(f"only episodes of one {name} can be joined, not {sorted(values)}")
@@ -173,14 +190,18 @@ def concatenate(parts: Sequence[Episodes]) -> Episodes:
 
     def join(*arrays: Array) -> Array:
         xp = np if all(isinstance(x, np.ndarray) for x in arrays) else jnp
-        if arrays[0].ndim > 1:
-            pads = [((0, 0), (0, steps - x.shape[1])) + ((0, 0),) * (x.ndim - 2) for x in arrays]
-            arrays = tuple(xp.pad(x, pad) for x, pad in zip(arrays, pads, strict=True))
-        return xp.concatenate(arrays)
+        return xp.concatenate([_padded(xp, x, steps) for x in arrays])
 
     attempted = sum(part.attempted for part in parts)
     same = [dataclasses.replace(part, attempted=attempted) for part in parts]
     return jax.tree.map(join, *same)
+
+
+def _padded(xp: Any, array: Array, steps: int) -> Array:
+    """`[E, ...]` as it is, `[E, T, ...]` with zeros up to `steps`."""
+    if array.ndim == 1 or array.shape[1] == steps:
+        return array
+    return xp.pad(array, [(0, 0), (0, steps - array.shape[1])] + [(0, 0)] * (array.ndim - 2))
 
 
 @contextlib.contextmanager

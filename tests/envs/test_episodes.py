@@ -1,13 +1,12 @@
-"""Episodes on disk and in memory, and the command line's manners."""
+"""Episodes on disk and in memory."""
 
 import dataclasses
+import json
 
 import jax
 import numpy as np
 import pytest
-from PIL import Image
 
-from envs import __main__ as command_line
 from envs.episodes import Episodes, concatenate
 
 
@@ -97,7 +96,11 @@ def test_foreign_files(tmp_path):
         ({"header": None}, "holds no"),
         ({"header": np.frombuffer(b"[]", np.uint8)}, "holds no"),
         ({"header": np.frombuffer(b'{"format": "envs-episodes-1"}', np.uint8)}, "lacks attempted"),
-        ({"action": np.zeros((3, 4, 6), np.float32)}, "action must have state's shape"),
+        (
+            {"action": np.zeros((3, 4, 6), np.float32)},
+            r"action must have shape \(3, 4, 7\), not \(3, 4, 6\)",
+        ),
+        ({"action": np.zeros((3, 4, 7))}, "action must be float32, not float64"),
         ({"image/side": np.zeros((3, 4, 6, 8), np.uint8)}, "image 'side' must be uint8"),
         ({"image/wrist": np.zeros((3, 4, 6, 8, 3), np.float32)}, "image 'wrist' must be uint8"),
         ({"image/side": None, "image/wrist": None}, "no camera"),
@@ -112,6 +115,26 @@ def test_bad_contents(tmp_path, changes, message):
     rewritten(path, **changes)
     with pytest.raises(ValueError, match=message):
         Episodes.load(path)
+
+
+def test_every_action_convention(tmp_path):
+    panda = {"robot": "panda", "state": np.zeros((3, 4, 8), np.float32)}
+    tool = make(**panda, actions="end_effector", action=np.ones((3, 4, 7), np.float32))
+    tool.save(tmp_path / "e.npz")
+    assert_equal(Episodes.load(tmp_path / "e.npz"), tool)
+    with pytest.raises(ValueError, match=r"action must have shape \(3, 4, 8\)"):
+        dataclasses.replace(tool, actions="joint").validate()
+    with pytest.raises(ValueError, match="actions must be one of joint, delta_joint, end_effector"):
+        make(actions="voltage").validate()
+
+
+def test_files_from_before_actions_were_told_apart(tmp_path):
+    make().save(tmp_path / "e.npz")
+    with np.load(tmp_path / "e.npz") as archive:
+        facts = json.loads(archive["header"].tobytes())
+    assert facts.pop("actions") == "joint"
+    rewritten(tmp_path / "e.npz", header=np.frombuffer(json.dumps(facts).encode(), np.uint8))
+    assert Episodes.load(tmp_path / "e.npz").actions == "joint"
 
 
 def test_other_control_period(tmp_path):
@@ -159,60 +182,12 @@ def test_concatenate_pads_to_the_longest():
     assert isinstance(both.state, np.ndarray)
 
 
-@pytest.mark.parametrize("changes", [{"robot": "panda"}, {"control_dt": 0.2}, {"task": "pour"}])
+@pytest.mark.parametrize(
+    "changes",
+    [{"robot": "panda"}, {"control_dt": 0.2}, {"task": "pour"}, {"actions": "delta_joint"}],
+)
 def test_concatenate_refuses_mixtures(changes):
     with pytest.raises(ValueError, match=f"one {next(iter(changes))} can be joined"):
         concatenate([make(), make(**changes)])
     with pytest.raises(ValueError, match="empty"):
         concatenate([])
-
-
-def run(capsys, *arguments):
-    code = command_line.main([str(argument) for argument in arguments])
-    return code, capsys.readouterr().err.strip()
-
-
-def test_command_line_refuses_in_one_sentence(tmp_path, capsys, monkeypatch):
-    for switch in ("enable_fast_cpu", "enable_compilation_cache"):  # these act on the process
-        monkeypatch.setattr(command_line.physics, switch, lambda: None)
-    existing = tmp_path / "episodes.npz"
-    existing.write_text("precious")
-    press = ("--task", "press", "--robot", "piper", "--out")
-    for arguments, message in (
-        (("collect", *press, existing), "exists already"),
-        (("collect", *press, tmp_path / "new.npz", "--num-episodes", 0), "num_episodes"),
-        (("play", *press, tmp_path / "a.mp4", "--image-size", 33), "even --image-size"),
-        (("play", "--task", "dance", "--robot", "piper", "--out", tmp_path / "a.mp4"), "dance"),
-        (("gallery", "--task", "press", "--robot", "r2d2", "--out", tmp_path / "g"), "r2d2"),
-    ):
-        code, error = run(capsys, *arguments)
-        assert code == 2
-        assert message in error
-        assert "Traceback" not in error
-    assert existing.read_text() == "precious"
-    assert [file.name for file in tmp_path.iterdir()] == ["episodes.npz"]
-
-
-def test_command_line_writes_files(tmp_path, capsys, monkeypatch):
-    for switch in ("enable_fast_cpu", "enable_compilation_cache"):
-        monkeypatch.setattr(command_line.physics, switch, lambda: None)
-
-    def collect(task, robot, *, num_episodes, progress, **options):
-        progress(0, num_episodes)
-        progress(num_episodes, num_episodes)
-        length = np.full(num_episodes, 4, np.int32)
-        return make(num_episodes, length=length, task=task, robot=robot)
-
-    monkeypatch.setattr(command_line.envs, "collect", collect)
-    press = ("--task", "press", "--robot", "piper", "--out")
-    for command, out in (("collect", "e.npz"), ("play", "v.mp4"), ("gallery", "g")):
-        code, error = run(capsys, command, *press, tmp_path / out)
-        assert code == 0, error
-    assert Episodes.load(tmp_path / "e.npz").num_episodes == 64
-    assert (tmp_path / "v.mp4").read_bytes()[4:8] == b"ftyp"
-    (file,) = (tmp_path / "g").iterdir()
-    assert file.name == "press_piper.gif"
-    with Image.open(file) as picture:
-        assert picture.size == (2 * 8, 6)  # both cameras
-        assert picture.n_frames == 2  # every second step of four
-        assert picture.info["duration"] == 200  # ms

@@ -1,0 +1,280 @@
+"""The commands of `python -m envs`: each gets the parsed options and a console to report to."""
+
+import argparse
+import contextlib
+import pkgutil
+import shutil
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import jax
+import mujoco
+import numpy as np
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+import envs
+import envs.robots
+import envs.tasks
+from envs import collection, rlds, videos
+from envs.episodes import Episodes, replacing
+
+WORLDS = 4
+"""Tries at once where one episode is wanted: the expert may fail in one."""
+_EVERY = 2  # control steps to a picture of a GIF
+
+Report = Callable[[int, int], None]
+"""Called with the episodes that are done and those that are wanted."""
+
+
+def collect(options: argparse.Namespace, console: Console) -> None:
+    """Writes successful expert episodes, an RLDS dataset for every task; continues if stopped."""
+    tasks = names(envs.tasks) if options.task == ["all"] else options.task
+    out: Path = options.out
+    if len(tasks) > 1 and out.suffix == ".npz":
+        raise ValueError(f"{out} can hold one task, not {len(tasks)}: give a folder as --out")
+    files = [out / task for task in tasks] if len(tasks) > 1 else [out]
+    scenes = [_scene(options, task) for task in tasks]  # bad input shows before any work
+    left = {f: e for f, e in zip(files, scenes, strict=True) if not _is_done(options, e, f)}
+    try:
+        found = _side_by_side(options, left, console)
+    except KeyboardInterrupt:
+        kept = [_kept(f, options.num_episodes) for f in left if _unfinished(f).exists()]
+        raise KeyboardInterrupt("; ".join(kept)) from None
+    for file in files:
+        if file in found:
+            console.print(f"{file}: {found[file]}", soft_wrap=True)
+        else:
+            console.print(f"{file} is there already", soft_wrap=True)
+
+
+def gallery(options: argparse.Namespace, console: Console) -> None:
+    """Writes a GIF of an expert episode, all cameras together, for every task and robot."""
+    tasks = [options.task] if options.task else names(envs.tasks)
+    robots = [options.robot] if options.robot else names(envs.robots)
+    for task in tasks:
+        for robot in robots:
+            file = options.out / f"{task}_{Path(robot).stem}.gif"
+            _refuse_existing(options, file)
+            episode = _episode(options, console, task, robot)
+            views = _views(episode)[::_EVERY]
+            options.out.mkdir(parents=True, exist_ok=True)
+            with replacing(file) as unfinished:
+                videos.write_gif(unfinished, views, _EVERY * episode.control_dt)
+            console.print(str(file))
+
+
+def play(options: argparse.Namespace, console: Console) -> None:
+    """Shows an expert episode in a window, or writes a video of it, all cameras together."""
+    if options.out is None:
+        from envs import viewer  # opens a connection to the display
+
+        viewer.check_display()
+        env = envs.make(options.task, options.robot, num_envs=WORLDS)
+        with console.status("simulating an episode ..."):
+            scene, positions = viewer.episode(env, jax.random.key(options.seed))
+        viewer.show(scene, positions, env.control_dt)
+        return
+    if options.image_size % 2:
+        raise ValueError(f"a video needs an even --image-size, not {options.image_size}")
+    _refuse_existing(options, options.out)
+    episode = _episode(options, console, options.task, options.robot)
+    views = _views(episode)
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(options.out) as unfinished:
+        videos.write_video(unfinished, views, fps=1 / episode.control_dt)
+    text = episode.instructions[int(episode.instruction[0])]
+    console.print(f"{options.out}: {len(views)} steps, {text!r}")
+
+
+def names(package: ModuleType) -> list[str]:
+    """The tasks of `envs.tasks`, the robots of `envs.robots`."""
+    return sorted(module.name for module in pkgutil.iter_modules(package.__path__))
+
+
+def _scene(options: argparse.Namespace, task: str) -> envs.Env:
+    """The worlds to collect in."""
+    return envs.make(
+        task,
+        options.robot,
+        num_envs=collection.worlds(options.num_episodes, options.num_envs),
+        image_size=options.image_size,
+        antialias=options.antialias,
+        control_dt=options.control_dt,
+        actions=options.actions,
+        distractors=options.distractors,
+    )
+
+
+def _is_done(options: argparse.Namespace, env: envs.Env, file: Path) -> bool:
+    """Whether the same command has made this dataset before.
+
+    Raises:
+        ValueError: if something else stands there that must not be replaced.
+    """
+    if file.exists() and file.suffix != ".npz":
+        made = rlds.metadata(file)["options"]  # nothing but a dataset is ever replaced
+        if made == _recipe(options, env) and not options.overwrite:
+            return True
+    _refuse_existing(options, file)
+    return False
+
+
+def _side_by_side(
+    options: argparse.Namespace, scenes: Mapping[Path, envs.Env], console: Console
+) -> dict[Path, str]:
+    """Collects all tasks at once, because compilation is most of the time; returns what was made.
+
+    Raises:
+        KeyboardInterrupt: after Ctrl-C, once the parts under way are finished.
+    """
+    stop = threading.Event()
+    running: dict[Path, Future[str]] = {}
+    with _bars(console, stop) as new_bar, ThreadPoolExecutor() as pool:
+        try:
+            for file, env in scenes.items():
+                bar = new_bar(env.task.name, env.robot.name)
+                running[file] = pool.submit(_collect, options, env, file, bar)
+            wait(running.values(), return_when=FIRST_EXCEPTION)
+        finally:
+            stop.set()
+    errors = [future.exception() for future in running.values()]
+    # Where one failed, the others were stopped.
+    for error in sorted(filter(None, errors), key=lambda e: isinstance(e, KeyboardInterrupt)):
+        raise error
+    return {file: future.result() for file, future in running.items()}
+
+
+def _collect(options: argparse.Namespace, env: envs.Env, out: Path, report: Report) -> str:
+    """Collects one task, from where an earlier call was stopped; returns what was made."""
+    parts = rlds.Parts(_unfinished(out), _recipe(options, env))
+    report(parts.num_episodes, options.num_episodes)
+    for part in collection.gather(
+        env,
+        options.num_episodes,
+        jax.random.key(options.seed),
+        options.action_noise,
+        kept=parts.num_episodes,
+        attempted=parts.attempted,
+    ):
+        parts.append(part)
+        report(parts.num_episodes, options.num_episodes)
+    parts.complete()
+    size = sum(file.stat().st_size for file in parts.folder.iterdir())
+    if out.suffix == ".npz":
+        rlds.read(parts.folder).save(out)
+        shutil.rmtree(parts.folder)
+        size = out.stat().st_size
+    else:
+        rlds.install(parts.folder, out)
+    return (
+        f"{parts.num_episodes} episodes of {parts.attempted} tried, {parts.facts['steps']} steps, "
+        f"{size / 1e6:.0f} MB"
+    )
+
+
+def _recipe(options: argparse.Namespace, env: envs.Env) -> dict[str, Any]:
+    """All that the episodes depend on."""
+    return {
+        "task": env.task.name,
+        "robot": options.robot,
+        "num_episodes": options.num_episodes,
+        "num_envs": env.num_envs,
+        "image_size": env.image_size,
+        "antialias": env.antialias,
+        "control_dt": env.control_dt,
+        "actions": env.actions,
+        "distractors": env.distractors,
+        "action_noise": options.action_noise,
+        "seed": options.seed,
+        "physics": env.physics.backend,
+        "device": jax.default_backend(),
+        "jax": jax.__version__,
+        "mujoco": mujoco.__version__,
+    }
+
+
+def _unfinished(out: Path) -> Path:
+    """Where the finished parts of a dataset are until all are there."""
+    return out.with_name(f"{out.name}.partial")
+
+
+def _kept(out: Path, num_episodes: int) -> str:
+    """What a stopped collection has left."""
+    folder = _unfinished(out)
+    kept = sum(rlds.metadata(folder)["parts"])
+    return f"{kept} of {num_episodes} episodes are kept in {folder}, the same command goes on there"
+
+
+def _episode(options: argparse.Namespace, console: Console, task: str, robot: str) -> Episodes:
+    """One episode of the expert."""
+    with _bars(console, threading.Event()) as new_bar:
+        return envs.collect(
+            task,
+            robot,
+            num_episodes=1,
+            key=jax.random.key(options.seed),
+            image_size=options.image_size,
+            num_envs=WORLDS,
+            antialias=2,
+            progress=new_bar(task, robot),
+        )
+
+
+def _views(episode: Episodes) -> np.ndarray:
+    """The first episode as seen by all cameras beside one another, uint8 [T, H, K W, 3]."""
+    steps = int(episode.length[0])
+    return videos.side_by_side({k: np.asarray(p[0, :steps]) for k, p in episode.image.items()})
+
+
+@contextlib.contextmanager
+def _bars(console: Console, stop: threading.Event) -> Iterator[Callable[[str, str], Report]]:
+    """Progress bars: a function that makes one for a task and a robot, and gives what moves it.
+
+    Where `stop` is set, a report raises a KeyboardInterrupt.
+    """
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console) as progress:
+
+        def new_bar(task: str, robot: str) -> Report:
+            bar = progress.add_task(f"{task}, {robot}: compiling ...", total=None, rate="")
+            begun: list[int] = []  # how many there were at the first report
+
+            def report(done: int, total: int) -> None:
+                if stop.is_set():
+                    raise KeyboardInterrupt
+                progress.update(bar, completed=done, total=total)
+                begun.append(done)
+                if len(begun) > 1:
+                    rate = (done - begun[0]) / (progress.tasks[bar].elapsed or 1)
+                    text = f"{task}, {robot}: collecting"
+                    progress.update(bar, description=text, rate=f"{rate:.1f} episodes/s")
+
+            return report
+
+        yield new_bar
+
+
+def _refuse_existing(options: argparse.Namespace, file: Path) -> None:
+    if file.exists() and not options.overwrite:
+        raise ValueError(f"{file} exists already: choose another --out or add --overwrite")

@@ -1,0 +1,72 @@
+"""What child processes of test_commands.py run: collections that come to a sudden end."""
+
+import itertools
+import os
+import signal
+import sys
+import time
+
+import jax
+import numpy as np
+
+from envs import __main__ as command_line
+from envs import collection, rlds, rlds_schema
+
+COLLECT = "collect --task press --robot piper --num-episodes 20 --num-envs 6 --image-size 16"
+# Where a process is killed: a function, and which call of it the process does not survive.
+MOMENTS = {
+    "in the middle of a part": (rlds_schema, "record", 9),
+    "before the second part counts": (os, "replace", 3),
+    "before a further part": (collection, "_record", 4),
+    "when all parts are there": (rlds.Parts, "complete", 1),
+    "before the dataset is in place": (os, "rename", 1),
+}
+
+
+def fake_record(env, key, action_noise):
+    """Stands in for `_record`: noise instead of pictures, some attempts fail."""
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    size, width = (env.num_envs, 5), env.num_joints + 1
+    episodes = {
+        "image": {
+            name: rng.integers(0, 256, (*size, 4, 4, 3), dtype=np.uint8) for name in env.cameras
+        },
+        "state": rng.normal(size=(*size, width)).astype(np.float32),
+        "action": rng.normal(size=(*size, width)).astype(np.float32),
+        "length": rng.integers(1, 6, env.num_envs, dtype=np.int32),
+        "instruction": rng.integers(0, len(env.instructions), env.num_envs, dtype=np.int32),
+    }
+    return episodes, rng.random(env.num_envs) < 0.8
+
+
+def die_at(owner, name, call):
+    """The process is killed, as by kill -9, instead of that call of a function."""
+    survived, count = getattr(owner, name), itertools.count(1)
+
+    def deadly(*arguments, **options):
+        if next(count) == call:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return survived(*arguments, **options)
+
+    setattr(owner, name, deadly)
+
+
+def collect_and_die(moment, out):
+    """What a child process runs."""
+    collection._record = fake_record
+    die_at(*MOMENTS[moment])
+    command_line.main([*COLLECT.split(), "--out", out])
+
+
+def collect_and_interrupt(out):
+    """What another child process runs: Ctrl-C while the second part is made."""
+    calls = itertools.count()
+
+    def record(*arguments):
+        if next(calls) == 1:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(1)
+        return fake_record(*arguments)
+
+    collection._record = record
+    sys.exit(command_line.main([*COLLECT.split(), "--out", out]))
