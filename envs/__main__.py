@@ -54,6 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     option("--actions", default="joint", help=f"{', '.join(actions.MODES)} (%(default)s)")
     option("--action-noise", type=float, default=0.0, help="rad (%(default)s)")
     option("--distractors", type=int, default=0, help=f"up to {distractors.MOST} (%(default)s)")
+    option("--randomize", action="store_true", help="masses, cameras, light and more differ")
     option("--antialias", type=int, default=1, help="rays a pixel, squared (%(default)s)")
 
     option = add(commands.gallery, image_size=128)

@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs import experts
-from envs.actions import Mode
 from envs.env import Env
 from envs.episodes import Episodes, concatenate
-from envs.making import make
+from envs.making import AnyRobot, make
+from envs.randomization import Draw, Randomization
 
 # Worlds a call, where nobody says otherwise: enough to fill the device, few enough for its memory.
 _NUM_ENVS = {"cpu": 32, "gpu": 256, "tpu": 256}
@@ -38,6 +38,7 @@ class Rollout:
         length: int32 [W] control steps until the world was done.
         success: bool [W].
         instruction: int32 [W].
+        draw: what the worlds drew, or None.
     """
 
     state: jax.Array
@@ -46,9 +47,15 @@ class Rollout:
     length: jax.Array
     success: jax.Array
     instruction: jax.Array
+    draw: Draw | None
 
 
-def rollout(env: Env, key: jax.Array, action_noise: float | jax.Array = 0.0) -> Rollout:
+def rollout(
+    env: Env,
+    key: jax.Array,
+    action_noise: float | jax.Array = 0.0,
+    ranges: Randomization | None = None,
+) -> Rollout:
     """The expert's attempt at fresh random layouts; to be called under jit.
 
     Args:
@@ -56,9 +63,10 @@ def rollout(env: Env, key: jax.Array, action_noise: float | jax.Array = 0.0) -> 
         key: all randomness.
         action_noise: standard deviation [rad] of gaussian noise on the executed joint targets. The
             recorded actions are free of it, so they show how to recover.
+        ranges: what differs from world to world, see `envs.randomization`.
     """
     reset_key, plan_key, noise_key = jax.random.split(key, 3)
-    first = env.reset(reset_key)
+    first = env.reset(reset_key, ranges)
     plan = experts.plan(env, first, plan_key)
 
     def body(state: Any, key: jax.Array) -> tuple[Any, tuple]:
@@ -77,64 +85,65 @@ def rollout(env: Env, key: jax.Array, action_noise: float | jax.Array = 0.0) -> 
         length=jnp.sum(alive, axis=0, dtype=jnp.int32),
         success=last.info["success"],
         instruction=last.info["instruction"],
+        draw=first.info["draw"],
     )
 
 
 def collect(
     task: str,
-    robot: str = "piper",
+    robot: AnyRobot = "piper",
     *,
     num_episodes: int,
     key: jax.Array,
-    image_size: int = 64,
     num_envs: int | None = None,
-    control_dt: float = 0.1,
-    actions: Mode = "joint",
-    distractors: int = 0,
     action_noise: float = 0.0,
-    antialias: int = 1,
+    ranges: Randomization | None = None,
     progress: Callable[[int, int], None] | None = None,
+    **options: Any,
 ) -> Episodes:
     """Successful demonstrations by the scripted expert, on the device, padded to its longest time.
 
     Args:
-        task, robot, image_size, control_dt, actions, distractors, antialias: as for `envs.make`.
+        task, robot: as for `envs.make`.
         num_episodes: episodes E to return.
         key: all randomness; the same key gives the same episodes.
         num_envs: worlds W simulated at once; None picks by device.
-        action_noise: see `rollout`.
+        action_noise, ranges: see `rollout`.
         progress: called with (episodes so far, num_episodes), first with 0 before compilation.
+        **options: others of `envs.make`; the backend is jax unless they say otherwise.
 
     Raises:
         ValueError: for bad names or numbers, or if the expert fails far too often.
     """
-    env = make(
-        task,
-        robot,
-        num_envs=worlds(num_episodes, num_envs),
-        image_size=image_size,
-        control_dt=control_dt,
-        actions=actions,
-        distractors=distractors,
-        antialias=antialias,
-    )
-    parts = gather(env, num_episodes, key, action_noise)
+    env = make_repeatable(task, robot, num_envs=worlds(num_episodes, num_envs), **options)
+    parts = gather(env, num_episodes, key, action_noise, ranges)
     return concatenate(list(_reported(parts, num_episodes, progress)))
 
 
 def expert_success(
     task: str,
-    robot: str = "piper",
+    robot: AnyRobot = "piper",
     *,
     num_episodes: int,
     key: jax.Array,
     num_envs: int | None = None,
+    ranges: Randomization | None = None,
+    **options: Any,
 ) -> jax.Array:
-    """Whether the expert solves each of `num_episodes` random layouts, bool [num_episodes]."""
-    env = make(task, robot, num_envs=worlds(num_episodes, num_envs))
+    """Whether the expert solves each of `num_episodes` random layouts, bool [num_episodes].
+
+    Arguments are those of `collect`.
+    """
+    env = make_repeatable(task, robot, num_envs=worlds(num_episodes, num_envs), **options)
     calls = -(-num_episodes // env.num_envs)
-    results = [_attempt(env, chunk_key) for chunk_key in jax.random.split(key, calls)]
+    results = [_attempt(env, chunk_key, ranges) for chunk_key in jax.random.split(key, calls)]
     return jnp.concatenate(results)[:num_episodes]
+
+
+def make_repeatable(task: str, robot: AnyRobot, **options: Any) -> Env:
+    """`envs.make` with physics that gives the same again: Warp sums forces in any order."""
+    options.setdefault("backend", "jax")
+    return make(task, robot, **options)
 
 
 def gather(
@@ -142,6 +151,7 @@ def gather(
     num_episodes: int,
     key: jax.Array,
     action_noise: float = 0.0,
+    ranges: Randomization | None = None,
     *,
     kept: int = 0,
     attempted: int = 0,
@@ -150,7 +160,7 @@ def gather(
 
     Args:
         env: W worlds, the attempts of one call.
-        num_episodes, key, action_noise: as for `collect`.
+        num_episodes, key, action_noise, ranges: as for `collect`.
         kept, attempted: num_episodes and attempted of all that was yielded before, to go on as if
             it had never stopped.
 
@@ -163,7 +173,7 @@ def gather(
     while kept < num_episodes:
         _check_success(env, kept, attempted)
         key, chunk_key = jax.random.split(key)
-        chunk, success = _record(env, chunk_key, action_noise)
+        chunk, success = _record(env, chunk_key, action_noise, ranges)
         wins = np.flatnonzero(success)[: num_episodes - kept]
         kept += len(wins)
         # Attempts after the last one that was needed do not count.
@@ -217,12 +227,15 @@ def _check_success(env: Env, kept: int, attempted: int) -> None:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _record(env: Env, key: jax.Array, action_noise: jax.Array) -> tuple[dict[str, Any], jax.Array]:
-    tries = rollout(env, key, action_noise)
+def _record(
+    env: Env, key: jax.Array, action_noise: jax.Array, ranges: Randomization | None
+) -> tuple[dict[str, Any], jax.Array]:
+    tries = rollout(env, key, action_noise, ranges)
     steps, worlds = tries.action.shape[:2]
     # World-major order, so that an episode's pictures end up next to each other.
     flat = [jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]) for x in tries.poses]
-    pictures = env.render(*flat)
+    drawn = jax.tree.map(lambda x: jnp.repeat(x, steps, axis=0), tries.draw)
+    pictures = env.render(*flat, draw=drawn)
     episodes = {
         "image": {k: x.reshape(worlds, steps, *x.shape[1:]) for k, x in pictures.items()},
         "state": jnp.swapaxes(tries.state, 0, 1),
@@ -234,8 +247,8 @@ def _record(env: Env, key: jax.Array, action_noise: jax.Array) -> tuple[dict[str
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _attempt(env: Env, key: jax.Array) -> jax.Array:
-    return rollout(env, key).success
+def _attempt(env: Env, key: jax.Array, ranges: Randomization | None) -> jax.Array:
+    return rollout(env, key, ranges=ranges).success
 
 
 def worlds(num_episodes: int, num_envs: int | None) -> int:

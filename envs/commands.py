@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import dataclasses
 import pkgutil
 import shutil
 import threading
@@ -106,7 +107,7 @@ def names(package: ModuleType) -> list[str]:
 
 def _scene(options: argparse.Namespace, task: str) -> envs.Env:
     """The worlds to collect in."""
-    return envs.make(
+    return collection.make_repeatable(
         task,
         options.robot,
         num_envs=collection.worlds(options.num_episodes, options.num_envs),
@@ -166,6 +167,7 @@ def _collect(options: argparse.Namespace, env: envs.Env, out: Path, report: Repo
         options.num_episodes,
         jax.random.key(options.seed),
         options.action_noise,
+        _ranges(options),
         kept=parts.num_episodes,
         attempted=parts.attempted,
     ):
@@ -198,12 +200,17 @@ def _recipe(options: argparse.Namespace, env: envs.Env) -> dict[str, Any]:
         "actions": env.actions,
         "distractors": env.distractors,
         "action_noise": options.action_noise,
+        "randomize": dataclasses.asdict(ranges) if (ranges := _ranges(options)) else None,
         "seed": options.seed,
         "physics": env.physics.backend,
         "device": jax.default_backend(),
         "jax": jax.__version__,
         "mujoco": mujoco.__version__,
     }
+
+
+def _ranges(options: argparse.Namespace) -> envs.Randomization | None:
+    return envs.Randomization.typical() if options.randomize else None
 
 
 def _unfinished(out: Path) -> Path:

@@ -17,13 +17,14 @@ from envs.env import TARGET_DT, Env, Renderer
 from envs.physics import Backend
 from envs.robots import Robot
 
+AnyRobot = str | os.PathLike[str] | Robot
 RendererName = Literal["rays", "warp"]
 RENDERERS: tuple[str, ...] = get_args(RendererName)
 
 
 def make(
     task: str,
-    robot: str | os.PathLike[str] | Robot = "piper",
+    robot: AnyRobot = "piper",
     *,
     num_envs: int = 1,
     image_size: int = 64,
@@ -123,7 +124,7 @@ def _check_options(control_dt: float, actions: str, distractors: int) -> None:
         raise ValueError(f"distractors must be 0 to {most}, got {distractors}")
 
 
-def _find_robot(robot: str | os.PathLike[str] | Robot) -> Robot:
+def _find_robot(robot: AnyRobot) -> Robot:
     if isinstance(robot, Robot):
         return robot
     if os.fspath(robot).endswith(".xml"):

@@ -1,4 +1,4 @@
-"""How a layout gets into a MuJoCo model: loose bodies through qpos, fixed ones through the model."""
+"""How a layout gets into a MuJoCo model: loose bodies by qpos, fixed ones by the model itself."""
 
 import jax
 import jax.numpy as jnp

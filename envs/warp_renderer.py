@@ -52,7 +52,7 @@ class WarpRenderer:
                 mujoco_warp.create_render_context(
                     _lamplit(model),
                     nworld=num_worlds,
-                    cam_res=(samples * image_size,) * 2,
+                    cam_res=(samples * image_size, samples * image_size),
                     render_rgb=True,
                     render_depth=False,
                     cam_active=[camera],

@@ -23,7 +23,7 @@ MOMENTS = {
 }
 
 
-def fake_record(env, key, action_noise):
+def fake_record(env, key, action_noise, ranges):
     """Stands in for `_record`: noise instead of pictures, some attempts fail."""
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     size, width = (env.num_envs, 5), env.num_joints + 1

@@ -200,8 +200,8 @@ def test_several_tasks_go_on_where_they_were(tmp_path, run, fake, monkeypatch):
 
 
 def test_one_bad_task_stops_the_others(tmp_path, run, monkeypatch):
-    def record(env, key, action_noise):
-        episodes, success = fake_record(env, key, action_noise)
+    def record(env, key, action_noise, ranges):
+        episodes, success = fake_record(env, key, action_noise, ranges)
         return episodes, success & (env.task.name != "pour")
 
     monkeypatch.setattr(collection, "_record", record)

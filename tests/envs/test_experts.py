@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import envs
-from envs import collection, experts, robots
+from envs import collection, experts, physics, robots
 from envs.tasks import route
 
-LAYOUTS = 256
+LAYOUTS = 1024
 
 
 def valid(episodes) -> np.ndarray:
@@ -24,9 +24,17 @@ def test_experts_succeed(episodes):
 
 
 @pytest.mark.slow
-def test_experts_succeed_on_many_layouts(task_name, robot_name):
-    key = jax.random.key(1)
-    success = envs.expert_success(task_name, robot_name, num_episodes=LAYOUTS, key=key)
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("backend", sorted({"jax", physics.default_backend()}))
+def test_experts_succeed_on_many_layouts(task_name, robot_name, backend):
+    success = envs.expert_success(
+        task_name,
+        robot_name,
+        num_episodes=LAYOUTS,
+        num_envs=256,
+        key=jax.random.key(1),
+        backend=backend,
+    )
     assert success.shape == (LAYOUTS,)
     assert success.dtype == bool
     assert success.mean() >= 0.97
@@ -121,7 +129,7 @@ def test_hurried_experts_slow_down_to_half_the_speed_limits(env):
 def fake_record(success):
     """Stands in for `_record`: one step an episode, numbered by world."""
 
-    def record(env, key, action_noise):
+    def record(env, key, action_noise, ranges):
         world = jnp.arange(env.num_envs)
         numbers = jnp.broadcast_to(world[:, None, None].astype(jnp.float32), (env.num_envs, 1, 7))
         chunk = {
@@ -160,7 +168,7 @@ def test_collect_gives_up_on_a_broken_expert(monkeypatch):
 def test_expert_success_counts_whole_and_part_batches(monkeypatch):
     seen = []
 
-    def attempt(env, key):
+    def attempt(env, key, ranges):
         seen.append(key)
         return jnp.array([True, True, False])
 

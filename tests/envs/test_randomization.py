@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import envs
-from envs import experts, randomization
+from envs import collection, experts, randomization
 from envs.randomization import Randomization
 
 WORLDS, STEPS = 2, 50  # the expert lifts the grape at about step 35
@@ -128,6 +128,14 @@ def test_latency_delays_what_is_sent(env, neutral):
     now, late = sent(0.0), sent(0.04)
     np.testing.assert_array_equal(late[8:], now[:-8])  # 8 physics steps of 5 ms
     np.testing.assert_allclose(now[-1, :-1], target[:-1], atol=1e-6)
+
+
+def test_recorded_pictures_show_each_world_as_it_is(env):
+    ranges, key = Randomization.typical(), jax.random.key(3)
+    recorded, _ = collection._record(env, key, 0.0, ranges)
+    start = env.reset(jax.random.split(key, 3)[0], ranges)
+    for name, picture in env.observe(start)["image"].items():
+        np.testing.assert_allclose(recorded["image"][name][:, 0], picture, atol=1)
 
 
 def test_worlds_draw_for_themselves(episode):
