@@ -5,8 +5,8 @@
 For each task, backend and batch: seconds to compile (`--jobs` programs at once), physics steps/s,
 control steps/s without and with ("seeing") the pictures of both cameras, images/s of the ray caster
 alone (hard shadows, two cameras), memory, and the ratio to MuJoCo's C engine with a thread a core
-on the same scene. Actions are noise around the start pose. Inputs are built under jit, everything is
-warmed up twice, the best of three calls counts.
+on the same scene. Actions are noise around the start pose. Inputs are built under jit, everything
+is warmed up twice, the best of three calls counts.
 """
 
 import argparse
