@@ -41,7 +41,7 @@ from envs.state import State
 CONTROL_STEPS = 10  # to a timed call
 C_STEPS = 500  # physics steps to a timed call of the C engine
 PICTURE_SIZES = (64, 128)  # [px] of the renderer's columns
-PLAYGROUND = "PandaPickCube"
+PLAYGROUND, PLAYGROUND_CONTACTS = "PandaPickCube", 24  # a world's contacts, its own default
 
 
 @dataclasses.dataclass
@@ -144,11 +144,13 @@ def mujoco_c(env: Env, state: State) -> float:
     return len(worlds) * C_STEPS / seconds
 
 
-def playground(batch: int) -> float:
-    """Physics steps/s of MuJoCo Playground's environment with default settings."""
+def playground(backend: str, batch: int) -> float:
+    """Physics steps/s of MuJoCo Playground's environment, with room for each world's contacts."""
     from mujoco_playground import registry  # pyright: ignore[reportMissingImports]
 
-    env = registry.load(PLAYGROUND)
+    room = PLAYGROUND_CONTACTS * batch
+    overrides = {"impl": backend, "naconmax": room, "naccdmax": room}
+    env = registry.load(PLAYGROUND, config_overrides=overrides)
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), batch))
 
     def run(state: Any, key: jax.Array) -> Any:
@@ -200,8 +202,13 @@ def main() -> None:
     print_tables(console, rows)
     found: dict[str, Any] = {"machine": machine, "rows": rows}
     if importlib.util.find_spec("mujoco_playground"):
-        found[PLAYGROUND] = {batch: playground(batch) for batch in options.batches}
-        console.print(f"Playground's {PLAYGROUND}, physics steps/s by batch: {found[PLAYGROUND]}")
+        found[PLAYGROUND] = []
+        for backend, batch in itertools.product(options.backends, options.batches):
+            speed = playground(backend, batch)
+            found[PLAYGROUND].append({"backend": backend, "batch": batch, "physics/s": speed})
+            console.print(
+                f"Playground's {PLAYGROUND}, {backend}, {batch}: {_text(speed)} physics/s"
+            )
     else:
         console.print(f"mujoco_playground is not installed: no figures of its {PLAYGROUND}")
     if options.json:

@@ -15,6 +15,7 @@ def test_example(code, capsys):
     assert "lora_sp" in capsys.readouterr().out
 
 
-def test_simulation_example_compiles_as_text():
-    assert len(EXAMPLES) == 2
-    compile(EXAMPLES[1], "README.md", "exec")
+def test_simulation_examples_compile_as_text():
+    assert len(EXAMPLES) == 3
+    for code in EXAMPLES[1:]:
+        compile(code, "README.md", "exec")
