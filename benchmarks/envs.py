@@ -110,7 +110,7 @@ def time_pictures(env: Env, state: State, size: int) -> float:
     poses = (data.geom_xpos, data.geom_xmat, data.cam_xpos, data.cam_xmat)
     draw = jax.jit(
         lambda poses: render.render_batch(
-            env.render_model, *poses, height=size, width=size, samples=env.antialias
+            env.render_model, *poses, height=size, width=size, samples=1
         )
     )
     return env.num_envs * len(env.cameras) / best(lambda: draw(poses))
@@ -144,7 +144,7 @@ def mujoco_c(env: Env, state: State) -> float:
     return len(worlds) * C_STEPS / seconds
 
 
-def playground(backend: str, batch: int) -> float:
+def playground(backend: Any, batch: Any) -> float:
     """Physics steps/s of MuJoCo Playground's environment, with room for each world's contacts."""
     from mujoco_playground import registry  # pyright: ignore[reportMissingImports]
 

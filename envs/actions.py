@@ -15,11 +15,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs import robots
+from envs import robots, scene
 from envs.robots import Robot, multiply
 
 Mode = Literal["joint", "delta_joint", "end_effector"]
 MODES: tuple[str, ...] = get_args(Mode)
+
+TARGET_DT = 0.02
+"""Joint targets are interpolated to this rate between two actions [s]."""
 
 _TOOL_SPEED = np.array([0.5] * 3 + [2.0] * 3, np.float32)  # own choice [m/s, rad/s]
 
@@ -62,6 +65,24 @@ def from_targets(mode: Mode, robot: Robot, command: jax.Array, targets: jax.Arra
     )
     turn = _rotation_vector(multiply(after, before.T))
     return jnp.concatenate([end - start, turn, targets[-1:]])
+
+
+def interpolate(commands: jax.Array, control_dt: float, latency: float | jax.Array) -> jax.Array:
+    """Actuator targets [S, J + 1] of the S physics steps between two actions.
+
+    Args:
+        commands: [3, J + 1] targets of the last action but one, the last one and the new one.
+        control_dt: seconds from one to the next, a multiple of `TARGET_DT`.
+        latency: seconds, at most `control_dt`, by which they come late.
+    """
+    moves, repeats = round(control_dt / TARGET_DT), round(TARGET_DT / scene.PHYSICS_DT)
+    fraction = jnp.arange(1, moves + 1, dtype=jnp.float32)[:, None] / moves
+    # What is sent in this control step, after what was sent in the one before.
+    path = commands[:-1, None] + fraction * jnp.diff(commands, axis=0)[:, None]
+    path = path.at[..., -1].multiply(0.5)  # each finger makes half of the opening
+    sent = jnp.repeat(path.reshape(2 * moves, -1), repeats, axis=0)
+    late = jnp.round(latency / scene.PHYSICS_DT).astype(jnp.int32)
+    return jax.lax.dynamic_slice_in_dim(sent, moves * repeats - late, moves * repeats)
 
 
 def _rotation_vector(rotation: jax.Array) -> jax.Array:

@@ -17,7 +17,7 @@ from envs import experts
 from envs.env import Env
 from envs.episodes import Episodes, concatenate
 from envs.making import AnyRobot, make
-from envs.randomization import Draw, Randomization
+from envs.randomization import Draw, Randomization, prepared
 
 # Worlds a call, where nobody says otherwise: enough to fill the device, few enough for its memory.
 _NUM_ENVS = {"cpu": 32, "gpu": 256, "tpu": 256}
@@ -135,6 +135,7 @@ def expert_success(
     Arguments are those of `collect`.
     """
     env = make_repeatable(task, robot, num_envs=worlds(num_episodes, num_envs), **options)
+    ranges = prepared(ranges, env.control_dt)
     calls = -(-num_episodes // env.num_envs)
     results = [_attempt(env, chunk_key, ranges) for chunk_key in jax.random.split(key, calls)]
     return jnp.concatenate(results)[:num_episodes]
@@ -167,6 +168,7 @@ def gather(
     Raises:
         ValueError: if the expert fails far too often.
     """
+    ranges = prepared(ranges, env.control_dt)
     for _ in range(attempted // env.num_envs):
         key, _ = jax.random.split(key)
     tried = 0  # since the last success
@@ -255,4 +257,6 @@ def worlds(num_episodes: int, num_envs: int | None) -> int:
     """Worlds at once for so many episodes, where `num_envs` does not say it."""
     if num_episodes < 1:
         raise ValueError(f"num_episodes must be at least 1, got {num_episodes}")
-    return num_envs or min(num_episodes, _NUM_ENVS.get(jax.default_backend(), 256))
+    if num_envs is not None:
+        return num_envs
+    return min(num_episodes, _NUM_ENVS.get(jax.default_backend(), 256))

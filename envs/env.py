@@ -10,7 +10,7 @@ Nothing is rendered unless `observe` is called, and no world restarts unless `re
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -21,16 +21,11 @@ import numpy as np
 from envs import actions, distractors, placing, randomization, scene
 from envs.physics import Changes, Data, Physics
 from envs.randomization import Draw, Randomization
-from envs.render import Look, RenderModel
+from envs.render import Look, Renderer, RenderModel
 from envs.robots import Robot
 from envs.state import State, Trajectory, where
 from envs.tasks import Layout, Task, View
 
-Renderer = Callable[[Sequence[jax.Array], Look | None, jax.Array | None], jax.Array]
-"""geom_xpos, geom_xmat, cam_xpos, cam_xmat, looks and sizes of geoms of N worlds -> pictures, uint8
-[N, K, height, width, 3]; None for the model's own."""
-
-TARGET_DT = 0.02  # s, joint targets are interpolated to this rate between two actions
 _HOME_NOISE = 0.03  # rad, half the range of the random start pose around home
 _START_OPENING = 0.04  # m, of the gripper
 
@@ -42,8 +37,6 @@ class Env:
     task: Task
     robot: Robot
     num_envs: int
-    image_size: int
-    antialias: int
     distractors: int
     control_dt: float
     actions: actions.Mode
@@ -59,6 +52,16 @@ class Env:
     def num_joints(self) -> int:
         """J, without the gripper."""
         return self.robot.num_joints
+
+    @property
+    def image_size(self) -> int:
+        """Height and width of the pictures in pixels."""
+        return self.renderer.image_size
+
+    @property
+    def antialias(self) -> int:
+        """n for n x n rays a pixel."""
+        return self.renderer.samples
 
     @property
     def action_low(self) -> np.ndarray:
@@ -161,7 +164,13 @@ class Env:
     def reset_done(
         self, state: State, key: jax.Array, ranges: Randomization | None = None
     ) -> State:
-        """The same worlds, those that are done started afresh, with the ranges of their `reset`."""
+        """The same worlds, those that are done started afresh, with the ranges of their `reset`.
+
+        Raises:
+            ValueError: if only one of the two had ranges, or they make no sense.
+        """
+        if (ranges is None) != (state.info["draw"] is None):
+            raise ValueError("reset_done needs ranges if, and only if, reset was given some")
         return jax.jit(where)(state.done, self.reset(key, ranges), state)
 
     def proprio(self, state: State) -> jax.Array:
@@ -235,7 +244,10 @@ class Env:
         target = actions.to_targets(self.actions, self.robot, info["command"], action)
         target = jnp.clip(target, self.robot.action_low, self.robot.action_high)
         target = jnp.clip(target, info["command"] - reach, info["command"] + reach)
-        draw, controls = info["draw"], self._controls(info, target)
+        draw = info["draw"]
+        commands = jnp.stack([info["earlier"], info["command"], target])
+        latency = draw.latency if draw else 0.0
+        controls = actions.interpolate(commands, self.control_dt, latency)
         changes = self._changes(draw, info["layout"])
         data = self._filmed(draw, self.physics.advance(changes, state.data, controls))
         reached, metrics = self._check(draw, data)
@@ -284,16 +296,3 @@ class Env:
 
     def _check(self, draw: Draw | None, data: Data) -> tuple[jax.Array, dict[str, jax.Array]]:
         return self.task.check(View(self.model, data, draw.size if draw else 1.0))
-
-    def _controls(self, info: dict[str, Any], target: jax.Array) -> jax.Array:
-        """Actuator targets [S, J + 1] of the S physics steps to a new command."""
-        moves, repeats = round(self.control_dt / TARGET_DT), round(TARGET_DT / scene.PHYSICS_DT)
-        knots = jnp.stack([info["earlier"], info["command"], target])
-        fraction = jnp.arange(1, moves + 1, dtype=jnp.float32)[:, None] / moves
-        # What is sent during this control step, after what was sent during the last one.
-        path = knots[:-1, None] + fraction * jnp.diff(knots, axis=0)[:, None]
-        path = path.at[..., -1].multiply(0.5)  # each finger makes half of the opening
-        sent = jnp.repeat(path.reshape(2 * moves, -1), repeats, axis=0)
-        steps, draw = moves * repeats, info["draw"]
-        late = jnp.round(draw.latency / scene.PHYSICS_DT).astype(jnp.int32) if draw else 0
-        return jax.lax.dynamic_slice_in_dim(sent, steps - late, steps)

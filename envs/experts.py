@@ -64,8 +64,8 @@ def _plan(env: Env, info: dict, key: jax.Array) -> Plan:
     noise = jax.random.normal(position_key, way.position.shape) * way.spread[:, None]
     start = info["command"]
     rotations = leaning(env.robot, way)
-    anchors = way.position.at[:, 2].multiply(size) + noise
-    positions = anchors + way.reach[:, None] * rotations[:, :, 2]
+    grown = way.position.at[:, 2].add((size - 1) * (way.position[:, 2] - way.reach))
+    positions = grown + noise + way.reach[:, None] * rotations[:, :, 2]
     joints = _joints(env.robot, positions, rotations, start[:-1])
     knots = jnp.concatenate([joints, way.opening[:, None]], axis=1)
     knots = jnp.concatenate([start[None], knots])

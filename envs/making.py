@@ -1,19 +1,16 @@
 """Making an environment from the names of a task and a robot, which are those of their files."""
 
-import functools
 import importlib
 import os
 import pkgutil
-from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
-import jax
 import mujoco
 
 import envs.distractors
 from envs import mjcf, physics, render, scene
-from envs.actions import MODES, Mode
-from envs.env import TARGET_DT, Env, Renderer
+from envs.actions import MODES, TARGET_DT, Mode
+from envs.env import Env
 from envs.physics import Backend
 from envs.robots import Robot
 
@@ -60,49 +57,33 @@ def make(
     _check_options(control_dt, actions, distractors)
     things = found_task.scene + envs.distractors.mjcf(distractors)
     model = scene.build(things, found_robot)
-    drawn = render.build(model, scene.CAMERAS)
+    rays = render.RayRenderer(render.build(model, scene.CAMERAS), image_size, antialias)
     return Env(
         task=found_task,
         robot=found_robot,
         num_envs=num_envs,
-        image_size=image_size,
-        antialias=antialias,
         control_dt=control_dt,
         actions=actions,
         distractors=distractors,
         model=model,
         physics=physics.Physics(model, backend or physics.default_backend()),
-        render_model=drawn,
-        renderer=_renderer(renderer, model, drawn, (num_envs, image_size, antialias)),
+        render_model=rays.model,
+        renderer=_renderer(renderer, model, rays, num_envs),
     )
 
 
 def _renderer(
-    name: str, model: mujoco.MjModel, drawn: render.RenderModel, sizes: tuple[int, int, int]
-) -> Renderer:
-    """A renderer by its name, for so many worlds, pixels and samples."""
-    num_envs, image_size, samples = sizes
+    name: str, model: mujoco.MjModel, rays: render.RayRenderer, num_envs: int
+) -> render.Renderer:
+    """A renderer by its name, with the pictures of the ray caster."""
     if name == "rays":
-        return functools.partial(_cast, drawn, image_size, samples)
+        return rays
     if name != "warp":
         raise ValueError(f"unknown renderer {name!r}: choose from {', '.join(RENDERERS)}")
     physics.need_warp("renderer")
     from envs.warp_renderer import WarpRenderer
 
-    return WarpRenderer(model, drawn, num_worlds=num_envs, image_size=image_size, samples=samples)
-
-
-def _cast(
-    drawn: render.RenderModel,
-    side: int,
-    samples: int,
-    poses: Sequence[jax.Array],
-    look: render.Look | None,
-    size: jax.Array | None,
-) -> jax.Array:
-    return render.render_batch(
-        drawn, *poses, height=side, width=side, samples=samples, look=look, size=size
-    )
+    return WarpRenderer(model, rays, num_envs)
 
 
 def _check_counts(**counts: int) -> None:

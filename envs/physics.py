@@ -1,4 +1,4 @@
-"""MuJoCo MJX behind one small class; the only file that names one of its implementations.
+"""Physics behind one small class; the only file that names MJX, `warp_physics` being its guest.
 
 Worlds are batched by `jax.vmap`. What a world keeps between two steps, `Data`, is the same for all
 implementations: those fields alone that a step reads, and the poses that others look at.
@@ -112,9 +112,10 @@ Changes = dict[str, jax.Array]
 
 
 def default_backend() -> str:
-    """warp on an NVIDIA GPU where warp-lang is installed, else jax."""
+    """warp on one NVIDIA GPU where warp-lang is installed, else jax."""
     nvidia = jax.default_backend() == "gpu" and "cuda" in jax.devices()[0].client.platform_version
-    return "warp" if nvidia and importlib.util.find_spec("warp") else "jax"
+    alone = jax.device_count() == 1  # Warp's graphs belong to one GPU
+    return "warp" if nvidia and alone and importlib.util.find_spec("warp") else "jax"
 
 
 class Physics:
@@ -189,9 +190,14 @@ def _check_backend(backend: str) -> None:
 
 
 def need_warp(option: str) -> None:
-    """Raises a ValueError if warp-lang, which this option asks for, is not installed."""
+    """Raises a ValueError if warp-lang, which this option asks for, is not there or cannot work."""
     if not importlib.util.find_spec("warp"):
         raise ValueError(f"{option} 'warp' needs warp-lang: pip install -e '.[warp]'")
+    if jax.default_backend() == "gpu" and jax.device_count() > 1:
+        raise ValueError(
+            f"{option} 'warp' works on one GPU, but JAX sees {jax.device_count()}: "
+            "set CUDA_VISIBLE_DEVICES to one of them"
+        )
 
 
 def _full_precision() -> Any:

@@ -23,6 +23,7 @@ from envs.tasks import Layout
 
 Range = tuple[float, float]
 _POSITIVE = ("size", "mass", "friction", "gains", "brightness")
+_MOST_DEGREES = 20.0  # of change to a field of view; the narrowest camera has 32
 _STILL, _SAME = (0.0, 0.0), (1.0, 1.0)
 
 
@@ -82,13 +83,17 @@ class Randomization:
 
     def check(self, control_dt: float) -> None:
         """Raises a ValueError for ranges that make no sense; `control_dt` in s."""
-        for name, (low, high) in dataclasses.asdict(self).items():
-            if not low <= high:
-                raise ValueError(f"{name} must be (low, high), got {(low, high)}")
-            if name in _POSITIVE and low <= 0:
-                raise ValueError(f"{name} is a factor and must be above 0, got {(low, high)}")
-        if self.size[1] > MOST_GROWTH:
-            raise ValueError(f"size must be at most {MOST_GROWTH}, got {self.size}")
+        for name, given in vars(self).items():
+            if np.shape(given) != (2,) or not np.all(np.isfinite(given)) or given[0] > given[1]:
+                raise ValueError(f"{name} must be two finite numbers (low, high), got {given}")
+            if name in _POSITIVE and given[0] <= 0:
+                raise ValueError(f"{name} is a factor and must be above 0, got {given}")
+        if self.size[0] < 1 / MOST_GROWTH or self.size[1] > MOST_GROWTH:
+            limits = f"{1 / MOST_GROWTH} to {MOST_GROWTH}"
+            raise ValueError(f"size must lie in {limits}, got {self.size}")
+        if max(map(abs, self.field_of_view)) > _MOST_DEGREES:
+            limit = f"-{_MOST_DEGREES} to {_MOST_DEGREES} degrees"
+            raise ValueError(f"field_of_view must lie in {limit}, got {self.field_of_view}")
         if self.latency[0] < 0 or self.latency[1] > control_dt:
             raise ValueError(f"latency must lie in 0 to {control_dt} s, got {self.latency}")
 

@@ -14,7 +14,10 @@ Light, colours, fields of view (`Look`) and sizes of geoms are traced: they can 
 to world. Cameras follow MuJoCo (looking along -z, y up); inside a geom they look through it.
 """
 
+import dataclasses
 import functools
+from collections.abc import Sequence
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +28,16 @@ from envs.intersections import Geom, Geoms, Matrix, Vec, dot
 from envs.render_model import Look, RenderModel, build, unit_shapes
 from envs.shading import Raster, View
 
-__all__ = ["Look", "RenderModel", "build", "cast", "render", "render_batch"]
+__all__ = [
+    "Look",
+    "RayRenderer",
+    "RenderModel",
+    "Renderer",
+    "build",
+    "cast",
+    "render",
+    "render_batch",
+]
 
 # Pixels rendered together. CPU: the few arrays in use stay in a core's cache (measured at 64 and
 # 128 px). Accelerators: about 120 bytes a pixel are alive, measured, so this is about 1 GiB.
@@ -103,6 +115,44 @@ def render_batch(
     )
 
 
+class Renderer(Protocol):
+    """What draws the pictures of an environment; see `RayRenderer`."""
+
+    @property
+    def image_size(self) -> int: ...  # noqa: D102
+
+    @property
+    def samples(self) -> int: ...  # noqa: D102
+
+    def __call__(  # noqa: D102
+        self, poses: Sequence[jax.Array], look: Look | None, size: jax.Array | None
+    ) -> jax.Array: ...
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class RayRenderer:
+    """The ray caster for an environment: square pictures of N worlds a call.
+
+    Attributes:
+        model: from `build`.
+        image_size: height and width [px].
+        samples: n for n x n rays a pixel.
+    """
+
+    model: RenderModel
+    image_size: int
+    samples: int
+
+    def __call__(
+        self, poses: Sequence[jax.Array], look: Look | None, size: jax.Array | None
+    ) -> jax.Array:
+        """Pictures, uint8 `[N, K, height, width, 3]`; arguments as for `render_batch`."""
+        side, samples = self.image_size, self.samples
+        return render_batch(
+            self.model, *poses, height=side, width=side, samples=samples, look=look, size=size
+        )
+
+
 @functools.partial(jax.jit, static_argnames=("height", "width"))
 def cast(
     model: RenderModel,
@@ -156,13 +206,7 @@ def seen_by_cameras(
     cameras, leaves `[K]`.
     """
     geom_xpos, geom_xmat, cam_xpos, cam_xmat = poses
-    for name, given, count in (
-        ("geom_xpos", geom_xpos, look.rgba.shape[0]),
-        ("cam_xpos", cam_xpos, look.fovy.shape[0]),
-        ("size", size, look.rgba.shape[0]),
-    ):
-        if given.shape != (count, 3):
-            raise ValueError(f"{name} must have shape {(count, 3)}, not {given.shape}")
+    _check_shapes(look, geom_xpos=geom_xpos, cam_xpos=cam_xpos, size=size)
     visible, chosen = np.array(model.geoms), np.array(model.cameras)
     scale, half = unit_shapes(model, size)
     to_unit = _rows(jnp.swapaxes(geom_xmat[visible], -1, -2) / scale[:, :, None])
@@ -195,6 +239,13 @@ def seen_by_cameras(
         return geoms, camera
 
     return jax.vmap(view)(cam_xpos[chosen], cam_xmat[chosen], jnp.asarray(look.fovy)[chosen])
+
+
+def _check_shapes(look: Look, **given: jax.Array | np.ndarray) -> None:
+    for name, array in given.items():
+        count = (look.fovy if name == "cam_xpos" else look.rgba).shape[0]
+        if array.shape != (count, 3):
+            raise ValueError(f"{name} must have shape {(count, 3)}, not {array.shape}")
 
 
 def _vec(vectors: jax.Array) -> Vec:

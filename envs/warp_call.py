@@ -1,16 +1,17 @@
 """Functions that work on Warp's arrays, called from JAX."""
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import warp as wp
 
 
 def device() -> Any:
     """Warp's name for the device that JAX computes on."""
-    return wp.device_from_jax(jax.devices()[0])
+    return wp.device_from_jax(jax.local_devices()[0])
 
 
 def from_jax(function: Callable[..., None], like: Mapping[str, Any], **options: Any) -> Any:
@@ -36,3 +37,23 @@ def from_jax(function: Callable[..., None], like: Mapping[str, Any], **options: 
     modes = wp.JaxCallableGraphMode
     mode = modes.NONE if jax.default_backend() == "cpu" else modes.WARP_STAGED
     return wp.jax_callable(function, graph_mode=mode, vmap_method=None, **options)
+
+
+def flattening_vmap(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of trees of arrays with a leading axis of worlds; to vmap it makes that longer."""
+
+    @jax.custom_batching.custom_vmap
+    def run(*arguments: Any) -> Any:
+        return function(*arguments)
+
+    @run.def_vmap
+    def _(size: int, batched: Sequence[Any], *arguments: Any) -> Any:
+        def flat(x: jax.Array, given: bool) -> jax.Array:
+            x = x if given else jnp.broadcast_to(x, (size, *x.shape))
+            return x.reshape(-1, *x.shape[2:])
+
+        results = run(*jax.tree.map(flat, list(arguments), list(batched)))
+        results = jax.tree.map(lambda x: x.reshape(size, -1, *x.shape[1:]), results)
+        return results, jax.tree.map(lambda _: True, results)
+
+    return run

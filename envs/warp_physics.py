@@ -25,7 +25,9 @@ _FIXED = ("geom_xpos", "geom_xmat")
 class WarpSteps:
     """A MuJoCo model that simulates batches of worlds.
 
-    Device memory for each number of worlds is taken at its first call and kept.
+    Device memory for each number of worlds is taken when its first call is traced, and kept until
+    the process ends. Not for threads: what one traces while another's graph is captured would
+    become part of that graph.
     """
 
     def __init__(self, model: mujoco.MjModel, *, contacts: int, rows: int, growth: float) -> None:
@@ -52,24 +54,13 @@ class WarpSteps:
     def _batch(self, names: tuple[str, ...]) -> Any:
         """The same for W worlds, all arrays with a leading axis."""
 
-        @jax.custom_batching.custom_vmap
         def run(controls: jax.Array, *arrays: jax.Array) -> list[jax.Array]:
             # Memory must be there before a graph is captured; steps follow one another in memory.
             with wp.ScopedDevice(warp_call.device()):
                 self._worlds(len(controls))
             return self._callable(names)(jnp.swapaxes(controls, 0, 1), *arrays)
 
-        @run.def_vmap
-        def _(size: int, batched: Sequence[bool], *arrays: jax.Array) -> Any:
-            # Worlds of worlds are just worlds.
-            full = [
-                x if given else jnp.broadcast_to(x, (size, *x.shape))
-                for x, given in zip(arrays, batched, strict=True)
-            ]
-            results = run(*(x.reshape(-1, *x.shape[2:]) for x in full))
-            return [x.reshape(size, -1, *x.shape[1:]) for x in results], [True] * len(results)
-
-        return run
+        return warp_call.flattening_vmap(run)
 
     def _callable(self, names: tuple[str, ...]) -> Any:
         """JAX's way into Warp: controls [S, W, nu], changed fields, `_FIXED`, `MOVING`."""

@@ -15,36 +15,27 @@ import warp as wp
 from mujoco.mjx.third_party import mujoco_warp
 
 from envs import warp_call
-from envs.render_model import Look, RenderModel
+from envs.render import Look, RayRenderer
 
 _PER_WORLD = ("geom_size", "geom_rgba", "mat_rgba", "cam_fovy")  # fields of the model
 _POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "light_xdir")  # of data
 
 
 class WarpRenderer:
-    """Pictures of `num_worlds` worlds a call; its memory is taken when it is made."""
+    """Pictures of any number of worlds; its memory is taken when it is made, and kept for good."""
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        own: RenderModel,
-        *,
-        num_worlds: int,
-        image_size: int,
-        samples: int,
-    ) -> None:
+    def __init__(self, model: mujoco.MjModel, rays: RayRenderer, num_worlds: int) -> None:
         """Prepare a model.
 
         Args:
             model: what all worlds share, with a light called lamp.
-            own: the ray caster's view of it, for its cameras and its look.
-            num_worlds: worlds a call.
-            image_size: height and width of the pictures [px].
-            samples: n for n x n rays a pixel.
+            rays: the ray caster for it, whose cameras, look and kind of picture are taken over.
+            num_worlds: worlds that Warp draws at a time.
         """
-        self._mujoco, self._own = model, own
+        self._mujoco, self._own = model, rays.model
         # Warp's own way to take several rays a pixel cannot vary the field of view.
-        self._num_worlds, self._image_size, self._samples = num_worlds, image_size, samples
+        self.image_size, self.samples = rays.image_size, rays.samples
+        self._num_worlds = num_worlds
         with wp.ScopedDevice(warp_call.device()):
             self._model = mujoco_warp.put_model(_lamplit(model))
             self._data = mujoco_warp.make_data(model, nworld=num_worlds)
@@ -52,7 +43,7 @@ class WarpRenderer:
                 mujoco_warp.create_render_context(
                     _lamplit(model),
                     nworld=num_worlds,
-                    cam_res=(samples * image_size, samples * image_size),
+                    cam_res=(rays.samples * rays.image_size,) * 2,  # pyright: ignore
                     render_rgb=True,
                     render_depth=False,
                     cam_active=[camera],
@@ -62,9 +53,10 @@ class WarpRenderer:
                     use_precomputed_rays=False,  # fields of view differ from world to world
                     enable_specular=False,
                 )
-                for camera in own.cameras
+                for camera in self._own.cameras
             ]
         self._render = self._callable()
+        self._batch = warp_call.flattening_vmap(self._all)
 
     def __call__(
         self, poses: Sequence[jax.Array], look: Look | None, size: jax.Array | None
@@ -77,6 +69,12 @@ class WarpRenderer:
                 shares must be brighter or darker by one factor; sky and squares keep their own.
             size: `[N, G, 3]` sizes of geoms; None for the model's own.
         """
+        return self._batch(tuple(poses), look, size)
+
+    def _all(
+        self, poses: Sequence[jax.Array], look: Look | None, size: jax.Array | None
+    ) -> jax.Array:
+        """Pictures of all worlds, chunk by chunk."""
         number, chunk = len(poses[0]), self._num_worlds
 
         def every(x: Any) -> jax.Array:
@@ -84,22 +82,21 @@ class WarpRenderer:
 
         look = jax.tree.map(every, self._own.look) if look is None else look
         size = every(self._own.size) if size is None else size
-        worlds = (tuple(poses), look, size)
         # A call takes exactly `num_worlds`: the last chunk is filled up with the last world.
         rest = -number % chunk
-        worlds = jax.tree.map(
-            lambda x: jnp.concatenate([x, jnp.repeat(x[-1:], rest, axis=0)]).reshape(
-                -1, chunk, *x.shape[1:]
-            ),
-            worlds,
-        )
+
+        def chunks(x: jax.Array) -> jax.Array:
+            filled = jnp.concatenate([x, jnp.repeat(x[-1:], rest, axis=0)])
+            return filled.reshape(-1, chunk, *x.shape[1:])
+
+        worlds = jax.tree.map(chunks, (poses, look, size))
         pictures = jax.lax.map(lambda world: self._pictures(*world), worlds)
         return pictures.reshape(-1, *pictures.shape[2:])[:number]
 
     def _pictures(self, poses: Sequence[jax.Array], look: Look, size: jax.Array) -> jax.Array:
         """Pictures of one chunk."""
         geom_xpos, geom_xmat, cam_xpos, cam_xmat = poses
-        worlds, side = self._num_worlds, self._image_size
+        worlds, side = self._num_worlds, self.image_size
         own, light = self._own.look, -look.light
         direction = (
             jnp.zeros((worlds, self._mujoco.nlight, 3))
@@ -111,7 +108,7 @@ class WarpRenderer:
         per_world = (size, look.rgba, self._material_colours(look), look.fovy)
         lights = (direction, *jnp.moveaxis(place, 1, 0))
         packed = self._render(*per_world, geom_xpos, geom_xmat, cam_xpos, cam_xmat, *lights)
-        rays = (side, self._samples) * 2
+        rays = (side, self.samples) * 2
         packed = jnp.stack(packed, axis=1).reshape(worlds, len(packed), *rays)
         rgb = jnp.stack([(packed >> shift) & 0xFF for shift in (16, 8, 0)], axis=-1)
         rgb = jnp.mean(rgb.astype(jnp.float32), axis=(3, 5))

@@ -5,7 +5,8 @@
 
 The file describes an arm: hinges from its base to a hand with two sliding fingers, which are found
 by what they are, not by name, and a position actuator for each hinge and for the fingers. Joints,
-masses, gains, meshes and the pose of the base are kept. What a scene has of its own is not: floor,
+masses, gains, meshes, names (after "robot/") and the pose of the base are kept; a hinge's limits
+are both its range and its actuator's ctrlrange. What a scene has of its own is not kept: floor,
 lights, options, keyframes, sensors, tendons, equalities. A camera "wrist" is the wrist camera; an
 arm without one gets that of the robots of this package. Of the arm only the fingers touch things,
 each with a box around the ends of its colliding geoms and a small sphere at the tip, like the
@@ -18,6 +19,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from envs import scene
 from envs.mjcf import attaching, hands, posing, reading
 from envs.robots import Robot
 
@@ -49,29 +51,37 @@ def load(
         ValueError: if the file cannot be read, or lacks something that the tasks need: the message
             says what, and what there is instead.
     """
-    spec, model = reading.read(path)
     try:
-        arm = reading.find_arm(model)
-        hand = hands.find(model, arm, tcp)
-        gripper = reading.find_gripper(model, arm, hand.signs)
-        limits = model.jnt_range[arm.joints]
-        robot = Robot(
-            name=str(path),
-            chain=hand.chain,
-            tool=hand.tool,
-            lower=limits[:, 0],
-            upper=limits[:, 1],
-            speed=_positive("speed", speed, len(limits)),
-            home=_guess(model, arm),
-            lean=0.0,
-            tilt_side=1,
-            stroke=hand.stroke,
-            gripper_speed=float(_positive("gripper_speed", gripper_speed, 1)[0]),
-            body=attaching.prepare(spec, model, arm, gripper, hand),
-        )
+        robot = _found(path, tcp, speed, gripper_speed)
+        scene.build("", robot)  # what MuJoCo refuses is said here, not when a task is made
         return posing.posed(robot)
     except ValueError as error:
-        raise ValueError(f"robot {path}: {error}") from None
+        raise ValueError(f"robot {path}: {' '.join(str(error).split())}") from None
+
+
+def _found(
+    path: str | os.PathLike[str], tcp: str | None, speed: float | Sequence[float], gripper: float
+) -> Robot:
+    """What the file says of a robot; its home is a guess, its lean and tilt side are unknown."""
+    spec, model = reading.read(path)
+    arm = reading.find_arm(model)
+    hand = hands.find(model, arm, tcp)
+    lower, upper = reading.find_limits(model, arm)
+    pull = reading.find_gripper(model, arm, hand.signs)
+    return Robot(
+        name=str(path),
+        chain=hand.chain,
+        tool=hand.tool,
+        lower=lower,
+        upper=upper,
+        speed=_positive("speed", speed, len(lower)),
+        home=_guess(model, arm, (lower + upper) / 2),
+        lean=0.0,
+        tilt_side=1,
+        stroke=hand.stroke,
+        gripper_speed=float(_positive("gripper_speed", gripper, 1)[0]),
+        body=attaching.prepare(spec, model, arm, pull, hand),
+    )
 
 
 def _positive(name: str, given: float | Sequence[float], count: int) -> np.ndarray:
@@ -81,9 +91,9 @@ def _positive(name: str, given: float | Sequence[float], count: int) -> np.ndarr
     return np.broadcast_to(numbers, count).copy()
 
 
-def _guess(model: mujoco.MjModel, arm: reading.Arm) -> np.ndarray:
+def _guess(model: mujoco.MjModel, arm: reading.Arm, middle: np.ndarray) -> np.ndarray:
     """Joint angles [J] near which to look for the start pose: the keyframe "home" or mid-range."""
     for i in range(model.nkey):
         if model.key(i).name == "home":
             return model.key_qpos[i, model.jnt_qposadr[arm.joints]]
-    return model.jnt_range[arm.joints].mean(axis=1)
+    return middle

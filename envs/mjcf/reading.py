@@ -20,6 +20,7 @@ class Arm(NamedTuple):
     joints: list[int]  # hinges from the base to the hand
     fingers: list[int]  # the two fingers' slides
     servos: list[int]  # actuators of the hinges
+    gears: list[float]  # how fast their lengths grow with the hinges
 
 
 class Gripper(NamedTuple):
@@ -37,14 +38,14 @@ def read(path: str | os.PathLike[str]) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
         ValueError: if there is none, or MuJoCo does not take it.
     """
     if not Path(path).is_file():
-        raise ValueError(f"there is no robot file {path}")
+        raise ValueError("there is no such file")
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         # Bodies and geoms keep their numbers.
         spec.compiler.fusestatic = spec.compiler.discardvisual = False
         return spec, spec.compile()
     except ValueError as error:
-        raise ValueError(f"MuJoCo cannot read the robot {path}: {error}") from error
+        raise ValueError(f"MuJoCo cannot read it: {error}") from error
 
 
 def find_arm(model: mujoco.MjModel) -> Arm:
@@ -72,7 +73,28 @@ def find_arm(model: mujoco.MjModel) -> Arm:
         raise ValueError(f"{_names(model, others)}: neither part of the arm nor one of its fingers")
     if free := [joint for joint in (*joints, *fingers) if not model.jnt_limited[joint]]:
         raise ValueError(f"every joint needs a range; {_names(model, free)} have none")
-    return Arm(base, joints, fingers, [_servo(model, joint) for joint in joints])
+    servos, gears = zip(*(_servo(model, joint) for joint in joints), strict=True)
+    return Arm(base, joints, fingers, list(servos), list(gears))
+
+
+def find_limits(model: mujoco.MjModel, arm: Arm) -> tuple[np.ndarray, np.ndarray]:
+    """Least and largest angles [J] that the hinges have and their servos can be told [rad].
+
+    Raises:
+        ValueError: if there are none.
+    """
+    lower, upper = model.jnt_range[arm.joints].T
+    told = np.where(
+        model.actuator_ctrllimited[arm.servos, None],
+        model.actuator_ctrlrange[arm.servos],
+        (-np.inf, np.inf),
+    )
+    lower, upper = np.maximum(lower, told[:, 0]), np.minimum(upper, told[:, 1])
+    if none := [joint for joint, room in zip(arm.joints, upper - lower, strict=True) if room <= 0]:
+        raise ValueError(
+            f"{_names(model, none)}: range and the actuator's ctrlrange do not overlap"
+        )
+    return lower, upper
 
 
 def find_gripper(model: mujoco.MjModel, arm: Arm, signs: np.ndarray) -> Gripper:
@@ -100,16 +122,18 @@ def find_gripper(model: mujoco.MjModel, arm: Arm, signs: np.ndarray) -> Gripper:
     )
 
 
-def _servo(model: mujoco.MjModel, joint: int) -> int:
+def _servo(model: mujoco.MjModel, joint: int) -> tuple[int, float]:
+    """The actuator that moves this joint alone, and its rate."""
     rates = _rates(model, joint)
-    for i in np.flatnonzero(rates).tolist():
+    others = np.any([_rates(model, j) for j in range(model.njnt) if j != joint], axis=0)
+    for i in np.flatnonzero(rates * ~others).tolist():
         gain = model.actuator_gainprm[i, 0]
         # Without force where length, rate times angle, makes up for the control: there they agree.
         if _is_servo(model, i) and np.isclose(gain, -model.actuator_biasprm[i, 1] * rates[i]):
-            return i
+            return i, float(rates[i])
     raise ValueError(
-        f"joint {_names(model, [joint])} needs a position actuator, whose control is its angle; "
-        f"{_actuators(model)}"
+        f"joint {_names(model, [joint])} needs a position actuator of its own, whose control "
+        f"is its angle; {_actuators(model)}"
     )
 
 

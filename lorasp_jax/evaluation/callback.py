@@ -12,7 +12,9 @@ import numpy as np
 from rich.progress import Progress
 
 import envs
+from envs import physics
 from envs.env import Env
+from envs.render import RayRenderer
 from lorasp_jax import adaptation
 from lorasp_jax.data.demonstrations import side_by_side
 from lorasp_jax.evaluation import video
@@ -57,7 +59,9 @@ class Evaluation(Callback):
         with run.timed("evaluate"), bars(run.console, "episodes") as progress:
             one = functools.partial(self._measure_task, run, when, progress)
             tasks = run.config.tasks
-            results = dict(zip(tasks, side_by_side(one, tasks), strict=True))
+            # Warp is not for threads.
+            each = map if physics.default_backend() == "warp" else side_by_side
+            results = dict(zip(tasks, each(one, tasks), strict=True))
         for task, result in results.items():
             low, high = (100 * bound for bound in result.ci95)
             run.console.print(
@@ -147,7 +151,7 @@ def _mean(trees: list[Any]) -> Any:
 
 def _film(env: Env, result: Result, path: Path) -> None:
     """Render a recorded episode at film size and write it at the control rate."""
-    camera = dataclasses.replace(env, image_size=video.FILM_SIZE)
+    camera = dataclasses.replace(env, renderer=RayRenderer(env.render_model, video.FILM_SIZE, 1))
     images = jax.jit(camera.render)(*result.poses)
     frames = video.side_by_side({name: np.asarray(image) for name, image in images.items()})
     video.write_video(path, frames, fps=1 / env.control_dt)

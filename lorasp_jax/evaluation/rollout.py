@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.env import Env
+from envs.randomization import Randomization
 from envs.state import State
 from lorasp_jax import adaptation
 from lorasp_jax.evaluation import metrics
@@ -69,12 +70,16 @@ class Result:
 
 
 def make_rollout(
-    env: Env, *, execute_steps: int = 5, denoise_steps: int = 10
+    env: Env,
+    *,
+    execute_steps: int = 5,
+    denoise_steps: int = 10,
+    ranges: Randomization | None = None,
 ) -> Callable[[Policy, jax.Array], Rollout]:
     """The rollout of `env.num_envs` episodes, a pure function of policy and key, ready for jit.
 
     Every `execute_steps` control steps the policy looks and draws a new chunk with `denoise_steps`
-    Euler steps.
+    Euler steps. `ranges` are those of `env.reset`; the recorded poses know nothing of colours.
     """
     looks = -(-env.max_steps // execute_steps)
 
@@ -85,7 +90,7 @@ def make_rollout(
         reset_key, sample_key = jax.random.split(key)
         look = functools.partial(_look, env, policy, execute_steps, denoise_steps)
         state, (poses, ranks, histogram, running) = jax.lax.scan(
-            look, env.reset(reset_key), jax.random.split(sample_key, looks)
+            look, env.reset(reset_key, ranges), jax.random.split(sample_key, looks)
         )
         weights = running / jnp.maximum(running.sum(), 1)
         mean = functools.partial(jnp.tensordot, weights, axes=1, precision="highest")

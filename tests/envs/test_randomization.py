@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import envs
-from envs import collection, experts, randomization
+from envs import actions, collection, experts, randomization
 from envs.randomization import Randomization
 
 WORLDS, STEPS = 2, 50  # the expert lifts the grape at about step 35
@@ -117,17 +117,14 @@ def test_brightness_scales_the_pictures(episode, neutral):
     assert dark / bright == pytest.approx(0.5, abs=0.03)
 
 
-def test_latency_delays_what_is_sent(env, neutral):
-    info = jax.tree.map(lambda x: x[0], neutral[2].info)
-    target = info["command"] + 0.05
-
-    def sent(latency):
-        draw = dataclasses.replace(info["draw"], latency=jnp.float32(latency))
-        return np.asarray(env._controls(info | {"draw": draw}, target))
-
-    now, late = sent(0.0), sent(0.04)
+def test_latency_delays_what_is_sent():
+    commands = jnp.array([[0.0, 0.02], [0.1, 0.04], [0.3, 0.0]])
+    now, late = (np.asarray(actions.interpolate(commands, 0.1, x)) for x in (0.0, 0.04))
     np.testing.assert_array_equal(late[8:], now[:-8])  # 8 physics steps of 5 ms
-    np.testing.assert_allclose(now[-1, :-1], target[:-1], atol=1e-6)
+    np.testing.assert_allclose(now[[0, -1]], [[0.14, 0.016], [0.3, 0.0]], atol=1e-6)
+    np.testing.assert_allclose(late[0], [0.08, 0.018], atol=1e-6)
+    last = np.asarray(actions.interpolate(commands, 0.1, 0.1))
+    np.testing.assert_allclose(last[-1], [0.1, 0.02], atol=1e-6)
 
 
 def test_recorded_pictures_show_each_world_as_it_is(env):
@@ -178,12 +175,26 @@ def mujoco_xml(env):
 @pytest.mark.parametrize(
     ("ranges", "message"),
     [
-        ({"mass": (2.0, 1.0)}, "mass must be"),
+        ({"mass": (2.0, 1.0)}, "mass must be two finite numbers"),
         ({"friction": (0.0, 1.0)}, "friction is a factor"),
-        ({"size": (1.0, 1.5)}, "size must be at most 1.25"),
+        ({"mass": 2.0}, "mass must be two finite numbers"),
+        ({"position": (-np.inf, 0.0)}, "position must be two finite numbers"),
+        ({"size": (1.0, 1.5)}, "size must lie in 0.8 to 1.25"),
+        ({"field_of_view": (-90.0, 0.0)}, "field_of_view must lie in -20"),
         ({"latency": (0.0, 0.2)}, "latency must lie in 0 to 0.1 s"),
     ],
 )
 def test_senseless_ranges_are_refused(env, ranges, message):
     with pytest.raises(ValueError, match=message):
         env.reset(jax.random.key(0), Randomization(**ranges))
+    with pytest.raises(ValueError, match=message):
+        envs.expert_success(
+            "press", num_episodes=1, key=jax.random.key(0), ranges=Randomization(**ranges)
+        )
+
+
+def test_reset_done_wants_the_ranges_of_reset(env):
+    key, ranges = jax.random.key(0), Randomization()
+    for first, second in ((None, ranges), (ranges, None)):
+        with pytest.raises(ValueError, match="reset_done needs ranges if, and only if"):
+            env.reset_done(env.reset(key, first), key, second)

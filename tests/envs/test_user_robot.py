@@ -86,7 +86,7 @@ def test_lean_and_tilt_of_known_robots_are_found(name):
 
 def test_scene_has_the_arm_alone(model):
     names = [model.body(i).name for i in range(model.nbody)]
-    assert names[1:3] == ["base", "robot/base"]
+    assert names[1:3] == ["base", "robot/column"]
     assert "button" in names
     assert not any("ball" in name for name in names)
     assert (model.nlight, model.opt.timestep, model.opt.cone) == (2, scene.PHYSICS_DT, 0)
@@ -150,6 +150,69 @@ def test_own_wrist_camera_is_kept(tmp_path):
     model = scene.build(press.TASK.scene, robot)
     assert model.camera("wrist").fovy[0] == 33
     assert model.body(model.camera("wrist").bodyid[0]).name == "robot/flange"
+
+
+def built(folder: Path, *edits: tuple[str, str]) -> mujoco.MjModel:
+    return scene.build(press.TASK.scene, mjcf.load(write(folder, *edits)))
+
+
+def test_names_may_be_those_of_the_scene(tmp_path):
+    edits = [(f'"{old}"', f'"{new}"') for old, new in zip("ab", ("right", "left"), strict=True)]
+    edits += [('"upper"', '"base"'), ('"lower"', '"button"'), ('"yaw"', '"gripper"')]
+    edits += [('"column"', '"hand"'), ('"blue"', '"table"'), ('"shell"', '"squares"')]
+    edits += [('name="elbow" axis', 'name="tcp" axis'), ('"elbow"', '"tcp"')]
+    camera = '<camera name="side" mode="targetbody" target="hand"/><site name="askew"'
+    model = built(tmp_path, *edits, ('<site name="askew"', camera))
+    names = [model.joint(i).name for i in range(8)]
+    assert names[:3] == ["robot/gripper", "robot/shoulder", "robot/tcp"]
+    assert names[6:] == ["left", "right"]
+    target = model.cam_targetbodyid[model.camera("robot/side").id]
+    assert model.body(target).name == "robot/hand"
+
+
+def test_a_hinge_may_be_called_left_and_the_rest_nothing(tmp_path):
+    edits = [('<body name="column"', "<body"), ('"shoulder"', '"left"')]
+    edits += [('joint name="b"', 'joint name="number 8"'), ('joint="b"', 'joint="number 8"')]
+    model = built(tmp_path, *edits, ('joint2="b"', 'joint2="number 8"'))
+    assert model.joint("robot/left").id == 1
+    assert model.actuator("robot/left").trnid[0] == 1
+    assert model.actuator("gripper").trnid[0] == model.joint("left").id == 6
+
+
+def test_small_meshes_are_not_drawn(tmp_path):
+    model = built(tmp_path, ('name="shell"', 'name="shell" scale=".05 .05 .05"'))
+    assert np.sum(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH) == 1
+    drawn = render.build(model, ["side"]).geoms
+    assert not np.any(model.geom_type[list(drawn)] == mujoco.mjtGeom.mjGEOM_MESH)
+
+
+def test_limits_are_also_those_of_the_actuators(tmp_path):
+    edit = ('<position name="yaw" joint="yaw"', '<position name="yaw" joint="yaw" ctrlrange="-1 9"')
+    robot = mjcf.load(write(tmp_path, edit))
+    assert (robot.lower[0], robot.upper[0]) == pytest.approx((-1, np.deg2rad(150)))
+
+
+def test_a_tendon_may_turn_a_hinge(tmp_path):
+    edits = (
+        ("</tendon>", '<fixed name="belt"><joint joint="yaw" coef="2"/></fixed></tendon>'),
+        (
+            '<position name="yaw" joint="yaw"/>',
+            '<general tendon="belt" ctrlrange="-3 3" biastype="affine" gainprm="100"'
+            ' biasprm="0 -50 -4"/>',
+        ),
+    )
+    model = built(tmp_path, *edits)
+    assert model.actuator("robot/yaw").gear[0] == 2
+    np.testing.assert_allclose(model.actuator("robot/yaw").biasprm[:3], [0, -50, -4])
+
+
+def test_colours_are_the_geoms_own(tmp_path):
+    geoms = '<default class="robot"><geom contype="1"'
+    model = built(tmp_path, (geoms, f'{geoms} material="blue"'))
+    arm = model.body_rootid[model.geom_bodyid] == model.body("base").id
+    assert np.all(model.geom_matid[arm] < 0)
+    drawn = arm & (model.geom_rgba[:, 3] > 0)
+    assert np.sum(np.all(np.isclose(model.geom_rgba[drawn], [0.1, 0.2, 0.9, 1]), axis=1)) == 8
 
 
 def test_ray_caster_draws_something_in_the_place_of_a_mesh(robot, model):

@@ -38,7 +38,7 @@ _MISSING = (
         [(' range="-30 130"', ""), (' range=".005 .045"', "")],
     ),
     (
-        "joint elbow needs a position actuator, whose control is its angle; the actuators are grip",
+        "joint elbow needs a position actuator of its own, whose control is its angle; the",
         [('<position name="elbow"', '<motor name="elbow"')],
     ),
     (
@@ -71,7 +71,35 @@ _MISSING = (
         "a site tcp is needed, z out of the hand and y along which the fingers open",
         [('name="turn" axis="0 0 -1"', 'name="turn" axis="0 1 0"')],
     ),
-    ("MuJoCo cannot read the robot", [("</mujoco>", "")]),
+    (
+        "joint yaw needs a position actuator of its own",
+        [
+            (
+                "</tendon>",
+                '<fixed name="belt"><joint joint="yaw" coef="1"/>'
+                '<joint joint="roll" coef="1"/></fixed></tendon>',
+            ),
+            ('<position name="yaw" joint="yaw"', '<position name="yaw" tendon="belt"'),
+        ],
+    ),
+    (
+        "pitch: range and the actuator's ctrlrange do not overlap",
+        [('joint="pitch"/>', 'joint="pitch" ctrlrange="-3 -2"/>')],
+    ),
+    (
+        "mocap body 'robot/column' is not a fixed child of world",
+        [('childclass="robot"', 'childclass="robot" mocap="true"')],
+    ),
+    (
+        "target body",
+        [
+            (
+                '<site name="aside"',
+                '<camera name="wrist" mode="targetbody" target="ball"/><site name="aside"',
+            )
+        ],
+    ),
+    ("MuJoCo cannot read it", [("</mujoco>", "")]),
     ("the hand must reach x 0.34 m, y 0 m, z 0.18 m", [('range="0 160"', 'range="0 5"')]),
 )
 
@@ -81,7 +109,15 @@ def test_what_is_missing_is_named(tmp_path, message, edits):
     file = write(tmp_path, *edits)
     with pytest.raises(ValueError, match=re.escape(message)) as raised:
         mjcf.load(file)
-    assert str(file) in str(raised.value)
+    assert str(raised.value).startswith(f"robot {file}: ")
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
+def test_a_total_mass_is_refused(tmp_path):
+    file = write(tmp_path, ('angle="degree"', 'angle="degree" settotalmass="9"'))
+    with pytest.raises(ValueError, match="settotalmass is not supported"):
+        mjcf.load(file)
 
 
 @pytest.mark.parametrize(
@@ -101,7 +137,7 @@ def test_wrong_options_are_named(tmp_path, options, message):
 
 
 def test_missing_file_is_named():
-    with pytest.raises(ValueError, match=r"there is no robot file nowhere\.xml"):
+    with pytest.raises(ValueError, match=r"robot nowhere\.xml: there is no such file"):
         envs.make("press", "nowhere.xml")
 
 

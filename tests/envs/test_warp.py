@@ -39,6 +39,10 @@ def test_the_backend_is_picked_by_the_device(pair, monkeypatch):
     gpu = type("Device", (), {"client": type("Client", (), {"platform_version": "cuda 13000"})})
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(jax, "devices", lambda: [gpu])
+    assert physics.default_backend() == "jax"  # eight devices here
+    with pytest.raises(ValueError, match="backend 'warp' works on one GPU, but JAX sees 8"):
+        make("press", backend="warp")
+    monkeypatch.setattr(jax, "device_count", lambda: 1)
     assert physics.default_backend() == "warp"
     monkeypatch.setattr(physics.importlib.util, "find_spec", lambda name: None)
     assert physics.default_backend() == "jax"
@@ -95,3 +99,7 @@ def test_pictures_match_the_ray_caster(ranges, antialias):
     seen = theirs.observe(state)["image"]
     for name, picture in pictures.items():
         np.testing.assert_array_equal(picture, jnp.concatenate([seen[name], seen[name][:1]]))
+    # A further vmap makes more worlds of it.
+    twice = jax.vmap(theirs.observe)(jax.tree.map(lambda x: jnp.stack([x, x]), state))["image"]
+    for name, picture in twice.items():
+        np.testing.assert_array_equal(picture[1], seen[name])
