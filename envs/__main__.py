@@ -1,6 +1,7 @@
 """Command line: `python -m envs collect | gallery | play --help`."""
 
 import argparse
+import math
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -33,15 +34,17 @@ def main(arguments: Sequence[str]) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m envs", description="Scripted expert episodes.")
     subparsers = parser.add_subparsers(required=True, metavar="command")
-    tasks, robots = ", ".join(commands.names(envs.tasks)), ", ".join(commands.names(envs.robots))
+    tasks = ", ".join(commands.names(envs.tasks))
+    robots = f"{', '.join(commands.names(envs.robots))}, or the path of an MJCF file"
 
-    def add(command: Callable[..., None], image_size: int) -> Callable[..., Any]:
+    def add(command: Callable[..., None], image_size: int, of: str = "") -> Callable[..., Any]:
         text = command.__doc__
         sub = subparsers.add_parser(command.__name__, help=text, description=text)
         sub.set_defaults(command=command)
-        sub.add_argument("--overwrite", action="store_true", help="replace what is there")
-        sub.add_argument("--image-size", type=int, default=image_size, help="pixels (%(default)s)")
-        sub.add_argument("--seed", type=int, default=0, help="of all randomness (%(default)s)")
+        sub.add_argument("--overwrite", action="store_true", help=f"{of}replace what is there")
+        pixels = f"{of}pixels (%(default)s)"
+        sub.add_argument("--image-size", type=int, default=image_size, help=pixels)
+        sub.add_argument("--seed", type=seed, default=0, help="of all randomness (%(default)s)")
         return sub.add_argument
 
     option = add(commands.collect, image_size=64)
@@ -50,9 +53,9 @@ def _parser() -> argparse.ArgumentParser:
     option("--out", required=True, type=Path, help="folder; one task: a dataset or an .npz file")
     option("--num-episodes", type=int, default=64, help="of each task (%(default)s)")
     option("--num-envs", type=int, help="worlds at once (default: by device)")
-    option("--control-dt", type=float, default=0.1, help="s between two actions (%(default)s)")
+    option("--control-dt", type=finite, default=0.1, help="s between two actions (%(default)s)")
     option("--actions", default="joint", help=f"{', '.join(actions.MODES)} (%(default)s)")
-    option("--action-noise", type=float, default=0.0, help="rad (%(default)s)")
+    option("--action-noise", type=finite, default=0.0, help="rad (%(default)s)")
     option("--distractors", type=int, default=0, help=f"up to {distractors.MOST} (%(default)s)")
     option("--randomize", action="store_true", help="masses, cameras, light and more differ")
     option("--antialias", type=int, default=1, help="rays a pixel, squared (%(default)s)")
@@ -62,11 +65,25 @@ def _parser() -> argparse.ArgumentParser:
     option("--robot", help=f"{robots} (default: all)")
     option("--out", required=True, type=Path, help="folder")
 
-    option = add(commands.play, image_size=256)
+    option = add(commands.play, image_size=256, of="with --out: ")
     option("--task", required=True, help=tasks)
     option("--robot", required=True, help=robots)
     option("--out", type=Path, help=".mp4 file (default: a window)")
     return parser
+
+
+def seed(text: str) -> int:
+    """A seed of JAX, which takes no more than 32 bits of one; argparse says what does not fit."""
+    if not 0 <= (value := int(text)) < 2**32:
+        raise argparse.ArgumentTypeError(f"must be 0 to {2**32 - 1}, not {value}")
+    return value
+
+
+def finite(text: str) -> float:
+    """A number, neither infinite nor nan; argparse says what is none."""
+    if not math.isfinite(value := float(text)):
+        raise argparse.ArgumentTypeError(f"must be a finite number, not {text}")
+    return value
 
 
 if __name__ == "__main__":

@@ -2,58 +2,49 @@
 
 import argparse
 import contextlib
-import dataclasses
 import pkgutil
 import shutil
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import jax
-import mujoco
 import numpy as np
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    SpinnerColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 import envs
 import envs.robots
 import envs.tasks
-from envs import collection, rlds, videos
+from envs import collection, places, recipes, rlds, videos
+from envs.bars import Report, bars
 from envs.episodes import Episodes, replacing
 
 WORLDS = 4
 """Tries at once where one episode is wanted: the expert may fail in one."""
 _EVERY = 2  # control steps to a picture of a GIF
 
-Report = Callable[[int, int], None]
-"""Called with the episodes that are done and those that are wanted."""
-
 
 def collect(options: argparse.Namespace, console: Console) -> None:
     """Writes successful expert episodes, an RLDS dataset for every task; continues if stopped."""
-    tasks = names(envs.tasks) if options.task == ["all"] else options.task
+    tasks = names(envs.tasks) if options.task == ["all"] else list(dict.fromkeys(options.task))
     out: Path = options.out
     if len(tasks) > 1 and out.suffix == ".npz":
         raise ValueError(f"{out} can hold one task, not {len(tasks)}: give a folder as --out")
     files = [out / task for task in tasks] if len(tasks) > 1 else [out]
     scenes = [_scene(options, task) for task in tasks]  # bad input shows before any work
-    left = {f: e for f, e in zip(files, scenes, strict=True) if not _is_done(options, e, f)}
-    try:
-        found = _side_by_side(options, left, console)
-    except KeyboardInterrupt:
-        kept = [_kept(f, options.num_episodes) for f in left if _unfinished(f).exists()]
-        raise KeyboardInterrupt("; ".join(kept)) from None
+    with contextlib.ExitStack() as locks:
+        for file in files:
+            locks.enter_context(places.alone(file))
+            places.recover(file)
+        left = {f: e for f, e in zip(files, scenes, strict=True) if not _is_done(options, e, f)}
+        try:
+            found = _side_by_side(options, left, console)
+        except KeyboardInterrupt:
+            kept = [_kept(f, options.num_episodes) for f in left if _unfinished(f).exists()]
+            raise KeyboardInterrupt("; ".join(kept)) from None
     for file in files:
         if file in found:
             console.print(f"{file}: {found[file]}", soft_wrap=True)
@@ -107,7 +98,7 @@ def names(package: ModuleType) -> list[str]:
 
 def _scene(options: argparse.Namespace, task: str) -> envs.Env:
     """The worlds to collect in."""
-    return collection.make_repeatable(
+    env = collection.make_repeatable(
         task,
         options.robot,
         num_envs=collection.worlds(options.num_episodes, options.num_envs),
@@ -117,6 +108,9 @@ def _scene(options: argparse.Namespace, task: str) -> envs.Env:
         actions=options.actions,
         distractors=options.distractors,
     )
+    if ranges := recipes.ranges(options):
+        ranges.check(env.control_dt)
+    return env
 
 
 def _is_done(options: argparse.Namespace, env: envs.Env, file: Path) -> bool:
@@ -125,12 +119,22 @@ def _is_done(options: argparse.Namespace, env: envs.Env, file: Path) -> bool:
     Raises:
         ValueError: if something else stands there that must not be replaced.
     """
-    if file.exists() and file.suffix != ".npz":
+    if not file.exists():
+        return False
+    recipe, left = recipes.recipe(options, env), _unfinished(file)
+    if file.suffix != ".npz":
         made = rlds.metadata(file)["options"]  # nothing but a dataset is ever replaced
-        if made == _recipe(options, env) and not options.overwrite:
+        if made == recipe and not options.overwrite:
             return True
+    elif left.exists() and _is_complete(rlds.metadata(left), recipe):
+        return False  # perhaps killed when all but these parts was in order: `_save` finds out
     _refuse_existing(options, file)
     return False
+
+
+def _is_complete(facts: Mapping[str, Any], recipe: Mapping[str, Any]) -> bool:
+    """Whether parts with these facts are all that was asked for."""
+    return facts["options"] == recipe and sum(facts["parts"]) == recipe["num_episodes"]
 
 
 def _side_by_side(
@@ -143,7 +147,7 @@ def _side_by_side(
     """
     stop = threading.Event()
     running: dict[Path, Future[str]] = {}
-    with _bars(console, stop) as new_bar, ThreadPoolExecutor() as pool:
+    with bars(console, stop) as new_bar, ThreadPoolExecutor() as pool:
         try:
             for file, env in scenes.items():
                 bar = new_bar(env.task.name, env.robot.name)
@@ -160,14 +164,14 @@ def _side_by_side(
 
 def _collect(options: argparse.Namespace, env: envs.Env, out: Path, report: Report) -> str:
     """Collects one task, from where an earlier call was stopped; returns what was made."""
-    parts = rlds.Parts(_unfinished(out), _recipe(options, env))
+    parts = rlds.Parts(_unfinished(out), recipes.recipe(options, env))
     report(parts.num_episodes, options.num_episodes)
     for part in collection.gather(
         env,
         options.num_episodes,
         jax.random.key(options.seed),
         options.action_noise,
-        _ranges(options),
+        recipes.ranges(options),
         kept=parts.num_episodes,
         attempted=parts.attempted,
     ):
@@ -176,41 +180,34 @@ def _collect(options: argparse.Namespace, env: envs.Env, out: Path, report: Repo
     parts.complete()
     size = sum(file.stat().st_size for file in parts.folder.iterdir())
     if out.suffix == ".npz":
-        rlds.read(parts.folder).save(out)
-        shutil.rmtree(parts.folder)
+        _save(options, parts.folder, out)
         size = out.stat().st_size
     else:
-        rlds.install(parts.folder, out)
+        places.install(parts.folder, out)
     return (
         f"{parts.num_episodes} episodes of {parts.attempted} tried, {parts.facts['steps']} steps, "
         f"{size / 1e6:.0f} MB"
     )
 
 
-def _recipe(options: argparse.Namespace, env: envs.Env) -> dict[str, Any]:
-    """All that the episodes depend on."""
-    return {
-        "task": env.task.name,
-        "robot": options.robot,
-        "num_episodes": options.num_episodes,
-        "num_envs": env.num_envs,
-        "image_size": env.image_size,
-        "antialias": env.antialias,
-        "control_dt": env.control_dt,
-        "actions": env.actions,
-        "distractors": env.distractors,
-        "action_noise": options.action_noise,
-        "randomize": dataclasses.asdict(ranges) if (ranges := _ranges(options)) else None,
-        "seed": options.seed,
-        "physics": env.physics.backend,
-        "device": jax.default_backend(),
-        "jax": jax.__version__,
-        "mujoco": mujoco.__version__,
-    }
+def _save(options: argparse.Namespace, folder: Path, out: Path) -> None:
+    """Makes one file of a dataset, which it deletes; an earlier call may have been killed between.
+
+    Raises:
+        ValueError: if another file stands there that must not be replaced.
+    """
+    episodes = rlds.read(folder)
+    if options.overwrite or not (out.exists() and _are_same(episodes, Episodes.load(out))):
+        _refuse_existing(options, out)
+        episodes.save(out)
+    shutil.rmtree(folder)
 
 
-def _ranges(options: argparse.Namespace) -> envs.Randomization | None:
-    return envs.Randomization.typical() if options.randomize else None
+def _are_same(one: Episodes, other: Episodes) -> bool:
+    """Whether arrays and facts agree."""
+    trees = [jax.tree.flatten(episodes) for episodes in (one, other)]
+    (leaves, facts), (other_leaves, other_facts) = trees
+    return facts == other_facts and all(map(np.array_equal, leaves, other_leaves))
 
 
 def _unfinished(out: Path) -> Path:
@@ -227,7 +224,7 @@ def _kept(out: Path, num_episodes: int) -> str:
 
 def _episode(options: argparse.Namespace, console: Console, task: str, robot: str) -> Episodes:
     """One episode of the expert."""
-    with _bars(console, threading.Event()) as new_bar:
+    with bars(console, threading.Event()) as new_bar:
         return envs.collect(
             task,
             robot,
@@ -244,42 +241,6 @@ def _views(episode: Episodes) -> np.ndarray:
     """The first episode as seen by all cameras beside one another, uint8 [T, H, K W, 3]."""
     steps = int(episode.length[0])
     return videos.side_by_side({k: np.asarray(p[0, :steps]) for k, p in episode.image.items()})
-
-
-@contextlib.contextmanager
-def _bars(console: Console, stop: threading.Event) -> Iterator[Callable[[str, str], Report]]:
-    """Progress bars: a function that makes one for a task and a robot, and gives what moves it.
-
-    Where `stop` is set, a report raises a KeyboardInterrupt.
-    """
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console) as progress:
-
-        def new_bar(task: str, robot: str) -> Report:
-            bar = progress.add_task(f"{task}, {robot}: compiling ...", total=None, rate="")
-            begun: list[int] = []  # how many there were at the first report
-
-            def report(done: int, total: int) -> None:
-                if stop.is_set():
-                    raise KeyboardInterrupt
-                progress.update(bar, completed=done, total=total)
-                begun.append(done)
-                if len(begun) > 1:
-                    rate = (done - begun[0]) / (progress.tasks[bar].elapsed or 1)
-                    text = f"{task}, {robot}: collecting"
-                    progress.update(bar, description=text, rate=f"{rate:.1f} episodes/s")
-
-            return report
-
-        yield new_bar
 
 
 def _refuse_existing(options: argparse.Namespace, file: Path) -> None:

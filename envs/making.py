@@ -1,6 +1,7 @@
 """Making an environment from the names of a task and a robot, which are those of their files."""
 
 import importlib
+import math
 import os
 import pkgutil
 from typing import Any, Literal, get_args
@@ -94,7 +95,7 @@ def _check_counts(**counts: int) -> None:
 
 def _check_options(control_dt: float, actions: str, distractors: int) -> None:
     moves = control_dt / TARGET_DT
-    if round(moves) < 1 or abs(moves - round(moves)) > 1e-6:
+    if not math.isfinite(moves) or round(moves) < 1 or abs(moves - round(moves)) > 1e-6:
         raise ValueError(
             f"control_dt must be a positive multiple of {TARGET_DT} s, got {control_dt}"
         )

@@ -14,7 +14,7 @@ import functools
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -46,6 +46,7 @@ def write(episodes: Episodes, path: str | os.PathLike) -> None:
 
     Raises:
         ValueError: if the path exists already or the arrays do not fit one another.
+        OSError: if there is no room for it.
     """
     path = Path(path)
     if path.exists():
@@ -83,22 +84,6 @@ def read(path: str | os.PathLike) -> Episodes:
             read_one = functools.partial(rlds_schema.episode, cameras=cameras, facts=shared)
             found = list(pool.map(lambda i: read_one(source[i]), range(len(source))))
         return replace(concatenate(found), attempted=facts["attempted"])
-
-
-def install(folder: Path, path: Path) -> None:
-    """Moves a complete dataset to its place; another one that stands there is replaced.
-
-    Raises:
-        ValueError: if something else stands there.
-    """
-    if not path.exists():
-        os.rename(folder, path)
-        return
-    metadata(path)  # only a dataset is ever deleted
-    old = path.with_name(f".{path.name}.{os.getpid()}.old")
-    os.rename(path, old)
-    os.rename(folder, path)
-    shutil.rmtree(old)
 
 
 def metadata(path: Path) -> dict[str, Any]:
@@ -171,6 +156,7 @@ class Parts:
 
         Raises:
             ValueError: if the arrays do not fit one another or the episodes not those before.
+            OSError: if there is no room for it; the parts before it are as they were.
         """
         episodes.validate()
         shared: dict[str, Any] = {name: getattr(episodes, name) for name in SHARED}
@@ -183,12 +169,9 @@ class Parts:
         _check_same(self.folder, {name: self.facts[name] for name in shared}, shared)
         record = functools.partial(rlds_schema.record, features, jax.tree.map(np.asarray, episodes))
         first, numbers = self.num_episodes, range(episodes.num_episodes)
-        file = self._file(len(self.facts["parts"]))
-        writer = array_record_module.ArrayRecordWriter(str(file), _RECORDS)
         with ThreadPoolExecutor() as pool:
-            for data in pool.map(record, numbers, range(first, first + len(numbers))):
-                writer.write(data)
-        writer.close()
+            data = pool.map(record, numbers, range(first, first + len(numbers)))
+            _write_records(self._file(len(self.facts["parts"])), data)
         self.facts["parts"].append(len(numbers))
         self.facts["steps"] += episodes.num_steps
         self.facts["attempted"] += episodes.attempted
@@ -226,7 +209,8 @@ class Parts:
 
     @property
     def _name(self) -> str:
-        return "{task}_{robot}".format(**self.facts)
+        robot = Path(self.facts["robot"]).stem  # a user's is a path
+        return f"{self.facts['task']}_{robot}"
 
     @property
     def _template(self) -> tfds.core.ShardedFileTemplate:
@@ -252,6 +236,16 @@ def _check_same(folder: Path, there: Mapping[str, Any], new: Mapping[str, Any]) 
             )
 
 
+def _write_records(file: Path, records: Iterable[bytes]) -> None:
+    """Raises an OSError if there is no room for all; the library's own error is another one."""
+    writer = array_record_module.ArrayRecordWriter(str(file), _RECORDS)
+    for record in records:
+        with _failure_in_one_sentence(file):
+            writer.write(record)
+    with _failure_in_one_sentence(file):
+        writer.close()
+
+
 def _check_whole(file: Path, episodes: int) -> None:
     """Raises a ValueError if a part is damaged; every record has a checksum."""
     with _damage_in_one_sentence(file, f": delete {file.parent} to start anew"):
@@ -266,6 +260,17 @@ def _damage_in_one_sentence(path: Path, remedy: str = "") -> Iterator[None]:
     try:
         yield
     except (OSError, RuntimeError, ValueError, KeyError, ParseError) as error:
-        # What the libraries say can be long; its beginning says what is wrong.
-        reason = str(error).split("; ")[0].split("\n")[0]
-        raise ValueError(f"{path} is damaged ({reason}){remedy}") from error
+        raise ValueError(f"{path} is damaged ({_reason(error)}){remedy}") from error
+
+
+@contextlib.contextmanager
+def _failure_in_one_sentence(file: Path) -> Iterator[None]:
+    try:
+        yield
+    except RuntimeError as error:
+        raise OSError(f"{file} could not be written ({_reason(error)})") from error
+
+
+def _reason(error: Exception) -> str:
+    """What the libraries say can be long; its beginning says what is wrong."""
+    return str(error).split("; ")[0].split("\n")[0]

@@ -2,9 +2,12 @@
 
 import itertools
 import os
+import shutil
 import signal
+import subprocess
 import sys
 import time
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -20,6 +23,13 @@ MOMENTS = {
     "before a further part": (collection, "_record", 4),
     "when all parts are there": (rlds.Parts, "complete", 1),
     "before the dataset is in place": (os, "rename", 1),
+}
+
+# Further moments, with what is made meanwhile.
+REPLACING = {
+    "between two datasets": (os, "rename", 2, "press"),
+    "before the old dataset is deleted": (shutil, "rmtree", 1, "press"),
+    "before the parts of a file are deleted": (shutil, "rmtree", 1, "press.npz"),
 }
 
 
@@ -51,11 +61,18 @@ def die_at(owner, name, call):
     setattr(owner, name, deadly)
 
 
-def collect_and_die(moment, out):
+def run_child(call):
+    """What the tests call: a process that runs one of the functions below to its end."""
+    code = f"from tests.envs import children; children.{call}"
+    root = Path(__file__).parents[2]
+    return subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, check=False)
+
+
+def collect_and_die(moment, out, options=""):
     """What a child process runs."""
     collection._record = fake_record
-    die_at(*MOMENTS[moment])
-    command_line.main([*COLLECT.split(), "--out", out])
+    die_at(*(MOMENTS | REPLACING)[moment][:3])
+    command_line.main([*COLLECT.split(), "--out", out, *options.split()])
 
 
 def collect_and_interrupt(out):

@@ -3,9 +3,6 @@
 import itertools
 import os
 import signal
-import subprocess
-import sys
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -14,17 +11,12 @@ from PIL import Image
 
 import envs
 from envs import __main__ as command_line
-from envs import collection, rlds
+from envs import collection, places, rlds
 from envs.episodes import Episodes
-from tests.envs.children import COLLECT, MOMENTS, fake_record
+from tests.envs import user_arm
+from tests.envs.children import COLLECT, MOMENTS, REPLACING, fake_record, run_child
 from tests.envs.test_episodes import assert_equal, make
 from tests.envs.test_rlds import trimmed
-
-
-def run_child(call):
-    code = f"from tests.envs import children; children.{call}"
-    root = Path(__file__).parents[2]
-    return subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, check=False)
 
 
 def stopping(function, calls):
@@ -66,6 +58,8 @@ def test_bad_input_is_one_sentence(tmp_path, run):
         (f"collect {press}", existing, "exists already"),
         (f"collect --overwrite {press}", photos, "photos is not a folder of envs-rlds-1 episodes"),
         (f"collect --num-episodes 0 {press}", tmp_path / "new", "num_episodes"),
+        (f"collect --num-envs 0 {press}", tmp_path / "new", "num_envs must be at least 1"),
+        (f"collect --randomize --control-dt 0.02 {press}", tmp_path / "new", "latency must lie in"),
         (f"collect --control-dt 0.03 {press}", tmp_path / "new", "multiple of 0.02 s"),
         (f"collect --actions voltage {press}", tmp_path / "new", "joint, delta_joint, end_eff"),
         (f"collect --distractors 5 {press}", tmp_path / "new", "distractors must be 0 to 4"),
@@ -179,7 +173,7 @@ def test_interrupted_before_anything(tmp_path, run, fake, monkeypatch):
 def test_several_tasks_go_on_where_they_were(tmp_path, run, fake, monkeypatch):
     text, out = COLLECT.replace("press", "all"), tmp_path / "many"
     with monkeypatch.context() as patch:
-        patch.setattr(rlds, "install", stopping(rlds.install, 2))
+        patch.setattr(places, "install", stopping(places.install, 2))
         code, said = run(text, "--out", out)
     assert code == 130
     done, rest = ([f for f in out.iterdir() if (f.suffix == ".partial") == p] for p in (0, 1))
@@ -244,3 +238,58 @@ def test_a_damaged_part_is_refused(tmp_path, run, fake, monkeypatch):
     assert code == 2
     assert f"{file} is damaged" in said
     assert said.endswith(f"delete {file.parent} to start anew")
+
+
+def test_an_edited_robot_is_another(tmp_path, run, fake):
+    text = COLLECT.replace("piper", str(user_arm.write(tmp_path)))
+    assert run(text, "--out", tmp_path / "done")[0] == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rlds.Parts, "complete", stopping(rlds.Parts.complete, 0))
+        assert run(text, "--out", tmp_path / "begun")[0] == 130
+    code, said = run(text, "--out", tmp_path / "done")
+    assert (code, "is there already" in said) == (0, True)
+    user_arm.write(tmp_path, ('kp="150"', 'kp="140"'))
+    code, said = run(text, "--out", tmp_path / "done")
+    assert (code, "exists already" in said) == (2, True)
+    code, said = run(text, "--out", tmp_path / "begun")
+    assert (code, "was begun with model" in said) == (2, True)
+
+
+def test_a_second_process_is_refused(tmp_path, run, fake):
+    out = tmp_path / "press"
+    with places.alone(out):
+        code, said = run(COLLECT, "--out", out)
+        assert code == 2
+        assert said.endswith(f"another process is collecting into {out}")
+        assert not out.with_name("press.partial").exists()
+    assert run(COLLECT, "--out", out)[0] == 0
+    assert os.listdir(tmp_path) == ["press"]
+
+
+@pytest.mark.parametrize("moment", REPLACING)
+def test_killed_while_the_old_is_replaced(tmp_path, run, fake, moment):
+    out = tmp_path / REPLACING[moment][3]
+    if out.suffix != ".npz":
+        run(COLLECT, "--out", out)
+    text = "" if out.suffix == ".npz" else "--seed 1 --overwrite"
+    child = run_child(f"collect_and_die({moment!r}, {str(out)!r}, {text!r})")
+    assert child.returncode == -signal.SIGKILL, child.stderr
+    assert len(os.listdir(tmp_path)) > 1
+    code, said = run(f"{COLLECT} {text}", "--out", out)
+    assert code == 0, said
+    assert os.listdir(tmp_path) == [out.name]
+    found = Episodes.load(out) if out.suffix == ".npz" else rlds.read(out)
+    assert found.num_episodes == 20
+
+
+def test_a_file_of_others_survives_parts_that_are_whole(tmp_path, run, fake, monkeypatch):
+    out = tmp_path / "press.npz"
+    with monkeypatch.context() as patch:
+        patch.setattr(rlds.Parts, "complete", stopping(rlds.Parts.complete, 0))
+        run(COLLECT, "--out", out)
+    make().save(out)
+    code, said = run(COLLECT, "--out", out)
+    assert (code, "exists already" in said) == (2, True)
+    assert_equal(Episodes.load(out), make())
+    assert run(f"{COLLECT} --overwrite", "--out", out)[0] == 0
+    assert os.listdir(tmp_path) == ["press.npz"]

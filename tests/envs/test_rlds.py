@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import shutil
 import subprocess
 import sys
@@ -228,12 +229,25 @@ def test_parts_of_another_dataset_are_noticed(tmp_path):
         rlds.Parts(two.folder, {})
 
 
-def test_only_datasets_are_replaced(tmp_path, path):
-    rlds.write(make(2), path)
-    rlds.write(make(3), tmp_path / "better")
-    (tmp_path / "photos").mkdir()
-    with pytest.raises(ValueError, match="photos is not a folder of envs-rlds-1 episodes"):
-        rlds.install(tmp_path / "better", tmp_path / "photos")
-    rlds.install(tmp_path / "better", path)
-    assert rlds.read(path).num_episodes == 3
-    assert os.listdir(path.parent) == ["press"]
+def test_a_robot_by_path(path, tmp_path):
+    episodes = make(robot="../my robots/arm-v1.2 [new].xml")
+    rlds.write(episodes, path)
+    assert_equal(rlds.read(path), trimmed(episodes))
+
+
+def test_no_room_for_a_part(tmp_path):
+    folder = tmp_path / "parts"
+    parts = rlds.Parts(folder, {})
+    parts.append(make(2))
+    facts = rlds.metadata(folder)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+    try:
+        with pytest.raises(OSError, match=r"could not be written \(write\(\) failed: [^;\n]*\)$"):
+            parts.append(make(60))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert rlds.metadata(folder) == facts
+    again = rlds.Parts(folder, {})
+    again.append(make(60))
+    assert again.num_episodes == 62

@@ -1,0 +1,34 @@
+"""What the command line takes, and what it says of its options."""
+
+import pytest
+
+from envs import __main__ as command_line
+from tests.envs.children import COLLECT
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("--seed 99999999999999999999", "argument --seed: must be 0 to 4294967295, not 99"),
+        ("--seed -1", "argument --seed: must be 0 to"),
+        ("--seed one", "argument --seed: invalid seed value: 'one'"),
+        ("--control-dt inf", "argument --control-dt: must be a finite number, not inf"),
+        ("--action-noise nan", "argument --action-noise: must be a finite number, not nan"),
+    ],
+)
+def test_numbers_that_are_none(tmp_path, capsys, text, message):
+    with pytest.raises(SystemExit, match="2"):
+        command_line.main([*COLLECT.split(), "--out", str(tmp_path / "new"), *text.split()])
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_help_says_what_options_are_for(capsys):
+    for command, texts in (
+        ("play", ("with --out: pixels", "with --out: replace", "or the path of an MJCF file")),
+        ("collect", ("replace what is there", "or the path of an MJCF file")),
+    ):
+        with pytest.raises(SystemExit, match="0"):
+            command_line.main([command, "--help"])
+        said = " ".join(capsys.readouterr().out.split())
+        assert all(text in said for text in texts)
