@@ -182,11 +182,8 @@ def gather(
         tries = env.num_envs if kept < num_episodes else int(wins[-1]) + 1
         attempted, tried = attempted + tries, tried + tries
         if len(wins):
-            yield Episodes(
-                **jax.tree.map(lambda x, wins=wins: x[wins], chunk),
-                **_facts(env),
-                attempted=tried,
-            )
+            won = jax.tree.map(lambda x, wins=wins: x[wins], chunk)
+            yield Episodes(**won, **_facts(env), attempted=tried)
             tried = 0
 
 

@@ -19,11 +19,11 @@ import mujoco
 import numpy as np
 
 from envs import actions, distractors, placing, randomization, scene
-from envs.physics import Changes, Data, Physics
+from envs.physics import Physics
 from envs.randomization import Draw, Randomization
 from envs.render import Look, Renderer, RenderModel
 from envs.robots import Robot
-from envs.state import State, Trajectory, where
+from envs.state import Changes, Data, State, Trajectory, where
 from envs.tasks import Layout, Task, View
 
 _HOME_NOISE = 0.03  # rad, half the range of the random start pose around home

@@ -1,7 +1,6 @@
 """Physics behind one small class; the only file that names MJX, `warp_physics` being its guest.
 
-Worlds are batched by `jax.vmap`. What a world keeps between two steps, `Data`, is the same for all
-implementations: those fields alone that a step reads, and the poses that others look at.
+Worlds are batched by `jax.vmap`. What a world keeps between two steps is the same for all engines.
 """
 
 import contextlib
@@ -12,13 +11,15 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
-from typing import Any, Literal, Self, get_args
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax._src import xla_bridge  # there is no public way to ask whether a backend has started
+
+from envs.state import MOVING, Changes, Data
 
 Backend = Literal["jax", "warp"]
 BACKENDS: tuple[str, ...] = get_args(Backend)
@@ -72,43 +73,6 @@ def enable_compilation_cache() -> None:
         folder = os.path.join(os.path.expanduser("~"), ".cache", "lorasp_jax", "xla")
         jax.config.update("jax_compilation_cache_dir", folder)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Data:
-    """One world, or W worlds with a leading axis; names and units are MuJoCo's.
-
-    Attributes:
-        qpos, qvel: positions and velocities of all joints.
-        qacc_warmstart: where the constraint solver starts.
-        xpos, xquat, xmat: `[bodies, 3]` in m, `[bodies, 4]`, `[bodies, 3, 3]`, in the world frame.
-        geom_xpos, geom_xmat, site_xpos, site_xmat, cam_xpos, cam_xmat: the same of geoms, sites and
-            cameras.
-    """
-
-    qpos: jax.Array
-    qvel: jax.Array
-    qacc_warmstart: jax.Array
-    xpos: jax.Array
-    xquat: jax.Array
-    xmat: jax.Array
-    geom_xpos: jax.Array
-    geom_xmat: jax.Array
-    site_xpos: jax.Array
-    site_xmat: jax.Array
-    cam_xpos: jax.Array
-    cam_xmat: jax.Array
-
-    def replace(self, **changes: Any) -> Self:
-        """The same with other values of some fields."""
-        return dataclasses.replace(self, **changes)
-
-
-MOVING = ("qpos", "qvel", "qacc_warmstart")
-"""The fields of `Data` that steps change; all others follow from them."""
-Changes = dict[str, jax.Array]
-"""Fields of the MuJoCo model that differ in one world, by MuJoCo's names."""
 
 
 def default_backend() -> str:

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from envs.physics import Changes
+from envs.state import Changes
 from envs.tasks import Layout
 
 

@@ -16,9 +16,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.physics import MOST_GROWTH, Changes, Data
+from envs.physics import MOST_GROWTH
 from envs.render import Look
 from envs.robots import multiply, turn
+from envs.state import Changes, Data
 from envs.tasks import Layout
 
 Range = tuple[float, float]

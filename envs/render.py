@@ -224,21 +224,24 @@ def seen_by_cameras(
             half=half,
             kind=jnp.array(model.kinds, jnp.float32),
         )
-        camera = View(
-            position=_vec(position),
-            rotation=_rows(rotation),
-            pixel=jnp.tan(jnp.deg2rad(fovy) / 2) / height,
-            ambient=jnp.asarray(look.ambient),
-            headlight=jnp.asarray(look.headlight),
-            diffuse=jnp.asarray(look.diffuse),
-            horizon=_vec(look.sky[0]),
-            zenith=_vec(look.sky[1]),
-            square=jnp.asarray(look.checker[0]),
-            contrast=jnp.asarray(look.checker[1]),
-        )
-        return geoms, camera
+        return geoms, _camera(look, position, rotation, jnp.tan(jnp.deg2rad(fovy) / 2) / height)
 
     return jax.vmap(view)(cam_xpos[chosen], cam_xmat[chosen], jnp.asarray(look.fovy)[chosen])
+
+
+def _camera(look: Look, position: jax.Array, rotation: jax.Array, pixel: jax.Array) -> View:
+    return View(
+        position=_vec(position),
+        rotation=_rows(rotation),
+        pixel=pixel,
+        ambient=jnp.asarray(look.ambient),
+        headlight=jnp.asarray(look.headlight),
+        diffuse=jnp.asarray(look.diffuse),
+        horizon=_vec(look.sky[0]),
+        zenith=_vec(look.sky[1]),
+        square=jnp.asarray(look.checker[0]),
+        contrast=jnp.asarray(look.checker[1]),
+    )
 
 
 def _check_shapes(look: Look, **given: jax.Array | np.ndarray) -> None:

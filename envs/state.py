@@ -1,12 +1,49 @@
 """What a batch of worlds is between two steps, and what is kept of an episode."""
 
 import dataclasses
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
 
-from envs.physics import Data
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Data:
+    """One world, or W worlds with a leading axis; names and units are MuJoCo's.
+
+    Of all that MuJoCo has, only what a step reads and the poses that others look at.
+
+    Attributes:
+        qpos, qvel: positions and velocities of all joints.
+        qacc_warmstart: where the constraint solver starts.
+        xpos, xquat, xmat: `[bodies, 3]` in m, `[bodies, 4]`, `[bodies, 3, 3]`, in the world frame.
+        geom_xpos, geom_xmat, site_xpos, site_xmat, cam_xpos, cam_xmat: the same of geoms, sites and
+            cameras.
+    """
+
+    qpos: jax.Array
+    qvel: jax.Array
+    qacc_warmstart: jax.Array
+    xpos: jax.Array
+    xquat: jax.Array
+    xmat: jax.Array
+    geom_xpos: jax.Array
+    geom_xmat: jax.Array
+    site_xpos: jax.Array
+    site_xmat: jax.Array
+    cam_xpos: jax.Array
+    cam_xmat: jax.Array
+
+    def replace(self, **changes: Any) -> Self:
+        """The same with other values of some fields."""
+        return dataclasses.replace(self, **changes)
+
+
+MOVING = ("qpos", "qvel", "qacc_warmstart")
+"""The fields of `Data` that steps change; all others follow from them."""
+Changes = dict[str, jax.Array]
+"""Fields of the MuJoCo model that differ in one world, by MuJoCo's names."""
 
 
 @jax.tree_util.register_dataclass

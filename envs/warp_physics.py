@@ -16,7 +16,7 @@ import warp as wp
 from mujoco.mjx.third_party import mujoco_warp
 
 from envs import warp_call
-from envs.physics import MOVING, Changes, Data
+from envs.state import MOVING, Changes, Data
 
 # Warp computes where the geoms of fixed bodies are but once, for the model that all worlds share.
 _FIXED = ("geom_xpos", "geom_xmat")
