@@ -56,6 +56,7 @@ def test_warp_that_is_missing_is_named(monkeypatch):
             make("press", **{option: "warp"})
 
 
+@pytest.mark.slow  # compiles both engines: a minute and a half
 def test_both_engines_move_alike(pair):
     """40 control steps: the lid rests on the pot, most worlds have lifted it at the end."""
     ours, theirs = (run(env, RANGES, 40) for env in pair)
@@ -66,6 +67,7 @@ def test_both_engines_move_alike(pair):
     assert not bool(theirs.info["broken"].any())
 
 
+@pytest.mark.slow
 def test_worlds_of_worlds_are_worlds(pair):
     """A further vmap, such as Brax's, gives what a batch gives."""
     env = pair[1]
