@@ -20,7 +20,11 @@ def pytest_generate_tests(metafunc):
     chosen = {mark.args[0] for mark in metafunc.definition.iter_markers("parametrize")}
     for name, values in (("task_name", TASKS), ("robot_name", ROBOTS)):
         if name in metafunc.fixturenames and name not in chosen:
-            metafunc.parametrize(name, values)
+            # Episodes take a minute a scene to compile: those of other robots are long tests.
+            long = "episodes" in metafunc.fixturenames and name == "robot_name"
+            rare = [v for v in values if long and v != "piper"]
+            marked = [pytest.param(v, marks=pytest.mark.slow) if v in rare else v for v in values]
+            metafunc.parametrize(name, marked)
 
 
 @functools.cache
