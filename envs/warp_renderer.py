@@ -36,12 +36,13 @@ class WarpRenderer:
         # Warp's own way to take several rays a pixel cannot vary the field of view.
         self.image_size, self.samples = rays.image_size, rays.samples
         self._num_worlds = num_worlds
+        lamplit = _lamplit(model)
         with wp.ScopedDevice(warp_call.device()):
-            self._model = mujoco_warp.put_model(_lamplit(model))
+            self._model = mujoco_warp.put_model(lamplit)
             self._data = mujoco_warp.make_data(model, nworld=num_worlds)
             self._contexts = [
                 mujoco_warp.create_render_context(
-                    _lamplit(model),
+                    lamplit,
                     nworld=num_worlds,
                     cam_res=(rays.samples * rays.image_size,) * 2,  # pyright: ignore
                     render_rgb=True,

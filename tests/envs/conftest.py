@@ -22,9 +22,8 @@ def pytest_generate_tests(metafunc):
         if name in metafunc.fixturenames and name not in chosen:
             # Episodes take a minute a scene to compile: those of other robots are long tests.
             long = "episodes" in metafunc.fixturenames and name == "robot_name"
-            rare = [v for v in values if long and v != "piper"]
-            marked = [pytest.param(v, marks=pytest.mark.slow) if v in rare else v for v in values]
-            metafunc.parametrize(name, marked)
+            marks = {v: [pytest.mark.slow] if long and v != "piper" else [] for v in values}
+            metafunc.parametrize(name, [pytest.param(v, marks=marks[v]) for v in values])
 
 
 @functools.cache
