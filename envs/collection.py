@@ -6,6 +6,7 @@ poses of all geoms and cameras; pictures are rendered from those poses in bounde
 
 import dataclasses
 import functools
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
@@ -24,6 +25,9 @@ _NUM_ENVS = {"cpu": 32, "gpu": 256, "tpu": 256}
 # Below this share of successes, once so many attempts were made, something is broken, and going on
 # would only waste time.
 _LEAST_SUCCESS, _PATIENCE = 0.5, 16
+# Python traces one program at a time. In turn, the first is compiled and runs while the second is
+# traced; all at once, none would start before the last is traced.
+_TRACING = threading.Lock()
 
 
 @jax.tree_util.register_dataclass
@@ -175,6 +179,8 @@ def gather(
     while kept < num_episodes:
         _check_success(env, kept, attempted)
         key, chunk_key = jax.random.split(key)
+        with _TRACING:
+            _record.lower(env, chunk_key, action_noise, ranges)  # which the call then finds done
         chunk, success = _record(env, chunk_key, action_noise, ranges)
         wins = np.flatnonzero(success)[: num_episodes - kept]
         kept += len(wins)

@@ -149,7 +149,8 @@ def _side_by_side(
     running: dict[Path, Future[str]] = {}
     with bars(console, stop) as new_bar, ThreadPoolExecutor() as pool:
         try:
-            for file, env in scenes.items():
+            # The longest first: it runs while the others are still traced.
+            for file, env in sorted(scenes.items(), key=lambda item: -item[1].expert_steps):
                 bar = new_bar(env.task.name, env.robot.name)
                 running[file] = pool.submit(_collect, options, env, file, bar)
             wait(running.values(), return_when=FIRST_EXCEPTION)

@@ -99,6 +99,7 @@ class Physics:
         self._model = mjx.put_model(model, impl="jax")
         data = mjx.make_data(model, impl="jax")
         self._data = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), data)  # strongly typed
+        self._posed = jax.jit(self._posed)  # traced once for a start and a step
         self._simulate = self._mjx_steps
         if backend == "warp":
             from envs.warp_physics import WarpSteps
@@ -129,13 +130,15 @@ class Physics:
         """The `MOVING` of a world after S physics steps."""
         model = self._model.replace(**changes)
 
-        def body(data: Any, control: jax.Array) -> tuple[Any, None]:
-            return mjx.step(model, data.replace(ctrl=control)), None
+        def body(moving: Sequence[jax.Array], control: jax.Array) -> tuple[Any, None]:
+            now = dict(zip(MOVING, moving, strict=True))
+            data = mjx.step(model, self._data.replace(ctrl=control, **now))
+            return [getattr(data, name) for name in MOVING], None
 
-        data = self._data.replace(**{name: getattr(start, name) for name in MOVING})
+        # Nothing else is carried: `vmap` traces a scan once more if part of its carry starts out
+        # the same in all worlds.
         with _full_precision():
-            data = jax.lax.scan(body, data, controls)[0]
-        return [getattr(data, name) for name in MOVING]
+            return jax.lax.scan(body, [getattr(start, name) for name in MOVING], controls)[0]
 
     def _posed(self, changes: Changes, moving: Sequence[jax.Array]) -> Data:
         """A world with all poses that follow from its joint positions."""

@@ -1,0 +1,130 @@
+"""Whether worlds can go on for ever: randomised expert episodes one after the other.
+
+    python -m benchmarks.long_run --tasks pour --backend warp --episodes 200 --num-envs 256
+
+For each task: the share that the experts solved, worlds that broke (were ended because a position
+or velocity was not finite), and the memory of host and device, once the run has settled and at its
+end. The exit code is 1 where a world broke or memory grew by more than 2 %.
+"""
+
+import argparse
+import dataclasses
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from rich.console import Console
+
+import envs
+from envs import Randomization, experts, physics
+from envs.env import Env
+from envs.state import State
+
+SETTLED = 0.2  # of the episodes: by then, all that is made once has been made
+MOST_GROWTH = 1.02
+
+
+@dataclasses.dataclass
+class Found:
+    """What `run` has seen.
+
+    Attributes:
+        success: share of the episodes that the experts solved.
+        broken: episodes that were ended because a value was not finite.
+        memory: [MiB] by its owner, once the run had settled and at its end.
+        seconds: of all episodes.
+    """
+
+    success: float
+    broken: int
+    memory: tuple[dict[str, float], dict[str, float]]
+    seconds: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing broke or grew."""
+        early, late = self.memory
+        return not self.broken and all(late[k] <= MOST_GROWTH * early[k] for k in early)
+
+    def __str__(self) -> str:
+        early, late = self.memory
+        grown = ", ".join(f"{name} {early[name]:.1f} -> {late[name]:.1f}" for name in early)
+        return (
+            f"{self.seconds:.0f} s, success {self.success:.4f}, broken {self.broken}, MiB: {grown}"
+        )
+
+
+def run(env: Env, episodes: int) -> Found:
+    """Consecutive episodes of the expert in all worlds, each with a picture at its end."""
+    ranges = Randomization.typical()
+
+    @jax.jit
+    def episode(state: State, key: jax.Array) -> tuple[State, dict[str, jax.Array]]:
+        # A world whose expert has run out of waypoints, but not of the task's time, restarts too.
+        state = dataclasses.replace(state, done=jnp.ones(env.num_envs, bool))
+        state = env.reset_done(state, key, ranges)
+        plan = experts.plan(env, state, key)
+
+        def body(state: State, _: None) -> tuple[State, None]:
+            return env.step(state, experts.act(env, plan, state)), None
+
+        state = jax.lax.scan(body, state, length=env.expert_steps)[0]
+        pictures = {name: image.mean() for name, image in env.observe(state)["image"].items()}
+        return state, pictures | {k: state.info[k].sum() for k in ("success", "broken")}
+
+    state, begun = env.reset(jax.random.key(0), ranges), time.perf_counter()
+    success = broken = 0
+    settled = {}
+    for number in range(episodes):
+        state, seen = episode(state, jax.random.key(number))
+        success, broken = success + int(seen["success"]), broken + int(seen["broken"])
+        if number == int(SETTLED * episodes):
+            settled = memory(env)
+    tried, seconds = env.num_envs * episodes, time.perf_counter() - begun
+    return Found(success / tried, broken, (settled, memory(env)), seconds)
+
+
+def memory(env: Env) -> dict[str, float]:
+    """What the process holds now, in MiB."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    held: dict[str, float] = {"host": pages * 4096 / 2**20}
+    if of_device := jax.devices()[0].memory_stats():  # None on CPU
+        held["JAX"] = of_device["bytes_in_use"] / 2**20
+    if env.physics.backend == "warp" and jax.default_backend() == "gpu":
+        import warp
+
+        held["Warp"] = warp.get_mempool_used_mem_current(warp.get_device()) / 2**20
+    return held
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run, print; the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--tasks", nargs="+", default=["open_pot", "pour", "press", "pick_place"])
+    parser.add_argument("--robot", default="piper")
+    parser.add_argument("--backend", help="default: warp where it is picked, else jax")
+    parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("--num-envs", type=int, default=256)
+    options = parser.parse_args(arguments)
+    physics.enable_fast_cpu()
+    physics.enable_compilation_cache()
+    backend: Any = options.backend or physics.default_backend()
+    console, passed = Console(soft_wrap=True), True
+    for task in options.tasks:
+        env = envs.make(
+            task, options.robot, num_envs=options.num_envs, backend=backend, distractors=2
+        )
+        found = run(env, options.episodes)
+        console.print(
+            f"{task}, {options.robot}, {backend}: {options.episodes} episodes x {env.num_envs} "
+            f"worlds in {found}"
+        )
+        passed &= found.passed
+    return 0 if passed else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
