@@ -28,7 +28,6 @@ import jax
 import mujoco
 import mujoco.rollout
 import numpy as np
-from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -144,8 +143,12 @@ def mujoco_c(env: Env, state: State) -> float:
     return len(worlds) * C_STEPS / seconds
 
 
-def playground(backend: Any, batch: Any) -> float:
-    """Physics steps/s of MuJoCo Playground's environment, with room for each world's contacts."""
+def playground(backend: Any, batch: Any) -> tuple[Callable[[], Any], int]:
+    """MuJoCo Playground's environment, with room for each world's contacts.
+
+    Returns:
+        A compiled call, and the physics steps that it makes in all worlds.
+    """
     from mujoco_playground import registry  # pyright: ignore[reportMissingImports]
 
     room = PLAYGROUND_CONTACTS * batch
@@ -161,8 +164,17 @@ def playground(backend: Any, batch: Any) -> float:
         return jax.lax.scan(body, state, jax.random.split(key, CONTROL_STEPS))[0]
 
     compiled = jax.jit(run).lower(state, jax.random.key(1)).compile()
-    seconds = best(lambda: compiled(state, jax.random.key(1)))
-    return batch * CONTROL_STEPS * round(env.dt / env.sim_dt) / seconds
+    steps = batch * CONTROL_STEPS * round(env.dt / env.sim_dt)
+    return lambda: compiled(state, jax.random.key(1)), steps
+
+
+def measure_playground(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """The rows of MuJoCo Playground, one a backend and batch size."""
+    wanted = list(itertools.product(options.backends, options.batches))
+    with ThreadPoolExecutor(options.jobs) as pool:
+        prepared = list(pool.map(lambda names: playground(*names), wanted))
+    for (backend, batch), (call, steps) in zip(wanted, prepared, strict=True):
+        yield {"backend": backend, "batch": batch, "physics/s": steps / best(call)}
 
 
 def measure(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
@@ -199,40 +211,37 @@ def main() -> None:
     for row in measure(options):
         rows.append(row)
         console.print(", ".join(f"{k} {_text(v)}" for k, v in row.items()))
-    print_tables(console, rows)
+    images = [name for name in rows[0] if name.startswith("images/s")]
+    print_table(console, [{k: v for k, v in row.items() if k not in images} for row in rows])
+    names = ["task", "backend", "batch", *images]
+    print_table(console, [{name: row[name] for name in names} for row in rows])
     found: dict[str, Any] = {"machine": machine, "rows": rows}
     if importlib.util.find_spec("mujoco_playground"):
-        found[PLAYGROUND] = []
-        for backend, batch in itertools.product(options.backends, options.batches):
-            speed = playground(backend, batch)
-            found[PLAYGROUND].append({"backend": backend, "batch": batch, "physics/s": speed})
-            console.print(
-                f"Playground's {PLAYGROUND}, {backend}, {batch}: {_text(speed)} physics/s"
-            )
+        found[PLAYGROUND] = list(measure_playground(options))
+        print_table(console, found[PLAYGROUND], f"MuJoCo Playground's {PLAYGROUND}")
     else:
         console.print(f"mujoco_playground is not installed: no figures of its {PLAYGROUND}")
     if options.json:
         options.json.write_text(json.dumps(found, indent=1))
 
 
-def print_tables(console: Console, rows: list[dict[str, Any]]) -> None:
-    """Steps and pictures apart, which fits 80 columns."""
-    images = [name for name in rows[0] if name.startswith("images/s")]
-    steps = [name for name in rows[0] if name not in images]
-    for names in (steps, ["task", "backend", "batch", *images]):
-        table = Table(*map(escape, names), box=box.SIMPLE, pad_edge=False)
-        table.columns[0].no_wrap = True
-        for row in rows:
-            table.add_row(*(_text(row[name]) for name in names))
-        console.print(table)
+def print_table(console: Console, rows: list[dict[str, Any]], title: str = "") -> None:
+    """One line a row, which fits 80 columns."""
+    table = Table(title=title, box=None, pad_edge=False)
+    for name in rows[0]:
+        table.add_column(escape(name), no_wrap=True, justify="right")
+    for row in rows:
+        table.add_row(*map(_text, row.values()))
+    console.print(table)
 
 
 def _text(value: Any) -> str:
     if not isinstance(value, float):
         return str(value)
-    if value >= 1e6:
-        return f"{value / 1e6:.2f} M"
-    return f"{value:,.3g}" if value < 100 else f"{value:,.0f}"
+    for size, letter in ((1e6, " M"), (1e3, " k")):
+        if value >= size:
+            return f"{value / size:.3g}{letter}"
+    return f"{value:.3g}"
 
 
 if __name__ == "__main__":

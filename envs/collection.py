@@ -5,8 +5,6 @@ poses of all geoms and cameras; pictures are rendered from those poses in bounde
 """
 
 import dataclasses
-import functools
-import threading
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
@@ -14,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs import experts
+from envs import experts, programs
 from envs.env import Env
 from envs.episodes import Episodes, concatenate
 from envs.making import AnyRobot, make
@@ -25,9 +23,6 @@ _NUM_ENVS = {"cpu": 32, "gpu": 256, "tpu": 256}
 # Below this share of successes, once so many attempts were made, something is broken, and going on
 # would only waste time.
 _LEAST_SUCCESS, _PATIENCE = 0.5, 16
-# Python traces one program at a time. In turn, the first is compiled and runs while the second is
-# traced; all at once, none would start before the last is traced.
-_TRACING = threading.Lock()
 
 
 @jax.tree_util.register_dataclass
@@ -179,8 +174,6 @@ def gather(
     while kept < num_episodes:
         _check_success(env, kept, attempted)
         key, chunk_key = jax.random.split(key)
-        with _TRACING:
-            _record.lower(env, chunk_key, action_noise, ranges)  # which the call then finds done
         chunk, success = _record(env, chunk_key, action_noise, ranges)
         wins = np.flatnonzero(success)[: num_episodes - kept]
         kept += len(wins)
@@ -231,7 +224,7 @@ def _check_success(env: Env, kept: int, attempted: int) -> None:
         )
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@programs.kept
 def _record(
     env: Env, key: jax.Array, action_noise: jax.Array, ranges: Randomization | None
 ) -> tuple[dict[str, Any], jax.Array]:
@@ -251,7 +244,7 @@ def _record(
     return episodes, tries.success
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@programs.kept
 def _attempt(env: Env, key: jax.Array, ranges: Randomization | None) -> jax.Array:
     return rollout(env, key, ranges=ranges).success
 

@@ -98,7 +98,7 @@ class Physics:
         self.backend = backend
         self._model = mjx.put_model(model, impl="jax")
         data = mjx.make_data(model, impl="jax")
-        self._data = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), data)  # strongly typed
+        self._data = jax.device_put(jax.tree.map(np.asarray, data))  # strongly typed
         self._posed = jax.jit(self._posed)  # traced once for a start and a step
         self._simulate = self._mjx_steps
         if backend == "warp":

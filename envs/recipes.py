@@ -2,14 +2,13 @@
 
 import argparse
 import dataclasses
-import hashlib
 from typing import Any
 
 import jax
 import mujoco
-import numpy as np
 
 import envs
+from envs import programs
 
 
 def recipe(options: argparse.Namespace, env: envs.Env) -> dict[str, Any]:
@@ -17,7 +16,7 @@ def recipe(options: argparse.Namespace, env: envs.Env) -> dict[str, Any]:
     return {
         "task": env.task.name,
         "robot": options.robot,
-        "model": _digest(env),
+        "model": programs.digest(env),  # a user may edit the robot's file
         "num_episodes": options.num_episodes,
         "num_envs": env.num_envs,
         "image_size": env.image_size,
@@ -38,14 +37,3 @@ def recipe(options: argparse.Namespace, env: envs.Env) -> dict[str, Any]:
 def ranges(options: argparse.Namespace) -> envs.Randomization | None:
     """What differs from world to world."""
     return envs.Randomization.typical() if options.randomize else None
-
-
-def _digest(env: envs.Env) -> str:
-    """SHA-256 of the scene and of how its robot may move: a user may edit the robot's file."""
-    scene = np.empty(mujoco.mj_sizeModel(env.model), np.uint8)
-    mujoco.mj_saveModel(env.model, None, scene)
-    found = hashlib.sha256(scene.tobytes())
-    for field in dataclasses.fields(env.robot):
-        if field.name not in ("name", "body"):  # the body is in the scene
-            found.update(np.asarray(getattr(env.robot, field.name)).tobytes())
-    return found.hexdigest()
