@@ -227,7 +227,7 @@ def main() -> None:
 
 def print_table(console: Console, rows: list[dict[str, Any]], title: str = "") -> None:
     """One line a row, which fits 80 columns."""
-    table = Table(title=title, box=None, pad_edge=False)
+    table = Table(title=title, box=None, padding=(0, 1, 0, 0))
     for name in rows[0]:
         table.add_column(escape(name), no_wrap=True, justify="right")
     for row in rows:

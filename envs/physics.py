@@ -9,6 +9,7 @@ import importlib.util
 import io
 import os
 import sys
+import types
 import warnings
 from collections.abc import Sequence
 from typing import Any, Literal, get_args
@@ -41,7 +42,20 @@ def _import_mjx() -> Any:
     for line in printed.getvalue().splitlines():
         if not line.startswith(("Failed to import warp:", "Failed to import mujoco_warp:")):
             print(line, file=sys.stdout)
+    # Sums over the children of bodies. MJX leaves them to scatters, which GPUs add up in any order:
+    # on an H200, two calls with the same input differed in the last bits.
+    ordered = types.SimpleNamespace(**vars(jax))
+    ordered.ops = types.SimpleNamespace(segment_sum=_sum_in_order)
+    mujoco.mjx._src.scan.jax = ordered
     return mjx
+
+
+def _sum_in_order(values: jax.Array, segments: np.ndarray, number: int) -> jax.Array:
+    """`jax.ops.segment_sum` for few segments that are known, first to last."""
+    rows = [np.flatnonzero(segments == segment) for segment in range(number)]
+    if all(len(row) == 1 for row in rows):
+        return values[np.concatenate(rows)]
+    return jnp.stack([sum((values[i] for i in row), jnp.zeros_like(values[0])) for row in rows])
 
 
 mjx = _import_mjx()

@@ -1,0 +1,69 @@
+"""The benchmarks' own arithmetic; what they measure is measured by running them."""
+
+import io
+
+import pytest
+from rich.console import Console
+
+from benchmarks import envs as bench
+from benchmarks import long_run
+
+
+def part(broken=0, **memory):
+    return long_run.Found(1, 1.0, broken, memory, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("parts", "good"),
+    [
+        ([part(host=100.0), part(host=101.9)], True),
+        ([part(host=100.0), part(host=102.1)], False),
+        ([part(host=100.0, JAX=5.0), part(host=90.0, JAX=6.0)], False),
+        ([part(host=100.0), part(1, host=100.0)], False),
+    ],
+)
+def test_a_long_run_passes_if_nothing_grows_or_breaks(parts, good):
+    assert long_run.passed(parts) == good
+
+
+@pytest.mark.parametrize("episodes", [1, 3, 5, 7, 200])
+def test_a_long_run_reports_at_its_end(episodes, monkeypatch):
+    class Worlds:
+        num_envs = 2
+
+        def reset(self, key, ranges):
+            return None
+
+    info = {"success": 1, "broken": 0}
+    monkeypatch.setattr(long_run.jax, "jit", lambda _: lambda state, key: (state, info))
+    monkeypatch.setattr(long_run, "memory", lambda env: {"host": 1.0})
+    parts = list(long_run.run(Worlds(), episodes))
+    assert len(parts) == min(episodes, 5)
+    assert parts[-1].episodes == episodes
+    assert parts[-1].success == 0.5
+
+
+@pytest.mark.slow
+def test_a_long_run(capsys):
+    arguments = ["--tasks", "press", "--backend", "jax", "--episodes", "5", "--num-envs", "2"]
+    assert long_run.main(arguments) == 0
+    assert "5 episodes" in capsys.readouterr().out
+
+
+def test_tables_fit_a_terminal():
+    row = {
+        "task": "pick_place",
+        "backend": "jax",
+        "batch": 8192,
+        "compile s": 123.4,
+        "physics/s": 13_880_000.0,
+        "control/s": 694_131.0,
+        "seeing/s": 337_390.0,
+        "MiB": 12_345.0,
+        "over C": 0.0123,
+    }
+    console = Console(width=80, record=True, file=io.StringIO())
+    bench.print_table(console, [row])
+    text = console.export_text()
+    assert "…" not in text
+    assert "pick_place jax 8192 123 13.9 M 694 k 337 k 12.3 k 0.0123" in " ".join(text.split())
