@@ -121,12 +121,12 @@ def _load(file: Path) -> export.Exported | None:
     """What was saved; None if there is nothing, or something damaged."""
     if not file.exists():
         return None
-    data = file.read_bytes()
+    data = bytearray(file.read_bytes())
     checksum, program = data[:_CHECKSUM], data[_CHECKSUM:]
     return export.deserialize(program) if _checksum(program) == checksum else None
 
 
-def _save(file: Path, program: bytes) -> None:
+def _save(file: Path, program: bytearray) -> None:
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with replacing(file) as unfinished:
@@ -135,5 +135,5 @@ def _save(file: Path, program: bytes) -> None:
         warnings.warn(f"a traced program could not be kept: {error}", stacklevel=2)
 
 
-def _checksum(program: bytes) -> bytes:
+def _checksum(program: bytearray) -> bytes:
     return hashlib.sha256(program).digest()

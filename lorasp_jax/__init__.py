@@ -10,7 +10,8 @@ Axis letters used in every docstring and einsum of this package:
 """
 
 from lorasp_jax import dense, peft
-from lorasp_jax.adaptation import adapt, merge, summary
+from lorasp_jax.adaptation import adapt, merge
 from lorasp_jax.dense import collect_aux
+from lorasp_jax.tables import summary
 
 __all__ = ["adapt", "collect_aux", "dense", "merge", "peft", "summary"]

@@ -1,4 +1,4 @@
-"""Adapting a whole model: attach methods by path rules, split, count, summarise, merge.
+"""Adapting a whole model: attach methods by path rules, split, count, merge.
 
 A rule is (pattern, method). Patterns are `re.search`ed in "/"-joined paths, and the first rule that
 matches a path governs it, whether it can apply there or not: with [("vision", LoRA()),
@@ -21,7 +21,6 @@ from lorasp_jax.peft import FullFineTuning, Method
 from lorasp_jax.peft.method import Params
 
 Rules = Sequence[tuple[str, Method | None]]
-Row = tuple[str, str, str, str, str, str]
 Model = TypeVar("Model", bound=nnx.Module)
 
 
@@ -92,7 +91,7 @@ def count(model: nnx.Module) -> Counts:
 def methods(model: nnx.Module) -> dict[str, Method]:
     """Method by path: of each layer with an adapter, and full fine-tuning of each parameter."""
     found = {}
-    for path, parent, name, _ in _places(nnx.List([model]), AdapterParam):
+    for path, parent, name, _ in places(nnx.List([model]), AdapterParam):
         if isinstance(parent, Dense) and name == "adapter":
             found[path.rpartition("/")[0]] = parent.method
         else:
@@ -107,7 +106,7 @@ def merge(model: Model) -> Model:
       ValueError: a method whose delta depends on the input.
     """
     holder = _copy(model)
-    for place in _places(holder, Dense):
+    for place in places(holder, Dense):
         layer = place.child
         if layer.adapter is not None:
             try:
@@ -117,35 +116,21 @@ def merge(model: Model) -> Model:
             layer.kernel.set_value(kernel)
             layer.adapter = None
         layer.method = None
-    _retype(_places(holder, AdapterParam), nnx.Param)
+    _retype(places(holder, AdapterParam), nnx.Param)
     return holder[0]
 
 
-def summary(model: nnx.Module) -> str:
-    """A table of the dense layers and of every other parameter that trains, with totals.
-
-    Columns: path, method, kernel shape, rank, parameters (base and adapter), trainable ones.
-    """
-    holder = nnx.List([model])
-    rows = [("path", "method", "shape", "rank", "parameters", "trainable")]
-    inside = set()
-    for path, _, _, layer in _places(holder, (Dense, nnx.Linear)):
-        inside |= {id(v) for v in vars(layer).values() if isinstance(v, nnx.Variable)}
-        method, counts = getattr(layer, "method", None), count(layer)
-        name = method.name if method else "full" if counts.trainable else "-"
-        rank = getattr(method, "rank", "-")
-        rows.append(_row(path, name, layer.kernel.get_value(), rank, counts))
-    for path, _, _, variable in _places(holder, AdapterParam):
-        if id(variable) not in inside:
-            counts = Counts(variable.get_value().size, variable.get_value().size)
-            rows.append(_row(path, "full", variable.get_value(), "-", counts))
-    trainable, total = count(model)
-    rows.append(("total", "", "", "", f"{total:,}", f"{trainable:,}"))
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = ["  ".join(_align(row, widths)).rstrip() for row in rows]
-    rule = "-" * max(map(len, lines))
-    share = f"{trainable / max(total, 1):.2%} of all parameters train"
-    return "\n".join([lines[0], rule, *lines[1:-1], rule, lines[-1], share])
+def penalties(model: nnx.Module) -> dict[str, jax.Array]:
+    """Each loss on parameters alone, averaged over the adapted matrices whose method has it."""
+    found: dict[str, list[jax.Array]] = {}
+    for _, _, _, layer in places(nnx.List([model]), Dense):
+        if layer.adapter is not None:
+            one = layer.method.penalty
+            for _ in layer.kernel.get_value().shape[:-2]:
+                one = jax.vmap(one)
+            for name, values in one(layer.adapter.get_value()).items():
+                found.setdefault(name, []).append(values.ravel())
+    return {name: jnp.concatenate(values).mean() for name, values in found.items()}
 
 
 def attach(layer: Dense | nnx.Linear, method: Method, key: jax.Array) -> Dense:
@@ -162,10 +147,11 @@ def attach(layer: Dense | nnx.Linear, method: Method, key: jax.Array) -> Dense:
     """
     if isinstance(layer, nnx.Linear):
         layer = _as_dense(layer)
-    _retype([p for p in _places(nnx.List([layer]), AdapterParam) if p.name != "adapter"], nnx.Param)
+    _retype([p for p in places(nnx.List([layer]), AdapterParam) if p.name != "adapter"], nnx.Param)
     layer.method = method
-    shape = layer.kernel.get_value().shape
-    layer.adapter = AdapterParam(_init_params(key, method, shape))
+    params, kernel = _init(key, method, layer.kernel.get_value())
+    layer.kernel.set_value(kernel)
+    layer.adapter = AdapterParam(params)
     return layer
 
 
@@ -179,7 +165,7 @@ def _copy(model: nnx.Module) -> nnx.List:
     return nnx.List([model])
 
 
-def _places(holder: nnx.List, kind: type | tuple[type, ...]) -> list[Place]:
+def places(holder: nnx.List, kind: type | tuple[type, ...]) -> list[Place]:
     """All children of a type, with paths that start below the holder."""
 
     def walk() -> Iterator[Place]:
@@ -200,7 +186,7 @@ def _governing(rules: Rules, *paths: str) -> int | None:
 def _attach_all(holder: nnx.List, rules: Rules, key: jax.Array) -> set[int]:
     """Attaches additive adapters in place; returns the rules that were used."""
     used = set()
-    for path, parent, name, layer in _places(holder, (Dense, nnx.Linear)):
+    for path, parent, name, layer in places(holder, (Dense, nnx.Linear)):
         i = _governing(rules, path)
         method = None if i is None else rules[i][1]
         if method is not None and not method.trains_base:
@@ -213,7 +199,7 @@ def _attach_all(holder: nnx.List, rules: Rules, key: jax.Array) -> set[int]:
 def _free_all(holder: nnx.List, rules: Rules) -> set[int]:
     """Makes base parameters trainable in place; returns the rules that were used."""
     used, freed = set(), []
-    for place in _places(holder, nnx.Param):
+    for place in places(holder, nnx.Param):
         i = _governing(rules, place.path.rpartition("/")[0], place.path)
         method = None if i is None else rules[i][1]
         if i is None or (method is not None and not method.trains_base):
@@ -252,18 +238,17 @@ def _as_dense(linear: nnx.Linear) -> Dense:
     return layer
 
 
-def _init_params(key: jax.Array, method: Method, shape: tuple[int, ...]) -> Params:
-    """Parameters for a kernel [..., I, O]: one draw per leading index.
+def _init(key: jax.Array, method: Method, kernel: jax.Array) -> tuple[Params, Any]:
+    """`method.init` for a kernel [..., I, O]: one draw per leading index.
 
     Not jitted as a whole: its random draws compile once for each I instead of for each shape.
     """
-    matrix = jax.ShapeDtypeStruct(shape[-2:], jnp.float32)
-    leading = shape[:-2]
+    *leading, d_in, d_out = kernel.shape
     if not leading:
-        return method.init(key, matrix)[0]
+        return method.init(key, kernel)
     keys = jax.random.split(key, math.prod(leading))
-    params = jax.vmap(lambda one: method.init(one, matrix)[0])(keys)
-    return jax.tree.map(lambda leaf: leaf.reshape(*leading, *leaf.shape[1:]), params)
+    found = jax.vmap(method.init)(keys, kernel.reshape(-1, d_in, d_out))
+    return jax.tree.map(lambda leaf: leaf.reshape(*leading, *leaf.shape[1:]), found)
 
 
 def _merged(method: Method, params: Params, kernel: jax.Array) -> jax.Array:
@@ -275,20 +260,10 @@ def _merged(method: Method, params: Params, kernel: jax.Array) -> jax.Array:
 
 
 def _no_match(pattern: str, holder: nnx.List) -> str:
-    paths = [place.path for place in _places(holder, (Dense, nnx.Linear))]
+    paths = [place.path for place in places(holder, (Dense, nnx.Linear))]
     close = difflib.get_close_matches(pattern, paths, n=5, cutoff=0.3) or paths[:5]
     return f"rule {pattern!r} applies to nothing; dense layers here: {', '.join(close) or 'none'}."
 
 
 def _size(tree: Any) -> int:
     return sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(tree))
-
-
-def _row(path: str, method: str, kernel: Any, rank: Any, counts: Counts) -> Row:
-    shape = "x".join(map(str, kernel.shape))
-    return path, method, shape, str(rank), f"{counts.total:,}", f"{counts.trainable:,}"
-
-
-def _align(row: Row, widths: list[int]) -> list[str]:
-    left, right = zip(row[:3], widths[:3], strict=True), zip(row[3:], widths[3:], strict=True)
-    return [cell.ljust(w) for cell, w in left] + [cell.rjust(w) for cell, w in right]

@@ -69,8 +69,10 @@ class AuxiliaryConfig:
     """Weight of the balance loss."""
     z: float = 1e-3
     """Weight of the router z-loss."""
+    orthogonality: float = 0.1
+    """Weight of AdaLoRA's orthogonality penalty, eq. 4 of arXiv 2303.10512."""
     warmup: float = 0.02
-    """Share of the steps over which the three weights rise linearly from zero."""
+    """Share of the steps over which the weights rise linearly from zero."""
 
 
 @dataclass(frozen=True)

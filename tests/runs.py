@@ -1,6 +1,8 @@
 """A run that needs no simulation: random episodes and the dummy backbone."""
 
 import io
+import os
+import signal
 from pathlib import Path
 
 import jax
@@ -14,7 +16,7 @@ from lorasp_jax.config import Config, OptimConfig
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.peft import LoRASP
-from lorasp_jax.training.loop import Run
+from lorasp_jax.training.loop import Callback, Run
 from lorasp_jax.training.setup import processor
 
 CONFIG = Config(
@@ -29,6 +31,20 @@ CONFIG = Config(
     log_every=2,
     checkpoint_every=2,
 )
+
+
+class Terminate(Callback):
+    """Sends this process a SIGTERM after step 2, as a scheduler would."""
+
+    def __init__(self):
+        self.started = 0
+
+    def on_start(self, run):
+        self.started += 1
+
+    def on_log(self, run, step, metrics):
+        if step == 2:
+            os.kill(os.getpid(), signal.SIGTERM)
 
 
 def random_episodes(task: str, seed: int) -> Episodes:

@@ -12,6 +12,7 @@ ROOMS = [
     "lorasp_jax.peft",
     "lorasp_jax.dense",
     "lorasp_jax.adaptation",
+    "lorasp_jax.tables",
     "lorasp_jax.adapter_io",
     "lorasp_jax.config",
     "lorasp_jax.models",

@@ -18,6 +18,7 @@ class FullFineTuning(Method):
     """
 
     trains_base: ClassVar[bool] = True
+    additive: ClassVar[bool] = False
 
     def init(
         self, key: jax.Array, kernel: Kernel, *, statistics: Any = None
@@ -25,13 +26,6 @@ class FullFineTuning(Method):
         """The kernel is its own starting point."""
         del key, statistics
         return {"kernel": kernel}, kernel
-
-    def delta(
-        self, params: Params, x: jax.Array, *, token_mask: jax.Array | None = None
-    ) -> tuple[jax.Array, Aux]:
-        """Raises: full fine-tuning is not additive."""
-        del params, x, token_mask
-        raise ValueError("full fine-tuning replaces the kernel and has no delta; use apply.")
 
     def apply(
         self,

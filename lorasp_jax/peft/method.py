@@ -63,6 +63,8 @@ class Method:
 
     trains_base: ClassVar[bool] = False
     """True if the base weights themselves are what trains."""
+    additive: ClassVar[bool] = True
+    """True if the adapted map is x @ kernel + delta."""
 
     @property
     def name(self) -> str:
@@ -109,7 +111,12 @@ class Method:
           params: from `init`.
           x: [...tokens, I].
           token_mask: bool [...tokens]; False (padding) stays out of losses and statistics.
+
+        Raises:
+          ValueError: the method is not additive.
         """
+        if not self.additive:
+            raise ValueError(f"{type(self).__name__} is not additive and has no delta; use apply.")
         z, u, aux = self.project(params, x, token_mask)
         return z @ u, aux
 
@@ -133,9 +140,12 @@ class Method:
         del params
         return {}
 
-    def transform(self) -> optax.GradientTransformation | None:
-        """A gradient transformation the method needs, to be chained after the optimizer."""
-        return None
+    def transform(
+        self, optimizer: optax.GradientTransformation, total_steps: int
+    ) -> optax.GradientTransformation:
+        """The optimizer with what the method does after each of its `total_steps` steps."""
+        del total_steps
+        return optimizer
 
     def merge(self, params: Params, kernel: jax.Array) -> jax.Array:
         """The kernel [I, O] with the adapter folded in, in the kernel's type.

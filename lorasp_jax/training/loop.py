@@ -98,7 +98,8 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
         RunError: the loss is not finite; the last checkpoint before stays.
         KeyboardInterrupt: a signal asked to stop; the state is saved.
     """
-    optimizer = make_optimizer(run.config.optim)
+    methods = adaptation.methods(run.policy.model).values()
+    optimizer = make_optimizer(run.config.optim, methods)
     mesh = meshes.make_mesh(run.config.fsdp)
     graphdef, adapters, frozen = adaptation.split(run.policy.model)
     # A copy: every call of the step takes its state's memory over.

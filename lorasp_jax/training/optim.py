@@ -1,8 +1,11 @@
 """Optimizer and learning-rate schedule."""
 
+from collections.abc import Collection
+
 import optax
 
 from lorasp_jax.config import AuxiliaryConfig, OptimConfig
+from lorasp_jax.peft import Method
 
 
 def learning_rate(config: OptimConfig) -> optax.Schedule:
@@ -16,12 +19,23 @@ def learning_rate(config: OptimConfig) -> optax.Schedule:
     )
 
 
-def make_optimizer(config: OptimConfig) -> optax.GradientTransformation:
-    """AdamW on gradients clipped to a global norm."""
-    return optax.chain(
-        optax.clip_by_global_norm(config.clip_norm),
-        optax.adamw(learning_rate(config), b2=config.b2, weight_decay=config.weight_decay),
-    )
+def make_optimizer(
+    config: OptimConfig, methods: Collection[Method] = ()
+) -> optax.GradientTransformation:
+    """AdamW on gradients clipped to a global norm, with what the adapters' methods add to it.
+
+    Raises:
+        ValueError: several settings of a method that has one budget for all layers.
+    """
+    adamw = optax.adamw(learning_rate(config), b2=config.b2, weight_decay=config.weight_decay)
+    wrapped = [method.transform(adamw, config.steps) for method in dict.fromkeys(methods)]
+    own = [optimizer for optimizer in wrapped if optimizer is not adamw]
+    if len(own) > 1:
+        raise ValueError(
+            "all layers that share a budget need the same settings, but AdaLoRA is used with "
+            f"{len(own)} different ones."
+        )
+    return optax.chain(optax.clip_by_global_norm(config.clip_norm), *(own or [adamw]))
 
 
 def auxiliary_weights(config: AuxiliaryConfig, steps: int) -> dict[str, optax.Schedule]:
@@ -33,5 +47,6 @@ def auxiliary_weights(config: AuxiliaryConfig, steps: int) -> dict[str, optax.Sc
             ("spectral", config.spectral),
             ("balance", config.balance),
             ("z", config.z),
+            ("orthogonality", config.orthogonality),
         )
     }

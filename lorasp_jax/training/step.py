@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import optax
 from flax import nnx
 
+from lorasp_jax import adaptation
 from lorasp_jax.data.batches import Batch
 from lorasp_jax.peft import Aux
 
@@ -72,7 +73,7 @@ def loss_fn(
     )
     mask = batch.action_mask
     task = jnp.sum(per_element * mask) / jnp.maximum(jnp.sum(mask), 1)
-    losses = auxiliary_losses(aux)
+    losses = auxiliary_losses(aux) | adaptation.penalties(model)
     total = task + sum(weights[name] * value for name, value in losses.items())
     return total, {"loss": total, "task": task, **losses, **mean_active_rank(aux)}
 

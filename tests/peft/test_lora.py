@@ -10,42 +10,73 @@ import pytest
 from lorasp_jax.peft import LoRA
 
 GOLDEN = Path(__file__).parent.parent / "golden"
+SIDES = {"lora_a": "lora_A", "lora_b": "lora_B"}
 CASES = [
-    ("lora_r8", LoRA(rank=8, alpha=16)),
-    ("lora_rslora", LoRA(rank=8, alpha=16, rank_stabilized=True)),
+    ("lora_r8", [LoRA(rank=8, alpha=16)] * 3),
+    ("lora_rslora", [LoRA(rank=8, alpha=16, rank_stabilized=True)] * 3),
+    (
+        "lora_rank_alpha_pattern",
+        [LoRA(rank=8, alpha=16), LoRA(rank=4, alpha=16), LoRA(rank=8, alpha=4)],
+    ),
 ]
 
 
-@pytest.mark.parametrize(("case", "method"), CASES)
-def test_equals_hugging_face(case, method):
+def assert_close(actual, expected, relative):
+    """To the golden files' tolerance, which is relative to the largest value."""
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=relative * np.abs(expected).max())
+
+
+def load(case, names):
+    """A golden file; its kernels [I, O]; the adapters' parameters and gradients, by our names."""
     with np.load(GOLDEN / f"{case}.npz") as file:
         golden = dict(file)
-    kernels = [golden[f"base/lin.{i}.weight"].T for i in range(3)]
-    biases = [golden[f"base/lin.{i}.bias"] for i in range(3)]
 
-    def factors(kind, i):
-        a, b = (golden[f"{kind}/lin.{i}.lora_{side}.default.weight"].T for side in "AB")
-        return {"lora_a": a, "lora_b": b}
+    def adapters(kind):
+        return [
+            {
+                ours: jnp.asarray(golden[f"{kind}/lin.{i}.{theirs}.default.weight"].T)
+                for ours, theirs in names.items()
+            }
+            for i in range(3)
+        ]
+
+    kernels = [jnp.asarray(golden[f"base/lin.{i}.weight"].T) for i in range(3)]
+    return golden, kernels, adapters("param"), adapters("grad")
+
+
+def forward(x, golden, layer):
+    """The net with `layer(i, x)` in the place of x @ kernel i."""
+    for i in range(3):
+        x = layer(i, x) + golden[f"base/lin.{i}.bias"]
+        x = jnp.tanh(x) if i < 2 else x
+    return x
+
+
+def assert_equals_hugging_face(golden, methods, kernels, params, gradients):
+    """Output, loss, every gradient, scales and merged weights of one golden file."""
 
     def loss(params):
-        x = golden["x"]
-        for i in range(3):
-            x = method.apply(params[i], x, jnp.asarray(kernels[i]))[0] + biases[i]
-            x = jnp.tanh(x) if i < 2 else x
-        return 0.5 * jnp.mean(x**2), x
+        y = forward(golden["x"], golden, lambda i, x: methods[i].apply(params[i], x, kernels[i])[0])
+        return 0.5 * jnp.mean(y**2), y
 
-    params = [factors("param", i) for i in range(3)]
-    (value, y), gradients = jax.jit(jax.value_and_grad(loss, has_aux=True))(params)
-    np.testing.assert_allclose(value, golden["loss"], rtol=1e-5)
-    np.testing.assert_allclose(y, golden["y"], atol=1e-5 * np.abs(golden["y"]).max())
+    (value, y), actual = jax.jit(jax.value_and_grad(loss, has_aux=True))(params)
+    assert_close(value, golden["loss"], 1e-5)
+    assert_close(y, golden["y"], 1e-5)
+    jax.tree.map(lambda a, b: assert_close(a, b, 1e-4), actual, gradients)
+    merged = [methods[i].merge(params[i], kernels[i]) for i in range(3)]
     for i in range(3):
-        assert method.scale == pytest.approx(float(golden[f"scaling/{i}"]))
-        merged = method.merge(params[i], jnp.asarray(kernels[i]))
-        expected = golden[f"merged/{i}"].T
-        np.testing.assert_allclose(merged, expected, atol=1e-5 * np.abs(expected).max())
-        for name, expected in factors("grad", i).items():
-            tolerance = 1e-4 * np.abs(expected).max()
-            np.testing.assert_allclose(gradients[i][name], expected, atol=tolerance)
+        assert methods[i].scale == pytest.approx(float(golden[f"scaling/{i}"]))
+        assert_close(merged[i], golden[f"merged/{i}"].T, 1e-5)
+    assert_close(forward(golden["x"], golden, lambda i, x: x @ merged[i]), golden["y_merged"], 1e-5)
+
+
+@pytest.mark.parametrize(("case", "methods"), CASES)
+def test_equals_hugging_face(case, methods):
+    golden, kernels, params, gradients = load(case, SIDES)
+    assert_equals_hugging_face(golden, methods, kernels, params, gradients)
+    for i in range(3):
+        delta, _ = methods[i].delta(params[i], jnp.eye(len(kernels[i])))
+        assert_close(delta, golden[f"delta_weight/{i}"].T, 1e-5)
 
 
 def test_initialisation_and_count():

@@ -11,8 +11,14 @@ import pytest
 from lorasp_jax import peft
 
 D_IN, D_OUT, RANK = 6, 10, 12  # a rank above both sides
-INPUT_DEPENDENT = (peft.LoRASP,)  # cannot be merged; every other method must be
-SMALL = {"rank": RANK, "hidden_width": 4, "alpha": 5.0}  # alpha unlike the rank
+INPUT_DEPENDENT = (peft.LoRASP, peft.LoRAMoE)  # cannot be merged; every other method must be
+SMALL = {
+    "rank": RANK,
+    "target_rank": 6,
+    "hidden_width": 4,
+    "alpha": 5.0,
+    "experts": 2,
+}  # alpha unlike the rank
 
 
 def small(name):
@@ -64,13 +70,13 @@ def test_starts_as_the_base(method, kernel, x):
     params = initial(method, jax.random.key(0), kernel)
     y, _ = apply(method, params, x, kernel)
     np.testing.assert_allclose(y, x @ kernel, rtol=1e-5, atol=1e-5)
-    if not method.trains_base:
+    if method.additive:
         np.testing.assert_array_equal(delta(method, params, x)[0], 0)
 
 
 def test_init_depends_on_key_and_shape_alone(method, kernel):
-    if method.trains_base:
-        pytest.skip("starts at the kernel itself")
+    if not method.additive:
+        pytest.skip("starts from the kernel's values")
     params = initial(method, jax.random.key(0), kernel)
     shape = jax.ShapeDtypeStruct(kernel.shape, jnp.bfloat16)
     again = jax.jit(lambda key: method.init(key, shape)[0])(jax.random.key(0))
@@ -88,7 +94,7 @@ def test_apply_is_base_plus_delta(method, kernel, x):
     params = trained(method, kernel)
     y, aux = apply(method, params, x, kernel)
     assert y.shape == (2, 5, D_OUT)
-    if not method.trains_base:
+    if method.additive:
         expected = x @ kernel + delta(method, params, x)[0]
         np.testing.assert_allclose(y, expected, rtol=1e-5, atol=1e-5)
     for per_token in (aux.active_rank, aux.kept_energy):
@@ -176,7 +182,10 @@ def test_methods_are_found_by_file_name(method):
 
 
 def test_unknown_names():
-    with pytest.raises(ValueError, match=r"did you mean 'lora_sp'.*valid are full, lora, lora_sp"):
+    with pytest.raises(
+        ValueError,
+        match=r"did you mean 'lora_sp'.*valid are ada_lora, dora, full, lora, lora_moe, lora_sp",
+    ):
         peft.create("lora_ps")
     with pytest.raises(ValueError, match="lora has no field 'rnk'; valid are rank, alpha"):
         peft.create("lora", rnk=4)

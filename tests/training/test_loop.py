@@ -12,7 +12,7 @@ from lorasp_jax import adaptation
 from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.loop import Callback, RunError, _Stretches, train
 from lorasp_jax.training.run_folder import read_metrics
-from tests.runs import CONFIG, leaves, make_run
+from tests.runs import CONFIG, Terminate, leaves, make_run
 
 
 @pytest.fixture(autouse=True)
@@ -20,20 +20,6 @@ def one_device(monkeypatch):
     """Compiles in a quarter of the time; tests of the mesh use all eight."""
     mesh = meshes.make_mesh(1, jax.devices()[:1])
     monkeypatch.setattr(meshes, "make_mesh", lambda fsdp: mesh)
-
-
-class Terminate(Callback):
-    """Sends this process a SIGTERM after step 2, as a scheduler would."""
-
-    def __init__(self):
-        self.started = 0
-
-    def on_start(self, run):
-        self.started += 1
-
-    def on_log(self, run, step, metrics):
-        if step == 2:
-            os.kill(os.getpid(), signal.SIGTERM)
 
 
 def test_resume_is_bit_exact_and_frozen_stays_frozen(tmp_path):

@@ -1,0 +1,229 @@
+"""AdaLoRA against Hugging Face PEFT, and what its allocation promises."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from lorasp_jax.peft import AdaLoRA, LoRA, ada_lora
+
+GOLDEN = Path(__file__).parent.parent / "golden"
+LAYERS = ("lin.0", "lin.1", "lin.2")
+
+
+def layer(arrays, prefix, suffix=""):
+    """Parameters of a layer in our layout."""
+    a, b, e = (arrays[f"{prefix}.lora_{name}{suffix}"] for name in "ABE")
+    return {"lora_a": jnp.array(a.T), "lora_b": jnp.array(b.T), "lora_e": jnp.array(e[:, 0])}
+
+
+def model(arrays, prefix):
+    """Parameters of the oracle's three layers."""
+    return {name: {"adapter": layer(arrays, f"{prefix}/{name}")} for name in LAYERS}
+
+
+@pytest.fixture(scope="module")
+def trace():
+    return dict(np.load(GOLDEN / "adalora_alloc_train.npz"))
+
+
+@pytest.fixture(scope="module")
+def oracle(trace):
+    """The method with the oracle's schedule, and the number of steps."""
+    cfg = json.loads(str(trace["cfg"]))
+    total = cfg["total_step"]
+    shares = {"warmup": cfg["tinit"] / total, "final": cfg["tfinal"] / total}
+    ranks = {"rank": cfg["init_r"], "target_rank": cfg["target_r"]}
+    return AdaLoRA(**ranks, **shares, alpha=cfg["lora_alpha"], interval=cfg["deltaT"]), total
+
+
+@pytest.fixture(scope="module")
+def replay(trace, oracle):
+    """Parameters and allocation after each step on the oracle's gradients."""
+    method, total = oracle
+    optimizer = method.transform(optax.sgd(0.05), total)
+
+    @jax.jit
+    def step(params, state, grads):
+        updates, state = optimizer.update(grads, state, params)
+        return optax.apply_updates(params, updates), state
+
+    params = model(trace, "init")
+    state, found = optimizer.init(params), []
+    for t in range(total):
+        params, state = step(params, state, model(trace, f"grad/{t}"))
+        found.append((params, state))
+    return found
+
+
+def test_masks_and_values_of_every_step(trace, replay):
+    checked = 0
+    for t, (params, state) in enumerate(replay):
+        for name, kept in zip(LAYERS, state.kept, strict=True):
+            e = trace[f"E_after/{t}/{name}.lora_E"][:, 0]
+            ours = params[name]["adapter"]["lora_e"]
+            np.testing.assert_allclose(ours, e, rtol=1e-5, atol=1e-7)
+            np.testing.assert_array_equal(ours == 0, e == 0)
+            if f"mask/{t}/{name}.lora_E" in trace:
+                np.testing.assert_array_equal(kept, trace[f"mask/{t}/{name}.lora_E"])
+                checked += 1
+    assert checked == 156
+
+
+def test_end_of_training(trace, replay):
+    expected = model(trace, "final")
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6),
+        replay[-1][0],
+        expected,
+    )
+
+
+@pytest.mark.parametrize("t", [0, 1, 30])
+def test_moving_means(trace, replay, t):
+    state = replay[t][1]
+    for ours, name in ((state.importance, "ema_ipt"), (state.uncertainty, "ema_unc")):
+        for found, key in zip(ours, LAYERS, strict=True):
+            expected = layer(trace, f"{name}/{t}/{key}")
+            for leaf in expected:
+                np.testing.assert_allclose(found[leaf], expected[leaf], rtol=1e-4, atol=1e-9)
+
+
+def test_budgets(trace, oracle):
+    method, total = oracle
+    begin, end = round(method.warmup * total), total - round(method.final * total)
+    found = ada_lora.budgets(24, 12, begin, end)
+    np.testing.assert_array_equal(found, trace["budget"][: end + 1])
+    long = ada_lora.budgets(128 * 400, 60 * 400, 1000, 10_000)
+    t = np.arange(1000, 10_001)
+    left = [1 - (int(step) - 1000) / 9000 for step in t]
+    assert long[t].tolist() == [int((128 - 60) * 400 * x**3 + 60 * 400) for x in left]
+
+
+def test_forward_and_orthogonality():
+    arrays = dict(np.load(GOLDEN / "adalora_forward.npz"))
+    method, x, penalties = AdaLoRA(rank=6, target_rank=3, alpha=16), jnp.array(arrays["x"]), []
+    for i in range(3):
+        name = f"param/lin.{i}"
+        params = layer(arrays, name, ".default")
+        kernel, bias = arrays[f"{name}.weight"].T, arrays[f"{name}.bias"]
+        delta = method.merge(params, jnp.zeros(kernel.shape))
+        np.testing.assert_allclose(delta.T, arrays[f"delta/{i}"], rtol=1e-5, atol=1e-6)
+        x, aux = method.apply(params, x, jnp.array(kernel))
+        x = x + bias if i == 2 else jnp.tanh(x + bias)
+        assert np.all(aux.active_rank == 6)
+        penalties.append(method.penalty(params)["orthogonality"])
+    np.testing.assert_allclose(x, arrays["y"], rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(np.mean(penalties), arrays["orth_reg_mean"], rtol=1e-6)
+
+
+def test_unmasked_equals_lora():
+    key, x, kernel = jax.random.key(0), jnp.ones((3, 5)), jnp.ones((5, 7))
+    method = AdaLoRA(rank=4, target_rank=2, alpha=6.0)
+    params = method.init(key, kernel)[0] | {"lora_e": jnp.ones(4)}
+    lora = {"lora_a": params["lora_a"], "lora_b": params["lora_b"]}
+    expected, _ = LoRA(rank=4, alpha=6.0).apply(lora, x, kernel)
+    np.testing.assert_allclose(method.apply(params, x, kernel)[0], expected, rtol=1e-5)
+
+
+def run(method, params, total, seed=0):
+    """Entries of e that are not 0 after each step, all layers together, on random gradients."""
+    optimizer = method.transform(optax.adam(1e-2), total)
+
+    def step(carry, key):
+        params, state = carry
+        leaves, structure = jax.tree.flatten(params)
+        keys = jax.random.split(key, len(leaves))
+        grads = [jax.random.normal(k, leaf.shape) for k, leaf in zip(keys, leaves, strict=True)]
+        updates, state = optimizer.update(jax.tree.unflatten(structure, grads), state, params)
+        params = optax.apply_updates(params, updates)
+        e = [t["lora_e"].ravel() for t in ada_lora._triplets(params)]
+        return (params, state), jnp.concatenate(e) != 0
+
+    keys = jax.random.split(jax.random.key(seed), total)
+    return jax.jit(lambda p: jax.lax.scan(step, (p, optimizer.init(p)), keys))(params)
+
+
+def small(**fields):
+    return AdaLoRA(**{"rank": 6, "target_rank": 2, "interval": 3} | fields)
+
+
+def test_rank_shrinks_to_the_target_and_stays():
+    method = small()
+    params = {"one": method.init(jax.random.key(0), jnp.zeros((4, 5)))[0], "other": jnp.ones(3)}
+    params["two"] = method.init(jax.random.key(1), jnp.zeros((8, 3)))[0]
+    (after, state), kept = run(method, params, 40)
+    ranks = kept.sum(1)
+    assert np.all(ranks[:4] == 12)
+    assert np.all(ranks[28:] == 4)
+    assert np.all(kept[28:] == kept[28])
+    pruned = np.flatnonzero(ranks[:-1] > ranks[1:]) + 1
+    assert len(pruned) > 3
+    assert not np.any(pruned % 3 * (pruned != 28))
+    assert np.any(kept[1:] & ~kept[:-1])  # a pruned triplet trains on and can come back
+    assert not np.array_equal(after["other"], params["other"])  # the optimizer trains all else
+    assert int(state.step) == 40
+
+
+def test_stacked_layers_are_layers():
+    method = small()
+    one = method.init(jax.random.key(0), jnp.zeros((4, 5)))[0]
+    stacked = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), one)
+    _, kept = run(method, {"stack": stacked}, 40)
+    assert kept[-1].sum() == 2 * method.target_rank
+    shaped = kept[-1].reshape(2, 6).sum(1)
+    assert shaped.sum() == 4
+
+
+def test_no_pruning_where_nothing_is_to_prune():
+    _, kept = run(
+        small(target_rank=6), {"a": small().init(jax.random.key(0), jnp.zeros((4, 5)))[0]}, 20
+    )
+    assert kept.all()
+
+
+def test_ties_at_the_threshold_go_too():
+    scores = [jnp.array([3.0, 1.0]), jnp.array([1.0, 2.0])]
+    kept = ada_lora._keep(scores, jnp.array(1))
+    assert [k.tolist() for k in kept] == [[True, False], [False, True]]
+
+
+def test_the_budget_that_lora_sp_used():
+    assert AdaLoRA(rank=128).match_budget(75.6) == AdaLoRA(rank=128, target_rank=76)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"target_rank": 7},
+        {"target_rank": 0},
+        {"interval": 0},
+        {"warmup": 0.6, "final": 0.4},
+        {"final": -0.1},
+    ],
+    ids=str,
+)
+def test_bad_fields(fields):
+    with pytest.raises(ValueError, match="got"):
+        small(**fields)
+
+
+def test_too_few_steps():
+    with pytest.raises(ValueError, match="cannot prune in 1 steps"):
+        small(warmup=0.2, final=0.6).transform(optax.sgd(1.0), 1)
+
+
+def test_gradients_and_parameters_agree():
+    method = small()
+    params, kernel = method.init(jax.random.key(0), jnp.ones((4, 5)))
+    assert sum(leaf.size for leaf in jax.tree.leaves(params)) == (4 + 5 + 1) * 6
+    x = jax.random.normal(jax.random.key(1), (3, 4))
+    grads = jax.grad(lambda p: method.apply(p, x, kernel)[0].sum())(params)
+    assert np.all(grads["lora_a"] == 0)  # e is zero
+    assert np.any(grads["lora_e"] != 0)
+    assert dataclasses.replace(method) == method

@@ -1,0 +1,183 @@
+"""DoRA against Hugging Face PEFT and against its formula written out."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lorasp_jax import peft
+from lorasp_jax.peft.dora import DoRA
+from tests.peft.test_lora import SIDES, assert_close, assert_equals_hugging_face, load
+
+D_IN, D_OUT, RANK = 6, 10, 3
+METHOD = DoRA(rank=RANK, alpha=5.0)
+KERNEL = jax.random.normal(jax.random.key(1), (D_IN, D_OUT))
+X = jax.random.normal(jax.random.key(2), (2, 5, D_IN))
+
+
+def trained(method=METHOD, kernel=KERNEL):
+    """Parameters moved off their start: B and the magnitude too."""
+    params, _ = method.init(jax.random.key(3), kernel)
+    keys = dict(zip(params, jax.random.split(jax.random.key(4), 3), strict=True))
+    return {
+        name: leaf + 0.3 * jax.random.normal(keys[name], leaf.shape)
+        for name, leaf in params.items()
+    }
+
+
+def test_equals_hugging_face():
+    names = SIDES | {"magnitude": "lora_magnitude_vector"}
+    golden, kernels, params, gradients = load("lora_dora", names)
+    methods = [DoRA(rank=8, alpha=16)] * 3
+    assert_equals_hugging_face(golden, methods, kernels, params, gradients)
+    for kernel, one in zip(kernels, params, strict=True):  # the recorded magnitudes are fresh ones
+        fresh = methods[0].init(jax.random.key(0), kernel)[0]
+        assert_close(fresh["magnitude"], one["magnitude"], 1e-6)
+
+
+def test_is_found_by_its_name():
+    assert peft.find("dora") is DoRA
+    assert peft.create("dora", rank=4, rank_stabilized=True) == DoRA(4, rank_stabilized=True)
+    assert METHOD.name == "dora"
+
+
+def test_starts_as_the_base():
+    """Equal to x @ kernel, with (I + O) R + O fp32 parameters."""
+    params, kernel = METHOD.init(jax.random.key(0), KERNEL)
+    assert kernel is KERNEL
+    assert sum(leaf.size for leaf in params.values()) == (D_IN + D_OUT) * RANK + D_OUT
+    assert {leaf.dtype for leaf in params.values()} == {jnp.dtype("float32")}
+    y, aux = jax.jit(METHOD.apply)(params, X, KERNEL)
+    np.testing.assert_allclose(y, X @ KERNEL, rtol=1e-5, atol=1e-5)
+    np.testing.assert_array_equal(aux.active_rank, jnp.full((2, 5), RANK))
+    np.testing.assert_allclose(METHOD.merge(params, KERNEL), KERNEL, rtol=1e-6)
+
+
+def test_starts_from_the_norms_over_the_input():
+    kernel = jnp.array([[3.0, 0.0], [4.0, 2.0], [0.0, 0.0]], jnp.bfloat16)
+    magnitude = METHOD.init(jax.random.key(0), kernel)[0]["magnitude"]
+    np.testing.assert_array_equal(magnitude, [5, 2])
+    assert magnitude.dtype == jnp.float32
+
+
+@pytest.mark.parametrize("stabilized", [False, True])
+def test_equals_the_formula_with_a_constant_norm(stabilized):
+    """Forward and gradients of x (W + s A B) m / n, where n is a number and no function."""
+    method = DoRA(rank=RANK, alpha=5.0, rank_stabilized=stabilized)
+    params = trained(method)
+    scale = 5 / RANK ** (0.5 if stabilized else 1)
+
+    def adapted(params):
+        return KERNEL + scale * params["lora_a"] @ params["lora_b"]
+
+    norm = np.sqrt(np.square(np.asarray(adapted(params), np.float64)).sum(0)).astype(np.float32)
+
+    def formula(params, x):
+        y = x @ adapted(params) * params["magnitude"] / norm
+        return (y**3).sum(), y
+
+    def ours(params, x):
+        y, _ = method.apply(params, x, KERNEL)
+        return (y**3).sum(), y
+
+    (expected, y), actual = [
+        jax.value_and_grad(f, argnums=(0, 1), has_aux=True)(params, X) for f in (formula, ours)
+    ]
+    jax.tree.map(lambda a, b: assert_close(a, b, 1e-5), actual, (expected, y))
+
+
+def test_the_norm_carries_no_gradient():
+    """With it, stretching a column would change nothing and have no gradient; without, it has."""
+    params = trained() | {"lora_a": jnp.eye(D_IN, RANK)}
+
+    def loss(params, kernel):
+        return METHOD.apply(params, X, kernel)[0].sum()
+
+    kernel = jnp.zeros_like(KERNEL)  # V is scale A B alone: scaling B scales V
+    gradient = jax.grad(loss)(params, kernel)["lora_b"]
+    assert np.abs((gradient * params["lora_b"]).sum(0)).min() > 1e-3
+    stretched = params | {"lora_b": 2 * params["lora_b"]}
+    np.testing.assert_allclose(loss(stretched, kernel), loss(params, kernel), rtol=1e-5)
+
+
+def test_merge_equals_apply():
+    params = trained()
+    merged = METHOD.merge(params, KERNEL)
+    np.testing.assert_allclose(X @ merged, METHOD.apply(params, X, KERNEL)[0], atol=1e-5)
+    np.testing.assert_allclose(
+        jnp.linalg.norm(merged, axis=0), jnp.abs(params["magnitude"]), rtol=1e-5
+    )
+    assert METHOD.merge(params, KERNEL.astype(jnp.bfloat16)).dtype == jnp.bfloat16
+
+
+def test_no_gradient_reaches_the_kernel():
+    params = trained()
+    gradient = jax.grad(lambda kernel: METHOD.apply(params, X, kernel)[0].sum())(KERNEL)
+    np.testing.assert_array_equal(gradient, 0)
+
+
+def test_keeps_low_precision():
+    """bf16 in, bf16 out over a bf16 base, fp32 gradients; close to the same in fp32."""
+    params = trained()
+    x, kernel = X.astype(jnp.bfloat16), KERNEL.astype(jnp.bfloat16)
+
+    def loss(params, x, kernel):
+        y, _ = METHOD.apply(params, x, kernel)
+        return jnp.square(y.astype(jnp.float32)).sum(), y
+
+    gradients, y = jax.grad(loss, has_aux=True)(params, x, kernel)
+    exact = (x.astype(jnp.float32), kernel.astype(jnp.float32))
+    expected_gradients, expected = jax.grad(loss, has_aux=True)(params, *exact)
+    assert y.dtype == jnp.bfloat16
+    assert {leaf.dtype for leaf in gradients.values()} == {jnp.dtype("float32")}
+    assert_close(y.astype(jnp.float32), expected, 0.02)
+    jax.tree.map(lambda a, b: assert_close(a, b, 0.03), gradients, expected_gradients)
+
+
+def test_the_factor_is_not_rounded_to_low_precision():
+    """In bf16 a factor of 1.003 would be 1 and every output stay as it was."""
+    method, kernel = DoRA(rank=1), jnp.ones((1, 1), jnp.bfloat16)
+    params, _ = method.init(jax.random.key(0), kernel)
+    x = jnp.linspace(1, 2, 129)[:, None].astype(jnp.bfloat16)
+    y, _ = method.apply(params | {"magnitude": 1.003 * params["magnitude"]}, x, kernel)
+    assert y.dtype == jnp.bfloat16
+    assert (y > x).mean() > 0.5
+
+
+def test_a_zero_kernel_starts_at_zero_and_learns():
+    """Its columns have no direction, 0 / 0: the output is 0, and B then the magnitude move."""
+    kernel = jnp.zeros((D_IN, D_OUT))
+    params, _ = METHOD.init(jax.random.key(0), kernel)
+
+    def loss(params):
+        y, _ = METHOD.apply(params, X, kernel)
+        return (y - 1).sum(), y
+
+    gradient, y = jax.grad(loss, has_aux=True)(params)
+    np.testing.assert_array_equal(y, 0)
+    np.testing.assert_array_equal(gradient["magnitude"], 0)
+    assert gradient["lora_b"].any()
+    params = jax.tree.map(lambda p, g: p - 0.1 * g, params, gradient)
+    assert jax.grad(loss, has_aux=True)(params)[0]["magnitude"].all()
+
+
+def test_needs_the_kernels_values():
+    shape = jax.ShapeDtypeStruct((D_IN, D_OUT), jnp.float32)
+    with pytest.raises(ValueError, match=r"norms of the kernel .* needs its values.*\(6, 10\)"):
+        METHOD.init(jax.random.key(0), shape)
+    shapes, _ = jax.eval_shape(METHOD.init, jax.random.key(0), shape)  # there it is a tracer
+    assert {name: leaf.shape for name, leaf in shapes.items()} == {
+        "lora_a": (D_IN, RANK),
+        "lora_b": (RANK, D_OUT),
+        "magnitude": (D_OUT,),
+    }
+
+
+def test_has_no_delta():
+    with pytest.raises(ValueError, match="DoRA is not additive and has no delta; use apply"):
+        METHOD.delta(trained(), X)
+
+
+def test_bad_rank():
+    with pytest.raises(ValueError, match="rank must be at least 1, got 0"):
+        DoRA(rank=0)

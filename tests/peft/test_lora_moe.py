@@ -1,0 +1,220 @@
+"""LoRA-MoE: router losses against Hugging Face, routing against plain loops, identities."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lorasp_jax.peft import LoRA, LoRASP
+from lorasp_jax.peft.lora_moe import LoRAMoE, balance_loss, z_loss
+
+GOLDEN = Path(__file__).parent.parent / "golden" / "moe_switch_losses.npz"
+D_IN, D_OUT, EXPERTS, RANK = 6, 5, 4, 2
+TOP1 = [
+    LoRAMoE(EXPERTS, RANK, routing="top1"),
+    LoRAMoE(EXPERTS, RANK, alpha=5.0, routing="top1", gate_gradient="switch"),
+]
+ALL = [LoRAMoE(EXPERTS, RANK, alpha=5.0), *TOP1]
+
+
+@pytest.fixture(scope="module")
+def x():
+    return jax.random.normal(jax.random.key(0), (3, 7, D_IN))
+
+
+def arrays(experts=EXPERTS, rank=RANK):
+    """Parameters that are nowhere zero, with a router that makes up its mind."""
+    keys = jax.random.split(jax.random.key(1), 3)
+    shapes = {
+        "lora_a": (D_IN, experts * rank),
+        "lora_b": (experts * rank, D_OUT),
+        "router": (D_IN, experts),
+    }
+    return {
+        name: jax.random.normal(key, shape)
+        for key, (name, shape) in zip(keys, shapes.items(), strict=True)
+    }
+
+
+def probabilities_of(x, router):
+    """Softmax of x @ router in float64, by hand."""
+    powers = np.exp(np.asarray(x, np.float64) @ np.asarray(router, np.float64))
+    return powers / powers.sum(-1, keepdims=True)
+
+
+def expert_deltas(params, x, rank=RANK):
+    """x A_i B_i of each expert in float64, [E, tokens, O]."""
+    x, a, b = (np.asarray(v, np.float64) for v in (x, params["lora_a"], params["lora_b"]))
+    starts = range(0, a.shape[1], rank)
+    return np.stack([x @ a[:, i : i + rank] @ b[i : i + rank] for i in starts])
+
+
+def test_losses_equal_hugging_face():
+    """Theirs averages the balance of single sequences, ours pools: 1.0865 against 1.0253."""
+    with np.load(GOLDEN) as file:
+        logits, balance, z = jnp.asarray(file["logits"]), file["lb"], file["z"]
+    probabilities = jax.nn.softmax(logits)
+    ours = jnp.mean(jnp.stack([balance_loss(sequence, None) for sequence in probabilities]))
+    np.testing.assert_allclose(ours, balance, rtol=1e-6)
+    np.testing.assert_allclose(balance_loss(probabilities, None), 1.025313, rtol=1e-6)
+    np.testing.assert_allclose(z_loss(logits, None), z, rtol=1e-6)
+
+
+def test_balance_is_between_one_and_the_experts():
+    """Tokens spread evenly give 1, all on one expert E; f has no gradient, P's is E f / n."""
+    spread = jnp.eye(EXPERTS) * 0.9 + 0.1 / EXPERTS
+    assert balance_loss(spread, None) == pytest.approx(1)
+    assert balance_loss(jnp.eye(EXPERTS)[jnp.zeros(9, int)], None) == pytest.approx(EXPERTS)
+    rows = jnp.array([[0.7, 0.3], [0.6, 0.4], [0.2, 0.8]])
+    gradient = jax.grad(balance_loss)(rows, None)
+    np.testing.assert_allclose(gradient, np.tile([2 * 2 / 9, 2 / 9], (3, 1)), rtol=1e-6)
+
+
+def test_weighted_equals_a_loop_over_experts(x):
+    method, params = ALL[0], arrays()
+    weights = probabilities_of(x, params["router"])
+    expected = 0
+    for i, expert in enumerate(expert_deltas(params, x)):
+        expected += 2.5 * weights[..., i, None] * expert
+    delta, aux = method.delta(params, x)
+    np.testing.assert_allclose(delta, expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_array_equal(aux.active_rank, EXPERTS * RANK)
+
+
+@pytest.mark.parametrize("method", TOP1, ids=lambda method: method.gate_gradient)
+def test_top1_uses_one_expert(method, x):
+    params, switch = arrays(), method.gate_gradient == "switch"
+    weights = probabilities_of(x, params["router"])
+    deltas = expert_deltas(params, x)
+    expected = np.zeros((*x.shape[:-1], D_OUT))
+    for token in np.ndindex(x.shape[:-1]):
+        best = weights[token].argmax()
+        expected[token] = deltas[(best, *token)] * (weights[token][best] if switch else 1)
+    delta, aux = method.delta(params, x)
+    np.testing.assert_allclose(delta, method.scale * expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_array_equal(aux.active_rank, RANK)
+    z, _, _ = method.project(params, x, None)
+    used = (np.asarray(z) != 0).reshape(*x.shape[:-1], EXPERTS, RANK)
+    np.testing.assert_array_equal(used.all(-1), used.any(-1))
+    np.testing.assert_array_equal(used.any(-1).sum(-1), 1)
+    assert len(np.unique(weights.argmax(-1))) > 1
+
+
+@pytest.mark.parametrize("method", ALL, ids=lambda m: f"{m.routing}-{m.gate_gradient}")
+def test_the_task_teaches_the_router_unless_top1_is_hard(method, x):
+    def task(params):
+        return jnp.sum(method.delta(params, x)[0] ** 2)
+
+    def router_losses(params):
+        return sum(method.delta(params, x)[1].losses.values())
+
+    taught = jnp.abs(jax.grad(task)(arrays())["router"]).max() > 1e-3
+    assert taught == (method is not TOP1[0])
+    assert jnp.abs(jax.grad(router_losses)(arrays())["router"]).max() > 1e-3
+    if not taught:
+        np.testing.assert_array_equal(jax.grad(task)(arrays())["router"], 0)
+
+
+@pytest.mark.parametrize("fields", [{}, {"routing": "top1"}, TOP1[1].__dict__ | {"alpha": None}])
+def test_one_expert_equals_lora(fields, x):
+    params = arrays(experts=1, rank=3)
+    ours, aux = LoRAMoE(**fields | {"experts": 1, "rank": 3}).delta(params, x)
+    lora = {"lora_a": params["lora_a"], "lora_b": params["lora_b"]}
+    theirs, theirs_aux = LoRA(rank=3).delta(lora, x)
+    np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-6)
+    np.testing.assert_array_equal(aux.active_rank, theirs_aux.active_rank)
+    assert aux.losses["balance"] == pytest.approx(1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_lora_sp_of_the_paper_starts_as_a_weighted_mixture(seed, x):
+    """At η = 1 and W2 = its 0/1 start they are one map, whatever the bank and the router hold."""
+    sp = LoRASP.paper(rank=EXPERTS * RANK, energy_target=1.0)
+    start, _ = sp.init(jax.random.key(seed), jax.ShapeDtypeStruct((D_IN, D_OUT), jnp.float32))
+    bank = start["bank"] | {"u": jax.random.normal(jax.random.key(seed), (sp.rank, D_OUT))}
+    w1 = start["router"]["w1"] * 3.0**seed
+    theirs, _ = sp.delta({"bank": bank, "router": start["router"] | {"w1": w1}}, x)
+    params = {"lora_a": bank["v"], "lora_b": bank["u"], "router": w1}
+    moe = LoRAMoE(EXPERTS, RANK)
+    assert moe.scale == sp.scale
+    np.testing.assert_allclose(moe.delta(params, x)[0], theirs, rtol=1e-5, atol=1e-6)
+
+
+def test_initialisation_and_count():
+    """(I + O) E R + I E parameters; A and the router uniform in ±1/√I, B zero."""
+    kernel = jax.ShapeDtypeStruct((400, 30), jnp.float32)
+    params, _ = LoRAMoE(EXPERTS, 8).init(jax.random.key(0), kernel)
+    count = sum(leaf.size for leaf in jax.tree.leaves(params))
+    assert count == (400 + 30) * EXPERTS * 8 + 400 * EXPERTS
+    for name in ("lora_a", "router"):
+        assert np.abs(params[name]).max() == pytest.approx(1 / 20, rel=0.01)
+        assert np.std(params[name]) == pytest.approx(1 / 20 / 3**0.5, rel=0.05)
+    assert not params["lora_b"].any()
+
+
+@pytest.mark.parametrize("method", ALL, ids=lambda m: f"{m.routing}-{m.gate_gradient}")
+def test_padding_has_no_influence(method, x):
+    """Losses and their gradients are those of the valid tokens by themselves."""
+    mask = jnp.arange(7)[None] < jnp.array([[3], [7], [0]])
+
+    def losses(params, x, mask):
+        aux = method.delta(params, x, token_mask=mask)[1]
+        return sum(aux.losses.values()), aux.losses
+
+    both = jax.value_and_grad(losses, has_aux=True)
+    alone = both(arrays(), x[mask], None)
+    for garbage in (1e3, -1e3, 1e8):
+        padded = both(arrays(), jnp.where(mask[..., None], x, garbage), mask)
+        for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(padded), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
+
+
+def test_nothing_but_padding(x):
+    """Losses and their gradients are zero, not NaN."""
+    mask = jnp.zeros(x.shape[:-1], bool)
+
+    def losses(params):
+        return sum(ALL[0].delta(params, 1e3 * x, token_mask=mask)[1].losses.values())
+
+    value, gradients = jax.value_and_grad(losses)(arrays())
+    assert value == 0
+    assert all(not leaf.any() for leaf in jax.tree.leaves(gradients))
+
+
+def test_logits_keep_fp32_sums_in_low_precision(x):
+    """A bf16 input gives bf16 factors, and losses as near as the rounding of its inputs allows."""
+    low = x.astype(jnp.bfloat16)
+    z, u, aux = ALL[0].project(arrays(), low, None)
+    assert {z.dtype, u.dtype} == {jnp.dtype("bfloat16")}
+    router = arrays()["router"].astype(jnp.bfloat16).astype(jnp.float32)
+    logits = low.astype(jnp.float32) @ router
+    assert aux.losses["z"].dtype == jnp.float32
+    np.testing.assert_allclose(aux.losses["z"], z_loss(logits, None), rtol=1e-5)
+    expected = balance_loss(jax.nn.softmax(logits), None)
+    np.testing.assert_allclose(aux.losses["balance"], expected, rtol=1e-5)
+    task = jax.grad(lambda params, x: TOP1[1].delta(params, x)[0].sum(), argnums=(0, 1))
+    of_params, of_x = task(arrays(), low)
+    assert {leaf.dtype for leaf in jax.tree.leaves(of_params)} == {jnp.dtype("float32")}
+    assert of_x.dtype == jnp.bfloat16
+
+
+def test_merge_names_the_ways_out():
+    with pytest.raises(ValueError, match=r"depends on the input .* prune .* distill"):
+        ALL[0].merge(arrays(), jnp.zeros((D_IN, D_OUT)))
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"experts": 0}, "experts and rank must be at least 1, got 0, 32"),
+        ({"rank": 0}, "experts and rank must be at least 1, got 4, 0"),
+        ({"routing": "top2"}, "routing must be 'weighted' or 'top1', got 'top2'"),
+        ({"gate_gradient": "soft"}, "gate_gradient must be 'hard' or 'switch', got 'soft'"),
+        ({"gate_gradient": "switch"}, "'switch' needs routing 'top1', got 'weighted'"),
+    ],
+)
+def test_bad_fields(fields, message):
+    with pytest.raises(ValueError, match=message):
+        LoRAMoE(**fields)
