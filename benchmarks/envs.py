@@ -12,12 +12,10 @@ is warmed up twice, the best of three calls counts.
 import argparse
 import copy
 import dataclasses
-import importlib.metadata
 import importlib.util
 import itertools
 import json
 import os
-import platform
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -29,10 +27,10 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 import envs
+from benchmarks import measuring
+from benchmarks.measuring import best, print_table, text
 from envs import physics, render
 from envs.env import Env
 from envs.state import State
@@ -115,16 +113,6 @@ def time_pictures(env: Env, state: State, size: int) -> float:
     return env.num_envs * len(env.cameras) / best(lambda: draw(poses))
 
 
-def best(call: Callable[[], Any]) -> float:
-    """Seconds of the fastest of three calls, after two to warm up."""
-    seconds = []
-    for _ in range(5):
-        start = time.perf_counter()
-        jax.block_until_ready(call())
-        seconds.append(time.perf_counter() - start)
-    return min(seconds[2:])
-
-
 def mujoco_c(env: Env, state: State) -> float:
     """Physics steps/s of MuJoCo's C engine from the same start, one thread a core."""
     cores = os.cpu_count() or 1
@@ -203,14 +191,13 @@ def main() -> None:
     physics.enable_fast_cpu()
     options.backends = options.backends or sorted({"jax", physics.default_backend()})
     console = Console()
-    versions = {p: importlib.metadata.version(p) for p in ("jax", "mujoco", "mujoco-mjx")}
-    machine = f"{jax.devices()[0].device_kind}, {os.cpu_count()} cores, Python "
-    machine += f"{platform.python_version()}, {versions}, pictures {options.image_size} px"
+    machine = measuring.machine("jax", "mujoco", "mujoco-mjx")
+    machine += f", pictures {options.image_size} px"
     console.print(machine)
     rows = []
     for row in measure(options):
         rows.append(row)
-        console.print(", ".join(f"{k} {_text(v)}" for k, v in row.items()))
+        console.print(", ".join(f"{k} {text(v)}" for k, v in row.items()))
     images = [name for name in rows[0] if name.startswith("images/s")]
     print_table(console, [{k: v for k, v in row.items() if k not in images} for row in rows])
     names = ["task", "backend", "batch", *images]
@@ -222,26 +209,7 @@ def main() -> None:
     else:
         console.print(f"mujoco_playground is not installed: no figures of its {PLAYGROUND}")
     if options.json:
-        options.json.write_text(json.dumps(found, indent=1))
-
-
-def print_table(console: Console, rows: list[dict[str, Any]], title: str = "") -> None:
-    """One line a row, which fits 80 columns."""
-    table = Table(title=title, box=None, padding=(0, 1, 0, 0))
-    for name in rows[0]:
-        table.add_column(escape(name), no_wrap=True, justify="right")
-    for row in rows:
-        table.add_row(*map(_text, row.values()))
-    console.print(table)
-
-
-def _text(value: Any) -> str:
-    if not isinstance(value, float):
-        return str(value)
-    for size, letter in ((1e6, " M"), (1e3, " k")):
-        if value >= size:
-            return f"{value / size:.3g}{letter}"
-    return f"{value:.3g}"
+        options.json.writetext(json.dumps(found, indent=1))
 
 
 if __name__ == "__main__":

@@ -143,10 +143,13 @@ def attach(layer: Dense | nnx.Linear, method: Method, key: jax.Array) -> Dense:
       key: typed random key.
 
     Raises:
-      ValueError: an `nnx.Linear` with a custom matrix product or precision.
+      ValueError: an `nnx.Linear` with a custom matrix product or precision, or a layer whose
+        adapter holds a part of its kernel.
     """
     if isinstance(layer, nnx.Linear):
         layer = _as_dense(layer)
+    if layer.adapter is not None and layer.method is not None and layer.method.splits_kernel:
+        raise ValueError("an adapter that holds a part of its kernel cannot be replaced: merge it.")
     _retype([p for p in places(nnx.List([layer]), AdapterParam) if p.name != "adapter"], nnx.Param)
     layer.method = method
     params, kernel = _init(key, method, layer.kernel.get_value())

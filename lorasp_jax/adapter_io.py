@@ -66,8 +66,8 @@ def save_adapters(
     text = json.dumps(description, indent=2)  # before anything is written: it may raise
     folder = pathlib.Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    _write(folder / TENSORS, data)
-    _write(folder / DESCRIPTION, text.encode())
+    write_whole(folder / TENSORS, data)
+    write_whole(folder / DESCRIPTION, text.encode())
 
 
 def load_adapters(
@@ -144,7 +144,7 @@ def _method(settings: Settings) -> Method:
     return peft.create(settings["method"], **fields)
 
 
-def _write(path: pathlib.Path, data: bytes) -> None:
+def write_whole(path: pathlib.Path, data: bytes) -> None:
     """Writes a whole file or nothing."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     temporary.write_bytes(data)

@@ -190,6 +190,11 @@ class LinenDense(nn.Module):
 
     def _init_adapter(self, kernel: jax.Array) -> Params:
         assert self.method is not None
+        if self.method.splits_kernel:
+            raise ValueError(
+                "Linen cannot change a kernel that is there already, which this method's "
+                "initialization asks for: use `adapt` on an NNX model or another initialization."
+            )
         return self.method.init(self.make_rng("params"), kernel)[0]
 
 

@@ -5,8 +5,7 @@ import io
 import pytest
 from rich.console import Console
 
-from benchmarks import envs as bench
-from benchmarks import long_run
+from benchmarks import long_run, measuring
 
 
 def part(broken=0, **memory):
@@ -63,7 +62,7 @@ def test_tables_fit_a_terminal():
         "over C": 0.0123,
     }
     console = Console(width=80, record=True, file=io.StringIO())
-    bench.print_table(console, [row])
+    measuring.print_table(console, [row])
     text = console.export_text()
     assert "…" not in text
     assert "pick_place jax 8192 123 13.9 M 694 k 337 k 12.3 k 0.0123" in " ".join(text.split())

@@ -14,6 +14,7 @@ ROOMS = [
     "lorasp_jax.adaptation",
     "lorasp_jax.tables",
     "lorasp_jax.adapter_io",
+    "lorasp_jax.hugging_face",
     "lorasp_jax.config",
     "lorasp_jax.models",
     "lorasp_jax.data",

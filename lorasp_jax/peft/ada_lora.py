@@ -42,8 +42,8 @@ class AdaLoRA(Method):
 
     rank: int = 128
     """R at the start."""
-    target_rank: int = 64
-    """Mean rank of a layer at the end; see `match_budget`."""
+    target_rank: int | None = None
+    """Mean rank of a layer at the end, None: half of R; see `match_budget`."""
     alpha: float | None = None
     """α of the scale α/R; None is 2 R. R stays that of the start, as in PEFT."""
     warmup: float = 0.1
@@ -59,7 +59,7 @@ class AdaLoRA(Method):
 
     def __post_init__(self) -> None:
         """Checks the fields."""
-        if not 1 <= self.target_rank <= self.rank or self.interval < 1:
+        if self.rank < 1 or not 1 <= self.final_rank <= self.rank or self.interval < 1:
             raise ValueError(
                 "target_rank must be 1 to rank and interval at least 1, got "
                 f"{self.target_rank}, {self.rank}, {self.interval}."
@@ -69,6 +69,11 @@ class AdaLoRA(Method):
                 "warmup and final are shares of the steps that leave some between them, got "
                 f"{self.warmup}, {self.final}."
             )
+
+    @property
+    def final_rank(self) -> int:
+        """Mean rank of a layer at the end."""
+        return (self.rank + 1) // 2 if self.target_rank is None else self.target_rank
 
     @property
     def scale(self) -> float:
@@ -179,7 +184,7 @@ def _allocate(
     Between two allocations pruned entries train on; after the last one they stay pruned.
     """
     step, number = state.step, sum(s.size for s in scores)
-    table = budgets(number, number // method.rank * method.target_rank, begin, end)
+    table = budgets(number, number // method.rank * method.final_rank, begin, end)
     fewer = number - jnp.asarray(table)[jnp.minimum(step, end)]
     due = ((step > begin) & (step < end) & (step % method.interval == 0)) | (step == end)
     pairs = zip(_keep(scores, fewer), state.kept, strict=True)

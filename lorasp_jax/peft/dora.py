@@ -41,13 +41,13 @@ class DoRA(LoRA):
         Raises:
           ValueError: the kernel is not a matrix, or is a shape without values.
         """
-        params, kernel = super().init(key, kernel, statistics=statistics)
         if isinstance(kernel, jax.ShapeDtypeStruct):
             raise ValueError(
                 "DoRA starts from the norms of the kernel and so needs its values, got only "
                 f"the shape {kernel.shape}."
             )
-        return params | {"magnitude": norms(kernel)}, kernel
+        params, rest = super().init(key, kernel, statistics=statistics)
+        return params | {"magnitude": norms(kernel)}, rest
 
     def apply(
         self,

@@ -1,15 +1,19 @@
 """LoRA: ΔW = (α/R) A B of fixed rank (Hu et al., arXiv 2106.09685), with rsLoRA scaling on request.
 
-Conventions and initialisation are those of Hugging Face PEFT: A Kaiming-uniform with a = √5, that
-is U(±1/√I), B = 0; scale α/R, or α/√R for rsLoRA (Kalajdzievski, arXiv 2312.03732).
+Conventions and initialisations are those of Hugging Face PEFT: A Kaiming-uniform with a = √5, that
+is U(±1/√I), or gaussian, and B = 0; or a part of the kernel, which leaves the rest frozen. Scale
+α/R, or α/√R for rsLoRA (Kalajdzievski, arXiv 2312.03732).
 """
 
 import dataclasses
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 
-from lorasp_jax.peft.method import Aux, Method, Params, kaiming_uniform
+from lorasp_jax.peft.method import Aux, Kernel, Method, Params, check_matrix, kaiming_uniform
+
+_SPLITS = ("pissa", "olora")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,20 +23,35 @@ class LoRA(Method):
     Parameters: lora_a [I, R], lora_b [R, O], (I + O) R numbers.
 
     Raises:
-      ValueError: a rank below 1.
+      ValueError: a rank below 1 or an unknown initialization.
     """
 
     rank: int = 128
-    """R; it may exceed the kernel's sides. 128 is the paper's main baseline."""
+    """R; it may exceed the kernel's sides, unless A and B start as parts of the kernel. 128 is the
+    paper's main baseline."""
     alpha: float | None = None
     """α; None is 2 R, the scale 2 of LoRA-SP's defaults."""
     rank_stabilized: bool = False
     """Scale by α/√R (rsLoRA) instead of α/R."""
+    initialization: Literal["kaiming", "gaussian", "pissa", "olora"] = "kaiming"
+    """"kaiming": A in U(±1/√I). "gaussian": A in N(0, 1/R²). "pissa": A B is the kernel's best
+    approximation of rank R (`principal_part`), "olora": the first R columns of its QR
+    decomposition (`orthogonal_part`); what trains is then taken out of the kernel."""
 
     def __post_init__(self) -> None:
-        """Checks the rank."""
+        """Checks the fields."""
         if self.rank < 1:
             raise ValueError(f"rank must be at least 1, got {self.rank}.")
+        if self.initialization not in ("kaiming", "gaussian", *_SPLITS):
+            raise ValueError(
+                "initialization must be 'kaiming', 'gaussian', 'pissa' or 'olora', got "
+                f"{self.initialization!r}."
+            )
+
+    @property
+    def splits_kernel(self) -> bool:
+        """True if A and B start as a part of the kernel."""
+        return self.initialization in _SPLITS
 
     @property
     def scale(self) -> float:
@@ -40,12 +59,36 @@ class LoRA(Method):
         alpha = 2 * self.rank if self.alpha is None else self.alpha
         return alpha / (self.rank**0.5 if self.rank_stabilized else self.rank)
 
+    def init(
+        self, key: jax.Array, kernel: Kernel, *, statistics: Any = None
+    ) -> tuple[Params, Kernel]:
+        """A and B, and the kernel, less scale A B where they start as a part of it.
+
+        Arguments and results as for `Method.init`.
+
+        Raises:
+          ValueError: the kernel is not a matrix; or, where it is split, it is a shape without
+            values or has a side below the rank.
+        """
+        if not self.splits_kernel:
+            return super().init(key, kernel, statistics=statistics)
+        check_matrix(kernel)
+        if isinstance(kernel, jax.ShapeDtypeStruct) or self.rank > min(kernel.shape):
+            raise ValueError(
+                f"{self.initialization!r} splits a kernel, so it needs its values and a rank up to "
+                f"its smaller side, got rank {self.rank} and {kernel}."
+            )
+        part = principal_part if self.initialization == "pissa" else orthogonal_part
+        a, b = part(kernel.astype(jnp.float32), self.rank, self.scale)
+        params = {"lora_a": a, "lora_b": b}
+        return params, (kernel.astype(jnp.float32) - self.scale * (a @ b)).astype(kernel.dtype)
+
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
-        """A uniform, B zero: the delta starts at exactly zero."""
-        return {
-            "lora_a": kaiming_uniform(key, (d_in, self.rank)),
-            "lora_b": jnp.zeros((self.rank, d_out)),
-        }
+        """A random, B zero: the delta starts at exactly zero."""
+        shape = (d_in, self.rank)
+        gaussian = self.initialization == "gaussian"
+        a = jax.random.normal(key, shape) / self.rank if gaussian else kaiming_uniform(key, shape)
+        return {"lora_a": a, "lora_b": jnp.zeros((self.rank, d_out))}
 
     def project(
         self, params: Params, x: jax.Array, token_mask: jax.Array | None
@@ -59,3 +102,23 @@ class LoRA(Method):
         """W + scale A B, summed in fp32."""
         delta = self.scale * (params["lora_a"] @ params["lora_b"])
         return (kernel.astype(jnp.float32) + delta).astype(kernel.dtype)
+
+
+def principal_part(kernel: jax.Array, rank: int, scale: float) -> tuple[jax.Array, jax.Array]:
+    """A [I, R] and B [R, O] with scale A B the R largest terms of the kernel's SVD.
+
+    PiSSA (Meng et al., arXiv 2404.02948, eqs. 2-4): the singular values go to both in halves.
+    """
+    left, values, right = jnp.linalg.svd(kernel, full_matrices=False)
+    root = jnp.sqrt(values[:rank] / scale)
+    return left[:, :rank] * root, root[:, None] * right[:rank]
+
+
+def orthogonal_part(kernel: jax.Array, rank: int, scale: float) -> tuple[jax.Array, jax.Array]:
+    """A [I, R] and B [R, O], the rows of B orthonormal: QR of the kernel's transpose, cut at R.
+
+    OLoRA (Büyükakyüz, arXiv 2406.01775, algorithm 1), which does not divide by the scale.
+    """
+    del scale
+    orthonormal, triangular = jnp.linalg.qr(kernel.T)
+    return triangular[:rank].T, orthonormal[:, :rank].T

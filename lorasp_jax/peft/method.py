@@ -67,6 +67,11 @@ class Method:
     """True if the adapted map is x @ kernel + delta."""
 
     @property
+    def splits_kernel(self) -> bool:
+        """True if `init` takes a part of the kernel, which then lacks it, into the parameters."""
+        return False
+
+    @property
     def name(self) -> str:
         """The method's file name, as `create` takes it."""
         return type(self).__module__.rpartition(".")[2]
@@ -88,8 +93,7 @@ class Method:
           ValueError: the kernel is not a matrix.
         """
         del statistics
-        if len(kernel.shape) != 2:
-            raise ValueError(f"an adapter needs a kernel [I, O], got shape {tuple(kernel.shape)}.")
+        check_matrix(kernel)
         return self.init_params(key, *kernel.shape), kernel
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
@@ -154,6 +158,12 @@ class Method:
           ValueError: the delta depends on the input.
         """
         raise NotImplementedError
+
+
+def check_matrix(kernel: Kernel) -> None:
+    """Raises a ValueError unless it is one."""
+    if len(kernel.shape) != 2:
+        raise ValueError(f"an adapter needs a kernel [I, O], got shape {tuple(kernel.shape)}.")
 
 
 def kaiming_uniform(key: jax.Array, shape: tuple[int, int]) -> jax.Array:

@@ -193,6 +193,10 @@ def test_ties_at_the_threshold_go_too():
     assert [k.tolist() for k in kept] == [[True, False], [False, True]]
 
 
+def test_half_the_rank_is_the_target_if_nothing_is_said():
+    assert [AdaLoRA(rank=rank).final_rank for rank in (1, 2, 16)] == [1, 1, 8]
+
+
 def test_the_budget_that_lora_sp_used():
     assert AdaLoRA(rank=128).match_budget(75.6) == AdaLoRA(rank=128, target_rank=76)
 

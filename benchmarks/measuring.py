@@ -1,0 +1,50 @@
+"""What all benchmarks share: the clock, the machine's name, tables that fit a terminal."""
+
+import importlib.metadata
+import os
+import platform
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+
+def best(call: Callable[[], Any], *, calls: int = 1, repeats: int = 3) -> float:
+    """Seconds of one of `calls` that are queued together, the fastest of `repeats`, after two."""
+    seconds = []
+    for _ in range(2 + repeats):
+        start = time.perf_counter()
+        jax.block_until_ready([call() for _ in range(calls)])
+        seconds.append((time.perf_counter() - start) / calls)
+    return min(seconds[2:])
+
+
+def machine(*packages: str) -> str:
+    """Device, cores and versions, in words."""
+    versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)
+    device = jax.devices()[0].device_kind
+    return f"{device}, {os.cpu_count()} cores, Python {platform.python_version()}, {versions}"
+
+
+def print_table(console: Console, rows: list[dict[str, Any]], title: str = "") -> None:
+    """One line a row, close together."""
+    table = Table(title=title, box=None, padding=(0, 1, 0, 0))
+    for name in rows[0]:
+        table.add_column(escape(name), no_wrap=True, justify="right")
+    for row in rows:
+        table.add_row(*map(text, row.values()))
+    console.print(table)
+
+
+def text(value: Any) -> str:
+    """Three digits of a number."""
+    if not isinstance(value, float):
+        return str(value)
+    for size, letter in ((1e6, " M"), (1e3, " k")):
+        if value >= size:
+            return f"{value / size:.3g}{letter}"
+    return f"{value:.3g}"

@@ -1,0 +1,170 @@
+"""What adapters cost: one dense layer, bare and under every method, forward and with gradients.
+
+    python -m benchmarks.peft --json peft.json
+    python -m benchmarks.peft --tokens 1024 --shapes 256x2048 2048x256 --dtype float32   # on a CPU
+
+For each shape [I, O]: the frozen layer alone ("bare"), LoRA written the usual way (`usual_lora`,
+automatic differentiation of x W + scale (x A) B), and this project's methods at rank R, with their
+losses. Gradients are those of training: with respect to the input and the adapter. The ratios are
+to the usual LoRA in the same run. Memory is what the compiled program needs beside its arguments.
+At last the energy gate next to a copy of its scores. Inputs are made under jit, everything is
+warmed up twice, calls are queued ten together.
+"""
+
+import argparse
+import functools
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from rich.console import Console
+
+from benchmarks.measuring import best, machine, print_table
+from lorasp_jax import peft
+from lorasp_jax.kernels.energy_gate import energy_gate
+
+SHAPES = ((2048, 16384), (16384, 2048), (2048, 2048), (1152, 4304))
+QUEUED = 10
+COPIES = 20  # of the gate in one program: one alone takes no longer than its launch
+LOSS_WEIGHT = 1e-2
+
+Layer = Callable[[Any, jax.Array, jax.Array], tuple[jax.Array, Any]]
+
+
+def bare(params: Any, x: jax.Array, kernel: jax.Array) -> tuple[jax.Array, Any]:
+    """The frozen layer."""
+    del params
+    return x @ kernel, {}
+
+
+def usual_lora(params: Any, x: jax.Array, kernel: jax.Array) -> tuple[jax.Array, Any]:
+    """LoRA as it is usually written."""
+    a, b = (params[name].astype(x.dtype) for name in ("lora_a", "lora_b"))
+    return x @ kernel + 2.0 * ((x @ a) @ b), {}
+
+
+def layers(rank: int) -> Iterator[tuple[str, Layer, Any]]:
+    """Name, function and the method that makes its parameters."""
+    yield "bare", bare, peft.LoRA(rank=1)
+    yield "usual LoRA", usual_lora, peft.LoRA(rank=rank)
+    for name in peft.names():
+        method = make(name, rank)
+
+        def layer(params: Any, x: jax.Array, kernel: jax.Array, method: Any = method) -> Any:
+            y, aux = method.apply(params, x, kernel)
+            return y, aux.losses
+
+        yield name, layer, method
+
+
+def make(name: str, rank: int) -> peft.Method:
+    """A method with `rank` directions in all."""
+    fields: dict[str, dict[str, Any]] = {
+        "full": {},
+        "lora_moe": {"rank": rank // 4},
+    }
+    return peft.create(name, **fields.get(name, {"rank": rank}))
+
+
+def inputs(method: peft.Method, shape: tuple[int, int], tokens: int, dtype: str) -> Any:
+    """Parameters, x [tokens, I], kernel [I, O] and the gradient of y, made on the device."""
+
+    @jax.jit
+    def draw(key: jax.Array) -> Any:
+        keys = jax.random.split(key, 4)
+        kernel = jax.random.normal(keys[0], shape, dtype) / shape[0] ** 0.5
+        x = jax.random.normal(keys[1], (tokens, shape[0]), dtype)
+        gradient = jax.random.normal(keys[2], (tokens, shape[1]), dtype)
+        return method.init(keys[3], kernel)[0], x, kernel, gradient
+
+    return draw(jax.random.key(0))
+
+
+def with_gradients(layer: Layer, params: Any, x: jax.Array, kernel: jax.Array, g: jax.Array) -> Any:
+    """y and the gradients of x and the adapter, the auxiliary losses taken along."""
+
+    def run(params: Any, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        y, losses = layer(params, x, kernel)
+        return y, sum(losses.values(), jnp.zeros(()))
+
+    (y, loss), pull = jax.vjp(run, params, x)
+    return y, pull((g, jnp.full_like(loss, LOSS_WEIGHT)))
+
+
+def measure(options: argparse.Namespace, shape: tuple[int, int]) -> Iterator[dict[str, Any]]:
+    """The rows of one shape."""
+    base: dict[str, float] = {}
+    for name, layer, method in layers(options.rank):
+        params, x, kernel, g = inputs(method, shape, options.tokens, options.dtype)
+        forward = jax.jit(lambda p, x, w, layer=layer: layer(p, x, w)[0])
+        forward = forward.lower(params, x, kernel).compile()
+        backward = jax.jit(functools.partial(with_gradients, layer))
+        backward = backward.lower(params, x, kernel, g).compile()
+        seconds = {
+            "forward": best(functools.partial(forward, params, x, kernel), calls=QUEUED),
+            "both": best(functools.partial(backward, params, x, kernel, g), calls=QUEUED),
+        }
+        if name == "usual LoRA":
+            base = seconds
+        needed: Any = backward.memory_analysis()
+        yield {
+            "shape": "x".join(map(str, shape)),
+            "layer": name,
+            "fwd ms": 1e3 * seconds["forward"],
+            "fwd+bwd ms": 1e3 * seconds["both"],
+            "fwd ratio": seconds["forward"] / base["forward"] if base else "",
+            "ratio": seconds["both"] / base["both"] if base else "",
+            "MiB": (needed.temp_size_in_bytes + needed.output_size_in_bytes) / 2**20,
+        }
+
+
+def measure_gate(options: argparse.Namespace) -> dict[str, Any]:
+    """The gate's time next to that of a copy of its scores, fp32 [tokens, R]."""
+    keys = jax.random.split(jax.random.key(0), COPIES)
+    draw = jax.jit(jax.vmap(lambda key: jax.random.normal(key, (options.tokens, options.rank))))
+    scores = [*jax.nn.softplus(draw(keys))]
+    gate = jax.jit(lambda many: [energy_gate(s, 0.9)[0] for s in many])
+    copy = jax.jit(lambda many: [-s for s in many])
+    gated, copied = (best(lambda f=f: f(scores)) / COPIES for f in (gate, copy))
+    return {
+        "gate": f"{options.tokens}x{options.rank}",
+        "us": 1e6 * gated,
+        "copy us": 1e6 * copied,
+        "ratio": gated / copied,
+    }
+
+
+def _shape(text: str) -> tuple[int, int]:
+    d_in, d_out = map(int, text.split("x"))
+    return d_in, d_out
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--shapes", nargs="+", type=_shape, default=SHAPES, metavar="IxO")
+    parser.add_argument("--tokens", type=int, default=26112)
+    parser.add_argument("--rank", type=int, default=128)
+    parser.add_argument("--dtype", default="bfloat16")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    options = parser.parse_args()
+    console = Console(soft_wrap=True)
+    found: dict[str, Any] = {"machine": machine("jax"), "rows": []}
+    console.print(
+        f"{found['machine']}; {options.tokens} tokens, rank {options.rank}, {options.dtype}"
+    )
+    for shape in options.shapes:
+        rows = list(measure(options, shape))
+        print_table(console, rows)
+        found["rows"] += rows
+    found["gate"] = measure_gate(options)
+    print_table(console, [found["gate"]])
+    if options.json:
+        options.json.write_text(json.dumps(found, indent=1))
+
+
+if __name__ == "__main__":
+    main()

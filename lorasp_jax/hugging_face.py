@@ -1,0 +1,286 @@
+"""Adapter folders of Hugging Face PEFT, in and out: LoRA, rsLoRA, DoRA, and AdaLoRA once pruned.
+
+Such a folder holds adapter_config.json and adapter_model.safetensors, whose tensors are named
+base_model.model.<module>.lora_A.weight and so on, with torch's layout [out, in]. Which module is
+which layer of a model says a function of the layer's path and its index in a scanned stack; without
+one, "a/0/b" is "a.0.b". (Format as PEFT 0.21.2 writes it.)
+"""
+
+import collections
+import difflib
+import json
+import math
+import os
+import pathlib
+import re
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import safetensors.numpy
+from flax import nnx
+
+from lorasp_jax import adaptation
+from lorasp_jax.adapter_io import write_whole
+from lorasp_jax.dense import Dense
+from lorasp_jax.peft import AdaLoRA, DoRA, LoRA
+
+CONFIG, TENSORS = "adapter_config.json", "adapter_model.safetensors"
+_PREFIX = "base_model.model."
+_TENSOR = re.compile(
+    rf"{re.escape(_PREFIX)}(.+)\.(lora_A|lora_B|lora_E|lora_magnitude_vector)(\.weight)?"
+)
+_ADA_CONSTANT = 1e-5  # AdaLoRA's scale is α/(r + this)
+# What a folder may ask for beyond its tensors, and the values that ask for nothing.
+_NOTHING = (None, False, [], {}, "none")
+_UNKNOWN = (
+    "bias", "lora_bias", "modules_to_save", "fan_in_fan_out", "layer_replication", "use_qalora",
+    "target_parameters", "trainable_token_indices", "use_bdlora", "alora_invocation_tokens",
+)  # fmt: skip
+
+Names = Callable[[str, tuple[int, ...]], str]
+Adapter = dict[str, np.ndarray]
+
+
+def dotted(path: str, index: tuple[int, ...]) -> str:
+    """The module's name where a model's attributes are called as in torch.
+
+    Raises:
+      ValueError: for a layer of a stack, whose name cannot be guessed.
+    """
+    if index:
+        raise ValueError(f"{path} is a stack of layers: give names(path, index) for its modules.")
+    return path.replace("/", ".")
+
+
+def load_peft(
+    folder: str | os.PathLike, model: adaptation.Model, *, names: Names = dotted
+) -> adaptation.Model:
+    """The model with the adapters of a folder of Hugging Face PEFT.
+
+    AdaLoRA comes as the LoRA that it has become. Layers of a stack may differ in rank and scale:
+    they are padded with zeros, which change nothing.
+
+    Args:
+      folder: with adapter_config.json and adapter_model.safetensors.
+      model: left untouched; adapters that it has are replaced.
+      names: module of the layer at a path and an index in its stack, () outside of stacks.
+
+    Raises:
+      ValueError: missing or damaged files, an adapter of another kind, modules that the model does
+        not have, or adapters that do not fit their layers.
+    """
+    folder = pathlib.Path(folder)
+    config, modules = _read(folder)
+    kind = DoRA if config.get("use_dora") else LoRA
+    left, rules, values = dict(modules), [], {}
+    for place in adaptation.places(nnx.List([model]), (Dense, nnx.Linear)):
+        *leading, d_in, d_out = place.child.kernel.get_value().shape
+        wanted = [names(place.path, index) for index in np.ndindex(*leading)]
+        found = [left.pop(name) for name in wanted if name in left]
+        if not found:
+            continue
+        if len(found) < len(wanted):
+            raise ValueError(f"{folder} adapts only some of the layers of the stack {place.path}.")
+        for name, adapter in zip(wanted, found, strict=True):
+            _check_fits(folder, name, adapter, d_in, d_out)
+        scale, values[place.path] = _stacked(found, leading)
+        rank = values[place.path]["lora_a"].shape[-1]
+        rules.append((f"^{re.escape(place.path)}$", kind(rank=rank, alpha=scale * rank)))
+    if left or not rules:
+        raise ValueError(_no_module(folder, sorted(left), model, names))
+    adapted = adaptation.adapt(model, rules, rngs=nnx.Rngs(0))
+    for place in adaptation.places(nnx.List([adapted]), Dense):
+        if place.path in values:
+            new = {name: jnp.asarray(value) for name, value in values[place.path].items()}
+            place.child.adapter.set_value(new)
+    return adapted
+
+
+def save_peft(
+    folder: str | os.PathLike, model: nnx.Module, *, names: Names = dotted, base: str | None = None
+) -> None:
+    """Writes the adapters of a model as a folder of Hugging Face PEFT.
+
+    AdaLoRA is written as the LoRA that it has become, pruned directions left out.
+
+    Args:
+      folder: made if absent; an adapter in it is replaced.
+      model: adapted by LoRA and AdaLoRA, or by DoRA, and nothing else.
+      names: as for `load_peft`.
+      base: what the folder says of its base model.
+
+    Raises:
+      ValueError: adapters that PEFT has no counterpart for, or LoRA and DoRA together.
+    """
+    modules: dict[str, tuple[float, Adapter]] = {}
+    kinds = set()
+    known = {path for path, method in adaptation.methods(model).items() if _is_known(path, method)}
+    for place in adaptation.places(nnx.List([model]), Dense):
+        if place.path in known:
+            kinds.add(isinstance(place.child.method, DoRA))
+            shape = place.child.kernel.get_value().shape[:-2]
+            for index in np.ndindex(*shape):
+                modules[names(place.path, index)] = _exported(place.child, index)
+    if len(kinds) != 1:
+        raise ValueError("a PEFT folder holds either LoRA or DoRA, and at least one adapter.")
+    tensors = {
+        f"{_PREFIX}{module}.{name}": value
+        for module, (_, adapter) in modules.items()
+        for name, value in adapter.items()
+    }
+    data = safetensors.numpy.save(tensors, {"format": "pt"})
+    folder = pathlib.Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_whole(folder / TENSORS, data)
+    text = json.dumps(_config(modules, dora=kinds.pop(), base=base), indent=2)
+    write_whole(folder / CONFIG, text.encode())
+
+
+def _read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter]]:
+    """The configuration, and by module lora_A, lora_B in our layout, the scale among them."""
+    for name in (CONFIG, TENSORS):
+        if not (folder / name).is_file():
+            raise ValueError(
+                f"{folder} holds no {name}; a PEFT adapter is a folder with both files."
+            )
+    try:
+        config = json.loads((folder / CONFIG).read_bytes())
+        tensors = safetensors.numpy.load_file(folder / TENSORS)
+        kind = config["peft_type"]
+    except (ValueError, KeyError, TypeError, safetensors.SafetensorError) as error:
+        raise ValueError(f"{folder} is damaged or no PEFT adapter: {error}") from error
+    if kind not in ("LORA", "ADALORA"):
+        raise ValueError(f"{folder} holds {kind}; LORA and ADALORA can be loaded.")
+    if asked := [name for name in _UNKNOWN if config.get(name) not in _NOTHING]:
+        raise ValueError(
+            f"{folder} sets {asked[0]} to {config[asked[0]]!r}, which is not supported."
+        )
+    modules: dict[str, Adapter] = collections.defaultdict(dict)
+    for name, tensor in tensors.items():
+        if not (match := _TENSOR.fullmatch(name)):
+            raise ValueError(f"{folder} holds {name!r}, which belongs to no LoRA.")
+        modules[match[1]][match[2]] = tensor.astype(np.float32)
+    return config, {name: _imported(config, name, found) for name, found in modules.items()}
+
+
+def _imported(config: Mapping[str, Any], module: str, found: Adapter) -> Adapter:
+    """lora_a, lora_b, perhaps magnitude, and scale, in our layout."""
+    missing = {"lora_A", "lora_B"} - found.keys()
+    if config.get("use_dora"):
+        missing |= {"lora_magnitude_vector"} - found.keys()
+    if missing:
+        raise ValueError(f"the adapter of {module} lacks {min(missing)}.")
+    a, b = found["lora_A"].T, found["lora_B"].T
+    alpha = _pattern(config.get("alpha_pattern"), module, config["lora_alpha"])
+    if config["peft_type"] == "ADALORA":
+        scale = alpha / (config["init_r"] + _ADA_CONSTANT)
+        a = a * found["lora_E"][:, 0]
+    else:
+        rank = a.shape[1]
+        scale = alpha / (math.sqrt(rank) if config.get("use_rslora") else rank)
+    adapter = {"lora_a": a, "lora_b": b, "scale": np.float32(scale)}
+    if "lora_magnitude_vector" in found:
+        adapter["magnitude"] = found["lora_magnitude_vector"].reshape(-1)
+    return adapter
+
+
+def _pattern(pattern: Mapping[str, Any] | None, module: str, default: Any) -> Any:
+    """The value of the first regular expression that the end of the module's name matches."""
+    for key, value in (pattern or {}).items():
+        if re.match(rf"(.*\.)?({key})$", module):
+            return value
+    return default
+
+
+def _check_fits(folder: pathlib.Path, module: str, adapter: Adapter, d_in: int, d_out: int) -> None:
+    """Raises a ValueError unless a kernel [I, O] can carry the adapter."""
+    (a_in, rank), (b_rank, b_out) = adapter["lora_a"].shape, adapter["lora_b"].shape
+    if (a_in, b_out) != (d_in, d_out) or rank != b_rank:
+        raise ValueError(
+            f"{folder} adapts {module} as a map from {a_in} to {b_out}, the model's is from {d_in} "
+            f"to {d_out}."
+        )
+
+
+def _stacked(found: list[Adapter], leading: list[int]) -> tuple[float, Adapter]:
+    """One scale, and parameters of one rank with the stack's leading axes."""
+    rank, scale = max(1, *(a["lora_a"].shape[1] for a in found)), float(found[0]["scale"])
+
+    def padded(adapter: Adapter) -> Adapter:
+        room = rank - adapter["lora_a"].shape[1]
+        ratio = float(adapter["scale"]) / scale
+        return {
+            "lora_a": np.pad(adapter["lora_a"], ((0, 0), (0, room))),
+            "lora_b": np.pad(adapter["lora_b"] * np.float32(ratio), ((0, room), (0, 0))),
+        } | {name: adapter[name] for name in ("magnitude",) if name in adapter}
+
+    same = [padded(adapter) for adapter in found]
+    stacked = {name: np.stack([a[name] for a in same]) for name in same[0]}
+    return scale, {name: x.reshape(*leading, *x.shape[1:]) for name, x in stacked.items()}
+
+
+def _is_known(path: str, method: Any) -> bool:
+    """Raises a ValueError for a method that PEFT does not have."""
+    if not isinstance(method, LoRA | AdaLoRA):
+        raise ValueError(f"{path} has {method.name}, which Hugging Face PEFT does not know.")
+    if method.splits_kernel:
+        raise ValueError(f"{path} holds a part of its kernel, so it fits no other base: merge it.")
+    return True
+
+
+def _exported(layer: Dense, index: tuple[int, ...]) -> tuple[float, Adapter]:
+    """Scale and tensors of one module, in PEFT's names and layout."""
+    assert layer.adapter is not None
+    params = {k: np.asarray(v[index], np.float32) for k, v in layer.adapter.get_value().items()}
+    a, b = params["lora_a"], params["lora_b"]
+    if isinstance(layer.method, AdaLoRA):
+        kept = np.flatnonzero(params["lora_e"])
+        kept = kept if len(kept) else np.array([0])  # PEFT needs a rank of at least 1
+        a, b = (a * params["lora_e"])[:, kept], b[kept]
+    tensors = {
+        "lora_A.weight": np.ascontiguousarray(a.T),
+        "lora_B.weight": np.ascontiguousarray(b.T),
+    }
+    if "magnitude" in params:
+        tensors["lora_magnitude_vector"] = params["magnitude"]
+    return layer.method.scale, tensors  # pyright: ignore[reportAttributeAccessIssue, reportOptionalMemberAccess]
+
+
+def _config(
+    modules: Mapping[str, tuple[float, Adapter]], *, dora: bool, base: str | None
+) -> dict[str, Any]:
+    """adapter_config.json: one rank and α for most, patterns for the others."""
+    ranks = {name: len(found["lora_A.weight"]) for name, (_, found) in modules.items()}
+    alphas = {name: scale * ranks[name] for name, (scale, _) in modules.items()}
+    rank, alpha = (collections.Counter(x.values()).most_common(1)[0][0] for x in (ranks, alphas))
+    return {
+        "peft_type": "LORA",
+        "base_model_name_or_path": base,
+        "r": rank,
+        "lora_alpha": alpha,
+        "rank_pattern": {re.escape(n): r for n, r in ranks.items() if r != rank},
+        "alpha_pattern": {re.escape(n): a for n, a in alphas.items() if a != alpha},
+        "target_modules": sorted(modules),
+        "use_dora": dora,
+        "use_rslora": False,
+        "bias": "none",
+        "fan_in_fan_out": False,
+        "inference_mode": True,
+        "lora_dropout": 0.0,
+        "task_type": None,
+    }
+
+
+def _no_module(folder: pathlib.Path, left: list[str], model: nnx.Module, names: Names) -> str:
+    places = adaptation.places(nnx.List([model]), (Dense, nnx.Linear))
+    known = [
+        names(place.path, index)
+        for place in places
+        for index in np.ndindex(*place.child.kernel.get_value().shape[:-2])
+    ]
+    if not left:
+        return f"{folder} adapts nothing."
+    close = difflib.get_close_matches(left[0], known, n=5, cutoff=0.3) or known[:5]
+    return f"{folder} adapts {left[0]!r}, which the model lacks; it has {', '.join(close)}."

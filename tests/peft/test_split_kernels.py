@@ -1,0 +1,144 @@
+"""Initialisations that take a part of the kernel: PiSSA and OLoRA."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from lorasp_jax import adaptation, adapter_io
+from lorasp_jax.dense import Dense, LinenDense
+from lorasp_jax.peft import DoRA, LoRA
+
+KERNEL = jax.random.normal(jax.random.key(0), (9, 14))
+X = jax.random.normal(jax.random.key(1), (5, 9))
+SPLIT = pytest.mark.parametrize("name", ["pissa", "olora"])
+CLASSES = pytest.mark.parametrize("cls", [LoRA, DoRA])
+
+
+def lora(name, cls=LoRA, **fields):
+    return cls(**{"rank": 3, "alpha": 5.0, "initialization": name} | fields)
+
+
+def model(depth=None):
+    """A model of one layer, or of a stack of them."""
+
+    class Net(nnx.Module):
+        def __init__(self):
+            self.layer = Dense(9, 14, rngs=nnx.Rngs(0))
+            if depth:
+                kernels = jax.random.normal(jax.random.key(2), (depth, 9, 14))
+                self.layer.kernel = nnx.Param(kernels)
+
+    return Net()
+
+
+@SPLIT
+@CLASSES
+def test_starts_as_the_base(name, cls):
+    method = lora(name, cls)
+    params, rest = method.init(jax.random.key(3), KERNEL)
+    np.testing.assert_allclose(method.apply(params, X, rest)[0], X @ KERNEL, atol=1e-5)
+    np.testing.assert_allclose(method.merge(params, rest), KERNEL, atol=1e-5)
+    assert np.abs(rest - KERNEL).max() > 0.1
+
+
+def test_pissa_is_the_best_approximation():
+    method = lora("pissa")
+    params, rest = method.init(jax.random.key(3), KERNEL)
+    values = np.linalg.svd(np.asarray(KERNEL), compute_uv=False)
+    np.testing.assert_allclose(np.linalg.norm(rest), np.linalg.norm(values[3:]), rtol=1e-5)
+    left = np.linalg.svd(np.asarray(rest), compute_uv=False)
+    np.testing.assert_allclose(left[:6], values[3:], rtol=1e-4)
+    a, b = params["lora_a"], params["lora_b"]
+    np.testing.assert_allclose(jnp.linalg.norm(a, axis=0), jnp.linalg.norm(b, axis=1), rtol=1e-5)
+
+
+def test_olora_is_orthonormal():
+    method = lora("olora")
+    params, rest = method.init(jax.random.key(3), KERNEL)
+    a, b = map(np.asarray, (params["lora_a"], params["lora_b"]))
+    np.testing.assert_allclose(b @ b.T, np.eye(3), atol=1e-5)
+    orthonormal, triangular = np.linalg.qr(np.asarray(KERNEL).T)
+    np.testing.assert_allclose(np.abs(b), np.abs(orthonormal[:, :3].T), atol=1e-5)
+    np.testing.assert_allclose(a @ b, (orthonormal[:, :3] @ triangular[:3]).T, atol=1e-5)
+    np.testing.assert_allclose(rest, KERNEL - 5 / 3 * a @ b, atol=1e-5)
+
+
+@SPLIT
+def test_low_precision_bases_keep_their_type(name):
+    low = KERNEL.astype(jnp.bfloat16)
+    method = lora(name)
+    params, rest = method.init(jax.random.key(3), low)
+    assert rest.dtype == jnp.bfloat16
+    assert {leaf.dtype for leaf in params.values()} == {jnp.dtype("float32")}
+    np.testing.assert_allclose(method.merge(params, rest), low, atol=0.05)
+
+
+@SPLIT
+@pytest.mark.parametrize("depth", [None, 2])
+def test_a_model_is_the_same_before_training_and_after_merging(name, depth):
+    base = model(depth)
+    kernel = np.asarray(base.layer.kernel.get_value())
+    adapted = adaptation.adapt(base, [("layer", lora(name))], rngs=nnx.Rngs(0))
+    rest = adapted.layer.kernel.get_value()
+    assert np.abs(rest - kernel).max() > 0.1
+    np.testing.assert_array_equal(base.layer.kernel.get_value(), kernel)
+    merged = adaptation.merge(adapted)
+    np.testing.assert_allclose(merged.layer.kernel.get_value(), kernel, atol=1e-5)
+
+
+@SPLIT
+def test_saved_adapters_fit_the_base_they_were_made_from(name, tmp_path):
+    adapted = adaptation.adapt(model(), [("layer", lora(name))], rngs=nnx.Rngs(0))
+    trained = adapted.layer.adapter.get_value()
+    adapted.layer.adapter.set_value(jax.tree.map(lambda leaf: leaf + 0.1, trained))
+    adapter_io.save_adapters(tmp_path, adapted)
+    loaded = adapter_io.load_adapters(tmp_path, model())
+    np.testing.assert_allclose(loaded.layer(X), adapted.layer(X), atol=1e-5)
+
+
+@SPLIT
+def test_an_adapter_that_holds_a_part_is_not_thrown_away(name):
+    adapted = adaptation.adapt(model(), [("layer", lora(name))], rngs=nnx.Rngs(0))
+    with pytest.raises(ValueError, match="holds a part of its kernel cannot be replaced: merge it"):
+        adaptation.adapt(adapted, [("layer", LoRA(rank=2))], rngs=nnx.Rngs(0))
+    adaptation.adapt(adaptation.merge(adapted), [("layer", LoRA(rank=2))], rngs=nnx.Rngs(0))
+
+
+@SPLIT
+def test_linen_says_that_it_cannot(name):
+    with pytest.raises(ValueError, match="Linen cannot change a kernel"):
+        LinenDense(14, method=lora(name)).init(jax.random.key(0), X)
+    assert isinstance(LinenDense(14, method=LoRA(rank=2)), nn.Module)
+
+
+@SPLIT
+@CLASSES
+def test_values_and_a_fitting_rank_are_needed(name, cls):
+    shape = jax.ShapeDtypeStruct((9, 14), jnp.float32)
+    with pytest.raises(ValueError, match="values"):
+        lora(name, cls).init(jax.random.key(0), shape)
+    with pytest.raises(ValueError, match="a rank up to its smaller side, got rank 10"):
+        lora(name, cls, rank=10).init(jax.random.key(0), KERNEL)
+
+
+@SPLIT
+def test_a_matrix_is_needed(name):
+    with pytest.raises(ValueError, match=r"needs a kernel \[I, O\], got shape \(2, 9, 14\)"):
+        lora(name).init(jax.random.key(0), jnp.zeros((2, 9, 14)))
+
+
+def test_gaussian():
+    params, kernel = LoRA(rank=20, initialization="gaussian").init(
+        jax.random.key(0), jax.ShapeDtypeStruct((900, 50), jnp.float32)
+    )
+    assert np.std(params["lora_a"]) == pytest.approx(1 / 20, rel=0.02)
+    assert not params["lora_b"].any()
+    assert kernel.shape == (900, 50)
+
+
+def test_unknown_initialization():
+    with pytest.raises(ValueError, match="must be 'kaiming', 'gaussian', 'pissa' or 'olora'"):
+        lora("psisa")

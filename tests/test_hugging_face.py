@@ -1,0 +1,263 @@
+"""Adapter folders of Hugging Face PEFT, both ways."""
+
+import itertools
+import json
+import shutil
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import safetensors.numpy
+from flax import nnx
+
+from lorasp_jax import adaptation, hugging_face
+from lorasp_jax.dense import Dense
+from lorasp_jax.peft import AdaLoRA, DoRA, LoRA, LoRASP
+
+GOLDEN = Path(__file__).parent / "golden"
+FOLDER = GOLDEN / "adapter_lora"
+SIZES = (24, 40, 24, 16)
+
+
+class Net(nnx.Module):
+    """The oracle's net; a random one without its arrays."""
+
+    def __init__(self, arrays=None):
+        self.lin = nnx.List(
+            [
+                nnx.Linear(i, o, rngs=nnx.Rngs(n))
+                for n, (i, o) in enumerate(itertools.pairwise(SIZES))
+            ]
+        )
+        for n, layer in enumerate(self.lin if arrays is not None else []):
+            layer.kernel.set_value(jnp.array(arrays[f"base/lin.{n}.weight"].T))
+            layer.bias.set_value(jnp.array(arrays[f"base/lin.{n}.bias"]))
+
+    def __call__(self, x):
+        for n, layer in enumerate(self.lin):
+            x = layer(x)
+            x = jnp.tanh(x) if n < 2 else x
+        return x
+
+
+class Stack(nnx.Module):
+    """Three layers in one kernel."""
+
+    def __init__(self):
+        self.layer = Dense(6, 5, rngs=nnx.Rngs(0))
+        self.layer.kernel = nnx.Param(jax.random.normal(jax.random.key(0), (3, 6, 5)))
+
+
+def module(path, index):
+    return f"blocks.{index[0]}.{path}"
+
+
+X = jax.random.normal(jax.random.key(9), (4, 24))
+
+
+def trained(model, seed=5):
+    """The model with nothing left at zero."""
+    graphdef, adapters, frozen = adaptation.split(model)
+    leaves, structure = jax.tree.flatten(adapters)
+    keys = jax.random.split(jax.random.key(seed), len(leaves))
+    noise = [
+        leaf + 0.3 * jax.random.normal(k, leaf.shape) for leaf, k in zip(leaves, keys, strict=True)
+    ]
+    return nnx.merge(graphdef, jax.tree.unflatten(structure, noise), frozen)
+
+
+def adapted(*rules, seed=5):
+    return trained(adaptation.adapt(Net(), rules, rngs=nnx.Rngs(1)), seed)
+
+
+@pytest.fixture
+def copy(tmp_path):
+    return Path(shutil.copytree(FOLDER, tmp_path / "copy"))
+
+
+def edit(folder, **changes):
+    """Changes the folder's configuration."""
+    config = json.loads((folder / hugging_face.CONFIG).read_text()) | changes
+    (folder / hugging_face.CONFIG).write_text(json.dumps(config))
+
+
+def retensor(folder, change):
+    """Changes the folder's tensors."""
+    tensors = safetensors.numpy.load_file(folder / hugging_face.TENSORS)
+    safetensors.numpy.save_file(change(tensors), folder / hugging_face.TENSORS)
+
+
+def test_a_folder_that_peft_wrote_gives_its_outputs():
+    arrays = dict(np.load(GOLDEN / "adapter_lora_io.npz"))
+    model = hugging_face.load_peft(FOLDER, Net(arrays))
+    np.testing.assert_allclose(model(arrays["x"]), arrays["y"], rtol=0, atol=1e-5)
+    expected = LoRA(rank=4, alpha=8)
+    assert adaptation.methods(model) == {"lin/0": expected, "lin/2": expected}
+
+
+def test_what_peft_wrote_is_written_again(tmp_path):
+    hugging_face.save_peft(tmp_path, hugging_face.load_peft(FOLDER, Net()))
+    ours, theirs = (
+        safetensors.numpy.load_file(folder / hugging_face.TENSORS) for folder in (tmp_path, FOLDER)
+    )
+    assert ours.keys() == theirs.keys()
+    for name, value in theirs.items():
+        np.testing.assert_array_equal(ours[name], value)
+    ours, theirs = (
+        json.loads((folder / hugging_face.CONFIG).read_text()) for folder in (tmp_path, FOLDER)
+    )
+    for name, value in ours.items():
+        assert theirs[name] == value, name
+
+
+@pytest.mark.parametrize(
+    "methods",
+    [
+        [LoRA(rank=3, alpha=4.0)],
+        [LoRA(rank=3, rank_stabilized=True), LoRA(rank=5, alpha=1.0), LoRA(rank=3)],
+        [DoRA(rank=3, alpha=4.0), DoRA(rank=2)],
+        [AdaLoRA(rank=4, target_rank=2, alpha=4.0), LoRA(rank=2)],
+    ],
+    ids=["lora", "patterns", "dora", "adalora"],
+)
+def test_round_trip(methods, tmp_path):
+    model = adapted(*((f"lin/{i}", method) for i, method in enumerate(methods)))
+    if isinstance(methods[0], AdaLoRA):
+        params = model.lin[0].adapter.get_value()
+        model.lin[0].adapter.set_value(params | {"lora_e": params["lora_e"].at[1:].set(0.0)})
+    hugging_face.save_peft(tmp_path, model)
+    again = hugging_face.load_peft(tmp_path, Net())
+    np.testing.assert_allclose(again(X), model(X), rtol=1e-5, atol=1e-5)
+    ranks = [again.lin[i].method.rank for i in range(len(methods))]
+    assert ranks == [1 if isinstance(m, AdaLoRA) else m.rank for m in methods]
+    assert np.abs(again(X) - Net()(X)).max() > 0.1
+
+
+def test_adalora_as_peft_saves_it(tmp_path):
+    rng = np.random.default_rng(0)
+    a, b, e = rng.normal(size=(2, 24)), rng.normal(size=(40, 2)), rng.normal(size=(2, 1))
+    parts = {"lora_A": a, "lora_B": b, "lora_E": e}
+    tensors = {f"base_model.model.lin.0.{k}": v.astype(np.float32) for k, v in parts.items()}
+    safetensors.numpy.save_file(tensors, tmp_path / hugging_face.TENSORS)
+    config = {"peft_type": "ADALORA", "init_r": 6, "target_r": 2, "lora_alpha": 16, "r": 8}
+    (tmp_path / hugging_face.CONFIG).write_text(json.dumps(config))
+    model = hugging_face.load_peft(tmp_path, Net())
+    kernel = adaptation.merge(model).lin[0].kernel.get_value()
+    expected = Net().lin[0].kernel.get_value() + (b @ (a * e)).T * 16 / (6 + 1e-5)
+    np.testing.assert_allclose(kernel, expected, atol=1e-4)
+
+
+def test_patterns_follow_the_end_of_a_name(copy):
+    edit(copy, alpha_pattern={r"lin\.2": 16}, rank_pattern={"2": 4})
+    model = hugging_face.load_peft(copy, Net())
+    assert [model.lin[i].method.scale for i in (0, 2)] == [2, 4]
+
+
+def test_rank_stabilized(copy):
+    edit(copy, use_rslora=True)
+    assert hugging_face.load_peft(copy, Net()).lin[0].method.scale == 4
+
+
+def test_stacks(tmp_path):
+    method = LoRA(rank=2, alpha=3.0)
+    model = trained(adaptation.adapt(Stack(), [("layer", method)], rngs=nnx.Rngs(0)))
+    hugging_face.save_peft(tmp_path, model, names=module, base="a base")
+    assert json.loads((tmp_path / hugging_face.CONFIG).read_text())["target_modules"] == [
+        f"blocks.{i}.layer" for i in range(3)
+    ]
+
+    def shrink(tensors):  # the second layer's rank
+        for side, cut in (("A", np.s_[:1]), ("B", np.s_[:, :1])):
+            name = f"base_model.model.blocks.1.layer.lora_{side}.weight"
+            tensors[name] = np.ascontiguousarray(tensors[name][cut])
+        return tensors
+
+    retensor(tmp_path, shrink)
+    edit(tmp_path, alpha_pattern={"1.layer": 6.0})
+    again = hugging_face.load_peft(tmp_path, Stack(), names=module)
+    ours, theirs = (adaptation.merge(m).layer.kernel.get_value() for m in (again, model))
+    np.testing.assert_allclose(ours[::2], theirs[::2], atol=1e-5)
+    params = {k: v[1] for k, v in model.layer.adapter.get_value().items()}
+    one = 6.0 * params["lora_a"][:, :1] @ params["lora_b"][:1]
+    np.testing.assert_allclose(ours[1], Stack().layer.kernel.get_value()[1] + one, atol=1e-5)
+
+    with pytest.raises(ValueError, match=r"layer is a stack of layers: give names"):
+        hugging_face.load_peft(tmp_path, Stack())
+    retensor(tmp_path, lambda t: {k: v for k, v in t.items() if "blocks.2" not in k})
+    with pytest.raises(ValueError, match="only some of the layers of the stack layer"):
+        hugging_face.load_peft(tmp_path, Stack(), names=module)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"peft_type": "LOHA"}, "holds LOHA; LORA and ADALORA can be loaded"),
+        ({"bias": "all"}, "sets bias to 'all', which is not supported"),
+        ({"modules_to_save": ["head"]}, r"sets modules_to_save to \['head'\]"),
+        ({"use_dora": True}, "adapter of lin.0 lacks lora_magnitude_vector"),
+    ],
+)
+def test_folders_that_ask_for_more(copy, changes, message):
+    edit(copy, **changes)
+    with pytest.raises(ValueError, match=message):
+        hugging_face.load_peft(copy, Net())
+
+
+def renamed(tensors):
+    return {name.replace("lin.2", "lin.7"): value for name, value in tensors.items()}
+
+
+def halved(tensors):
+    return {name: value for name, value in tensors.items() if "2.lora_B" not in name}
+
+
+def narrowed(tensors):
+    return {k: v[:, :-1].copy() if "lora_A" in k else v for k, v in tensors.items()}
+
+
+def extended(tensors):
+    return tensors | {"base_model.model.head.weight": np.zeros(3, np.float32)}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (renamed, r"adapts 'lin.7', which the model lacks; it has lin"),
+        (halved, "adapter of lin.2 lacks lora_B"),
+        (narrowed, "adapts lin.0 as a map from 23 to 40, the model's is from 24"),
+        (extended, "head.weight', which belongs to no LoRA"),
+        (lambda tensors: {}, "adapts nothing"),
+    ],
+)
+def test_tensors_that_do_not_fit(copy, change, message):
+    retensor(copy, change)
+    with pytest.raises(ValueError, match=message):
+        hugging_face.load_peft(copy, Net())
+
+
+@pytest.mark.parametrize("name", [hugging_face.CONFIG, hugging_face.TENSORS])
+def test_damaged_and_missing_files(copy, name):
+    (copy / name).write_bytes(b"{")
+    with pytest.raises(ValueError, match="is damaged or no PEFT adapter"):
+        hugging_face.load_peft(copy, Net())
+    (copy / name).unlink()
+    with pytest.raises(ValueError, match=f"holds no {name}"):
+        hugging_face.load_peft(copy, Net())
+
+
+@pytest.mark.parametrize(
+    ("rules", "message"),
+    [
+        ([("lin/0", LoRASP(rank=4))], "lin/0 has lora_sp, which Hugging Face PEFT does not know"),
+        ([("lin/0", LoRA(rank=2, initialization="pissa"))], "holds a part of its kernel"),
+        ([("lin/0", LoRA(rank=2)), ("lin/1", DoRA(rank=2))], "either LoRA or DoRA"),
+        ([], "at least one adapter"),
+    ],
+)
+def test_what_cannot_be_written(rules, message, tmp_path):
+    model = adapted(*rules) if rules else Net()
+    with pytest.raises(ValueError, match=message):
+        hugging_face.save_peft(tmp_path / "new", model)
+    assert not (tmp_path / "new").exists()
