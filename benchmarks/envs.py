@@ -10,7 +10,6 @@ is warmed up twice, the best of three calls counts.
 """
 
 import argparse
-import copy
 import dataclasses
 import importlib.util
 import itertools
@@ -31,7 +30,7 @@ from rich.console import Console
 import envs
 from benchmarks import measuring
 from benchmarks.measuring import best, print_table, text
-from envs import physics, render
+from envs import physics, placing, render
 from envs.env import Env
 from envs.state import State
 
@@ -116,9 +115,7 @@ def time_pictures(env: Env, state: State, size: int) -> float:
 def mujoco_c(env: Env, state: State) -> float:
     """Physics steps/s of MuJoCo's C engine from the same start, one thread a core."""
     cores = os.cpu_count() or 1
-    model = copy.copy(env.model)
-    for name, place in state.info["layout"].items():
-        model.body_pos[model.body(name).id] = np.asarray(place[0, :3])
+    model = placing.placed(env.model, state.info["layout"], 0)
     data = [mujoco.MjData(model) for _ in range(cores)]
     data[0].qpos[:] = np.asarray(state.data.qpos[0])
     spec = mujoco.mjtState.mjSTATE_FULLPHYSICS

@@ -9,9 +9,7 @@ from typing import Any
 
 from rich.console import Console
 
-import envs.robots
-import envs.tasks
-from envs import actions, commands, distractors, physics
+from envs import actions, commands, distractors, making, physics
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -34,8 +32,8 @@ def main(arguments: Sequence[str]) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m envs", description="Scripted expert episodes.")
     subparsers = parser.add_subparsers(required=True, metavar="command")
-    tasks = ", ".join(commands.names(envs.tasks))
-    robots = f"{', '.join(commands.names(envs.robots))}, or the path of an MJCF file"
+    tasks = ", ".join(making.names("task"))
+    robots = f"{', '.join(making.names('robot'))}, or the path of an MJCF file"
 
     def add(command: Callable[..., None], image_size: int, of: str = "") -> Callable[..., Any]:
         text = command.__doc__

@@ -2,13 +2,11 @@
 
 import argparse
 import contextlib
-import pkgutil
 import shutil
 import threading
 from collections.abc import Mapping
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import jax
@@ -16,11 +14,10 @@ import numpy as np
 from rich.console import Console
 
 import envs
-import envs.robots
-import envs.tasks
 from envs import collection, places, recipes, rlds, videos
 from envs.bars import Report, bars
 from envs.episodes import Episodes, replacing
+from envs.making import names
 
 WORLDS = 4
 """Tries at once where one episode is wanted: the expert may fail in one."""
@@ -29,7 +26,7 @@ _EVERY = 2  # control steps to a picture of a GIF
 
 def collect(options: argparse.Namespace, console: Console) -> None:
     """Writes successful expert episodes, an RLDS dataset for every task; continues if stopped."""
-    tasks = names(envs.tasks) if options.task == ["all"] else list(dict.fromkeys(options.task))
+    tasks = names("task") if options.task == ["all"] else list(dict.fromkeys(options.task))
     out: Path = options.out
     if len(tasks) > 1 and out.suffix == ".npz":
         raise ValueError(f"{out} can hold one task, not {len(tasks)}: give a folder as --out")
@@ -54,8 +51,8 @@ def collect(options: argparse.Namespace, console: Console) -> None:
 
 def gallery(options: argparse.Namespace, console: Console) -> None:
     """Writes a GIF of an expert episode, all cameras together, for every task and robot."""
-    tasks = [options.task] if options.task else names(envs.tasks)
-    robots = [options.robot] if options.robot else names(envs.robots)
+    tasks = [options.task] if options.task else names("task")
+    robots = [options.robot] if options.robot else names("robot")
     for task in tasks:
         for robot in robots:
             file = options.out / f"{task}_{Path(robot).stem}.gif"
@@ -89,11 +86,6 @@ def play(options: argparse.Namespace, console: Console) -> None:
         videos.write_video(unfinished, views, fps=1 / episode.control_dt)
     text = episode.instructions[int(episode.instruction[0])]
     console.print(f"{options.out}: {len(views)} steps, {text!r}")
-
-
-def names(package: ModuleType) -> list[str]:
-    """The tasks of `envs.tasks`, the robots of `envs.robots`."""
-    return sorted(module.name for module in pkgutil.iter_modules(package.__path__))
 
 
 def _scene(options: argparse.Namespace, task: str) -> envs.Env:

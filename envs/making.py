@@ -114,9 +114,13 @@ def _find_robot(robot: AnyRobot) -> Robot:
     return _find("robot", os.fspath(robot))
 
 
-def _find(kind: str, name: str) -> Any:
+def names(kind: str) -> list[str]:
+    """The names of all of a kind, task or robot: those of their files."""
     package = importlib.import_module(f"envs.{kind}s")
-    names = sorted(module.name for module in pkgutil.iter_modules(package.__path__))
-    if name not in names:
-        raise ValueError(f"unknown {kind} {name!r}: choose from {', '.join(names)}")
+    return sorted(module.name for module in pkgutil.iter_modules(package.__path__))
+
+
+def _find(kind: str, name: str) -> Any:
+    if name not in names(kind):
+        raise ValueError(f"unknown {kind} {name!r}: choose from {', '.join(names(kind))}")
     return getattr(importlib.import_module(f"envs.{kind}s.{name}"), kind.upper())

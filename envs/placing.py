@@ -1,8 +1,11 @@
 """How a layout gets into a MuJoCo model: loose bodies by qpos, fixed ones by the model itself."""
 
+import copy
+
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from envs.state import Changes
 from envs.tasks import Layout
@@ -32,6 +35,15 @@ def fixed_bodies(model: mujoco.MjModel, layout: Layout, changes: Changes) -> Cha
             position = position.at[body.id].set(pose[:3])
             rotation = rotation.at[body.id].set(pose[3:])
     return {"body_pos": position, "body_quat": rotation}
+
+
+def placed(model: mujoco.MjModel, layout: Layout, world: int) -> mujoco.MjModel:
+    """A copy of the model with its fixed bodies where one world of a batch has them."""
+    model = copy.copy(model)
+    own = {name: places[world] for name, places in layout.items()}
+    for name, value in fixed_bodies(model, own, {}).items():
+        getattr(model, name)[:] = np.asarray(value)
+    return model
 
 
 def _pose(place: jax.Array) -> jax.Array:

@@ -1,6 +1,5 @@
 """An expert episode in MuJoCo's own window, in real time, over and over."""
 
-import copy
 import itertools
 import time
 import warnings
@@ -11,9 +10,8 @@ import mujoco
 import mujoco.viewer
 import numpy as np
 
-from envs import experts
+from envs import experts, placing
 from envs.env import Env
-from envs.tasks import Layout
 
 _TRIES = 8  # calls, of all worlds each
 
@@ -45,7 +43,7 @@ def episode(env: Env, key: jax.Array) -> tuple[mujoco.MjModel, np.ndarray]:
             world = wins[0]
             steps = int(states[-1].info["steps"][world])
             positions = [np.asarray(state.data.qpos[world]) for state in states[: steps + 1]]
-            return _placed(env, states[0].info["layout"], world), np.stack(positions)
+            return placing.placed(env.model, states[0].info["layout"], world), np.stack(positions)
     raise ValueError(f"the expert failed in all of {_TRIES * env.num_envs} layouts")
 
 
@@ -70,16 +68,6 @@ def show(model: mujoco.MjModel, positions: np.ndarray, seconds: float) -> None:
             time.sleep(max(0.0, start + seconds - time.monotonic()))
             if not window.is_running():
                 return
-
-
-def _placed(env: Env, layout: Layout, world: int) -> mujoco.MjModel:
-    """The scene with its bodies where one world has them; positions say it only of loose ones."""
-    model = copy.copy(env.model)
-    for name, places in layout.items():
-        place = np.asarray(places[world])
-        model.body(name).pos = place[:3]
-        model.body(name).quat = np.cos(place[3] / 2), 0, 0, np.sin(place[3] / 2)
-    return model
 
 
 _plan = jax.jit(experts.plan, static_argnums=0)

@@ -95,12 +95,19 @@ class WarpSteps:
         key = (str(wp.get_device()), number)
         if key not in self._made:
             data = mujoco_warp.make_data(self._mujoco, nworld=number, **self._sizes)
-            model = mujoco_warp.put_model(self._mujoco)
-            # A fixed, small number of iterations is what the scene asks for.
-            few = mujoco_warp.OverflowType.ITERATIONS | mujoco_warp.OverflowType.LS_ITERATIONS
-            model.opt.warn_overflow &= ~few
-            self._made[key] = model, data
+            self._made[key] = self._model(key[0]), data
         return self._made[key]
+
+    def _model(self, device: str) -> Any:
+        """The model on Warp's current device, which is called so."""
+        for (other, _), (model, _) in self._made.items():
+            if other == device:
+                return model
+        model = mujoco_warp.put_model(self._mujoco)
+        # A fixed, small number of iterations is what the scene asks for.
+        few = mujoco_warp.OverflowType.ITERATIONS | mujoco_warp.OverflowType.LS_ITERATIONS
+        model.opt.warn_overflow &= ~few
+        return model
 
 
 def _with_room(model: mujoco.MjModel, growth: float) -> mujoco.MjModel:

@@ -97,6 +97,14 @@ def test_a_folder_that_peft_wrote_gives_its_outputs():
     assert adaptation.methods(model) == {"lin/0": expected, "lin/2": expected}
 
 
+@pytest.mark.parametrize("name", ["dora", "rs", "ada"])
+def test_folders_that_peft_trained_give_its_outputs(name):
+    """DoRA, rsLoRA and AdaLoRA, 20 steps of SGD in PEFT 0.21.2, ranks and α by pattern."""
+    arrays = dict(np.load(GOLDEN / "adapter_trained_io.npz"))
+    model = hugging_face.load_peft(GOLDEN / f"adapter_{name}", Net(arrays))
+    np.testing.assert_allclose(model(arrays["x"]), arrays[f"y/{name}"], rtol=0, atol=1e-5)
+
+
 def test_what_peft_wrote_is_written_again(tmp_path):
     hugging_face.save_peft(tmp_path, hugging_face.load_peft(FOLDER, Net()))
     ours, theirs = (
