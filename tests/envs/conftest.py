@@ -13,6 +13,7 @@ from envs import robots, tasks
 TASKS = sorted(module.name for module in pkgutil.iter_modules(tasks.__path__))
 ROBOTS = sorted(module.name for module in pkgutil.iter_modules(robots.__path__))
 EPISODES = 32
+SHORT = ("pick_place", "pour", "piper")  # whose episodes every run of the tests looks at
 
 
 def pytest_generate_tests(metafunc):
@@ -20,10 +21,10 @@ def pytest_generate_tests(metafunc):
     chosen = {mark.args[0] for mark in metafunc.definition.iter_markers("parametrize")}
     for name, values in (("task_name", TASKS), ("robot_name", ROBOTS)):
         if name in metafunc.fixturenames and name not in chosen:
-            # Episodes take a minute a scene to compile: those of other robots are long tests.
-            long = "episodes" in metafunc.fixturenames and name == "robot_name"
-            marks = {v: [pytest.mark.slow] if long and v != "piper" else [] for v in values}
-            metafunc.parametrize(name, [pytest.param(v, marks=marks[v]) for v in values])
+            # Episodes take a minute a scene to compile: most are long tests.
+            long = values if "episodes" in metafunc.fixturenames else []
+            marks = {v: [] if v in SHORT else [pytest.mark.slow] for v in long}
+            metafunc.parametrize(name, [pytest.param(v, marks=marks.get(v, [])) for v in values])
 
 
 @functools.cache
