@@ -110,6 +110,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--num-envs", type=int, default=256)
     options = parser.parse_args(arguments)
+    if options.episodes < PARTS:
+        parser.error(f"--episodes must be at least {PARTS}, to see whether memory grows")
     physics.enable_fast_cpu()
     physics.enable_compilation_cache()
     backend: Any = options.backend or physics.default_backend()

@@ -8,7 +8,9 @@ a change of any of them traces anew.
 
 import functools
 import hashlib
+import importlib
 import importlib.metadata
+import importlib.util
 import threading
 import warnings
 from collections.abc import Callable
@@ -20,9 +22,11 @@ import mujoco
 import numpy as np
 from jax import export
 
+from envs import tasks
 from envs.env import Env
 from envs.episodes import replacing
 from envs.render import RayRenderer
+from envs.tasks import Task
 
 # Python traces one program at a time. In turn, the first is compiled and runs while the second is
 # traced; all at once, none would start before the last is traced.
@@ -34,8 +38,8 @@ _CHECKSUM = hashlib.sha256().digest_size  # bytes, at the beginning of a file
 def kept(function: Callable[..., Any]) -> Callable[..., Any]:
     """As `jax.jit(function, static_argnums=0)`, traced once for all processes on this machine.
 
-    Only where a compilation cache is enabled, and not where Warp takes part, whose programs hold
-    addresses of their process. For threads.
+    Only where a compilation cache is enabled, for tasks of this package, and not where Warp takes
+    part, whose programs hold addresses of their process. For threads; not to be vmapped.
 
     Args:
         function: of an `Env` and trees of arrays, in this package; returns arrays in dicts, lists
@@ -44,11 +48,14 @@ def kept(function: Callable[..., Any]) -> Callable[..., Any]:
     jitted = jax.jit(function, static_argnums=0)
 
     @functools.lru_cache(maxsize=32)
-    def program(env: Env, tree: Any, kinds: tuple[Any, ...]) -> Callable[..., Any]:
+    def program(
+        env: Env, tree: Any, kinds: tuple[Any, ...], settings: tuple[Any, ...]
+    ) -> Callable[..., Any]:
         def run(*leaves: Any) -> Any:
             return function(env, *jax.tree.unflatten(tree, leaves))
 
-        file = _folder() / f"{function.__name__}-{_name(env, tree, kinds)}"
+        called = f"{function.__module__}.{function.__qualname__}"
+        file = _folder() / f"{called}-{_name(env, tree, kinds, settings)}"
         if (exported := _load(file)) is None:
             exported = export.export(jax.jit(run))(*kinds)
             _save(file, exported.serialize())
@@ -60,7 +67,7 @@ def kept(function: Callable[..., Any]) -> Callable[..., Any]:
         if _can_be_kept(env):
             kinds = tuple(jax.eval_shape(lambda *x: x, *leaves))
             with _TRACING:
-                found = program(env, tree, kinds)
+                found = program(env, tree, kinds, _settings())
             return found(*leaves)
         with _TRACING:
             jitted.lower(env, *arguments)  # which the call then finds done
@@ -87,21 +94,35 @@ def _can_be_kept(env: Env) -> bool:
         and "://" not in folder
         and env.physics.backend == "jax"
         and isinstance(env.renderer, RayRenderer)
+        and _is_shipped(env.task)
     )
+
+
+def _is_shipped(task: Task) -> bool:
+    """Whether it is one of this package, whose source files say all of it."""
+    name = f"{tasks.__name__}.{task.name}"
+    found = importlib.util.find_spec(name)
+    return found is not None and importlib.import_module(name).TASK is task
+
+
+def _settings() -> tuple[Any, ...]:
+    """Every setting of JAX as this thread has it."""
+    every = sorted(jax.config.values.items())  # as they are outside of context managers
+    return tuple((name, getattr(jax.config, name, value)) for name, value in every)
 
 
 def _folder() -> Path:
     return Path(jax.config.jax_compilation_cache_dir) / "traced"
 
 
-def _name(env: Env, tree: Any, kinds: tuple[Any, ...]) -> str:
+def _name(env: Env, tree: Any, kinds: tuple[Any, ...], settings: tuple[Any, ...]) -> str:
     """All that the program depends on, as a short text."""
     facts = [
         digest(env),
         env.task.name,
         (env.num_envs, env.image_size, env.antialias),
         (env.control_dt, env.actions, env.distractors),
-        (tree, kinds, jax.default_backend(), sorted(jax.config.values.items())),
+        (tree, kinds, settings, jax.default_backend()),
         [importlib.metadata.version(name) for name in _VERSIONED],
         _sources(),
     ]
@@ -118,10 +139,11 @@ def _sources() -> str:
 
 
 def _load(file: Path) -> export.Exported | None:
-    """What was saved; None if there is nothing, or something damaged."""
-    if not file.exists():
+    """What was saved; None if there is nothing, or nothing that can be read."""
+    try:
+        data = bytearray(file.read_bytes())
+    except OSError:
         return None
-    data = bytearray(file.read_bytes())
     checksum, program = data[:_CHECKSUM], data[_CHECKSUM:]
     return export.deserialize(program) if _checksum(program) == checksum else None
 

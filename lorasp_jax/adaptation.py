@@ -113,7 +113,7 @@ def merge(model: Model) -> Model:
                 kernel = _merged(layer.method, layer.adapter.get_value(), layer.kernel.get_value())
             except ValueError as error:
                 raise ValueError(f"cannot merge {place.path}: {error}") from error
-            layer.kernel.set_value(kernel)
+            layer.kernel = _renewed(layer.kernel, kernel)
             layer.adapter = None
         layer.method = None
     _retype(places(holder, AdapterParam), nnx.Param)
@@ -153,7 +153,8 @@ def attach(layer: Dense | nnx.Linear, method: Method, key: jax.Array) -> Dense:
     _retype([p for p in places(nnx.List([layer]), AdapterParam) if p.name != "adapter"], nnx.Param)
     layer.method = method
     params, kernel = _init(key, method, layer.kernel.get_value())
-    layer.kernel.set_value(kernel)
+    if method.splits_kernel:
+        layer.kernel = _renewed(layer.kernel, kernel)
     layer.adapter = AdapterParam(params)
     return layer
 
@@ -229,6 +230,11 @@ def _retype(places: Sequence[Place], kind: type[nnx.Param]) -> None:
                 value = jnp.array(value, jnp.float32, copy=True)
             renewed[id(variable)] = kind(value, **variable.get_metadata())
         setattr(parent, name, renewed[id(variable)])
+
+
+def _renewed(variable: nnx.Param, value: jax.Array) -> nnx.Param:
+    """A variable of its own with another value: the old one may be shared with other layers."""
+    return type(variable)(value, **variable.get_metadata())
 
 
 def _as_dense(linear: nnx.Linear) -> Dense:

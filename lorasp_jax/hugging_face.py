@@ -34,6 +34,9 @@ _TENSOR = re.compile(
 _ADA_CONSTANT = 1e-5  # AdaLoRA's scale is α/(r + this)
 # What a folder may ask for beyond its tensors, and the values that ask for nothing.
 _NOTHING = (None, False, [], {}, "none")
+# Initialisations that leave the base as it is. After the others (PiSSA, OLoRA, CorDA, LoRA-GA,
+# LoftQ) A and B belong to what was left of the base.
+_WHOLE_BASE = (None, True, False, "gaussian", "orthogonal", "eva", "mica")
 _UNKNOWN = (
     "bias", "lora_bias", "modules_to_save", "fan_in_fan_out", "layer_replication", "use_qalora",
     "target_parameters", "trainable_token_indices", "use_bdlora", "alora_invocation_tokens",
@@ -64,7 +67,7 @@ def load_peft(
 
     Args:
       folder: with adapter_config.json and adapter_model.safetensors.
-      model: left untouched; adapters that it has are replaced.
+      model: left untouched; adapters that it has elsewhere than the folder stay.
       names: module of the layer at a path and an index in its stack, () outside of stacks.
 
     Raises:
@@ -157,6 +160,11 @@ def _read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter]]:
         raise ValueError(
             f"{folder} sets {asked[0]} to {config[asked[0]]!r}, which is not supported."
         )
+    if (start := config.get("init_lora_weights")) not in _WHOLE_BASE:
+        raise ValueError(
+            f"{folder} was trained on what {start!r} left of its base: save it in PEFT with "
+            "path_initial_model_for_weight_conversion, which makes a plain LoRA of it."
+        )
     modules: dict[str, Adapter] = collections.defaultdict(dict)
     for name, tensor in tensors.items():
         if not (match := _TENSOR.fullmatch(name)):
@@ -167,14 +175,16 @@ def _read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter]]:
 
 def _imported(config: Mapping[str, Any], module: str, found: Adapter) -> Adapter:
     """lora_a, lora_b, perhaps magnitude, and scale, in our layout."""
-    missing = {"lora_A", "lora_B"} - found.keys()
-    if config.get("use_dora"):
-        missing |= {"lora_magnitude_vector"} - found.keys()
-    if missing:
+    ada = config["peft_type"] == "ADALORA"
+    needed = {"lora_A", "lora_B"} | ({"lora_E"} if ada else set())
+    needed |= {"lora_magnitude_vector"} if config.get("use_dora") else set()
+    if missing := needed - found.keys():
         raise ValueError(f"the adapter of {module} lacks {min(missing)}.")
     a, b = found["lora_A"].T, found["lora_B"].T
-    alpha = _pattern(config.get("alpha_pattern"), module, config["lora_alpha"])
-    if config["peft_type"] == "ADALORA":
+    alpha = _pattern(config.get("alpha_pattern"), module, config.get("lora_alpha"))
+    if not alpha or (ada and not config.get("init_r")):
+        raise ValueError(f"the adapter of {module} lacks lora_alpha or init_r, which scale it.")
+    if ada:
         scale = alpha / (config["init_r"] + _ADA_CONSTANT)
         a = a * found["lora_E"][:, 0]
     else:
@@ -196,11 +206,12 @@ def _pattern(pattern: Mapping[str, Any] | None, module: str, default: Any) -> An
 
 def _check_fits(folder: pathlib.Path, module: str, adapter: Adapter, d_in: int, d_out: int) -> None:
     """Raises a ValueError unless a kernel [I, O] can carry the adapter."""
-    (a_in, rank), (b_rank, b_out) = adapter["lora_a"].shape, adapter["lora_b"].shape
-    if (a_in, b_out) != (d_in, d_out) or rank != b_rank:
+    a, b = adapter["lora_a"].shape, adapter["lora_b"].shape
+    rank = a[-1]
+    magnitude = adapter.get("magnitude", np.empty(d_out)).shape
+    if (a, b, magnitude) != ((d_in, rank), (rank, d_out), (d_out,)):
         raise ValueError(
-            f"{folder} adapts {module} as a map from {a_in} to {b_out}, the model's is from {d_in} "
-            f"to {d_out}."
+            f"{folder} adapts {module} by arrays {a} and {b}, the model's kernel is {d_in}x{d_out}."
         )
 
 
@@ -260,8 +271,9 @@ def _config(
         "base_model_name_or_path": base,
         "r": rank,
         "lora_alpha": alpha,
-        "rank_pattern": {re.escape(n): r for n, r in ranks.items() if r != rank},
-        "alpha_pattern": {re.escape(n): a for n, a in alphas.items() if a != alpha},
+        # Without the ^ a key would also match longer names that end in it.
+        "rank_pattern": {f"^{re.escape(n)}": r for n, r in ranks.items() if r != rank},
+        "alpha_pattern": {f"^{re.escape(n)}": a for n, a in alphas.items() if a != alpha},
         "target_modules": sorted(modules),
         "use_dora": dora,
         "use_rslora": False,

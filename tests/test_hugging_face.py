@@ -163,6 +163,25 @@ def test_patterns_follow_the_end_of_a_name(copy):
     assert [model.lin[i].method.scale for i in (0, 2)] == [2, 4]
 
 
+def test_names_that_end_in_another_name(tmp_path):
+    class Twins(nnx.Module):
+        def __init__(self):
+            self.proj = nnx.Linear(4, 3, rngs=nnx.Rngs(0))
+            self.head = nnx.List([nnx.Linear(3, 3, rngs=nnx.Rngs(1))])
+            self.head[0].proj = nnx.Linear(4, 3, rngs=nnx.Rngs(2))
+
+    rules = [("^proj", LoRA(rank=2, alpha=4.0)), ("head/0/proj", LoRA(rank=3, alpha=30.0))]
+    model = trained(adaptation.adapt(Twins(), rules, rngs=nnx.Rngs(0)))
+    hugging_face.save_peft(tmp_path, model)
+    again = adaptation.merge(hugging_face.load_peft(tmp_path, Twins()))
+    for ours, theirs in zip(
+        jax.tree.leaves(nnx.state(again)),
+        jax.tree.leaves(nnx.state(adaptation.merge(model))),
+        strict=True,
+    ):
+        np.testing.assert_allclose(ours, theirs, atol=1e-4)
+
+
 def test_rank_stabilized(copy):
     edit(copy, use_rslora=True)
     assert hugging_face.load_peft(copy, Net()).lin[0].method.scale == 4
@@ -205,6 +224,9 @@ def test_stacks(tmp_path):
         ({"bias": "all"}, "sets bias to 'all', which is not supported"),
         ({"modules_to_save": ["head"]}, r"sets modules_to_save to \['head'\]"),
         ({"use_dora": True}, "adapter of lin.0 lacks lora_magnitude_vector"),
+        ({"peft_type": "ADALORA"}, "adapter of lin.0 lacks lora_E"),
+        ({"lora_alpha": 0}, "lacks lora_alpha or init_r, which scale it"),
+        ({"init_lora_weights": "pissa"}, "trained on what 'pissa' left of its base"),
     ],
 )
 def test_folders_that_ask_for_more(copy, changes, message):
@@ -234,7 +256,7 @@ def extended(tensors):
     [
         (renamed, r"adapts 'lin.7', which the model lacks; it has lin"),
         (halved, "adapter of lin.2 lacks lora_B"),
-        (narrowed, "adapts lin.0 as a map from 23 to 40, the model's is from 24"),
+        (narrowed, r"adapts lin.0 by arrays \(23, 4\) and \(4, 40\), the model's kernel is 24x40"),
         (extended, "head.weight', which belongs to no LoRA"),
         (lambda tensors: {}, "adapts nothing"),
     ],

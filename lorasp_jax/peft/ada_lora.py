@@ -105,7 +105,7 @@ class AdaLoRA(Method):
     def penalty(self, params: Params) -> dict[str, jax.Array]:
         """Eq. (4) as PEFT has it: the mean of ‖AᵀA − I‖ and ‖BBᵀ − I‖, Frobenius, not squared."""
         a, b = params["lora_a"], params["lora_b"]
-        norms = [jnp.linalg.norm(gram - jnp.eye(len(gram))) for gram in (a.T @ a, b @ b.T)]
+        norms = [_norm(gram - jnp.eye(len(gram))) for gram in (a.T @ a, b @ b.T)]
         return {"orthogonality": (norms[0] + norms[1]) / 2}
 
     def transform(
@@ -113,15 +113,17 @@ class AdaLoRA(Method):
     ) -> optax.GradientTransformation:
         """The optimizer, after each step of which the budget of all layers is allocated.
 
-        It is to see the gradients that the optimizer sees: clip before it. Importance is that of
-        the updated parameters. All AdaLoRA layers in the tree share one budget.
+        It wraps the whole optimizer, learning rate included, and what is chained behind it would
+        undo the pruning; clipping goes before it. Importance is that of the updated parameters.
+        All AdaLoRA layers in the tree share one budget.
 
         Args:
           optimizer: of any tree of parameters, some of them made by `init`.
           total_steps: T.
 
         Raises:
-          ValueError: if no step would be left between warm-up and final phase.
+          ValueError: if no step would be left between warm-up and final phase, or the parameters
+            hold no AdaLoRA.
         """
         begin, end = round(self.warmup * total_steps), total_steps - round(self.final * total_steps)
         if begin >= end:
@@ -131,7 +133,8 @@ class AdaLoRA(Method):
             )
 
         def init(params: Any) -> AllocationState:
-            found = _triplets(params)
+            if not (found := _triplets(params)):
+                raise ValueError("there is no AdaLoRA among the parameters of AdaLoRA's optimizer.")
             importance, uncertainty = (jax.tree.map(jnp.zeros_like, found) for _ in range(2))
             kept = [jnp.ones(t["lora_e"].shape, bool) for t in found]
             step, inner = jnp.zeros((), jnp.int32), optimizer.init(params)
@@ -192,6 +195,12 @@ def _allocate(
     return kept, [(due | (step > end)) & ~keep for keep in kept]
 
 
+def _norm(matrix: jax.Array) -> jax.Array:
+    """Frobenius norm, whose gradient is 0 where all is 0."""
+    total = jnp.square(matrix).sum()
+    return jnp.where(total > 0, jnp.sqrt(jnp.where(total > 0, total, 1.0)), 0.0)
+
+
 def _is_triplets(node: Any) -> bool:
     return isinstance(node, Mapping) and set(node) == _NAMES
 
@@ -208,7 +217,7 @@ def _sensitivity(
     """Eqs. (8)-(10): I = |w g|, its moving mean Ī, and Ū, that of |I − Ī|."""
 
     def mean(decay: float, old: jax.Array, new: jax.Array) -> jax.Array:
-        return jnp.where(learn, decay * old + (1 - decay) * new, old)
+        return jnp.where(learn, decay * old + (1 - decay) * new, old).astype(old.dtype)
 
     now = jax.tree.map(lambda w, g: jnp.abs(w * g), params, grads)
     importance = jax.tree.map(

@@ -1,5 +1,6 @@
 """Programs that are traced once for all processes."""
 
+import dataclasses
 import threading
 import time
 import types
@@ -30,10 +31,8 @@ def env():
 class Drawn:
     """A program as `programs.kept` takes it, that counts how often it is traced."""
 
-    __name__ = __qualname__ = "drawn"
-
     def __init__(self):
-        self.traced = 0
+        self.traced, self.__name__, self.__qualname__ = 0, "drawn", "drawn"
 
     def __call__(self, env, key, scale, ranges=None):
         self.traced += 1
@@ -110,12 +109,12 @@ def test_other_arguments_are_traced(env, cache):
 
 def test_another_setting_is_traced(env, cache, monkeypatch):
     new_process(env, KEY, 0.5)
-    with jax.default_matmul_precision("float32"):
-        pass  # outside, it is what it was
+    with jax.default_matmul_precision("float32"):  # of this thread alone
+        assert new_process(env, KEY, 0.5)[1]
     assert not new_process(env, KEY, 0.5)[1]
     before = jax.config.jax_default_matmul_precision
     try:
-        jax.config.update("jax_default_matmul_precision", "float32")
+        jax.config.update("jax_default_matmul_precision", "tensorfloat32")
         assert new_process(env, KEY, 0.5)[1]
     finally:
         jax.config.update("jax_default_matmul_precision", before)
@@ -142,6 +141,15 @@ def test_without_a_cache_nothing_is_kept(env, cache):
     assert new_process(env, KEY, 0.5)[1]
     assert new_process(env, KEY, 0.5)[1]
     assert not cache.exists()
+
+
+def test_a_task_that_was_changed_is_not_kept(env, cache):
+    task = dataclasses.replace(env.task, time_limit=2 * env.task.time_limit)
+    changed = dataclasses.replace(env, task=task)
+    assert new_process(changed, KEY, 0.5)[1]
+    assert new_process(changed, KEY, 0.5)[1]
+    stranger = dataclasses.replace(env, task=dataclasses.replace(env.task, name="a_new_one"))
+    assert not programs._can_be_kept(stranger)
 
 
 def test_warp_is_not_kept(env, cache):

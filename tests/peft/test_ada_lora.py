@@ -217,6 +217,17 @@ def test_bad_fields(fields):
         small(**fields)
 
 
+def test_orthogonal_parameters_have_a_gradient_of_zero():
+    params = {"lora_a": jnp.eye(4, 2), "lora_b": jnp.eye(2, 3), "lora_e": jnp.ones(2)}
+    gradient = jax.grad(lambda p: small(rank=2).penalty(p)["orthogonality"])(params)
+    assert not any(np.any(leaf) for leaf in jax.tree.leaves(gradient))
+
+
+def test_an_optimizer_without_adalora():
+    with pytest.raises(ValueError, match="there is no AdaLoRA among the parameters"):
+        small().transform(optax.sgd(1.0), 40).init({"kernel": jnp.ones(3)})
+
+
 def test_too_few_steps():
     with pytest.raises(ValueError, match="cannot prune in 1 steps"):
         small(warmup=0.2, final=0.6).transform(optax.sgd(1.0), 1)

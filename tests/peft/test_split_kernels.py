@@ -89,6 +89,24 @@ def test_a_model_is_the_same_before_training_and_after_merging(name, depth):
     np.testing.assert_allclose(merged.layer.kernel.get_value(), kernel, atol=1e-5)
 
 
+@pytest.mark.parametrize("method", [LoRA(rank=3), lora("pissa"), lora("olora")], ids=str)
+def test_layers_that_share_a_kernel_stay_right(method):
+    class Tied(nnx.Module):
+        def __init__(self):
+            self.one, self.two = (Dense(9, 14, rngs=nnx.Rngs(i)) for i in range(2))
+            self.two.kernel = self.one.kernel
+
+    base = Tied()
+    adapted = adaptation.adapt(base, [(".*", method)], rngs=nnx.Rngs(0))
+    np.testing.assert_allclose(adapted.two(X), base.two(X), atol=1e-5)
+    for layer in (adapted.one, adapted.two):
+        params = layer.adapter.get_value()
+        layer.adapter.set_value(jax.tree.map(lambda leaf: leaf + 0.2, params))
+    merged = adaptation.merge(adapted)
+    np.testing.assert_allclose(merged.one(X), adapted.one(X), atol=1e-4)
+    np.testing.assert_allclose(merged.two(X), adapted.two(X), atol=1e-4)
+
+
 @SPLIT
 def test_saved_adapters_fit_the_base_they_were_made_from(name, tmp_path):
     adapted = adaptation.adapt(model(), [("layer", lora(name))], rngs=nnx.Rngs(0))
