@@ -16,6 +16,7 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import safetensors.numpy
@@ -62,8 +63,7 @@ def load_peft(
 ) -> adaptation.Model:
     """The model with the adapters of a folder of Hugging Face PEFT.
 
-    AdaLoRA comes as the LoRA that it has become. Layers of a stack may differ in rank and scale:
-    they are padded with zeros, which change nothing.
+    AdaLoRA comes as the LoRA that it has become. Zeros make up for different ranks in a stack.
 
     Args:
       folder: with adapter_config.json and adapter_model.safetensors.
@@ -96,8 +96,7 @@ def load_peft(
     adapted = adaptation.adapt(model, rules, rngs=nnx.Rngs(0))
     for place in adaptation.places(nnx.List([adapted]), Dense):
         if place.path in values:
-            new = {name: jnp.asarray(value) for name, value in values[place.path].items()}
-            place.child.adapter.set_value(new)
+            place.child.adapter.set_value(jax.tree.map(jnp.asarray, values[place.path]))
     return adapted
 
 

@@ -133,12 +133,7 @@ class AdaLoRA(Method):
             )
 
         def init(params: Any) -> AllocationState:
-            if not (found := _triplets(params)):
-                raise ValueError("there is no AdaLoRA among the parameters of AdaLoRA's optimizer.")
-            importance, uncertainty = (jax.tree.map(jnp.zeros_like, found) for _ in range(2))
-            kept = [jnp.ones(t["lora_e"].shape, bool) for t in found]
-            step, inner = jnp.zeros((), jnp.int32), optimizer.init(params)
-            return AllocationState(step, importance, uncertainty, kept, inner)
+            return _begun(params, optimizer.init(params))
 
         def update(updates: Any, state: Any, params: Any = None) -> Any:
             grads, (updates, inner) = updates, optimizer.update(updates, state.inner, params)
@@ -177,6 +172,15 @@ def budgets(initial: int, target: int, begin: int, end: int) -> np.ndarray:
     steps = np.arange(end + 1)
     left = 1 - np.clip((steps - begin) / (end - begin), 0.0, 1.0)
     return (target + (initial - target) * left**3).astype(np.int32)
+
+
+def _begun(params: Any, inner: Any) -> AllocationState:
+    """The state before the first step."""
+    if not (found := _triplets(params)):
+        raise ValueError("there is no AdaLoRA among the parameters of AdaLoRA's optimizer.")
+    importance, uncertainty = (jax.tree.map(jnp.zeros_like, found) for _ in range(2))
+    kept = [jnp.ones(t["lora_e"].shape, bool) for t in found]
+    return AllocationState(jnp.zeros((), jnp.int32), importance, uncertainty, kept, inner)
 
 
 def _allocate(
