@@ -206,7 +206,7 @@ def main() -> None:
     else:
         console.print(f"mujoco_playground is not installed: no figures of its {PLAYGROUND}")
     if options.json:
-        options.json.writetext(json.dumps(found, indent=1))
+        options.json.write_text(json.dumps(found, indent=1))
 
 
 if __name__ == "__main__":
