@@ -93,11 +93,7 @@ class Case:
     def memory(self) -> float:
         """What the program needs beside its arguments, and what Warp has taken, in MiB."""
         needed: int = self.steps.memory_analysis().temp_size_in_bytes
-        if self.env.physics.backend == "warp" and jax.default_backend() == "gpu":
-            import warp
-
-            needed += warp.get_mempool_used_mem_current(warp.get_device())
-        return needed / 2**20
+        return needed / 2**20 + measuring.warp_mib(self.env.physics.backend)
 
 
 def time_pictures(env: Env, state: State, size: int) -> float:

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 from rich.console import Console
 
 import envs
+from benchmarks import measuring
 from envs import Randomization, experts, physics
 from envs.env import Env
 from envs.state import State
@@ -94,10 +95,8 @@ def memory(env: Env) -> dict[str, float]:
     held: dict[str, float] = {"host": pages * 4096 / 2**20}
     if of_device := jax.devices()[0].memory_stats():  # None on CPU
         held["JAX"] = of_device["bytes_in_use"] / 2**20
-    if env.physics.backend == "warp" and jax.default_backend() == "gpu":
-        import warp
-
-        held["Warp"] = warp.get_mempool_used_mem_current(warp.get_device()) / 2**20
+    if mib := measuring.warp_mib(env.physics.backend):
+        held["Warp"] = mib
     return held
 
 

@@ -30,6 +30,15 @@ def machine(*packages: str) -> str:
     return f"{device}, {os.cpu_count()} cores, Python {platform.python_version()}, {versions}"
 
 
+def warp_mib(backend: str) -> float:
+    """What Warp has taken of the device for its physics, in MiB; 0 where another engine runs."""
+    if backend != "warp" or jax.default_backend() != "gpu":
+        return 0.0
+    import warp
+
+    return warp.get_mempool_used_mem_current(warp.get_device()) / 2**20
+
+
 def print_table(console: Console, rows: list[dict[str, Any]], title: str = "") -> None:
     """One line a row, close together."""
     table = Table(title=title, box=None, padding=(0, 1, 0, 0))

@@ -9,7 +9,7 @@ import difflib
 import math
 import re
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -110,7 +110,8 @@ def merge(model: Model) -> Model:
         layer = place.child
         if layer.adapter is not None:
             try:
-                kernel = _merged(layer.method, layer.adapter.get_value(), layer.kernel.get_value())
+                kernel = layer.kernel.get_value()
+                kernel = _over_stack(layer.method.merge, kernel)(layer.adapter.get_value(), kernel)
             except ValueError as error:
                 raise ValueError(f"cannot merge {place.path}: {error}") from error
             layer.kernel = _renewed(layer.kernel, kernel)
@@ -125,10 +126,8 @@ def penalties(model: nnx.Module) -> dict[str, jax.Array]:
     found: dict[str, list[jax.Array]] = {}
     for _, _, _, layer in places(nnx.List([model]), Dense):
         if layer.adapter is not None:
-            one = layer.method.penalty
-            for _ in layer.kernel.get_value().shape[:-2]:
-                one = jax.vmap(one)
-            for name, values in one(layer.adapter.get_value()).items():
+            penalty = _over_stack(layer.method.penalty, layer.kernel.get_value())
+            for name, values in penalty(layer.adapter.get_value()).items():
                 found.setdefault(name, []).append(values.ravel())
     return {name: jnp.concatenate(values).mean() for name, values in found.items()}
 
@@ -260,18 +259,22 @@ def _init(key: jax.Array, method: Method, kernel: jax.Array) -> tuple[Params, An
     return jax.tree.map(lambda leaf: leaf.reshape(*leading, *leaf.shape[1:]), found)
 
 
-def _merged(method: Method, params: Params, kernel: jax.Array) -> jax.Array:
-    """`method.merge` over a kernel's leading axes."""
-    merge_one = method.merge
+def _over_stack(function: Callable[..., Any], kernel: jax.Array) -> Callable[..., Any]:
+    """A function of one layer's arrays, over the leading axes of a kernel [..., I, O]."""
     for _ in kernel.shape[:-2]:
-        merge_one = jax.vmap(merge_one)
-    return merge_one(params, kernel)
+        function = jax.vmap(function)
+    return function
+
+
+def near_misses(wanted: str, known: Sequence[str]) -> str:
+    """A few of the known names, those that are most like the wanted one, or the first."""
+    return ", ".join(difflib.get_close_matches(wanted, known, n=5, cutoff=0.3) or known[:5])
 
 
 def _no_match(pattern: str, holder: nnx.List) -> str:
     paths = [place.path for place in places(holder, (Dense, nnx.Linear))]
-    close = difflib.get_close_matches(pattern, paths, n=5, cutoff=0.3) or paths[:5]
-    return f"rule {pattern!r} applies to nothing; dense layers here: {', '.join(close) or 'none'}."
+    close = near_misses(pattern, paths) or "none"
+    return f"rule {pattern!r} applies to nothing; dense layers here: {close}."
 
 
 def _size(tree: Any) -> int:

@@ -7,13 +7,12 @@ one, "a/0/b" is "a.0.b". (Format as PEFT 0.21.2 writes it.)
 """
 
 import collections
-import difflib
 import json
 import math
 import os
 import pathlib
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import jax
@@ -77,10 +76,11 @@ def load_peft(
     folder = pathlib.Path(folder)
     config, modules = _read(folder)
     kind = DoRA if config.get("use_dora") else LoRA
-    left, rules, values = dict(modules), [], {}
+    left, known, rules, values = dict(modules), [], [], {}
     for place in adaptation.places(nnx.List([model]), (Dense, nnx.Linear)):
         *leading, d_in, d_out = place.child.kernel.get_value().shape
         wanted = [names(place.path, index) for index in np.ndindex(*leading)]
+        known += wanted
         found = [left.pop(name) for name in wanted if name in left]
         if not found:
             continue
@@ -91,8 +91,7 @@ def load_peft(
         scale, values[place.path] = _stacked(found, leading)
         rank = values[place.path]["lora_a"].shape[-1]
         rules.append((f"^{re.escape(place.path)}$", kind(rank=rank, alpha=scale * rank)))
-    if left or not rules:
-        raise ValueError(_no_module(folder, sorted(left), model, names))
+    _check_used(folder, modules, left, known)
     adapted = adaptation.adapt(model, rules, rngs=nnx.Rngs(0))
     for place in adaptation.places(nnx.List([adapted]), Dense):
         if place.path in values:
@@ -214,6 +213,17 @@ def _check_fits(folder: pathlib.Path, module: str, adapter: Adapter, d_in: int, 
         )
 
 
+def _check_used(
+    folder: pathlib.Path, modules: Collection[str], left: Collection[str], known: list[str]
+) -> None:
+    """Raises a ValueError unless there are modules and none is left that the model lacks."""
+    if not modules:
+        raise ValueError(f"{folder} adapts nothing.")
+    if left:
+        close = adaptation.near_misses(min(left), known)
+        raise ValueError(f"{folder} adapts {min(left)!r}, which the model lacks; it has {close}.")
+
+
 def _stacked(found: list[Adapter], leading: list[int]) -> tuple[float, Adapter]:
     """One scale, and parameters of one rank with the stack's leading axes."""
     rank, scale = max(1, *(a["lora_a"].shape[1] for a in found)), float(found[0]["scale"])
@@ -282,16 +292,3 @@ def _config(
         "lora_dropout": 0.0,
         "task_type": None,
     }
-
-
-def _no_module(folder: pathlib.Path, left: list[str], model: nnx.Module, names: Names) -> str:
-    places = adaptation.places(nnx.List([model]), (Dense, nnx.Linear))
-    known = [
-        names(place.path, index)
-        for place in places
-        for index in np.ndindex(*place.child.kernel.get_value().shape[:-2])
-    ]
-    if not left:
-        return f"{folder} adapts nothing."
-    close = difflib.get_close_matches(left[0], known, n=5, cutoff=0.3) or known[:5]
-    return f"{folder} adapts {left[0]!r}, which the model lacks; it has {', '.join(close)}."
