@@ -10,7 +10,8 @@ row to its `Boundary`, the last kept (score, index) in that order; the mask foll
   η on a rare row.
 - "bisection": no sort. Binary search on the bits of the threshold, since fp32 numbers >= 0 are
   ordered as their bit patterns.
-- "pallas": the same search in a Triton kernel, a few rows to a program, scores held in registers.
+- "block": the same for a few rows, which stop as soon as they know: the body of a kernel.
+- "pallas": "block" in a Triton kernel of its own, scores held in registers.
 
 η is the decimal that was written: 0.9 means 9/10, and E_k >= 9/10 is tested as 10 Σ_k >= 9 Σ, so a
 row that reaches the target exactly is not lost to the rounding of 0.9.
@@ -26,7 +27,7 @@ import jax
 import jax.numpy as jnp
 from jax.experimental import pallas as pl
 
-Implementation = Literal["pairwise", "sort", "bisection", "pallas"]
+Implementation = Literal["pairwise", "sort", "bisection", "block", "pallas"]
 
 PAIRWISE_RANK = 32
 """Largest R for which pairwise is the default on CPU: the crossing of both on two cores."""
@@ -111,6 +112,7 @@ def _finder(implementation: str) -> Callable[[jax.Array, Ratio], jax.Array]:
     boundaries = {
         "sort": _sorted_boundary,
         "bisection": _bisected_boundary,
+        "block": functools.partial(_bisected_boundary, is_block=True),
         "pallas": _pallas_boundary,
     }
     if implementation == "pairwise":
@@ -178,45 +180,91 @@ def _float(bits: jax.Array) -> jax.Array:
     return jax.lax.bitcast_convert_type(bits, jnp.float32)
 
 
-def _bisected_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
-    """Two binary searches: the largest score that reaches the target together with all above it,
-    then the last tie of it that is needed.
+class _Bracket(NamedTuple):
+    """Bits of scores around each row's threshold, int32 [..., 1].
 
-    Only elementwise work and row sums: the XLA implementation is also the Pallas kernel's body.
+    The scores from `low` on reach the target, those from `high` on do not.
+    """
+
+    low: jax.Array
+    high: jax.Array
+    num_low: jax.Array
+    """How many scores there are from `low` on."""
+    num_high: jax.Array
+
+    @property
+    def is_wide(self) -> jax.Array:
+        """Whether several scores lie in it that may differ, bool [..., 1]."""
+        return (self.high - self.low > 1) & (self.num_low - self.num_high > 1)
+
+
+def _bisected_boundary(scores: jax.Array, ratio: Ratio, *, is_block: bool = False) -> Boundary:
+    """A binary search for the largest score that reaches the target together with all above it, and
+    one for the last tie of it that is needed.
+
+    Only elementwise work and row sums: the XLA implementation is also the Pallas kernel's body. A
+    few rows, a block, stop as soon as they know (11 steps of 31 for softplus scores, R = 128). For
+    many rows in XLA there is nothing to gain, and devices that share them would ask one another.
     """
     energy = _energy(scores)
     target = ratio.numerator * energy.sum(-1, keepdims=True)
 
-    def reaches(chosen: jax.Array) -> jax.Array:
-        return ratio.denominator * jnp.where(chosen, energy, 0).sum(-1, keepdims=True) >= target
+    def halve(bracket: _Bracket) -> _Bracket:
+        middle = bracket.low + jax.lax.shift_right_logical(bracket.high - bracket.low, 1)
+        chosen = scores >= _float(middle)
+        number = chosen.astype(jnp.int32).sum(-1, keepdims=True, dtype=jnp.int32)
+        reached = jnp.where(chosen, energy, 0).sum(-1, keepdims=True)
+        low = ratio.denominator * reached >= target
+        return _Bracket(
+            jnp.where(low, middle, bracket.low),
+            jnp.where(low, bracket.high, middle),
+            jnp.where(low, number, bracket.num_low),
+            jnp.where(low, bracket.num_high, number),
+        )
 
-    zero = jnp.zeros_like(target, jnp.int32)
-    score = _float(_largest(lambda bits: reaches(scores >= _float(bits)), zero, num_bits=31))
+    lowest, highest = (_bits(f(scores, axis=-1, keepdims=True)) for f in (jnp.min, jnp.max))
+    none = jnp.zeros_like(lowest)
+    bracket = _Bracket(lowest, highest + 1, none + scores.shape[-1], none)
+    if is_block:
+        bracket = jax.lax.while_loop(lambda b: _any(b.is_wide), halve, bracket)
+    else:
+        bracket = jax.lax.fori_loop(0, 31, lambda _, b: halve(b), bracket)
+    # What is left in the bracket is one score, or ties.
+    score = jnp.where(scores < _float(bracket.high), scores, -1).max(-1, keepdims=True)
+    ties = functools.partial(_last_tie, scores, energy, score, target, ratio)
+    if is_block:
+        several = _any(bracket.num_low - bracket.num_high > 1)
+        index = jax.lax.cond(several, ties, lambda: none + scores.shape[-1])
+    else:
+        index = ties()
+    return Boundary(jnp.where(target > 0, score, jnp.nan), index)
 
-    # Ties share one energy; one is kept while the energy before it falls short of the target.
+
+def _last_tie(
+    scores: jax.Array, energy: jax.Array, score: jax.Array, target: jax.Array, ratio: Ratio
+) -> jax.Array:
+    """Index of the last position of `score` that is needed, int32 [..., 1].
+
+    Ties share one energy; one is kept while the energy before it falls short of the target.
+    """
     above = jnp.where(scores > score, energy, 0).sum(-1, keepdims=True)
     tied = scores == score
     each = jnp.where(tied, energy, 0).max(-1, keepdims=True)
     position = jax.lax.broadcasted_iota(jnp.int32, scores.shape, scores.ndim - 1)
-
-    def falls_short(index: jax.Array) -> jax.Array:
-        before = (tied & (position < index)).astype(jnp.float32).sum(-1, keepdims=True)
-        return ratio.denominator * (above + before * each) < target
-
     num_bits = (scores.shape[-1] - 1).bit_length()
-    return Boundary(score, _largest(falls_short, zero, num_bits=num_bits))
-
-
-def _largest(
-    holds: Callable[[jax.Array], jax.Array], zero: jax.Array, *, num_bits: int
-) -> jax.Array:
-    """The largest int32 below 2^num_bits for which `holds`, which turns false once and for all."""
 
     def step(i: jax.Array, found: jax.Array) -> jax.Array:
         candidate = found | jax.lax.shift_left(jnp.int32(1), num_bits - 1 - i)
-        return jnp.where(holds(candidate), candidate, found)
+        before = (tied & (position < candidate)).astype(jnp.float32).sum(-1, keepdims=True)
+        falls_short = ratio.denominator * (above + before * each) < target
+        return jnp.where(falls_short, candidate, found)
 
-    return jax.lax.fori_loop(0, num_bits, step, zero)
+    return jax.lax.fori_loop(0, num_bits, step, jnp.zeros_like(score, jnp.int32))
+
+
+def _any(condition: jax.Array) -> jax.Array:
+    """Whether it holds in any row; Triton reduces numbers."""
+    return condition.astype(jnp.int32).max() > 0
 
 
 def _sorted_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
@@ -265,4 +313,4 @@ def _pallas_boundary(scores: jax.Array, ratio: Ratio, *, interpret: bool = False
 
 def _boundary_kernel(scores: Any, score: Any, index: Any, *, ratio: Ratio) -> None:
     """One program: references to scores [rows, width] in, to the two columns of `Boundary` out."""
-    score[...], index[...] = _bisected_boundary(scores[...], ratio)
+    score[...], index[...] = _bisected_boundary(scores[...], ratio, is_block=True)

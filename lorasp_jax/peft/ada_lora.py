@@ -5,7 +5,7 @@ sensitive the loss is to them; `AdaLoRA.transform` wraps the optimizer and does 
 jitted step, so a training loop cannot forget it. The arithmetic is that of Hugging Face PEFT
 0.21.2. One function per equation of the paper:
 
-    (1)  update          P Λ Q, here A diag(e) B                      `AdaLoRA.project`
+    (1)  update          P Λ Q, here A diag(e) B                      `AdaLoRA.between`
     (4)  orthogonality   ‖PᵀP − I‖ + ‖QQᵀ − I‖                        `AdaLoRA.penalty`
     (7)-(11) importance  Ī, Ū, S of each triplet                      `_sensitivity`, `_importance`
     (6)  allocation      the b(t) most important stay                 `_keep`
@@ -93,14 +93,22 @@ class AdaLoRA(Method):
             "lora_b": _INIT_STD * jax.random.normal(b_key, (self.rank, d_out)),
         }
 
-    def project(
-        self, params: Params, x: jax.Array, token_mask: jax.Array | None
-    ) -> tuple[jax.Array, jax.Array, Aux]:
-        """Eq. (1): z = s x A diag(e), u = B; the active rank is the number of entries not 0."""
-        z = x @ params["lora_a"].astype(x.dtype) * (self.scale * params["lora_e"]).astype(x.dtype)
+    def down(self, params: Params) -> jax.Array:
+        """A."""
+        return params["lora_a"]
+
+    def between(
+        self, params: Params, rows: jax.Array, token_mask: jax.Array | None
+    ) -> tuple[jax.Array, Aux]:
+        """Eq. (1): z = s x A diag(e); the active rank is the number of entries not 0."""
+        del token_mask
         rank = (params["lora_e"] != 0).sum().astype(jnp.float32)
-        aux = Aux(jnp.broadcast_to(rank, x.shape[:-1]), token_mask=token_mask)
-        return z, params["lora_b"].astype(x.dtype), aux
+        z = rows * (self.scale * params["lora_e"]).astype(rows.dtype)
+        return z, Aux(jnp.broadcast_to(rank, rows.shape[:-1]))
+
+    def up(self, params: Params) -> jax.Array:
+        """B."""
+        return params["lora_b"]
 
     def penalty(self, params: Params) -> dict[str, jax.Array]:
         """Eq. (4) as PEFT has it: the mean of ‖AᵀA − I‖ and ‖BBᵀ − I‖, Frobenius, not squared."""

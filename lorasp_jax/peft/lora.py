@@ -90,13 +90,20 @@ class LoRA(Method):
         a = jax.random.normal(key, shape) / self.rank if gaussian else kaiming_uniform(key, shape)
         return {"lora_a": a, "lora_b": jnp.zeros((self.rank, d_out))}
 
-    def project(
-        self, params: Params, x: jax.Array, token_mask: jax.Array | None
-    ) -> tuple[jax.Array, jax.Array, Aux]:
-        """z = scale x A, u = B; every token uses the whole rank."""
-        z = self.scale * (x @ params["lora_a"].astype(x.dtype))
-        active_rank = jnp.full(x.shape[:-1], self.rank, jnp.float32)
-        return z, params["lora_b"].astype(x.dtype), Aux(active_rank, token_mask=token_mask)
+    def down(self, params: Params) -> jax.Array:
+        """A."""
+        return params["lora_a"]
+
+    def between(
+        self, params: Params, rows: jax.Array, token_mask: jax.Array | None
+    ) -> tuple[jax.Array, Aux]:
+        """z = scale x A; every token uses the whole rank."""
+        del params, token_mask
+        return self.scale * rows, Aux(jnp.full(rows.shape[:-1], self.rank, jnp.float32))
+
+    def up(self, params: Params) -> jax.Array:
+        """B."""
+        return params["lora_b"]
 
     def merge(self, params: Params, kernel: jax.Array) -> jax.Array:
         """W + scale A B, summed in fp32."""

@@ -10,7 +10,7 @@ type of each task, is left out as in that code.
 """
 
 import dataclasses
-from typing import Literal
+from typing import ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,8 @@ class LoRAMoE(Method):
       ValueError: a count or rank below 1, an unknown routing or gate gradient, or "switch" without
         "top1".
     """
+
+    reads_in_fp32: ClassVar[bool] = True
 
     experts: int = 4
     """E."""
@@ -70,25 +72,29 @@ class LoRAMoE(Method):
         lora_a, router = jnp.split(inputs, [width], axis=1)
         return {"lora_a": lora_a, "lora_b": jnp.zeros((width, d_out)), "router": router}
 
-    def project(
-        self, params: Params, x: jax.Array, token_mask: jax.Array | None
-    ) -> tuple[jax.Array, jax.Array, Aux]:
-        """z = scale w(x) x A, each weight over its expert's R columns, u = B; the router's losses.
+    def down(self, params: Params) -> jax.Array:
+        """[A, W_g]."""
+        return jnp.concatenate([params["lora_a"], params["router"]], axis=1)
 
-        The logits are summed in fp32 from the types of x; everything after them is fp32.
-        """
-        router = params["router"].astype(x.dtype)
-        logits = jnp.matmul(x, router, preferred_element_type=jnp.float32)
+    def between(
+        self, params: Params, rows: jax.Array, token_mask: jax.Array | None
+    ) -> tuple[jax.Array, Aux]:
+        """z = scale w(x) x A, each weight over its expert's R columns; the router's losses."""
+        del params
+        projected, logits = jnp.split(rows, [self.experts * self.rank], axis=-1)
         probabilities = jax.nn.softmax(logits)
         columns = jnp.repeat(self.scale * self._weights(probabilities), self.rank, axis=-1)
-        z = x @ params["lora_a"].astype(x.dtype) * columns.astype(x.dtype)
+        z = projected * columns
         active = self.rank * (1 if self.routing == "top1" else self.experts)
         losses = {
             "balance": balance_loss(probabilities, token_mask),
             "z": z_loss(logits, token_mask),
         }
-        aux = Aux(jnp.full(x.shape[:-1], active, jnp.float32), None, losses, token_mask)
-        return z, params["lora_b"].astype(x.dtype), aux
+        return z, Aux(jnp.full(rows.shape[:-1], active, jnp.float32), None, losses)
+
+    def up(self, params: Params) -> jax.Array:
+        """B."""
+        return params["lora_b"]
 
     def _weights(self, probabilities: jax.Array) -> jax.Array:
         """w [..., E] of probabilities [..., E]."""

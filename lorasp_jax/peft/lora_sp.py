@@ -109,24 +109,31 @@ class LoRASP(Method):
             "b2": jnp.full(self.rank, SOFTPLUS_INVERSE_OF_ONE),
         }
 
-    def project(
-        self, params: Params, x: jax.Array, token_mask: jax.Array | None
-    ) -> tuple[jax.Array, jax.Array, Aux]:
-        """z = scale Σ(x) V x and u = U of eq. (9), with the gate's statistics and losses."""
-        bank, router = params["bank"], dict(params["router"])
-        tokens = x.shape[:-1]
-        both = jnp.concatenate([bank["v"], router.pop("w1")], axis=1).astype(x.dtype)
+    def down(self, params: Params) -> jax.Array:
+        """[V, W1]."""
+        return jnp.concatenate([params["bank"]["v"], params["router"]["w1"]], axis=1)
+
+    def between(
+        self, params: Params, rows: jax.Array, token_mask: jax.Array | None
+    ) -> tuple[jax.Array, Aux]:
+        """z = scale Σ(x) V x of eq. (9), with the gate's statistics and losses."""
+        router = {name: p for name, p in params["router"].items() if name != "w1"}
+        *tokens, width = rows.shape
         counts = jnp.ones(tokens, bool) if token_mask is None else token_mask
         z, sums, (active_rank, energy) = self._route(
-            router, (x @ both).reshape(-1, both.shape[1]), counts.reshape(-1, 1)
+            router, rows.reshape(-1, width), counts.reshape(-1, 1)
         )
         losses = {
             "spectral": spectral_loss(sums),
             "balance": balance_loss(sums),
             "z": z_loss(sums),
         }
-        aux = Aux(active_rank.reshape(tokens), energy.reshape(tokens), losses, token_mask)
-        return z.reshape(*tokens, self.rank), bank["u"].astype(x.dtype), aux
+        aux = Aux(active_rank.reshape(tokens), energy.reshape(tokens), losses)
+        return z.reshape(*tokens, self.rank), aux
+
+    def up(self, params: Params) -> jax.Array:
+        """U."""
+        return params["bank"]["u"]
 
     def _route(
         self, router: dict[str, jax.Array], rows: jax.Array, counts: jax.Array
@@ -136,7 +143,7 @@ class LoRASP(Method):
         widths = (self.rank, self.hidden_width)
         function = functools.partial(route, energy_target=self.energy_target, scale=self.scale)
         if gate == "pallas" and self.router == "gelu" and all(map(_fits_triton, widths)):
-            function = functools.partial(function, gate="bisection")
+            function = functools.partial(function, gate="block")
             return fused_rows(function, router, rows, widths, counts)
         columns = jnp.split(rows, widths[:1], axis=1)
         z, sums, _, statistics = function(router, columns, counts, None, gate=gate)

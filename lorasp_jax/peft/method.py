@@ -56,7 +56,9 @@ def masked_mean(values: jax.Array, mask: jax.Array | None) -> jax.Array:
 
 
 class Method:
-    """Base of all methods. An additive low-rank one only has `init_params` and `project` to write.
+    """Base of all methods. An additive one writes `init_params`, `down`, `between` and `up`:
+
+        delta = z U    with z, aux = between(params, x P)
 
     x is [...tokens, I], a kernel [I, O]; the result has the type of x. Parameters are fp32.
     """
@@ -65,6 +67,8 @@ class Method:
     """True if the base weights themselves are what trains."""
     additive: ClassVar[bool] = True
     """True if the adapted map is x @ kernel + delta."""
+    reads_in_fp32: ClassVar[bool] = False
+    """True if x P must not be rounded to the type of x."""
 
     @property
     def splits_kernel(self) -> bool:
@@ -100,10 +104,27 @@ class Method:
         """Fresh parameters for a kernel [d_in, d_out], a pure function of key and shape."""
         raise NotImplementedError
 
-    def project(
-        self, params: Params, x: jax.Array, token_mask: jax.Array | None
-    ) -> tuple[jax.Array, jax.Array, Aux]:
-        """The two factors of the delta, z [...tokens, R] and u [R, O] in the type of x, and aux."""
+    def down(self, params: Params) -> jax.Array:
+        """P [I, Q], the matrix that reads x."""
+        raise NotImplementedError
+
+    def between(
+        self, params: Params, rows: jax.Array, token_mask: jax.Array | None
+    ) -> tuple[jax.Array, Aux]:
+        """What happens between the two matrices, row by row.
+
+        Args:
+          params: from `init`.
+          rows: x P, [...tokens, Q] in the type of x, or in fp32 where `reads_in_fp32`.
+          token_mask: as for `delta`.
+
+        Returns:
+          z [...tokens, R], to be multiplied by U, and aux without its token_mask.
+        """
+        raise NotImplementedError
+
+    def up(self, params: Params) -> jax.Array:
+        """U [R, O], the matrix that writes y."""
         raise NotImplementedError
 
     def delta(
@@ -121,8 +142,10 @@ class Method:
         """
         if not self.additive:
             raise ValueError(f"{type(self).__name__} is not additive and has no delta; use apply.")
-        z, u, aux = self.project(params, x, token_mask)
-        return z @ u, aux
+        down, up = (side(params).astype(x.dtype) for side in (self.down, self.up))
+        rows = jnp.matmul(x, down, preferred_element_type=self._rows_dtype(x))
+        z, aux = self.between(params, rows, token_mask)
+        return z.astype(x.dtype) @ up, dataclasses.replace(aux, token_mask=token_mask)
 
     def apply(
         self,
@@ -136,8 +159,12 @@ class Method:
 
         No gradient reaches `kernel`; arguments as for `delta`.
         """
-        z, u, aux = self.project(params, x, token_mask)
-        return low_rank_matmul(x, kernel.astype(x.dtype), z, u), aux
+        sides = kernel.astype(x.dtype), self.down(params), self.up(params)
+        y, aux = low_rank_matmul(self.between, self._rows_dtype(x), params, x, *sides, token_mask)
+        return y, dataclasses.replace(aux, token_mask=token_mask)
+
+    def _rows_dtype(self, x: jax.Array) -> Any:
+        return jnp.float32 if self.reads_in_fp32 else x.dtype
 
     def penalty(self, params: Params) -> dict[str, jax.Array]:
         """Losses on the parameters alone, by name."""

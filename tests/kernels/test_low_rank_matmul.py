@@ -1,4 +1,4 @@
-"""The frozen-base product equals x @ W + z @ U and never computes a gradient for W."""
+"""The frozen-base product equals its formula and never computes a gradient for W."""
 
 import re
 
@@ -9,8 +9,9 @@ import pytest
 
 from lorasp_jax.kernels.low_rank_matmul import low_rank_matmul
 
-SHAPES = [(6, 10), (10, 6), (8, 8)]
-RANK = 3
+# Every way to multiply: wide outputs, far wider ones, square and wide inputs.
+SHAPES = [(8, 10), (6, 20), (8, 8), (10, 6)]
+READ, RANK = 4, 3
 
 
 @pytest.fixture(autouse=True)
@@ -20,59 +21,89 @@ def full_precision():
         yield
 
 
+def between(params, rows, token_mask):
+    """Not linear, narrower behind than in front, with a loss and a statistic."""
+    rows = rows if token_mask is None else jnp.where(token_mask[..., None], rows, 0)
+    z = jnp.tanh(rows[..., :RANK] * params["scale"]) * rows[..., RANK:]
+    return z, {"loss": jnp.square(rows).mean(), "statistic": rows.max(-1)}
+
+
 def inputs(d_in, d_out, dtype=jnp.float32):
     keys = jax.random.split(jax.random.key(0), 4)
-    shapes = [(2, 5, d_in), (d_in, d_out), (2, 5, RANK), (RANK, d_out)]
-    return [jax.random.normal(k, s, dtype) for k, s in zip(keys, shapes, strict=True)]
+    shapes = [(2, 5, d_in), (d_in, d_out), (d_in, READ), (RANK, d_out)]
+    x, kernel, down, up = (jax.random.normal(k, s) for k, s in zip(keys, shapes, strict=True))
+    return {"scale": jnp.full(RANK, 0.3)}, x.astype(dtype), kernel.astype(dtype), down, up
 
 
-def reference(x, kernel, z, u):
-    return x @ kernel + z @ u
+MASK = jnp.arange(10).reshape(2, 5) != 3
 
 
-@pytest.mark.parametrize(("d_in", "d_out"), SHAPES)
-def test_equals_the_reference(d_in, d_out):
-    x, kernel, z, u = inputs(d_in, d_out)
-
-    def gradients(product):
-        def loss(x, z, u):
-            return jnp.sum(jnp.sin(product(x, kernel, z, u)))
-
-        return jax.jit(jax.value_and_grad(jax.checkpoint(loss), argnums=(0, 1, 2)))(x, z, u)
-
-    for ours, theirs in zip(
-        jax.tree.leaves(gradients(low_rank_matmul)),
-        jax.tree.leaves(gradients(reference)),
-        strict=True,
-    ):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-5)
+def ours(params, x, kernel, down, up, mask=MASK):
+    return low_rank_matmul(between, x.dtype, params, x, kernel, down, up, mask)
 
 
-@pytest.mark.parametrize(("d_in", "d_out"), SHAPES)
-def test_no_gradient_of_the_kernel(d_in, d_out):
+def reference(params, x, kernel, down, up, mask=MASK):
+    z, aux = between(params, x @ down, mask)
+    return x @ kernel + z @ up, aux
+
+
+def loss_of(product):
+    def loss(params, x, kernel, down, up):
+        y, aux = product(params, x, kernel, down, up)
+        return jnp.sum(jnp.sin(y)) + 0.7 * aux["loss"], aux
+
+    return loss
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_equals_the_formula(shape):
+    def everything(product):
+        gradient = jax.value_and_grad(jax.checkpoint(loss_of(product)), (0, 1, 3, 4), has_aux=True)
+        return jax.jit(gradient)(*inputs(*shape))
+
+    found, expected = everything(ours), everything(reference)
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
+        assert np.linalg.norm(b) > 0
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_no_gradient_of_the_kernel(shape):
     """Not even a buffer: no product in the gradient's program has the kernel's shape."""
-    x, kernel, z, u = inputs(d_in, d_out)
+    arguments = inputs(*shape)
+
+    def gradient(product):
+        return jax.grad(loss_of(product), argnums=(2, 3), has_aux=True)
 
     def program(product):
-        def loss(kernel, z):
-            return jnp.sum(product(x, kernel, z, u) ** 2)
+        return str(jax.make_jaxpr(gradient(product))(*arguments))
 
-        return loss, str(jax.make_jaxpr(jax.grad(loss, argnums=(0, 1)))(kernel, z))
-
+    d_in, d_out = shape
     sides = rf"({d_in}|{d_in + RANK}|{d_out})"
     products = rf"f32\[{sides},{sides}\] = dot_general"
-    loss, text = program(low_rank_matmul)
-    assert not re.search(products, text)
-    assert re.search(products, program(reference)[1])
-    np.testing.assert_array_equal(jax.grad(loss)(kernel, z), 0)
+    assert not re.search(products, program(ours))
+    assert re.search(products, program(reference))
+    np.testing.assert_array_equal(gradient(ours)(*arguments)[0][0], 0)
 
 
-def test_keeps_the_type_of_the_input():
-    y = jax.eval_shape(low_rank_matmul, *inputs(6, 10, jnp.bfloat16))
-    assert y.dtype == jnp.bfloat16
+def test_types():
+    """y as x; gradients of the fp32 matrices in fp32, rows as asked for."""
+    arguments = inputs(6, 10, jnp.bfloat16)
+    y, aux = jax.eval_shape(ours, *arguments)
+    assert (y.dtype, aux["statistic"].dtype) == (jnp.bfloat16, jnp.bfloat16)
+    gradient = jax.grad(loss_of(ours), argnums=(1, 3, 4), has_aux=True)
+    of_x, of_down, of_up = jax.eval_shape(gradient, *arguments)[0]
+    assert (of_x.dtype, of_down.dtype, of_up.dtype) == (jnp.bfloat16, jnp.float32, jnp.float32)
+    params, x, *matrices = arguments
+    exact = jax.jit(lambda x: low_rank_matmul(between, jnp.float32, params, x, *matrices, MASK))
+    expected = x.astype(jnp.float32) @ matrices[1].astype(jnp.bfloat16).astype(jnp.float32)
+    statistic = exact(x)[1]["statistic"]
+    assert statistic.dtype == jnp.float32
+    np.testing.assert_allclose(statistic[0, 0], expected[0, 0].max(), rtol=1e-5)
 
 
 def test_vmap():
-    x, kernel, z, u = inputs(6, 10)
-    ours = jax.vmap(low_rank_matmul, in_axes=(0, None, 0, None))(x, kernel, z, u)
-    np.testing.assert_allclose(ours, reference(x, kernel, z, u), rtol=1e-5, atol=1e-5)
+    params, x, *matrices = inputs(6, 10)
+    mapped = jax.vmap(lambda x, mask: ours(params, x, *matrices, mask)[0])(x, MASK)
+    np.testing.assert_allclose(mapped, reference(params, x, *matrices)[0], rtol=1e-5, atol=1e-5)

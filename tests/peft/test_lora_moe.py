@@ -95,7 +95,7 @@ def test_top1_uses_one_expert(method, x):
     delta, aux = method.delta(params, x)
     np.testing.assert_allclose(delta, method.scale * expected, rtol=1e-4, atol=1e-5)
     np.testing.assert_array_equal(aux.active_rank, RANK)
-    z, _, _ = method.project(params, x, None)
+    z, _ = method.between(params, x @ method.down(params), None)
     used = (np.asarray(z) != 0).reshape(*x.shape[:-1], EXPERTS, RANK)
     np.testing.assert_array_equal(used.all(-1), used.any(-1))
     np.testing.assert_array_equal(used.any(-1).sum(-1), 1)
@@ -184,10 +184,10 @@ def test_nothing_but_padding(x):
 
 
 def test_logits_keep_fp32_sums_in_low_precision(x):
-    """A bf16 input gives bf16 factors, and losses as near as the rounding of its inputs allows."""
+    """A bf16 input gives a bf16 delta, and losses as near as the rounding of its inputs allows."""
     low = x.astype(jnp.bfloat16)
-    z, u, aux = ALL[0].project(arrays(), low, None)
-    assert {z.dtype, u.dtype} == {jnp.dtype("bfloat16")}
+    delta, aux = ALL[0].delta(arrays(), low)
+    assert delta.dtype == jnp.bfloat16
     router = arrays()["router"].astype(jnp.bfloat16).astype(jnp.float32)
     logits = low.astype(jnp.float32) @ router
     assert aux.losses["z"].dtype == jnp.float32
