@@ -35,6 +35,9 @@ _FILES = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_INDEX}"  # as tfds.core.Sequenti
 _METADATA = "metadata.json"  # where tfds looks for it
 # One episode is read at a time, and PNG does not shrink any further (measured: 7 times as fast).
 _RECORDS = "group_size:1,uncompressed"
+# For PNG, shared by all datasets that are made at once. A third of the work holds Python's lock, so
+# more threads only wait for it.
+_THREADS = ThreadPoolExecutor(4)
 
 
 def write(episodes: Episodes, path: str | os.PathLike) -> None:
@@ -80,9 +83,8 @@ def read(path: str | os.PathLike) -> Episodes:
         # Decoding is left to the threads: tfds would decode one picture after the other.
         encoded = {name: tfds.decode.SkipDecoding() for name in cameras.values()}
         source = builder.as_data_source(_SPLIT, decoders={"steps": {"observation": encoded}})
-        with ThreadPoolExecutor() as pool:
-            read_one = functools.partial(rlds_schema.episode, cameras=cameras, facts=shared)
-            found = list(pool.map(lambda i: read_one(source[i]), range(len(source))))
+        read_one = functools.partial(rlds_schema.episode, cameras=cameras, facts=shared)
+        found = list(_THREADS.map(lambda i: read_one(source[i]), range(len(source))))
         return replace(concatenate(found), attempted=facts["attempted"])
 
 
@@ -169,9 +171,8 @@ class Parts:
         _check_same(self.folder, {name: self.facts[name] for name in shared}, shared)
         record = functools.partial(rlds_schema.record, features, jax.tree.map(np.asarray, episodes))
         first, numbers = self.num_episodes, range(episodes.num_episodes)
-        with ThreadPoolExecutor() as pool:
-            data = pool.map(record, numbers, range(first, first + len(numbers)))
-            _write_records(self._file(len(self.facts["parts"])), data)
+        data = _THREADS.map(record, numbers, range(first, first + len(numbers)))
+        _write_records(self._file(len(self.facts["parts"])), data)
         self.facts["parts"].append(len(numbers))
         self.facts["steps"] += episodes.num_steps
         self.facts["attempted"] += episodes.attempted

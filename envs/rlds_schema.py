@@ -144,7 +144,7 @@ def _encode(images: Any) -> list[bytes]:
     encoder.height, encoder.width = images.shape[1:3]
     encoder.pix_fmt, encoder.time_base = "rgb24", Fraction(1)
     encoder.options = {"compression_level": _COMPRESSION}
-    frames = [av.VideoFrame.from_ndarray(image, format="rgb24") for image in images]
+    frames = [av.VideoFrame.from_numpy_buffer(image, format="rgb24") for image in images]
     return [bytes(packet) for frame in frames for packet in encoder.encode(frame)]
 
 

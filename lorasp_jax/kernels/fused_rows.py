@@ -12,17 +12,28 @@ on an H200 (35k bf16 rows, R = 64, H = 32): 180 us, 500 us in XLA.
 
 import functools
 import itertools
+import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.experimental import pallas as pl
 
-ROWS_PER_BLOCK = 16  # the smallest that Triton's matrix product takes
-WARPS_PER_PROGRAM = 4
-PROGRAMS = 512
-"""About how many programs share the rows; each leaves one partial sum."""
+
+class Launch(NamedTuple):
+    """How rows are spread over the GPU."""
+
+    rows: int
+    """Rows to a block, at least 16, the smallest that Triton's matrix product takes."""
+    warps: int
+    """Warps to a program."""
+    programs: int
+    """About how many programs share the blocks; each leaves one partial sum."""
+
+
+FORWARD = Launch(16, 4, 512)
+BACKWARD = Launch(16, 4, 512)
 
 Columns = list[jax.Array]
 """Arrays [n, width] that lie side by side in one [n, sum of widths]."""
@@ -58,7 +69,7 @@ def fused_rows(
       output [T, O], sums, statistics [T, 1]. Gradients reach `shared` and `rows`.
     """
     num_rows = len(rows)
-    fill = ((0, -num_rows % ROWS_PER_BLOCK), (0, 0))
+    fill = ((0, -num_rows % math.lcm(FORWARD.rows, BACKWARD.rows)), (0, 0))
     rows, counts = jnp.pad(rows, fill), jnp.pad(counts, fill).astype(jnp.int8)
     found: Any = _fused((function, widths, interpret), shared, rows, counts)
     output, sums, statistics = found
@@ -79,7 +90,7 @@ def _forward(static: tuple, shared: Any, rows: jax.Array, counts: jax.Array) -> 
         return [[output], [kept], *([column] for column in statistics)], sums
 
     inputs = [(rows, widths), (counts, (1,))]
-    (output, kept, *statistics), sums = _map_blocks(block, shared, inputs, interpret)
+    (output, kept, *statistics), sums = _map_blocks(block, shared, inputs, FORWARD, interpret)
     return (output, sums, statistics), (shared, rows, counts, kept)
 
 
@@ -100,7 +111,7 @@ def _backward(static: tuple, residuals: tuple, cotangents: tuple) -> tuple:
         return [d_columns], d_shared
 
     inputs = [(rows, widths), *((a, (a.shape[1],)) for a in (counts, kept, d_output))]
-    (d_rows,), d_shared = _map_blocks(block, (shared, d_sums), inputs, interpret)
+    (d_rows,), d_shared = _map_blocks(block, (shared, d_sums), inputs, BACKWARD, interpret)
     return d_shared, d_rows, None
 
 
@@ -108,7 +119,11 @@ _fused.defvjp(_forward, _backward)
 
 
 def _map_blocks(
-    body: Body, shared: Any, inputs: list[tuple[jax.Array, Widths]], interpret: bool
+    body: Body,
+    shared: Any,
+    inputs: list[tuple[jax.Array, Widths]],
+    launch: Launch,
+    interpret: bool,
 ) -> tuple[list[jax.Array], Any]:
     """body(shared, columns of each input) -> (columns of each output, sums), in one kernel.
 
@@ -118,14 +133,14 @@ def _map_blocks(
 
     arrays = [array for array, _ in inputs]
     widths = [widths for _, widths in inputs]
-    blocks = len(arrays[0]) // ROWS_PER_BLOCK
-    most = pl.cdiv(blocks, PROGRAMS)
+    blocks = len(arrays[0]) // launch.rows
+    most = pl.cdiv(blocks, launch.programs)
     stretch = next(n for n in range(most, 0, -1) if blocks % n == 0)
     programs = blocks // stretch
     columns, sums = jax.eval_shape(
         body,
         shared,
-        *([_shape(array.dtype, ROWS_PER_BLOCK, width) for width in w] for array, w in inputs),
+        *([_shape(array.dtype, launch.rows, width) for width in w] for array, w in inputs),
     )
     out_widths = [tuple(column.shape[1] for column in output) for output in columns]
     rows = [
@@ -133,10 +148,10 @@ def _map_blocks(
         for output, w in zip(columns, out_widths, strict=True)
     ]
     outputs, partial_sums = pl.pallas_call(
-        functools.partial(_kernel, body, stretch, widths, out_widths),
+        functools.partial(_kernel, body, launch.rows, stretch, widths, out_widths),
         grid=(programs,),
         out_shape=(rows, jax.tree.map(lambda s: _shape(s.dtype, programs, *s.shape), sums)),
-        compiler_params=triton.CompilerParams(num_warps=WARPS_PER_PROGRAM, num_stages=1),
+        compiler_params=triton.CompilerParams(num_warps=launch.warps, num_stages=1),
         interpret=interpret,
         name="fused_rows",
     )(shared, arrays)
@@ -150,6 +165,7 @@ def _shape(dtype: Any, *sides: int) -> jax.ShapeDtypeStruct:
 
 def _kernel(
     body: Body,
+    num_rows: int,
     stretch: int,
     widths: list[Widths],
     out_widths: list[Widths],
@@ -158,12 +174,12 @@ def _kernel(
     output_refs: Any,
     sum_refs: Any,
 ) -> None:
-    """One program: `stretch` blocks, one after the other."""
+    """One program: `stretch` blocks of `num_rows`, one after the other."""
     shared = jax.tree.map(lambda ref: ref[...], shared_refs)
     program = pl.program_id(0)
 
     def block(i: jax.Array, sums: Any) -> Any:
-        at = pl.ds((program * stretch + i) * ROWS_PER_BLOCK, ROWS_PER_BLOCK)
+        at = pl.ds((program * stretch + i) * num_rows, num_rows)
         loaded = [
             [ref[at, pl.ds(*place)] for place in _places(w)]
             for ref, w in zip(input_refs, widths, strict=True)

@@ -63,7 +63,9 @@ def test_programs_share_the_rows(shared, monkeypatch):
     rows = jax.random.normal(jax.random.key(1), (16 * 12, 48))
     counts = jnp.ones((len(rows), 1), bool)
     one_each = run(True, shared, rows, counts)
-    monkeypatch.setattr(kernels, "PROGRAMS", 5)  # 12 blocks: 3 each is the largest that divides
+    # 12 blocks: 3 each is the largest that divides. And 3 blocks, which divide into single ones.
+    monkeypatch.setattr(kernels, "FORWARD", kernels.Launch(16, 4, 5))
+    monkeypatch.setattr(kernels, "BACKWARD", kernels.Launch(64, 4, 2))
     together = run(True, shared, rows, counts)
     jax.tree.map(close, together, one_each)
 
