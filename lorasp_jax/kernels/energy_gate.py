@@ -11,7 +11,7 @@ row to its `Boundary`, the last kept (score, index) in that order; the mask foll
 - "bisection": no sort. Binary search on the bits of the threshold, since fp32 numbers >= 0 are
   ordered as their bit patterns.
 - "block": the same for a few rows, which stop as soon as they know: the body of a kernel.
-- "pallas": "block" in a Triton kernel of its own, scores held in registers.
+- "pallas": "block" in a Triton kernel of its own, a row to a warp, scores held in registers.
 
 η is the decimal that was written: 0.9 means 9/10, and E_k >= 9/10 is tested as 10 Σ_k >= 9 Σ, so a
 row that reaches the target exactly is not lost to the rounding of 0.9.
@@ -31,8 +31,6 @@ Implementation = Literal["pairwise", "sort", "bisection", "block", "pallas"]
 
 PAIRWISE_RANK = 32
 """Largest R for which pairwise is the default on CPU: the crossing of both on two cores."""
-ROWS_PER_PROGRAM = 4
-WARPS_PER_PROGRAM = 4
 
 
 class Boundary(NamedTuple):
@@ -181,21 +179,13 @@ def _float(bits: jax.Array) -> jax.Array:
 
 
 class _Bracket(NamedTuple):
-    """Bits of scores around each row's threshold, int32 [..., 1].
-
-    The scores from `low` on reach the target, those from `high` on do not.
-    """
+    """Bits of scores, int32 [..., 1]: those from `low` on reach the target, from `high` on not."""
 
     low: jax.Array
     high: jax.Array
     num_low: jax.Array
     """How many scores there are from `low` on."""
     num_high: jax.Array
-
-    @property
-    def is_wide(self) -> jax.Array:
-        """Whether several scores lie in it that may differ, bool [..., 1]."""
-        return (self.high - self.low > 1) & (self.num_low - self.num_high > 1)
 
 
 def _bisected_boundary(scores: jax.Array, ratio: Ratio, *, is_block: bool = False) -> Boundary:
@@ -214,30 +204,27 @@ def _bisected_boundary(scores: jax.Array, ratio: Ratio, *, is_block: bool = Fals
         chosen = scores >= _float(middle)
         number = chosen.astype(jnp.int32).sum(-1, keepdims=True, dtype=jnp.int32)
         reached = jnp.where(chosen, energy, 0).sum(-1, keepdims=True)
-        low = ratio.denominator * reached >= target
-        return _Bracket(
-            jnp.where(low, middle, bracket.low),
-            jnp.where(low, bracket.high, middle),
-            jnp.where(low, number, bracket.num_low),
-            jnp.where(low, bracket.num_high, number),
-        )
+        is_low = ratio.denominator * reached >= target
+        upper = bracket._replace(low=middle, num_low=number)
+        lower = bracket._replace(high=middle, num_high=number)
+        return jax.tree.map(functools.partial(jnp.where, is_low), upper, lower)
 
     lowest, highest = (_bits(f(scores, axis=-1, keepdims=True)) for f in (jnp.min, jnp.max))
     none = jnp.zeros_like(lowest)
     bracket = _Bracket(lowest, highest + 1, none + scores.shape[-1], none)
     if is_block:
-        bracket = jax.lax.while_loop(lambda b: _any(b.is_wide), halve, bracket)
+        bracket = jax.lax.while_loop(
+            lambda b: _any((b.high - b.low > 1) & (b.num_low - b.num_high > 1)), halve, bracket
+        )
     else:
         bracket = jax.lax.fori_loop(0, 31, lambda _, b: halve(b), bracket)
     # What is left in the bracket is one score, or ties.
     score = jnp.where(scores < _float(bracket.high), scores, -1).max(-1, keepdims=True)
-    ties = functools.partial(_last_tie, scores, energy, score, target, ratio)
+    index = functools.partial(_last_tie, scores, energy, score, target, ratio)
     if is_block:
         several = _any(bracket.num_low - bracket.num_high > 1)
-        index = jax.lax.cond(several, ties, lambda: none + scores.shape[-1])
-    else:
-        index = ties()
-    return Boundary(jnp.where(target > 0, score, jnp.nan), index)
+        index = functools.partial(jax.lax.cond, several, index, lambda: none + scores.shape[-1])
+    return Boundary(jnp.where(target > 0, score, jnp.nan), index())
 
 
 def _last_tie(
@@ -287,28 +274,24 @@ def _sorted_row_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
 
 
 def _pallas_boundary(scores: jax.Array, ratio: Ratio, *, interpret: bool = False) -> Boundary:
-    """The bisection as a Triton kernel; rows and R are padded with zeros, which are never kept."""
+    """The bisection as a Triton kernel; R is padded with zeros, which are never kept."""
     from jax.experimental.pallas import triton  # absent from builds without NVIDIA support
 
-    rows = scores.reshape(-1, scores.shape[-1])
-    num_rows, rank = rows.shape
+    *leading, rank = scores.shape
     width = max(pl.next_power_of_2(rank), 2)
-    programs = pl.cdiv(num_rows, ROWS_PER_PROGRAM)
-    rows = jnp.pad(rows, ((0, programs * ROWS_PER_PROGRAM - num_rows), (0, width - rank)))
-
-    column = pl.BlockSpec((ROWS_PER_PROGRAM, 1), lambda i: (i, 0))
+    rows = jnp.pad(scores.reshape(-1, rank), ((0, 0), (0, width - rank)))
+    column = pl.BlockSpec((1, 1), lambda i: (i, 0))
     score, index = pl.pallas_call(
         functools.partial(_boundary_kernel, ratio=ratio),
-        grid=(programs,),
-        in_specs=[pl.BlockSpec((ROWS_PER_PROGRAM, width), lambda i: (i, 0))],
+        grid=(len(rows),),  # one row and one warp to a program: the fastest measured
+        in_specs=[pl.BlockSpec((1, width), lambda i: (i, 0))],
         out_specs=[column, column],
         out_shape=[jax.ShapeDtypeStruct((len(rows), 1), t) for t in (jnp.float32, jnp.int32)],
-        compiler_params=triton.CompilerParams(num_warps=WARPS_PER_PROGRAM, num_stages=1),
+        compiler_params=triton.CompilerParams(num_warps=1, num_stages=1),
         interpret=interpret,
         name="energy_gate",
     )(rows)
-    last = Boundary(score[:num_rows], index[:num_rows])
-    return jax.tree.map(lambda leaf: leaf.reshape(*scores.shape[:-1], 1), last)
+    return Boundary(score.reshape(*leading, 1), index.reshape(*leading, 1))
 
 
 def _boundary_kernel(scores: Any, score: Any, index: Any, *, ratio: Ratio) -> None:

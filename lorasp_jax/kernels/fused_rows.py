@@ -32,7 +32,7 @@ class Launch(NamedTuple):
     """About how many programs share the blocks; each leaves one partial sum."""
 
 
-FORWARD = Launch(16, 4, 512)
+FORWARD = Launch(16, 2, 816)
 BACKWARD = Launch(16, 4, 512)
 
 Columns = list[jax.Array]
@@ -56,9 +56,9 @@ def fused_rows(
     Args:
       function: (shared, columns, counts, kept) -> (output, sums, kept, statistics), for any number
         n of rows: columns [n, width] each, counts bool [n, 1], output [n, O]; sums is a pytree of
-        arrays that add up over rows, kept, bool [n, K], what its gradient takes as given (None on
-        the way forward), statistics a list of [n, 1] without gradient. It may use what Triton has:
-        sides are powers of two, in a matrix product at least 16.
+        fp32 arrays that add up over rows, kept, bool [n, K], what its gradient takes as given (None
+        on the way forward), statistics a list of [n, 1] without gradient. It may use what Triton
+        has: sides are powers of two, in a matrix product at least 16.
       shared: pytree of small fp32 arrays that every row uses.
       rows: [T, sum of widths].
       widths: of the columns that `function` takes.
@@ -147,15 +147,20 @@ def _map_blocks(
         _shape(output[0].dtype, len(arrays[0]), sum(w))
         for output, w in zip(columns, out_widths, strict=True)
     ]
+    leaves, tree = jax.tree.flatten(sums)
+    sizes = tuple(leaf.size for leaf in leaves)
     outputs, partial_sums = pl.pallas_call(
-        functools.partial(_kernel, body, launch.rows, stretch, widths, out_widths),
+        functools.partial(_kernel, body, launch.rows, stretch, widths, out_widths, sums),
         grid=(programs,),
-        out_shape=(rows, jax.tree.map(lambda s: _shape(s.dtype, programs, *s.shape), sums)),
+        out_shape=(rows, _shape(jnp.float32, programs, sum(sizes))),
         compiler_params=triton.CompilerParams(num_warps=launch.warps, num_stages=1),
         interpret=interpret,
         name="fused_rows",
     )(shared, arrays)
-    return outputs, jax.tree.map(lambda s: s.sum(0), partial_sums)
+    # One array of all sums, which XLA adds up in one kernel and not in one for each.
+    added = jnp.split(partial_sums.sum(0), list(itertools.accumulate(sizes))[:-1])
+    shaped = [value.reshape(leaf.shape) for value, leaf in zip(added, leaves, strict=True)]
+    return outputs, jax.tree.unflatten(tree, shaped)
 
 
 def _shape(dtype: Any, *sides: int) -> jax.ShapeDtypeStruct:
@@ -169,10 +174,11 @@ def _kernel(
     stretch: int,
     widths: list[Widths],
     out_widths: list[Widths],
+    sums: Any,
     shared_refs: Any,
     input_refs: Any,
     output_refs: Any,
-    sum_refs: Any,
+    sum_ref: Any,
 ) -> None:
     """One program: `stretch` blocks of `num_rows`, one after the other."""
     shared = jax.tree.map(lambda ref: ref[...], shared_refs)
@@ -190,9 +196,10 @@ def _kernel(
                 ref[at, pl.ds(*place)] = column
         return jax.tree.map(jnp.add, sums, more)
 
-    zeros = jax.tree.map(lambda ref: jnp.zeros(ref.shape[1:], ref.dtype), sum_refs)
-    sums = jax.lax.fori_loop(0, stretch, block, zeros)
-    jax.tree.map(lambda ref, value: ref.__setitem__(program, value), sum_refs, sums)
+    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), sums)
+    leaves = jax.tree.leaves(jax.lax.fori_loop(0, stretch, block, zeros))
+    for place, leaf in zip(_places(tuple(leaf.size for leaf in leaves)), leaves, strict=True):
+        sum_ref[program, pl.ds(*place)] = leaf.reshape(-1)
 
 
 def _places(widths: Widths) -> list[tuple[int, int]]:

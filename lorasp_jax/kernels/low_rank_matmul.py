@@ -57,7 +57,8 @@ def _forward(
     up: jax.Array,
     token_mask: jax.Array | None,
 ) -> tuple:
-    rows = jnp.matmul(x, down.astype(x.dtype), preferred_element_type=rows_dtype)
+    p = _aligned(down.astype(x.dtype))
+    rows = jnp.matmul(x, p, preferred_element_type=rows_dtype)[..., : down.shape[1]]
 
     def inner(params: Any, rows: jax.Array) -> tuple[jax.Array, Any]:
         z, aux = between(params, rows, token_mask)
@@ -78,18 +79,24 @@ def _backward(between: Between, rows_dtype: Any, residuals: tuple, cotangents: t
     pull_back, x, kernel, down, up, z = residuals
     g, d_aux = cotangents
     d_in, d_out = kernel.shape
-    p, u = down.astype(x.dtype), up.astype(x.dtype)
+    p, u = _aligned(down.astype(x.dtype)), up.astype(x.dtype)
     if d_out > 2 * d_in:
         through_base, dz = jnp.split(g @ jnp.concatenate([kernel, u]).T, [d_in], axis=-1)
     else:
         through_base, dz = None, g @ u.T
     d_params, d_rows = pull_back((dz, d_aux))
-    q = d_rows.astype(x.dtype)
+    q = _aligned(d_rows.astype(x.dtype))
     if d_out <= d_in:
         dx = jnp.concatenate([g, q], axis=-1) @ jnp.concatenate([kernel, p], axis=1).T
     else:
         dx = (g @ kernel.T if through_base is None else through_base) + q @ p.T
-    return d_params, dx, None, _outer(x, q, down.dtype), _outer(z, g, up.dtype), None
+    d_down = _outer(x, q, down.dtype)[:, : down.shape[1]]
+    return d_params, dx, None, d_down, _outer(z, g, up.dtype), None
+
+
+def _aligned(matrix: jax.Array) -> jax.Array:
+    """Zeros up to a multiple of 8 columns: 132 made LoRA-MoE's backward pass twice as long."""
+    return jnp.pad(matrix, [(0, 0)] * (matrix.ndim - 1) + [(0, -matrix.shape[-1] % 8)])
 
 
 def _outer(left: jax.Array, right: jax.Array, dtype: Any) -> jax.Array:

@@ -10,7 +10,7 @@ import pytest
 from lorasp_jax.kernels.low_rank_matmul import low_rank_matmul
 
 # Every way to multiply: wide outputs, far wider ones, square and wide inputs.
-SHAPES = [(8, 10), (6, 20), (8, 8), (10, 6)]
+SHAPES = [(9, 10), (6, 20), (12, 12), (10, 7)]
 READ, RANK = 4, 3
 
 
