@@ -35,8 +35,7 @@ _FILES = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_INDEX}"  # as tfds.core.Sequenti
 _METADATA = "metadata.json"  # where tfds looks for it
 # One episode is read at a time, and PNG does not shrink any further (measured: 7 times as fast).
 _RECORDS = "group_size:1,uncompressed"
-# For PNG, shared by all datasets that are made at once. A third of the work holds Python's lock, so
-# more threads only wait for it.
+# Shared by all datasets that are made at once: more threads would only wait for Python's lock.
 _THREADS = ThreadPoolExecutor(4)
 
 
