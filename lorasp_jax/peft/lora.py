@@ -94,9 +94,24 @@ class LoRA(Method):
         self, params: Params, x: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, jax.Array, Aux]:
         """z = scale x A, u = B; every token uses the whole rank."""
-        z = self.scale * (x @ params["lora_a"].astype(x.dtype))
-        active_rank = jnp.full(x.shape[:-1], self.rank, jnp.float32)
-        return z, params["lora_b"].astype(x.dtype), Aux(active_rank, token_mask=token_mask)
+        return self.project_hidden(params, x @ params["lora_a"].astype(x.dtype), token_mask)
+
+    def project_hidden(
+        self, params: Params, hidden: jax.Array, token_mask: jax.Array | None = None
+    ) -> tuple[jax.Array, jax.Array, Aux]:
+        """As `project`, from x A [...tokens, R]: a lookup or a convolution where x is not dense."""
+        active_rank = jnp.full(hidden.shape[:-1], self.rank, jnp.float32)
+        aux = Aux(active_rank, token_mask=token_mask)
+        return self.scale * hidden, params["lora_b"].astype(hidden.dtype), aux
+
+    def init_table(self, key: jax.Array, table: Kernel) -> tuple[Params, Kernel]:
+        """Parameters for an embedding [V, D]: A zero, B in N(0, 1), as in Hugging Face PEFT.
+
+        Only the rows of A that were looked up get a gradient, so A is what must start at zero.
+        """
+        entries, width = table.shape
+        b = jax.random.normal(key, (self.rank, width))
+        return {"lora_a": jnp.zeros((entries, self.rank)), "lora_b": b}, table
 
     def merge(self, params: Params, kernel: jax.Array) -> jax.Array:
         """W + scale A B, summed in fp32."""
