@@ -128,7 +128,7 @@ def merge(model: Model) -> Model:
         if layer.adapter is not None:
             try:
                 kernel = layer.kernel_matrices()
-                kernel = _over_stack(layer.method.merge, kernel)(layer.adapter.get_value(), kernel)
+                kernel = over_stack(layer.method.merge, kernel)(layer.adapter.get_value(), kernel)
             except ValueError as error:
                 raise ValueError(f"cannot merge {place.path}: {error}") from error
             layer.set_kernel_matrices(kernel)
@@ -142,7 +142,7 @@ def penalties(model: nnx.Module) -> dict[str, jax.Array]:
     found: dict[str, list[jax.Array]] = {}
     for _, _, _, layer in places(nnx.List([model]), AdaptedLayer):
         if layer.adapter is not None:
-            penalty = _over_stack(layer.method.penalty, layer.kernel_matrices())
+            penalty = over_stack(layer.method.penalty, layer.kernel_matrices())
             for name, values in penalty(layer.adapter.get_value()).items():
                 found.setdefault(name, []).append(values.ravel())
     return {name: jnp.concatenate(values).mean() for name, values in found.items()}
@@ -163,7 +163,7 @@ def attach(layer: AdaptedLayer, method: Method, key: jax.Array) -> None:
     if layer.adapter is not None and layer.method is not None and layer.method.splits_kernel:
         raise ValueError("an adapter that holds a part of its kernel cannot be replaced: merge it.")
     _retype([p for p in places(nnx.List([layer]), AdapterParam) if p.name != "adapter"], nnx.Param)
-    params, kernel = _init(key, layer.adapter_init(method), layer.kernel_matrices())
+    params, kernel = init_stack(key, layer.adapter_init(method), layer.kernel_matrices())
     layer.method = method
     if method.splits_kernel:
         layer.set_kernel_matrices(kernel)
@@ -201,7 +201,7 @@ def layer_places(holder: nnx.List, einsums: layers.Einsums | None = None) -> lis
     ]
 
 
-def _governing(rules: Rules, *paths: str) -> int | None:
+def governing(rules: Rules, *paths: str) -> int | None:
     """Index of the first rule that matches one of the paths."""
     hits = (i for i, (pattern, _) in enumerate(rules) if any(re.search(pattern, p) for p in paths))
     return next(hits, None)
@@ -213,7 +213,7 @@ def _attach_all(
     """Attaches adapters in place; returns the rules that were used."""
     used = set()
     for path, parent, name, layer in layer_places(holder, einsums):
-        i = _governing(rules, path)
+        i = governing(rules, path)
         method = None if i is None else rules[i][1]
         if method is not None and not method.trains_base:
             own_key = jax.random.fold_in(key, zlib.crc32(path.encode()))
@@ -231,7 +231,7 @@ def _free_all(holder: nnx.List, rules: Rules) -> set[int]:
     """Makes base parameters trainable in place; returns the rules that were used."""
     used, freed = set(), []
     for place in places(holder, nnx.Param):
-        i = _governing(rules, place.path.rpartition("/")[0], place.path)
+        i = governing(rules, place.path.rpartition("/")[0], place.path)
         method = None if i is None else rules[i][1]
         if i is None or (method is not None and not method.trains_base):
             continue
@@ -260,7 +260,7 @@ def _retype(places: Sequence[Place], kind: type[nnx.Param]) -> None:
         setattr(parent, name, renewed[id(variable)])
 
 
-def _init(key: jax.Array, init: Callable[..., Any], kernel: jax.Array) -> tuple[Params, Any]:
+def init_stack(key: jax.Array, init: Callable[..., Any], kernel: jax.Array) -> tuple[Params, Any]:
     """A method's `init` for a kernel [..., I, O]: one draw per leading index.
 
     Not jitted as a whole: its random draws compile once for each I instead of for each shape.
@@ -273,7 +273,7 @@ def _init(key: jax.Array, init: Callable[..., Any], kernel: jax.Array) -> tuple[
     return jax.tree.map(lambda leaf: leaf.reshape(*leading, *leaf.shape[1:]), found)
 
 
-def _over_stack(function: Callable[..., Any], kernel: jax.Array) -> Callable[..., Any]:
+def over_stack(function: Callable[..., Any], kernel: jax.Array) -> Callable[..., Any]:
     """A function of one layer's arrays, over the leading axes of a kernel [..., I, O]."""
     for _ in kernel.shape[:-2]:
         function = jax.vmap(function)

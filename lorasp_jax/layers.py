@@ -10,7 +10,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from flax import nnx
+from flax import linen, nnx
 from flax.nnx.nn.dtypes import promote_dtype
 
 from lorasp_jax import einsum
@@ -34,7 +34,7 @@ _PLAIN: dict[str, tuple[Any, ...]] = {
     "einsum_op": (jnp.einsum,),
     "precision": (None,),
     "preferred_element_type": (None,),
-    "promote_dtype": (promote_dtype,),
+    "promote_dtype": (promote_dtype, linen.dtypes.promote_dtype),
 }
 
 
@@ -83,17 +83,8 @@ class LoRALayer(AdaptedLayer):
     """Mixin for a layer that adds LoRA's low-rank map to what its own class computes."""
 
     def adapter_init(self, method: Method) -> Callable[[jax.Array, jax.Array], Any]:
-        """As for every layer, but for LoRA alone."""
-        if type(method) is not LoRA or method.splits_kernel:
-            raise ValueError(
-                f"{type(self).__name__} takes LoRA that leaves the kernel whole, not {method}: put "
-                "a rule with None, or with such a LoRA, in front."
-            )
-        return self.lora_init(method)
-
-    def lora_init(self, method: LoRA) -> Callable[[jax.Array, jax.Array], Any]:
-        """What makes LoRA's parameters from a key and a kernel [I, O]."""
-        return method.init
+        """As for every layer, but see `lora_init`."""
+        return lora_init(self, method)
 
     def with_delta(self, y: jax.Array, hidden: jax.Array) -> jax.Array:
         """Y plus the delta, from what A makes of the input."""
@@ -126,10 +117,6 @@ class EmbedLayer(LoRALayer):
         y = super().attend(query, **kwargs)
         return y + attend_delta(*self.lora(), query.astype(y.dtype))
 
-    def lora_init(self, method: LoRA) -> Callable[[jax.Array, jax.Array], Any]:
-        """A zero, B normal."""
-        return method.init_table
-
 
 class ConvLayer(LoRALayer):
     """Mixin for `nnx.Conv`: A is a convolution onto R channels, B one of size 1."""
@@ -144,11 +131,6 @@ class ConvLayer(LoRALayer):
         kernel = super().kernel_matrices()
         outer = kernel.ndim - len(self.kernel_size) - 2
         return kernel.reshape(*kernel.shape[:outer], -1, kernel.shape[-1])
-
-    def adapter_init(self, method: Method) -> Callable[[jax.Array, jax.Array], Any]:
-        """As for every layer, but for LoRA and convolutions of one group, without a mask."""
-        check_conv(self)
-        return super().adapter_init(method)
 
 
 def lookup(table: jax.Array, ids: jax.Array) -> jax.Array:
@@ -165,7 +147,7 @@ def attend_delta(method: LoRA, params: Any, query: jax.Array) -> jax.Array:
 
 
 def convolved(layer: Any, a: jax.Array, inputs: jax.Array) -> jax.Array:
-    """inputs [..., *spatial, I] under A [sizes · I, R], moved over them as the layer's own kernel.
+    """inputs [..., *spatial, I] under A [sizes · I, R], moved over them like the layer's kernel.
 
     Args:
       layer: a convolution of NNX or Linen; their settings have the same names.
@@ -186,10 +168,22 @@ def convolved(layer: Any, a: jax.Array, inputs: jax.Array) -> jax.Array:
     )(inputs)
 
 
-def check_conv(layer: Any) -> None:
-    """Raises a ValueError for a convolution that LoRA cannot take over."""
+def lora_init(layer: Any, method: Method) -> Callable[[jax.Array, jax.Array], Any]:
+    """What makes LoRA's parameters for an embedding or a convolution from a key and a kernel.
+
+    Raises:
+      ValueError: another method, or a convolution in groups or with a mask.
+    """
+    if type(method) is not LoRA or method.splits_kernel:
+        raise ValueError(
+            f"{type(layer).__name__} takes LoRA that leaves the kernel whole, not {method}: put a "
+            "rule with None, or with such a LoRA, in front."
+        )
+    if not isinstance(layer, nnx.Conv | linen.Conv):
+        return method.init_table
     if layer.feature_group_count != 1 or layer.mask is not None:
         raise ValueError("a convolution in groups or with a mask cannot be adapted.")
+    return method.init
 
 
 def adapted(layer: nnx.Module, einsums: Einsums) -> AdaptedLayer:
@@ -206,7 +200,7 @@ def adapted(layer: nnx.Module, einsums: Einsums) -> AdaptedLayer:
         return layer
     known = kind(layer, einsums)
     if known not in (nnx.Embed, nnx.Conv):
-        _check_plain(layer)
+        check_plain(layer)
     if known is nnx.Linear:
         return _as_dense(layer)
     if known in (nnx.Embed, nnx.Conv):
@@ -233,12 +227,12 @@ def kernel_of(layer: Any) -> nnx.Param:
     return getattr(layer, getattr(layer, "kernel_name", name))
 
 
-def _check_plain(layer: nnx.Module) -> None:
+def check_plain(layer: Any) -> None:
     """Raises a ValueError for settings that an adapted layer would not follow."""
     for name, plain in _PLAIN.items():
         if getattr(layer, name, plain[0]) not in plain:
             raise ValueError(
-                f"an nnx.{type(layer).__name__} with its own dot_general or precision cannot be "
+                f"a {type(layer).__name__} with its own dot_general or precision cannot be "
                 f"adapted: it sets {name}."
             )
 

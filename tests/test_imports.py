@@ -14,6 +14,7 @@ ROOMS = [
     "lorasp_jax.einsum",
     "lorasp_jax.layers",
     "lorasp_jax.adaptation",
+    "lorasp_jax.linen_layers",
     "lorasp_jax.linen",
     "lorasp_jax.tables",
     "lorasp_jax.adapter_io",
