@@ -119,6 +119,9 @@ def methods(model: nnx.Module) -> dict[str, Method]:
 def merge(model: Model) -> Model:
     """A model without adapters that computes the same: deltas folded into kernels, all frozen.
 
+    Of an embedding, `attend` is adapted as lookups are; a table that the model reads past both is
+    not, but merging changes it.
+
     Raises:
       ValueError: a method whose delta depends on the input.
     """

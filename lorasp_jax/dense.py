@@ -43,6 +43,12 @@ class AdapterAux(nnx.Intermediate):
     """What a drop-in layer kept in its last call."""
 
 
+def refuse_sharding(out_sharding: Any) -> None:
+    """Raises a ValueError unless it is None: some models pass it to every layer."""
+    if out_sharding is not None:
+        raise ValueError("an adapted layer takes no out_sharding: constrain what it returns.")
+
+
 def dense(
     x: jax.Array,
     kernel: jax.Array,
@@ -170,9 +176,15 @@ class Dense(AdaptedLayer):
             self.adapter = AdapterParam(params)
 
     def __call__(
-        self, x: jax.Array, *, token_mask: jax.Array | None = None, return_aux: bool = False
+        self,
+        x: jax.Array,
+        *,
+        token_mask: jax.Array | None = None,
+        return_aux: bool = False,
+        out_sharding: None = None,
     ) -> Any:
-        """y [...tokens, O], or (y, aux) if asked; see `dense`."""
+        """y [...tokens, O], or (y, aux) if asked; see `dense`. An output sharding is refused."""
+        refuse_sharding(out_sharding)
         kernel = self.kernel.get_value()
         bias = None if self.bias is None else self.bias.get_value()
         params = None if self.adapter is None else self.adapter.get_value()

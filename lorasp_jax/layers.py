@@ -14,7 +14,7 @@ from flax import linen, nnx
 from flax.nnx.nn.dtypes import promote_dtype
 
 from lorasp_jax import einsum
-from lorasp_jax.dense import AdaptedLayer, Dense
+from lorasp_jax.dense import AdaptedLayer, Dense, refuse_sharding
 from lorasp_jax.peft import LoRA, Method
 
 Einsums = Mapping[type[nnx.Module], Callable[[Any], tuple[str, str]]]
@@ -53,8 +53,7 @@ class EinsumLayer(AdaptedLayer):
         Raises:
           ValueError: an output sharding was asked for.
         """
-        if out_sharding is not None:
-            raise ValueError("an adapted layer takes no out_sharding: constrain what it returns.")
+        refuse_sharding(out_sharding)
         kernel = getattr(self, self.kernel_name).get_value()
         bias = None if getattr(self, "bias", None) is None else self.bias.get_value()
         params = None if self.adapter is None else self.adapter.get_value()
@@ -107,23 +106,23 @@ class LoRALayer(AdaptedLayer):
 class EmbedLayer(LoRALayer):
     """Mixin for `nnx.Embed`: the rows looked up, and the logits of `attend`, see W + scale A B."""
 
-    def __call__(self, inputs: jax.Array, **kwargs: Any) -> jax.Array:
+    def __call__(self, inputs: jax.Array, *args: Any, **kwargs: Any) -> jax.Array:
         """Rows of the table for ids [...], [..., D]."""
-        y = super().__call__(inputs, **kwargs)
+        y = super().__call__(inputs, *args, **kwargs)
         return self.with_delta(y, lookup(self.lora()[1]["lora_a"], inputs))
 
-    def attend(self, query: jax.Array, **kwargs: Any) -> jax.Array:
+    def attend(self, query: jax.Array, *args: Any, **kwargs: Any) -> jax.Array:
         """Inner products of queries [..., D] with the rows, [..., V]."""
-        y = super().attend(query, **kwargs)
+        y = super().attend(query, *args, **kwargs)
         return y + attend_delta(*self.lora(), query.astype(y.dtype))
 
 
 class ConvLayer(LoRALayer):
     """Mixin for `nnx.Conv`: A is a convolution onto R channels, B one of size 1."""
 
-    def __call__(self, inputs: jax.Array, **kwargs: Any) -> jax.Array:
+    def __call__(self, inputs: jax.Array, *args: Any, **kwargs: Any) -> jax.Array:
         """The convolution, [..., *spatial, O]."""
-        y = super().__call__(inputs, **kwargs)
+        y = super().__call__(inputs, *args, **kwargs)
         return self.with_delta(y, convolved(self, self.lora()[1]["lora_a"], inputs))
 
     def kernel_matrices(self) -> jax.Array:

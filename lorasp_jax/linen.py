@@ -27,6 +27,9 @@ from lorasp_jax.linen_layers import Einsums, kind, layer_map, with_lora
 from lorasp_jax.peft import Method
 
 ADAPTER = "lorasp_adapter"  # name of an adapter among its layer's parameters
+# Set on scopes of the model: its code may apply other modules, which have variables of their own,
+# as Hugging Face's tied heads do.
+OURS = "lorasp_jax"
 Next = Callable[..., Any]
 
 
@@ -112,10 +115,13 @@ class LinenAdapter:
         if flax.core.scope.in_filter(mutable, "params"):
             raise ValueError("'params' cannot be mutable: it holds the adapters during the call.")
         with nn.intercept_methods(self._call):
-            return self.model.apply(_joined(variables), *args, mutable=mutable, **kwargs)
+            return _apply(self.model, _joined(variables), *args, mutable=mutable, **kwargs)
 
     def merge(self, variables: Mapping[str, Any], *args: Any, **kwargs: Any) -> dict[str, Any]:
         """Variables of the bare model that compute the same.
+
+        An embedding whose table the model also reads past the layer, for tied logits, is adapted
+        where it is looked up, but merged for both: give such a layer no adapter.
 
         Args:
           variables: as for `apply`.
@@ -135,13 +141,18 @@ class LinenAdapter:
 
         def interceptor(run: Next, args: Any, kwargs: Any, context: nn.module.InterceptorContext):
             y = run(*args, **kwargs)
-            if context.method_name == "__call__" and kind(context.module, self.einsums):
+            if context.method_name == "__call__" and self._kind(context.module):
                 visit(context.module, args, kwargs)
             return y
 
         with nn.intercept_methods(interceptor):
-            _, changed = self.model.apply(variables, *args, mutable=True, **kwargs)
+            _, changed = _apply(self.model, variables, *args, mutable=True, **kwargs)
         return flax.core.unfreeze(changed["params"])
+
+    def _kind(self, module: nn.Module) -> type[nn.Module] | None:
+        """The known class that a layer of the model is called as."""
+        ours = module.scope is not None and module.scope.has_flag(OURS)
+        return kind(module, self.einsums) if ours else None
 
     def _method(self, module: nn.Module) -> tuple[int, Method] | None:
         """The rule that gives the layer an adapter, and its method."""
@@ -206,17 +217,18 @@ class LinenAdapter:
 
     def _call(self, run: Next, args: Any, kwargs: Any, context: Any) -> Any:
         """The interceptor that computes adapted layers."""
-        module, found = context.module, None
-        if context.method_name in ("__call__", "attend") and kind(module, self.einsums):
-            found = self._method(module)
+        module = context.module
+        if context.method_name not in ("__call__", "attend") or not self._kind(module):
+            return run(*args, **kwargs)
+        params, found = module.get_variable("params", ADAPTER), self._method(module)
+        if (params is None) != (found is None):
+            has = "no adapter" if params is None else "an adapter"
+            raise ValueError(
+                f"{'/'.join(module.path)} has {has}, against the rules: `init` or `attach` with "
+                "these rules makes variables that fit."
+            )
         if found is None:
             return run(*args, **kwargs)
-        params = module.get_variable("params", ADAPTER)
-        if params is None:
-            path = "/".join(module.path)
-            raise ValueError(
-                f"{path} has no adapter: `init` or `attach` with these rules makes one."
-            )
         params, method = flax.core.unfreeze(params), cast(Any, found[1])
         if context.method_name == "attend":
             y = run(*args, **kwargs)
@@ -237,6 +249,19 @@ class _Record:
     used: set[int] = dataclasses.field(default_factory=set)
     seen: list[str] = dataclasses.field(default_factory=list)
     kernels: set[tuple[str, ...]] = dataclasses.field(default_factory=set)
+
+
+def _apply(model: nn.Module, variables: Any, *args: Any, method: Any = None, **kwargs: Any) -> Any:
+    """`model.apply`, in scopes that can be told from others."""
+
+    def run(module: nn.Module, *args: Any, **kwargs: Any) -> Any:
+        assert module.scope is not None
+        module.scope.flags = module.scope.flags.copy({OURS: True})
+        if callable(method):
+            return method(module, *args, **kwargs)
+        return getattr(module, method or "__call__")(*args, **kwargs)
+
+    return model.apply(variables, *args, method=run, **kwargs)
 
 
 def _joined(variables: Mapping[str, Any]) -> dict[str, Any]:

@@ -204,8 +204,10 @@ def test_rules_that_apply_to_nothing(published, ids):
 
 def test_wrong_variables(published, ids):
     adapter, variables = attached(published, ids, ("dense", SP))
-    with pytest.raises(ValueError, match="dense has no adapter: `init` or `attach` with these"):
+    with pytest.raises(ValueError, match="dense has no adapter, against the rules: `init`"):
         adapter.apply(published, ids)
+    with pytest.raises(ValueError, match="dense has an adapter, against the rules"):
+        LinenAdapter(Net(), [("first", SP)]).apply(variables, ids)
     with pytest.raises(ValueError, match="these variables have adapters already"):
         adapter.attach(jax.random.key(0), variables, ids)
     with pytest.raises(ValueError, match="'params' cannot be mutable"):
