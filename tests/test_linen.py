@@ -207,7 +207,7 @@ def test_wrong_variables(published, ids):
     with pytest.raises(ValueError, match="dense has no adapter, against the rules: `init`"):
         adapter.apply(published, ids)
     with pytest.raises(ValueError, match="dense has an adapter, against the rules"):
-        LinenAdapter(Net(), [("first", SP)]).apply(variables, ids)
+        LinenAdapter(Net(), [("dense", None)]).apply(variables, ids)
     with pytest.raises(ValueError, match="these variables have adapters already"):
         adapter.attach(jax.random.key(0), variables, ids)
     with pytest.raises(ValueError, match="'params' cannot be mutable"):
