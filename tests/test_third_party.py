@@ -24,7 +24,7 @@ MASK = jnp.broadcast_to(jnp.tril(jnp.ones((5, 5), bool)), (2, 5, 5))
 def gemma(request):
     """With weights at random: Flax's example starts some at zero."""
     if request.param == "of_flax":
-        pytest.importorskip("transformer_cfg", reason="flax/examples/gemma is not on the path")
+        pytest.importorskip("transformer", reason="flax/examples/gemma is not on the path")
     model = (gemmas.Gemma if request.param == "own" else gemmas.of_flax)(nnx.Rngs(0))
     graphdef, params, rest = nnx.split(model, nnx.Param, ...)
     return nnx.merge(graphdef, perturbed(params, 0.2), rest)
