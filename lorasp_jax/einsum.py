@@ -143,12 +143,7 @@ def einsum(
     Raises:
       ValueError: an equation that is no adaptable map, or shapes that do not fit it.
     """
-    axes = parse(equation).expanded(x.ndim)
-    if kernel.ndim != len(axes.kernel):
-        raise ValueError(f"{equation!r} meets a kernel of shape {kernel.shape}.")
-    sizes = dict(zip(axes.kernel + axes.x, kernel.shape + x.shape, strict=True))
-    if kernel.shape != tuple(sizes[c] for c in axes.kernel):
-        raise ValueError(f"{equation!r} meets shapes {x.shape} and {kernel.shape}.")
+    axes, sizes = _sizes(equation, x, kernel)
     tokens = "".join(c for c in axes.x if c not in axes.kernel)
     order = [axes.x.index(c) for c in axes.batch + tokens + axes.inputs]
     rows = x.transpose(order).reshape(*(sizes[c] for c in axes.batch + tokens), -1)
@@ -166,6 +161,16 @@ def einsum(
         y = y + bias.reshape(shape).astype(y.dtype)
     losses = {name: jnp.mean(values) for name, values in aux.losses.items()}
     return y, Aux(aux.active_rank, aux.kept_energy, losses)
+
+
+def _sizes(equation: str, x: jax.Array, kernel: jax.Array) -> tuple[Axes, dict[str, int]]:
+    """Axes for such an x, and their sizes."""
+    axes = parse(equation).expanded(x.ndim)
+    if kernel.ndim == len(axes.kernel):
+        sizes = dict(zip(axes.kernel + axes.x, kernel.shape + x.shape, strict=True))
+        if kernel.shape == tuple(sizes[c] for c in axes.kernel):
+            return axes, sizes
+    raise ValueError(f"{equation!r} meets shapes {x.shape} and {kernel.shape}.")
 
 
 def _order(equation: str, ndim: int) -> tuple[Axes, list[int]]:
