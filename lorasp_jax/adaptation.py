@@ -3,6 +3,16 @@
 A rule is (pattern, method). Patterns are `re.search`ed in "/"-joined paths, and the first rule that
 matches a path governs it, whether it can apply there or not: with [("vision", LoRA()),
 (".*", FullFineTuning())] the vision tower's norms stay frozen. `None` leaves a path alone.
+
+What Hugging Face PEFT has options for are rules here, the special ones first:
+
+    rank_pattern, alpha_pattern    ("attn/q", LoRA(rank=4, alpha=32)), (".*", LoRA(rank=8))
+    modules_to_save                ("head", FullFineTuning()), (".*", LoRA())
+    bias="all"                     ("bias$", FullFineTuning()), (".*", LoRA())
+    exclude_modules                ("head", None), (".*", LoRA())
+
+A rule ("bias$", FullFineTuning()) frees biases of layers that another rule gives adapters to, since
+their kernels have other paths.
 """
 
 import difflib
@@ -16,7 +26,8 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax.dense import AdapterAux, AdapterParam, Dense
+from lorasp_jax import layers
+from lorasp_jax.dense import AdaptedLayer, AdapterAux, AdapterParam
 from lorasp_jax.peft import FullFineTuning, Method
 from lorasp_jax.peft.method import Params
 
@@ -40,12 +51,15 @@ class Place(NamedTuple):
     child: Any
 
 
-def adapt(model: Model, rules: Rules, *, rngs: nnx.Rngs) -> Model:
-    """Attaches adapters to dense layers, or frees base weights for full fine-tuning, by path rules.
+def adapt(
+    model: Model, rules: Rules, *, rngs: nnx.Rngs, einsums: layers.Einsums | None = None
+) -> Model:
+    """Attaches adapters to layers, or frees base weights for full fine-tuning, by path rules.
 
-    Additive methods apply to every `Dense` and `nnx.Linear` (which becomes a `Dense`) at its path,
-    for instance "language/gate_proj". A stacked kernel [L, I, O] gets stacked adapters. The layer's
-    own weights are frozen, and an adapter it already had is replaced.
+    Adapters apply to every `Dense`, `nnx.Linear` (which becomes a `Dense`), `nnx.LinearGeneral` and
+    `nnx.Einsum` at its path, for instance "language/gate_proj"; LoRA to `nnx.Embed` and `nnx.Conv`
+    too. A stacked kernel [L, I, O] gets stacked adapters. The layer's own weights are frozen, and
+    an adapter it already had is replaced. Subclasses that are called differently are left alone.
     `FullFineTuning` applies to every parameter under the paths it matches, norms, embeddings and
     biases included, which becomes an fp32 `AdapterParam` in its place.
 
@@ -53,6 +67,9 @@ def adapt(model: Model, rules: Rules, *, rngs: nnx.Rngs) -> Model:
       model: left untouched; the result shares its frozen arrays.
       rules: (pattern, method or None) pairs, first match wins.
       rngs: source of the adapters' keys. A layer's adapter depends on the key and its path alone.
+      einsums: further layer classes that do nothing but an einsum of their input and a parameter,
+        each with a function of the layer that gives the parameter's name and the equation, as in
+        {gemma.Einsum: lambda layer: ("w", layer.einsum_str)}.
 
     Returns:
       The adapted model.
@@ -67,10 +84,10 @@ def adapt(model: Model, rules: Rules, *, rngs: nnx.Rngs) -> Model:
         except re.error as error:
             raise ValueError(f"rule {pattern!r} is no regular expression: {error}.") from error
     holder, key = _copy(model), rngs.params()
-    used = _attach_all(holder, rules, key) | _free_all(holder, rules)
+    used = _attach_all(holder, rules, key, einsums or {}) | _free_all(holder, rules)
     for i, (pattern, _) in enumerate(rules):
         if i not in used:
-            raise ValueError(_no_match(pattern, holder))
+            raise ValueError(_no_match(pattern, holder, einsums or {}))
     return holder[0]
 
 
@@ -92,7 +109,7 @@ def methods(model: nnx.Module) -> dict[str, Method]:
     """Method by path: of each layer with an adapter, and full fine-tuning of each parameter."""
     found = {}
     for path, parent, name, _ in places(nnx.List([model]), AdapterParam):
-        if isinstance(parent, Dense) and name == "adapter":
+        if isinstance(parent, AdaptedLayer) and name == "adapter":
             found[path.rpartition("/")[0]] = parent.method
         else:
             found[path] = FullFineTuning()
@@ -102,21 +119,23 @@ def methods(model: nnx.Module) -> dict[str, Method]:
 def merge(model: Model) -> Model:
     """A model without adapters that computes the same: deltas folded into kernels, all frozen.
 
+    Of an embedding, `attend` is adapted as lookups are; a table that the model reads past both is
+    not, but merging changes it.
+
     Raises:
       ValueError: a method whose delta depends on the input.
     """
     holder = _copy(model)
-    for place in places(holder, Dense):
+    for place in places(holder, AdaptedLayer):
         layer = place.child
         if layer.adapter is not None:
             try:
-                kernel = layer.kernel.get_value()
-                kernel = _over_stack(layer.method.merge, kernel)(layer.adapter.get_value(), kernel)
+                kernel = layer.kernel_matrices()
+                kernel = over_stack(layer.method.merge, kernel)(layer.adapter.get_value(), kernel)
             except ValueError as error:
                 raise ValueError(f"cannot merge {place.path}: {error}") from error
-            layer.kernel = _renewed(layer.kernel, kernel)
-            layer.adapter = None
-        layer.method = None
+            layer.set_kernel_matrices(kernel)
+        layer.without_adapter()
     _retype(places(holder, AdapterParam), nnx.Param)
     return holder[0]
 
@@ -124,38 +143,34 @@ def merge(model: Model) -> Model:
 def penalties(model: nnx.Module) -> dict[str, jax.Array]:
     """Each loss on parameters alone, averaged over the adapted matrices whose method has it."""
     found: dict[str, list[jax.Array]] = {}
-    for _, _, _, layer in places(nnx.List([model]), Dense):
+    for _, _, _, layer in places(nnx.List([model]), AdaptedLayer):
         if layer.adapter is not None:
-            penalty = _over_stack(layer.method.penalty, layer.kernel.get_value())
+            penalty = over_stack(layer.method.penalty, layer.kernel_matrices())
             for name, values in penalty(layer.adapter.get_value()).items():
                 found.setdefault(name, []).append(values.ravel())
     return {name: jnp.concatenate(values).mean() for name, values in found.items()}
 
 
-def attach(layer: Dense | nnx.Linear, method: Method, key: jax.Array) -> Dense:
-    """The layer with a fresh adapter and its own weights frozen.
+def attach(layer: AdaptedLayer, method: Method, key: jax.Array) -> None:
+    """Gives the layer a fresh adapter and freezes its own weights.
 
     Args:
-      layer: kernel [..., I, O]; leading axes are layers of a scanned stack. A `Dense` is changed in
-        place, an `nnx.Linear` replaced.
+      layer: changed in place. Leading axes of its kernel are layers of a scanned stack.
       method: an additive method.
       key: typed random key.
 
     Raises:
-      ValueError: an `nnx.Linear` with a custom matrix product or precision, or a layer whose
-        adapter holds a part of its kernel.
+      ValueError: a method that the layer cannot carry, or a layer whose adapter holds a part of its
+        kernel.
     """
-    if isinstance(layer, nnx.Linear):
-        layer = _as_dense(layer)
     if layer.adapter is not None and layer.method is not None and layer.method.splits_kernel:
         raise ValueError("an adapter that holds a part of its kernel cannot be replaced: merge it.")
     _retype([p for p in places(nnx.List([layer]), AdapterParam) if p.name != "adapter"], nnx.Param)
+    params, kernel = init_stack(key, layer.adapter_init(method), layer.kernel_matrices())
     layer.method = method
-    params, kernel = _init(key, method, layer.kernel.get_value())
     if method.splits_kernel:
-        layer.kernel = _renewed(layer.kernel, kernel)
+        layer.set_kernel_matrices(kernel)
     layer.adapter = AdapterParam(params)
-    return layer
 
 
 def _copy(model: nnx.Module) -> nnx.List:
@@ -180,21 +195,37 @@ def places(holder: nnx.List, kind: type | tuple[type, ...]) -> list[Place]:
     return list(walk())
 
 
-def _governing(rules: Rules, *paths: str) -> int | None:
+def layer_places(holder: nnx.List, einsums: layers.Einsums | None = None) -> list[Place]:
+    """All layers that have an adapter or could."""
+    return [
+        place
+        for place in places(holder, nnx.Module)
+        if isinstance(place.child, AdaptedLayer) or layers.kind(place.child, einsums or {})
+    ]
+
+
+def governing(rules: Rules, *paths: str) -> int | None:
     """Index of the first rule that matches one of the paths."""
     hits = (i for i, (pattern, _) in enumerate(rules) if any(re.search(pattern, p) for p in paths))
     return next(hits, None)
 
 
-def _attach_all(holder: nnx.List, rules: Rules, key: jax.Array) -> set[int]:
-    """Attaches additive adapters in place; returns the rules that were used."""
+def _attach_all(
+    holder: nnx.List, rules: Rules, key: jax.Array, einsums: layers.Einsums
+) -> set[int]:
+    """Attaches adapters in place; returns the rules that were used."""
     used = set()
-    for path, parent, name, layer in places(holder, (Dense, nnx.Linear)):
-        i = _governing(rules, path)
+    for path, parent, name, layer in layer_places(holder, einsums):
+        i = governing(rules, path)
         method = None if i is None else rules[i][1]
         if method is not None and not method.trains_base:
             own_key = jax.random.fold_in(key, zlib.crc32(path.encode()))
-            setattr(parent, name, attach(layer, method, own_key))
+            try:
+                layer = layers.adapted(layer, einsums)
+                attach(layer, method, own_key)
+            except ValueError as error:
+                raise ValueError(f"cannot adapt {path or 'the model'}: {error}") from error
+            setattr(parent, name, layer)
             used.add(i)
     return used
 
@@ -203,16 +234,17 @@ def _free_all(holder: nnx.List, rules: Rules) -> set[int]:
     """Makes base parameters trainable in place; returns the rules that were used."""
     used, freed = set(), []
     for place in places(holder, nnx.Param):
-        i = _governing(rules, place.path.rpartition("/")[0], place.path)
+        i = governing(rules, place.path.rpartition("/")[0], place.path)
         method = None if i is None else rules[i][1]
         if i is None or (method is not None and not method.trains_base):
             continue
         used.add(i)
         if method is not None and not isinstance(place.child, AdapterParam):
-            if place.name == "kernel" and getattr(place.parent, "adapter", None) is not None:
+            layer = place.parent if isinstance(place.parent, AdaptedLayer) else None
+            if layer and layer.adapter is None:
+                layer.method = method
+            elif layer and place.name == layer.kernel_name:
                 raise ValueError(f"{place.path} cannot train in full under the layer's adapter.")
-            if isinstance(place.parent, Dense) and place.parent.adapter is None:
-                place.parent.method = method
             if jnp.issubdtype(place.child.get_value().dtype, jnp.floating):
                 freed.append(place)
     _retype(freed, AdapterParam)
@@ -231,35 +263,20 @@ def _retype(places: Sequence[Place], kind: type[nnx.Param]) -> None:
         setattr(parent, name, renewed[id(variable)])
 
 
-def _renewed(variable: nnx.Param, value: jax.Array) -> nnx.Param:
-    """A variable of its own with another value: the old one may be shared with other layers."""
-    return type(variable)(value, **variable.get_metadata())
-
-
-def _as_dense(linear: nnx.Linear) -> Dense:
-    """A `Dense` that holds a linear layer's own variables."""
-    if linear.dot_general is not jax.lax.dot_general or linear.precision is not None:
-        raise ValueError("an nnx.Linear with its own dot_general or precision cannot be adapted.")
-    has_bias, zeros = linear.bias is not None, nnx.initializers.zeros
-    layer = Dense(1, 1, use_bias=has_bias, dtype=linear.dtype, kernel_init=zeros, rngs=nnx.Rngs(0))
-    layer.kernel, layer.bias = linear.kernel, linear.bias
-    return layer
-
-
-def _init(key: jax.Array, method: Method, kernel: jax.Array) -> tuple[Params, Any]:
-    """`method.init` for a kernel [..., I, O]: one draw per leading index.
+def init_stack(key: jax.Array, init: Callable[..., Any], kernel: jax.Array) -> tuple[Params, Any]:
+    """A method's `init` for a kernel [..., I, O]: one draw per leading index.
 
     Not jitted as a whole: its random draws compile once for each I instead of for each shape.
     """
     *leading, d_in, d_out = kernel.shape
     if not leading:
-        return method.init(key, kernel)
+        return init(key, kernel)
     keys = jax.random.split(key, math.prod(leading))
-    found = jax.vmap(method.init)(keys, kernel.reshape(-1, d_in, d_out))
+    found = jax.vmap(init)(keys, kernel.reshape(-1, d_in, d_out))
     return jax.tree.map(lambda leaf: leaf.reshape(*leading, *leaf.shape[1:]), found)
 
 
-def _over_stack(function: Callable[..., Any], kernel: jax.Array) -> Callable[..., Any]:
+def over_stack(function: Callable[..., Any], kernel: jax.Array) -> Callable[..., Any]:
     """A function of one layer's arrays, over the leading axes of a kernel [..., I, O]."""
     for _ in kernel.shape[:-2]:
         function = jax.vmap(function)
@@ -271,10 +288,10 @@ def near_misses(wanted: str, known: Sequence[str]) -> str:
     return ", ".join(difflib.get_close_matches(wanted, known, n=5, cutoff=0.3) or known[:5])
 
 
-def _no_match(pattern: str, holder: nnx.List) -> str:
-    paths = [place.path for place in places(holder, (Dense, nnx.Linear))]
+def _no_match(pattern: str, holder: nnx.List, einsums: layers.Einsums) -> str:
+    paths = [place.path for place in layer_places(holder, einsums)]
     close = near_misses(pattern, paths) or "none"
-    return f"rule {pattern!r} applies to nothing; dense layers here: {close}."
+    return f"rule {pattern!r} applies to nothing; layers here: {close}."
 
 
 def _size(tree: Any) -> int:

@@ -17,7 +17,7 @@ second result asks for it, `layer(x, return_aux=True)`, and then nothing is stor
 """
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import flax.errors
@@ -41,6 +41,12 @@ class AdapterParam(nnx.LoRAParam):
 
 class AdapterAux(nnx.Intermediate):
     """What a drop-in layer kept in its last call."""
+
+
+def refuse_sharding(out_sharding: Any) -> None:
+    """Raises a ValueError unless it is None: some models pass it to every layer."""
+    if out_sharding is not None:
+        raise ValueError("an adapted layer takes no out_sharding: constrain what it returns.")
 
 
 def dense(
@@ -80,7 +86,50 @@ def dense(
     return (y if bias is None else y + bias.astype(y.dtype)), aux
 
 
-class Dense(nnx.Module):
+class AdaptedLayer(nnx.Module):
+    """A layer that can carry an adapter: what adaptation, tables and files know of it.
+
+    Attributes:
+      kernel_name: name of the attribute that holds the layer's kernel.
+      adapter: `AdapterParam` holding the method's parameters, or None.
+      method: the adapter's method, static.
+    """
+
+    kernel_name: str = "kernel"
+    adapter: AdapterParam | None
+    method: Method | None
+
+    def kernel_matrices(self) -> jax.Array:
+        """The kernel as the adapter sees it, [..., I, O]; leading axes are stacks of layers."""
+        return getattr(self, self.kernel_name).get_value()
+
+    def set_kernel_matrices(self, matrices: jax.Array) -> None:
+        """Gives the layer another kernel in a variable of its own: the old one may be shared."""
+        old = getattr(self, self.kernel_name)
+        value = matrices.reshape(old.get_value().shape)
+        setattr(self, self.kernel_name, type(old)(value, **old.get_metadata()))
+
+    def adapter_init(self, method: Method) -> Callable[[jax.Array, jax.Array], tuple[Params, Any]]:
+        """What makes a method's parameters, and the kernel it leaves, from a key and one [I, O].
+
+        Raises:
+          ValueError: a method that this kind of layer cannot carry.
+        """
+        return method.init
+
+    def without_adapter(self) -> nnx.Module:
+        """The layer as it was before adaptation, or as near as it comes, with its kernel of now."""
+        self.adapter, self.method = None, None
+        return self
+
+    def keep_aux(self, aux: Aux) -> None:
+        """Stores aux for `collect_aux`, where the layer may be changed."""
+        # A module of an outer trace cannot be changed; collect_aux then raises.
+        with contextlib.suppress(flax.errors.TraceContextError):
+            setattr(self, KEPT, AdapterAux(aux))
+
+
+class Dense(AdaptedLayer):
     """A dense layer with an optional adapter, a drop-in for `nnx.Linear`.
 
     Attributes:
@@ -127,9 +176,15 @@ class Dense(nnx.Module):
             self.adapter = AdapterParam(params)
 
     def __call__(
-        self, x: jax.Array, *, token_mask: jax.Array | None = None, return_aux: bool = False
+        self,
+        x: jax.Array,
+        *,
+        token_mask: jax.Array | None = None,
+        return_aux: bool = False,
+        out_sharding: None = None,
     ) -> Any:
-        """y [...tokens, O], or (y, aux) if asked; see `dense`."""
+        """y [...tokens, O], or (y, aux) if asked; see `dense`. An output sharding is refused."""
+        refuse_sharding(out_sharding)
         kernel = self.kernel.get_value()
         bias = None if self.bias is None else self.bias.get_value()
         params = None if self.adapter is None else self.adapter.get_value()
@@ -138,9 +193,7 @@ class Dense(nnx.Module):
         if return_aux:
             return y, aux
         if self.adapter is not None:
-            # A module of an outer trace cannot be changed; collect_aux then raises.
-            with contextlib.suppress(flax.errors.TraceContextError):
-                setattr(self, KEPT, AdapterAux(aux))
+            self.keep_aux(aux)
         return y
 
 

@@ -23,7 +23,7 @@ from flax import nnx
 
 from lorasp_jax import adaptation
 from lorasp_jax.adapter_io import write_whole
-from lorasp_jax.dense import Dense
+from lorasp_jax.dense import AdaptedLayer, Dense
 from lorasp_jax.peft import AdaLoRA, DoRA, LoRA
 
 CONFIG, TENSORS = "adapter_config.json", "adapter_model.safetensors"
@@ -118,8 +118,10 @@ def save_peft(
     modules: dict[str, tuple[float, Adapter]] = {}
     kinds = set()
     known = {path for path, method in adaptation.methods(model).items() if _is_known(path, method)}
-    for place in adaptation.places(nnx.List([model]), Dense):
+    for place in adaptation.places(nnx.List([model]), AdaptedLayer):
         if place.path in known:
+            if not isinstance(place.child, Dense):
+                raise ValueError(f"{place.path} is no dense layer: it cannot be in a PEFT folder.")
             kinds.add(isinstance(place.child.method, DoRA))
             shape = place.child.kernel.get_value().shape[:-2]
             for index in np.ndindex(*shape):

@@ -1,40 +1,67 @@
 """Tables that say what an adapted model consists of."""
 
+from collections.abc import Mapping
 from typing import Any
 
 from flax import nnx
 
-from lorasp_jax.adaptation import Counts, count, places
-from lorasp_jax.dense import AdapterParam, Dense
+from lorasp_jax.adaptation import Counts, count, layer_places, places
+from lorasp_jax.dense import AdapterParam
+from lorasp_jax.layers import kernel_of
+from lorasp_jax.peft import Aux
 
-Row = tuple[str, str, str, str, str, str]
+Row = tuple[str, ...]
 
 
-def summary(model: nnx.Module) -> str:
-    """A table of the dense layers and of every other parameter that trains, with totals.
+def summary(model: nnx.Module, aux: Mapping[str, Aux] | None = None) -> str:
+    """A table of the layers and of every other parameter that trains, with totals.
 
-    Columns: path, method, kernel shape, rank, parameters (base and adapter), trainable ones.
+    Columns: path, method, kernel shape, rank, parameters (base and adapter), trainable ones, and
+    with `aux` the mean active rank.
+
+    Args:
+      model: adapted or not.
+      aux: what `collect_aux` returned after a call of the model, by path.
+
+    Raises:
+      ValueError: aux of a layer that the model lacks.
     """
-    holder = nnx.List([model])
-    rows = [("path", "method", "shape", "rank", "parameters", "trainable")]
-    inside = set()
-    for path, _, _, layer in places(holder, (Dense, nnx.Linear)):
+    rows = _rows(model)
+    if aux is not None:
+        if unknown := aux.keys() - {row[0] for row in rows}:
+            raise ValueError(f"there is aux for {min(unknown)!r}, which is no layer of the model.")
+        rows = [(*row, _active_rank(aux.get(row[0]))) for row in rows]
+    trainable, total = count(model)
+    head = ("path", "method", "shape", "rank", "parameters", "trainable", "active rank")
+    last = ("total", "", "", "", f"{total:,}", f"{trainable:,}", "")
+    columns = 6 if aux is None else 7
+    table = [head[:columns], *rows, last[:columns]]
+    widths = [max(len(row[i]) for row in table) for i in range(columns)]
+    lines = ["  ".join(_align(row, widths)).rstrip() for row in table]
+    rule = "-" * max(map(len, lines))
+    share = f"{trainable / max(total, 1):.2%} of all parameters train"
+    return "\n".join([lines[0], rule, *lines[1:-1], rule, lines[-1], share])
+
+
+def _rows(model: nnx.Module) -> list[Row]:
+    """Of each layer, and of each other parameter that trains."""
+    holder, rows, inside = nnx.List([model]), [], set()
+    for path, _, _, layer in layer_places(holder):
         inside |= {id(v) for v in vars(layer).values() if isinstance(v, nnx.Variable)}
         method, counts = getattr(layer, "method", None), count(layer)
         name = method.name if method else "full" if counts.trainable else "-"
         rank = getattr(method, "rank", "-")
-        rows.append(_row(path, name, layer.kernel.get_value(), rank, counts))
+        rows.append(_row(path, name, kernel_of(layer).get_value(), rank, counts))
     for path, _, _, variable in places(holder, AdapterParam):
         if id(variable) not in inside:
             counts = Counts(variable.get_value().size, variable.get_value().size)
             rows.append(_row(path, "full", variable.get_value(), "-", counts))
-    trainable, total = count(model)
-    rows.append(("total", "", "", "", f"{total:,}", f"{trainable:,}"))
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = ["  ".join(_align(row, widths)).rstrip() for row in rows]
-    rule = "-" * max(map(len, lines))
-    share = f"{trainable / max(total, 1):.2%} of all parameters train"
-    return "\n".join([lines[0], rule, *lines[1:-1], rule, lines[-1], share])
+    return rows
+
+
+def _active_rank(aux: Aux | None) -> str:
+    mean = None if aux is None else aux.mean_active_rank()
+    return "-" if mean is None else f"{float(mean):.1f}"
 
 
 def _row(path: str, method: str, kernel: Any, rank: Any, counts: Counts) -> Row:
@@ -43,5 +70,6 @@ def _row(path: str, method: str, kernel: Any, rank: Any, counts: Counts) -> Row:
 
 
 def _align(row: Row, widths: list[int]) -> list[str]:
+    """The first three cells to the left, numbers to the right."""
     left, right = zip(row[:3], widths[:3], strict=True), zip(row[3:], widths[3:], strict=True)
     return [cell.ljust(w) for cell, w in left] + [cell.rjust(w) for cell, w in right]

@@ -90,6 +90,15 @@ class LoRA(Method):
         a = jax.random.normal(key, shape) / self.rank if gaussian else kaiming_uniform(key, shape)
         return {"lora_a": a, "lora_b": jnp.zeros((self.rank, d_out))}
 
+    def init_table(self, key: jax.Array, table: Kernel) -> tuple[Params, Kernel]:
+        """Parameters for an embedding [V, D]: A zero, B in N(0, 1), as in Hugging Face PEFT.
+
+        Only the rows of A that were looked up get a gradient, so A is what must start at zero.
+        """
+        entries, width = table.shape
+        b = jax.random.normal(key, (self.rank, width))
+        return {"lora_a": jnp.zeros((entries, self.rank)), "lora_b": b}, table
+
     def down(self, params: Params) -> jax.Array:
         """A."""
         return params["lora_a"]

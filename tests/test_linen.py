@@ -1,0 +1,219 @@
+"""An unmodified Linen model under path rules: every kind of layer, scan, remat, merging."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax.traverse_util import flatten_dict
+
+import lorasp_jax
+from lorasp_jax import LinenAdapter, peft
+from lorasp_jax.peft import DoRA, FullFineTuning, LoRA, LoRASP
+
+SP = LoRASP(rank=8, hidden_width=4)
+
+
+class Block(nn.Module):
+    @nn.compact
+    def __call__(self, x, _):
+        heads = nn.DenseGeneral((2, 3), name="split")(x)
+        heads = nn.Einsum((2, 3, 3), "bnh,nhk->bnk", name="experts")(heads)
+        return x + nn.DenseGeneral(6, axis=(-2, -1), name="join")(jnp.tanh(heads)), None
+
+
+class Net(nn.Module):
+    """A stranger's model: a scanned and a rematerialised block, all kinds of layers."""
+
+    @nn.compact
+    def __call__(self, ids):
+        embed = nn.Embed(7, 6, name="embed")
+        x = nn.Conv(6, (3,), name="conv")(embed(ids)).sum(-2)
+        x, _ = nn.remat(Block)(name="first")(x, None)
+        split = {"params": True}
+        scanned = nn.scan(Block, {"params": 0}, split_rngs=split, length=3, metadata_params={})
+        x, _ = scanned(name="blocks")(x, None)
+        dense = nn.Dense(6, name="dense")
+        return embed.attend(nn.LayerNorm(name="norm")(dense(dense(x))))
+
+
+@pytest.fixture(scope="module")
+def ids():
+    return jnp.array([[1, 2, 3, 3, 0], [6, 5, 4, 1, 1]])
+
+
+@pytest.fixture(scope="module")
+def published(ids):
+    """Parameters that somebody else trained: biases are not zero."""
+    params = jax.jit(Net().init)(jax.random.key(0), ids)
+    return perturbed(params, 0.1)
+
+
+def perturbed(tree, size=0.3):
+    leaves, structure = jax.tree.flatten(tree)
+    keys = jax.random.split(jax.random.key(5), len(leaves))
+    moved = [v + size * jax.random.normal(k, v.shape) for k, v in zip(keys, leaves, strict=True)]
+    return jax.tree.unflatten(structure, moved)
+
+
+def attached(published, ids, *rules):
+    adapter = LinenAdapter(Net(), rules)
+    return adapter, jax.jit(adapter.attach)(jax.random.key(1), published, ids)
+
+
+def call(adapter, variables, ids):
+    return jax.jit(adapter.apply)(variables, ids)
+
+
+MATRICES = "first|blocks|dense"
+
+
+@pytest.mark.parametrize("name", peft.names())
+def test_every_method_starts_at_the_base(published, ids, name):
+    method = SP if name == "lora_sp" else peft.create(name)
+    adapter, variables = attached(published, ids, ("split|experts|dense", method))
+    expected = call(Net(), published, ids)
+    np.testing.assert_allclose(call(adapter, variables, ids), expected, rtol=1e-4, atol=1e-4)
+    moved = variables | {"adapters": perturbed(variables["adapters"])}
+    assert jnp.abs(call(adapter, moved, ids) - expected).max() > 1e-2
+    if not method.trains_base:
+        jax.tree.map(np.testing.assert_array_equal, variables["params"], published["params"])
+
+
+def test_init_is_the_models_own(ids):
+    adapter = LinenAdapter(Net(), [(".*", LoRA(rank=2))])
+    variables = jax.jit(adapter.init)(jax.random.key(0), ids)
+    own = jax.jit(Net().init)(jax.random.key(0), ids)
+    jax.tree.map(np.testing.assert_array_equal, variables["params"], own["params"])
+    assert set(variables) == {"params", "adapters"}
+
+
+def test_stacks_have_stacked_adapters(published, ids):
+    _, variables = attached(published, ids, (".*", LoRA(rank=2)))
+    flat = flatten_dict(variables["adapters"], sep="/")
+    shapes = {path.replace("/lorasp_adapter", ""): leaf.shape for path, leaf in flat.items()}
+    assert shapes["blocks/split/lora_a"] == (3, 6, 2)
+    assert shapes["blocks/experts/lora_a"] == (3, 2, 3, 2)
+    assert shapes["first/join/lora_a"] == (6, 2)
+    assert shapes["conv/lora_a"] == (18, 2)
+    a = flat["blocks/split/lorasp_adapter/lora_a"]
+    assert not np.array_equal(a[0], a[1])
+    assert not flat["embed/lorasp_adapter/lora_a"].any()
+
+
+@pytest.mark.parametrize(
+    "rules",
+    [
+        [(".*", LoRA(rank=2, alpha=5.0))],
+        [("embed|conv", None), (MATRICES, DoRA(rank=2))],
+        [(MATRICES, LoRA(rank=2, initialization="pissa"))],
+        [("bias|norm", FullFineTuning()), ("first", LoRA(rank=2))],
+    ],
+)
+def test_merged_equals_adapted(published, ids, rules):
+    """The bare model with merged parameters, which have the published ones' names and shapes."""
+    adapter, variables = attached(published, ids, *rules)
+    expected = call(Net(), published, ids)
+    np.testing.assert_allclose(call(adapter, variables, ids), expected, rtol=1e-3, atol=1e-3)
+    variables = variables | {"adapters": perturbed(variables["adapters"])}
+    merged = jax.jit(adapter.merge)(variables, ids)
+    assert jax.tree.map(jnp.shape, merged) == jax.tree.map(jnp.shape, published)
+    y = call(adapter, variables, ids)
+    np.testing.assert_allclose(call(Net(), merged, ids), y, rtol=1e-3, atol=1e-3)
+
+
+def test_against_a_kernel_made_by_hand(published, ids):
+    adapter, variables = attached(published, ids, ("embed|blocks/split", LoRA(rank=2, alpha=6)))
+    variables = variables | {"adapters": perturbed(variables["adapters"])}
+    trained = variables["adapters"]
+    params = jax.tree.map(lambda v: v, published["params"])
+    delta = {
+        path: 3 * own["lorasp_adapter"]["lora_a"] @ own["lorasp_adapter"]["lora_b"]
+        for path, own in (("embed", trained["embed"]), ("split", trained["blocks"]["split"]))
+    }
+    params["embed"]["embedding"] += delta["embed"]
+    params["blocks"]["split"]["kernel"] += delta["split"].reshape(3, 6, 2, 3)
+    expected = call(Net(), {"params": params}, ids)
+    np.testing.assert_allclose(call(adapter, variables, ids), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_gradients_and_aux(published, ids):
+    adapter, variables = attached(published, ids, ("embed|conv", LoRA(rank=2)), (MATRICES, SP))
+
+    def loss(adapters):
+        full = variables | {"adapters": adapters}
+        y, kept = adapter.apply(full, ids, mutable=["intermediates"])
+        return jnp.sum(y**2), lorasp_jax.collect_aux(kept)
+
+    gradients, aux = jax.jit(jax.grad(loss, has_aux=True))(perturbed(variables["adapters"]))
+    assert all(jnp.abs(g).max() > 0 for g in jax.tree.leaves(gradients))
+    assert {"embed", "conv", "first/split", "first/experts", "first/join", "dense"} == set(aux)
+    assert aux["first/experts"].active_rank.shape == (2, 2)
+
+
+def test_freed_parameters_train_in_fp32(ids):
+    half = jax.tree.map(lambda v: v.astype(jnp.bfloat16), Net().init(jax.random.key(0), ids))
+    adapter, variables = attached(half, ids, ("bias$|norm", FullFineTuning()), ("dense", SP))
+    flat = flatten_dict(variables["adapters"], sep="/")
+    assert {leaf.dtype for leaf in flat.values()} == {jnp.dtype("float32")}
+    assert {"norm/scale", "dense/bias", "blocks/join/bias"} <= set(flat)
+    assert "bias" not in variables["params"]["dense"]
+    assert call(adapter, variables, ids).shape == (2, 7)
+
+
+class Product(nn.Module):
+    """An einsum whose equation comes with the call."""
+
+    shape: tuple
+
+    @nn.compact
+    def __call__(self, equation, x):
+        return jnp.einsum(equation, x, self.param("w", nn.initializers.normal(), self.shape))
+
+
+def test_layers_described_by_the_user():
+    class Outer(nn.Module):
+        @nn.compact
+        def __call__(self, x):
+            return Product((2, 6, 3), name="q")("bd,ndh->nbh", x)
+
+    x = jax.random.normal(jax.random.key(0), (4, 6))
+    einsums = {Product: lambda layer, equation, x: (x, "w", equation)}
+    adapter = LinenAdapter(Outer(), [("q", LoRA(rank=2))], einsums)
+    variables = perturbed(adapter.init(jax.random.key(0), x))
+    own = variables["adapters"]["q"]["lorasp_adapter"]
+    assert own["lora_a"].shape == (6, 2)
+    w = variables["params"]["q"]["w"]
+    w = w + 2 * jnp.einsum("dr,rnh->ndh", own["lora_a"], own["lora_b"].reshape(2, 2, 3))
+    expected = jnp.einsum("bd,ndh->nbh", x, w)
+    np.testing.assert_allclose(adapter.apply(variables, x), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_rules_that_apply_to_nothing(published, ids):
+    with pytest.raises(ValueError, match=r"rule 'frist' applies to nothing; layers here: first/"):
+        attached(published, ids, ("frist", SP))
+    with pytest.raises(ValueError, match="rule 'dense' applies to nothing"):  # shadowed
+        attached(published, ids, (MATRICES, SP), ("dense", LoRA(rank=2)))
+    with pytest.raises(ValueError, match="rule 'norm' applies to nothing"):
+        attached(published, ids, ("norm", SP))
+    with pytest.raises(ValueError, match="cannot adapt embed: Embed takes LoRA that leaves"):
+        attached(published, ids, (".*", SP))
+    with pytest.raises(ValueError, match="dense/kernel cannot train in full under"):
+        attached(published, ids, ("kernel$", FullFineTuning()), ("dense", SP))
+
+
+def test_wrong_variables(published, ids):
+    adapter, variables = attached(published, ids, ("dense", SP))
+    with pytest.raises(ValueError, match="dense has no adapter, against the rules: `init`"):
+        adapter.apply(published, ids)
+    with pytest.raises(ValueError, match="dense has an adapter, against the rules"):
+        LinenAdapter(Net(), [("dense", None)]).apply(variables, ids)
+    with pytest.raises(ValueError, match="these variables have adapters already"):
+        adapter.attach(jax.random.key(0), variables, ids)
+    with pytest.raises(ValueError, match="'params' cannot be mutable"):
+        adapter.apply(variables, ids, mutable=True)
+    with pytest.raises(ValueError, match="cannot merge dense: LoRA-SP"):
+        adapter.merge(variables, ids)
+    exact = LinenAdapter(nn.Dense(3, precision="highest"), [("", SP)])
+    with pytest.raises(ValueError, match=r"cannot adapt the model: a Dense with .* sets precision"):
+        exact.init(jax.random.key(0), jnp.ones((1, 2)))
