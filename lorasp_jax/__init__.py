@@ -9,9 +9,23 @@ Axis letters used in every docstring and einsum of this package:
     J joints         W parallel worlds
 """
 
-from lorasp_jax import dense, hugging_face, peft
+from lorasp_jax import dense, hugging_face, named, peft
 from lorasp_jax.adaptation import adapt, merge
 from lorasp_jax.dense import collect_aux
+from lorasp_jax.named import choose, combine, extract, swap
 from lorasp_jax.tables import summary
 
-__all__ = ["adapt", "collect_aux", "dense", "hugging_face", "merge", "peft", "summary"]
+__all__ = [
+    "adapt",
+    "choose",
+    "collect_aux",
+    "combine",
+    "dense",
+    "extract",
+    "hugging_face",
+    "merge",
+    "named",
+    "peft",
+    "summary",
+    "swap",
+]

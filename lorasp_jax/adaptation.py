@@ -111,10 +111,10 @@ def merge(model: Model) -> Model:
         if layer.adapter is not None:
             try:
                 kernel = layer.kernel.get_value()
-                kernel = _over_stack(layer.method.merge, kernel)(layer.adapter.get_value(), kernel)
+                kernel = over_stack(layer.method.merge, kernel)(layer.adapter.get_value(), kernel)
             except ValueError as error:
                 raise ValueError(f"cannot merge {place.path}: {error}") from error
-            layer.kernel = _renewed(layer.kernel, kernel)
+            layer.kernel = renewed(layer.kernel, kernel)
             layer.adapter = None
         layer.method = None
     _retype(places(holder, AdapterParam), nnx.Param)
@@ -126,7 +126,7 @@ def penalties(model: nnx.Module) -> dict[str, jax.Array]:
     found: dict[str, list[jax.Array]] = {}
     for _, _, _, layer in places(nnx.List([model]), Dense):
         if layer.adapter is not None:
-            penalty = _over_stack(layer.method.penalty, layer.kernel.get_value())
+            penalty = over_stack(layer.method.penalty, layer.kernel.get_value())
             for name, values in penalty(layer.adapter.get_value()).items():
                 found.setdefault(name, []).append(values.ravel())
     return {name: jnp.concatenate(values).mean() for name, values in found.items()}
@@ -146,14 +146,14 @@ def attach(layer: Dense | nnx.Linear, method: Method, key: jax.Array) -> Dense:
         adapter holds a part of its kernel.
     """
     if isinstance(layer, nnx.Linear):
-        layer = _as_dense(layer)
+        layer = as_dense(layer)
     if layer.adapter is not None and layer.method is not None and layer.method.splits_kernel:
         raise ValueError("an adapter that holds a part of its kernel cannot be replaced: merge it.")
     _retype([p for p in places(nnx.List([layer]), AdapterParam) if p.name != "adapter"], nnx.Param)
     layer.method = method
     params, kernel = _init(key, method, layer.kernel.get_value())
     if method.splits_kernel:
-        layer.kernel = _renewed(layer.kernel, kernel)
+        layer.kernel = renewed(layer.kernel, kernel)
     layer.adapter = AdapterParam(params)
     return layer
 
@@ -231,12 +231,12 @@ def _retype(places: Sequence[Place], kind: type[nnx.Param]) -> None:
         setattr(parent, name, renewed[id(variable)])
 
 
-def _renewed(variable: nnx.Param, value: jax.Array) -> nnx.Param:
+def renewed(variable: nnx.Param, value: jax.Array) -> nnx.Param:
     """A variable of its own with another value: the old one may be shared with other layers."""
     return type(variable)(value, **variable.get_metadata())
 
 
-def _as_dense(linear: nnx.Linear) -> Dense:
+def as_dense(linear: nnx.Linear) -> Dense:
     """A `Dense` that holds a linear layer's own variables."""
     if linear.dot_general is not jax.lax.dot_general or linear.precision is not None:
         raise ValueError("an nnx.Linear with its own dot_general or precision cannot be adapted.")
@@ -259,7 +259,7 @@ def _init(key: jax.Array, method: Method, kernel: jax.Array) -> tuple[Params, An
     return jax.tree.map(lambda leaf: leaf.reshape(*leading, *leaf.shape[1:]), found)
 
 
-def _over_stack(function: Callable[..., Any], kernel: jax.Array) -> Callable[..., Any]:
+def over_stack(function: Callable[..., Any], kernel: jax.Array) -> Callable[..., Any]:
     """A function of one layer's arrays, over the leading axes of a kernel [..., I, O]."""
     for _ in kernel.shape[:-2]:
         function = jax.vmap(function)

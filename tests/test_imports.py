@@ -15,6 +15,8 @@ ROOMS = [
     "lorasp_jax.tables",
     "lorasp_jax.adapter_io",
     "lorasp_jax.hugging_face",
+    "lorasp_jax.adapter_set",
+    "lorasp_jax.named",
     "lorasp_jax.config",
     "lorasp_jax.models",
     "lorasp_jax.data",
