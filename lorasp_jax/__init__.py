@@ -12,6 +12,7 @@ Axis letters used in every docstring and einsum of this package:
 from lorasp_jax import dense, hugging_face, named, peft
 from lorasp_jax.adaptation import adapt, merge
 from lorasp_jax.dense import collect_aux
+from lorasp_jax.fusion import fuse, unmerge
 from lorasp_jax.named import choose, combine, extract, swap
 from lorasp_jax.tables import summary
 
@@ -22,10 +23,12 @@ __all__ = [
     "combine",
     "dense",
     "extract",
+    "fuse",
     "hugging_face",
     "merge",
     "named",
     "peft",
     "summary",
     "swap",
+    "unmerge",
 ]

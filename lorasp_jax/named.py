@@ -49,7 +49,7 @@ def combine(models: Mapping[str, Model], *, rank: int | None = None) -> Model:
         raise ValueError("there are no models to combine.")
     known = tuple(models)
     bases = {name: bare(model) for name, model in models.items()}
-    adapters = {name: _adapters(name, model) for name, model in models.items()}
+    adapters = {name: adapters_by_path(name, model) for name, model in models.items()}
     for name in known[1:]:
         _check_same(bases[known[0]], known[0], bases[name], name)
     holder = nnx.List([bases[known[0]]])
@@ -75,7 +75,7 @@ def choose(model: Model, choice: One | Sequence[One] | jax.Array | np.ndarray) -
     """
     chosen = weights(model, choice)
     model = nnx.clone(model)
-    for place in _sets(model):
+    for place in sets(model):
         held = place.child.adapter
         leading = held.params.get_value()["bank"]["scale"].shape[:-1]
         held.choice = AdapterChoice(jnp.broadcast_to(chosen, (*leading, *chosen.shape)))
@@ -106,7 +106,7 @@ def names(model: nnx.Module) -> tuple[str, ...]:
     Raises:
       ValueError: the model has none.
     """
-    for place in _sets(model):
+    for place in sets(model):
         return place.child.method.names
     raise ValueError("the model has no named adapters: combine models first.")
 
@@ -126,10 +126,10 @@ def extract(model: Model, name: str | None) -> Model:
     known, result = names(model), bare(model)
     if name is None:
         return result
-    _index(known, name)
+    index_of(known, name)
     layers = {place.path: place.child for place in adaptation.places(nnx.List([result]), Dense)}
-    for place in _sets(model):
-        method, params = _member(place.child, name)
+    for place in sets(model):
+        method, params = member(place.child, name)
         if method is not None:
             layers[place.path].method = method
             layers[place.path].adapter = AdapterParam(params)
@@ -150,10 +150,10 @@ def swap(model: Model, name: str, other: nnx.Module) -> Model:
     Raises:
       ValueError: as for `combine`, or an adapter that does not fit the place.
     """
-    index, adapters = _index(names(model), name), _adapters(name, other)
+    index, adapters = index_of(names(model), name), adapters_by_path(name, other)
     _check_same(bare(model), "the combined model", bare(other), name)
     model = nnx.clone(model)
-    places = _sets(model)
+    places = sets(model)
     if beyond := sorted(adapters.keys() - {place.path for place in places}):
         raise ValueError(f"{name} adapts {beyond[0]}, where the combined model has no adapters.")
     for path, _, _, layer in places:
@@ -188,13 +188,13 @@ def bare(model: Model) -> Model:
     return holder[0]
 
 
-def _adapters(name: str, model: nnx.Module) -> Adapters:
+def adapters_by_path(name: str, model: nnx.Module) -> Adapters:
     """Method and parameters of every adapted layer by path.
 
     Raises:
       ValueError: something else trains too, or the model was combined already.
     """
-    if _sets(model):
+    if sets(model):
         raise ValueError(f"{name} has named adapters already: extract one of them.")
     found = {
         place.path: (place.child.method, place.child.adapter.get_value())
@@ -251,13 +251,13 @@ def _is_banked(method: Method | None) -> TypeGuard[LoRA | None]:
     return method is None or type(method) is LoRA
 
 
-def _sets(model: nnx.Module) -> list[Place]:
+def sets(model: nnx.Module) -> list[Place]:
     """The layers that hold named adapters."""
     layers = adaptation.places(nnx.List([model]), Dense)
     return [place for place in layers if isinstance(place.child.adapter, NamedAdapters)]
 
 
-def _member(layer: Any, name: str) -> tuple[Method | None, Params]:
+def member(layer: Any, name: str) -> tuple[Method | None, Params]:
     """One adapter of a layer's set, or None twice where the layer does not have it."""
     value = layer.adapter.params.get_value()
     if name in layer.method.others:
@@ -270,11 +270,12 @@ def _row(known: tuple[str, ...], one: One) -> list[float]:
     row = [0.0] * len(known)
     chosen = {one: 1.0} if isinstance(one, str) else one or {}
     for name, weight in chosen.items():
-        row[_index(known, name)] = weight
+        row[index_of(known, name)] = weight
     return row
 
 
-def _index(known: tuple[str, ...], name: str) -> int:
+def index_of(known: tuple[str, ...], name: str) -> int:
+    """The place of a name; raises a ValueError that lists near misses for an unknown one."""
     if name not in known:
         close = adaptation.near_misses(name, known)
         raise ValueError(f"there is no adapter {name!r}; the model has {close}.")

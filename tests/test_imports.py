@@ -17,6 +17,7 @@ ROOMS = [
     "lorasp_jax.hugging_face",
     "lorasp_jax.adapter_set",
     "lorasp_jax.named",
+    "lorasp_jax.fusion",
     "lorasp_jax.config",
     "lorasp_jax.models",
     "lorasp_jax.data",

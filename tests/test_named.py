@@ -1,8 +1,5 @@
 """Named adapters in one model: against each adapted model alone, and against Hugging Face PEFT."""
 
-import itertools
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,52 +9,11 @@ from flax import nnx
 import lorasp_jax
 from lorasp_jax import adaptation, named, peft
 from lorasp_jax.adapter_io import load_adapters, save_adapters
-from lorasp_jax.dense import AdapterParam, Dense
+from lorasp_jax.dense import AdapterParam
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.pi0 import Pi0Config
-from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA, LoRAMoE, LoRASP
-
-GOLDEN = Path(__file__).parent / "golden"
-SP = LoRASP(rank=8, hidden_width=4)
-
-
-class Net(nnx.Module):
-    """A stranger's nnx.Linear, and a stack that is scanned over."""
-
-    def __init__(self):
-        self.inp = nnx.Linear(5, 4, rngs=nnx.Rngs(0))
-        self.blocks = nnx.vmap(lambda r: Dense(4, 4, rngs=r))(nnx.Rngs(1).split(3))
-        self.out = nnx.Linear(4, 2, rngs=nnx.Rngs(2))
-
-    def __call__(self, x):
-        graphdef, layers = nnx.split(self.blocks)
-
-        def block(x, layer):
-            y, _ = nnx.merge(graphdef, layer)(x, return_aux=True)
-            return x + jnp.tanh(y), None
-
-        x, _ = jax.lax.scan(jax.checkpoint(block), self.inp(x), layers)
-        return self.out(x)
-
-
-NET = Net()
-X = jax.random.normal(jax.random.key(0), (4, 3, 5))
-
-
-@jax.jit
-def call(model, x):
-    return model(x)
-
-
-def trained(*rules, seed, net=NET):
-    """An adapted model whose adapters have moved off their start."""
-    model = adaptation.adapt(net, rules, rngs=nnx.Rngs(seed))
-    graphdef, adapters, frozen = adaptation.split(model)
-    leaves, structure = jax.tree.flatten(adapters)
-    keys = jax.random.split(jax.random.key(seed), len(leaves))
-    moved = [x + 0.5 * jax.random.normal(k, x.shape) for k, x in zip(keys, leaves, strict=True)]
-    return nnx.merge(graphdef, jax.tree.unflatten(structure, moved), frozen)
-
+from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA, LoRAMoE
+from tests.nets import NET, SP, Net, X, assert_close, call, golden_models, trained
 
 MODELS = {
     "pour": trained(("inp", LoRA(rank=2, alpha=3)), ("blocks", LoRA(rank=3)), seed=1),
@@ -67,10 +23,6 @@ MODELS = {
 }
 MODEL = lorasp_jax.combine(MODELS)
 WEIGHTS = {"pour": 0.5, "press": -0.7}
-
-
-def assert_close(actual, expected):
-    np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -214,31 +166,6 @@ def test_adapters_that_do_not_fit_a_place():
         lorasp_jax.swap(few, "pour", MODELS["press"])
 
 
-class Tiny(nnx.Module):
-    """The golden file's net."""
-
-    def __init__(self, golden):
-        sizes = itertools.pairwise((24, 40, 24, 16))
-        self.lin = nnx.List([nnx.Linear(i, o, rngs=nnx.Rngs(0)) for i, o in sizes])
-        for n, layer in enumerate(self.lin):
-            layer.kernel.set_value(jnp.array(golden[f"base/lin.{n}.weight"].T))
-            layer.bias.set_value(jnp.array(golden[f"base/lin.{n}.bias"]))
-
-    def __call__(self, x):
-        x = jnp.tanh(self.lin[1](jnp.tanh(self.lin[0](x))))
-        return self.lin[2](x)
-
-
-def golden_model(golden, name, method):
-    layers = [n for n in range(3) if f"param/lin.{n}.lora_A.{name}.weight" in golden]
-    pattern = "|".join(f"lin/{n}" for n in layers)
-    model = adaptation.adapt(Tiny(golden), [(pattern, method)], rngs=nnx.Rngs(0))
-    for n in layers:
-        a, b = (golden[f"param/lin.{n}.lora_{side}.{name}.weight"].T for side in "AB")
-        model.lin[n].adapter.set_value({"lora_a": jnp.array(a), "lora_b": jnp.array(b)})
-    return model
-
-
 @pytest.mark.parametrize(
     ("case", "choice"),
     [
@@ -252,14 +179,7 @@ def golden_model(golden, name, method):
 )
 def test_hugging_face(case, choice):
     """PEFT 0.21.2: single, disabled, two at once, mixed batch, weighted sum; tolerance 1e-5."""
-    with np.load(GOLDEN / "lora_multi.npz") as file:
-        golden = dict(file)
-    methods = {
-        "a": LoRA(rank=4, alpha=10),
-        "b": LoRA(rank=6, alpha=5, rank_stabilized=True),
-        "c": LoRA(rank=6, alpha=5),
-    }
-    models = {name: golden_model(golden, name, method) for name, method in methods.items()}
+    golden, models = golden_models()
     model = lorasp_jax.choose(lorasp_jax.combine(models), choice)
     expected = golden[f"y/{case}"]
     atol = 1e-5 * np.abs(expected).max()
