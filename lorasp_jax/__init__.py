@@ -14,6 +14,7 @@ from lorasp_jax.adaptation import adapt, merge
 from lorasp_jax.dense import collect_aux
 from lorasp_jax.fusion import fuse, unmerge
 from lorasp_jax.named import choose, combine, extract, swap
+from lorasp_jax.quantization import quantize
 from lorasp_jax.tables import summary
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     "merge",
     "named",
     "peft",
+    "quantize",
     "summary",
     "swap",
     "unmerge",

@@ -9,7 +9,7 @@ import difflib
 import math
 import re
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from lorasp_jax.dense import AdapterAux, AdapterParam, Dense
+from lorasp_jax.kernels.quantized import QuantizedKernel
 from lorasp_jax.peft import FullFineTuning, Method
 from lorasp_jax.peft.method import Params
 
@@ -61,11 +62,7 @@ def adapt(model: Model, rules: Rules, *, rngs: nnx.Rngs) -> Model:
       ValueError: a rule that is no regular expression or governs nothing that it applies to (lists
         near misses), or a layer that an adapter cannot take over.
     """
-    for pattern, _ in rules:
-        try:
-            re.compile(pattern)
-        except re.error as error:
-            raise ValueError(f"rule {pattern!r} is no regular expression: {error}.") from error
+    check_patterns(pattern for pattern, _ in rules)
     holder, key = _copy(model), rngs.params()
     used = _attach_all(holder, rules, key) | _free_all(holder, rules)
     for i, (pattern, _) in enumerate(rules):
@@ -114,7 +111,7 @@ def merge(model: Model) -> Model:
                 kernel = over_stack(layer.method.merge, kernel)(layer.adapter.get_value(), kernel)
             except ValueError as error:
                 raise ValueError(f"cannot merge {place.path}: {error}") from error
-            layer.kernel = renewed(layer.kernel, kernel)
+            layer.kernel = with_value(layer.kernel, kernel)
             layer.adapter = None
         layer.method = None
     _retype(places(holder, AdapterParam), nnx.Param)
@@ -142,18 +139,20 @@ def attach(layer: Dense | nnx.Linear, method: Method, key: jax.Array) -> Dense:
       key: typed random key.
 
     Raises:
-      ValueError: an `nnx.Linear` with a custom matrix product or precision, or a layer whose
-        adapter holds a part of its kernel.
+      ValueError: an `nnx.Linear` with a custom matrix product or precision, a layer whose adapter
+        holds a part of its kernel, or a quantised kernel of which the method would take a part.
     """
     if isinstance(layer, nnx.Linear):
         layer = as_dense(layer)
     if layer.adapter is not None and layer.method is not None and layer.method.splits_kernel:
         raise ValueError("an adapter that holds a part of its kernel cannot be replaced: merge it.")
+    if method.splits_kernel and isinstance(layer.kernel.get_value(), QuantizedKernel):
+        raise ValueError("a quantised kernel cannot be split: adapt first, then quantise the rest.")
     _retype([p for p in places(nnx.List([layer]), AdapterParam) if p.name != "adapter"], nnx.Param)
     layer.method = method
     params, kernel = _init(key, method, layer.kernel.get_value())
     if method.splits_kernel:
-        layer.kernel = renewed(layer.kernel, kernel)
+        layer.kernel = with_value(layer.kernel, kernel)
     layer.adapter = AdapterParam(params)
     return layer
 
@@ -178,6 +177,15 @@ def places(holder: nnx.List, kind: type | tuple[type, ...]) -> list[Place]:
                     yield Place("/".join(map(str, (*path, name)[1:])), module, name, child)
 
     return list(walk())
+
+
+def check_patterns(patterns: Iterable[str]) -> None:
+    """Raises a ValueError for a pattern that is no regular expression."""
+    for pattern in patterns:
+        try:
+            re.compile(pattern)
+        except re.error as error:
+            raise ValueError(f"rule {pattern!r} is no regular expression: {error}.") from error
 
 
 def _governing(rules: Rules, *paths: str) -> int | None:
@@ -209,6 +217,8 @@ def _free_all(holder: nnx.List, rules: Rules) -> set[int]:
             continue
         used.add(i)
         if method is not None and not isinstance(place.child, AdapterParam):
+            if isinstance(place.child.get_value(), QuantizedKernel):
+                raise ValueError(f"{place.path} is quantised and cannot train in full.")
             if place.name == "kernel" and getattr(place.parent, "adapter", None) is not None:
                 raise ValueError(f"{place.path} cannot train in full under the layer's adapter.")
             if isinstance(place.parent, Dense) and place.parent.adapter is None:
@@ -231,7 +241,7 @@ def _retype(places: Sequence[Place], kind: type[nnx.Param]) -> None:
         setattr(parent, name, renewed[id(variable)])
 
 
-def renewed(variable: nnx.Param, value: jax.Array) -> nnx.Param:
+def with_value(variable: nnx.Param, value: Any) -> nnx.Param:
     """A variable of its own with another value: the old one may be shared with other layers."""
     return type(variable)(value, **variable.get_metadata())
 
@@ -278,4 +288,5 @@ def _no_match(pattern: str, holder: nnx.List) -> str:
 
 
 def _size(tree: Any) -> int:
-    return sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(tree))
+    leaves = jax.tree.leaves(tree, is_leaf=lambda node: isinstance(node, QuantizedKernel))
+    return sum(math.prod(leaf.shape) for leaf in leaves)

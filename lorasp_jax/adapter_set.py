@@ -99,7 +99,7 @@ class AdapterSet(Method):
             if aux.active_rank is not None:
                 rank += jnp.where(weights[name] != 0, aux.active_rank, 0)
         z, u = jnp.concatenate(sides[0], axis=-1), jnp.concatenate(sides[1], axis=0)
-        y = sum(changes, low_rank_matmul(x, kernel.astype(x.dtype), z, u))
+        y = sum(changes, low_rank_matmul(x, kernel, z, u))
         return y, Aux(jnp.broadcast_to(rank, x.shape[:-1]), token_mask=token_mask)
 
     def merge(self, params: Params, kernel: jax.Array) -> jax.Array:

@@ -95,7 +95,7 @@ def unmerge(merged: Model, adapted: nnx.Module) -> Model:
         except (ValueError, TypeError) as error:
             raise ValueError(f"cannot unmerge {place.path}: {error}") from error
         base = (kernel.astype(jnp.float32) - delta).astype(kernel.dtype)
-        layer.kernel = adaptation.renewed(layer.kernel, base)
+        layer.kernel = adaptation.with_value(layer.kernel, base)
         layer.method, layer.adapter = method, AdapterParam(params)
         setattr(place.parent, place.name, layer)
     if adapters:

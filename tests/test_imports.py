@@ -18,6 +18,7 @@ ROOMS = [
     "lorasp_jax.adapter_set",
     "lorasp_jax.named",
     "lorasp_jax.fusion",
+    "lorasp_jax.quantization",
     "lorasp_jax.config",
     "lorasp_jax.models",
     "lorasp_jax.data",

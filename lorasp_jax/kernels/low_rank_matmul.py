@@ -5,25 +5,33 @@ no gradient is ever computed for W, and where the output is at least as wide as 
 products become one, [x, z] @ [W; U] (and one in the backward pass), which spares a second pass over
 the wide side. On an H200 (forward and backward, bf16, 26k tokens, R = 128) against plain LoRA:
 2048 -> 16384 6.1 against 6.9 ms; for wide inputs (16384 -> 2048) concatenation does not pay.
+
+W is cast to the type of x in each pass and kept between them as it came, so a quantised one is not
+widened in memory for long.
 """
 
 import jax
 import jax.numpy as jnp
 
+from lorasp_jax.kernels.quantized import QuantizedKernel
+
 
 @jax.custom_vjp
-def low_rank_matmul(x: jax.Array, kernel: jax.Array, z: jax.Array, u: jax.Array) -> jax.Array:
+def low_rank_matmul(
+    x: jax.Array, kernel: jax.Array | QuantizedKernel, z: jax.Array, u: jax.Array
+) -> jax.Array:
     """x @ kernel + z @ u in the type of x, without a gradient for `kernel`.
 
     Args:
       x: [..., I].
-      kernel: [I, O], frozen: its cotangent is zero by definition.
+      kernel: [I, O] of any type, frozen: its cotangent is zero by definition.
       z: [..., R].
       u: [R, O].
 
     Returns:
-      [..., O]. All inputs are expected in one floating type.
+      [..., O]. x, z and u are expected in one floating type.
     """
+    kernel = kernel.astype(x.dtype)
     if _concatenates(kernel):
         return jnp.concatenate([x, z], axis=-1) @ jnp.concatenate([kernel, u], axis=0)
     return x @ kernel + z @ u
@@ -35,6 +43,7 @@ def _forward(x: jax.Array, kernel: jax.Array, z: jax.Array, u: jax.Array) -> tup
 
 def _backward(residuals: tuple, g: jax.Array) -> tuple:
     kernel, z, u = residuals
+    kernel = kernel.astype(g.dtype)
     if _concatenates(kernel):
         gradient = g @ jnp.concatenate([kernel, u], axis=0).T
         dx, dz = jnp.split(gradient, [kernel.shape[0]], axis=-1)

@@ -137,7 +137,7 @@ class Method:
         No gradient reaches `kernel`; arguments as for `delta`.
         """
         z, u, aux = self.project(params, x, token_mask)
-        return low_rank_matmul(x, kernel.astype(x.dtype), z, u), aux
+        return low_rank_matmul(x, kernel, z, u), aux
 
     def penalty(self, params: Params) -> dict[str, jax.Array]:
         """Losses on the parameters alone, by name."""
