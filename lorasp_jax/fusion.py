@@ -14,7 +14,7 @@ from flax import nnx
 from lorasp_jax import adaptation, named
 from lorasp_jax.adaptation import Model
 from lorasp_jax.dense import AdapterParam, Dense
-from lorasp_jax.peft import LoRA
+from lorasp_jax.peft import LoRA, Method
 from lorasp_jax.peft.method import Params
 
 
@@ -83,24 +83,27 @@ def unmerge(merged: Model, adapted: nnx.Module) -> Model:
     for place in adaptation.places(holder, (Dense, nnx.Linear)):
         if place.path not in adapters:
             continue
-        method, params = adapters.pop(place.path)
-        if not method.additive:
-            raise ValueError(f"cannot unmerge {place.path}: {method} did not just add to its base.")
-        is_linear = isinstance(place.child, nnx.Linear)
-        layer = adaptation.as_dense(place.child) if is_linear else place.child
-        kernel = layer.kernel.get_value()
         try:
-            zeros = jnp.zeros(kernel.shape)
-            delta = adaptation.over_stack(method.merge, kernel)(params, zeros)
+            layer = _unmerged(place.child, *adapters.pop(place.path))
         except (ValueError, TypeError) as error:
             raise ValueError(f"cannot unmerge {place.path}: {error}") from error
-        base = (kernel.astype(jnp.float32) - delta).astype(kernel.dtype)
-        layer.kernel = adaptation.with_value(layer.kernel, base)
-        layer.method, layer.adapter = method, AdapterParam(params)
         setattr(place.parent, place.name, layer)
     if adapters:
         raise ValueError(f"the merged model has no dense layer {min(adapters)}.")
     return holder[0]
+
+
+def _unmerged(layer: Dense | nnx.Linear, method: Method, params: Params) -> Dense:
+    """The layer with the adapter, less what it had added."""
+    if not method.additive:
+        raise ValueError(f"{method} did not just add to its base.")
+    layer = adaptation.as_dense(layer) if isinstance(layer, nnx.Linear) else layer
+    kernel = layer.kernel.get_value()
+    delta = adaptation.over_stack(method.merge, kernel)(params, jnp.zeros(kernel.shape))
+    base = (kernel.astype(jnp.float32) - delta).astype(kernel.dtype)
+    layer.kernel = adaptation.with_value(layer.kernel, base)
+    layer.method, layer.adapter = method, AdapterParam(params)
+    return layer
 
 
 def _one(

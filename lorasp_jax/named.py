@@ -8,7 +8,9 @@
 
 A choice is an array of the model and no part of its structure, so a jitted function that gets the
 model as an argument runs on after another choice (once more compiled for choices by example, whose
-array has the batch's axis too). `lorasp_jax.adapter_set` has the maths.
+array has the batch's axis too). One adapter alone is `extract(model, "pour")`, to be saved by
+`save_adapters`, and gets back, or another in its place, by `swap(model, "pour", other)`.
+`lorasp_jax.adapter_set` has the maths.
 """
 
 from collections.abc import Mapping, Sequence
@@ -89,15 +91,18 @@ def weights(model: nnx.Module, choice: One | Sequence[One] | jax.Array | np.ndar
     """
     known = names(model)
     if isinstance(choice, jax.Array | np.ndarray):
-        if choice.ndim not in (1, 2) or choice.shape[-1] != len(known):
-            raise ValueError(
-                f"weights of {len(known)} adapters have shape [{len(known)}] or "
-                f"[B, {len(known)}], got {choice.shape}."
-            )
-        return jnp.asarray(choice, jnp.float32)
-    if choice is None or isinstance(choice, str | Mapping):
-        return jnp.array(_row(known, choice), jnp.float32)
-    return jnp.array([_row(known, one) for one in choice], jnp.float32)
+        found = choice
+    elif choice is None or isinstance(choice, str | Mapping):
+        found = np.array(_row(known, choice))
+    else:
+        found = np.array([_row(known, one) for one in choice])
+    size = len(known)
+    if found.ndim not in (1, 2) or found.shape[-1] != size or found.dtype.kind != "f":
+        raise ValueError(
+            f"weights of {size} adapters are floats of shape [{size}] or [B, {size}], got "
+            f"{found.dtype} {found.shape}."
+        )
+    return jnp.asarray(found, jnp.float32)
 
 
 def names(model: nnx.Module) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ Adapters that take a part of a kernel (PiSSA, OLoRA) come first, and what they l
 
 import re
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 from flax import nnx
@@ -20,6 +20,10 @@ from flax import nnx
 from lorasp_jax import adaptation
 from lorasp_jax.dense import AdapterParam, Dense
 from lorasp_jax.kernels.quantized import Kind, QuantizedKernel, quantized
+
+# By identity of a variable and kind: what replaces it, the variable itself, which so stays alive,
+# and the error.
+Shared: TypeAlias = dict[tuple[int, Kind], tuple[nnx.Param, nnx.Param, float]]
 
 
 class Quantized(NamedTuple):
@@ -49,6 +53,7 @@ def quantize(model: nnx.Module, rules: Sequence[tuple[str, Kind | None]]) -> Qua
     """
     adaptation.check_patterns(pattern for pattern, _ in rules)
     holder, errors, used = nnx.List([nnx.merge(*adaptation.split(model))]), {}, set()
+    shared: Shared = {}
     layers = adaptation.places(holder, (Dense, nnx.Linear))
     for place in layers:
         matching = [rule for rule in rules if re.search(rule[0], place.path)]
@@ -57,7 +62,7 @@ def quantize(model: nnx.Module, rules: Sequence[tuple[str, Kind | None]]) -> Qua
         used.add(matching[0])
         if (kind := matching[0][1]) is not None:
             try:
-                layer, errors[place.path] = _quantized(place.child, kind)
+                layer, errors[place.path] = _quantized(place.child, kind, shared)
             except ValueError as error:
                 raise ValueError(f"cannot quantise {place.path}: {error}") from error
             setattr(place.parent, place.name, layer)
@@ -74,18 +79,22 @@ def is_quantized(model: nnx.Module) -> bool:
     return any(isinstance(place.child.get_value(), QuantizedKernel) for place in parameters)
 
 
-def _quantized(layer: Dense | nnx.Linear, kind: Kind) -> tuple[Dense, float]:
-    """The layer with a quantised kernel, and its relative error."""
+def _quantized(layer: Dense | nnx.Linear, kind: Kind, shared: Shared) -> tuple[Dense, float]:
+    """The layer with a quantised kernel, and its relative error; shared kernels stay shared."""
     if isinstance(layer, nnx.Linear):
         layer = adaptation.as_dense(layer)
-    kernel = layer.kernel.get_value()
-    if isinstance(layer.kernel, AdapterParam):
+    variable, kernel = layer.kernel, layer.kernel.get_value()
+    if isinstance(variable, AdapterParam):
         raise ValueError("its kernel trains, and what trains needs all of its bits.")
     if isinstance(kernel, QuantizedKernel):
         raise ValueError("its kernel is quantised already.")
-    smaller = quantized(kernel, kind)
-    layer.kernel = adaptation.with_value(layer.kernel, smaller)
-    whole = kernel.astype(jnp.float32)
-    length = jnp.linalg.norm(whole)
-    lost = jnp.linalg.norm(whole - smaller.astype(jnp.float32))
-    return layer, float(jnp.where(length > 0, lost / length, 0.0))
+    if (id(variable), kind) not in shared:
+        smaller = quantized(kernel, kind)
+        lost, length = (
+            jnp.linalg.norm(values.astype(jnp.float32))
+            for values in (kernel - smaller.astype(jnp.float32), kernel)
+        )
+        error = float(jnp.where(length > 0, lost / length, 0.0))
+        shared[id(variable), kind] = adaptation.with_value(variable, smaller), variable, error
+    layer.kernel, _, error = shared[id(variable), kind]
+    return layer, error

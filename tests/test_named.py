@@ -135,8 +135,9 @@ def test_unknown_names():
         lorasp_jax.extract(MODEL, "prss")
     with pytest.raises(ValueError, match="no named adapters: combine models first"):
         lorasp_jax.choose(NET, "pour")
-    with pytest.raises(ValueError, match=r"have shape \[4\] or \[B, 4\], got \(3,\)"):
-        lorasp_jax.choose(MODEL, jnp.ones(3))
+    for bad in (jnp.ones(3), [], np.array([0, 1, 2, 3]), np.ones((2, 2, 4))):
+        with pytest.raises(ValueError, match=r"are floats of shape \[4\] or \[B, 4\], got "):
+            lorasp_jax.choose(MODEL, bad)
 
 
 def test_models_that_do_not_combine():

@@ -168,3 +168,23 @@ def test_rules():
         lorasp_jax.quantize(broken, [("", "nf4")])
     with pytest.raises(ValueError, match="out/kernel is quantised"):
         adaptation.adapt(model, [("out", FullFineTuning())], rngs=nnx.Rngs(0))
+
+
+def test_shared_kernels_stay_shared():
+    tied = nnx.List([nnx.Linear(4, 4, use_bias=False, rngs=nnx.Rngs(i)) for i in range(2)])
+    tied[1].kernel = tied[0].kernel
+    model, errors = lorasp_jax.quantize(tied, [("", "int8")])
+    assert model[0].kernel is model[1].kernel
+    assert errors["0"] == errors["1"] > 0
+    assert size(model) == 4 * 4 + 4 * 4
+
+
+def test_tables_and_reports():
+    """A summary counts weights, not bytes; adapters report as ever."""
+    model = trained(("", LoRA(rank=2)), seed=1, net=ALL["nf4"])
+    assert "inp" in lorasp_jax.summary(model)
+    assert lorasp_jax.summary(model) == lorasp_jax.summary(widened(model))
+    named = lorasp_jax.choose(lorasp_jax.combine({"a": model}), None)
+    named(X)
+    assert not lorasp_jax.collect_aux(named)["inp"].active_rank.any()
+    assert "adapter_set" in lorasp_jax.summary(named)
