@@ -99,6 +99,8 @@ def methods(model: nnx.Module) -> dict[str, Method]:
 def merge(model: Model) -> Model:
     """A model without adapters that computes the same: deltas folded into kernels, all frozen.
 
+    A quantised kernel under an adapter becomes an array again.
+
     Raises:
       ValueError: a method whose delta depends on the input.
     """

@@ -14,6 +14,7 @@ import re
 from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias
 
+import jax
 import jax.numpy as jnp
 from flax import nnx
 
@@ -90,11 +91,16 @@ def _quantized(layer: Dense | nnx.Linear, kind: Kind, shared: Shared) -> tuple[D
         raise ValueError("its kernel is quantised already.")
     if (id(variable), kind) not in shared:
         smaller = quantized(kernel, kind)
-        lost, length = (
-            jnp.linalg.norm(values.astype(jnp.float32))
-            for values in (kernel - smaller.astype(jnp.float32), kernel)
-        )
-        error = float(jnp.where(length > 0, lost / length, 0.0))
+        error = float(_error(kernel, smaller))
         shared[id(variable), kind] = adaptation.with_value(variable, smaller), variable, error
     layer.kernel, _, error = shared[id(variable), kind]
     return layer, error
+
+
+@jax.jit
+def _error(kernel: jax.Array, smaller: QuantizedKernel) -> jax.Array:
+    """‖W − Ŵ‖ / ‖W‖, 0 for a kernel of zeros."""
+    whole = kernel.astype(jnp.float32)
+    length = jnp.linalg.norm(whole)
+    lost = jnp.linalg.norm(whole - smaller.astype(jnp.float32))
+    return jnp.where(length > 0, lost / length, 0.0)

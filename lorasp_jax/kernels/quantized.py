@@ -3,11 +3,12 @@
 Symmetric, scaled by the largest magnitude of what shares a scale. nf4 is the 4-bit NormalFloat of
 QLoRA (Dettmers et al., arXiv 2305.14314, appendix E), without its second quantisation of the
 scales: 4.5 bits a weight. With m the largest magnitude under a scale, a weight is off by at most
-m/255 in int8 and 0.152 m in nf4, half the widest gap of its table. (As a frozen product reads
-a kernel only to multiply by it, it is widened there and then, also in the backward pass.)
+m/255 in int8 and 0.152 m in nf4, half the widest gap of its table. The product under an adapter
+widens a kernel where it multiplies by it, again in the backward pass, and keeps the codes alone.
 """
 
 import dataclasses
+import functools
 import math
 from typing import Any, Literal, TypeAlias
 
@@ -90,8 +91,15 @@ def quantized(kernel: jax.Array, kind: Kind) -> QuantizedKernel:
     """
     if kind not in KINDS:
         raise ValueError(f"kernels can be {' or '.join(KINDS)}, got {kind!r}.")
-    if not bool(jnp.isfinite(kernel).all()):
+    codes, scale = _codes(kernel, kind)
+    if not bool(jnp.isfinite(scale).all()):
         raise ValueError("a kernel with infinite or undefined values cannot be quantised.")
+    return QuantizedKernel(codes, scale, kernel.shape[-2], jnp.dtype(kernel.dtype))
+
+
+@functools.partial(jax.jit, static_argnames="kind")
+def _codes(kernel: jax.Array, kind: Kind) -> tuple[jax.Array, jax.Array]:
+    """Codes and scales of a `QuantizedKernel`."""
     *leading, d_in, d_out = kernel.shape
     values = kernel.astype(jnp.float32)
     if kind == "nf4":
@@ -103,8 +111,7 @@ def quantized(kernel: jax.Array, kind: Kind) -> QuantizedKernel:
     largest = jnp.abs(values).max(-2, keepdims=True)
     scale = largest / (1 if kind == "nf4" else INT8_BOUND)
     relative = values / jnp.where(scale > 0, scale, 1)
-    codes = _nf4(relative) if kind == "nf4" else _int8(relative)
-    return QuantizedKernel(codes, scale, d_in, jnp.dtype(kernel.dtype))
+    return _nf4(relative) if kind == "nf4" else _int8(relative), scale
 
 
 def _int8(relative: jax.Array) -> jax.Array:
