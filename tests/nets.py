@@ -1,5 +1,6 @@
 """Small models with adapters that have moved off their start, shared by several tests."""
 
+import dataclasses
 import itertools
 from pathlib import Path
 
@@ -8,12 +9,22 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax import adaptation
+from lorasp_jax import adaptation, peft
 from lorasp_jax.dense import Dense
 from lorasp_jax.peft import LoRA, LoRASP
 
 GOLDEN = Path(__file__).parent / "golden"
 SP = LoRASP(rank=8, hidden_width=4)
+SIZES = {"rank": 8, "hidden_width": 4}
+
+
+def small(name):
+    """A method by its file's name, small where it has sizes."""
+    fields = {field.name for field in dataclasses.fields(peft.find(name))}
+    return peft.create(name, **{key: size for key, size in SIZES.items() if key in fields})
+
+
+METHODS = {name: small(name) for name in peft.names()}
 
 
 class Net(nnx.Module):

@@ -10,15 +10,15 @@ import pytest
 from flax import nnx
 
 import lorasp_jax
-from lorasp_jax import adaptation, peft
+from lorasp_jax import adaptation
 from lorasp_jax.adapter_io import load_adapters, save_adapters
 from lorasp_jax.named import bare
 from lorasp_jax.peft import LoRA, LoRAMoE, LoRASP
-from tests.nets import NET, SP, X, assert_close, call, trained
+from tests import nets
+from tests.nets import NET, X, assert_close, call, trained
 
 STARTS = ["gaussian", "pissa", "olora"]
-METHODS = {n: SP if n == "lora_sp" else peft.create(n) for n in peft.names()}
-METHODS |= {start: LoRA(rank=2, initialization=start) for start in STARTS}
+METHODS = nets.METHODS | {start: LoRA(rank=2, initialization=start) for start in STARTS}
 LAYERS = "inp|blocks"
 
 

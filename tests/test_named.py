@@ -7,13 +7,13 @@ import pytest
 from flax import nnx
 
 import lorasp_jax
-from lorasp_jax import adaptation, named, peft
+from lorasp_jax import adaptation, named
 from lorasp_jax.adapter_io import load_adapters, save_adapters
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA, LoRAMoE
-from tests.nets import NET, SP, Net, X, assert_close, call, golden_models, trained
+from tests.nets import METHODS, NET, SP, Net, X, assert_close, call, golden_models, trained
 
 MODELS = {
     "pour": trained(("inp", LoRA(rank=2, alpha=3)), ("blocks", LoRA(rank=3)), seed=1),
@@ -187,9 +187,9 @@ def test_hugging_face(case, choice):
     np.testing.assert_allclose(model(golden["x"]), expected, rtol=0, atol=atol)
 
 
-@pytest.mark.parametrize("name", [n for n in peft.names() if n != "full"])
+@pytest.mark.parametrize("name", [n for n in METHODS if n != "full"])
 def test_half_of_an_adapter_is_half_of_what_it_changes(name):
-    model = trained(("inp", SP if name == "lora_sp" else peft.create(name)), seed=6)
+    model = trained(("inp", METHODS[name]), seed=6)
     pair = lorasp_jax.combine({"lora": MODELS["pour"], "own": model})
     half = lorasp_jax.choose(pair, {"own": 0.5}).inp(X)
     assert_close(half, 0.5 * (NET.inp(X) + model.inp(X)))

@@ -8,12 +8,12 @@ import pytest
 from flax import nnx
 
 import lorasp_jax
-from lorasp_jax import adaptation, peft
+from lorasp_jax import adaptation
 from lorasp_jax.adapter_io import load_adapters, save_adapters
 from lorasp_jax.dense import AdapterParam, Dense
 from lorasp_jax.kernels.quantized import KINDS, QuantizedKernel
 from lorasp_jax.peft import FullFineTuning, LoRA
-from tests.nets import NET, SP, Net, X, assert_close, call, trained
+from tests.nets import METHODS, NET, SP, Net, X, assert_close, call, trained
 
 WIDE = nnx.Linear(256, 512, rngs=nnx.Rngs(0))
 ALL = {kind: lorasp_jax.quantize(NET, [("", kind)]).model for kind in KINDS}
@@ -56,10 +56,10 @@ def test_quantised_equals_widened(kind):
     assert_close(jax.jit(lambda s: nnx.merge(graphdef, s)(X))(state), call(model, X))
 
 
-@pytest.mark.parametrize("name", peft.names())
+@pytest.mark.parametrize("name", METHODS)
 def test_methods_over_a_quantised_base(name):
     """By discovery: attached after or before, the same as over the widened kernels."""
-    method = SP if name == "lora_sp" else peft.create(name)
+    method = METHODS[name]
     if method.trains_base:
         with pytest.raises(ValueError, match="inp/kernel is quantised and cannot train in full"):
             adaptation.adapt(ALL["nf4"], [("inp", method)], rngs=nnx.Rngs(0))
