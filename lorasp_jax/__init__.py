@@ -9,19 +9,30 @@ Axis letters used in every docstring and einsum of this package:
     J joints         W parallel worlds
 """
 
-from lorasp_jax import dense, hugging_face, peft
+from lorasp_jax import dense, hugging_face, named, peft
 from lorasp_jax.adaptation import adapt, merge
 from lorasp_jax.dense import collect_aux
+from lorasp_jax.fusion import fuse, unmerge
 from lorasp_jax.linen import LinenAdapter
+from lorasp_jax.named import choose, combine, extract, swap
+from lorasp_jax.quantization import quantize
 from lorasp_jax.tables import summary
 
 __all__ = [
     "LinenAdapter",
     "adapt",
+    "choose",
     "collect_aux",
+    "combine",
     "dense",
+    "extract",
+    "fuse",
     "hugging_face",
     "merge",
+    "named",
     "peft",
+    "quantize",
     "summary",
+    "swap",
+    "unmerge",
 ]

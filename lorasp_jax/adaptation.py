@@ -19,7 +19,7 @@ import difflib
 import math
 import re
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -28,6 +28,7 @@ from flax import nnx
 
 from lorasp_jax import layers
 from lorasp_jax.dense import AdaptedLayer, AdapterAux, AdapterParam
+from lorasp_jax.kernels.quantized import QuantizedKernel
 from lorasp_jax.peft import FullFineTuning, Method
 from lorasp_jax.peft.method import Params
 
@@ -78,11 +79,7 @@ def adapt(
       ValueError: a rule that is no regular expression or governs nothing that it applies to (lists
         near misses), or a layer that an adapter cannot take over.
     """
-    for pattern, _ in rules:
-        try:
-            re.compile(pattern)
-        except re.error as error:
-            raise ValueError(f"rule {pattern!r} is no regular expression: {error}.") from error
+    check_patterns(pattern for pattern, _ in rules)
     holder, key = _copy(model), rngs.params()
     used = _attach_all(holder, rules, key, einsums or {}) | _free_all(holder, rules)
     for i, (pattern, _) in enumerate(rules):
@@ -120,7 +117,7 @@ def merge(model: Model) -> Model:
     """A model without adapters that computes the same: deltas folded into kernels, all frozen.
 
     Of an embedding, `attend` is adapted as lookups are; a table that the model reads past both is
-    not, but merging changes it.
+    not, but merging changes it. A quantised kernel under an adapter becomes an array again.
 
     Raises:
       ValueError: a method whose delta depends on the input.
@@ -160,11 +157,13 @@ def attach(layer: AdaptedLayer, method: Method, key: jax.Array) -> None:
       key: typed random key.
 
     Raises:
-      ValueError: a method that the layer cannot carry, or a layer whose adapter holds a part of its
-        kernel.
+      ValueError: a method that the layer cannot carry, a layer whose adapter holds a part of its
+        kernel, or a quantised kernel of which the method would take a part.
     """
     if layer.adapter is not None and layer.method is not None and layer.method.splits_kernel:
         raise ValueError("an adapter that holds a part of its kernel cannot be replaced: merge it.")
+    if method.splits_kernel and isinstance(layer.kernel_matrices(), QuantizedKernel):
+        raise ValueError("a quantised kernel cannot be split: adapt first, then quantise the rest.")
     _retype([p for p in places(nnx.List([layer]), AdapterParam) if p.name != "adapter"], nnx.Param)
     params, kernel = init_stack(key, layer.adapter_init(method), layer.kernel_matrices())
     layer.method = method
@@ -204,6 +203,15 @@ def layer_places(holder: nnx.List, einsums: layers.Einsums | None = None) -> lis
     ]
 
 
+def check_patterns(patterns: Iterable[str]) -> None:
+    """Raises a ValueError for a pattern that is no regular expression."""
+    for pattern in patterns:
+        try:
+            re.compile(pattern)
+        except re.error as error:
+            raise ValueError(f"rule {pattern!r} is no regular expression: {error}.") from error
+
+
 def governing(rules: Rules, *paths: str) -> int | None:
     """Index of the first rule that matches one of the paths."""
     hits = (i for i, (pattern, _) in enumerate(rules) if any(re.search(pattern, p) for p in paths))
@@ -240,6 +248,8 @@ def _free_all(holder: nnx.List, rules: Rules) -> set[int]:
             continue
         used.add(i)
         if method is not None and not isinstance(place.child, AdapterParam):
+            if isinstance(place.child.get_value(), QuantizedKernel):
+                raise ValueError(f"{place.path} is quantised and cannot train in full.")
             layer = place.parent if isinstance(place.parent, AdaptedLayer) else None
             if layer and layer.adapter is None:
                 layer.method = method
@@ -295,4 +305,5 @@ def _no_match(pattern: str, holder: nnx.List, einsums: layers.Einsums) -> str:
 
 
 def _size(tree: Any) -> int:
-    return sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(tree))
+    leaves = jax.tree.leaves(tree, is_leaf=lambda node: isinstance(node, QuantizedKernel))
+    return sum(math.prod(leaf.shape) for leaf in leaves)

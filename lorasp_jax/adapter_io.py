@@ -53,7 +53,7 @@ def save_adapters(
     adapters = nnx.state(model, AdapterParam)
     tensors = {name: np.asarray(leaf) for name, leaf in _named(adapters).items()}
     if not tensors:
-        raise ValueError("the model has no adapters to save.")
+        raise ValueError("the model has no adapters to save; of a combined one, extract one first.")
     data = safetensors.numpy.save(tensors)
     description = {
         "format": FORMAT,

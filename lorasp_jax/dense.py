@@ -86,6 +86,11 @@ def dense(
     return (y if bias is None else y + bias.astype(y.dtype)), aux
 
 
+def with_value(variable: nnx.Param, value: Any) -> nnx.Param:
+    """A variable of its own with another value: the old one may be shared with other layers."""
+    return type(variable)(value, **variable.get_metadata())
+
+
 class AdaptedLayer(nnx.Module):
     """A layer that can carry an adapter: what adaptation, tables and files know of it.
 
@@ -106,8 +111,7 @@ class AdaptedLayer(nnx.Module):
     def set_kernel_matrices(self, matrices: jax.Array) -> None:
         """Gives the layer another kernel in a variable of its own: the old one may be shared."""
         old = getattr(self, self.kernel_name)
-        value = matrices.reshape(old.get_value().shape)
-        setattr(self, self.kernel_name, type(old)(value, **old.get_metadata()))
+        setattr(self, self.kernel_name, with_value(old, matrices.reshape(old.get_value().shape)))
 
     def adapter_init(self, method: Method) -> Callable[[jax.Array, jax.Array], tuple[Params, Any]]:
         """What makes a method's parameters, and the kernel it leaves, from a key and one [I, O].

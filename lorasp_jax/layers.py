@@ -198,10 +198,10 @@ def adapted(layer: nnx.Module, einsums: Einsums) -> AdaptedLayer:
     if isinstance(layer, AdaptedLayer):
         return layer
     known = kind(layer, einsums)
+    if known is nnx.Linear:
+        return as_dense(layer)
     if known not in (nnx.Embed, nnx.Conv):
         check_plain(layer)
-    if known is nnx.Linear:
-        return _as_dense(layer)
     if known in (nnx.Embed, nnx.Conv):
         mixin, name = (ConvLayer, "kernel") if known is nnx.Conv else (EmbedLayer, "embedding")
         settings = {"kernel_name": name}
@@ -236,8 +236,15 @@ def check_plain(layer: Any) -> None:
             )
 
 
-def _as_dense(linear: Any) -> Dense:
-    """A `Dense` that holds a linear layer's own variables."""
+def as_dense(linear: Dense | nnx.Linear) -> Dense:
+    """A `Dense` that holds a linear layer's own variables; one that is there already as it is.
+
+    Raises:
+      ValueError: a layer with its own matrix product, precision or the like.
+    """
+    if isinstance(linear, Dense):
+        return linear
+    check_plain(linear)
     has_bias, zeros = linear.bias is not None, nnx.initializers.zeros
     layer = Dense(1, 1, use_bias=has_bias, dtype=linear.dtype, kernel_init=zeros, rngs=nnx.Rngs(0))
     layer.kernel, layer.bias = linear.kernel, linear.bias

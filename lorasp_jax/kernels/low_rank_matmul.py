@@ -9,6 +9,9 @@ cost, since at these sizes each pass over a wide array takes as long as the adap
 - where it is far wider, so are g Wᵀ and g Uᵀ of the gradient g of y, g [W; U]ᵀ;
 - where the input is at least as wide as the output, the gradient of x is one product,
   [g, q] [W, P]ᵀ with q the gradient of x P.
+
+W is cast to the type of x in each pass and kept between them as it came, so a quantised one is not
+widened in memory for long.
 """
 
 import functools
@@ -17,6 +20,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+
+from lorasp_jax.kernels.quantized import QuantizedKernel
 
 Between = Callable[[Any, jax.Array, jax.Array | None], tuple[jax.Array, Any]]
 
@@ -27,7 +32,7 @@ def low_rank_matmul(
     rows_dtype: Any,
     params: Any,
     x: jax.Array,
-    kernel: jax.Array,
+    kernel: jax.Array | QuantizedKernel,
     down: jax.Array,
     up: jax.Array,
     token_mask: jax.Array | None,
@@ -39,7 +44,7 @@ def low_rank_matmul(
       rows_dtype: type of the rows, which are summed in fp32.
       params: what f needs.
       x: [..., I].
-      kernel: W [I, O] in the type of x, frozen: its cotangent is zero by definition.
+      kernel: W [I, O] of any type, frozen: its cotangent is zero by definition.
       down: P [I, Q], fp32, used in the type of x.
       up: U [R, O], fp32, used in the type of x.
       token_mask: handed to f.
@@ -52,7 +57,7 @@ def _forward(
     rows_dtype: Any,
     params: Any,
     x: jax.Array,
-    kernel: jax.Array,
+    kernel: jax.Array | QuantizedKernel,
     down: jax.Array,
     up: jax.Array,
     token_mask: jax.Array | None,
@@ -66,11 +71,11 @@ def _forward(
 
     (z, aux), pull_back = jax.vjp(inner, params, rows)
     d_in, d_out = kernel.shape
-    u = up.astype(x.dtype)
+    w, u = kernel.astype(x.dtype), up.astype(x.dtype)
     if d_out >= d_in:
-        y = jnp.concatenate([x, z], axis=-1) @ jnp.concatenate([kernel, u])
+        y = jnp.concatenate([x, z], axis=-1) @ jnp.concatenate([w, u])
     else:
-        y = x @ kernel + z @ u
+        y = x @ w + z @ u
     return (y, aux), (pull_back, x, kernel, down, up, z)
 
 
@@ -79,17 +84,17 @@ def _backward(between: Between, rows_dtype: Any, residuals: tuple, cotangents: t
     pull_back, x, kernel, down, up, z = residuals
     g, d_aux = cotangents
     d_in, d_out = kernel.shape
-    p, u = _aligned(down.astype(x.dtype)), up.astype(x.dtype)
+    w, p, u = kernel.astype(x.dtype), _aligned(down.astype(x.dtype)), up.astype(x.dtype)
     if d_out > 2 * d_in:
-        through_base, dz = jnp.split(g @ jnp.concatenate([kernel, u]).T, [d_in], axis=-1)
+        through_base, dz = jnp.split(g @ jnp.concatenate([w, u]).T, [d_in], axis=-1)
     else:
         through_base, dz = None, g @ u.T
     d_params, d_rows = pull_back((dz, d_aux))
     q = _aligned(d_rows.astype(x.dtype))
     if d_out <= d_in:
-        dx = jnp.concatenate([g, q], axis=-1) @ jnp.concatenate([kernel, p], axis=1).T
+        dx = jnp.concatenate([g, q], axis=-1) @ jnp.concatenate([w, p], axis=1).T
     else:
-        dx = (g @ kernel.T if through_base is None else through_base) + q @ p.T
+        dx = (g @ w.T if through_base is None else through_base) + q @ p.T
     d_down = _outer(x, q, down.dtype)[:, : down.shape[1]]
     return d_params, dx, None, d_down, _outer(z, g, up.dtype), None
 

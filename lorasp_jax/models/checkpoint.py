@@ -21,7 +21,9 @@ import safetensors
 import safetensors.numpy
 from flax import nnx
 
+from lorasp_jax.adapter_set import SetParam
 from lorasp_jax.dense import AdapterParam
+from lorasp_jax.quantization import is_quantized
 
 CONFIG, SINGLE, INDEX = "config.json", "model.safetensors", "model.safetensors.index.json"
 SHARD_BYTES = 15 * 2**20
@@ -43,12 +45,14 @@ def save(folder: Folder, model: Any) -> None:
         model: a backbone, with `config`.
 
     Raises:
-        ValueError: the model has adapters.
+        ValueError: the model has adapters or quantised kernels.
     """
-    if jax.tree.leaves(nnx.state(model, AdapterParam)):
+    if jax.tree.leaves(nnx.state(model, (AdapterParam, SetParam))):
         raise ValueError(
             "models.save takes a model without adapters; merge them or save them alone."
         )
+    if is_quantized(model):
+        raise ValueError("models.save takes whole kernels: save a base before quantising it.")
     arrays = {name: np.asarray(leaf, jnp.bfloat16) for name, leaf in _named(model).items()}
     backbone = type(model).__module__.split(".")[-2]
     description = {

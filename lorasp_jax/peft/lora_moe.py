@@ -10,7 +10,7 @@ type of each task, is left out as in that code.
 """
 
 import dataclasses
-from typing import ClassVar, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -29,8 +29,6 @@ class LoRAMoE(Method):
       ValueError: a count or rank below 1, an unknown routing or gate gradient, or "switch" without
         "top1".
     """
-
-    reads_in_fp32: ClassVar[bool] = True
 
     experts: int = 4
     """E."""
@@ -58,6 +56,11 @@ class LoRAMoE(Method):
             )
         if self.gate_gradient == "switch" and self.routing != "top1":
             raise ValueError(f"gate_gradient 'switch' needs routing 'top1', got {self.routing!r}.")
+
+    @property
+    def reads_in_fp32(self) -> bool:
+        """True: the router's logits are sums in fp32."""
+        return True
 
     @property
     def scale(self) -> float:

@@ -67,12 +67,15 @@ class Method:
     """True if the base weights themselves are what trains."""
     additive: ClassVar[bool] = True
     """True if the adapted map is x @ kernel + delta."""
-    reads_in_fp32: ClassVar[bool] = False
-    """True if x P must not be rounded to the type of x."""
 
     @property
     def splits_kernel(self) -> bool:
         """True if `init` takes a part of the kernel, which then lacks it, into the parameters."""
+        return False
+
+    @property
+    def reads_in_fp32(self) -> bool:
+        """True if x P must not be rounded to the type of x."""
         return False
 
     @property
@@ -159,8 +162,9 @@ class Method:
 
         No gradient reaches `kernel`; arguments as for `delta`.
         """
-        sides = kernel.astype(x.dtype), self.down(params), self.up(params)
-        y, aux = low_rank_matmul(self.between, self._rows_dtype(x), params, x, *sides, token_mask)
+        sides = self.down(params), self.up(params)
+        rows_dtype = self._rows_dtype(x)
+        y, aux = low_rank_matmul(self.between, rows_dtype, params, x, kernel, *sides, token_mask)
         return y, dataclasses.replace(aux, token_mask=token_mask)
 
     def _rows_dtype(self, x: jax.Array) -> Any:

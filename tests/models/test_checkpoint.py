@@ -56,8 +56,11 @@ def test_hash_knows_the_base_and_not_its_adapters(folder, model):
     adapted = lorasp_jax.adapt(loaded, [("^action", LoRA(rank=2))], rngs=nnx.Rngs(0))
     assert models.weights_hash(adapted) == models.weights_hash(folder)
     assert models.weights_hash(model) != models.weights_hash(folder)  # not yet rounded to bf16
-    with pytest.raises(ValueError, match="without adapters"):
-        models.save(folder, adapted)
+    for has_adapters in (adapted, lorasp_jax.combine({"own": adapted})):
+        with pytest.raises(ValueError, match="without adapters"):
+            models.save(folder, has_adapters)
+    with pytest.raises(ValueError, match="save a base before quantising it"):
+        models.save(folder, lorasp_jax.quantize(loaded, [("state_proj", "int8")]).model)
 
 
 def test_shards_stay_under_their_limit(tmp_path, model, monkeypatch):

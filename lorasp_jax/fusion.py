@@ -1,0 +1,136 @@
+"""Named LoRAs made into one, and merged kernels taken apart again.
+
+`fuse` gives one LoRA that is the weighted sum of several: exact, of all their ranks together, or
+the best one of a smaller rank, with the error that this makes. `unmerge` is the inverse of `merge`.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+from lorasp_jax import adaptation, named
+from lorasp_jax.adaptation import Model
+from lorasp_jax.dense import AdapterParam, Dense
+from lorasp_jax.layers import as_dense
+from lorasp_jax.peft import LoRA, Method
+from lorasp_jax.peft.method import Params
+
+
+class Fused(NamedTuple):
+    """A model with one LoRA a layer, and what it costs to have only one.
+
+    Attributes:
+      model: adapted by plain LoRA of scale 1, fit to train, save and merge.
+      errors: ‖ΔW − ΔW'‖ / ‖ΔW‖ by path, Frobenius, of a whole stack at once: what the layer's delta
+        is off by, relative to itself, for inputs that are as long in every direction.
+    """
+
+    model: nnx.Module
+    errors: dict[str, float]
+
+
+def fuse(model: nnx.Module, weights: Mapping[str, float], *, rank: int | None = None) -> Fused:
+    """The weighted sum of some of a combined model's LoRAs as one LoRA.
+
+    Args:
+      model: from `combine`; left untouched.
+      weights: w_i by name, of any sign.
+      rank: None: their ranks together, which is exact. Else at most that, by singular values.
+
+    Raises:
+      ValueError: as for `choose`; no weight, a rank below 1, or a method that is no LoRA.
+    """
+    if not weights or (rank is not None and rank < 1):
+        raise ValueError(f"fuse needs weights and a rank of at least 1, got {weights}, {rank}.")
+    for name in weights:
+        named.index_of(named.names(model), name)
+    result, errors = named.bare(model), {}
+    layers = {place.path: place.child for place in adaptation.places(nnx.List([result]), Dense)}
+    for path, _, _, layer in named.sets(model):
+        found = []
+        for name, weight in weights.items():
+            method, params = named.member(layer, name)
+            if method is not None and type(method) is not LoRA:
+                raise ValueError(f"cannot fuse {name} at {path}: {method} is no LoRA.")
+            if method is not None:
+                found.append((params["lora_a"], weight * method.scale * params["lora_b"]))
+        if found:
+            layers[path].method, layers[path].adapter, errors[path] = _one(found, rank)
+    return Fused(result, errors)
+
+
+def unmerge(merged: Model, adapted: nnx.Module) -> Model:
+    """The adapted model that `merge` made the merged one of, from the adapters alone.
+
+    What they added is subtracted in fp32 and rounded to the kernel's type, so that a kernel comes
+    back up to eps/2 (|W + ΔW| + |W|), entry by entry (eps 1.2e-7 in fp32, 7.8e-3 in bf16).
+
+    Args:
+      merged: from `merge`; left untouched.
+      adapted: a model with the adapters, of which nothing else is read: for a saved adapter,
+        `load_adapters(folder, merged)`, unless it holds a part of its kernel.
+
+    Raises:
+      ValueError: the merged model has adapters or lacks a layer, or an adapter that did not just
+        add a constant: DoRA rescaled the kernel, and what it was before is not in the result.
+    """
+    adapters = named.adapters_by_path("the model to unmerge by", adapted)
+    if has := adaptation.methods(merged):
+        raise ValueError(f"{min(has)} of the merged model has an adapter.")
+    holder = nnx.List([nnx.merge(*adaptation.split(merged))])
+    for place in adaptation.places(holder, (Dense, nnx.Linear)):
+        if place.path not in adapters:
+            continue
+        try:
+            layer = _unmerged(place.child, *adapters.pop(place.path))
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"cannot unmerge {place.path}: {error}") from error
+        setattr(place.parent, place.name, layer)
+    if adapters:
+        raise ValueError(f"the merged model has no dense layer {min(adapters)}.")
+    return holder[0]
+
+
+def _unmerged(layer: Dense | nnx.Linear, method: Method, params: Params) -> Dense:
+    """The layer with the adapter, less what it had added."""
+    if not method.additive:
+        raise ValueError(f"{method} did not just add to its base.")
+    layer = as_dense(layer)
+    kernel = layer.kernel.get_value()
+    delta = adaptation.over_stack(method.merge, kernel)(params, jnp.zeros(kernel.shape))
+    base = (kernel.astype(jnp.float32) - delta).astype(kernel.dtype)
+    layer.set_kernel_matrices(base)
+    layer.method, layer.adapter = method, AdapterParam(params)
+    return layer
+
+
+def _one(
+    found: list[tuple[jax.Array, jax.Array]], rank: int | None
+) -> tuple[LoRA, AdapterParam, float]:
+    """One LoRA of scale 1 with Σ A_i B_i, and its relative error."""
+    a = jnp.concatenate([a for a, _ in found], axis=-1)
+    b = jnp.concatenate([b for _, b in found], axis=-2)
+    error = 0.0
+    if rank is not None and rank < a.shape[-1]:
+        a, b, error = truncated(a, b, rank)
+    params: Params = {"lora_a": a, "lora_b": b}
+    return LoRA(rank=a.shape[-1], alpha=a.shape[-1]), AdapterParam(params), error
+
+
+def truncated(a: jax.Array, b: jax.Array, rank: int) -> tuple[jax.Array, jax.Array, float]:
+    """The best A', B' of a smaller rank for A [..., I, R] and B [..., R, O], with ‖A‖ = ‖B‖.
+
+    A B = Q_a (R_a R_bᵀ) Q_bᵀ by QR of A and Bᵀ, so only a matrix of R x R is decomposed. The
+    singular values go to both sides in halves; the error is sqrt(Σ left out² / Σ all²).
+    """
+    (qa, ra), (qb, rb) = jnp.linalg.qr(a), jnp.linalg.qr(jnp.swapaxes(b, -1, -2))
+    left, values, right = jnp.linalg.svd(ra @ jnp.swapaxes(rb, -1, -2), full_matrices=False)
+    root = jnp.sqrt(values[..., :rank])
+    a = qa @ left[..., :rank] * root[..., None, :]
+    b = root[..., None] * right[..., :rank, :] @ jnp.swapaxes(qb, -1, -2)
+    total = jnp.linalg.norm(values)
+    lost = jnp.linalg.norm(values[..., rank:])
+    return a, b, float(jnp.where(total > 0, lost / total, 0.0))

@@ -1,0 +1,106 @@
+"""Small models with adapters that have moved off their start, shared by several tests."""
+
+import dataclasses
+import itertools
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from lorasp_jax import adaptation, peft
+from lorasp_jax.dense import Dense
+from lorasp_jax.peft import LoRA, LoRASP
+
+GOLDEN = Path(__file__).parent / "golden"
+SP = LoRASP(rank=8, hidden_width=4)
+SIZES = {"rank": 8, "hidden_width": 4}
+
+
+def small(name):
+    """A method by its file's name, small where it has sizes."""
+    fields = {field.name for field in dataclasses.fields(peft.find(name))}
+    return peft.create(name, **{key: size for key, size in SIZES.items() if key in fields})
+
+
+METHODS = {name: small(name) for name in peft.names()}
+
+
+class Net(nnx.Module):
+    """A stranger's nnx.Linear, and a stack that is scanned over."""
+
+    def __init__(self):
+        self.inp = nnx.Linear(5, 4, rngs=nnx.Rngs(0))
+        self.blocks = nnx.vmap(lambda r: Dense(4, 4, rngs=r))(nnx.Rngs(1).split(3))
+        self.out = nnx.Linear(4, 2, rngs=nnx.Rngs(2))
+
+    def __call__(self, x):
+        graphdef, layers = nnx.split(self.blocks)
+
+        def block(x, layer):
+            y, _ = nnx.merge(graphdef, layer)(x, return_aux=True)
+            return x + jnp.tanh(y), None
+
+        x, _ = jax.lax.scan(jax.checkpoint(block), self.inp(x), layers)
+        return self.out(x)
+
+
+NET = Net()
+X = jax.random.normal(jax.random.key(0), (4, 3, 5))
+
+
+@jax.jit
+def call(model, x):
+    return model(x)
+
+
+def trained(*rules, seed, net=NET):
+    """An adapted model whose adapters have moved off their start."""
+    model = adaptation.adapt(net, rules, rngs=nnx.Rngs(seed))
+    graphdef, adapters, frozen = adaptation.split(model)
+    leaves, structure = jax.tree.flatten(adapters)
+    keys = jax.random.split(jax.random.key(seed), len(leaves))
+    moved = [x + 0.5 * jax.random.normal(k, x.shape) for k, x in zip(keys, leaves, strict=True)]
+    return nnx.merge(graphdef, jax.tree.unflatten(structure, moved), frozen)
+
+
+def assert_close(actual, expected):
+    np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-5)
+
+
+class Tiny(nnx.Module):
+    """The golden file's net."""
+
+    def __init__(self, golden):
+        sizes = itertools.pairwise((24, 40, 24, 16))
+        self.lin = nnx.List([nnx.Linear(i, o, rngs=nnx.Rngs(0)) for i, o in sizes])
+        for n, layer in enumerate(self.lin):
+            layer.kernel.set_value(jnp.array(golden[f"base/lin.{n}.weight"].T))
+            layer.bias.set_value(jnp.array(golden[f"base/lin.{n}.bias"]))
+
+    def __call__(self, x):
+        x = jnp.tanh(self.lin[1](jnp.tanh(self.lin[0](x))))
+        return self.lin[2](x)
+
+
+def golden_model(golden, name, method):
+    layers = [n for n in range(3) if f"param/lin.{n}.lora_A.{name}.weight" in golden]
+    pattern = "|".join(f"lin/{n}" for n in layers)
+    model = adaptation.adapt(Tiny(golden), [(pattern, method)], rngs=nnx.Rngs(0))
+    for n in layers:
+        a, b = (golden[f"param/lin.{n}.lora_{side}.{name}.weight"].T for side in "AB")
+        model.lin[n].adapter.set_value({"lora_a": jnp.array(a), "lora_b": jnp.array(b)})
+    return model
+
+
+def golden_models():
+    """PEFT's several adapters over one base (lora_multi.npz), by name, and the file."""
+    with np.load(GOLDEN / "lora_multi.npz") as file:
+        golden = dict(file)
+    methods = {
+        "a": LoRA(rank=4, alpha=10),
+        "b": LoRA(rank=6, alpha=5, rank_stabilized=True),
+        "c": LoRA(rank=6, alpha=5),
+    }
+    return golden, {name: golden_model(golden, name, method) for name, method in methods.items()}

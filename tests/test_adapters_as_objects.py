@@ -1,0 +1,112 @@
+"""Laws of adapters as objects, for every method in `peft/`: a new file there is found by itself.
+
+Off is the base, merging is the forward pass, unmerging restores, and what was saved, combined or
+extracted comes back. Methods for which the maths does not allow one of them say so.
+"""
+
+import jax
+import numpy as np
+import pytest
+from flax import nnx
+
+import lorasp_jax
+from lorasp_jax import adaptation
+from lorasp_jax.adapter_io import load_adapters, save_adapters
+from lorasp_jax.named import bare
+from lorasp_jax.peft import LoRA, LoRAMoE, LoRASP
+from tests import nets
+from tests.nets import NET, X, assert_close, call, trained
+
+STARTS = ["gaussian", "pissa", "olora"]
+METHODS = nets.METHODS | {start: LoRA(rank=2, initialization=start) for start in STARTS}
+LAYERS = "inp|blocks"
+
+
+@pytest.fixture(params=METHODS)
+def method(request):
+    return METHODS[request.param]
+
+
+@pytest.fixture
+def model(method):
+    return trained((LAYERS, method), seed=3)
+
+
+def parameters(model):
+    return jax.tree.leaves(nnx.to_pure_dict(nnx.state(model, nnx.Param)))
+
+
+def test_off_is_the_base(method, model):
+    """Bit by bit where the adapter is taken away; beside another one, up to a sum with zeros."""
+    if method.trains_base:
+        with pytest.raises(ValueError, match=r"own trains (blocks|inp)/(bias|kernel)"):
+            lorasp_jax.combine({"own": model})
+        return
+    if method.splits_kernel:
+        for take_away in (bare, lambda model: lorasp_jax.combine({"own": model})):
+            with pytest.raises(ValueError, match="holds a part of its kernel"):
+                take_away(model)
+        return
+    assert np.abs(call(model, X) - call(NET, X)).max() > 1e-3
+    pair = lorasp_jax.combine({"other": trained(("out", LoRA(rank=2)), seed=1), "own": model})
+    for base in (bare(model), lorasp_jax.extract(pair, None)):
+        np.testing.assert_array_equal(call(base, X), call(NET, X))
+        for ours, theirs in zip(parameters(base), parameters(NET), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+    assert_close(call(lorasp_jax.choose(pair, None), X), call(NET, X))
+    assert_close(call(lorasp_jax.choose(pair, "own"), X), call(model, X))
+
+
+def test_merging_is_the_forward_pass_and_unmerging_restores(method, model):
+    if isinstance(method, LoRASP | LoRAMoE):
+        with pytest.raises(
+            ValueError, match=r"cannot merge (inp|blocks): .*; prune it .* or distill"
+        ):
+            lorasp_jax.merge(model)
+        return
+    merged = lorasp_jax.merge(model)
+    assert not adaptation.methods(merged)
+    assert_close(call(merged, X), call(model, X))
+    assert_close(call(lorasp_jax.merge(merged), X), call(model, X))  # again changes nothing
+    if not method.additive:
+        with pytest.raises(ValueError, match="unmerge"):
+            lorasp_jax.unmerge(merged, model)
+        return
+    back = lorasp_jax.unmerge(merged, model)
+    for ours, theirs in zip(parameters(back), parameters(model), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-6)
+    assert_close(call(back, X), call(model, X))
+
+
+def test_what_was_saved_comes_back(tmp_path, method, model):
+    """Alone, onto the base; and out of a combined model, where the method can have a name."""
+    save_adapters(tmp_path / "alone", model)
+    loaded = load_adapters(tmp_path / "alone", NET)
+    np.testing.assert_array_equal(call(loaded, X), call(model, X))
+    if method.trains_base or method.splits_kernel:
+        return
+    pair = lorasp_jax.combine({"other": trained(("", LoRA(rank=5)), seed=1), "own": loaded})
+    save_adapters(tmp_path / "out", lorasp_jax.extract(pair, "own"))
+    again = load_adapters(tmp_path / "out", NET)
+    for ours, theirs in zip(parameters(again), parameters(model), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    with pytest.raises(ValueError, match="of a combined one, extract one first"):
+        save_adapters(tmp_path / "none", pair)
+
+
+def test_mapped_choices(method, model):
+    """vmap over choices is one choice after the other, with gradients to x alike."""
+    if method.trains_base or method.splits_kernel:
+        return
+    pair = lorasp_jax.combine({"other": trained(("", LoRA(rank=2)), seed=1), "own": model})
+    rows = np.array([[0.0, 1.0], [1.0, 0.0], [0.3, -0.5]], np.float32)
+
+    def loss(x, weights):
+        return (lorasp_jax.choose(pair, weights)(x) ** 2).sum()
+
+    both = jax.value_and_grad(loss)
+    mapped = jax.jit(jax.vmap(both, (None, 0)))(X, rows)
+    single = jax.jit(both)
+    for i, row in enumerate(rows):
+        for ours, theirs in zip(mapped, single(X, row), strict=True):
+            np.testing.assert_allclose(ours[i], theirs, rtol=1e-3, atol=1e-3)
