@@ -34,12 +34,14 @@ class Aux:
       kept_energy: f32 [...tokens], E_k of eq. (12); None without a gate.
       losses: fp32 scalars by name, already averaged over the valid tokens.
       token_mask: bool [...tokens], True where a token counts; None means all do.
+      usage: f32 [R], for how many valid tokens each direction was in use; None without a gate.
     """
 
     active_rank: jax.Array | None = None
     kept_energy: jax.Array | None = None
     losses: Mapping[str, jax.Array] = dataclasses.field(default_factory=dict)
     token_mask: jax.Array | None = None
+    usage: jax.Array | None = None
 
     def mean_active_rank(self) -> jax.Array | None:
         """Active rank averaged over valid tokens (and over layers, if stacked), an f32 scalar."""
