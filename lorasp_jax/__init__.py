@@ -11,7 +11,18 @@ Axis letters used in every docstring and einsum of this package:
 
 from lorasp_jax import dense, hugging_face, peft
 from lorasp_jax.adaptation import adapt, merge
+from lorasp_jax.compaction import distill, prune
 from lorasp_jax.dense import collect_aux
 from lorasp_jax.tables import summary
 
-__all__ = ["adapt", "collect_aux", "dense", "hugging_face", "merge", "peft", "summary"]
+__all__ = [
+    "adapt",
+    "collect_aux",
+    "dense",
+    "distill",
+    "hugging_face",
+    "merge",
+    "peft",
+    "prune",
+    "summary",
+]

@@ -9,7 +9,8 @@ import difflib
 import math
 import re
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -40,7 +41,13 @@ class Place(NamedTuple):
     child: Any
 
 
-def adapt(model: Model, rules: Rules, *, rngs: nnx.Rngs) -> Model:
+def adapt(
+    model: Model,
+    rules: Rules,
+    *,
+    rngs: nnx.Rngs,
+    statistics: Mapping[str, jax.Array] = MappingProxyType({}),
+) -> Model:
     """Attaches adapters to dense layers, or frees base weights for full fine-tuning, by path rules.
 
     Additive methods apply to every `Dense` and `nnx.Linear` (which becomes a `Dense`) at its path,
@@ -53,6 +60,7 @@ def adapt(model: Model, rules: Rules, *, rngs: nnx.Rngs) -> Model:
       model: left untouched; the result shares its frozen arrays.
       rules: (pattern, method or None) pairs, first match wins.
       rngs: source of the adapters' keys. A layer's adapter depends on the key and its path alone.
+      statistics: by path, [..., I, I] of `calibration.input_moments`, for what starts from data.
 
     Returns:
       The adapted model.
@@ -67,7 +75,7 @@ def adapt(model: Model, rules: Rules, *, rngs: nnx.Rngs) -> Model:
         except re.error as error:
             raise ValueError(f"rule {pattern!r} is no regular expression: {error}.") from error
     holder, key = _copy(model), rngs.params()
-    used = _attach_all(holder, rules, key) | _free_all(holder, rules)
+    used = _attach_all(holder, rules, key, statistics) | _free_all(holder, rules)
     for i, (pattern, _) in enumerate(rules):
         if i not in used:
             raise ValueError(_no_match(pattern, holder))
@@ -132,7 +140,9 @@ def penalties(model: nnx.Module) -> dict[str, jax.Array]:
     return {name: jnp.concatenate(values).mean() for name, values in found.items()}
 
 
-def attach(layer: Dense | nnx.Linear, method: Method, key: jax.Array) -> Dense:
+def attach(
+    layer: Dense | nnx.Linear, method: Method, key: jax.Array, statistics: jax.Array | None = None
+) -> Dense:
     """The layer with a fresh adapter and its own weights frozen.
 
     Args:
@@ -140,6 +150,7 @@ def attach(layer: Dense | nnx.Linear, method: Method, key: jax.Array) -> Dense:
         place, an `nnx.Linear` replaced.
       method: an additive method.
       key: typed random key.
+      statistics: [..., I, I] of the layer's inputs, where the method starts from them.
 
     Raises:
       ValueError: an `nnx.Linear` with a custom matrix product or precision, or a layer whose
@@ -151,7 +162,7 @@ def attach(layer: Dense | nnx.Linear, method: Method, key: jax.Array) -> Dense:
         raise ValueError("an adapter that holds a part of its kernel cannot be replaced: merge it.")
     _retype([p for p in places(nnx.List([layer]), AdapterParam) if p.name != "adapter"], nnx.Param)
     layer.method = method
-    params, kernel = _init(key, method, layer.kernel.get_value())
+    params, kernel = _init(key, method, layer.kernel.get_value(), statistics)
     if method.splits_kernel:
         layer.kernel = _renewed(layer.kernel, kernel)
     layer.adapter = AdapterParam(params)
@@ -186,7 +197,9 @@ def _governing(rules: Rules, *paths: str) -> int | None:
     return next(hits, None)
 
 
-def _attach_all(holder: nnx.List, rules: Rules, key: jax.Array) -> set[int]:
+def _attach_all(
+    holder: nnx.List, rules: Rules, key: jax.Array, statistics: Mapping[str, jax.Array]
+) -> set[int]:
     """Attaches additive adapters in place; returns the rules that were used."""
     used = set()
     for path, parent, name, layer in places(holder, (Dense, nnx.Linear)):
@@ -194,7 +207,7 @@ def _attach_all(holder: nnx.List, rules: Rules, key: jax.Array) -> set[int]:
         method = None if i is None else rules[i][1]
         if method is not None and not method.trains_base:
             own_key = jax.random.fold_in(key, zlib.crc32(path.encode()))
-            setattr(parent, name, attach(layer, method, own_key))
+            setattr(parent, name, attach(layer, method, own_key, statistics.get(path)))
             used.add(i)
     return used
 
@@ -246,16 +259,21 @@ def _as_dense(linear: nnx.Linear) -> Dense:
     return layer
 
 
-def _init(key: jax.Array, method: Method, kernel: jax.Array) -> tuple[Params, Any]:
+def _init(
+    key: jax.Array, method: Method, kernel: jax.Array, statistics: jax.Array | None
+) -> tuple[Params, Any]:
     """`method.init` for a kernel [..., I, O]: one draw per leading index.
 
     Not jitted as a whole: its random draws compile once for each I instead of for each shape.
     """
     *leading, d_in, d_out = kernel.shape
     if not leading:
-        return method.init(key, kernel)
+        return method.init(key, kernel, statistics=statistics)
     keys = jax.random.split(key, math.prod(leading))
-    found = jax.vmap(method.init)(keys, kernel.reshape(-1, d_in, d_out))
+    init = jax.vmap(lambda key, kernel, own: method.init(key, kernel, statistics=own))
+    if statistics is not None:
+        statistics = statistics.reshape(-1, d_in, d_in)
+    found = init(keys, kernel.reshape(-1, d_in, d_out), statistics)
     return jax.tree.map(lambda leaf: leaf.reshape(*leading, *leaf.shape[1:]), found)
 
 

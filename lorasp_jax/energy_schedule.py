@@ -66,7 +66,7 @@ def scheduling(
     def init(params: Any) -> ScheduleState:
         return ScheduleState(jnp.zeros((), jnp.int32), optimizer.init(params))
 
-    def update(updates: Any, state: ScheduleState, params: Any = None) -> Any:
+    def update(updates: Any, state: Any, params: Any = None) -> Any:
         updates, inner = optimizer.update(updates, state.inner, params)
         done = (state.step + 1) / total_steps
 

@@ -13,7 +13,36 @@ Unlike there, padding stays out and everything is in fp32.
 import jax
 import jax.numpy as jnp
 
+from lorasp_jax.kernels.energy_gate import kept_energy
 from lorasp_jax.peft.method import masked_mean
+from lorasp_jax.routing import Routed, select
+
+
+def release_route(
+    router: dict[str, jax.Array],
+    columns: list[jax.Array],
+    counts: jax.Array,
+    *,
+    energy_target: float,
+    scale: float,
+) -> Routed:
+    """Everything between the two matrix products with the bank.
+
+    Args:
+      router: w2 [H, R], or empty.
+      columns: V x [...tokens, n], where n < R once directions were pruned, and W1 x.
+      counts: bool [...tokens], False for padding.
+      energy_target: η.
+      scale: α/R.
+    """
+    projected, hidden = columns
+    scores = release_scores(router, hidden)
+    mask = release_gate(scores, energy_target)
+    mask &= jnp.arange(mask.shape[-1]) < projected.shape[-1]
+    usage = (mask & counts[..., None]).reshape(-1, mask.shape[-1]).astype(jnp.float32).sum(0)
+    statistics = [mask.astype(jnp.float32).sum(-1), kept_energy(jnp.abs(scores), mask)]
+    z = select(projected, scale * scores, mask)
+    return z, release_losses(scores, mask, counts), usage, statistics
 
 
 def release_scores(router: dict[str, jax.Array], hidden: jax.Array) -> jax.Array:

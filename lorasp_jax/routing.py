@@ -15,6 +15,9 @@ from lorasp_jax.kernels.energy_gate import energy_share
 ScoreFunction = Literal["softplus", "relu", "softmax"]
 Granularity = Literal["token", "sample", "layer"]
 
+Routed = tuple[jax.Array, dict[str, jax.Array], jax.Array, list[jax.Array]]
+"""z, losses, how often each direction was kept, and active rank and kept energy by token."""
+
 SOFTPLUS_INVERSE_OF_ONE = math.log(math.e - 1)
 UNIT_LOGIT: dict[str, float] = {"softplus": SOFTPLUS_INVERSE_OF_ONE, "relu": 1.0, "softmax": 0.0}
 """The logit, the same for all directions, at which each score function gives 1."""
@@ -63,6 +66,7 @@ def pooled_scores(scores: jax.Array, valid: jax.Array, granularity: Granularity)
     """
     if granularity == "token" or scores.ndim == 1:
         return scores
+    scores = jax.lax.stop_gradient(scores)  # of no use to a mask, and infinite at zero
     axes = (scores.ndim - 2,) if granularity == "sample" else tuple(range(scores.ndim - 1))
     valid = valid[..., None]
     total = jnp.where(valid, jnp.square(scores), 0).sum(axes, keepdims=True)

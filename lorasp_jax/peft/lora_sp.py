@@ -45,8 +45,6 @@ _CHOICES: dict[str, Any] = {
     "granularity": routing.Granularity,
     "energy_curve": energy_schedule.Curve,
 }
-Routed = tuple[jax.Array, dict[str, jax.Array], jax.Array, list[jax.Array]]
-"""z, losses, how often each direction was kept, and active rank and kept energy by token."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,8 +78,8 @@ class LoRASP(Method):
     rule: Rule = "paper"
     """"release": signed scores, gate and losses of `lorasp_jax.release`."""
     granularity: routing.Granularity = "token"
-    """What shares one mask, that of its `pooled_scores`: each "token" has its own, the tokens of a
-    "sample" (the last token axis), or all tokens of a "layer" (the whole batch)."""
+    """What shares a mask, that of its `pooled_scores`: nothing ("token"), the tokens of a "sample"
+    (the last token axis), or all of a "layer" (the whole batch)."""
     energy_start: float | None = None
     """η at the first step, None: always `energy_target`; see `lorasp_jax.energy_schedule`."""
     energy_curve: energy_schedule.Curve = "linear"
@@ -91,6 +89,9 @@ class LoRASP(Method):
     normalized_bank: bool = False
     """Keep the bank's directions orthonormal, so that the scores' energy is that of ΔW and eq. (4),
     ‖ΔW - ΔW_k‖ = √(1 - E_k) ‖ΔW‖, holds (`lorasp_jax.bank`). Needs a side of at least R."""
+    pruned: int = 0
+    """Directions that pruning dropped. The router still scores them, behind the R others, as their
+    energy counts in E_k."""
     gate: Implementation | None = dataclasses.field(default=None, metadata={"saved": False})
     """Implementation of the energy gate, None: the backend's default. Not saved with adapters."""
 
@@ -99,9 +100,10 @@ class LoRASP(Method):
         exact_ratio(self.energy_target)
         if self.energy_start is not None:
             exact_ratio(self.energy_start)
-        if self.rank < 1 or self.hidden_width < 1:
+        if self.rank < 1 or self.hidden_width < 1 or self.pruned < 0:
             raise ValueError(
-                f"rank and hidden_width must be at least 1, got {self.rank}, {self.hidden_width}."
+                "rank and hidden_width must be at least 1 and pruned not negative, got "
+                f"{self.rank}, {self.hidden_width}, {self.pruned}."
             )
         if not 0 < self.energy_share <= 1:
             raise ValueError(f"energy_share must lie in (0, 1], got {self.energy_share}.")
@@ -109,9 +111,9 @@ class LoRASP(Method):
             if (value := getattr(self, name)) not in get_args(kind):
                 valid = ", ".join(get_args(kind))
                 raise ValueError(f"{name} must be one of {valid}, got {value!r}.")
-        if self.router == "softmax" and self.rank % self.hidden_width:
+        if self.router == "softmax" and self.scored % self.hidden_width:
             raise ValueError(
-                f"a softmax router needs a rank divisible by its width, got {self.rank} and "
+                f"a softmax router needs a rank divisible by its width, got {self.scored} and "
                 f"{self.hidden_width}."
             )
         self._check_combination()
@@ -150,6 +152,11 @@ class LoRASP(Method):
         return cls(rank, energy_target, hidden_width=width, router=router, rule="release")
 
     @property
+    def scored(self) -> int:
+        """How many directions the router scores."""
+        return self.rank + self.pruned
+
+    @property
     def scale(self) -> float:
         """α/R."""
         return 2.0 if self.alpha is None else self.alpha / self.rank
@@ -157,7 +164,7 @@ class LoRASP(Method):
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
         """V and the router random, U (or its gain) zero: the delta starts at exactly zero."""
         input_key, score_key = jax.random.split(key)
-        width = self.rank if self.router == "linear" else self.hidden_width
+        width = self.scored if self.router == "linear" else self.hidden_width
         # V and W1 both read x and share one distribution: one draw, which compiles once.
         inputs = kaiming_uniform(input_key, (d_in, self.rank + width))
         v, w1 = jnp.split(inputs, [self.rank], axis=1)
@@ -169,7 +176,7 @@ class LoRASP(Method):
 
     def _init_scores(self, key: jax.Array) -> dict[str, jax.Array]:
         """The router's second layer, and the biases of both."""
-        shape = (self.hidden_width, self.rank)
+        shape = (self.hidden_width, self.scored)
         if self.router == "linear":
             return {}
         if self.router == "softmax":
@@ -177,7 +184,7 @@ class LoRASP(Method):
         return {
             "b1": jnp.zeros(self.hidden_width),
             "w2": SCORE_INIT_STD * jax.random.normal(key, shape),
-            "b2": jnp.full(self.rank, routing.UNIT_LOGIT[self.score_function]),
+            "b2": jnp.full(self.scored, routing.UNIT_LOGIT[self.score_function], jnp.float32),
         }
 
     def project(
@@ -194,9 +201,9 @@ class LoRASP(Method):
         aux = Aux(active_rank, energy, losses, token_mask, usage)
         return z.reshape(*tokens, self.rank), bank["u"].astype(x.dtype), aux
 
-    def _route(self, params: Params, rows: jax.Array, counts: jax.Array) -> Routed:
+    def _route(self, params: Params, rows: jax.Array, counts: jax.Array) -> routing.Routed:
         """`route` of x [V W1], [...tokens, R + H], where possible in one kernel."""
-        gate = self.gate or default_implementation(self.rank)
+        gate = self.gate or default_implementation(self.scored)
         router, widths = params["router"], (self.rank, self.hidden_width)
         function = functools.partial(route, energy_target=self.energy_target, scale=self.scale)
         kept = self._shared_mask(params, rows, counts)
@@ -214,7 +221,7 @@ class LoRASP(Method):
 
     def _shared_mask(self, params: Params, rows: jax.Array, counts: jax.Array) -> jax.Array | None:
         """The mask, bool [T, R], where it takes more than each row's scores; else None."""
-        if (self.granularity, self.energy_start) == ("token", None):
+        if (self.granularity, self.energy_start, self.pruned) == ("token", None, 0):
             return None
         scores, _ = router_scores(params["router"], rows[..., self.rank :], self.score_function)
         pooled = routing.pooled_scores(scores, counts, self.granularity)
@@ -222,23 +229,16 @@ class LoRASP(Method):
             mask, _, _ = energy_gate(pooled, self.energy_target, implementation=self.gate)
         else:
             ends = (self.energy_start, self.energy_target)
-            progress = params[energy_schedule.PROGRESS]
-            target = energy_schedule.scheduled_target(
-                progress, *ends, self.energy_share, self.energy_curve
-            )
-            mask = energy_schedule.gate_at(pooled, target)
-        return jnp.broadcast_to(mask, scores.shape).reshape(-1, self.rank)
+            moved = (params[energy_schedule.PROGRESS], *ends, self.energy_share, self.energy_curve)
+            mask = energy_schedule.gate_at(pooled, energy_schedule.scheduled_target(*moved))
+        mask &= jnp.arange(self.scored) < self.rank
+        return jnp.broadcast_to(mask, scores.shape).reshape(-1, self.scored)
 
-    def _route_released(self, params: Params, rows: jax.Array, counts: jax.Array) -> Routed:
+    def _route_released(self, params: Params, rows: jax.Array, counts: jax.Array) -> routing.Routed:
         """What `_route` gives, by the rule of the public code."""
-        projected, hidden = jnp.split(rows, [self.rank], axis=-1)
-        scores = release.release_scores(params["router"], hidden)
-        mask = release.release_gate(scores, self.energy_target)
-        z = select(projected, self.scale * scores, mask)
-        usage = jnp.where(counts[..., None], mask, False).reshape(-1, self.rank).sum(0)
-        statistics = [mask.sum(-1).astype(jnp.float32), kept_energy(jnp.abs(scores), mask)]
-        losses = release.release_losses(scores, mask, counts)
-        return z, losses, usage.astype(jnp.float32), statistics
+        columns = jnp.split(rows, [self.rank], axis=-1)
+        settings = {"energy_target": self.energy_target, "scale": self.scale}
+        return release.release_route(params["router"], columns, counts, **settings)
 
     def transform(
         self, optimizer: optax.GradientTransformation, total_steps: int

@@ -35,6 +35,7 @@ class Aux:
       losses: fp32 scalars by name, already averaged over the valid tokens.
       token_mask: bool [...tokens], True where a token counts; None means all do.
       usage: f32 [R], for how many valid tokens each direction was in use; None without a gate.
+      statistics: sums over valid tokens by layer path, where `lorasp_jax.calibration` observes.
     """
 
     active_rank: jax.Array | None = None
@@ -42,6 +43,7 @@ class Aux:
     losses: Mapping[str, jax.Array] = dataclasses.field(default_factory=dict)
     token_mask: jax.Array | None = None
     usage: jax.Array | None = None
+    statistics: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def mean_active_rank(self) -> jax.Array | None:
         """Active rank averaged over valid tokens (and over layers, if stacked), an f32 scalar."""
@@ -77,6 +79,11 @@ class Method:
     def name(self) -> str:
         """The method's file name, as `create` takes it."""
         return type(self).__module__.rpartition(".")[2]
+
+    @property
+    def as_saved(self) -> "Method":
+        """The method as it is saved with its parameters, under which they can be loaded."""
+        return self
 
     def init(
         self, key: jax.Array, kernel: Kernel, *, statistics: Any = None
