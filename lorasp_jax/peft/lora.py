@@ -56,6 +56,11 @@ class LoRA(Method):
         return self.initialization in _SPLITS
 
     @property
+    def needs_statistics(self) -> bool:
+        """True if A starts from the layer's inputs."""
+        return self.initialization == "eva"
+
+    @property
     def scale(self) -> float:
         """α/R, or α/√R when rank-stabilized."""
         alpha = 2 * self.rank if self.alpha is None else self.alpha
@@ -72,7 +77,7 @@ class LoRA(Method):
           ValueError: the kernel is not a matrix; or, where it is split, it is a shape without
             values or has a side below the rank; or statistics are missing or of another layer.
         """
-        if self.initialization == "eva":
+        if self.needs_statistics:
             check_matrix(kernel)
             a = principal_inputs(statistics, kernel.shape[0], self.rank)
             return {"lora_a": a, "lora_b": jnp.zeros((self.rank, kernel.shape[1]))}, kernel
@@ -107,8 +112,9 @@ class LoRA(Method):
     @property
     def as_saved(self) -> "LoRA":
         """The same without "eva", whose statistics are needed for the start alone."""
-        eva = self.initialization == "eva"
-        return dataclasses.replace(self, initialization="kaiming") if eva else self
+        if self.needs_statistics:
+            return dataclasses.replace(self, initialization="kaiming")
+        return self
 
     def merge(self, params: Params, kernel: jax.Array) -> jax.Array:
         """W + scale A B, summed in fp32."""

@@ -81,6 +81,11 @@ class Method:
         return type(self).__module__.rpartition(".")[2]
 
     @property
+    def needs_statistics(self) -> bool:
+        """True if `init` asks for the statistics of the layer's inputs."""
+        return False
+
+    @property
     def as_saved(self) -> "Method":
         """The method as it is saved with its parameters, under which they can be loaded."""
         return self
