@@ -3,8 +3,6 @@
 import jax
 import jax.numpy as jnp
 
-from lorasp_jax.peft.method import kaiming_uniform
-
 Bank = dict[str, jax.Array]
 
 
@@ -22,7 +20,7 @@ def init_bank(key: jax.Array, v: jax.Array, d_out: int, *, normalized: bool) -> 
             f"a normalised bank of {rank} directions needs a kernel with a side of at least that, "
             f"got {d_in} x {d_out}."
         )
-    return {"u": kaiming_uniform(key, (d_out, rank)).T, "v": v, "gain": jnp.zeros(())}
+    return {"u": jax.random.normal(key, (rank, d_out)), "v": v, "gain": jnp.zeros(())}
 
 
 def normalized_bank(bank: Bank) -> Bank:

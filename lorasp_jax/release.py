@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 
 from lorasp_jax.kernels.energy_gate import kept_energy
-from lorasp_jax.peft.method import masked_mean
 from lorasp_jax.routing import Routed, select
 
 
@@ -64,25 +63,28 @@ def release_gate(scores: jax.Array, energy_target: float) -> jax.Array:
     return jnp.take_along_axis(within, jnp.argsort(order, axis=-1), axis=-1)
 
 
-def release_losses(
-    scores: jax.Array, mask: jax.Array, valid: jax.Array | None
-) -> dict[str, jax.Array]:
+def release_losses(scores: jax.Array, mask: jax.Array, valid: jax.Array) -> dict[str, jax.Array]:
     """Spectral, balance and z of the public code, f32 scalars over the valid tokens.
 
     Args:
       scores: f32 [...tokens, R].
       mask: bool [...tokens, R], from `release_gate`.
-      valid: bool [...tokens], or None for all.
+      valid: bool [...tokens], False for padding.
     """
+
+    def mean(values: jax.Array) -> jax.Array:
+        total = jnp.where(valid, values, 0).sum()
+        return total / jnp.maximum(valid.sum(), 1)
+
+    by_direction = jax.vmap(mean, in_axes=-1)
     energy = jnp.square(scores).sum(-1)
     kept = jnp.square(jnp.where(mask, scores, 0)).sum(-1)
-    share = masked_mean(kept, valid) / (masked_mean(energy, valid) + 1e-9)
+    share = mean(kept) / (mean(energy) + 1e-9)
     gates = jax.nn.softmax(jnp.where(mask, scores, 0))
     first = jax.nn.one_hot(gates.argmax(-1), scores.shape[-1])
-    mean = jax.vmap(masked_mean, in_axes=(-1, None))
     size = jnp.clip(jax.nn.logsumexp(scores, axis=-1), -1, 10)
     return {
         "spectral": 1 - jnp.clip(share, 0, 1),
-        "balance": scores.shape[-1] * jnp.sum(mean(first, valid) * mean(gates, valid)),
-        "z": masked_mean(jnp.log1p(size), valid),
+        "balance": scores.shape[-1] * jnp.sum(by_direction(first) * by_direction(gates)),
+        "z": mean(jnp.log1p(size)),
     }
