@@ -122,22 +122,10 @@ def observe(
     Raises:
       ValueError: no batches, or a layer that was not called or whose aux `forward` did not return.
     """
-    model = _observed(model, reports, others)
-    graphdef, state = nnx.split(model)
-
-    @jax.jit
-    def step(state: Any, batch: Any) -> dict[str, Sums]:
-        model = nnx.merge(graphdef, state)
-        found = [aux for aux in _nodes(forward(model, batch)) if isinstance(aux, Aux)]
-        kept = nnx.to_flat_state(nnx.pop(model, AdapterAux))
-        total: dict[str, Sums] = {}
-        for aux in [*found, *(variable.get_value() for _, variable in kept)]:
-            _add(total, aux.statistics)
-        return total
-
+    step = _stepping(_observed(model, reports, others), forward)
     total: dict[str, Sums] = {}
     for batch in batches:
-        _add(total, step(state, batch))
+        _add(total, step(batch))
     if missing := sorted(reports.keys() - total.keys()):
         raise ValueError(
             f"nothing was seen of {adaptation.near_misses(missing[0], missing)}: the batches must "
@@ -151,6 +139,23 @@ def outputs(model: nnx.Module, forward: Forward = call) -> Callable[[Any], list[
     graphdef, state = nnx.split(model)
     run = jax.jit(lambda state, batch: _arrays(forward(nnx.merge(graphdef, state), batch)))
     return functools.partial(run, state)
+
+
+def _stepping(model: nnx.Module, forward: Forward) -> Callable[[Any], dict[str, Sums]]:
+    """The jitted function from a batch to the reports of a model that reports."""
+    graphdef, state = nnx.split(model)
+
+    @jax.jit
+    def step(state: Any, batch: Any) -> dict[str, Sums]:
+        model = nnx.merge(graphdef, state)
+        found = [aux for aux in _nodes(forward(model, batch)) if isinstance(aux, Aux)]
+        kept = nnx.to_flat_state(nnx.pop(model, AdapterAux))
+        total: dict[str, Sums] = {}
+        for aux in [*found, *(variable.get_value() for _, variable in kept)]:
+            _add(total, aux.statistics)
+        return total
+
+    return functools.partial(step, state)
 
 
 def _observed(
