@@ -11,6 +11,7 @@ Axis letters used in every docstring and einsum of this package:
 
 from lorasp_jax import dense, hugging_face, named, peft
 from lorasp_jax.adaptation import adapt, merge
+from lorasp_jax.compaction import distill, prune
 from lorasp_jax.dense import collect_aux
 from lorasp_jax.fusion import fuse, unmerge
 from lorasp_jax.linen import LinenAdapter
@@ -25,12 +26,14 @@ __all__ = [
     "collect_aux",
     "combine",
     "dense",
+    "distill",
     "extract",
     "fuse",
     "hugging_face",
     "merge",
     "named",
     "peft",
+    "prune",
     "quantize",
     "summary",
     "swap",

@@ -15,24 +15,22 @@ A rule ("bias$", FullFineTuning()) frees biases of layers that another rule give
 their kernels have other paths.
 """
 
-import difflib
 import math
-import re
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax import layers
+from lorasp_jax import layers, paths
 from lorasp_jax.dense import AdaptedLayer, AdapterAux, AdapterParam
 from lorasp_jax.kernels.quantized import QuantizedKernel
 from lorasp_jax.peft import FullFineTuning, Method
 from lorasp_jax.peft.method import Params
 
-Rules = Sequence[tuple[str, Method | None]]
 Model = TypeVar("Model", bound=nnx.Module)
 
 
@@ -43,17 +41,13 @@ class Counts(NamedTuple):
     total: int
 
 
-class Place(NamedTuple):
-    """Where a layer or parameter hangs in a model: `getattr(parent, name)` is `child`."""
-
-    path: str
-    parent: Any
-    name: str
-    child: Any
-
-
 def adapt(
-    model: Model, rules: Rules, *, rngs: nnx.Rngs, einsums: layers.Einsums | None = None
+    model: Model,
+    rules: paths.Rules,
+    *,
+    rngs: nnx.Rngs,
+    einsums: layers.Einsums = MappingProxyType({}),
+    statistics: Mapping[str, jax.Array] = MappingProxyType({}),
 ) -> Model:
     """Attaches adapters to layers, or frees base weights for full fine-tuning, by path rules.
 
@@ -71,6 +65,7 @@ def adapt(
       einsums: further layer classes that do nothing but an einsum of their input and a parameter,
         each with a function of the layer that gives the parameter's name and the equation, as in
         {gemma.Einsum: lambda layer: ("w", layer.einsum_str)}.
+      statistics: by path, [..., I, I] of `calibration.input_moments`, for what starts from data.
 
     Returns:
       The adapted model.
@@ -79,12 +74,12 @@ def adapt(
       ValueError: a rule that is no regular expression or governs nothing that it applies to (lists
         near misses), or a layer that an adapter cannot take over.
     """
-    check_patterns(pattern for pattern, _ in rules)
+    paths.check_patterns(pattern for pattern, _ in rules)
     holder, key = _copy(model), rngs.params()
-    used = _attach_all(holder, rules, key, einsums or {}) | _free_all(holder, rules)
+    used = _attach_all(holder, rules, key, einsums, statistics) | _free_all(holder, rules)
     for i, (pattern, _) in enumerate(rules):
         if i not in used:
-            raise ValueError(_no_match(pattern, holder, einsums or {}))
+            raise ValueError(_no_match(pattern, holder, einsums))
     return holder[0]
 
 
@@ -105,7 +100,7 @@ def count(model: nnx.Module) -> Counts:
 def methods(model: nnx.Module) -> dict[str, Method]:
     """Method by path: of each layer with an adapter, and full fine-tuning of each parameter."""
     found = {}
-    for path, parent, name, _ in places(nnx.List([model]), AdapterParam):
+    for path, parent, name, _ in paths.places(nnx.List([model]), AdapterParam):
         if isinstance(parent, AdaptedLayer) and name == "adapter":
             found[path.rpartition("/")[0]] = parent.method
         else:
@@ -123,7 +118,7 @@ def merge(model: Model) -> Model:
       ValueError: a method whose delta depends on the input.
     """
     holder = _copy(model)
-    for place in places(holder, AdaptedLayer):
+    for place in paths.places(holder, AdaptedLayer):
         layer = place.child
         if layer.adapter is not None:
             try:
@@ -133,14 +128,14 @@ def merge(model: Model) -> Model:
                 raise ValueError(f"cannot merge {place.path}: {error}") from error
             layer.set_kernel_matrices(kernel)
         layer.without_adapter()
-    _retype(places(holder, AdapterParam), nnx.Param)
+    _retype(paths.places(holder, AdapterParam), nnx.Param)
     return holder[0]
 
 
 def penalties(model: nnx.Module) -> dict[str, jax.Array]:
     """Each loss on parameters alone, averaged over the adapted matrices whose method has it."""
     found: dict[str, list[jax.Array]] = {}
-    for _, _, _, layer in places(nnx.List([model]), AdaptedLayer):
+    for _, _, _, layer in paths.places(nnx.List([model]), AdaptedLayer):
         if layer.adapter is not None:
             penalty = over_stack(layer.method.penalty, layer.kernel_matrices())
             for name, values in penalty(layer.adapter.get_value()).items():
@@ -148,13 +143,16 @@ def penalties(model: nnx.Module) -> dict[str, jax.Array]:
     return {name: jnp.concatenate(values).mean() for name, values in found.items()}
 
 
-def attach(layer: AdaptedLayer, method: Method, key: jax.Array) -> None:
+def attach(
+    layer: AdaptedLayer, method: Method, key: jax.Array, statistics: jax.Array | None = None
+) -> None:
     """Gives the layer a fresh adapter and freezes its own weights.
 
     Args:
       layer: changed in place. Leading axes of its kernel are layers of a scanned stack.
       method: an additive method.
       key: typed random key.
+      statistics: [..., I, I] of the layer's inputs, where the method starts from them.
 
     Raises:
       ValueError: a method that the layer cannot carry, a layer whose adapter holds a part of its
@@ -164,8 +162,11 @@ def attach(layer: AdaptedLayer, method: Method, key: jax.Array) -> None:
         raise ValueError("an adapter that holds a part of its kernel cannot be replaced: merge it.")
     if method.splits_kernel and isinstance(layer.kernel_matrices(), QuantizedKernel):
         raise ValueError("a quantised kernel cannot be split: adapt first, then quantise the rest.")
-    _retype([p for p in places(nnx.List([layer]), AdapterParam) if p.name != "adapter"], nnx.Param)
-    params, kernel = init_stack(key, layer.adapter_init(method), layer.kernel_matrices())
+    _retype(
+        [p for p in paths.places(nnx.List([layer]), AdapterParam) if p.name != "adapter"], nnx.Param
+    )
+    init = layer.adapter_init(method)
+    params, kernel = init_stack(key, init, layer.kernel_matrices(), statistics)
     layer.method = method
     if method.splits_kernel:
         layer.set_kernel_matrices(kernel)
@@ -182,55 +183,23 @@ def _copy(model: nnx.Module) -> nnx.List:
     return nnx.List([model])
 
 
-def places(holder: nnx.List, kind: type | tuple[type, ...]) -> list[Place]:
-    """All children of a type, with paths that start below the holder."""
-
-    def walk() -> Iterator[Place]:
-        for path, module in nnx.iter_modules(holder):
-            for name, child in vars(module).items():
-                if isinstance(child, kind):
-                    yield Place("/".join(map(str, (*path, name)[1:])), module, name, child)
-
-    return list(walk())
-
-
-def layer_places(holder: nnx.List, einsums: layers.Einsums | None = None) -> list[Place]:
-    """All layers that have an adapter or could."""
-    return [
-        place
-        for place in places(holder, nnx.Module)
-        if isinstance(place.child, AdaptedLayer) or layers.kind(place.child, einsums or {})
-    ]
-
-
-def check_patterns(patterns: Iterable[str]) -> None:
-    """Raises a ValueError for a pattern that is no regular expression."""
-    for pattern in patterns:
-        try:
-            re.compile(pattern)
-        except re.error as error:
-            raise ValueError(f"rule {pattern!r} is no regular expression: {error}.") from error
-
-
-def governing(rules: Rules, *paths: str) -> int | None:
-    """Index of the first rule that matches one of the paths."""
-    hits = (i for i, (pattern, _) in enumerate(rules) if any(re.search(pattern, p) for p in paths))
-    return next(hits, None)
-
-
 def _attach_all(
-    holder: nnx.List, rules: Rules, key: jax.Array, einsums: layers.Einsums
+    holder: nnx.List,
+    rules: paths.Rules,
+    key: jax.Array,
+    einsums: layers.Einsums,
+    statistics: Mapping[str, jax.Array],
 ) -> set[int]:
     """Attaches adapters in place; returns the rules that were used."""
     used = set()
-    for path, parent, name, layer in layer_places(holder, einsums):
-        i = governing(rules, path)
+    for path, parent, name, layer in paths.layer_places(holder, einsums):
+        i = paths.governing(rules, path)
         method = None if i is None else rules[i][1]
         if method is not None and not method.trains_base:
             own_key = jax.random.fold_in(key, zlib.crc32(path.encode()))
             try:
                 layer = layers.adapted(layer, einsums)
-                attach(layer, method, own_key)
+                attach(layer, method, own_key, statistics.get(path))
             except ValueError as error:
                 raise ValueError(f"cannot adapt {path or 'the model'}: {error}") from error
             setattr(parent, name, layer)
@@ -238,11 +207,11 @@ def _attach_all(
     return used
 
 
-def _free_all(holder: nnx.List, rules: Rules) -> set[int]:
+def _free_all(holder: nnx.List, rules: paths.Rules) -> set[int]:
     """Makes base parameters trainable in place; returns the rules that were used."""
     used, freed = set(), []
-    for place in places(holder, nnx.Param):
-        i = governing(rules, place.path.rpartition("/")[0], place.path)
+    for place in paths.places(holder, nnx.Param):
+        i = paths.governing(rules, place.path.rpartition("/")[0], place.path)
         method = None if i is None else rules[i][1]
         if i is None or (method is not None and not method.trains_base):
             continue
@@ -261,7 +230,7 @@ def _free_all(holder: nnx.List, rules: Rules) -> set[int]:
     return used
 
 
-def _retype(places: Sequence[Place], kind: type[nnx.Param]) -> None:
+def _retype(places: Sequence[paths.Place], kind: type[nnx.Param]) -> None:
     """Replaces variables by ones of another type, shared ones by one; those that train are fp32."""
     renewed = {}
     for _, parent, name, variable in places:
@@ -273,16 +242,24 @@ def _retype(places: Sequence[Place], kind: type[nnx.Param]) -> None:
         setattr(parent, name, renewed[id(variable)])
 
 
-def init_stack(key: jax.Array, init: Callable[..., Any], kernel: jax.Array) -> tuple[Params, Any]:
+def init_stack(
+    key: jax.Array,
+    init: Callable[..., Any],
+    kernel: jax.Array,
+    statistics: jax.Array | None = None,
+) -> tuple[Params, Any]:
     """A method's `init` for a kernel [..., I, O]: one draw per leading index.
 
     Not jitted as a whole: its random draws compile once for each I instead of for each shape.
     """
     *leading, d_in, d_out = kernel.shape
     if not leading:
-        return init(key, kernel)
+        return init(key, kernel, statistics=statistics)
+    if statistics is not None:
+        statistics = statistics.reshape(-1, d_in, d_in)
     keys = jax.random.split(key, math.prod(leading))
-    found = jax.vmap(init)(keys, kernel.reshape(-1, d_in, d_out))
+    each = jax.vmap(lambda key, kernel, own: init(key, kernel, statistics=own))
+    found = each(keys, kernel.reshape(-1, d_in, d_out), statistics)
     return jax.tree.map(lambda leaf: leaf.reshape(*leading, *leaf.shape[1:]), found)
 
 
@@ -293,14 +270,9 @@ def over_stack(function: Callable[..., Any], kernel: jax.Array) -> Callable[...,
     return function
 
 
-def near_misses(wanted: str, known: Sequence[str]) -> str:
-    """A few of the known names, those that are most like the wanted one, or the first."""
-    return ", ".join(difflib.get_close_matches(wanted, known, n=5, cutoff=0.3) or known[:5])
-
-
 def _no_match(pattern: str, holder: nnx.List, einsums: layers.Einsums) -> str:
-    paths = [place.path for place in layer_places(holder, einsums)]
-    close = near_misses(pattern, paths) or "none"
+    known = [place.path for place in paths.layer_places(holder, einsums)]
+    close = paths.near_misses(pattern, known) or "none"
     return f"rule {pattern!r} applies to nothing; layers here: {close}."
 
 

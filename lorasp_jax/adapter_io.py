@@ -135,6 +135,7 @@ def _named(adapters: nnx.State) -> dict[str, jax.Array]:
 
 def _settings(method: Method) -> Settings:
     """A method as JSON: its name and the fields that belong to a saved adapter."""
+    method = method.as_saved
     saved = [f.name for f in dataclasses.fields(method) if f.metadata.get("saved", True)]  # pyright: ignore[reportArgumentType]
     return {"method": method.name, **{name: getattr(method, name) for name in saved}}
 

@@ -118,6 +118,7 @@ class AdapterSet(Method):
         """
         y, aux = super().apply(params, x, kernel, token_mask=token_mask)
         rank, weights = aux.active_rank, self._weights(params["choice"], x)
+        assert rank is not None
         for name, method in self.others.items():
             if not method.additive:
                 own = params["others"][name]

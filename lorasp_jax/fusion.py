@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax import adaptation, named
+from lorasp_jax import adaptation, named, paths
 from lorasp_jax.adaptation import Model
 from lorasp_jax.dense import AdapterParam, Dense
 from lorasp_jax.layers import as_dense
@@ -48,7 +48,7 @@ def fuse(model: nnx.Module, weights: Mapping[str, float], *, rank: int | None = 
     for name in weights:
         named.index_of(named.names(model), name)
     result, errors = named.bare(model), {}
-    layers = {place.path: place.child for place in adaptation.places(nnx.List([result]), Dense)}
+    layers = {place.path: place.child for place in paths.places(nnx.List([result]), Dense)}
     for path, _, _, layer in named.sets(model):
         found = []
         for name, weight in weights.items():
@@ -81,7 +81,7 @@ def unmerge(merged: Model, adapted: nnx.Module) -> Model:
     if has := adaptation.methods(merged):
         raise ValueError(f"{min(has)} of the merged model has an adapter.")
     holder = nnx.List([nnx.merge(*adaptation.split(merged))])
-    for place in adaptation.places(holder, (Dense, nnx.Linear)):
+    for place in paths.places(holder, (Dense, nnx.Linear)):
         if place.path not in adapters:
             continue
         try:

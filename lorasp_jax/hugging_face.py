@@ -21,7 +21,7 @@ import numpy as np
 import safetensors.numpy
 from flax import nnx
 
-from lorasp_jax import adaptation
+from lorasp_jax import adaptation, paths
 from lorasp_jax.adapter_io import write_whole
 from lorasp_jax.dense import AdaptedLayer, Dense
 from lorasp_jax.peft import AdaLoRA, DoRA, LoRA
@@ -77,7 +77,7 @@ def load_peft(
     config, modules = _read(folder)
     kind = DoRA if config.get("use_dora") else LoRA
     left, known, rules, values = dict(modules), [], [], {}
-    for place in adaptation.places(nnx.List([model]), (Dense, nnx.Linear)):
+    for place in paths.places(nnx.List([model]), (Dense, nnx.Linear)):
         *leading, d_in, d_out = place.child.kernel.get_value().shape
         wanted = [names(place.path, index) for index in np.ndindex(*leading)]
         known += wanted
@@ -93,7 +93,7 @@ def load_peft(
         rules.append((f"^{re.escape(place.path)}$", kind(rank=rank, alpha=scale * rank)))
     _check_used(folder, modules, left, known)
     adapted = adaptation.adapt(model, rules, rngs=nnx.Rngs(0))
-    for place in adaptation.places(nnx.List([adapted]), Dense):
+    for place in paths.places(nnx.List([adapted]), Dense):
         if place.path in values:
             place.child.adapter.set_value(jax.tree.map(jnp.asarray, values[place.path]))
     return adapted
@@ -118,7 +118,7 @@ def save_peft(
     modules: dict[str, tuple[float, Adapter]] = {}
     kinds = set()
     known = {path for path, method in adaptation.methods(model).items() if _is_known(path, method)}
-    for place in adaptation.places(nnx.List([model]), AdaptedLayer):
+    for place in paths.places(nnx.List([model]), AdaptedLayer):
         if place.path in known:
             if not isinstance(place.child, Dense):
                 raise ValueError(f"{place.path} is no dense layer: it cannot be in a PEFT folder.")
@@ -222,7 +222,7 @@ def _check_used(
     if not modules:
         raise ValueError(f"{folder} adapts nothing.")
     if left:
-        close = adaptation.near_misses(min(left), known)
+        close = paths.near_misses(min(left), known)
         raise ValueError(f"{folder} adapts {min(left)!r}, which the model lacks; it has {close}.")
 
 

@@ -173,10 +173,10 @@ def lora_init(layer: Any, method: Method) -> Callable[[jax.Array, jax.Array], An
     Raises:
       ValueError: another method, or a convolution in groups or with a mask.
     """
-    if type(method) is not LoRA or method.splits_kernel:
+    if type(method) is not LoRA or method.splits_kernel or method.needs_statistics:
         raise ValueError(
-            f"{type(layer).__name__} takes LoRA that leaves the kernel whole, not {method}: put a "
-            "rule with None, or with such a LoRA, in front."
+            f"{type(layer).__name__} takes LoRA that starts without the kernel or data, not "
+            f"{method}: put a rule with None, or with such a LoRA, in front."
         )
     if not isinstance(layer, nnx.Conv | linen.Conv):
         return method.init_table
@@ -198,7 +198,7 @@ def adapted(layer: nnx.Module, einsums: Einsums) -> AdaptedLayer:
     if isinstance(layer, AdaptedLayer):
         return layer
     known = kind(layer, einsums)
-    if known is nnx.Linear:
+    if isinstance(layer, nnx.Linear) and known is nnx.Linear:
         return as_dense(layer)
     if known not in (nnx.Embed, nnx.Conv):
         check_plain(layer)

@@ -21,9 +21,10 @@ import jax.numpy as jnp
 from flax.traverse_util import flatten_dict, unflatten_dict
 
 from lorasp_jax import layers
-from lorasp_jax.adaptation import Rules, governing, init_stack, near_misses, over_stack
+from lorasp_jax.adaptation import init_stack, over_stack
 from lorasp_jax.dense import KEPT
 from lorasp_jax.linen_layers import Einsums, kind, layer_map, with_lora
+from lorasp_jax.paths import Rules, governing, near_misses
 from lorasp_jax.peft import Method
 
 ADAPTER = "lorasp_adapter"  # name of an adapter among its layer's parameters

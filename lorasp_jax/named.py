@@ -21,11 +21,12 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax import adaptation
-from lorasp_jax.adaptation import Model, Place
+from lorasp_jax import adaptation, paths
+from lorasp_jax.adaptation import Model
 from lorasp_jax.adapter_set import AdapterChoice, AdapterSet, NamedAdapters, empty_bank, put, take
 from lorasp_jax.dense import AdapterParam, Dense
 from lorasp_jax.layers import as_dense
+from lorasp_jax.paths import Place
 from lorasp_jax.peft import LoRA, Method
 from lorasp_jax.peft.method import Params
 
@@ -56,7 +57,7 @@ def combine(models: Mapping[str, Model], *, rank: int | None = None) -> Model:
     for name in known[1:]:
         _check_same(bases[known[0]], known[0], bases[name], name)
     holder = nnx.List([bases[known[0]]])
-    for place in adaptation.places(holder, (Dense, nnx.Linear)):
+    for place in paths.places(holder, (Dense, nnx.Linear)):
         found = {n: adapters[n][place.path] for n in known if place.path in adapters[n]}
         if found:
             setattr(place.parent, place.name, _with_set(place.child, known, found, rank))
@@ -133,7 +134,7 @@ def extract(model: Model, name: str | None) -> Model:
     if name is None:
         return result
     index_of(known, name)
-    layers = {place.path: place.child for place in adaptation.places(nnx.List([result]), Dense)}
+    layers = {place.path: place.child for place in paths.places(nnx.List([result]), Dense)}
     for place in sets(model):
         method, params = member(place.child, name)
         if method is not None:
@@ -183,7 +184,7 @@ def bare(model: Model) -> Model:
       ValueError: an adapter holds a part of its kernel.
     """
     holder = nnx.List([nnx.merge(*adaptation.split(model))])
-    for place in adaptation.places(holder, Dense):
+    for place in paths.places(holder, Dense):
         if place.child.adapter is not None:
             if place.child.method.splits_kernel:
                 raise ValueError(
@@ -204,7 +205,7 @@ def adapters_by_path(name: str, model: nnx.Module) -> Adapters:
         raise ValueError(f"{name} has named adapters already: extract one of them.")
     found = {
         place.path: (place.child.method, place.child.adapter.get_value())
-        for place in adaptation.places(nnx.List([model]), Dense)
+        for place in paths.places(nnx.List([model]), Dense)
         if isinstance(place.child.adapter, AdapterParam)
     }
     if beyond := sorted(adaptation.methods(model).keys() - found.keys()):
@@ -259,7 +260,7 @@ def _is_banked(method: Method | None) -> TypeGuard[LoRA | None]:
 
 def sets(model: nnx.Module) -> list[Place]:
     """The layers that hold named adapters."""
-    layers = adaptation.places(nnx.List([model]), Dense)
+    layers = paths.places(nnx.List([model]), Dense)
     return [place for place in layers if isinstance(place.child.adapter, NamedAdapters)]
 
 
@@ -283,6 +284,6 @@ def _row(known: tuple[str, ...], one: One) -> list[float]:
 def index_of(known: tuple[str, ...], name: str) -> int:
     """The place of a name; raises a ValueError that lists near misses for an unknown one."""
     if name not in known:
-        close = adaptation.near_misses(name, known)
+        close = paths.near_misses(name, known)
         raise ValueError(f"there is no adapter {name!r}; the model has {close}.")
     return known.index(name)

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax import adaptation
+from lorasp_jax import adaptation, paths
 from lorasp_jax.dense import AdapterParam, Dense, with_value
 from lorasp_jax.kernels.quantized import Kind, QuantizedKernel, quantized
 from lorasp_jax.layers import as_dense
@@ -53,10 +53,10 @@ def quantize(model: nnx.Module, rules: Sequence[tuple[str, Kind | None]]) -> Qua
       ValueError: a rule that governs no layer (lists near misses), an unknown kind, or a kernel
         that trains, is quantised already or is not finite.
     """
-    adaptation.check_patterns(pattern for pattern, _ in rules)
+    paths.check_patterns(pattern for pattern, _ in rules)
     holder, errors, used = nnx.List([nnx.merge(*adaptation.split(model))]), {}, set()
     shared: Shared = {}
-    layers = adaptation.places(holder, (Dense, nnx.Linear))
+    layers = paths.places(holder, (Dense, nnx.Linear))
     for place in layers:
         matching = [rule for rule in rules if re.search(rule[0], place.path)]
         if not matching:
@@ -70,14 +70,14 @@ def quantize(model: nnx.Module, rules: Sequence[tuple[str, Kind | None]]) -> Qua
             setattr(place.parent, place.name, layer)
     for rule in rules:
         if rule not in used:
-            close = adaptation.near_misses(rule[0], [place.path for place in layers]) or "none"
+            close = paths.near_misses(rule[0], [place.path for place in layers]) or "none"
             raise ValueError(f"rule {rule[0]!r} governs nothing; dense layers here: {close}.")
     return Quantized(holder[0], errors)
 
 
 def is_quantized(model: nnx.Module) -> bool:
     """Whether a kernel of the model is quantised."""
-    parameters = adaptation.places(nnx.List([model]), nnx.Param)
+    parameters = paths.places(nnx.List([model]), nnx.Param)
     return any(isinstance(place.child.get_value(), QuantizedKernel) for place in parameters)
 
 

@@ -5,9 +5,10 @@ from typing import Any
 
 from flax import nnx
 
-from lorasp_jax.adaptation import Counts, count, layer_places, places
+from lorasp_jax.adaptation import Counts, count
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.layers import kernel_of
+from lorasp_jax.paths import layer_places, places
 from lorasp_jax.peft import Aux
 
 Row = tuple[str, ...]

@@ -7,7 +7,7 @@ import pytest
 from flax import nnx
 
 import lorasp_jax
-from lorasp_jax import adaptation, peft
+from lorasp_jax import adaptation, paths, peft
 from lorasp_jax.adapter_io import load_adapters, save_adapters
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.hugging_face import save_peft
@@ -111,7 +111,7 @@ def test_shapes_counts_and_paths(heads):
 
 
 def layers(model):
-    return adaptation.layer_places(nnx.List([model]))
+    return paths.layer_places(nnx.List([model]))
 
 
 def test_save_and_load(heads, vision, x, tmp_path):

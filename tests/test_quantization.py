@@ -8,7 +8,7 @@ import pytest
 from flax import nnx
 
 import lorasp_jax
-from lorasp_jax import adaptation
+from lorasp_jax import adaptation, paths
 from lorasp_jax.adapter_io import load_adapters, save_adapters
 from lorasp_jax.dense import AdapterParam, Dense
 from lorasp_jax.kernels.quantized import KINDS, QuantizedKernel
@@ -22,7 +22,7 @@ ALL = {kind: lorasp_jax.quantize(NET, [("", kind)]).model for kind in KINDS}
 def widened(model):
     """The model with every quantised kernel as an array again."""
     holder = nnx.List([nnx.clone(model)])
-    for place in adaptation.places(holder, Dense):
+    for place in paths.places(holder, Dense):
         kernel = place.child.kernel.get_value()
         if isinstance(kernel, QuantizedKernel):
             place.child.kernel = nnx.Param(kernel.astype(kernel.dtype))

@@ -33,18 +33,20 @@ class LoRA(Method):
     """α; None is 2 R, the scale 2 of LoRA-SP's defaults."""
     rank_stabilized: bool = False
     """Scale by α/√R (rsLoRA) instead of α/R."""
-    initialization: Literal["kaiming", "gaussian", "pissa", "olora"] = "kaiming"
+    initialization: Literal["kaiming", "gaussian", "pissa", "olora", "eva"] = "kaiming"
     """"kaiming": A in U(±1/√I). "gaussian": A in N(0, 1/R²). "pissa": A B is the kernel's best
     approximation of rank R (`principal_part`), "olora": the first R columns of its QR
-    decomposition (`orthogonal_part`); what trains is then taken out of the kernel."""
+    decomposition (`orthogonal_part`); what trains is then taken out of the kernel. "eva": A spans
+    most of what the layer's inputs contain (`principal_inputs`), for which `adapt` needs
+    statistics."""
 
     def __post_init__(self) -> None:
         """Checks the fields."""
         if self.rank < 1:
             raise ValueError(f"rank must be at least 1, got {self.rank}.")
-        if self.initialization not in ("kaiming", "gaussian", *_SPLITS):
+        if self.initialization not in ("kaiming", "gaussian", *_SPLITS, "eva"):
             raise ValueError(
-                "initialization must be 'kaiming', 'gaussian', 'pissa' or 'olora', got "
+                "initialization must be 'kaiming', 'gaussian', 'pissa', 'olora' or 'eva', got "
                 f"{self.initialization!r}."
             )
 
@@ -52,6 +54,11 @@ class LoRA(Method):
     def splits_kernel(self) -> bool:
         """True if A and B start as a part of the kernel."""
         return self.initialization in _SPLITS
+
+    @property
+    def needs_statistics(self) -> bool:
+        """True if A starts from the layer's inputs."""
+        return self.initialization == "eva"
 
     @property
     def scale(self) -> float:
@@ -68,8 +75,12 @@ class LoRA(Method):
 
         Raises:
           ValueError: the kernel is not a matrix; or, where it is split, it is a shape without
-            values or has a side below the rank.
+            values or has a side below the rank; or statistics are missing or of another layer.
         """
+        if self.needs_statistics:
+            check_matrix(kernel)
+            a = principal_inputs(statistics, kernel.shape[0], self.rank)
+            return {"lora_a": a, "lora_b": jnp.zeros((self.rank, kernel.shape[1]))}, kernel
         if not self.splits_kernel:
             return super().init(key, kernel, statistics=statistics)
         check_matrix(kernel)
@@ -90,11 +101,14 @@ class LoRA(Method):
         a = jax.random.normal(key, shape) / self.rank if gaussian else kaiming_uniform(key, shape)
         return {"lora_a": a, "lora_b": jnp.zeros((self.rank, d_out))}
 
-    def init_table(self, key: jax.Array, table: Kernel) -> tuple[Params, Kernel]:
+    def init_table(
+        self, key: jax.Array, table: Kernel, *, statistics: Any = None
+    ) -> tuple[Params, Kernel]:
         """Parameters for an embedding [V, D]: A zero, B in N(0, 1), as in Hugging Face PEFT.
 
         Only the rows of A that were looked up get a gradient, so A is what must start at zero.
         """
+        del statistics
         entries, width = table.shape
         b = jax.random.normal(key, (self.rank, width))
         return {"lora_a": jnp.zeros((entries, self.rank)), "lora_b": b}, table
@@ -113,6 +127,13 @@ class LoRA(Method):
     def up(self, params: Params) -> jax.Array:
         """B."""
         return params["lora_b"]
+
+    @property
+    def as_saved(self) -> "LoRA":
+        """The same without "eva", whose statistics are needed for the start alone."""
+        if self.needs_statistics:
+            return dataclasses.replace(self, initialization="kaiming")
+        return self
 
     def merge(self, params: Params, kernel: jax.Array) -> jax.Array:
         """W + scale A B, summed in fp32."""
@@ -138,3 +159,31 @@ def orthogonal_part(kernel: jax.Array, rank: int, scale: float) -> tuple[jax.Arr
     del scale
     orthonormal, triangular = jnp.linalg.qr(kernel.T)
     return triangular[:rank].T, orthonormal[:, :rank].T
+
+
+def principal_inputs(moment: jax.Array | None, d_in: int, rank: int) -> jax.Array:
+    """A [I, R]: the R leading right singular vectors of the stacked inputs x [T, I].
+
+    EVA (Paischer et al., arXiv 2410.07170, section 3.1), without its redistribution of ranks; as
+    eigenvectors of Σ x xᵀ, which is summed over batches.
+
+    Args:
+      moment: Σ x xᵀ, [I, I], not centred.
+      d_in: I.
+      rank: R, at most I.
+
+    Raises:
+      ValueError: no moment, one of another layer, or a rank above I.
+    """
+    if moment is None:
+        raise ValueError(
+            "initialization 'eva' needs the inputs' statistics: pass those of "
+            "calibration.input_moments to adapt."
+        )
+    if moment.shape != (d_in, d_in) or rank > d_in:
+        raise ValueError(
+            f"initialization 'eva' needs statistics [{d_in}, {d_in}] and a rank up to {d_in}, got "
+            f"{list(moment.shape)} and {rank}."
+        )
+    _, vectors = jnp.linalg.eigh(moment.astype(jnp.float32))
+    return vectors[:, ::-1][:, :rank]

@@ -10,30 +10,40 @@ scores reach the energy target η stay active. One function per equation of the 
     (14) router       L_router: balance and z                         `balance_loss`, `z_loss`
 
 Where the paper is silent (activation, initialisation, scale, form of the router losses) the choices
-are this project's; each is stated where it is made.
+are this project's; each is stated where it is made, the router's in `lorasp_jax.routing`.
 """
 
 import dataclasses
 import functools
-import math
-from typing import Literal, NamedTuple
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
+import optax
 
+from lorasp_jax import energy_schedule, release, routing
+from lorasp_jax.bank import init_bank, normalized_bank
 from lorasp_jax.kernels.energy_gate import (
     Implementation,
     default_implementation,
     energy_gate,
-    energy_share,
     exact_ratio,
-    kept_energy,
 )
 from lorasp_jax.kernels.fused_rows import fused_rows
 from lorasp_jax.peft.method import Aux, Method, Params, kaiming_uniform
+from lorasp_jax.routing import router_scores
 
-SOFTPLUS_INVERSE_OF_ONE = math.log(math.e - 1)
 SCORE_INIT_STD = 0.01
+
+Router = Literal["gelu", "softmax", "linear"]
+Rule = Literal["paper", "release"]
+_CHOICES: dict[str, Any] = {
+    "router": Router,
+    "rule": Rule,
+    "score_function": routing.ScoreFunction,
+    "granularity": routing.Granularity,
+    "energy_curve": energy_schedule.Curve,
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,10 +51,13 @@ class LoRASP(Method):
     """Adapter with an input-dependent active rank.
 
     Parameters: bank.u [R, O], bank.v [I, R]; router.w1 [I, H], w2 [H, R] and, for the "gelu"
-    router, b1 [H], b2 [R]. With H the hidden width: R (I + O) + H (I + R), and H + R biases.
+    router, b1 [H], b2 [R]. With H the hidden width: R (I + O) + H (I + R), and H + R biases. A
+    "linear" router is w1 [I, R] alone. One number more each for a normalised bank (bank.gain) and
+    for a moving η (progress).
 
     Raises:
-      ValueError: a rank or width below 1, η outside (0, 1], or blocks that do not divide the rank.
+      ValueError: a rank or width below 1, η outside (0, 1], blocks that do not divide the rank, or
+        settings that exclude each other.
     """
 
     rank: int = 128
@@ -55,25 +68,66 @@ class LoRASP(Method):
     """α of the scale α/R; None is 2 R."""
     hidden_width: int = 32
     """H, width of the router's hidden layer."""
-    router: Literal["gelu", "softmax"] = "gelu"
-    """"gelu": GELU, biases, softplus scores, s = 1 at init. "softmax": softmax over H, no biases,
-    second layer starting as the 0/1 matrix that spreads H values over R (paper's Table I)."""
+    router: Router = "gelu"
+    """"gelu": GELU, biases, s = 1 at init. "softmax": softmax over H, no biases, second layer
+    starting as the 0/1 matrix that spreads H values over R (paper's Table I). "linear": one layer
+    of signed scores, for the rule of the release."""
+    score_function: routing.ScoreFunction = "softplus"
+    """What makes the scores of a "gelu" router non-negative: softplus, relu, or R times softmax."""
+    rule: Rule = "paper"
+    """"release": signed scores, gate and losses of `lorasp_jax.release`."""
+    granularity: routing.Granularity = "token"
+    """What shares a mask, that of its `pooled_scores`: nothing ("token"), the tokens of a "sample"
+    (the last token axis), or all of a "layer" (the whole batch)."""
+    energy_start: float | None = None
+    """η at the first step, None: always `energy_target`; see `lorasp_jax.energy_schedule`."""
+    energy_curve: energy_schedule.Curve = "linear"
+    """How η goes from start to target."""
+    energy_share: float = 0.5
+    """Share of the steps in which it does."""
+    normalized_bank: bool = False
+    """Keep the bank's directions orthonormal, so that the scores' energy is that of ΔW and eq. (4),
+    ‖ΔW - ΔW_k‖ = √(1 - E_k) ‖ΔW‖, holds (`lorasp_jax.bank`). Needs a side of at least R."""
+    pruned: int = 0
+    """Directions that pruning dropped. The router still scores them, behind the R others, as their
+    energy counts in E_k."""
     gate: Implementation | None = dataclasses.field(default=None, metadata={"saved": False})
     """Implementation of the energy gate, None: the backend's default. Not saved with adapters."""
 
     def __post_init__(self) -> None:
         """Checks the fields."""
         exact_ratio(self.energy_target)
-        if self.rank < 1 or self.hidden_width < 1:
+        if self.energy_start is not None:
+            exact_ratio(self.energy_start)
+        if self.rank < 1 or self.hidden_width < 1 or self.pruned < 0:
             raise ValueError(
-                f"rank and hidden_width must be at least 1, got {self.rank}, {self.hidden_width}."
+                "rank and hidden_width must be at least 1 and pruned not negative, got "
+                f"{self.rank}, {self.hidden_width}, {self.pruned}."
             )
-        if self.router not in ("gelu", "softmax"):
-            raise ValueError(f"router must be 'gelu' or 'softmax', got {self.router!r}.")
-        if self.router == "softmax" and self.rank % self.hidden_width:
+        if not 0 < self.energy_share <= 1:
+            raise ValueError(f"energy_share must lie in (0, 1], got {self.energy_share}.")
+        for name, kind in _CHOICES.items():
+            if (value := getattr(self, name)) not in get_args(kind):
+                valid = ", ".join(get_args(kind))
+                raise ValueError(f"{name} must be one of {valid}, got {value!r}.")
+        if self.router == "softmax" and self.scored % self.hidden_width:
             raise ValueError(
-                f"a softmax router needs a rank divisible by its width, got {self.rank} and "
+                f"a softmax router needs a rank divisible by its width, got {self.scored} and "
                 f"{self.hidden_width}."
+            )
+        self._check_combination()
+
+    def _check_combination(self) -> None:
+        """Raises a ValueError for a setting that another one would leave without effect."""
+        if self.router != "gelu" and self.score_function != "softplus":
+            raise ValueError(f"only a 'gelu' router has a score_function, not {self.router!r}.")
+        if self.router == "linear" and self.rule != "release":
+            raise ValueError("a 'linear' router has signed scores, which need rule 'release'.")
+        changed = (self.granularity, self.energy_start) != ("token", None)
+        if self.rule == "release" and (self.router == "gelu" or changed):
+            raise ValueError(
+                "rule 'release' needs a 'linear' or 'softmax' router, masks by token and a "
+                "constant energy_target."
             )
 
     @classmethod
@@ -84,70 +138,125 @@ class LoRASP(Method):
         """
         return cls(rank=rank, energy_target=energy_target, hidden_width=4, router="softmax")
 
+    @classmethod
+    def release(
+        cls, *, rank: int = 128, energy_target: float = 0.9, projection: bool = False
+    ) -> "LoRASP":
+        """The public code's rule, which is not the paper's; only to compare with its results.
+
+        `projection` takes its option `router_projection`, softmax over 4 and a matrix, instead of
+        its default, one linear layer. Its dropout of 5 % on the router's input is left out.
+        """
+        router, width = ("softmax", 4) if projection else ("linear", rank)
+        return cls(rank, energy_target, hidden_width=width, router=router, rule="release")
+
+    @property
+    def scored(self) -> int:
+        """How many directions the router scores."""
+        return self.rank + self.pruned
+
     @property
     def scale(self) -> float:
         """α/R."""
         return 2.0 if self.alpha is None else self.alpha / self.rank
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
-        """V and the router random, U zero: the delta starts at exactly zero."""
+        """V and the router random, U (or its gain) zero: the delta starts at exactly zero."""
         input_key, score_key = jax.random.split(key)
+        width = self.scored if self.router == "linear" else self.hidden_width
         # V and W1 both read x and share one distribution: one draw, which compiles once.
-        inputs = kaiming_uniform(input_key, (d_in, self.rank + self.hidden_width))
+        inputs = kaiming_uniform(input_key, (d_in, self.rank + width))
         v, w1 = jnp.split(inputs, [self.rank], axis=1)
-        bank = {"u": jnp.zeros((self.rank, d_out)), "v": v}
-        return {"bank": bank, "router": {"w1": w1, **self._init_scores(score_key)}}
+        bank_key = jax.random.fold_in(key, 1)
+        bank = init_bank(bank_key, v, d_out, normalized=self.normalized_bank)
+        params = {"bank": bank, "router": {"w1": w1, **self._init_scores(score_key)}}
+        moves = self.energy_start is not None
+        return params | ({energy_schedule.PROGRESS: jnp.zeros(())} if moves else {})
 
     def _init_scores(self, key: jax.Array) -> dict[str, jax.Array]:
         """The router's second layer, and the biases of both."""
-        shape = (self.hidden_width, self.rank)
+        shape = (self.hidden_width, self.scored)
+        if self.router == "linear":
+            return {}
         if self.router == "softmax":
             return {"w2": jnp.repeat(jnp.eye(shape[0]), shape[1] // shape[0], axis=1)}
         return {
             "b1": jnp.zeros(self.hidden_width),
             "w2": SCORE_INIT_STD * jax.random.normal(key, shape),
-            "b2": jnp.full(self.rank, SOFTPLUS_INVERSE_OF_ONE),
+            "b2": jnp.full(self.scored, routing.UNIT_LOGIT[self.score_function], jnp.float32),
         }
 
     def down(self, params: Params) -> jax.Array:
         """[V, W1]."""
-        return jnp.concatenate([params["bank"]["v"], params["router"]["w1"]], axis=1)
+        return jnp.concatenate([self._bank(params)["v"], params["router"]["w1"]], axis=1)
 
     def between(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
         """z = scale Σ(x) V x of eq. (9), with the gate's statistics and losses."""
         router = {name: p for name, p in params["router"].items() if name != "w1"}
-        *tokens, width = rows.shape
+        tokens = rows.shape[:-1]
         counts = jnp.ones(tokens, bool) if token_mask is None else token_mask
-        z, sums, (active_rank, energy) = self._route(
-            router, rows.reshape(-1, width), counts.reshape(-1, 1)
-        )
-        losses = {
-            "spectral": spectral_loss(sums),
-            "balance": balance_loss(sums),
-            "z": z_loss(sums),
-        }
-        aux = Aux(active_rank.reshape(tokens), energy.reshape(tokens), losses)
-        return z.reshape(*tokens, self.rank), aux
+        routed = self._route_released if self.rule == "release" else self._route
+        z, losses, usage, statistics = routed({**params, "router": router}, rows, counts)
+        active_rank, energy = (column.reshape(tokens) for column in statistics)
+        return z.reshape(*tokens, self.rank), Aux(active_rank, energy, losses, usage=usage)
 
     def up(self, params: Params) -> jax.Array:
         """U."""
-        return params["bank"]["u"]
+        return self._bank(params)["u"]
 
-    def _route(
-        self, router: dict[str, jax.Array], rows: jax.Array, counts: jax.Array
-    ) -> tuple[jax.Array, "LossSums", list[jax.Array]]:
-        """`route` of x [V W1], [T, R + H], where possible in one kernel."""
-        gate = self.gate or default_implementation(self.rank)
-        widths = (self.rank, self.hidden_width)
-        function = functools.partial(route, energy_target=self.energy_target, scale=self.scale)
-        if gate == "pallas" and self.router == "gelu" and all(map(_fits_triton, widths)):
+    def _bank(self, params: Params) -> Params:
+        return normalized_bank(params["bank"]) if self.normalized_bank else params["bank"]
+
+    def _route(self, params: Params, rows: jax.Array, counts: jax.Array) -> routing.Routed:
+        """`route` of x [V W1], [...tokens, R + H], where possible in one kernel."""
+        gate = self.gate or default_implementation(self.scored)
+        router, widths = params["router"], (self.rank, self.hidden_width)
+        function = functools.partial(
+            routing.route, energy_target=self.energy_target, scale=self.scale
+        )
+        kept = self._shared_mask(params, rows, counts)
+        rows, counts = rows.reshape(-1, rows.shape[-1]), counts.reshape(-1, 1)
+        plain = (self.router, self.score_function) == ("gelu", "softplus") and kept is None
+        if gate == "pallas" and plain and all(map(_fits_triton, widths)):
             function = functools.partial(function, gate="block")
-            return fused_rows(function, router, rows, widths, counts)
-        columns = jnp.split(rows, widths[:1], axis=1)
-        z, sums, _, statistics = function(router, columns, counts, None, gate=gate)
-        return z, sums, statistics
+            z, sums, statistics = fused_rows(function, router, rows, widths, counts)
+        else:
+            columns = jnp.split(rows, widths[:1], axis=1)
+            z, sums, _, statistics = function(
+                router, columns, counts, kept, gate=gate, score_function=self.score_function
+            )
+        return z, routing.losses(sums), sums.kept, statistics
+
+    def _shared_mask(self, params: Params, rows: jax.Array, counts: jax.Array) -> jax.Array | None:
+        """The mask, bool [T, R], where it takes more than each row's scores; else None."""
+        if (self.granularity, self.energy_start, self.pruned) == ("token", None, 0):
+            return None
+        scores, _ = router_scores(params["router"], rows[..., self.rank :], self.score_function)
+        pooled = routing.pooled_scores(scores, counts, self.granularity)
+        if self.energy_start is None:
+            mask, _, _ = energy_gate(pooled, self.energy_target, implementation=self.gate)
+        else:
+            ends = (self.energy_start, self.energy_target)
+            moved = (params[energy_schedule.PROGRESS], *ends, self.energy_share, self.energy_curve)
+            mask = energy_schedule.gate_at(pooled, energy_schedule.scheduled_target(*moved))
+        mask &= jnp.arange(self.scored) < self.rank
+        return jnp.broadcast_to(mask, scores.shape).reshape(-1, self.scored)
+
+    def _route_released(self, params: Params, rows: jax.Array, counts: jax.Array) -> routing.Routed:
+        """What `_route` gives, by the rule of the public code."""
+        columns = jnp.split(rows, [self.rank], axis=-1)
+        settings = {"energy_target": self.energy_target, "scale": self.scale}
+        return release.release_route(params["router"], columns, counts, **settings)
+
+    def transform(
+        self, optimizer: optax.GradientTransformation, total_steps: int
+    ) -> optax.GradientTransformation:
+        """The optimizer, which also moves a scheduled η over its `total_steps` steps."""
+        if self.energy_start is None:
+            return optimizer
+        return energy_schedule.scheduling(optimizer, total_steps)
 
     def merge(self, params: Params, kernel: jax.Array) -> jax.Array:
         """Raises: the delta depends on the input."""
@@ -161,128 +270,3 @@ class LoRASP(Method):
 def _fits_triton(side: int) -> bool:
     """Whether a side of an array suits Triton's blocks and matrix product."""
     return side >= 16 and side.bit_count() == 1
-
-
-def route(
-    router: dict[str, jax.Array],
-    columns: list[jax.Array],
-    counts: jax.Array,
-    kept: jax.Array | None,
-    *,
-    energy_target: float,
-    scale: float,
-    gate: Implementation,
-) -> tuple[jax.Array, "LossSums", jax.Array, list[jax.Array]]:
-    """Everything between the two matrix products with the bank, row by row.
-
-    Args:
-      router: w2 [H, R], and b1 [H], b2 [R] or none.
-      columns: V x [n, R] and W1 x [n, H] in one type.
-      counts: bool [n, 1], False for padding.
-      kept: bool [n, R], the gate's mask where it is known already; it has no gradient.
-      energy_target: η.
-      scale: α/R.
-      gate: implementation of the energy gate.
-
-    Returns:
-      z [n, R], the losses' sums over rows, the mask, and f32 [n, 1] each active rank and kept
-      energy.
-    """
-    projected, hidden = columns
-    scores, logits = router_scores(router, hidden)
-    mask = energy_gate(scores, energy_target, implementation=gate)[0] if kept is None else kept
-    energy = kept_energy(scores, mask)[:, None]
-    z = select(projected, scale * scores, mask)
-    active_rank = mask.astype(jnp.float32).sum(-1, keepdims=True)
-    return z, loss_sums(scores, logits, mask, energy, counts), mask, [active_rank, energy]
-
-
-def router_scores(router: dict[str, jax.Array], hidden: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Eq. (10): h = φ(x W1 + b1), s(x) = h W2 + b2 made non-negative.
-
-    With biases φ is GELU and softplus makes the scores positive. Without, φ is softmax, whose
-    product with a 0/1 matrix is non-negative at the start; ReLU keeps it so.
-
-    Args:
-      router: w2 [H, R] and b1 [H], b2 [R] or none.
-      hidden: x W1, [..., H]; everything from here on is in fp32.
-
-    Returns:
-      scores f32 [..., R], and the logits the z-loss acts on: the softplus' input [..., R] or the
-      softmax' input [..., H].
-    """
-    hidden = hidden.astype(jnp.float32)
-    if "b1" not in router:
-        return jax.nn.relu(jax.nn.softmax(hidden) @ router["w2"]), hidden
-    logits = jax.nn.gelu(hidden + router["b1"]) @ router["w2"] + router["b2"]
-    return jax.nn.softplus(logits), logits
-
-
-def select(projected: jax.Array, scores: jax.Array, mask: jax.Array) -> jax.Array:
-    """Eq. (11): Σ(x) V x with the pruned scores at zero, [..., R] in the type of `projected`."""
-    return projected * jnp.where(mask, scores, 0).astype(projected.dtype)
-
-
-class LossSums(NamedTuple):
-    """What the auxiliary losses need, summed over the valid rows: f32 [1], kept and share [R]."""
-
-    rows: jax.Array
-    spectral: jax.Array
-    """1 - E_k."""
-    z: jax.Array
-    """Squared mean logit, on the scale of exponentials."""
-    kept: jax.Array
-    """1 for each kept direction; no gradient."""
-    share: jax.Array
-    """Share of the energy."""
-
-
-def loss_sums(
-    scores: jax.Array, logits: jax.Array, mask: jax.Array, energy: jax.Array, counts: jax.Array
-) -> LossSums:
-    """The sums for scores and mask [n, R], logits [n, :], kept energy and counts [n, 1].
-
-    A row of zeros is not valid: it teaches the router nothing. NaN shows in the sums.
-    """
-    valid = (scores.max(-1, keepdims=True) != 0) & counts
-    mean_logit = jax.nn.logsumexp(logits, axis=-1, keepdims=True) - math.log(logits.shape[-1])
-
-    def total(values: jax.Array) -> jax.Array:
-        return jnp.where(valid, values, 0).sum(0)
-
-    return LossSums(
-        rows=total(jnp.ones_like(energy)),
-        spectral=total(1 - energy),
-        z=total(jnp.square(mean_logit)),
-        kept=total(mask.astype(jnp.float32)),
-        share=total(energy_share(scores)),
-    )
-
-
-def spectral_loss(sums: LossSums) -> jax.Array:
-    """Eq. (13): 1 - E_k, averaged over valid rows, f32 scalar."""
-    return _mean(sums.spectral, sums)
-
-
-def balance_loss(sums: LossSums) -> jax.Array:
-    """Balance term of eq. (14): R Σ_i f_i P_i, 1 where all directions are used alike.
-
-    The load-balancing loss of Fedus et al. (arXiv 2101.03961, eq. 4) for k(x) choices a token: f_i
-    is direction i's share of all kept places (no gradient), P_i its mean share of the energy.
-    """
-    kept = jax.lax.stop_gradient(sums.kept)
-    used = kept / jnp.maximum(kept.sum(), 1)
-    return len(kept) * _mean(jnp.sum(used * sums.share, keepdims=True), sums)
-
-
-def z_loss(sums: LossSums) -> jax.Array:
-    """z term of eq. (14): (logsumexp(logits) - ln n)², n = logits' width, over valid rows.
-
-    Zoph et al. (arXiv 2202.08906, eq. 5) without the ln n, which would push the logits of a wide
-    router down even where they are all zero.
-    """
-    return _mean(sums.z, sums)
-
-
-def _mean(total: jax.Array, sums: LossSums) -> jax.Array:
-    return total[0] / jnp.maximum(sums.rows[0], 1)

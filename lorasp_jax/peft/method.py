@@ -34,12 +34,16 @@ class Aux:
       kept_energy: f32 [...tokens], E_k of eq. (12); None without a gate.
       losses: fp32 scalars by name, already averaged over the valid tokens.
       token_mask: bool [...tokens], True where a token counts; None means all do.
+      usage: f32 [R], for how many valid tokens each direction was in use; None without a gate.
+      statistics: sums over valid tokens by layer path, where `lorasp_jax.calibration` observes.
     """
 
     active_rank: jax.Array | None = None
     kept_energy: jax.Array | None = None
     losses: Mapping[str, jax.Array] = dataclasses.field(default_factory=dict)
     token_mask: jax.Array | None = None
+    usage: jax.Array | None = None
+    statistics: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def mean_active_rank(self) -> jax.Array | None:
         """Active rank averaged over valid tokens (and over layers, if stacked), an f32 scalar."""
@@ -82,6 +86,16 @@ class Method:
     def name(self) -> str:
         """The method's file name, as `create` takes it."""
         return type(self).__module__.rpartition(".")[2]
+
+    @property
+    def needs_statistics(self) -> bool:
+        """True if `init` asks for the statistics of the layer's inputs."""
+        return False
+
+    @property
+    def as_saved(self) -> "Method":
+        """The method as it is saved with its parameters, under which they can be loaded."""
+        return self
 
     def init(
         self, key: jax.Array, kernel: Kernel, *, statistics: Any = None
@@ -164,7 +178,10 @@ class Method:
         """
         sides = self.down(params), self.up(params)
         rows_dtype = self._rows_dtype(x)
-        y, aux = low_rank_matmul(self.between, rows_dtype, params, x, kernel, *sides, token_mask)
+        found: Any = low_rank_matmul(
+            self.between, rows_dtype, params, x, kernel, *sides, token_mask
+        )
+        y, aux = found
         return y, dataclasses.replace(aux, token_mask=token_mask)
 
     def _rows_dtype(self, x: jax.Array) -> Any:

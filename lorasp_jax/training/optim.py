@@ -5,7 +5,7 @@ from collections.abc import Collection
 import optax
 
 from lorasp_jax.config import AuxiliaryConfig, OptimConfig
-from lorasp_jax.peft import Method
+from lorasp_jax.peft import AdaLoRA, Method
 
 
 def learning_rate(config: OptimConfig) -> optax.Schedule:
@@ -27,15 +27,16 @@ def make_optimizer(
     Raises:
         ValueError: several settings of a method that has one budget for all layers.
     """
-    adamw = optax.adamw(learning_rate(config), b2=config.b2, weight_decay=config.weight_decay)
-    wrapped = [method.transform(adamw, config.steps) for method in dict.fromkeys(methods)]
-    own = [optimizer for optimizer in wrapped if optimizer is not adamw]
-    if len(own) > 1:
+    optimizer = optax.adamw(learning_rate(config), b2=config.b2, weight_decay=config.weight_decay)
+    budgets = {method for method in methods if isinstance(method, AdaLoRA)}
+    if len(budgets) > 1:
         raise ValueError(
             "all layers that share a budget need the same settings, but AdaLoRA is used with "
-            f"{len(own)} different ones."
+            f"{len(budgets)} different ones."
         )
-    return optax.chain(optax.clip_by_global_norm(config.clip_norm), *(own or [adamw]))
+    for method in dict.fromkeys(methods):
+        optimizer = method.transform(optimizer, config.steps)
+    return optax.chain(optax.clip_by_global_norm(config.clip_norm), optimizer)
 
 
 def auxiliary_weights(config: AuxiliaryConfig, steps: int) -> dict[str, optax.Schedule]:

@@ -2,8 +2,10 @@
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +16,9 @@ from rich.progress import TaskID
 
 import envs
 from envs.episodes import Episodes
-from lorasp_jax import adaptation, models
+from lorasp_jax import adaptation, calibration, models, peft
 from lorasp_jax.config import Config
+from lorasp_jax.data.batches import Batch, flatten, sample_batch
 from lorasp_jax.data.demonstrations import demonstrations
 from lorasp_jax.models import pi0, tokenizer
 from lorasp_jax.models.policy import Policy
@@ -23,6 +26,8 @@ from lorasp_jax.models.processing import Processor, Statistics, robot_slots
 from lorasp_jax.training.loop import Run
 from lorasp_jax.training.progress import bars
 
+STATISTICS_BATCHES = 8
+"""Batches that an initialization from data looks at."""
 TRAINING = "training.json"
 """File beside base weights: what they were trained on, with the control period."""
 
@@ -51,8 +56,7 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
             f"batch_size must be a multiple of the {jax.device_count()} devices, "
             f"got {config.optim.batch_size}"
         )
-    rngs = nnx.Rngs(jax.random.fold_in(jax.random.key(config.seed), 3))
-    model = adaptation.adapt(model, [(path, config.peft) for path in config.targets], rngs=rngs)
+    base, model = model, _adapted(config, model, config.peft.as_saved)
     counts = adaptation.count(model)
     console.print(
         f"scale {config.scale}: {type(config.peft).__name__} on pi0 {config.size}, "
@@ -61,8 +65,44 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
     run = Run(config, folder, console, base_hash, started)
     with run.timed("collect"):
         run.episodes = _collect(run)
-    run.policy = Policy(model, processor(config, list(run.episodes.values()), model.config))
+    found = processor(config, list(run.episodes.values()), model.config)
+    if config.peft.needs_statistics:
+        statistics = input_moments(run, base, found)
+        model = _adapted(config, base, config.peft, statistics)
+    run.policy = Policy(model, found)
     return run
+
+
+def _adapted(
+    config: Config,
+    model: pi0.Pi0,
+    method: peft.Method,
+    statistics: Mapping[str, jax.Array] = MappingProxyType({}),
+) -> pi0.Pi0:
+    """The model with the method on the run's targets, from the run's key."""
+    rngs = nnx.Rngs(jax.random.fold_in(jax.random.key(config.seed), 3))
+    rules = [(path, method) for path in config.targets]
+    return adaptation.adapt(model, rules, rngs=rngs, statistics=statistics)
+
+
+def input_moments(run: Run, model: pi0.Pi0, processor: Processor) -> dict[str, jax.Array]:
+    """`calibration.input_moments` of the run's targets, over batches as training draws them."""
+    config, steps = run.config, flatten(list(run.episodes.values()))
+    sizes = {"batch_size": config.optim.batch_size, "chunk": model.config.chunk}
+    draw = jax.jit(
+        lambda key: sample_batch(
+            key, steps, processor, **sizes, state_noise=config.optim.state_noise
+        )
+    )
+
+    def forward(model: pi0.Pi0, drawn: tuple[jax.Array, Batch]) -> Any:
+        key, batch = drawn
+        return model.loss(key, batch.observation, batch.actions, action_mask=batch.action_mask)
+
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 5), STATISTICS_BATCHES)
+    pattern = "|".join(f"(?:{path})" for path in config.targets)
+    batches = ((key, draw(key)) for key in keys)
+    return calibration.input_moments(model, batches, pattern, forward)
 
 
 def base_model(config: Config) -> tuple[pi0.Pi0, str]:

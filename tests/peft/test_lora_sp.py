@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lorasp_jax import routing
 from lorasp_jax.peft import LoRA, LoRASP, lora_sp
 
 D_IN, D_OUT = 24, 40
@@ -24,15 +25,15 @@ def initial(method, key=1):
 
 
 def scores_of(router, x):
-    return lora_sp.router_scores(router, x @ router["w1"])
+    return routing.router_scores(router, x @ router["w1"])
 
 
 def losses_of(scores, kept_energy=1.0, rows=None):
     """The three losses of rows of scores that are all kept; logits are the scores."""
     counts = jnp.ones((len(scores), 1), bool) if rows is None else rows
     energy = jnp.broadcast_to(jnp.asarray(kept_energy).reshape(-1, 1), (len(scores), 1))
-    sums = lora_sp.loss_sums(scores, scores, scores > 0, energy, counts)
-    return lora_sp.spectral_loss(sums), lora_sp.balance_loss(sums), lora_sp.z_loss(sums)
+    sums = routing.loss_sums(scores, scores, scores > 0, energy, counts)
+    return routing.spectral_loss(sums), routing.balance_loss(sums), routing.z_loss(sums)
 
 
 @pytest.mark.parametrize(
@@ -104,7 +105,7 @@ def test_pruned_directions_get_no_task_gradient(x):
     def task(shift):
         scores = scores_of(params["router"], x)[0] + shift
         mask, _, _ = lora_sp.energy_gate(scores, 0.5)
-        return lora_sp.select(x @ params["bank"]["v"], scores, mask).sum(), mask
+        return routing.select(x @ params["bank"]["v"], scores, mask).sum(), mask
 
     gradient, mask = jax.jit(jax.grad(task, has_aux=True))(jnp.zeros((3, 7, 16)))
     np.testing.assert_array_equal(gradient != 0, mask)
@@ -192,7 +193,7 @@ def test_a_broken_router_is_not_hidden(x):
         ({"energy_target": 0.0}, r"energy_target must lie in \(0, 1\], got 0.0"),
         ({"energy_target": 1.5}, r"energy_target must lie in \(0, 1\], got 1.5"),
         ({"rank": 0}, "at least 1"),
-        ({"router": "relu"}, "router must be 'gelu' or 'softmax', got 'relu'"),
+        ({"router": "relu"}, "router must be one of gelu, softmax, linear, got 'relu'"),
         ({"router": "softmax", "hidden_width": 5}, "divisible by its width, got 128 and 5"),
     ],
 )

@@ -158,5 +158,7 @@ def test_gaussian():
 
 
 def test_unknown_initialization():
-    with pytest.raises(ValueError, match="must be 'kaiming', 'gaussian', 'pissa' or 'olora'"):
+    with pytest.raises(
+        ValueError, match="must be 'kaiming', 'gaussian', 'pissa', 'olora' or 'eva'"
+    ):
         lora("psisa")

@@ -1,5 +1,6 @@
 """The command line: one sentence per mistake, typos suggest the right name."""
 
+import dataclasses
 import re
 
 import pytest
@@ -22,6 +23,21 @@ def test_dotted_overrides():
 def test_scale_is_chosen_by_backend_and_can_be_forced():
     assert parse(MULTITASK)[0].scale == "cpu"
     assert parse([*MULTITASK, "--scale", "accelerator"])[0].size == "small"
+
+
+def test_every_variant_of_lora_sp_is_an_option():
+    changes = {
+        "score_function": "relu",
+        "granularity": "sample",
+        "energy_start": 0.5,
+        "energy_curve": "cosine",
+        "energy_share": 0.25,
+    }
+    options = [f"--peft.{name.replace('_', '-')}={value}" for name, value in changes.items()]
+    chosen = override(CONFIG, [*options, "--peft.normalized-bank"]).peft
+    assert chosen == LoRASP(rank=8, normalized_bank=True, **changes)
+    released = override(CONFIG, ["--peft.rule", "release", "--peft.router", "linear"]).peft
+    assert dataclasses.replace(released, hidden_width=8) == LoRASP.release(rank=8)
 
 
 def test_method_by_name_keeps_the_rank():

@@ -1,0 +1,65 @@
+"""Where things are in a model: paths, and the rules that match them."""
+
+import difflib
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from flax import nnx
+
+from lorasp_jax import layers
+from lorasp_jax.dense import AdaptedLayer
+from lorasp_jax.peft import Method
+
+Rules = Sequence[tuple[str, Method | None]]
+
+
+class Place(NamedTuple):
+    """Where a layer or parameter hangs in a model: `getattr(parent, name)` is `child`."""
+
+    path: str
+    parent: Any
+    name: str
+    child: Any
+
+
+def places(holder: nnx.List, kind: type | tuple[type, ...]) -> list[Place]:
+    """All children of a type, with paths that start below the holder."""
+
+    def walk() -> Iterator[Place]:
+        for path, module in nnx.iter_modules(holder):
+            for name, child in vars(module).items():
+                if isinstance(child, kind):
+                    yield Place("/".join(map(str, (*path, name)[1:])), module, name, child)
+
+    return list(walk())
+
+
+def layer_places(holder: nnx.List, einsums: layers.Einsums = MappingProxyType({})) -> list[Place]:
+    """All layers that have an adapter or could."""
+    return [
+        place
+        for place in places(holder, nnx.Module)
+        if isinstance(place.child, AdaptedLayer) or layers.kind(place.child, einsums)
+    ]
+
+
+def check_patterns(patterns: Iterable[str]) -> None:
+    """Raises a ValueError for a pattern that is no regular expression."""
+    for pattern in patterns:
+        try:
+            re.compile(pattern)
+        except re.error as error:
+            raise ValueError(f"rule {pattern!r} is no regular expression: {error}.") from error
+
+
+def governing(rules: Rules, *paths: str) -> int | None:
+    """Index of the first rule that matches one of the paths."""
+    hits = (i for i, (pattern, _) in enumerate(rules) if any(re.search(pattern, p) for p in paths))
+    return next(hits, None)
+
+
+def near_misses(wanted: str, known: Sequence[str]) -> str:
+    """A few of the known names, those that are most like the wanted one, or the first."""
+    return ", ".join(difflib.get_close_matches(wanted, known, n=5, cutoff=0.3) or known[:5])

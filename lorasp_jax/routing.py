@@ -1,0 +1,194 @@
+"""LoRA-SP's router: its scores, how scores of several tokens are pooled, and its losses.
+
+One function per equation of the paper (arXiv 2603.07404), all in fp32; `lorasp_jax.peft.lora_sp`
+puts them together. Padding stays out of everything that is summed over tokens.
+"""
+
+import math
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from lorasp_jax.kernels.energy_gate import (
+    Implementation,
+    energy_gate,
+    energy_share,
+    kept_energy,
+)
+
+ScoreFunction = Literal["softplus", "relu", "softmax"]
+Granularity = Literal["token", "sample", "layer"]
+
+Routed = tuple[jax.Array, dict[str, jax.Array], jax.Array, list[jax.Array]]
+"""z, losses, how often each direction was kept, and active rank and kept energy by token."""
+
+SOFTPLUS_INVERSE_OF_ONE = math.log(math.e - 1)
+UNIT_LOGIT: dict[str, float] = {"softplus": SOFTPLUS_INVERSE_OF_ONE, "relu": 1.0, "softmax": 0.0}
+"""The logit, the same for all directions, at which each score function gives 1."""
+
+
+def route(
+    router: dict[str, jax.Array],
+    columns: list[jax.Array],
+    counts: jax.Array,
+    kept: jax.Array | None,
+    *,
+    energy_target: float,
+    scale: float,
+    gate: Implementation,
+    score_function: ScoreFunction = "softplus",
+) -> tuple[jax.Array, "LossSums", jax.Array, list[jax.Array]]:
+    """Everything between the two matrix products with the bank, row by row.
+
+    Args:
+      router: w2 [H, R], and b1 [H], b2 [R] or none.
+      columns: V x [n, R] and W1 x [n, H] in one type.
+      counts: bool [n, 1], False for padding.
+      kept: bool [n, R], the gate's mask where it is known already; it has no gradient.
+      energy_target: η.
+      scale: α/R.
+      gate: implementation of the energy gate.
+      score_function: of a router with biases.
+
+    Returns:
+      z [n, R], the losses' sums over rows, the mask, and f32 [n, 1] each active rank and kept
+      energy.
+    """
+    projected, hidden = columns
+    scores, logits = router_scores(router, hidden, score_function)
+    mask = energy_gate(scores, energy_target, implementation=gate)[0] if kept is None else kept
+    energy = kept_energy(scores, mask)[:, None]
+    z = select(projected, scale * scores, mask)
+    active_rank = mask.astype(jnp.float32).sum(-1, keepdims=True)
+    return z, loss_sums(scores, logits, mask, energy, counts), mask, [active_rank, energy]
+
+
+def router_scores(
+    router: dict[str, jax.Array], hidden: jax.Array, score_function: ScoreFunction = "softplus"
+) -> tuple[jax.Array, jax.Array]:
+    """Eq. (10): h = φ(x W1 + b1), s(x) = h W2 + b2 made non-negative.
+
+    With biases φ is GELU and a score function makes the scores non-negative: softplus, ReLU, or R
+    times the softmax over the R directions. Without, φ is softmax, whose product with a 0/1 matrix
+    is non-negative at the start; ReLU keeps it so.
+
+    Args:
+      router: w2 [H, R] and b1 [H], b2 [R] or none.
+      hidden: x W1, [..., H]; everything from here on is in fp32.
+      score_function: of a router with biases.
+
+    Returns:
+      scores f32 [..., R], and the logits the z-loss acts on: the score function's input [..., R] or
+      the softmax' input [..., H].
+    """
+    hidden = hidden.astype(jnp.float32)
+    if "b1" not in router:
+        return jax.nn.relu(jax.nn.softmax(hidden) @ router["w2"]), hidden
+    logits = jax.nn.gelu(hidden + router["b1"]) @ router["w2"] + router["b2"]
+    if score_function == "softmax":
+        return logits.shape[-1] * jax.nn.softmax(logits), logits
+    return (jax.nn.softplus if score_function == "softplus" else jax.nn.relu)(logits), logits
+
+
+def pooled_scores(scores: jax.Array, valid: jax.Array, granularity: Granularity) -> jax.Array:
+    """Scores whose squares are the mean squares over the tokens that share one mask.
+
+    So a set of directions that reaches η of the pooled energy holds η of the energy of all valid
+    tokens of its sample or layer together, though perhaps not of each.
+
+    Args:
+      scores: f32 [...tokens, R].
+      valid: bool [...tokens], False for padding.
+      granularity: "sample": the last token axis is pooled. "layer": all of them, the whole batch.
+
+    Returns:
+      [...tokens, R] with 1 for each pooled axis; scores without a token axis as they are.
+    """
+    if granularity == "token" or scores.ndim == 1:
+        return scores
+    scores = jax.lax.stop_gradient(scores)  # of no use to a mask, and infinite at zero
+    axes = (scores.ndim - 2,) if granularity == "sample" else tuple(range(scores.ndim - 1))
+    valid = valid[..., None]
+    total = jnp.where(valid, jnp.square(scores), 0).sum(axes, keepdims=True)
+    return jnp.sqrt(total / jnp.maximum(valid.sum(axes, keepdims=True), 1))
+
+
+def select(projected: jax.Array, scores: jax.Array, mask: jax.Array) -> jax.Array:
+    """Eq. (11): Σ(x) V x with the pruned scores at zero, in the type of `projected` [..., n].
+
+    Scores and mask may be wider; what is beyond n has no direction any more.
+    """
+    if (here := projected.shape[-1]) < scores.shape[-1]:
+        scores, mask = scores[..., :here], mask[..., :here]
+    return projected * jnp.where(mask, scores, 0).astype(projected.dtype)
+
+
+class LossSums(NamedTuple):
+    """What the auxiliary losses need, summed over the valid rows: f32 [1], kept and share [R]."""
+
+    rows: jax.Array
+    spectral: jax.Array
+    """1 - E_k."""
+    z: jax.Array
+    """Squared mean logit, on the scale of exponentials."""
+    kept: jax.Array
+    """1 for each kept direction; no gradient."""
+    share: jax.Array
+    """Share of the energy."""
+
+
+def loss_sums(
+    scores: jax.Array, logits: jax.Array, mask: jax.Array, energy: jax.Array, counts: jax.Array
+) -> LossSums:
+    """The sums for scores and mask [n, R], logits [n, :], kept energy and counts [n, 1].
+
+    A row of zeros is not valid: it teaches the router nothing. NaN shows in the sums.
+    """
+    valid = (scores.max(-1, keepdims=True) != 0) & counts
+    mean_logit = jax.nn.logsumexp(logits, axis=-1, keepdims=True) - math.log(logits.shape[-1])
+
+    def total(values: jax.Array) -> jax.Array:
+        return jnp.where(valid, values, 0).sum(0)
+
+    return LossSums(
+        rows=total(jnp.ones_like(energy)),
+        spectral=total(1 - energy),
+        z=total(jnp.square(mean_logit)),
+        kept=total(mask.astype(jnp.float32)),
+        share=total(energy_share(scores)),
+    )
+
+
+def losses(sums: LossSums) -> dict[str, jax.Array]:
+    """The auxiliary losses of eq. (14) by name, f32 scalars."""
+    return {"spectral": spectral_loss(sums), "balance": balance_loss(sums), "z": z_loss(sums)}
+
+
+def spectral_loss(sums: LossSums) -> jax.Array:
+    """Eq. (13): 1 - E_k, averaged over valid rows, f32 scalar."""
+    return _mean(sums.spectral, sums)
+
+
+def balance_loss(sums: LossSums) -> jax.Array:
+    """Balance term of eq. (14): R Σ_i f_i P_i, 1 where all directions are used alike.
+
+    The load-balancing loss of Fedus et al. (arXiv 2101.03961, eq. 4) for k(x) choices a token: f_i
+    is direction i's share of all kept places (no gradient), P_i its mean share of the energy.
+    """
+    kept = jax.lax.stop_gradient(sums.kept)
+    used = kept / jnp.maximum(kept.sum(), 1)
+    return len(kept) * _mean(jnp.sum(used * sums.share, keepdims=True), sums)
+
+
+def z_loss(sums: LossSums) -> jax.Array:
+    """z term of eq. (14): (logsumexp(logits) - ln n)², n = logits' width, over valid rows.
+
+    Zoph et al. (arXiv 2202.08906, eq. 5) without the ln n, which would push the logits of a wide
+    router down even where they are all zero.
+    """
+    return _mean(sums.z, sums)
+
+
+def _mean(total: jax.Array, sums: LossSums) -> jax.Array:
+    return total[0] / jnp.maximum(sums.rows[0], 1)

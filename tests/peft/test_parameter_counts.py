@@ -1,0 +1,93 @@
+"""Parameters of one adapted layer against the formulas, for every method and preset."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from lorasp_jax import peft
+from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA, LoRAMoE, LoRASP
+
+I, O = 24, 40
+"""d_in, d_out."""
+
+TABLE = [
+    # LoRA and what it is initialised with: A and B.
+    (LoRA(), 128 * (I + O)),
+    (LoRA(rank=7, rank_stabilized=True), 7 * (I + O)),
+    *((LoRA(rank=7, initialization=name), 7 * (I + O)) for name in ("gaussian", "pissa", "olora")),
+    (LoRA(rank=7, initialization="eva"), 7 * (I + O)),
+    # A magnitude by output.
+    (DoRA(), 128 * (I + O) + O),
+    # A diagonal between A and B.
+    (AdaLoRA(), 128 * (I + O) + 128),
+    # Four experts of 32 and a linear router, weighted or top-1.
+    (LoRAMoE(), 4 * 32 * (I + O) + 4 * I),
+    (LoRAMoE(routing="top1"), 4 * 32 * (I + O) + 4 * I),
+    # A bank of R, h hidden units: R (I + O) + h (I + R), and h + R biases.
+    (LoRASP(), 128 * (I + O) + 32 * (I + 128) + 32 + 128),
+    *(
+        (LoRASP(rank=8, hidden_width=4, score_function=name), 8 * (I + O) + 4 * (I + 8) + 4 + 8)
+        for name in ("softplus", "relu", "softmax")
+    ),
+    (LoRASP(rank=8, hidden_width=4, energy_start=0.5), 8 * (I + O) + 4 * (I + 8) + 4 + 8 + 1),
+    (LoRASP(rank=8, hidden_width=4, normalized_bank=True), 8 * (I + O) + 4 * (I + 8) + 4 + 8 + 1),
+    # Three directions fewer in the bank; the router still scores eight.
+    (LoRASP(rank=5, hidden_width=4, pruned=3), 5 * (I + O) + 4 * (I + 8) + 4 + 8),
+    (LoRASP.paper(), 128 * (I + O) + 4 * (I + 128)),
+    (LoRASP.release(), 128 * (I + O) + 128 * I),
+    (LoRASP.release(projection=True), 128 * (I + O) + 4 * (I + 128)),
+    (FullFineTuning(), I * O),
+]
+
+
+@pytest.mark.parametrize(("method", "expected"), TABLE, ids=lambda x: str(x)[:60])
+def test_parameter_count(method, expected):
+    def init(key, kernel):
+        return method.init(key, kernel, statistics=jnp.eye(I))[0]
+
+    kernel = jax.ShapeDtypeStruct((I, O), jnp.float32)
+    shapes = jax.eval_shape(init, jax.random.key(0), kernel)
+    assert sum(leaf.size for leaf in jax.tree.leaves(shapes)) == expected
+
+
+def test_every_method_and_preset_is_in_the_table():
+    assert {method.name for method, _ in TABLE} == set(peft.names())
+    presets = {
+        getattr(peft.find(name), attribute)()
+        for name in peft.names()
+        for attribute, value in vars(peft.find(name)).items()
+        if isinstance(value, classmethod) and not attribute.startswith("_")
+    }
+    assert presets == {LoRASP.paper(), LoRASP.release()} <= {method for method, _ in TABLE}
+
+
+@pytest.mark.parametrize(
+    ("method", "pi0", "smolvla"),
+    [
+        (LoRA(rank=16), 1.233, 2.497),
+        (LoRA(), 9.078, 17.004),
+        (LoRAMoE(), 9.172, 17.206),
+        (LoRASP.release(), 12.00, 23.03),
+    ],
+    ids=["lora16", "lora128", "moe", "release"],
+)
+def test_shares_of_the_papers_backbones(method, pi0, smolvla):
+    """Adapters over all linear layers, in per cent of all parameters: every formula is linear in
+    I, in O and constant, so sums over layers say all (facts of both backbones, Table I)."""
+    count = lambda i, o: sum(  # noqa: E731
+        leaf.size
+        for leaf in jax.tree.leaves(
+            jax.eval_shape(
+                lambda key: method.init(key, jax.ShapeDtypeStruct((i, o), jnp.float32))[0],
+                jax.random.key(0),
+            )
+        )
+    )
+    constant = count(1, 1) - (count(2, 1) - count(1, 1)) - (count(1, 2) - count(1, 1))
+    by_in, by_out = count(2, 1) - count(1, 1), count(1, 2) - count(1, 1)
+    for layers, both, inputs, total, percent in (
+        (422, 2_731_200, 998_960, 3_501.37e6, pi0),
+        (303, 720_336, 331_584, 450_046_176, smolvla),
+    ):
+        adapters = layers * constant + by_in * inputs + by_out * (both - inputs)
+        assert 100 * adapters / (total + adapters) == pytest.approx(percent, abs=0.006)

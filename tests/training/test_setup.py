@@ -1,0 +1,54 @@
+"""A run whose adapters start from the demonstrations."""
+
+import dataclasses
+import io
+import time
+
+import numpy as np
+import pytest
+from flax import nnx
+from rich.console import Console
+
+from lorasp_jax import adaptation, paths
+from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.peft import LoRA
+from lorasp_jax.training import setup
+from lorasp_jax.training.overrides import override
+from tests.runs import CONFIG, random_episodes
+
+TARGETS = ("patch_embed", "language.*q_proj", "action_out_proj")
+
+
+@pytest.fixture
+def config(monkeypatch):
+    """No simulation, and the dummy backbone."""
+    monkeypatch.setattr(setup.envs, "make", lambda *_, **__: None)
+    monkeypatch.setattr(setup, "base_model", lambda _: (Pi0Config.dummy().create(nnx.Rngs(0)), ""))
+    monkeypatch.setattr(
+        setup, "_collect", lambda run: {t: random_episodes(t, 0) for t in run.config.tasks}
+    )
+    config = dataclasses.replace(CONFIG, peft=LoRA(rank=4), targets=TARGETS)
+    config = dataclasses.replace(
+        config, evaluation=dataclasses.replace(config.evaluation, execute_steps=1)
+    )
+    return override(config, ["--peft.initialization", "eva"])
+
+
+def test_eva_of_the_command_line_sees_the_demonstrations(config, tmp_path):
+    run = setup.prepare(config, tmp_path, Console(file=io.StringIO()), time.perf_counter())
+    found = adaptation.methods(run.policy.model)
+    assert {method.initialization for method in found.values()} == {"eva"}
+    base = Pi0Config.dummy().create(nnx.Rngs(0))
+    moments = setup.input_moments(run, base, run.policy.processor)
+    assert set(moments) == set(found)
+    assert len(found) == 3
+    for path, parent, _, variable in paths.places(
+        nnx.List([run.policy.model]), adaptation.AdapterParam
+    ):
+        a = np.float64(variable.get_value()["lora_a"])
+        moment = np.float64(moments[path.rpartition("/")[0]])
+        captured = np.einsum("...ir,...ij,...jr->...", a, moment, a)
+        best = np.linalg.eigvalsh(moment)[..., -4:].sum(-1)
+        np.testing.assert_allclose(captured, best, rtol=1e-3)  # no 4 directions hold more
+        assert (captured > 0).all()
+        assert parent.method == LoRA(rank=4, initialization="eva")
