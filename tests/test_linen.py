@@ -196,7 +196,7 @@ def test_rules_that_apply_to_nothing(published, ids):
         attached(published, ids, (MATRICES, SP), ("dense", LoRA(rank=2)))
     with pytest.raises(ValueError, match="rule 'norm' applies to nothing"):
         attached(published, ids, ("norm", SP))
-    with pytest.raises(ValueError, match="cannot adapt embed: Embed takes LoRA that leaves"):
+    with pytest.raises(ValueError, match="cannot adapt embed: Embed takes LoRA that starts without"):
         attached(published, ids, (".*", SP))
     with pytest.raises(ValueError, match="dense/kernel cannot train in full under"):
         attached(published, ids, ("kernel$", FullFineTuning()), ("dense", SP))

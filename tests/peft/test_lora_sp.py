@@ -155,7 +155,7 @@ def test_what_triton_cannot_take_keeps_the_gate_alone(x, monkeypatch, method):
     monkeypatch.setattr(lora_sp, "fused_rows", None)
     gates = []
     monkeypatch.setattr(
-        lora_sp,
+        routing,
         "energy_gate",
         lambda s, eta, implementation: gates.append(implementation) or (s > 0,),
     )
