@@ -15,6 +15,7 @@ from lorasp_jax.adapter_io import load_adapters, save_adapters
 from lorasp_jax.named import bare
 from lorasp_jax.peft import LoRA, LoRAMoE, LoRASP
 from tests import nets
+from tests.cases import mostly_slow
 from tests.nets import NET, X, assert_close, call, trained
 
 STARTS = ["gaussian", "pissa", "olora"]
@@ -22,7 +23,7 @@ METHODS = nets.METHODS | {start: LoRA(rank=2, initialization=start) for start in
 LAYERS = "inp|blocks"
 
 
-@pytest.fixture(params=METHODS)
+@pytest.fixture(params=mostly_slow(METHODS, ["lora", "lora_sp", "dora"]))
 def method(request):
     return METHODS[request.param]
 

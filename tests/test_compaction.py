@@ -13,6 +13,7 @@ import lorasp_jax
 from lorasp_jax import adaptation, adapter_io, compaction, paths
 from lorasp_jax.dense import AdapterParam, Dense
 from lorasp_jax.peft import LoRA, LoRASP
+from tests.cases import mostly_slow
 from tests.test_adaptation import Net, trained
 
 RANK = 12
@@ -73,7 +74,7 @@ def banish(model, path, layer, directions):
     return model
 
 
-@pytest.mark.parametrize("method", VARIANTS, ids=IDS)
+@pytest.mark.parametrize("method", mostly_slow(VARIANTS, VARIANTS[:1]), ids=IDS)
 def test_never_active_directions_leave_outputs_as_they_are(method, batches):
     """What the calibration set never uses goes; on it every number is the same to rounding."""
     model = model_of(method)
@@ -85,6 +86,7 @@ def test_never_active_directions_leave_outputs_as_they_are(method, batches):
     assert all((error < 1e-5).all() for error in report.layer_errors.values())
 
 
+@pytest.mark.slow
 def test_arrays_shrink_to_the_largest_need_of_a_stack(batches):
     """Ranks 7, 9 and 8 in three layers: one rank of 9, and a layer keeps what it uses."""
     model = model_of(dataclasses.replace(VARIANTS[0], energy_target=1.0))
@@ -124,6 +126,7 @@ def counted(model, batches):
     return np.array(share)
 
 
+@pytest.mark.slow
 def test_a_tolerance_drops_what_is_hardly_active_and_says_what_it_costs(batches):
     model = model_of(VARIANTS[0])
     share = counted(model, batches)
@@ -141,6 +144,7 @@ def test_a_tolerance_drops_what_is_hardly_active_and_says_what_it_costs(batches)
     assert second.output_error < 1e-6
 
 
+@pytest.mark.slow
 def test_the_error_of_a_layer_is_on_the_inputs_it_had():
     """One layer alone: its error is the model's, counted over valid tokens only."""
     layer = Dense(5, 4, use_bias=False, method=VARIANTS[0], rngs=nnx.Rngs(0))
@@ -161,6 +165,7 @@ def test_the_error_of_a_layer_is_on_the_inputs_it_had():
     np.testing.assert_array_equal(clean.ranks["0"], padded.ranks["0"])
 
 
+@pytest.mark.slow
 def test_a_pruned_model_trains_saves_and_loads(batches, tmp_path):
     model = model_of(VARIANTS[0])
     smaller, _ = compaction.prune(model, batches, 0.3, forward=forward)
@@ -174,7 +179,7 @@ def test_a_pruned_model_trains_saves_and_loads(batches, tmp_path):
     assert adaptation.count(smaller).trainable < adaptation.count(model).trainable
 
 
-@pytest.mark.parametrize("rank", [None, 2])
+@pytest.mark.parametrize("rank", mostly_slow([None, 2], [None]))
 def test_distill_is_the_best_update_of_its_rank(rank, batches):
     """Its error is the least squares' residual; a LoRA near it, or the mean update, is worse."""
     layer = Dense(5, 4, use_bias=False, method=VARIANTS[0], rngs=nnx.Rngs(0))

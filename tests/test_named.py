@@ -195,6 +195,7 @@ def test_half_of_an_adapter_is_half_of_what_it_changes(name):
     assert_close(half, 0.5 * (NET.inp(X) + model.inp(X)))
 
 
+@pytest.mark.slow
 def test_mixed_batch_through_pi0():
     """Scanned towers, the cameras folded into the batch, a cache shared by both experts."""
     config = Pi0Config.dummy()

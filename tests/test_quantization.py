@@ -13,6 +13,7 @@ from lorasp_jax.adapter_io import load_adapters, save_adapters
 from lorasp_jax.dense import AdapterParam, Dense
 from lorasp_jax.kernels.quantized import KINDS, QuantizedKernel
 from lorasp_jax.peft import FullFineTuning, LoRA
+from tests.cases import mostly_slow
 from tests.nets import METHODS, NET, SP, Net, X, assert_close, call, trained
 
 WIDE = nnx.Linear(256, 512, rngs=nnx.Rngs(0))
@@ -56,7 +57,7 @@ def test_quantised_equals_widened(kind):
     assert_close(jax.jit(lambda s: nnx.merge(graphdef, s)(X))(state), call(model, X))
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", mostly_slow(METHODS, ["lora", "lora_sp"]))
 def test_methods_over_a_quantised_base(name):
     """By discovery: attached after or before, the same as over the widened kernels."""
     method = METHODS[name]

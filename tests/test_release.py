@@ -10,6 +10,7 @@ import pytest
 
 from lorasp_jax import release
 from lorasp_jax.peft import LoRASP
+from tests.cases import mostly_slow
 
 GOLDEN = Path(__file__).parent / "golden"
 D_IN, D_OUT, RANK = 12, 10, 16
@@ -127,7 +128,7 @@ def test_gradients_are_those_of_the_rule(method, x):
     assert slope == pytest.approx((plus - minus) / 2e-4, rel=2e-2)
 
 
-@pytest.mark.parametrize("method", METHODS, ids=["linear", "projection"])
+@pytest.mark.parametrize("method", mostly_slow(METHODS, METHODS[:1]), ids=["linear", "projection"])
 def test_padding_stays_out(method, x):
     mask = jnp.arange(6)[None] < jnp.array([[4], [1]])
     params = arrays(method)

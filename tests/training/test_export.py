@@ -43,6 +43,7 @@ def test_adapters(tmp_path):
         adapter_io.load_adapters(run.folder, bare, base="another")
 
 
+@pytest.mark.slow
 def test_base(tmp_path):
     config = dataclasses.replace(CONFIG, peft=FullFineTuning(), targets=(".*",))
     run = moved(make_run(tmp_path / "run", config))

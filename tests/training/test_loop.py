@@ -78,6 +78,7 @@ def test_signal_handlers_are_put_back(tmp_path):
     assert jax.device_count() == 8
 
 
+@pytest.mark.slow
 def test_each_length_of_stretch_compiles_once_and_beside_the_callbacks(tmp_path, monkeypatch):
     compiled = []
     begin = _Stretches.compile

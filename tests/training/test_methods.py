@@ -46,6 +46,7 @@ def test_trains(name, tmp_path):
     assert all(np.isfinite(row["loss"]) for row in read_metrics(run.folder))
 
 
+@pytest.mark.slow
 def test_a_budget_is_kept_by_the_loop_and_over_an_interruption(tmp_path):
     config = configure("ada_lora", steps=6)
     whole, halved = make_run(tmp_path / "whole", config), make_run(tmp_path / "halved", config)
