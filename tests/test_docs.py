@@ -44,7 +44,9 @@ def test_pages_are_those_of_the_methods():
 
 @pytest.mark.parametrize("name", peft.names())
 def test_option_table_is_that_of_the_method(name):
-    options = [(field, ast.literal_eval(d)) for field, d in OPTION.findall(page_of(name).read_text())]
+    options = [
+        (field, ast.literal_eval(d)) for field, d in OPTION.findall(page_of(name).read_text())
+    ]
     fields = dataclasses.fields(peft.find(name))
     assert options == [(field.name, field.default) for field in fields]
 
