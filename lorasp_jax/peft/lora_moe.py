@@ -110,8 +110,8 @@ class LoRAMoE(Method):
         """Raises: the delta depends on the input."""
         del params, kernel
         raise ValueError(
-            "LoRA-MoE's delta depends on the input and cannot be merged into one kernel; "
-            "prune it (drop experts that stay unused) or distill it into a LoRA first."
+            "LoRA-MoE's delta depends on the input and cannot be merged into one kernel: keep its "
+            "adapter beside the base."
         )
 
 
