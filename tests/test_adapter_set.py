@@ -135,6 +135,7 @@ def test_low_precision(params, x, kernel):
     np.testing.assert_allclose(y.astype(jnp.float32), expected, atol=0.05 * jnp.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_gradients(params, x, kernel):
     """They reach x, the weights and the parameters of the adapters that count, not the kernel."""
     choice = jnp.zeros(len(METHODS)).at[1].set(1.0)

@@ -18,6 +18,8 @@ from tests import nets
 from tests.cases import mostly_slow
 from tests.nets import NET, X, assert_close, call, trained
 
+pytestmark = pytest.mark.slow
+
 STARTS = ["gaussian", "pissa", "olora"]
 METHODS = nets.METHODS | {start: LoRA(rank=2, initialization=start) for start in STARTS}
 LAYERS = "inp|blocks"

@@ -11,6 +11,8 @@ from lorasp_jax import routing
 from lorasp_jax.bank import normalized_bank
 from lorasp_jax.peft import LoRASP
 
+pytestmark = pytest.mark.slow
+
 METHOD = LoRASP(rank=8, hidden_width=4, energy_target=0.7, normalized_bank=True)
 
 

@@ -16,6 +16,8 @@ from lorasp_jax.peft import LoRA, LoRASP
 from tests.cases import mostly_slow
 from tests.test_adaptation import Net, trained
 
+pytestmark = pytest.mark.slow
+
 RANK = 12
 TOKENS = 40
 VARIANTS = [

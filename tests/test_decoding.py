@@ -11,6 +11,8 @@ from lorasp_jax import decoding
 from lorasp_jax.peft import LoRASP
 from tests.cases import mostly_slow
 
+pytestmark = pytest.mark.slow
+
 D_IN, D_OUT = 24, 40
 METHOD = LoRASP(rank=16, hidden_width=4, energy_target=0.7)
 VARIANTS = [

@@ -51,6 +51,7 @@ def test_kernels_of_a_scanned_stack():
     np.testing.assert_array_equal(from_matrices("btd,ndh->btnh", seen, kernel.shape), kernel)
 
 
+@pytest.mark.slow
 def test_bias_and_losses_over_batch_axes():
     """One adapter for each expert: losses are averaged over experts."""
     method, x, kernel = LoRASP(rank=8, hidden_width=4), normal(0, 3, 2, 4), normal(1, 3, 4, 5)

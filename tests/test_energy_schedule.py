@@ -15,6 +15,8 @@ from lorasp_jax.kernels.energy_gate import energy_gate
 from lorasp_jax.peft import AdaLoRA, LoRASP
 from lorasp_jax.training.optim import make_optimizer
 
+pytestmark = pytest.mark.slow
+
 KERNEL = jax.ShapeDtypeStruct((6, 5), jnp.float32)
 METHOD = LoRASP(rank=8, hidden_width=4, energy_start=0.5, energy_share=0.5)
 

@@ -55,6 +55,7 @@ def test_smaller_is_the_best_of_its_rank(rank):
         assert getattr(fused, path).method == LoRA(rank=rank, alpha=rank)
 
 
+@pytest.mark.slow
 def test_hugging_face():
     """PEFT 0.21.2's add_weighted_adapter, "cat" and "svd": deltas and outputs to 1e-5."""
     golden, models = golden_models()

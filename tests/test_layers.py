@@ -87,6 +87,7 @@ def test_every_method_starts_at_the_base(heads, x, name):
     assert jnp.abs(call(perturbed(model), x) - call(heads, x)).max() > 1e-2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", [LoRA(rank=2), DoRA(rank=2), LoRA(rank=2, initialization="pissa")]
 )
@@ -143,6 +144,7 @@ def test_aux_summary_and_print(heads, x):
         lorasp_jax.summary(model, {"other": aux["join"]})
 
 
+@pytest.mark.slow
 def test_penalties(heads):
     model = perturbed(adapted(heads, ("split|experts", peft.create("ada_lora"))))
     found = []
@@ -166,6 +168,7 @@ def test_attention_of_flax(x):
     assert set(adaptation.methods(model)) == {"query", "value", "out"}
 
 
+@pytest.mark.slow
 def test_embedding_and_convolution(vision, ids):
     """Against the base model with W + scale A B in place of its kernels, and PEFT's start."""
     method = LoRA(rank=3, alpha=6.0)
@@ -200,6 +203,7 @@ def test_convolutions_of_two_dimensions():
     assert lorasp_jax.collect_aux(model)[""].active_rank.shape == (2, 2, 6, 5)
 
 
+@pytest.mark.slow
 def test_gradients_reach_the_adapters_alone(vision, ids):
     graphdef, adapters, frozen = adaptation.split(perturbed(adapted(vision, (".*", LoRA(rank=2)))))
     loss = jax.jit(lambda a: sum(y.sum() for y in nnx.merge(graphdef, a, frozen)(ids)))
@@ -223,6 +227,7 @@ class Product(nnx.Module):
         return self.w.get_value().shape[0]
 
 
+@pytest.mark.slow
 def test_layers_described_by_the_user(x):
     product = Product("bd,ndh->nbh", (2, 6, 3), nnx.Rngs(0))
     einsums = {Product: lambda layer: ("w", layer.einsum_str)}

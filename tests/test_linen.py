@@ -108,7 +108,9 @@ def test_stacks_have_stacked_adapters(published, ids):
         [(".*", LoRA(rank=2, alpha=5.0))],
         pytest.param([("embed|conv", None), (MATRICES, DoRA(rank=2))], marks=pytest.mark.slow),
         pytest.param([(MATRICES, LoRA(rank=2, initialization="pissa"))], marks=pytest.mark.slow),
-        [("bias|norm", FullFineTuning()), ("first", LoRA(rank=2))],
+        pytest.param(
+            [("bias|norm", FullFineTuning()), ("first", LoRA(rank=2))], marks=pytest.mark.slow
+        ),
     ],
 )
 def test_merged_equals_adapted(published, ids, rules):
@@ -138,6 +140,7 @@ def test_against_a_kernel_made_by_hand(published, ids):
     np.testing.assert_allclose(call(adapter, variables, ids), expected, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_gradients_and_aux(published, ids):
     adapter, variables = attached(published, ids, ("embed|conv", LoRA(rank=2)), (MATRICES, SP))
 
@@ -152,6 +155,7 @@ def test_gradients_and_aux(published, ids):
     assert aux["first/experts"].active_rank.shape == (2, 2)
 
 
+@pytest.mark.slow
 def test_freed_parameters_train_in_fp32(ids):
     half = jax.tree.map(lambda v: v.astype(jnp.bfloat16), Net().init(jax.random.key(0), ids))
     adapter, variables = attached(half, ids, ("bias$|norm", FullFineTuning()), ("dense", SP))

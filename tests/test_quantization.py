@@ -116,6 +116,7 @@ def test_merge_widens_what_it_merges():
     assert_close(back.blocks.kernel.get_value(), widened(ALL["nf4"]).blocks.kernel.get_value())
 
 
+@pytest.mark.slow
 def test_named_adapters_over_one_quantised_base():
     models = {
         n: trained(("", LoRA(rank=i)), seed=i, net=ALL["nf4"]) for i, n in ((1, "a"), (2, "b"))

@@ -12,6 +12,8 @@ from lorasp_jax import release
 from lorasp_jax.peft import LoRASP
 from tests.cases import mostly_slow
 
+pytestmark = pytest.mark.slow
+
 GOLDEN = Path(__file__).parent / "golden"
 D_IN, D_OUT, RANK = 12, 10, 16
 METHODS = [LoRASP.release(rank=RANK), LoRASP.release(rank=RANK, projection=True)]

@@ -8,6 +8,8 @@ import pytest
 from lorasp_jax import routing
 from lorasp_jax.peft import LoRASP
 
+pytestmark = pytest.mark.slow
+
 D_IN, D_OUT, RANK = 6, 5, 16
 MASK = jnp.arange(7)[None] < jnp.array([[3], [7], [0]])
 

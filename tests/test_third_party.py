@@ -14,6 +14,8 @@ from lorasp_jax.dense import AdapterParam
 from lorasp_jax.peft import LoRA, LoRASP
 from tests import gemmas
 
+pytestmark = pytest.mark.slow
+
 SP = LoRASP(rank=8, hidden_width=4)
 TOKENS = jnp.array([[1, 2, 3, 4, 5], [5, 5, 2, 1, 0]])
 POSITIONS = jnp.broadcast_to(jnp.arange(5), (2, 5))

@@ -81,6 +81,7 @@ def test_expert_works_in_every_convention(env, mode):
     assert tries.success.all()
 
 
+@pytest.mark.slow
 def test_rollout_puts_a_policy_in_the_loop(env):
     def policy(seen, key):
         del key

@@ -148,6 +148,7 @@ def test_killed_and_continued(tmp_path, run, fake, moment):
         assert (out / file.name).stat().st_mtime_ns == before[file]
 
 
+@pytest.mark.slow
 def test_interrupted_simulation_goes_on_bit_for_bit(tmp_path, run, env, monkeypatch):
     for module in (envs, collection):
         monkeypatch.setattr(module, "make", lambda *arguments, **options: env)

@@ -196,6 +196,7 @@ def test_brax_observation(env, wrapped, first):
     assert np.any(first.obs[0] != first.obs[1])
 
 
+@pytest.mark.slow
 def test_brax_episodes_end_and_restart(env, wrapped, first):
     state, targets = first, first.pipeline_state.info["command"][:, 0] + 0.008
     for count in (1, 2, 3, 1):

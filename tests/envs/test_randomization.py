@@ -127,6 +127,7 @@ def test_latency_delays_what_is_sent():
     np.testing.assert_allclose(last[-1], [0.1, 0.02], atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.slow  # a scene of its own to compile
 def test_recorded_pictures_show_each_world_as_it_is(env):
     ranges, key = Randomization.typical(), jax.random.key(3)

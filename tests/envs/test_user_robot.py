@@ -238,6 +238,7 @@ def _mesh_axes(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndar
     return data.geom_xmat[geom].reshape(3, 3) @ turn.reshape(3, 3).T
 
 
+@pytest.mark.slow
 def test_steps_and_pictures(robot):
     env = envs.make("press", robot, num_envs=2, image_size=48)
     start = env.reset(jax.random.key(0))

@@ -27,6 +27,7 @@ def moved(run):
     return run
 
 
+@pytest.mark.slow
 def test_adapters(tmp_path):
     run = moved(make_run(tmp_path / "run"))
     export.write(run)

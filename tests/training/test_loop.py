@@ -57,6 +57,7 @@ def test_other_base_is_refused(tmp_path):
         train(other, resume=True)
 
 
+@pytest.mark.slow
 def test_loss_that_is_not_finite_stops_and_keeps_the_last_checkpoint(tmp_path):
     # The warm-up's first step has learning rate zero; the second overflows.
     optim = dataclasses.replace(CONFIG.optim, learning_rate=1e38, warmup_steps=2)
