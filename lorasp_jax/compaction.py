@@ -6,7 +6,7 @@ inputs that it has in the model as it came, and of the model's output.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -109,8 +109,8 @@ def distill(
     for path, layer in layers.items():
         kernel = layer.kernel.get_value()
         r = min(rank or layer.method.rank, layer.method.rank, *kernel.shape[-2:])
-        fit = over_stack(functools.partial(_fitted, rank=r), kernel)
-        u = over_stack(functools.partial(_factor, layer.method), kernel)(layer.adapter.get_value())
+        fit = adaptation.over_stack(functools.partial(_fitted, rank=r), kernel)
+        u = adaptation.over_stack(layer.method.up, kernel)(layer.adapter.get_value())
         changed[path] = LoRA(rank=r, alpha=float(r)), fit(sums[path]["xx"], sums[path]["xz"], u)
         ranks[path] = np.full(kernel.shape[:-2], r)
     return _finished(model, batches, changed, ranks, forward)
@@ -138,7 +138,8 @@ def _pruned(layer: Any, used: np.ndarray, rank: int) -> tuple[Method, Params]:
     order = np.concatenate([np.sort(best[..., :rank]), np.sort(best[..., rank:])], axis=-1)
     params = layer.adapter.get_value()
     reorder = functools.partial(_reordered, method=method, rank=rank)
-    params = over_stack(reorder, layer.kernel.get_value())(params, jnp.asarray(order))
+    each = adaptation.over_stack(reorder, layer.kernel.get_value())
+    params = each(params, jnp.asarray(order))
     smaller = dataclasses.replace(
         method, rank=rank, pruned=method.scored - rank, alpha=method.scale * rank
     )
@@ -159,17 +160,10 @@ def _reordered(params: Params, order: jax.Array, *, method: LoRASP, rank: int) -
 
 def _regression(layer: Layer) -> Sums:
     """Σ x xᵀ and Σ x zᵀ, where the delta is z U."""
-    method, x = layer.method, layer.x
-    assert method is not None
-    rows = x @ method.down(layer.params).astype(x.dtype)
-    z, _ = method.between(layer.params, rows, layer.valid)
+    assert layer.method is not None  # only layers with LoRA-SP are asked
+    z, _ = layer.method.read(layer.params, layer.x, layer.valid)
     x, z = layer.rows(layer.x), layer.rows(z)
     return {"xx": x.T @ x, "xz": x.T @ z}
-
-
-def _factor(method: Method, params: Params) -> jax.Array:
-    """U [R, O] as the layer applies it."""
-    return method.up(params)
 
 
 def _fitted(xx: jax.Array, xz: jax.Array, u: jax.Array, *, rank: int) -> Params:
@@ -233,10 +227,3 @@ def _difference(layer: Layer) -> Sums:
     assert layer.other is not None  # every changed layer has its new adapter beside it
     y, other = layer.rows(layer.y), layer.rows(layer.other)
     return {"error": jnp.square(other - y).sum(), "norm": jnp.square(y).sum()}
-
-
-def over_stack(function: Callable[..., Any], kernel: jax.Array) -> Callable[..., Any]:
-    """A function of one layer's arrays, over the leading axes of a kernel [..., I, O]."""
-    for _ in kernel.shape[:-2]:
-        function = jax.vmap(function)
-    return function

@@ -159,10 +159,18 @@ class Method:
         """
         if not self.additive:
             raise ValueError(f"{type(self).__name__} is not additive and has no delta; use apply.")
-        down, up = (side(params).astype(x.dtype) for side in (self.down, self.up))
+        z, aux = self.read(params, x, token_mask)
+        up = self.up(params).astype(x.dtype)
+        return z @ up, dataclasses.replace(aux, token_mask=token_mask)
+
+    def read(
+        self, params: Params, x: jax.Array, token_mask: jax.Array | None
+    ) -> tuple[jax.Array, Aux]:
+        """z [...tokens, R] in the type of x and aux, from x itself."""
+        down = self.down(params).astype(x.dtype)
         rows = jnp.matmul(x, down, preferred_element_type=self._rows_dtype(x))
         z, aux = self.between(params, rows, token_mask)
-        return z.astype(x.dtype) @ up, dataclasses.replace(aux, token_mask=token_mask)
+        return z.astype(x.dtype), aux
 
     def apply(
         self,
