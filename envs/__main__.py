@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,6 +17,9 @@ def main(arguments: Sequence[str]) -> int:
     """Runs one command; returns the exit code: 0 done, 2 bad input, 130 stopped."""
     options = _parser().parse_args(arguments)
     console = Console(stderr=True)
+    # JAX would reserve most of a GPU at its start, which takes a second (measured) for a command of
+    # half a minute.
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     physics.enable_fast_cpu()  # before anything starts a JAX backend
     physics.enable_compilation_cache()
     try:

@@ -174,7 +174,8 @@ def gather(
     while kept < num_episodes:
         _check_success(env, kept, attempted)
         key, chunk_key = jax.random.split(key)
-        chunk, success = _record(env, chunk_key, action_noise, ranges)
+        # Waiting here, a thread leaves Python to those that write what others recorded.
+        chunk, success = jax.block_until_ready(_record(env, chunk_key, action_noise, ranges))
         wins = np.flatnonzero(success)[: num_episodes - kept]
         kept += len(wins)
         # Attempts after the last one that was needed do not count.

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 import tensorflow_datasets as tfds
 from array_record.python import array_record_module
 from google.protobuf.json_format import ParseError
@@ -36,7 +35,7 @@ _METADATA = "metadata.json"  # where tfds looks for it
 # One episode is read at a time, and PNG does not shrink any further (measured: 7 times as fast).
 _RECORDS = "group_size:1,uncompressed"
 # Shared by all datasets that are made at once: more threads would only wait for Python's lock.
-_THREADS = ThreadPoolExecutor(4)
+_THREADS = ThreadPoolExecutor(8)
 
 
 def write(episodes: Episodes, path: str | os.PathLike) -> None:
@@ -168,7 +167,8 @@ class Parts:
             features.save_config(str(self.folder))
             self.facts |= shared
         _check_same(self.folder, {name: self.facts[name] for name in shared}, shared)
-        record = functools.partial(rlds_schema.record, features, jax.tree.map(np.asarray, episodes))
+        to = rlds_schema.serializer(features)
+        record = functools.partial(rlds_schema.record, to, jax.device_get(episodes))
         first, numbers = self.num_episodes, range(episodes.num_episodes)
         data = _THREADS.map(record, numbers, range(first, first + len(numbers)))
         _write_records(self._file(len(self.facts["parts"])), data)
