@@ -7,8 +7,9 @@ For each shape [I, O]: the frozen layer alone ("bare"), LoRA written the usual w
 automatic differentiation of x W + scale (x A) B), and this project's methods at rank R, with their
 losses. Gradients are those of training: with respect to the input and the adapter. The ratios are
 to the usual LoRA in the same run. Memory is what the compiled program needs beside its arguments.
-At last the energy gate next to a copy of its scores. Inputs are made under jit, everything is
-warmed up twice, calls are queued ten together.
+Then layers of one input, "I:O,O,O", called one by one and together; at last the energy gate next to
+a copy of its scores. Inputs are made under jit, everything is warmed up twice, calls are queued ten
+together.
 """
 
 import argparse
@@ -25,13 +26,16 @@ from rich.console import Console
 from benchmarks.measuring import best, machine, print_table
 from lorasp_jax import peft
 from lorasp_jax.kernels.energy_gate import energy_gate
+from lorasp_jax.peft.method import apply_together
 
 SHAPES = ((2048, 16384), (16384, 2048), (2048, 2048), (1152, 4304))
+# Query, key and value of pi0's language expert and vision tower; gate and up of a smaller MLP.
+TOGETHER = ((2048, (2048, 256, 256)), (1152, (1152, 1152, 1152)), (1024, (4096, 4096)))
 QUEUED = 10
 COPIES = 20  # of the gate in one program: one alone takes no longer than its launch
 LOSS_WEIGHT = 1e-2
 
-Layer = Callable[[Any, jax.Array, jax.Array], tuple[jax.Array, Any]]
+Layer = Callable[[Any, jax.Array, Any], tuple[Any, Any]]
 
 
 def bare(params: Any, x: jax.Array, kernel: jax.Array) -> tuple[jax.Array, Any]:
@@ -83,7 +87,7 @@ def inputs(method: peft.Method, shape: tuple[int, int], tokens: int, dtype: str)
     return draw(jax.random.key(0))
 
 
-def with_gradients(layer: Layer, params: Any, x: jax.Array, kernel: jax.Array, g: jax.Array) -> Any:
+def with_gradients(layer: Layer, params: Any, x: jax.Array, kernel: Any, g: Any) -> Any:
     """y and the gradients of x and the adapter, the auxiliary losses taken along."""
 
     def run(params: Any, x: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -92,6 +96,42 @@ def with_gradients(layer: Layer, params: Any, x: jax.Array, kernel: jax.Array, g
 
     (y, loss), pull = jax.vjp(run, params, x)
     return y, pull((g, jnp.full_like(loss, LOSS_WEIGHT)))
+
+
+def measure_together(
+    options: argparse.Namespace, d_in: int, d_outs: tuple[int, ...]
+) -> Iterator[dict[str, Any]]:
+    """Layers of one input, one by one and together."""
+    for name in ("lora", "lora_sp"):
+        method = make(name, options.rank)
+        drawn = [inputs(method, (d_in, d_out), options.tokens, options.dtype) for d_out in d_outs]
+        params, xs, kernels, gradients = map(list, zip(*drawn, strict=True))
+
+        def apart(params: Any, x: jax.Array, kernels: Any, method: Any = method) -> Any:
+            return [method.apply(p, x, k) for p, k in zip(params, kernels, strict=True)]
+
+        def together(params: Any, x: jax.Array, kernels: Any, method: Any = method) -> Any:
+            return apply_together([(method, *a) for a in zip(params, kernels, strict=True)], x)
+
+        seconds = []
+        for layers in (apart, together):
+            run = jax.jit(functools.partial(with_gradients, functools.partial(_summed, layers)))
+            arguments = (params, xs[0], kernels, gradients)
+            run = run.lower(*arguments).compile()
+            seconds.append(best(functools.partial(run, *arguments), calls=QUEUED))
+        yield {
+            "layers": f"{d_in}:{','.join(map(str, d_outs))}",
+            "method": name,
+            "apart ms": 1e3 * seconds[0],
+            "together ms": 1e3 * seconds[1],
+            "ratio": seconds[1] / seconds[0],
+        }
+
+
+def _summed(layers: Callable[..., Any], *arguments: Any) -> tuple[list[jax.Array], Any]:
+    """The outputs of several layers, and their losses under the names of one."""
+    found = layers(*arguments)
+    return [y for y, _ in found], jax.tree.map(lambda *x: sum(x), *(aux.losses for _, aux in found))
 
 
 def measure(options: argparse.Namespace, shape: tuple[int, int]) -> Iterator[dict[str, Any]]:
@@ -142,10 +182,16 @@ def _shape(text: str) -> tuple[int, int]:
     return d_in, d_out
 
 
+def _several(text: str) -> tuple[int, tuple[int, ...]]:
+    d_in, _, d_outs = text.partition(":")
+    return int(d_in), tuple(map(int, d_outs.split(",")))
+
+
 def main() -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--shapes", nargs="+", type=_shape, default=SHAPES, metavar="IxO")
+    parser.add_argument("--together", nargs="+", type=_several, default=TOGETHER, metavar="I:O,O")
     parser.add_argument("--tokens", type=int, default=26112)
     parser.add_argument("--rank", type=int, default=128)
     parser.add_argument("--dtype", default="bfloat16")
@@ -160,6 +206,10 @@ def main() -> None:
         rows = list(measure(options, shape))
         print_table(console, rows)
         found["rows"] += rows
+    found["together"] = [
+        row for case in options.together for row in measure_together(options, *case)
+    ]
+    print_table(console, found["together"])
     found["gate"] = measure_gate(options)
     print_table(console, [found["gate"]])
     if options.json:

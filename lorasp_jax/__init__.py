@@ -12,12 +12,11 @@ Axis letters used in every docstring and einsum of this package:
 from lorasp_jax import dense, hugging_face, named, peft
 from lorasp_jax.adaptation import adapt, merge
 from lorasp_jax.compaction import distill, prune
-from lorasp_jax.dense import collect_aux
 from lorasp_jax.fusion import fuse, unmerge
 from lorasp_jax.linen import LinenAdapter
 from lorasp_jax.named import choose, combine, extract, swap
 from lorasp_jax.quantization import quantize
-from lorasp_jax.tables import summary
+from lorasp_jax.tables import collect_aux, summary
 
 __all__ = [
     "LinenAdapter",

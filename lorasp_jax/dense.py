@@ -17,19 +17,18 @@ second result asks for it, `layer(x, return_aux=True)`, and then nothing is stor
 """
 
 import contextlib
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
 
 import flax.errors
 import flax.linen as nn
-import flax.traverse_util
 import jax
 import jax.numpy as jnp
 from flax import nnx
 from flax.typing import Dtype, Initializer
 
 from lorasp_jax.peft import Aux, Method
-from lorasp_jax.peft.method import Params
+from lorasp_jax.peft.method import Params, apply_together
 
 KEPT = "kept_aux"
 KERNEL_INIT = jax.nn.initializers.lecun_normal()  # of nnx.Linear and nn.Dense too
@@ -47,6 +46,10 @@ def refuse_sharding(out_sharding: Any) -> None:
     """Raises a ValueError unless it is None: some models pass it to every layer."""
     if out_sharding is not None:
         raise ValueError("an adapted layer takes no out_sharding: constrain what it returns.")
+
+
+DenseLayer: TypeAlias = tuple[jax.Array, jax.Array | None, Params | None, Method | None]
+"""Kernel, bias, params and method of a layer, as `dense` takes them."""
 
 
 def dense(
@@ -74,16 +77,41 @@ def dense(
     Raises:
       ValueError: x does not end in the kernel's input size.
     """
-    d_in, *outputs = kernel.shape
-    if x.shape[-1] != d_in:
-        raise ValueError(f"input of width {x.shape[-1]} meets a kernel {tuple(kernel.shape)}.")
-    matrix = kernel.reshape(d_in, -1)
-    if method is None or params is None:
-        y, aux = x @ matrix.astype(x.dtype), Aux()
-    else:
-        y, aux = method.apply(params, x, matrix, token_mask=token_mask)
-    y = y.reshape(*x.shape[:-1], *outputs)
-    return (y if bias is None else y + bias.astype(y.dtype)), aux
+    return dense_together(x, [(kernel, bias, params, method)], token_mask=token_mask)[0]
+
+
+def dense_together(
+    x: jax.Array, layers: Sequence[DenseLayer], *, token_mask: jax.Array | None = None
+) -> list[tuple[jax.Array, Aux]]:
+    """`dense` of several layers that share their input, which their adapters then read once.
+
+    Args:
+      x: [...tokens, I].
+      layers: (kernel, bias, params, method) of each; see `dense`.
+      token_mask: bool [...tokens].
+
+    Returns:
+      y and aux of each layer.
+
+    Raises:
+      ValueError: x does not end in a kernel's input size.
+    """
+    plain, adapted = {}, {}
+    for i, (kernel, _, params, method) in enumerate(layers):
+        if x.shape[-1] != kernel.shape[0]:
+            raise ValueError(f"input of width {x.shape[-1]} meets a kernel {tuple(kernel.shape)}.")
+        matrix = kernel.reshape(kernel.shape[0], -1)
+        if method is None or params is None:
+            plain[i] = x @ matrix.astype(x.dtype), Aux()
+        else:
+            adapted[i] = method, params, matrix
+    fused = apply_together([*adapted.values()], x, token_mask=token_mask)
+    found = plain | dict(zip(adapted, fused, strict=True))
+    results = []
+    for i, (kernel, bias, _, _) in enumerate(layers):
+        y = found[i][0].reshape(*x.shape[:-1], *kernel.shape[1:])
+        results.append((y if bias is None else y + bias.astype(y.dtype), found[i][1]))
+    return results
 
 
 def with_value(variable: nnx.Param, value: Any) -> nnx.Param:
@@ -189,16 +217,22 @@ class Dense(AdaptedLayer):
     ) -> Any:
         """y [...tokens, O], or (y, aux) if asked; see `dense`. An output sharding is refused."""
         refuse_sharding(out_sharding)
-        kernel = self.kernel.get_value()
-        bias = None if self.bias is None else self.bias.get_value()
-        params = None if self.adapter is None else self.adapter.get_value()
-        x = x.astype(self.dtype or jnp.promote_types(x.dtype, kernel.dtype))
-        y, aux = dense(x, kernel, bias, params, self.method, token_mask=token_mask)
+        y, aux = dense(self.as_input(x), *self.arrays(), token_mask=token_mask)
         if return_aux:
             return y, aux
         if self.adapter is not None:
             self.keep_aux(aux)
         return y
+
+    def as_input(self, x: jax.Array) -> jax.Array:
+        """x in the type of the computation."""
+        return x.astype(self.dtype or jnp.promote_types(x.dtype, self.kernel.get_value().dtype))
+
+    def arrays(self) -> DenseLayer:
+        """What `dense` and `dense_together` take."""
+        bias = None if self.bias is None else self.bias.get_value()
+        params = None if self.adapter is None else self.adapter.get_value()
+        return self.kernel.get_value(), bias, params, self.method
 
 
 class LinenDense(nn.Module):
@@ -253,31 +287,3 @@ class LinenDense(nn.Module):
                 "initialization asks for: use `adapt` on an NNX model or another initialization."
             )
         return self.method.init(self.make_rng("params"), kernel)[0]
-
-
-def collect_aux(model: nnx.Module | Mapping) -> dict[str, Aux]:
-    """What the drop-in layers of a model kept in the last call, by layer path; taken out of it.
-
-    Args:
-      model: an NNX model that was just called, or the variables a Linen model returned from
-        `apply(..., mutable=["intermediates"])`.
-
-    Returns:
-      Aux by "/"-joined path of the layer.
-
-    Raises:
-      ValueError: no adapted layer kept anything.
-    """
-    if isinstance(model, nnx.Module):
-        kept = nnx.to_flat_state(nnx.pop(model, AdapterAux))
-        found = {path[:-1]: variable.get_value() for path, variable in kept}
-    else:
-        sown: dict[tuple[str, ...], Any]
-        sown = flax.traverse_util.flatten_dict(model.get("intermediates", {}))  # type: ignore
-        found = {path[:-1]: values[-1] for path, values in sown.items() if path[-1] == KEPT}
-    if not found:
-        raise ValueError(
-            "no adapted layer kept anything: call the model first, inside the same traced function "
-            "(NNX) or with mutable=['intermediates'] (Linen)."
-        )
-    return {"/".join(map(str, path)): aux for path, aux in found.items()}

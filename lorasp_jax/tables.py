@@ -1,12 +1,13 @@
-"""Tables that say what an adapted model consists of."""
+"""What an adapted model consists of, as a table, and what its layers reported."""
 
 from collections.abc import Mapping
 from typing import Any
 
+import flax.traverse_util
 from flax import nnx
 
 from lorasp_jax.adaptation import Counts, count
-from lorasp_jax.dense import AdapterParam
+from lorasp_jax.dense import KEPT, AdapterAux, AdapterParam
 from lorasp_jax.layers import kernel_of
 from lorasp_jax.paths import layer_places, places
 from lorasp_jax.peft import Aux
@@ -74,3 +75,31 @@ def _align(row: Row, widths: list[int]) -> list[str]:
     """The first three cells to the left, numbers to the right."""
     left, right = zip(row[:3], widths[:3], strict=True), zip(row[3:], widths[3:], strict=True)
     return [cell.ljust(w) for cell, w in left] + [cell.rjust(w) for cell, w in right]
+
+
+def collect_aux(model: nnx.Module | Mapping) -> dict[str, Aux]:
+    """What the drop-in layers of a model kept in the last call, by layer path; taken out of it.
+
+    Args:
+      model: an NNX model that was just called, or the variables a Linen model returned from
+        `apply(..., mutable=["intermediates"])`.
+
+    Returns:
+      Aux by "/"-joined path of the layer.
+
+    Raises:
+      ValueError: no adapted layer kept anything.
+    """
+    if isinstance(model, nnx.Module):
+        kept = nnx.to_flat_state(nnx.pop(model, AdapterAux))
+        found = {path[:-1]: variable.get_value() for path, variable in kept}
+    else:
+        sown: dict[tuple[str, ...], Any]
+        sown = flax.traverse_util.flatten_dict(model.get("intermediates", {}))  # type: ignore
+        found = {path[:-1]: values[-1] for path, values in sown.items() if path[-1] == KEPT}
+    if not found:
+        raise ValueError(
+            "no adapted layer kept anything: call the model first, inside the same traced function "
+            "(NNX) or with mutable=['intermediates'] (Linen)."
+        )
+    return {"/".join(map(str, path)): aux for path, aux in found.items()}

@@ -8,8 +8,8 @@ import pytest
 from flax import nnx
 
 import lorasp_jax
-from lorasp_jax.dense import AdapterParam, Dense, LinenDense, dense
-from lorasp_jax.peft import FullFineTuning, LoRASP
+from lorasp_jax.dense import AdapterParam, Dense, LinenDense, dense, dense_together
+from lorasp_jax.peft import DoRA, FullFineTuning, LoRA, LoRASP
 
 METHOD = LoRASP(rank=8, hidden_width=4)
 
@@ -43,6 +43,30 @@ def test_equals_nnx_linear(x):
     assert Dense(5, 6, rngs=nnx.Rngs(1)).kernel.get_value().std() == pytest.approx(
         linear.kernel.get_value().std()
     )
+
+
+def test_layers_of_one_input(x):
+    """Whatever the methods, and also where some have none: each as if it were called alone."""
+    methods = [LoRA(rank=2), None, METHOD, DoRA(rank=2), LoRA(rank=3)]
+    mask = jnp.arange(4) != 1
+    layers = [Dense(5, 6 + i, method=m, rngs=nnx.Rngs(i)) for i, m in enumerate(methods)]
+    for i, layer in enumerate(layers):
+        layer.bias.set_value(jnp.full(6 + i, 0.5))
+        if layer.adapter is not None:
+            params = layer.adapter.get_value()
+            draw = jax.random.normal(jax.random.key(i), (1000,))
+            layer.adapter.set_value(
+                jax.tree.map(lambda p, d=draw: p + d[: p.size].reshape(p.shape), params)
+            )
+    found = dense_together(x, [layer.arrays() for layer in layers], token_mask=mask)
+    for layer, (y, aux) in zip(layers, found, strict=True):
+        alone, expected = layer(x, token_mask=mask, return_aux=True)
+        np.testing.assert_allclose(y, alone, rtol=1e-5, atol=1e-5)
+        assert jax.tree.structure(aux) == jax.tree.structure(expected)
+        for a, b in zip(jax.tree.leaves(aux), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-5)
+    with pytest.raises(ValueError, match="input of width 4 meets a kernel"):
+        dense_together(x[:, :4], [layers[0].arrays()])
 
 
 def test_linen_equals_nnx(x):

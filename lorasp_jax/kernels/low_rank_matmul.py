@@ -1,13 +1,15 @@
-"""x W + f(x P) U with W frozen: the matrix products under every low-rank adapter.
+"""x W + f(x P) U with W frozen, for one layer or several that read the same x.
 
 P [I, Q] reads the input, U [R, O] writes the output, and f, small, works on rows in between. The
 reference is that formula. The function here computes the same and differs in what the products
 cost, since at these sizes each pass over a wide array takes as long as the adapter itself:
 
 - no gradient is ever computed for W;
+- the P of all layers are one product with x, and in the backward pass one more gives their
+  gradients and one the gradient of x through them;
 - where the output is at least as wide as the input, x W + z U is one product, [x, z] [W; U];
 - where it is far wider, so are g Wᵀ and g Uᵀ of the gradient g of y, g [W; U]ᵀ;
-- where the input is at least as wide as the output, the gradient of x is one product,
+- where the input is at least as wide as the outputs, the gradient of x is one product,
   [g, q] [W, P]ᵀ with q the gradient of x P.
 
 W is cast to the type of x in each pass and kept between them as it came, so a quantised one is not
@@ -15,8 +17,9 @@ widened in memory for long.
 """
 
 import functools
-from collections.abc import Callable
-from typing import Any
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,77 +29,123 @@ from lorasp_jax.kernels.quantized import QuantizedKernel
 Between = Callable[[Any, jax.Array, jax.Array | None], tuple[jax.Array, Any]]
 
 
+class LowRankLayer(NamedTuple):
+    """What multiplies the common input."""
+
+    params: Any
+    """What f needs."""
+    kernel: jax.Array | QuantizedKernel | Any
+    """W [I, O] of any type, frozen: its cotangent is zero by definition."""
+    down: jax.Array
+    """P [I, Q], fp32, used in the type of x."""
+    up: jax.Array
+    """U [R, O], fp32, used in the type of x."""
+
+
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def low_rank_matmul(
-    between: Between,
+    between: Sequence[Between],
     rows_dtype: Any,
-    params: Any,
+    layers: Sequence[LowRankLayer],
     x: jax.Array,
-    kernel: jax.Array | QuantizedKernel,
-    down: jax.Array,
-    up: jax.Array,
     token_mask: jax.Array | None,
-) -> tuple[jax.Array, Any]:
-    """x W + z U in the type of x and aux, with z, aux = between(params, x P, token_mask).
+) -> list[tuple[jax.Array, Any]]:
+    """Of each layer x W + z U in the type of x and aux, with z, aux = f(params, x P, token_mask).
 
     Args:
-      between: f. It gets rows [..., Q] and returns z [..., R] and a pytree.
+      between: f of each layer. It gets rows [..., Q] and returns z [..., R] and a pytree.
       rows_dtype: type of the rows, which are summed in fp32.
-      params: what f needs.
+      layers: arrays of each layer.
       x: [..., I].
-      kernel: W [I, O] of any type, frozen: its cotangent is zero by definition.
-      down: P [I, Q], fp32, used in the type of x.
-      up: U [R, O], fp32, used in the type of x.
-      token_mask: handed to f.
+      token_mask: handed to each f.
     """
-    return _forward(between, rows_dtype, params, x, kernel, down, up, token_mask)[0]
+    return _forward(between, rows_dtype, layers, x, token_mask)[0]
 
 
 def _forward(
-    between: Between,
+    between: Sequence[Between],
     rows_dtype: Any,
-    params: Any,
+    layers: Sequence[LowRankLayer],
     x: jax.Array,
-    kernel: jax.Array | QuantizedKernel,
-    down: jax.Array,
-    up: jax.Array,
     token_mask: jax.Array | None,
 ) -> tuple:
-    p = _aligned(down.astype(x.dtype))
-    rows = jnp.matmul(x, p, preferred_element_type=rows_dtype)[..., : down.shape[1]]
+    read = jnp.matmul(x, _side_by_side(layers, x), preferred_element_type=rows_dtype)
+    found, pull_backs, written = [], [], []
+    for f, layer, rows in zip(between, layers, _split(layers, read), strict=True):
 
-    def inner(params: Any, rows: jax.Array) -> tuple[jax.Array, Any]:
-        z, aux = between(params, rows, token_mask)
-        return z.astype(x.dtype), aux
+        def inner(params: Any, rows: jax.Array, f: Between = f) -> tuple[jax.Array, Any]:
+            z, aux = f(params, rows, token_mask)
+            return z.astype(x.dtype), aux
 
-    (z, aux), pull_back = jax.vjp(inner, params, rows)
-    d_in, d_out = kernel.shape
-    w, u = kernel.astype(x.dtype), up.astype(x.dtype)
-    if d_out >= d_in:
-        y = jnp.concatenate([x, z], axis=-1) @ jnp.concatenate([w, u])
-    else:
-        y = x @ w + z @ u
-    return (y, aux), (pull_back, x, kernel, down, up, z)
+        (z, aux), pull_back = jax.vjp(inner, layer.params, rows)
+        w, u = layer.kernel.astype(x.dtype), layer.up.astype(x.dtype)
+        d_in, d_out = layer.kernel.shape
+        if d_out >= d_in:
+            y = jnp.concatenate([x, z], axis=-1) @ jnp.concatenate([w, u])
+        else:
+            y = x @ w + z @ u
+        found.append((y, aux))
+        pull_backs.append(pull_back)
+        written.append(z)
+    return found, (layers, x, pull_backs, written)
 
 
-def _backward(between: Between, rows_dtype: Any, residuals: tuple, cotangents: tuple) -> tuple:
+def _backward(
+    between: Sequence[Between], rows_dtype: Any, residuals: tuple, cotangents: Sequence[tuple]
+) -> tuple:
     del between, rows_dtype
-    pull_back, x, kernel, down, up, z = residuals
-    g, d_aux = cotangents
-    d_in, d_out = kernel.shape
-    w, p, u = kernel.astype(x.dtype), _aligned(down.astype(x.dtype)), up.astype(x.dtype)
-    if d_out > 2 * d_in:
-        through_base, dz = jnp.split(g @ jnp.concatenate([w, u]).T, [d_in], axis=-1)
-    else:
-        through_base, dz = None, g @ u.T
-    d_params, d_rows = pull_back((dz, d_aux))
-    q = _aligned(d_rows.astype(x.dtype))
-    if d_out <= d_in:
-        dx = jnp.concatenate([g, q], axis=-1) @ jnp.concatenate([w, p], axis=1).T
-    else:
-        dx = (g @ w.T if through_base is None else through_base) + q @ p.T
-    d_down = _outer(x, q, down.dtype)[:, : down.shape[1]]
-    return d_params, dx, None, d_down, _outer(z, g, up.dtype), None
+    layers, x, pull_backs, written = residuals
+    gradients = [g for g, _ in cotangents]
+    through_bases, d_params, d_rows = [], [], []
+    for layer, pull_back, (g, d_aux) in zip(layers, pull_backs, cotangents, strict=True):
+        d_in, d_out = layer.kernel.shape
+        w, u = layer.kernel.astype(x.dtype), layer.up.astype(x.dtype)
+        through_base, dz = None, None
+        if d_out > 2 * d_in:
+            through_base, dz = jnp.split(g @ jnp.concatenate([w, u]).T, [d_in], axis=-1)
+        of_params, of_rows = pull_back((g @ u.T if dz is None else dz, d_aux))
+        through_bases.append(through_base)
+        d_params.append(of_params)
+        d_rows.append(of_rows.astype(x.dtype))
+    q = _aligned(jnp.concatenate(d_rows, axis=-1))
+    dx = _gradient_of_input(layers, x, gradients, through_bases, q)
+    d_downs = _split(layers, _outer(x, q, layers[0].down.dtype))
+    d_layers = [
+        LowRankLayer(of_params, None, d_down, _outer(z, g, layer.up.dtype))
+        for layer, of_params, d_down, z, g in zip(
+            layers, d_params, d_downs, written, gradients, strict=True
+        )
+    ]
+    return d_layers, dx, None
+
+
+def _gradient_of_input(
+    layers: Sequence[LowRankLayer],
+    x: jax.Array,
+    gradients: Sequence[jax.Array],
+    through_bases: Sequence[jax.Array | None],
+    q: jax.Array,
+) -> jax.Array:
+    """Σ g Wᵀ + q Pᵀ, [..., I]; `through_bases` holds those g Wᵀ that are there already."""
+    p = _side_by_side(layers, x)
+    w = [layer.kernel.astype(x.dtype) for layer in layers]
+    if sum(g.shape[-1] for g in gradients) <= x.shape[-1]:
+        return jnp.concatenate([*gradients, q], axis=-1) @ jnp.concatenate([*w, p], axis=1).T
+    dx = q @ p.T
+    for g, kernel, through_base in zip(gradients, w, through_bases, strict=True):
+        dx += g @ kernel.T if through_base is None else through_base
+    return dx
+
+
+def _side_by_side(layers: Sequence[LowRankLayer], x: jax.Array) -> jax.Array:
+    """The P of all layers, [I, ΣQ], in the type of x."""
+    return _aligned(jnp.concatenate([layer.down.astype(x.dtype) for layer in layers], axis=1))
+
+
+def _split(layers: Sequence[LowRankLayer], columns: jax.Array) -> list[jax.Array]:
+    """Each layer's share [..., Q] of columns [..., ΣQ or more]."""
+    ends = list(itertools.accumulate(layer.down.shape[1] for layer in layers))
+    return jnp.split(columns, ends, axis=-1)[:-1]
 
 
 def _aligned(matrix: jax.Array) -> jax.Array:

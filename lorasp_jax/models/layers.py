@@ -1,7 +1,7 @@
 """What the backbones share: norms, rotary positions, attention, masks, and the scan over depth."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from lorasp_jax.dense import Dense, dense_together
 from lorasp_jax.peft import Aux
 
 MASKED = -2.3819763e38
@@ -66,6 +67,17 @@ class Linears:
         layer = getattr(self._module, name)
         y, self.aux[name] = layer(x, token_mask=self._token_mask, return_aux=True)
         return y
+
+    def together(self, names: Sequence[str], x: jax.Array) -> list[jax.Array]:
+        """y of each layer for the same x `[B, T, I]`, which adapters of `Dense` read once."""
+        layers = [getattr(self._module, name) for name in names]
+        inputs = [layer.as_input(x) for layer in layers if type(layer) is Dense]
+        if len(inputs) < len(layers) or len({x.dtype for x in inputs}) > 1:
+            return [self(name, x) for name in names]
+        mask = self._token_mask
+        found = dense_together(inputs[0], [layer.arrays() for layer in layers], token_mask=mask)
+        self.aux |= {name: aux for name, (_, aux) in zip(names, found, strict=True)}
+        return [y for y, _ in found]
 
 
 def stack(make: Callable[[nnx.Rngs], Block], depth: int, rngs: nnx.Rngs) -> Block:

@@ -9,14 +9,14 @@ import dataclasses
 import difflib
 import importlib
 import pkgutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import optax
 
-from lorasp_jax.kernels.low_rank_matmul import low_rank_matmul
+from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul
 
 PACKAGE = __name__.rpartition(".")[0]
 
@@ -184,13 +184,7 @@ class Method:
 
         No gradient reaches `kernel`; arguments as for `delta`.
         """
-        sides = self.down(params), self.up(params)
-        rows_dtype = self._rows_dtype(x)
-        found: Any = low_rank_matmul(
-            self.between, rows_dtype, params, x, kernel, *sides, token_mask
-        )
-        y, aux = found
-        return y, dataclasses.replace(aux, token_mask=token_mask)
+        return _apply_fused([(self, params, kernel)], x, token_mask)[0]
 
     def _rows_dtype(self, x: jax.Array) -> Any:
         return jnp.float32 if self.reads_in_fp32 else x.dtype
@@ -214,6 +208,45 @@ class Method:
           ValueError: the delta depends on the input.
         """
         raise NotImplementedError
+
+
+def apply_together(
+    layers: Sequence[tuple[Method, Params, jax.Array]],
+    x: jax.Array,
+    *,
+    token_mask: jax.Array | None = None,
+) -> list[tuple[jax.Array, Aux]]:
+    """`apply` of several layers (method, params, kernel) to one input, which is read once.
+
+    Once for all layers whose methods leave `apply` as it is and agree in `reads_in_fp32`; no
+    gradient reaches their kernels.
+    """
+    groups: dict[Any, list[int]] = {}
+    for i, (method, _, _) in enumerate(layers):
+        is_fused = type(method).apply is Method.apply
+        groups.setdefault(method.reads_in_fp32 if is_fused else (i,), []).append(i)
+    found: dict[int, tuple[jax.Array, Aux]] = {}
+    for members in groups.values():
+        if len(members) > 1:
+            fused = _apply_fused([layers[i] for i in members], x, token_mask)
+            found |= zip(members, fused, strict=True)
+        else:
+            method, params, kernel = layers[members[0]]
+            found[members[0]] = method.apply(params, x, kernel, token_mask=token_mask)
+    return [found[i] for i in range(len(layers))]
+
+
+def _apply_fused(
+    layers: Sequence[tuple[Method, Params, jax.Array]], x: jax.Array, token_mask: jax.Array | None
+) -> list[tuple[jax.Array, Aux]]:
+    rows_dtype = layers[0][0]._rows_dtype(x)
+    arrays = [
+        LowRankLayer(params, kernel, method.down(params), method.up(params))
+        for method, params, kernel in layers
+    ]
+    between = tuple(method.between for method, _, _ in layers)
+    found: Any = low_rank_matmul(between, rows_dtype, arrays, x, token_mask)
+    return [(y, dataclasses.replace(aux, token_mask=token_mask)) for y, aux in found]
 
 
 def check_matrix(kernel: Kernel) -> None:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lorasp_jax.kernels.low_rank_matmul import low_rank_matmul
+from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul
 
 # Every way to multiply: wide outputs, far wider ones, square and wide inputs.
 SHAPES = [(9, 10), (6, 20), (12, 12), (10, 7)]
@@ -39,7 +39,8 @@ MASK = jnp.arange(10).reshape(2, 5) != 3
 
 
 def ours(params, x, kernel, down, up, mask=MASK):
-    return low_rank_matmul(between, x.dtype, params, x, kernel, down, up, mask)
+    layers = [LowRankLayer(params, kernel, down, up)]
+    return low_rank_matmul((between,), x.dtype, layers, x, mask)[0]
 
 
 def reference(params, x, kernel, down, up, mask=MASK):
@@ -66,6 +67,45 @@ def test_equals_the_formula(shape):
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
         assert np.linalg.norm(b) > 0
+
+
+@pytest.mark.parametrize("d_outs", [(4, 3), (12, 9), (30, 20, 3)])
+def test_several_layers_of_one_input(d_outs):
+    """Each way to the input's gradient: all in one product, apart, through [W; U]."""
+    params, x, *_ = inputs(9, 1)
+    layers = [LowRankLayer(params, *inputs(9, d_out)[2:]) for d_out in d_outs]
+
+    def together(params, x, layers):
+        layers = [layer._replace(params=p) for p, layer in zip(params, layers, strict=True)]
+        return low_rank_matmul((between,) * len(layers), x.dtype, layers, x, MASK)
+
+    def apart(params, x, layers):
+        return [reference(p, x, *layer[1:]) for p, layer in zip(params, layers, strict=True)]
+
+    def everything(several):
+        def loss(params, x, layers):
+            found = several(params, x, layers)
+            total = sum(jnp.sum(jnp.sin((i + 1) * y)) for i, (y, _) in enumerate(found))
+            return total + sum(0.3 * i * aux["loss"] for i, (_, aux) in enumerate(found)), found
+
+        (_, found), gradients = jax.value_and_grad(loss, (0, 1, 2), has_aux=True)(
+            [{"scale": params["scale"] * (i + 1)} for i in range(len(layers))], x, layers
+        )
+        of_params, of_x, of_layers = gradients
+        return found, of_params, of_x, [layer[2:] for layer in of_layers]
+
+    found, expected = everything(together), everything(apart)
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-3)
+
+
+def test_several_layers_read_once():
+    params, x, *_ = inputs(9, 1)
+    layers = [LowRankLayer(params, *inputs(9, d_out)[2:]) for d_out in (4, 3, 2)]
+    program = jax.make_jaxpr(lambda x: low_rank_matmul((between,) * 3, x.dtype, layers, x, MASK))(x)
+    products = [line for line in str(program).splitlines() if "dot_general" in line]
+    assert len(products) == 1 + 3 * 2  # x P; x W and z U of each
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -96,7 +136,8 @@ def test_types():
     of_x, of_down, of_up = jax.eval_shape(gradient, *arguments)[0]
     assert (of_x.dtype, of_down.dtype, of_up.dtype) == (jnp.bfloat16, jnp.float32, jnp.float32)
     params, x, *matrices = arguments
-    exact = jax.jit(lambda x: low_rank_matmul(between, jnp.float32, params, x, *matrices, MASK))
+    layers = [LowRankLayer(params, *matrices)]
+    exact = jax.jit(lambda x: low_rank_matmul((between,), jnp.float32, layers, x, MASK)[0])
     expected = x.astype(jnp.float32) @ matrices[1].astype(jnp.bfloat16).astype(jnp.float32)
     statistic = exact(x)[1]["statistic"]
     assert statistic.dtype == jnp.float32

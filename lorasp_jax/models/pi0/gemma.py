@@ -74,7 +74,8 @@ class ExpertBlock(nnx.Module):
         linear = Linears(self, token_mask)
         heads = (*x.shape[:2], -1, self.head_dim)
         h = self.input_layernorm(x)
-        q, k, v = (linear(name, h).reshape(heads) for name in ("q_proj", "k_proj", "v_proj"))
+        read = linear.together(("q_proj", "k_proj", "v_proj"), h)
+        q, k, v = (y.reshape(heads) for y in read)
         q, k = rope(q, table, scale=self.head_dim**-0.5), rope(k, table)
         keys, values = k, v
         if cache is not None:
@@ -82,7 +83,8 @@ class ExpertBlock(nnx.Module):
             values = jnp.concatenate([cache[1], v], axis=1)
         x = x + linear("o_proj", attention(q, keys, values, mask))
         h = self.post_attention_layernorm(x)
-        h = jax.nn.gelu(linear("gate_proj", h), approximate=True) * linear("up_proj", h)
+        gate, up = linear.together(("gate_proj", "up_proj"), h)
+        h = jax.nn.gelu(gate, approximate=True) * up
         return x + linear("down_proj", h), ((k, v), linear.aux)
 
 

@@ -30,7 +30,8 @@ class VisionBlock(nnx.Module):
         linear = Linears(self, token_mask)
         heads = (*x.shape[:2], self.heads, -1)
         h = self.layer_norm1(x)
-        q, k, v = (linear(name, h).reshape(heads) for name in ("q_proj", "k_proj", "v_proj"))
+        read = linear.together(("q_proj", "k_proj", "v_proj"), h)
+        q, k, v = (y.reshape(heads) for y in read)
         x = x + linear("out_proj", attention(q * q.shape[-1] ** -0.5, k, v, None))
         h = jax.nn.gelu(linear("fc1", self.layer_norm2(x)), approximate=True)
         return x + linear("fc2", h), linear.aux
