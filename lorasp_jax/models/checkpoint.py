@@ -53,7 +53,7 @@ def save(folder: Folder, model: Any) -> None:
         )
     if is_quantized(model):
         raise ValueError("models.save takes whole kernels: save a base before quantising it.")
-    arrays = {name: np.asarray(leaf, jnp.bfloat16) for name, leaf in _named(model).items()}
+    arrays = {name: np.asarray(leaf, jnp.bfloat16) for name, leaf in named_arrays(model).items()}
     backbone = type(model).__module__.split(".")[-2]
     description = {
         "backbone": backbone,
@@ -128,7 +128,7 @@ def set_arrays(model: Model, arrays: Mapping[str, Any]) -> Model:
     Raises:
         ValueError: missing or unexpected arrays, or other shapes.
     """
-    expected = _named(model)
+    expected = named_arrays(model)
     for problem, names in (
         ("missing", expected.keys() - arrays.keys()),
         ("unexpected", arrays.keys() - expected.keys()),
@@ -156,13 +156,13 @@ def weights_hash(source: Folder | nnx.Module) -> str:
         source: a folder that `save` wrote, or a model.
     """
     if isinstance(source, nnx.Module):
-        return _hash(_named(source, adapters=False))
+        return _hash(named_arrays(source, adapters=False))
     folder = pathlib.Path(source)
     _description(folder)
     return _hash(_read(folder))
 
 
-def _named(model: nnx.Module, adapters: bool = True) -> dict[str, Any]:
+def named_arrays(model: nnx.Module, adapters: bool = True) -> dict[str, Any]:
     """Parameters in tree order by "/"-joined path."""
     state = nnx.state(model, nnx.Param if adapters else nnx.All(nnx.Param, nnx.Not(AdapterParam)))
     leaves = jax.tree_util.tree_flatten_with_path(nnx.to_pure_dict(state))[0]

@@ -1,21 +1,24 @@
-"""openpi's pi0 parameters, a tree of arrays, as parameters of our `Pi0`.
+"""The layouts in which pi0's parameters are published: openpi's and LeRobot's.
 
 openpi keeps one einsum kernel for several linear maps (keys and values, gate and up) and separate
-head axes; ours are matrices under the names of Hugging Face. Values are only sliced, transposed and
-reshaped, so they stay exact.
+head axes. LeRobot has PyTorch's transposed matrices, layer by layer. Ours are matrices under the
+names of Hugging Face, stacked over layers.
 """
-
-from collections.abc import Mapping
 
 import numpy as np
 
-from lorasp_jax.models.pi0.config import Pi0Config
+from lorasp_jax.models.layouts import Rule, copied, reshaped, stacked, transposed
+from lorasp_jax.models.pi0.config import ExpertConfig, Pi0Config
 
-Arrays = dict[str, np.ndarray]
-"""Arrays by "/"-joined path."""
-
-_VISION = "PaliGemma/img"
-_LAYERS = "PaliGemma/llm/layers"
+_IMG, _LLM = "PaliGemma/img", "PaliGemma/llm"
+_PALIGEMMA = "paligemma_with_expert.paligemma"
+_EXPERT = "paligemma_with_expert.gemma_expert"
+_VISION = f"{_PALIGEMMA}.model.vision_tower.vision_model"
+_LANGUAGE = f"{_PALIGEMMA}.model.language_model"
+UNUSED = (f"{_PALIGEMMA}.lm_head.weight", f"{_EXPERT}.lm_head.weight")
+"""LeRobot's heads, which no computation reads."""
+TIED = {UNUSED[0]: f"{_LANGUAGE}.embed_tokens.weight"}
+"""Of those, what is another tensor once more."""
 _PROJECTIONS = (
     "state_proj",
     "action_in_proj",
@@ -25,102 +28,199 @@ _PROJECTIONS = (
 )
 
 
-def from_openpi(arrays: Mapping[str, np.ndarray], config: Pi0Config) -> Arrays:
-    """Rename and reshape openpi's leaves.
-
-    Args:
-        arrays: leaves by "/"-joined path below `params`; a trailing "/value" is dropped.
-        config: sizes of the model they are for.
-
-    Returns:
-        Leaves by path in our model, for `models.set_arrays`.
-
-    Raises:
-        ValueError: a leaf is missing, or some are left over (adapters, another model).
-    """
-    source = _Source({path.removesuffix("/value"): np.asarray(a) for path, a in arrays.items()})
-    ours = {**_vision(source, config), **_expert(source, "language", "")}
-    ours |= _expert(source, "action", "_1")
-    ours["language/embedding"] = source.take("PaliGemma/llm/embedder/input_embedding")
+def openpi_layout(config: Pi0Config) -> list[Rule]:
+    """openpi's leaves by "/"-joined path below `params` (models/pi0.py, gemma.py, siglip.py)."""
+    rules = [
+        *_openpi_vision(config),
+        copied("language/embedding", f"{_LLM}/embedder/input_embedding"),
+    ]
+    for tower, size, suffix in (("language", config.language, ""), ("action", config.action, "_1")):
+        rules += _openpi_expert(tower, size, suffix)
     for name in _PROJECTIONS:
-        ours |= {f"{name}/{leaf}": source.take(f"{name}/{leaf}") for leaf in ("kernel", "bias")}
-    source.check()
-    return ours
+        rules += [copied(f"{name}/{leaf}", f"{name}/{leaf}") for leaf in ("kernel", "bias")]
+    return rules
 
 
-class _Source:
-    """Leaves that are taken one by one; knows what nobody took."""
-
-    def __init__(self, arrays: Arrays) -> None:
-        self._left = arrays
-
-    def take(self, path: str) -> np.ndarray:
-        """The leaf at `path`."""
-        if path not in self._left:
-            raise ValueError(f"openpi parameters lack {path}.")
-        return self._left.pop(path)
-
-    def check(self) -> None:
-        """Raises ValueError if a leaf is left."""
-        if self._left:
-            raise ValueError(
-                f"openpi parameters have leaves this model lacks: {', '.join(sorted(self._left))}."
-            )
-
-
-def _vision(source: _Source, config: Pi0Config) -> Arrays:
-    layers, width = config.vision.depth, config.vision.width
-    block = f"{_VISION}/Transformer/encoderblock"
-    ours = {
-        "patch_embed/kernel": source.take(f"{_VISION}/embedding/kernel").reshape(-1, width),
-        "patch_embed/bias": source.take(f"{_VISION}/embedding/bias"),
-        "position_embedding": source.take(f"{_VISION}/pos_embedding")[0],
-    }
+def _openpi_vision(config: Pi0Config) -> list[Rule]:
+    size = config.vision
+    layers, width, patch = size.depth, size.width, size.patch
+    heads = (size.heads, width // size.heads)
+    block, ours = f"{_IMG}/Transformer/encoderblock", "vision/blocks"
+    attention = f"{block}/MultiHeadDotProductAttention_0"
+    embedding, matrix = (patch, patch, 3, width), (layers, width, width)
+    rules = [
+        reshaped("vision/patch_embed/kernel", f"{_IMG}/embedding/kernel", (-1, width), embedding),
+        copied("vision/patch_embed/bias", f"{_IMG}/embedding/bias"),
+        reshaped("vision/position_embedding", f"{_IMG}/pos_embedding", (-1, width), (1, -1, width)),
+        reshaped(
+            f"{ours}/out_proj/kernel", f"{attention}/out/kernel", matrix, (layers, *heads, width)
+        ),
+        copied(f"{ours}/out_proj/bias", f"{attention}/out/bias"),
+    ]
     for name, theirs in (("q_proj", "query"), ("k_proj", "key"), ("v_proj", "value")):
-        path = f"{block}/MultiHeadDotProductAttention_0/{theirs}"
-        ours[f"blocks/{name}/kernel"] = source.take(f"{path}/kernel").reshape(layers, width, -1)
-        ours[f"blocks/{name}/bias"] = source.take(f"{path}/bias").reshape(layers, -1)
-    path = f"{block}/MultiHeadDotProductAttention_0/out"
-    ours["blocks/out_proj/kernel"] = source.take(f"{path}/kernel").reshape(layers, -1, width)
-    ours["blocks/out_proj/bias"] = source.take(f"{path}/bias")
-    copies = {
-        "blocks/fc1/kernel": f"{block}/MlpBlock_0/Dense_0/kernel",
-        "blocks/fc1/bias": f"{block}/MlpBlock_0/Dense_0/bias",
-        "blocks/fc2/kernel": f"{block}/MlpBlock_0/Dense_1/kernel",
-        "blocks/fc2/bias": f"{block}/MlpBlock_0/Dense_1/bias",
-        "head/kernel": f"{_VISION}/head/kernel",
-        "head/bias": f"{_VISION}/head/bias",
-    }
+        theirs = f"{attention}/{theirs}"
+        kernel, bias = (layers, width, *heads), (layers, *heads)
+        rules += [
+            reshaped(f"{ours}/{name}/kernel", f"{theirs}/kernel", matrix, kernel),
+            reshaped(f"{ours}/{name}/bias", f"{theirs}/bias", (layers, width), bias),
+        ]
+    for leaf in ("kernel", "bias"):
+        rules += [
+            copied(f"{ours}/fc{i + 1}/{leaf}", f"{block}/MlpBlock_0/Dense_{i}/{leaf}")
+            for i in (0, 1)
+        ]
+        rules.append(copied(f"vision/head/{leaf}", f"{_IMG}/head/{leaf}"))
     for leaf in ("scale", "bias"):
-        copies[f"blocks/layer_norm1/{leaf}"] = f"{block}/LayerNorm_0/{leaf}"
-        copies[f"blocks/layer_norm2/{leaf}"] = f"{block}/LayerNorm_1/{leaf}"
-        copies[f"norm/{leaf}"] = f"{_VISION}/Transformer/encoder_norm/{leaf}"
-    ours |= {name: source.take(path) for name, path in copies.items()}
-    return {f"vision/{name}": array for name, array in ours.items()}
+        rules += [
+            copied(f"{ours}/layer_norm{i + 1}/{leaf}", f"{block}/LayerNorm_{i}/{leaf}")
+            for i in (0, 1)
+        ]
+        rules.append(copied(f"vision/norm/{leaf}", f"{_IMG}/Transformer/encoder_norm/{leaf}"))
+    return rules
 
 
-def _expert(source: _Source, name: str, suffix: str) -> Arrays:
-    """Leaves of one expert; openpi marks the action expert's with "_1"."""
-    q = source.take(f"{_LAYERS}/attn/q_einsum{suffix}/w")  # [L, N, D, H]
-    kv = source.take(f"{_LAYERS}/attn/kv_einsum{suffix}/w")  # [L, 2, K, D, H]
-    out = source.take(f"{_LAYERS}/attn/attn_vec_einsum{suffix}/w")  # [L, N, H, D]
-    gating = source.take(f"{_LAYERS}/mlp{suffix}/gating_einsum")  # [L, 2, D, F]
-    ours = {
-        "q_proj/kernel": _heads_last(q),
-        "k_proj/kernel": _heads_last(kv[:, 0]),
-        "v_proj/kernel": _heads_last(kv[:, 1]),
-        "o_proj/kernel": out.reshape(len(out), -1, out.shape[-1]),
-        "gate_proj/kernel": gating[:, 0],
-        "up_proj/kernel": gating[:, 1],
-        "down_proj/kernel": source.take(f"{_LAYERS}/mlp{suffix}/linear"),
-        "input_layernorm/scale": source.take(f"{_LAYERS}/pre_attention_norm{suffix}/scale"),
-        "post_attention_layernorm/scale": source.take(f"{_LAYERS}/pre_ffw_norm{suffix}/scale"),
-    }
-    norm = source.take(f"PaliGemma/llm/final_norm{suffix}/scale")
-    return {f"{name}/blocks/{leaf}": a for leaf, a in ours.items()} | {f"{name}/norm/scale": norm}
+def _openpi_expert(tower: str, size: ExpertConfig, suffix: str) -> list[Rule]:
+    """One expert; openpi marks the action expert's leaves with "_1"."""
+    layers, ours = f"{_LLM}/layers", f"{tower}/blocks"
+    heads, kv_heads = size.heads, size.kv_heads
+
+    def kernel(name: str) -> str:
+        return f"{ours}/{name}/kernel"
+
+    out = (size.depth, heads, size.head_dim, size.width)
+    return [
+        # [L, N, D, H]; keys and values [L, 2, K, D, H]; gate and up [L, 2, D, F].
+        Rule(
+            (kernel("q_proj"),),
+            (f"{layers}/attn/q_einsum{suffix}/w",),
+            lambda arrays: [_heads_last(w) for w in arrays],
+            lambda q: [_heads_first(q, heads)],
+        ),
+        Rule(
+            (kernel("k_proj"), kernel("v_proj")),
+            (f"{layers}/attn/kv_einsum{suffix}/w",),
+            lambda arrays: [_heads_last(a) for w in arrays for a in (w[:, 0], w[:, 1])],
+            lambda k, v: [np.stack([_heads_first(a, kv_heads) for a in (k, v)], axis=1)],
+        ),
+        Rule(
+            (kernel("gate_proj"), kernel("up_proj")),
+            (f"{layers}/mlp{suffix}/gating_einsum",),
+            lambda arrays: [a for w in arrays for a in (w[:, 0], w[:, 1])],
+            lambda gate, up: [np.stack([gate, up], axis=1)],
+        ),
+        reshaped(
+            kernel("o_proj"),
+            f"{layers}/attn/attn_vec_einsum{suffix}/w",
+            (size.depth, -1, size.width),
+            out,
+        ),
+        copied(kernel("down_proj"), f"{layers}/mlp{suffix}/linear"),
+        copied(f"{ours}/input_layernorm/scale", f"{layers}/pre_attention_norm{suffix}/scale"),
+        copied(f"{ours}/post_attention_layernorm/scale", f"{layers}/pre_ffw_norm{suffix}/scale"),
+        copied(f"{tower}/norm/scale", f"{_LLM}/final_norm{suffix}/scale"),
+    ]
 
 
 def _heads_last(kernel: np.ndarray) -> np.ndarray:
     """`[L, N, D, H]` -> `[L, D, N H]`."""
     layers, _, width, _ = kernel.shape
     return kernel.swapaxes(1, 2).reshape(layers, width, -1)
+
+
+def _heads_first(kernel: np.ndarray, heads: int) -> np.ndarray:
+    """`[L, D, N H]` -> `[L, N, D, H]`."""
+    layers, width, _ = kernel.shape
+    return kernel.reshape(layers, width, heads, -1).swapaxes(1, 2)
+
+
+def canonical_name(name: str) -> str:
+    """LeRobot's name of today for a tensor: its towers have moved between versions."""
+    if name.endswith("lm_head.weight"):
+        return UNUSED["gemma_expert." in name]
+    for mark, inner, tower in (
+        ("vision_tower.", "vision_model.", _VISION),
+        ("gemma_expert.", "model.", f"{_EXPERT}.model"),
+        ("language_model.", "model.", _LANGUAGE),
+        ("multi_modal_projector.", "", f"{_PALIGEMMA}.model.multi_modal_projector"),
+    ):
+        _, found, rest = name.partition(mark)
+        if found:
+            return f"{tower}.{rest.removeprefix(inner)}"
+    return name
+
+
+def lerobot_layout(config: Pi0Config) -> list[Rule]:
+    """LeRobot's tensors by name without the leading "model." (policies/pi0/modeling_pi0.py)."""
+    vision, tower = config.vision, _VISION
+    patch = f"{tower}.embeddings.patch_embedding"
+    rules = [
+        Rule(
+            ("vision/patch_embed/kernel",),
+            (f"{patch}.weight",),
+            lambda arrays: [w.transpose(2, 3, 1, 0).reshape(-1, w.shape[0]) for w in arrays],
+            lambda k: [
+                k.reshape(vision.patch, vision.patch, 3, vision.width).transpose(3, 2, 0, 1)
+            ],
+        ),
+        copied("vision/patch_embed/bias", f"{patch}.bias"),
+        copied("vision/position_embedding", f"{tower}.embeddings.position_embedding.weight"),
+        *_norm("vision/norm", f"{tower}.post_layernorm"),
+        *_linear("vision/head", f"{_PALIGEMMA}.model.multi_modal_projector.linear"),
+        copied("language/embedding", f"{_LANGUAGE}.embed_tokens.weight"),
+    ]
+    layers = [f"{tower}.encoder.layers.{i}" for i in range(vision.depth)]
+    parts = {name: f"self_attn.{name}" for name in ("q_proj", "k_proj", "v_proj", "out_proj")}
+    for name, theirs in (parts | {"fc1": "mlp.fc1", "fc2": "mlp.fc2"}).items():
+        rules += _linears(f"vision/blocks/{name}", [f"{layer}.{theirs}" for layer in layers])
+    for name in ("layer_norm1", "layer_norm2"):
+        theirs = [f"{layer}.{name}" for layer in layers]
+        for leaf, torch in (("scale", "weight"), ("bias", "bias")):
+            rules.append(stacked(f"vision/blocks/{name}/{leaf}", [f"{t}.{torch}" for t in theirs]))
+    for name, theirs in (
+        ("language", _LANGUAGE),
+        ("action", f"{_EXPERT}.model"),
+    ):
+        rules += _lerobot_expert(name, theirs, config.language.depth)
+    for name in _PROJECTIONS:
+        rules += _linear(name, name)
+    return rules
+
+
+def _lerobot_expert(tower: str, theirs: str, depth: int) -> list[Rule]:
+    layers = [f"{theirs}.layers.{i}" for i in range(depth)]
+    parts = {name: f"self_attn.{name}" for name in ("q_proj", "k_proj", "v_proj", "o_proj")}
+    parts |= {name: f"mlp.{name}" for name in ("gate_proj", "up_proj", "down_proj")}
+    rules = [
+        stacked(
+            f"{tower}/blocks/{ours}/kernel", [f"{x}.{name}.weight" for x in layers], transpose=True
+        )
+        for ours, name in parts.items()
+    ]
+    rules += [
+        stacked(f"{tower}/blocks/{name}/scale", [f"{x}.{name}.weight" for x in layers])
+        for name in ("input_layernorm", "post_attention_layernorm")
+    ]
+    return [*rules, copied(f"{tower}/norm/scale", f"{theirs}.norm.weight")]
+
+
+def _linear(ours: str, theirs: str) -> list[Rule]:
+    return [
+        transposed(f"{ours}/kernel", f"{theirs}.weight"),
+        copied(f"{ours}/bias", f"{theirs}.bias"),
+    ]
+
+
+def _linears(ours: str, theirs: list[str]) -> list[Rule]:
+    """The same of stacked layers."""
+    return [
+        stacked(f"{ours}/kernel", [f"{name}.weight" for name in theirs], transpose=True),
+        stacked(f"{ours}/bias", [f"{name}.bias" for name in theirs]),
+    ]
+
+
+def _norm(ours: str, theirs: str) -> list[Rule]:
+    return [copied(f"{ours}/scale", f"{theirs}.weight"), copied(f"{ours}/bias", f"{theirs}.bias")]
+
+
+LAYOUTS = {"openpi": openpi_layout, "lerobot": lerobot_layout}
+"""Function of a config that gives the rules, by the layout's name."""
