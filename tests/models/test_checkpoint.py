@@ -120,6 +120,6 @@ def test_a_file_cut_short_raises(folder):
 def test_set_arrays_lists_what_does_not_fit(model):
     with pytest.raises(ValueError, match="missing arrays: action/blocks/down_proj/kernel, "):
         models.set_arrays(model, {})
-    arrays = checkpoint._named(model)
+    arrays = checkpoint.named_arrays(model)
     with pytest.raises(ValueError, match=r"unexpected arrays: lm_head\.$"):
         models.set_arrays(model, {**arrays, "lm_head": np.zeros(1)})

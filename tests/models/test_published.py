@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import shutil
 
 import flax.traverse_util
 import jax
@@ -188,8 +187,6 @@ def test_damage_is_one_sentence(layout, model, tmp_path):
         file = tmp_path / "new" / "model.safetensors"
         file.write_bytes(file.read_bytes()[:-1000])
     else:
-        for data in [f for f in (tmp_path / "new").rglob("*") if f.parent.name == "d"]:
-            data.write_bytes(data.read_bytes()[:100])
+        (tmp_path / "new" / "params" / "manifest.ocdbt").write_bytes(b"nothing")
     with pytest.raises(ValueError, match="damaged"):
         published.load(tmp_path / "new", CONFIG)
-    shutil.rmtree(tmp_path / "new")
