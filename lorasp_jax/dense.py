@@ -121,6 +121,12 @@ class AdaptedLayer(nnx.Module):
         """
         return method.init
 
+    def carried(self) -> tuple[Method, Params]:
+        """The method and the parameters of an adapter that is there."""
+        assert self.method is not None
+        assert self.adapter is not None
+        return self.method, self.adapter.get_value()
+
     def without_adapter(self) -> nnx.Module:
         """The layer as it was before adaptation, or as near as it comes, with its kernel of now."""
         self.adapter, self.method = None, None

@@ -11,6 +11,7 @@ order of the kernel's axes; an adapter has the batch axes in front, as it has th
 stack. "BTD,NDH->BTNH" thus has one adapter of D inputs and N·H outputs.
 """
 
+import dataclasses
 import math
 import re
 import string
@@ -138,7 +139,8 @@ def einsum(
       method: the adapter's method, given with `params`.
 
     Returns:
-      y in the type of x, and the adapter's aux with leading batch axes; losses averaged over them.
+      y in the type of x, and the adapter's aux, all with leading batch axes but the losses, which
+      are averaged over them.
 
     Raises:
       ValueError: an equation that is no adaptable map, or shapes that do not fit it.
@@ -160,7 +162,7 @@ def einsum(
         shape = [sizes[c] if c in axes.kernel else 1 for c in axes.y]
         y = y + bias.reshape(shape).astype(y.dtype)
     losses = {name: jnp.mean(values) for name, values in aux.losses.items()}
-    return y, Aux(aux.active_rank, aux.kept_energy, losses)
+    return y, dataclasses.replace(aux, losses=losses)
 
 
 def _sizes(equation: str, x: jax.Array, kernel: jax.Array) -> tuple[Axes, dict[str, int]]:
