@@ -114,7 +114,7 @@ def observe(
     Args:
       model: left untouched.
       batches: of one shape each, or it compiles for each.
-      reports: by path of a layer, of those of `multiplying`.
+      reports: by path of a layer, of those of `paths.multiplying`.
       forward: how to call the model.
       others: adapters by path that some layers' output is to be compared with.
 
@@ -168,7 +168,7 @@ def _observed(
     """A copy of the model that reports."""
     holder = nnx.List([nnx.clone(model)])
     nnx.pop(holder, AdapterAux)
-    for path, parent, name, layer in multiplying(holder):
+    for path, parent, name, layer in paths.multiplying(holder):
         if path not in reports:
             continue
         try:
@@ -188,12 +188,6 @@ def _observed(
             layer.method = method
             layer.adapter = AdapterParam(params)
     return holder[0]
-
-
-def multiplying(holder: nnx.List) -> list[paths.Place]:
-    """The layers that multiply their input by matrices: dense ones and einsums, adapted or not."""
-    places = paths.layer_places(holder)
-    return [place for place in places if not isinstance(place.child, nnx.Embed | nnx.Conv)]
 
 
 def _nodes(tree: Any) -> list[Any]:
@@ -221,7 +215,7 @@ def input_moments(
     Raises:
       ValueError: as for `observe`, or no such layer matches.
     """
-    known = [place.path for place in multiplying(nnx.List([model]))]
+    known = [place.path for place in paths.multiplying(nnx.List([model]))]
     reports = {path: second_moment for path in known if re.search(pattern, path)}
     if not reports:
         close = paths.near_misses(pattern, known) or "none"

@@ -28,6 +28,7 @@ import jax.numpy as jnp
 from flax import nnx
 from flax.typing import Dtype, Initializer
 
+from lorasp_jax.kernels.quantized import QuantizedKernel
 from lorasp_jax.peft import Aux, Method
 from lorasp_jax.peft.method import Params
 
@@ -108,7 +109,7 @@ class AdaptedLayer(nnx.Module):
         """The kernel as the adapter sees it, [..., I, O]; leading axes are stacks of layers."""
         return getattr(self, self.kernel_name).get_value()
 
-    def set_kernel_matrices(self, matrices: jax.Array) -> None:
+    def set_kernel_matrices(self, matrices: jax.Array | QuantizedKernel) -> None:
         """Gives the layer another kernel in a variable of its own: the old one may be shared."""
         old = getattr(self, self.kernel_name)
         setattr(self, self.kernel_name, with_value(old, matrices.reshape(old.get_value().shape)))

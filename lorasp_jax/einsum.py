@@ -8,7 +8,8 @@ An equation "x,kernel->y" has one "..." at most in x and y. It says what each ke
 
 To an adapter the kernel is a stack of matrices [*batch, I, O], inputs and outputs flattened in the
 order of the kernel's axes; an adapter has the batch axes in front, as it has those of a scanned
-stack. "BTD,NDH->BTNH" thus has one adapter of D inputs and N·H outputs.
+stack. "BTD,NDH->BTNH" thus has one adapter of D inputs and N·H outputs. A quantised kernel is kept
+as that stack of matrices, with the sizes of its axes beside it.
 """
 
 import dataclasses
@@ -16,12 +17,13 @@ import math
 import re
 import string
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from lorasp_jax.dense import dense
+from lorasp_jax.kernels.quantized import QuantizedKernel
 from lorasp_jax.peft import Aux, Method
 from lorasp_jax.peft.method import Params
 
@@ -105,8 +107,19 @@ def general_equation(axis: Sequence[int], batch: Sequence[int], outputs: int) ->
     return f"{x},{shared}{summed}{new}->{shared}{free[0]}...{free[1]}{new}"
 
 
-def to_matrices(equation: str, kernel: jax.Array) -> jax.Array:
+def kernel_shape(equation: str, kernel: Any) -> tuple[int, ...]:
+    """A kernel's shape as the equation has it, after leading axes of a stack."""
+    if not isinstance(kernel, QuantizedKernel):
+        return kernel.shape
+    assert kernel.axes is not None
+    outer = len(kernel.shape) - 2 - len(parse(equation).batch)
+    return *kernel.shape[:outer], *kernel.axes
+
+
+def to_matrices(equation: str, kernel: Any) -> Any:
     """A kernel, which may have further leading axes of a stack, as [..., *batch, I, O]."""
+    if isinstance(kernel, QuantizedKernel):
+        return kernel
     axes, order = _order(equation, kernel.ndim)
     kernel = kernel.transpose(order)
     outer = kernel.ndim - len(axes.inputs + axes.outputs)
@@ -114,9 +127,11 @@ def to_matrices(equation: str, kernel: jax.Array) -> jax.Array:
     return kernel.reshape(*kernel.shape[:outer], -1, math.prod(outputs))
 
 
-def from_matrices(equation: str, matrices: jax.Array, shape: Sequence[int]) -> jax.Array:
+def from_matrices(equation: str, matrices: Any, shape: Sequence[int]) -> Any:
     """The inverse of `to_matrices` for a kernel of this shape."""
-    _, order = _order(equation, len(shape))
+    axes, order = _order(equation, len(shape))
+    if isinstance(matrices, QuantizedKernel):
+        return dataclasses.replace(matrices, axes=tuple(shape[len(shape) - len(axes.kernel) :]))
     inverse = [order.index(i) for i in range(len(shape))]
     return matrices.reshape([shape[i] for i in order]).transpose(inverse)
 
@@ -124,7 +139,7 @@ def from_matrices(equation: str, matrices: jax.Array, shape: Sequence[int]) -> j
 def einsum(
     equation: str,
     x: jax.Array,
-    kernel: jax.Array,
+    kernel: jax.Array | QuantizedKernel,
     bias: jax.Array | None = None,
     params: Params | None = None,
     method: Method | None = None,
@@ -165,14 +180,14 @@ def einsum(
     return y, dataclasses.replace(aux, losses=losses)
 
 
-def _sizes(equation: str, x: jax.Array, kernel: jax.Array) -> tuple[Axes, dict[str, int]]:
+def _sizes(equation: str, x: jax.Array, kernel: Any) -> tuple[Axes, dict[str, int]]:
     """Axes for such an x, and their sizes."""
-    axes = parse(equation).expanded(x.ndim)
-    if kernel.ndim == len(axes.kernel):
-        sizes = dict(zip(axes.kernel + axes.x, kernel.shape + x.shape, strict=True))
-        if kernel.shape == tuple(sizes[c] for c in axes.kernel):
+    axes, shape = parse(equation).expanded(x.ndim), kernel_shape(equation, kernel)
+    if len(shape) == len(axes.kernel):
+        sizes = dict(zip(axes.kernel + axes.x, shape + x.shape, strict=True))
+        if shape == tuple(sizes[c] for c in axes.kernel):
             return axes, sizes
-    raise ValueError(f"{equation!r} meets shapes {x.shape} and {kernel.shape}.")
+    raise ValueError(f"{equation!r} meets shapes {x.shape} and {shape}.")
 
 
 def _order(equation: str, ndim: int) -> tuple[Axes, list[int]]:

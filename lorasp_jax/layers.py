@@ -14,7 +14,8 @@ from flax import linen, nnx
 from flax.nnx.nn.dtypes import promote_dtype
 
 from lorasp_jax import einsum
-from lorasp_jax.dense import AdaptedLayer, Dense, refuse_sharding
+from lorasp_jax.dense import AdaptedLayer, Dense, refuse_sharding, with_value
+from lorasp_jax.kernels.quantized import QuantizedKernel
 from lorasp_jax.peft import LoRA, Method
 
 Einsums = Mapping[type[nnx.Module], Callable[[Any], tuple[str, str]]]
@@ -62,21 +63,25 @@ class EinsumLayer(AdaptedLayer):
         y, aux = einsum.einsum(
             self.kernel_equation, x.astype(dtype), kernel, bias, params, self.method
         )
-        self.keep_aux(aux)
+        if self.adapter is not None:
+            self.keep_aux(aux)
         return y
 
     def kernel_matrices(self) -> jax.Array:
         """The kernel as [..., *batch, I, O]."""
         return einsum.to_matrices(self.kernel_equation, super().kernel_matrices())
 
-    def set_kernel_matrices(self, matrices: jax.Array) -> None:
+    def set_kernel_matrices(self, matrices: jax.Array | QuantizedKernel) -> None:
         """Gives the layer another kernel."""
-        shape = getattr(self, self.kernel_name).get_value().shape
-        super().set_kernel_matrices(einsum.from_matrices(self.kernel_equation, matrices, shape))
+        old, equation = getattr(self, self.kernel_name), self.kernel_equation
+        shape = einsum.kernel_shape(equation, old.get_value())
+        new = with_value(old, einsum.from_matrices(equation, matrices, shape))
+        setattr(self, self.kernel_name, new)
 
     def without_adapter(self) -> nnx.Module:
-        """The layer in its own class again."""
-        return _undressed(self)
+        """The layer in its own class again, unless that cannot read a quantised kernel."""
+        quantized = isinstance(super().kernel_matrices(), QuantizedKernel)
+        return super().without_adapter() if quantized else _undressed(self)
 
 
 class LoRALayer(AdaptedLayer):
@@ -86,17 +91,12 @@ class LoRALayer(AdaptedLayer):
         """As for every layer, but see `lora_init`."""
         return lora_init(self, method)
 
-    def with_delta(self, y: jax.Array, hidden: jax.Array) -> jax.Array:
-        """Y plus the delta, from what A makes of the input."""
+    def with_delta(self, y: jax.Array, read: Callable[[jax.Array], jax.Array]) -> jax.Array:
+        """Y plus the delta, from what `read` makes of the input and A."""
         method, params = self.carried()
-        z, aux = method.between(params, hidden.astype(y.dtype), None)
+        z, aux = method.between(params, read(method.down(params)).astype(y.dtype), None)
         self.keep_aux(aux)
         return y + z @ method.up(params).astype(y.dtype)
-
-    def down(self) -> jax.Array:
-        """A, of all adapters side by side."""
-        method, params = self.carried()
-        return method.down(params)
 
     def without_adapter(self) -> nnx.Module:
         """The layer in its own class again."""
@@ -109,7 +109,7 @@ class EmbedLayer(LoRALayer):
     def __call__(self, inputs: jax.Array, *args: Any, **kwargs: Any) -> jax.Array:
         """Rows of the table for ids [...], [..., D]."""
         y = super().__call__(inputs, *args, **kwargs)
-        return self.with_delta(y, lookup(self.down(), inputs))
+        return self.with_delta(y, lambda a: lookup(a, inputs))
 
     def attend(self, query: jax.Array, *args: Any, **kwargs: Any) -> jax.Array:
         """Inner products of queries [..., D] with the rows, [..., V]."""
@@ -123,7 +123,7 @@ class ConvLayer(LoRALayer):
     def __call__(self, inputs: jax.Array, *args: Any, **kwargs: Any) -> jax.Array:
         """The convolution, [..., *spatial, O]."""
         y = super().__call__(inputs, *args, **kwargs)
-        return self.with_delta(y, convolved(self, self.down(), inputs))
+        return self.with_delta(y, lambda a: convolved(self, a, inputs))
 
     def kernel_matrices(self) -> jax.Array:
         """The kernel [..., *sizes, I, O] as [..., sizes · I, O]."""

@@ -45,6 +45,12 @@ def layer_places(holder: nnx.List, einsums: layers.Einsums = MappingProxyType({}
     ]
 
 
+def multiplying(holder: nnx.List) -> list[Place]:
+    """The layers that multiply their input by matrices: dense ones and einsums, adapted or not."""
+    found = layer_places(holder)
+    return [place for place in found if not isinstance(place.child, nnx.Embed | nnx.Conv)]
+
+
 def check_patterns(patterns: Iterable[str]) -> None:
     """Raises a ValueError for a pattern that is no regular expression."""
     for pattern in patterns:

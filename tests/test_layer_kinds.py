@@ -15,37 +15,16 @@ import lorasp_jax
 from lorasp_jax import adaptation, adapter_io, calibration
 from lorasp_jax.dense import AdapterParam, Dense
 from lorasp_jax.peft import DoRA, LoRA, LoRASP
-from tests.nets import assert_close, trained
+from tests.nets import Kinds, assert_close, call, trained
 
 SP = LoRASP(rank=6, hidden_width=4, energy_target=0.6)
 WEIGHTS = {"a": 0.6, "b": -0.3}
-
-
-class Kinds(nnx.Module):
-    """All kinds of layers: ids [B, T] in, [B, T, 4] out."""
-
-    def __init__(self):
-        rngs, init = nnx.Rngs(0), nnx.initializers.normal()
-        self.embed = nnx.Embed(7, 6, rngs=rngs)
-        self.conv = nnx.Conv(6, 6, (2,), rngs=rngs)
-        self.split = nnx.LinearGeneral(6, (2, 3), rngs=rngs, bias_init=init)
-        self.experts = nnx.Einsum("...nh,nhk->...nk", (2, 3, 3), (2, 3), rngs=rngs)
-        self.join = nnx.LinearGeneral((2, 3), 6, axis=(-2, -1), use_bias=False, rngs=rngs)
-        self.blocks = nnx.vmap(lambda r: nnx.Einsum("...d,fd->...f", (6, 6), rngs=r))(rngs.split(3))
-        self.out = nnx.Linear(6, 4, rngs=rngs)
-
-    def __call__(self, ids):
-        x = self.conv(self.embed(ids))
-        x = self.join(jnp.tanh(self.experts(self.split(x))))
-        scan = nnx.scan(lambda x, layer: (x + layer(x), None), in_axes=(nnx.Carry, 0))
-        return self.out(scan(x, self.blocks)[0])
 
 
 NET = Kinds()
 KINDS = ["blocks", "conv", "embed", "experts", "join", "out", "split"]
 EINSUMS = ["blocks", "experts", "join", "split"]
 IDS = [jax.random.randint(jax.random.key(i), (4, 5), 0, 7) for i in range(3)]
-call = jax.jit(lambda model, x: model(x))
 
 
 def kernels(model):

@@ -46,6 +46,8 @@ class QuantizedKernel:
     """I; the last block may be longer than what is left of it."""
     dtype: Any = dataclasses.field(metadata={"static": True})
     """The type that it stands for."""
+    axes: tuple[int, ...] | None = dataclasses.field(default=None, metadata={"static": True})
+    """Sizes of the axes of an einsum's kernel that it stands for; see `lorasp_jax.einsum`."""
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -68,13 +70,13 @@ class QuantizedKernel:
         whole = (values * self.scale).astype(dtype).reshape(*leading, blocks * rows, d_out)
         return whole[..., : self.d_in, :]
 
-    def reshape(self, *shape: int) -> "QuantizedKernel":
+    def reshape(self, *shape: Any) -> "QuantizedKernel":
         """With other leading axes; -1 is allowed as in `jnp.reshape`.
 
         Raises:
           ValueError: another [I, O].
         """
-        *leading, d_in, d_out = np.empty(self.shape, np.void).reshape(shape).shape
+        *leading, d_in, d_out = np.empty(self.shape, np.void).reshape(*shape).shape
         if (d_in, d_out) != self.shape[-2:]:
             raise ValueError(f"a quantised kernel {self.shape} cannot become {shape}.")
         arrays = {n: getattr(self, n) for n in ("codes", "scale")}
