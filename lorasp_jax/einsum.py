@@ -107,19 +107,10 @@ def general_equation(axis: Sequence[int], batch: Sequence[int], outputs: int) ->
     return f"{x},{shared}{summed}{new}->{shared}{free[0]}...{free[1]}{new}"
 
 
-def kernel_shape(equation: str, kernel: Any) -> tuple[int, ...]:
-    """A kernel's shape as the equation has it, after leading axes of a stack."""
-    if not isinstance(kernel, QuantizedKernel):
-        return kernel.shape
-    assert kernel.axes is not None
-    outer = len(kernel.shape) - 2 - len(parse(equation).batch)
-    return *kernel.shape[:outer], *kernel.axes
-
-
 def to_matrices(equation: str, kernel: Any) -> Any:
     """A kernel, which may have further leading axes of a stack, as [..., *batch, I, O]."""
     if isinstance(kernel, QuantizedKernel):
-        return kernel
+        return dataclasses.replace(kernel, axes=None, batch=0)
     axes, order = _order(equation, kernel.ndim)
     kernel = kernel.transpose(order)
     outer = kernel.ndim - len(axes.inputs + axes.outputs)
@@ -131,7 +122,8 @@ def from_matrices(equation: str, matrices: Any, shape: Sequence[int]) -> Any:
     """The inverse of `to_matrices` for a kernel of this shape."""
     axes, order = _order(equation, len(shape))
     if isinstance(matrices, QuantizedKernel):
-        return dataclasses.replace(matrices, axes=tuple(shape[len(shape) - len(axes.kernel) :]))
+        sizes = tuple(shape[len(shape) - len(axes.kernel) :])
+        return dataclasses.replace(matrices, axes=sizes, batch=len(axes.batch))
     inverse = [order.index(i) for i in range(len(shape))]
     return matrices.reshape([shape[i] for i in order]).transpose(inverse)
 
@@ -182,7 +174,7 @@ def einsum(
 
 def _sizes(equation: str, x: jax.Array, kernel: Any) -> tuple[Axes, dict[str, int]]:
     """Axes for such an x, and their sizes."""
-    axes, shape = parse(equation).expanded(x.ndim), kernel_shape(equation, kernel)
+    axes, shape = parse(equation).expanded(x.ndim), kernel.shape
     if len(shape) == len(axes.kernel):
         sizes = dict(zip(axes.kernel + axes.x, shape + x.shape, strict=True))
         if shape == tuple(sizes[c] for c in axes.kernel):

@@ -74,8 +74,9 @@ def unmerge(merged: Model, adapted: nnx.Module) -> Model:
         `load_adapters(folder, merged)`, unless it holds a part of its kernel.
 
     Raises:
-      ValueError: the merged model has adapters or lacks a layer, or an adapter that did not just
-        add a constant: DoRA rescaled the kernel, and what it was before is not in the result.
+      ValueError: the merged model has adapters, lacks a layer or has one of another class; or an
+        adapter that did not just add a constant: DoRA rescaled the kernel, and what it was before
+        is not in the result.
     """
     adapters = named.adapters_by_path("the model to unmerge by", adapted)
     if has := adaptation.methods(merged):
@@ -84,8 +85,11 @@ def unmerge(merged: Model, adapted: nnx.Module) -> Model:
     for place in paths.places(holder, nnx.Module):
         if place.path not in adapters:
             continue
+        own = adapters.pop(place.path)
+        if getattr(place.child, "adapter", None) is not None:
+            continue  # it hangs in several places, and it was taken apart at another one
         try:
-            layer = _unmerged(place.child, adapters.pop(place.path))
+            layer = _unmerged(place.child, own)
         except (ValueError, TypeError) as error:
             raise ValueError(f"cannot unmerge {place.path}: {error}") from error
         setattr(place.parent, place.name, layer)

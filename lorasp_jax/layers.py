@@ -73,10 +73,9 @@ class EinsumLayer(AdaptedLayer):
 
     def set_kernel_matrices(self, matrices: jax.Array | QuantizedKernel) -> None:
         """Gives the layer another kernel."""
-        old, equation = getattr(self, self.kernel_name), self.kernel_equation
-        shape = einsum.kernel_shape(equation, old.get_value())
-        new = with_value(old, einsum.from_matrices(equation, matrices, shape))
-        setattr(self, self.kernel_name, new)
+        old = getattr(self, self.kernel_name)
+        kernel = einsum.from_matrices(self.kernel_equation, matrices, old.get_value().shape)
+        setattr(self, self.kernel_name, with_value(old, kernel))
 
     def without_adapter(self) -> nnx.Module:
         """The layer in its own class again, unless that cannot read a quantised kernel."""

@@ -37,8 +37,8 @@ Adapters: TypeAlias = dict[str, AdaptedLayer]
 def combine(models: Mapping[str, Model], *, rank: int | None = None) -> Model:
     """One model with the adapters of several; the first is chosen at first.
 
-    The adapters may differ in method, rank and scale and in the layers that they adapt. Nothing
-    trains in the result.
+    The adapters may differ in method, rank and scale and in the layers that they adapt, which may
+    be of every kind that `adapt` knows. Nothing trains in the result.
 
     Args:
       models: adapted from one base, by name; left untouched. The result shares their base. A bare
@@ -184,7 +184,7 @@ def bare(model: Model) -> Model:
       ValueError: an adapter holds a part of its kernel.
     """
     holder = nnx.List([nnx.merge(*adaptation.split(model))])
-    for place in paths.places(holder, AdaptedLayer):
+    for place in paths.once(paths.places(holder, AdaptedLayer)):
         if place.child.adapter is not None:
             if place.child.method.splits_kernel:
                 raise ValueError(

@@ -36,6 +36,11 @@ def places(holder: nnx.List, kind: type | tuple[type, ...]) -> list[Place]:
     return list(walk())
 
 
+def once(found: list[Place]) -> list[Place]:
+    """Without the further places of a child that hangs in several."""
+    return list({id(place.child): place for place in reversed(found)}.values())[::-1]
+
+
 def layer_places(holder: nnx.List, einsums: layers.Einsums = MappingProxyType({})) -> list[Place]:
     """All layers that have an adapter or could."""
     return [

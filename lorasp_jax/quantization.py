@@ -73,7 +73,7 @@ def quantize(model: nnx.Module, rules: Sequence[tuple[str, Kind | None]]) -> Qua
         if rule not in used:
             close = paths.near_misses(rule[0], [place.path for place in known]) or "none"
             raise ValueError(
-                f"rule {rule[0]!r} governs no dense layer or einsum; those here: {close}."
+                f"rule {rule[0]!r} governs nothing; dense layers and einsums here: {close}."
             )
     return Quantized(holder[0], errors)
 

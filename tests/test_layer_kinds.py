@@ -51,11 +51,11 @@ def combined(models):
 
 
 def experts_and_twins(method):
-    """An einsum of three experts, and as many dense layers with its weights and adapters."""
+    """An einsum of two experts, and as many dense layers with its weights and adapters."""
     init = nnx.initializers.normal(0.5)
-    layer = nnx.Einsum("nbh,nhk->bnk", (3, 5, 4), rngs=nnx.Rngs(0), kernel_init=init)
+    layer = nnx.Einsum("nbh,nhk->bnk", (2, 5, 4), rngs=nnx.Rngs(0), kernel_init=init)
     layer = trained((".*", method), seed=3, net=layer)
-    twins = [Dense(5, 4, use_bias=False, method=method, rngs=nnx.Rngs(0)) for _ in range(3)]
+    twins = [Dense(5, 4, use_bias=False, method=method, rngs=nnx.Rngs(0)) for _ in range(2)]
     params = layer.adapter.get_value()
     for i, twin in enumerate(twins):
         twin.kernel.set_value(layer.kernel[...][i])
@@ -99,22 +99,23 @@ def test_moments_of_lookups_are_refused():
 @pytest.mark.parametrize("tool", [lorasp_jax.prune, lorasp_jax.distill])
 def test_experts_get_smaller_like_dense_twins(tool):
     layer, twins = experts_and_twins(SP)
-    x = jax.random.normal(jax.random.key(0), (3, 40, 5))
+    x = jax.random.normal(jax.random.key(0), (2, 40, 5))
     assert_close(layer(x), by_twins(twins, x))
     amount = 0.3 if tool is lorasp_jax.prune else 2
     smaller, report = tool(layer, [x], amount)
     expected, each = tool(twins, [x], amount, forward=by_twins)
-    np.testing.assert_array_equal(report.ranks[""], [each.ranks[str(i)] for i in range(3)])
+    np.testing.assert_array_equal(report.ranks[""], [each.ranks[str(i)] for i in range(2)])
     if tool is lorasp_jax.prune:  # a stack has one rank: the largest
         assert smaller.method.rank == max(report.ranks[""]) < SP.rank
     else:
-        own = [each.layer_errors[str(i)] for i in range(3)]
+        own = [each.layer_errors[str(i)] for i in range(2)]
         np.testing.assert_allclose(report.layer_errors[""], own, rtol=1e-3)
         assert_close(call(smaller, x), by_twins(expected, x))
     error = np.linalg.norm(smaller(x) - layer(x)) / np.linalg.norm(layer(x))
     np.testing.assert_allclose(report.output_error, error, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_distilled_kinds_merge_save_and_load(tmp_path):
     model = trained(("split|experts|join|blocks", SP), seed=4, net=NET)
     smaller, report = lorasp_jax.distill(model, IDS)
@@ -130,6 +131,7 @@ def test_distilled_kinds_merge_save_and_load(tmp_path):
     np.testing.assert_array_equal(call(loaded, IDS[0]), call(smaller, IDS[0]))
 
 
+@pytest.mark.slow
 def test_pruned_kinds_answer_as_before():
     """η = 0.6 never needs them all, so something goes, and nothing that was used."""
     model = trained(("split|experts|join|blocks", SP), seed=4, net=NET)
@@ -193,6 +195,7 @@ def test_swapping_compiles_nothing(models, combined):
     assert_close(call(lorasp_jax.choose(swapped, "a"), IDS[0]), call(models["a"], IDS[0]))
 
 
+@pytest.mark.slow
 def test_other_methods_have_names_too(models):
     others = {
         "sp": trained(("split|experts|blocks", SP), seed=5, net=NET),
@@ -218,3 +221,28 @@ def test_unmerging_needs_layers_of_the_same_kind(models):
     message = "cannot unmerge split: a Linear is there instead of a LinearGeneral"
     with pytest.raises(ValueError, match=message):
         lorasp_jax.unmerge(merged, models["a"])
+
+
+class Shared(nnx.Module):
+    """One layer in two places."""
+
+    def __init__(self):
+        self.first = nnx.Einsum("...d,df->...f", (4, 4), rngs=nnx.Rngs(0))
+        self.second = self.first
+
+    def __call__(self, x):
+        return self.second(self.first(x))
+
+
+def test_a_shared_layer_changes_once():
+    net, x = Shared(), jax.random.normal(jax.random.key(0), (5, 4))
+    model = trained((".*", LoRA(rank=2)), seed=1, net=net)
+    merged = lorasp_jax.merge(model)
+    assert merged.first is merged.second
+    assert_close(merged(x), model(x))
+    apart = lorasp_jax.unmerge(merged, model)
+    assert_close(apart.first.kernel[...], net.first.kernel[...])
+    assert_close(apart(x), model(x))
+    both = lorasp_jax.combine({"a": model, "b": net})
+    assert_close(lorasp_jax.extract(both, "a")(x), model(x))
+    assert_close(lorasp_jax.choose(both, None)(x), net(x))

@@ -47,12 +47,18 @@ class QuantizedKernel:
     dtype: Any = dataclasses.field(metadata={"static": True})
     """The type that it stands for."""
     axes: tuple[int, ...] | None = dataclasses.field(default=None, metadata={"static": True})
-    """Sizes of the axes of an einsum's kernel that it stands for; see `lorasp_jax.einsum`."""
+    """Where it stands for an einsum's kernel, the sizes of that one's axes: its shape after the
+    axes of a stack. The codes stay matrices, and so does what `astype` gives."""
+    batch: int = dataclasses.field(default=0, metadata={"static": True})
+    """How many of the codes' leading axes are among them."""
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """[..., I, O]."""
-        return *self.codes.shape[:-3], self.d_in, self.codes.shape[-1]
+        """[..., I, O], or [..., *axes]."""
+        leading = self.codes.shape[:-3]
+        if self.axes is None:
+            return *leading, self.d_in, self.codes.shape[-1]
+        return *leading[: len(leading) - self.batch], *self.axes
 
     @property
     def nbytes(self) -> int:
