@@ -70,8 +70,9 @@ def choose(model: Model, choice: One | Sequence[One] | jax.Array | np.ndarray) -
     Args:
       model: from `combine`; left untouched, the result shares its arrays.
       choice: a name, weights by name, or None for the base; a sequence of those, one for each
-        example of the batch; or an array of `weights`, f32 [A] or [B, A]. Where the model folds
-        other axes into that of the batch, as in [B * cameras, ...], an example's rows are in turn.
+        example of the batch; or an array of `weights`, f32 [A] or [B, A]. The batch is the first
+        axis of a layer's input, of an einsum's the first that its kernel lacks. Where the model
+        folds other axes into it, as in [B * cameras, ...], an example's rows are in turn.
 
     Raises:
       ValueError: a model without named adapters, an unknown name (lists near misses), or an array
