@@ -118,7 +118,7 @@ def merge(model: Model) -> Model:
       ValueError: a method whose delta depends on the input.
     """
     holder = _copy(model)
-    for place in paths.places(holder, AdaptedLayer):
+    for place in paths.once(paths.places(holder, AdaptedLayer)):
         layer = place.child
         if layer.adapter is not None:
             try:

@@ -1,4 +1,7 @@
-"""What passes through a model's dense layers on a calibration set, summed over its valid tokens.
+"""What passes through a model's layers on a calibration set, summed over its valid tokens.
+
+That is dense layers and einsums, which multiply their input, as rows [...tokens, I], by a matrix.
+Embeddings and convolutions do not and are left out.
 
 Each layer's method is wrapped in one that leaves the output alone and reports sums in `Aux`, under
 the layer's path. So they come out of any model that adapters work in: a stranger's, whose layers
@@ -16,9 +19,8 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax import adaptation, paths
-from lorasp_jax.dense import AdapterAux, AdapterParam, Dense
-from lorasp_jax.layers import as_dense
+from lorasp_jax import adaptation, layers, paths
+from lorasp_jax.dense import AdapterAux, AdapterParam
 from lorasp_jax.peft.method import Aux, Method, Params
 
 Forward = Callable[[Any, Any], Any]
@@ -35,7 +37,7 @@ def call(model: Any, batch: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Layer:
-    """One call of one dense layer, as a report sees it.
+    """One call of one matrix of a layer, as a report sees it; see `lorasp_jax.einsum`.
 
     Attributes:
       method: the layer's own, or None.
@@ -112,16 +114,17 @@ def observe(
     Args:
       model: left untouched.
       batches: of one shape each, or it compiles for each.
-      reports: by path of a `Dense` or `nnx.Linear`.
+      reports: by path of a layer, of those of `paths.multiplying`.
       forward: how to call the model.
       others: adapters by path that some layers' output is to be compared with.
 
     Returns:
-      Sums by path, with "tokens", the number of valid ones; for a layer of a scanned stack with a
-      leading axis L.
+      Sums by path, with "tokens", the number of valid ones, all with the leading axes of the
+      layer's kernel matrices: those of a scanned stack and the batch axes of an einsum.
 
     Raises:
-      ValueError: no batches, or a layer that was not called or whose aux `forward` did not return.
+      ValueError: no batches, a layer that was not called or whose aux `forward` did not return, or
+        one with its own matrix product, precision or the like.
     """
     step = _stepping(_observed(model, reports, others), forward)
     total: dict[str, Sums] = {}
@@ -165,16 +168,18 @@ def _observed(
     """A copy of the model that reports."""
     holder = nnx.List([nnx.clone(model)])
     nnx.pop(holder, AdapterAux)
-    for path, parent, name, layer in paths.places(holder, (Dense, nnx.Linear)):
+    for path, parent, name, layer in paths.multiplying(holder):
         if path not in reports:
             continue
-        method = Observed(path, getattr(layer, "method", None), reports[path])
-        if getattr(layer, "adapter", None) is None:
-            method = dataclasses.replace(method, inner=None)
-            layer = as_dense(layer)
-            adaptation.attach(layer, method, jax.random.key(0))
-            setattr(parent, name, layer)
+        try:
+            layer = layers.adapted(layer, {})
+        except ValueError as error:
+            raise ValueError(f"cannot observe {path}: {error}") from error
+        setattr(parent, name, layer)
+        if layer.adapter is None:
+            adaptation.attach(layer, Observed(path, None, reports[path]), jax.random.key(0))
         else:
+            method = Observed(path, layer.method, reports[path])
             params = layer.adapter.get_value()
             if path in others:
                 another, its_params = others[path]
@@ -202,12 +207,19 @@ def _add(total: dict[str, Sums], more: Any) -> None:
 def input_moments(
     model: nnx.Module, batches: Iterable[Any], pattern: str = ".*", forward: Forward = call
 ) -> dict[str, jax.Array]:
-    """Σ x xᵀ of the inputs of the dense layers whose path matches, f32 [..., I, I] by path.
+    """Σ x xᵀ of the inputs of the layers whose path matches, f32 [..., I, I] by path.
 
-    It is what `adapt(..., statistics=...)` needs for LoRA's initialization "eva". Not centred.
+    It is what `adapt(..., statistics=...)` needs for LoRA's initialization "eva". Not centred. Of
+    dense layers and einsums; other people's einsum classes are known once they are adapted.
+
+    Raises:
+      ValueError: as for `observe`, or no such layer matches.
     """
-    places = paths.places(nnx.List([model]), (Dense, nnx.Linear))
-    reports = {p.path: second_moment for p in places if re.search(pattern, p.path)}
+    known = [place.path for place in paths.multiplying(nnx.List([model]))]
+    reports = {path: second_moment for path in known if re.search(pattern, path)}
+    if not reports:
+        close = paths.near_misses(pattern, known) or "none"
+        raise ValueError(f"{pattern!r} matches no dense layer or einsum; those here: {close}.")
     found = observe(model, batches, reports, forward)
     return {path: sums["moment"] for path, sums in found.items()}
 

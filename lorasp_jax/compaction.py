@@ -1,7 +1,8 @@
 """Smaller LoRA-SP: `prune` drops directions that stay inactive, `distill` makes a mergeable LoRA.
 
 Both look at a calibration set and report the error that they cause on it, of each layer on the
-inputs that it has in the model as it came, and of the model's output.
+inputs that it has in the model as it came, and of the model's output. They work on every layer
+that LoRA-SP works on, dense or einsum; an einsum's batch axes count as those of a stack.
 """
 
 import dataclasses
@@ -17,7 +18,7 @@ from flax import nnx
 from lorasp_jax import adaptation, calibration, paths
 from lorasp_jax.bank import normalized_bank
 from lorasp_jax.calibration import Forward, Layer, Sums
-from lorasp_jax.dense import AdapterParam, Dense
+from lorasp_jax.dense import AdaptedLayer, AdapterParam
 from lorasp_jax.peft import LoRA, LoRASP, Method
 from lorasp_jax.peft.method import Params
 
@@ -107,7 +108,7 @@ def distill(
     changed: Changed = {}
     ranks = {}
     for path, layer in layers.items():
-        kernel = layer.kernel.get_value()
+        kernel = layer.kernel_matrices()
         r = min(rank or layer.method.rank, layer.method.rank, *kernel.shape[-2:])
         fit = adaptation.over_stack(functools.partial(_fitted, rank=r), kernel)
         u = adaptation.over_stack(layer.method.up, kernel)(layer.adapter.get_value())
@@ -118,7 +119,7 @@ def distill(
 
 def _lora_sp_layers(model: nnx.Module) -> dict[str, Any]:
     """The layers with a LoRA-SP adapter by path."""
-    places = paths.places(nnx.List([model]), Dense)
+    places = paths.places(nnx.List([model]), AdaptedLayer)
     found = {p.path: p.child for p in places if isinstance(p.child.method, LoRASP)}
     if not found:
         raise ValueError("the model has no LoRA-SP layers.")
@@ -138,7 +139,7 @@ def _pruned(layer: Any, used: np.ndarray, rank: int) -> tuple[Method, Params]:
     order = np.concatenate([np.sort(best[..., :rank]), np.sort(best[..., rank:])], axis=-1)
     params = layer.adapter.get_value()
     reorder = functools.partial(_reordered, method=method, rank=rank)
-    each = adaptation.over_stack(reorder, layer.kernel.get_value())
+    each = adaptation.over_stack(reorder, layer.kernel_matrices())
     params = each(params, jnp.asarray(order))
     smaller = dataclasses.replace(
         method, rank=rank, pruned=method.scored - rank, alpha=method.scale * rank
@@ -192,7 +193,7 @@ def _finished(
 ) -> tuple[adaptation.Model, Compaction]:
     """The model with its new adapters, and what they cost."""
     holder = nnx.List([nnx.clone(model)])
-    for place in paths.places(holder, Dense):
+    for place in paths.places(holder, AdaptedLayer):
         if place.path in changed:
             place.child.method, params = changed[place.path]
             place.child.adapter = AdapterParam(params)

@@ -27,6 +27,7 @@ import jax.numpy as jnp
 from flax import nnx
 from flax.typing import Dtype, Initializer
 
+from lorasp_jax.kernels.quantized import QuantizedKernel
 from lorasp_jax.peft import Aux, Method
 from lorasp_jax.peft.method import Params, apply_together
 
@@ -136,7 +137,7 @@ class AdaptedLayer(nnx.Module):
         """The kernel as the adapter sees it, [..., I, O]; leading axes are stacks of layers."""
         return getattr(self, self.kernel_name).get_value()
 
-    def set_kernel_matrices(self, matrices: jax.Array) -> None:
+    def set_kernel_matrices(self, matrices: jax.Array | QuantizedKernel) -> None:
         """Gives the layer another kernel in a variable of its own: the old one may be shared."""
         old = getattr(self, self.kernel_name)
         setattr(self, self.kernel_name, with_value(old, matrices.reshape(old.get_value().shape)))
@@ -148,6 +149,12 @@ class AdaptedLayer(nnx.Module):
           ValueError: a method that this kind of layer cannot carry.
         """
         return method.init
+
+    def carried(self) -> tuple[Method, Params]:
+        """The method and the parameters of an adapter that is there."""
+        assert self.method is not None
+        assert self.adapter is not None
+        return self.method, self.adapter.get_value()
 
     def without_adapter(self) -> nnx.Module:
         """The layer as it was before adaptation, or as near as it comes, with its kernel of now."""

@@ -8,19 +8,22 @@ An equation "x,kernel->y" has one "..." at most in x and y. It says what each ke
 
 To an adapter the kernel is a stack of matrices [*batch, I, O], inputs and outputs flattened in the
 order of the kernel's axes; an adapter has the batch axes in front, as it has those of a scanned
-stack. "BTD,NDH->BTNH" thus has one adapter of D inputs and N·H outputs.
+stack. "BTD,NDH->BTNH" thus has one adapter of D inputs and N·H outputs. A quantised kernel is kept
+as that stack of matrices, with the sizes of its axes beside it.
 """
 
+import dataclasses
 import math
 import re
 import string
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from lorasp_jax.dense import dense
+from lorasp_jax.kernels.quantized import QuantizedKernel
 from lorasp_jax.peft import Aux, Method
 from lorasp_jax.peft.method import Params
 
@@ -104,8 +107,10 @@ def general_equation(axis: Sequence[int], batch: Sequence[int], outputs: int) ->
     return f"{x},{shared}{summed}{new}->{shared}{free[0]}...{free[1]}{new}"
 
 
-def to_matrices(equation: str, kernel: jax.Array) -> jax.Array:
+def to_matrices(equation: str, kernel: Any) -> Any:
     """A kernel, which may have further leading axes of a stack, as [..., *batch, I, O]."""
+    if isinstance(kernel, QuantizedKernel):
+        return dataclasses.replace(kernel, axes=None, batch=0)
     axes, order = _order(equation, kernel.ndim)
     kernel = kernel.transpose(order)
     outer = kernel.ndim - len(axes.inputs + axes.outputs)
@@ -113,9 +118,12 @@ def to_matrices(equation: str, kernel: jax.Array) -> jax.Array:
     return kernel.reshape(*kernel.shape[:outer], -1, math.prod(outputs))
 
 
-def from_matrices(equation: str, matrices: jax.Array, shape: Sequence[int]) -> jax.Array:
+def from_matrices(equation: str, matrices: Any, shape: Sequence[int]) -> Any:
     """The inverse of `to_matrices` for a kernel of this shape."""
-    _, order = _order(equation, len(shape))
+    axes, order = _order(equation, len(shape))
+    if isinstance(matrices, QuantizedKernel):
+        sizes = tuple(shape[len(shape) - len(axes.kernel) :])
+        return dataclasses.replace(matrices, axes=sizes, batch=len(axes.batch))
     inverse = [order.index(i) for i in range(len(shape))]
     return matrices.reshape([shape[i] for i in order]).transpose(inverse)
 
@@ -123,7 +131,7 @@ def from_matrices(equation: str, matrices: jax.Array, shape: Sequence[int]) -> j
 def einsum(
     equation: str,
     x: jax.Array,
-    kernel: jax.Array,
+    kernel: jax.Array | QuantizedKernel,
     bias: jax.Array | None = None,
     params: Params | None = None,
     method: Method | None = None,
@@ -138,7 +146,8 @@ def einsum(
       method: the adapter's method, given with `params`.
 
     Returns:
-      y in the type of x, and the adapter's aux with leading batch axes; losses averaged over them.
+      y in the type of x, and the adapter's aux, all with leading batch axes but the losses, which
+      are averaged over them.
 
     Raises:
       ValueError: an equation that is no adaptable map, or shapes that do not fit it.
@@ -160,17 +169,17 @@ def einsum(
         shape = [sizes[c] if c in axes.kernel else 1 for c in axes.y]
         y = y + bias.reshape(shape).astype(y.dtype)
     losses = {name: jnp.mean(values) for name, values in aux.losses.items()}
-    return y, Aux(aux.active_rank, aux.kept_energy, losses)
+    return y, dataclasses.replace(aux, losses=losses)
 
 
-def _sizes(equation: str, x: jax.Array, kernel: jax.Array) -> tuple[Axes, dict[str, int]]:
+def _sizes(equation: str, x: jax.Array, kernel: Any) -> tuple[Axes, dict[str, int]]:
     """Axes for such an x, and their sizes."""
-    axes = parse(equation).expanded(x.ndim)
-    if kernel.ndim == len(axes.kernel):
-        sizes = dict(zip(axes.kernel + axes.x, kernel.shape + x.shape, strict=True))
-        if kernel.shape == tuple(sizes[c] for c in axes.kernel):
+    axes, shape = parse(equation).expanded(x.ndim), kernel.shape
+    if len(shape) == len(axes.kernel):
+        sizes = dict(zip(axes.kernel + axes.x, shape + x.shape, strict=True))
+        if shape == tuple(sizes[c] for c in axes.kernel):
             return axes, sizes
-    raise ValueError(f"{equation!r} meets shapes {x.shape} and {kernel.shape}.")
+    raise ValueError(f"{equation!r} meets shapes {x.shape} and {shape}.")
 
 
 def _order(equation: str, ndim: int) -> tuple[Axes, list[int]]:

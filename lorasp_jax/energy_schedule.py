@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from lorasp_jax.kernels import energy_gate as gates
+from lorasp_jax.kernels.energy_gate import Ratio, bisected_boundary, kept_mask
 
 Curve = Literal["linear", "cosine"]
 PROGRESS = "progress"
@@ -43,8 +43,8 @@ def gate_at(scores: jax.Array, target: jax.Array) -> jax.Array:
     As exact as η itself, which is the fp32 number here and not a decimal.
     """
     constant = jax.lax.stop_gradient(scores.astype(jnp.float32))
-    last = gates._bisected_boundary(constant, gates.Ratio(target, 1))  # type: ignore[arg-type]
-    return jnp.where(target >= 1, constant > 0, gates._mask(constant, last))
+    last = bisected_boundary(constant, Ratio(target, 1))
+    return jnp.where(target >= 1, constant > 0, kept_mask(constant, last))
 
 
 class ScheduleState(NamedTuple):

@@ -11,11 +11,10 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax import adaptation, named, paths
+from lorasp_jax import adaptation, layers, named, paths
 from lorasp_jax.adaptation import Model
-from lorasp_jax.dense import AdapterParam, Dense
-from lorasp_jax.layers import as_dense
-from lorasp_jax.peft import LoRA, Method
+from lorasp_jax.dense import AdaptedLayer, AdapterParam
+from lorasp_jax.peft import LoRA
 from lorasp_jax.peft.method import Params
 
 
@@ -48,7 +47,7 @@ def fuse(model: nnx.Module, weights: Mapping[str, float], *, rank: int | None = 
     for name in weights:
         named.index_of(named.names(model), name)
     result, errors = named.bare(model), {}
-    layers = {place.path: place.child for place in paths.places(nnx.List([result]), Dense)}
+    there = named.modules(result)
     for path, _, _, layer in named.sets(model):
         found = []
         for name, weight in weights.items():
@@ -58,7 +57,8 @@ def fuse(model: nnx.Module, weights: Mapping[str, float], *, rank: int | None = 
             if method is not None:
                 found.append((params["lora_a"], weight * method.scale * params["lora_b"]))
         if found:
-            layers[path].method, layers[path].adapter, errors[path] = _one(found, rank)
+            one = layers.like(there[path], layer)
+            one.method, one.adapter, errors[path] = _one(found, rank)
     return Fused(result, errors)
 
 
@@ -74,32 +74,37 @@ def unmerge(merged: Model, adapted: nnx.Module) -> Model:
         `load_adapters(folder, merged)`, unless it holds a part of its kernel.
 
     Raises:
-      ValueError: the merged model has adapters or lacks a layer, or an adapter that did not just
-        add a constant: DoRA rescaled the kernel, and what it was before is not in the result.
+      ValueError: the merged model has adapters, lacks a layer or has one of another class; or an
+        adapter that did not just add a constant: DoRA rescaled the kernel, and what it was before
+        is not in the result.
     """
     adapters = named.adapters_by_path("the model to unmerge by", adapted)
     if has := adaptation.methods(merged):
         raise ValueError(f"{min(has)} of the merged model has an adapter.")
     holder = nnx.List([nnx.merge(*adaptation.split(merged))])
-    for place in paths.places(holder, (Dense, nnx.Linear)):
+    for place in paths.places(holder, nnx.Module):
         if place.path not in adapters:
             continue
+        own = adapters.pop(place.path)
+        if getattr(place.child, "adapter", None) is not None:
+            continue  # it hangs in several places, and it was taken apart at another one
         try:
-            layer = _unmerged(place.child, *adapters.pop(place.path))
+            layer = _unmerged(place.child, own)
         except (ValueError, TypeError) as error:
             raise ValueError(f"cannot unmerge {place.path}: {error}") from error
         setattr(place.parent, place.name, layer)
     if adapters:
-        raise ValueError(f"the merged model has no dense layer {min(adapters)}.")
+        raise ValueError(f"the merged model has no layer {min(adapters)}.")
     return holder[0]
 
 
-def _unmerged(layer: Dense | nnx.Linear, method: Method, params: Params) -> Dense:
-    """The layer with the adapter, less what it had added."""
+def _unmerged(layer: nnx.Module, adapted: AdaptedLayer) -> AdaptedLayer:
+    """The layer with the adapter of the adapted one, less what it had added."""
+    method, params = adapted.carried()
     if not method.additive:
         raise ValueError(f"{method} did not just add to its base.")
-    layer = as_dense(layer)
-    kernel = layer.kernel.get_value()
+    layer = layers.like(layer, adapted)
+    kernel = layer.kernel_matrices()
     delta = adaptation.over_stack(method.merge, kernel)(params, jnp.zeros(kernel.shape))
     base = (kernel.astype(jnp.float32) - delta).astype(kernel.dtype)
     layer.set_kernel_matrices(base)

@@ -14,7 +14,8 @@ from flax import linen, nnx
 from flax.nnx.nn.dtypes import promote_dtype
 
 from lorasp_jax import einsum
-from lorasp_jax.dense import AdaptedLayer, Dense, refuse_sharding
+from lorasp_jax.dense import AdaptedLayer, Dense, refuse_sharding, with_value
+from lorasp_jax.kernels.quantized import QuantizedKernel
 from lorasp_jax.peft import LoRA, Method
 
 Einsums = Mapping[type[nnx.Module], Callable[[Any], tuple[str, str]]]
@@ -27,6 +28,7 @@ EINSUMS: Einsums = {
     ),
     nnx.Einsum: lambda layer: ("kernel", layer.einsum_str),
 }
+_SETTINGS = ("kernel_name", "kernel_equation")  # of an adapted layer, beside adapter and method
 # Settings that an adapted layer does not follow, and the values that ask for nothing.
 _PLAIN: dict[str, tuple[Any, ...]] = {
     "dot_general": (None, jax.lax.dot_general),
@@ -61,42 +63,39 @@ class EinsumLayer(AdaptedLayer):
         y, aux = einsum.einsum(
             self.kernel_equation, x.astype(dtype), kernel, bias, params, self.method
         )
-        self.keep_aux(aux)
+        if self.adapter is not None:
+            self.keep_aux(aux)
         return y
 
     def kernel_matrices(self) -> jax.Array:
         """The kernel as [..., *batch, I, O]."""
         return einsum.to_matrices(self.kernel_equation, super().kernel_matrices())
 
-    def set_kernel_matrices(self, matrices: jax.Array) -> None:
+    def set_kernel_matrices(self, matrices: jax.Array | QuantizedKernel) -> None:
         """Gives the layer another kernel."""
-        shape = getattr(self, self.kernel_name).get_value().shape
-        super().set_kernel_matrices(einsum.from_matrices(self.kernel_equation, matrices, shape))
+        old = getattr(self, self.kernel_name)
+        kernel = einsum.from_matrices(self.kernel_equation, matrices, old.get_value().shape)
+        setattr(self, self.kernel_name, with_value(old, kernel))
 
     def without_adapter(self) -> nnx.Module:
-        """The layer in its own class again."""
-        return _undressed(self)
+        """The layer in its own class again, unless that cannot read a quantised kernel."""
+        quantized = isinstance(super().kernel_matrices(), QuantizedKernel)
+        return super().without_adapter() if quantized else _undressed(self)
 
 
 class LoRALayer(AdaptedLayer):
-    """Mixin for a layer that adds LoRA's low-rank map to what its own class computes."""
+    """Mixin for a layer that adds LoRA's low-rank map, or several, to what its class computes."""
 
     def adapter_init(self, method: Method) -> Callable[[jax.Array, jax.Array], Any]:
         """As for every layer, but see `lora_init`."""
         return lora_init(self, method)
 
-    def with_delta(self, y: jax.Array, hidden: jax.Array) -> jax.Array:
-        """Y plus the delta, from what A makes of the input."""
-        method, params = self.lora()
-        z, aux = method.between(params, hidden.astype(y.dtype), None)
+    def with_delta(self, y: jax.Array, read: Callable[[jax.Array], jax.Array]) -> jax.Array:
+        """Y plus the delta, from what `read` makes of the input and A."""
+        method, params = self.carried()
+        z, aux = method.between(params, read(method.down(params)).astype(y.dtype), None)
         self.keep_aux(aux)
         return y + z @ method.up(params).astype(y.dtype)
-
-    def lora(self) -> tuple[LoRA, Any]:
-        """The method and its parameters."""
-        assert isinstance(self.method, LoRA)
-        assert self.adapter is not None
-        return self.method, self.adapter.get_value()
 
     def without_adapter(self) -> nnx.Module:
         """The layer in its own class again."""
@@ -109,12 +108,12 @@ class EmbedLayer(LoRALayer):
     def __call__(self, inputs: jax.Array, *args: Any, **kwargs: Any) -> jax.Array:
         """Rows of the table for ids [...], [..., D]."""
         y = super().__call__(inputs, *args, **kwargs)
-        return self.with_delta(y, lookup(self.lora()[1]["lora_a"], inputs))
+        return self.with_delta(y, lambda a: lookup(a, inputs))
 
     def attend(self, query: jax.Array, *args: Any, **kwargs: Any) -> jax.Array:
         """Inner products of queries [..., D] with the rows, [..., V]."""
         y = super().attend(query, *args, **kwargs)
-        return y + attend_delta(*self.lora(), query.astype(y.dtype))
+        return y + attend_delta(*self.carried(), query.astype(y.dtype))
 
 
 class ConvLayer(LoRALayer):
@@ -123,7 +122,7 @@ class ConvLayer(LoRALayer):
     def __call__(self, inputs: jax.Array, *args: Any, **kwargs: Any) -> jax.Array:
         """The convolution, [..., *spatial, O]."""
         y = super().__call__(inputs, *args, **kwargs)
-        return self.with_delta(y, convolved(self, self.lora()[1]["lora_a"], inputs))
+        return self.with_delta(y, lambda a: convolved(self, a, inputs))
 
     def kernel_matrices(self) -> jax.Array:
         """The kernel [..., *sizes, I, O] as [..., sizes · I, O]."""
@@ -139,10 +138,10 @@ def lookup(table: jax.Array, ids: jax.Array) -> jax.Array:
     return jnp.take(table, ids, axis=0)
 
 
-def attend_delta(method: LoRA, params: Any, query: jax.Array) -> jax.Array:
+def attend_delta(method: Method, params: Any, query: jax.Array) -> jax.Array:
     """What scale A B adds to the inner products of queries [..., D] with a table's rows."""
-    transposed = {"lora_a": params["lora_b"].T, "lora_b": params["lora_a"].T}
-    return method.delta(transposed, query)[0]
+    down, up = (side.astype(query.dtype) for side in (method.down(params), method.up(params)))
+    return method.between(params, query @ up.T, None)[0].astype(query.dtype) @ down.T
 
 
 def convolved(layer: Any, a: jax.Array, inputs: jax.Array) -> jax.Array:
@@ -213,6 +212,27 @@ def adapted(layer: nnx.Module, einsums: Einsums) -> AdaptedLayer:
     return _dressed(layer, mixin, settings)
 
 
+def like(layer: Any, other: AdaptedLayer) -> AdaptedLayer:
+    """The layer as one that can carry the adapters of another, which has been adapted.
+
+    Args:
+      layer: of the other's kind, adapted or not; changed in place, unless it is an `nnx.Linear`.
+      other: left untouched.
+
+    Raises:
+      ValueError: a layer of another class.
+    """
+    if isinstance(layer, type(other)):
+        return layer
+    mixin, plain = (Dense, nnx.Linear) if isinstance(other, Dense) else type(other).__bases__
+    if not isinstance(layer, plain):
+        raise ValueError(f"a {type(layer).__name__} is there instead of a {plain.__name__}.")
+    if mixin is Dense:
+        return as_dense(layer)
+    settings = {name: value for name, value in vars(other).items() if name in _SETTINGS}
+    return _dressed(layer, mixin, settings)
+
+
 def kind(layer: Any, einsums: Einsums) -> type[nnx.Module] | None:
     """The known class that the layer is called as; a subclass with a call of its own has none."""
     known = (nnx.Linear, nnx.Embed, nnx.Conv, *EINSUMS, *einsums)
@@ -271,7 +291,7 @@ def _dressed(layer: Any, mixin: type[AdaptedLayer], settings: dict[str, str]) ->
 
 def _undressed(layer: Any) -> nnx.Module:
     """What `_dressed` was given."""
-    for name in {"adapter", "method", "kernel_name", "kernel_equation"} & vars(layer).keys():
+    for name in {"adapter", "method", *_SETTINGS} & vars(layer).keys():
         delattr(layer, name)
     layer.__class__ = type(layer).__bases__[1]
     return layer

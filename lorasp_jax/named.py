@@ -21,24 +21,24 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax import adaptation, paths
+from lorasp_jax import adaptation, layers, paths
 from lorasp_jax.adaptation import Model
 from lorasp_jax.adapter_set import AdapterChoice, AdapterSet, NamedAdapters, empty_bank, put, take
-from lorasp_jax.dense import AdapterParam, Dense
-from lorasp_jax.layers import as_dense
+from lorasp_jax.dense import AdaptedLayer, AdapterParam
 from lorasp_jax.paths import Place
 from lorasp_jax.peft import LoRA, Method
 from lorasp_jax.peft.method import Params
 
 One: TypeAlias = str | Mapping[str, float] | None
-Adapters: TypeAlias = dict[str, tuple[Method, Params]]
+Adapters: TypeAlias = dict[str, AdaptedLayer]
+"""Layers with an adapter, by path of the layer or by name of the model."""
 
 
 def combine(models: Mapping[str, Model], *, rank: int | None = None) -> Model:
     """One model with the adapters of several; the first is chosen at first.
 
-    The adapters may differ in method, rank and scale and in the layers that they adapt. Nothing
-    trains in the result.
+    The adapters may differ in method, rank and scale and in the layers that they adapt, which may
+    be of every kind that `adapt` knows. Nothing trains in the result.
 
     Args:
       models: adapted from one base, by name; left untouched. The result shares their base. A bare
@@ -57,7 +57,7 @@ def combine(models: Mapping[str, Model], *, rank: int | None = None) -> Model:
     for name in known[1:]:
         _check_same(bases[known[0]], known[0], bases[name], name)
     holder = nnx.List([bases[known[0]]])
-    for place in paths.places(holder, (Dense, nnx.Linear)):
+    for place in paths.places(holder, nnx.Module):
         found = {n: adapters[n][place.path] for n in known if place.path in adapters[n]}
         if found:
             setattr(place.parent, place.name, _with_set(place.child, known, found, rank))
@@ -70,8 +70,9 @@ def choose(model: Model, choice: One | Sequence[One] | jax.Array | np.ndarray) -
     Args:
       model: from `combine`; left untouched, the result shares its arrays.
       choice: a name, weights by name, or None for the base; a sequence of those, one for each
-        example of the batch; or an array of `weights`, f32 [A] or [B, A]. Where the model folds
-        other axes into that of the batch, as in [B * cameras, ...], an example's rows are in turn.
+        example of the batch; or an array of `weights`, f32 [A] or [B, A]. The batch is the first
+        axis of a layer's input, of an einsum's the first that its kernel lacks. Where the model
+        folds other axes into it, as in [B * cameras, ...], an example's rows are in turn.
 
     Raises:
       ValueError: a model without named adapters, an unknown name (lists near misses), or an array
@@ -134,12 +135,12 @@ def extract(model: Model, name: str | None) -> Model:
     if name is None:
         return result
     index_of(known, name)
-    layers = {place.path: place.child for place in paths.places(nnx.List([result]), Dense)}
+    there = modules(result)
     for place in sets(model):
         method, params = member(place.child, name)
         if method is not None:
-            layers[place.path].method = method
-            layers[place.path].adapter = AdapterParam(params)
+            layer = layers.like(there[place.path], place.child)
+            layer.method, layer.adapter = method, AdapterParam(params)
     return result
 
 
@@ -164,7 +165,7 @@ def swap(model: Model, name: str, other: nnx.Module) -> Model:
     if beyond := sorted(adapters.keys() - {place.path for place in places}):
         raise ValueError(f"{name} adapts {beyond[0]}, where the combined model has no adapters.")
     for path, _, _, layer in places:
-        method, params = adapters.get(path, (None, None))
+        method, params = adapters[path].carried() if path in adapters else (None, None)
         value = dict(layer.adapter.params.get_value())
         if layer.method.methods[index] != (None if _is_banked(method) else method):
             raise ValueError(f"{name} at {path} needs {layer.method.methods[index] or 'a LoRA'}.")
@@ -184,32 +185,29 @@ def bare(model: Model) -> Model:
       ValueError: an adapter holds a part of its kernel.
     """
     holder = nnx.List([nnx.merge(*adaptation.split(model))])
-    for place in paths.places(holder, Dense):
+    for place in paths.once(paths.places(holder, AdaptedLayer)):
         if place.child.adapter is not None:
             if place.child.method.splits_kernel:
                 raise ValueError(
                     f"the adapter of {place.path} holds a part of its kernel, so the base alone "
                     "is not there: merge it."
                 )
-            place.child.adapter = place.child.method = None
+            place.child.without_adapter()
     return holder[0]
 
 
 def adapters_by_path(name: str, model: nnx.Module) -> Adapters:
-    """Method and parameters of every adapted layer by path.
+    """Every adapted layer by path.
 
     Raises:
       ValueError: something else trains too, or the model was combined already.
     """
     if sets(model):
         raise ValueError(f"{name} has named adapters already: extract one of them.")
-    found = {
-        place.path: (place.child.method, place.child.adapter.get_value())
-        for place in paths.places(nnx.List([model]), Dense)
-        if isinstance(place.child.adapter, AdapterParam)
-    }
+    places = paths.places(nnx.List([model]), AdaptedLayer)
+    found = {p.path: p.child for p in places if isinstance(p.child.adapter, AdapterParam)}
     if beyond := sorted(adaptation.methods(model).keys() - found.keys()):
-        raise ValueError(f"{name} trains {beyond[0]}; only adapters of dense layers have names.")
+        raise ValueError(f"{name} trains {beyond[0]}; only adapters of layers have names.")
     return found
 
 
@@ -234,20 +232,21 @@ def _equal(a: jax.Array, b: jax.Array) -> bool:
 
 
 def _with_set(
-    layer: Dense | nnx.Linear, known: tuple[str, ...], found: Adapters, rank: int | None
-) -> Dense:
+    layer: nnx.Module, known: tuple[str, ...], found: Adapters, rank: int | None
+) -> AdaptedLayer:
     """The layer with what was found for it as a set, of whose weights all are 0."""
-    layer = as_dense(layer)
-    methods = [found[name][0] if name in found else None for name in known]
+    layer = layers.like(layer, next(iter(found.values())))
+    own = {name: adapted.carried() for name, adapted in found.items()}
+    methods = [own[name][0] if name in own else None for name in known]
     if rank is None:
         rank = max([m.rank for m in methods if type(m) is LoRA], default=0)
     banked = [name for name, method in zip(known, methods, strict=True) if _is_banked(method)]
-    shape = layer.kernel.get_value().shape
+    shape = layer.kernel_matrices().shape
     bank = empty_bank(len(banked), rank, shape)
     for i, name in enumerate(banked):
-        method, params = found.get(name, (None, None))
+        method, params = own.get(name, (None, None))
         bank = put(bank, i, method, params)  # pyright: ignore[reportArgumentType]
-    params = {"bank": bank, "others": {n: p for n, (m, p) in found.items() if not _is_banked(m)}}
+    params = {"bank": bank, "others": {n: p for n, (m, p) in own.items() if not _is_banked(m)}}
     layer.method = AdapterSet(known, tuple(None if _is_banked(m) else m for m in methods))
     layer.adapter = NamedAdapters(params, jnp.zeros((*shape[:-2], len(known))))
     return layer
@@ -260,8 +259,13 @@ def _is_banked(method: Method | None) -> TypeGuard[LoRA | None]:
 
 def sets(model: nnx.Module) -> list[Place]:
     """The layers that hold named adapters."""
-    layers = paths.places(nnx.List([model]), Dense)
-    return [place for place in layers if isinstance(place.child.adapter, NamedAdapters)]
+    places = paths.places(nnx.List([model]), AdaptedLayer)
+    return [place for place in places if isinstance(place.child.adapter, NamedAdapters)]
+
+
+def modules(model: nnx.Module) -> dict[str, nnx.Module]:
+    """The model and all modules in it, by path."""
+    return {place.path: place.child for place in paths.places(nnx.List([model]), nnx.Module)}
 
 
 def member(layer: Any, name: str) -> tuple[Method | None, Params]:

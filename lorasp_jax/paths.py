@@ -36,6 +36,11 @@ def places(holder: nnx.List, kind: type | tuple[type, ...]) -> list[Place]:
     return list(walk())
 
 
+def once(found: list[Place]) -> list[Place]:
+    """Without the further places of a child that hangs in several."""
+    return list({id(place.child): place for place in reversed(found)}.values())[::-1]
+
+
 def layer_places(holder: nnx.List, einsums: layers.Einsums = MappingProxyType({})) -> list[Place]:
     """All layers that have an adapter or could."""
     return [
@@ -43,6 +48,12 @@ def layer_places(holder: nnx.List, einsums: layers.Einsums = MappingProxyType({}
         for place in places(holder, nnx.Module)
         if isinstance(place.child, AdaptedLayer) or layers.kind(place.child, einsums)
     ]
+
+
+def multiplying(holder: nnx.List) -> list[Place]:
+    """The layers that multiply their input by matrices: dense ones and einsums, adapted or not."""
+    found = layer_places(holder)
+    return [place for place in found if not isinstance(place.child, nnx.Embed | nnx.Conv)]
 
 
 def check_patterns(patterns: Iterable[str]) -> None:

@@ -2,10 +2,11 @@
 
     model, errors = quantize(model, [("vision", None), (".*", "nf4")])
 
-The kernels of dense layers shrink to 8 or 4.5 bits a weight; adapters, biases, norms and embeddings
-stay. Everything else works as before: gradients reach x and the adapters, adapters are saved alone
-and can be attached, replaced and combined. `merge` gives the layers it merges a whole kernel again,
-that of the quantised layer with the delta added.
+The kernels of dense layers and einsums shrink to 8 or 4.5 bits a weight, an einsum's with inputs
+flattened; adapters, biases, norms, embeddings and convolutions stay. Everything else works as
+before: gradients reach x and the adapters, adapters are saved alone and can be attached, replaced
+and combined. `merge` gives the layers it merges a whole kernel again, that of the quantised layer
+with the delta added.
 
 Adapters that take a part of a kernel (PiSSA, OLoRA) come first, and what they leave is quantised.
 """
@@ -18,14 +19,13 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax import adaptation, paths
-from lorasp_jax.dense import AdapterParam, Dense, with_value
+from lorasp_jax import adaptation, layers, paths
+from lorasp_jax.dense import AdaptedLayer, AdapterParam
 from lorasp_jax.kernels.quantized import Kind, QuantizedKernel, quantized
-from lorasp_jax.layers import as_dense
 
-# By identity of a variable and kind: what replaces it, the variable itself, which so stays alive,
-# and the error.
-Shared: TypeAlias = dict[tuple[int, Kind], tuple[nnx.Param, nnx.Param, float]]
+# By identity of a variable, equation and kind: what replaces it, the variable itself, which so
+# stays alive, and the error.
+Shared: TypeAlias = dict[tuple[int, str, Kind], tuple[nnx.Param, nnx.Param, float]]
 
 
 class Quantized(NamedTuple):
@@ -42,11 +42,12 @@ class Quantized(NamedTuple):
 
 
 def quantize(model: nnx.Module, rules: Sequence[tuple[str, Kind | None]]) -> Quantized:
-    """Quantises the kernels of dense layers by path rules.
+    """Quantises the kernels of dense layers and einsums by path rules.
 
     Args:
       model: left untouched; the result shares everything else with it.
-      rules: (pattern, "int8" or "nf4" or None) pairs over the paths of `Dense` and `nnx.Linear`, as
+      rules: (pattern, "int8" or "nf4" or None) pairs over the paths of `Dense`, `nnx.Linear`,
+        `nnx.LinearGeneral`, `nnx.Einsum` and of other einsum classes that are adapted already, as
         for `adapt`: the first that matches governs, None leaves alone.
 
     Raises:
@@ -56,8 +57,8 @@ def quantize(model: nnx.Module, rules: Sequence[tuple[str, Kind | None]]) -> Qua
     paths.check_patterns(pattern for pattern, _ in rules)
     holder, errors, used = nnx.List([nnx.merge(*adaptation.split(model))]), {}, set()
     shared: Shared = {}
-    layers = paths.places(holder, (Dense, nnx.Linear))
-    for place in layers:
+    known = paths.multiplying(holder)
+    for place in known:
         matching = [rule for rule in rules if re.search(rule[0], place.path)]
         if not matching:
             continue
@@ -70,8 +71,10 @@ def quantize(model: nnx.Module, rules: Sequence[tuple[str, Kind | None]]) -> Qua
             setattr(place.parent, place.name, layer)
     for rule in rules:
         if rule not in used:
-            close = paths.near_misses(rule[0], [place.path for place in layers]) or "none"
-            raise ValueError(f"rule {rule[0]!r} governs nothing; dense layers here: {close}.")
+            close = paths.near_misses(rule[0], [place.path for place in known]) or "none"
+            raise ValueError(
+                f"rule {rule[0]!r} governs nothing; dense layers and einsums here: {close}."
+            )
     return Quantized(holder[0], errors)
 
 
@@ -81,19 +84,22 @@ def is_quantized(model: nnx.Module) -> bool:
     return any(isinstance(place.child.get_value(), QuantizedKernel) for place in parameters)
 
 
-def _quantized(layer: Dense | nnx.Linear, kind: Kind, shared: Shared) -> tuple[Dense, float]:
+def _quantized(layer: nnx.Module, kind: Kind, shared: Shared) -> tuple[AdaptedLayer, float]:
     """The layer with a quantised kernel, and its relative error; shared kernels stay shared."""
-    layer = as_dense(layer)
-    variable, kernel = layer.kernel, layer.kernel.get_value()
+    layer = layers.adapted(layer, {})
+    name, kernel = layer.kernel_name, layer.kernel_matrices()
+    variable = getattr(layer, name)
     if isinstance(variable, AdapterParam):
         raise ValueError("its kernel trains, and what trains needs all of its bits.")
     if isinstance(kernel, QuantizedKernel):
         raise ValueError("its kernel is quantised already.")
-    if (id(variable), kind) not in shared:
+    key = id(variable), getattr(layer, "kernel_equation", ""), kind
+    if key not in shared:
         smaller = quantized(kernel, kind)
-        error = float(_error(kernel, smaller))
-        shared[id(variable), kind] = with_value(variable, smaller), variable, error
-    layer.kernel, _, error = shared[id(variable), kind]
+        layer.set_kernel_matrices(smaller)
+        shared[key] = getattr(layer, name), variable, float(_error(kernel, smaller))
+    new, _, error = shared[key]
+    setattr(layer, name, new)
     return layer, error
 
 

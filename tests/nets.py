@@ -46,6 +46,26 @@ class Net(nnx.Module):
         return self.out(x)
 
 
+class Kinds(nnx.Module):
+    """All kinds of layers: ids [B, T] in, [B, T, 4] out."""
+
+    def __init__(self):
+        rngs, init = nnx.Rngs(0), nnx.initializers.normal()
+        self.embed = nnx.Embed(7, 6, rngs=rngs)
+        self.conv = nnx.Conv(6, 6, (2,), rngs=rngs)
+        self.split = nnx.LinearGeneral(6, (2, 3), rngs=rngs, bias_init=init)
+        self.experts = nnx.Einsum("...nh,nhk->...nk", (2, 3, 3), (2, 3), rngs=rngs)
+        self.join = nnx.LinearGeneral((2, 3), 6, axis=(-2, -1), use_bias=False, rngs=rngs)
+        self.blocks = nnx.vmap(lambda r: nnx.Einsum("...d,fd->...f", (6, 6), rngs=r))(rngs.split(3))
+        self.out = nnx.Linear(6, 4, rngs=rngs)
+
+    def __call__(self, ids):
+        x = self.conv(self.embed(ids))
+        x = self.join(jnp.tanh(self.experts(self.split(x))))
+        scan = nnx.scan(lambda x, layer: (x + layer(x), None), in_axes=(nnx.Carry, 0))
+        return self.out(scan(x, self.blocks)[0])
+
+
 NET = Net()
 X = jax.random.normal(jax.random.key(0), (4, 3, 5))
 

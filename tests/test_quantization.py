@@ -155,7 +155,10 @@ def test_rules():
     assert errors["blocks"] < 0.01 < errors["out"]
     assert not jax.tree.leaves(nnx.state(model, AdapterParam))
     for rules, message in (
-        ([("blcks", "nf4")], r"rule 'blcks' governs nothing; dense layers here: blocks"),
+        (
+            [("blcks", "nf4")],
+            r"rule 'blcks' governs nothing; dense layers and einsums here: blocks",
+        ),
         ([("", "nf4"), ("out", "int8")], "rule 'out' governs nothing"),
         ([("out", "fp4")], "cannot quantise out: kernels can be int8 or nf4, got 'fp4'"),
         ([("(", "nf4")], r"rule '\(' is no regular expression"),

@@ -101,6 +101,21 @@ def test_nnx_gemma_merges_into_its_own_parameters(gemma):
     np.testing.assert_allclose(logits(loaded), logits(model), rtol=1e-3, atol=1e-3)
 
 
+def test_nnx_gemma_with_names_and_in_fewer_bits(gemma):
+    """It reads sizes off its kernels, which must not show how they are kept."""
+    pour, press = (adapted(gemma, (".*", LoRA(rank=rank))) for rank in (2, 3))
+    graphdef, adapters, frozen = adaptation.split(pour)
+    pour = nnx.merge(graphdef, perturbed(adapters, 0.3), frozen)
+    both = lorasp_jax.combine({"pour": pour, "press": press})
+    np.testing.assert_allclose(logits(both), logits(pour), rtol=1e-3, atol=1e-4)
+    apart = lorasp_jax.unmerge(lorasp_jax.merge(pour), pour)
+    np.testing.assert_allclose(logits(apart), logits(pour), rtol=1e-3, atol=1e-4)
+    small, errors = lorasp_jax.quantize(pour, [("attn|mlp", "int8")])
+    assert len(errors) == 2 * 6
+    off = jnp.linalg.norm(logits(small) - logits(pour)) / jnp.linalg.norm(logits(pour))
+    assert 0 < off < 0.03
+
+
 @pytest.fixture(scope="module")
 def linen():
     """Gemma of Hugging Face's transformers, and its parameters."""

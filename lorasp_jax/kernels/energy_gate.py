@@ -43,7 +43,7 @@ class Boundary(NamedTuple):
 class Ratio(NamedTuple):
     """η as numerator / denominator, in [0, 1], exact in fp32 for decimals of up to 7 digits."""
 
-    numerator: float
+    numerator: float | jax.Array  # an array where η is one
     denominator: float
 
 
@@ -86,8 +86,7 @@ def energy_gate(
     find = _finder(implementation or default_implementation(scores.shape[-1]))
     scores = scores.astype(jnp.float32)
     constant = jax.lax.stop_gradient(scores)
-    everything = ratio.numerator == ratio.denominator
-    mask = constant > 0 if everything else find(constant, ratio)
+    mask = constant > 0 if ratio.numerator == ratio.denominator else find(constant, ratio)
     return mask, mask.sum(-1).astype(jnp.float32), kept_energy(scores, mask)
 
 
@@ -109,8 +108,8 @@ def _finder(implementation: str) -> Callable[[jax.Array, Ratio], jax.Array]:
     """The function from scores [..., R] and η to the mask."""
     boundaries = {
         "sort": _sorted_boundary,
-        "bisection": _bisected_boundary,
-        "block": functools.partial(_bisected_boundary, is_block=True),
+        "bisection": bisected_boundary,
+        "block": functools.partial(bisected_boundary, is_block=True),
         "pallas": _pallas_boundary,
     }
     if implementation == "pairwise":
@@ -119,7 +118,7 @@ def _finder(implementation: str) -> Callable[[jax.Array, Ratio], jax.Array]:
         valid = ", ".join(("pairwise", *boundaries))
         raise ValueError(f"unknown gate {implementation!r}; valid are {valid}.")
     boundary = boundaries[implementation]
-    return lambda scores, ratio: _mask(scores, boundary(scores, ratio))
+    return lambda scores, ratio: kept_mask(scores, boundary(scores, ratio))
 
 
 def _pairwise_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
@@ -135,7 +134,8 @@ def _pairwise_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
     return (ratio.denominator * before < target) & (scores > 0)
 
 
-def _mask(scores: jax.Array, last: Boundary) -> jax.Array:
+def kept_mask(scores: jax.Array, last: Boundary) -> jax.Array:
+    """The mask, bool [..., R], of scores up to the last that is kept."""
     position = jax.lax.broadcasted_iota(jnp.int32, scores.shape, scores.ndim - 1)
     return (scores > last.score) | ((scores == last.score) & (position <= last.index))
 
@@ -188,7 +188,7 @@ class _Bracket(NamedTuple):
     num_high: jax.Array
 
 
-def _bisected_boundary(scores: jax.Array, ratio: Ratio, *, is_block: bool = False) -> Boundary:
+def bisected_boundary(scores: jax.Array, ratio: Ratio, *, is_block: bool = False) -> Boundary:
     """A binary search for the largest score that reaches the target together with all above it, and
     one for the last tie of it that is needed.
 
@@ -296,4 +296,4 @@ def _pallas_boundary(scores: jax.Array, ratio: Ratio, *, interpret: bool = False
 
 def _boundary_kernel(scores: Any, score: Any, index: Any, *, ratio: Ratio) -> None:
     """One program: references to scores [rows, width] in, to the two columns of `Boundary` out."""
-    score[...], index[...] = _bisected_boundary(scores[...], ratio, is_block=True)
+    score[...], index[...] = bisected_boundary(scores[...], ratio, is_block=True)

@@ -46,11 +46,19 @@ class QuantizedKernel:
     """I; the last block may be longer than what is left of it."""
     dtype: Any = dataclasses.field(metadata={"static": True})
     """The type that it stands for."""
+    axes: tuple[int, ...] | None = dataclasses.field(default=None, metadata={"static": True})
+    """Where it stands for an einsum's kernel, the sizes of that one's axes: its shape after the
+    axes of a stack. The codes stay matrices, and so does what `astype` gives."""
+    batch: int = dataclasses.field(default=0, metadata={"static": True})
+    """How many of the codes' leading axes are among them."""
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """[..., I, O]."""
-        return *self.codes.shape[:-3], self.d_in, self.codes.shape[-1]
+        """[..., I, O], or [..., *axes]."""
+        leading = self.codes.shape[:-3]
+        if self.axes is None:
+            return *leading, self.d_in, self.codes.shape[-1]
+        return *leading[: len(leading) - self.batch], *self.axes
 
     @property
     def nbytes(self) -> int:
@@ -68,13 +76,13 @@ class QuantizedKernel:
         whole = (values * self.scale).astype(dtype).reshape(*leading, blocks * rows, d_out)
         return whole[..., : self.d_in, :]
 
-    def reshape(self, *shape: int) -> "QuantizedKernel":
+    def reshape(self, *shape: Any) -> "QuantizedKernel":
         """With other leading axes; -1 is allowed as in `jnp.reshape`.
 
         Raises:
           ValueError: another [I, O].
         """
-        *leading, d_in, d_out = np.empty(self.shape, np.void).reshape(shape).shape
+        *leading, d_in, d_out = np.empty(self.shape, np.void).reshape(*shape).shape
         if (d_in, d_out) != self.shape[-2:]:
             raise ValueError(f"a quantised kernel {self.shape} cannot become {shape}.")
         arrays = {n: getattr(self, n) for n in ("codes", "scale")}

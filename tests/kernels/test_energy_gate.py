@@ -78,10 +78,10 @@ def test_special_rows(implementation):
 def test_pallas_takes_any_shape(shape):
     scores, ratio = scores_like(shape), gate.exact_ratio(0.9)
     pallas = jax.jit(jax.vmap(lambda s: run_kernel(s, ratio)))(scores[None])
-    reference = jax.jit(lambda s: gate._bisected_boundary(s, ratio))(scores)
+    reference = jax.jit(lambda s: gate.bisected_boundary(s, ratio))(scores)
     np.testing.assert_array_equal(pallas.score[0], reference.score)
-    mask = gate._mask(scores, jax.tree.map(lambda leaf: leaf[0], pallas))
-    np.testing.assert_array_equal(mask, gate._mask(scores, reference))
+    mask = gate.kept_mask(scores, jax.tree.map(lambda leaf: leaf[0], pallas))
+    np.testing.assert_array_equal(mask, gate.kept_mask(scores, reference))
 
 
 @pytest.mark.parametrize("implementation", ["pairwise", "sort", "bisection"])

@@ -1,0 +1,248 @@
+"""Tools on adapters over every kind of layer: general, einsum, scanned, lookup, convolution.
+
+Dense layers have their own tests, file by file; here einsums must do what dense twins do.
+"""
+
+import operator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+import lorasp_jax
+from lorasp_jax import adaptation, adapter_io, calibration
+from lorasp_jax.dense import AdapterParam, Dense
+from lorasp_jax.peft import DoRA, LoRA, LoRASP
+from tests.nets import Kinds, assert_close, call, trained
+
+SP = LoRASP(rank=6, hidden_width=4, energy_target=0.6)
+WEIGHTS = {"a": 0.6, "b": -0.3}
+
+
+NET = Kinds()
+KINDS = ["blocks", "conv", "embed", "experts", "join", "out", "split"]
+EINSUMS = ["blocks", "experts", "join", "split"]
+IDS = [jax.random.randint(jax.random.key(i), (4, 5), 0, 7) for i in range(3)]
+
+
+def kernels(model):
+    """Kernels by path, as arrays."""
+    layers = {path: getattr(model, path) for path in KINDS}
+    return {
+        p: np.asarray(v.embedding[...] if p == "embed" else v.kernel[...])
+        for p, v in layers.items()
+    }
+
+
+@pytest.fixture(scope="module")
+def models():
+    """Two models over one base whose LoRAs differ in rank, scale and layers."""
+    return {
+        "a": trained((".*", LoRA(rank=2)), seed=1, net=NET),
+        "b": trained(("embed|conv|experts|blocks", LoRA(rank=3, alpha=1)), seed=2, net=NET),
+    }
+
+
+@pytest.fixture(scope="module")
+def combined(models):
+    return lorasp_jax.combine(models)
+
+
+def experts_and_twins(method):
+    """An einsum of two experts, and as many dense layers with its weights and adapters."""
+    init = nnx.initializers.normal(0.5)
+    layer = nnx.Einsum("nbh,nhk->bnk", (2, 5, 4), rngs=nnx.Rngs(0), kernel_init=init)
+    layer = trained((".*", method), seed=3, net=layer)
+    twins = [Dense(5, 4, use_bias=False, method=method, rngs=nnx.Rngs(0)) for _ in range(2)]
+    params = layer.adapter.get_value()
+    for i, twin in enumerate(twins):
+        twin.kernel.set_value(layer.kernel[...][i])
+        twin.adapter = AdapterParam(jax.tree.map(operator.itemgetter(i), params))
+    return layer, nnx.List(twins)
+
+
+def by_twins(twins, x):
+    return jnp.stack([twin(one) for twin, one in zip(twins, x, strict=True)], axis=1)
+
+
+def test_moments_are_those_of_the_inputs_by_hand():
+    found = calibration.input_moments(NET, IDS)
+    assert sorted(found) == ["blocks", "experts", "join", "out", "split"]
+    x = np.concatenate([NET.conv(NET.embed(ids)) for ids in IDS])
+    heads = NET.split(x)
+    mixed = np.tanh(NET.experts(heads))
+    seen = {"split": x, "join": mixed.reshape(*mixed.shape[:2], 6)}
+    for path, inputs in seen.items():
+        rows = np.asarray(inputs, np.float64).reshape(-1, 6)
+        np.testing.assert_allclose(found[path], rows.T @ rows, rtol=1e-4, atol=1e-4)
+    by_expert = np.einsum("btni,btnj->nij", heads, heads)
+    np.testing.assert_allclose(found["experts"], by_expert, rtol=1e-4, atol=1e-4)
+    assert found["blocks"].shape == (3, 6, 6)
+    start = lorasp_jax.adapt(
+        NET,
+        [("experts|blocks", LoRA(rank=2, initialization="eva"))],
+        rngs=nnx.Rngs(0),
+        statistics=found,
+    )
+    a = start.experts.adapter.get_value()["lora_a"][1]
+    right = np.linalg.svd(np.asarray(heads[:, :, 1]).reshape(-1, 3), full_matrices=False)[2][:2]
+    np.testing.assert_allclose(np.abs(right @ a), np.eye(2), atol=1e-3)
+
+
+def test_moments_of_lookups_are_refused():
+    with pytest.raises(ValueError, match="'embed' matches no dense layer or einsum; those here: "):
+        calibration.input_moments(NET, IDS, "embed")
+
+
+@pytest.mark.parametrize("tool", [lorasp_jax.prune, lorasp_jax.distill])
+def test_experts_get_smaller_like_dense_twins(tool):
+    layer, twins = experts_and_twins(SP)
+    x = jax.random.normal(jax.random.key(0), (2, 40, 5))
+    assert_close(layer(x), by_twins(twins, x))
+    amount = 0.3 if tool is lorasp_jax.prune else 2
+    smaller, report = tool(layer, [x], amount)
+    expected, each = tool(twins, [x], amount, forward=by_twins)
+    np.testing.assert_array_equal(report.ranks[""], [each.ranks[str(i)] for i in range(2)])
+    if tool is lorasp_jax.prune:  # a stack has one rank: the largest
+        assert smaller.method.rank == max(report.ranks[""]) < SP.rank
+    else:
+        own = [each.layer_errors[str(i)] for i in range(2)]
+        np.testing.assert_allclose(report.layer_errors[""], own, rtol=1e-3)
+        assert_close(call(smaller, x), by_twins(expected, x))
+    error = np.linalg.norm(smaller(x) - layer(x)) / np.linalg.norm(layer(x))
+    np.testing.assert_allclose(report.output_error, error, rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_distilled_kinds_merge_save_and_load(tmp_path):
+    model = trained(("split|experts|join|blocks", SP), seed=4, net=NET)
+    smaller, report = lorasp_jax.distill(model, IDS)
+    assert sorted(report.layer_errors) == EINSUMS
+    assert {path: ranks.shape for path, ranks in report.ranks.items()} == {
+        "blocks": (3,), "experts": (2,), "join": (), "split": ()
+    }  # fmt: skip
+    assert set(map(type, adaptation.methods(smaller).values())) == {LoRA}
+    assert_close(call(lorasp_jax.merge(smaller), IDS[0]), call(smaller, IDS[0]))
+    assert 0 < report.output_error < 1
+    adapter_io.save_adapters(tmp_path, smaller)
+    loaded = adapter_io.load_adapters(tmp_path, NET)
+    np.testing.assert_array_equal(call(loaded, IDS[0]), call(smaller, IDS[0]))
+
+
+@pytest.mark.slow
+def test_pruned_kinds_answer_as_before():
+    """η = 0.6 never needs them all, so something goes, and nothing that was used."""
+    model = trained(("split|experts|join|blocks", SP), seed=4, net=NET)
+    smaller, report = lorasp_jax.prune(model, IDS)
+    assert report.output_error < 1e-5
+    for path, ranks in report.ranks.items():
+        assert getattr(smaller, path).method.rank == ranks.max()
+    assert sum(ranks.sum() for ranks in report.ranks.values()) < 6 * 7
+    assert_close(call(smaller, IDS[0]), call(model, IDS[0]))
+
+
+def test_each_name_answers_as_its_model(models, combined):
+    for name, model in models.items():
+        assert_close(call(lorasp_jax.choose(combined, name), IDS[0]), call(model, IDS[0]))
+        alone = lorasp_jax.extract(combined, name)
+        assert adaptation.methods(alone).keys() == adaptation.methods(model).keys()
+        np.testing.assert_array_equal(call(alone, IDS[0]), call(model, IDS[0]))
+    assert type(lorasp_jax.extract(combined, None).experts) is nnx.Einsum
+    assert_close(call(lorasp_jax.choose(combined, None), IDS[0]), call(NET, IDS[0]))
+
+
+def test_each_example_has_its_own(models, combined):
+    found = call(lorasp_jax.choose(combined, ["b", None, "a", "b"]), IDS[0])
+    expected = [(models["b"], 0), (NET, 1), (models["a"], 2), (models["b"], 3)]
+    for model, row in expected:
+        assert_close(found[row], call(model, IDS[0])[row])
+
+
+def test_a_table_adapted_twice_attends_with_both(models, combined):
+    query = jax.random.normal(jax.random.key(0), (4, 6))
+    attend = [lorasp_jax.choose(combined, one).embed.attend(query) for one in ("a", "b", None)]
+    for found, model in zip(attend, [*models.values(), NET], strict=True):
+        assert_close(found, model.embed.attend(query))
+    both = lorasp_jax.choose(combined, WEIGHTS).embed.attend(query)
+    assert_close(both, attend[2] + 0.6 * (attend[0] - attend[2]) - 0.3 * (attend[1] - attend[2]))
+
+
+def test_weighted_sums_add_up_in_the_kernels(models, combined):
+    chosen = lorasp_jax.choose(combined, WEIGHTS)
+    fused, errors = lorasp_jax.fuse(combined, WEIGHTS)
+    base, merged = kernels(NET), kernels(lorasp_jax.merge(chosen))
+    each = {name: kernels(lorasp_jax.merge(model)) for name, model in models.items()}
+    for path, kernel in kernels(lorasp_jax.merge(fused)).items():
+        sums = base[path] + sum(w * (each[name][path] - base[path]) for name, w in WEIGHTS.items())
+        assert_close(merged[path], sums)
+        assert_close(kernel, sums)
+    assert errors == dict.fromkeys(KINDS, 0.0)
+    assert_close(call(fused, IDS[0]), call(chosen, IDS[0]))
+    smaller, errors = lorasp_jax.fuse(combined, WEIGHTS, rank=3)
+    assert smaller.experts.adapter.get_value()["lora_a"].shape == (2, 3, 3)
+    assert 0 < errors["blocks"] < 1
+
+
+def test_swapping_compiles_nothing(models, combined):
+    other = trained(("conv|join|blocks", LoRA(rank=1, alpha=5)), seed=7, net=NET)
+    run = jax.jit(lambda model, x: model(x))
+    run(lorasp_jax.choose(combined, "b"), IDS[0])
+    swapped = lorasp_jax.swap(lorasp_jax.choose(combined, "b"), "b", other)
+    assert_close(run(swapped, IDS[0]), call(other, IDS[0]))
+    assert run._cache_size() == 1
+    assert_close(call(lorasp_jax.choose(swapped, "a"), IDS[0]), call(models["a"], IDS[0]))
+
+
+@pytest.mark.slow
+def test_other_methods_have_names_too(models):
+    others = {
+        "sp": trained(("split|experts|blocks", SP), seed=5, net=NET),
+        "dora": trained(("split|experts|blocks", DoRA(rank=2)), seed=6, net=NET),
+    }
+    model = lorasp_jax.combine(models | others)
+    for name, expected in others.items():
+        assert_close(call(lorasp_jax.choose(model, name), IDS[0]), call(expected, IDS[0]))
+
+
+def test_merged_kinds_come_apart(models):
+    merged = lorasp_jax.merge(models["a"])
+    apart = lorasp_jax.unmerge(merged, models["a"])
+    assert adaptation.methods(apart) == adaptation.methods(models["a"])
+    for path, kernel in kernels(apart).items():
+        np.testing.assert_allclose(kernel, kernels(NET)[path], rtol=1e-5, atol=1e-5)
+    assert_close(call(apart, IDS[0]), call(models["a"], IDS[0]))
+
+
+def test_unmerging_needs_layers_of_the_same_kind(models):
+    merged = lorasp_jax.merge(models["a"])
+    merged.split = nnx.Linear(6, 6, rngs=nnx.Rngs(0))
+    message = "cannot unmerge split: a Linear is there instead of a LinearGeneral"
+    with pytest.raises(ValueError, match=message):
+        lorasp_jax.unmerge(merged, models["a"])
+
+
+class Shared(nnx.Module):
+    """One layer in two places."""
+
+    def __init__(self):
+        self.first = nnx.Einsum("...d,df->...f", (4, 4), rngs=nnx.Rngs(0))
+        self.second = self.first
+
+    def __call__(self, x):
+        return self.second(self.first(x))
+
+
+def test_a_shared_layer_changes_once():
+    net, x = Shared(), jax.random.normal(jax.random.key(0), (5, 4))
+    model = trained((".*", LoRA(rank=2)), seed=1, net=net)
+    merged = lorasp_jax.merge(model)
+    assert merged.first is merged.second
+    assert_close(merged(x), model(x))
+    apart = lorasp_jax.unmerge(merged, model)
+    assert_close(apart.first.kernel[...], net.first.kernel[...])
+    assert_close(apart(x), model(x))
+    both = lorasp_jax.combine({"a": model, "b": net})
+    assert_close(lorasp_jax.extract(both, "a")(x), model(x))
+    assert_close(lorasp_jax.choose(both, None)(x), net(x))
