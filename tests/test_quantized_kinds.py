@@ -98,6 +98,7 @@ def test_merging_makes_whole_kernels_and_leaves_the_others(quantised):
     assert_close(call(merged, IDS), call(model, IDS))
 
 
+@pytest.mark.slow
 def test_saved_adapters_and_names_over_codes(quantised, tmp_path):
     model = trained(
         ("split|experts|blocks", LoRASP(rank=4, hidden_width=2)), seed=1, net=quantised.model

@@ -94,7 +94,7 @@ def test_several_layers_of_one_input(d_outs):
         of_params, of_x, of_layers = gradients
         return found, of_params, of_x, [layer[2:] for layer in of_layers]
 
-    found, expected = everything(together), everything(apart)
+    found, expected = (jax.jit(everything, static_argnums=0)(way) for way in (together, apart))
     assert jax.tree.structure(found) == jax.tree.structure(expected)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-3)
