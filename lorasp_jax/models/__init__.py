@@ -1,6 +1,15 @@
 """Backbones, policies and what surrounds them; a backbone is a folder here, found by its name."""
 
-from lorasp_jax.models import pi0, published
+from lorasp_jax.models import pi0, published, smolvla
 from lorasp_jax.models.checkpoint import load, load_config, save, set_arrays, weights_hash
 
-__all__ = ["load", "load_config", "pi0", "published", "save", "set_arrays", "weights_hash"]
+__all__ = [
+    "load",
+    "load_config",
+    "pi0",
+    "published",
+    "save",
+    "set_arrays",
+    "smolvla",
+    "weights_hash",
+]

@@ -47,21 +47,13 @@ def save(folder: Folder, model: Any) -> None:
     Raises:
         ValueError: the model has adapters or quantised kernels.
     """
-    if jax.tree.leaves(nnx.state(model, (AdapterParam, SetParam))):
-        raise ValueError(
-            "models.save takes a model without adapters; merge them or save them alone."
-        )
-    if is_quantized(model):
-        raise ValueError("models.save takes whole kernels: save a base before quantising it.")
-    arrays = {name: np.asarray(leaf, jnp.bfloat16) for name, leaf in named_arrays(model).items()}
+    arrays = {name: a.astype(jnp.bfloat16) for name, a in base_arrays(model).items()}
     backbone = type(model).__module__.split(".")[-2]
     description = {
         "backbone": backbone,
         "config": _sizes(model.config),
         "sha256": _hash(arrays),
     }
-    folder = pathlib.Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     shards = _shards(arrays)
     names = [f"model-{i + 1:05}-of-{len(shards):05}.safetensors" for i in range(len(shards))]
     names = names if len(shards) > 1 else [SINGLE]
@@ -71,6 +63,28 @@ def save(folder: Folder, model: Any) -> None:
         total = {"total_size": sum(array.nbytes for array in arrays.values())}
         files[INDEX] = json.dumps({"metadata": total, "weight_map": where}, indent=1).encode()
     files[CONFIG] = (json.dumps(description, indent=1) + "\n").encode()
+    write(folder, files)
+
+
+def base_arrays(model: nnx.Module) -> dict[str, np.ndarray]:
+    """Every parameter of a model by "/"-joined path, in its stored type.
+
+    Raises:
+        ValueError: the model has adapters or quantised kernels.
+    """
+    if jax.tree.leaves(nnx.state(model, (AdapterParam, SetParam))):
+        raise ValueError(
+            "models.save takes a model without adapters; merge them or save them alone."
+        )
+    if is_quantized(model):
+        raise ValueError("models.save takes whole kernels: save a base before quantising it.")
+    return {name: np.asarray(leaf) for name, leaf in named_arrays(model).items()}
+
+
+def write(folder: Folder, files: Mapping[str, bytes]) -> None:
+    """Put files of a model, by name, in the place of those that are in the folder."""
+    folder = pathlib.Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
     for file, data in files.items():
         temporary = folder / f".{file}.{os.getpid()}"
         temporary.write_bytes(data)
@@ -97,7 +111,7 @@ def load(folder: Folder, config: Any = None) -> Any:
     config = config or stored
     if type(config) is not type(stored) or _sizes(config) != _sizes(stored):
         raise ValueError(f"{folder} does not fit the model: {_difference(stored, config)}.")
-    arrays = _read(folder)
+    arrays = read(folder)
     model = nnx.eval_shape(lambda: config.create(nnx.Rngs(0)))
     try:
         model = set_arrays(model, arrays)
@@ -159,7 +173,7 @@ def weights_hash(source: Folder | nnx.Module) -> str:
         return _hash(named_arrays(source, adapters=False))
     folder = pathlib.Path(source)
     _description(folder)
-    return _hash(_read(folder))
+    return _hash(read(folder))
 
 
 def named_arrays(model: nnx.Module, adapters: bool = True) -> dict[str, Any]:
@@ -225,8 +239,13 @@ def _config(folder: pathlib.Path, description: Mapping[str, Any]) -> Any:
         raise ValueError(f"{folder / CONFIG} describes no backbone of this version.") from error
 
 
-def _read(folder: pathlib.Path) -> dict[str, np.ndarray]:
-    """All tensors of the one file, or of the shards that the index lists."""
+def read(folder: Folder) -> dict[str, np.ndarray]:
+    """All tensors of the one file, or of the shards that the index lists.
+
+    Raises:
+        ValueError: a file is missing or damaged.
+    """
+    folder = pathlib.Path(folder)
     files: Iterable[str] = [SINGLE]
     try:
         if (folder / INDEX).exists():

@@ -20,17 +20,29 @@ Block = TypeVar("Block", bound=nnx.Module)
 
 
 class RMSNorm(nnx.Module):
-    """x / sqrt(mean(x^2) + eps) * (1 + scale) in fp32 (Gemma's form), back in the type of x."""
+    """x / sqrt(mean(x^2) + eps) * (offset + scale) in fp32, back in the type of x.
 
-    def __init__(self, width: int, *, eps: float = 1e-6, param_dtype: Any = jnp.float32) -> None:
-        self.scale = nnx.Param(jnp.zeros((width,), param_dtype))
+    Gemma stores its factor minus one (offset 1), other models the factor itself (offset 0).
+    """
+
+    def __init__(
+        self,
+        width: int,
+        *,
+        eps: float = 1e-6,
+        offset: float = 1.0,
+        param_dtype: Any = jnp.float32,
+    ) -> None:
+        self.scale = nnx.Param(jnp.full((width,), 1 - offset, param_dtype))
         self.eps = eps
+        self.offset = offset
 
     def __call__(self, x: jax.Array) -> jax.Array:
         """x `[..., D]`."""
         wide = x.astype(jnp.float32)
         inverse = jax.lax.rsqrt(jnp.mean(jnp.square(wide), axis=-1, keepdims=True) + self.eps)
-        return (wide * inverse * (1 + self.scale.get_value().astype(jnp.float32))).astype(x.dtype)
+        factor = self.offset + self.scale.get_value().astype(jnp.float32)
+        return (wide * inverse * factor).astype(x.dtype)
 
 
 class LayerNorm(nnx.Module):

@@ -28,7 +28,13 @@ import safetensors.numpy
 from flax import nnx
 
 from lorasp_jax.models import layouts
-from lorasp_jax.models.checkpoint import INDEX, SINGLE, named_arrays, set_arrays
+from lorasp_jax.models.checkpoint import (
+    INDEX,
+    SINGLE,
+    base_arrays,
+    named_arrays,
+    set_arrays,
+)
 
 _READ_AHEAD = 1  # GB that Orbax reads at once, beside the result
 _PREFIX = "model."  # of all tensors in a LeRobot policy's file
@@ -78,7 +84,7 @@ def save(folder: Path, model: Any, layout: str, dtypes: Mapping[str, Any] | None
         dtypes: type of each of their leaves, as `stored_dtypes` tells; None: the model's types.
 
     Raises:
-        ValueError: unknown layout, or something is there already.
+        ValueError: unknown layout, adapters or quantised kernels, or something is there already.
     """
     weights = _weights(model.config)
     if layout not in weights.LAYOUTS:
@@ -87,7 +93,7 @@ def save(folder: Path, model: Any, layout: str, dtypes: Mapping[str, Any] | None
     if target.exists():
         raise ValueError(f"{target} exists already: choose another folder.")
     rules = weights.LAYOUTS[layout](model.config)
-    theirs = layouts.write(rules, named_arrays(model))
+    theirs = layouts.write(rules, base_arrays(model))
     if dtypes is not None:
         theirs = {name: array.astype(dtypes[name]) for name, array in theirs.items()}
     folder.mkdir(parents=True, exist_ok=True)

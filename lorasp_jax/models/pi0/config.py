@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from lorasp_jax.models.config import BackboneConfig, ExpertConfig, VisionConfig
 from lorasp_jax.models.tokenizer import VOCABULARY_SIZE
 
 if TYPE_CHECKING:
@@ -14,103 +15,14 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class VisionConfig:
-    """Size of the SigLIP tower."""
-
-    width: int
-    depth: int
-    mlp: int
-    heads: int
-    patch: int
-    """Height and width of a patch [pixels]."""
-
-
-@dataclass(frozen=True)
-class ExpertConfig:
-    """Size of one Gemma expert; both experts agree in depth, heads, kv_heads and head_dim."""
-
-    width: int
-    depth: int
-    mlp: int
-    heads: int
-    kv_heads: int
-    head_dim: int
-
-
-@dataclass(frozen=True)
-class Pi0Config:
-    """Every size of a pi0.
-
-    Raises:
-        ValueError: sizes that do not fit together.
-    """
-
-    vision: VisionConfig
-    language: ExpertConfig
-    action: ExpertConfig
-    cameras: tuple[str, ...]
-    """Names of the pictures, in the order of their tokens."""
-    image_size: int
-    """Height and width of the pictures [pixels]."""
-    vocabulary: int
-    """Rows of the embedding table."""
-    max_tokens: int
-    """Length of the padded instruction."""
-    chunk: int
-    """Actions per chunk, C."""
-    action_dim: int
-    """Slots of state and action vectors, A."""
-    dtype: str = "float32"
-    """Type of the towers' matrix products; norms, softmax, projections and the loss are fp32."""
-    param_dtype: str = "float32"
-    """Type the parameters are stored in."""
-    remat: bool = False
-    """Recompute each layer's inside in the backward pass: less memory, a third more work."""
-    unroll: bool = False
-    """Straight-line code instead of a loop over layers: faster for a few small ones (a loop copies
-    what the backward pass needs into stacks and out again), at the price of compile time."""
-
-    def __post_init__(self) -> None:
-        """Checks that the parts fit."""
-        language, action = self.language, self.action
-        for name in ("depth", "heads", "kv_heads", "head_dim"):
-            a, b = getattr(language, name), getattr(action, name)
-            if a != b:
-                raise ValueError(f"experts share attention, but {name} is {a} and {b}.")
-        if self.image_size % self.vision.patch:
-            raise ValueError(
-                f"image_size {self.image_size} is not a multiple of the patch, {self.vision.patch}."
-            )
-        if self.vision.width % self.vision.heads or language.heads % language.kv_heads:
-            raise ValueError("heads must divide the vision width, kv_heads the experts' heads.")
-        if language.head_dim % 2 or action.width % 2:
-            raise ValueError("head_dim and the action width must be even.")
-
-    @property
-    def image_tokens(self) -> int:
-        """Tokens per camera."""
-        return (self.image_size // self.vision.patch) ** 2
+class Pi0Config(BackboneConfig):
+    """Every size of a pi0."""
 
     def create(self, rngs: nnx.Rngs) -> Pi0:
         """A model with random weights; works under `nnx.eval_shape`."""
         from lorasp_jax.models.pi0.pi0 import Pi0
 
         return Pi0(self, rngs=rngs)
-
-    @classmethod
-    def from_dict(cls, fields: dict[str, Any]) -> Pi0Config:
-        """The config of `dataclasses.asdict`, also after JSON.
-
-        Raises:
-            TypeError, KeyError: missing or unknown fields.
-        """
-        parts = {
-            "vision": VisionConfig(**fields["vision"]),
-            "language": ExpertConfig(**fields["language"]),
-            "action": ExpertConfig(**fields["action"]),
-            "cameras": tuple(fields["cameras"]),
-        }
-        return cls(**{**fields, **parts})
 
     @classmethod
     def base(cls) -> Pi0Config:

@@ -7,8 +7,10 @@ names of Hugging Face, stacked over layers.
 
 import numpy as np
 
-from lorasp_jax.models.layouts import Rule, copied, reshaped, stacked, transposed
-from lorasp_jax.models.pi0.config import ExpertConfig, Pi0Config
+from lorasp_jax.models.config import ExpertConfig
+from lorasp_jax.models.layouts import Rule, copied, reshaped
+from lorasp_jax.models.pi0.config import Pi0Config
+from lorasp_jax.models.torch_layouts import PROJECTIONS, decoder, linear, siglip
 
 _IMG, _LLM = "PaliGemma/img", "PaliGemma/llm"
 _PALIGEMMA = "paligemma_with_expert.paligemma"
@@ -19,13 +21,6 @@ UNUSED = (f"{_PALIGEMMA}.lm_head.weight", f"{_EXPERT}.lm_head.weight")
 """LeRobot's heads, which no computation reads."""
 TIED = {UNUSED[0]: f"{_LANGUAGE}.embed_tokens.weight"}
 """Of those, what is another tensor once more."""
-_PROJECTIONS = (
-    "state_proj",
-    "action_in_proj",
-    "action_time_mlp_in",
-    "action_time_mlp_out",
-    "action_out_proj",
-)
 
 
 def openpi_layout(config: Pi0Config) -> list[Rule]:
@@ -36,7 +31,7 @@ def openpi_layout(config: Pi0Config) -> list[Rule]:
     ]
     for tower, size, suffix in (("language", config.language, ""), ("action", config.action, "_1")):
         rules += _openpi_expert(tower, size, suffix)
-    for name in _PROJECTIONS:
+    for name in PROJECTIONS:
         rules += [copied(f"{name}/{leaf}", f"{name}/{leaf}") for leaf in ("kernel", "bias")]
     return rules
 
@@ -151,75 +146,17 @@ def canonical_name(name: str) -> str:
 
 def lerobot_layout(config: Pi0Config) -> list[Rule]:
     """LeRobot's tensors by name without the leading "model." (policies/pi0/modeling_pi0.py)."""
-    vision, tower = config.vision, _VISION
-    patch = f"{tower}.embeddings.patch_embedding"
     rules = [
-        Rule(
-            ("vision/patch_embed/kernel",),
-            (f"{patch}.weight",),
-            lambda arrays: [w.transpose(2, 3, 1, 0).reshape(-1, w.shape[0]) for w in arrays],
-            lambda k: [
-                k.reshape(vision.patch, vision.patch, 3, vision.width).transpose(3, 2, 0, 1)
-            ],
-        ),
-        copied("vision/patch_embed/bias", f"{patch}.bias"),
-        copied("vision/position_embedding", f"{tower}.embeddings.position_embedding.weight"),
-        *_norm("vision/norm", f"{tower}.post_layernorm"),
-        *_linear("vision/head", f"{_PALIGEMMA}.model.multi_modal_projector.linear"),
+        *siglip(_VISION, config.vision),
+        *linear("vision/head", f"{_PALIGEMMA}.model.multi_modal_projector.linear"),
         copied("language/embedding", f"{_LANGUAGE}.embed_tokens.weight"),
     ]
-    layers = [f"{tower}.encoder.layers.{i}" for i in range(vision.depth)]
-    parts = {name: f"self_attn.{name}" for name in ("q_proj", "k_proj", "v_proj", "out_proj")}
-    for name, theirs in (parts | {"fc1": "mlp.fc1", "fc2": "mlp.fc2"}).items():
-        rules += _linears(f"vision/blocks/{name}", [f"{layer}.{theirs}" for layer in layers])
-    for name in ("layer_norm1", "layer_norm2"):
-        theirs = [f"{layer}.{name}" for layer in layers]
-        for leaf, torch in (("scale", "weight"), ("bias", "bias")):
-            rules.append(stacked(f"vision/blocks/{name}/{leaf}", [f"{t}.{torch}" for t in theirs]))
-    for name, theirs in (
-        ("language", _LANGUAGE),
-        ("action", f"{_EXPERT}.model"),
-    ):
-        rules += _lerobot_expert(name, theirs, config.language.depth)
-    for name in _PROJECTIONS:
-        rules += _linear(name, name)
+    for tower, theirs in (("language", _LANGUAGE), ("action", f"{_EXPERT}.model")):
+        rules += decoder(f"{tower}/blocks", theirs, range(config.language.depth))
+        rules.append(copied(f"{tower}/norm/scale", f"{theirs}.norm.weight"))
+    for name in PROJECTIONS:
+        rules += linear(name, name)
     return rules
-
-
-def _lerobot_expert(tower: str, theirs: str, depth: int) -> list[Rule]:
-    layers = [f"{theirs}.layers.{i}" for i in range(depth)]
-    parts = {name: f"self_attn.{name}" for name in ("q_proj", "k_proj", "v_proj", "o_proj")}
-    parts |= {name: f"mlp.{name}" for name in ("gate_proj", "up_proj", "down_proj")}
-    rules = [
-        stacked(
-            f"{tower}/blocks/{ours}/kernel", [f"{x}.{name}.weight" for x in layers], transpose=True
-        )
-        for ours, name in parts.items()
-    ]
-    rules += [
-        stacked(f"{tower}/blocks/{name}/scale", [f"{x}.{name}.weight" for x in layers])
-        for name in ("input_layernorm", "post_attention_layernorm")
-    ]
-    return [*rules, copied(f"{tower}/norm/scale", f"{theirs}.norm.weight")]
-
-
-def _linear(ours: str, theirs: str) -> list[Rule]:
-    return [
-        transposed(f"{ours}/kernel", f"{theirs}.weight"),
-        copied(f"{ours}/bias", f"{theirs}.bias"),
-    ]
-
-
-def _linears(ours: str, theirs: list[str]) -> list[Rule]:
-    """The same of stacked layers."""
-    return [
-        stacked(f"{ours}/kernel", [f"{name}.weight" for name in theirs], transpose=True),
-        stacked(f"{ours}/bias", [f"{name}.bias" for name in theirs]),
-    ]
-
-
-def _norm(ours: str, theirs: str) -> list[Rule]:
-    return [copied(f"{ours}/scale", f"{theirs}.weight"), copied(f"{ours}/bias", f"{theirs}.bias")]
 
 
 LAYOUTS = {"openpi": openpi_layout, "lerobot": lerobot_layout}

@@ -1,18 +1,18 @@
-"""SigLIP vision tower (Zhai et al., arXiv 2303.15343) with pi0's projection to language tokens."""
+"""SigLIP vision tower (Zhai et al., arXiv 2303.15343) with its projection to language tokens."""
 
 import jax
 import jax.numpy as jnp
 from flax import nnx
 
 from lorasp_jax.dense import Dense
+from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.layers import LayerAux, LayerNorm, Linears, attention, scan_depth, stack
-from lorasp_jax.models.pi0.config import Pi0Config
 
 
 class VisionBlock(nnx.Module):
     """Pre-norm transformer layer: x + attention(norm(x)), x + mlp(norm(x)), tanh-GELU, biases."""
 
-    def __init__(self, config: Pi0Config, *, rngs: nnx.Rngs) -> None:
+    def __init__(self, config: BackboneConfig, *, rngs: nnx.Rngs) -> None:
         width, mlp = config.vision.width, config.vision.mlp
         kinds = {"dtype": config.dtype, "param_dtype": config.param_dtype, "rngs": rngs}
         self.heads = config.vision.heads
@@ -41,18 +41,25 @@ class SigLIP(nnx.Module):
     """Pictures to language tokens.
 
     The patch embedding, a dense layer over flattened patches, equals the usual strided convolution.
+    The head reads `config.vision.shuffle` by as many neighbouring tokens as one (pixel shuffle).
     """
 
-    def __init__(self, config: Pi0Config, *, rngs: nnx.Rngs) -> None:
+    def __init__(self, config: BackboneConfig, *, head_bias: bool = True, rngs: nnx.Rngs) -> None:
         vision, kinds = config.vision, {"param_dtype": config.param_dtype, "rngs": rngs}
         self.config = config
         self.patch_embed = Dense(3 * vision.patch**2, vision.width, dtype=jnp.float32, **kinds)
-        shape = (config.image_tokens, vision.width)
+        shape = (config.patches, vision.width)
         draw = jax.random.normal(rngs.params(), shape, config.param_dtype)
         self.position_embedding = nnx.Param(draw * vision.width**-0.5)
         self.blocks = stack(lambda rngs: VisionBlock(config, rngs=rngs), vision.depth, rngs)
         self.norm = LayerNorm(vision.width, param_dtype=config.param_dtype)
-        self.head = Dense(vision.width, config.language.width, dtype=config.dtype, **kinds)
+        self.head = Dense(
+            vision.shuffle**2 * vision.width,
+            config.language.width,
+            use_bias=head_bias,
+            dtype=config.dtype,
+            **kinds,
+        )
 
     def __call__(self, images: jax.Array, present: jax.Array) -> tuple[jax.Array, LayerAux]:
         """Encode pictures.
@@ -64,7 +71,7 @@ class SigLIP(nnx.Module):
         Returns:
             `[B, T, D]` tokens of the language width, and the adapters' reports.
         """
-        mask = jnp.broadcast_to(present[:, None], (images.shape[0], self.config.image_tokens))
+        mask = jnp.broadcast_to(present[:, None], (images.shape[0], self.config.patches))
         linear = Linears(self, mask)
         x = linear("patch_embed", patches(images, self.config.vision.patch))
         x = x + self.position_embedding.get_value().astype(x.dtype)
@@ -75,12 +82,15 @@ class SigLIP(nnx.Module):
             remat=self.config.remat,
             unroll=self.config.unroll,
         )
-        x = linear("head", self.norm(x))
-        return x, {**aux, **linear.aux}
+        side = self.config.image_size // self.config.vision.patch
+        grid = self.norm(x).reshape(x.shape[0], side, side, -1)
+        head = Linears(self, mask[:, : self.config.image_tokens])
+        x = head("head", patches(grid, self.config.vision.shuffle))
+        return x, {**aux, **linear.aux, **head.aux}
 
 
 def patches(images: jax.Array, size: int) -> jax.Array:
-    """`[B, H, W, 3]` -> `[B, T, 3 size^2]`: patches row by row, each flattened as (y, x, rgb)."""
-    batch, height, width, _ = images.shape
-    grid = images.reshape(batch, height // size, size, width // size, size, 3)
-    return grid.swapaxes(2, 3).reshape(batch, -1, size * size * 3)
+    """`[B, H, W, C]` -> `[B, T, C size^2]`: patches row by row, each flattened as (y, x, c)."""
+    batch, height, width, channels = images.shape
+    grid = images.reshape(batch, height // size, size, width // size, size, channels)
+    return grid.swapaxes(2, 3).reshape(batch, -1, size * size * channels)

@@ -1,10 +1,11 @@
-"""Gemma experts (arXiv 2403.08295) that share attention: pi0's mixture of transformers.
+"""Experts that share attention: a mixture of transformers (pi0, arXiv 2410.24164).
 
 An expert's tokens attend to the keys and values that earlier experts left for the same layer.
 Since language tokens never see action tokens, the language expert runs first, whole, and the action
 expert follows with its cache; training and sampling take the same path.
 """
 
+import functools
 import math
 from typing import Any
 
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from lorasp_jax.dense import Dense
+from lorasp_jax.models.config import BackboneConfig, ExpertConfig
 from lorasp_jax.models.layers import (
     LayerAux,
     Linears,
@@ -23,30 +25,43 @@ from lorasp_jax.models.layers import (
     scan_depth,
     stack,
 )
-from lorasp_jax.models.pi0.config import ExpertConfig, Pi0Config
 
 KeysValues = tuple[jax.Array, jax.Array]
 """Keys after the rotation and values, each `[B, S, K, H]`, or `[L, B, S, K, H]` for all layers."""
 
 
 class ExpertBlock(nnx.Module):
-    """One Gemma layer: RMS norms, rotary grouped-query attention, GeGLU; no biases."""
+    """One Gemma layer (arXiv 2403.08295): RMS norms, rotary grouped-query attention, GeGLU.
 
-    def __init__(self, size: ExpertConfig, config: Pi0Config, *, rngs: nnx.Rngs) -> None:
+    There are no biases. Subclasses have other norms and activations.
+    """
+
+    make_norm = staticmethod(RMSNorm)
+    activation = staticmethod(functools.partial(jax.nn.gelu, approximate=True))
+
+    def __init__(
+        self,
+        size: ExpertConfig,
+        config: BackboneConfig,
+        *,
+        context: int | None = None,
+        rngs: nnx.Rngs,
+    ) -> None:
+        """Draws the weights; keys and values are read from width `context`, its own by default."""
         kinds: dict[str, Any] = {
             "use_bias": False,
             "dtype": config.dtype,
             "param_dtype": config.param_dtype,
             "rngs": rngs,
         }
-        width, inner = size.width, size.heads * size.head_dim
+        width, inner, context = size.width, size.heads * size.head_dim, context or size.width
         self.head_dim = size.head_dim
-        self.input_layernorm = RMSNorm(width, param_dtype=config.param_dtype)
+        self.input_layernorm = self.make_norm(width, param_dtype=config.param_dtype)
         self.q_proj = Dense(width, inner, **kinds)
-        self.k_proj = Dense(width, size.kv_heads * size.head_dim, **kinds)
-        self.v_proj = Dense(width, size.kv_heads * size.head_dim, **kinds)
+        self.k_proj = Dense(context, size.kv_heads * size.head_dim, **kinds)
+        self.v_proj = Dense(context, size.kv_heads * size.head_dim, **kinds)
         self.o_proj = Dense(inner, width, **kinds)
-        self.post_attention_layernorm = RMSNorm(width, param_dtype=config.param_dtype)
+        self.post_attention_layernorm = self.make_norm(width, param_dtype=config.param_dtype)
         self.gate_proj = Dense(width, size.mlp, **kinds)
         self.up_proj = Dense(width, size.mlp, **kinds)
         self.down_proj = Dense(size.mlp, width, **kinds)
@@ -81,21 +96,27 @@ class ExpertBlock(nnx.Module):
         if cache is not None:
             keys = jnp.concatenate([cache[0], k], axis=1)
             values = jnp.concatenate([cache[1], v], axis=1)
-        x = x + linear("o_proj", attention(q, keys, values, mask))
+        x = self.finish(linear, x, attention(q, keys, values, mask))
+        return x, ((k, v), linear.aux)
+
+    def finish(self, linear: Linears, x: jax.Array, attended: jax.Array) -> jax.Array:
+        """x `[B, T, D]` after the attention's result `[B, T, N H]` and the gated MLP."""
+        x = x + linear("o_proj", attended)
         h = self.post_attention_layernorm(x)
         gate, up = linear.together(("gate_proj", "up_proj"), h)
-        h = jax.nn.gelu(gate, approximate=True) * up
-        return x + linear("down_proj", h), ((k, v), linear.aux)
+        return x + linear("down_proj", self.activation(gate) * up)
 
 
 class Expert(nnx.Module):
-    """A stack of Gemma layers with its final norm."""
+    """A stack of layers with its final norm."""
 
-    def __init__(self, size: ExpertConfig, config: Pi0Config, *, rngs: nnx.Rngs) -> None:
+    block = ExpertBlock
+
+    def __init__(self, size: ExpertConfig, config: BackboneConfig, *, rngs: nnx.Rngs) -> None:
         self.config = config
         self.head_dim = size.head_dim
-        self.blocks = stack(lambda rngs: ExpertBlock(size, config, rngs=rngs), size.depth, rngs)
-        self.norm = RMSNorm(size.width, param_dtype=config.param_dtype)
+        self.blocks = stack(lambda rngs: self.block(size, config, rngs=rngs), size.depth, rngs)
+        self.norm = self.block.make_norm(size.width, param_dtype=config.param_dtype)
 
     def __call__(
         self,
@@ -134,13 +155,13 @@ class Expert(nnx.Module):
 class LanguageExpert(Expert):
     """The expert that owns the token embedding."""
 
-    def __init__(self, size: ExpertConfig, config: Pi0Config, *, rngs: nnx.Rngs) -> None:
+    def __init__(self, size: ExpertConfig, config: BackboneConfig, *, rngs: nnx.Rngs) -> None:
         super().__init__(size, config, rngs=rngs)
         shape = (config.vocabulary, size.width)
         draw = jax.random.normal(rngs.params(), shape, config.param_dtype)
         self.embedding = nnx.Param(draw * size.width**-0.5)
 
     def embed(self, tokens: jax.Array) -> jax.Array:
-        """`[B, T]` int32 -> `[B, T, D]`, scaled by sqrt(D) as Gemma does."""
+        """`[B, T]` int32 -> `[B, T, D]`, scaled by sqrt(D)."""
         table = self.embedding.get_value()
         return (table[tokens] * math.sqrt(table.shape[-1])).astype(self.config.dtype)

@@ -1,0 +1,174 @@
+"""What every backbone does: look at pictures, match flows, draw action chunks."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+from lorasp_jax.models import flow_matching
+from lorasp_jax.models.config import BackboneConfig
+from lorasp_jax.models.layers import LayerAux, Linears, time_embedding
+from lorasp_jax.models.observation import Observation
+from lorasp_jax.models.siglip import SigLIP
+
+ModelAux = dict[str, LayerAux]
+"""Adapters' reports by tower ("vision", "language", "action") and layer name."""
+
+
+class Backbone(nnx.Module):
+    """A vision-language model with an action expert.
+
+    A backbone says what is computed once per observation, `run_prefix`, and what in every step of
+    the flow, `run_suffix`.
+    """
+
+    config: BackboneConfig
+    vision: SigLIP
+
+    def run_prefix(self, obs: Observation) -> tuple[Any, ModelAux]:
+        """Everything that does not depend on the actions, once per observation."""
+        raise NotImplementedError
+
+    def run_suffix(
+        self,
+        prefix: Any,
+        obs: Observation,
+        x_t: jax.Array,
+        flow_time: jax.Array,
+        action_valid: jax.Array | None = None,
+    ) -> tuple[jax.Array, LayerAux]:
+        """Velocity `[B, C, A]` f32 given the prefix.
+
+        Args:
+            prefix: from `run_prefix`.
+            obs: what the prefix was made of.
+            x_t: `[B, C, A]`.
+            flow_time: `[B]`.
+            action_valid: `[B, C]` bool, what the adapters count; None counts all.
+        """
+        raise NotImplementedError
+
+    def look(self, obs: Observation) -> tuple[jax.Array, jax.Array, ModelAux]:
+        """Tokens of the pictures, camera by camera.
+
+        Returns:
+            tokens `[B, P, D]`, valid `[B, P]` bool, reports of the vision tower's adapters.
+
+        Raises:
+            ValueError: a camera is missing or a picture has the wrong size.
+        """
+        cameras, size = self.config.cameras, self.config.image_size
+        for name in cameras:
+            if name not in obs.images or obs.images[name].shape[1:] != (size, size, 3):
+                found = {camera: image.shape[1:] for camera, image in obs.images.items()}
+                raise ValueError(f"need pictures {(size, size, 3)} of {cameras}, got {found}.")
+        images = jnp.stack([obs.images[name] for name in cameras], axis=1)
+        present = jnp.stack([obs.image_masks[name] for name in cameras], axis=1)
+        seen, aux = self.vision(images.reshape(-1, size, size, 3), present.reshape(-1))
+        tokens = seen.reshape(images.shape[0], -1, seen.shape[-1])
+        valid = jnp.repeat(present, self.config.image_tokens, axis=1)
+        return tokens, valid, {"vision": aux}
+
+    def velocity(self, obs: Observation, x_t: jax.Array, flow_time: jax.Array) -> jax.Array:
+        """Velocity v_t `[B, C, A]` at x_t `[B, C, A]` and flow_time `[B]` (1 noise, 0 data)."""
+        prefix, _ = self.run_prefix(obs)
+        return self.run_suffix(prefix, obs, x_t, flow_time)[0]
+
+    def loss(
+        self,
+        key: jax.Array,
+        obs: Observation,
+        actions: jax.Array,
+        *,
+        action_mask: jax.Array | None = None,
+        noise: jax.Array | None = None,
+        flow_time: jax.Array | None = None,
+    ) -> tuple[jax.Array, ModelAux]:
+        """Flow-matching error; the key is consumed.
+
+        Args:
+            key: typed random key for what of `noise`, `flow_time` is not given.
+            obs: what the policy sees.
+            actions: `[B, C, A]` normalised.
+            action_mask: `[B, C, A]` bool. Slots without any valid step are held at zero in x_t, and
+                adapters do not count steps without any valid slot. The error itself is not masked.
+            noise: `[B, C, A]`.
+            flow_time: `[B]`.
+
+        Returns:
+            `[B, C, A]` f32 squared errors, not reduced, and the adapters' reports.
+        """
+        slots = None if action_mask is None else action_mask.any(axis=1, keepdims=True)
+        valid = None if action_mask is None else action_mask.any(axis=2)
+        prefix, aux = self.run_prefix(obs)
+        per_element, action_aux = flow_matching.loss(
+            lambda x_t, t: self.run_suffix(prefix, obs, x_t, t, valid),
+            key,
+            actions,
+            slots=slots,
+            noise=noise,
+            flow_time=flow_time,
+        )
+        return per_element, _with_action(aux, action_aux)
+
+    def sample_actions(
+        self,
+        key: jax.Array,
+        obs: Observation,
+        *,
+        num_steps: int = 10,
+        noise: jax.Array | None = None,
+        slots: jax.Array | None = None,
+        return_aux: bool = False,
+    ) -> Any:
+        """Draw action chunks; the key is consumed for `noise` if that is not given.
+
+        Args:
+            key: typed random key.
+            obs: what the policy sees.
+            num_steps: Euler steps.
+            noise: `[B, C, A]` start of the flow.
+            slots: `[A]` bool, the robot's slots; the others stay zero. None: all.
+            return_aux: also return the adapters' reports; those of "action" get a leading axis of
+                steps, before the layers'. What ran once counts as if it had run in every step.
+
+        Returns:
+            `[B, C, A]` f32 normalised actions, or (actions, aux).
+        """
+        if noise is None:
+            shape = (obs.state.shape[0], self.config.chunk, self.config.action_dim)
+            noise = jax.random.normal(key, shape)
+        prefix, aux = self.run_prefix(obs)
+        actions, action_aux = flow_matching.sample(
+            lambda x_t, t: self.run_suffix(prefix, obs, x_t, t),
+            noise,
+            num_steps=num_steps,
+            slots=slots,
+        )
+        if not return_aux:
+            return actions
+        once = jax.tree.map(
+            lambda a: jnp.broadcast_to(a, (num_steps, *a.shape)), aux.get("action", {})
+        )
+        return actions, _with_action({**aux, "action": once}, action_aux)
+
+
+def action_tokens(linear: Linears, x_t: jax.Array, flow_time: jax.Array) -> jax.Array:
+    """Tokens `[B, C, D]` f32 of noisy actions `[B, C, A]` at `[B]` times.
+
+    Args:
+        linear: of a module with `action_in_proj`, `action_time_mlp_in` and `action_time_mlp_out`.
+        x_t: `[B, C, A]`.
+        flow_time: `[B]`.
+    """
+    h = linear("action_in_proj", x_t.astype(jnp.float32))
+    time = time_embedding(flow_time, h.shape[-1])[:, None]
+    h = jnp.concatenate([h, jnp.broadcast_to(time, h.shape)], axis=-1)
+    h = jax.nn.silu(linear("action_time_mlp_in", h))
+    return linear("action_time_mlp_out", h)
+
+
+def _with_action(aux: ModelAux, action: LayerAux) -> ModelAux:
+    """Reports with those of the action expert's steps next to what it did in the prefix."""
+    return {**aux, "action": {**aux.get("action", {}), **action}}

@@ -1,0 +1,108 @@
+"""Sizes that every backbone has."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Self
+
+
+@dataclass(frozen=True)
+class VisionConfig:
+    """Size of the SigLIP tower."""
+
+    width: int
+    depth: int
+    mlp: int
+    heads: int
+    patch: int
+    """Height and width of a patch [pixels]."""
+    shuffle: int = 1
+    """Height and width of the square of tokens that the head reads as one [tokens]."""
+
+
+@dataclass(frozen=True)
+class ExpertConfig:
+    """Size of one expert; both experts agree in depth, heads, kv_heads and head_dim."""
+
+    width: int
+    depth: int
+    mlp: int
+    heads: int
+    kv_heads: int
+    head_dim: int
+
+
+@dataclass(frozen=True)
+class BackboneConfig:
+    """Every size of a backbone.
+
+    Raises:
+        ValueError: sizes that do not fit together.
+    """
+
+    vision: VisionConfig
+    language: ExpertConfig
+    action: ExpertConfig
+    cameras: tuple[str, ...]
+    """Names of the pictures, in the order of their tokens."""
+    image_size: int
+    """Height and width of the pictures [pixels]."""
+    vocabulary: int
+    """Rows of the embedding table."""
+    max_tokens: int
+    """Length of the padded instruction."""
+    chunk: int
+    """Actions per chunk, C."""
+    action_dim: int
+    """Slots of state and action vectors, A."""
+    dtype: str = "float32"
+    """Type of the towers' matrix products; norms, softmax, projections and the loss are fp32."""
+    param_dtype: str = "float32"
+    """Type the parameters are stored in."""
+    remat: bool = False
+    """Recompute each layer's inside in the backward pass: less memory, a third more work."""
+    unroll: bool = False
+    """Straight-line code instead of a loop over layers: faster for a few small ones (a loop copies
+    what the backward pass needs into stacks and out again), at the price of compile time."""
+
+    def __post_init__(self) -> None:
+        """Checks that the parts fit."""
+        language, action = self.language, self.action
+        for name in ("depth", "heads", "kv_heads", "head_dim"):
+            a, b = getattr(language, name), getattr(action, name)
+            if a != b:
+                raise ValueError(f"experts share attention, but {name} is {a} and {b}.")
+        side = self.vision.patch * self.vision.shuffle
+        if self.image_size % side:
+            raise ValueError(
+                f"image_size {self.image_size} is not a multiple of the patch, {side}."
+            )
+        if self.vision.width % self.vision.heads or language.heads % language.kv_heads:
+            raise ValueError("heads must divide the vision width, kv_heads the experts' heads.")
+        if language.head_dim % 2 or action.width % 2:
+            raise ValueError("head_dim and the action width must be even.")
+
+    @property
+    def patches(self) -> int:
+        """Patches per camera."""
+        return (self.image_size // self.vision.patch) ** 2
+
+    @property
+    def image_tokens(self) -> int:
+        """Tokens per camera."""
+        return self.patches // self.vision.shuffle**2
+
+    @classmethod
+    def from_dict(cls, fields: dict[str, Any]) -> Self:
+        """The config of `dataclasses.asdict`, also after JSON.
+
+        Raises:
+            TypeError, KeyError: missing or unknown fields.
+        """
+        parts = {
+            "vision": VisionConfig(**fields["vision"]),
+            "language": ExpertConfig(**fields["language"]),
+            "action": ExpertConfig(**fields["action"]),
+            "cameras": tuple(fields["cameras"]),
+        }
+        return cls(**{**fields, **parts})

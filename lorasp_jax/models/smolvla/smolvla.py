@@ -1,0 +1,141 @@
+"""SmolVLA (Shukor et al., arXiv 2506.01844): flow matching on a small vision-language model.
+
+Tokens fall into blocks: [pictures, instruction], [state], and each noisy action by itself; each
+block sees itself and those before it. Pictures, instruction and state are the prefix of the
+language model, the actions the suffix of the action expert.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from lorasp_jax.dense import Dense
+from lorasp_jax.models.backbone import Backbone, ModelAux, action_tokens
+from lorasp_jax.models.experts import KeysValues
+from lorasp_jax.models.layers import LayerAux, Linears, block_mask, positions
+from lorasp_jax.models.observation import Observation
+from lorasp_jax.models.siglip import SigLIP
+from lorasp_jax.models.smolvla.config import SmolVLAConfig
+from lorasp_jax.models.smolvla.experts import ActionExpert, Language
+
+
+class Prefix(NamedTuple):
+    """Pictures, instruction and state as the action expert needs them.
+
+    Attributes:
+        cache: keys and values `[L / 2, B, P, K, H]` of the language model's even layers.
+        cross: what the expert's odd layers made of the odd ones, in the same shape.
+        valid: `[B, P]` bool.
+    """
+
+    cache: KeysValues
+    cross: KeysValues
+    valid: jax.Array
+
+
+class SmolVLA(Backbone):
+    """SmolVLA of any size."""
+
+    config: SmolVLAConfig
+
+    def __init__(self, config: SmolVLAConfig, *, rngs: nnx.Rngs) -> None:
+        width, dim = config.action.width, config.action_dim
+        kinds: dict[str, Any] = {
+            "dtype": jnp.float32,
+            "param_dtype": config.param_dtype,
+            "rngs": rngs,
+        }
+        self.config = config
+        self.vision = SigLIP(config, head_bias=False, rngs=rngs)
+        self.language = Language(config.language, config, rngs=rngs)
+        self.action = ActionExpert(config.action, config, rngs=rngs)
+        self.state_proj = Dense(dim, config.language.width, **kinds)
+        self.action_in_proj = Dense(dim, width, **kinds)
+        self.action_time_mlp_in = Dense(2 * width, width, **kinds)
+        self.action_time_mlp_out = Dense(width, width, **kinds)
+        self.action_out_proj = Dense(width, dim, **kinds)
+
+    def embed_prefix(self, obs: Observation) -> tuple[jax.Array, jax.Array, ModelAux]:
+        """Tokens of pictures, instruction and state.
+
+        Returns:
+            tokens `[B, P, D]`, valid `[B, P]` bool, reports of the adapters.
+
+        Raises:
+            ValueError: a camera is missing or a picture has the wrong size.
+        """
+        seen, image_valid, aux = self.look(obs)
+        one = jnp.ones((obs.state.shape[0], 1), bool)
+        linear = Linears(self, one)
+        state = linear("state_proj", obs.state[:, None].astype(jnp.float32))
+        # Unlike pi0's, the pictures' tokens have the scale of the language's.
+        seen = seen * math.sqrt(seen.shape[-1])
+        text = self.language.embed(obs.tokens)
+        tokens = jnp.concatenate([seen, text, state.astype(text.dtype)], axis=1)
+        valid = jnp.concatenate([image_valid, obs.token_mask, one], axis=1)
+        return tokens, valid, {**aux, "action": linear.aux}
+
+    def embed_suffix(
+        self,
+        obs: Observation,
+        x_t: jax.Array,
+        flow_time: jax.Array,
+        action_valid: jax.Array | None = None,
+    ) -> tuple[jax.Array, LayerAux]:
+        """Tokens of the noisy actions.
+
+        Args:
+            obs: not read, the state is in the prefix.
+            x_t: `[B, C, A]`.
+            flow_time: `[B]`.
+            action_valid: `[B, C]` bool, what the adapters count; None counts all.
+
+        Returns:
+            `[B, C, D]` f32, and the adapters' reports.
+        """
+        del obs
+        linear = Linears(self, action_valid)
+        return action_tokens(linear, x_t, flow_time), linear.aux
+
+    def run_prefix(self, obs: Observation) -> tuple[Prefix, ModelAux]:
+        """Everything that does not depend on the actions, once per observation."""
+        tokens, valid, aux = self.embed_prefix(obs)
+        block = _prefix_blocks(valid.shape[1])
+        mask = block_mask(block, block, valid, valid)
+        _, cache, language = self.language(tokens, positions(valid), mask, token_mask=valid)
+        own, cross, read = self.action.read(cache, valid)
+        prefix = Prefix(own, cross, valid)
+        return prefix, {**aux, "language": language, "action": {**aux["action"], **read}}
+
+    def run_suffix(
+        self,
+        prefix: Prefix,
+        obs: Observation,
+        x_t: jax.Array,
+        flow_time: jax.Array,
+        action_valid: jax.Array | None = None,
+    ) -> tuple[jax.Array, LayerAux]:
+        """Velocity `[B, C, A]` f32 given the prefix; arguments as in `embed_suffix`."""
+        if action_valid is None:
+            action_valid = jnp.ones(x_t.shape[:2], bool)
+        tokens, aux = self.embed_suffix(obs, x_t, flow_time, action_valid)
+        valid = jnp.ones(tokens.shape[:2], bool)
+        block = 2 + np.arange(tokens.shape[1])
+        seen = np.concatenate([_prefix_blocks(prefix.valid.shape[1]), block])
+        mask = block_mask(block, seen, valid, jnp.concatenate([prefix.valid, valid], axis=1))
+        position = jnp.sum(prefix.valid, axis=1, dtype=jnp.int32)[:, None] + positions(valid)
+        out, expert_aux = self.action(
+            tokens, position, mask, prefix.cache, prefix.cross, token_mask=action_valid
+        )
+        linear = Linears(self, action_valid)
+        v_t = linear("action_out_proj", out.astype(jnp.float32))
+        return v_t, {**expert_aux, **aux, **linear.aux}
+
+
+def _prefix_blocks(tokens: int) -> np.ndarray:
+    """`[P]` blocks of the prefix: pictures and instruction, then the state."""
+    return np.array([0] * (tokens - 1) + [1])

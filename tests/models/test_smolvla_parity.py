@@ -1,0 +1,180 @@
+"""SmolVLA against numbers recorded from LeRobot (tests/golden/smolvla_tiny, fp32).
+
+LeRobot computed velocity, loss and gradients on the whole sequence and the sample with its cache;
+here all of them go through the cache.
+"""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import ml_dtypes
+import numpy as np
+import pytest
+import safetensors.numpy
+from flax import nnx
+
+import lorasp_jax
+from lorasp_jax.models import checkpoint, layouts, published
+from lorasp_jax.models.config import ExpertConfig, VisionConfig
+from lorasp_jax.models.layers import block_mask, positions
+from lorasp_jax.models.observation import Observation
+from lorasp_jax.models.smolvla import SmolVLAConfig, weights
+from lorasp_jax.peft import LoRA
+
+GOLDEN = Path(__file__).parent.parent / "golden" / "smolvla_tiny"
+CONFIG = SmolVLAConfig(
+    vision=VisionConfig(width=32, depth=2, mlp=48, heads=4, patch=8, shuffle=4),
+    language=ExpertConfig(width=64, depth=4, mlp=96, heads=4, kv_heads=2, head_dim=16),
+    action=ExpertConfig(width=48, depth=4, mlp=256, heads=4, kv_heads=2, head_dim=16),
+    cameras=("0", "1"),
+    image_size=64,
+    vocabulary=101,
+    max_tokens=6,
+    chunk=5,
+    action_dim=32,
+)
+HEAD = "model.vlm_with_expert.vlm.lm_head.weight"
+
+
+def arrays(name: str) -> dict[str, np.ndarray]:
+    with np.load(GOLDEN / f"{name}.npz") as file:
+        return dict(file)
+
+
+@pytest.fixture(scope="module")
+def tensors():
+    return safetensors.numpy.load_file(GOLDEN / "model.safetensors")
+
+
+@pytest.fixture(scope="module")
+def model():
+    return published.load(GOLDEN, CONFIG)[0]
+
+
+@pytest.fixture(scope="module")
+def inputs():
+    return {name: jnp.asarray(array) for name, array in arrays("inputs").items()}
+
+
+@pytest.fixture(scope="module")
+def expected():
+    return arrays("outputs")
+
+
+@pytest.fixture(scope="module")
+def obs(inputs):
+    return Observation(
+        images={name: inputs[f"image/{name}"].transpose(0, 2, 3, 1) for name in CONFIG.cameras},
+        image_masks={name: inputs[f"image_mask/{name}"] for name in CONFIG.cameras},
+        tokens=inputs["tokens"].astype(jnp.int32),
+        token_mask=inputs["token_mask"],
+        state=inputs["state"],
+    )
+
+
+def close(found, wanted, atol):
+    np.testing.assert_allclose(np.asarray(found), wanted, rtol=0, atol=atol)
+
+
+def test_prefix(model, obs, expected):
+    both = jax.jit(lambda model: (model.look(obs)[0], model.embed_prefix(obs)[:2]))
+    seen, (tokens, valid) = both(model)
+    wanted = [expected[f"image_tokens_unscaled/{name}"] for name in CONFIG.cameras]
+    close(seen, np.concatenate(wanted, axis=1), 1e-5)
+    assert np.array_equal(valid, expected["prefix_pad_mask"])
+    close(tokens, expected["prefix_embs"], 2e-5)
+
+
+def test_suffix_and_velocity(model, obs, inputs, expected):
+    """At the recorded time, and at the first and the last step of the sampler."""
+    compiled = jax.jit(
+        lambda x_t, t: (model.embed_suffix(obs, x_t, t)[0], model.velocity(obs, x_t, t))
+    )
+    tokens, v_t = compiled(jnp.asarray(expected["x_t"]), inputs["time"])
+    close(tokens, expected["suffix_embs"], 5e-5)
+    close(v_t, expected["v_t"], 1e-4)
+    _, first = compiled(inputs["noise"], jnp.ones(2))
+    close(first, expected["sample_v_first_step"], 1e-4)
+    before_last = expected["sample"] + 0.1 * expected["sample_v_last_step"]
+    _, last = compiled(jnp.asarray(before_last), jnp.full(2, 0.1))
+    close(last, expected["sample_v_last_step"], 1e-4)
+
+
+def test_masks_and_positions(expected):
+    """Prefix and suffix in one sequence give LeRobot's mask and positions."""
+    valid = np.concatenate([expected["prefix_pad_mask"], expected["suffix_pad_mask"]], axis=1)
+    marks = np.concatenate([expected["prefix_att_mask"], expected["suffix_att_mask"]], axis=1)
+    block = np.array([0] * (expected["prefix_pad_mask"].shape[1] - 1) + [1, 2, 3, 4, 5, 6])
+    assert np.array_equal(np.cumsum(marks[0]), block)
+    assert np.array_equal(block_mask(block, block, valid, valid), expected["attn_mask_2d"])
+    assert np.array_equal(positions(jnp.asarray(valid)), expected["positions"])
+
+
+def test_loss_and_gradients(model, obs, inputs, expected):
+    graphdef, parameters = nnx.split(model)
+
+    def mean_loss(parameters):
+        per_element, _ = nnx.merge(graphdef, parameters).loss(
+            jax.random.key(0),
+            obs,
+            inputs["actions"],
+            noise=inputs["noise"],
+            flow_time=inputs["time"],
+        )
+        return per_element.mean(), per_element
+
+    (mean, loss), grads = jax.jit(jax.value_and_grad(mean_loss, has_aux=True))(parameters)
+    close(loss, expected["loss"], 3e-4)
+    close(mean, expected["mean_loss"], 3e-4)
+    grads = checkpoint.base_arrays(nnx.merge(graphdef, grads))
+    theirs = layouts.write(weights.lerobot_layout(CONFIG), grads)
+    grads = {f"model.{name}": grad for name, grad in theirs.items()}
+    recorded = [name.removeprefix("grad/") for name in expected if name.startswith("grad/")]
+    assert len(recorded) == 3
+    for name in recorded:
+        wanted = expected[f"grad/{name}"]
+        close(grads[name], wanted, 1e-3 * np.abs(wanted).max())
+    last = "model.vlm_with_expert.vlm.model.text_model.layers.3."
+    unused = {f"{last}self_attn.{linear}_proj.weight" for linear in "qo"}
+    unused |= {f"{last}mlp.{linear}_proj.weight" for linear in ("gate", "up", "down")}
+    unused |= {f"{last}post_attention_layernorm.weight", HEAD}
+    unused |= {"model.vlm_with_expert.vlm.model.text_model.norm.weight"}
+    assert {name for name, grad in grads.items() if not np.any(grad)} == unused
+
+
+def test_sampling(model, obs, inputs, expected):
+    sample = jax.jit(lambda m: m.sample_actions(jax.random.key(0), obs, noise=inputs["noise"]))(
+        model
+    )
+    close(sample, expected["sample"], 1e-4)
+
+
+def test_saving_gives_back_every_tensor(model, tensors, tmp_path):
+    published.save(tmp_path, model, "lerobot")
+    found = safetensors.numpy.load_file(tmp_path / "model.safetensors")
+    assert found.keys() == tensors.keys()
+    for name, tensor in tensors.items():
+        assert found[name].dtype == tensor.dtype, name
+        np.testing.assert_array_equal(found[name], tensor)
+    adapted = lorasp_jax.adapt(model, [("state_proj", LoRA(rank=2))], rngs=nnx.Rngs(0))
+    with pytest.raises(ValueError, match="without adapters"):
+        published.save(tmp_path / "adapted", adapted, "lerobot")
+
+
+def test_stored_types_are_kept(tensors, tmp_path):
+    """As in the published file: the projections in fp32, the rest in bf16."""
+    mixed = {
+        name: tensor if "_proj.bias" in name or name == HEAD else tensor.astype(ml_dtypes.bfloat16)
+        for name, tensor in tensors.items()
+    }
+    (tmp_path / "from").mkdir()
+    safetensors.numpy.save_file(mixed, tmp_path / "from" / "model.safetensors")
+    loaded, unused = published.load(tmp_path / "from", CONFIG)
+    assert unused == []
+    types = published.stored_dtypes(tmp_path / "from", CONFIG)
+    published.save(tmp_path / "to", loaded, "lerobot", types)
+    found = safetensors.numpy.load_file(tmp_path / "to" / "model.safetensors")
+    assert {name: t.dtype for name, t in found.items()} == {n: t.dtype for n, t in mixed.items()}
+    for name, tensor in mixed.items():
+        assert found[name].tobytes() == tensor.tobytes(), name
