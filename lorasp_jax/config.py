@@ -108,9 +108,11 @@ class Config:
     peft: Method
     """Adapter method and its settings."""
     size: str
-    """Backbone size: nano or small."""
+    """Size of the backbone: nano or small."""
     base: str
     """Folder of the base weights, or empty to start from random ones."""
+    backbone: str = "pi0"
+    """pi0 or smolvla; the base must be of that kind."""
     robot: str = "piper"
     """Robot the demonstrations are made with and the policy is evaluated on."""
     tasks: tuple[str, ...] = ("press", "pick_place")

@@ -1,5 +1,7 @@
 """What every backbone does: look at pictures, match flows, draw action chunks."""
 
+import importlib
+import pkgutil
 from typing import Any
 
 import jax
@@ -12,8 +14,27 @@ from lorasp_jax.models.layers import LayerAux, Linears, time_embedding
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.siglip import SigLIP
 
+_PACKAGE = __name__.rpartition(".")[0]
+
 ModelAux = dict[str, LayerAux]
 """Adapters' reports by tower ("vision", "language", "action") and layer name."""
+
+
+def names() -> list[str]:
+    """Names of the backbones: the folders beside this file."""
+    here = importlib.import_module(_PACKAGE).__path__
+    return sorted(module.name for module in pkgutil.iter_modules(here) if module.ispkg)
+
+
+def find(name: str) -> type[BackboneConfig]:
+    """The class of configs of a backbone.
+
+    Raises:
+        ValueError: there is no such backbone; lists what exists.
+    """
+    if name not in names():
+        raise ValueError(f"unknown backbone {name!r}: it is one of {', '.join(names())}.")
+    return importlib.import_module(f"{_PACKAGE}.{name}").Config
 
 
 class Backbone(nnx.Module):

@@ -7,7 +7,6 @@ files together, so a folder that is damaged or half written is not loaded.
 
 import dataclasses
 import hashlib
-import importlib
 import json
 import os
 import pathlib
@@ -23,6 +22,7 @@ from flax import nnx
 
 from lorasp_jax.adapter_set import SetParam
 from lorasp_jax.dense import AdapterParam
+from lorasp_jax.models import backbone
 from lorasp_jax.quantization import is_quantized
 
 CONFIG, SINGLE, INDEX = "config.json", "model.safetensors", "model.safetensors.index.json"
@@ -48,9 +48,8 @@ def save(folder: Folder, model: Any) -> None:
         ValueError: the model has adapters or quantised kernels.
     """
     arrays = {name: a.astype(jnp.bfloat16) for name, a in base_arrays(model).items()}
-    backbone = type(model).__module__.split(".")[-2]
     description = {
-        "backbone": backbone,
+        "backbone": type(model).__module__.split(".")[-2],
         "config": _sizes(model.config),
         "sha256": _hash(arrays),
     }
@@ -233,9 +232,8 @@ def _description(folder: pathlib.Path) -> dict[str, Any]:
 
 def _config(folder: pathlib.Path, description: Mapping[str, Any]) -> Any:
     try:
-        backbone = importlib.import_module(f"{__package__}.{description['backbone']}")
-        return backbone.Config.from_dict(description["config"])
-    except (ImportError, AttributeError, KeyError, TypeError, ValueError) as error:
+        return backbone.find(description["backbone"]).from_dict(description["config"])
+    except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{folder / CONFIG} describes no backbone of this version.") from error
 
 

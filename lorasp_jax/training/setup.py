@@ -20,7 +20,9 @@ from lorasp_jax import adaptation, calibration, models, peft
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Batch, flatten, sample_batch
 from lorasp_jax.data.demonstrations import demonstrations
-from lorasp_jax.models import pi0, tokenizer
+from lorasp_jax.models import backbone, tokenizer
+from lorasp_jax.models.backbone import Backbone
+from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.processing import Processor, Statistics, robot_slots
 from lorasp_jax.training.loop import Run
@@ -38,8 +40,8 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
     What can be wrong with a config is found before anything long begins.
 
     Raises:
-        ValueError: an unknown task, robot or size, a base that does not fit, a rule that matches
-            nothing, a chunk or batch that does not fit.
+        ValueError: an unknown task, robot, backbone or size, a base that does not fit, a rule that
+            matches nothing, a chunk or batch that does not fit.
     """
     for task in config.tasks:
         envs.make(
@@ -59,7 +61,7 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
     base, model = model, _adapted(config, model, config.peft.as_saved)
     counts = adaptation.count(model)
     console.print(
-        f"scale {config.scale}: {type(config.peft).__name__} on pi0 {config.size}, "
+        f"scale {config.scale}: {type(config.peft).__name__} on {config.backbone} {config.size}, "
         f"{counts.trainable:,} of {counts.total:,} parameters train"
     )
     run = Run(config, folder, console, base_hash, started)
@@ -75,17 +77,17 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
 
 def _adapted(
     config: Config,
-    model: pi0.Pi0,
+    model: Backbone,
     method: peft.Method,
     statistics: Mapping[str, jax.Array] = MappingProxyType({}),
-) -> pi0.Pi0:
+) -> Backbone:
     """The model with the method on the run's targets, from the run's key."""
     rngs = nnx.Rngs(jax.random.fold_in(jax.random.key(config.seed), 3))
     rules = [(path, method) for path in config.targets]
     return adaptation.adapt(model, rules, rngs=rngs, statistics=statistics)
 
 
-def input_moments(run: Run, model: pi0.Pi0, processor: Processor) -> dict[str, jax.Array]:
+def input_moments(run: Run, model: Backbone, processor: Processor) -> dict[str, jax.Array]:
     """`calibration.input_moments` of the run's targets, over batches as training draws them."""
     config, steps = run.config, flatten(list(run.episodes.values()))
     sizes = {"batch_size": config.optim.batch_size, "chunk": model.config.chunk}
@@ -95,7 +97,7 @@ def input_moments(run: Run, model: pi0.Pi0, processor: Processor) -> dict[str, j
         )
     )
 
-    def forward(model: pi0.Pi0, drawn: tuple[jax.Array, Batch]) -> Any:
+    def forward(model: Backbone, drawn: tuple[jax.Array, Batch]) -> Any:
         key, batch = drawn
         return model.loss(key, batch.observation, batch.actions, action_mask=batch.action_mask)
 
@@ -105,15 +107,15 @@ def input_moments(run: Run, model: pi0.Pi0, processor: Processor) -> dict[str, j
     return calibration.input_moments(model, batches, pattern, forward)
 
 
-def base_model(config: Config) -> tuple[pi0.Pi0, str]:
+def base_model(config: Config) -> tuple[Backbone, str]:
     """The frozen base and its hash: loaded from `config.base`, or random where that is empty.
 
     Raises:
-        ValueError: an unknown size, or a base of another one.
+        ValueError: an unknown backbone or size, or a base of another one.
     """
     if config.size not in ("nano", "small"):
         raise ValueError(f"unknown size {config.size!r}: it is one of nano, small")
-    wanted = getattr(pi0.Pi0Config, config.size)()
+    wanted: BackboneConfig = getattr(backbone.find(config.backbone), config.size)()
     wanted = dataclasses.replace(wanted, image_size=config.image_size, dtype=config.compute_dtype)
     if config.base:
         model = models.load(config.base, wanted)
@@ -138,7 +140,7 @@ def _check_time(config: Config) -> None:
 
 
 def processor(
-    config: Config, episodes: Sequence[Episodes], model_config: pi0.Pi0Config
+    config: Config, episodes: Sequence[Episodes], model_config: BackboneConfig
 ) -> Processor:
     """Statistics of the demonstrations and the token table of all their instructions, in order."""
     slots = robot_slots(episodes[0].state.shape[-1] - 1)
