@@ -35,7 +35,10 @@ def files():
         ([*MULTITASK, *NANO, "--tasks", "press", "press"], "tasks must be different"),
         ([*MULTITASK, *NANO, "--size", "large"], "unknown size 'large'"),
         ([*MULTITASK, *NANO, "--size", "small"], "does not fit the model"),
-        ([*MULTITASK, *NANO, "--backbone", "pi5"], "unknown backbone 'pi5': it is one of pi0, smol"),
+        (
+            [*MULTITASK, *NANO, "--backbone", "pi5"],
+            "unknown backbone 'pi5': it is one of pi0, smol",
+        ),
         ([*MULTITASK, *NANO, "--backbone", "smolvla"], "does not fit the model"),
         ([*MULTITASK, "--base", "nowhere"], "nowhere"),
         ([*MULTITASK, *NANO, "--targets", "[a-z]+_prj"], "rule '[a-z]+_prj' applies to nothing"),
