@@ -69,6 +69,7 @@ def save(folder: Folder, model: SmolVLA, *, like: Folder | None = None) -> None:
         types = {name: a.dtype for name, a in _plain(checkpoint.read(like)).items()}
         _check(types, {_plain_name(name) for name in theirs})
         theirs = {name: a.astype(types[_plain_name(name)]) for name, a in theirs.items()}
+    theirs = {name: np.ascontiguousarray(a) for name, a in theirs.items()}
     data = safetensors.numpy.save(theirs, metadata={"format": "pt"})
     checkpoint.write(folder, {checkpoint.SINGLE: data})
 
@@ -107,7 +108,7 @@ def to_lerobot(arrays: Mapping[str, np.ndarray], config: SmolVLAConfig) -> Array
     for leaf in _leaves(config):
         array = np.asarray(arrays[leaf.path])
         for name, each in zip(leaf.names, array if leaf.stacked else [array], strict=True):
-            theirs[_PREFIX + name] = np.ascontiguousarray(leaf.kind.write(each))
+            theirs[_PREFIX + name] = leaf.kind.write(each)
     return theirs
 
 
