@@ -4,6 +4,7 @@ LeRobot computed velocity, loss and gradients on the whole sequence and the samp
 here all of them go through the cache.
 """
 
+import dataclasses
 from pathlib import Path
 
 import jax
@@ -21,6 +22,7 @@ from lorasp_jax.models.layers import block_mask, positions
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.smolvla import SmolVLAConfig, weights
 from lorasp_jax.peft import LoRA
+from tests import quick
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "smolvla_tiny"
 CONFIG = SmolVLAConfig(
@@ -78,7 +80,7 @@ def close(found, wanted, atol):
 
 
 def test_prefix(model, obs, expected):
-    both = jax.jit(lambda model: (model.look(obs)[0], model.embed_prefix(obs)[:2]))
+    both = quick.jit(lambda model: (model.look(obs)[0], model.embed_prefix(obs)[:2]))
     seen, (tokens, valid) = both(model)
     wanted = [expected[f"image_tokens_unscaled/{name}"] for name in CONFIG.cameras]
     close(seen, np.concatenate(wanted, axis=1), 1e-5)
@@ -88,7 +90,7 @@ def test_prefix(model, obs, expected):
 
 def test_suffix_and_velocity(model, obs, inputs, expected):
     """At the recorded time, and at the first and the last step of the sampler."""
-    compiled = jax.jit(
+    compiled = quick.jit(
         lambda x_t, t: (model.embed_suffix(obs, x_t, t)[0], model.velocity(obs, x_t, t))
     )
     tokens, v_t = compiled(jnp.asarray(expected["x_t"]), inputs["time"])
@@ -124,7 +126,7 @@ def test_loss_and_gradients(model, obs, inputs, expected):
         )
         return per_element.mean(), per_element
 
-    (mean, loss), grads = jax.jit(jax.value_and_grad(mean_loss, has_aux=True))(parameters)
+    (mean, loss), grads = quick.jit(jax.value_and_grad(mean_loss, has_aux=True))(parameters)
     close(loss, expected["loss"], 3e-4)
     close(mean, expected["mean_loss"], 3e-4)
     grads = checkpoint.base_arrays(nnx.merge(graphdef, grads))
@@ -178,3 +180,17 @@ def test_stored_types_are_kept(tensors, tmp_path):
     assert {name: t.dtype for name, t in found.items()} == {n: t.dtype for n, t in mixed.items()}
     for name, tensor in mixed.items():
         assert found[name].tobytes() == tensor.tobytes(), name
+
+
+def test_other_sizes_raise():
+    with pytest.raises(ValueError, match=r"language/embedding has shape \(101, 64\)"):
+        published.load(GOLDEN, dataclasses.replace(CONFIG, vocabulary=100))
+
+
+def test_names_without_prefix(model, tensors, tmp_path):
+    bare = {name.removeprefix("model."): tensor for name, tensor in tensors.items()}
+    safetensors.numpy.save_file(bare, tmp_path / "model.safetensors")
+    found, _ = published.load(tmp_path, CONFIG)
+    pairs = zip(jax.tree.leaves(nnx.state(found)), jax.tree.leaves(nnx.state(model)), strict=True)
+    for ours, theirs in pairs:
+        np.testing.assert_array_equal(ours, theirs)

@@ -1,0 +1,230 @@
+"""Laws of every backbone that need no recorded numbers: who sees whom, adapters, remat, types."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+import lorasp_jax
+from lorasp_jax.models import pi0, smolvla
+from lorasp_jax.models.observation import Observation
+from lorasp_jax.peft import LoRA, LoRASP
+from tests import quick
+from tests.models.drawn import drawn
+
+BATCH, RANK, STEPS = 2, 4, 2
+MLP = "gate_proj up_proj down_proj"
+VISION = "patch_embed q_proj k_proj v_proj out_proj fc1 fc2 head"
+PROJECTIONS = "state_proj action_in_proj action_time_mlp_in action_time_mlp_out action_out_proj"
+EXPERT = f"q_proj k_proj v_proj o_proj {MLP}"
+PAIR = [f"{layer}/{name}" for layer in ("self_layer", "cross_layer") for name in EXPERT.split()]
+ACTION = {pi0: EXPERT.split(), smolvla: PAIR}
+
+
+@pytest.fixture(scope="module", params=[pi0, smolvla], ids=["pi0", "smolvla"])
+def backbone(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def config(backbone):
+    return backbone.Config.dummy()
+
+
+@pytest.fixture(scope="module")
+def model(config):
+    return drawn(config)
+
+
+@pytest.fixture(scope="module")
+def obs(config):
+    keys = jax.random.split(jax.random.key(0), 3)
+    shape = (BATCH, config.image_size, config.image_size, 3)
+    return Observation(
+        images={n: jax.random.uniform(keys[0], shape, minval=-1) for n in config.cameras},
+        image_masks={"side": jnp.ones(BATCH, bool), "wrist": jnp.array([True, False])},
+        tokens=jax.random.randint(keys[1], (BATCH, config.max_tokens), 0, config.vocabulary),
+        token_mask=jnp.arange(config.max_tokens) < jnp.array([[3], [5]]),
+        state=jax.random.normal(keys[2], (BATCH, config.action_dim)),
+    )
+
+
+@pytest.fixture(scope="module")
+def actions(config):
+    return jax.random.normal(jax.random.key(1), (BATCH, config.chunk, config.action_dim))
+
+
+@pytest.fixture(scope="module")
+def velocity(model):
+    """Compiled once: (obs, x_t) -> v_t at time 0.4."""
+    return quick.jit(lambda obs, x_t: model.velocity(obs, x_t, jnp.full(BATCH, 0.4)))
+
+
+def test_missing_camera_and_wrong_size_raise(model, obs):
+    with pytest.raises(ValueError, match=r"need pictures \(32, 32, 3\) of \('side', 'wrist'\)"):
+        model.embed_prefix(dataclasses.replace(obs, images={"side": obs.images["side"]}))
+    large = {name: jnp.zeros((BATCH, 64, 64, 3)) for name in obs.images}
+    with pytest.raises(ValueError, match=r"got \{'side': \(64, 64, 3\)"):
+        model.embed_prefix(dataclasses.replace(obs, images=large))
+
+
+def test_padding_and_missing_cameras_are_not_seen(velocity, obs, actions):
+    wanted = velocity(obs, actions)
+    wrist = obs.images["wrist"].at[1].set(0.7)
+    tokens = jnp.where(obs.token_mask, obs.tokens, 9)
+    hidden = dataclasses.replace(obs, images={**obs.images, "wrist": wrist}, tokens=tokens)
+    np.testing.assert_array_equal(velocity(hidden, actions), wanted)
+    seen = dataclasses.replace(obs, images={**obs.images, "wrist": wrist.at[0].set(0.7)})
+    assert np.abs(velocity(seen, actions) - wanted)[0].max() > 1e-4
+
+
+def test_every_action_sees_the_state(velocity, obs, actions):
+    other = velocity(dataclasses.replace(obs, state=obs.state + 1), actions)
+    assert (np.abs(other - velocity(obs, actions)).max(axis=-1) > 1e-6).all()
+
+
+@pytest.fixture(scope="module")
+def adapted(model):
+    """LoRA-SP in every tower and kind of layer, LoRA, which compiles sooner, on what is left."""
+    # The gate has its own tests; without a search (η = 1) this compiles in a third of the time.
+    sparse = LoRASP(rank=RANK, hidden_width=4, energy_target=1.0)
+    rules = [("vision/head|o_proj|state_proj|cross_layer/k_proj", sparse), (".*", LoRA(rank=2))]
+    return lorasp_jax.adapt(model, rules, rngs=nnx.Rngs(1))
+
+
+@pytest.fixture(scope="module")
+def mask(actions):
+    """A padded last step, two unused slots."""
+    return jnp.ones(actions.shape, bool).at[:, -1].set(False).at[:, :, 5:7].set(False)
+
+
+@pytest.fixture(scope="module")
+def trained(adapted, obs, actions, mask):
+    """Loss, aux and gradients."""
+    graphdef, adapters, frozen = lorasp_jax.adaptation.split(adapted)
+
+    def loss(adapters):
+        model = nnx.merge(graphdef, adapters, frozen)
+        per_element, aux = model.loss(jax.random.key(2), obs, actions, action_mask=mask)
+        return jnp.mean(per_element, where=mask), (per_element, aux)
+
+    (_, (per_element, aux)), grads = quick.jit(jax.value_and_grad(loss, has_aux=True))(adapters)
+    return per_element, aux, nnx.to_pure_dict(grads)
+
+
+def test_every_dense_layer_is_reached(trained, backbone, actions):
+    per_element, aux, _ = trained
+    assert per_element.shape == actions.shape
+    assert per_element.dtype == jnp.float32
+    assert {tower: set(layers) for tower, layers in aux.items()} == {
+        "vision": set(VISION.split()),
+        "language": set(EXPERT.split()),
+        "action": {*ACTION[backbone], *PROJECTIONS.split()},
+    }
+
+
+def test_adapters_change_nothing_at_the_start(trained, model, obs, actions, mask):
+    plain = quick.jit(
+        lambda model: model.loss(jax.random.key(2), obs, actions, action_mask=mask)[0]
+    )
+    np.testing.assert_allclose(trained[0], plain(model), rtol=1e-4, atol=1e-5)
+
+
+def test_reports_are_masked(trained, config, obs):
+    _, aux, _ = trained
+    image = config.patches
+    seen = 3 * config.image_tokens + 3 + 5  # three of four pictures, the valid words
+    counted = {
+        tower: {name: int(a.token_mask.sum(axis=(-2, -1)).max()) for name, a in layers.items()}
+        for tower, layers in aux.items()
+    }
+    assert counted["vision"] == {
+        name: 3 * (config.image_tokens if name == "head" else image) for name in counted["vision"]
+    }
+    state = BATCH if isinstance(config, smolvla.SmolVLAConfig) else 0
+    assert set(counted["language"].values()) == {seen + state}
+    valid = BATCH * (config.chunk - 1)
+    assert counted["action"]["action_out_proj"] == counted["action"]["action_in_proj"] == valid
+    assert counted["action"]["state_proj"] == BATCH
+    cross = {n: c for n, c in counted["action"].items() if n.startswith("cross_layer/")}
+    assert all(c == (seen + state if n[-6] in "kv" else valid) for n, c in cross.items())
+    assert aux["vision"]["head"].losses["balance"].shape == ()
+    assert aux["language"]["o_proj"].losses["spectral"].shape == (config.language.depth,)
+
+
+def test_adapters_train(trained, backbone):
+    """U and B start at zero, so at first they alone have a gradient, in every layer."""
+    _, _, grads = trained
+    ups = []
+    for path, leaf in jax.tree_util.tree_leaves_with_path(grads):
+        name = jax.tree_util.keystr(path, simple=True, separator="/")
+        ups.append(name.endswith(("bank/u", "lora_b")))
+        assert bool(np.any(leaf)) == ups[-1], name
+    assert sum(ups) == 8 + 7 + len(ACTION[backbone]) + 5
+
+
+def test_unused_slots_do_not_matter(adapted, config, obs, actions):
+    """x_t is held at zero there, in sampling as in training."""
+    slots = np.arange(config.action_dim) < 5
+
+    @quick.jit
+    def sample(noise: jax.Array):
+        fixed = {"noise": noise, "slots": slots, "num_steps": STEPS}
+        return adapted.sample_actions(jax.random.key(0), obs, **fixed, return_aux=True)
+
+    found, aux = sample(actions)
+    other, _ = sample(jnp.where(slots, actions, 7.0))
+    np.testing.assert_array_equal(found, other)
+    assert not np.any(found[..., 5:])
+    assert {report.active_rank.shape[0] for report in aux["action"].values()} == {STEPS}
+    # What ran once per observation has no axis of steps of its own: all steps read the same.
+    once = aux["action"]["state_proj"].active_rank
+    np.testing.assert_array_equal(once[0], once[-1])
+
+
+@pytest.fixture(scope="module")
+def loss_of(config, obs, actions):
+    """Runtime fields -> the mean loss as a function of the parameters."""
+
+    def make(**change):
+        graphdef = nnx.split(
+            nnx.eval_shape(lambda: dataclasses.replace(config, **change).create(nnx.Rngs(0)))
+        )[0]
+
+        def loss(parameters):
+            model = nnx.merge(graphdef, parameters)
+            return model.loss(jax.random.key(2), obs, actions)[0].mean()
+
+        return loss
+
+    return make
+
+
+def test_remat_changes_nothing(model, loss_of):
+    parameters = nnx.split(model)[1]
+    plain, remat = (
+        quick.jit(jax.value_and_grad(loss_of(remat=remat)))(parameters) for remat in (False, True)
+    )
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), remat, plain)
+
+
+def test_unroll_and_bfloat16_hardly_change_the_loss(model, loss_of):
+    parameters = nnx.split(model)[1]
+    plain = quick.jit(loss_of())(parameters)
+    np.testing.assert_allclose(quick.jit(loss_of(unroll=True))(parameters), plain, rtol=1e-5)
+    half = quick.jit(loss_of(dtype="bfloat16"))(parameters)
+    assert half != plain
+    np.testing.assert_allclose(half, plain, rtol=0.02)
+
+
+def test_works_without_graph_mode(config, obs, actions):
+    """NNX as it will be: trees only."""
+    with nnx.set_graph_mode(False), nnx.set_graph_updates(False):
+        graphdef, state = nnx.split(nnx.eval_shape(lambda: config.create(nnx.Rngs(0))))
+        found = jax.eval_shape(
+            lambda state: nnx.merge(graphdef, state).sample_actions(jax.random.key(0), obs), state
+        )
+    assert found.shape == actions.shape
