@@ -148,7 +148,7 @@ def _restored(place: Path) -> dict[str, np.ndarray]:
         as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), tree)
         restored = checkpointer.restore(place.absolute(), restore_args=as_numpy)
     except Exception as error:  # Orbax and its C++ parts raise many kinds
-        raise ValueError(f"{place} is damaged or no Orbax checkpoint: {error}") from error
+        raise ValueError(f"{place} is damaged or no Orbax checkpoint.") from error
     leaves = jax.tree_util.tree_flatten_with_path(restored)[0]
     names = [jax.tree_util.keystr(path, simple=True, separator="/") for path, _ in leaves]
     short = [name.removeprefix("params/").removesuffix("/value") for name in names]

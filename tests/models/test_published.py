@@ -187,6 +187,6 @@ def test_damage_is_one_sentence(layout, model, tmp_path):
         file = tmp_path / "new" / "model.safetensors"
         file.write_bytes(file.read_bytes()[:-1000])
     else:
-        (tmp_path / "new" / "params" / "manifest.ocdbt").write_bytes(b"nothing")
+        (tmp_path / "new" / "params" / "_METADATA").write_bytes(b"nothing")
     with pytest.raises(ValueError, match="damaged"):
         published.load(tmp_path / "new", CONFIG)
