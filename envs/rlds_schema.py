@@ -108,8 +108,8 @@ def record(to: ExampleSerializer, episodes: Episodes, number: int, episode_id: i
         "control_dt": np.float32(episodes.control_dt),
         "physics_dt": np.float32(episodes.physics_dt),
     }
-    record: dict[str, Any] = {"steps": columns, "episode_metadata": metadata}
-    return to.serialize_example(record)
+    example: dict[str, Any] = {"steps": columns, "episode_metadata": metadata}
+    return to.serialize_example(example)
 
 
 def episode(

@@ -6,11 +6,19 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 
+from lorasp_jax.dense import Dense
 from lorasp_jax.models import flow_matching
 from lorasp_jax.models.config import BackboneConfig
-from lorasp_jax.models.layers import LayerAux, Linears, time_embedding
+from lorasp_jax.models.layers import (
+    LayerAux,
+    Linears,
+    block_mask,
+    positions,
+    time_embedding,
+)
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.siglip import SigLIP
 
@@ -46,6 +54,20 @@ class Backbone(nnx.Module):
 
     config: BackboneConfig
     vision: SigLIP
+
+    def _make_projections(self, state_width: int, rngs: nnx.Rngs) -> None:
+        """The linear maps around the towers: of state, noisy actions, their time and velocity."""
+        width, dim = self.config.action.width, self.config.action_dim
+        kinds: dict[str, Any] = {
+            "dtype": jnp.float32,
+            "param_dtype": self.config.param_dtype,
+            "rngs": rngs,
+        }
+        self.state_proj = Dense(dim, state_width, **kinds)
+        self.action_in_proj = Dense(dim, width, **kinds)
+        self.action_time_mlp_in = Dense(2 * width, width, **kinds)
+        self.action_time_mlp_out = Dense(width, width, **kinds)
+        self.action_out_proj = Dense(width, dim, **kinds)
 
     def run_prefix(self, obs: Observation) -> tuple[Any, ModelAux]:
         """Everything that does not depend on the actions, once per observation."""
@@ -188,6 +210,25 @@ def action_tokens(linear: Linears, x_t: jax.Array, flow_time: jax.Array) -> jax.
     h = jnp.concatenate([h, jnp.broadcast_to(time, h.shape)], axis=-1)
     h = jax.nn.silu(linear("action_time_mlp_in", h))
     return linear("action_time_mlp_out", h)
+
+
+def suffix_view(
+    prefix_valid: jax.Array, prefix_block: np.ndarray, block: np.ndarray
+) -> tuple[jax.Array, jax.Array]:
+    """What tokens behind the prefix see, and where they are.
+
+    Args:
+        prefix_valid: `[B, P]` bool.
+        prefix_block: `[P]` int, number of the block each prefix token belongs to.
+        block: `[T]` int, of the tokens behind it, all of them valid.
+
+    Returns:
+        mask `[B, T, P + T]` bool, positions `[B, T]` int32, counted on from the prefix.
+    """
+    valid = jnp.ones((len(prefix_valid), len(block)), bool)
+    seen = np.concatenate([prefix_block, block])
+    mask = block_mask(block, seen, valid, jnp.concatenate([prefix_valid, valid], axis=1))
+    return mask, jnp.sum(prefix_valid, axis=1, dtype=jnp.int32)[:, None] + positions(valid)
 
 
 def _with_action(aux: ModelAux, action: LayerAux) -> ModelAux:

@@ -10,7 +10,7 @@ import hashlib
 import json
 import os
 import pathlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, TypeVar
 
 import jax
@@ -62,7 +62,7 @@ def save(folder: Folder, model: Any) -> None:
         total = {"total_size": sum(array.nbytes for array in arrays.values())}
         files[INDEX] = json.dumps({"metadata": total, "weight_map": where}, indent=1).encode()
     files[CONFIG] = (json.dumps(description, indent=1) + "\n").encode()
-    write(folder, files)
+    _write(pathlib.Path(folder), files)
 
 
 def base_arrays(model: nnx.Module) -> dict[str, np.ndarray]:
@@ -80,9 +80,8 @@ def base_arrays(model: nnx.Module) -> dict[str, np.ndarray]:
     return {name: np.asarray(leaf) for name, leaf in named_arrays(model).items()}
 
 
-def write(folder: Folder, files: Mapping[str, bytes]) -> None:
+def _write(folder: pathlib.Path, files: Mapping[str, bytes]) -> None:
     """Put files of a model, by name, in the place of those that are in the folder."""
-    folder = pathlib.Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     for file, data in files.items():
         temporary = folder / f".{file}.{os.getpid()}"
@@ -110,7 +109,7 @@ def load(folder: Folder, config: Any = None) -> Any:
     config = config or stored
     if type(config) is not type(stored) or _sizes(config) != _sizes(stored):
         raise ValueError(f"{folder} does not fit the model: {_difference(stored, config)}.")
-    arrays = read(folder)
+    arrays = _read(folder)
     model = nnx.eval_shape(lambda: config.create(nnx.Rngs(0)))
     try:
         model = set_arrays(model, arrays)
@@ -172,13 +171,18 @@ def weights_hash(source: Folder | nnx.Module) -> str:
         return _hash(named_arrays(source, adapters=False))
     folder = pathlib.Path(source)
     _description(folder)
-    return _hash(read(folder))
+    return _hash(_read(folder))
 
 
 def named_arrays(model: nnx.Module, adapters: bool = True) -> dict[str, Any]:
     """Parameters in tree order by "/"-joined path."""
     state = nnx.state(model, nnx.Param if adapters else nnx.All(nnx.Param, nnx.Not(AdapterParam)))
-    leaves = jax.tree_util.tree_flatten_with_path(nnx.to_pure_dict(state))[0]
+    return by_path(nnx.to_pure_dict(state))
+
+
+def by_path(tree: Any) -> dict[str, Any]:
+    """Leaves of a tree by "/"-joined path, in its order."""
+    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
 
 
@@ -237,25 +241,29 @@ def _config(folder: pathlib.Path, description: Mapping[str, Any]) -> Any:
         raise ValueError(f"{folder / CONFIG} describes no backbone of this version.") from error
 
 
-def read(folder: Folder) -> dict[str, np.ndarray]:
-    """All tensors of the one file, or of the shards that the index lists.
+def weight_files(folder: pathlib.Path) -> list[pathlib.Path]:
+    """The one safetensors file of a folder, or the shards that its index lists.
 
     Raises:
-        ValueError: a file is missing or damaged.
+        ValueError: the index is damaged.
     """
-    folder = pathlib.Path(folder)
-    files: Iterable[str] = [SINGLE]
     try:
         if (folder / INDEX).exists():
-            files = sorted(set(json.loads((folder / INDEX).read_bytes())["weight_map"].values()))
+            where = json.loads((folder / INDEX).read_bytes())["weight_map"]
+            return [folder / name for name in sorted(set(where.values()))]
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{folder / INDEX} is damaged.") from error
+    return [folder / SINGLE]
+
+
+def _read(folder: pathlib.Path) -> dict[str, np.ndarray]:
+    """All tensors of the folder's files."""
     arrays: dict[str, np.ndarray] = {}
-    for file in files:
+    for file in weight_files(folder):
         try:
-            arrays |= safetensors.numpy.load_file(folder / file)
+            arrays |= safetensors.numpy.load_file(file)
         except FileNotFoundError as error:
-            raise ValueError(f"{folder} lacks {file}.") from error
+            raise ValueError(f"{folder} lacks {file.name}.") from error
         except (safetensors.SafetensorError, OSError, ValueError) as error:
-            raise ValueError(f"{folder / file} is damaged or cut short.") from error
+            raise ValueError(f"{file} is damaged or cut short.") from error
     return arrays

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Self
 
+from lorasp_jax.models.tokenizer import VOCABULARY_SIZE
+
 
 @dataclass(frozen=True)
 class VisionConfig:
@@ -81,6 +83,32 @@ class BackboneConfig:
             raise ValueError("heads must divide the vision width, kv_heads the experts' heads.")
         if language.head_dim % 2 or action.width % 2:
             raise ValueError("head_dim and the action width must be even.")
+
+    @classmethod
+    def miniature(
+        cls,
+        vision: VisionConfig,
+        language: ExpertConfig,
+        action: ExpertConfig,
+        *,
+        image_size: int = 64,
+        max_tokens: int = 10,
+        chunk: int = 10,
+        unroll: bool = True,
+    ) -> Self:
+        """A config for simulation: its two cameras, the offline tokenizer's words, a robot arm."""
+        return cls(
+            vision,
+            language,
+            action,
+            cameras=("side", "wrist"),
+            image_size=image_size,
+            vocabulary=VOCABULARY_SIZE,
+            max_tokens=max_tokens,
+            chunk=chunk,
+            action_dim=8,
+            unroll=unroll,
+        )
 
     @property
     def patches(self) -> int:

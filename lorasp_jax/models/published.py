@@ -12,7 +12,6 @@ little more host memory than the model itself.
 """
 
 import importlib
-import json
 from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from pathlib import Path
 from types import ModuleType
@@ -32,8 +31,10 @@ from lorasp_jax.models.checkpoint import (
     INDEX,
     SINGLE,
     base_arrays,
+    by_path,
     named_arrays,
     set_arrays,
+    weight_files,
 )
 
 _READ_AHEAD = 1  # GB that Orbax reads at once, beside the result
@@ -129,8 +130,8 @@ def _open(
     for place in (folder / "params", folder):
         if (place / "_METADATA").exists():
             return "openpi", _restored(place)
-    files = _safetensors(folder)
-    if not files:
+    files = weight_files(folder)
+    if not ((folder / INDEX).exists() or files[0].exists()):
         raise ValueError(
             f"{folder} holds neither an Orbax checkpoint of openpi (params/_METADATA) nor "
             f"safetensors of LeRobot ({SINGLE})."
@@ -149,20 +150,10 @@ def _restored(place: Path) -> dict[str, np.ndarray]:
         restored = checkpointer.restore(place.absolute(), restore_args=as_numpy)
     except Exception as error:  # Orbax and its C++ parts raise many kinds
         raise ValueError(f"{place} is damaged or no Orbax checkpoint.") from error
-    leaves = jax.tree_util.tree_flatten_with_path(restored)[0]
-    names = [jax.tree_util.keystr(path, simple=True, separator="/") for path, _ in leaves]
-    short = [name.removeprefix("params/").removesuffix("/value") for name in names]
-    return dict(zip(short, (leaf for _, leaf in leaves), strict=True))
-
-
-def _safetensors(folder: Path) -> list[Path]:
-    try:
-        if (folder / INDEX).exists():
-            index = json.loads((folder / INDEX).read_bytes())
-            return [folder / name for name in sorted(set(index["weight_map"].values()))]
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{folder / INDEX} is damaged.") from error
-    return [folder / SINGLE] if (folder / SINGLE).exists() else []
+    return {
+        name.removeprefix("params/").removesuffix("/value"): leaf
+        for name, leaf in by_path(restored).items()
+    }
 
 
 class _Tensors(MutableMapping[str, np.ndarray]):

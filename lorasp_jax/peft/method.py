@@ -221,18 +221,16 @@ def apply_together(
     Once for all layers whose methods leave `apply` as it is and agree in `reads_in_fp32`; no
     gradient reaches their kernels.
     """
-    groups: dict[Any, list[int]] = {}
-    for i, (method, _, _) in enumerate(layers):
-        is_fused = type(method).apply is Method.apply
-        groups.setdefault(method.reads_in_fp32 if is_fused else (i,), []).append(i)
+    groups: dict[bool, list[int]] = {}
     found: dict[int, tuple[jax.Array, Aux]] = {}
-    for members in groups.values():
-        if len(members) > 1:
-            fused = _apply_fused([layers[i] for i in members], x, token_mask)
-            found |= zip(members, fused, strict=True)
+    for i, (method, params, kernel) in enumerate(layers):
+        if type(method).apply is Method.apply:
+            groups.setdefault(method.reads_in_fp32, []).append(i)
         else:
-            method, params, kernel = layers[members[0]]
-            found[members[0]] = method.apply(params, x, kernel, token_mask=token_mask)
+            found[i] = method.apply(params, x, kernel, token_mask=token_mask)
+    for members in groups.values():
+        fused = _apply_fused([layers[i] for i in members], x, token_mask)
+        found |= zip(members, fused, strict=True)
     return [found[i] for i in range(len(layers))]
 
 

@@ -10,10 +10,9 @@ from flax import nnx
 
 import lorasp_jax
 from lorasp_jax.models import pi0, smolvla
-from lorasp_jax.models.observation import Observation
 from lorasp_jax.peft import LoRA, LoRASP
 from tests import quick
-from tests.models.drawn import drawn
+from tests.models.drawn import drawn, observation
 
 BATCH, RANK, STEPS = 2, 4, 2
 MLP = "gate_proj up_proj down_proj"
@@ -41,15 +40,7 @@ def model(config):
 
 @pytest.fixture(scope="module")
 def obs(config):
-    keys = jax.random.split(jax.random.key(0), 3)
-    shape = (BATCH, config.image_size, config.image_size, 3)
-    return Observation(
-        images={n: jax.random.uniform(keys[0], shape, minval=-1) for n in config.cameras},
-        image_masks={"side": jnp.ones(BATCH, bool), "wrist": jnp.array([True, False])},
-        tokens=jax.random.randint(keys[1], (BATCH, config.max_tokens), 0, config.vocabulary),
-        token_mask=jnp.arange(config.max_tokens) < jnp.array([[3], [5]]),
-        state=jax.random.normal(keys[2], (BATCH, config.action_dim)),
-    )
+    return observation(config, BATCH)
 
 
 @pytest.fixture(scope="module")

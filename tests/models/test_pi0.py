@@ -9,10 +9,9 @@ import pytest
 from flax import nnx
 
 from lorasp_jax.models.layers import block_mask
-from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.pi0 import Pi0Config
 from tests import quick
-from tests.models.drawn import drawn
+from tests.models.drawn import drawn, observation
 
 CONFIG = Pi0Config.dummy()
 BATCH = 2
@@ -28,15 +27,7 @@ def actions(seed: int = 1) -> jax.Array:
 
 @pytest.fixture(scope="module")
 def obs():
-    keys = jax.random.split(jax.random.key(0), 3)
-    shape = (BATCH, CONFIG.image_size, CONFIG.image_size, 3)
-    return Observation(
-        images={n: jax.random.uniform(keys[0], shape, minval=-1) for n in CONFIG.cameras},
-        image_masks={"side": jnp.ones(BATCH, bool), "wrist": jnp.array([True, False])},
-        tokens=jax.random.randint(keys[1], (BATCH, CONFIG.max_tokens), 0, CONFIG.vocabulary),
-        token_mask=jnp.arange(CONFIG.max_tokens) < jnp.array([[3], [5]]),
-        state=jax.random.normal(keys[2], (BATCH, CONFIG.action_dim)),
-    )
+    return observation(CONFIG, BATCH)
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig, VisionConfig
-from lorasp_jax.models.tokenizer import VOCABULARY_SIZE
 
 if TYPE_CHECKING:
     from flax import nnx
@@ -43,46 +42,30 @@ class Pi0Config(BackboneConfig):
     @classmethod
     def small(cls) -> Pi0Config:
         """For one accelerator: about 9.5 M parameters, 64 tokens a camera."""
-        return cls(
+        return cls.miniature(
             vision=VisionConfig(width=256, depth=4, mlp=768, heads=4, patch=8),
             language=ExpertConfig(192, 6, 512, heads=8, kv_heads=1, head_dim=32),
             action=ExpertConfig(256, 6, 768, heads=8, kv_heads=1, head_dim=32),
-            cameras=("side", "wrist"),
-            image_size=64,
-            vocabulary=VOCABULARY_SIZE,
-            max_tokens=10,
-            chunk=10,
-            action_dim=8,
-            unroll=True,
         )
 
     @classmethod
     def nano(cls) -> Pi0Config:
         """For a CPU: about 1 M parameters, 16 tokens a camera."""
-        return cls(
+        return cls.miniature(
             vision=VisionConfig(width=96, depth=2, mlp=256, heads=3, patch=16),
             language=ExpertConfig(96, 3, 192, heads=4, kv_heads=1, head_dim=32),
             action=ExpertConfig(128, 3, 256, heads=4, kv_heads=1, head_dim=32),
-            cameras=("side", "wrist"),
-            image_size=64,
-            vocabulary=VOCABULARY_SIZE,
-            max_tokens=10,
-            chunk=10,
-            action_dim=8,
-            unroll=True,
         )
 
     @classmethod
     def dummy(cls) -> Pi0Config:
         """For tests: compiles and runs in seconds."""
-        return cls(
+        return cls.miniature(
             vision=VisionConfig(width=32, depth=2, mlp=48, heads=2, patch=16),
             language=ExpertConfig(48, 2, 64, heads=4, kv_heads=2, head_dim=16),
             action=ExpertConfig(32, 2, 64, heads=4, kv_heads=2, head_dim=16),
-            cameras=("side", "wrist"),
             image_size=32,
-            vocabulary=VOCABULARY_SIZE,
             max_tokens=6,
             chunk=4,
-            action_dim=8,
+            unroll=False,
         )

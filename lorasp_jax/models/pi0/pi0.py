@@ -4,15 +4,14 @@ Tokens fall into three blocks: [pictures, instruction], [state], [noisy actions]
 and the blocks before it. The first is the prefix, the other two the suffix of the action expert.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax.dense import Dense
-from lorasp_jax.models.backbone import Backbone, ModelAux, action_tokens
+from lorasp_jax.models.backbone import Backbone, ModelAux, action_tokens, suffix_view
 from lorasp_jax.models.experts import Expert, KeysValues, LanguageExpert
 from lorasp_jax.models.layers import LayerAux, Linears, block_mask, positions
 from lorasp_jax.models.observation import Observation
@@ -40,21 +39,11 @@ class Pi0(Backbone):
     config: Pi0Config
 
     def __init__(self, config: Pi0Config, *, rngs: nnx.Rngs) -> None:
-        width, dim = config.action.width, config.action_dim
-        kinds: dict[str, Any] = {
-            "dtype": jnp.float32,
-            "param_dtype": config.param_dtype,
-            "rngs": rngs,
-        }
         self.config = config
         self.vision = SigLIP(config, rngs=rngs)
         self.language = LanguageExpert(config.language, config, rngs=rngs)
         self.action = Expert(config.action, config, rngs=rngs)
-        self.state_proj = Dense(dim, width, **kinds)
-        self.action_in_proj = Dense(dim, width, **kinds)
-        self.action_time_mlp_in = Dense(2 * width, width, **kinds)
-        self.action_time_mlp_out = Dense(width, width, **kinds)
-        self.action_out_proj = Dense(width, dim, **kinds)
+        self._make_projections(config.action.width, rngs)
 
     def embed_prefix(self, obs: Observation) -> tuple[jax.Array, jax.Array, ModelAux]:
         """Tokens of pictures and instruction.
@@ -114,12 +103,9 @@ class Pi0(Backbone):
         if action_valid is None:
             action_valid = jnp.ones((batch, chunk), bool)
         tokens, aux = self.embed_suffix(obs, x_t, flow_time, action_valid)
-        valid = jnp.ones(tokens.shape[:2], bool)
         block = np.array([1] + [2] * chunk)
-        seen = np.concatenate([np.zeros(prefix.valid.shape[1], int), block])
-        mask = block_mask(block, seen, valid, jnp.concatenate([prefix.valid, valid], axis=1))
-        position = jnp.sum(prefix.valid, axis=1, dtype=jnp.int32)[:, None] + positions(valid)
-        counted = jnp.concatenate([valid[:, :1], action_valid], axis=1)
+        mask, position = suffix_view(prefix.valid, np.zeros(prefix.valid.shape[1], int), block)
+        counted = jnp.concatenate([jnp.ones((batch, 1), bool), action_valid], axis=1)
         out, _, expert_aux = self.action(tokens, position, mask, prefix.cache, token_mask=counted)
         linear = Linears(self, action_valid)
         v_t = linear("action_out_proj", out[:, -chunk:].astype(jnp.float32))

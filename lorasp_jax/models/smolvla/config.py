@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig, VisionConfig
-from lorasp_jax.models.tokenizer import VOCABULARY_SIZE
 
 if TYPE_CHECKING:
     from flax import nnx
@@ -60,46 +59,30 @@ class SmolVLAConfig(BackboneConfig):
     @classmethod
     def small(cls) -> SmolVLAConfig:
         """For one accelerator: about 9 M parameters, 64 tokens a camera."""
-        return cls(
+        return cls.miniature(
             vision=VisionConfig(width=256, depth=4, mlp=768, heads=4, patch=4, shuffle=2),
             language=ExpertConfig(256, 6, 640, heads=6, kv_heads=2, head_dim=32),
             action=ExpertConfig(192, 6, 512, heads=6, kv_heads=2, head_dim=32),
-            cameras=("side", "wrist"),
-            image_size=64,
-            vocabulary=VOCABULARY_SIZE,
-            max_tokens=10,
-            chunk=10,
-            action_dim=8,
-            unroll=True,
         )
 
     @classmethod
     def nano(cls) -> SmolVLAConfig:
         """For a CPU: about 1 M parameters, 16 tokens a camera."""
-        return cls(
+        return cls.miniature(
             vision=VisionConfig(width=96, depth=2, mlp=256, heads=3, patch=8, shuffle=2),
             language=ExpertConfig(96, 4, 192, heads=3, kv_heads=1, head_dim=32),
             action=ExpertConfig(96, 4, 256, heads=3, kv_heads=1, head_dim=32),
-            cameras=("side", "wrist"),
-            image_size=64,
-            vocabulary=VOCABULARY_SIZE,
-            max_tokens=10,
-            chunk=10,
-            action_dim=8,
-            unroll=True,
         )
 
     @classmethod
     def dummy(cls) -> SmolVLAConfig:
         """For tests: compiles and runs in seconds."""
-        return cls(
+        return cls.miniature(
             vision=VisionConfig(width=32, depth=2, mlp=48, heads=2, patch=8, shuffle=2),
             language=ExpertConfig(48, 4, 64, heads=4, kv_heads=2, head_dim=16),
             action=ExpertConfig(32, 4, 64, heads=4, kv_heads=2, head_dim=16),
-            cameras=("side", "wrist"),
             image_size=32,
-            vocabulary=VOCABULARY_SIZE,
             max_tokens=6,
             chunk=4,
-            action_dim=8,
+            unroll=False,
         )

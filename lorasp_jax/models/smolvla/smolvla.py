@@ -6,15 +6,14 @@ language model, the actions the suffix of the action expert.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax.dense import Dense
-from lorasp_jax.models.backbone import Backbone, ModelAux, action_tokens
+from lorasp_jax.models.backbone import Backbone, ModelAux, action_tokens, suffix_view
 from lorasp_jax.models.experts import KeysValues
 from lorasp_jax.models.layers import LayerAux, Linears, block_mask, positions
 from lorasp_jax.models.observation import Observation
@@ -43,21 +42,11 @@ class SmolVLA(Backbone):
     config: SmolVLAConfig
 
     def __init__(self, config: SmolVLAConfig, *, rngs: nnx.Rngs) -> None:
-        width, dim = config.action.width, config.action_dim
-        kinds: dict[str, Any] = {
-            "dtype": jnp.float32,
-            "param_dtype": config.param_dtype,
-            "rngs": rngs,
-        }
         self.config = config
         self.vision = SigLIP(config, head_bias=False, rngs=rngs)
         self.language = Language(config.language, config, rngs=rngs)
         self.action = ActionExpert(config.action, config, rngs=rngs)
-        self.state_proj = Dense(dim, config.language.width, **kinds)
-        self.action_in_proj = Dense(dim, width, **kinds)
-        self.action_time_mlp_in = Dense(2 * width, width, **kinds)
-        self.action_time_mlp_out = Dense(width, width, **kinds)
-        self.action_out_proj = Dense(width, dim, **kinds)
+        self._make_projections(config.language.width, rngs)
 
     def embed_prefix(self, obs: Observation) -> tuple[jax.Array, jax.Array, ModelAux]:
         """Tokens of pictures, instruction and state.
@@ -123,11 +112,9 @@ class SmolVLA(Backbone):
         if action_valid is None:
             action_valid = jnp.ones(x_t.shape[:2], bool)
         tokens, aux = self.embed_suffix(obs, x_t, flow_time, action_valid)
-        valid = jnp.ones(tokens.shape[:2], bool)
         block = 2 + np.arange(tokens.shape[1])
-        seen = np.concatenate([_prefix_blocks(prefix.valid.shape[1]), block])
-        mask = block_mask(block, seen, valid, jnp.concatenate([prefix.valid, valid], axis=1))
-        position = jnp.sum(prefix.valid, axis=1, dtype=jnp.int32)[:, None] + positions(valid)
+        before = _prefix_blocks(prefix.valid.shape[1])
+        mask, position = suffix_view(prefix.valid, before, block)
         out, expert_aux = self.action(
             tokens, position, mask, prefix.cache, prefix.cross, token_mask=action_valid
         )
