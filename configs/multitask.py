@@ -1,13 +1,15 @@
-"""Adapt a pretrained miniature pi0 from the Panda arm to the PiPER arm: two tasks, LoRA-SP.
+"""Adapt a pretrained miniature policy from the Panda arm to the PiPER arm: four tasks, LoRA-SP.
 
     python train.py --config configs/multitask.py
+    python train.py --config configs/multitask.py --model.backbone smolvla --name smolvla
+    python train.py --config configs/multitask.py --method lora --peft.rank 16 --name lora
 
 Loads the base pretrained on a simulated Franka Panda (assets/), collects PiPER demonstrations with
-the scripted expert, measures the base, trains LoRA-SP adapters on press and pick_place together,
-measures again and writes runs/multitask/report.html. The README has the expected result and time.
+the scripted expert, measures the base, trains adapters on the paper's four tasks together, measures
+again and writes runs/multitask/report.html. The README has the expected result and time.
 """
 
-from lorasp_jax.config import Config, DataConfig, EvaluationConfig, OptimConfig
+from lorasp_jax.config import Config, DataConfig, EvaluationConfig, ModelConfig, OptimConfig
 from lorasp_jax.peft import LoRASP
 
 
@@ -21,8 +23,6 @@ def _smoke() -> Config:
         name="multitask",
         scale="smoke",
         peft=LoRASP(rank=8),
-        size="nano",
-        base="assets/pi0_nano",
         data=DataConfig(episodes=4, num_envs=8),
         optim=OptimConfig(steps=4, batch_size=8, warmup_steps=1),
         evaluation=EvaluationConfig(episodes=8, num_envs=8),
@@ -36,10 +36,8 @@ def _cpu() -> Config:
         name="multitask",
         scale="cpu",
         peft=LoRASP(rank=16, hidden_width=16),
-        size="nano",
-        base="assets/pi0_nano",
         data=DataConfig(episodes=128, num_envs=32),
-        optim=OptimConfig(steps=2000, batch_size=64, learning_rate=3e-3, warmup_steps=100),
+        optim=OptimConfig(steps=3000, batch_size=64, learning_rate=3e-3, warmup_steps=100),
         evaluation=EvaluationConfig(episodes=64, num_envs=32),
         log_every=50,
         checkpoint_every=500,
@@ -51,12 +49,10 @@ def _accelerator() -> Config:
         name="multitask",
         scale="accelerator",
         peft=LoRASP(rank=64),
-        size="small",
-        base="assets/pi0_small",
+        model=ModelConfig(size="small", dtype="bfloat16"),
         data=DataConfig(episodes=512, num_envs=256),
-        optim=OptimConfig(steps=2500, batch_size=256, learning_rate=1e-3, warmup_steps=100),
+        optim=OptimConfig(steps=5000, batch_size=256, learning_rate=1e-3, warmup_steps=100),
         evaluation=EvaluationConfig(episodes=256, num_envs=256),
-        compute_dtype="bfloat16",
         log_every=100,
         checkpoint_every=1000,
     )

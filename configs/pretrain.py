@@ -1,32 +1,32 @@
 """Pretrain the base policies that ship in assets/, from scratch, on Panda demonstrations.
 
-    python train.py --config configs/pretrain.py
-    python train.py --config configs/pretrain.py --name pretrain_nano --size nano \\
-        --optim.steps 16000 --optim.learning-rate 2e-3
+    python train.py --config configs/pretrain.py --name pi0_small
+    python train.py --config configs/pretrain.py --name smolvla_small --model.backbone smolvla
+    python train.py --config configs/pretrain.py --name pi0_nano --model.size nano \\
+        --optim.steps 30000 --optim.learning-rate 2e-3
 
-All parameters train (FullFineTuning on every path). The run leaves runs/<name>/base, which is what
-assets/pi0_<size> holds; the model cards there state hardware, time and measured success.
+All parameters train (FullFineTuning on every path), on the paper's four tasks. The run leaves
+runs/<name>/base, which is what assets/<name> holds; the model cards there state hardware, time and
+measured success.
 """
 
 import dataclasses
 
-from lorasp_jax.config import Config, DataConfig, EvaluationConfig, OptimConfig
+from lorasp_jax.config import Config, DataConfig, EvaluationConfig, ModelConfig, OptimConfig
 from lorasp_jax.peft import FullFineTuning
 
 
 def get_config(scale: str) -> Config:
     """The experiment at `scale`; accelerator is the one that makes the shipped bases."""
     config = Config(
-        name="pretrain_small",
+        name="pretrain",
         scale=scale,
         peft=FullFineTuning(),
-        size="small",
-        base="",
+        model=ModelConfig(size="small", checkpoint="", dtype="bfloat16"),
         robot="panda",
         data=DataConfig(episodes=1024, num_envs=256),
-        optim=OptimConfig(steps=10_000, batch_size=512, learning_rate=1e-3, warmup_steps=300),
+        optim=OptimConfig(steps=20_000, batch_size=512, learning_rate=1e-3, warmup_steps=300),
         evaluation=EvaluationConfig(episodes=256, num_envs=256),
-        compute_dtype="bfloat16" if scale == "accelerator" else "float32",
         log_every=200,
         checkpoint_every=2000,
     )
@@ -34,7 +34,7 @@ def get_config(scale: str) -> Config:
         return config
     return dataclasses.replace(
         config,
-        size="nano",
+        model=ModelConfig(checkpoint=""),
         data=DataConfig(episodes=4, num_envs=8),
         optim=OptimConfig(steps=4, batch_size=8, warmup_steps=1),
         evaluation=EvaluationConfig(episodes=8, num_envs=8),

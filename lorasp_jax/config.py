@@ -16,6 +16,28 @@ def _at_least_one(owner: object, *names: str) -> None:
 
 
 @dataclass(frozen=True)
+class ModelConfig:
+    """The backbone and its base weights."""
+
+    backbone: str = "pi0"
+    """pi0 or smolvla."""
+    size: str = "nano"
+    """nano for a CPU, small for one accelerator, base as published."""
+    checkpoint: str = "assets/{backbone}_{size}"
+    """Where the base weights are, or empty for random ones; {backbone} and {size} stand for those
+    fields."""
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """Type of the matrix products."""
+    param_dtype: Literal["float32", "bfloat16"] = "float32"
+    """Type the base is stored in; adapters are float32."""
+
+    @property
+    def source(self) -> str:
+        """`checkpoint` with the names filled in."""
+        return self.checkpoint.replace("{backbone}", self.backbone).replace("{size}", self.size)
+
+
+@dataclass(frozen=True)
 class DataConfig:
     """Demonstrations made by the scripted expert."""
 
@@ -107,20 +129,16 @@ class Config:
     """Which sizes were chosen: smoke, cpu or accelerator."""
     peft: Method
     """Adapter method and its settings."""
-    size: str
-    """Size of the backbone: nano or small."""
-    base: str
-    """Folder of the base weights, or empty to start from random ones."""
-    backbone: str = "pi0"
-    """pi0 or smolvla; the base must be of that kind."""
+    model: ModelConfig = field(default_factory=ModelConfig)
+    """Backbone and base weights."""
     robot: str = "piper"
     """Robot the demonstrations are made with and the policy is evaluated on."""
-    tasks: tuple[str, ...] = ("press", "pick_place")
-    """Tasks trained together."""
+    tasks: tuple[str, ...] = ("open_pot", "pour", "press", "pick_place")
+    """Tasks trained together; the default are the paper's four."""
     targets: tuple[str, ...] = (".*",)
     """Regular expressions over layer paths: what the method is attached to."""
     image_size: int = 64
-    """Height and width of both camera pictures [pixels]."""
+    """Height and width of the simulated cameras' pictures [pixels]; a backbone resizes them."""
     data: DataConfig = field(default_factory=DataConfig)
     """Demonstrations."""
     optim: OptimConfig = field(default_factory=OptimConfig)
@@ -131,8 +149,6 @@ class Config:
     """Evaluation in simulation."""
     control_dt: float = 0.1
     """Seconds between two actions; demonstrations and base must agree."""
-    compute_dtype: Literal["float32", "bfloat16"] = "float32"
-    """Type of the matrix products: float32 or bfloat16."""
     fsdp: int = 1
     """Devices over which large frozen arrays are split; the rest of the mesh is data parallel."""
     log_every: int = 50

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from envs.episodes import Episodes
 from lorasp_jax import adaptation
-from lorasp_jax.config import Config, OptimConfig
+from lorasp_jax.config import Config, ModelConfig, OptimConfig
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.peft import LoRASP
@@ -23,8 +23,8 @@ CONFIG = Config(
     name="test",
     scale="smoke",
     peft=LoRASP(rank=8, hidden_width=8),
-    size="dummy",
-    base="",
+    tasks=("press", "pick_place"),
+    model=ModelConfig(size="dummy", checkpoint=""),
     targets=("patch_embed", "q_proj", "down_proj", "action_out_proj"),
     image_size=32,
     optim=OptimConfig(steps=4, batch_size=8, warmup_steps=1),
@@ -75,7 +75,7 @@ def make_run(folder: Path, config: Config = CONFIG) -> Run:
     )
     run = Run(config, folder, Console(file=io.StringIO()), "hash of the base")
     run.episodes = {task: random_episodes(task, i) for i, task in enumerate(config.tasks)}
-    run.policy = Policy(model, processor(config, list(run.episodes.values()), model.config))
+    run.policy = Policy(model, processor(list(run.episodes.values()), model.config))
     return run
 
 

@@ -11,7 +11,7 @@ import train
 
 ROOT = Path(__file__).parent.parent
 MULTITASK = ["--config", str(ROOT / "configs" / "multitask.py"), "--scale", "smoke"]
-NANO = ["--base", str(ROOT / "assets" / "pi0_nano")]
+NANO = ["--model.checkpoint", str(ROOT / "assets" / "pi0_nano")]
 
 
 @pytest.fixture(autouse=True)
@@ -33,21 +33,21 @@ def files():
         ([*MULTITASK, *NANO, "--robot", "pipper"], "unknown robot 'pipper': choose from panda"),
         ([*MULTITASK, *NANO, "--tasks", "juggle"], "unknown task 'juggle': choose from open_pot"),
         ([*MULTITASK, *NANO, "--tasks", "press", "press"], "tasks must be different"),
-        ([*MULTITASK, *NANO, "--size", "large"], "unknown size 'large'"),
-        ([*MULTITASK, *NANO, "--size", "small"], "does not fit the model"),
+        ([*MULTITASK, *NANO, "--model.size", "large"], "unknown size 'large'"),
+        ([*MULTITASK, *NANO, "--model.size", "small"], "does not fit the model"),
         (
-            [*MULTITASK, *NANO, "--backbone", "pi5"],
+            [*MULTITASK, *NANO, "--model.backbone", "pi5"],
             "unknown backbone 'pi5': it is one of pi0, smol",
         ),
-        ([*MULTITASK, *NANO, "--backbone", "smolvla"], "does not fit the model"),
-        ([*MULTITASK, "--base", "nowhere"], "nowhere"),
+        ([*MULTITASK, *NANO, "--model.backbone", "smolvla"], "does not fit the model"),
+        ([*MULTITASK, "--model.checkpoint", "nowhere"], "nowhere"),
         ([*MULTITASK, *NANO, "--targets", "[a-z]+_prj"], "rule '[a-z]+_prj' applies to nothing"),
         ([*MULTITASK, *NANO, "--control-dt", "0.2"], "with control_dt 0.1 s, this run has 0.2"),
         ([*MULTITASK, *NANO, "--evaluation.execute-steps", "11"], "must be 1 to the chunk, 10"),
         ([*MULTITASK, *NANO, "--evaluation.episodes", "12"], "must be a multiple of num_envs"),
         ([*MULTITASK, *NANO, "--optim.batch-size", "9"], "multiple of the 8 devices"),
         ([*MULTITASK, *NANO, "--checkpoint-every", "0"], "must be at least 1, got 0"),
-        ([*MULTITASK, *NANO, "--compute-dtype", "float99"], "float99"),
+        ([*MULTITASK, *NANO, "--model.dtype", "float99"], "float99"),
         ([*MULTITASK, *NANO, "--name", "../up"], "must be a plain folder name"),
     ],
 )
@@ -76,14 +76,14 @@ def test_folder_of_another_run_is_left_alone(capsys):
 def test_base_without_its_control_period(capsys):
     shutil.copytree(ROOT / "assets" / "pi0_nano", "base")
     os.remove("base/training.json")
-    assert train.main([*MULTITASK, "--base", "base"]) == 2
+    assert train.main([*MULTITASK, "--model.checkpoint", "base"]) == 2
     assert "does not say the control_dt" in capsys.readouterr().err
 
 
 def test_finished_run_is_not_run_again(capsys):
-    assert train.main([*MULTITASK, "--base", "nowhere"]) == 2
+    assert train.main([*MULTITASK, "--model.checkpoint", "nowhere"]) == 2
     record = json.loads(Path("runs/multitask/config.json").read_text())
     assert record["peft"]["method"] == "LoRASP"
     Path("runs/multitask/report.html").write_text("done")
-    assert train.main([*MULTITASK, "--base", "nowhere", "--resume"]) == 0
+    assert train.main([*MULTITASK, "--model.checkpoint", "nowhere", "--resume"]) == 0
     assert "this run is finished" in capsys.readouterr().out

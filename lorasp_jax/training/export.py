@@ -24,7 +24,7 @@ def write(run: Run) -> None:
         run.policy.model,
         base=run.base_hash,
         metadata={
-            "base": config.base,
+            "base": config.model.source,
             **_facts(run),
             "statistics": json.loads(run.policy.processor.statistics.to_json()),
         },

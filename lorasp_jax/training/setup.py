@@ -30,6 +30,7 @@ from lorasp_jax.training.progress import bars
 
 STATISTICS_BATCHES = 8
 """Batches that an initialization from data looks at."""
+SIZES = ("nano", "small", "base")
 TRAINING = "training.json"
 """File beside base weights: what they were trained on, with the control period."""
 
@@ -61,13 +62,14 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
     base, model = model, _adapted(config, model, config.peft.as_saved)
     counts = adaptation.count(model)
     console.print(
-        f"scale {config.scale}: {type(config.peft).__name__} on {config.backbone} {config.size}, "
+        f"scale {config.scale}: {type(config.peft).__name__} on {config.model.backbone} "
+        f"{config.model.size}, "
         f"{counts.trainable:,} of {counts.total:,} parameters train"
     )
     run = Run(config, folder, console, base_hash, started)
     with run.timed("collect"):
         run.episodes = _collect(run)
-    found = processor(config, list(run.episodes.values()), model.config)
+    found = processor(list(run.episodes.values()), model.config)
     if config.peft.needs_statistics:
         statistics = input_moments(run, base, found)
         model = _adapted(config, base, config.peft, statistics)
@@ -108,17 +110,18 @@ def input_moments(run: Run, model: Backbone, processor: Processor) -> dict[str, 
 
 
 def base_model(config: Config) -> tuple[Backbone, str]:
-    """The frozen base and its hash: loaded from `config.base`, or random where that is empty.
+    """The frozen base and its hash: loaded from the checkpoint, or random where none is named.
 
     Raises:
         ValueError: an unknown backbone or size, or a base of another one.
     """
-    if config.size not in ("nano", "small"):
-        raise ValueError(f"unknown size {config.size!r}: it is one of nano, small")
-    wanted: BackboneConfig = getattr(backbone.find(config.backbone), config.size)()
-    wanted = dataclasses.replace(wanted, image_size=config.image_size, dtype=config.compute_dtype)
-    if config.base:
-        model = models.load(config.base, wanted)
+    chosen = config.model
+    if chosen.size not in SIZES:
+        raise ValueError(f"unknown size {chosen.size!r}: it is one of {', '.join(SIZES)}")
+    wanted: BackboneConfig = getattr(backbone.find(chosen.backbone), chosen.size)()
+    wanted = dataclasses.replace(wanted, dtype=chosen.dtype, param_dtype=chosen.param_dtype)
+    if chosen.source:
+        model = models.load(chosen.source, wanted)
         _check_time(config)
         return model, models.weights_hash(model)
     key = jax.random.fold_in(jax.random.key(config.seed), 4)
@@ -128,20 +131,19 @@ def base_model(config: Config) -> tuple[Backbone, str]:
 
 def _check_time(config: Config) -> None:
     """Raise ValueError unless the base was trained at this run's control period."""
-    path = Path(config.base) / TRAINING
+    source = config.model.source
+    path = Path(source) / TRAINING
     try:
         found = json.loads(path.read_text())["control_dt"]
     except (OSError, KeyError, ValueError) as error:
         raise ValueError(f"{path} does not say the control_dt that the base needs") from error
     if found != config.control_dt:
         raise ValueError(
-            f"{config.base} was trained with control_dt {found} s, this run has {config.control_dt}"
+            f"{source} was trained with control_dt {found} s, this run has {config.control_dt}"
         )
 
 
-def processor(
-    config: Config, episodes: Sequence[Episodes], model_config: BackboneConfig
-) -> Processor:
+def processor(episodes: Sequence[Episodes], model_config: BackboneConfig) -> Processor:
     """Statistics of the demonstrations and the token table of all their instructions, in order."""
     slots = robot_slots(episodes[0].state.shape[-1] - 1)
     valid = [np.arange(e.state.shape[1]) < np.asarray(e.length)[:, None] for e in episodes]
@@ -156,7 +158,9 @@ def processor(
     )
     phrases = [phrase for group in episodes for phrase in group.instructions]
     ids, mask = tokenizer.encode(phrases, model_config.max_tokens)
-    return Processor(slots, statistics, jnp.asarray(ids), jnp.asarray(mask), config.image_size)
+    return Processor(
+        slots, statistics, jnp.asarray(ids), jnp.asarray(mask), model_config.image_size
+    )
 
 
 def _collect(run: Run) -> dict[str, Episodes]:

@@ -10,6 +10,7 @@ import pytest
 from flax import nnx
 
 from lorasp_jax import adaptation, adapter_io, models
+from lorasp_jax.config import ModelConfig
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.processing import Statistics
@@ -66,10 +67,8 @@ def test_base(tmp_path):
 
 @pytest.mark.parametrize("size", ["nano", "small"])
 def test_shipped_bases_load_and_say_what_they_are(size):
-    config = dataclasses.replace(
-        CONFIG, size=size, base=f"assets/pi0_{size}", image_size=64, compute_dtype="bfloat16"
-    )
+    config = dataclasses.replace(CONFIG, model=ModelConfig(size=size, dtype="bfloat16"))
     model, base_hash = setup.base_model(config)
-    assert base_hash == models.weights_hash(config.base)
+    assert base_hash == models.weights_hash(config.model.source)
     assert adaptation.count(model) == (0, {"nano": 1_020_008, "small": 9_877_128}[size])
     assert model.config.dtype == "bfloat16"

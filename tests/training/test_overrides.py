@@ -9,7 +9,7 @@ from lorasp_jax.config import Config
 from lorasp_jax.peft import LoRA, LoRASP
 from lorasp_jax.training.overrides import load, override, parse
 
-CONFIG = Config(name="a", scale="cpu", peft=LoRASP(rank=8), size="nano", base="")
+CONFIG = Config(name="a", scale="cpu", peft=LoRASP(rank=8))
 MULTITASK = ["--config", "configs/multitask.py"]
 
 
@@ -22,7 +22,7 @@ def test_dotted_overrides():
 
 def test_scale_is_chosen_by_backend_and_can_be_forced():
     assert parse(MULTITASK)[0].scale == "cpu"
-    assert parse([*MULTITASK, "--scale", "accelerator"])[0].size == "small"
+    assert parse([*MULTITASK, "--scale", "accelerator"])[0].model.size == "small"
 
 
 def test_every_variant_of_lora_sp_is_an_option():

@@ -9,7 +9,7 @@ from lorasp_jax.config import Config, DataConfig
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.training.run_folder import MetricsLog, open_run, read_metrics
 
-CONFIG = Config(name="a", scale="cpu", peft=LoRASP(rank=8), size="nano", base="")
+CONFIG = Config(name="a", scale="cpu", peft=LoRASP(rank=8))
 
 
 def test_second_run_in_one_folder_is_refused(tmp_path):
