@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 from lorasp_jax.models.tokenizer import VOCABULARY_SIZE
+
+Remat = Literal["none", "products", "full"]
 
 
 @dataclass(frozen=True)
@@ -61,8 +63,10 @@ class BackboneConfig:
     """Type of the towers' matrix products; norms, softmax, projections and the loss are fp32."""
     param_dtype: str = "float32"
     """Type the parameters are stored in."""
-    remat: bool = False
-    """Recompute each layer's inside in the backward pass: less memory, a third more work."""
+    remat: Remat = "none"
+    """What the backward pass computes again: nothing; all but the results of matrix products
+    ("products": half the memory, a few percent more work); everything inside a layer ("full": the
+    least memory, a third more work)."""
     unroll: bool = False
     """Straight-line code instead of a loop over layers: faster for a few small ones (a loop copies
     what the backward pass needs into stacks and out again), at the price of compile time."""

@@ -1,5 +1,6 @@
 """What the backbones share: norms, rotary positions, attention, masks, and the scan over depth."""
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
@@ -10,10 +11,16 @@ import numpy as np
 from flax import nnx
 
 from lorasp_jax.dense import Dense, dense_together
+from lorasp_jax.models.config import Remat
 from lorasp_jax.peft import Aux
 
 MASKED = -2.3819763e38
 """Logit of a forbidden key; finite, so a row without any key gets a uniform softmax, not NaN."""
+
+CUDNN_TOKENS = 256
+"""Fewest queries for which attention goes through cuDNN."""
+
+_KEPT = {"products": jax.checkpoint_policies.dots_with_no_batch_dims_saveable, "full": None}
 
 LayerAux = dict[str, Aux]
 Block = TypeVar("Block", bound=nnx.Module)
@@ -104,7 +111,7 @@ def scan_depth(
     x: jax.Array,
     per_layer: Any = None,
     *,
-    remat: bool = False,
+    remat: Remat = "none",
     unroll: bool = False,
 ) -> tuple[jax.Array, Any]:
     """Run x through stacked blocks.
@@ -114,7 +121,7 @@ def scan_depth(
         call: (block, x, its slice of `per_layer`) -> (x, what to keep).
         x: `[B, T, D]`.
         per_layer: pytree with a leading axis L, or None.
-        remat: compute the inside of a block again in the backward pass instead of storing it.
+        remat: what of a block is computed again in the backward pass instead of stored.
         unroll: straight-line code instead of a loop.
 
     Returns:
@@ -125,8 +132,9 @@ def scan_depth(
     def layer(x: jax.Array, scanned: tuple[Any, Any]) -> tuple[jax.Array, Any]:
         return call(nnx.merge(graphdef, scanned[0]), x, scanned[1])
 
-    body = jax.checkpoint(layer, prevent_cse=False) if remat else layer
-    return jax.lax.scan(body, x, (state, per_layer), unroll=unroll)
+    if remat != "none":
+        layer = jax.checkpoint(layer, prevent_cse=False, policy=_KEPT[remat])
+    return jax.lax.scan(layer, x, (state, per_layer), unroll=unroll)
 
 
 def positions(valid: jax.Array) -> jax.Array:
@@ -168,7 +176,9 @@ def rope(x: jax.Array, table: tuple[jax.Array, jax.Array], scale: float = 1.0) -
 
 
 def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) -> jax.Array:
-    """Grouped-query attention, softmax in fp32.
+    """Grouped-query attention, softmax in fp32; long bf16 sequences through cuDNN on NVIDIA GPUs.
+
+    cuDNN's gradient adds up in any order: two runs differ in the last bits.
 
     Args:
         q: `[B, T, N, H]`, already scaled.
@@ -180,6 +190,10 @@ def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) 
         `[B, T, N H]`.
     """
     batch, tokens, heads, size = q.shape
+    if _suits_cudnn(q, k):
+        allowed = None if mask is None else mask[:, None]
+        attend = functools.partial(jax.nn.dot_product_attention, implementation="cudnn")
+        return attend(q, k, v, mask=allowed, scale=1.0).reshape(batch, tokens, heads * size)
     # With K = 1 no axis of q, weights or result moves in memory.
     q = q.reshape(batch, tokens, k.shape[2], -1, size)
     logits = jnp.einsum("BTKGH,BSKH->BKTGS", q, k, preferred_element_type=jnp.float32)
@@ -187,6 +201,14 @@ def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) 
         logits = jnp.where(mask[:, None, :, None, :], logits, MASKED)
     weights = jax.nn.softmax(logits, axis=-1).astype(v.dtype)
     return jnp.einsum("BKTGS,BSKH->BTKGH", weights, v).reshape(batch, tokens, heads * size)
+
+
+def _suits_cudnn(q: jax.Array, k: jax.Array) -> bool:
+    """Whether cuDNN takes these arrays and is worth its launch."""
+    tokens, size, others = q.shape[1], q.shape[3], k.shape[1]
+    half = q.dtype in (jnp.bfloat16, jnp.float16)
+    fits = size <= 256 and size % 8 == 0 and tokens % 2 == 0 and others % 2 == 0
+    return jax.default_backend() == "gpu" and half and fits and tokens >= CUDNN_TOKENS
 
 
 def time_embedding(flow_time: jax.Array, width: int) -> jax.Array:

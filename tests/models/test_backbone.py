@@ -1,6 +1,7 @@
 """Laws of every backbone that need no recorded numbers: who sees whom, adapters, remat, types."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -196,10 +197,24 @@ def loss_of(config, obs, actions):
 
 def test_remat_changes_nothing(model, loss_of):
     parameters = nnx.split(model)[1]
-    plain, remat = (
-        quick.jit(jax.value_and_grad(loss_of(remat=remat)))(parameters) for remat in (False, True)
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5)
+    plain, *others = (
+        quick.jit(jax.value_and_grad(loss_of(remat=remat)))(parameters)
+        for remat in ("none", "products", "full")
     )
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), remat, plain)
+    for remat in others:
+        jax.tree.map(close, remat, plain)
+
+
+def test_remat_stores_less(model, loss_of):
+    parameters = nnx.split(model)[1]
+
+    def stored(remat):
+        arrays = jax.eval_shape(lambda p: jax.vjp(loss_of(remat=remat), p)[1], parameters)
+        return sum(a.size for a in jax.tree.leaves(arrays))
+
+    none, products, full = map(stored, ("none", "products", "full"))
+    assert none > 1.5 * products > 1.5 * full
 
 
 def test_unroll_and_bfloat16_hardly_change_the_loss(model, loss_of):

@@ -43,7 +43,7 @@ def test_round_trip_is_exact_in_bfloat16(folder, model):
 
 
 def test_types_are_as_asked(folder):
-    wanted = dataclasses.replace(CONFIG, dtype="bfloat16", param_dtype="bfloat16", remat=True)
+    wanted = dataclasses.replace(CONFIG, dtype="bfloat16", param_dtype="bfloat16", remat="full")
     loaded = models.load(folder, wanted)
     assert loaded.config == wanted
     assert {leaf.dtype for leaf in jax.tree.leaves(parameters(loaded))} == {jnp.dtype("bfloat16")}
