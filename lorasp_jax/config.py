@@ -30,6 +30,9 @@ class ModelConfig:
     """Type of the matrix products."""
     param_dtype: Literal["float32", "bfloat16"] = "float32"
     """Type the base is stored in; adapters are float32."""
+    remat: Literal["auto", "none", "products", "full"] = "auto"
+    """What the backward pass computes again to save memory: nothing, all but matrix products, or
+    all inside a layer; auto is the first of these that fits into the device."""
 
     @property
     def source(self) -> str:

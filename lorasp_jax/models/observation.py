@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import jax
 
+from lorasp_jax.models.config import BackboneConfig
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
@@ -23,3 +25,19 @@ class Observation:
     tokens: jax.Array
     token_mask: jax.Array
     state: jax.Array
+
+
+def abstract_observation(config: BackboneConfig, batch: int) -> Observation:
+    """Shapes of what a backbone sees, without arrays."""
+
+    def shape(dtype: str, *sides: int) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((batch, *sides), dtype)
+
+    size = config.image_size
+    return Observation(
+        images={name: shape("float32", size, size, 3) for name in config.cameras},
+        image_masks={name: shape("bool") for name in config.cameras},
+        tokens=shape("int32", config.max_tokens),
+        token_mask=shape("bool", config.max_tokens),
+        state=shape("float32", config.action_dim),
+    )

@@ -22,9 +22,10 @@ from lorasp_jax.data.batches import Batch, flatten, sample_batch
 from lorasp_jax.data.demonstrations import demonstrations
 from lorasp_jax.models import backbone, tokenizer
 from lorasp_jax.models.backbone import Backbone
-from lorasp_jax.models.config import BackboneConfig
+from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.processing import Processor, Statistics, robot_slots
+from lorasp_jax.training import preflight
 from lorasp_jax.training.loop import Run
 from lorasp_jax.training.progress import bars
 
@@ -48,24 +49,26 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
         envs.make(
             task, robot=config.robot, image_size=config.image_size, control_dt=config.control_dt
         )
-    model, base_hash = base_model(config)
-    if config.evaluation.execute_steps > model.config.chunk:
+    base, base_hash = base_model(config)
+    chunk = base.config.chunk
+    if config.evaluation.execute_steps > chunk:
         raise ValueError(
-            f"execute_steps must be 1 to the chunk, {model.config.chunk}, "
-            f"got {config.evaluation.execute_steps}"
+            f"execute_steps must be 1 to the chunk, {chunk}, got {config.evaluation.execute_steps}"
         )
     if config.optim.batch_size % jax.device_count():
         raise ValueError(
             f"batch_size must be a multiple of the {jax.device_count()} devices, "
             f"got {config.optim.batch_size}"
         )
-    base, model = model, _adapted(config, model, config.peft.as_saved)
+    remat, memory = preflight.choose_remat(config, base.config, preflight.available_bytes())
+    base = _with_remat(base, remat)
+    model = _adapted(config, base, config.peft.as_saved)
     counts = adaptation.count(model)
     console.print(
         f"scale {config.scale}: {type(config.peft).__name__} on {config.model.backbone} "
-        f"{config.model.size}, "
-        f"{counts.trainable:,} of {counts.total:,} parameters train"
+        f"{config.model.size}, {counts.trainable:,} of {counts.total:,} parameters train"
     )
+    console.print(f"memory by device in GiB: {memory}; rematerialisation: {remat}")
     run = Run(config, folder, console, base_hash, started)
     with run.timed("collect"):
         run.episodes = _collect(run)
@@ -127,6 +130,13 @@ def base_model(config: Config) -> tuple[Backbone, str]:
     key = jax.random.fold_in(jax.random.key(config.seed), 4)
     model = wanted.create(nnx.Rngs(key))
     return model, models.weights_hash(model)
+
+
+def _with_remat(model: Backbone, remat: Remat) -> Backbone:
+    """The same parameters in a model that keeps something else for its backward pass."""
+    wanted = dataclasses.replace(model.config, remat=remat)
+    abstract = nnx.eval_shape(lambda: wanted.create(nnx.Rngs(0)))
+    return nnx.merge(nnx.graphdef(abstract), nnx.state(model))
 
 
 def _check_time(config: Config) -> None:

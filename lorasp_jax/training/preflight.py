@@ -1,0 +1,136 @@
+"""What a training step will need of the device's memory, from shapes alone, before compilation.
+
+The base, the adapters, their gradients and the optimizer's state are counted exactly; activations
+are what JAX stores for the backward pass, which XLA can only lessen. What a layer needs while it
+runs comes on top: `HEADROOM`.
+"""
+
+import dataclasses
+import math
+import os
+from typing import Any
+
+import jax
+from flax import nnx
+
+from lorasp_jax import adaptation
+from lorasp_jax.config import Config
+from lorasp_jax.data.batches import Batch
+from lorasp_jax.models.backbone import Backbone
+from lorasp_jax.models.config import BackboneConfig, Remat
+from lorasp_jax.models.observation import abstract_observation
+from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
+from lorasp_jax.training.step import loss_fn
+
+HEADROOM = 1.1
+"""Factor on the sum for what is not counted: temporary arrays, the compiled program, fragments."""
+REMATS: tuple[Remat, ...] = ("none", "products", "full")
+GIB = 2**30
+
+
+@dataclasses.dataclass(frozen=True)
+class Memory:
+    """Bytes on one device."""
+
+    base: float
+    adapters: float
+    gradients: float
+    optimizer: float
+    activations: float
+
+    @property
+    def peak(self) -> float:
+        """What to expect at the worst moment."""
+        return HEADROOM * sum(dataclasses.astuple(self))
+
+    def __str__(self) -> str:
+        """All parts in GiB."""
+        parts = [f"{name} {value / GIB:.2f}" for name, value in dataclasses.asdict(self).items()]
+        return f"{', '.join(parts)}, peak {self.peak / GIB:.2f} GiB"
+
+
+def choose_remat(config: Config, wanted: BackboneConfig, available: float) -> tuple[Remat, Memory]:
+    """The least rematerialisation that fits into `available` bytes a device, and what it needs.
+
+    Raises:
+        ValueError: nothing that the config allows fits; says what would help.
+    """
+    asked = config.model.remat
+    choices = REMATS if asked == "auto" else (asked,)
+    for remat in choices:
+        memory = expected(config, dataclasses.replace(wanted, remat=remat))
+        if memory.peak <= available:
+            return remat, memory
+    raise ValueError(_refusal(config, memory, choices[-1], available))
+
+
+def _refusal(config: Config, memory: Memory, remat: Remat, available: float) -> str:
+    """Why a run cannot begin, and what would help."""
+    batch, fixed = config.optim.batch_size, memory.peak - HEADROOM * memory.activations
+    fitting = math.floor(batch * (available - fixed) / (memory.peak - fixed))
+    fitting -= fitting % jax.device_count()
+    hints = [f"--optim.batch-size {fitting}"] if 0 < fitting < batch else []
+    hints += ["--model.remat full"] if remat != "full" else []
+    hints += ["--model.param-dtype bfloat16"] if config.model.param_dtype != "bfloat16" else []
+    hints += [f"--fsdp {2 * config.fsdp} on as many devices"]
+    return (
+        f"this run needs about {memory.peak / GIB:.1f} GiB of memory and there are "
+        f"{available / GIB:.1f} ({memory}); try {', '.join(hints)}"
+    )
+
+
+def expected(config: Config, wanted: BackboneConfig) -> Memory:
+    """Memory of one training step; the base is split over `config.fsdp` devices.
+
+    Args:
+        config: the run.
+        wanted: the backbone's config.
+    """
+    method = config.peft.as_saved
+    rules = [(path, method) for path in config.targets]
+    model: Backbone = nnx.eval_shape(
+        lambda: adaptation.adapt(wanted.create(nnx.Rngs(0)), rules, rngs=nnx.Rngs(1))
+    )
+    graphdef, adapters, frozen = adaptation.split(model)
+    optimizer = make_optimizer(config.optim, adaptation.methods(model).values())
+    batch = abstract_batch(wanted, max(1, config.optim.batch_size // jax.device_count()))
+    weights = {
+        name: schedule(0) for name, schedule in auxiliary_weights(config.auxiliary, 1).items()
+    }
+
+    def stored(adapters: Any, frozen: Any, batch: Batch) -> Any:
+        loss = lambda a: loss_fn(a, frozen, graphdef, batch, jax.random.key(0), weights)  # noqa: E731
+        return jax.vjp(loss, adapters, has_aux=True)[1]
+
+    jaxpr = jax.make_jaxpr(stored)(adapters, frozen, batch).jaxpr
+    kept = {id(v): v.aval for v in jaxpr.outvars}
+    for variable in (*jaxpr.invars, *jaxpr.constvars):  # there anyway
+        kept.pop(id(variable), None)
+    return Memory(
+        base=_bytes(frozen) / config.fsdp,
+        adapters=_bytes(adapters),
+        gradients=_bytes(adapters),
+        optimizer=_bytes(jax.eval_shape(optimizer.init, adapters)),
+        activations=_bytes(list(kept.values())) + _bytes(batch),
+    )
+
+
+def abstract_batch(config: BackboneConfig, size: int) -> Batch:
+    """Shapes of a batch of `size` windows."""
+    shape = (size, config.chunk, config.action_dim)
+    actions, mask = (jax.ShapeDtypeStruct(shape, kind) for kind in ("float32", "bool"))
+    return Batch(abstract_observation(config, size), actions, mask)
+
+
+def available_bytes() -> float:
+    """Memory of the first device that JAX may use; of the machine on a CPU, shared by devices."""
+    stats = jax.devices()[0].memory_stats()
+    if stats and "bytes_limit" in stats:
+        return float(stats["bytes_limit"])
+    machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return machine / jax.local_device_count()
+
+
+def _bytes(tree: Any) -> float:
+    leaves = [leaf for leaf in jax.tree.leaves(tree) if hasattr(leaf, "dtype")]
+    return float(sum(leaf.size * leaf.dtype.itemsize for leaf in leaves))
