@@ -1,6 +1,7 @@
 """What a vision-language-action model sees, already normalised and tokenised."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 
@@ -30,7 +31,7 @@ class Observation:
 def abstract_observation(config: BackboneConfig, batch: int) -> Observation:
     """Shapes of what a backbone sees, without arrays."""
 
-    def shape(dtype: str, *sides: int) -> jax.ShapeDtypeStruct:
+    def shape(dtype: str, *sides: int) -> Any:
         return jax.ShapeDtypeStruct((batch, *sides), dtype)
 
     size = config.image_size

@@ -94,9 +94,7 @@ def expected(config: Config, wanted: BackboneConfig) -> Memory:
     graphdef, adapters, frozen = adaptation.split(model)
     optimizer = make_optimizer(config.optim, adaptation.methods(model).values())
     batch = abstract_batch(wanted, max(1, config.optim.batch_size // jax.device_count()))
-    weights = {
-        name: schedule(0) for name, schedule in auxiliary_weights(config.auxiliary, 1).items()
-    }
+    weights: Any = dict.fromkeys(auxiliary_weights(config.auxiliary, 1), 0.0)
 
     def stored(adapters: Any, frozen: Any, batch: Batch) -> Any:
         loss = lambda a: loss_fn(a, frozen, graphdef, batch, jax.random.key(0), weights)  # noqa: E731
@@ -118,6 +116,8 @@ def expected(config: Config, wanted: BackboneConfig) -> Memory:
 def abstract_batch(config: BackboneConfig, size: int) -> Batch:
     """Shapes of a batch of `size` windows."""
     shape = (size, config.chunk, config.action_dim)
+    actions: Any
+    mask: Any
     actions, mask = (jax.ShapeDtypeStruct(shape, kind) for kind in ("float32", "bool"))
     return Batch(abstract_observation(config, size), actions, mask)
 

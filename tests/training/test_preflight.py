@@ -1,4 +1,4 @@
-"""What a step needs of memory: exact where it can be, near XLA's own figure, one sentence if not."""
+"""What a step needs of memory: exact where it can be; one sentence where it cannot fit."""
 
 import dataclasses
 
@@ -49,7 +49,7 @@ def test_the_first_that_fits_is_chosen(memory):
 
 def test_what_cannot_fit_is_refused_with_a_batch_that_does(memory):
     room = (memory["full"].peak + preflight.HEADROOM * memory["full"].base) / 2
-    with pytest.raises(ValueError, match="needs about .* try --optim.batch-size") as caught:
+    with pytest.raises(ValueError, match=r"needs about .* try --optim.batch-size") as caught:
         preflight.choose_remat(CONFIG, TINY, room)
     assert "--fsdp 2" in str(caught.value)
     assert "\n" not in str(caught.value)

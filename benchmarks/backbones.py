@@ -1,0 +1,221 @@
+"""Whole backbones at their published sizes, with random weights: training steps and sampling.
+
+    python -m benchmarks.backbones --json backbones.json
+    python -m benchmarks.backbones --size nano --batch 4 --rank 8 --dtype float32    # on a CPU
+
+A training step is this project's own, with AdamW and the auxiliary losses, on a batch that lies on
+the device; its state is donated. GiB is what the compiled program needs with its arguments, MFU the
+matrix products of loss and gradients (`lorasp_jax.flops`, nothing that is computed twice) a second
+over the device's bf16 peak. Sampling is ten denoising steps in one program, from pictures to action
+chunk. "largest" is the largest batch whose step is expected to need at most 24 GiB.
+"""
+
+import argparse
+import dataclasses
+import functools
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+from rich.console import Console
+
+from benchmarks.measuring import best, machine, print_table
+from lorasp_jax import adaptation, flops, peft
+from lorasp_jax.config import Config, OptimConfig
+from lorasp_jax.models import backbone
+from lorasp_jax.models.backbone import Backbone
+from lorasp_jax.models.config import BackboneConfig, Remat
+from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
+from lorasp_jax.training.preflight import GIB, REMATS, abstract_batch, expected
+from lorasp_jax.training.step import init_state, loss_fn, train_step
+
+CAMERAS = {"pi0": 3, "smolvla": 2}
+EXPERT = ("action/.*", "state_proj", "action_.*")
+STEPS = 10
+
+
+def sized(name: str, options: argparse.Namespace, remat: Remat = "none") -> BackboneConfig:
+    """The backbone at the size asked for, the base stored in the type of the products."""
+    config = getattr(backbone.find(name), options.size)()
+    return dataclasses.replace(
+        config,
+        cameras=config.cameras[: CAMERAS[name]],
+        dtype=options.dtype,
+        param_dtype=options.dtype,
+        remat=remat,
+    )
+
+
+def run_config(method: peft.Method, targets: tuple[str, ...], batch: int) -> Config:
+    """A run with this method."""
+    optim = OptimConfig(batch_size=batch)
+    return Config(name="benchmark", scale="", peft=method, targets=targets, optim=optim)
+
+
+def adapted(config: BackboneConfig, run: Config | None, key: jax.Array) -> Backbone:
+    """A random model with the run's adapters."""
+    base, adapters = (nnx.Rngs(k) for k in jax.random.split(key))
+    model = config.create(base)
+    rules = [(path, run.peft) for path in run.targets] if run else []
+    return adaptation.adapt(model, rules, rngs=adapters) if rules else model
+
+
+def arrays(config: BackboneConfig, run: Config | None) -> tuple[Any, Any, Any]:
+    """Graph, adapters and frozen arrays, drawn on the device."""
+    graphdef = adaptation.split(nnx.eval_shape(lambda: adapted(config, run, jax.random.key(0))))[0]
+    draw = jax.jit(lambda key: adaptation.split(adapted(config, run, key))[1:])
+    return graphdef, *draw(jax.random.key(0, impl="rbg"))
+
+
+def noise(shapes: Any) -> Any:
+    """Arrays in which everything is valid."""
+
+    def fill(leaf: jax.ShapeDtypeStruct) -> jax.Array:
+        if leaf.dtype == jnp.float32:
+            return jax.random.uniform(jax.random.key(0), leaf.shape, minval=-1)
+        return jnp.ones(leaf.shape, leaf.dtype)
+
+    return jax.tree.map(fill, shapes)
+
+
+class Step:
+    """A compiled training step with what it needs."""
+
+    def __init__(self, config: BackboneConfig, run: Config) -> None:
+        graphdef, adapters, self.frozen = arrays(config, run)
+        optimizer = make_optimizer(run.optim, {run.peft})
+        weights = auxiliary_weights(run.auxiliary, run.optim.steps)
+        self.batch = noise(abstract_batch(config, run.optim.batch_size))
+        self.key = jax.random.key(1)
+        self.state = jax.jit(functools.partial(init_state, optimizer=optimizer))(adapters)
+        step = functools.partial(
+            train_step, graphdef=graphdef, optimizer=optimizer, weights=weights
+        )
+        lowered = jax.jit(step, donate_argnums=0).lower(*self._arguments())
+        self.compiled = lowered.compile()
+
+    def _arguments(self) -> tuple:
+        return self.state, self.frozen, self.batch, self.key
+
+    def __call__(self) -> Any:
+        """The next step's metrics."""
+        self.state, metrics = self.compiled(*self._arguments())
+        return metrics
+
+    @property
+    def bytes(self) -> float:
+        """What the program needs with its arguments."""
+        needed: Any = self.compiled.memory_analysis()
+        return needed.argument_size_in_bytes + needed.temp_size_in_bytes
+
+
+def work(config: BackboneConfig, run: Config) -> float:
+    """Operations of one step."""
+    model = nnx.eval_shape(lambda: adapted(config, run, jax.random.key(0)))
+    graphdef, adapters, frozen = adaptation.split(model)
+    weights: Any = dict.fromkeys(auxiliary_weights(run.auxiliary, 1), 0.0)
+
+    def gradients(adapters: Any, frozen: Any, batch: Any) -> Any:
+        loss = functools.partial(loss_fn, weights=weights)
+        gradient = jax.grad(loss, has_aux=True)
+        return gradient(adapters, frozen, graphdef, batch, jax.random.key(0))
+
+    batch = abstract_batch(config, run.optim.batch_size)
+    return flops.count(gradients, adapters, frozen, batch)
+
+
+def training(name: str, label: str, run: Config, options: argparse.Namespace, remat: Remat) -> Any:
+    """The row of one way to train."""
+    config = sized(name, options, remat)
+    step, size = Step(config, run), run.optim.batch_size
+    seconds = best(step, calls=options.calls)
+    operations = work(sized(name, options), run)
+    share = flops.utilisation(operations, seconds)
+    return {
+        "backbone": name,
+        "trains": label,
+        "batch": size,
+        "remat": remat,
+        "ms": 1e3 * seconds,
+        "samples/s": size / seconds,
+        "GiB": step.bytes / GIB,
+        "expected": expected(run, config).peak / GIB,
+        "TFLOP": operations / 1e12,
+        "MFU": "" if share is None else share,
+    }
+
+
+def largest(name: str, run: Config, options: argparse.Namespace) -> int:
+    """The largest batch whose step needs at most `options.gib`, by what is expected of two sizes."""
+    config = sized(name, options, "full")
+
+    def bytes_of(batch: int) -> float:
+        optim = dataclasses.replace(run.optim, batch_size=batch)
+        return expected(dataclasses.replace(run, optim=optim), config).peak
+
+    one, nine = bytes_of(1), bytes_of(9)
+    each = (nine - one) / 8
+    return max(1, int((options.gib * GIB - one + each) / each))
+
+
+def sampling(name: str, label: str, run: Config | None, options: argparse.Namespace) -> Iterator:
+    """Rows of drawing action chunks."""
+    config = sized(name, options)
+    graphdef, adapters, frozen = arrays(config, run)
+    observation = noise(abstract_batch(config, 1).observation)
+
+    @jax.jit
+    def sample(adapters: Any, frozen: Any, observation: Any) -> jax.Array:
+        model = nnx.merge(graphdef, adapters, frozen)
+        return model.sample_actions(jax.random.key(0), observation, num_steps=STEPS)
+
+    for batch in options.sampled:
+        seen = jax.tree.map(functools.partial(jnp.repeat, repeats=batch, axis=0), observation)
+        seconds = best(functools.partial(sample, adapters, frozen, seen), calls=1, repeats=10)
+        yield {"backbone": name, "adapters": label, "batch": batch, "ms": 1e3 * seconds}
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--backbones", nargs="+", default=list(CAMERAS))
+    parser.add_argument("--size", default="base", help="nano, small or base")
+    parser.add_argument("--batch", type=int, default=32)
+    parser.add_argument("--sampled", type=int, nargs="+", default=[1, 8], help="batches")
+    parser.add_argument("--rank", type=int, default=128)
+    parser.add_argument("--remat", choices=REMATS, default="products")
+    parser.add_argument("--dtype", default="bfloat16")
+    parser.add_argument("--gib", type=float, default=24, help="memory for the largest batch")
+    parser.add_argument("--calls", type=int, default=5, help="steps queued together")
+    parser.add_argument("--only", choices=["training", "largest", "sampling"])
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    options = parser.parse_args()
+    console, found = Console(soft_wrap=True), {"machine": machine("jax")}
+    console.print(f"{found['machine']}; {options.size}, rank {options.rank}, {options.dtype}")
+    tables: dict[str, list] = {"training": [], "largest": [], "sampling": []}
+    method = peft.LoRASP(rank=options.rank)
+    everywhere = run_config(method, (".*",), options.batch)
+    ways = {"LoRA-SP": everywhere}
+    ways["expert only"] = run_config(peft.FullFineTuning(), EXPERT, options.batch)
+    for name in options.backbones:
+        for table in [options.only] if options.only else tables:
+            if table == "training":
+                rows = [training(name, k, run, options, options.remat) for k, run in ways.items()]
+            elif table == "largest":
+                run = run_config(method, (".*",), largest(name, everywhere, options))
+                rows = [training(name, f"LoRA-SP, {options.gib:g} GiB", run, options, "full")]
+            else:
+                rows = [*sampling(name, "none", None, options)]
+                rows += sampling(name, "LoRA-SP", everywhere, options)
+            tables[table] += rows
+            print_table(console, rows)
+            if options.json:
+                options.json.write_text(json.dumps(found | tables, indent=1))
+
+
+if __name__ == "__main__":
+    main()
