@@ -118,7 +118,7 @@ class Config:
     tasks: tuple[str, ...] = ("press", "pick_place")
     """Tasks trained together."""
     targets: tuple[str, ...] = (".*",)
-    """Regular expressions over layer paths: what the method is attached to."""
+    """What the method is attached to: presets (models/presets.py), regular expressions of paths."""
     image_size: int = 64
     """Height and width of both camera pictures [pixels]."""
     data: DataConfig = field(default_factory=DataConfig)
