@@ -1,5 +1,6 @@
 """Presets: which layers of both backbones they name, and what trains then."""
 
+import dataclasses
 import re
 
 import pytest
@@ -54,6 +55,17 @@ def test_layers_of_each_preset(backbone):
     model = adapted(backbone.Config.dummy(), ["vision", "k_proj$"], LoRASP(rank=4))
     keys = {path for path in layers if path.endswith("/k_proj")}
     assert adaptation.methods(model).keys() == PATCH | VISION | keys
+
+
+def test_adaptive_norms_are_of_the_expert_and_not_openpis():
+    config = dataclasses.replace(pi0.Config.dummy(), pi05=True)
+    found = {
+        name: adaptation.methods(adapted(config, name, LoRA(rank=2))).keys()
+        for name in ("openpi", "action")
+    }
+    assert found["openpi"] == LANGUAGE | ACTION[pi0]
+    norms = ("blocks/input_layernorm", "blocks/post_attention_layernorm", "norm")
+    assert found["action"] == ACTION[pi0] | {f"action/{name}/dense" for name in norms}
 
 
 @pytest.mark.parametrize(
