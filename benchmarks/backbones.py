@@ -26,7 +26,7 @@ from rich.console import Console
 from benchmarks.measuring import best, machine, print_table
 from lorasp_jax import adaptation, flops, peft
 from lorasp_jax.config import Config, OptimConfig
-from lorasp_jax.models import backbone
+from lorasp_jax.models import backbone, presets
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
@@ -34,7 +34,6 @@ from lorasp_jax.training.preflight import GIB, REMATS, abstract_batch, expected
 from lorasp_jax.training.step import init_state, loss_fn, train_step
 
 CAMERAS = {"pi0": 3, "smolvla": 2}
-EXPERT = ("action/.*", "state_proj", "action_.*")
 STEPS = 10
 
 
@@ -60,8 +59,9 @@ def adapted(config: BackboneConfig, run: Config | None, key: jax.Array) -> Backb
     """A random model with the run's adapters."""
     base, adapters = (nnx.Rngs(k) for k in jax.random.split(key))
     model = config.create(base)
-    rules = [(path, run.peft) for path in run.targets] if run else []
-    return adaptation.adapt(model, rules, rngs=adapters) if rules else model
+    if run is None:
+        return model
+    return adaptation.adapt(model, presets.rules(run.targets, run.peft), rngs=adapters)
 
 
 def arrays(config: BackboneConfig, run: Config | None) -> tuple[Any, Any, Any]:
@@ -150,7 +150,7 @@ def training(name: str, label: str, run: Config, options: argparse.Namespace, re
 
 
 def largest(name: str, run: Config, options: argparse.Namespace) -> int:
-    """The largest batch whose step needs at most `options.gib`, by what is expected of two sizes."""
+    """The largest batch expected to need at most `options.gib`, from two sizes."""
     config = sized(name, options, "full")
 
     def bytes_of(batch: int) -> float:
@@ -198,15 +198,15 @@ def main() -> None:
     console.print(f"{found['machine']}; {options.size}, rank {options.rank}, {options.dtype}")
     tables: dict[str, list] = {"training": [], "largest": [], "sampling": []}
     method = peft.LoRASP(rank=options.rank)
-    everywhere = run_config(method, (".*",), options.batch)
+    everywhere = run_config(method, ("all-linear",), options.batch)
     ways = {"LoRA-SP": everywhere}
-    ways["expert only"] = run_config(peft.FullFineTuning(), EXPERT, options.batch)
+    ways["expert only"] = run_config(peft.FullFineTuning(), ("expert-only",), options.batch)
     for name in options.backbones:
         for table in [options.only] if options.only else tables:
             if table == "training":
                 rows = [training(name, k, run, options, options.remat) for k, run in ways.items()]
             elif table == "largest":
-                run = run_config(method, (".*",), largest(name, everywhere, options))
+                run = run_config(method, ("all-linear",), largest(name, everywhere, options))
                 rows = [training(name, f"LoRA-SP, {options.gib:g} GiB", run, options, "full")]
             else:
                 rows = [*sampling(name, "none", None, options)]

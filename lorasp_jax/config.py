@@ -139,7 +139,7 @@ class Config:
     tasks: tuple[str, ...] = ("open_pot", "pour", "press", "pick_place")
     """Tasks trained together; the default are the paper's four."""
     targets: tuple[str, ...] = (".*",)
-    """Regular expressions over layer paths: what the method is attached to."""
+    """What the method is attached to: presets (models/presets.py), regular expressions of paths."""
     image_size: int = 64
     """Height and width of the simulated cameras' pictures [pixels]; a backbone resizes them."""
     data: DataConfig = field(default_factory=DataConfig)

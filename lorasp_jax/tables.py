@@ -19,7 +19,7 @@ def summary(model: nnx.Module, aux: Mapping[str, Aux] | None = None) -> str:
     """A table of the layers and of every other parameter that trains, with totals.
 
     Columns: path, method, kernel shape, rank, parameters (base and adapter), trainable ones, and
-    with `aux` the mean active rank.
+    with `aux` the mean active rank. Below it, the share that trains and what is frozen.
 
     Args:
       model: adapted or not.
@@ -41,8 +41,20 @@ def summary(model: nnx.Module, aux: Mapping[str, Aux] | None = None) -> str:
     widths = [max(len(row[i]) for row in table) for i in range(columns)]
     lines = ["  ".join(_align(row, widths)).rstrip() for row in table]
     rule = "-" * max(map(len, lines))
-    share = f"{trainable / max(total, 1):.2%} of all parameters train"
-    return "\n".join([lines[0], rule, *lines[1:-1], rule, lines[-1], share])
+    return "\n".join([lines[0], rule, *lines[1:-1], rule, lines[-1], trained_share(model)])
+
+
+def trained_share(model: nnx.Module) -> str:
+    """One line: which share of the parameters trains, and which parts of the model are frozen."""
+    trainable, total = count(model)
+    holder = nnx.List([model])
+    parts = dict.fromkeys(place.path.split("/")[0] for place in places(holder, nnx.Param))
+    touched = {place.path.split("/")[0] for place in places(holder, AdapterParam)}
+    frozen = ", ".join(part for part in parts if part not in touched)
+    share = f"{trainable / max(total, 1):.2%} of all parameters train, {trainable:,} of {total:,}"
+    if trainable == total:
+        return f"{share}; nothing is frozen"
+    return f"{share}; the others are frozen" + (f", all of {frozen} among them" if frozen else "")
 
 
 def _rows(model: nnx.Module) -> list[Row]:

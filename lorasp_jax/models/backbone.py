@@ -58,16 +58,20 @@ class Backbone(nnx.Module):
     def _make_projections(self, state_width: int, rngs: nnx.Rngs) -> None:
         """The linear maps around the towers: of state, noisy actions, their time and velocity."""
         width, dim = self.config.action.width, self.config.action_dim
-        kinds: dict[str, Any] = {
-            "dtype": jnp.float32,
-            "param_dtype": self.config.param_dtype,
-            "rngs": rngs,
+        sizes = {
+            "state_proj": (dim, state_width),
+            "action_in_proj": (dim, width),
+            "action_time_mlp_in": (2 * width, width),
+            "action_time_mlp_out": (width, width),
+            "action_out_proj": (width, dim),
         }
-        self.state_proj = Dense(dim, state_width, **kinds)
-        self.action_in_proj = Dense(dim, width, **kinds)
-        self.action_time_mlp_in = Dense(2 * width, width, **kinds)
-        self.action_time_mlp_out = Dense(width, width, **kinds)
-        self.action_out_proj = Dense(width, dim, **kinds)
+        self._make_linears(sizes, rngs)
+
+    def _make_linears(self, sizes: dict[str, tuple[int, int]], rngs: nnx.Rngs) -> None:
+        """Dense layers [I, O] by name, which compute in fp32."""
+        kinds = {"dtype": jnp.float32, "param_dtype": self.config.param_dtype}
+        for name, (d_in, d_out) in sizes.items():
+            setattr(self, name, Dense(d_in, d_out, **kinds, rngs=rngs))
 
     def run_prefix(self, obs: Observation) -> tuple[Any, ModelAux]:
         """Everything that does not depend on the actions, once per observation."""

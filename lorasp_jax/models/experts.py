@@ -16,6 +16,7 @@ from flax import nnx
 from lorasp_jax.dense import Dense
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig
 from lorasp_jax.models.layers import (
+    AdaptiveRMSNorm,
     LayerAux,
     Linears,
     RMSNorm,
@@ -73,6 +74,7 @@ class ExpertBlock(nnx.Module):
         mask: jax.Array,
         cache: KeysValues | None,
         token_mask: jax.Array,
+        condition: jax.Array | None = None,
     ) -> tuple[jax.Array, tuple[KeysValues, LayerAux]]:
         """One layer.
 
@@ -82,13 +84,14 @@ class ExpertBlock(nnx.Module):
             mask: `[B, T, S + T]` bool over the cache's keys and the own ones, in this order.
             cache: keys and values of earlier tokens, or None (S = 0).
             token_mask: `[B, T]` bool, what the adapters count.
+            condition: `[B, 1, D]` of adaptive norms, or None.
 
         Returns:
             x, then the own keys and values and the adapters' reports.
         """
         linear = Linears(self, token_mask)
         heads = (*x.shape[:2], -1, self.head_dim)
-        h = self.input_layernorm(x)
+        h, branch = linear.norm("input_layernorm", x, condition)
         read = linear.together(("q_proj", "k_proj", "v_proj"), h)
         q, k, v = (y.reshape(heads) for y in read)
         q, k = rope(q, table, scale=self.head_dim**-0.5), rope(k, table)
@@ -96,15 +99,25 @@ class ExpertBlock(nnx.Module):
         if cache is not None:
             keys = jnp.concatenate([cache[0], k], axis=1)
             values = jnp.concatenate([cache[1], v], axis=1)
-        x = self.finish(linear, x, attention(q, keys, values, mask))
-        return x, ((k, v), linear.aux)
+        attended = attention(q, keys, values, mask)
+        return self.finish(linear, x, attended, branch, condition), ((k, v), linear.aux)
 
-    def finish(self, linear: Linears, x: jax.Array, attended: jax.Array) -> jax.Array:
-        """x `[B, T, D]` after the attention's result `[B, T, N H]` and the gated MLP."""
-        x = x + linear("o_proj", attended)
-        h = self.post_attention_layernorm(x)
+    def finish(
+        self,
+        linear: Linears,
+        x: jax.Array,
+        attended: jax.Array,
+        branch: jax.Array | int = 1,
+        condition: jax.Array | None = None,
+    ) -> jax.Array:
+        """x `[B, T, D]` after the attention's result `[B, T, N H]` and the gated MLP.
+
+        `branch` multiplies what the attention adds, see `Linears.norm`.
+        """
+        x = x + branch * linear("o_proj", attended)
+        h, branch = linear.norm("post_attention_layernorm", x, condition)
         gate, up = linear.together(("gate_proj", "up_proj"), h)
-        return x + linear("down_proj", self.activation(gate) * up)
+        return x + branch * linear("down_proj", self.activation(gate) * up)
 
 
 class Expert(nnx.Module):
@@ -126,6 +139,7 @@ class Expert(nnx.Module):
         cache: KeysValues | None = None,
         *,
         token_mask: jax.Array,
+        condition: jax.Array | None = None,
     ) -> tuple[jax.Array, KeysValues, LayerAux]:
         """All layers.
 
@@ -135,6 +149,7 @@ class Expert(nnx.Module):
             mask: `[B, T, S + T]` bool.
             cache: keys and values `[L, B, S, K, H]` of earlier tokens, or None (S = 0).
             token_mask: `[B, T]` bool.
+            condition: `[B, 1, D]` of adaptive norms, or None.
 
         Returns:
             `[B, T, D]` after the final norm, the own keys and values `[L, B, T, K, H]`, and the
@@ -143,13 +158,40 @@ class Expert(nnx.Module):
         table = rope_table(position, self.head_dim)
         x, (own, aux) = scan_depth(
             self.blocks,
-            lambda block, x, cache: block(x, table, mask, cache, token_mask),
+            lambda block, x, cache: block(x, table, mask, cache, token_mask, condition),
             x.astype(self.config.dtype),
             cache,
             remat=self.config.remat,
             unroll=self.config.unroll,
         )
-        return self.norm(x), own, aux
+        linear = Linears(self, None)
+        x, _ = linear.norm("norm", x, condition)
+        return x, own, aux | linear.aux
+
+
+class AdaptiveBlock(ExpertBlock):
+    """A layer whose norms follow a condition."""
+
+    def __init__(self, size: ExpertConfig, config: BackboneConfig, *, rngs: nnx.Rngs) -> None:
+        super().__init__(size, config, rngs=rngs)
+        self.input_layernorm = adaptive_norm(size, config, rngs)
+        self.post_attention_layernorm = adaptive_norm(size, config, rngs)
+
+
+class AdaptiveExpert(Expert):
+    """An expert whose norms follow a condition, pi0.5's for actions."""
+
+    block = AdaptiveBlock
+
+    def __init__(self, size: ExpertConfig, config: BackboneConfig, *, rngs: nnx.Rngs) -> None:
+        super().__init__(size, config, rngs=rngs)
+        self.norm = adaptive_norm(size, config, rngs)
+
+
+def adaptive_norm(size: ExpertConfig, config: BackboneConfig, rngs: nnx.Rngs) -> AdaptiveRMSNorm:
+    """A norm of an expert's tokens."""
+    kinds = {"dtype": config.dtype, "param_dtype": config.param_dtype, "rngs": rngs}
+    return AdaptiveRMSNorm(size.width, **kinds)
 
 
 class LanguageExpert(Expert):

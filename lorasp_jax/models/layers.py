@@ -26,6 +26,12 @@ LayerAux = dict[str, Aux]
 Block = TypeVar("Block", bound=nnx.Module)
 
 
+def normalized(x: jax.Array, eps: float) -> jax.Array:
+    """x / sqrt(mean(x^2) + eps) over the last axis, in fp32."""
+    wide = x.astype(jnp.float32)
+    return wide * jax.lax.rsqrt(jnp.mean(jnp.square(wide), axis=-1, keepdims=True) + eps)
+
+
 class RMSNorm(nnx.Module):
     """x / sqrt(mean(x^2) + eps) * (offset + scale) in fp32, back in the type of x.
 
@@ -46,10 +52,38 @@ class RMSNorm(nnx.Module):
 
     def __call__(self, x: jax.Array) -> jax.Array:
         """x `[..., D]`."""
-        wide = x.astype(jnp.float32)
-        inverse = jax.lax.rsqrt(jnp.mean(jnp.square(wide), axis=-1, keepdims=True) + self.eps)
         factor = self.offset + self.scale.get_value().astype(jnp.float32)
-        return (wide * inverse * factor).astype(x.dtype)
+        return (normalized(x, self.eps) * factor).astype(x.dtype)
+
+
+class AdaptiveRMSNorm(nnx.Module):
+    """RMSNorm with a factor, an offset and a gate from a condition, as pi0.5 has them ("adaRMS").
+
+        y = x / sqrt(mean(x^2) + eps) * (1 + scale) + shift
+        scale, shift, gate = split(dense(condition))
+
+    The gate multiplies the residual branch that reads y. The dense layer starts at zero, and so
+    do the branches (openpi, models/gemma.py).
+    """
+
+    def __init__(self, width: int, *, dtype: Any, param_dtype: Any, rngs: nnx.Rngs) -> None:
+        kinds = {"dtype": dtype, "param_dtype": param_dtype, "rngs": rngs}
+        self.dense = Dense(width, 3 * width, kernel_init=nnx.initializers.zeros, **kinds)
+        self.eps = 1e-6
+
+    def __call__(self, x: jax.Array, modulation: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """y and the gate.
+
+        Args:
+            x: `[B, T, D]`.
+            modulation: `[B, 1, 3 D]`, what `dense` made of the condition.
+
+        Returns:
+            `[B, T, D]` and `[B, 1, D]`, in the type of x.
+        """
+        scale, shift, gate = jnp.split(modulation.astype(jnp.float32), 3, axis=-1)
+        y = normalized(x, self.eps) * (1 + scale) + shift
+        return y.astype(x.dtype), gate.astype(x.dtype)
 
 
 class LayerNorm(nnx.Module):
@@ -97,6 +131,19 @@ class Linears:
         found = dense_together(inputs[0], [layer.arrays() for layer in layers], token_mask=mask)
         self.aux |= {name: aux for name, (_, aux) in zip(names, found, strict=True)}
         return [y for y, _ in found]
+
+    def norm(self, name: str, x: jax.Array, condition: jax.Array | None) -> tuple[jax.Array, Any]:
+        """y of the norm `name` for x `[B, T, D]`, and what multiplies the branch that reads it.
+
+        An adaptive norm reads a condition `[B, 1, D]` and has a gate `[B, 1, D]`; others have 1.
+        """
+        norm = getattr(self._module, name)
+        if condition is None:
+            return norm(x), 1
+        every = jnp.ones(condition.shape[:2], bool)
+        modulation, aux = norm.dense(condition, token_mask=every, return_aux=True)
+        self.aux[f"{name}/dense"] = aux
+        return norm(x, modulation)
 
 
 def stack(make: Callable[[nnx.Rngs], Block], depth: int, rngs: nnx.Rngs) -> Block:

@@ -36,6 +36,7 @@ from lorasp_jax.models.checkpoint import (
     set_arrays,
     weight_files,
 )
+from lorasp_jax.models.pi0 import openpi_lora
 
 _READ_AHEAD = 1  # GB that Orbax reads at once, beside the result
 _PREFIX = "model."  # of all tensors in a LeRobot policy's file
@@ -49,7 +50,8 @@ def load(folder: Path, config: Any) -> tuple[Any, list[str]]:
         config: sizes of the model, and the type to store its parameters in.
 
     Returns:
-        The model, and the names of tensors in the files that no computation reads.
+        The model, with adapters if openpi trained LoRA; and the names of tensors in the files that
+        no computation reads.
 
     Raises:
         ValueError: neither layout; damaged files; leaves missing, left over or of other shapes.
@@ -64,6 +66,7 @@ def load(folder: Path, config: Any) -> tuple[Any, list[str]]:
         unused = [name for name in weights.UNUSED if name in theirs]
         for name in unused:
             del theirs[name]
+    lora = openpi_lora.taken(theirs) if layout == "openpi" else {}
     model = nnx.eval_shape(lambda: config.create(nnx.Rngs(0)))
     dtypes = {name: leaf.dtype for name, leaf in named_arrays(model).items()}
 
@@ -72,7 +75,8 @@ def load(folder: Path, config: Any) -> tuple[Any, list[str]]:
 
     rules = weights.LAYOUTS[layout](config)
     arrays = layouts.read(rules, theirs, f"{folder} (layout {layout})", place)
-    return set_arrays(model, arrays), unused
+    model = set_arrays(model, arrays)
+    return openpi_lora.adapted(model, lora) if lora else model, unused
 
 
 def save(folder: Path, model: Any, layout: str, dtypes: Mapping[str, Any] | None = None) -> None:

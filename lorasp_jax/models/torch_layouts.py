@@ -45,16 +45,19 @@ def siglip(theirs: str, size: VisionConfig) -> list[Rule]:
     return rules
 
 
-def decoder(ours: str, theirs: str, layers: Iterable[int]) -> list[Rule]:
-    """Some layers of a Llama or Gemma as our stack `ours`."""
+def decoder(ours: str, theirs: str, layers: Iterable[int], *, adaptive: bool = False) -> list[Rule]:
+    """Some layers of a Llama or Gemma as our stack `ours`, perhaps with pi0.5's adaptive norms."""
     paths = [f"{theirs}.layers.{i}" for i in layers]
     attention = (f"self_attn.{name}_proj" for name in "qkvo")
     kernels = (*attention, "mlp.gate_proj", "mlp.up_proj", "mlp.down_proj")
-    norms = ("input_layernorm", "post_attention_layernorm")
-    return [
-        *(_weights(ours, paths, name) for name in kernels),
-        *(_scales(ours, paths, name) for name in norms),
-    ]
+    rules = [_weights(ours, paths, name) for name in kernels]
+    for name in ("input_layernorm", "post_attention_layernorm"):
+        if adaptive:
+            inside = [f"{path}.{name}" for path in paths]
+            rules += [each(f"{ours}/{name}", inside, "dense") for each in (_weights, _biases)]
+        else:
+            rules.append(_scales(ours, paths, name))
+    return rules
 
 
 def _patches(ours: str, theirs: str, patch: int) -> Rule:

@@ -16,6 +16,7 @@ from flax import nnx
 from lorasp_jax import adaptation
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Batch
+from lorasp_jax.models import presets
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.models.observation import abstract_observation
@@ -87,7 +88,7 @@ def expected(config: Config, wanted: BackboneConfig) -> Memory:
         wanted: the backbone's config.
     """
     method = config.peft.as_saved
-    rules = [(path, method) for path in config.targets]
+    rules = presets.rules(config.targets, method)
     model: Backbone = nnx.eval_shape(
         lambda: adaptation.adapt(wanted.create(nnx.Rngs(0)), rules, rngs=nnx.Rngs(1))
     )

@@ -16,11 +16,11 @@ from rich.progress import TaskID
 
 import envs
 from envs.episodes import Episodes
-from lorasp_jax import adaptation, calibration, models, peft
+from lorasp_jax import adaptation, calibration, models, peft, tables
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Batch, flatten, sample_batch
 from lorasp_jax.data.demonstrations import demonstrations
-from lorasp_jax.models import backbone, tokenizer
+from lorasp_jax.models import backbone, presets, tokenizer
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.models.policy import Policy
@@ -63,10 +63,9 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
     remat, memory = preflight.choose_remat(config, base.config, preflight.available_bytes())
     base = _with_remat(base, remat)
     model = _adapted(config, base, config.peft.as_saved)
-    counts = adaptation.count(model)
     console.print(
         f"scale {config.scale}: {type(config.peft).__name__} on {config.model.backbone} "
-        f"{config.model.size}, {counts.trainable:,} of {counts.total:,} parameters train"
+        f"{config.model.size}, {tables.trained_share(model)}"
     )
     console.print(f"memory by device in GiB: {memory}; rematerialisation: {remat}")
     run = Run(config, folder, console, base_hash, started)
@@ -88,7 +87,7 @@ def _adapted(
 ) -> Backbone:
     """The model with the method on the run's targets, from the run's key."""
     rngs = nnx.Rngs(jax.random.fold_in(jax.random.key(config.seed), 3))
-    rules = [(path, method) for path in config.targets]
+    rules = presets.rules(config.targets, method)
     return adaptation.adapt(model, rules, rngs=rngs, statistics=statistics)
 
 
@@ -107,7 +106,7 @@ def input_moments(run: Run, model: Backbone, processor: Processor) -> dict[str, 
         return model.loss(key, batch.observation, batch.actions, action_mask=batch.action_mask)
 
     keys = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 5), STATISTICS_BATCHES)
-    pattern = "|".join(f"(?:{path})" for path in config.targets)
+    pattern = "|".join(f"(?:{path})" for path in presets.patterns(config.targets))
     batches = ((key, draw(key)) for key in keys)
     return calibration.input_moments(model, batches, pattern, forward)
 

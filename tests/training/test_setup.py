@@ -34,6 +34,17 @@ def config(monkeypatch):
     return override(config, ["--peft.initialization", "eva"])
 
 
+def test_targets_of_the_command_line_can_be_presets(config, tmp_path):
+    plain = override(
+        config, ["--targets", "language", "^vision/head", "--peft.initialization", "kaiming"]
+    )
+    printed = io.StringIO()
+    run = setup.prepare(plain, tmp_path, Console(file=printed, width=200), time.perf_counter())
+    found = adaptation.methods(run.policy.model)
+    assert {path.rpartition("/")[0] for path in found} == {"language/blocks", "vision"}
+    assert "; the others are frozen, all of action, action_in_proj," in printed.getvalue()
+
+
 def test_eva_of_the_command_line_sees_the_demonstrations(config, tmp_path):
     run = setup.prepare(config, tmp_path, Console(file=io.StringIO()), time.perf_counter())
     found = adaptation.methods(run.policy.model)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,13 +16,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Pi0Config(BackboneConfig):
-    """Every size of a pi0."""
+    """Every size of a pi0, or of a pi0.5."""
+
+    pi05: bool = False
+    """pi0.5: the flow time reaches the action expert through its norms, not through the tokens, and
+    there is no token of the state, which the prompt tells instead."""
 
     def create(self, rngs: nnx.Rngs) -> Pi0:
         """A model with random weights; works under `nnx.eval_shape`."""
-        from lorasp_jax.models.pi0.pi0 import Pi0
+        from lorasp_jax.models.pi0.pi0 import Pi0, Pi05
 
-        return Pi0(self, rngs=rngs)
+        return (Pi05 if self.pi05 else Pi0)(self, rngs=rngs)
 
     @classmethod
     def base(cls) -> Pi0Config:
@@ -38,6 +43,11 @@ class Pi0Config(BackboneConfig):
             action_dim=32,
             dtype="bfloat16",
         )
+
+    @classmethod
+    def base_pi05(cls) -> Pi0Config:
+        """The published pi0.5, 3,353,433,872 parameters (openpi, models/pi0_config.py)."""
+        return dataclasses.replace(cls.base(), pi05=True, max_tokens=200)
 
     @classmethod
     def small(cls) -> Pi0Config:

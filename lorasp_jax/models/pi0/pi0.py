@@ -2,6 +2,9 @@
 
 Tokens fall into three blocks: [pictures, instruction], [state], [noisy actions]; each sees itself
 and the blocks before it. The first is the prefix, the other two the suffix of the action expert.
+
+pi0.5 (arXiv 2504.16054) has no block [state], its prompt tells the state; and the flow time is not
+mixed into the actions' tokens but conditions the action expert's norms.
 """
 
 from typing import NamedTuple
@@ -12,8 +15,8 @@ import numpy as np
 from flax import nnx
 
 from lorasp_jax.models.backbone import Backbone, ModelAux, action_tokens, suffix_view
-from lorasp_jax.models.experts import Expert, KeysValues, LanguageExpert
-from lorasp_jax.models.layers import LayerAux, Linears, block_mask, positions
+from lorasp_jax.models.experts import AdaptiveExpert, Expert, KeysValues, LanguageExpert
+from lorasp_jax.models.layers import LayerAux, Linears, block_mask, positions, time_embedding
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.pi0.config import Pi0Config
 from lorasp_jax.models.siglip import SigLIP
@@ -37,12 +40,13 @@ class Pi0(Backbone):
     """pi0 of any size."""
 
     config: Pi0Config
+    make_expert = Expert
 
     def __init__(self, config: Pi0Config, *, rngs: nnx.Rngs) -> None:
         self.config = config
         self.vision = SigLIP(config, rngs=rngs)
         self.language = LanguageExpert(config.language, config, rngs=rngs)
-        self.action = Expert(config.action, config, rngs=rngs)
+        self.action = self.make_expert(config.action, config, rngs=rngs)
         self._make_projections(config.action.width, rngs)
 
     def embed_prefix(self, obs: Observation) -> tuple[jax.Array, jax.Array, ModelAux]:
@@ -103,10 +107,67 @@ class Pi0(Backbone):
         if action_valid is None:
             action_valid = jnp.ones((batch, chunk), bool)
         tokens, aux = self.embed_suffix(obs, x_t, flow_time, action_valid)
-        block = np.array([1] + [2] * chunk)
+        condition, time_aux = self.condition(flow_time)
+        states = tokens.shape[1] - chunk
+        block = np.array([1] * states + [2] * chunk)
         mask, position = suffix_view(prefix.valid, np.zeros(prefix.valid.shape[1], int), block)
-        counted = jnp.concatenate([jnp.ones((batch, 1), bool), action_valid], axis=1)
-        out, _, expert_aux = self.action(tokens, position, mask, prefix.cache, token_mask=counted)
+        counted = jnp.concatenate([jnp.ones((batch, states), bool), action_valid], axis=1)
+        out, _, expert_aux = self.action(
+            tokens, position, mask, prefix.cache, token_mask=counted, condition=condition
+        )
         linear = Linears(self, action_valid)
         v_t = linear("action_out_proj", out[:, -chunk:].astype(jnp.float32))
-        return v_t, {**expert_aux, **aux, **linear.aux}
+        return v_t, {**expert_aux, **aux, **time_aux, **linear.aux}
+
+    def condition(self, flow_time: jax.Array) -> tuple[jax.Array | None, LayerAux]:
+        """What the action expert's norms follow at `[B]` times, none here; adapters' reports."""
+        del flow_time
+        return None, {}
+
+
+class Pi05(Pi0):
+    """pi0.5 of any size."""
+
+    make_expert = AdaptiveExpert
+
+    def _make_projections(self, state_width: int, rngs: nnx.Rngs) -> None:
+        """The linear maps around the towers: of noisy actions, their time and velocity."""
+        del state_width
+        width, dim = self.config.action.width, self.config.action_dim
+        sizes = {
+            "action_in_proj": (dim, width),
+            "time_mlp_in": (width, width),
+            "time_mlp_out": (width, width),
+            "action_out_proj": (width, dim),
+        }
+        self._make_linears(sizes, rngs)
+
+    def embed_suffix(
+        self,
+        obs: Observation,
+        x_t: jax.Array,
+        flow_time: jax.Array,
+        action_valid: jax.Array | None = None,
+    ) -> tuple[jax.Array, LayerAux]:
+        """Tokens of the noisy actions.
+
+        Args:
+            obs: not read, the prompt tells the state.
+            x_t: `[B, C, A]`.
+            flow_time: not read, see `condition`.
+            action_valid: `[B, C]` bool, what the adapters count; None counts all.
+
+        Returns:
+            `[B, C, D]` f32, and the adapters' reports.
+        """
+        del obs, flow_time
+        linear = Linears(self, action_valid)
+        return linear("action_in_proj", x_t.astype(jnp.float32)), linear.aux
+
+    def condition(self, flow_time: jax.Array) -> tuple[jax.Array, LayerAux]:
+        """What the action expert's norms follow at `[B]` times, `[B, 1, D]` f32, and reports."""
+        linear = Linears(self, jnp.ones((flow_time.shape[0], 1), bool))
+        h = time_embedding(flow_time, self.config.action.width)[:, None]
+        for name in ("time_mlp_in", "time_mlp_out"):
+            h = jax.nn.silu(linear(name, h))
+        return h, linear.aux

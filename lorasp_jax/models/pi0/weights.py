@@ -17,6 +17,7 @@ _PALIGEMMA = "paligemma_with_expert.paligemma"
 _EXPERT = "paligemma_with_expert.gemma_expert"
 _VISION = f"{_PALIGEMMA}.model.vision_tower.vision_model"
 _LANGUAGE = f"{_PALIGEMMA}.model.language_model"
+_PROJECTIONS05 = ("action_in_proj", "time_mlp_in", "time_mlp_out", "action_out_proj")
 UNUSED = (f"{_PALIGEMMA}.lm_head.weight", f"{_EXPERT}.lm_head.weight")
 """LeRobot's heads, which no computation reads."""
 TIED = {UNUSED[0]: f"{_LANGUAGE}.embed_tokens.weight"}
@@ -31,7 +32,8 @@ def openpi_layout(config: Pi0Config) -> list[Rule]:
     ]
     for tower, size, suffix in (("language", config.language, ""), ("action", config.action, "_1")):
         rules += _openpi_expert(tower, size, suffix)
-    for name in PROJECTIONS:
+        rules += _openpi_norms(tower, suffix, adaptive=config.pi05 and tower == "action")
+    for name in _PROJECTIONS05 if config.pi05 else PROJECTIONS:
         rules += [copied(f"{name}/{leaf}", f"{name}/{leaf}") for leaf in ("kernel", "bias")]
     return rules
 
@@ -110,9 +112,23 @@ def _openpi_expert(tower: str, size: ExpertConfig, suffix: str) -> list[Rule]:
             out,
         ),
         copied(kernel("down_proj"), f"{layers}/mlp{suffix}/linear"),
-        copied(f"{ours}/input_layernorm/scale", f"{layers}/pre_attention_norm{suffix}/scale"),
-        copied(f"{ours}/post_attention_layernorm/scale", f"{layers}/pre_ffw_norm{suffix}/scale"),
-        copied(f"{tower}/norm/scale", f"{_LLM}/final_norm{suffix}/scale"),
+    ]
+
+
+def _openpi_norms(tower: str, suffix: str, *, adaptive: bool) -> list[Rule]:
+    """Norms of one expert; pi0.5's for actions have a dense layer each and no scale."""
+    names = {
+        f"{tower}/blocks/input_layernorm": f"{_LLM}/layers/pre_attention_norm{suffix}",
+        f"{tower}/blocks/post_attention_layernorm": f"{_LLM}/layers/pre_ffw_norm{suffix}",
+        f"{tower}/norm": f"{_LLM}/final_norm{suffix}",
+    }
+    leaves = {"scale": "scale"}
+    if adaptive:
+        leaves = {"dense/kernel": "Dense_0/kernel", "dense/bias": "Dense_0/bias"}
+    return [
+        copied(f"{ours}/{leaf}", f"{theirs}/{twin}")
+        for ours, theirs in names.items()
+        for leaf, twin in leaves.items()
     ]
 
 
@@ -145,16 +161,21 @@ def canonical_name(name: str) -> str:
 
 
 def lerobot_layout(config: Pi0Config) -> list[Rule]:
-    """LeRobot's tensors by name without the leading "model." (policies/pi0/modeling_pi0.py)."""
+    """LeRobot's tensors by name without the leading "model." (its policies/pi0 and pi05)."""
     rules = [
         *siglip(_VISION, config.vision),
         *linear("vision/head", f"{_PALIGEMMA}.model.multi_modal_projector.linear"),
         copied("language/embedding", f"{_LANGUAGE}.embed_tokens.weight"),
     ]
     for tower, theirs in (("language", _LANGUAGE), ("action", f"{_EXPERT}.model")):
-        rules += decoder(f"{tower}/blocks", theirs, range(config.language.depth))
-        rules.append(copied(f"{tower}/norm/scale", f"{theirs}.norm.weight"))
-    for name in PROJECTIONS:
+        adaptive = config.pi05 and tower == "action"
+        layers = range(config.language.depth)
+        rules += decoder(f"{tower}/blocks", theirs, layers, adaptive=adaptive)
+        if adaptive:
+            rules += linear(f"{tower}/norm/dense", f"{theirs}.norm.dense")
+        else:
+            rules.append(copied(f"{tower}/norm/scale", f"{theirs}.norm.weight"))
+    for name in _PROJECTIONS05 if config.pi05 else PROJECTIONS:
         rules += linear(name, name)
     return rules
 

@@ -1,0 +1,116 @@
+"""openpi's LoRA against the einsums that its models/lora.py writes down."""
+
+import flax.traverse_util
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+import pytest
+from flax import nnx
+
+from lorasp_jax.models import layouts, published
+from lorasp_jax.models.checkpoint import base_arrays
+from lorasp_jax.models.pi0 import Pi0Config, openpi_lora, weights
+from tests.models.drawn import drawn
+
+CONFIG = Pi0Config.dummy()
+SCALE = 0.5
+"""alpha / rank, which the MLP ignores."""
+LAYERS = "PaliGemma/llm/layers"
+RANK = {"": 3, "_1": 2}
+BATCH, TOKENS = 2, 3
+
+
+@pytest.fixture(scope="module")
+def model():
+    return drawn(CONFIG)
+
+
+@pytest.fixture(scope="module")
+def leaves():
+    """LoRA of both experts, in openpi's shapes."""
+    rng, found = np.random.default_rng(1), {}
+    for size, suffix in ((CONFIG.language, ""), (CONFIG.action, "_1")):
+        kernels = {
+            f"attn/q_einsum{suffix}/": (size.heads, size.width, size.head_dim),
+            f"attn/kv_einsum{suffix}/": (2, size.kv_heads, size.width, size.head_dim),
+            f"attn/attn_vec_einsum{suffix}/": (size.heads, size.head_dim, size.width),
+            f"mlp{suffix}/gating_einsum_": (2, size.width, size.mlp),
+            f"mlp{suffix}/linear_": (size.mlp, size.width),
+        }
+        for name, (*outer, d_in, d_out) in kernels.items():
+            for side, shape in (("a", (d_in, RANK[suffix])), ("b", (RANK[suffix], d_out))):
+                drawn = rng.normal(size=(size.depth, *outer, *shape)).astype(np.float32)
+                found[f"{LAYERS}/{name}lora_{side}"] = drawn
+    return found
+
+
+@pytest.mark.parametrize(("tower", "suffix"), [("language", ""), ("action", "_1")])
+def test_the_layers_compute_openpis_einsums(model, leaves, tower, suffix):
+    adapted = openpi_lora.adapted(model, leaves, scale=SCALE)
+    size, layer = getattr(CONFIG, tower), 1
+    rng = np.random.default_rng(2)
+
+    def pair(name):
+        return (leaves[f"{LAYERS}/{name}lora_{side}"][layer] for side in "ab")
+
+    def delta(name, x):
+        """What our layer adds to x W."""
+        dense = getattr(getattr(adapted, tower).blocks, name)
+        one = {key: leaf[layer] for key, leaf in dense.adapter.get_value().items()}
+        return dense.method.delta(one, jnp.asarray(x, jnp.float32))[0]
+
+    def close(found, wanted):
+        np.testing.assert_allclose(found, wanted.reshape(found.shape), rtol=1e-4, atol=1e-4)
+
+    x = rng.normal(size=(BATCH, TOKENS, size.width))
+    a, b = pair(f"attn/q_einsum{suffix}/")
+    inner = np.einsum("BTD,NDL->BTNL", x, a)
+    close(delta("q_proj", x), SCALE * np.einsum("BTNL,NLH->BTNH", inner, b))
+    a, b = pair(f"attn/kv_einsum{suffix}/")
+    inner = np.einsum("BSD,zKDL->zBSKL", x, a)
+    k, v = SCALE * np.einsum("zBSKL,zKLH->zBSKH", inner, b)
+    close(delta("k_proj", x), k)
+    close(delta("v_proj", x), v)
+    a, b = pair(f"mlp{suffix}/gating_einsum_")
+    close(delta("gate_proj", x), x @ a[0] @ b[0])
+    close(delta("up_proj", x), x @ a[1] @ b[1])
+
+    x = rng.normal(size=(BATCH, TOKENS, size.heads, size.head_dim))
+    a, b = pair(f"attn/attn_vec_einsum{suffix}/")
+    inner = np.einsum("BTNH,NHL->BTL", x, a)
+    close(
+        delta("o_proj", x.reshape(BATCH, TOKENS, -1)), SCALE * np.einsum("BTL,NLD->BTD", inner, b)
+    )
+    x = rng.normal(size=(BATCH, TOKENS, size.mlp))
+    a, b = pair(f"mlp{suffix}/linear_")
+    close(delta("down_proj", x), x @ a @ b)
+
+
+def test_a_checkpoint_with_lora_is_loaded(model, leaves, tmp_path):
+    """As openpi saves one: base and LoRA in one tree. One expert may have none."""
+    one = {name: leaf for name, leaf in leaves.items() if "_1" not in name}
+    base = layouts.write(weights.openpi_layout(CONFIG), base_arrays(model))
+    tree = flax.traverse_util.unflatten_dict({**base, **one}, sep="/")
+    ocp.PyTreeCheckpointer().save(tmp_path / "params", {"params": tree})
+    found, unused = published.load(tmp_path, CONFIG)
+    assert unused == []
+    wanted = openpi_lora.adapted(model, one)
+    assert wanted.action.blocks.q_proj.adapter is None
+    found, wanted = (nnx.to_flat_state(nnx.state(m, nnx.Param)) for m in (found, wanted))
+    for (path, leaf), (other, expected) in zip(found, wanted, strict=True):
+        assert path == other
+        for key, array in leaf.get_value().items() if path[-1] == "adapter" else [("", leaf[...])]:
+            whole = expected.get_value()
+            np.testing.assert_array_equal(array, whole[key] if key else whole)
+
+
+def test_what_does_not_fit_is_named(model, leaves):
+    missing = f"{LAYERS}/mlp_1/linear_lora_b"
+    less = {name: leaf for name, leaf in leaves.items() if name != missing}
+    with pytest.raises(ValueError, match=f"lacks {missing}"):
+        openpi_lora.adapted(model, less)
+    with pytest.raises(ValueError, match="no leaves state_proj/lora_a"):
+        openpi_lora.adapted(model, {**leaves, "state_proj/lora_a": np.zeros(1)})
+    wide = {**leaves, f"{LAYERS}/mlp/linear_lora_a": np.zeros((2, 7, 3), np.float32)}
+    with pytest.raises(ValueError, match="does not fit language/blocks/down_proj"):
+        openpi_lora.adapted(model, wide)

@@ -1,0 +1,107 @@
+"""Presets: which layers of both backbones they name, and what trains then."""
+
+import dataclasses
+import re
+
+import pytest
+from flax import nnx
+
+import lorasp_jax
+from lorasp_jax import adaptation, paths, tables
+from lorasp_jax.models import pi0, presets, smolvla
+from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP
+
+EXPERT = {f"{name}_proj" for name in ("q", "k", "v", "o", "gate", "up", "down")}
+BLOCK = {"q_proj", "k_proj", "v_proj", "out_proj", "fc1", "fc2"}
+AROUND = {
+    *(f"{name}_proj" for name in ("state", "action_in", "action_out")),
+    *(f"action_time_mlp_{name}" for name in ("in", "out")),
+}
+VISION = {"vision/head", *(f"vision/blocks/{name}" for name in BLOCK)}
+PATCH = {"vision/patch_embed"}
+LANGUAGE = {f"language/blocks/{name}" for name in EXPERT}
+ACTION = {
+    pi0: {f"action/blocks/{name}" for name in EXPERT},
+    smolvla: {f"action/blocks/{kind}_layer/{n}" for kind in ("self", "cross") for n in EXPERT},
+}
+
+
+def adapted(config, targets, method):
+    rules = presets.rules(targets, method)
+    return nnx.eval_shape(
+        lambda: lorasp_jax.adapt(config.create(nnx.Rngs(0)), rules, rngs=nnx.Rngs(1))
+    )
+
+
+@pytest.mark.parametrize("backbone", [pi0, smolvla], ids=["pi0", "smolvla"])
+def test_layers_of_each_preset(backbone):
+    """Scanned layers included; every preset is in the table."""
+    action = ACTION[backbone]
+    wanted = {
+        "paper": VISION | LANGUAGE | action | AROUND,
+        "all-linear": PATCH | VISION | LANGUAGE | action | AROUND,
+        "openpi": LANGUAGE | action,
+        "expert-only": action | AROUND,
+        "vision": PATCH | VISION,
+        "language": LANGUAGE,
+        "action": action,
+    }
+    assert wanted.keys() == presets.PRESETS.keys()
+    holder = nnx.List([nnx.eval_shape(lambda: backbone.Config.dummy().create(nnx.Rngs(0)))])
+    layers = {place.path for place in paths.layer_places(holder)}
+    for name, layer_paths in wanted.items():
+        rules = presets.patterns(name)
+        assert {p for p in layers if any(re.search(rule, p) for rule in rules)} == layer_paths, name
+    model = adapted(backbone.Config.dummy(), ["vision", "k_proj$"], LoRASP(rank=4))
+    keys = {path for path in layers if path.endswith("/k_proj")}
+    assert adaptation.methods(model).keys() == PATCH | VISION | keys
+
+
+def test_adaptive_norms_are_of_the_expert_and_not_openpis():
+    config = dataclasses.replace(pi0.Config.dummy(), pi05=True)
+    found = {
+        name: adaptation.methods(adapted(config, name, LoRA(rank=2))).keys()
+        for name in ("openpi", "action")
+    }
+    assert found["openpi"] == LANGUAGE | ACTION[pi0]
+    norms = ("blocks/input_layernorm", "blocks/post_attention_layernorm", "norm")
+    assert found["action"] == ACTION[pi0] | {f"action/{name}/dense" for name in norms}
+
+
+@pytest.mark.parametrize(
+    ("config", "adapters", "base", "share"),
+    [
+        (pi0.Config.base(), 2_213_824 * 128, 3_238_048_528, "8.05%"),
+        (smolvla.Config.base(), 670_096 * 128, 450_046_176, "16.01%"),
+    ],
+    ids=["pi0", "smolvla"],
+)
+def test_share_of_the_published_sizes(config, adapters, base, share):
+    """Sum of I + O over all linear layers but the lm_heads, times the rank."""
+    model = adapted(config, "paper", LoRA(rank=128))
+    line = tables.trained_share(model)
+    assert line.startswith(
+        f"{share} of all parameters train, {adapters:,} of {adapters + base:,}; the others are"
+    )
+
+
+def test_what_is_frozen_is_said():
+    """LeRobot's `train_expert_only` frees as many parameters; no adapter, nothing trains."""
+    config = smolvla.Config.base()
+    model = adapted(config, "expert-only", FullFineTuning())
+    assert adaptation.count(model).trainable == 99_880_992
+    line = "22.19% of all parameters train, 99,880,992 of 450,046,176; the others are frozen, all "
+    assert tables.trained_share(model) == f"{line}of language, vision among them"
+    dummy = smolvla.Config.dummy()
+    line = tables.trained_share(adapted(dummy, "all-linear", LoRA(rank=2)))
+    assert line.endswith("; the others are frozen")
+    line = tables.trained_share(adapted(dummy, ".*", FullFineTuning()))
+    assert line.startswith("100.00%")
+    assert line.endswith("; nothing is frozen")
+    bare = nnx.eval_shape(lambda: dummy.create(nnx.Rngs(0)))
+    assert tables.trained_share(bare).startswith("0.00% of all parameters train, 0 of ")
+
+
+def test_a_wrong_name():
+    with pytest.raises(ValueError, match=r"no preset 'expert-onyl': it is one of paper, all-lin"):
+        presets.rules(["q_proj", "expert-onyl"], LoRA())
