@@ -110,13 +110,13 @@ def load(folder: Folder, config: Any = None) -> Any:
     if type(config) is not type(stored) or _sizes(config) != _sizes(stored):
         raise ValueError(f"{folder} does not fit the model: {_difference(stored, config)}.")
     arrays = TensorFiles(weight_files(folder))
+    if _hash(arrays) != description["sha256"]:  # before the model needs the memory
+        raise ValueError(f"{folder} is damaged: the weights do not have the hash in {CONFIG}.")
     model = nnx.eval_shape(lambda: config.create(nnx.Rngs(0)))
     try:
         model = set_arrays(model, arrays)
     except ValueError as error:
         raise ValueError(f"{folder} does not fit its {CONFIG}: {error}") from error
-    if _hash(arrays) != description["sha256"]:
-        raise ValueError(f"{folder} is damaged: the weights do not have the hash in {CONFIG}.")
     return model
 
 
@@ -153,6 +153,7 @@ def set_arrays(model: Model, arrays: Mapping[str, Any]) -> Model:
         if array.shape != leaf.shape:
             raise ValueError(f"{name} has shape {array.shape}, the model needs {leaf.shape}.")
         values.append(jnp.asarray(array, leaf.dtype))
+        del array  # or it would stay beside the next one
     graphdef, parameters, rest = nnx.split(model, nnx.Param, ...)
     parameters = jax.tree.unflatten(jax.tree.structure(parameters), values)
     return nnx.merge(graphdef, parameters, rest)
@@ -192,6 +193,7 @@ def _hash(arrays: Mapping[str, Any]) -> str:
         values = np.asarray(arrays[name]).astype(np.float32)
         digest.update(f"{name}{values.shape}".encode())
         digest.update(np.ascontiguousarray(values).data)
+        del values  # or it would stay beside the next one
     return digest.hexdigest()
 
 

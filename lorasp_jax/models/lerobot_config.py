@@ -1,18 +1,16 @@
 """LeRobot's config.json of a policy as a backbone's config.
 
-It says little of the towers' sizes, which are those of the published models, and names them where
-they vary (policies/{pi0,smolvla}/configuration_*.py of LeRobot 0.6).
+The package of a backbone has a module `lerobot` with `TYPES`: a policy's type -> function of the
+file's fields that gives a config with the towers' sizes. What all policies share is read here.
 """
 
 import dataclasses
-import math
+import importlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from lorasp_jax.models import backbone
 from lorasp_jax.models.config import BackboneConfig
-from lorasp_jax.models.inputs import LEROBOT_CENTRED
-from lorasp_jax.models.pi0.config import Pi0Config
-from lorasp_jax.models.smolvla.config import SmolVLAConfig
 
 Fields = Mapping[str, Any]
 _IMAGES = ("observation.images.", "observation.")
@@ -23,14 +21,7 @@ _MODES = {
     "IDENTITY": "identity",
 }
 # What this project's backbones do, and LeRobot's may do otherwise.
-_FIXED: Fields = {
-    "min_period": 4e-3,
-    "max_period": 4.0,
-    "attention_mode": "cross_attn",
-    "self_attn_every_n_layers": 2,
-    "add_image_special_tokens": False,
-    "adapt_to_pi_aloha": False,
-}
+_FIXED: Fields = {"min_period": 4e-3, "max_period": 4.0, "adapt_to_pi_aloha": False}
 
 
 def config_of(fields: Fields) -> BackboneConfig:
@@ -40,19 +31,27 @@ def config_of(fields: Fields) -> BackboneConfig:
         fields: its config.json.
 
     Raises:
-        ValueError: a type that is not pi0 or smolvla, or something that no config here can say.
+        ValueError: a type that no backbone has, or something that no config here can say.
     """
-    kind = str(fields.get("type"))
-    if kind not in _KINDS:
-        raise ValueError(f"a policy of type {kind!r} is not one of {', '.join(_KINDS)}")
+    kind, types = str(fields.get("type")), _types()
+    if kind not in types:
+        raise ValueError(f"a policy of type {kind!r} is not one of {', '.join(types)}")
     for name, only in _FIXED.items():
         if fields.get(name, only) != only:
             raise ValueError(f"{name} must be {only!r} here, not {fields[name]!r}")
     try:
-        config = _KINDS[kind](fields)
+        config = types[kind](fields)
         return dataclasses.replace(config, **_shared(config, fields))
     except (AttributeError, KeyError, TypeError) as error:
         raise ValueError(f"it is not as LeRobot writes it ({error!r})") from error
+
+
+def _types() -> dict[str, Callable[[Fields], BackboneConfig]]:
+    found = {}
+    for name in backbone.names():
+        package = backbone.find(name).__module__.rpartition(".")[0]
+        found |= importlib.import_module(f"{package}.lerobot").TYPES
+    return found
 
 
 def _shared(config: BackboneConfig, fields: Fields) -> dict[str, Any]:
@@ -91,35 +90,3 @@ def _cameras(fields: Fields) -> tuple[str, ...]:
             found.append(key.removeprefix(prefix))
     empty = [f"empty_camera_{i}" for i in range(fields.get("empty_cameras", 0))]
     return tuple(dict.fromkeys([*found, *empty]))
-
-
-def _pi0(fields: Fields) -> Pi0Config:
-    config = Pi0Config.base()
-    sizes = {"gemma_2b": config.language, "gemma_300m": config.action}
-    return dataclasses.replace(
-        config,
-        language=sizes[fields.get("paligemma_variant", "gemma_2b")],
-        action=sizes[fields.get("action_expert_variant", "gemma_300m")],
-        inputs=LEROBOT_CENTRED,
-    )
-
-
-def _smolvla(fields: Fields) -> SmolVLAConfig:
-    config = SmolVLAConfig.base()
-    depth = fields.get("num_vlm_layers", config.language.depth)
-    if fields.get("num_expert_layers", -1) not in {-1, 0, depth}:
-        raise ValueError(f"num_expert_layers must be that of the language model, {depth}")
-    action = config.action
-    if "expert_width_multiplier" in fields:
-        width = int(config.language.width * fields["expert_width_multiplier"])
-        # Two thirds of four times the width, in whole 256s (smolvlm_with_expert.py).
-        mlp = 256 * math.ceil(4 * int(2 * width / 3) / 256)
-        action = dataclasses.replace(action, width=width, mlp=mlp)
-    return dataclasses.replace(
-        config,
-        language=dataclasses.replace(config.language, depth=depth),
-        action=dataclasses.replace(action, depth=depth),
-    )
-
-
-_KINDS: Mapping[str, Callable[[Fields], BackboneConfig]] = {"pi0": _pi0, "smolvla": _smolvla}

@@ -70,4 +70,6 @@ def _config(folder: Path, fields: dict[str, Any]) -> Any:
     try:
         return lerobot_config.config_of(fields)
     except ValueError as error:
-        raise ValueError(f"{folder / checkpoint.CONFIG} fits no backbone: {error}.") from error
+        raise ValueError(
+            f"{folder / checkpoint.CONFIG} fits no backbone: {str(error).rstrip('.')}."
+        ) from error

@@ -146,16 +146,8 @@ class Processor:
         if statistics.dim != config.action_dim:
             statistics = statistics.placed(slots, config.action_dim)
         chosen = () if cameras is None else camera_slots(config.cameras, cameras)
-        return cls(
-            slots,
-            statistics,
-            jnp.asarray(ids),
-            jnp.asarray(mask),
-            config.image_size,
-            config.inputs,
-            chosen,
-            tuple(delta),
-        )
+        table, size = (jnp.asarray(ids), jnp.asarray(mask)), config.image_size
+        return cls(slots, statistics, *table, size, config.inputs, chosen, tuple(delta))
 
     @property
     def slot_mask(self) -> np.ndarray:

@@ -12,6 +12,7 @@ little more host memory than the model itself.
 """
 
 import importlib
+import re
 from collections.abc import Callable, Mapping, MutableMapping
 from pathlib import Path
 from types import ModuleType
@@ -27,11 +28,11 @@ from flax import nnx
 
 from lorasp_jax.models import layouts
 from lorasp_jax.models.checkpoint import base_arrays, by_path, named_arrays, set_arrays
-from lorasp_jax.models.statistics_files import TENSOR as STATISTIC
 from lorasp_jax.models.tensor_files import INDEX, SINGLE, TensorFiles, weight_files
 
 _READ_AHEAD = 1  # GB that Orbax reads at once, beside the result
 _PREFIX = "model."  # of all tensors in a LeRobot policy's file
+_STATISTIC = re.compile(r"(?:un)?normalize_(?:inputs|targets|outputs)\.")  # of older policies
 _COMPILED = "_orig_mod."  # what PyTorch puts before the names of a compiled module
 
 
@@ -56,14 +57,15 @@ def load(folder: Path, config: Any) -> tuple[Any, list[str]]:
         for head, twin in weights.TIED.items():
             if head in theirs and twin not in theirs:  # as older files have it
                 theirs.rename(head, twin)
-        unused = [n for n in theirs if n in weights.UNUSED or STATISTIC.fullmatch(n)]
+        unused = [n for n in theirs if n in weights.UNUSED or _STATISTIC.match(n)]
         for name in unused:
             del theirs[name]
     model = nnx.eval_shape(lambda: config.create(nnx.Rngs(0)))
     dtypes = {name: leaf.dtype for name, leaf in named_arrays(model).items()}
 
     def place(name: str, array: np.ndarray) -> jax.Array:
-        return jnp.asarray(array, dtypes[name])
+        # Converted by numpy: JAX would hold a second copy, and return before it is gone.
+        return jnp.asarray(np.asarray(array, dtypes[name]))
 
     rules = weights.LAYOUTS[layout](config)
     arrays = layouts.read(rules, theirs, f"{folder} (layout {layout})", place)

@@ -80,7 +80,10 @@ class TokenizersFile:
     def encode(
         self, texts: Sequence[str], max_tokens: int, *, complete: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The text with a newline at its end; see `tokenizer.Tokenizer`."""
+        """The text with a newline at its end, and what the file itself puts around it, as BOS.
+
+        See `tokenizer.Tokenizer`.
+        """
         written = [text if complete else prompts.lerobot(text) for text in texts]
         rows = [encoding.ids for encoding in self._model.encode_batch(written)]
         return _padded(texts, rows, max_tokens, pad=self._pad)
