@@ -24,8 +24,11 @@ class ModelConfig:
     size: str = "nano"
     """nano for a CPU, small for one accelerator, base as published."""
     checkpoint: str = "assets/{backbone}_{size}"
-    """Where the base weights are, or empty for random ones; {backbone} and {size} stand for those
-    fields."""
+    """Where the base weights are: a folder, an id on Hugging Face's hub, a bucket; empty for random
+    ones. {backbone} and {size} stand for those fields."""
+    tokenizer: str = ""
+    """A SentencePiece .model or tokenizer.json, on this machine or the hub; empty: the offline one
+    of nano and small."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Type of the matrix products."""
     param_dtype: Literal["float32", "bfloat16"] = "float32"

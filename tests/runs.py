@@ -13,6 +13,7 @@ from rich.console import Console
 from envs.episodes import Episodes
 from lorasp_jax import adaptation
 from lorasp_jax.config import Config, ModelConfig, OptimConfig
+from lorasp_jax.models import tokenizer
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.peft import LoRASP
@@ -75,7 +76,9 @@ def make_run(folder: Path, config: Config = CONFIG) -> Run:
     )
     run = Run(config, folder, Console(file=io.StringIO()), "hash of the base")
     run.episodes = {task: random_episodes(task, i) for i, task in enumerate(config.tasks)}
-    run.policy = Policy(model, processor(list(run.episodes.values()), model.config))
+    run.policy = Policy(
+        model, processor(list(run.episodes.values()), model.config, tokenizer.Offline())
+    )
     return run
 
 

@@ -25,7 +25,7 @@ class Batch:
     Attributes:
         observation: normalised model input, leading axis B.
         actions: `[B, C, A]` normalised action chunks in the policy's slots.
-        action_mask: `[B, C, A]` bool, True inside the episode and in the robot's slots.
+        action_mask: `[B, C, A]` bool, True inside the episode and in the slots that flow.
     """
 
     observation: Observation
@@ -100,8 +100,7 @@ def sample_batch(
         "state": steps.state[start],
     }
     observation = processor.encode(raw, steps.instruction[start])
-    actions = processor.normalize_actions(steps.action[jnp.minimum(window, last)])
-    slots = processor.slot_mask  # [A]
-    noise = state_noise * jax.random.normal(noise_key, observation.state.shape) * slots
-    observation = replace(observation, state=observation.state + noise)
-    return Batch(observation, actions, (window <= last)[..., None] & slots)
+    actions = processor.normalize_actions(steps.action[jnp.minimum(window, last)], raw["state"])
+    noise = state_noise * jax.random.normal(noise_key, observation.state.shape)
+    observation = replace(observation, state=observation.state + noise * processor.slot_mask)
+    return Batch(observation, actions, (window <= last)[..., None] & processor.flow_slots)

@@ -1,7 +1,8 @@
 """Backbones, policies and what surrounds them; a backbone is a folder here, found by its name."""
 
 from lorasp_jax.models import pi0, published, smolvla
-from lorasp_jax.models.checkpoint import load, load_config, save, set_arrays, weights_hash
+from lorasp_jax.models.checkpoint import save, set_arrays, weights_hash
+from lorasp_jax.models.loading import load, load_config
 
 __all__ = [
     "load",

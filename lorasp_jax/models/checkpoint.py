@@ -16,16 +16,16 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-import safetensors
 import safetensors.numpy
 from flax import nnx
 
 from lorasp_jax.adapter_set import SetParam
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.models import backbone
+from lorasp_jax.models.tensor_files import INDEX, SINGLE, TensorFiles, weight_files
 from lorasp_jax.quantization import is_quantized
 
-CONFIG, SINGLE, INDEX = "config.json", "model.safetensors", "model.safetensors.index.json"
+CONFIG = "config.json"
 SHARD_BYTES = 15 * 2**20
 """Largest shard, its header included; a larger tensor has a shard of its own."""
 HEADER_BYTES = 2**16
@@ -109,14 +109,14 @@ def load(folder: Folder, config: Any = None) -> Any:
     config = config or stored
     if type(config) is not type(stored) or _sizes(config) != _sizes(stored):
         raise ValueError(f"{folder} does not fit the model: {_difference(stored, config)}.")
-    arrays = _read(folder)
+    arrays = TensorFiles(weight_files(folder))
+    if _hash(arrays) != description["sha256"]:  # before the model needs the memory
+        raise ValueError(f"{folder} is damaged: the weights do not have the hash in {CONFIG}.")
     model = nnx.eval_shape(lambda: config.create(nnx.Rngs(0)))
     try:
         model = set_arrays(model, arrays)
     except ValueError as error:
         raise ValueError(f"{folder} does not fit its {CONFIG}: {error}") from error
-    if _hash(arrays) != description["sha256"]:
-        raise ValueError(f"{folder} is damaged: the weights do not have the hash in {CONFIG}.")
     return model
 
 
@@ -147,13 +147,14 @@ def set_arrays(model: Model, arrays: Mapping[str, Any]) -> Model:
     ):
         if names:
             raise ValueError(f"{problem} arrays: {', '.join(sorted(names))}.")
+    values = []
     for name, leaf in expected.items():
-        if arrays[name].shape != leaf.shape:
-            raise ValueError(
-                f"{name} has shape {arrays[name].shape}, the model needs {leaf.shape}."
-            )
+        array = arrays[name]  # perhaps read at this moment, so once
+        if array.shape != leaf.shape:
+            raise ValueError(f"{name} has shape {array.shape}, the model needs {leaf.shape}.")
+        values.append(jnp.asarray(array, leaf.dtype))
+        del array  # or it would stay beside the next one
     graphdef, parameters, rest = nnx.split(model, nnx.Param, ...)
-    values = [jnp.asarray(arrays[name], leaf.dtype) for name, leaf in expected.items()]
     parameters = jax.tree.unflatten(jax.tree.structure(parameters), values)
     return nnx.merge(graphdef, parameters, rest)
 
@@ -171,7 +172,7 @@ def weights_hash(source: Folder | nnx.Module) -> str:
         return _hash(named_arrays(source, adapters=False))
     folder = pathlib.Path(source)
     _description(folder)
-    return _hash(_read(folder))
+    return _hash(TensorFiles(weight_files(folder)))
 
 
 def named_arrays(model: nnx.Module, adapters: bool = True) -> dict[str, Any]:
@@ -192,6 +193,7 @@ def _hash(arrays: Mapping[str, Any]) -> str:
         values = np.asarray(arrays[name]).astype(np.float32)
         digest.update(f"{name}{values.shape}".encode())
         digest.update(np.ascontiguousarray(values).data)
+        del values  # or it would stay beside the next one
     return digest.hexdigest()
 
 
@@ -239,31 +241,3 @@ def _config(folder: pathlib.Path, description: Mapping[str, Any]) -> Any:
         return backbone.find(description["backbone"]).from_dict(description["config"])
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{folder / CONFIG} describes no backbone of this version.") from error
-
-
-def weight_files(folder: pathlib.Path) -> list[pathlib.Path]:
-    """The one safetensors file of a folder, or the shards that its index lists.
-
-    Raises:
-        ValueError: the index is damaged.
-    """
-    try:
-        if (folder / INDEX).exists():
-            where = json.loads((folder / INDEX).read_bytes())["weight_map"]
-            return [folder / name for name in sorted(set(where.values()))]
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{folder / INDEX} is damaged.") from error
-    return [folder / SINGLE]
-
-
-def _read(folder: pathlib.Path) -> dict[str, np.ndarray]:
-    """All tensors of the folder's files."""
-    arrays: dict[str, np.ndarray] = {}
-    for file in weight_files(folder):
-        try:
-            arrays |= safetensors.numpy.load_file(file)
-        except FileNotFoundError as error:
-            raise ValueError(f"{folder} lacks {file.name}.") from error
-        except (safetensors.SafetensorError, OSError, ValueError) as error:
-            raise ValueError(f"{file} is damaged or cut short.") from error
-    return arrays

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal, Self
 
+from lorasp_jax.models.inputs import OURS, InputConfig
 from lorasp_jax.models.tokenizer import VOCABULARY_SIZE
 
 Remat = Literal["none", "products", "full"]
@@ -59,6 +60,8 @@ class BackboneConfig:
     """Actions per chunk, C."""
     action_dim: int
     """Slots of state and action vectors, A."""
+    inputs: InputConfig = OURS
+    """How pictures, states and actions are prepared."""
     dtype: str = "float32"
     """Type of the towers' matrix products; norms, softmax, projections and the loss are fp32."""
     param_dtype: str = "float32"
@@ -136,5 +139,6 @@ class BackboneConfig:
             "language": ExpertConfig(**fields["language"]),
             "action": ExpertConfig(**fields["action"]),
             "cameras": tuple(fields["cameras"]),
+            "inputs": InputConfig(**fields.get("inputs", {})),
         }
         return cls(**{**fields, **parts})

@@ -93,6 +93,7 @@ def read(
         except (ValueError, IndexError) as error:
             raise ValueError(f"{whose} has another shape of {rule.theirs[0]}: {error}.") from error
         found |= {name: place(name, a) for name, a in zip(rule.ours, ours, strict=True)}
+        del ours  # or it would stay beside what the next rule reads
     return found
 
 

@@ -49,8 +49,8 @@ class Policy:
             key,
             self.processor.encode(observation, instruction),
             num_steps=num_steps,
-            slots=self.processor.slot_mask,
+            slots=self.processor.flow_slots,
             return_aux=True,
         )
-        actions = self.processor.decode(chunk)
+        actions = self.processor.decode(chunk, observation["state"])
         return (actions, aux) if return_aux else actions

@@ -1,108 +1,86 @@
 """Between a robot and a backbone: pictures, statistics, slots, token table; both ways.
 
-State and action vectors of the backbone have fixed slots: joints from slot 0, the gripper in slot
-7, unused slots zero.
+State and action vectors of a backbone have slots. With this project's own weights they are fixed:
+joints from slot 0, the gripper in slot 7; published weights have the robot's numbers side by side.
+Unused slots are zero.
 """
 
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lorasp_jax.models.config import BackboneConfig
+from lorasp_jax.models.images import resize_with_pad, to_unit
+from lorasp_jax.models.inputs import OURS, InputConfig
+from lorasp_jax.models.normalization import normalize, unnormalize
 from lorasp_jax.models.observation import Observation
+from lorasp_jax.models.statistics import Statistics, check_slots
 
 RawObservation = Mapping[str, Any]
 """{"image": camera -> uint8 `[B, H, W, 3]`, "state": f32 `[B, J+1]`}, joints [rad], gripper [m]."""
 
-GRIPPER_SLOT = 7
-SMALLEST_STD = 1e-3
-"""Floor of the standard deviations [rad, m]: a slot that never moves (a gripper that stays open) is
-not blown up to noise."""
 
+def robot_slots(num_joints: int, inputs: InputConfig = OURS) -> tuple[int, ...]:
+    """Slot of each of J joints and of the gripper.
 
-def robot_slots(num_joints: int) -> tuple[int, ...]:
-    """Slot of each of J joints and of the gripper: PiPER (0..5, 7), Panda (0..6, 7).
+    PiPER has (0..5, 7) and Panda (0..6, 7); without a slot of the gripper's own, (0..6) and (0..7).
 
     Raises:
         ValueError: more joints than slots before the gripper's.
     """
-    if not 0 < num_joints <= GRIPPER_SLOT:
-        raise ValueError(f"a robot has 1 to {GRIPPER_SLOT} joints here, got {num_joints}.")
-    return (*range(num_joints), GRIPPER_SLOT)
+    gripper = num_joints if inputs.gripper_slot is None else inputs.gripper_slot
+    if not 0 < num_joints <= gripper:
+        raise ValueError(f"a robot has 1 to {gripper} joints here, got {num_joints}.")
+    return (*range(num_joints), gripper)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Statistics:
-    """Mean and standard deviation per slot, `[A]` f32 each; unused slots have mean 0, std 1."""
+def camera_slots(
+    cameras: Sequence[str], robot: Mapping[str, str]
+) -> tuple[tuple[str, str | None], ...]:
+    """Which of the robot's cameras each of a backbone's pictures comes from, for `Processor`.
 
-    state_mean: jax.Array
-    state_std: jax.Array
-    action_mean: jax.Array
-    action_std: jax.Array
+    Args:
+        cameras: the backbone's, `config.cameras`.
+        robot: backbone's name -> robot's name; what is not in it is missing.
 
-    @classmethod
-    def measure(
-        cls,
-        state: np.ndarray,
-        action: np.ndarray,
-        valid: np.ndarray,
-        *,
-        slots: Sequence[int],
-        dim: int,
-    ) -> "Statistics":
-        """Statistics of demonstrations.
-
-        Args:
-            state: `[..., J+1]` joints [rad] and gripper [m].
-            action: `[..., J+1]` likewise.
-            valid: `[...]` bool, False at padding.
-            slots: slot of each of the J+1 numbers.
-            dim: number of slots, A.
-
-        Raises:
-            ValueError: nothing is valid, or the slots do not match the data.
-        """
-        valid = np.asarray(valid, bool)
-        _check_slots(slots, dim, np.shape(state)[-1])
-        if not valid.any():
-            raise ValueError("statistics need at least one valid step.")
-        arrays = []
-        for values in (state, action):
-            rows = np.asarray(values, np.float64)[valid]
-            mean, std = np.zeros(dim, np.float32), np.ones(dim, np.float32)
-            mean[list(slots)] = rows.mean(axis=0)
-            std[list(slots)] = np.maximum(rows.std(axis=0), SMALLEST_STD)
-            arrays += [jnp.asarray(mean), jnp.asarray(std)]
-        return cls(*arrays)
-
-    def to_json(self) -> str:
-        """JSON object of four lists; exact in fp32."""
-        return json.dumps(
-            {f.name: np.asarray(getattr(self, f.name)).tolist() for f in fields(self)}, indent=1
+    Raises:
+        ValueError: a name that the backbone does not have, or nothing at all.
+    """
+    unknown = sorted(robot.keys() - set(cameras))
+    if unknown or not robot:
+        raise ValueError(
+            f"the backbone's cameras are {', '.join(cameras)}, one of which is needed; "
+            f"got {', '.join(unknown) or 'none'}."
         )
+    return tuple((name, robot.get(name)) for name in cameras)
 
-    @classmethod
-    def from_json(cls, text: str) -> "Statistics":
-        """What `to_json` wrote.
 
-        Raises:
-            ValueError: not such an object.
-        """
-        names = [f.name for f in fields(cls)]
-        try:
-            found = json.loads(text)
-            arrays = {name: jnp.asarray(found[name], jnp.float32) for name in names}
-        except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"statistics need lists of numbers {', '.join(names)}.") from error
-        shapes = {array.shape for array in arrays.values()}
-        if len(shapes) != 1 or len(shapes.pop()) != 1 or set(found) != set(names):
-            raise ValueError(f"statistics need lists of one length {', '.join(names)}.")
-        return cls(**arrays)
+def to_delta(actions: jax.Array, state: jax.Array, mask: Sequence[bool]) -> jax.Array:
+    """Actions relative to the state they start from (openpi, DeltaActions).
+
+    Args:
+        actions: `[..., C, J]`.
+        state: `[..., J]`.
+        mask: True where an action becomes relative, as joints do and grippers do not; may be
+            shorter than J.
+    """
+    return actions - _start(actions, state, mask)
+
+
+def to_absolute(actions: jax.Array, state: jax.Array, mask: Sequence[bool]) -> jax.Array:
+    """The inverse of `to_delta` (openpi, AbsoluteActions)."""
+    return actions + _start(actions, state, mask)
+
+
+def _start(actions: jax.Array, state: jax.Array, mask: Sequence[bool]) -> jax.Array:
+    """The state `[..., 1, J]` f32 where the mask is True, else zero."""
+    whole = np.zeros(actions.shape[-1], bool)
+    whole[: len(mask)] = mask
+    return jnp.where(whole, state, 0)[..., None, :].astype(jnp.float32)
 
 
 @jax.tree_util.register_dataclass
@@ -112,10 +90,14 @@ class Processor:
 
     Attributes:
         robot_slots: slot of each of the robot's J+1 numbers, see `robot_slots`.
-        statistics: mean and std per slot.
+        statistics: of states and actions, per slot.
         tokens: `[P, T]` int32, one row per instruction.
         token_mask: `[P, T]` bool.
         image_size: height and width of the backbone's pictures [pixels].
+        inputs: what the backbone was trained to see.
+        cameras: (backbone's camera, robot's camera or None) each, see `camera_slots`; empty: the
+            robot's cameras have the backbone's names.
+        delta: where actions are relative to the state, see `to_delta`; the statistics are theirs.
 
     Raises:
         ValueError: slots that the statistics do not have.
@@ -126,80 +108,127 @@ class Processor:
     tokens: jax.Array
     token_mask: jax.Array
     image_size: int = field(default=64, metadata={"static": True})
+    inputs: InputConfig = field(default=OURS, metadata={"static": True})
+    cameras: tuple[tuple[str, str | None], ...] = field(default=(), metadata={"static": True})
+    delta: tuple[bool, ...] = field(default=(), metadata={"static": True})
+
+    @classmethod
+    def of(
+        cls,
+        config: BackboneConfig,
+        statistics: Statistics,
+        tokens: tuple[np.ndarray, np.ndarray],
+        *,
+        num_joints: int,
+        cameras: Mapping[str, str] | None = None,
+        delta: Sequence[bool] = (),
+    ) -> "Processor":
+        """The processor that a backbone's config asks for.
+
+        Args:
+            config: sizes and inputs.
+            statistics: of the robot's numbers, in their order or already in slots.
+            tokens: ids and mask `[P, T]` of the instructions, from a tokenizer.
+            num_joints: J.
+            cameras: backbone's name -> robot's name, see `camera_slots`; None: the same names.
+            delta: see `to_delta`.
+
+        Raises:
+            ValueError: joints, statistics, cameras or token ids that do not fit the backbone.
+        """
+        ids, mask = tokens
+        if ids.max(initial=0) >= config.vocabulary:
+            raise ValueError(
+                f"token {ids.max()} is beyond the backbone's vocabulary of {config.vocabulary}: "
+                "the tokenizer is another model's."
+            )
+        slots = robot_slots(num_joints, config.inputs)
+        if statistics.dim != config.action_dim:
+            statistics = statistics.placed(slots, config.action_dim)
+        chosen = () if cameras is None else camera_slots(config.cameras, cameras)
+        table, size = (jnp.asarray(ids), jnp.asarray(mask)), config.image_size
+        return cls(slots, statistics, *table, size, config.inputs, chosen, tuple(delta))
 
     @property
     def slot_mask(self) -> np.ndarray:
         """`[A]` bool, True in the robot's slots."""
-        mask = np.zeros(self.statistics.state_mean.shape[-1], bool)
+        mask = np.zeros(self.statistics.dim, bool)
         mask[list(self.robot_slots)] = True
         return mask
 
+    @property
+    def flow_slots(self) -> np.ndarray:
+        """`[A]` bool, True in the slots that take part in the flow and its loss."""
+        return self.slot_mask | (not self.inputs.quiet_slots)
+
     def encode(self, raw: RawObservation, instruction: jax.Array) -> Observation:
-        """Raw observation to model input.
+        """Raw observation to model input; a missing camera's picture is black, with mask False.
 
         Args:
             raw: pictures of any size and the robot's state.
             instruction: `[B]` int32 rows of the token table.
 
         Raises:
-            ValueError: pictures that are not uint8 `[B, H, W, 3]`, or a state of the wrong length.
+            ValueError: pictures that are not uint8 `[B, H, W, 3]`, a camera that is not there, or a
+                state of the wrong length.
         """
-        statistics = self.statistics
-        state = self._to_slots(raw["state"], statistics.state_mean, statistics.state_std)
-        images = {name: self._image(name, image) for name, image in raw["image"].items()}
-        present = jnp.ones(state.shape[:1], bool)
+        state = self._to_slots("state", raw["state"])
+        sources = dict(self.cameras) or {name: name for name in raw["image"]}
+        absent = sorted({name for name in sources.values() if name} - set(raw["image"]))
+        if absent:
+            raise ValueError(
+                f"camera {', '.join(absent)} is not among {', '.join(raw['image']) or 'none'}."
+            )
+        black = jnp.full((len(state), self.image_size, self.image_size, 3), -1.0)
         return Observation(
-            images=images,
-            image_masks=dict.fromkeys(images, present),
+            images={
+                name: black if source is None else self._image(source, raw["image"][source])
+                for name, source in sources.items()
+            },
+            image_masks={
+                name: jnp.full(len(state), source is not None) for name, source in sources.items()
+            },
             tokens=jnp.asarray(self.tokens)[instruction],
             token_mask=jnp.asarray(self.token_mask)[instruction],
             state=state,
         )
 
-    def normalize_actions(self, actions: jax.Array) -> jax.Array:
-        """`[..., J+1]` [rad, m] -> `[..., A]` in slots, zero mean and unit variance."""
-        return self._to_slots(actions, self.statistics.action_mean, self.statistics.action_std)
+    def normalize_actions(self, actions: jax.Array, state: jax.Array | None = None) -> jax.Array:
+        """Actions as the backbone learns them.
 
-    def decode(self, actions: jax.Array) -> jax.Array:
-        """The inverse of `normalize_actions`: `[..., A]` -> `[..., J+1]` f32 [rad, m]."""
-        slots = np.array(self.robot_slots)
-        std, mean = self.statistics.action_std[slots], self.statistics.action_mean[slots]
-        return actions[..., slots].astype(jnp.float32) * std + mean
+        Args:
+            actions: `[..., C, J+1]` [rad, m].
+            state: `[..., J+1]` raw state at the chunk's start; needed where actions are relative.
 
-    def _to_slots(self, values: jax.Array, mean: jax.Array, std: jax.Array) -> jax.Array:
-        slots = np.array(self.robot_slots)
-        _check_slots(self.robot_slots, mean.shape[-1], values.shape[-1])
-        scaled = (values.astype(jnp.float32) - mean[slots]) / std[slots]
-        return jnp.zeros((*values.shape[:-1], *mean.shape)).at[..., slots].set(scaled)
+        Returns:
+            `[..., C, A]` normalised, in slots.
+        """
+        if self.delta:
+            actions = to_delta(actions, _given(state), self.delta)
+        return self._to_slots("action", actions)
+
+    def decode(self, actions: jax.Array, state: jax.Array | None = None) -> jax.Array:
+        """The inverse of `normalize_actions`: `[..., C, A]` -> `[..., C, J+1]` f32 [rad, m]."""
+        slots, inputs = np.array(self.robot_slots), self.inputs
+        known = {name: array[slots] for name, array in self.statistics.action.items()}
+        actions = unnormalize(actions[..., slots], known, inputs.action, inputs.convention)
+        return to_absolute(actions, _given(state), self.delta) if self.delta else actions
+
+    def _to_slots(self, kind: str, values: jax.Array) -> jax.Array:
+        """Normalised states or actions `[..., J+1]`, `[..., A]`."""
+        slots, dim = np.array(self.robot_slots), self.statistics.dim
+        check_slots(self.robot_slots, dim, values.shape[-1])
+        known = {name: array[slots] for name, array in getattr(self.statistics, kind).items()}
+        scaled = normalize(values, known, getattr(self.inputs, kind), self.inputs.convention)
+        return jnp.zeros((*values.shape[:-1], dim)).at[..., slots].set(scaled)
 
     def _image(self, name: str, image: jax.Array) -> jax.Array:
-        if image.dtype != jnp.uint8 or image.ndim != 4 or image.shape[-1] != 3:
-            raise ValueError(
-                f"camera {name!r} needs uint8 [B, H, W, 3], got {image.dtype} {image.shape}."
-            )
-        return resize_with_pad(image.astype(jnp.float32) / 127.5 - 1, self.image_size)
+        centred, antialias = self.inputs.centred, self.inputs.antialias
+        unit = to_unit(name, image)
+        return resize_with_pad(unit, self.image_size, centred=centred, antialias=antialias)
 
 
-def resize_with_pad(images: jax.Array, size: int) -> jax.Array:
-    """`[B, H, W, 3]` in [-1, 1] -> `[B, size, size, 3]`: aspect kept, centred on black (-1).
-
-    Bilinear, antialiased when shrinking, as pi0's preprocessing (openpi, shared/image_tools.py).
-    """
-    batch, height, width, channels = images.shape
-    if height == width == size:
-        return images
-    longest = max(height, width)
-    inner = (max(1, height * size // longest), max(1, width * size // longest))
-    shape = (batch, *inner, channels)
-    images = jnp.clip(jax.image.resize(images, shape, method="linear"), -1, 1)
-    before = [(size - length) // 2 for length in inner]
-    after = [size - length - b for length, b in zip(inner, before, strict=True)]
-    pad = [(0, 0), (before[0], after[0]), (before[1], after[1]), (0, 0)]
-    return jnp.pad(images, pad, constant_values=-1)
-
-
-def _check_slots(slots: Sequence[int], dim: int, length: int) -> None:
-    if len(slots) != length or len(set(slots)) != length or not all(0 <= s < dim for s in slots):
-        raise ValueError(
-            f"{length} numbers need as many different slots below {dim}, got {tuple(slots)}."
-        )
+def _given(state: jax.Array | None) -> jax.Array:
+    if state is None:
+        raise ValueError("actions are relative to the state here: give the raw state.")
+    return state

@@ -12,7 +12,8 @@ little more host memory than the model itself.
 """
 
 import importlib
-from collections.abc import Callable, Iterator, Mapping, MutableMapping
+import re
+from collections.abc import Callable, Mapping, MutableMapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -22,24 +23,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
-import safetensors
 import safetensors.numpy
 from flax import nnx
 
 from lorasp_jax.models import layouts
-from lorasp_jax.models.checkpoint import (
-    INDEX,
-    SINGLE,
-    base_arrays,
-    by_path,
-    named_arrays,
-    set_arrays,
-    weight_files,
-)
+from lorasp_jax.models.checkpoint import base_arrays, by_path, named_arrays, set_arrays
 from lorasp_jax.models.pi0 import openpi_lora
+from lorasp_jax.models.tensor_files import INDEX, SINGLE, TensorFiles, weight_files
 
 _READ_AHEAD = 1  # GB that Orbax reads at once, beside the result
 _PREFIX = "model."  # of all tensors in a LeRobot policy's file
+_STATISTIC = re.compile(r"(?:un)?normalize_(?:inputs|targets|outputs)\.")  # of older policies
+_COMPILED = "_orig_mod."  # what PyTorch puts before the names of a compiled module
 
 
 def load(folder: Path, config: Any) -> tuple[Any, list[str]]:
@@ -51,7 +46,8 @@ def load(folder: Path, config: Any) -> tuple[Any, list[str]]:
 
     Returns:
         The model, with adapters if openpi trained LoRA; and the names of tensors in the files that
-        no computation reads.
+        no computation reads: heads, and the statistics that LeRobot once kept there, which
+        `statistics_files` reads.
 
     Raises:
         ValueError: neither layout; damaged files; leaves missing, left over or of other shapes.
@@ -59,11 +55,11 @@ def load(folder: Path, config: Any) -> tuple[Any, list[str]]:
     weights = _weights(config)
     layout, theirs = _open(folder, weights.canonical_name)
     unused: list[str] = []
-    if isinstance(theirs, _Tensors):
+    if isinstance(theirs, TensorFiles):
         for head, twin in weights.TIED.items():
             if head in theirs and twin not in theirs:  # as older files have it
                 theirs.rename(head, twin)
-        unused = [name for name in weights.UNUSED if name in theirs]
+        unused = [n for n in theirs if n in weights.UNUSED or _STATISTIC.match(n)]
         for name in unused:
             del theirs[name]
     lora = openpi_lora.taken(theirs) if layout == "openpi" else {}
@@ -71,7 +67,8 @@ def load(folder: Path, config: Any) -> tuple[Any, list[str]]:
     dtypes = {name: leaf.dtype for name, leaf in named_arrays(model).items()}
 
     def place(name: str, array: np.ndarray) -> jax.Array:
-        return jnp.asarray(array, dtypes[name])
+        # Converted by numpy: JAX would hold a second copy, and return before it is gone.
+        return jnp.asarray(np.asarray(array, dtypes[name]))
 
     rules = weights.LAYOUTS[layout](config)
     arrays = layouts.read(rules, theirs, f"{folder} (layout {layout})", place)
@@ -131,16 +128,25 @@ def _open(
     folder: Path, canonical_name: Callable[[str], str]
 ) -> tuple[str, MutableMapping[str, Any]]:
     """The layout of a folder and its leaves."""
-    for place in (folder / "params", folder):
-        if (place / "_METADATA").exists():
-            return "openpi", _restored(place)
+    if place := orbax_folder(folder):
+        return "openpi", _restored(place)
     files = weight_files(folder)
     if not ((folder / INDEX).exists() or files[0].exists()):
         raise ValueError(
             f"{folder} holds neither an Orbax checkpoint of openpi (params/_METADATA) nor "
             f"safetensors of LeRobot ({SINGLE})."
         )
-    return "lerobot", _Tensors(files, canonical_name)
+
+    def rename(name: str) -> str:
+        return canonical_name(name.removeprefix(_PREFIX).removeprefix(_COMPILED))
+
+    return "lerobot", TensorFiles(files, rename)
+
+
+def orbax_folder(folder: Path) -> Path | None:
+    """Where in a folder openpi's leaves are; None: it is not openpi's."""
+    places = (folder / "params", folder)
+    return next((place for place in places if (place / "_METADATA").exists()), None)
 
 
 def _restored(place: Path) -> dict[str, np.ndarray]:
@@ -158,41 +164,3 @@ def _restored(place: Path) -> dict[str, np.ndarray]:
         name.removeprefix("params/").removesuffix("/value"): leaf
         for name, leaf in by_path(restored).items()
     }
-
-
-class _Tensors(MutableMapping[str, np.ndarray]):
-    """Tensors in safetensors files by canonical name, read when asked for."""
-
-    def __init__(self, files: list[Path], canonical_name: Callable[[str], str]) -> None:
-        self._found: dict[str, tuple[Any, str]] = {}
-        for path in files:
-            try:
-                file = safetensors.safe_open(path, framework="np")
-            except (OSError, safetensors.SafetensorError) as error:
-                raise ValueError(f"{path} is missing, damaged or cut short.") from error
-            for name in file.keys():  # noqa: SIM118, which is no mapping
-                short = canonical_name(name.removeprefix(_PREFIX))
-                if short in self._found:
-                    other = self._found[short][1]
-                    raise ValueError(f"{path} has one tensor under two names, {other} and {name}.")
-                self._found[short] = file, name
-
-    def rename(self, old: str, new: str) -> None:
-        """Lets a tensor be found under another name."""
-        self._found[new] = self._found.pop(old)
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        file, stored = self._found[name]
-        return file.get_tensor(stored)
-
-    def __delitem__(self, name: str) -> None:
-        del self._found[name]
-
-    def __setitem__(self, name: str, array: np.ndarray) -> None:
-        raise TypeError("files are only read")
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._found)
-
-    def __len__(self) -> int:
-        return len(self._found)

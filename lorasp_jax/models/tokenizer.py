@@ -1,15 +1,19 @@
-"""A tiny offline tokenizer for the project's own base weights: WordPiece over manipulation words.
+"""Text to token ids. `load` reads the published language models' tokenizers.
 
-Words outside the list fall into characters, so every printable ASCII text encodes. The position of
-an entry is its id and shipped weights depend on it: entries are never moved or removed, new words
-take the place of the next reserved one.
+The one written here is a tiny offline tokenizer for the project's own base weights: WordPiece over
+manipulation words. Words outside the list fall into characters, so every printable ASCII text
+encodes. The position of an entry is its id and shipped weights depend on it: entries are never
+moved or removed, new words take the place of the next reserved one.
 """
 
 import functools
+import os
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
-from tokenizers import Tokenizer, models, normalizers, pre_tokenizers
+import tokenizers
+from tokenizers import models, normalizers, pre_tokenizers
 
 VOCABULARY_SIZE = 320
 """Rows of the embedding table, reserved ones included."""
@@ -41,15 +45,78 @@ VOCABULARY = _vocabulary()
 
 
 @functools.cache
-def _tokenizer() -> Tokenizer:
-    tokenizer = Tokenizer(models.WordPiece(VOCABULARY, unk_token="[UNK]"))
+def _tokenizer() -> tokenizers.Tokenizer:
+    tokenizer = tokenizers.Tokenizer(models.WordPiece(VOCABULARY, unk_token="[UNK]"))
     tokenizer.normalizer = normalizers.BertNormalizer(lowercase=True)
     tokenizer.pre_tokenizer = pre_tokenizers.BertPreTokenizer()
     return tokenizer
 
 
+class Tokenizer(Protocol):
+    """What turns instructions into a backbone's token ids."""
+
+    @property
+    def vocabulary(self) -> int:
+        """Number of tokens; a backbone's embedding table must have as many rows or more."""
+        ...
+
+    def encode(
+        self, texts: Sequence[str], max_tokens: int, *, complete: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Token ids of P instructions, padded on the right.
+
+        One that is too long is cut, with a warning; the offline tokenizer raises ValueError.
+
+        Args:
+            texts: instructions.
+            max_tokens: T.
+            complete: the texts are whole prompts, as `prompts.pi05` writes, and stay as they are.
+
+        Returns:
+            ids `[P, T]` int32, valid `[P, T]` bool.
+        """
+        ...
+
+
+def load(where: str | os.PathLike[str]) -> Tokenizer:
+    """A tokenizer from its file.
+
+    Args:
+        where: a SentencePiece `.model`, a `tokenizer.json`, or a folder with one of them, in a
+            place that `places.local` knows: on this machine, on the hub, in a bucket. Empty: the
+            offline tokenizer.
+
+    Raises:
+        ValueError: there is no such place, or no tokenizer in it.
+    """
+    from lorasp_jax.models import places
+    from lorasp_jax.models.tokenizer_files import SentencePiece, TokenizersFile
+
+    if not os.fspath(where):
+        return Offline()
+    path = places.local(where, only=["tokenizer.json", "*.model"])
+    files = [path] if path.is_file() else [*path.glob("tokenizer.json"), *path.glob("*.model")]
+    for file in files:
+        if file.suffix in (".json", ".model"):
+            return (TokenizersFile if file.suffix == ".json" else SentencePiece)(file)
+    raise ValueError(f"{where} holds no tokenizer.json and no .model of SentencePiece.")
+
+
+class Offline:
+    """The tokenizer of this file."""
+
+    vocabulary = VOCABULARY_SIZE
+
+    def encode(
+        self, texts: Sequence[str], max_tokens: int, *, complete: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """As `tokenizer.encode`; a prompt is the text itself."""
+        del complete
+        return encode(texts, max_tokens)
+
+
 def encode(texts: Sequence[str], max_tokens: int) -> tuple[np.ndarray, np.ndarray]:
-    """Token ids of P texts, padded on the right with id 0.
+    """Token ids of P texts from the offline tokenizer, padded on the right with id 0.
 
     Args:
         texts: instructions; case does not matter.

@@ -8,7 +8,6 @@ from types import MappingProxyType
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from rich.console import Console
@@ -20,7 +19,7 @@ from lorasp_jax import adaptation, calibration, models, peft, tables
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Batch, flatten, sample_batch
 from lorasp_jax.data.demonstrations import demonstrations
-from lorasp_jax.models import backbone, presets, tokenizer
+from lorasp_jax.models import backbone, loading, presets, tokenizer
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.models.policy import Policy
@@ -49,6 +48,7 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
         envs.make(
             task, robot=config.robot, image_size=config.image_size, control_dt=config.control_dt
         )
+    words = tokenizer.load(config.model.tokenizer)
     base, base_hash = base_model(config)
     chunk = base.config.chunk
     if config.evaluation.execute_steps > chunk:
@@ -71,7 +71,7 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
     run = Run(config, folder, console, base_hash, started)
     with run.timed("collect"):
         run.episodes = _collect(run)
-    found = processor(list(run.episodes.values()), model.config)
+    found = processor(list(run.episodes.values()), model.config, words)
     if config.peft.needs_statistics:
         statistics = input_moments(run, base, found)
         model = _adapted(config, base, config.peft, statistics)
@@ -122,9 +122,12 @@ def base_model(config: Config) -> tuple[Backbone, str]:
         raise ValueError(f"unknown size {chosen.size!r}: it is one of {', '.join(SIZES)}")
     wanted: BackboneConfig = getattr(backbone.find(chosen.backbone), chosen.size)()
     wanted = dataclasses.replace(wanted, dtype=chosen.dtype, param_dtype=chosen.param_dtype)
+    if not wanted.inputs.masks_missing:
+        wanted = dataclasses.replace(wanted, cameras=wanted.cameras[: len(envs.Env.cameras)])
     if chosen.source:
         model = models.load(chosen.source, wanted)
-        _check_time(config)
+        if loading.is_own(chosen.source):
+            _check_time(config)
         return model, models.weights_hash(model)
     key = jax.random.fold_in(jax.random.key(config.seed), 4)
     model = wanted.create(nnx.Rngs(key))
@@ -152,9 +155,15 @@ def _check_time(config: Config) -> None:
         )
 
 
-def processor(episodes: Sequence[Episodes], model_config: BackboneConfig) -> Processor:
-    """Statistics of the demonstrations and the token table of all their instructions, in order."""
-    slots = robot_slots(episodes[0].state.shape[-1] - 1)
+def processor(
+    episodes: Sequence[Episodes], model_config: BackboneConfig, words: tokenizer.Tokenizer
+) -> Processor:
+    """Statistics of the demonstrations and the token table of all their instructions, in order.
+
+    The robot's cameras take the backbone's places in turn; there may be more places than cameras.
+    """
+    joints = episodes[0].state.shape[-1] - 1
+    slots = robot_slots(joints, model_config.inputs)
     valid = [np.arange(e.state.shape[1]) < np.asarray(e.length)[:, None] for e in episodes]
 
     def steps(name: str) -> np.ndarray:
@@ -166,10 +175,9 @@ def processor(episodes: Sequence[Episodes], model_config: BackboneConfig) -> Pro
         state, action, np.ones(len(state), bool), slots=slots, dim=model_config.action_dim
     )
     phrases = [phrase for group in episodes for phrase in group.instructions]
-    ids, mask = tokenizer.encode(phrases, model_config.max_tokens)
-    return Processor(
-        slots, statistics, jnp.asarray(ids), jnp.asarray(mask), model_config.image_size
-    )
+    tokens = words.encode(phrases, model_config.max_tokens)
+    cameras = dict(zip(model_config.cameras, sorted(episodes[0].image), strict=False))
+    return Processor.of(model_config, statistics, tokens, num_joints=joints, cameras=cameras)
 
 
 def _collect(run: Run) -> dict[str, Episodes]:

@@ -1,5 +1,7 @@
 """Windows: inside one episode, padded and masked past its end."""
 
+import dataclasses
+
 import jax
 import numpy as np
 
@@ -50,6 +52,24 @@ def test_noise_touches_the_robots_slots_only(tmp_path):
     )
     assert not batch.observation.state[:, 6].any()
     assert batch.observation.state[:, :6].any()
+
+
+def test_published_weights_learn_the_slots_that_the_robot_lacks(tmp_path):
+    """And relative actions count from the window's first state."""
+    run = make_run(tmp_path / "run", CONFIG)
+    steps, own = flatten(list(run.episodes.values())), run.policy.processor
+    inputs = dataclasses.replace(own.inputs, quiet_slots=False)
+    sizes = {"batch_size": 16, "chunk": 4, "state_noise": 0.0}
+    plain = sample_batch(jax.random.key(1), steps, own, **sizes)
+    other = dataclasses.replace(own, inputs=inputs, delta=(True, False))
+    batch = sample_batch(jax.random.key(1), steps, other, **sizes)
+    assert (batch.action_mask == plain.action_mask[..., :1]).all()
+    assert not batch.actions[..., 6].any()
+    std, known = own.statistics.action["std"][0], own.statistics.state
+    start = batch.observation.state[:, 0] * known["std"][0] + known["mean"][0]
+    moved = (plain.actions - batch.actions) * std
+    np.testing.assert_allclose(moved[..., 0], start[:, None] * np.ones(4), atol=1e-4)
+    np.testing.assert_array_equal(batch.actions[..., 1:], plain.actions[..., 1:])
 
 
 def _raw(steps):

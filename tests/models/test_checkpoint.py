@@ -93,7 +93,7 @@ def edit(folder, **change):
 
 def test_damaged_and_foreign_folders_raise(folder):
     with pytest.raises(ValueError, match=r"holds no model: there is no config\.json"):
-        models.load(folder / "nothing")
+        checkpoint.load(folder / "nothing")
     sizes = json.loads((folder / "config.json").read_text())["config"]
     edit(folder, config={**sizes, "vocabulary": 7})
     with pytest.raises(ValueError, match="language/embedding has shape"):
@@ -107,7 +107,7 @@ def test_damaged_and_foreign_folders_raise(folder):
             models.load(folder)
     (folder / "config.json").write_text('{"architectures": []}')
     with pytest.raises(ValueError, match="was not written by this project"):
-        models.load(folder)
+        checkpoint.load(folder)
 
 
 def test_a_file_cut_short_raises(folder):

@@ -1,18 +1,15 @@
-import json
+import dataclasses
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.policy import Policy
-from lorasp_jax.models.processing import (
-    SMALLEST_STD,
-    Processor,
-    Statistics,
-    resize_with_pad,
-    robot_slots,
-)
+from lorasp_jax.models.processing import Processor, robot_slots, to_absolute, to_delta
+from lorasp_jax.models.smolvla import SmolVLAConfig
+from lorasp_jax.models.statistics import Statistics
 
 DIM = 8
 RNG = np.random.default_rng(0)
@@ -48,38 +45,6 @@ def test_decode_inverts_normalize(robot):
     np.testing.assert_allclose(own.decode(inside), actions, atol=1e-5)
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
-def test_statistics_count_valid_steps_only(robot):
-    slots, _ = ROBOTS[robot]
-    state = RNG.normal(size=(3, 6, len(slots))).astype(np.float32)
-    valid = np.arange(6) < np.array([[2], [6], [4]])
-    state[..., -1] = 0.07  # a gripper that never moves
-    padded = np.where(valid[..., None], state, 1e6)
-    statistics = Statistics.measure(padded, padded, valid, slots=slots, dim=DIM)
-    rows = state[valid]
-    np.testing.assert_allclose(statistics.state_mean[np.array(slots)], rows.mean(0), atol=1e-6)
-    np.testing.assert_allclose(statistics.state_std[np.array(slots[:-1])], rows.std(0)[:-1], 1e-5)
-    assert statistics.action_std[7] == np.float32(SMALLEST_STD)
-    unused = np.setdiff1d(np.arange(DIM), slots)
-    assert (statistics.state_std[unused] == 1).all()
-    with pytest.raises(ValueError, match="at least one valid step"):
-        Statistics.measure(state, state, valid & False, slots=slots, dim=DIM)
-    with pytest.raises(ValueError, match="as many different slots below 8"):
-        Statistics.measure(state, state, valid, slots=slots[:-1], dim=DIM)
-
-
-def test_statistics_survive_json():
-    statistics = processor(6).statistics
-    again = Statistics.from_json(statistics.to_json())
-    jax.tree.map(np.testing.assert_array_equal, again, statistics)
-    broken = json.loads(statistics.to_json())
-    for change in ({"state_std": broken["state_std"][:-1]}, {"action_mean": "x"}, {"more": 1}):
-        with pytest.raises(ValueError, match=r"statistics need lists of"):
-            Statistics.from_json(json.dumps({**broken, **change}))
-    with pytest.raises(ValueError, match="statistics need lists of"):
-        Statistics.from_json("{}")
-
-
 def test_encode():
     own = processor(6)
     image = RNG.integers(0, 256, (2, 16, 16, 3), np.uint8)
@@ -91,7 +56,7 @@ def test_encode():
     assert obs.token_mask.sum(axis=1).tolist() == [1, 2]
     assert obs.image_masks["side"].all()
     assert not obs.state[:, 6].any()
-    gripper = (state[:, -1] - own.statistics.state_mean[7]) / own.statistics.state_std[7]
+    gripper = (state[:, -1] - own.statistics.state["mean"][7]) / own.statistics.state["std"][7]
     np.testing.assert_allclose(obs.state[:, 7], gripper, rtol=1e-5)
 
 
@@ -132,19 +97,101 @@ def test_unused_slots_reach_no_motor():
     np.testing.assert_array_equal(own.decode(chunk), own.decode(chunk.at[..., 6].set(99.0)))
     moved = own.decode(chunk.at[..., 7].add(1.0)) - own.decode(chunk)
     assert not moved[..., :6].any()
-    np.testing.assert_allclose(moved[..., 6], own.statistics.action_std[7], rtol=1e-4)
+    np.testing.assert_allclose(moved[..., 6], own.statistics.action["std"][7], rtol=1e-4)
 
 
-def test_pictures_are_centred_on_black():
-    wide = resize_with_pad(jnp.ones((1, 8, 16, 3)), 16)[0]
-    assert wide.shape == (16, 16, 3)
-    assert (wide[4:12] == 1).all()
-    assert (wide[:4] == -1).all()
-    assert (wide[12:] == -1).all()
-    small = resize_with_pad(jnp.ones((1, 20, 10, 3)), 10)[0]
-    assert (small[:, 2:7] == 1).all()
-    assert (small[:, :2] == -1).all()
-    assert (small[:, 7:] == -1).all()
+def published(num_joints: int = 6, **choices) -> Processor:
+    """With openpi's inputs: one block of numbers, noise in all of the 32 slots."""
+    config = dataclasses.replace(Pi0Config.base(), image_size=28)
+    state, action = RNG.normal(2.0, 3.0, (2, 20, num_joints + 1))
+    valid = np.ones(20, bool)
+    statistics = Statistics.measure(
+        state, action, valid, slots=range(num_joints + 1), dim=num_joints + 1
+    )
+    ids = np.array([[3, 4, 0]], np.int32)
+    return Processor.of(config, statistics, (ids, ids > 0), num_joints=num_joints, **choices)
+
+
+def test_published_weights_have_one_block_of_numbers():
+    own = published()
+    assert own.robot_slots == (0, 1, 2, 3, 4, 5, 6)
+    assert (own.slot_mask.sum(), own.flow_slots.sum()) == (7, 32)
+    assert processor(6).flow_slots.tolist() == processor(6).slot_mask.tolist()
+    state = RNG.normal(size=(2, 7)).astype(np.float32)
+    obs = own.encode({"image": {}, "state": jnp.asarray(state)}, jnp.zeros(2, int))
+    mean, std = own.statistics.state["mean"][:7], own.statistics.state["std"][:7]
+    np.testing.assert_allclose(obs.state[:, :7], (state - mean) / (std + 1e-6), rtol=1e-5)
+    assert not obs.state[:, 7:].any()
+    actions = RNG.normal(size=(2, 4, 7)).astype(np.float32)
+    np.testing.assert_allclose(own.decode(own.normalize_actions(actions)), actions, atol=1e-5)
+
+
+def test_missing_cameras_are_black_and_masked():
+    """The robot's two cameras fill two of pi0's three pictures."""
+    own = published(cameras={"base_0_rgb": "side", "left_wrist_0_rgb": "wrist"})
+    raw = {
+        "image": {
+            "wrist": jnp.full((2, 14, 28, 3), 255, jnp.uint8),
+            "side": jnp.full((2, 28, 28, 3), 0, jnp.uint8),
+        },
+        "state": jnp.zeros((2, 7)),
+    }
+    obs = jax.jit(lambda own, raw: own.encode(raw, jnp.zeros(2, int)))(own, raw)
+    assert list(obs.images) == list(Pi0Config.base().cameras)
+    assert {name: mask.tolist() for name, mask in obs.image_masks.items()} == {
+        "base_0_rgb": [True, True],
+        "left_wrist_0_rgb": [True, True],
+        "right_wrist_0_rgb": [False, False],
+    }
+    wrist = obs.images["left_wrist_0_rgb"]
+    np.testing.assert_allclose(wrist[:, 7:21], 1, atol=1e-6)
+    assert (wrist[:, :7] == -1).all()
+    assert obs.images["right_wrist_0_rgb"].shape == (2, 28, 28, 3)
+    assert (obs.images["right_wrist_0_rgb"] == -1).all()
+    with pytest.raises(ValueError, match="camera wrist is not among side"):
+        own.encode({**raw, "image": {"side": raw["image"]["side"]}}, jnp.zeros(2, int))
+    with pytest.raises(ValueError, match=r"backbone's cameras are base_0_rgb, .* got top"):
+        published(cameras={"top": "side"})
+
+
+def test_smolvla_has_its_bar_above():
+    config = dataclasses.replace(SmolVLAConfig.base(), image_size=64)
+    own = processor(6)
+    own = dataclasses.replace(own, image_size=64, inputs=config.inputs)
+    own = dataclasses.replace(own, robot_slots=robot_slots(6, config.inputs))
+    raw = {"image": {"side": jnp.full((1, 32, 64, 3), 255, jnp.uint8)}, "state": jnp.zeros((1, 7))}
+    found = own.encode(raw, jnp.zeros(1, int)).images["side"][0]
+    np.testing.assert_allclose(found[32:], 1, atol=1e-6)
+    assert (found[:32] == -1).all()
+
+
+def test_delta_actions():
+    """Joints count from the state, the gripper does not; numbers by hand."""
+    state = jnp.array([[1.0, 2.0, 3.0]])
+    actions = jnp.array([[[1.5, 2.0, 0.1], [0.0, 5.0, 0.2]]])
+    found = to_delta(actions, state, (True, True, False))
+    np.testing.assert_allclose(found, [[[0.5, 0.0, 0.1], [-1.0, 3.0, 0.2]]], atol=1e-6)
+    np.testing.assert_allclose(to_delta(actions, state, (True,))[0, 1], [-1.0, 5.0, 0.2])
+    np.testing.assert_allclose(to_absolute(found, state, (True, True, False)), actions, atol=1e-6)
+
+
+def test_policies_of_delta_actions_move_absolutely():
+    own, plain = published(delta=(*[True] * 6, False)), published()
+    own = dataclasses.replace(own, statistics=plain.statistics)
+    state = jnp.asarray(RNG.normal(size=(2, 7)), jnp.float32)
+    actions = jnp.asarray(RNG.normal(size=(2, 4, 7)), jnp.float32)
+    relative = actions - state[:, None].at[..., 6].set(0)
+    inside = own.normalize_actions(actions, state)
+    np.testing.assert_allclose(inside, plain.normalize_actions(relative), atol=1e-5)
+    np.testing.assert_allclose(own.decode(inside, state), actions, atol=1e-5)
+    with pytest.raises(ValueError, match="give the raw state"):
+        own.decode(inside)
+
+
+def test_a_tokenizer_of_another_model():
+    config, ids = Pi0Config.dummy(), np.array([[5000]], np.int32)
+    with pytest.raises(ValueError, match="token 5000 is beyond the backbone's vocabulary of 320"):
+        Processor.of(config, processor(6).statistics, (ids, ids > 0), num_joints=6)
 
 
 class Still:
@@ -157,12 +204,15 @@ class Still:
 
 def test_policy_goes_from_robot_to_robot():
     own = processor(6)
-    raw = {"image": {}, "state": jnp.asarray(own.statistics.state_mean[jnp.array(own.robot_slots)])}
+    raw = {
+        "image": {},
+        "state": jnp.asarray(own.statistics.state["mean"][jnp.array(own.robot_slots)]),
+    }
     raw["state"] = jnp.broadcast_to(raw["state"], (2, 7))
     policy = Policy(Still(), own)
     actions, aux = policy.sample(
         jax.random.key(0), raw, jnp.zeros(2, int), num_steps=4, return_aux=True
     )
-    mean = own.statistics.action_mean[jnp.array(own.robot_slots)]
+    mean = own.statistics.action["mean"][jnp.array(own.robot_slots)]
     np.testing.assert_allclose(actions, jnp.broadcast_to(mean, (2, 4, 7)), atol=1e-5)
     assert aux == {"steps": 4}

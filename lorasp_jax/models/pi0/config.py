@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig, VisionConfig
+from lorasp_jax.models.inputs import OPENPI
 
 if TYPE_CHECKING:
     from flax import nnx
@@ -41,6 +42,7 @@ class Pi0Config(BackboneConfig):
             max_tokens=48,
             chunk=50,
             action_dim=32,
+            inputs=OPENPI,
             dtype="bfloat16",
         )
 

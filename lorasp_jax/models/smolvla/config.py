@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig, VisionConfig
+from lorasp_jax.models.inputs import LEROBOT
 
 if TYPE_CHECKING:
     from flax import nnx
@@ -53,6 +54,7 @@ class SmolVLAConfig(BackboneConfig):
             max_tokens=48,
             chunk=50,
             action_dim=32,
+            inputs=LEROBOT,
             dtype="bfloat16",
         )
 

@@ -1,0 +1,84 @@
+"""Models from wherever they are published, in whichever layout."""
+
+import json
+import logging
+import os
+from pathlib import Path
+from typing import Any
+
+from lorasp_jax.models import backbone, checkpoint, lerobot_config, places, published
+
+_log = logging.getLogger(__name__)
+
+
+def load(where: str | os.PathLike[str], config: Any = None) -> Any:
+    """A model from a folder, a repository on Hugging Face's hub or a bucket.
+
+    Layouts are told apart by their files: this project's config.json, LeRobot's config.json with
+    the policy's type, openpi's Orbax folder `params`.
+
+    Args:
+        where: a folder; "owner/name" on the hub; "gs://bucket/folder", see `places.local`.
+        config: sizes of the model, and the types to compute and to store in. None takes the sizes
+            from LeRobot's or this project's config.json, and those of pi0 as published for openpi.
+
+    Raises:
+        ValueError: the place cannot be reached, none of these layouts is there, files are damaged,
+            or the model is another one than `config` or config.json say.
+    """
+    folder = places.local(where)
+    fields = _fields(folder)
+    if "backbone" in fields:
+        return checkpoint.load(folder, config)
+    model, unused = published.load(folder, config or _config(folder, fields))
+    if unused:
+        _log.info("%s: nothing reads %s, left out", where, ", ".join(unused))
+    return model
+
+
+def load_config(where: str | os.PathLike[str]) -> Any:
+    """The config that `load` gives a model without one, before any weights are read.
+
+    Raises:
+        ValueError: as `load`.
+    """
+    folder = places.local(where)
+    fields = _fields(folder)
+    return checkpoint.load_config(folder) if "backbone" in fields else _config(folder, fields)
+
+
+def is_own(where: str | os.PathLike[str]) -> bool:
+    """Whether a place holds a model in this project's layout.
+
+    Raises:
+        ValueError: as `load`.
+    """
+    return "backbone" in _fields(places.local(where))
+
+
+def _fields(folder: Path) -> dict[str, Any]:
+    """The content of config.json, empty where there is none."""
+    path = folder / checkpoint.CONFIG
+    try:
+        found = json.loads(path.read_bytes()) if path.exists() else {}
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path} is damaged.") from error
+    if not isinstance(found, dict):
+        raise ValueError(f"{path} is damaged.")
+    return found
+
+
+def _config(folder: Path, fields: dict[str, Any]) -> Any:
+    if published.orbax_folder(folder):
+        return backbone.find("pi0").base()
+    if not fields:
+        raise ValueError(
+            f"{folder} holds no model: there is no {checkpoint.CONFIG} of this project or LeRobot, "
+            "and no params/_METADATA of openpi."
+        )
+    try:
+        return lerobot_config.config_of(fields)
+    except ValueError as error:
+        raise ValueError(
+            f"{folder / checkpoint.CONFIG} fits no backbone: {str(error).rstrip('.')}."
+        ) from error

@@ -1,0 +1,79 @@
+"""Nothing here touches a network: the hub is replaced, the bucket lies in memory."""
+
+import fsspec
+import huggingface_hub
+import pytest
+from huggingface_hub.errors import LocalEntryNotFoundError
+
+from lorasp_jax.models import places
+
+
+def test_what_is_here_stays_here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs" / "base").mkdir(parents=True)
+    assert places.local("runs/base").samefile(tmp_path / "runs" / "base")
+    assert places.local(tmp_path) == tmp_path
+
+
+def test_hub(tmp_path, monkeypatch):
+    asked = {}
+
+    def snapshot_download(name, **options):
+        asked.update(options, name=name)
+        return str(tmp_path)
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
+    assert places.local("lerobot/smolvla_base", only=["*.json"]) == tmp_path
+    assert (asked["name"], asked["allow_patterns"]) == ("lerobot/smolvla_base", ["*.json"])
+    assert "train_state/*" in asked["ignore_patterns"]
+
+
+def test_offline_is_one_sentence(monkeypatch):
+    def snapshot_download(name, **_):
+        raise LocalEntryNotFoundError("Got: no connection\nand a page of explanations")
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
+    with pytest.raises(ValueError, match=r"there is no folder a/b, .*no connection\)\.$") as caught:
+        places.local("a/b")
+    assert "\n" not in str(caught.value)
+    for name in ("/a/b", "a", "a/b/c"):
+        with pytest.raises(ValueError, match=f"^{name} does not exist"):
+            places.local(name)
+
+
+@pytest.fixture
+def bucket(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    store = fsspec.filesystem("memory")
+    for name in ("params/_METADATA", "params/d/0", "train_state/d/0"):
+        store.pipe(f"/models/pi0/{name}", name.encode())
+    yield store
+    store.rm("/models", recursive=True)
+
+
+def test_bucket_is_fetched_once(bucket, tmp_path):
+    found = places.local("memory://models/pi0/")
+    assert found == tmp_path / "lorasp_jax" / "memory" / "models" / "pi0"
+    files = {path.relative_to(found).as_posix() for path in found.rglob("*") if path.is_file()}
+    assert files == {"params/_METADATA", "params/d/0"}
+    assert (found / "params" / "d" / "0").read_text() == "params/d/0"
+    bucket.pipe("/models/pi0/params/d/0", b"new")
+    assert (places.local("memory://models/pi0") / "params" / "d" / "0").read_text() == "params/d/0"
+    one = places.local("memory://models/pi0/params/_METADATA")
+    assert one.read_text() == "params/_METADATA"
+    assert not list(tmp_path.rglob(".*"))
+
+
+def test_bucket_that_cannot_be_read(bucket, tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match=r"models/no cannot be fetched: .*nothing of that name\.$"):
+        places.local("memory://models/no")
+
+    def get_file(*_, **__):
+        raise OSError("connection lost")
+
+    monkeypatch.setattr(type(bucket), "get_file", get_file)
+    with pytest.raises(ValueError, match=r"cannot be fetched: OSError: connection lost\.$"):
+        places.local("memory://models/pi0")
+    assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".")]
+    with pytest.raises(ValueError, match="cannot be fetched"):
+        places.local("nothing://models/pi0")
