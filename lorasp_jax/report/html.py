@@ -63,7 +63,8 @@ def _subtitle(config: dict[str, Any], results: dict[str, Any]) -> str:
     """One line: method, backbone, robot, parameters."""
     trainable, total = results["trainable_parameters"], results["total_parameters"]
     return html.escape(
-        f"{config['peft']['method']} on π0 {config['size']}, robot {config['robot']}: "
+        f"{config['peft']['method']} on {config['model']['backbone']} {config['model']['size']}, "
+        f"robot {config['robot']}: "
         f"{trainable:,} trainable of {total:,} parameters ({100 * trainable / total:.1f} %), "
         f"scale {results['scale']}"
     )
