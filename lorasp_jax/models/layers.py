@@ -17,8 +17,9 @@ from lorasp_jax.peft import Aux
 MASKED = -2.3819763e38
 """Logit of a forbidden key; finite, so a row without any key gets a uniform softmax, not NaN."""
 
-CUDNN_TOKENS = 256
-"""Fewest queries for which attention goes through cuDNN."""
+CUDNN_TOKENS, CUDNN_WIDTH = 256, 64
+"""Fewest queries and narrowest heads for which attention goes through cuDNN: those of published
+sizes, while the miniatures repeat themselves bit for bit."""
 
 _KEPT = {"products": jax.checkpoint_policies.dots_with_no_batch_dims_saveable, "full": None}
 
@@ -225,7 +226,7 @@ def rope(x: jax.Array, table: tuple[jax.Array, jax.Array], scale: float = 1.0) -
 def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) -> jax.Array:
     """Grouped-query attention, softmax in fp32; long bf16 sequences through cuDNN on NVIDIA GPUs.
 
-    cuDNN's gradient adds up in any order: two runs differ in the last bits.
+    cuDNN's gradient adds up in any order: two runs differ in the last bits. Hence `CUDNN_WIDTH`.
 
     Args:
         q: `[B, T, N, H]`, already scaled.
@@ -254,7 +255,7 @@ def _suits_cudnn(q: jax.Array, k: jax.Array) -> bool:
     """Whether cuDNN takes these arrays and is worth its launch."""
     tokens, size, others = q.shape[1], q.shape[3], k.shape[1]
     half = q.dtype in (jnp.bfloat16, jnp.float16)
-    fits = size <= 256 and size % 8 == 0 and tokens % 2 == 0 and others % 2 == 0
+    fits = CUDNN_WIDTH <= size <= 256 and size % 8 == 0 and tokens % 2 == 0 and others % 2 == 0
     return jax.default_backend() == "gpu" and half and fits and tokens >= CUDNN_TOKENS
 
 

@@ -60,9 +60,9 @@ class SmolVLAConfig(BackboneConfig):
 
     @classmethod
     def small(cls) -> SmolVLAConfig:
-        """For one accelerator: about 9 M parameters, 64 tokens a camera."""
+        """For one accelerator: about 9 M parameters, 16 tokens a camera of 64 patches."""
         return cls.miniature(
-            vision=VisionConfig(width=256, depth=4, mlp=768, heads=4, patch=4, shuffle=2),
+            vision=VisionConfig(width=256, depth=4, mlp=768, heads=4, patch=8, shuffle=2),
             language=ExpertConfig(256, 6, 640, heads=6, kv_heads=2, head_dim=32),
             action=ExpertConfig(192, 6, 512, heads=6, kv_heads=2, head_dim=32),
         )
