@@ -3,7 +3,7 @@
     python train.py --config configs/pretrain.py --name pi0_small
     python train.py --config configs/pretrain.py --name smolvla_small --model.backbone smolvla
     python train.py --config configs/pretrain.py --name pi0_nano --model.size nano \\
-        --optim.steps 30000 --optim.learning-rate 2e-3
+        --optim.steps 24000 --optim.learning-rate 2e-3
 
 All parameters train (FullFineTuning on every path), on the paper's four tasks. The run leaves
 runs/<name>/base, which is what assets/<name> holds; the model cards there state hardware, time and
@@ -25,7 +25,7 @@ def get_config(scale: str) -> Config:
         model=ModelConfig(size="small", checkpoint="", dtype="bfloat16"),
         robot="panda",
         data=DataConfig(episodes=1024, num_envs=256),
-        optim=OptimConfig(steps=20_000, batch_size=512, learning_rate=1e-3, warmup_steps=300),
+        optim=OptimConfig(steps=12_000, batch_size=512, learning_rate=1e-3, warmup_steps=300),
         evaluation=EvaluationConfig(episodes=256, num_envs=256),
         log_every=200,
         checkpoint_every=2000,

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -65,10 +66,16 @@ def test_base(tmp_path):
     }
 
 
-@pytest.mark.parametrize("size", ["nano", "small"])
-def test_shipped_bases_load_and_say_what_they_are(size):
-    config = dataclasses.replace(CONFIG, model=ModelConfig(size=size, dtype="bfloat16"))
-    model, base_hash = setup.base_model(config)
-    assert base_hash == models.weights_hash(config.model.source)
-    assert adaptation.count(model) == (0, {"nano": 1_020_008, "small": 9_877_128}[size])
+@pytest.mark.parametrize("path", sorted(Path("assets").glob("*_*")), ids=lambda path: path.name)
+def test_shipped_bases_load_and_say_what_they_are(path):
+    backbone, size = path.name.split("_")
+    chosen = ModelConfig(backbone=backbone, size=size, dtype="bfloat16")
+    model, base_hash = setup.base_model(dataclasses.replace(CONFIG, model=chosen))
+    assert base_hash == models.weights_hash(path)
+    assert f"{adaptation.count(model).total:,} parameters" in (path / "README.md").read_text()
     assert model.config.dtype == "bfloat16"
+
+
+def test_all_assets_are_small_enough_to_ship():
+    assert len(list(Path("assets").glob("*_*"))) == 4
+    assert sum(f.stat().st_size for f in Path("assets").rglob("*") if f.is_file()) < 48e6
