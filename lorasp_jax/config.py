@@ -33,6 +33,8 @@ class ModelConfig:
     """Type of the matrix products."""
     param_dtype: Literal["float32", "bfloat16"] = "float32"
     """Type the base is stored in; adapters are float32."""
+    relative_actions: bool = False
+    """Joint targets relative to the state a chunk starts from, as openpi trained pi0."""
     remat: Literal["auto", "none", "products", "full"] = "auto"
     """What the backward pass computes again to save memory: nothing, all but matrix products, or
     all inside a layer; auto is the first of these that fits into the device."""

@@ -115,7 +115,7 @@ def dense_together(
     return results
 
 
-def with_value(variable: nnx.Param, value: Any) -> nnx.Param:
+def with_value(variable: Any, value: Any) -> Any:
     """A variable of its own with another value: the old one may be shared with other layers."""
     return type(variable)(value, **variable.get_metadata())
 

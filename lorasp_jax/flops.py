@@ -15,7 +15,7 @@ PEAK = {"NVIDIA H200": 989e12, "NVIDIA H100": 989e12, "NVIDIA A100": 312e12, "TP
 """Dense bf16 operations a second by how a device's name begins (NVIDIA's and Google's data sheets,
 SXM and without sparsity)."""
 
-_CUDNN = {"dot_product_fwd_wrapper": 4, "dot_product_bwd_wrapper": 8}
+_CUDNN = {"dot_product_attention_fwd_wrapper": 4, "dot_product_attention_bwd_wrapper": 8}
 """Operations of attention by cuDNN, B N T S H of them: two products forwards, four backwards (a
 fifth repeats one)."""
 

@@ -12,12 +12,14 @@ cost, since at these sizes each pass over a wide array takes as long as the adap
 - where the input is at least as wide as the outputs, the gradient of x is one product,
   [g, q] [W, P]ᵀ with q the gradient of x P.
 
+The last three only where there are more tokens than inputs: for few, the copy of W is what costs.
 W is cast to the type of x in each pass and kept between them as it came, so a quantised one is not
 widened in memory for long.
 """
 
 import functools
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -40,6 +42,17 @@ class LowRankLayer(NamedTuple):
     """P [I, Q], fp32, used in the type of x."""
     up: jax.Array
     """U [R, O], fp32, used in the type of x."""
+
+
+class Prepared(NamedTuple):
+    """An adapter's parameters with its matrices at hand, see `lorasp_jax.inference`."""
+
+    params: Any
+    """What f needs."""
+    down: jax.Array
+    """P [I, Q]."""
+    up: jax.Array
+    """U [R, O]."""
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
@@ -80,7 +93,7 @@ def _forward(
         (z, aux), pull_back = jax.vjp(inner, layer.params, rows)
         w, u = layer.kernel.astype(x.dtype), layer.up.astype(x.dtype)
         d_in, d_out = layer.kernel.shape
-        if d_out >= d_in:
+        if d_out >= d_in and _joins(layer, x):
             y = jnp.concatenate([x, z], axis=-1) @ jnp.concatenate([w, u])
         else:
             y = x @ w + z @ u
@@ -101,7 +114,7 @@ def _backward(
         d_in, d_out = layer.kernel.shape
         w, u = layer.kernel.astype(x.dtype), layer.up.astype(x.dtype)
         through_base, dz = None, None
-        if d_out > 2 * d_in:
+        if d_out > 2 * d_in and _joins(layer, x):
             through_base, dz = jnp.split(g @ jnp.concatenate([w, u]).T, [d_in], axis=-1)
         of_params, of_rows = pull_back((g @ u.T if dz is None else dz, d_aux))
         through_bases.append(through_base)
@@ -129,12 +142,17 @@ def _gradient_of_input(
     """Σ g Wᵀ + q Pᵀ, [..., I]; `through_bases` holds those g Wᵀ that are there already."""
     p = _side_by_side(layers, x)
     w = [layer.kernel.astype(x.dtype) for layer in layers]
-    if sum(g.shape[-1] for g in gradients) <= x.shape[-1]:
+    if sum(g.shape[-1] for g in gradients) <= x.shape[-1] and _joins(layers[0], x):
         return jnp.concatenate([*gradients, q], axis=-1) @ jnp.concatenate([*w, p], axis=1).T
     dx = q @ p.T
     for g, kernel, through_base in zip(gradients, w, through_bases, strict=True):
         dx += g @ kernel.T if through_base is None else through_base
     return dx
+
+
+def _joins(layer: LowRankLayer, x: jax.Array) -> bool:
+    """Whether there are so many tokens that copying W next to U costs less than it saves."""
+    return math.prod(x.shape[:-1]) >= layer.kernel.shape[0]
 
 
 def _side_by_side(layers: Sequence[LowRankLayer], x: jax.Array) -> jax.Array:

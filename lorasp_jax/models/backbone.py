@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from lorasp_jax import inference
 from lorasp_jax.dense import Dense
 from lorasp_jax.models import flow_matching
 from lorasp_jax.models.config import BackboneConfig
@@ -18,6 +19,7 @@ from lorasp_jax.models.layers import (
     block_mask,
     positions,
     time_embedding,
+    unstacked,
 )
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.siglip import SigLIP
@@ -54,6 +56,8 @@ class Backbone(nnx.Module):
 
     config: BackboneConfig
     vision: SigLIP
+    action: Any
+    """The action expert, with stacked `blocks`."""
 
     def _make_projections(self, state_width: int, rngs: nnx.Rngs) -> None:
         """The linear maps around the towers: of state, noisy actions, their time and velocity."""
@@ -187,8 +191,10 @@ class Backbone(nnx.Module):
             shape = (obs.state.shape[0], self.config.chunk, self.config.action_dim)
             noise = jax.random.normal(key, shape)
         prefix, aux = self.run_prefix(obs)
+        acting = inference.prepared(self)
+        acting.action.blocks = unstacked(acting.action.blocks)
         actions, action_aux = flow_matching.sample(
-            lambda x_t, t: self.run_suffix(prefix, obs, x_t, t),
+            lambda x_t, t: acting.run_suffix(prefix, obs, x_t, t),
             noise,
             num_steps=num_steps,
             slots=slots,

@@ -21,7 +21,15 @@ CUDNN_TOKENS, CUDNN_WIDTH = 256, 64
 """Fewest queries and narrowest heads for which attention goes through cuDNN: those of published
 sizes, while the miniatures repeat themselves bit for bit."""
 
-_KEPT = {"products": jax.checkpoint_policies.dots_with_no_batch_dims_saveable, "full": None}
+
+def _keep_products(primitive: Any, *shapes: Any, **params: Any) -> Any:
+    """Results of matrix products are stored, and cuDNN's attention, which is slow to repeat."""
+    if primitive.name == "dot_product_attention_fwd_wrapper":
+        return True
+    return jax.checkpoint_policies.dots_with_no_batch_dims_saveable(primitive, *shapes, **params)
+
+
+_KEPT = {"products": _keep_products, "full": None}
 
 LayerAux = dict[str, Aux]
 Block = TypeVar("Block", bound=nnx.Module)
@@ -165,7 +173,7 @@ def scan_depth(
     """Run x through stacked blocks.
 
     Args:
-        blocks: from `stack`.
+        blocks: from `stack` or `unstacked`.
         call: (block, x, its slice of `per_layer`) -> (x, what to keep).
         x: `[B, T, D]`.
         per_layer: pytree with a leading axis L, or None.
@@ -175,6 +183,8 @@ def scan_depth(
     Returns:
         `[B, T, D]`, and what the blocks gave to keep, stacked to `[L, ...]`.
     """
+    if isinstance(blocks, nnx.List):
+        return _one_by_one(blocks, call, x, per_layer)
     graphdef, state = nnx.split(blocks)
 
     def layer(x: jax.Array, scanned: tuple[Any, Any]) -> tuple[jax.Array, Any]:
@@ -183,6 +193,23 @@ def scan_depth(
     if remat != "none":
         layer = jax.checkpoint(layer, prevent_cse=False, policy=_KEPT[remat])
     return jax.lax.scan(layer, x, (state, per_layer), unroll=unroll)
+
+
+def unstacked(blocks: nnx.Module) -> nnx.List:
+    """Stacked blocks one by one: a loop around them then slices no weights."""
+    graphdef, state = nnx.split(blocks)
+    depth = jax.tree.leaves(state)[0].shape[0]
+    layers = [jax.tree.map(lambda a, i=i: a[i], state) for i in range(depth)]
+    return nnx.List([nnx.merge(graphdef, layer) for layer in layers])
+
+
+def _one_by_one(blocks: nnx.List, call: Any, x: jax.Array, per_layer: Any) -> tuple:
+    """`scan_depth` of `unstacked` blocks."""
+    kept = []
+    for i, block in enumerate(blocks):
+        x, keep = call(block, x, jax.tree.map(lambda a, i=i: a[i], per_layer))
+        kept.append(keep)
+    return x, jax.tree.map(lambda *layers: jnp.stack(layers), *kept)
 
 
 def positions(valid: jax.Array) -> jax.Array:

@@ -23,7 +23,7 @@ from lorasp_jax.models import backbone, loading, presets, tokenizer
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.models.policy import Policy
-from lorasp_jax.models.processing import Processor, Statistics, robot_slots
+from lorasp_jax.models.processing import Processor, Statistics, robot_slots, to_delta
 from lorasp_jax.training import preflight
 from lorasp_jax.training.loop import Run
 from lorasp_jax.training.progress import bars
@@ -71,7 +71,8 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
     run = Run(config, folder, console, base_hash, started)
     with run.timed("collect"):
         run.episodes = _collect(run)
-    found = processor(list(run.episodes.values()), model.config, words)
+    relative = config.model.relative_actions
+    found = processor([*run.episodes.values()], model.config, words, relative=relative)
     if config.peft.needs_statistics:
         statistics = input_moments(run, base, found)
         model = _adapted(config, base, config.peft, statistics)
@@ -156,28 +157,51 @@ def _check_time(config: Config) -> None:
 
 
 def processor(
-    episodes: Sequence[Episodes], model_config: BackboneConfig, words: tokenizer.Tokenizer
+    episodes: Sequence[Episodes],
+    model_config: BackboneConfig,
+    words: tokenizer.Tokenizer,
+    *,
+    relative: bool = False,
 ) -> Processor:
     """Statistics of the demonstrations and the token table of all their instructions, in order.
 
     The robot's cameras take the backbone's places in turn; there may be more places than cameras.
+
+    Args:
+        episodes: by task.
+        model_config: sizes and inputs.
+        words: of the instructions.
+        relative: joint targets are learned relative to the state that a chunk starts from.
     """
     joints = episodes[0].state.shape[-1] - 1
-    slots = robot_slots(joints, model_config.inputs)
-    valid = [np.arange(e.state.shape[1]) < np.asarray(e.length)[:, None] for e in episodes]
-
-    def steps(name: str) -> np.ndarray:
-        pairs = zip(episodes, valid, strict=True)
-        return np.concatenate([np.asarray(getattr(e, name))[mask] for e, mask in pairs])
-
-    state, action = steps("state"), steps("action")
-    statistics = Statistics.measure(
-        state, action, np.ones(len(state), bool), slots=slots, dim=model_config.action_dim
-    )
+    slots, dim = robot_slots(joints, model_config.inputs), model_config.action_dim
+    delta = (*[True] * joints, False) if relative else ()
+    pairs = [_windows(e, model_config.chunk if relative else 1) for e in episodes]
+    state, action = map(np.concatenate, zip(*pairs, strict=True))
+    action = np.asarray(to_delta(action, state, delta)).reshape(-1, joints + 1)
+    state = np.repeat(state, len(action) // len(state), axis=0)
+    everything = np.ones(len(state), bool)
+    statistics = Statistics.measure(state, action, everything, slots=slots, dim=dim)
     phrases = [phrase for group in episodes for phrase in group.instructions]
     tokens = words.encode(phrases, model_config.max_tokens)
     cameras = dict(zip(model_config.cameras, sorted(episodes[0].image), strict=False))
-    return Processor.of(model_config, statistics, tokens, num_joints=joints, cameras=cameras)
+    return Processor.of(
+        model_config, statistics, tokens, num_joints=joints, cameras=cameras, delta=delta
+    )
+
+
+def _windows(episodes: Episodes, chunk: int) -> tuple[np.ndarray, np.ndarray]:
+    """States `[N, J+1]` of all valid steps and the actions `[N, C, J+1]` from there on.
+
+    As in training, the last action of an episode is repeated.
+    """
+    length = np.asarray(episodes.length)[:, None]
+    steps = np.arange(episodes.state.shape[1])
+    valid = steps < length
+    following = np.minimum(steps[:, None] + np.arange(chunk), length[..., None] - 1)
+    rows = np.arange(len(length))[:, None, None]
+    actions = np.asarray(episodes.action)[rows, following]
+    return np.asarray(episodes.state)[valid], actions[valid]
 
 
 def _collect(run: Run) -> dict[str, Episodes]:

@@ -1,5 +1,6 @@
 """The frozen-base product equals its formula and never computes a gradient for W."""
 
+import math
 import re
 
 import jax
@@ -9,8 +10,9 @@ import pytest
 
 from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul
 
-# Every way to multiply: wide outputs, far wider ones, square and wide inputs.
-SHAPES = [(9, 10), (6, 20), (12, 12), (10, 7)]
+# Every way to multiply 10 tokens: wide outputs, far wider ones, square and wide inputs; then the
+# same with more inputs than tokens.
+SHAPES = [(9, 10), (6, 20), (10, 10), (10, 7), (12, 30), (12, 12), (12, 7)]
 READ, RANK = 4, 3
 
 
@@ -148,3 +150,17 @@ def test_vmap():
     params, x, *matrices = inputs(6, 10)
     mapped = jax.vmap(lambda x, mask: ours(params, x, *matrices, mask)[0])(x, MASK)
     np.testing.assert_allclose(mapped, reference(params, x, *matrices)[0], rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(9, 20), (10, 10), (10, 7), (12, 30), (12, 12), (12, 7)])
+def test_kernels_are_copied_for_many_tokens_only(shape):
+    params, x, *rest = inputs(*shape)
+
+    def gradients(*arrays):
+        y, pull_back = jax.vjp(lambda *a: ours(*a)[0], *arrays)
+        return pull_back(y)
+
+    program = str(jax.make_jaxpr(gradients)(params, x, *rest))
+    joined = re.findall(r"f32\[(\d+),(\d+)\] = concatenate", program)
+    copies = [sides for sides in joined if math.prod(map(int, sides)) > math.prod(shape)]
+    assert bool(copies) == (shape[0] <= 10)

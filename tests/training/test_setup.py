@@ -11,6 +11,7 @@ from rich.console import Console
 
 from lorasp_jax import adaptation, paths
 from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.models.tokenizer import Offline
 from lorasp_jax.peft import LoRA
 from lorasp_jax.training import setup
 from lorasp_jax.training.overrides import override
@@ -63,3 +64,28 @@ def test_eva_of_the_command_line_sees_the_demonstrations(config, tmp_path):
         np.testing.assert_allclose(captured, best, rtol=1e-3)  # no 4 directions hold more
         assert (captured > 0).all()
         assert parent.method == LoRA(rank=4, initialization="eva")
+
+
+@pytest.mark.parametrize("relative", [False, True])
+def test_actions_are_normalised_as_they_are_learned(relative):
+    """Over all windows as training draws them, mean 0 and standard deviation 1."""
+    group, model = random_episodes("press", 0), Pi0Config.dummy()
+    found = setup.processor([group], model, Offline(), relative=relative)
+    states, chunks = [], []
+    for episode in range(3):
+        end = group.length[episode] - 1
+        for step in range(end + 1):
+            states.append(group.state[episode, step])
+            chunks.append(group.action[episode, np.minimum(step + np.arange(model.chunk), end)])
+    state, chunk = np.stack(states), np.stack(chunks)
+    learned = found.normalize_actions(chunk, state)[..., found.slot_mask]
+    looked_at = learned if relative else learned[:, :1]
+    np.testing.assert_allclose(looked_at.mean(axis=(0, 1)), 0, atol=1e-5)
+    np.testing.assert_allclose(looked_at.std(axis=(0, 1)), 1, atol=1e-4)
+    np.testing.assert_allclose(
+        found.decode(found.normalize_actions(chunk, state), state), chunk, atol=1e-5
+    )
+    if relative:  # the first action of a chunk, less its state; the gripper stays absolute
+        moved = chunk - np.append(np.ones(6), 0) * state[:, None]
+        expected = (moved - moved.mean(axis=(0, 1))) / moved.std(axis=(0, 1))
+        np.testing.assert_allclose(learned, expected, atol=1e-4)

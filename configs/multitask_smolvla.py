@@ -1,0 +1,27 @@
+"""Adapt the published SmolVLA (0.45 B parameters) to the PiPER arm: four tasks, LoRA-SP, rank 128.
+
+    python train.py --config configs/multitask_smolvla.py
+    python train.py --config configs/multitask_smolvla.py --model.checkpoint FOLDER \\
+        --model.tokenizer FILE
+
+Weights and tokenizer come from Hugging Face's hub unless places of your own are named.
+"""
+
+import dataclasses
+from pathlib import Path
+
+from lorasp_jax.config import Config
+from lorasp_jax.training.overrides import load
+
+
+def get_config(scale: str) -> Config:
+    """The experiment, as configs/multitask_pi0.py has it; smoke is a few steps of it."""
+    config = load(Path(__file__).with_name("multitask_pi0.py"), scale)
+    model = dataclasses.replace(
+        config.model,
+        backbone="smolvla",
+        checkpoint="lerobot/smolvla_base",
+        relative_actions=False,
+        tokenizer="HuggingFaceTB/SmolVLM2-500M-Video-Instruct",
+    )
+    return dataclasses.replace(config, name="multitask_smolvla", model=model, image_size=256)

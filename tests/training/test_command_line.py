@@ -1,0 +1,63 @@
+"""Every method trains from the command line, on both backbones; published sizes at least build."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import train
+from lorasp_jax import peft
+from lorasp_jax.models import backbone
+from lorasp_jax.training import mesh as meshes
+from lorasp_jax.training.overrides import parse
+from lorasp_jax.training.run_folder import read_metrics
+
+ROOT = Path(__file__).parents[2]
+ASSETS = f"{ROOT}/assets/{{backbone}}_{{size}}"
+COMMAND = ["--config", f"{ROOT}/configs/multitask.py", "--scale", "smoke", "--tasks", "press"]
+
+
+@pytest.fixture(scope="module")
+def demonstrations(tmp_path_factory):
+    """A folder that the first run fills and the others copy."""
+    return tmp_path_factory.mktemp("demonstrations")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("name", backbone.names())
+@pytest.mark.parametrize("method", peft.names())
+def test_twenty_steps(name, method, demonstrations, tmp_path, monkeypatch):
+    from lorasp_jax.training import setup
+
+    collect = setup.demonstrations
+    monkeypatch.setattr(setup, "demonstrations", lambda c, _, p: collect(c, demonstrations, p))
+    monkeypatch.setattr(meshes, "make_mesh", one_device(meshes.make_mesh))
+    monkeypatch.chdir(tmp_path)
+    chosen = ["--model.backbone", name, "--model.checkpoint", ASSETS, "--method", method]
+    assert train.main([*COMMAND, *chosen, "--optim.steps", "20"]) == 0
+    rows = read_metrics(Path("runs/multitask"))
+    assert rows[-1]["step"] == 20
+    assert all(np.isfinite(row["loss"]) for row in rows)
+    assert Path("runs/multitask/report.html").exists()
+
+
+def one_device(make):
+    """Compiles in a quarter of the time."""
+    return lambda fsdp: make(fsdp, jax.devices()[:1])
+
+
+@pytest.mark.parametrize("name", backbone.names())
+def test_published_sizes_are_configs_of_their_own(name):
+    config, _ = parse(["--config", f"{ROOT}/configs/multitask_{name}.py", "--scale", "smoke"])
+    assert (config.model.backbone, config.model.size) == (name, "base")
+    assert config.targets == ("paper",)
+    assert isinstance(config.peft, peft.LoRASP)
+    assert config.evaluation.execute_steps <= backbone.find(name).base().chunk
+
+
+def test_a_task_by_its_name():
+    config, _ = parse(["--config", f"{ROOT}/configs/single_task.py", "--tasks", "pour"])
+    assert config.tasks == ("pour",)
+    assert config.peft == parse(["--config", f"{ROOT}/configs/multitask.py"])[0].peft
