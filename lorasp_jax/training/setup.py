@@ -178,7 +178,7 @@ def processor(
     delta = (*[True] * joints, False) if relative else ()
     pairs = [_windows(e, model_config.chunk if relative else 1) for e in episodes]
     state, action = map(np.concatenate, zip(*pairs, strict=True))
-    action = np.asarray(to_delta(action, state, delta)).reshape(-1, joints + 1)
+    action = np.asarray(to_delta(jnp.asarray(action), jnp.asarray(state), delta)).reshape(-1, joints + 1)
     state = np.repeat(state, len(action) // len(state), axis=0)
     everything = np.ones(len(state), bool)
     statistics = Statistics.measure(state, action, everything, slots=slots, dim=dim)
