@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from rich.console import Console
@@ -177,9 +178,9 @@ def processor(
     slots, dim = robot_slots(joints, model_config.inputs), model_config.action_dim
     delta = (*[True] * joints, False) if relative else ()
     pairs = [_windows(e, model_config.chunk if relative else 1) for e in episodes]
-    state, action = map(np.concatenate, zip(*pairs, strict=True))
-    action = np.asarray(to_delta(jnp.asarray(action), jnp.asarray(state), delta)).reshape(-1, joints + 1)
-    state = np.repeat(state, len(action) // len(state), axis=0)
+    state, action = (jnp.concatenate(arrays) for arrays in zip(*pairs, strict=True))
+    action = np.asarray(to_delta(action, state, delta)).reshape(-1, joints + 1)
+    state = np.repeat(np.asarray(state), len(action) // len(state), axis=0)
     everything = np.ones(len(state), bool)
     statistics = Statistics.measure(state, action, everything, slots=slots, dim=dim)
     phrases = [phrase for group in episodes for phrase in group.instructions]
