@@ -2,7 +2,7 @@
 
 import importlib
 import pkgutil
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -191,8 +191,7 @@ class Backbone(nnx.Module):
             shape = (obs.state.shape[0], self.config.chunk, self.config.action_dim)
             noise = jax.random.normal(key, shape)
         prefix, aux = self.run_prefix(obs)
-        acting = inference.prepared(self)
-        acting.action.blocks = unstacked(acting.action.blocks)
+        acting = self._acting()
         actions, action_aux = flow_matching.sample(
             lambda x_t, t: acting.run_suffix(prefix, obs, x_t, t),
             noise,
@@ -205,6 +204,12 @@ class Backbone(nnx.Module):
             lambda a: jnp.broadcast_to(a, (num_steps, *a.shape)), aux.get("action", {})
         )
         return actions, _with_action({**aux, "action": once}, action_aux)
+
+    def _acting(self) -> Self:
+        """A copy for the steps of a flow, in which nothing depends on weights alone any more."""
+        model = inference.prepared(self)
+        model.action.blocks = unstacked(model.action.blocks)
+        return model
 
 
 def action_tokens(linear: Linears, x_t: jax.Array, flow_time: jax.Array) -> jax.Array:

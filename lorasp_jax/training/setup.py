@@ -51,16 +51,7 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
         )
     words = tokenizer.load(config.model.tokenizer)
     base, base_hash = base_model(config)
-    chunk = base.config.chunk
-    if config.evaluation.execute_steps > chunk:
-        raise ValueError(
-            f"execute_steps must be 1 to the chunk, {chunk}, got {config.evaluation.execute_steps}"
-        )
-    if config.optim.batch_size % jax.device_count():
-        raise ValueError(
-            f"batch_size must be a multiple of the {jax.device_count()} devices, "
-            f"got {config.optim.batch_size}"
-        )
+    _check_sizes(config, base.config.chunk)
     remat, memory = preflight.choose_remat(config, base.config, preflight.available_bytes())
     base = _with_remat(base, remat)
     model = _adapted(config, base, config.peft.as_saved)
@@ -79,6 +70,19 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
         model = _adapted(config, base, config.peft, statistics)
     run.policy = Policy(model, found)
     return run
+
+
+def _check_sizes(config: Config, chunk: int) -> None:
+    """Raise ValueError unless chunk and batch fit."""
+    if config.evaluation.execute_steps > chunk:
+        raise ValueError(
+            f"execute_steps must be 1 to the chunk, {chunk}, got {config.evaluation.execute_steps}"
+        )
+    if config.optim.batch_size % jax.device_count():
+        raise ValueError(
+            f"batch_size must be a multiple of the {jax.device_count()} devices, "
+            f"got {config.optim.batch_size}"
+        )
 
 
 def _adapted(
@@ -138,6 +142,8 @@ def base_model(config: Config) -> tuple[Backbone, str]:
 
 def _with_remat(model: Backbone, remat: Remat) -> Backbone:
     """The same parameters in a model that keeps something else for its backward pass."""
+    if remat == model.config.remat:
+        return model
     wanted = dataclasses.replace(model.config, remat=remat)
     abstract = nnx.eval_shape(lambda: wanted.create(nnx.Rngs(0)))
     return nnx.merge(nnx.graphdef(abstract), nnx.state(model))
