@@ -19,6 +19,8 @@ ROOMS = [
     "lorasp_jax.layers",
     "lorasp_jax.paths",
     "lorasp_jax.adaptation",
+    "lorasp_jax.inference",
+    "lorasp_jax.flops",
     "lorasp_jax.linen_layers",
     "lorasp_jax.linen",
     "lorasp_jax.calibration",

@@ -12,6 +12,7 @@ from lorasp_jax.kernels.low_rank_matmul import Prepared
 from lorasp_jax.models import pi0, smolvla
 from lorasp_jax.models.layers import scan_depth, stack, unstacked
 from tests import quick
+from tests.cases import mostly_slow
 from tests.models.drawn import drawn, observation
 from tests.nets import METHODS
 
@@ -38,7 +39,7 @@ def through(layers, x):
     return scan_depth(layers, call, x)
 
 
-@pytest.mark.parametrize("name", ADDITIVE)
+@pytest.mark.parametrize("name", mostly_slow(ADDITIVE, ["lora_sp"]))
 def test_computes_the_same(name):
     model, x = stacked(METHODS[name]), jnp.sin(jnp.arange(48.0)).reshape(6, 8).astype("bfloat16")
     ready = inference.prepared(model)
@@ -70,7 +71,9 @@ def test_what_cannot_be_prepared_stays():
     assert not isinstance(twice.adapter.get_value().params, Prepared)
 
 
-@pytest.mark.parametrize("backbone", [pi0, smolvla], ids=["pi0", "smolvla"])
+@pytest.mark.parametrize(
+    "backbone", [pi0, pytest.param(smolvla, marks=pytest.mark.slow)], ids=["pi0", "smolvla"]
+)
 def test_sampling_follows_the_velocity(backbone):
     config = backbone.Config.dummy()
     model = moved(adapt(drawn(config), [("q_proj", METHODS["lora"])], rngs=nnx.Rngs(1)))

@@ -96,9 +96,8 @@ def test_moments_of_lookups_are_refused():
         calibration.input_moments(NET, IDS, "embed")
 
 
-@pytest.mark.parametrize(
-    "tool", [pytest.param(lorasp_jax.prune, marks=pytest.mark.slow), lorasp_jax.distill]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("tool", [lorasp_jax.prune, lorasp_jax.distill])
 def test_experts_get_smaller_like_dense_twins(tool):
     layer, twins = experts_and_twins(SP)
     x = jax.random.normal(jax.random.key(0), (2, 40, 5))

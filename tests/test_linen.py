@@ -69,7 +69,7 @@ def call(adapter, variables, ids):
 MATRICES = "first|blocks|dense"
 
 
-@pytest.mark.parametrize("name", mostly_slow(peft.names(), ["lora", "lora_sp"]))
+@pytest.mark.parametrize("name", mostly_slow(peft.names(), ["lora"]))
 def test_every_method_starts_at_the_base(published, ids, name):
     method = SP if name == "lora_sp" else peft.create(name)
     adapter, variables = attached(published, ids, ("split|experts|dense", method))

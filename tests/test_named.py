@@ -13,6 +13,7 @@ from lorasp_jax.dense import AdapterParam
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA, LoRAMoE
+from tests.cases import mostly_slow
 from tests.nets import METHODS, NET, SP, Net, X, assert_close, call, golden_models, trained
 
 MODELS = {
@@ -187,7 +188,7 @@ def test_hugging_face(case, choice):
     np.testing.assert_allclose(model(golden["x"]), expected, rtol=0, atol=atol)
 
 
-@pytest.mark.parametrize("name", [n for n in METHODS if n != "full"])
+@pytest.mark.parametrize("name", mostly_slow([n for n in METHODS if n != "full"], ["lora_sp"]))
 def test_half_of_an_adapter_is_half_of_what_it_changes(name):
     model = trained(("inp", METHODS[name]), seed=6)
     pair = lorasp_jax.combine({"lora": MODELS["pour"], "own": model})

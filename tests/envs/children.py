@@ -6,7 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
+import threading
 from pathlib import Path
 
 import jax
@@ -77,13 +77,19 @@ def collect_and_die(moment, out, options=""):
 
 def collect_and_interrupt(out):
     """What another child process runs: Ctrl-C while the second part is made."""
-    calls = itertools.count()
+    calls, noticed = itertools.count(), threading.Event()
+
+    def notice(*_):
+        noticed.set()
+        raise KeyboardInterrupt
 
     def record(*arguments):
         if next(calls) == 1:
             os.kill(os.getpid(), signal.SIGINT)
-            time.sleep(3)  # long enough for the main thread of a busy machine
+            assert noticed.wait(60)  # the main thread of a busy machine may take its time
         return fake_record(*arguments)
+
+    signal.signal(signal.SIGINT, notice)
 
     collection._record = record
     sys.exit(command_line.main([*COLLECT.split(), "--out", out]))

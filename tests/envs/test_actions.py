@@ -69,9 +69,8 @@ def test_unknown_convention_is_named():
         envs.make("press", actions="cartesian")
 
 
-@pytest.mark.parametrize(
-    "mode", [pytest.param("delta_joint", marks=pytest.mark.slow), "end_effector"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["delta_joint", "end_effector"])
 def test_expert_works_in_every_convention(env, mode):
     other = dataclasses.replace(env, actions=mode)
     tries = jax.jit(collection.rollout, static_argnums=0)(other, jax.random.key(0))

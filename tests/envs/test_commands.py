@@ -13,6 +13,7 @@ import envs
 from envs import __main__ as command_line
 from envs import collection, places, rlds
 from envs.episodes import Episodes
+from tests.cases import mostly_slow
 from tests.envs import user_arm
 from tests.envs.children import COLLECT, MOMENTS, REPLACING, fake_record, run_child
 from tests.envs.test_episodes import assert_equal, make
@@ -124,7 +125,7 @@ def test_collect_writes_a_file_or_many_datasets(tmp_path, run, fake):
     assert rlds.read(tmp_path / "many" / "pour").task == "pour"
 
 
-@pytest.mark.parametrize("moment", MOMENTS)
+@pytest.mark.parametrize("moment", mostly_slow(MOMENTS, [*MOMENTS][:2]))
 def test_killed_and_continued(tmp_path, run, fake, moment):
     run(COLLECT, "--out", tmp_path / "whole")
     out, unfinished = tmp_path / "killed", tmp_path / "killed.partial"
@@ -241,6 +242,7 @@ def test_a_damaged_part_is_refused(tmp_path, run, fake, monkeypatch):
     assert said.endswith(f"delete {file.parent} to start anew")
 
 
+@pytest.mark.slow
 def test_an_edited_robot_is_another(tmp_path, run, fake):
     text = COLLECT.replace("piper", str(user_arm.write(tmp_path)))
     assert run(text, "--out", tmp_path / "done")[0] == 0
@@ -267,7 +269,7 @@ def test_a_second_process_is_refused(tmp_path, run, fake):
     assert os.listdir(tmp_path) == ["press"]
 
 
-@pytest.mark.parametrize("moment", REPLACING)
+@pytest.mark.parametrize("moment", mostly_slow(REPLACING, [*REPLACING][:1]))
 def test_killed_while_the_old_is_replaced(tmp_path, run, fake, moment):
     out = tmp_path / REPLACING[moment][3]
     if out.suffix != ".npz":

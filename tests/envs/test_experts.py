@@ -112,6 +112,7 @@ def test_path_rests_at_every_knot_and_holds_the_last():
     np.testing.assert_allclose(np.abs(speed).max(axis=0), [1.875, 1.875 * 3 / 2], rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_hurried_experts_slow_down_to_half_the_speed_limits(env):
     def hurried(layout):
         way = env.task.waypoints(layout)

@@ -211,6 +211,7 @@ def test_brax_episodes_end_and_restart(env, wrapped, first):
     np.testing.assert_allclose(state.pipeline_state.info["command"][:, 0], targets, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_brax_actions_are_clipped(env, wrapped, first):
     command = np.asarray(first.pipeline_state.info["command"])[:, 0]
     state = wrapped[2](first, np.full((B, 7), 9.0, np.float32))

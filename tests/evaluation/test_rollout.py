@@ -28,9 +28,9 @@ def policy_with(folder, **fields):
 @pytest.mark.parametrize(
     ("platform", "kind", "gate"),
     [
-        ("cpu", "cpu", "bisection"),
+        pytest.param("cpu", "cpu", "bisection", marks=pytest.mark.slow),
         ("cuda", "NVIDIA H200", "pallas"),
-        ("tpu", "TPU v5e", "bisection"),
+        pytest.param("tpu", "TPU v5e", "bisection", marks=pytest.mark.slow),
     ],
 )
 def test_lowers_for(platform, kind, gate, env, tmp_path):
