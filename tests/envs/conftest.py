@@ -13,7 +13,7 @@ from envs import robots, tasks
 TASKS = sorted(module.name for module in pkgutil.iter_modules(tasks.__path__))
 ROBOTS = sorted(module.name for module in pkgutil.iter_modules(robots.__path__))
 EPISODES = 32
-SHORT = ("pick_place", "piper")  # whose episodes every run of the tests looks at
+SHORT = ("press", "piper")  # whose episodes every run of the tests looks at
 
 
 def pytest_generate_tests(metafunc):

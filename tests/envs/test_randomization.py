@@ -60,6 +60,7 @@ def equal(a, b):
     return all(map(np.array_equal, jax.tree.leaves(a), jax.tree.leaves(b)))
 
 
+@pytest.mark.slow
 def test_defaults_change_nothing(env, neutral):
     start, seen, _ = neutral
     plain = env.reset(jax.random.key(5))
@@ -69,6 +70,7 @@ def test_defaults_change_nothing(env, neutral):
         assert np.mean(picture != seen["image"][name]) < 0.002  # rounding at edges
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FIELDS)
 def test_a_range_changes_its_own_outcome_and_no_other(episode, neutral, name):
     (start, seen, end), (start0, seen0, end0) = episode(**exactly(name)), neutral
@@ -89,6 +91,7 @@ def test_a_range_changes_its_own_outcome_and_no_other(episode, neutral, name):
     assert not bool(end.info["broken"].any())
 
 
+@pytest.mark.slow
 def test_objects_are_moved_turned_and_grown(episode, neutral):
     layout0 = neutral[0].info["layout"]
     for name, change in (
@@ -101,6 +104,7 @@ def test_objects_are_moved_turned_and_grown(episode, neutral):
             np.testing.assert_allclose(place, change(np.asarray(layout0[body])), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_cameras_move_along_and_about_their_own_axes(env, episode, neutral):
     data0 = neutral[0].data
     data = episode(**exactly("camera_position"))[0].data
@@ -112,6 +116,7 @@ def test_cameras_move_along_and_about_their_own_axes(env, episode, neutral):
     np.testing.assert_allclose(angle, 0.1 * np.sqrt(3), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_brightness_scales_the_pictures(episode, neutral):
     bright, dark = (e[1]["image"]["side"].mean() for e in (neutral, episode(brightness=(0.5, 0.5))))
     assert dark / bright == pytest.approx(0.5, abs=0.03)
@@ -127,7 +132,6 @@ def test_latency_delays_what_is_sent():
     np.testing.assert_allclose(last[-1], [0.1, 0.02], atol=1e-6)
 
 
-@pytest.mark.slow
 @pytest.mark.slow  # a scene of its own to compile
 def test_recorded_pictures_show_each_world_as_it_is(env):
     ranges, key = Randomization.typical(), jax.random.key(3)
@@ -137,6 +141,7 @@ def test_recorded_pictures_show_each_world_as_it_is(env):
         np.testing.assert_allclose(recorded["image"][name][:, 0], picture, atol=1)
 
 
+@pytest.mark.slow
 def test_worlds_draw_for_themselves(episode):
     draw = episode(mass=(0.5, 2.0), brightness=(0.5, 1.5))[0].info["draw"]
     assert draw.brightness[0] != draw.brightness[1]
@@ -144,6 +149,7 @@ def test_worlds_draw_for_themselves(episode):
     assert len(np.unique(draw.mass)) == draw.mass.size
 
 
+@pytest.mark.slow
 def test_other_ranges_compile_nothing(env):
     env.reset(jax.random.key(0), Randomization())
     compiled = env._resets._cache_size()

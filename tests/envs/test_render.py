@@ -226,6 +226,7 @@ def test_memory_does_not_grow_with_the_samples(built, poses):
     assert memory(8) < 1.5 * memory(1)
 
 
+@pytest.mark.slow
 def test_environments_pass_antialias_on():
     plain, smooth = (envs.make("press", image_size=12, antialias=n) for n in (1, 3))
     batch = [x[None] for x in poses_of(world(plain))]

@@ -79,9 +79,10 @@ def test_worlds_of_worlds_are_worlds(pair):
     np.testing.assert_allclose(twice.data.qpos[1], batch.data.qpos, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ranges", "antialias"),
-    [(None, 2), pytest.param(Randomization.typical(), 1, marks=pytest.mark.slow)],
+    [(None, 2), (Randomization.typical(), 1)],
 )
 def test_pictures_match_the_ray_caster(ranges, antialias):
     """On average within a level of 255; single pixels at edges differ."""

@@ -149,16 +149,9 @@ class Pi05(Pi0):
         flow_time: jax.Array,
         action_valid: jax.Array | None = None,
     ) -> tuple[jax.Array, LayerAux]:
-        """Tokens of the noisy actions.
+        """Tokens `[B, C, D]` f32 of the noisy actions, as in `Pi0`, and the adapters' reports.
 
-        Args:
-            obs: not read, the prompt tells the state.
-            x_t: `[B, C, A]`.
-            flow_time: not read, see `condition`.
-            action_valid: `[B, C]` bool, what the adapters count; None counts all.
-
-        Returns:
-            `[B, C, D]` f32, and the adapters' reports.
+        The state is in the prompt and the time in the norms, so `obs` and `flow_time` are not read.
         """
         del obs, flow_time
         linear = Linears(self, action_valid)
