@@ -4,6 +4,7 @@ import dataclasses
 
 import jax
 import numpy as np
+import pytest
 
 from lorasp_jax.data.batches import flatten, sample_batch
 from tests.runs import CONFIG, make_run, random_episodes
@@ -21,6 +22,7 @@ def test_flatten_keeps_valid_steps_in_order():
     np.testing.assert_array_equal(steps.image["wrist"][6], first.image["wrist"][1, 1])
 
 
+@pytest.mark.slow
 def test_chunks_stay_in_their_episode(tmp_path):
     run = make_run(tmp_path / "run")
     steps, table = flatten(list(run.episodes.values())), run.policy.processor

@@ -220,6 +220,7 @@ def test_brax_actions_are_clipped(env, wrapped, first):
     np.testing.assert_allclose(found, np.minimum(reach, env.action_high), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_brax_success_is_rewarded_once(env, wrapped, first, pressed):
     before, action, (_, reward, *_), _ = pressed
     worlds = [int(np.argmax(reward)), int(np.argmin(reward))]

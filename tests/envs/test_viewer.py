@@ -39,6 +39,7 @@ class Window:
         return self.left > 0
 
 
+@pytest.mark.slow
 def test_play_repeats_an_episode_until_the_window_closes(env, monkeypatch):
     opened, slept = [], []
 

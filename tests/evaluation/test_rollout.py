@@ -44,6 +44,7 @@ def test_lowers_for(platform, kind, gate, env, tmp_path):
     assert ("__gpu$xla.gpu.triton" in text) == (gate == "pallas")
 
 
+@pytest.mark.slow
 def test_evaluate_reports_what_happened(env, tmp_path):
     policy = policy_with(tmp_path / "run")
     rollout = jax.jit(make_rollout(env, execute_steps=4, denoise_steps=1))
