@@ -36,14 +36,19 @@ def config_of(fields: Fields) -> BackboneConfig:
     kind, types = str(fields.get("type")), _types()
     if kind not in types:
         raise ValueError(f"a policy of type {kind!r} is not one of {', '.join(types)}")
-    for name, only in _FIXED.items():
-        if fields.get(name, only) != only:
-            raise ValueError(f"{name} must be {only!r} here, not {fields[name]!r}")
+    require(fields, _FIXED)
     try:
         config = types[kind](fields)
         return dataclasses.replace(config, **_shared(config, fields))
     except (AttributeError, KeyError, TypeError) as error:
         raise ValueError(f"it is not as LeRobot writes it ({error!r})") from error
+
+
+def require(fields: Fields, fixed: Fields) -> None:
+    """Raise ValueError where a policy does something else than is fixed here."""
+    for name, only in fixed.items():
+        if fields.get(name, only) != only:
+            raise ValueError(f"{name} must be {only!r} here, not {fields[name]!r}")
 
 
 def _types() -> dict[str, Callable[[Fields], BackboneConfig]]:

@@ -20,7 +20,7 @@ from lorasp_jax import adaptation, calibration, models, peft, tables
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Batch, flatten, sample_batch
 from lorasp_jax.data.demonstrations import demonstrations
-from lorasp_jax.models import backbone, loading, presets, tokenizer
+from lorasp_jax.models import backbone, loading, places, presets, tokenizer
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.models.policy import Policy
@@ -131,9 +131,10 @@ def base_model(config: Config) -> tuple[Backbone, str]:
     if not wanted.inputs.masks_missing:
         wanted = dataclasses.replace(wanted, cameras=wanted.cameras[: len(envs.Env.cameras)])
     if chosen.source:
-        model = models.load(chosen.source, wanted)
-        if loading.is_own(chosen.source):
-            _check_time(config)
+        folder = places.local(chosen.source)
+        model = models.load(folder, wanted)
+        if loading.is_own(folder):
+            _check_time(folder, config.control_dt)
         return model, models.weights_hash(model)
     key = jax.random.fold_in(jax.random.key(config.seed), 4)
     model = wanted.create(nnx.Rngs(key))
@@ -149,17 +150,16 @@ def _with_remat(model: Backbone, remat: Remat) -> Backbone:
     return nnx.merge(nnx.graphdef(abstract), nnx.state(model))
 
 
-def _check_time(config: Config) -> None:
-    """Raise ValueError unless the base was trained at this run's control period."""
-    source = config.model.source
-    path = Path(source) / TRAINING
+def _check_time(folder: Path, control_dt: float) -> None:
+    """Raise ValueError unless the base in a folder was trained at this control period."""
+    path = folder / TRAINING
     try:
         found = json.loads(path.read_text())["control_dt"]
     except (OSError, KeyError, ValueError) as error:
         raise ValueError(f"{path} does not say the control_dt that the base needs") from error
-    if found != config.control_dt:
+    if found != control_dt:
         raise ValueError(
-            f"{source} was trained with control_dt {found} s, this run has {config.control_dt}"
+            f"{folder} was trained with control_dt {found} s, this run has {control_dt}"
         )
 
 

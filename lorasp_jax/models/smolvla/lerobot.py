@@ -5,6 +5,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from lorasp_jax.models.lerobot_config import require
 from lorasp_jax.models.smolvla.config import SmolVLAConfig
 
 # What this backbone does, and LeRobot's may do otherwise.
@@ -23,9 +24,7 @@ def smolvla(fields: Mapping[str, Any]) -> SmolVLAConfig:
     """
     config = SmolVLAConfig.base()
     depth = fields.get("num_vlm_layers", config.language.depth)
-    for name, only in _FIXED.items():
-        if fields.get(name, only) != only:
-            raise ValueError(f"{name} must be {only!r} here, not {fields[name]!r}")
+    require(fields, _FIXED)
     if fields.get("num_expert_layers", -1) not in {-1, 0, depth}:
         raise ValueError(f"num_expert_layers must be that of the language model, {depth}")
     action = config.action
