@@ -1,40 +1,128 @@
-"""Adapters made ready for inference: what does not depend on the input is computed once.
+"""Adapted layers made ready for inference: what does not depend on the input is computed once.
 
-A layer that is called again and again on a few tokens, as in the steps of a flow, should not join,
-normalise and convert its adapter's matrices each time.
+A layer that is called again and again on a few tokens, as in the steps of a flow, is as fast as its
+kernels are few. So layers that read one input get one matrix for all that reads it and one for all
+that adapters write:
+
+    [x W, x P] = x [W, P]         for the W and P of all layers
+    y = x W + z diag(U)           with z = f(x P)
+
+Their chains f between the matrices run as one. `lorasp_jax.kernels.low_rank_matmul` is the same for
+training, where the copies of W would cost more than they save.
 """
 
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax.adaptation import Model, over_stack
-from lorasp_jax.dense import Dense, with_value
-from lorasp_jax.kernels.low_rank_matmul import Prepared
-from lorasp_jax.peft import Method
-from lorasp_jax.peft.method import Params
+from lorasp_jax.dense import Dense
+from lorasp_jax.kernels.low_rank_matmul import aligned
+from lorasp_jax.peft import Aux, Method
+
+Names = tuple[str, ...]
 
 
-def prepared(model: Model) -> Model:
-    """A copy whose adapters have P and U at hand, in the type of their layer's computation.
+class Joined(NamedTuple):
+    """Layers of one method that read the same input."""
 
-    It computes the same; it is not meant to be trained or saved. Layers of the kind `Dense` with a
-    type of their own are prepared, if their method is x W + z U.
+    params: Any
+    """Adapters' parameters of the n layers, [n, ...]; None where their shapes differ."""
+    read: jax.Array
+    """[W, P], [I, sum of O and of Q or a little more]."""
+    write: jax.Array
+    """Each layer's U [R, O] on the diagonal, [n R, sum of O]."""
+    bias: jax.Array | None
+    """[sum of O], None if no layer has one."""
+
+
+class Ready(nnx.Variable):
+    """What `prepare` leaves in a module: `Joined` by the names of the layers."""
+
+
+def prepare(module: nnx.Module) -> None:
+    """Joins the adapted layers that are attributes of the module; it then computes the same.
+
+    `module.together`, if there is one, names layers that read the same input. Layers of the kind
+    `Dense` with a type of their own are joined, if their method is x W + z U; the others stay.
     """
-    model = nnx.merge(*nnx.split(model))
-    for _, layer in nnx.iter_modules(model):
-        if type(layer) is Dense and layer.adapter is not None and layer.dtype is not None:
-            method, params = layer.carried()
-            if type(method).apply is Method.apply and not isinstance(params, Prepared):
-                _prepare(layer, method)
-    return model
+    layers = {name: layer for name, layer in vars(module).items() if _can_join(layer)}
+    groups = [names for names in getattr(module, "together", ()) if _one_kind(layers, names)]
+    grouped = {name for names in groups for name in names}
+    groups += [(name,) for name in layers if name not in grouped]
+    if groups:
+        joined = {names: _join([layers[name] for name in names]) for names in groups}
+        module.ready = Ready(joined)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def _prepare(layer: Dense, method: Method) -> None:
-    def one(params: Params) -> Prepared:
-        down, up = (
-            matrix.astype(layer.dtype) for matrix in (method.down(params), method.up(params))
-        )
-        return Prepared(params, down, up)
+def call(
+    module: nnx.Module, names: Names, x: jax.Array, token_mask: jax.Array | None
+) -> list[tuple[jax.Array, Aux]] | None:
+    """y and aux of each layer for the same x `[..., I]`, or None if they are not joined."""
+    ready = getattr(module, "ready", None)
+    if ready is None or names not in ready.get_value():
+        return None
+    layers: list[Dense] = [getattr(module, name) for name in names]
+    joined: Joined = ready.get_value()[names]
+    method, _ = layers[0].carried()
+    tokens, n, outs = x.shape[:-1], len(names), joined.write.shape[1]
+    read = layers[0].as_input(x) @ joined.read
+    rows = read[..., outs : outs + n * _rows(layers[0])].reshape(*tokens, n, -1)
+    z, aux = jax.vmap(
+        lambda params, rows: method.between(params, rows, token_mask), in_axes=(0, -2)
+    )(joined.params, rows)
+    z = jnp.moveaxis(z, 0, -2).reshape(*tokens, -1).astype(read.dtype)
+    y = read[..., :outs] + z @ joined.write
+    y = y if joined.bias is None else y + joined.bias
+    ends = [sum(layer.kernel_matrices().shape[1] for layer in layers[: i + 1]) for i in range(n)]
+    aux = [jax.tree.map(lambda a, i=i: a[i], aux) for i in range(n)]
+    reports = [dataclasses.replace(one, token_mask=token_mask) for one in aux]
+    return list(zip(jnp.split(y, ends[:-1], axis=-1), reports, strict=True))
 
-    assert layer.adapter is not None
-    ready = over_stack(one, layer.kernel_matrices())(layer.adapter.get_value())
-    layer.adapter = with_value(layer.adapter, ready)  # the old variable is the given model's too
+
+def _can_join(layer: Any) -> bool:
+    """Whether it is an adapted layer, not a stack, of a method that leaves `apply` as it is."""
+    if type(layer) is not Dense or layer.adapter is None or layer.dtype is None:
+        return False
+    method, _ = layer.carried()
+    plain = type(method).apply is Method.apply and not method.reads_in_fp32
+    return plain and layer.kernel_matrices().ndim == 2
+
+
+def _one_kind(layers: dict[str, Dense], names: Names) -> bool:
+    """Whether all of these are there, with one method and type."""
+    found = [layers[name] for name in names if name in layers]
+    return len(found) == len(names) and len({(a.method, a.dtype) for a in found}) == 1
+
+
+def _rows(layer: Dense) -> int:
+    """Q, the width of P."""
+    method, params = layer.carried()
+    return jax.eval_shape(method.down, params).shape[1]
+
+
+def _join(layers: Sequence[Dense]) -> Joined:
+    method, _ = layers[0].carried()
+    params = [layer.carried()[1] for layer in layers]
+    outs = [layer.kernel_matrices().shape[1] for layer in layers]
+
+    def stacked(*leaves: jax.Array) -> jax.Array | None:
+        return jnp.stack(leaves) if len({leaf.shape for leaf in leaves}) == 1 else None
+
+    dtype = layers[0].dtype
+    kernels = [layer.kernel_matrices().astype(dtype) for layer in layers]
+    downs = [method.down(p).astype(dtype) for p in params]
+    biases = [
+        jnp.zeros(o, dtype) if layer.bias is None else layer.bias.get_value().astype(dtype)
+        for o, layer in zip(outs, layers, strict=True)
+    ]
+    has_bias = any(layer.bias is not None for layer in layers)
+    return Joined(
+        params=jax.tree.map(stacked, *params),
+        read=aligned(jnp.concatenate(kernels + downs, axis=1)),
+        write=jax.scipy.linalg.block_diag(*(method.up(p).astype(dtype) for p in params)),
+        bias=jnp.concatenate(biases) if has_bias else None,
+    )

@@ -85,10 +85,17 @@ def router_scores(
     hidden = hidden.astype(jnp.float32)
     if "b1" not in router:
         return jax.nn.relu(jax.nn.softmax(hidden) @ router["w2"]), hidden
-    logits = jax.nn.gelu(hidden + router["b1"]) @ router["w2"] + router["b2"]
+    logits = _product(jax.nn.gelu(hidden + router["b1"]), router["w2"]) + router["b2"]
     if score_function == "softmax":
         return logits.shape[-1] * jax.nn.softmax(logits), logits
     return (jax.nn.softplus if score_function == "softplus" else jax.nn.relu)(logits), logits
+
+
+def _product(rows: jax.Array, matrix: jax.Array) -> jax.Array:
+    """rows @ matrix, [n, R]; of one row a sum, as Triton's matrix product takes 16 or more."""
+    if rows.shape[:-1] != (1,):
+        return rows @ matrix
+    return (rows.reshape(-1, 1) * matrix).sum(0, keepdims=True)
 
 
 def pooled_scores(scores: jax.Array, valid: jax.Array, granularity: Granularity) -> jax.Array:

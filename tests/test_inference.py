@@ -1,4 +1,4 @@
-"""Prepared adapters compute the same, from matrices that were joined and converted before."""
+"""Joined layers compute what they did, with fewer products."""
 
 import jax
 import jax.numpy as jnp
@@ -8,62 +8,79 @@ from flax import nnx
 
 from lorasp_jax import inference
 from lorasp_jax.dense import Dense
-from lorasp_jax.kernels.low_rank_matmul import Prepared
 from lorasp_jax.models import pi0, smolvla
-from lorasp_jax.models.layers import scan_depth, stack, unstacked
+from lorasp_jax.models.layers import Linears
 from tests import quick
 from tests.cases import mostly_slow
 from tests.models.drawn import drawn, observation
 from tests.nets import METHODS, trained
 
-ADDITIVE = [name for name in METHODS if name not in ("full", "dora")]
+JOINED = [name for name in METHODS if name not in ("full", "dora", "lora_moe")]
 
 
-def stacked(method, dtype="bfloat16"):
-    """Three layers [3, 8, 8], adapted."""
-    layers = stack(lambda rngs: Dense(8, 8, dtype=dtype, rngs=rngs), 3, nnx.Rngs(0))
-    return trained((".*", method), seed=1, net=layers)
+class Readers(nnx.Module):
+    """Three layers that read x, one with a bias, and one that reads their sum."""
+
+    together = (("first", "second"),)
+
+    def __init__(self, dtype="bfloat16"):
+        kinds = {"dtype": dtype, "rngs": nnx.Rngs(0)}
+        self.first = Dense(8, 8, **kinds, use_bias=False)
+        self.second = Dense(8, 12, **kinds)
+        self.third = Dense(8, 8, **kinds)
+
+    def __call__(self, x, token_mask=None):
+        linear = Linears(self, token_mask)
+        first, second = linear.together(("first", "second"), x)
+        return linear("third", first) + second[..., :8], linear.aux
 
 
-def through(layers, x):
-    def call(layer, x, _):
-        return layer(x, return_aux=True)
+def adapted(method, dtype="bfloat16"):
+    net = Readers(dtype)
+    net.second.bias.set_value(jnp.arange(12.0))
+    return trained((".*", method), seed=1, net=net)
 
-    return scan_depth(layers, call, x)
+
+def ready(model):
+    model = nnx.merge(*nnx.split(model))
+    inference.prepare(model)
+    return model
 
 
-@pytest.mark.parametrize("name", mostly_slow(ADDITIVE, ["lora_sp"]))
+@pytest.mark.parametrize("name", mostly_slow(JOINED, ["lora_sp"]))
 def test_computes_the_same(name):
-    model, x = stacked(METHODS[name]), jnp.sin(jnp.arange(48.0)).reshape(6, 8).astype("bfloat16")
-    ready = inference.prepared(model)
-    params = ready.adapter.get_value()
-    assert isinstance(params, Prepared)
-    assert params.down.dtype == params.up.dtype == jnp.bfloat16
-    assert not isinstance(model.adapter.get_value(), Prepared)
-    expected, aux = through(model, x)
-    for layers in (ready, unstacked(ready)):
-        found, other = through(layers, x)
-        np.testing.assert_allclose(
-            *(np.float32(a) for a in (found, expected)), rtol=0.02, atol=0.02
-        )
-        assert jax.tree.structure(other) == jax.tree.structure(aux)
-        jax.tree.map(
-            lambda a, b: np.testing.assert_allclose(a, b, rtol=0.02, atol=1e-3), other, aux
-        )
-    np.testing.assert_array_equal(params.up[1], METHODS[name].up(one(model, 1)).astype("bfloat16"))
+    model, x = adapted(METHODS[name], "float32"), jnp.sin(jnp.arange(96.0)).reshape(2, 6, 8)
+    mask = jnp.arange(12).reshape(2, 6) % 5 != 0
+    expected, aux = model(x, mask)
+    prepared = ready(model)
+    assert set(prepared.ready.get_value()) == {("first", "second"), ("third",)}
+    found, other = prepared(x, mask)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
+    assert jax.tree.structure(other) == jax.tree.structure(aux)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), other, aux)
 
 
-def one(model, i):
-    """Parameters of layer i."""
-    return jax.tree.map(lambda a: a[i], model.adapter.get_value())
+def test_layers_of_one_input_are_two_products():
+    model, x = adapted(METHODS["lora"]), jnp.ones((2, 8), jnp.bfloat16)
+    products = lambda model: str(jax.make_jaxpr(lambda x: model(x)[0])(x)).count("dot_general")  # noqa: E731
+    assert products(model) > products(ready(model)) == 4
 
 
-def test_what_cannot_be_prepared_stays():
-    for model in (stacked(METHODS["dora"]), stacked(METHODS["lora"], dtype=None)):
-        ready = inference.prepared(model)
-        assert not isinstance(ready.adapter.get_value(), Prepared)
-    twice = inference.prepared(inference.prepared(stacked(METHODS["lora"])))
-    assert not isinstance(twice.adapter.get_value().params, Prepared)
+@pytest.mark.parametrize(
+    "model",
+    [adapted(METHODS["dora"]), adapted(METHODS["lora_moe"]), adapted(METHODS["lora"], dtype=None)],
+    ids=["another product", "rows in fp32", "no type of its own"],
+)
+def test_what_cannot_be_joined_stays(model):
+    assert not hasattr(ready(model), "ready")
+
+
+def test_layers_of_two_methods_are_joined_alone():
+    model = adapted(METHODS["lora"], "float32")
+    model.second = adapted(METHODS["lora_sp"], "float32").second
+    prepared, x = ready(model), jnp.ones((2, 8))
+    assert set(prepared.ready.get_value()) == {("first",), ("second",), ("third",)}
+    np.testing.assert_allclose(prepared(x)[0], model(x)[0], rtol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -71,7 +88,7 @@ def test_what_cannot_be_prepared_stays():
 )
 def test_sampling_follows_the_velocity(backbone):
     config = backbone.Config.dummy()
-    model = trained(("q_proj", METHODS["lora"]), seed=1, net=drawn(config))
+    model = trained((".*_proj", METHODS["lora"]), seed=1, net=drawn(config))
     obs = observation(config, 2)
     noise = jax.random.normal(jax.random.key(0), (2, config.chunk, config.action_dim))
     velocity = quick.jit(lambda model, x, t: model.velocity(obs, x, jnp.full(2, t)))

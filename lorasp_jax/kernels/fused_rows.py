@@ -25,7 +25,7 @@ class Launch(NamedTuple):
     """How rows are spread over the GPU."""
 
     rows: int
-    """Rows to a block, at least 16, the smallest that Triton's matrix product takes."""
+    """Rows to a block: 1, or at least 16, the smallest that Triton's matrix product takes."""
     warps: int
     """Warps to a program."""
     programs: int
@@ -34,6 +34,11 @@ class Launch(NamedTuple):
 
 FORWARD = Launch(16, 2, 816)
 BACKWARD = Launch(16, 4, 512)
+FEW = Launch(1, 4, 1024)
+"""Both ways for so few rows that what counts is how long one takes."""
+FEW_ROWS = 1024
+FEW_WIDTH = 128
+"""The widest column of which a program has registers for all pairs of numbers."""
 
 Columns = list[jax.Array]
 """Arrays [n, width] that lie side by side in one [n, sum of widths]."""
@@ -54,11 +59,11 @@ def fused_rows(
     """`function` of all rows in one kernel, its gradient in another.
 
     Args:
-      function: (shared, columns, counts, kept) -> (output, sums, kept, statistics), for any number
-        n of rows: columns [n, width] each, counts bool [n, 1], output [n, O]; sums is a pytree of
-        fp32 arrays that add up over rows, kept, bool [n, K], what its gradient takes as given (None
-        on the way forward), statistics a list of [n, 1] without gradient. It may use what Triton
-        has: sides are powers of two, in a matrix product at least 16.
+      function: (shared, columns, counts, kept) -> (output, sums, kept, statistics), for n rows, one
+        or a power of two: columns [n, width] each, counts bool [n, 1], output [n, O]; sums is a
+        pytree of fp32 arrays that add up over rows, kept, bool [n, K], what its gradient takes as
+        given (None on the way forward), statistics a list of [n, 1] without gradient. It may use
+        what Triton has: sides are powers of two, in a matrix product at least 16.
       shared: pytree of small fp32 arrays that every row uses.
       rows: [T, sum of widths].
       widths: of the columns that `function` takes.
@@ -68,10 +73,12 @@ def fused_rows(
     Returns:
       output [T, O], sums, statistics [T, 1]. Gradients reach `shared` and `rows`.
     """
-    num_rows = len(rows)
-    fill = ((0, -num_rows % math.lcm(FORWARD.rows, BACKWARD.rows)), (0, 0))
+    num_rows, launches = len(rows), (FORWARD, BACKWARD)
+    if num_rows <= FEW_ROWS and max(widths) <= FEW_WIDTH:
+        launches = FEW, FEW
+    fill = ((0, -num_rows % math.lcm(*(launch.rows for launch in launches))), (0, 0))
     rows, counts = jnp.pad(rows, fill), jnp.pad(counts, fill).astype(jnp.int8)
-    found: Any = _fused((function, widths, interpret), shared, rows, counts)
+    found: Any = _fused((function, widths, launches, interpret), shared, rows, counts)
     output, sums, statistics = found
     return output[:num_rows], sums, [column[:num_rows] for column in statistics]
 
@@ -82,7 +89,7 @@ def _fused(static: tuple, shared: Any, rows: jax.Array, counts: jax.Array) -> tu
 
 
 def _forward(static: tuple, shared: Any, rows: jax.Array, counts: jax.Array) -> tuple:
-    function, widths, interpret = static
+    function, widths, (launch, _), interpret = static
 
     def block(shared: Any, columns: Columns, counts: Columns) -> tuple[list[Columns], Any]:
         output, sums, kept, statistics = function(shared, columns, counts[0] != 0, None)
@@ -90,12 +97,12 @@ def _forward(static: tuple, shared: Any, rows: jax.Array, counts: jax.Array) -> 
         return [[output], [kept], *([column] for column in statistics)], sums
 
     inputs = [(rows, widths), (counts, (1,))]
-    (output, kept, *statistics), sums = _map_blocks(block, shared, inputs, FORWARD, interpret)
+    (output, kept, *statistics), sums = _map_blocks(block, shared, inputs, launch, interpret)
     return (output, sums, statistics), (shared, rows, counts, kept)
 
 
 def _backward(static: tuple, residuals: tuple, cotangents: tuple) -> tuple:
-    function, widths, interpret = static
+    function, widths, (_, launch), interpret = static
     shared, rows, counts, kept = residuals
     d_output, d_sums, _ = cotangents
 
@@ -111,7 +118,7 @@ def _backward(static: tuple, residuals: tuple, cotangents: tuple) -> tuple:
         return [d_columns], d_shared
 
     inputs = [(rows, widths), *((a, (a.shape[1],)) for a in (counts, kept, d_output))]
-    (d_rows,), d_shared = _map_blocks(block, (shared, d_sums), inputs, BACKWARD, interpret)
+    (d_rows,), d_shared = _map_blocks(block, (shared, d_sums), inputs, launch, interpret)
     return d_shared, d_rows, None
 
 

@@ -44,17 +44,6 @@ class LowRankLayer(NamedTuple):
     """U [R, O], fp32, used in the type of x."""
 
 
-class Prepared(NamedTuple):
-    """An adapter's parameters with its matrices at hand, see `lorasp_jax.inference`."""
-
-    params: Any
-    """What f needs."""
-    down: jax.Array
-    """P [I, Q]."""
-    up: jax.Array
-    """U [R, O]."""
-
-
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def low_rank_matmul(
     between: Sequence[Between],
@@ -120,7 +109,7 @@ def _backward(
         through_bases.append(through_base)
         d_params.append(of_params)
         d_rows.append(of_rows.astype(x.dtype))
-    q = _aligned(jnp.concatenate(d_rows, axis=-1))
+    q = aligned(jnp.concatenate(d_rows, axis=-1))
     dx = _gradient_of_input(layers, x, gradients, through_bases, q)
     d_downs = _split(layers, _outer(x, q, layers[0].down.dtype))
     d_layers = [
@@ -157,7 +146,7 @@ def _joins(layer: LowRankLayer, x: jax.Array) -> bool:
 
 def _side_by_side(layers: Sequence[LowRankLayer], x: jax.Array) -> jax.Array:
     """The P of all layers, [I, ΣQ], in the type of x."""
-    return _aligned(jnp.concatenate([layer.down.astype(x.dtype) for layer in layers], axis=1))
+    return aligned(jnp.concatenate([layer.down.astype(x.dtype) for layer in layers], axis=1))
 
 
 def _split(layers: Sequence[LowRankLayer], columns: jax.Array) -> list[jax.Array]:
@@ -166,7 +155,7 @@ def _split(layers: Sequence[LowRankLayer], columns: jax.Array) -> list[jax.Array
     return jnp.split(columns, ends, axis=-1)[:-1]
 
 
-def _aligned(matrix: jax.Array) -> jax.Array:
+def aligned(matrix: jax.Array) -> jax.Array:
     """Zeros up to a multiple of 8 columns: 132 made LoRA-MoE's backward pass twice as long."""
     return jnp.pad(matrix, [(0, 0)] * (matrix.ndim - 1) + [(0, -matrix.shape[-1] % 8)])
 

@@ -207,8 +207,10 @@ class Backbone(nnx.Module):
 
     def _acting(self) -> Self:
         """A copy for the steps of a flow, in which nothing depends on weights alone any more."""
-        model = inference.prepared(self)
+        model = nnx.merge(*nnx.split(self))
         model.action.blocks = unstacked(model.action.blocks)
+        for module in (model, *(module for _, module in nnx.iter_modules(model.action))):
+            inference.prepare(module)
         return model
 
 

@@ -31,12 +31,17 @@ KeysValues = tuple[jax.Array, jax.Array]
 """Keys after the rotation and values, each `[B, S, K, H]`, or `[L, B, S, K, H]` for all layers."""
 
 
+QKV = ("q_proj", "k_proj", "v_proj")
+GATED = ("gate_proj", "up_proj")
+
+
 class ExpertBlock(nnx.Module):
     """One Gemma layer (arXiv 2403.08295): RMS norms, rotary grouped-query attention, GeGLU.
 
     There are no biases. Subclasses have other norms and activations.
     """
 
+    together = (QKV, GATED)
     make_norm = staticmethod(RMSNorm)
     activation = staticmethod(functools.partial(jax.nn.gelu, approximate=True))
 
@@ -92,7 +97,7 @@ class ExpertBlock(nnx.Module):
         linear = Linears(self, token_mask)
         heads = (*x.shape[:2], -1, self.head_dim)
         h, branch = linear.norm("input_layernorm", x, condition)
-        read = linear.together(("q_proj", "k_proj", "v_proj"), h)
+        read = linear.together(QKV, h)
         q, k, v = (y.reshape(heads) for y in read)
         q, k = rope(q, table, scale=self.head_dim**-0.5), rope(k, table)
         keys, values = k, v
@@ -116,7 +121,7 @@ class ExpertBlock(nnx.Module):
         """
         x = x + branch * linear("o_proj", attended)
         h, branch = linear.norm("post_attention_layernorm", x, condition)
-        gate, up = linear.together(("gate_proj", "up_proj"), h)
+        gate, up = linear.together(GATED, h)
         return x + branch * linear("down_proj", self.activation(gate) * up)
 
 

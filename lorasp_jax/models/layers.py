@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from lorasp_jax import inference
 from lorasp_jax.dense import Dense, dense_together
 from lorasp_jax.models.config import Remat
 from lorasp_jax.peft import Aux
@@ -126,20 +127,22 @@ class Linears:
 
     def __call__(self, name: str, x: jax.Array) -> jax.Array:
         """y of the layer `name` for x `[B, T, I]`."""
-        layer = getattr(self._module, name)
-        y, self.aux[name] = layer(x, token_mask=self._token_mask, return_aux=True)
-        return y
+        return self.together((name,), x)[0]
 
-    def together(self, names: Sequence[str], x: jax.Array) -> list[jax.Array]:
+    def together(self, names: tuple[str, ...], x: jax.Array) -> list[jax.Array]:
         """y of each layer for the same x `[B, T, I]`, which adapters of `Dense` read once."""
-        layers = [getattr(self._module, name) for name in names]
-        inputs = [layer.as_input(x) for layer in layers if type(layer) is Dense]
-        if len(inputs) < len(layers) or len({x.dtype for x in inputs}) > 1:
-            return [self(name, x) for name in names]
         mask = self._token_mask
-        found = dense_together(inputs[0], [layer.arrays() for layer in layers], token_mask=mask)
+        found = inference.call(self._module, names, x, mask) or self._together(names, x)
         self.aux |= {name: aux for name, (_, aux) in zip(names, found, strict=True)}
         return [y for y, _ in found]
+
+    def _together(self, names: tuple[str, ...], x: jax.Array) -> list[tuple[jax.Array, Aux]]:
+        layers = [getattr(self._module, name) for name in names]
+        inputs = [layer.as_input(x) for layer in layers if type(layer) is Dense]
+        mask = self._token_mask
+        if len(inputs) < len(layers) or len({x.dtype for x in inputs}) > 1:
+            return [layer(x, token_mask=mask, return_aux=True) for layer in layers]
+        return dense_together(inputs[0], [layer.arrays() for layer in layers], token_mask=mask)
 
     def norm(self, name: str, x: jax.Array, condition: jax.Array | None) -> tuple[jax.Array, Any]:
         """y of the norm `name` for x `[B, T, D]`, and what multiplies the branch that reads it.

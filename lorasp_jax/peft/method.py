@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, Prepared, low_rank_matmul
+from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul
 
 PACKAGE = __name__.rpartition(".")[0]
 
@@ -239,9 +239,7 @@ def _apply_fused(
 ) -> list[tuple[jax.Array, Aux]]:
     rows_dtype = layers[0][0]._rows_dtype(x)
     arrays = [
-        LowRankLayer(params.params, kernel, params.down, params.up)
-        if isinstance(params, Prepared)
-        else LowRankLayer(params, kernel, method.down(params), method.up(params))
+        LowRankLayer(params, kernel, method.down(params), method.up(params))
         for method, params, kernel in layers
     ]
     between = tuple(method.between for method, _, _ in layers)

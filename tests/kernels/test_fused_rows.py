@@ -49,8 +49,12 @@ def close(found, expected):
     assert np.linalg.norm(found - expected) <= 1e-5 * np.linalg.norm(expected)
 
 
-@pytest.mark.parametrize("num_rows", [1, 16, 83])  # less than a block, one, the last one not full
-def test_equals_the_function(shared, num_rows):
+@pytest.mark.parametrize(
+    ("num_rows", "few"),  # one by one; less than a block, one, the last one not full
+    [(5, kernels.FEW_ROWS), (1, 0), (16, 0), (83, 0)],
+)
+def test_equals_the_function(shared, num_rows, few, monkeypatch):
+    monkeypatch.setattr(kernels, "FEW_ROWS", few)
     rows = jax.random.normal(jax.random.key(1), (num_rows, 48))
     counts = jax.random.bernoulli(jax.random.key(2), 0.7, (num_rows, 1))
     expected, found = (run(fused, shared, rows, counts) for fused in (False, True))
@@ -60,6 +64,7 @@ def test_equals_the_function(shared, num_rows):
 
 def test_programs_share_the_rows(shared, monkeypatch):
     """Several blocks to a program add up to the same."""
+    monkeypatch.setattr(kernels, "FEW_ROWS", 0)
     rows = jax.random.normal(jax.random.key(1), (16 * 12, 48))
     counts = jnp.ones((len(rows), 1), bool)
     one_each = run(True, shared, rows, counts)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from lorasp_jax import routing
+from lorasp_jax.kernels import fused_rows
 from lorasp_jax.peft import LoRA, LoRASP, lora_sp
 
 D_IN, D_OUT = 24, 40
@@ -124,12 +125,13 @@ def test_losses_of_uniform_and_concentrated_routing():
     assert spectral == pytest.approx(0.05)
 
 
-@pytest.mark.parametrize("masked", [False, True])
-def test_one_kernel_equals_the_equations(x, monkeypatch, masked):
+@pytest.mark.parametrize(("masked", "few"), [(False, 0), (True, 0), (True, fused_rows.FEW_ROWS)])
+def test_one_kernel_equals_the_equations(x, monkeypatch, masked, few):
     """The fused chain, run by Triton on a GPU and by its interpreter elsewhere."""
     interpret = jax.default_backend() != "gpu"
     kernel = functools.partial(lora_sp.fused_rows, interpret=interpret)
     monkeypatch.setattr(lora_sp, "fused_rows", kernel)
+    monkeypatch.setattr(fused_rows, "FEW_ROWS", few)
     plain = LoRASP(rank=32, hidden_width=16, energy_target=0.7, gate="bisection")
     params = initial(plain)
     params["bank"]["u"] = jax.random.normal(jax.random.key(2), (32, D_OUT))

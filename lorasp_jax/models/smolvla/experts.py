@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig
-from lorasp_jax.models.experts import ExpertBlock, KeysValues, LanguageExpert
+from lorasp_jax.models.experts import GATED, ExpertBlock, KeysValues, LanguageExpert
 from lorasp_jax.models.layers import (
     LayerAux,
     Linears,
@@ -35,6 +35,8 @@ class SelfBlock(ExpertBlock):
 
 class CrossBlock(SelfBlock):
     """A layer of the action expert that attends to the language model's keys and values alone."""
+
+    together = (GATED,)
 
     def __init__(self, size: ExpertConfig, config: BackboneConfig, *, rngs: nnx.Rngs) -> None:
         super().__init__(size, config, context=size.kv_heads * size.head_dim, rngs=rngs)
