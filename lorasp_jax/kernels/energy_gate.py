@@ -10,8 +10,7 @@ row to its `Boundary`, the last kept (score, index) in that order; the mask foll
   η on a rare row.
 - "bisection": no sort. Binary search on the bits of the threshold, since fp32 numbers >= 0 are
   ordered as their bit patterns.
-- "block": the body of a kernel: the same for a few rows, which stop as soon as they know; one row
-  compares all pairs at once.
+- "block": the same for a few rows, which stop as soon as they know: the body of a kernel.
 - "pallas": "block" in a Triton kernel of its own, a row to a warp, scores held in registers.
 
 η is the decimal that was written: 0.9 means 9/10, and E_k >= 9/10 is tested as 10 Σ_k >= 9 Σ, so a
@@ -22,10 +21,11 @@ import decimal
 import fractions
 import functools
 from collections.abc import Callable
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.experimental import pallas as pl
 
 Implementation = Literal["pairwise", "sort", "bisection", "block", "pallas"]
 
@@ -109,21 +109,20 @@ def _finder(implementation: str) -> Callable[[jax.Array, Ratio], jax.Array]:
     boundaries = {
         "sort": _sorted_boundary,
         "bisection": bisected_boundary,
+        "block": functools.partial(bisected_boundary, is_block=True),
         "pallas": _pallas_boundary,
     }
     if implementation == "pairwise":
         return _pairwise_mask
-    if implementation == "block":
-        return _block_mask
     if implementation not in boundaries:
-        valid = ", ".join(get_args(Implementation))
+        valid = ", ".join(("pairwise", *boundaries))
         raise ValueError(f"unknown gate {implementation!r}; valid are {valid}.")
     boundary = boundaries[implementation]
     return lambda scores, ratio: kept_mask(scores, boundary(scores, ratio))
 
 
 def _pairwise_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
-    """Scores [..., R], one direction after the other."""
+    """Keeps what falls short of the target with all that ranks before it; zeros are never kept."""
     energy = _energy(scores)
     position = jax.lax.broadcasted_iota(jnp.int32, scores.shape, scores.ndim - 1)
     before = jnp.zeros_like(scores)
@@ -131,23 +130,8 @@ def _pairwise_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
         other = scores[..., j : j + 1]
         first = (other > scores) | ((other == scores) & (j < position))
         before += jnp.where(first, energy[..., j : j + 1], 0)
-    return _falls_short(before, energy, ratio) & (scores > 0)
-
-
-def _block_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
-    """Scores [n, R] of a kernel's block; for one row all pairs are one square in registers."""
-    if scores.shape[:-1] != (1,):
-        return kept_mask(scores, bisected_boundary(scores, ratio, is_block=True))
-    energy, others = _energy(scores), scores.reshape(-1, 1)
-    i, j = (jax.lax.broadcasted_iota(jnp.int32, (scores.size,) * 2, axis) for axis in (1, 0))
-    first = (others > scores) | ((others == scores) & (j < i))
-    before = jnp.where(first, energy.reshape(-1, 1), 0).sum(0, keepdims=True)
-    return _falls_short(before, energy, ratio) & (scores > 0)
-
-
-def _falls_short(before: jax.Array, energy: jax.Array, ratio: Ratio) -> jax.Array:
-    """Whether the energy that ranks before a direction is less than the target."""
-    return ratio.denominator * before < ratio.numerator * energy.sum(-1, keepdims=True)
+    target = ratio.numerator * energy.sum(-1, keepdims=True)
+    return (ratio.denominator * before < target) & (scores > 0)
 
 
 def kept_mask(scores: jax.Array, last: Boundary) -> jax.Array:
@@ -289,7 +273,27 @@ def _sorted_row_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
     return Boundary(score, index.astype(jnp.int32))
 
 
-def _pallas_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
-    from lorasp_jax.kernels.gate_kernel import pallas_boundary  # which takes its body from here
+def _pallas_boundary(scores: jax.Array, ratio: Ratio, *, interpret: bool = False) -> Boundary:
+    """The bisection as a Triton kernel; R is padded with zeros, which are never kept."""
+    from jax.experimental.pallas import triton  # absent from builds without NVIDIA support
 
-    return pallas_boundary(scores, ratio)
+    *leading, rank = scores.shape
+    width = max(pl.next_power_of_2(rank), 2)
+    rows = jnp.pad(scores.reshape(-1, rank), ((0, 0), (0, width - rank)))
+    column = pl.BlockSpec((1, 1), lambda i: (i, 0))
+    score, index = pl.pallas_call(
+        functools.partial(_boundary_kernel, ratio=ratio),
+        grid=(len(rows),),  # one row and one warp to a program: the fastest measured
+        in_specs=[pl.BlockSpec((1, width), lambda i: (i, 0))],
+        out_specs=[column, column],
+        out_shape=[jax.ShapeDtypeStruct((len(rows), 1), t) for t in (jnp.float32, jnp.int32)],
+        compiler_params=triton.CompilerParams(num_warps=1, num_stages=1),
+        interpret=interpret,
+        name="energy_gate",
+    )(rows)
+    return Boundary(score.reshape(*leading, 1), index.reshape(*leading, 1))
+
+
+def _boundary_kernel(scores: Any, score: Any, index: Any, *, ratio: Ratio) -> None:
+    """One program: references to scores [rows, width] in, to the two columns of `Boundary` out."""
+    score[...], index[...] = bisected_boundary(scores[...], ratio, is_block=True)

@@ -34,11 +34,8 @@ class Launch(NamedTuple):
 
 FORWARD = Launch(16, 2, 816)
 BACKWARD = Launch(16, 4, 512)
-FEW = Launch(1, 4, 1024)
-"""Both ways for so few rows that what counts is how long one takes."""
-FEW_ROWS = 1024
-FEW_WIDTH = 128
-"""The widest column of which a program has registers for all pairs of numbers."""
+FEW, FEW_ROWS = Launch(1, 1, 8192), 1024
+"""Both ways for up to so many rows, where what counts is how long one takes: a warp to a row."""
 
 Columns = list[jax.Array]
 """Arrays [n, width] that lie side by side in one [n, sum of widths]."""
@@ -73,9 +70,8 @@ def fused_rows(
     Returns:
       output [T, O], sums, statistics [T, 1]. Gradients reach `shared` and `rows`.
     """
-    num_rows, launches = len(rows), (FORWARD, BACKWARD)
-    if num_rows <= FEW_ROWS and max(widths) <= FEW_WIDTH:
-        launches = FEW, FEW
+    num_rows = len(rows)
+    launches = (FEW, FEW) if num_rows <= FEW_ROWS else (FORWARD, BACKWARD)
     fill = ((0, -num_rows % math.lcm(*(launch.rows for launch in launches))), (0, 0))
     rows, counts = jnp.pad(rows, fill), jnp.pad(counts, fill).astype(jnp.int8)
     found: Any = _fused((function, widths, launches, interpret), shared, rows, counts)
@@ -154,20 +150,18 @@ def _map_blocks(
         _shape(output[0].dtype, len(arrays[0]), sum(w))
         for output, w in zip(columns, out_widths, strict=True)
     ]
-    leaves, tree = jax.tree.flatten(sums)
-    sizes = tuple(leaf.size for leaf in leaves)
+    shapes = jax.tree.map(lambda leaf: _shape(leaf.dtype, *leaf.shape), shared)
     outputs, partial_sums = pl.pallas_call(
-        functools.partial(_kernel, body, launch.rows, stretch, widths, out_widths, sums),
+        functools.partial(_kernel, body, launch.rows, stretch, widths, out_widths, shapes, sums),
         grid=(programs,),
-        out_shape=(rows, _shape(jnp.float32, programs, sum(sizes))),
+        out_shape=(rows, _shape(jnp.float32, programs, sum(_sizes(sums)))),
         compiler_params=triton.CompilerParams(num_warps=launch.warps, num_stages=1),
         interpret=interpret,
         name="fused_rows",
-    )(shared, arrays)
-    # One array of all sums, which XLA adds up in one kernel and not in one for each.
-    added = jnp.split(partial_sums.sum(0), list(itertools.accumulate(sizes))[:-1])
-    shaped = [value.reshape(leaf.shape) for value, leaf in zip(added, leaves, strict=True)]
-    return outputs, jax.tree.unflatten(tree, shaped)
+    )(_in_a_row(shared), arrays)
+    # One array of all sums: XLA adds it up, as it joins what is shared, in one kernel for all.
+    added = partial_sums.sum(0)
+    return outputs, _taken_apart(lambda start, size: added[start : start + size], sums)
 
 
 def _shape(dtype: Any, *sides: int) -> jax.ShapeDtypeStruct:
@@ -181,14 +175,15 @@ def _kernel(
     stretch: int,
     widths: list[Widths],
     out_widths: list[Widths],
+    shapes: Any,
     sums: Any,
-    shared_refs: Any,
+    shared_ref: Any,
     input_refs: Any,
     output_refs: Any,
     sum_ref: Any,
 ) -> None:
     """One program: `stretch` blocks of `num_rows`, one after the other."""
-    shared = jax.tree.map(lambda ref: ref[...], shared_refs)
+    shared = _taken_apart(lambda *place: shared_ref[pl.ds(*place)], shapes)
     program = pl.program_id(0)
 
     def block(i: jax.Array, sums: Any) -> Any:
@@ -204,9 +199,27 @@ def _kernel(
         return jax.tree.map(jnp.add, sums, more)
 
     zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), sums)
-    leaves = jax.tree.leaves(jax.lax.fori_loop(0, stretch, block, zeros))
-    for place, leaf in zip(_places(tuple(leaf.size for leaf in leaves)), leaves, strict=True):
+    found = jax.lax.fori_loop(0, stretch, block, zeros)
+    for place, leaf in zip(_places(_sizes(found)), jax.tree.leaves(found), strict=True):
         sum_ref[program, pl.ds(*place)] = leaf.reshape(-1)
+
+
+def _in_a_row(tree: Any) -> jax.Array:
+    """All numbers of a tree, [n]."""
+    return jnp.concatenate([leaf.reshape(-1) for leaf in jax.tree.leaves(tree)])
+
+
+def _taken_apart(part: Callable[[int, int], jax.Array], shapes: Any) -> Any:
+    """The tree of which part(start, size) is a stretch of `_in_a_row`."""
+    leaves, structure = jax.tree.flatten(shapes)
+    places = _places(_sizes(shapes))
+    found = [part(*p).reshape(leaf.shape) for p, leaf in zip(places, leaves, strict=True)]
+    return jax.tree.unflatten(structure, found)
+
+
+def _sizes(tree: Any) -> Widths:
+    """How many numbers each leaf has."""
+    return tuple(math.prod(leaf.shape) for leaf in jax.tree.leaves(tree))
 
 
 def _places(widths: Widths) -> list[tuple[int, int]]:

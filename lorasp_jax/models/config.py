@@ -71,8 +71,9 @@ class BackboneConfig:
     ("products": half the memory, a few percent more work); everything inside a layer ("full": the
     least memory, a third more work)."""
     unroll: bool = False
-    """Straight-line code instead of a loop over layers: faster for a few small ones (a loop copies
-    what the backward pass needs into stacks and out again), at the price of compile time."""
+    """Straight-line code instead of a loop over layers: faster, the most for small ones (a loop
+    copies what the backward pass needs into stacks and out again), but two to three times as long
+    to compile."""
 
     def __post_init__(self) -> None:
         """Checks that the parts fit."""

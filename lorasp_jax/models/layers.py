@@ -23,9 +23,13 @@ CUDNN_TOKENS, CUDNN_WIDTH = 256, 64
 sizes, while the miniatures repeat themselves bit for bit."""
 
 
+_SLOW_TO_REPEAT = ("dot_product_attention_fwd_wrapper", "pallas_call")
+"""Primitives of cuDNN's attention and of the adapters' kernel."""
+
+
 def _keep_products(primitive: Any, *shapes: Any, **params: Any) -> Any:
-    """Results of matrix products are stored, and cuDNN's attention, which is slow to repeat."""
-    if primitive.name == "dot_product_attention_fwd_wrapper":
+    """Results of matrix products are stored, and what is slow to repeat."""
+    if primitive.name in _SLOW_TO_REPEAT:
         return True
     return jax.checkpoint_policies.dots_with_no_batch_dims_saveable(primitive, *shapes, **params)
 
@@ -186,33 +190,39 @@ def scan_depth(
     Returns:
         `[B, T, D]`, and what the blocks gave to keep, stacked to `[L, ...]`.
     """
-    if isinstance(blocks, nnx.List):
-        return _one_by_one(blocks, call, x, per_layer)
-    graphdef, state = nnx.split(blocks)
+    one_by_one = isinstance(blocks, nnx.List)
+    graphdef, state = nnx.split(blocks[0] if one_by_one else blocks)
 
     def layer(x: jax.Array, scanned: tuple[Any, Any]) -> tuple[jax.Array, Any]:
         return call(nnx.merge(graphdef, scanned[0]), x, scanned[1])
 
     if remat != "none":
-        layer = jax.checkpoint(layer, prevent_cse=False, policy=_KEPT[remat])
-    return jax.lax.scan(layer, x, (state, per_layer), unroll=unroll)
+        layer = jax.checkpoint(layer, prevent_cse=unroll, policy=_KEPT[remat])
+    if not one_by_one and not unroll:
+        return jax.lax.scan(layer, x, (state, per_layer))
+    states = [nnx.state(block) for block in blocks] if one_by_one else _layers_of(state)
+    others = [None] * len(states) if per_layer is None else _layers_of(per_layer)
+    layer, kept = jax.jit(layer), []  # traced once
+    for own, other in zip(states, others, strict=True):
+        x, keep = layer(x, (own, other))
+        kept.append(keep)
+    return x, jax.tree.map(lambda *layers: jnp.stack(layers), *kept)
+
+
+def _layers_of(stacked: Any) -> list[Any]:
+    """Each layer's part of arrays [L, ...]; their gradients are stacked, not added up."""
+    leaves, structure = jax.tree.flatten(stacked)
+    parts = zip(*(jax.lax.split(leaf, [1] * len(leaf)) for leaf in leaves), strict=True)
+    return [
+        jax.tree.unflatten(structure, [jax.lax.squeeze(part, [0]) for part in layer])
+        for layer in parts
+    ]
 
 
 def unstacked(blocks: nnx.Module) -> nnx.List:
     """Stacked blocks one by one: a loop around them then slices no weights."""
     graphdef, state = nnx.split(blocks)
-    depth = jax.tree.leaves(state)[0].shape[0]
-    layers = [jax.tree.map(lambda a, i=i: a[i], state) for i in range(depth)]
-    return nnx.List([nnx.merge(graphdef, layer) for layer in layers])
-
-
-def _one_by_one(blocks: nnx.List, call: Any, x: jax.Array, per_layer: Any) -> tuple:
-    """`scan_depth` of `unstacked` blocks."""
-    kept = []
-    for i, block in enumerate(blocks):
-        x, keep = call(block, x, jax.tree.map(lambda a, i=i: a[i], per_layer))
-        kept.append(keep)
-    return x, jax.tree.map(lambda *layers: jnp.stack(layers), *kept)
+    return nnx.List([nnx.merge(graphdef, layer) for layer in _layers_of(state)])
 
 
 def positions(valid: jax.Array) -> jax.Array:

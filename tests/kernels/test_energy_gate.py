@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from lorasp_jax.kernels import energy_gate as gate
-from lorasp_jax.kernels import gate_kernel
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "energy_gate_exact.npz"
-KERNEL = gate_kernel.pallas_boundary
+KERNEL = gate._pallas_boundary
 
 
 @pytest.fixture(scope="module")

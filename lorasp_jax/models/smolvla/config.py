@@ -56,6 +56,7 @@ class SmolVLAConfig(BackboneConfig):
             action_dim=32,
             inputs=LEROBOT,
             dtype="bfloat16",
+            unroll=True,
         )
 
     @classmethod
