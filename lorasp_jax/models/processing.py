@@ -1,4 +1,4 @@
-"""Between a robot and a backbone: pictures, statistics, slots, token table; both ways.
+"""Between a robot and a backbone: pictures, statistics, slots, prompts; both ways.
 
 State and action vectors of a backbone have slots. With this project's own weights they are fixed:
 joints from slot 0, the gripper in slot 7; published weights have the robot's numbers side by side.
@@ -18,6 +18,7 @@ from lorasp_jax.models.images import resize_with_pad, to_unit
 from lorasp_jax.models.inputs import OURS, InputConfig
 from lorasp_jax.models.normalization import normalize, unnormalize
 from lorasp_jax.models.observation import Observation
+from lorasp_jax.models.prompt_table import PromptTable
 from lorasp_jax.models.statistics import Statistics, check_slots
 
 RawObservation = Mapping[str, Any]
@@ -91,8 +92,7 @@ class Processor:
     Attributes:
         robot_slots: slot of each of the robot's J+1 numbers, see `robot_slots`.
         statistics: of states and actions, per slot.
-        tokens: `[P, T]` int32, one row per instruction.
-        token_mask: `[P, T]` bool.
+        prompts: of the instructions.
         image_size: height and width of the backbone's pictures [pixels].
         inputs: what the backbone was trained to see.
         cameras: (backbone's camera, robot's camera or None) each, see `camera_slots`; empty: the
@@ -105,8 +105,7 @@ class Processor:
 
     robot_slots: tuple[int, ...] = field(metadata={"static": True})
     statistics: Statistics
-    tokens: jax.Array
-    token_mask: jax.Array
+    prompts: PromptTable
     image_size: int = field(default=64, metadata={"static": True})
     inputs: InputConfig = field(default=OURS, metadata={"static": True})
     cameras: tuple[tuple[str, str | None], ...] = field(default=(), metadata={"static": True})
@@ -117,7 +116,7 @@ class Processor:
         cls,
         config: BackboneConfig,
         statistics: Statistics,
-        tokens: tuple[np.ndarray, np.ndarray],
+        prompts: PromptTable,
         *,
         num_joints: int,
         cameras: Mapping[str, str] | None = None,
@@ -128,26 +127,20 @@ class Processor:
         Args:
             config: sizes and inputs.
             statistics: of the robot's numbers, in their order or already in slots.
-            tokens: ids and mask `[P, T]` of the instructions, from a tokenizer.
+            prompts: of the instructions.
             num_joints: J.
             cameras: backbone's name -> robot's name, see `camera_slots`; None: the same names.
             delta: see `to_delta`.
 
         Raises:
-            ValueError: joints, statistics, cameras or token ids that do not fit the backbone.
+            ValueError: joints, statistics or cameras that do not fit the backbone.
         """
-        ids, mask = tokens
-        if ids.max(initial=0) >= config.vocabulary:
-            raise ValueError(
-                f"token {ids.max()} is beyond the backbone's vocabulary of {config.vocabulary}: "
-                "the tokenizer is another model's."
-            )
         slots = robot_slots(num_joints, config.inputs)
         if statistics.dim != config.action_dim:
             statistics = statistics.placed(slots, config.action_dim)
         chosen = () if cameras is None else camera_slots(config.cameras, cameras)
-        table, size = (jnp.asarray(ids), jnp.asarray(mask)), config.image_size
-        return cls(slots, statistics, *table, size, config.inputs, chosen, tuple(delta))
+        size, inputs = config.image_size, config.inputs
+        return cls(slots, statistics, prompts, size, inputs, chosen, tuple(delta))
 
     @property
     def slot_mask(self) -> np.ndarray:
@@ -166,7 +159,7 @@ class Processor:
 
         Args:
             raw: pictures of any size and the robot's state.
-            instruction: `[B]` int32 rows of the token table.
+            instruction: `[B]` int32 rows of the table of prompts.
 
         Raises:
             ValueError: pictures that are not uint8 `[B, H, W, 3]`, a camera that is not there, or a
@@ -179,6 +172,7 @@ class Processor:
             raise ValueError(
                 f"camera {', '.join(absent)} is not among {', '.join(raw['image']) or 'none'}."
             )
+        tokens, token_mask = self.prompts.encode(instruction)
         black = jnp.full((len(state), self.image_size, self.image_size, 3), -1.0)
         return Observation(
             images={
@@ -188,8 +182,8 @@ class Processor:
             image_masks={
                 name: jnp.full(len(state), source is not None) for name, source in sources.items()
             },
-            tokens=jnp.asarray(self.tokens)[instruction],
-            token_mask=jnp.asarray(self.token_mask)[instruction],
+            tokens=tokens,
+            token_mask=token_mask,
             state=state,
         )
 

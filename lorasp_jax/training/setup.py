@@ -25,6 +25,7 @@ from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.processing import Processor, Statistics, robot_slots, to_delta
+from lorasp_jax.models.prompt_table import PromptTable
 from lorasp_jax.training import preflight
 from lorasp_jax.training.loop import Run
 from lorasp_jax.training.progress import bars
@@ -42,15 +43,15 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
     What can be wrong with a config is found before anything long begins.
 
     Raises:
-        ValueError: an unknown task, robot, backbone or size, a base that does not fit, a rule that
-            matches nothing, a chunk or batch that does not fit.
+        ValueError: an unknown task, robot, backbone or size, a base or a tokenizer that does not
+            fit, a rule that matches nothing, a chunk or batch that does not fit.
     """
-    for task in config.tasks:
-        envs.make(
-            task, robot=config.robot, image_size=config.image_size, control_dt=config.control_dt
-        )
+    sizes = {"image_size": config.image_size, "control_dt": config.control_dt}
+    worlds = [envs.make(task, robot=config.robot, **sizes) for task in config.tasks]
+    instructions = [phrase for env in worlds for phrase in env.instructions]
     words = tokenizer.load(config.model.tokenizer)
     base, base_hash = base_model(config)
+    prompts = PromptTable.of(words, instructions, base.config)
     _check_sizes(config, base.config.chunk)
     remat, memory = preflight.choose_remat(config, base.config, preflight.available_bytes())
     base = _with_remat(base, remat)
@@ -62,9 +63,9 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
     console.print(f"memory by device in GiB: {memory}; rematerialisation: {remat}")
     run = Run(config, folder, console, base_hash, started)
     with run.timed("collect"):
-        run.episodes = _collect(run)
+        run.episodes = _collect(run, instructions)
     relative = config.model.relative_actions
-    found = processor([*run.episodes.values()], model.config, words, relative=relative)
+    found = processor([*run.episodes.values()], model.config, prompts, relative=relative)
     if config.peft.needs_statistics:
         statistics = input_moments(run, base, found)
         model = _adapted(config, base, config.peft, statistics)
@@ -166,18 +167,18 @@ def _check_time(folder: Path, control_dt: float) -> None:
 def processor(
     episodes: Sequence[Episodes],
     model_config: BackboneConfig,
-    words: tokenizer.Tokenizer,
+    prompts: PromptTable,
     *,
     relative: bool = False,
 ) -> Processor:
-    """Statistics of the demonstrations and the token table of all their instructions, in order.
+    """Statistics of the demonstrations, with the prompts of all their instructions, in order.
 
     The robot's cameras take the backbone's places in turn; there may be more places than cameras.
 
     Args:
         episodes: by task.
         model_config: sizes and inputs.
-        words: of the instructions.
+        prompts: of the instructions, task after task.
         relative: joint targets are learned relative to the state that a chunk starts from.
     """
     joints = episodes[0].state.shape[-1] - 1
@@ -189,11 +190,9 @@ def processor(
     state = np.repeat(np.asarray(state), len(action) // len(state), axis=0)
     everything = np.ones(len(state), bool)
     statistics = Statistics.measure(state, action, everything, slots=slots, dim=dim)
-    phrases = [phrase for group in episodes for phrase in group.instructions]
-    tokens = words.encode(phrases, model_config.max_tokens)
     cameras = dict(zip(model_config.cameras, sorted(episodes[0].image), strict=False))
     return Processor.of(
-        model_config, statistics, tokens, num_joints=joints, cameras=cameras, delta=delta
+        model_config, statistics, prompts, num_joints=joints, cameras=cameras, delta=delta
     )
 
 
@@ -211,8 +210,8 @@ def _windows(episodes: Episodes, chunk: int) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(episodes.state)[valid], actions[valid]
 
 
-def _collect(run: Run) -> dict[str, Episodes]:
-    """Demonstrations by task, with a bar each."""
+def _collect(run: Run, instructions: Sequence[str]) -> dict[str, Episodes]:
+    """Demonstrations by task, with a bar each; they index the instructions."""
     with bars(run.console, "episodes") as progress:
         started: dict[str, TaskID] = {}
 
@@ -222,4 +221,7 @@ def _collect(run: Run) -> dict[str, Episodes]:
                 started[task] = progress.add_task(text, total=total)
             progress.update(started[task], completed=done, description=text)
 
-        return demonstrations(run.config, run.folder, report)
+        found = demonstrations(run.config, run.folder, report)
+    if [phrase for group in found.values() for phrase in group.instructions] != instructions:
+        raise ValueError(f"{run.folder} holds demonstrations of other instructions; start anew")
+    return found

@@ -8,6 +8,7 @@ import pytest
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.processing import Processor, robot_slots, to_absolute, to_delta
+from lorasp_jax.models.prompt_table import PromptTable
 from lorasp_jax.models.smolvla import SmolVLAConfig
 from lorasp_jax.models.statistics import Statistics
 
@@ -23,7 +24,7 @@ def processor(num_joints: int) -> Processor:
     valid = np.ones((4, 5), bool)
     statistics = Statistics.measure(state, action, valid, slots=slots, dim=DIM)
     tokens = jnp.array([[3, 4, 0], [5, 0, 0]])
-    return Processor(slots, statistics, tokens, tokens > 0, image_size=16)
+    return Processor(slots, statistics, PromptTable(tokens, tokens > 0), image_size=16)
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -108,8 +109,9 @@ def published(num_joints: int = 6, **choices) -> Processor:
     statistics = Statistics.measure(
         state, action, valid, slots=range(num_joints + 1), dim=num_joints + 1
     )
-    ids = np.array([[3, 4, 0]], np.int32)
-    return Processor.of(config, statistics, (ids, ids > 0), num_joints=num_joints, **choices)
+    ids = jnp.array([[3, 4, 0]])
+    prompts = PromptTable(ids, ids > 0)
+    return Processor.of(config, statistics, prompts, num_joints=num_joints, **choices)
 
 
 def test_published_weights_have_one_block_of_numbers():
@@ -186,12 +188,6 @@ def test_policies_of_delta_actions_move_absolutely():
     np.testing.assert_allclose(own.decode(inside, state), actions, atol=1e-5)
     with pytest.raises(ValueError, match="give the raw state"):
         own.decode(inside)
-
-
-def test_a_tokenizer_of_another_model():
-    config, ids = Pi0Config.dummy(), np.array([[5000]], np.int32)
-    with pytest.raises(ValueError, match="token 5000 is beyond the backbone's vocabulary of 320"):
-        Processor.of(config, processor(6).statistics, (ids, ids > 0), num_joints=6)
 
 
 class Still:

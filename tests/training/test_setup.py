@@ -3,6 +3,8 @@
 import dataclasses
 import io
 import time
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from rich.console import Console
 
 from lorasp_jax import adaptation, paths
 from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.models.prompt_table import PromptTable
 from lorasp_jax.models.tokenizer import Offline
 from lorasp_jax.peft import LoRA
 from lorasp_jax.training import setup
@@ -23,10 +26,11 @@ TARGETS = ("patch_embed", "language.*q_proj", "action_out_proj")
 @pytest.fixture
 def config(monkeypatch):
     """No simulation, and the dummy backbone."""
-    monkeypatch.setattr(setup.envs, "make", lambda *_, **__: None)
+    worlds = SimpleNamespace(instructions=random_episodes("", 0).instructions)
+    monkeypatch.setattr(setup.envs, "make", lambda *_, **__: worlds)
     monkeypatch.setattr(setup, "base_model", lambda _: (Pi0Config.dummy().create(nnx.Rngs(0)), ""))
     monkeypatch.setattr(
-        setup, "_collect", lambda run: {t: random_episodes(t, 0) for t in run.config.tasks}
+        setup, "demonstrations", lambda c, *_: {t: random_episodes(t, 0) for t in c.tasks}
     )
     config = dataclasses.replace(CONFIG, peft=LoRA(rank=4), targets=TARGETS)
     config = dataclasses.replace(
@@ -44,6 +48,21 @@ def test_targets_of_the_command_line_can_be_presets(config, tmp_path):
     found = adaptation.methods(run.policy.model)
     assert {path.rpartition("/")[0] for path in found} == {"language/blocks", "vision"}
     assert "; the others are frozen, all of action, action_in_proj," in printed.getvalue()
+
+
+def test_a_tokenizer_of_another_model_is_found_before_anything_long(config, tmp_path, monkeypatch):
+    """As are demonstrations that an older version of the tasks left."""
+    console = Console(file=io.StringIO())
+    smolvlm = Path(__file__).parents[1] / "golden/tokenizers/smolvlm_like_tokenizer.json"
+    other = override(config, ["--model.tokenizer", str(smolvlm)])
+    with monkeypatch.context() as patched:
+        patched.setattr(setup, "demonstrations", lambda *_: pytest.fail("it began"))
+        with pytest.raises(ValueError, match="beyond the backbone's vocabulary of 320: the token"):
+            setup.prepare(other, tmp_path, console, time.perf_counter())
+    worlds = SimpleNamespace(instructions=("press the red button",))
+    monkeypatch.setattr(setup.envs, "make", lambda *_, **__: worlds)
+    with pytest.raises(ValueError, match="demonstrations of other instructions"):
+        setup.prepare(config, tmp_path, console, time.perf_counter())
 
 
 def test_eva_of_the_command_line_sees_the_demonstrations(config, tmp_path):
@@ -70,7 +89,8 @@ def test_eva_of_the_command_line_sees_the_demonstrations(config, tmp_path):
 def test_actions_are_normalised_as_they_are_learned(relative):
     """Over all windows as training draws them, mean 0 and standard deviation 1."""
     group, model = random_episodes("press", 0), Pi0Config.dummy()
-    found = setup.processor([group], model, Offline(), relative=relative)
+    prompts = PromptTable.of(Offline(), group.instructions, model)
+    found = setup.processor([group], model, prompts, relative=relative)
     states, chunks = [], []
     for episode in range(3):
         end = group.length[episode] - 1
