@@ -79,7 +79,7 @@ def make_run(folder: Path, config: Config = CONFIG) -> Run:
     run.episodes = {task: random_episodes(task, i) for i, task in enumerate(config.tasks)}
     groups = list(run.episodes.values())
     phrases = [phrase for group in groups for phrase in group.instructions]
-    prompts = PromptTable.of(tokenizer.Offline(), phrases, model.config)
+    prompts = PromptTable.of(tokenizer.Offline(), phrases, model.config, num_joints=6)
     run.policy = Policy(model, processor(groups, model.config, prompts))
     return run
 

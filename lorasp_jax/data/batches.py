@@ -6,7 +6,7 @@ one integer.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -99,8 +99,7 @@ def sample_batch(
         "image": {name: image[start] for name, image in steps.image.items()},
         "state": steps.state[start],
     }
-    observation = processor.encode(raw, steps.instruction[start])
+    noise = state_noise * jax.random.normal(noise_key, (batch_size, processor.statistics.dim))
+    observation = processor.encode(raw, steps.instruction[start], state_noise=noise)
     actions = processor.normalize_actions(steps.action[jnp.minimum(window, last)], raw["state"])
-    noise = state_noise * jax.random.normal(noise_key, observation.state.shape)
-    observation = replace(observation, state=observation.state + noise * processor.slot_mask)
     return Batch(observation, actions, (window <= last)[..., None] & processor.flow_slots)

@@ -68,7 +68,8 @@ def _shared(config: BackboneConfig, fields: Fields) -> dict[str, Any]:
         raise ValueError(
             f"state and action must have one length, pictures be square: {dims}, {size}"
         )
-    modes = {"VISUAL": "IDENTITY", "STATE": "MEAN_STD", "ACTION": "MEAN_STD"}
+    inputs = config.inputs
+    modes = {"VISUAL": "IDENTITY", "STATE": inputs.state.upper(), "ACTION": inputs.action.upper()}
     modes |= fields.get("normalization_mapping", {})
     if modes["VISUAL"] != "IDENTITY" or not modes.keys() <= {"VISUAL", "STATE", "ACTION"}:
         raise ValueError(f"pictures are not normalised here, but normalization_mapping is {modes}")
@@ -81,7 +82,7 @@ def _shared(config: BackboneConfig, fields: Fields) -> dict[str, Any]:
         "chunk": fields.get("chunk_size", config.chunk),
         "action_dim": dims.pop(),
         "inputs": dataclasses.replace(
-            config.inputs, state=_MODES[modes["STATE"]], action=_MODES[modes["ACTION"]]
+            inputs, state=_MODES[modes["STATE"]], action=_MODES[modes["ACTION"]]
         ),
     }
 

@@ -154,25 +154,30 @@ class Processor:
         """`[A]` bool, True in the slots that take part in the flow and its loss."""
         return self.slot_mask | (not self.inputs.quiet_slots)
 
-    def encode(self, raw: RawObservation, instruction: jax.Array) -> Observation:
+    def encode(
+        self, raw: RawObservation, instruction: jax.Array, *, state_noise: jax.Array | None = None
+    ) -> Observation:
         """Raw observation to model input; a missing camera's picture is black, with mask False.
 
         Args:
             raw: pictures of any size and the robot's state.
             instruction: `[B]` int32 rows of the table of prompts.
+            state_noise: `[B, A]` that the normalised state has on top in the robot's slots.
 
         Raises:
             ValueError: pictures that are not uint8 `[B, H, W, 3]`, a camera that is not there, or a
                 state of the wrong length.
         """
         state = self._to_slots("state", raw["state"])
+        if state_noise is not None:
+            state = state + state_noise * self.slot_mask
         sources = dict(self.cameras) or {name: name for name in raw["image"]}
         absent = sorted({name for name in sources.values() if name} - set(raw["image"]))
         if absent:
             raise ValueError(
                 f"camera {', '.join(absent)} is not among {', '.join(raw['image']) or 'none'}."
             )
-        tokens, token_mask = self.prompts.encode(instruction)
+        prompt = self.prompts.encode(instruction, state[:, np.array(self.robot_slots)])
         black = jnp.full((len(state), self.image_size, self.image_size, 3), -1.0)
         return Observation(
             images={
@@ -182,8 +187,8 @@ class Processor:
             image_masks={
                 name: jnp.full(len(state), source is not None) for name, source in sources.items()
             },
-            tokens=tokens,
-            token_mask=token_mask,
+            tokens=prompt.ids,
+            token_mask=prompt.mask,
             state=state,
         )
 

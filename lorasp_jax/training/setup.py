@@ -32,7 +32,7 @@ from lorasp_jax.training.progress import bars
 
 STATISTICS_BATCHES = 8
 """Batches that an initialization from data looks at."""
-SIZES = ("nano", "small", "base")
+SIZES = ("nano", "small", "base", "nano_pi05", "base_pi05")
 TRAINING = "training.json"
 """File beside base weights: what they were trained on, with the control period."""
 
@@ -51,7 +51,8 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
     instructions = [phrase for env in worlds for phrase in env.instructions]
     words = tokenizer.load(config.model.tokenizer)
     base, base_hash = base_model(config)
-    prompts = PromptTable.of(words, instructions, base.config)
+    joints = worlds[0].robot.num_joints
+    prompts = PromptTable.of(words, instructions, base.config, num_joints=joints)
     _check_sizes(config, base.config.chunk)
     remat, memory = preflight.choose_remat(config, base.config, preflight.available_bytes())
     base = _with_remat(base, remat)
@@ -124,10 +125,11 @@ def base_model(config: Config) -> tuple[Backbone, str]:
     Raises:
         ValueError: an unknown backbone or size, or a base of another one.
     """
-    chosen = config.model
-    if chosen.size not in SIZES:
-        raise ValueError(f"unknown size {chosen.size!r}: it is one of {', '.join(SIZES)}")
-    wanted: BackboneConfig = getattr(backbone.find(chosen.backbone), chosen.size)()
+    chosen, kind = config.model, backbone.find(config.model.backbone)
+    sizes = [size for size in SIZES if hasattr(kind, size)]
+    if chosen.size not in sizes:
+        raise ValueError(f"unknown size {chosen.size!r}: it is one of {', '.join(sizes)}")
+    wanted: BackboneConfig = getattr(kind, chosen.size)()
     wanted = dataclasses.replace(wanted, dtype=chosen.dtype, param_dtype=chosen.param_dtype)
     if not wanted.inputs.masks_missing:
         wanted = dataclasses.replace(wanted, cameras=wanted.cameras[: len(envs.Env.cameras)])

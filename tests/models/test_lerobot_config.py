@@ -2,7 +2,7 @@ import dataclasses
 
 import pytest
 
-from lorasp_jax.models.inputs import LEROBOT, LEROBOT_CENTRED
+from lorasp_jax.models.inputs import LEROBOT, LEROBOT_CENTRED, LEROBOT_PI05
 from lorasp_jax.models.lerobot_config import config_of
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.smolvla import SmolVLAConfig
@@ -36,6 +36,9 @@ def test_published_fields_are_the_published_sizes():
     assert config_of({"type": "smolvla"}) == SmolVLAConfig.base()
     expected = dataclasses.replace(Pi0Config.base(), inputs=LEROBOT_CENTRED)
     assert config_of({"type": "pi0", "image_resolution": [224, 224]}) == expected
+    expected = dataclasses.replace(Pi0Config.base_pi05(), inputs=LEROBOT_PI05)
+    assert config_of({"type": "pi05", "tokenizer_max_length": 200}) == expected
+    assert (expected.inputs.state, expected.inputs.action) == ("quantiles", "quantiles")
 
 
 def test_what_differs_is_read():
@@ -71,13 +74,14 @@ def test_what_differs_is_read():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"type": "act"}, "of type 'act' is not one of pi0, smolvla"),
+        ({"type": "act"}, "of type 'act' is not one of pi0, pi05, smolvla"),
         ({"attention_mode": "self_attn"}, "attention_mode must be 'cross_attn' here"),
         ({"max_state_dim": 7}, "state and action must have one length"),
         ({"resize_imgs_with_padding": [512, 256]}, "pictures be square"),
         ({"resize_imgs_with_padding": None}, "pictures be square"),
         ({"normalization_mapping": {"STATE": "QUANTILE10"}}, "'QUANTILE10' is not one of MEAN_STD"),
         ({"normalization_mapping": {"VISUAL": "MEAN_STD"}}, "pictures are not normalised here"),
+        ({"type": "pi05", "use_visual_memory": True}, "use_visual_memory must be False here"),
         ({"num_expert_layers": 8}, "must be that of the language model, 16"),
         ({"input_features": [1]}, "not as LeRobot writes it"),
     ],

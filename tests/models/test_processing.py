@@ -5,12 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lorasp_jax.models import prompts
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.processing import Processor, robot_slots, to_absolute, to_delta
-from lorasp_jax.models.prompt_table import PromptTable
+from lorasp_jax.models.prompt_table import Ids, PromptTable
 from lorasp_jax.models.smolvla import SmolVLAConfig
 from lorasp_jax.models.statistics import Statistics
+from lorasp_jax.models.tokenizer import Offline
 
 DIM = 8
 RNG = np.random.default_rng(0)
@@ -24,7 +26,7 @@ def processor(num_joints: int) -> Processor:
     valid = np.ones((4, 5), bool)
     statistics = Statistics.measure(state, action, valid, slots=slots, dim=DIM)
     tokens = jnp.array([[3, 4, 0], [5, 0, 0]])
-    return Processor(slots, statistics, PromptTable(tokens, tokens > 0), image_size=16)
+    return Processor(slots, statistics, PromptTable(Ids(tokens, tokens > 0)), image_size=16)
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -110,7 +112,7 @@ def published(num_joints: int = 6, **choices) -> Processor:
         state, action, valid, slots=range(num_joints + 1), dim=num_joints + 1
     )
     ids = jnp.array([[3, 4, 0]])
-    prompts = PromptTable(ids, ids > 0)
+    prompts = PromptTable(Ids(ids, ids > 0))
     return Processor.of(config, statistics, prompts, num_joints=num_joints, **choices)
 
 
@@ -188,6 +190,28 @@ def test_policies_of_delta_actions_move_absolutely():
     np.testing.assert_allclose(own.decode(inside, state), actions, atol=1e-5)
     with pytest.raises(ValueError, match="give the raw state"):
         own.decode(inside)
+
+
+def test_prompts_tell_the_normalised_state():
+    """Of the robot's slots, with its noise; by the plain function."""
+    config, texts = Pi0Config.nano_pi05(), ["press the button", "push it"]
+    state, action = RNG.normal(2.0, 3.0, (2, 50, 7))
+    valid = np.ones(50, bool)
+    statistics = Statistics.measure(state, action, valid, slots=range(7), dim=7)
+    table = PromptTable.of(Offline(), texts, config, num_joints=6)
+    own = Processor.of(config, statistics, table, num_joints=6)
+    raw = {"image": {}, "state": jnp.asarray(state, jnp.float32)}
+    noise = jnp.asarray(RNG.normal(size=(50, DIM)), jnp.float32)
+    rows = RNG.integers(0, 2, 50)
+    obs = jax.jit(Processor.encode)(own, raw, jnp.asarray(rows), state_noise=noise)
+    low, high = np.quantile(state, [0.01, 0.99], axis=0)
+    numbers = 2 * (state - low) / (high - low) - 1 + noise[:, [0, 1, 2, 3, 4, 5, 7]]
+    np.testing.assert_allclose(obs.state[:, [0, 1, 2, 3, 4, 5, 7]], numbers, atol=1e-5)
+    numbers = np.asarray(obs.state[:, [0, 1, 2, 3, 4, 5, 7]])
+    wanted = [prompts.pi05(texts[row], mine) for row, mine in zip(rows, numbers, strict=True)]
+    ids, mask = Offline().encode(wanted, config.max_tokens, complete=True)
+    np.testing.assert_array_equal(obs.tokens, ids)
+    np.testing.assert_array_equal(obs.token_mask, mask)
 
 
 class Still:
