@@ -6,8 +6,9 @@ number with what follows, one after the other. That is so for a tokenizer that n
 with its neighbours; every number beside every other is looked at.
 """
 
+import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import jax
@@ -39,11 +40,13 @@ class PromptTable:
         start: `[P, T]`, one row per instruction: the prompt, or what of it is before the state.
         numbers: by bin, -1 first, where prompts tell the state: a number with its blank.
         last: likewise, the last number with what ends the prompt.
+        instructions: P texts.
     """
 
     start: Ids
     numbers: Ids | None = None
     last: Ids | None = None
+    instructions: tuple[str, ...] = field(default=(), metadata={"static": True})
 
     @classmethod
     def of(
@@ -76,7 +79,19 @@ class PromptTable:
                 f"token {highest} is beyond the backbone's vocabulary of {config.vocabulary}: "
                 "the tokenizer is another model's."
             )
-        return table
+        return dataclasses.replace(table, instructions=tuple(instructions))
+
+    def chosen(self, instructions: Sequence[str]) -> "PromptTable":
+        """The table of these of its instructions, in this order.
+
+        Raises:
+            ValueError: one that it does not have.
+        """
+        if missing := sorted(set(instructions) - set(self.instructions)):
+            raise ValueError(f"the policy has no prompt for {missing[0]!r}.")
+        rows = np.array([self.instructions.index(text) for text in instructions])
+        start = Ids(*(array[rows] for array in self.start))
+        return dataclasses.replace(self, start=start, instructions=tuple(instructions))
 
     def encode(self, instruction: jax.Array, state: jax.Array) -> Ids:
         """The prompts `[B, T]` of instructions in states.
@@ -103,12 +118,13 @@ def _with_state(
     numbers = [f"{starts[0]} {name}" for name in range(-1, prompts.STATE_BINS)]
     last = [number + prompts.PI05_END for number in numbers]
     ids, mask = _encoded(words, starts, max_tokens)
-    ends = [_ends(words, texts, skip=int(mask[0].sum())) for texts in (numbers, last)]
-    _check(words, instructions, *ends)
-    longest = _inside(np.full(count, ends[0].mask.sum(axis=1).argmax() - 1))
+    skip = int(mask[0].sum())
+    middle, end = _ends(words, numbers, skip), _ends(words, last, skip)
+    _check(words, instructions, middle, end)
+    longest = _inside(np.full(count, middle.mask.sum(axis=1).argmax() - 1))
     whole = [prompts.pi05(text, longest) for text in instructions]
     words.encode(whole, max_tokens, complete=True)  # as it does with what is too long
-    return PromptTable(_ids(ids[:, :max_tokens], mask[:, :max_tokens]), *ends)
+    return PromptTable(_ids(ids[:, :max_tokens], mask[:, :max_tokens]), middle, end)
 
 
 def _check(words: Tokenizer, instructions: Sequence[str], numbers: Ids, last: Ids) -> None:
@@ -145,7 +161,7 @@ def _encoded(
     words: Tokenizer, texts: Sequence[str], least: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Ids and mask of whole prompts, uncut, of at least so many columns."""
-    room = 4 * max(map(len, texts)) + 8  # a token is a byte or more; others at both ends
+    room = max(len(text.encode()) for text in texts) + 8  # a token is a byte or more; BOS, EOS
     return words.encode(texts, max(room, least), complete=True)
 
 

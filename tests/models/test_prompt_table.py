@@ -4,6 +4,7 @@ import dataclasses
 import json
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -26,6 +27,19 @@ def test_a_row_for_each_instruction():
     wanted = tokenizer.encode([TEXTS[i] for i in (1, 0, 1)], config.max_tokens)
     for mine, theirs in zip(found, wanted, strict=True):
         np.testing.assert_array_equal(mine, theirs)
+
+
+def test_some_of_its_instructions():
+    """As an environment numbers its own."""
+    words, rows = tokenizer.load(SMOLVLM), jnp.arange(2)
+    config = dataclasses.replace(PI05, max_tokens=100, vocabulary=words.vocabulary)
+    table = PromptTable.of(words, ["open the lid", *TEXTS], config, num_joints=6)
+    own = PromptTable.of(words, TEXTS[::-1], config, num_joints=6)
+    state = jnp.zeros((2, 7))
+    jax.tree.map(np.testing.assert_array_equal, table.chosen(TEXTS[::-1]), own)
+    assert (own.encode(rows, state).ids != table.encode(rows, state).ids).any()
+    with pytest.raises(ValueError, match="the policy has no prompt for 'close the lid'"):
+        table.chosen([TEXTS[0], "close the lid"])
 
 
 @pytest.mark.parametrize("words", ["paligemma_like.model", SMOLVLM.name, ""])
