@@ -4,7 +4,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Literal
 
-Mode = Literal["mean_std", "min_max", "quantiles", "identity"]
+Mode = Literal["mean_std", "min_max", "quantiles", "quantile10", "identity"]
 Convention = Literal["ours", "openpi", "lerobot"]
 
 
@@ -20,6 +20,9 @@ class InputConfig:
     """How states are normalised, see `normalization`."""
     action: Mode = "mean_std"
     """How actions are."""
+    delta: tuple[bool, ...] = ()
+    """Which actions are relative to the state that a chunk starts from, see `processing.to_delta`;
+    the robot's statistics are then those of such actions."""
     convention: Convention = "ours"
     """Whose way to avoid a division by zero."""
     gripper_slot: int | None = 7

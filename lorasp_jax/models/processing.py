@@ -5,6 +5,7 @@ joints from slot 0, the gripper in slot 7; published weights have the robot's nu
 Unused slots are zero.
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -77,6 +78,15 @@ def to_absolute(actions: jax.Array, state: jax.Array, mask: Sequence[bool]) -> j
     return actions + _start(actions, state, mask)
 
 
+def check_delta(mask: Sequence[bool], num_joints: int) -> None:
+    """Raise ValueError if more numbers than a robot has are said to be relative or not."""
+    if len(mask) > num_joints + 1:
+        raise ValueError(
+            f"relative actions are said of {len(mask)} numbers, the robot has {num_joints + 1}: "
+            "the weights are another robot's."
+        )
+
+
 def _start(actions: jax.Array, state: jax.Array, mask: Sequence[bool]) -> jax.Array:
     """The state `[..., 1, J]` f32 where the mask is True, else zero."""
     whole = np.zeros(actions.shape[-1], bool)
@@ -97,7 +107,6 @@ class Processor:
         inputs: what the backbone was trained to see.
         cameras: (backbone's camera, robot's camera or None) each, see `camera_slots`; empty: the
             robot's cameras have the backbone's names.
-        delta: where actions are relative to the state, see `to_delta`; the statistics are theirs.
 
     Raises:
         ValueError: slots that the statistics do not have.
@@ -109,7 +118,6 @@ class Processor:
     image_size: int = field(default=64, metadata={"static": True})
     inputs: InputConfig = field(default=OURS, metadata={"static": True})
     cameras: tuple[tuple[str, str | None], ...] = field(default=(), metadata={"static": True})
-    delta: tuple[bool, ...] = field(default=(), metadata={"static": True})
 
     @classmethod
     def of(
@@ -120,7 +128,7 @@ class Processor:
         *,
         num_joints: int,
         cameras: Mapping[str, str] | None = None,
-        delta: Sequence[bool] = (),
+        delta: Sequence[bool] | None = None,
     ) -> "Processor":
         """The processor that a backbone's config asks for.
 
@@ -130,17 +138,22 @@ class Processor:
             prompts: of the instructions.
             num_joints: J.
             cameras: backbone's name -> robot's name, see `camera_slots`; None: the same names.
-            delta: see `to_delta`.
+            delta: where actions are relative to the state, see `to_delta`; the statistics are
+                theirs. None: as the backbone's config says.
 
         Raises:
-            ValueError: joints, statistics or cameras that do not fit the backbone.
+            ValueError: joints, statistics or cameras that do not fit the backbone, or relative
+                actions that the robot does not have.
         """
         slots = robot_slots(num_joints, config.inputs)
         if statistics.dim != config.action_dim:
             statistics = statistics.placed(slots, config.action_dim)
         chosen = () if cameras is None else camera_slots(config.cameras, cameras)
-        size, inputs = config.image_size, config.inputs
-        return cls(slots, statistics, prompts, size, inputs, chosen, tuple(delta))
+        inputs = config.inputs
+        if delta is not None:
+            inputs = dataclasses.replace(inputs, delta=tuple(delta))
+        check_delta(inputs.delta, num_joints)
+        return cls(slots, statistics, prompts, config.image_size, inputs, chosen)
 
     @property
     def slot_mask(self) -> np.ndarray:
@@ -202,8 +215,8 @@ class Processor:
         Returns:
             `[..., C, A]` normalised, in slots.
         """
-        if self.delta:
-            actions = to_delta(actions, _given(state), self.delta)
+        if self.inputs.delta:
+            actions = to_delta(actions, _given(state), self.inputs.delta)
         return self._to_slots("action", actions)
 
     def decode(self, actions: jax.Array, state: jax.Array | None = None) -> jax.Array:
@@ -211,7 +224,7 @@ class Processor:
         slots, inputs = np.array(self.robot_slots), self.inputs
         known = {name: array[slots] for name, array in self.statistics.action.items()}
         actions = unnormalize(actions[..., slots], known, inputs.action, inputs.convention)
-        return to_absolute(actions, _given(state), self.delta) if self.delta else actions
+        return to_absolute(actions, _given(state), inputs.delta) if inputs.delta else actions
 
     def _to_slots(self, kind: str, values: jax.Array) -> jax.Array:
         """Normalised states or actions `[..., J+1]`, `[..., A]`."""

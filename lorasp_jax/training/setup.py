@@ -24,7 +24,7 @@ from lorasp_jax.models import backbone, loading, places, presets, tokenizer
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.models.policy import Policy
-from lorasp_jax.models.processing import Processor, Statistics, robot_slots, to_delta
+from lorasp_jax.models.processing import Processor, Statistics, check_delta, robot_slots, to_delta
 from lorasp_jax.models.prompt_table import PromptTable
 from lorasp_jax.training import preflight
 from lorasp_jax.training.loop import Run
@@ -54,6 +54,7 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
     joints = worlds[0].robot.num_joints
     prompts = PromptTable.of(words, instructions, base.config, num_joints=joints)
     _check_sizes(config, base.config.chunk)
+    check_delta(base.config.inputs.delta, joints)
     remat, memory = preflight.choose_remat(config, base.config, preflight.available_bytes())
     base = _with_remat(base, remat)
     model = _adapted(config, base, config.peft.as_saved)
@@ -135,6 +136,8 @@ def base_model(config: Config) -> tuple[Backbone, str]:
         wanted = dataclasses.replace(wanted, cameras=wanted.cameras[: len(envs.Env.cameras)])
     if chosen.source:
         folder = places.local(chosen.source)
+        inputs = loading.lerobot_inputs(folder) or wanted.inputs
+        wanted = dataclasses.replace(wanted, inputs=inputs)
         model = models.load(folder, wanted)
         if loading.is_own(folder):
             _check_time(folder, config.control_dt)
@@ -181,12 +184,13 @@ def processor(
         episodes: by task.
         model_config: sizes and inputs.
         prompts: of the instructions, task after task.
-        relative: joint targets are learned relative to the state that a chunk starts from.
+        relative: joint targets are learned relative to the state that a chunk starts from; else
+            what the model's config says is.
     """
     joints = episodes[0].state.shape[-1] - 1
     slots, dim = robot_slots(joints, model_config.inputs), model_config.action_dim
-    delta = (*[True] * joints, False) if relative else ()
-    pairs = [_windows(e, model_config.chunk if relative else 1) for e in episodes]
+    delta = (*[True] * joints, False) if relative else model_config.inputs.delta
+    pairs = [_windows(e, model_config.chunk if delta else 1) for e in episodes]
     state, action = (jnp.concatenate(arrays) for arrays in zip(*pairs, strict=True))
     action = np.asarray(to_delta(action, state, delta)).reshape(-1, joints + 1)
     state = np.repeat(np.asarray(state), len(action) // len(state), axis=0)

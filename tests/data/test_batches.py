@@ -60,10 +60,10 @@ def test_published_weights_learn_the_slots_that_the_robot_lacks(tmp_path):
     """And relative actions count from the window's first state."""
     run = make_run(tmp_path / "run", CONFIG)
     steps, own = flatten(list(run.episodes.values())), run.policy.processor
-    inputs = dataclasses.replace(own.inputs, quiet_slots=False)
+    inputs = dataclasses.replace(own.inputs, quiet_slots=False, delta=(True, False))
     sizes = {"batch_size": 16, "chunk": 4, "state_noise": 0.0}
     plain = sample_batch(jax.random.key(1), steps, own, **sizes)
-    other = dataclasses.replace(own, inputs=inputs, delta=(True, False))
+    other = dataclasses.replace(own, inputs=inputs)
     batch = sample_batch(jax.random.key(1), steps, other, **sizes)
     assert (batch.action_mask == plain.action_mask[..., :1]).all()
     assert not batch.actions[..., 6].any()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lorasp_jax.models import prompts
+from lorasp_jax.models.inputs import OPENPI
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.processing import Processor, robot_slots, to_absolute, to_delta
@@ -103,9 +104,10 @@ def test_unused_slots_reach_no_motor():
     np.testing.assert_allclose(moved[..., 6], own.statistics.action["std"][7], rtol=1e-4)
 
 
-def published(num_joints: int = 6, **choices) -> Processor:
+def published(num_joints: int = 6, relative: tuple[bool, ...] = (), **choices) -> Processor:
     """With openpi's inputs: one block of numbers, noise in all of the 32 slots."""
-    config = dataclasses.replace(Pi0Config.base(), image_size=28)
+    inputs = dataclasses.replace(OPENPI, delta=relative)
+    config = dataclasses.replace(Pi0Config.base(), image_size=28, inputs=inputs)
     state, action = RNG.normal(2.0, 3.0, (2, 20, num_joints + 1))
     valid = np.ones(20, bool)
     statistics = Statistics.measure(
@@ -179,8 +181,11 @@ def test_delta_actions():
     np.testing.assert_allclose(to_absolute(found, state, (True, True, False)), actions, atol=1e-6)
 
 
-def test_policies_of_delta_actions_move_absolutely():
-    own, plain = published(delta=(*[True] * 6, False)), published()
+@pytest.mark.parametrize("said", ["by the caller", "by the backbone"])
+def test_policies_of_delta_actions_move_absolutely(said):
+    mask = (*[True] * 6, False)
+    own = published(delta=mask) if said == "by the caller" else published(relative=mask)
+    plain = published(relative=mask, delta=())
     own = dataclasses.replace(own, statistics=plain.statistics)
     state = jnp.asarray(RNG.normal(size=(2, 7)), jnp.float32)
     actions = jnp.asarray(RNG.normal(size=(2, 4, 7)), jnp.float32)
@@ -190,6 +195,8 @@ def test_policies_of_delta_actions_move_absolutely():
     np.testing.assert_allclose(own.decode(inside, state), actions, atol=1e-5)
     with pytest.raises(ValueError, match="give the raw state"):
         own.decode(inside)
+    with pytest.raises(ValueError, match="said of 14 numbers, the robot has 7"):
+        published(relative=(True,) * 14)
 
 
 def test_prompts_tell_the_normalised_state():

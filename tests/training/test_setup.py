@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import json
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -75,6 +76,33 @@ def test_a_tokenizer_of_another_model_is_found_before_anything_long(config, tmp_
     monkeypatch.setattr(setup.envs, "make", lambda *_, **__: world("press the red button"))
     with pytest.raises(ValueError, match="demonstrations of other instructions"):
         setup.prepare(config, tmp_path, console, time.perf_counter())
+
+
+def test_policies_of_lerobot_are_fed_as_they_say(config, tmp_path, monkeypatch):
+    fields = {
+        "type": "pi0",
+        "normalization_mapping": {"STATE": "QUANTILE10", "ACTION": "MIN_MAX"},
+        "use_relative_actions": True,
+        "action_feature_names": ["a", "b", "gripper"],
+        "output_features": {"action": {"shape": [3]}},
+    }
+    (tmp_path / "config.json").write_text(json.dumps(fields))
+    monkeypatch.setattr(setup.models, "load", lambda _, wanted: SimpleNamespace(config=wanted))
+    monkeypatch.setattr(setup.models, "weights_hash", lambda _: "")
+    model = ModelConfig(size="base", checkpoint=str(tmp_path))
+    wanted = dataclasses.replace(
+        inputs.LEROBOT_CENTRED, state="quantile10", action="min_max", delta=(True, True, False)
+    )
+    found, _ = BASE_MODEL(dataclasses.replace(config, model=model))
+    assert found.config.inputs == wanted
+    (tmp_path / "config.json").unlink()
+    found, _ = BASE_MODEL(dataclasses.replace(config, model=model))
+    assert found.config.inputs == inputs.OPENPI
+    two_arms = dataclasses.replace(inputs.OURS, delta=(True,) * 14)
+    found = dataclasses.replace(Pi0Config.dummy(), inputs=two_arms).create(nnx.Rngs(0))
+    monkeypatch.setattr(setup, "base_model", lambda _: (found, ""))
+    with pytest.raises(ValueError, match="said of 14 numbers, the robot has 7"):
+        setup.prepare(config, tmp_path, Console(file=io.StringIO()), time.perf_counter())
 
 
 @pytest.mark.slow
