@@ -18,7 +18,7 @@ import envs
 from envs.episodes import Episodes
 from lorasp_jax import adaptation, calibration, models, peft, tables
 from lorasp_jax.config import Config
-from lorasp_jax.data.batches import Batch, flatten, sample_batch
+from lorasp_jax.data.batches import Batch, flatten, sample_batch, windows
 from lorasp_jax.data.demonstrations import demonstrations
 from lorasp_jax.models import backbone, loading, places, presets, tokenizer
 from lorasp_jax.models.backbone import Backbone
@@ -190,30 +190,17 @@ def processor(
     joints = episodes[0].state.shape[-1] - 1
     slots, dim = robot_slots(joints, model_config.inputs), model_config.action_dim
     delta = (*[True] * joints, False) if relative else model_config.inputs.delta
-    pairs = [_windows(e, model_config.chunk if delta else 1) for e in episodes]
-    state, action = (jnp.concatenate(arrays) for arrays in zip(*pairs, strict=True))
-    action = np.asarray(to_delta(action, state, delta)).reshape(-1, joints + 1)
-    state = np.repeat(np.asarray(state), len(action) // len(state), axis=0)
+    steps = flatten([dataclasses.replace(group, image={}) for group in episodes])
+    chunk = model_config.chunk if delta else 1
+    window, _ = windows(steps, jnp.arange(len(steps.end)), chunk)
+    action = np.asarray(to_delta(steps.action[window], steps.state, delta)).reshape(-1, joints + 1)
+    state = np.repeat(np.asarray(steps.state), chunk, axis=0)
     everything = np.ones(len(state), bool)
     statistics = Statistics.measure(state, action, everything, slots=slots, dim=dim)
     cameras = dict(zip(model_config.cameras, sorted(episodes[0].image), strict=False))
     return Processor.of(
         model_config, statistics, prompts, num_joints=joints, cameras=cameras, delta=delta
     )
-
-
-def _windows(episodes: Episodes, chunk: int) -> tuple[np.ndarray, np.ndarray]:
-    """States `[N, J+1]` of all valid steps and the actions `[N, C, J+1]` from there on.
-
-    As in training, the last action of an episode is repeated.
-    """
-    length = np.asarray(episodes.length)[:, None]
-    steps = np.arange(episodes.state.shape[1])
-    valid = steps < length
-    following = np.minimum(steps[:, None] + np.arange(chunk), length[..., None] - 1)
-    rows = np.arange(len(length))[:, None, None]
-    actions = np.asarray(episodes.action)[rows, following]
-    return np.asarray(episodes.state)[valid], actions[valid]
 
 
 def _collect(run: Run, instructions: Sequence[str]) -> dict[str, Episodes]:
