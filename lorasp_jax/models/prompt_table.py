@@ -129,10 +129,11 @@ def _with_state(
 
 def _check(words: Tokenizer, instructions: Sequence[str], numbers: Ids, last: Ids) -> None:
     """Raise ValueError unless a table gives what the tokenizer does, whatever the numbers are."""
-    names = prompts.STATE_BINS + 1  # a prime: with every step from 0 on, all come after all
-    bins = np.outer(np.arange(names), np.arange(names + 1)) % names - 1
-    state = _inside(bins)
-    row = np.arange(names) % len(instructions)
+    names = np.arange(prompts.STATE_BINS + 1)
+    # A row for each number: it alternates with all of them, and is the first and the last.
+    others = (names[:, None] + 1 + names) % len(names)
+    state = _inside(np.stack([names[:, None] + 0 * others, others], -1).reshape(len(names), -1) - 1)
+    row = names % len(instructions)
     texts = [prompts.pi05(instructions[i], own) for i, own in zip(row.tolist(), state, strict=True)]
     wanted = _encoded(words, texts)
     starts = [prompts.pi05_start(text) for text in instructions]

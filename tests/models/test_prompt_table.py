@@ -32,7 +32,7 @@ def test_a_row_for_each_instruction():
 def test_some_of_its_instructions():
     """As an environment numbers its own."""
     words, rows = tokenizer.load(SMOLVLM), jnp.arange(2)
-    config = dataclasses.replace(PI05, max_tokens=100, vocabulary=words.vocabulary)
+    config = dataclasses.replace(Pi0Config.nano(), max_tokens=20, vocabulary=words.vocabulary)
     table = PromptTable.of(words, ["open the lid", *TEXTS], config, num_joints=6)
     own = PromptTable.of(words, TEXTS[::-1], config, num_joints=6)
     state = jnp.zeros((2, 7))
@@ -75,12 +75,12 @@ def test_what_is_too_long_is_cut_as_the_tokenizer_cuts_it():
         PromptTable.of(tokenizer.Offline(), TEXTS, config, num_joints=6)
 
 
-def test_a_tokenizer_that_joins_numbers_is_refused(tmp_path):
-    """One that has a token for " 7 8", which no table of single numbers gives."""
+@pytest.mark.parametrize("joined", [" 7 8", " 9 9", "5 255;"])
+def test_a_tokenizer_that_joins_numbers_is_refused(joined, tmp_path):
+    """One that has a token for two numbers, which no table of single ones gives."""
     fields = json.loads(SMOLVLM.read_text())
-    joined = {"id": 400, "content": " 7 8", "single_word": False, "lstrip": False}
-    joined |= {"rstrip": False, "normalized": False, "special": False}
-    fields["added_tokens"].append(joined)
+    flags = dict.fromkeys(("single_word", "lstrip", "rstrip", "normalized", "special"), False)
+    fields["added_tokens"].append({"id": 400, "content": joined, **flags})
     (tmp_path / "tokenizer.json").write_text(json.dumps(fields))
     config = dataclasses.replace(PI05, max_tokens=100, vocabulary=401)
     with pytest.raises(ValueError, match="does not write a state's numbers one by one"):

@@ -24,7 +24,7 @@ from lorasp_jax.models.tokenizer import Offline
 from lorasp_jax.peft import FullFineTuning, LoRA
 from lorasp_jax.training import export, setup
 from lorasp_jax.training import mesh as meshes
-from lorasp_jax.training.loop import train
+from lorasp_jax.training.loop import Run, train
 from lorasp_jax.training.overrides import override
 from tests import quick
 from tests.runs import CONFIG, leaves, random_episodes
@@ -69,13 +69,11 @@ def test_a_tokenizer_of_another_model_is_found_before_anything_long(config, tmp_
     console = Console(file=io.StringIO())
     smolvlm = Path(__file__).parents[1] / "golden/tokenizers/smolvlm_like_tokenizer.json"
     other = override(config, ["--model.tokenizer", str(smolvlm)])
-    with monkeypatch.context() as patched:
-        patched.setattr(setup, "demonstrations", lambda *_: pytest.fail("it began"))
-        with pytest.raises(ValueError, match="beyond the backbone's vocabulary of 320: the token"):
-            setup.prepare(other, tmp_path, console, time.perf_counter())
-    monkeypatch.setattr(setup.envs, "make", lambda *_, **__: world("press the red button"))
     with pytest.raises(ValueError, match="demonstrations of other instructions"):
-        setup.prepare(config, tmp_path, console, time.perf_counter())
+        setup._collect(Run(config, tmp_path, console, "", 0), ["press the red button"])
+    monkeypatch.setattr(setup, "demonstrations", lambda *_: pytest.fail("it began"))
+    with pytest.raises(ValueError, match="beyond the backbone's vocabulary of 320: the token"):
+        setup.prepare(other, tmp_path, console, time.perf_counter())
 
 
 def test_policies_of_lerobot_are_fed_as_they_say(config, tmp_path, monkeypatch):
