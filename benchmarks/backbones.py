@@ -26,12 +26,13 @@ from rich.console import Console
 from benchmarks.measuring import best, machine, print_table
 from lorasp_jax import adaptation, flops, peft
 from lorasp_jax.config import Config, OptimConfig
-from lorasp_jax.models import backbone, presets
+from lorasp_jax.models import backbone
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
+from lorasp_jax.training import preflight
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
 from lorasp_jax.training.preflight import GIB, REMATS, abstract_batch, expected
-from lorasp_jax.training.step import init_state, loss_fn, train_step
+from lorasp_jax.training.step import init_state, train_step
 
 CAMERAS = {"pi0": 3, "smolvla": 2}
 STEPS = 10
@@ -55,19 +56,14 @@ def run_config(method: peft.Method, targets: tuple[str, ...], batch: int) -> Con
     return Config(name="benchmark", scale="", peft=method, targets=targets, optim=optim)
 
 
-def adapted(config: BackboneConfig, run: Config | None, key: jax.Array) -> Backbone:
-    """A random model with the run's adapters."""
-    base, adapters = (nnx.Rngs(k) for k in jax.random.split(key))
-    model = config.create(base)
-    if run is None:
-        return model
-    return adaptation.adapt(model, presets.rules(run.targets, run.peft), rngs=adapters)
-
-
 def arrays(config: BackboneConfig, run: Config | None) -> tuple[Any, Any, Any]:
-    """Graph, adapters and frozen arrays, drawn on the device."""
-    graphdef = adaptation.split(nnx.eval_shape(lambda: adapted(config, run, jax.random.key(0))))[0]
-    draw = jax.jit(lambda key: adaptation.split(adapted(config, run, key))[1:])
+    """Graph, adapters and frozen arrays, drawn on the device; no adapters without a run."""
+
+    def model(key: jax.Array) -> Backbone:
+        return preflight.adapted(run, config, key) if run else config.create(nnx.Rngs(key))
+
+    graphdef = adaptation.split(nnx.eval_shape(lambda: model(jax.random.key(0))))[0]
+    draw = jax.jit(lambda key: adaptation.split(model(key))[1:])
     return graphdef, *draw(jax.random.key(0, impl="rbg"))
 
 
@@ -115,17 +111,9 @@ class Step:
 
 def work(config: BackboneConfig, run: Config) -> float:
     """Operations of one step."""
-    model = nnx.eval_shape(lambda: adapted(config, run, jax.random.key(0)))
-    graphdef, adapters, frozen = adaptation.split(model)
-    weights: Any = dict.fromkeys(auxiliary_weights(run.auxiliary, 1), 0.0)
-
-    def gradients(adapters: Any, frozen: Any, batch: Any) -> Any:
-        loss = functools.partial(loss_fn, weights=weights)
-        gradient = jax.grad(loss, has_aux=True)
-        return gradient(adapters, frozen, graphdef, batch, jax.random.key(0))
-
-    batch = abstract_batch(config, run.optim.batch_size)
-    return flops.count(gradients, adapters, frozen, batch)
+    step = preflight.abstract_step(run, config, run.optim.batch_size)
+    gradient = jax.grad(step.loss, has_aux=True)
+    return flops.count(gradient, step.adapters, step.frozen, step.batch)
 
 
 def training(name: str, label: str, run: Config, options: argparse.Namespace, remat: Remat) -> Any:

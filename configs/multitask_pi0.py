@@ -3,10 +3,13 @@
     python train.py --config configs/multitask_pi0.py
     python train.py --config configs/multitask_pi0.py --model.checkpoint FOLDER \\
         --model.tokenizer FILE
+    python train.py --config configs/multitask_pi0.py --model.size base_pi05 \\
+        --model.checkpoint gs://openpi-assets/checkpoints/pi05_base
 
 Weights and tokenizer come from openpi's buckets unless places of your own are named; both of
 openpi's and LeRobot's layouts are read. Needs a GPU of 80 GB or, with `--model.remat full`, of 24;
 `--fsdp N` splits the base over N devices. pi0 has places for three cameras; the third is masked.
+The last command adapts pi0.5.
 """
 
 from lorasp_jax.config import Config, DataConfig, EvaluationConfig, ModelConfig, OptimConfig

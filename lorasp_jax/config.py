@@ -22,7 +22,8 @@ class ModelConfig:
     backbone: str = "pi0"
     """pi0 or smolvla."""
     size: str = "nano"
-    """nano for a CPU, small for one accelerator, base as published."""
+    """nano for a CPU, small for one accelerator, base as published; of pi0 also nano_pi05 and
+    base_pi05."""
     checkpoint: str = "assets/{backbone}_{size}"
     """Where the base weights are: a folder, an id on Hugging Face's hub, a bucket; empty for random
     ones. {backbone} and {size} stand for those fields."""

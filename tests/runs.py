@@ -16,6 +16,7 @@ from lorasp_jax.config import Config, ModelConfig, OptimConfig
 from lorasp_jax.models import tokenizer
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.policy import Policy
+from lorasp_jax.models.prompt_table import PromptTable
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.training.loop import Callback, Run
 from lorasp_jax.training.setup import processor
@@ -76,9 +77,10 @@ def make_run(folder: Path, config: Config = CONFIG) -> Run:
     )
     run = Run(config, folder, Console(file=io.StringIO()), "hash of the base")
     run.episodes = {task: random_episodes(task, i) for i, task in enumerate(config.tasks)}
-    run.policy = Policy(
-        model, processor(list(run.episodes.values()), model.config, tokenizer.Offline())
-    )
+    groups = list(run.episodes.values())
+    phrases = [phrase for group in groups for phrase in group.instructions]
+    prompts = PromptTable.of(tokenizer.Offline(), phrases, model.config, num_joints=6)
+    run.policy = Policy(model, processor(groups, model.config, prompts))
     return run
 
 

@@ -6,7 +6,7 @@ one integer.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -78,6 +78,22 @@ def flatten(episodes: Sequence[Episodes]) -> Steps:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
+def windows(steps: Steps, start: jax.Array, chunk: int) -> tuple[jax.Array, jax.Array]:
+    """Chunks of steps; one that would reach past its episode repeats the last step there.
+
+    Args:
+        steps: N of them.
+        start: `[B]` int32, index of each chunk's first step.
+        chunk: C.
+
+    Returns:
+        `[B, C]` int32 indices, and `[B, C]` bool, False where a step is a repetition.
+    """
+    window = start[:, None] + jnp.arange(chunk)
+    last = steps.end[start][:, None] - 1
+    return jnp.minimum(window, last), window <= last
+
+
 def sample_batch(
     key: jax.Array,
     steps: Steps,
@@ -89,18 +105,16 @@ def sample_batch(
 ) -> Batch:
     """Draw `batch_size` windows uniformly over steps; `key` is consumed.
 
-    A chunk that would reach past its episode repeats the last action there, with the mask False.
+    The mask is False where a chunk repeats its episode's last action, see `windows`.
     """
     start_key, noise_key = jax.random.split(key)
     start = jax.random.randint(start_key, (batch_size,), 0, steps.end.shape[0])
-    window = start[:, None] + jnp.arange(chunk)  # [B, C]
-    last = steps.end[start][:, None] - 1
+    window, inside = windows(steps, start, chunk)
     raw = {
         "image": {name: image[start] for name, image in steps.image.items()},
         "state": steps.state[start],
     }
-    observation = processor.encode(raw, steps.instruction[start])
-    actions = processor.normalize_actions(steps.action[jnp.minimum(window, last)], raw["state"])
-    noise = state_noise * jax.random.normal(noise_key, observation.state.shape)
-    observation = replace(observation, state=observation.state + noise * processor.slot_mask)
-    return Batch(observation, actions, (window <= last)[..., None] & processor.flow_slots)
+    noise = state_noise * jax.random.normal(noise_key, (batch_size, processor.statistics.dim))
+    observation = processor.encode(raw, steps.instruction[start], state_noise=noise)
+    actions = processor.normalize_actions(steps.action[window], raw["state"])
+    return Batch(observation, actions, inside[..., None] & processor.flow_slots)

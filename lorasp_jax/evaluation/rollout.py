@@ -14,7 +14,6 @@ from envs.randomization import Randomization
 from envs.state import State
 from lorasp_jax import adaptation
 from lorasp_jax.evaluation import metrics
-from lorasp_jax.models import tokenizer
 from lorasp_jax.models.policy import Policy
 
 FILMED_WORLDS = 8
@@ -117,7 +116,7 @@ def evaluate(
     """Success of `policy` on the task of `env` in fresh episodes.
 
     Args:
-        policy: for the robot of `env`; it is told the task in the words of `env.instructions`.
+        policy: for the robot of `env`; its processor has prompts for `env.instructions`.
         env: where to evaluate; `num_envs` episodes run at a time.
         key: consumed; the same key gives the same layouts.
         num_episodes: a multiple of `env.num_envs`.
@@ -125,7 +124,8 @@ def evaluate(
         progress: called with episodes done and episodes wanted.
 
     Raises:
-        ValueError: `num_episodes` is not a positive multiple of `env.num_envs`.
+        ValueError: `num_episodes` is not a positive multiple of `env.num_envs`, or the policy was
+            never told one of the instructions.
     """
     batches, rest = divmod(num_episodes, env.num_envs)
     if rest or batches < 1:
@@ -189,10 +189,9 @@ def _result(runs: Sequence[Rollout]) -> Result:
 
 
 def _told(policy: Policy, env: Env) -> Policy:
-    """The policy with the instructions of one environment in its token table."""
-    ids, valid = tokenizer.encode(env.instructions, policy.model.config.max_tokens)
-    table = {"tokens": jnp.asarray(ids), "token_mask": jnp.asarray(valid)}
-    return Policy(policy.model, dataclasses.replace(policy.processor, **table))
+    """The policy with the prompts of one environment, whose worlds index them."""
+    prompts = policy.processor.prompts.chosen(env.instructions)
+    return Policy(policy.model, dataclasses.replace(policy.processor, prompts=prompts))
 
 
 def _film(run: Rollout) -> Poses:

@@ -135,11 +135,12 @@ class BackboneConfig:
         Raises:
             TypeError, KeyError: missing or unknown fields.
         """
+        inputs = fields.get("inputs", {})
         parts = {
             "vision": VisionConfig(**fields["vision"]),
             "language": ExpertConfig(**fields["language"]),
             "action": ExpertConfig(**fields["action"]),
             "cameras": tuple(fields["cameras"]),
-            "inputs": InputConfig(**fields.get("inputs", {})),
+            "inputs": InputConfig(**{**inputs, "delta": tuple(inputs.get("delta", ()))}),
         }
         return cls(**{**fields, **parts})

@@ -7,19 +7,15 @@ file's fields that gives a config with the towers' sizes. What all policies shar
 import dataclasses
 import importlib
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, get_args
 
 from lorasp_jax.models import backbone
 from lorasp_jax.models.config import BackboneConfig
+from lorasp_jax.models.inputs import Mode
 
 Fields = Mapping[str, Any]
 _IMAGES = ("observation.images.", "observation.")
-_MODES = {
-    "MEAN_STD": "mean_std",
-    "MIN_MAX": "min_max",
-    "QUANTILES": "quantiles",
-    "IDENTITY": "identity",
-}
+_MODES = {mode.upper(): mode for mode in get_args(Mode)}
 # What this project's backbones do, and LeRobot's may do otherwise.
 _FIXED: Fields = {"min_period": 4e-3, "max_period": 4.0, "adapt_to_pi_aloha": False}
 
@@ -68,7 +64,8 @@ def _shared(config: BackboneConfig, fields: Fields) -> dict[str, Any]:
         raise ValueError(
             f"state and action must have one length, pictures be square: {dims}, {size}"
         )
-    modes = {"VISUAL": "IDENTITY", "STATE": "MEAN_STD", "ACTION": "MEAN_STD"}
+    inputs = config.inputs
+    modes = {"VISUAL": "IDENTITY", "STATE": inputs.state.upper(), "ACTION": inputs.action.upper()}
     modes |= fields.get("normalization_mapping", {})
     if modes["VISUAL"] != "IDENTITY" or not modes.keys() <= {"VISUAL", "STATE", "ACTION"}:
         raise ValueError(f"pictures are not normalised here, but normalization_mapping is {modes}")
@@ -81,9 +78,24 @@ def _shared(config: BackboneConfig, fields: Fields) -> dict[str, Any]:
         "chunk": fields.get("chunk_size", config.chunk),
         "action_dim": dims.pop(),
         "inputs": dataclasses.replace(
-            config.inputs, state=_MODES[modes["STATE"]], action=_MODES[modes["ACTION"]]
+            inputs,
+            state=_MODES[modes["STATE"]],
+            action=_MODES[modes["ACTION"]],
+            delta=_delta(fields),
         ),
     }
+
+
+def _delta(fields: Fields) -> tuple[bool, ...]:
+    """Which actions are relative: but those with an excluded word in their name, where they have
+    names (processor/relative_action_processor.py of 0.6)."""
+    if not fields.get("use_relative_actions"):
+        return ()
+    size = fields["output_features"]["action"]["shape"][0]
+    words = [word.lower() for word in fields.get("relative_exclude_joints", ["gripper"])]
+    names = (fields.get("action_feature_names") or [])[:size]
+    relative = [not any(word in name.lower() for word in words) for name in names]
+    return (*relative, *[True] * (size - len(relative)))
 
 
 def _cameras(fields: Fields) -> tuple[str, ...]:

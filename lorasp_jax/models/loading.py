@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lorasp_jax.models import backbone, checkpoint, lerobot_config, places, published
+from lorasp_jax.models.inputs import InputConfig
 
 _log = logging.getLogger(__name__)
 
@@ -54,6 +55,17 @@ def is_own(where: str | os.PathLike[str]) -> bool:
         ValueError: as `load`.
     """
     return "backbone" in _fields(places.local(where))
+
+
+def lerobot_inputs(where: str | os.PathLike[str]) -> InputConfig | None:
+    """How a policy of LeRobot's is fed, by its config.json; None for other layouts.
+
+    Raises:
+        ValueError: as `load`.
+    """
+    folder = places.local(where)
+    fields = _fields(folder)
+    return _config(folder, fields).inputs if "type" in fields else None
 
 
 def _fields(folder: Path) -> dict[str, Any]:

@@ -5,7 +5,8 @@ Divisor and factor are the same spread up to what keeps a constant slot from div
 that is a convention of each project:
 
     mean_std             shift mean, spread std, offset 0
-    min_max, quantiles   shift low, spread (high - low) / 2, offset -1: [low, high] becomes [-1, 1]
+    min_max, quantiles   shift low, spread (high - low) / 2, offset -1: [low, high] becomes [-1, 1];
+                         quantiles are the 1st and the 99th percentile, quantile10 10th and 90th
     identity             y = x
 
     ours      at least SMALLEST_SPREAD, both ways
@@ -25,7 +26,7 @@ from lorasp_jax.models.inputs import Convention, Mode
 SMALLEST_SPREAD = 1e-3
 """Floor of spreads [rad, m]: a slot that never moves (a gripper that stays open) is not blown up to
 noise."""
-BOUNDS = {"min_max": ("min", "max"), "quantiles": ("q01", "q99")}
+BOUNDS = {"min_max": ("min", "max"), "quantiles": ("q01", "q99"), "quantile10": ("q10", "q90")}
 """Statistics that [-1, 1] is mapped to."""
 _OPENPI, _LEROBOT = 1e-6, 1e-8
 

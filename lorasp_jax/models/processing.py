@@ -1,10 +1,11 @@
-"""Between a robot and a backbone: pictures, statistics, slots, token table; both ways.
+"""Between a robot and a backbone: pictures, statistics, slots, prompts; both ways.
 
 State and action vectors of a backbone have slots. With this project's own weights they are fixed:
 joints from slot 0, the gripper in slot 7; published weights have the robot's numbers side by side.
 Unused slots are zero.
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -18,6 +19,7 @@ from lorasp_jax.models.images import resize_with_pad, to_unit
 from lorasp_jax.models.inputs import OURS, InputConfig
 from lorasp_jax.models.normalization import normalize, unnormalize
 from lorasp_jax.models.observation import Observation
+from lorasp_jax.models.prompt_table import PromptTable
 from lorasp_jax.models.statistics import Statistics, check_slots
 
 RawObservation = Mapping[str, Any]
@@ -76,6 +78,15 @@ def to_absolute(actions: jax.Array, state: jax.Array, mask: Sequence[bool]) -> j
     return actions + _start(actions, state, mask)
 
 
+def check_delta(mask: Sequence[bool], num_joints: int) -> None:
+    """Raise ValueError if more numbers than a robot has are said to be relative or not."""
+    if len(mask) > num_joints + 1:
+        raise ValueError(
+            f"relative actions are said of {len(mask)} numbers, the robot has {num_joints + 1}: "
+            "the weights are another robot's."
+        )
+
+
 def _start(actions: jax.Array, state: jax.Array, mask: Sequence[bool]) -> jax.Array:
     """The state `[..., 1, J]` f32 where the mask is True, else zero."""
     whole = np.zeros(actions.shape[-1], bool)
@@ -91,13 +102,11 @@ class Processor:
     Attributes:
         robot_slots: slot of each of the robot's J+1 numbers, see `robot_slots`.
         statistics: of states and actions, per slot.
-        tokens: `[P, T]` int32, one row per instruction.
-        token_mask: `[P, T]` bool.
+        prompts: of the instructions.
         image_size: height and width of the backbone's pictures [pixels].
         inputs: what the backbone was trained to see.
         cameras: (backbone's camera, robot's camera or None) each, see `camera_slots`; empty: the
             robot's cameras have the backbone's names.
-        delta: where actions are relative to the state, see `to_delta`; the statistics are theirs.
 
     Raises:
         ValueError: slots that the statistics do not have.
@@ -105,49 +114,46 @@ class Processor:
 
     robot_slots: tuple[int, ...] = field(metadata={"static": True})
     statistics: Statistics
-    tokens: jax.Array
-    token_mask: jax.Array
+    prompts: PromptTable
     image_size: int = field(default=64, metadata={"static": True})
     inputs: InputConfig = field(default=OURS, metadata={"static": True})
     cameras: tuple[tuple[str, str | None], ...] = field(default=(), metadata={"static": True})
-    delta: tuple[bool, ...] = field(default=(), metadata={"static": True})
 
     @classmethod
     def of(
         cls,
         config: BackboneConfig,
         statistics: Statistics,
-        tokens: tuple[np.ndarray, np.ndarray],
+        prompts: PromptTable,
         *,
         num_joints: int,
         cameras: Mapping[str, str] | None = None,
-        delta: Sequence[bool] = (),
+        delta: Sequence[bool] | None = None,
     ) -> "Processor":
         """The processor that a backbone's config asks for.
 
         Args:
             config: sizes and inputs.
             statistics: of the robot's numbers, in their order or already in slots.
-            tokens: ids and mask `[P, T]` of the instructions, from a tokenizer.
+            prompts: of the instructions.
             num_joints: J.
             cameras: backbone's name -> robot's name, see `camera_slots`; None: the same names.
-            delta: see `to_delta`.
+            delta: where actions are relative to the state, see `to_delta`; the statistics are
+                theirs. None: as the backbone's config says.
 
         Raises:
-            ValueError: joints, statistics, cameras or token ids that do not fit the backbone.
+            ValueError: joints, statistics or cameras that do not fit the backbone, or relative
+                actions that the robot does not have.
         """
-        ids, mask = tokens
-        if ids.max(initial=0) >= config.vocabulary:
-            raise ValueError(
-                f"token {ids.max()} is beyond the backbone's vocabulary of {config.vocabulary}: "
-                "the tokenizer is another model's."
-            )
         slots = robot_slots(num_joints, config.inputs)
         if statistics.dim != config.action_dim:
             statistics = statistics.placed(slots, config.action_dim)
         chosen = () if cameras is None else camera_slots(config.cameras, cameras)
-        table, size = (jnp.asarray(ids), jnp.asarray(mask)), config.image_size
-        return cls(slots, statistics, *table, size, config.inputs, chosen, tuple(delta))
+        inputs = config.inputs
+        if delta is not None:
+            inputs = dataclasses.replace(inputs, delta=tuple(delta))
+        check_delta(inputs.delta, num_joints)
+        return cls(slots, statistics, prompts, config.image_size, inputs, chosen)
 
     @property
     def slot_mask(self) -> np.ndarray:
@@ -161,24 +167,30 @@ class Processor:
         """`[A]` bool, True in the slots that take part in the flow and its loss."""
         return self.slot_mask | (not self.inputs.quiet_slots)
 
-    def encode(self, raw: RawObservation, instruction: jax.Array) -> Observation:
+    def encode(
+        self, raw: RawObservation, instruction: jax.Array, *, state_noise: jax.Array | None = None
+    ) -> Observation:
         """Raw observation to model input; a missing camera's picture is black, with mask False.
 
         Args:
             raw: pictures of any size and the robot's state.
-            instruction: `[B]` int32 rows of the token table.
+            instruction: `[B]` int32 rows of the table of prompts.
+            state_noise: `[B, A]` that the normalised state has on top in the robot's slots.
 
         Raises:
             ValueError: pictures that are not uint8 `[B, H, W, 3]`, a camera that is not there, or a
                 state of the wrong length.
         """
         state = self._to_slots("state", raw["state"])
+        if state_noise is not None:
+            state = state + state_noise * self.slot_mask
         sources = dict(self.cameras) or {name: name for name in raw["image"]}
         absent = sorted({name for name in sources.values() if name} - set(raw["image"]))
         if absent:
             raise ValueError(
                 f"camera {', '.join(absent)} is not among {', '.join(raw['image']) or 'none'}."
             )
+        prompt = self.prompts.encode(instruction, state[:, np.array(self.robot_slots)])
         black = jnp.full((len(state), self.image_size, self.image_size, 3), -1.0)
         return Observation(
             images={
@@ -188,8 +200,8 @@ class Processor:
             image_masks={
                 name: jnp.full(len(state), source is not None) for name, source in sources.items()
             },
-            tokens=jnp.asarray(self.tokens)[instruction],
-            token_mask=jnp.asarray(self.token_mask)[instruction],
+            tokens=prompt.ids,
+            token_mask=prompt.mask,
             state=state,
         )
 
@@ -203,8 +215,8 @@ class Processor:
         Returns:
             `[..., C, A]` normalised, in slots.
         """
-        if self.delta:
-            actions = to_delta(actions, _given(state), self.delta)
+        if self.inputs.delta:
+            actions = to_delta(actions, _given(state), self.inputs.delta)
         return self._to_slots("action", actions)
 
     def decode(self, actions: jax.Array, state: jax.Array | None = None) -> jax.Array:
@@ -212,7 +224,7 @@ class Processor:
         slots, inputs = np.array(self.robot_slots), self.inputs
         known = {name: array[slots] for name, array in self.statistics.action.items()}
         actions = unnormalize(actions[..., slots], known, inputs.action, inputs.convention)
-        return to_absolute(actions, _given(state), self.delta) if self.delta else actions
+        return to_absolute(actions, _given(state), inputs.delta) if inputs.delta else actions
 
     def _to_slots(self, kind: str, values: jax.Array) -> jax.Array:
         """Normalised states or actions `[..., J+1]`, `[..., A]`."""

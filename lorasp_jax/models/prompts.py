@@ -4,6 +4,10 @@ import numpy as np
 
 STATE_BINS = 256
 """Bins of [-1, 1] that pi0.5 names a state's numbers by."""
+EDGES = np.linspace(-1, 1, STATE_BINS + 1)[:-1]
+"""Lower edges of the bins, exact in fp32."""
+PI05_END = ";\nAction: "
+"""What follows the numbers in the prompt of pi0.5."""
 
 
 def openpi(text: str) -> str:
@@ -20,12 +24,17 @@ def lerobot(text: str) -> str:
 
 
 def pi05(text: str, state: np.ndarray) -> str:
-    """The whole prompt of pi0.5, in openpi and LeRobot alike.
+    """The whole prompt of pi0.5, in openpi (models/tokenizer.py) and LeRobot (processor_pi05.py).
 
     Args:
         text: instruction.
-        state: `[A]`, normalised; what is below -1 is named -1, what is at or above 1 is named 255.
+        state: `[J+1]`, the robot's normalised numbers; what is below -1 is
+            named -1, what is at or above 1 is named 255.
     """
-    edges = np.linspace(-1, 1, STATE_BINS + 1)[:-1]
-    numbers = np.digitize(state, edges) - 1
-    return f"Task: {openpi(text)}, State: {' '.join(map(str, numbers))};\nAction: "
+    numbers = np.digitize(state, EDGES) - 1
+    return f"{pi05_start(text)} {' '.join(map(str, numbers))}{PI05_END}"
+
+
+def pi05_start(text: str) -> str:
+    """What of pi0.5's prompt stands before the blank and the first number."""
+    return f"Task: {openpi(text)}, State:"

@@ -10,9 +10,9 @@ import numpy as np
 
 from lorasp_jax.models.normalization import SMALLEST_SPREAD
 
-NAMES = ("mean", "std", "min", "max", "q01", "q99")
+NAMES = ("mean", "std", "min", "max", "q01", "q99", "q10", "q90")
 """Statistics that may be known."""
-_UNUSED: dict[str, float] = dict(zip(NAMES, (0, 1, -1, 1, -1, 1), strict=True))
+_UNUSED: dict[str, float] = dict(zip(NAMES, (0, 1, -1, 1, -1, 1, -1, 1), strict=True))
 """Values in slots that a robot does not use, where every normalisation is the identity."""
 
 
@@ -149,7 +149,7 @@ def check_slots(slots: Sequence[int], dim: int, length: int) -> None:
 
 def _measured(rows: np.ndarray) -> dict[str, jax.Array]:
     """Of rows `[N, J]` f64."""
-    q01, q99 = np.quantile(rows, [0.01, 0.99], axis=0)
+    q01, q10, q90, q99 = np.quantile(rows, [0.01, 0.1, 0.9, 0.99], axis=0)
     found = {
         "mean": rows.mean(axis=0),
         "std": np.maximum(rows.std(axis=0), SMALLEST_SPREAD),
@@ -157,5 +157,7 @@ def _measured(rows: np.ndarray) -> dict[str, jax.Array]:
         "max": rows.max(axis=0),
         "q01": q01,
         "q99": q99,
+        "q10": q10,
+        "q90": q90,
     }
     return {name: jnp.asarray(array, jnp.float32) for name, array in found.items()}

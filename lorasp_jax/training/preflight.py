@@ -8,7 +8,8 @@ runs comes on top: `HEADROOM`.
 import dataclasses
 import math
 import os
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 from flax import nnx
@@ -21,7 +22,7 @@ from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.models.observation import abstract_observation
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
-from lorasp_jax.training.step import loss_fn
+from lorasp_jax.training.step import Metrics, loss_fn
 
 HEADROOM = 1.1
 """Factor on the sum for what is not counted: temporary arrays, the compiled program, fragments."""
@@ -48,6 +49,22 @@ class Memory:
         """All parts in GiB."""
         parts = [f"{name} {value / GIB:.2f}" for name, value in dataclasses.asdict(self).items()]
         return f"{', '.join(parts)}, peak {self.peak / GIB:.2f} GiB"
+
+
+class AbstractStep(NamedTuple):
+    """What a training step differentiates, for a look at it without arrays.
+
+    Attributes:
+        loss: function of the other three that gives the loss and its metrics.
+        adapters: shapes of what trains.
+        frozen: of the base.
+        batch: of what the step sees.
+    """
+
+    loss: Callable[[Any, Any, Batch], tuple[jax.Array, Metrics]]
+    adapters: Any
+    frozen: Any
+    batch: Batch
 
 
 def choose_remat(config: Config, wanted: BackboneConfig, available: float) -> tuple[Remat, Memory]:
@@ -87,31 +104,42 @@ def expected(config: Config, wanted: BackboneConfig) -> Memory:
         config: the run.
         wanted: the backbone's config.
     """
-    method = config.peft.as_saved
-    rules = presets.rules(config.targets, method)
-    model: Backbone = nnx.eval_shape(
-        lambda: adaptation.adapt(wanted.create(nnx.Rngs(0)), rules, rngs=nnx.Rngs(1))
-    )
-    graphdef, adapters, frozen = adaptation.split(model)
-    optimizer = make_optimizer(config.optim, adaptation.methods(model).values())
-    batch = abstract_batch(wanted, max(1, config.optim.batch_size // jax.device_count()))
-    weights: Any = dict.fromkeys(auxiliary_weights(config.auxiliary, 1), 0.0)
+    step = abstract_step(config, wanted, max(1, config.optim.batch_size // jax.device_count()))
+    optimizer = make_optimizer(config.optim, {config.peft.as_saved})
 
     def stored(adapters: Any, frozen: Any, batch: Batch) -> Any:
-        loss = lambda a: loss_fn(a, frozen, graphdef, batch, jax.random.key(0), weights)  # noqa: E731
-        return jax.vjp(loss, adapters, has_aux=True)[1]
+        return jax.vjp(lambda a: step.loss(a, frozen, batch), adapters, has_aux=True)[1]
 
-    jaxpr = jax.make_jaxpr(stored)(adapters, frozen, batch).jaxpr
+    jaxpr = jax.make_jaxpr(stored)(step.adapters, step.frozen, step.batch).jaxpr
     kept = {id(v): v.aval for v in jaxpr.outvars}
     for variable in (*jaxpr.invars, *jaxpr.constvars):  # there anyway
         kept.pop(id(variable), None)
     return Memory(
-        base=_bytes(frozen) / config.fsdp,
-        adapters=_bytes(adapters),
-        gradients=_bytes(adapters),
-        optimizer=_bytes(jax.eval_shape(optimizer.init, adapters)),
-        activations=_bytes(list(kept.values())) + _bytes(batch),
+        base=_bytes(step.frozen) / config.fsdp,
+        adapters=_bytes(step.adapters),
+        gradients=_bytes(step.adapters),
+        optimizer=_bytes(jax.eval_shape(optimizer.init, step.adapters)),
+        activations=_bytes(list(kept.values())) + _bytes(step.batch),
     )
+
+
+def adapted(config: Config, wanted: BackboneConfig, key: jax.Array) -> Backbone:
+    """A random model with the run's adapters; works under `nnx.eval_shape`."""
+    base, adapters = (nnx.Rngs(k) for k in jax.random.split(key))
+    rules = presets.rules(config.targets, config.peft.as_saved)
+    return adaptation.adapt(wanted.create(base), rules, rngs=adapters)
+
+
+def abstract_step(config: Config, wanted: BackboneConfig, batch_size: int) -> AbstractStep:
+    """The loss of a run, whose auxiliary losses weigh nothing, and shapes of what it takes."""
+    model = nnx.eval_shape(lambda: adapted(config, wanted, jax.random.key(0)))
+    graphdef, adapters, frozen = adaptation.split(model)
+    weights: Any = dict.fromkeys(auxiliary_weights(config.auxiliary, 1), 0.0)
+
+    def loss(adapters: Any, frozen: Any, batch: Batch) -> tuple[jax.Array, Metrics]:
+        return loss_fn(adapters, frozen, graphdef, batch, jax.random.key(0), weights)
+
+    return AbstractStep(loss, adapters, frozen, abstract_batch(wanted, batch_size))
 
 
 def abstract_batch(config: BackboneConfig, size: int) -> Batch:

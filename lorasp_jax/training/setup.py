@@ -18,20 +18,21 @@ import envs
 from envs.episodes import Episodes
 from lorasp_jax import adaptation, calibration, models, peft, tables
 from lorasp_jax.config import Config
-from lorasp_jax.data.batches import Batch, flatten, sample_batch
+from lorasp_jax.data.batches import Batch, flatten, sample_batch, windows
 from lorasp_jax.data.demonstrations import demonstrations
 from lorasp_jax.models import backbone, loading, places, presets, tokenizer
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.models.policy import Policy
-from lorasp_jax.models.processing import Processor, Statistics, robot_slots, to_delta
+from lorasp_jax.models.processing import Processor, Statistics, check_delta, robot_slots, to_delta
+from lorasp_jax.models.prompt_table import PromptTable
 from lorasp_jax.training import preflight
 from lorasp_jax.training.loop import Run
 from lorasp_jax.training.progress import bars
 
 STATISTICS_BATCHES = 8
 """Batches that an initialization from data looks at."""
-SIZES = ("nano", "small", "base")
+SIZES = ("nano", "small", "base", "nano_pi05", "base_pi05")
 TRAINING = "training.json"
 """File beside base weights: what they were trained on, with the control period."""
 
@@ -42,16 +43,18 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
     What can be wrong with a config is found before anything long begins.
 
     Raises:
-        ValueError: an unknown task, robot, backbone or size, a base that does not fit, a rule that
-            matches nothing, a chunk or batch that does not fit.
+        ValueError: an unknown task, robot, backbone or size, a base or a tokenizer that does not
+            fit, a rule that matches nothing, a chunk or batch that does not fit.
     """
-    for task in config.tasks:
-        envs.make(
-            task, robot=config.robot, image_size=config.image_size, control_dt=config.control_dt
-        )
+    sizes = {"image_size": config.image_size, "control_dt": config.control_dt}
+    worlds = [envs.make(task, robot=config.robot, **sizes) for task in config.tasks]
+    instructions = [phrase for env in worlds for phrase in env.instructions]
     words = tokenizer.load(config.model.tokenizer)
     base, base_hash = base_model(config)
+    joints = worlds[0].robot.num_joints
+    prompts = PromptTable.of(words, instructions, base.config, num_joints=joints)
     _check_sizes(config, base.config.chunk)
+    check_delta(base.config.inputs.delta, joints)
     remat, memory = preflight.choose_remat(config, base.config, preflight.available_bytes())
     base = _with_remat(base, remat)
     model = _adapted(config, base, config.peft.as_saved)
@@ -62,9 +65,9 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
     console.print(f"memory by device in GiB: {memory}; rematerialisation: {remat}")
     run = Run(config, folder, console, base_hash, started)
     with run.timed("collect"):
-        run.episodes = _collect(run)
+        run.episodes = _collect(run, instructions)
     relative = config.model.relative_actions
-    found = processor([*run.episodes.values()], model.config, words, relative=relative)
+    found = processor([*run.episodes.values()], model.config, prompts, relative=relative)
     if config.peft.needs_statistics:
         statistics = input_moments(run, base, found)
         model = _adapted(config, base, config.peft, statistics)
@@ -123,15 +126,18 @@ def base_model(config: Config) -> tuple[Backbone, str]:
     Raises:
         ValueError: an unknown backbone or size, or a base of another one.
     """
-    chosen = config.model
-    if chosen.size not in SIZES:
-        raise ValueError(f"unknown size {chosen.size!r}: it is one of {', '.join(SIZES)}")
-    wanted: BackboneConfig = getattr(backbone.find(chosen.backbone), chosen.size)()
+    chosen, kind = config.model, backbone.find(config.model.backbone)
+    sizes = [size for size in SIZES if hasattr(kind, size)]
+    if chosen.size not in sizes:
+        raise ValueError(f"unknown size {chosen.size!r}: it is one of {', '.join(sizes)}")
+    wanted: BackboneConfig = getattr(kind, chosen.size)()
     wanted = dataclasses.replace(wanted, dtype=chosen.dtype, param_dtype=chosen.param_dtype)
     if not wanted.inputs.masks_missing:
         wanted = dataclasses.replace(wanted, cameras=wanted.cameras[: len(envs.Env.cameras)])
     if chosen.source:
         folder = places.local(chosen.source)
+        inputs = loading.lerobot_inputs(folder) or wanted.inputs
+        wanted = dataclasses.replace(wanted, inputs=inputs)
         model = models.load(folder, wanted)
         if loading.is_own(folder):
             _check_time(folder, config.control_dt)
@@ -166,53 +172,39 @@ def _check_time(folder: Path, control_dt: float) -> None:
 def processor(
     episodes: Sequence[Episodes],
     model_config: BackboneConfig,
-    words: tokenizer.Tokenizer,
+    prompts: PromptTable,
     *,
     relative: bool = False,
 ) -> Processor:
-    """Statistics of the demonstrations and the token table of all their instructions, in order.
+    """Statistics of the demonstrations, with the prompts of all their instructions, in order.
 
     The robot's cameras take the backbone's places in turn; there may be more places than cameras.
 
     Args:
         episodes: by task.
         model_config: sizes and inputs.
-        words: of the instructions.
-        relative: joint targets are learned relative to the state that a chunk starts from.
+        prompts: of the instructions, task after task.
+        relative: joint targets are learned relative to the state that a chunk starts from; else
+            what the model's config says is.
     """
     joints = episodes[0].state.shape[-1] - 1
     slots, dim = robot_slots(joints, model_config.inputs), model_config.action_dim
-    delta = (*[True] * joints, False) if relative else ()
-    pairs = [_windows(e, model_config.chunk if relative else 1) for e in episodes]
-    state, action = (jnp.concatenate(arrays) for arrays in zip(*pairs, strict=True))
-    action = np.asarray(to_delta(action, state, delta)).reshape(-1, joints + 1)
-    state = np.repeat(np.asarray(state), len(action) // len(state), axis=0)
+    delta = (*[True] * joints, False) if relative else model_config.inputs.delta
+    steps = flatten([dataclasses.replace(group, image={}) for group in episodes])
+    chunk = model_config.chunk if delta else 1
+    window, _ = windows(steps, jnp.arange(len(steps.end)), chunk)
+    action = np.asarray(to_delta(steps.action[window], steps.state, delta)).reshape(-1, joints + 1)
+    state = np.repeat(np.asarray(steps.state), chunk, axis=0)
     everything = np.ones(len(state), bool)
     statistics = Statistics.measure(state, action, everything, slots=slots, dim=dim)
-    phrases = [phrase for group in episodes for phrase in group.instructions]
-    tokens = words.encode(phrases, model_config.max_tokens)
     cameras = dict(zip(model_config.cameras, sorted(episodes[0].image), strict=False))
     return Processor.of(
-        model_config, statistics, tokens, num_joints=joints, cameras=cameras, delta=delta
+        model_config, statistics, prompts, num_joints=joints, cameras=cameras, delta=delta
     )
 
 
-def _windows(episodes: Episodes, chunk: int) -> tuple[np.ndarray, np.ndarray]:
-    """States `[N, J+1]` of all valid steps and the actions `[N, C, J+1]` from there on.
-
-    As in training, the last action of an episode is repeated.
-    """
-    length = np.asarray(episodes.length)[:, None]
-    steps = np.arange(episodes.state.shape[1])
-    valid = steps < length
-    following = np.minimum(steps[:, None] + np.arange(chunk), length[..., None] - 1)
-    rows = np.arange(len(length))[:, None, None]
-    actions = np.asarray(episodes.action)[rows, following]
-    return np.asarray(episodes.state)[valid], actions[valid]
-
-
-def _collect(run: Run) -> dict[str, Episodes]:
-    """Demonstrations by task, with a bar each."""
+def _collect(run: Run, instructions: Sequence[str]) -> dict[str, Episodes]:
+    """Demonstrations by task, with a bar each; they index the instructions."""
     with bars(run.console, "episodes") as progress:
         started: dict[str, TaskID] = {}
 
@@ -222,4 +214,7 @@ def _collect(run: Run) -> dict[str, Episodes]:
                 started[task] = progress.add_task(text, total=total)
             progress.update(started[task], completed=done, description=text)
 
-        return demonstrations(run.config, run.folder, report)
+        found = demonstrations(run.config, run.folder, report)
+    if [phrase for group in found.values() for phrase in group.instructions] != instructions:
+        raise ValueError(f"{run.folder} holds demonstrations of other instructions; start anew")
+    return found

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from lorasp_jax.data.batches import flatten, sample_batch
+from lorasp_jax.data.batches import flatten, sample_batch, windows
 from tests.runs import CONFIG, make_run, random_episodes
 
 
@@ -20,6 +20,14 @@ def test_flatten_keeps_valid_steps_in_order():
     np.testing.assert_array_equal(ends, [5, 5, 14, 14, 21, 21, 26, 42])
     np.testing.assert_array_equal(np.asarray(steps.instruction)[[0, 5, 21, 26]], [0, 1, 2, 3])
     np.testing.assert_array_equal(steps.image["wrist"][6], first.image["wrist"][1, 1])
+
+
+def test_windows_repeat_the_last_step_of_their_episode():
+    """By hand: episodes of 5, 9 and 7 steps."""
+    steps = flatten([random_episodes("a", 0)])
+    found, inside = windows(steps, np.array([0, 3, 4, 19]), 3)
+    assert found.tolist() == [[0, 1, 2], [3, 4, 4], [4, 4, 4], [19, 20, 20]]
+    assert inside.sum(axis=1).tolist() == [3, 2, 1, 2]
 
 
 @pytest.mark.slow
@@ -60,10 +68,10 @@ def test_published_weights_learn_the_slots_that_the_robot_lacks(tmp_path):
     """And relative actions count from the window's first state."""
     run = make_run(tmp_path / "run", CONFIG)
     steps, own = flatten(list(run.episodes.values())), run.policy.processor
-    inputs = dataclasses.replace(own.inputs, quiet_slots=False)
+    inputs = dataclasses.replace(own.inputs, quiet_slots=False, delta=(True, False))
     sizes = {"batch_size": 16, "chunk": 4, "state_noise": 0.0}
     plain = sample_batch(jax.random.key(1), steps, own, **sizes)
-    other = dataclasses.replace(own, inputs=inputs, delta=(True, False))
+    other = dataclasses.replace(own, inputs=inputs)
     batch = sample_batch(jax.random.key(1), steps, other, **sizes)
     assert (batch.action_mask == plain.action_mask[..., :1]).all()
     assert not batch.actions[..., 6].any()

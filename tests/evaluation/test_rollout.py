@@ -10,6 +10,9 @@ import pytest
 import envs
 from lorasp_jax.evaluation import evaluate, make_rollout
 from lorasp_jax.evaluation.rollout import Rollout, _largest_bank, _result, _told
+from lorasp_jax.models.policy import Policy
+from lorasp_jax.models.prompt_table import PromptTable
+from lorasp_jax.models.tokenizer import Offline
 from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP
 from tests.runs import CONFIG, make_run
 
@@ -19,9 +22,11 @@ def env():
     return envs.make("press", robot="piper", num_envs=2, image_size=32)
 
 
-def policy_with(folder, **fields):
+def policy_with(folder, env, **fields):
     config = dataclasses.replace(CONFIG, peft=LoRASP(rank=8, hidden_width=8, **fields))
-    return make_run(folder, config).policy
+    policy = make_run(folder, config).policy
+    prompts = PromptTable.of(Offline(), env.instructions, policy.model.config, num_joints=6)
+    return Policy(policy.model, dataclasses.replace(policy.processor, prompts=prompts))
 
 
 @pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
@@ -34,7 +39,7 @@ def policy_with(folder, **fields):
     ],
 )
 def test_lowers_for(platform, kind, gate, env, tmp_path):
-    policy = _told(policy_with(tmp_path / "run", gate=gate), env)
+    policy = _told(policy_with(tmp_path / "run", env, gate=gate), env)
     device = jax.sharding.AbstractDevice(device_kind=kind, num_cores=None, platform=platform)
     mesh = jax.sharding.AbstractMesh((), (), abstract_device=device)
     shapes = jax.eval_shape(lambda: (policy, jax.random.key(0)))
@@ -46,7 +51,7 @@ def test_lowers_for(platform, kind, gate, env, tmp_path):
 
 @pytest.mark.slow
 def test_evaluate_reports_what_happened(env, tmp_path):
-    policy = policy_with(tmp_path / "run")
+    policy = policy_with(tmp_path / "run", env)
     rollout = jax.jit(make_rollout(env, execute_steps=4, denoise_steps=1))
     seen = []
     result = evaluate(

@@ -13,11 +13,14 @@ KNOWN = {
     "max": [3.0, 0.5, 1.0, 3.00001],
     "q01": [-0.9, -1.9, 1.0, 3.0],
     "q99": [2.9, 0.4, 1.0, 3.00001],
+    "q10": [-0.5, -1.2, 1.0, 3.0],
+    "q90": [2.1, 0.3, 1.0, 3.00001],
 }
 KNOWN = {name: np.array(values, np.float32) for name, values in KNOWN.items()}
 X = np.array([[0.7, -0.9, 2.0, 0.1], [-3.0, 1.0, 1.0, 3.0]], np.float32)
 Y = np.array([[0.3, -1.2, 0.0, 1.0]], np.float32)
 K = {name: values.astype(np.float64) for name, values in KNOWN.items()}
+INNER = K["q90"] - K["q10"]
 SPAN, RANGE = K["q99"] - K["q01"], K["max"] - K["min"]
 
 EXPECTED = {
@@ -37,6 +40,10 @@ EXPECTED = {
     ("quantiles", "lerobot"): (
         2 * (X - K["q01"]) / np.where(SPAN == 0, 1e-8, SPAN) - 1,
         (Y + 1) * np.where(SPAN == 0, 1e-8, SPAN) / 2 + K["q01"],
+    ),
+    ("quantile10", "lerobot"): (
+        2 * (X - K["q10"]) / np.where(INNER == 0, 1e-8, INNER) - 1,
+        (Y + 1) * np.where(INNER == 0, 1e-8, INNER) / 2 + K["q10"],
     ),
     ("mean_std", "ours"): (
         (X - K["mean"]) / np.maximum(K["std"], SMALLEST_SPREAD),

@@ -5,11 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lorasp_jax.models import prompts
+from lorasp_jax.models.inputs import OPENPI
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.processing import Processor, robot_slots, to_absolute, to_delta
+from lorasp_jax.models.prompt_table import Ids, PromptTable
 from lorasp_jax.models.smolvla import SmolVLAConfig
 from lorasp_jax.models.statistics import Statistics
+from lorasp_jax.models.tokenizer import Offline
 
 DIM = 8
 RNG = np.random.default_rng(0)
@@ -23,7 +27,7 @@ def processor(num_joints: int) -> Processor:
     valid = np.ones((4, 5), bool)
     statistics = Statistics.measure(state, action, valid, slots=slots, dim=DIM)
     tokens = jnp.array([[3, 4, 0], [5, 0, 0]])
-    return Processor(slots, statistics, tokens, tokens > 0, image_size=16)
+    return Processor(slots, statistics, PromptTable(Ids(tokens, tokens > 0)), image_size=16)
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -100,16 +104,18 @@ def test_unused_slots_reach_no_motor():
     np.testing.assert_allclose(moved[..., 6], own.statistics.action["std"][7], rtol=1e-4)
 
 
-def published(num_joints: int = 6, **choices) -> Processor:
+def published(num_joints: int = 6, relative: tuple[bool, ...] = (), **choices) -> Processor:
     """With openpi's inputs: one block of numbers, noise in all of the 32 slots."""
-    config = dataclasses.replace(Pi0Config.base(), image_size=28)
+    inputs = dataclasses.replace(OPENPI, delta=relative)
+    config = dataclasses.replace(Pi0Config.base(), image_size=28, inputs=inputs)
     state, action = RNG.normal(2.0, 3.0, (2, 20, num_joints + 1))
     valid = np.ones(20, bool)
     statistics = Statistics.measure(
         state, action, valid, slots=range(num_joints + 1), dim=num_joints + 1
     )
-    ids = np.array([[3, 4, 0]], np.int32)
-    return Processor.of(config, statistics, (ids, ids > 0), num_joints=num_joints, **choices)
+    ids = jnp.array([[3, 4, 0]])
+    prompts = PromptTable(Ids(ids, ids > 0))
+    return Processor.of(config, statistics, prompts, num_joints=num_joints, **choices)
 
 
 def test_published_weights_have_one_block_of_numbers():
@@ -175,8 +181,11 @@ def test_delta_actions():
     np.testing.assert_allclose(to_absolute(found, state, (True, True, False)), actions, atol=1e-6)
 
 
-def test_policies_of_delta_actions_move_absolutely():
-    own, plain = published(delta=(*[True] * 6, False)), published()
+@pytest.mark.parametrize("said", ["by the caller", "by the backbone"])
+def test_policies_of_delta_actions_move_absolutely(said):
+    mask = (*[True] * 6, False)
+    own = published(delta=mask) if said == "by the caller" else published(relative=mask)
+    plain = published(relative=mask, delta=())
     own = dataclasses.replace(own, statistics=plain.statistics)
     state = jnp.asarray(RNG.normal(size=(2, 7)), jnp.float32)
     actions = jnp.asarray(RNG.normal(size=(2, 4, 7)), jnp.float32)
@@ -186,12 +195,30 @@ def test_policies_of_delta_actions_move_absolutely():
     np.testing.assert_allclose(own.decode(inside, state), actions, atol=1e-5)
     with pytest.raises(ValueError, match="give the raw state"):
         own.decode(inside)
+    with pytest.raises(ValueError, match="said of 14 numbers, the robot has 7"):
+        published(relative=(True,) * 14)
 
 
-def test_a_tokenizer_of_another_model():
-    config, ids = Pi0Config.dummy(), np.array([[5000]], np.int32)
-    with pytest.raises(ValueError, match="token 5000 is beyond the backbone's vocabulary of 320"):
-        Processor.of(config, processor(6).statistics, (ids, ids > 0), num_joints=6)
+def test_prompts_tell_the_normalised_state():
+    """Of the robot's slots, with its noise; by the plain function."""
+    config, texts = Pi0Config.nano_pi05(), ["press the button", "push it"]
+    state, action = RNG.normal(2.0, 3.0, (2, 50, 7))
+    valid = np.ones(50, bool)
+    statistics = Statistics.measure(state, action, valid, slots=range(7), dim=7)
+    table = PromptTable.of(Offline(), texts, config, num_joints=6)
+    own = Processor.of(config, statistics, table, num_joints=6)
+    raw = {"image": {}, "state": jnp.asarray(state, jnp.float32)}
+    noise = jnp.asarray(RNG.normal(size=(50, DIM)), jnp.float32)
+    rows = RNG.integers(0, 2, 50)
+    obs = jax.jit(Processor.encode)(own, raw, jnp.asarray(rows), state_noise=noise)
+    low, high = np.quantile(state, [0.01, 0.99], axis=0)
+    numbers = 2 * (state - low) / (high - low) - 1 + noise[:, [0, 1, 2, 3, 4, 5, 7]]
+    np.testing.assert_allclose(obs.state[:, [0, 1, 2, 3, 4, 5, 7]], numbers, atol=1e-5)
+    numbers = np.asarray(obs.state[:, [0, 1, 2, 3, 4, 5, 7]])
+    wanted = [prompts.pi05(texts[row], mine) for row, mine in zip(rows, numbers, strict=True)]
+    ids, mask = Offline().encode(wanted, config.max_tokens, complete=True)
+    np.testing.assert_array_equal(obs.tokens, ids)
+    np.testing.assert_array_equal(obs.token_mask, mask)
 
 
 class Still:

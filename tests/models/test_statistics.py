@@ -27,6 +27,8 @@ def test_valid_steps_alone_count(slots):
         "max": rows.max(0),
         "q01": np.percentile(rows, 1, axis=0),
         "q99": np.percentile(rows, 99, axis=0),
+        "q10": np.percentile(rows, 10, axis=0),
+        "q90": np.percentile(rows, 90, axis=0),
     }
     assert found.state.keys() == set(NAMES)
     for name, values in expected.items():

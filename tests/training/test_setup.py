@@ -2,31 +2,49 @@
 
 import dataclasses
 import io
+import json
 import time
+from pathlib import Path
+from types import SimpleNamespace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
 from rich.console import Console
 
-from lorasp_jax import adaptation, paths
+from lorasp_jax import adaptation, models, paths
+from lorasp_jax.config import ModelConfig
+from lorasp_jax.models import inputs
 from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.models.policy import Policy
+from lorasp_jax.models.prompt_table import PromptTable
 from lorasp_jax.models.tokenizer import Offline
-from lorasp_jax.peft import LoRA
-from lorasp_jax.training import setup
+from lorasp_jax.peft import FullFineTuning, LoRA
+from lorasp_jax.training import export, setup
+from lorasp_jax.training import mesh as meshes
+from lorasp_jax.training.loop import Run, train
 from lorasp_jax.training.overrides import override
-from tests.runs import CONFIG, random_episodes
+from tests import quick
+from tests.runs import CONFIG, leaves, random_episodes
 
+BASE_MODEL = setup.base_model
 TARGETS = ("patch_embed", "language.*q_proj", "action_out_proj")
+
+
+def world(*instructions):
+    return SimpleNamespace(instructions=instructions, robot=SimpleNamespace(num_joints=6))
 
 
 @pytest.fixture
 def config(monkeypatch):
     """No simulation, and the dummy backbone."""
-    monkeypatch.setattr(setup.envs, "make", lambda *_, **__: None)
+    worlds = world(*random_episodes("", 0).instructions)
+    monkeypatch.setattr(setup.envs, "make", lambda *_, **__: worlds)
     monkeypatch.setattr(setup, "base_model", lambda _: (Pi0Config.dummy().create(nnx.Rngs(0)), ""))
     monkeypatch.setattr(
-        setup, "_collect", lambda run: {t: random_episodes(t, 0) for t in run.config.tasks}
+        setup, "demonstrations", lambda c, *_: {t: random_episodes(t, 0) for t in c.tasks}
     )
     config = dataclasses.replace(CONFIG, peft=LoRA(rank=4), targets=TARGETS)
     config = dataclasses.replace(
@@ -44,6 +62,76 @@ def test_targets_of_the_command_line_can_be_presets(config, tmp_path):
     found = adaptation.methods(run.policy.model)
     assert {path.rpartition("/")[0] for path in found} == {"language/blocks", "vision"}
     assert "; the others are frozen, all of action, action_in_proj," in printed.getvalue()
+
+
+def test_a_tokenizer_of_another_model_is_found_before_anything_long(config, tmp_path, monkeypatch):
+    """As are demonstrations that an older version of the tasks left."""
+    console = Console(file=io.StringIO())
+    smolvlm = Path(__file__).parents[1] / "golden/tokenizers/smolvlm_like_tokenizer.json"
+    other = override(config, ["--model.tokenizer", str(smolvlm)])
+    with pytest.raises(ValueError, match="demonstrations of other instructions"):
+        setup._collect(Run(config, tmp_path, console, "", 0), ["press the red button"])
+    monkeypatch.setattr(setup, "demonstrations", lambda *_: pytest.fail("it began"))
+    with pytest.raises(ValueError, match="beyond the backbone's vocabulary of 320: the token"):
+        setup.prepare(other, tmp_path, console, time.perf_counter())
+
+
+def test_policies_of_lerobot_are_fed_as_they_say(config, tmp_path, monkeypatch):
+    fields = {
+        "type": "pi0",
+        "normalization_mapping": {"STATE": "QUANTILE10", "ACTION": "MIN_MAX"},
+        "use_relative_actions": True,
+        "action_feature_names": ["a", "b", "gripper"],
+        "output_features": {"action": {"shape": [3]}},
+    }
+    (tmp_path / "config.json").write_text(json.dumps(fields))
+    monkeypatch.setattr(setup.models, "load", lambda _, wanted: SimpleNamespace(config=wanted))
+    monkeypatch.setattr(setup.models, "weights_hash", lambda _: "")
+    model = ModelConfig(size="base", checkpoint=str(tmp_path))
+    wanted = dataclasses.replace(
+        inputs.LEROBOT_CENTRED, state="quantile10", action="min_max", delta=(True, True, False)
+    )
+    found, _ = BASE_MODEL(dataclasses.replace(config, model=model))
+    assert found.config.inputs == wanted
+    (tmp_path / "config.json").unlink()
+    found, _ = BASE_MODEL(dataclasses.replace(config, model=model))
+    assert found.config.inputs == inputs.OPENPI
+    two_arms = dataclasses.replace(inputs.OURS, delta=(True,) * 14)
+    found = dataclasses.replace(Pi0Config.dummy(), inputs=two_arms).create(nnx.Rngs(0))
+    monkeypatch.setattr(setup, "base_model", lambda _: (found, ""))
+    with pytest.raises(ValueError, match="said of 14 numbers, the robot has 7"):
+        setup.prepare(config, tmp_path, Console(file=io.StringIO()), time.perf_counter())
+
+
+@pytest.mark.slow
+def test_a_pi05_of_the_command_line_trains_and_acts(config, tmp_path, monkeypatch):
+    """And its base, trained in full, loads again; prompts with another state are others."""
+    monkeypatch.setattr(setup, "base_model", BASE_MODEL)
+    monkeypatch.setattr(
+        meshes, "make_mesh", lambda _, own=meshes.make_mesh: own(1, jax.devices()[:1])
+    )
+    config = dataclasses.replace(config, peft=FullFineTuning(), model=ModelConfig(checkpoint=""))
+    config = override(config, ["--model.size", "nano_pi05", "--optim.steps", "2"])
+    run = setup.prepare(config, tmp_path, Console(file=io.StringIO()), time.perf_counter())
+    before = leaves(nnx.state(run.policy.model))
+    train(run)
+    after = leaves(nnx.state(run.policy.model))
+    assert any((after[name] != array).any() for name, array in before.items())
+    group = next(iter(run.episodes.values()))
+    raw = {
+        "image": {name: jnp.asarray(image[:, 0]) for name, image in group.image.items()},
+        "state": jnp.asarray(group.state[:, 0]),
+    }
+    tokens = run.policy.processor.encode(raw, jnp.zeros(3, int)).tokens
+    assert (tokens[0] != tokens[1]).any()
+    sample = quick.jit(Policy.sample)
+    actions = sample(run.policy, jax.random.key(0), raw, jnp.zeros(3, int))
+    assert jnp.isfinite(actions).all()
+    export.write(run)
+    model = models.load(tmp_path / "base")
+    assert (model.config.pi05, model.config.inputs) == (True, inputs.OURS_PI05)
+    again = sample(Policy(model, run.policy.processor), jax.random.key(0), raw, jnp.zeros(3, int))
+    np.testing.assert_allclose(again, actions, atol=0.05)  # the file is bf16
 
 
 def test_eva_of_the_command_line_sees_the_demonstrations(config, tmp_path):
@@ -70,7 +158,8 @@ def test_eva_of_the_command_line_sees_the_demonstrations(config, tmp_path):
 def test_actions_are_normalised_as_they_are_learned(relative):
     """Over all windows as training draws them, mean 0 and standard deviation 1."""
     group, model = random_episodes("press", 0), Pi0Config.dummy()
-    found = setup.processor([group], model, Offline(), relative=relative)
+    prompts = PromptTable.of(Offline(), group.instructions, model, num_joints=6)
+    found = setup.processor([group], model, prompts, relative=relative)
     states, chunks = [], []
     for episode in range(3):
         end = group.length[episode] - 1

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig, VisionConfig
-from lorasp_jax.models.inputs import OPENPI
+from lorasp_jax.models.inputs import OPENPI, OPENPI_PI05, OURS_PI05
 
 if TYPE_CHECKING:
     from flax import nnx
@@ -49,7 +49,7 @@ class Pi0Config(BackboneConfig):
     @classmethod
     def base_pi05(cls) -> Pi0Config:
         """The published pi0.5, 3,353,433,872 parameters (openpi, models/pi0_config.py)."""
-        return dataclasses.replace(cls.base(), pi05=True, max_tokens=200)
+        return dataclasses.replace(cls.base(), pi05=True, max_tokens=200, inputs=OPENPI_PI05)
 
     @classmethod
     def small(cls) -> Pi0Config:
@@ -68,6 +68,11 @@ class Pi0Config(BackboneConfig):
             language=ExpertConfig(96, 3, 192, heads=4, kv_heads=1, head_dim=32),
             action=ExpertConfig(128, 3, 256, heads=4, kv_heads=1, head_dim=32),
         )
+
+    @classmethod
+    def nano_pi05(cls) -> Pi0Config:
+        """pi0.5 for a CPU; the offline tokenizer's prompts with a robot's state fit."""
+        return dataclasses.replace(cls.nano(), pi05=True, max_tokens=64, inputs=OURS_PI05)
 
     @classmethod
     def dummy(cls) -> Pi0Config:
