@@ -14,13 +14,13 @@ import jax.numpy as jnp
 from flax import nnx
 
 from lorasp_jax.dense import Dense
+from lorasp_jax.models.attention import attention
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig
 from lorasp_jax.models.layers import (
     AdaptiveRMSNorm,
     LayerAux,
     Linears,
     RMSNorm,
-    attention,
     rope,
     rope_table,
     scan_depth,

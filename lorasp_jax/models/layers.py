@@ -1,6 +1,5 @@
 """What the backbones share: norms, rotary positions, attention, masks, and the scan over depth."""
 
-import functools
 import math
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -14,14 +13,6 @@ from lorasp_jax import inference
 from lorasp_jax.dense import Dense, dense_together
 from lorasp_jax.models.config import Remat
 from lorasp_jax.peft import Aux
-
-MASKED = -2.3819763e38
-"""Logit of a forbidden key; finite, so a row without any key gets a uniform softmax, not NaN."""
-
-CUDNN_TOKENS, CUDNN_WIDTH = 256, 64
-"""Fewest queries and narrowest heads for which attention goes through cuDNN: those of published
-sizes, while the miniatures repeat themselves bit for bit."""
-
 
 _SLOW_TO_REPEAT = ("dot_product_attention_fwd_wrapper", "pallas_call")
 """Primitives of cuDNN's attention and of the adapters' kernel."""
@@ -194,7 +185,8 @@ def scan_depth(
     graphdef, state = nnx.split(blocks[0] if one_by_one else blocks)
 
     def layer(x: jax.Array, scanned: tuple[Any, Any]) -> tuple[jax.Array, Any]:
-        return call(nnx.merge(graphdef, scanned[0]), x, scanned[1])
+        block: Any = nnx.merge(graphdef, scanned[0])
+        return call(block, x, scanned[1])
 
     if remat != "none":
         layer = jax.checkpoint(layer, prevent_cse=unroll, policy=_KEPT[remat])
@@ -261,42 +253,6 @@ def rope(x: jax.Array, table: tuple[jax.Array, jax.Array], scale: float = 1.0) -
     first, second = jnp.split(x.astype(jnp.float32), 2, axis=-1)
     turned = [first * cos - second * sin, second * cos + first * sin]
     return (scale * jnp.concatenate(turned, axis=-1)).astype(x.dtype)
-
-
-def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) -> jax.Array:
-    """Grouped-query attention, softmax in fp32; long bf16 sequences through cuDNN on NVIDIA GPUs.
-
-    cuDNN's gradient adds up in any order: two runs differ in the last bits. Hence `CUDNN_WIDTH`.
-
-    Args:
-        q: `[B, T, N, H]`, already scaled.
-        k: `[B, S, K, H]`; each key head serves N / K query heads.
-        v: `[B, S, K, H]`.
-        mask: `[B, T, S]` bool, or None for all pairs.
-
-    Returns:
-        `[B, T, N H]`.
-    """
-    batch, tokens, heads, size = q.shape
-    if _suits_cudnn(q, k):
-        allowed = None if mask is None else mask[:, None]
-        attend = functools.partial(jax.nn.dot_product_attention, implementation="cudnn")
-        return attend(q, k, v, mask=allowed, scale=1.0).reshape(batch, tokens, heads * size)
-    # With K = 1 no axis of q, weights or result moves in memory.
-    q = q.reshape(batch, tokens, k.shape[2], -1, size)
-    logits = jnp.einsum("BTKGH,BSKH->BKTGS", q, k, preferred_element_type=jnp.float32)
-    if mask is not None:
-        logits = jnp.where(mask[:, None, :, None, :], logits, MASKED)
-    weights = jax.nn.softmax(logits, axis=-1).astype(v.dtype)
-    return jnp.einsum("BKTGS,BSKH->BTKGH", weights, v).reshape(batch, tokens, heads * size)
-
-
-def _suits_cudnn(q: jax.Array, k: jax.Array) -> bool:
-    """Whether cuDNN takes these arrays and is worth its launch."""
-    tokens, size, others = q.shape[1], q.shape[3], k.shape[1]
-    half = q.dtype in (jnp.bfloat16, jnp.float16)
-    fits = CUDNN_WIDTH <= size <= 256 and size % 8 == 0 and tokens % 2 == 0 and others % 2 == 0
-    return jax.default_backend() == "gpu" and half and fits and tokens >= CUDNN_TOKENS
 
 
 def time_embedding(flow_time: jax.Array, width: int) -> jax.Array:

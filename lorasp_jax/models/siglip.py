@@ -5,8 +5,9 @@ import jax.numpy as jnp
 from flax import nnx
 
 from lorasp_jax.dense import Dense
+from lorasp_jax.models.attention import attention
 from lorasp_jax.models.config import BackboneConfig
-from lorasp_jax.models.layers import LayerAux, LayerNorm, Linears, attention, scan_depth, stack
+from lorasp_jax.models.layers import LayerAux, LayerNorm, Linears, scan_depth, stack
 
 
 class VisionBlock(nnx.Module):

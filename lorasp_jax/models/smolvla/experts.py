@@ -11,13 +11,13 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
+from lorasp_jax.models.attention import attention
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig
 from lorasp_jax.models.experts import GATED, ExpertBlock, KeysValues, LanguageExpert
 from lorasp_jax.models.layers import (
     LayerAux,
     Linears,
     RMSNorm,
-    attention,
     positions,
     rope,
     rope_table,
