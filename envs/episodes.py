@@ -131,11 +131,9 @@ class Episodes:
         return episodes
 
     def validate(self) -> None:
-        """Raises a ValueError if the arrays do not fit one another."""
-        if self.state.ndim != 3 or not self.state.size:
-            raise ValueError(f"state must have shape [E, T, J + 1], not {self.state.shape}")
+        """Raises a ValueError if the arrays do not fit one another or a number is not finite."""
+        self.validate_numbers()
         steps = self.state.shape[:2]
-        self._validate_action()
         if not self.image:
             raise ValueError("image holds no camera, but at least one is needed")
         for name, picture in self.image.items():
@@ -144,6 +142,13 @@ class Episodes:
                     f"image {name!r} must be uint8 [{steps[0]}, {steps[1]}, H, W, 3], "
                     f"not {picture.dtype} {list(picture.shape)}"
                 )
+
+    def validate_numbers(self) -> None:
+        """`validate` without the pictures."""
+        if self.state.ndim != 3 or not self.state.size:
+            raise ValueError(f"state must have shape [E, T, J + 1], not {self.state.shape}")
+        steps = self.state.shape[:2]
+        self._validate_action()
         for name, low, high in (
             ("length", 1, steps[1]),
             ("instruction", 0, len(self.instructions) - 1),
@@ -169,6 +174,12 @@ class Episodes:
         for name in ("state", "action"):
             if getattr(self, name).dtype != np.float32:
                 raise ValueError(f"{name} must be float32, not {getattr(self, name).dtype}")
+            wrong = np.argwhere(~np.isfinite(np.asarray(getattr(self, name))))
+            if len(wrong):
+                episode, step, number = map(int, wrong[0])
+                raise ValueError(
+                    f"{name} is not finite in number {number} at step {step} of episode {episode}"
+                )
 
 
 def concatenate(parts: Sequence[Episodes]) -> Episodes:
