@@ -1,12 +1,13 @@
-"""Windows of demonstrations as training batches, sampled on the device.
+"""Windows of demonstrations as training batches.
 
-All episodes that fit in memory lie there as flat per-step arrays; a batch is a gather. What a step
-trains on is a function of the run's key and the step number alone, so the data position of a run is
-one integer.
+Episodes lie as flat per-step arrays, on the device where they fit, else in files; a batch is a
+gather. What a step trains on is a function of the run's key or seed and the step number alone, so
+the data position of a run is one integer.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ import numpy as np
 
 from envs.episodes import Array, Episodes
 from lorasp_jax.models.policy import Observation
-from lorasp_jax.models.processing import Processor
+from lorasp_jax.models.processing import Processor, RawObservation
 
 
 @jax.tree_util.register_dataclass
@@ -46,11 +47,32 @@ class Steps:
         instruction: `[N]` int32, row of the processor's token table.
     """
 
-    image: dict[str, jax.Array]
-    state: jax.Array
-    action: jax.Array
-    end: jax.Array
-    instruction: jax.Array
+    image: dict[str, Array]
+    state: Array
+    action: Array
+    end: Array
+    instruction: Array
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Windows:
+    """What a policy saw at B steps, and the actions from there on.
+
+    Attributes:
+        image: camera name -> `[B, H, W, 3]` uint8.
+        state: `[B, J+1]` joints [rad] and gripper opening [m].
+        actions: `[B, C, J+1]` joint targets [rad] and gripper opening [m]; past the end of the
+            episode, its last action again.
+        inside: `[B, C]` bool, False past the end of the episode.
+        instruction: `[B]` int32, row of the processor's token table.
+    """
+
+    image: dict[str, Array]
+    state: Array
+    actions: Array
+    inside: Array
+    instruction: Array
 
 
 def flatten(episodes: Sequence[Episodes]) -> Steps:
@@ -78,6 +100,31 @@ def flatten(episodes: Sequence[Episodes]) -> Steps:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
+def windows_at(steps: Steps, start: Array, chunk: int) -> Windows:
+    """The windows of `chunk` actions that begin at the steps `start` `[B]`, in NumPy or JAX."""
+    xp = jnp if isinstance(start, jax.Array) else np
+    last = steps.end[start][:, None] - 1
+    window = start[:, None] + xp.arange(chunk)  # [B, C]
+    return Windows(
+        image={name: image[start] for name, image in steps.image.items()},
+        state=steps.state[start],
+        actions=steps.action[xp.minimum(window, last)],
+        inside=window <= last,
+        instruction=steps.instruction[start],
+    )
+
+
+def encode(key: jax.Array, windows: Windows, processor: Processor, *, state_noise: float) -> Batch:
+    """Windows as the model sees them; `key` is consumed, for noise on the normalised state."""
+    given: Any = jax.tree.map(jnp.asarray, windows)
+    raw: RawObservation = {"image": given.image, "state": given.state}
+    observation = processor.encode(raw, given.instruction)
+    actions = processor.normalize_actions(given.actions, given.state)
+    noise = state_noise * jax.random.normal(key, observation.state.shape)
+    observation = replace(observation, state=observation.state + noise * processor.slot_mask)
+    return Batch(observation, actions, given.inside[..., None] & processor.flow_slots)
+
+
 def sample_batch(
     key: jax.Array,
     steps: Steps,
@@ -93,14 +140,4 @@ def sample_batch(
     """
     start_key, noise_key = jax.random.split(key)
     start = jax.random.randint(start_key, (batch_size,), 0, steps.end.shape[0])
-    window = start[:, None] + jnp.arange(chunk)  # [B, C]
-    last = steps.end[start][:, None] - 1
-    raw = {
-        "image": {name: image[start] for name, image in steps.image.items()},
-        "state": steps.state[start],
-    }
-    observation = processor.encode(raw, steps.instruction[start])
-    actions = processor.normalize_actions(steps.action[jnp.minimum(window, last)], raw["state"])
-    noise = state_noise * jax.random.normal(noise_key, observation.state.shape)
-    observation = replace(observation, state=observation.state + noise * processor.slot_mask)
-    return Batch(observation, actions, (window <= last)[..., None] & processor.flow_slots)
+    return encode(noise_key, windows_at(steps, start, chunk), processor, state_noise=state_noise)

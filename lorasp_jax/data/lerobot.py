@@ -74,6 +74,7 @@ class LeRobot:
 
     Attributes:
         kind: the format's name and version.
+        name: what it is called.
         path: its folder.
         index: what it says of itself.
         keys: which of its features are what.
@@ -81,12 +82,15 @@ class LeRobot:
         control_dt: time between two steps [s].
     """
 
-    def __init__(self, where: str | os.PathLike[str], keys: Keys | None = None) -> None:
+    def __init__(
+        self, where: str | os.PathLike[str], keys: Keys | None = None, *, name: str = ""
+    ) -> None:
         """Opens a dataset.
 
         Args:
             where: a folder, or an id on the hub, from where it is fetched.
             keys: which of its features are what.
+            name: what it is called; empty: what the folder or the repository is.
 
         Raises:
             ValueError: it is not there, damaged, or lacks a feature that the keys name.
@@ -94,7 +98,7 @@ class LeRobot:
         self.path = places.local(where, repository="dataset")
         self.index, self.keys = read_index(self.path), keys or Keys()
         self.kind = f"LeRobot {self.index.version}"
-        self.name = os.fspath(where).rstrip("/").rpartition("/")[2]
+        self.name = name or Path(where).name
         self.cameras = self._cameras()
         self.control_dt = self.keys.every / self.index.fps
         self._columns = {"state": self._chosen("state"), "action": self._chosen("action")}
