@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import json
 import os
+import shutil
 import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -45,7 +46,7 @@ class Episodes:
         task: name of the task.
         robot: name of the robot.
         control_dt: time between two actions [s].
-        physics_dt: time step of the simulation [s].
+        physics_dt: time step of the simulation [s]; 0 where nothing was simulated.
         attempted: episodes tried to get these; the others failed.
         actions: what an action means, see `envs.actions`.
     """
@@ -224,6 +225,25 @@ def replacing(file: Path) -> Iterator[Path]:
         os.replace(unfinished, file)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def creating(path: str | os.PathLike) -> Iterator[Path]:
+    """A temporary folder that takes the path's place when all went well, else nothing is left.
+
+    Raises:
+        ValueError: if the path exists already.
+    """
+    path = Path(path)
+    if path.exists():
+        raise ValueError(f"{path} exists already: choose another path")
+    folder = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        folder.mkdir(parents=True)
+        yield folder
+        os.rename(folder, path)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _read(path: str | os.PathLike) -> dict[str, np.ndarray]:

@@ -13,7 +13,6 @@ import contextlib
 import functools
 import json
 import os
-import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ import tensorflow_datasets as tfds
 from array_record.python import array_record_module
 
 from envs import rlds_schema
-from envs.episodes import SHARED, Episodes, replacing
+from envs.episodes import SHARED, Episodes, creating, replacing
 from envs.rlds_reading import (
     FORMAT,
     METADATA,
@@ -39,6 +38,10 @@ from envs.rlds_reading import (
 __all__ = ["METADATA", "Parts", "Reader", "metadata", "read", "write"]
 
 _VERSION = "1.0.0"
+_DESCRIPTIONS = {
+    True: "Scripted expert episodes of {task} by {robot} in simulation.",
+    False: "Recorded episodes of {task} by {robot}.",
+}
 _FILES = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_INDEX}"  # as tfds.core.SequentialWriter calls them
 # One episode is read at a time, and PNG does not shrink any further (measured: 7 times as fast).
 _RECORDS = "group_size:1,uncompressed"
@@ -55,17 +58,10 @@ def write(episodes: Episodes, path: str | os.PathLike) -> None:
         ValueError: if the path exists already or the arrays do not fit one another.
         OSError: if there is no room for it.
     """
-    path = Path(path)
-    if path.exists():
-        raise ValueError(f"{path} exists already: choose another path")
-    folder = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    with creating(path) as folder:
         parts = Parts(folder, {})
         parts.append(episodes)
         parts.complete()
-        os.rename(folder, path)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 class Parts:
@@ -152,9 +148,7 @@ class Parts:
         )
         info = tfds.core.DatasetInfo(
             builder=identity,
-            description="Scripted expert episodes of {task} by {robot} in simulation.".format(
-                **self.facts
-            ),
+            description=_DESCRIPTIONS[bool(self.facts["physics_dt"])].format(**self.facts),
             features=tfds.features.FeaturesDict.from_config(str(self.folder)),
         )
         info.set_file_format(tfds.core.FileFormat.ARRAY_RECORD)

@@ -12,14 +12,13 @@ of array_record files 5,000 and 3,800; PIL decodes 3,000 JPEG pictures/s.
 import contextlib
 import json
 import os
-import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
-from envs.episodes import SHARED, Episodes
+from envs.episodes import SHARED, Episodes, creating
 from lorasp_jax.data.batches import Steps
 from lorasp_jax.data.source import Progress, Source
 from lorasp_jax.models.statistics import Statistics
@@ -47,21 +46,12 @@ def write(sources: Sequence[Source], path: str | os.PathLike[str], progress: Pro
         ValueError: the path exists already, or an episode is not as the others or damaged.
         OSError: there is no room for it.
     """
-    path = Path(path)
-    if path.exists():
-        raise ValueError(f"{path} exists already: choose another path")
-    folder = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    folder.mkdir(parents=True)
     total = sum(source.num_steps for source in sources)
-    try:
-        with Writer(folder) as writer:
-            for source in sources:
-                for number in range(len(source)):
-                    writer.append(source.episode(number))
-                    progress(writer.num_steps, total)
-        os.rename(folder, path)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+    with creating(path) as folder, Writer(folder) as writer:
+        for source in sources:
+            for number in range(len(source)):
+                writer.append(source.episode(number))
+                progress(writer.num_steps, total)
 
 
 class Writer:
