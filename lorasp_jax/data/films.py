@@ -57,11 +57,10 @@ class Film:
         Raises:
             ValueError: the film ends too early, is damaged, or runs at another rate.
         """
-        tolerance = _TOLERANCE / fps
+        tolerance, pictures = _TOLERANCE / fps, np.empty(0)
         if abs(start - self._end) > tolerance:
             self._container.seek(round(start / self._stream.time_base), stream=self._stream)
             self._frames = self._container.decode(self._stream)
-        pictures = []
         for number in range(length):
             frame = self._next(start - tolerance, number, length)
             wanted = start + number / fps
@@ -71,9 +70,12 @@ class Film:
                     f"{wanted:.3f} s: it does not run at the dataset's {fps:g} frames a second"
                 )
             if number % every == 0:
-                pictures.append(reduced(frame.to_ndarray(format="rgb24"), image_size))
+                picture = reduced(frame.to_ndarray(format="rgb24"), image_size)
+                if not number:  # into one array at once: a list to stack would be as much again
+                    pictures = np.empty((-(-length // every), *picture.shape), np.uint8)
+                pictures[number // every] = picture
         self._end = start + length / fps
-        return np.stack(pictures)
+        return pictures
 
     def _next(self, earliest: float, number: int, length: int) -> Any:
         """The next frame that is not before a time [s]."""

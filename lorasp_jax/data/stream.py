@@ -13,7 +13,7 @@ import numpy as np
 
 from lorasp_jax.data.batches import Steps, Windows, windows_at
 
-_THREADS, _AHEAD = 2, 4  # that gather batches; batches that lie ready
+_THREADS, _AHEAD = 1, 4  # that gather batches (a second one waits for Python); batches ready
 
 
 class Stream:
