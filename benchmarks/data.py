@@ -47,6 +47,7 @@ class Drawn:
         return self.num_steps // EPISODE
 
     def episode(self, number: int, cameras: Any = None) -> Episodes:  # noqa: ARG002
+        """Noise."""
         draw = self._rng.standard_normal
         state, action = (draw((1, EPISODE, 7), np.float32) for _ in range(2))
         return Episodes(

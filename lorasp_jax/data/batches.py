@@ -56,8 +56,8 @@ class Steps:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Windows:
-    """What a policy saw at B steps, and the actions from there on.
+class Raw:
+    """A batch before it is normalised: what was seen at B steps, and the actions from there on.
 
     Attributes:
         image: camera name -> `[B, H, W, 3]` uint8.
@@ -100,25 +100,43 @@ def flatten(episodes: Sequence[Episodes]) -> Steps:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
-def windows_at(steps: Steps, start: Array, chunk: int) -> Windows:
-    """The windows of `chunk` actions that begin at the steps `start` `[B]`, in NumPy or JAX."""
+def windows(steps: Steps, start: Array, chunk: int) -> tuple[Array, Array]:
+    """Chunks of steps; one that would reach past its episode repeats the last step there.
+
+    Args:
+        steps: N of them.
+        start: `[B]` int32, index of each chunk's first step; a NumPy array gives NumPy arrays.
+        chunk: C.
+
+    Returns:
+        `[B, C]` int32 indices, and `[B, C]` bool, False where a step is a repetition.
+    """
     xp = jnp if isinstance(start, jax.Array) else np
+    window = start[:, None] + xp.arange(chunk)
     last = steps.end[start][:, None] - 1
-    window = start[:, None] + xp.arange(chunk)  # [B, C]
-    return Windows(
+    return xp.minimum(window, last), window <= last
+
+
+def gather(steps: Steps, start: Array, chunk: int) -> Raw:
+    """The windows that begin at the steps `start` `[B]`, see `windows`."""
+    window, inside = windows(steps, start, chunk)
+    return Raw(
         image={name: image[start] for name, image in steps.image.items()},
         state=steps.state[start],
-        actions=steps.action[xp.minimum(window, last)],
-        inside=window <= last,
+        actions=steps.action[window],
+        inside=inside,
         instruction=steps.instruction[start],
     )
 
 
-def encode(key: jax.Array, windows: Windows, processor: Processor, *, state_noise: float) -> Batch:
-    """Windows as the model sees them; `key` is consumed, for noise on the normalised state."""
-    given: Any = jax.tree.map(jnp.asarray, windows)
-    raw: RawObservation = {"image": given.image, "state": given.state}
-    observation = processor.encode(raw, given.instruction)
+def encode(key: jax.Array, raw: Raw, processor: Processor, *, state_noise: float) -> Batch:
+    """A batch as the model sees it; `key` is consumed, for noise on the normalised state.
+
+    The mask is False where a chunk repeats its episode's last action.
+    """
+    given: Any = jax.tree.map(jnp.asarray, raw)
+    seen: RawObservation = {"image": given.image, "state": given.state}
+    observation = processor.encode(seen, given.instruction)
     actions = processor.normalize_actions(given.actions, given.state)
     noise = state_noise * jax.random.normal(key, observation.state.shape)
     observation = replace(observation, state=observation.state + noise * processor.slot_mask)
@@ -134,10 +152,7 @@ def sample_batch(
     chunk: int,
     state_noise: float,
 ) -> Batch:
-    """Draw `batch_size` windows uniformly over steps; `key` is consumed.
-
-    A chunk that would reach past its episode repeats the last action there, with the mask False.
-    """
+    """Draw `batch_size` windows uniformly over steps; `key` is consumed."""
     start_key, noise_key = jax.random.split(key)
     start = jax.random.randint(start_key, (batch_size,), 0, steps.end.shape[0])
-    return encode(noise_key, windows_at(steps, start, chunk), processor, state_noise=state_noise)
+    return encode(noise_key, gather(steps, start, chunk), processor, state_noise=state_noise)

@@ -28,7 +28,7 @@ HEADER, STATISTICS = "cache.json", "statistics.json"
 ROWS = ("state", "action", "length", "instruction", "task")
 """Files beside those of the cameras: of steps, of steps, of episodes, of episodes, of episodes."""
 _IMAGE = "image_"
-_SHARED = tuple(name for name in SHARED if name not in ("task", "instructions"))
+FACTS = tuple(name for name in SHARED if name not in ("task", "instructions"))
 """What the episodes of a cache have in common."""
 _KINDS = {"robot": str, "actions": str, "control_dt": float, "physics_dt": float, "steps": int}
 _KINDS |= {"numbers": int, "cameras": dict, "tasks": list, "instructions": list}
@@ -93,7 +93,7 @@ class Writer:
             ValueError: its arrays do not fit one another or the episodes before.
         """
         episode.validate()
-        facts = {name: getattr(episode, name) for name in _SHARED}
+        facts = {name: getattr(episode, name) for name in FACTS}
         facts["cameras"] = {name: list(x.shape[2:4]) for name, x in sorted(episode.image.items())}
         facts["numbers"] = episode.state.shape[2]
         self._facts = self._facts or facts
@@ -230,7 +230,7 @@ class Cache:
             instructions=self.instructions,
             task=self.facts["tasks"][self._columns["task"][number]],
             attempted=1,
-            **{name: self.facts[name] for name in _SHARED},
+            **{name: self.facts[name] for name in FACTS},
         )
 
     def _mapped(self, name: str, shape: tuple[int | None, ...]) -> np.ndarray:

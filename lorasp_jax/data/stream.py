@@ -1,6 +1,6 @@
 """Windows from a cache in endless, shuffled order, by Grain; the position is one integer.
 
-    for windows in stream(Cache("my_cache").steps, batch_size=32, chunk=50, seed=0, start=1000):
+    for raw in Stream(Cache("my_cache").steps, batch_size=32, chunk=50, seed=0, start=1000):
 
 A batch is a function of seed and position alone. All processes together see the same batches
 however many they are, so a run may go on with another number of them.
@@ -11,13 +11,13 @@ from typing import Any
 import grain
 import numpy as np
 
-from lorasp_jax.data.batches import Steps, Windows, windows_at
+from lorasp_jax.data.batches import Raw, Steps, gather
 
 _THREADS, _AHEAD = 1, 4  # that gather batches (a second one waits for Python); batches ready
 
 
 class Stream:
-    """An endless iterator of `Windows` in host memory.
+    """An endless iterator of `Raw` batches in host memory.
 
     Attributes:
         position: batches given so far, counted from the very beginning.
@@ -54,11 +54,11 @@ class Stream:
             )
         self.position = start
 
-        def gather(begin: np.ndarray) -> Windows:
-            return windows_at(steps, begin, chunk)
+        def read(start: np.ndarray) -> Raw:
+            return gather(steps, start, chunk)
 
         order: Any = grain.MapDataset.range(len(steps.end)).seed(seed).shuffle().repeat()
-        batches = order[index::count].batch(batch_size // count).map(gather)
+        batches = order[index::count].batch(batch_size // count).map(read)
         ahead = grain.ReadOptions(num_threads=_THREADS, prefetch_buffer_size=_AHEAD)
         self._iterator: Any = iter(batches.to_iter_dataset(ahead))
         self._iterator.set_state({"next_index": start})
@@ -67,8 +67,8 @@ class Stream:
         """Itself."""
         return self
 
-    def __next__(self) -> Windows:
+    def __next__(self) -> Raw:
         """The batch at `position`."""
-        windows = next(self._iterator)
+        raw = next(self._iterator)
         self.position += 1
-        return windows
+        return raw

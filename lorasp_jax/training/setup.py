@@ -18,11 +18,13 @@ import envs
 from envs.episodes import Episodes
 from lorasp_jax import adaptation, calibration, models, peft, tables
 from lorasp_jax.config import Config
-from lorasp_jax.data.batches import Batch, flatten, sample_batch
+from lorasp_jax.data.batches import Batch, sample_batch
 from lorasp_jax.data.demonstrations import demonstrations
+from lorasp_jax.data.imported import cached, is_simulated, opened, outline
+from lorasp_jax.data.source import Source
 from lorasp_jax.models import backbone, loading, places, presets, tokenizer
 from lorasp_jax.models.backbone import Backbone
-from lorasp_jax.models.config import BackboneConfig, Remat
+from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.processing import Processor, Statistics, robot_slots, to_delta
 from lorasp_jax.training import preflight
@@ -45,15 +47,18 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
         ValueError: an unknown task, robot, backbone or size, a base that does not fit, a rule that
             matches nothing, a chunk or batch that does not fit.
     """
-    for task in config.tasks:
+    for task in () if config.data.source else config.tasks:
         envs.make(
             task, robot=config.robot, image_size=config.image_size, control_dt=config.control_dt
         )
     words = tokenizer.load(config.model.tokenizer)
     base, base_hash = base_model(config)
+    base = _changed(base, max_tokens=config.model.max_tokens or base.config.max_tokens)
     _check_sizes(config, base.config.chunk)
-    remat, memory = preflight.choose_remat(config, base.config, preflight.available_bytes())
-    base = _with_remat(base, remat)
+    source = opened(config, base.config, words, folder) if config.data.source else None
+    available = preflight.available_bytes()
+    remat, memory = preflight.choose_remat(config, base.config, available)
+    base = _changed(base, remat=remat)
     model = _adapted(config, base, config.peft.as_saved)
     console.print(
         f"scale {config.scale}: {type(config.peft).__name__} on {config.model.backbone} "
@@ -62,7 +67,10 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
     console.print(f"memory by device in GiB: {memory}; rematerialisation: {remat}")
     run = Run(config, folder, console, base_hash, started)
     with run.timed("collect"):
-        run.episodes = _collect(run)
+        if source:
+            _import(run, source, available - memory.peak)
+        else:
+            run.episodes = _collect(run)
     relative = config.model.relative_actions
     found = processor([*run.episodes.values()], model.config, words, relative=relative)
     if config.peft.needs_statistics:
@@ -99,7 +107,7 @@ def _adapted(
 
 def input_moments(run: Run, model: Backbone, processor: Processor) -> dict[str, jax.Array]:
     """`calibration.input_moments` of the run's targets, over batches as training draws them."""
-    config, steps = run.config, flatten(list(run.episodes.values()))
+    config, steps = run.config, run.steps
     sizes = {"batch_size": config.optim.batch_size, "chunk": model.config.chunk}
     draw = jax.jit(
         lambda key: sample_batch(
@@ -141,11 +149,11 @@ def base_model(config: Config) -> tuple[Backbone, str]:
     return model, models.weights_hash(model)
 
 
-def _with_remat(model: Backbone, remat: Remat) -> Backbone:
-    """The same parameters in a model that keeps something else for its backward pass."""
-    if remat == model.config.remat:
+def _changed(model: Backbone, **changes: Any) -> Backbone:
+    """The same parameters in a model whose config differs in what no parameter depends on."""
+    wanted = dataclasses.replace(model.config, **changes)
+    if wanted == model.config:
         return model
-    wanted = dataclasses.replace(model.config, remat=remat)
     abstract = nnx.eval_shape(lambda: wanted.create(nnx.Rngs(0)))
     return nnx.merge(nnx.graphdef(abstract), nnx.state(model))
 
@@ -209,6 +217,21 @@ def _windows(episodes: Episodes, chunk: int) -> tuple[np.ndarray, np.ndarray]:
     rows = np.arange(len(length))[:, None, None]
     actions = np.asarray(episodes.action)[rows, following]
     return np.asarray(episodes.state)[valid], actions[valid]
+
+
+def _import(run: Run, source: Source, room: float) -> None:
+    """Give the run its dataset, with a bar; it streams where it needs more than `room` bytes."""
+    with bars(run.console, "steps") as progress:
+        bar = progress.add_task(f"reading {run.config.data.source}", total=None)
+        report = lambda done, total: progress.update(bar, completed=done, total=total)  # noqa: E731
+        found = cached(source, run.folder, report)
+        progress.update(bar, completed=found.num_steps, total=found.num_steps)
+    facts = found.facts
+    run.dataset, run.episodes, run.simulated = found.steps, outline(found), is_simulated(found)
+    run.streams = sum(x.nbytes for x in jax.tree.leaves(run.dataset)) > room
+    run.config = dataclasses.replace(run.config, robot=facts["robot"], tasks=tuple(facts["tasks"]))
+    place = "in files" if run.streams else "on the device"
+    run.console.print(f"{found.num_steps} steps of {len(found)} episodes, {place}")
 
 
 def _collect(run: Run) -> dict[str, Episodes]:

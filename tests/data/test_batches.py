@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from lorasp_jax.data.batches import flatten, sample_batch
+from lorasp_jax.data.batches import flatten, sample_batch, windows
 from tests.runs import CONFIG, make_run, random_episodes
 
 
@@ -20,6 +20,16 @@ def test_flatten_keeps_valid_steps_in_order():
     np.testing.assert_array_equal(ends, [5, 5, 14, 14, 21, 21, 26, 42])
     np.testing.assert_array_equal(np.asarray(steps.instruction)[[0, 5, 21, 26]], [0, 1, 2, 3])
     np.testing.assert_array_equal(steps.image["wrist"][6], first.image["wrist"][1, 1])
+
+
+def test_windows_repeat_the_last_step_of_their_episode():
+    """By hand: episodes of 5, 9 and 7 steps; in NumPy and in JAX."""
+    steps = flatten([random_episodes("a", 0)])
+    start = np.array([0, 3, 4, 19])
+    for begin in (start, jax.numpy.asarray(start)):
+        found, inside = windows(steps, begin, 3)
+        assert found.tolist() == [[0, 1, 2], [3, 4, 4], [4, 4, 4], [19, 20, 20]]
+        assert inside.sum(axis=1).tolist() == [3, 2, 1, 2]
 
 
 @pytest.mark.slow

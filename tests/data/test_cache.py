@@ -11,7 +11,7 @@ import pytest
 
 from envs.episodes import Episodes
 from lorasp_jax.data import cache
-from lorasp_jax.data.batches import flatten, windows_at
+from lorasp_jax.data.batches import flatten, gather
 from lorasp_jax.data.lerobot import Keys, LeRobot
 from lorasp_jax.data.opening import open_source
 from tests.data.lerobots import GOLDEN, VERSIONS, copied, digest, edit_rows, golden, set_value
@@ -43,7 +43,7 @@ def test_windows_are_those_of_lerobot(version, tmp_path):
     """Padded where LeRobot pads, and statistics as LeRobot has them."""
     found = written(tmp_path / "cache", LeRobot(golden(version)))
     with np.load(GOLDEN / f"lerobot_{version}" / "truth.npz") as truth:
-        windows = windows_at(found.steps, truth["window_index"], 6)
+        windows = gather(found.steps, truth["window_index"], 6)
         np.testing.assert_array_equal(windows.actions, truth["window_action"])
         np.testing.assert_array_equal(windows.inside, ~truth["window_action_is_pad"])
         np.testing.assert_array_equal(windows.state, truth["all/state"][truth["window_index"]])

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from lorasp_jax.data.batches import encode, flatten, sample_batch, windows_at
+from lorasp_jax.data.batches import encode, flatten, gather, sample_batch
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.models import tokenizer
 from lorasp_jax.models.pi0 import Pi0Config
@@ -76,7 +76,7 @@ def test_a_streamed_window_trains_as_one_on_the_device():
     batch = quick.jit(lambda key: sample_batch(key, steps, table, **sizes))(key)
     start_key, noise_key = jax.random.split(key)
     start = np.asarray(jax.random.randint(start_key, (6,), 0, 42))
-    windows = windows_at(jax.tree.map(np.asarray, steps), start, 4)
+    windows = gather(jax.tree.map(np.asarray, steps), start, 4)
     found = quick.jit(lambda key, w: encode(key, w, table, state_noise=0.1))(noise_key, windows)
     jax.tree.map(np.testing.assert_array_equal, found, batch)
 
