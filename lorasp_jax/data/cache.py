@@ -1,12 +1,12 @@
 """A flat cache of steps on disk: what training reads of a dataset, made from it once.
 
-    cache.write([open_source("my_dataset")], "my_cache")
+    cache.write([open_source("my_dataset")], "my_cache", lambda done, total: None)
     steps = cache.Cache("my_cache").steps
 
 A folder of plain .npy files that are mapped into memory, raw pictures among them, cache.json with
 what all episodes share, and statistics.json. A batch is one gather per file. Measured on two cores,
 64 windows of two cameras at a time, shuffled: 128 x 128 pixels 37,000 windows/s, 224 x 168 18,000;
-of array_record files 5,000 and 3,800; PIL decodes 3,000 JPEG pictures/s.
+from array_record files of raw pictures 6,500 and 3,800.
 """
 
 import contextlib

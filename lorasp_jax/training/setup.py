@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -18,10 +18,11 @@ import envs
 from envs.episodes import Episodes
 from lorasp_jax import adaptation, calibration, models, peft, tables
 from lorasp_jax.config import Config
-from lorasp_jax.data.batches import Batch, sample_batch
+from lorasp_jax.data.batches import Batch, encode, sample_batch
 from lorasp_jax.data.demonstrations import demonstrations
 from lorasp_jax.data.imported import cached, is_simulated, opened, outline
 from lorasp_jax.data.source import Source
+from lorasp_jax.data.stream import Stream
 from lorasp_jax.models import backbone, loading, places, presets, tokenizer
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig
@@ -107,13 +108,7 @@ def _adapted(
 
 def input_moments(run: Run, model: Backbone, processor: Processor) -> dict[str, jax.Array]:
     """`calibration.input_moments` of the run's targets, over batches as training draws them."""
-    config, steps = run.config, run.steps
-    sizes = {"batch_size": config.optim.batch_size, "chunk": model.config.chunk}
-    draw = jax.jit(
-        lambda key: sample_batch(
-            key, steps, processor, **sizes, state_noise=config.optim.state_noise
-        )
-    )
+    config, draw = run.config, _drawing(run, processor, model.config.chunk)
 
     def forward(model: Backbone, drawn: tuple[jax.Array, Batch]) -> Any:
         key, batch = drawn
@@ -123,6 +118,20 @@ def input_moments(run: Run, model: Backbone, processor: Processor) -> dict[str, 
     pattern = "|".join(f"(?:{path})" for path in presets.patterns(config.targets))
     batches = ((key, draw(key)) for key in keys)
     return calibration.input_moments(model, batches, pattern, forward)
+
+
+def _drawing(run: Run, processor: Processor, chunk: int) -> Callable[[jax.Array], Batch]:
+    """What gives a batch for a key, of a run that is not yet trained."""
+    size, noise = run.config.optim.batch_size, run.config.optim.state_noise
+    if run.streams:
+        stream = Stream(run.steps, batch_size=size, chunk=chunk, seed=run.config.seed)
+        return lambda key: encode(key, next(stream), processor, state_noise=noise)
+    steps = jax.device_put(run.steps)
+    return jax.jit(
+        lambda key: sample_batch(
+            key, steps, processor, batch_size=size, chunk=chunk, state_noise=noise
+        )
+    )
 
 
 def base_model(config: Config) -> tuple[Backbone, str]:

@@ -4,6 +4,7 @@ import dataclasses
 import io
 import time
 
+import jax
 import numpy as np
 import pytest
 from flax import nnx
@@ -64,6 +65,17 @@ def test_eva_of_the_command_line_sees_the_demonstrations(config, tmp_path):
         np.testing.assert_allclose(captured, best, rtol=1e-3)  # no 4 directions hold more
         assert (captured > 0).all()
         assert parent.method == LoRA(rank=4, initialization="eva")
+
+
+def test_eva_sees_a_dataset_that_streams(config, tmp_path):
+    run = setup.prepare(config, tmp_path, Console(file=io.StringIO()), time.perf_counter())
+    table = run.policy.processor
+    on_device = setup._drawing(run, table, 4)(jax.random.key(0))
+    run.dataset, run.streams = jax.tree.map(np.asarray, run.steps), True
+    draw = setup._drawing(run, table, 4)
+    first, second = draw(jax.random.key(0)), draw(jax.random.key(0))
+    assert jax.tree.map(np.shape, first) == jax.tree.map(np.shape, on_device)
+    assert (first.actions != second.actions).any()
 
 
 @pytest.mark.parametrize("relative", [False, True])
