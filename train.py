@@ -46,12 +46,13 @@ def main(arguments: list[str]) -> int:
 
 def run(config, folder: Path, console: Console, started: float, *, resume: bool) -> None:
     """Train with evaluation before and after, export the adapters and write the report."""
-    from lorasp_jax.evaluation.callback import Evaluation
+    from lorasp_jax.evaluation.callback import Evaluation, NoEvaluation
     from lorasp_jax.report.html import write_report
     from lorasp_jax.training import export, loop, setup
 
     prepared = setup.prepare(config, folder, console, started)
-    loop.train(prepared, [Evaluation()], resume=resume)
+    evaluation = Evaluation() if prepared.simulated else NoEvaluation()
+    loop.train(prepared, [evaluation], resume=resume)
     export.write(prepared)
     report = write_report(folder)
     console.print(f"finished in {prepared.seconds['total']:.0f} s: {report}", markup=False)

@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import json
 import os
+import shutil
 import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -45,7 +46,7 @@ class Episodes:
         task: name of the task.
         robot: name of the robot.
         control_dt: time between two actions [s].
-        physics_dt: time step of the simulation [s].
+        physics_dt: time step of the simulation [s]; 0 where nothing was simulated.
         attempted: episodes tried to get these; the others failed.
         actions: what an action means, see `envs.actions`.
     """
@@ -131,11 +132,9 @@ class Episodes:
         return episodes
 
     def validate(self) -> None:
-        """Raises a ValueError if the arrays do not fit one another."""
-        if self.state.ndim != 3 or not self.state.size:
-            raise ValueError(f"state must have shape [E, T, J + 1], not {self.state.shape}")
+        """Raises a ValueError if the arrays do not fit one another or a number is not finite."""
+        self.validate_numbers()
         steps = self.state.shape[:2]
-        self._validate_action()
         if not self.image:
             raise ValueError("image holds no camera, but at least one is needed")
         for name, picture in self.image.items():
@@ -144,6 +143,13 @@ class Episodes:
                     f"image {name!r} must be uint8 [{steps[0]}, {steps[1]}, H, W, 3], "
                     f"not {picture.dtype} {list(picture.shape)}"
                 )
+
+    def validate_numbers(self) -> None:
+        """`validate` without the pictures."""
+        if self.state.ndim != 3 or not self.state.size:
+            raise ValueError(f"state must have shape [E, T, J + 1], not {self.state.shape}")
+        steps = self.state.shape[:2]
+        self._validate_action()
         for name, low, high in (
             ("length", 1, steps[1]),
             ("instruction", 0, len(self.instructions) - 1),
@@ -169,6 +175,12 @@ class Episodes:
         for name in ("state", "action"):
             if getattr(self, name).dtype != np.float32:
                 raise ValueError(f"{name} must be float32, not {getattr(self, name).dtype}")
+            wrong = np.argwhere(~np.isfinite(np.asarray(getattr(self, name))))
+            if len(wrong):
+                episode, step, number = map(int, wrong[0])
+                raise ValueError(
+                    f"{name} is not finite in number {number} at step {step} of episode {episode}"
+                )
 
 
 def concatenate(parts: Sequence[Episodes]) -> Episodes:
@@ -213,6 +225,25 @@ def replacing(file: Path) -> Iterator[Path]:
         os.replace(unfinished, file)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def creating(path: str | os.PathLike) -> Iterator[Path]:
+    """A temporary folder that takes the path's place when all went well, else nothing is left.
+
+    Raises:
+        ValueError: if the path exists already.
+    """
+    path = Path(path)
+    if path.exists():
+        raise ValueError(f"{path} exists already: choose another path")
+    folder = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        folder.mkdir(parents=True)
+        yield folder
+        os.rename(folder, path)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _read(path: str | os.PathLike) -> dict[str, np.ndarray]:

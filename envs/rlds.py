@@ -13,29 +13,38 @@ import contextlib
 import functools
 import json
 import os
-import shutil
 from collections.abc import Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import jax
 import tensorflow_datasets as tfds
 from array_record.python import array_record_module
-from google.protobuf.json_format import ParseError
 
 from envs import rlds_schema
-from envs.episodes import SHARED, Episodes, concatenate, replacing
+from envs.episodes import SHARED, Episodes, creating, replacing
+from envs.rlds_reading import (
+    FORMAT,
+    METADATA,
+    SPLIT,
+    THREADS,
+    Reader,
+    damage_in_one_sentence,
+    metadata,
+    read,
+    reason,
+)
 
-_FORMAT = "envs-rlds-1"
-_VERSION, _SPLIT = "1.0.0", "train"
+__all__ = ["METADATA", "Parts", "Reader", "metadata", "read", "write"]
+
+_VERSION = "1.0.0"
+_DESCRIPTIONS = {
+    True: "Scripted expert episodes of {task} by {robot} in simulation.",
+    False: "Recorded episodes of {task} by {robot}.",
+}
 _FILES = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_INDEX}"  # as tfds.core.SequentialWriter calls them
-_METADATA = "metadata.json"  # where tfds looks for it
 # One episode is read at a time, and PNG does not shrink any further (measured: 7 times as fast).
 _RECORDS = "group_size:1,uncompressed"
-# Shared by all datasets that are made at once: more threads would only wait for Python's lock.
-_THREADS = ThreadPoolExecutor(8)
 
 
 def write(episodes: Episodes, path: str | os.PathLike) -> None:
@@ -49,59 +58,10 @@ def write(episodes: Episodes, path: str | os.PathLike) -> None:
         ValueError: if the path exists already or the arrays do not fit one another.
         OSError: if there is no room for it.
     """
-    path = Path(path)
-    if path.exists():
-        raise ValueError(f"{path} exists already: choose another path")
-    folder = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    with creating(path) as folder:
         parts = Parts(folder, {})
         parts.append(episodes)
         parts.complete()
-        os.rename(folder, path)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def read(path: str | os.PathLike) -> Episodes:
-    """All episodes of a dataset that `write` or `python -m envs collect` made, in host memory.
-
-    They are padded with zeros to the longest.
-
-    Raises:
-        FileNotFoundError: if there is no such folder.
-        ValueError: if it is damaged or not such a dataset.
-    """
-    path = Path(path)
-    facts = metadata(path)
-    with _damage_in_one_sentence(path):
-        shared: dict[str, Any] = {name: facts[name] for name in SHARED} | {"attempted": 0}
-        shared["instructions"] = tuple(shared["instructions"])
-        builder: Any = tfds.builder_from_directory(path)
-        cameras = {camera: rlds_schema.picture_name(camera) for camera in facts["cameras"]}
-        # Decoding is left to the threads: tfds would decode one picture after the other.
-        encoded = {name: tfds.decode.SkipDecoding() for name in cameras.values()}
-        source = builder.as_data_source(_SPLIT, decoders={"steps": {"observation": encoded}})
-        read_one = functools.partial(rlds_schema.episode, cameras=cameras, facts=shared)
-        found = list(_THREADS.map(lambda i: read_one(source[i]), range(len(source))))
-        return replace(concatenate(found), attempted=facts["attempted"])
-
-
-def metadata(path: Path) -> dict[str, Any]:
-    """What all episodes of a dataset share, and how they were made; see `Parts`.
-
-    Raises:
-        FileNotFoundError: if there is no such folder.
-        ValueError: if it is damaged or not such a dataset.
-    """
-    if not path.exists():
-        raise FileNotFoundError(f"there is no dataset {path}")
-    try:
-        facts = json.loads((path / _METADATA).read_text())
-        if facts["format"] != _FORMAT:
-            raise KeyError("format")
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} is not a folder of {_FORMAT} episodes") from error
-    return facts
 
 
 class Parts:
@@ -128,11 +88,11 @@ class Parts:
             ValueError: if they do not, or if a part is damaged.
         """
         self.folder = folder
-        self.facts: dict[str, Any] = {"format": _FORMAT, "options": dict(options), "parts": []}
+        self.facts: dict[str, Any] = {"format": FORMAT, "options": dict(options), "parts": []}
         self.facts |= {"steps": 0, "attempted": 0}
-        if (folder / _METADATA).exists():
+        if (folder / METADATA).exists():
             self.facts = metadata(folder)
-            for rest in folder.glob(f".{_METADATA}.*"):  # of a process that was killed
+            for rest in folder.glob(f".{METADATA}.*"):  # of a process that was killed
                 rest.unlink()
             _check_same(folder, self.facts["options"], options)
             for number, episodes in enumerate(self.facts["parts"]):
@@ -170,7 +130,7 @@ class Parts:
         to = rlds_schema.serializer(features)
         record = functools.partial(rlds_schema.record, to, jax.device_get(episodes))
         first, numbers = self.num_episodes, range(episodes.num_episodes)
-        data = _THREADS.map(record, numbers, range(first, first + len(numbers)))
+        data = THREADS.map(record, numbers, range(first, first + len(numbers)))
         _write_records(self._file(len(self.facts["parts"])), data)
         self.facts["parts"].append(len(numbers))
         self.facts["steps"] += episodes.num_steps
@@ -188,14 +148,12 @@ class Parts:
         )
         info = tfds.core.DatasetInfo(
             builder=identity,
-            description="Scripted expert episodes of {task} by {robot} in simulation.".format(
-                **self.facts
-            ),
+            description=_DESCRIPTIONS[bool(self.facts["physics_dt"])].format(**self.facts),
             features=tfds.features.FeaturesDict.from_config(str(self.folder)),
         )
         info.set_file_format(tfds.core.FileFormat.ARRAY_RECORD)
         split = tfds.core.SplitInfo(
-            name=_SPLIT,
+            name=SPLIT,
             shard_lengths=self.facts["parts"],
             num_bytes=sum(file.stat().st_size for file in files),
             filename_template=self._template,
@@ -204,7 +162,7 @@ class Parts:
         info.write_to_directory(self.folder)
 
     def _save(self) -> None:
-        with replacing(self.folder / _METADATA) as unfinished:
+        with replacing(self.folder / METADATA) as unfinished:
             unfinished.write_text(json.dumps(self.facts, indent=2))
 
     @property
@@ -218,7 +176,7 @@ class Parts:
             data_dir=tfds.core.Path(self.folder),
             template=_FILES,
             dataset_name=self._name,
-            split=_SPLIT,
+            split=SPLIT,
             filetype_suffix=tfds.core.FileFormat.ARRAY_RECORD.file_suffix,
         )
 
@@ -248,7 +206,7 @@ def _write_records(file: Path, records: Iterable[bytes]) -> None:
 
 def _check_whole(file: Path, episodes: int) -> None:
     """Raises a ValueError if a part is damaged; every record has a checksum."""
-    with _damage_in_one_sentence(file, f": delete {file.parent} to start anew"):
+    with damage_in_one_sentence(file, f": delete {file.parent} to start anew"):
         reader = array_record_module.ArrayRecordReader(str(file))
         if len(reader.read_all()) != episodes:
             raise ValueError(f"it holds {reader.num_records()} episodes, not {episodes}")
@@ -256,21 +214,8 @@ def _check_whole(file: Path, episodes: int) -> None:
 
 
 @contextlib.contextmanager
-def _damage_in_one_sentence(path: Path, remedy: str = "") -> Iterator[None]:
-    try:
-        yield
-    except (OSError, RuntimeError, ValueError, KeyError, ParseError) as error:
-        raise ValueError(f"{path} is damaged ({_reason(error)}){remedy}") from error
-
-
-@contextlib.contextmanager
 def _failure_in_one_sentence(file: Path) -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        raise OSError(f"{file} could not be written ({_reason(error)})") from error
-
-
-def _reason(error: Exception) -> str:
-    """What the libraries say can be long; its beginning says what is wrong."""
-    return str(error).split("; ")[0].split("\n")[0]
+        raise OSError(f"{file} could not be written ({reason(error)})") from error

@@ -30,6 +30,8 @@ class ModelConfig:
     tokenizer: str = ""
     """A SentencePiece .model or tokenizer.json, on this machine or the hub; empty: the offline one
     of nano and small."""
+    max_tokens: int = 0
+    """Longest instruction [tokens]; 0: what the size has."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Type of the matrix products."""
     param_dtype: Literal["float32", "bfloat16"] = "float32"
@@ -48,8 +50,11 @@ class ModelConfig:
 
 @dataclass(frozen=True)
 class DataConfig:
-    """Demonstrations made by the scripted expert."""
+    """Demonstrations: made by the scripted expert, or a dataset."""
 
+    source: str = ""
+    """A dataset in place of the expert: LeRobot (folder or id on the hub), RLDS, or a cache
+    (python -m lorasp_jax.data convert); it says robot and tasks. Empty: the expert."""
     episodes: int = 512
     """Successful demonstrations per task."""
     num_envs: int = 256

@@ -5,7 +5,8 @@ import io
 import pytest
 from rich.console import Console
 
-from benchmarks import long_run, measuring
+from benchmarks import data, long_run, measuring
+from lorasp_jax.data.cache import Cache
 
 
 def part(broken=0, **memory):
@@ -66,3 +67,19 @@ def test_tables_fit_a_terminal():
     text = console.export_text()
     assert "…" not in text
     assert "pick_place jax 8192 123 13.9 M 694 k 337 k 12.3 k 0.0123" in " ".join(text.split())
+
+
+def test_what_data_measures(tmp_path):
+    row = data.reading(tmp_path, 500, (4, 6), batch=8, batches=3)
+    assert (row["pictures"], row["batch"]) == ("6x4", 8)
+    assert row["windows/s"] > 0
+    found = Cache(tmp_path / "4x6")
+    assert (len(found), found.num_steps, found.cameras["wrist"]) == (2, 500, [4, 6])
+
+
+@pytest.mark.slow
+def test_what_data_imports(tmp_path):
+    data.record(tmp_path / "recorded", 1)
+    row = data.importing(tmp_path, 64)
+    assert row["kept as"] == "64x48"
+    assert row["pictures/s"] == 2 * row["steps/s"]

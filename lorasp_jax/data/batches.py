@@ -1,12 +1,13 @@
-"""Windows of demonstrations as training batches, sampled on the device.
+"""Windows of demonstrations as training batches.
 
-All episodes that fit in memory lie there as flat per-step arrays; a batch is a gather. What a step
-trains on is a function of the run's key and the step number alone, so the data position of a run is
-one integer.
+Episodes lie as flat per-step arrays, on the device where they fit, else in files; a batch is a
+gather. What a step trains on is a function of the run's key or seed and the step number alone, so
+the data position of a run is one integer.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ import numpy as np
 
 from envs.episodes import Array, Episodes
 from lorasp_jax.models.policy import Observation
-from lorasp_jax.models.processing import Processor
+from lorasp_jax.models.processing import Processor, RawObservation
 
 
 @jax.tree_util.register_dataclass
@@ -46,11 +47,32 @@ class Steps:
         instruction: `[N]` int32, row of the processor's token table.
     """
 
-    image: dict[str, jax.Array]
-    state: jax.Array
-    action: jax.Array
-    end: jax.Array
-    instruction: jax.Array
+    image: dict[str, Array]
+    state: Array
+    action: Array
+    end: Array
+    instruction: Array
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Raw:
+    """A batch before it is normalised: what was seen at B steps, and the actions from there on.
+
+    Attributes:
+        image: camera name -> `[B, H, W, 3]` uint8.
+        state: `[B, J+1]` joints [rad] and gripper opening [m].
+        actions: `[B, C, J+1]` joint targets [rad] and gripper opening [m]; past the end of the
+            episode, its last action again.
+        inside: `[B, C]` bool, False past the end of the episode.
+        instruction: `[B]` int32, row of the processor's token table.
+    """
+
+    image: dict[str, Array]
+    state: Array
+    actions: Array
+    inside: Array
+    instruction: Array
 
 
 def flatten(episodes: Sequence[Episodes]) -> Steps:
@@ -78,20 +100,46 @@ def flatten(episodes: Sequence[Episodes]) -> Steps:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
-def windows(steps: Steps, start: jax.Array, chunk: int) -> tuple[jax.Array, jax.Array]:
+def windows(steps: Steps, start: Array, chunk: int) -> tuple[Array, Array]:
     """Chunks of steps; one that would reach past its episode repeats the last step there.
 
     Args:
         steps: N of them.
-        start: `[B]` int32, index of each chunk's first step.
+        start: `[B]` int32, index of each chunk's first step; a NumPy array gives NumPy arrays.
         chunk: C.
 
     Returns:
         `[B, C]` int32 indices, and `[B, C]` bool, False where a step is a repetition.
     """
-    window = start[:, None] + jnp.arange(chunk)
+    xp = jnp if isinstance(start, jax.Array) else np
+    window = start[:, None] + xp.arange(chunk)
     last = steps.end[start][:, None] - 1
-    return jnp.minimum(window, last), window <= last
+    return xp.minimum(window, last), window <= last
+
+
+def gather(steps: Steps, start: Array, chunk: int) -> Raw:
+    """The windows that begin at the steps `start` `[B]`, see `windows`."""
+    window, inside = windows(steps, start, chunk)
+    return Raw(
+        image={name: image[start] for name, image in steps.image.items()},
+        state=steps.state[start],
+        actions=steps.action[window],
+        inside=inside,
+        instruction=steps.instruction[start],
+    )
+
+
+def encode(key: jax.Array, raw: Raw, processor: Processor, *, state_noise: float) -> Batch:
+    """A batch as the model sees it; `key` is consumed, for noise on the normalised state.
+
+    The mask is False where a chunk repeats its episode's last action.
+    """
+    given: Any = jax.tree.map(jnp.asarray, raw)
+    seen: RawObservation = {"image": given.image, "state": given.state}
+    noise = state_noise * jax.random.normal(key, (len(given.state), processor.statistics.dim))
+    observation = processor.encode(seen, given.instruction, state_noise=noise)
+    actions = processor.normalize_actions(given.actions, given.state)
+    return Batch(observation, actions, given.inside[..., None] & processor.flow_slots)
 
 
 def sample_batch(
@@ -103,18 +151,7 @@ def sample_batch(
     chunk: int,
     state_noise: float,
 ) -> Batch:
-    """Draw `batch_size` windows uniformly over steps; `key` is consumed.
-
-    The mask is False where a chunk repeats its episode's last action, see `windows`.
-    """
+    """Draw `batch_size` windows uniformly over steps; `key` is consumed."""
     start_key, noise_key = jax.random.split(key)
     start = jax.random.randint(start_key, (batch_size,), 0, steps.end.shape[0])
-    window, inside = windows(steps, start, chunk)
-    raw = {
-        "image": {name: image[start] for name, image in steps.image.items()},
-        "state": steps.state[start],
-    }
-    noise = state_noise * jax.random.normal(noise_key, (batch_size, processor.statistics.dim))
-    observation = processor.encode(raw, steps.instruction[start], state_noise=noise)
-    actions = processor.normalize_actions(steps.action[window], raw["state"])
-    return Batch(observation, actions, inside[..., None] & processor.flow_slots)
+    return encode(noise_key, gather(steps, start, chunk), processor, state_noise=state_noise)

@@ -107,6 +107,16 @@ class Evaluation(Callback):
         return self._tasks[task]
 
 
+class NoEvaluation(Callback):
+    """For a dataset whose tasks cannot be simulated: results without success rates."""
+
+    def on_end(self, run: Run) -> None:
+        """Say so and write results.json."""
+        tasks, robot = ", ".join(run.config.tasks), run.config.robot
+        run.console.print(f"not evaluated: there is no simulation of {tasks} with {robot}")
+        write_json(run.folder / "results.json", summarise(run, {}))
+
+
 def success(result: Result) -> dict[str, Any]:
     """The part of a result that results.json keeps per task."""
     return {"success": result.success, "episodes": result.episodes, "ci95": list(result.ci95)}
@@ -114,7 +124,7 @@ def success(result: Result) -> dict[str, Any]:
 
 def summarise(run: Run, after: dict[str, Result]) -> dict[str, Any]:
     """The content of results.json."""
-    before = json.loads((run.folder / "before.json").read_text())
+    before = json.loads((run.folder / "before.json").read_text()) if after else {}
     layers = _mean([result.active_rank for result in after.values()])
     modules = {
         tower: float(np.mean(np.concatenate(list(layers[tower].values()))))
@@ -134,9 +144,9 @@ def summarise(run: Run, after: dict[str, Result]) -> dict[str, Any]:
         },
         "active_rank": modules,
         "layer_active_rank": layers,
-        "active_rank_histogram": jax.tree.map(
+        "active_rank_histogram": _joined(
             lambda *counts: sum(counts).tolist(),
-            *(result.active_rank_histogram for result in after.values()),
+            [result.active_rank_histogram for result in after.values()],
         ),
         "trainable_parameters": trainable,
         "total_parameters": total,
@@ -146,7 +156,12 @@ def summarise(run: Run, after: dict[str, Result]) -> dict[str, Any]:
 def _mean(trees: list[Any]) -> Any:
     """Mean of equal trees whose leaves are lists of numbers."""
     is_list = lambda node: isinstance(node, list)  # noqa: E731
-    return jax.tree.map(lambda *v: np.mean(v, axis=0).tolist(), *trees, is_leaf=is_list)
+    return _joined(lambda *v: np.mean(v, axis=0).tolist(), trees, is_leaf=is_list)
+
+
+def _joined(function: Callable, trees: list[Any], **options: Any) -> Any:
+    """`jax.tree.map` over any number of trees; of none, an empty one."""
+    return jax.tree.map(function, *trees, **options) if trees else {}
 
 
 def _film(env: Env, result: Result, path: Path) -> None:

@@ -4,6 +4,7 @@ import os
 import re
 import shutil
 from pathlib import Path
+from typing import Literal
 
 REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 """A repository's id on the hub, owner/name."""
@@ -11,13 +12,19 @@ LEFT_OUT = ("train_state/*", "*.bin", "*.pt", "*.pth", "*.onnx", "*.gguf", "*.ms
 """What nothing here reads: optimizer states, and the same weights for other libraries."""
 
 
-def local(where: str | os.PathLike[str], *, only: list[str] | None = None) -> Path:
+def local(
+    where: str | os.PathLike[str],
+    *,
+    only: list[str] | None = None,
+    repository: Literal["model", "dataset"] = "model",
+) -> Path:
     """The file or folder on this machine; it is downloaded first if it is somewhere else.
 
     Args:
         where: a path; or the id of a repository on the hub, kept in its own cache; or a URL of a
             bucket, gs://bucket/folder, kept below the user's cache folder, lorasp_jax/.
         only: patterns of the files that are wanted from a repository; None: all but `LEFT_OUT`.
+        repository: what kind of repository on the hub.
 
     Raises:
         ValueError: it is not there, or cannot be reached.
@@ -28,19 +35,19 @@ def local(where: str | os.PathLike[str], *, only: list[str] | None = None) -> Pa
     if "://" in name:
         return _from_bucket(name)
     if REPOSITORY.fullmatch(name):
-        return _from_hub(name, only)
+        return _from_hub(name, only, repository)
     raise ValueError(
         f"{name} does not exist, and is no owner/name on the hub nor gs://bucket/path."
     )
 
 
-def _from_hub(name: str, only: list[str] | None) -> Path:
+def _from_hub(name: str, only: list[str] | None, repository: str) -> Path:
     import huggingface_hub
     from huggingface_hub.errors import HfHubHTTPError
 
     try:
         found = huggingface_hub.snapshot_download(
-            name, allow_patterns=only, ignore_patterns=list(LEFT_OUT)
+            name, repo_type=repository, allow_patterns=only, ignore_patterns=list(LEFT_OUT)
         )
         return Path(found)
     except (OSError, ValueError, HfHubHTTPError) as error:

@@ -3,7 +3,7 @@
 import base64
 import html
 import json
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -35,13 +35,10 @@ def write_report(folder: Path) -> Path:
     parts = [
         f"<h1>{html.escape(config['name'])}</h1>",
         f"<p class=muted>{_subtitle(config, results)}</p>",
-        "<h2>Success before and after</h2>",
-        _image(figures.success(results)),
-        _success_table(results),
+        *_success(results),
         "<h2>Training</h2>",
         _image(figures.losses(rows)),
         *_active_rank(results, rows, config["peft"].get("rank")),
-        "<h2>What the policy sees and does</h2>",
         *_media(folder, results["tasks"]),
         "<h2>Time</h2>",
         _table(("phase", "seconds"), ((k, f"{v:.1f}") for k, v in results["seconds"].items())),
@@ -70,6 +67,14 @@ def _subtitle(config: dict[str, Any], results: dict[str, Any]) -> str:
     )
 
 
+def _success(results: dict[str, Any]) -> Iterable[str]:
+    """Success rates; nothing for a run that was not evaluated."""
+    if results["tasks"]:
+        yield "<h2>Success before and after</h2>"
+        yield _image(figures.success(results))
+        yield _success_table(results)
+
+
 def _success_table(results: dict[str, Any]) -> str:
     """Task, before, after, with intervals."""
 
@@ -89,6 +94,8 @@ def _active_rank(results: dict[str, Any], rows: figures.Rows, rank: Any) -> Iter
         return
     yield "<h2>Active rank</h2>"
     yield _image(figures.active_rank(rows, rank))
+    if not results["layer_active_rank"]:  # not evaluated
+        return
     modules = ((module, f"{mean:.1f}") for module, mean in results["active_rank"].items())
     yield _table(("module", "active rank in closed loop"), modules)
     yield _image(figures.layer_ranks(results["layer_active_rank"], rank))
@@ -112,8 +119,10 @@ def _image(svg: str) -> str:
     return f'<img alt="figure" src="data:image/svg+xml;base64,{data}">'
 
 
-def _media(folder: Path, tasks: Iterable[str]) -> Iterable[str]:
+def _media(folder: Path, tasks: Collection[str]) -> Iterable[str]:
     """Video and first camera pictures of every task."""
+    if tasks:
+        yield "<h2>What the policy sees and does</h2>"
     for task in tasks:
         picture, video = folder / f"cameras_{task}.png", folder / f"rollout_{task}.mp4"
         shown = base64.b64encode(picture.read_bytes()).decode()

@@ -19,7 +19,8 @@ from rich.console import Console
 from envs.episodes import Episodes
 from lorasp_jax import adaptation
 from lorasp_jax.config import Config
-from lorasp_jax.data.batches import Steps, flatten, sample_batch
+from lorasp_jax.data.batches import Raw, Steps, encode, flatten, sample_batch
+from lorasp_jax.data.stream import Stream
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.checkpoint import Checkpoints
@@ -43,7 +44,11 @@ class Run:
         folder: where everything is written.
         console: where to print.
         base_hash: hash of the frozen base.
-        episodes: demonstrations by task.
+        episodes: demonstrations by task; of a dataset, without all its pictures.
+        dataset: the steps of a dataset, in files; None: those of `episodes`.
+        streams: whether the steps of a dataset are read from there step by step, because the device
+            has no room for them.
+        simulated: whether the tasks can be evaluated in simulation.
         policy: the policy before the first step or after the last; in between, training owns its
             memory.
         started: `time.perf_counter()` when this process began.
@@ -56,6 +61,9 @@ class Run:
     base_hash: str
     started: float = field(default_factory=time.perf_counter)
     episodes: dict[str, Episodes] = field(default_factory=dict)
+    dataset: Steps | None = None
+    streams: bool = False
+    simulated: bool = True
     policy: Policy = field(init=False)
     seconds: dict[str, float] = field(init=False)
 
@@ -64,6 +72,11 @@ class Run:
         path = self.folder / "seconds.json"
         self.seconds = json.loads(path.read_text()) if path.exists() else {"total": 0.0}
         self._before = self.seconds["total"]
+
+    @property
+    def steps(self) -> Steps:
+        """All steps that are trained on."""
+        return self.dataset or flatten(list(self.episodes.values()))
 
     @contextlib.contextmanager
     def timed(self, phase: str) -> Iterator[None]:
@@ -109,10 +122,12 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
     run.policy = Policy(nnx.merge(graphdef, state.adapters, frozen), run.policy.processor)
     checkpoints = Checkpoints(run.folder, run.base_hash)
     restored = checkpoints.restore(state) if resume else None
-    steps = flatten(list(run.episodes.values()))
-    steps = jax.device_put(steps, meshes.replicated(mesh))
     state = restored or state
-    many = _Stretches(_jitted(run, graphdef, optimizer, mesh), frozen, steps)
+    jitted = _jitted(run, graphdef, optimizer, mesh)
+    if run.streams:
+        many = _Streamed(jitted, frozen, _batches(run, mesh, int(state.step)))
+    else:
+        many = _Stretches(jitted, frozen, jax.device_put(run.steps, meshes.replicated(mesh)))
     if restored is None:
         many.compile(state, _stretch(run.config, int(state.step)))  # beside what the callbacks do
         for callback in callbacks:
@@ -128,22 +143,21 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
 
 
 def _jitted(run: Run, graphdef: Any, optimizer: Any, mesh: jax.sharding.Mesh) -> Callable:
-    """The jitted stretch of steps: (frozen, steps, state, key, count) -> state, metrics."""
+    """The jitted stretch of steps: (frozen, data, state, key, count) -> state, metrics.
+
+    Data are all steps, or one raw batch.
+    """
     optim, processor = run.config.optim, run.policy.processor
     chunk = run.policy.model.config.chunk
     weights = auxiliary_weights(run.config.auxiliary, optim.steps)
     sharding = meshes.batch_sharding(mesh)
 
-    def one(state: TrainState, frozen: Any, steps: Steps, key: jax.Array) -> Any:
+    draw = functools.partial(sample_batch, batch_size=optim.batch_size, chunk=chunk)
+
+    def one(state: TrainState, frozen: Any, data: Steps | Raw, key: jax.Array) -> Any:
         batch_key, loss_key = jax.random.split(jax.random.fold_in(key, state.step))
-        batch = sample_batch(
-            batch_key,
-            steps,
-            processor,
-            batch_size=optim.batch_size,
-            chunk=chunk,
-            state_noise=optim.state_noise,
-        )
+        make: Any = encode if isinstance(data, Raw) else draw
+        batch = make(batch_key, data, processor, state_noise=optim.state_noise)
         batch = jax.lax.with_sharding_constraint(batch, sharding)
         return train_step(
             state, frozen, batch, loss_key, graphdef=graphdef, optimizer=optimizer, weights=weights
@@ -156,9 +170,9 @@ def _jitted(run: Run, graphdef: Any, optimizer: Any, mesh: jax.sharding.Mesh) ->
         donate_argnames="state",
         out_shardings=meshes.replicated(mesh),
     )
-    def many(frozen: Any, steps: Steps, state: TrainState, key: jax.Array, count: int) -> Any:
+    def many(frozen: Any, data: Steps | Raw, state: TrainState, key: jax.Array, count: int) -> Any:
         state, metrics = jax.lax.scan(
-            lambda state, _: one(state, frozen, steps, key), state, length=count
+            lambda state, _: one(state, frozen, data, key), state, length=count
         )
         return state, jax.tree.map(jnp.mean, metrics)
 
@@ -168,15 +182,15 @@ def _jitted(run: Run, graphdef: Any, optimizer: Any, mesh: jax.sharding.Mesh) ->
 class _Stretches:
     """Stretches of steps, (state, key, count) -> state, metrics, each length compiled once."""
 
-    def __init__(self, jitted: Callable, frozen: Any, steps: Steps) -> None:
-        self._jitted, self._frozen, self._steps = jitted, frozen, steps
+    def __init__(self, jitted: Callable, frozen: Any, data: Steps | Raw) -> None:
+        self._jitted, self._frozen, self._data = jitted, frozen, data
         self._compiled: dict[int, Future] = {}
 
     def compile(self, state: TrainState, count: int) -> Future:
         """Begin to compile in a thread, unless that was done."""
         if count not in self._compiled:
             key = jax.random.key(0)
-            lower = lambda: self._jitted.lower(self._frozen, self._steps, state, key, count)  # noqa: E731
+            lower = lambda: self._jitted.lower(self._frozen, self._data, state, key, count)  # noqa: E731
             pool = ThreadPoolExecutor(1)
             self._compiled[count] = pool.submit(lambda: lower().compile())
             pool.shutdown(wait=False)
@@ -184,7 +198,40 @@ class _Stretches:
 
     def __call__(self, state: TrainState, key: jax.Array, count: int) -> tuple[TrainState, Any]:
         run = self.compile(state, count).result()
-        return run(self._frozen, self._steps, state, key)
+        return run(self._frozen, self._data, state, key)
+
+
+class _Streamed(_Stretches):
+    """Stretches of steps whose batches come from files, one always on its way to the device."""
+
+    def __init__(self, jitted: Callable, frozen: Any, batches: Iterator[Raw]) -> None:
+        super().__init__(jitted, frozen, next(batches))
+        self._batches = batches
+
+    def compile(self, state: TrainState, count: int) -> Future:  # noqa: ARG002
+        return super().compile(state, 1)
+
+    def __call__(self, state: TrainState, key: jax.Array, count: int) -> tuple[TrainState, Any]:
+        found = []
+        for _ in range(count):
+            state, metrics = super().__call__(state, key, 1)
+            self._data = next(self._batches)
+            found.append(metrics)
+        return state, jax.tree.map(lambda *values: jnp.stack(values).mean(), *found)
+
+
+def _batches(run: Run, mesh: jax.sharding.Mesh, start: int) -> Iterator[Raw]:
+    """Batches of a dataset from a step on, split over the devices."""
+    stream = Stream(
+        run.steps,
+        batch_size=run.config.optim.batch_size,
+        chunk=run.policy.model.config.chunk,
+        seed=run.config.seed,
+        start=start,
+        process=(jax.process_index(), jax.process_count()),
+    )
+    put = functools.partial(jax.make_array_from_process_local_data, meshes.batch_sharding(mesh))
+    return (jax.tree.map(put, raw) for raw in stream)
 
 
 def _stretch(config: Config, done: int) -> int:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -15,14 +15,18 @@ from rich.console import Console
 from rich.progress import TaskID
 
 import envs
+from envs.env import Env
 from envs.episodes import Episodes
 from lorasp_jax import adaptation, calibration, models, peft, tables
 from lorasp_jax.config import Config
-from lorasp_jax.data.batches import Batch, flatten, sample_batch, windows
+from lorasp_jax.data.batches import Batch, encode, flatten, sample_batch, windows
 from lorasp_jax.data.demonstrations import demonstrations
+from lorasp_jax.data.imported import cached, is_simulated, opened, outline
+from lorasp_jax.data.source import Source
+from lorasp_jax.data.stream import Stream
 from lorasp_jax.models import backbone, loading, places, presets, tokenizer
 from lorasp_jax.models.backbone import Backbone
-from lorasp_jax.models.config import BackboneConfig, Remat
+from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.processing import Processor, Statistics, check_delta, robot_slots, to_delta
 from lorasp_jax.models.prompt_table import PromptTable
@@ -47,16 +51,18 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
             fit, a rule that matches nothing, a chunk or batch that does not fit.
     """
     sizes = {"image_size": config.image_size, "control_dt": config.control_dt}
-    worlds = [envs.make(task, robot=config.robot, **sizes) for task in config.tasks]
-    instructions = [phrase for env in worlds for phrase in env.instructions]
+    tasks = () if config.data.source else config.tasks
+    worlds = [envs.make(task, robot=config.robot, **sizes) for task in tasks]
     words = tokenizer.load(config.model.tokenizer)
     base, base_hash = base_model(config)
-    joints = worlds[0].robot.num_joints
-    prompts = PromptTable.of(words, instructions, base.config, num_joints=joints)
+    base = _changed(base, max_tokens=config.model.max_tokens or base.config.max_tokens)
+    source = opened(config, base.config, folder) if config.data.source else None
+    prompts, joints = _told(source, worlds, words, base.config)
     _check_sizes(config, base.config.chunk)
     check_delta(base.config.inputs.delta, joints)
-    remat, memory = preflight.choose_remat(config, base.config, preflight.available_bytes())
-    base = _with_remat(base, remat)
+    available = preflight.available_bytes()
+    remat, memory = preflight.choose_remat(config, base.config, available)
+    base = _changed(base, remat=remat)
     model = _adapted(config, base, config.peft.as_saved)
     console.print(
         f"scale {config.scale}: {type(config.peft).__name__} on {config.model.backbone} "
@@ -65,7 +71,10 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
     console.print(f"memory by device in GiB: {memory}; rematerialisation: {remat}")
     run = Run(config, folder, console, base_hash, started)
     with run.timed("collect"):
-        run.episodes = _collect(run, instructions)
+        if source:
+            _import(run, source, available - memory.peak)
+        else:
+            run.episodes = _collect(run, prompts.instructions)
     relative = config.model.relative_actions
     found = processor([*run.episodes.values()], model.config, prompts, relative=relative)
     if config.peft.needs_statistics:
@@ -73,6 +82,24 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
         model = _adapted(config, base, config.peft, statistics)
     run.policy = Policy(model, found)
     return run
+
+
+def _told(
+    source: Source | None, worlds: Sequence[Env], words: tokenizer.Tokenizer, model: BackboneConfig
+) -> tuple[PromptTable, int]:
+    """Prompts of a dataset's or the simulated tasks' instructions, and the robot's joints J."""
+    if source is None:
+        joints = worlds[0].robot.num_joints
+        instructions = [phrase for env in worlds for phrase in env.instructions]
+        return PromptTable.of(words, instructions, model, num_joints=joints), joints
+    first = source.episode(0, ())
+    joints = first.state.shape[-1] - 1
+    try:
+        prompts = PromptTable.of(words, first.instructions, model, num_joints=joints)
+    except ValueError as error:
+        fields = "--model.tokenizer or --model.max-tokens"
+        raise ValueError(f"the dataset does not fit {fields}: {error}") from error
+    return prompts, joints
 
 
 def _check_sizes(config: Config, chunk: int) -> None:
@@ -102,13 +129,7 @@ def _adapted(
 
 def input_moments(run: Run, model: Backbone, processor: Processor) -> dict[str, jax.Array]:
     """`calibration.input_moments` of the run's targets, over batches as training draws them."""
-    config, steps = run.config, flatten(list(run.episodes.values()))
-    sizes = {"batch_size": config.optim.batch_size, "chunk": model.config.chunk}
-    draw = jax.jit(
-        lambda key: sample_batch(
-            key, steps, processor, **sizes, state_noise=config.optim.state_noise
-        )
-    )
+    config, draw = run.config, _drawing(run, processor, model.config.chunk)
 
     def forward(model: Backbone, drawn: tuple[jax.Array, Batch]) -> Any:
         key, batch = drawn
@@ -118,6 +139,20 @@ def input_moments(run: Run, model: Backbone, processor: Processor) -> dict[str, 
     pattern = "|".join(f"(?:{path})" for path in presets.patterns(config.targets))
     batches = ((key, draw(key)) for key in keys)
     return calibration.input_moments(model, batches, pattern, forward)
+
+
+def _drawing(run: Run, processor: Processor, chunk: int) -> Callable[[jax.Array], Batch]:
+    """What gives a batch for a key, of a run that is not yet trained."""
+    size, noise = run.config.optim.batch_size, run.config.optim.state_noise
+    if run.streams:
+        stream = Stream(run.steps, batch_size=size, chunk=chunk, seed=run.config.seed)
+        return lambda key: encode(key, next(stream), processor, state_noise=noise)
+    steps = jax.device_put(run.steps)
+    return jax.jit(
+        lambda key: sample_batch(
+            key, steps, processor, batch_size=size, chunk=chunk, state_noise=noise
+        )
+    )
 
 
 def base_model(config: Config) -> tuple[Backbone, str]:
@@ -147,11 +182,11 @@ def base_model(config: Config) -> tuple[Backbone, str]:
     return model, models.weights_hash(model)
 
 
-def _with_remat(model: Backbone, remat: Remat) -> Backbone:
-    """The same parameters in a model that keeps something else for its backward pass."""
-    if remat == model.config.remat:
+def _changed(model: Backbone, **changes: Any) -> Backbone:
+    """The same parameters in a model whose config differs in what no parameter depends on."""
+    wanted = dataclasses.replace(model.config, **changes)
+    if wanted == model.config:
         return model
-    wanted = dataclasses.replace(model.config, remat=remat)
     abstract = nnx.eval_shape(lambda: wanted.create(nnx.Rngs(0)))
     return nnx.merge(nnx.graphdef(abstract), nnx.state(model))
 
@@ -193,7 +228,9 @@ def processor(
     steps = flatten([dataclasses.replace(group, image={}) for group in episodes])
     chunk = model_config.chunk if delta else 1
     window, _ = windows(steps, jnp.arange(len(steps.end)), chunk)
-    action = np.asarray(to_delta(steps.action[window], steps.state, delta)).reshape(-1, joints + 1)
+    action = np.asarray(
+        to_delta(jnp.asarray(steps.action[window]), jnp.asarray(steps.state), delta)
+    ).reshape(-1, joints + 1)
     state = np.repeat(np.asarray(steps.state), chunk, axis=0)
     everything = np.ones(len(state), bool)
     statistics = Statistics.measure(state, action, everything, slots=slots, dim=dim)
@@ -201,6 +238,21 @@ def processor(
     return Processor.of(
         model_config, statistics, prompts, num_joints=joints, cameras=cameras, delta=delta
     )
+
+
+def _import(run: Run, source: Source, room: float) -> None:
+    """Give the run its dataset, with a bar; it streams where it needs more than `room` bytes."""
+    with bars(run.console, "steps") as progress:
+        bar = progress.add_task(f"reading {run.config.data.source}", total=None)
+        report = lambda done, total: progress.update(bar, completed=done, total=total)  # noqa: E731
+        found = cached(source, run.folder, report)
+        progress.update(bar, completed=found.num_steps, total=found.num_steps)
+    facts = found.facts
+    run.dataset, run.episodes, run.simulated = found.steps, outline(found), is_simulated(found)
+    run.streams = sum(x.nbytes for x in jax.tree.leaves(run.dataset)) > room
+    run.config = dataclasses.replace(run.config, robot=facts["robot"], tasks=tuple(facts["tasks"]))
+    place = "in files" if run.streams else "on the device"
+    run.console.print(f"{found.num_steps} steps of {len(found)} episodes, {place}")
 
 
 def _collect(run: Run, instructions: Sequence[str]) -> dict[str, Episodes]:
@@ -215,6 +267,6 @@ def _collect(run: Run, instructions: Sequence[str]) -> dict[str, Episodes]:
             progress.update(started[task], completed=done, description=text)
 
         found = demonstrations(run.config, run.folder, report)
-    if [phrase for group in found.values() for phrase in group.instructions] != instructions:
+    if [phrase for group in found.values() for phrase in group.instructions] != [*instructions]:
         raise ValueError(f"{run.folder} holds demonstrations of other instructions; start anew")
     return found

@@ -23,11 +23,13 @@ def test_flatten_keeps_valid_steps_in_order():
 
 
 def test_windows_repeat_the_last_step_of_their_episode():
-    """By hand: episodes of 5, 9 and 7 steps."""
+    """By hand: episodes of 5, 9 and 7 steps; in NumPy and in JAX."""
     steps = flatten([random_episodes("a", 0)])
-    found, inside = windows(steps, np.array([0, 3, 4, 19]), 3)
-    assert found.tolist() == [[0, 1, 2], [3, 4, 4], [4, 4, 4], [19, 20, 20]]
-    assert inside.sum(axis=1).tolist() == [3, 2, 1, 2]
+    start = np.array([0, 3, 4, 19])
+    for begin in (start, jax.numpy.asarray(start)):
+        found, inside = windows(steps, begin, 3)
+        assert found.tolist() == [[0, 1, 2], [3, 4, 4], [4, 4, 4], [19, 20, 20]]
+        assert inside.sum(axis=1).tolist() == [3, 2, 1, 2]
 
 
 @pytest.mark.slow

@@ -117,6 +117,15 @@ def test_bad_contents(tmp_path, changes, message):
         Episodes.load(path)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_numbers_that_are_none(value):
+    episodes = make()
+    action = np.array(episodes.action)
+    action[1, 2, 3] = value
+    with pytest.raises(ValueError, match="action is not finite in number 3 at step 2 of episode 1"):
+        dataclasses.replace(episodes, action=action).validate()
+
+
 def test_every_action_convention(tmp_path):
     panda = {"robot": "panda", "state": np.zeros((3, 4, 8), np.float32)}
     tool = make(**panda, actions="end_effector", action=np.ones((3, 4, 7), np.float32))

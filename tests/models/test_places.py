@@ -26,6 +26,9 @@ def test_hub(tmp_path, monkeypatch):
     assert places.local("lerobot/smolvla_base", only=["*.json"]) == tmp_path
     assert (asked["name"], asked["allow_patterns"]) == ("lerobot/smolvla_base", ["*.json"])
     assert "train_state/*" in asked["ignore_patterns"]
+    assert asked["repo_type"] == "model"
+    places.local("lerobot/pusht", repository="dataset")
+    assert asked["repo_type"] == "dataset"
 
 
 def test_offline_is_one_sentence(monkeypatch):

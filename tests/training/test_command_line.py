@@ -61,3 +61,18 @@ def test_a_task_by_its_name():
     config, _ = parse(["--config", f"{ROOT}/configs/single_task.py", "--tasks", "pour"])
     assert config.tasks == ("pour",)
     assert config.peft == parse(["--config", f"{ROOT}/configs/multitask.py"])[0].peft
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("version", ["v21", "v3"])
+def test_a_lerobot_dataset(version, tmp_path, monkeypatch):
+    """From the files that LeRobot writes to adapters, without simulation."""
+    monkeypatch.setattr(meshes, "make_mesh", one_device(meshes.make_mesh))
+    monkeypatch.chdir(tmp_path)
+    source = str(ROOT / "tests" / "golden" / f"lerobot_{version}" / "dataset")
+    chosen = ["--model.checkpoint", ASSETS, "--model.max-tokens", "16", "--data.source", source]
+    assert train.main([*COMMAND, *chosen, "--optim.steps", "20"]) == 0
+    first, *_, last = read_metrics(Path("runs/multitask"))
+    assert last["task"] < first["task"]
+    for name in ("report.html", "adapter.safetensors", "cache/steps/statistics.json"):
+        assert Path("runs/multitask", name).stat().st_size

@@ -16,6 +16,7 @@ from rich.console import Console
 
 from lorasp_jax import adaptation, models, paths
 from lorasp_jax.config import ModelConfig
+from lorasp_jax.data.opening import open_source
 from lorasp_jax.models import inputs
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.policy import Policy
@@ -27,6 +28,7 @@ from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.loop import Run, train
 from lorasp_jax.training.overrides import override
 from tests import quick
+from tests.data.lerobots import golden
 from tests.runs import CONFIG, leaves, random_episodes
 
 BASE_MODEL = setup.base_model
@@ -154,6 +156,17 @@ def test_eva_of_the_command_line_sees_the_demonstrations(config, tmp_path):
         assert parent.method == LoRA(rank=4, initialization="eva")
 
 
+def test_eva_sees_a_dataset_that_streams(config, tmp_path):
+    run = setup.prepare(config, tmp_path, Console(file=io.StringIO()), time.perf_counter())
+    table = run.policy.processor
+    on_device = setup._drawing(run, table, 4)(jax.random.key(0))
+    run.dataset, run.streams = jax.tree.map(np.asarray, run.steps), True
+    draw = setup._drawing(run, table, 4)
+    first, second = draw(jax.random.key(0)), draw(jax.random.key(0))
+    assert jax.tree.map(np.shape, first) == jax.tree.map(np.shape, on_device)
+    assert (first.actions != second.actions).any()
+
+
 @pytest.mark.parametrize("relative", [False, True])
 def test_actions_are_normalised_as_they_are_learned(relative):
     """Over all windows as training draws them, mean 0 and standard deviation 1."""
@@ -178,3 +191,14 @@ def test_actions_are_normalised_as_they_are_learned(relative):
         moved = chunk - np.append(np.ones(6), 0) * state[:, None]
         expected = (moved - moved.mean(axis=(0, 1))) / moved.std(axis=(0, 1))
         np.testing.assert_allclose(learned, expected, atol=1e-4)
+
+
+def test_a_dataset_whose_words_are_too_many_is_refused():
+    words, model = Offline(), dataclasses.replace(Pi0Config.nano(), max_tokens=10)
+    source = open_source(golden("v3"))
+    fits = dataclasses.replace(model, max_tokens=11)
+    prompts, joints = setup._told(source, [], words, fits)
+    assert prompts.instructions == source.episode(0, ()).instructions
+    assert joints == source.episode(0, ()).state.shape[-1] - 1
+    with pytest.raises(ValueError, match=r"--model\.max-tokens: 'pick up .*' has 11 tokens"):
+        setup._told(source, [], words, model)

@@ -1,0 +1,183 @@
+"""Datasets: windows a second from the cache, the first batch, and how fast LeRobot's are imported.
+
+    python -m benchmarks.data --json data.json
+    python -m benchmarks.data --steps 50000 --batches 500     # more than lies in the page cache
+
+Windows have two cameras and 50 actions, in shuffled order. Imported are synthetic recordings of two
+cameras as LeRobot writes them (AV1, a key frame every 2), once kept at their size and once reduced
+to 224 pixels, as published models see them. Everything runs on the host; the accelerator is idle.
+"""
+
+import argparse
+import collections
+import itertools
+import json
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from rich.console import Console
+
+from benchmarks.measuring import machine, print_table
+from envs.episodes import Episodes
+from lorasp_jax.data import cache
+from lorasp_jax.data.lerobot import Keys, LeRobot
+from lorasp_jax.data.stream import Stream
+from lorasp_jax.models.statistics import Statistics
+
+CAMERAS, CHUNK, FPS = ("side", "wrist"), 50, 30
+EPISODE = 250  # steps
+HEIGHT, WIDTH = 480, 640
+
+
+class Drawn:
+    """Episodes of noise, made as they are read."""
+
+    kind, cameras, control_dt = "drawn", CAMERAS, 1 / FPS
+
+    def __init__(self, steps: int, height: int, width: int) -> None:
+        self.num_steps, self._rng = steps, np.random.default_rng(0)
+        self._size = (1, EPISODE, height, width, 3)
+
+    def __len__(self) -> int:
+        return self.num_steps // EPISODE
+
+    def episode(self, number: int, cameras: Any = None) -> Episodes:  # noqa: ARG002
+        """Noise."""
+        draw = self._rng.standard_normal
+        state, action = (draw((1, EPISODE, 7), np.float32) for _ in range(2))
+        return Episodes(
+            image={name: self._rng.integers(0, 255, self._size, np.uint8) for name in CAMERAS},
+            state=state,
+            action=action,
+            length=np.array([EPISODE], np.int32),
+            instruction=np.zeros(1, np.int32),
+            instructions=("do it",),
+            task="drawn",
+            robot="piper",
+            control_dt=self.control_dt,
+            physics_dt=0.0,
+            attempted=1,
+        )
+
+
+def seconds(call: Callable[[], Any]) -> float:
+    """Of one call, which is not repeated: the second one would find its files in memory."""
+    start = time.perf_counter()
+    call()
+    return time.perf_counter() - start
+
+
+def reading(folder: Path, steps: int, size: tuple[int, int], batch: int, batches: int) -> Any:
+    """Windows a second, and the first batch from opening the folder on."""
+    path = folder / f"{size[0]}x{size[1]}"
+    if not path.exists():
+        cache.write([Drawn(steps, *size)], path, lambda *_: None)
+    start = time.perf_counter()
+    stream = Stream(cache.Cache(path).steps, batch_size=batch, chunk=CHUNK, seed=0)
+    next(stream)
+    first = time.perf_counter() - start
+    taken = seconds(lambda: collections.deque(itertools.islice(stream, batches), maxlen=1))
+    pixels = f"{size[1]}x{size[0]}"
+    rate = batch * batches / taken
+    return {"pictures": pixels, "batch": batch, "windows/s": rate, "first batch s": first}
+
+
+def record(folder: Path, episodes: int) -> None:
+    """A LeRobot 2.1 dataset whose pictures are a moving pattern with a little noise."""
+    rng, lines = np.random.default_rng(0), []
+    for number in range(episodes):
+        state, action = (rng.standard_normal((EPISODE, 7), np.float32) for _ in range(2))
+        frames = np.arange(EPISODE)
+        rows = {"observation.state": list(state), "action": list(action)}
+        rows |= {"frame_index": frames, "timestamp": frames / FPS}
+        rows |= {"episode_index": [number] * EPISODE, "task_index": [0] * EPISODE}
+        table = folder / f"data/chunk-000/episode_{number:06d}.parquet"
+        table.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(pa.table(rows), table)
+        for shift, camera in enumerate(CAMERAS):
+            film = folder / f"videos/chunk-000/{camera}/episode_{number:06d}.mp4"
+            film.parent.mkdir(parents=True, exist_ok=True)
+            encode(film, rng, 100 * shift)
+        lines.append(json.dumps({"episode_index": number, "length": EPISODE}))
+    vector, film = {"dtype": "float32", "shape": [7]}, {"dtype": "video", "shape": []}
+    features = {"observation.state": vector, "action": vector, **dict.fromkeys(CAMERAS, film)}
+    path = "chunk-{episode_chunk:03d}/"
+    info = {"codebase_version": "v2.1", "fps": FPS, "robot_type": "piper", "features": features}
+    info |= {"chunks_size": 1000, "data_path": f"data/{path}episode_{{episode_index:06d}}.parquet"}
+    info |= {"video_path": f"videos/{path}{{video_key}}/episode_{{episode_index:06d}}.mp4"}
+    meta = folder / "meta"
+    meta.mkdir()
+    (meta / "info.json").write_text(json.dumps(info))
+    (meta / "tasks.jsonl").write_text(json.dumps({"task_index": 0, "task": "do it"}))
+    (meta / "episodes.jsonl").write_text("\n".join(lines))
+
+
+def encode(path: Path, rng: np.random.Generator, shift: int) -> None:
+    """A film with LeRobot's settings: libsvtav1, yuv420p, g 2, crf 30."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    with av.open(str(path), "w") as container:
+        stream: Any = container.add_stream("libsvtav1", rate=FPS)
+        stream.height, stream.width, stream.pix_fmt = HEIGHT, WIDTH, "yuv420p"
+        stream.options = {"g": "2", "crf": "30", "preset": "12"}
+        for number in range(EPISODE):
+            waves = np.sin((x + shift + 3 * number) / 40) + np.cos((y - 2 * number) / 30)
+            grey = 128 + 50 * waves + rng.integers(-4, 5, waves.shape)
+            picture = np.stack([grey, 255 - grey, 0 * grey + 90], -1).astype(np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode())
+
+
+def importing(folder: Path, image_size: int) -> dict[str, Any]:
+    """Steps and pictures a second from a LeRobot dataset to a cache, with statistics."""
+    source = LeRobot(folder / "recorded", Keys(image_size=image_size))
+    made = folder / f"imported_{image_size}"
+    rate = source.num_steps / seconds(lambda: cache.write([source], made, lambda *_: None))
+    side, _ = cache.Cache(made).cameras.values()
+    pictures = len(CAMERAS) * rate
+    return {"kept as": f"{side[1]}x{side[0]}", "steps/s": rate, "pictures/s": pictures}
+
+
+def statistics(steps: int) -> dict[str, Any]:
+    """Time of the normalisation statistics of so many steps."""
+    rows = np.random.default_rng(0).standard_normal((steps, 7), np.float32)
+    every = np.ones(steps, bool)
+    call = lambda: Statistics.measure(rows, rows, every, slots=range(7), dim=7)  # noqa: E731
+    return {"steps": float(steps), "statistics s": seconds(call)}
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--steps", type=int, default=5000, help="in the cache (%(default)s)")
+    parser.add_argument("--batches", type=int, default=200, help="that are timed (%(default)s)")
+    parser.add_argument("--episodes", type=int, default=4, help="imported (%(default)s)")
+    parser.add_argument("--json", type=Path, help="also write the numbers here")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        read = [
+            reading(folder, options.steps, size, batch, options.batches)
+            for size in ((128, 128), (168, 224))
+            for batch in (32, 256)
+        ]
+        record(folder / "recorded", options.episodes)
+        imported = [importing(folder, size) for size in (0, 224)]
+    found = {"cache": read, "LeRobot 640x480": imported, "columns": [statistics(1_000_000)]}
+    where = machine("numpy", "grain", "av")
+    console = Console()
+    console.print(where)
+    for title, rows in found.items():
+        print_table(console, rows, title)
+    if options.json:
+        options.json.write_text(json.dumps({"machine": where, **found}, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,128 @@
+"""Datasets in RLDS form, read without TensorFlow; `envs.rlds` writes them."""
+
+import contextlib
+import json
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import tensorflow_datasets as tfds
+from google.protobuf.json_format import ParseError
+
+from envs import rlds_schema
+from envs.episodes import SHARED, Episodes, concatenate
+
+FORMAT, SPLIT = "envs-rlds-1", "train"
+METADATA = "metadata.json"
+"""File in a dataset's folder, where tfds looks for it, too."""
+THREADS = ThreadPoolExecutor(8)
+"""Shared by all datasets that are made at once: more threads would only wait for Python's lock."""
+_FAILURES = (OSError, RuntimeError, ValueError, LookupError, TypeError, AttributeError, ParseError)
+_FAILURES += (ImportError,)  # what tfds says of features that would need TensorFlow
+
+
+def read(path: str | os.PathLike) -> Episodes:
+    """All episodes of a dataset that `write` or `python -m envs collect` made, in host memory.
+
+    They are padded with zeros to the longest.
+
+    Raises:
+        FileNotFoundError: if there is no such folder.
+        ValueError: if it is damaged or not such a dataset.
+    """
+    found = Reader(path)
+    parts = list(THREADS.map(found.episode, range(len(found))))
+    with damage_in_one_sentence(found.path):
+        return replace(concatenate(parts), attempted=found.facts["attempted"])
+
+
+def metadata(path: Path) -> dict[str, Any]:
+    """What all episodes of a dataset share, and how they were made; see `Parts`.
+
+    Raises:
+        FileNotFoundError: if there is no such folder.
+        ValueError: if it is damaged or not such a dataset.
+    """
+    if not path.exists():
+        raise FileNotFoundError(f"there is no dataset {path}")
+    try:
+        facts = json.loads((path / METADATA).read_text())
+        if facts["format"] != FORMAT:
+            raise KeyError("format")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} is not a folder of {FORMAT} episodes") from error
+    return facts
+
+
+class Reader:
+    """A dataset that `write` or `python -m envs collect` made, an episode at a time.
+
+    Attributes:
+        kind: the format's name.
+        path: its folder.
+        facts: see `Parts`.
+        cameras: name of a camera -> name of its pictures.
+        control_dt: time between two actions [s].
+        num_steps: control steps of all episodes.
+    """
+
+    kind = "RLDS"
+
+    def __init__(self, path: str | os.PathLike) -> None:
+        """Opens a dataset.
+
+        Raises:
+            FileNotFoundError: if there is no such folder.
+            ValueError: if it is damaged or not such a dataset.
+        """
+        self.path = Path(path)
+        self.facts = metadata(self.path)
+        with damage_in_one_sentence(self.path):
+            self.cameras = {name: rlds_schema.picture_name(name) for name in self.facts["cameras"]}
+            self.control_dt = float(self.facts["control_dt"])
+            self.num_steps = int(self.facts["steps"])
+            self._shared: dict[str, Any] = {name: self.facts[name] for name in SHARED}
+            self._shared |= {"instructions": tuple(self.facts["instructions"]), "attempted": 1}
+            builder: Any = tfds.builder_from_directory(self.path)
+            # Decoding is left to the schema: tfds would decode one picture after the other.
+            encoded = {name: tfds.decode.SkipDecoding() for name in self.cameras.values()}
+            decoders = {"steps": {"observation": encoded}}
+            self._source = builder.as_data_source(SPLIT, decoders=decoders)
+
+    def __len__(self) -> int:
+        """Number of episodes."""
+        return len(self._source)
+
+    def episode(self, number: int, cameras: Sequence[str] | None = None) -> Episodes:
+        """One episode, in host memory.
+
+        Args:
+            number: which.
+            cameras: those whose pictures are wanted; None: all.
+
+        Raises:
+            ValueError: if it is damaged or lacks something.
+        """
+        with damage_in_one_sentence(self.path):
+            names = self.cameras if cameras is None else cameras
+            wanted = {name: self.cameras[name] for name in names}
+            found = rlds_schema.episode(self._source[number], wanted, self._shared)
+            found.validate_numbers()
+            return found
+
+
+@contextlib.contextmanager
+def damage_in_one_sentence(path: Path, remedy: str = "") -> Iterator[None]:
+    """What goes wrong inside becomes one ValueError about this path."""
+    try:
+        yield
+    except _FAILURES as error:
+        raise ValueError(f"{path} is damaged ({reason(error)}){remedy}") from error
+
+
+def reason(error: Exception) -> str:
+    """What the libraries say can be long; its beginning says what is wrong."""
+    return str(error).split("; ")[0].split("\n")[0]

@@ -1,0 +1,133 @@
+"""Command line: `python -m lorasp_jax.data inspect | convert --help`."""
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import jax
+from rich.console import Console
+from rich.progress import MofNCompleteColumn, Progress, TextColumn
+
+from lorasp_jax.data import cache, conversion, inspection
+from lorasp_jax.data.lerobot import Keys
+from lorasp_jax.data.opening import open_source
+from lorasp_jax.data.source import Progress as Report
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs one command; returns the exit code: 0 done, 2 bad input, 130 stopped."""
+    options = _parser().parse_args(arguments)
+    jax.config.update("jax_platforms", "cpu")  # nothing here is worth taking an accelerator
+    errors = Console(stderr=True)
+    try:
+        options.command(options, Console())
+    except (ValueError, OSError) as error:
+        errors.print(f"error: {error}", style="red", soft_wrap=True, highlight=False, markup=False)
+        return 2
+    except KeyboardInterrupt:
+        errors.print("stopped: no unfinished file is left")
+        return 130
+    return 0
+
+
+def inspect(options: argparse.Namespace, console: Console) -> None:
+    """Prints what is in a dataset and writes a picture of it."""
+    source = open_source(options.path, _keys(options))
+    path: Path = options.out or Path(f"{Path(options.path).absolute().name}.png")
+    if path.exists() and not options.overwrite:
+        raise ValueError(f"{path} exists already: add --overwrite or choose another --out")
+    inspection.report(source, console)
+    inspection.write_contact_sheet(source, path)
+    console.print(f"pictures: {path}", soft_wrap=True, highlight=False, markup=False)
+
+
+def convert(options: argparse.Namespace, console: Console) -> None:
+    """Writes datasets as a cache, which training reads, or one as an RLDS dataset."""
+    keys = _keys(options)
+    sources = [open_source(path, keys) for path in options.paths]
+    if options.to == "rlds" and len(sources) > 1:
+        raise ValueError(f"an RLDS dataset is made of one dataset, not of {len(sources)}")
+    with _bar(f"writing {options.out.name}") as progress:
+        if options.to == "rlds":
+            conversion.to_rlds(sources[0], options.out, progress)
+        else:
+            cache.write(sources, options.out, progress)
+    episodes = sum(len(source) for source in sources)
+    console.print(f"{options.out}: {episodes} episodes", soft_wrap=True, highlight=False)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m lorasp_jax.data", description=__doc__)
+    subparsers = parser.add_subparsers(required=True, metavar="command")
+    where = "a LeRobot dataset (folder or id on the hub), an RLDS one, a cache or an .npz file"
+
+    text = inspect.__doc__
+    sub = subparsers.add_parser("inspect", help=text, description=text)
+    sub.set_defaults(command=inspect)
+    sub.add_argument("path", help=where)
+    sub.add_argument("--out", type=Path, help=".png file (default: the dataset's name)")
+    sub.add_argument("--overwrite", action="store_true", help="replace the .png file")
+    _add_keys(sub)
+
+    text = convert.__doc__
+    sub = subparsers.add_parser("convert", help=text, description=text)
+    sub.set_defaults(command=convert)
+    sub.add_argument("paths", nargs="+", metavar="path", help=where)
+    sub.add_argument("--out", type=Path, required=True, help="folder to make")
+    sub.add_argument("--to", choices=("cache", "rlds"), default="cache", help="(%(default)s)")
+    _add_keys(sub)
+    return parser
+
+
+def _add_keys(parser: argparse.ArgumentParser) -> None:
+    """The options that say what is what in a LeRobot dataset, see `Keys`."""
+    add = parser.add_argument_group("LeRobot datasets").add_argument
+    add("--state", default=Keys.state, help="feature with joints and gripper (%(default)s)")
+    add("--action", default=Keys.action, help="feature with their targets (%(default)s)")
+    names = "names or indices of its numbers, joints first, gripper last (all)"
+    add("--state-numbers", nargs="+", default=(), metavar="NAME", help=names)
+    add("--action-numbers", nargs="+", default=(), metavar="NAME", help=names)
+    text = "cameras wanted and what they are called here (all)"
+    add("--cameras", nargs="+", default=(), metavar="NAME=FEATURE", type=_camera, help=text)
+    add("--angles", choices=("radians", "degrees"), default=Keys.angles, help="(%(default)s)")
+    add("--gripper", choices=("metres", "millimetres"), default=Keys.gripper, help="(%(default)s)")
+    add("--every", type=int, default=1, help="take every so many-th frame (%(default)s)")
+    text = "longest side of a picture [pixels]; larger ones are reduced, 0: none (%(default)s)"
+    add("--image-size", type=int, default=224, help=text)
+
+
+def _keys(options: argparse.Namespace) -> Keys:
+    return Keys(
+        state=options.state,
+        action=options.action,
+        state_numbers=tuple(options.state_numbers),
+        action_numbers=tuple(options.action_numbers),
+        cameras=dict(options.cameras),
+        angles=options.angles,
+        gripper=options.gripper,
+        every=options.every,
+        image_size=options.image_size,
+    )
+
+
+def _camera(text: str) -> tuple[str, str]:
+    """NAME=FEATURE; argparse says what is not."""
+    name, equals, feature = text.partition("=")
+    if not (name and equals and feature):
+        raise argparse.ArgumentTypeError(f"must be NAME=FEATURE, not {text}")
+    return name, feature
+
+
+@contextmanager
+def _bar(title: str) -> Iterator[Report]:
+    """A progress bar, and what moves it."""
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn(), TextColumn("steps"))
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        bar = progress.add_task(title, total=None)
+        yield lambda done, total: progress.update(bar, completed=done, total=total)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,34 @@
+"""Any dataset in RLDS form, for whoever reads that; `cache.write` is what training needs."""
+
+import os
+
+from envs import rlds
+from envs.episodes import concatenate, creating
+from lorasp_jax.data.source import Progress, Source
+
+_TOGETHER = 16  # episodes in a file
+
+
+def to_rlds(source: Source, path: str | os.PathLike[str], progress: Progress) -> None:
+    """Writes an RLDS folder, which is there only when all of it is; see `envs.rlds`.
+
+    Args:
+        source: a dataset of one task; it is not changed.
+        path: the folder to make.
+        progress: told of the steps.
+
+    Raises:
+        ValueError: the path exists already, or the episodes differ in more than their steps.
+        OSError: there is no room for it.
+    """
+    with creating(path) as folder:
+        parts, done = rlds.Parts(folder, {}), 0
+        for first in range(0, len(source), _TOGETHER):
+            numbers = range(first, min(first + _TOGETHER, len(source)))
+            part = []
+            for number in numbers:
+                part.append(source.episode(number))
+                done += part[-1].num_steps
+                progress(done, source.num_steps)
+            parts.append(concatenate(part))
+        parts.complete()

@@ -1,0 +1,183 @@
+"""Where things lie in a LeRobot dataset: versions 2.0, 2.1 and 3.0 differ only here.
+
+    2.x   a parquet file for each episode, a video for each episode and camera; meta/*.jsonl
+    3.0   many episodes in one file of either kind; meta/**/*.parquet
+
+Source: LeRobot, src/lerobot/datasets/utils.py, at 0.3.3 (2.1) and at 0.6.1 (3.0).
+"""
+
+import contextlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from lorasp_jax.data.films import reason
+
+VERSIONS = ("v2.0", "v2.1", "v3.0")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Where an episode is.
+
+    Attributes:
+        number: its index in the dataset.
+        length: frames.
+        rows: parquet file that holds its numbers, perhaps with those of others.
+        films: feature -> video file and the time at which the episode begins in it [s].
+    """
+
+    number: int
+    length: int
+    rows: Path
+    films: Mapping[str, tuple[Path, float]]
+
+
+@dataclass(frozen=True)
+class Index:
+    """What a dataset says of itself.
+
+    Attributes:
+        version: of the format.
+        fps: frames a second.
+        robot: its type, as the writer called it.
+        features: name -> dtype, shape, names.
+        tasks: task index -> instruction.
+        recordings: of all episodes, in order.
+    """
+
+    version: str
+    fps: float
+    robot: str
+    features: Mapping[str, Mapping[str, Any]]
+    tasks: Mapping[int, str]
+    recordings: Sequence[Recording]
+
+
+def is_lerobot(folder: Path) -> bool:
+    """Whether a folder looks like a LeRobot dataset."""
+    return (folder / "meta" / "info.json").is_file()
+
+
+def read_index(folder: Path) -> Index:
+    """Everything but the episodes themselves.
+
+    Raises:
+        ValueError: not a LeRobot dataset of a known version, or damaged.
+    """
+    path = folder / "meta" / "info.json"
+    if not path.is_file():
+        raise ValueError(f"{folder} is not a LeRobot dataset: there is no meta/info.json in it")
+    with damage(path):
+        info = json.loads(path.read_text())
+        version, fps, features = info["codebase_version"], float(info["fps"]), info["features"]
+        videos = [name for name, feature in features.items() if feature["dtype"] == "video"]
+        robot = str(info.get("robot_type") or "unknown")
+    if version not in VERSIONS:
+        raise ValueError(f"{path} is of version {version!r}; known are {', '.join(VERSIONS)}")
+    if not 0 < fps < float("inf"):
+        raise ValueError(f"{path} has {fps:g} frames a second")
+    read = _read_3 if version == "v3.0" else _read_2
+    tasks, recordings = read(folder, info, videos)
+    _check(folder, info, recordings)
+    return Index(version, fps, robot, features, tasks, recordings)
+
+
+def _read_2(
+    folder: Path, info: Mapping[str, Any], videos: Sequence[str]
+) -> tuple[dict[int, str], list[Recording]]:
+    """Tasks and episodes of versions 2.0 and 2.1."""
+    path = folder / "meta" / "tasks.jsonl"
+    with damage(path):
+        tasks = {int(row["task_index"]): str(row["task"]) for row in _json_lines(path)}
+    path = folder / "meta" / "episodes.jsonl"
+    recordings = []
+    with damage(path):
+        for row in _json_lines(path):
+            number = int(row["episode_index"])
+            of = {"episode_index": number, "episode_chunk": number // int(info["chunks_size"])}
+            films = {
+                key: (folder / info["video_path"].format(video_key=key, **of), 0.0)
+                for key in videos
+            }
+            rows = folder / info["data_path"].format(**of)
+            recordings.append(Recording(number, int(row["length"]), rows, films))
+    return tasks, recordings
+
+
+def _read_3(
+    folder: Path, info: Mapping[str, Any], videos: Sequence[str]
+) -> tuple[dict[int, str], list[Recording]]:
+    """Tasks and episodes of version 3.0."""
+    path = folder / "meta" / "tasks.parquet"
+    with damage(path):
+        # Written by pandas, whose index may or may not have kept its name.
+        named = [
+            {"task": row.pop("__index_level_0__", None), **row}
+            for row in pq.read_table(path).to_pylist()
+        ]
+        tasks = {int(row["task_index"]): str(row["task"]) for row in named}
+    recordings = []
+    for path in sorted((folder / "meta" / "episodes").rglob("*.parquet")):
+        with damage(path):
+            names = [n for n in pq.read_schema(path).names if not n.startswith("stats/")]
+            for row in pq.read_table(path, columns=names).to_pylist():
+                at = {"chunk_index": row["data/chunk_index"], "file_index": row["data/file_index"]}
+                films = {key: _film_3(folder, info, key, row) for key in videos}
+                rows = folder / info["data_path"].format(**at)
+                number, length = int(row["episode_index"]), int(row["length"])
+                recordings.append(Recording(number, length, rows, films))
+    return tasks, recordings
+
+
+def _film_3(
+    folder: Path, info: Mapping[str, Any], key: str, row: Mapping[str, Any]
+) -> tuple[Path, float]:
+    """Where an episode's video is, in version 3.0."""
+    at = {name: row[f"videos/{key}/{name}"] for name in ("chunk_index", "file_index")}
+    path = folder / info["video_path"].format(video_key=key, **at)
+    return path, float(row[f"videos/{key}/from_timestamp"])
+
+
+def _check(folder: Path, info: Mapping[str, Any], recordings: Sequence[Recording]) -> None:
+    """Raise ValueError unless these are all the episodes there should be, none of them empty."""
+    if not recordings:
+        raise ValueError(f"{folder} holds no episode")
+    empty = [recording.number for recording in recordings if recording.length < 1]
+    if empty:
+        raise ValueError(f"episode {empty[0]} of {folder} is empty")
+    frames = sum(recording.length for recording in recordings)
+    for name, found in (("total_episodes", len(recordings)), ("total_frames", frames)):
+        if info.get(name, found) != found:
+            raise ValueError(
+                f"{folder} says {name} is {info[name]} in meta/info.json, but lists {found}"
+            )
+
+
+def _json_lines(path: Path) -> Iterator[dict[str, Any]]:
+    return (json.loads(line) for line in path.read_text().splitlines() if line.strip())
+
+
+@contextlib.contextmanager
+def damage(path: Path) -> Iterator[None]:
+    """What goes wrong inside becomes one ValueError about this file."""
+    try:
+        yield
+    except KeyError as error:
+        raise ValueError(f"{path} lacks {error}") from error
+    except FileNotFoundError as error:
+        raise ValueError(f"{path} is missing") from error
+    except (
+        pa.ArrowException,
+        OSError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        IndexError,
+    ) as error:
+        raise ValueError(f"{path} is damaged ({reason(error)})") from error

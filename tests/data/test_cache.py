@@ -1,0 +1,217 @@
+"""The cache: what goes in comes out, whole or not at all."""
+
+import contextlib
+import dataclasses
+import json
+import shutil
+
+import jax
+import numpy as np
+import pytest
+
+from envs.episodes import Episodes
+from lorasp_jax.data import cache
+from lorasp_jax.data.batches import flatten, gather
+from lorasp_jax.data.lerobot import Keys, LeRobot
+from lorasp_jax.data.opening import open_source
+from tests.data.lerobots import GOLDEN, VERSIONS, copied, digest, edit_rows, golden, set_value
+from tests.runs import random_episodes
+
+
+def quietly(done, total):
+    assert 0 < done <= total
+
+
+def written(folder, *sources):
+    cache.write(sources, folder, quietly)
+    return cache.Cache(folder)
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory):
+    """Two tasks' episodes, and a cache of them."""
+    folder, parts = tmp_path_factory.mktemp("simulated"), []
+    for number, task in enumerate(("press", "pour")):
+        parts.append(random_episodes(task, number))
+        parts[-1].save(folder / f"{task}.npz")
+    sources = [open_source(folder / f"{part.task}.npz") for part in parts]
+    return parts, written(folder / "cache", *sources)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_windows_are_those_of_lerobot(version, tmp_path):
+    """Padded where LeRobot pads, and statistics as LeRobot has them."""
+    found = written(tmp_path / "cache", LeRobot(golden(version)))
+    with np.load(GOLDEN / f"lerobot_{version}" / "truth.npz") as truth:
+        windows = gather(found.steps, truth["window_index"], 6)
+        np.testing.assert_array_equal(windows.actions, truth["window_action"])
+        np.testing.assert_array_equal(windows.inside, ~truth["window_action_is_pad"])
+        np.testing.assert_array_equal(windows.state, truth["all/state"][truth["window_index"]])
+        tasks = np.array(found.instructions)[found.steps.instruction]
+        np.testing.assert_array_equal(tasks, truth["all/task"])
+        index = truth["index"]
+        difference = found.steps.image["wrist"][index].astype(int) - truth["wrist_uint8_hwc"]
+        assert np.abs(difference).max() <= 3
+    with np.load(GOLDEN / "lerobot_v3" / "truth.npz") as truth:
+        for name in ("mean", "std", "min", "max"):
+            for key, known in (
+                ("observation.state", found.statistics.state),
+                ("action", found.statistics.action),
+            ):
+                wanted = truth[f"stats/{key}/{name}"]
+                np.testing.assert_allclose(known[name], wanted, rtol=1e-6, atol=1e-6)
+
+
+def test_steps_are_those_of_the_device(simulated):
+    """What training reads from files is what it has on the device where it fits."""
+    parts, found = simulated
+    expected = flatten(parts)
+    table = np.array([text for part in parts for text in part.instructions])
+    names = np.array(found.instructions)
+    for name in ("state", "action", "end"):
+        np.testing.assert_array_equal(getattr(found.steps, name), getattr(expected, name))
+    np.testing.assert_array_equal(
+        names[found.steps.instruction], table[np.asarray(expected.instruction)]
+    )
+    assert jax.tree.structure(found.steps) == jax.tree.structure(expected)
+    for name, picture in expected.image.items():
+        np.testing.assert_array_equal(found.steps.image[name], picture)
+
+
+def test_episodes_come_back(simulated):
+    parts, found = simulated
+    assert (len(found), found.num_steps, found.control_dt) == (6, 42, 0.1)
+    source, number = parts[1], 4 - 3
+    episode = found.episode(4)
+    episode.validate()
+    length = source.length[number]
+    np.testing.assert_array_equal(episode.action[0], source.action[number, :length])
+    np.testing.assert_array_equal(episode.image["side"][0], source.image["side"][number, :length])
+    assert episode.instructions[episode.instruction[0]] == source.instructions[1]
+    assert (episode.task, episode.robot) == ("pour", "piper")
+    assert found.episode(4, ()).image == {}
+
+
+def test_files_are_plain(simulated):
+    """Anybody reads them with NumPy."""
+    parts, found = simulated
+    state = np.load(found.path / "state.npy")
+    np.testing.assert_array_equal(state, flatten(parts).state)
+    assert not [path for path in found.path.parent.iterdir() if path.name.startswith(".")]
+
+
+class Broken:
+    """Episodes, the last of which cannot be read."""
+
+    kind, cameras, control_dt, num_steps = "broken", ("side", "wrist"), 0.1, 10
+
+    def __init__(self, *episodes: Episodes):
+        self.episodes = episodes
+
+    def __len__(self):
+        return len(self.episodes) + 1
+
+    def episode(self, number, cameras=None):
+        if number == len(self.episodes):
+            raise ValueError("the film ends")
+        return self.episodes[number]
+
+
+def one(**changes):
+    return dataclasses.replace(random_episodes("press", 0).select([0]), **changes)
+
+
+def test_all_or_nothing(tmp_path, simulated):
+    with pytest.raises(ValueError, match="the film ends"):
+        written(tmp_path / "cache", Broken(one()))
+    assert not list(tmp_path.iterdir())
+    before = digest(simulated[1].path)
+    with pytest.raises(ValueError, match="exists already"):
+        written(simulated[1].path, Broken(one()))
+    assert digest(simulated[1].path) == before
+    with pytest.raises(ValueError, match="no episode"):
+        written(tmp_path / "cache")
+
+
+def test_no_room(tmp_path, monkeypatch):
+    class Full(cache._Column):
+        def append(self, rows):
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(cache, "_Column", Full)
+    with pytest.raises(OSError, match="No space left"):
+        written(tmp_path / "cache", Broken(one()))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"robot": "panda"}, "robot is 'piper' in the first one and 'panda'"),
+        ({"control_dt": 0.05}, r"control_dt is 0\.1"),
+        ({"image": {"side": np.zeros((1, 9, 16, 32, 3), np.uint8)}}, "cameras is"),
+        ({"state": np.zeros((1, 9, 8), np.float32)}, "action must have shape"),
+        ({"action": np.full((1, 9, 7), np.nan, np.float32)}, "action is not finite"),
+    ],
+)
+def test_episodes_of_another_kind(changes, sentence, tmp_path):
+    with pytest.raises(ValueError, match=sentence):
+        written(tmp_path / "cache", Broken(one(), one(**changes)))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_broken_dataset_leaves_no_cache(tmp_path):
+    folder = copied("v3", tmp_path)
+    edit_rows(folder, set_value("action", 100, lambda x: [np.nan] * len(x)))
+    before = digest(folder)
+    with pytest.raises(ValueError, match="action is not finite in number 0 at step 2 of episode 0"):
+        written(tmp_path / "cache", LeRobot(folder))
+    assert digest(folder) == before
+    assert [path.name for path in tmp_path.iterdir()] == ["dataset"]
+
+
+def test_every_damage_is_one_sentence(simulated, tmp_path):
+    for number, file in enumerate(sorted(simulated[1].path.iterdir())):
+        for share in (0, 0.5, None):
+            folder = tmp_path / f"{number} {share}"
+            shutil.copytree(simulated[1].path, folder)
+            whole = file.read_bytes()
+            (folder / file.name).write_bytes(whole[: int(share * len(whole))] if share else b"")
+            if share is None:
+                (folder / file.name).unlink()
+            with pytest.raises(ValueError, match=r"is damaged|is not a cache") as caught:
+                cache.Cache(folder)
+            assert "\n" not in str(caught.value)
+
+
+def test_any_change_of_the_header_is_read_or_refused(simulated, tmp_path):
+    folder = shutil.copytree(simulated[1].path, tmp_path / "cache")
+    path = folder / "cache.json"
+    good = json.loads(path.read_text())
+    refused = 0
+    for key in good:
+        for value in (..., None, -1, "x", [], {}):
+            changed = {name: x for name, x in good.items() if name != key or value is not ...}
+            if value is not ...:
+                changed[key] = value
+            path.write_text(json.dumps(changed))
+            with contextlib.suppress(ValueError):
+                found = cache.Cache(folder)
+                [found.episode(number) for number in range(len(found))]
+                refused -= 1
+            refused += 1
+    assert refused >= 5 * len(good) - 2  # "x" is the name of a robot
+
+
+def test_opening(tmp_path, simulated):
+    assert open_source(golden("v3")).kind == "LeRobot v3.0"
+    assert open_source(simulated[1].path).kind == "cache"
+    assert open_source(simulated[1].path, Keys(image_size=64)).kind == "cache"
+    for where, sentence in (
+        (tmp_path, "is no dataset: it has neither"),
+        (tmp_path / "nothing", "does not exist"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            open_source(where)
+    with pytest.raises(ValueError, match="is no LeRobot dataset: it says itself"):
+        open_source(simulated[1].path, Keys(angles="degrees"))

@@ -1,0 +1,124 @@
+"""`python -m lorasp_jax.data`, without the interpreter around it."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from envs import rlds
+from lorasp_jax.data import conversion
+from lorasp_jax.data.__main__ import main
+from lorasp_jax.data.cache import Cache
+from lorasp_jax.data.lerobot import LeRobot
+from lorasp_jax.data.opening import open_source
+from tests.data.lerobots import copied, cut, digest, golden
+from tests.envs.test_episodes import assert_equal
+
+
+def run(capsys, *arguments):
+    code = main([str(argument) for argument in arguments])
+    printed = capsys.readouterr()
+    return code, printed.out, printed.err
+
+
+def test_inspect(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    before = digest(golden("v3"))
+    code, out, _ = run(capsys, "inspect", golden("v3"))
+    assert code == 0
+    for text in (
+        "LeRobot v3.0",
+        "side 128 x 96, wrist 128 x 96",
+        "4, of 25 to 40 steps",
+        "126 at 10 Hz",
+        "2  press the green button",
+        "action[6]",
+    ):
+        assert text in out
+    with Image.open("dataset.png") as picture:
+        assert picture.size[1] > 100
+    code, _, err = run(capsys, "inspect", golden("v3"))
+    assert (code, "dataset.png exists already" in err) == (2, True)
+    assert run(capsys, "inspect", golden("v3"), "--overwrite")[0] == 0
+    assert digest(golden("v3")) == before
+
+
+def test_convert_to_all_kinds_and_back(capsys, tmp_path):
+    made, again, third = tmp_path / "cache", tmp_path / "rlds", tmp_path / "third"
+    assert run(capsys, "convert", golden("v3"), "--out", made)[0] == 0
+    code, _, err = run(capsys, "convert", made, "--to", "rlds", "--out", again)
+    assert code == 0
+    assert "126/126 steps" in err
+    assert run(capsys, "convert", again, "--out", third)[0] == 0
+    dataset = LeRobot(golden("v3"))
+    for folder in (made, again, third):
+        source = open_source(folder)
+        for number in range(4):
+            assert_equal(source.episode(number), dataset.episode(number))
+    info = json.loads((again / "dataset_info.json").read_text())
+    assert info["description"] == "Recorded episodes of dataset by piper."
+
+
+def test_rlds_in_several_files(tmp_path, monkeypatch):
+    monkeypatch.setattr(conversion, "_TOGETHER", 3)
+    reports = []
+    conversion.to_rlds(
+        LeRobot(golden("v21")), tmp_path / "rlds", lambda *done: reports.append(done)
+    )
+    assert [done for done, _ in reports] == [25, 58, 98, 126]
+    found = rlds.read(tmp_path / "rlds")
+    assert found.length.tolist() == [25, 33, 40, 28]
+    assert len(list((tmp_path / "rlds").glob("*array_record*"))) == 2
+
+
+def test_two_datasets_in_one_cache(capsys, tmp_path):
+    out = tmp_path / "both"
+    options = ["--cameras", "main=observation.images.side", "--every", "2", "--image-size", "64"]
+    code, out_text, _ = run(capsys, "convert", golden("v3"), golden("v21"), "--out", out, *options)
+    assert (code, "8 episodes" in out_text) == (0, True)
+    found = Cache(out)
+    assert (len(found), found.control_dt, found.cameras) == (8, 0.2, {"main": [48, 64]})
+    half = len(found.steps.end) // 2
+    np.testing.assert_array_equal(found.steps.action[:half], found.steps.action[half:])
+    assert len(found.instructions) == 2
+
+
+@pytest.mark.parametrize("to", ["cache", "rlds"])
+def test_a_film_that_ends_too_early(to, capsys, tmp_path):
+    folder = copied("v21", tmp_path)
+    cut(folder / "videos", "*3.mp4", 0.5)
+    before = digest(folder)
+    code, _, err = run(capsys, "convert", folder, "--to", to, "--out", tmp_path / "made")
+    assert code == 2
+    assert "error: " in err
+    assert "000003.mp4" in err.replace("\n", "")
+    assert digest(folder) == before
+    assert [path.name for path in tmp_path.iterdir()] == ["dataset"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["inspect", "nothing"], "nothing does not exist"),
+        (["convert", golden("v3"), golden("v21"), "--to", "rlds"], "one dataset, not of 2"),
+        (["convert", golden("v3"), "--every", "0"], "every must be at least 1"),
+        (["convert", golden("v3"), "--state-numbers", "0", "1"], "2 for state and 7 for action"),
+    ],
+)
+def test_bad_input(arguments, sentence, capsys, tmp_path):
+    code, _, err = run(capsys, *arguments, "--out", tmp_path / "new.png")
+    assert code == 2
+    assert sentence in err.replace("\n", " ")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupt_leaves_nothing(capsys, tmp_path, monkeypatch):
+    def stop(self, number, cameras=None):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(LeRobot, "episode", stop)
+    assert run(capsys, "convert", golden("v3"), "--out", tmp_path / "cache")[0] == 130
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(SystemExit):
+        main(["convert", "x", "--out", "y", "--cameras", "side"])

@@ -1,0 +1,101 @@
+"""A run's dataset: what does not fit is said before anything long begins."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from lorasp_jax.config import DataConfig
+from lorasp_jax.data import cache, imported
+from lorasp_jax.data.cache import Cache
+from lorasp_jax.data.opening import open_source
+from lorasp_jax.models.pi0 import Pi0Config
+from tests.data.lerobots import golden
+from tests.runs import CONFIG, random_episodes
+
+MODEL = dataclasses.replace(Pi0Config.dummy(), max_tokens=12)
+
+
+def config(source, **changes):
+    return dataclasses.replace(CONFIG, data=DataConfig(source=str(source)), **changes)
+
+
+def quietly(done, total):
+    pass
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory):
+    """A cache of two tasks."""
+    folder = tmp_path_factory.mktemp("simulated")
+    for number, task in enumerate(("press", "pour")):
+        random_episodes(task, number).save(folder / f"{task}.npz")
+    sources = [open_source(folder / f"{task}.npz") for task in ("press", "pour")]
+    cache.write(sources, folder / "cache", quietly)
+    return Cache(folder / "cache")
+
+
+def test_a_dataset_becomes_a_cache_once(tmp_path):
+    chosen = config(golden("v3"))
+    source = imported.opened(chosen, MODEL, tmp_path)
+    found = imported.cached(source, tmp_path, quietly)
+    size = MODEL.image_size  # what the model sees, the longer side
+    assert found.cameras["side"] == [size * 96 // 128, size]
+    again = imported.opened(chosen, MODEL, tmp_path)
+    assert isinstance(again, Cache)
+    assert again.path == found.path == tmp_path / "cache" / "steps"
+    assert imported.cached(again, tmp_path, quietly) is again
+    assert not imported.is_simulated(found)
+
+
+@pytest.mark.parametrize(
+    ("changes", "model", "sentence"),
+    [
+        (
+            {"control_dt": 0.05},
+            {},
+            r"has 0\.1 s between two steps, this run has --control-dt 0\.05",
+        ),
+        ({}, {"cameras": ("side",)}, "has the cameras side, wrist, the backbone places for 1"),
+    ],
+)
+def test_what_does_not_fit_is_said_at_once(changes, model, sentence, tmp_path):
+    with pytest.raises(ValueError, match=sentence):
+        imported.opened(
+            config(golden("v3"), **changes),
+            dataclasses.replace(MODEL, **model),
+            tmp_path,
+        )
+    assert not list(tmp_path.iterdir())
+
+
+def test_outline(simulated):
+    """The numbers are those of the episodes; one picture stands for all."""
+    found = imported.outline(simulated)
+    assert list(found) == ["press", "pour"]
+    for number, (task, group) in enumerate(found.items()):
+        wanted = random_episodes(task, number)
+        group.validate()
+        np.testing.assert_array_equal(group.length, wanted.length)
+        for episode, length in enumerate(wanted.length):
+            for name in ("state", "action"):
+                rows = getattr(group, name)[episode]
+                expected = getattr(wanted, name)[episode, :length]
+                np.testing.assert_array_equal(rows[:length], expected)
+                assert not rows[length:].any()
+            assert (
+                group.instructions[group.instruction[episode]]
+                == wanted.instructions[wanted.instruction[episode]]
+            )
+        first = wanted.image["wrist"][0, 0]
+        assert (group.image["wrist"] == first).all()
+        assert group.image["wrist"].base is not None  # it takes no memory
+
+
+def test_what_can_be_simulated(simulated):
+    assert imported.is_simulated(simulated)
+    facts = dict(simulated.facts)
+    for changed in ({"robot": "so101"}, {"tasks": ["press", "fold"]}):
+        simulated.facts = facts | changed
+        assert not imported.is_simulated(simulated)
+    simulated.facts = facts

@@ -1,0 +1,72 @@
+"""What is said of a dataset is what is in it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from lorasp_jax.data import inspection
+from lorasp_jax.data.lerobot import Keys, LeRobot
+from tests.data.lerobots import GOLDEN, copied, edit_info, golden
+
+
+@pytest.fixture(scope="module")
+def source():
+    return LeRobot(golden("v3"))
+
+
+def test_summary(source):
+    found = inspection.summarise(source)
+    with np.load(GOLDEN / "lerobot_v3" / "truth.npz") as truth:
+        np.testing.assert_array_equal(found.state, truth["all/state"])
+        np.testing.assert_array_equal(found.action, truth["all/action"])
+    assert found.length.tolist() == [25, 33, 40, 28]
+    assert found.phrases == {
+        "pick up the red cube and place it in the basket": 2,
+        "press the green button": 2,
+    }
+    assert not inspection.hints(found)
+
+
+def test_units_are_doubted(source):
+    found = inspection.summarise(source)
+    scale = np.array([57.3] * 6 + [1000], np.float32)
+    degrees, millimetres = inspection.hints(dataclasses.replace(found, state=found.state * scale))
+    assert "--angles degrees" in degrees
+    assert "--gripper millimetres" in millimetres
+
+
+def test_contact_sheet(source, tmp_path):
+    """A row for each episode; the bar at the bottom of each picture tells which it is."""
+    path = tmp_path / "sheet.png"
+    inspection.write_contact_sheet(source, path)
+    with Image.open(path) as picture:
+        sheet = np.asarray(picture).astype(int)
+    row = inspection.LINE + 96 + 2
+    assert sheet.shape == (4 * row, inspection.FRAMES * (2 * 128 + 2), 3)
+    red = (sheet[..., 0] > 180) & (sheet[..., 1] < 80)
+    widths = [red[(number + 1) * row - 6, :128].sum() for number in range(4)]
+    assert np.allclose(np.diff(widths), widths[0], atol=2)
+    assert widths[0] > 10
+    white = (sheet[inspection.LINE + 4] > 200).all(-1).reshape(inspection.FRAMES, -1)
+    assert (np.diff(white[:, :128].sum(-1)) > 10).all()  # time goes on from left to right
+    assert [file.name for file in tmp_path.iterdir()] == ["sheet.png"]
+
+
+def test_pictures_are_reduced_and_of_any_shape(tmp_path):
+    """And an instruction in any script is no error."""
+    folder = copied("v21", tmp_path)
+    tasks = folder / "meta" / "tasks.jsonl"
+    tasks.write_text(tasks.read_text().replace("green button", "绿色按钮"))
+    edit_info(folder, lambda info: info["features"].pop("observation.images.wrist"))
+    sheet = inspection.contact_sheet(LeRobot(folder, Keys(image_size=32)))
+    assert sheet.shape == (4 * (inspection.LINE + 24 + 2), inspection.FRAMES * 34, 3)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 6, 7, 100])
+def test_chosen_ones_are_spread_over_all(count):
+    found = inspection._spread(count, 6)
+    assert found[0] == 0
+    assert found[-1] == count - 1
+    assert len(found) == len(set(found)) == min(count, 6)

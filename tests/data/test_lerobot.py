@@ -1,0 +1,274 @@
+"""LeRobot datasets, against what LeRobot's own readers give of them."""
+
+import contextlib
+import io
+import json
+import math
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from PIL import Image
+
+from lorasp_jax.data.lerobot import Keys, LeRobot
+from tests.data.lerobots import (
+    GOLDEN,
+    VERSIONS,
+    copied,
+    cut,
+    digest,
+    edit_info,
+    edit_rows,
+    golden,
+    replaced,
+    set_value,
+)
+
+
+def read_all(folder, keys=None, cameras=None):
+    dataset = LeRobot(folder, keys)
+    return [dataset.episode(number, cameras) for number in range(len(dataset))]
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_reads_what_lerobot_reads(version):
+    dataset = LeRobot(golden(version))
+    episodes = [dataset.episode(number) for number in range(len(dataset))]
+    with np.load(GOLDEN / f"lerobot_{version}" / "truth.npz") as truth:
+        for name in ("state", "action"):
+            found = np.concatenate([getattr(e, name)[0] for e in episodes])
+            np.testing.assert_array_equal(found, truth[f"all/{name}"])
+        steps = [(e.instructions[e.instruction[0]], n) for e in episodes for n in e.length]
+        tasks = np.concatenate([[task] * n for task, n in steps])
+        np.testing.assert_array_equal(tasks, truth["all/task"])
+        for row, (episode, frame) in enumerate(
+            zip(truth["episode_index"], truth["frame_index"], strict=True)
+        ):
+            for camera in ("side", "wrist"):
+                found = episodes[episode].image[camera][0, frame].astype(int)
+                wanted = truth[f"{camera}_uint8_hwc"][row]
+                # Another release of the decoder may round colours otherwise; a wrong frame
+                # differs by 200.
+                assert np.abs(found - wanted).max() <= 3
+    assert len(dataset) == 4
+    assert dataset.num_steps == sum(e.num_steps for e in episodes) == 126
+    assert (dataset.control_dt, episodes[0].robot) == (0.1, "piper")
+    for episode in episodes:
+        episode.validate()
+
+
+def test_order_of_reading_does_not_matter():
+    """Going back or ahead in a film seeks."""
+    dataset = LeRobot(golden("v3"))
+    forwards = [dataset.episode(number, ["side"]).image["side"] for number in range(4)]
+    for number in (2, 0, 3, 1, 1):
+        found = dataset.episode(number, ["side"]).image["side"]
+        np.testing.assert_array_equal(found, forwards[number])
+
+
+def test_numbers_are_chosen_and_converted(tmp_path):
+    """A state with more numbers, in degrees and millimetres, is the golden one again."""
+    folder = copied("v3", tmp_path)
+
+    def widen(table):
+        state = np.array(table["observation.state"].to_pylist())
+        native = np.concatenate([np.rad2deg(state[:, :6]), 1000 * state[:, 6:]], axis=1)
+        rows = np.insert(native, 3, -7.0, axis=1).tolist()
+        wide = replaced(table, "observation.state", pa.array(rows, pa.list_(pa.float64())))
+        action = np.array(table["action"].to_pylist())
+        native = np.concatenate([np.rad2deg(action[:, :6]), 1000 * action[:, 6:]], axis=1)
+        return replaced(wide, "action", pa.array(native.tolist(), pa.list_(pa.float64())))
+
+    def describe(info):
+        names = [*(f"joint_{i}.pos" for i in (1, 2, 3)), "torque"]
+        names += [*(f"joint_{i}.pos" for i in (4, 5, 6)), "gripper.pos"]
+        info["features"]["observation.state"] |= {"shape": [8], "names": {"motors": names}}
+
+    edit_rows(folder, widen)
+    edit_info(folder, describe)
+    with pytest.raises(ValueError, match=r"8 for state and 7 for action: choose among .*'torque'"):
+        LeRobot(folder)
+    joints = tuple(f"joint_{i + 1}.pos" for i in range(6))
+    for chosen in ((*joints, "gripper.pos"), ("0", "1", "2", "4", "5", "6", "7")):
+        keys = Keys(state_numbers=chosen, angles="degrees", gripper="millimetres")
+        for found, wanted in zip(
+            read_all(folder, keys, ()), read_all(golden("v3"), cameras=()), strict=True
+        ):
+            np.testing.assert_allclose(found.state, wanted.state, atol=1e-6)
+            np.testing.assert_allclose(found.action, wanted.action, atol=1e-6)
+
+
+def test_every_third_frame_goes_with_the_command_before_the_next():
+    (whole, *_), (found, *_) = read_all(golden("v21")), read_all(golden("v21"), Keys(every=3))
+    assert found.num_steps == 9  # of 25
+    np.testing.assert_array_equal(found.state[0], whole.state[0, ::3])
+    np.testing.assert_array_equal(found.action[0, :8], whole.action[0, 2:24:3])
+    np.testing.assert_array_equal(found.action[0, 8], whole.action[0, 24])
+    np.testing.assert_array_equal(found.image["side"][0], whole.image["side"][0, ::3])
+    assert found.control_dt == pytest.approx(0.3)
+
+
+def test_cameras_are_chosen_and_pictures_reduced():
+    keys = Keys(cameras={"main": "observation.images.wrist"}, image_size=64)
+    (found, *_), (whole, *_) = read_all(golden("v3"), keys), read_all(golden("v3"))
+    assert list(found.image) == ["main"]
+    assert found.image["main"].shape == (1, 25, 48, 64, 3)
+    blocks = whole.image["wrist"].reshape(1, 25, 48, 2, 64, 2, 3).mean((3, 5))
+    assert np.abs(found.image["main"] - blocks).mean() < 4
+
+
+def test_pictures_in_columns(tmp_path):
+    """Datasets without videos hold PNG files among their numbers."""
+    folder, key = copied("v21", tmp_path), "observation.images.side"
+    (wanted, *_) = read_all(golden("v21"), cameras=["side"])
+
+    def png(picture):
+        file = io.BytesIO()
+        Image.fromarray(picture).save(file, "png")
+        return {"bytes": file.getvalue(), "path": None}
+
+    files = [png(picture) for picture in wanted.image["side"][0]]
+    edit_rows(folder, lambda t: t.append_column(key, pa.array(files)))
+    edit_info(folder, lambda info: info["features"][key].update(dtype="image"))
+    found = LeRobot(folder).episode(0)
+    np.testing.assert_array_equal(found.image["side"], wanted.image["side"])
+    assert list(found.image) == ["side", "wrist"]
+    edit_rows(folder, set_value(key, 3, lambda file: file | {"bytes": file["bytes"][:100]}))
+    with pytest.raises(ValueError, match=r"000000\.parquet is damaged"):
+        LeRobot(folder).episode(0)
+
+
+def break_numbers(value):
+    return lambda folder: edit_rows(
+        folder, set_value("observation.state", 3, lambda x: [*x[:-1], value])
+    )
+
+
+BROKEN = {
+    "no column": (lambda f: edit_rows(f, lambda t: t.drop_columns("action")), "lacks 'action'"),
+    "no timestamps": (lambda f: edit_rows(f, lambda t: t.drop_columns("timestamp")), "lacks"),
+    "no feature": (lambda f: edit_info(f, lambda i: i["features"].pop("action")), "lacks 'action'"),
+    "no pictures": (
+        lambda f: edit_info(f, lambda i: [i["features"].pop(k) for k in [*i["features"]][2:4]]),
+        "no pictures at all",
+    ),
+    "other width": (
+        lambda f: edit_info(f, lambda i: i["features"]["action"].update(shape=[6])),
+        "7 for state and 6 for action",
+    ),
+    "wrong width": (
+        lambda f: edit_info(
+            f, lambda i: [i["features"][k].update(shape=[6]) for k in [*i["features"]][:2]]
+        ),
+        r"\['7'\] numbers in observation.state of episode 0, not 6",
+    ),
+    "one short row": (
+        lambda f: edit_rows(f, set_value("action", 3, lambda x: x[:-1])),
+        r"\['6', '7'\] numbers in action",
+    ),
+    "no number": (break_numbers(None), "not finite in number 6 at step 3|damaged"),
+    "nan": (break_numbers(math.nan), "state is not finite in number 6 at step 3 of episode 0"),
+    "text": (
+        lambda f: edit_rows(f, lambda t: replaced(t, "action", pa.array(["up"] * len(t)))),
+        "damaged",
+    ),
+    "other fps": (lambda f: edit_info(f, lambda i: i.update(fps=30)), "not the rate of 30 frames"),
+    "no fps": (lambda f: edit_info(f, lambda i: i.update(fps=0)), "0 frames a second"),
+    "mixed fps": (
+        lambda f: edit_rows(f, set_value("timestamp", 20, lambda x: x / 2)),
+        "frame 20 of episode 0 at 1.000 s",
+    ),
+    "lost frame": (lambda f: edit_rows(f, lambda t: t.slice(1)), "must have frames 0 to 24"),
+    "unknown task": (
+        lambda f: edit_rows(f, lambda t: replaced(t, "task_index", pa.array([7] * len(t)))),
+        r"one task that meta lists, not \[7\]",
+    ),
+    "version": (lambda f: edit_info(f, lambda i: i.update(codebase_version="v1.6")), "'v1.6'"),
+    "count": (lambda f: edit_info(f, lambda i: i.update(total_frames=125)), "is 125 .* lists 126"),
+    "cut parquet": (lambda f: cut(f / "data", "*.parquet", 0.7), "parquet is damaged"),
+    "cut json": (lambda f: cut(f, "info.json", 0.7), "info.json is damaged"),
+    "no info": (lambda f: (f / "meta" / "info.json").unlink(), "not a LeRobot dataset"),
+    "cut video": (lambda f: cut(f, "*.mp4", 0.6), "mp4 (is no whole video|gives)"),
+    "no video": (lambda f: next(iter(f.rglob("*.mp4"))).unlink(), "mp4 is no whole video"),
+}
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize("name", BROKEN)
+def test_broken_datasets_are_refused_in_one_sentence(name, version, tmp_path):
+    change, sentence = BROKEN[name]
+    folder = copied(version, tmp_path)
+    change(folder)
+    before = digest(folder)
+    with pytest.raises(ValueError, match=sentence) as caught:
+        read_all(folder)
+    assert "\n" not in str(caught.value)
+    assert digest(folder) == before
+
+
+def empty_episode(row):
+    return row | {"length": 0} if row["episode_index"] == 2 else row
+
+
+def test_empty_episode(tmp_path):
+    folder = copied("v21", tmp_path)
+    path = folder / "meta" / "episodes.jsonl"
+    rows = [empty_episode(json.loads(line)) for line in path.read_text().splitlines()]
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    with pytest.raises(ValueError, match=r"episode 2 of .* is empty"):
+        LeRobot(folder)
+    (tmp_path / "3").mkdir()
+    folder = copied("v3", tmp_path / "3")
+    edit_rows(folder, set_value("length", 2, lambda _: 0), of="meta/episodes")
+    with pytest.raises(ValueError, match=r"episode 2 of .* is empty"):
+        LeRobot(folder)
+
+
+def test_film_of_another_rate(tmp_path):
+    """In 3.0, an episode begins where the index says, between no two frames."""
+    folder = copied("v3", tmp_path)
+    name = "videos/observation.images.side/from_timestamp"
+    edit_rows(folder, set_value(name, 1, lambda time: time + 0.05), of="meta/episodes")
+    dataset = LeRobot(folder)
+    dataset.episode(0)
+    with pytest.raises(ValueError, match="does not run at the dataset's 10 frames a second"):
+        dataset.episode(1)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_any_change_of_the_description_is_read_or_refused(version, tmp_path):
+    """Every field of info.json, left out and of other kinds: never another exception."""
+    folder = copied(version, tmp_path)
+    path = folder / "meta" / "info.json"
+    good = json.loads(path.read_text())
+    fields = [(good, key) for key in good]
+    fields += [(good["features"], key) for key in good["features"]]
+    fields += [(good["features"][f], k) for f in good["features"] for k in ("dtype", "shape")]
+    refused = 0
+    for owner, key in fields:
+        kept = owner.pop(key)
+        for value in (..., None, -1, "x", [], {}, [[3]]):
+            if value is not ...:
+                owner[key] = value
+            path.write_text(json.dumps(good))
+            with contextlib.suppress(ValueError):
+                read_all(folder, cameras=())
+                refused -= 1
+            refused += 1
+        owner[key] = kept
+    assert refused > 50
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {"cameras": {"side": "observation.images.front"}},
+        {"state": "observation.qpos"},
+        {"state_numbers": ("joint_1", "joint_9")},
+    ],
+)
+def test_wrong_keys_name_what_there_is(keys):
+    with pytest.raises(ValueError, match=r"there are|lacks|no joint_9 .* joint_6, gripper"):
+        LeRobot(golden("v3"), Keys(**keys))
+    with pytest.raises(ValueError, match="every must be at least 1"):
+        Keys(every=0)

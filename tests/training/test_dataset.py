@@ -1,0 +1,143 @@
+"""Runs on a dataset: prepared from the command's fields, streamed from files to the bit."""
+
+import dataclasses
+import functools
+import io
+import json
+import time
+
+import jax
+import numpy as np
+import pytest
+from flax import nnx
+from rich.console import Console
+
+from lorasp_jax import adaptation
+from lorasp_jax.config import DataConfig
+from lorasp_jax.data.batches import flatten
+from lorasp_jax.evaluation.callback import NoEvaluation
+from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.report.html import write_report
+from lorasp_jax.training import mesh as meshes
+from lorasp_jax.training import preflight, setup
+from lorasp_jax.training.loop import _batches, _Streamed, train
+from lorasp_jax.training.run_folder import read_metrics, to_json, write_json
+from tests.runs import CONFIG, Terminate, leaves, make_run, random_episodes
+
+
+def one_device(monkeypatch):
+    mesh = meshes.make_mesh(1, jax.devices()[:1])
+    monkeypatch.setattr(meshes, "make_mesh", lambda fsdp: mesh)
+
+
+def streamed(folder):
+    run = make_run(folder)
+    run.dataset = jax.tree.map(np.asarray, flatten(list(run.episodes.values())))
+    run.streams = True
+    return run
+
+
+@pytest.mark.slow
+def test_a_streamed_run_resumes_to_the_bit(tmp_path, monkeypatch):
+    one_device(monkeypatch)
+    whole = streamed(tmp_path / "whole")
+    _, before, _ = adaptation.split(whole.policy.model)
+    train(whole)
+    with pytest.raises(KeyboardInterrupt):
+        train(streamed(tmp_path / "halved"), [Terminate()])
+    halved = streamed(tmp_path / "halved")
+    train(halved, resume=True)
+    assert [row["step"] for row in read_metrics(whole.folder)] == [2, 4]
+    assert read_metrics(whole.folder) == read_metrics(halved.folder)
+    _, adapters, _ = adaptation.split(whole.policy.model)
+    _, resumed, _ = adaptation.split(halved.policy.model)
+    for name, value in leaves(adapters).items():
+        np.testing.assert_array_equal(value, leaves(resumed)[name], err_msg=name)
+        assert (value != leaves(before)[name]).any()
+
+
+def test_every_step_of_a_stretch_has_the_next_batch(tmp_path):
+    """From the step on at which a run continues, however stretches are cut."""
+    run = streamed(tmp_path / "run")
+    mesh = meshes.make_mesh()
+
+    @functools.partial(jax.jit, static_argnames="count")
+    def note(frozen, raw, state, key, count):
+        assert count == 1
+        return state + 1, {"seen": raw.state.sum() + frozen}
+
+    def seen(start, *stretches):
+        many = _Streamed(note, 1.0, _batches(run, mesh, start))
+        state, found = start, []
+        for count in stretches:
+            state, metrics = many(state, jax.random.key(0), count)
+            found += [count * float(metrics["seen"])]
+        assert state == start + sum(stretches)
+        return found
+
+    batches = _batches(run, mesh, 0)
+    each = [float(next(batches).state.sum() + 1) for _ in range(9)]
+    np.testing.assert_allclose(seen(0, 2, 4, 3), [sum(each[:2]), sum(each[2:6]), sum(each[6:])])
+    np.testing.assert_allclose(seen(5, 1, 3), [each[5], sum(each[6:])])
+    shards = next(batches).image["side"].addressable_shards
+    assert [shard.data.shape[0] for shard in shards] == [1] * 8
+
+
+@pytest.mark.slow
+def test_a_streamed_run_on_eight_devices(tmp_path, monkeypatch):
+    """The batch is split over them; the numbers are those of one."""
+    many = streamed(tmp_path / "many")
+    train(many)
+    one_device(monkeypatch)
+    one = streamed(tmp_path / "one")
+    train(one)
+    rows = zip(read_metrics(one.folder), read_metrics(many.folder), strict=True)
+    for expected, found in rows:
+        assert found["task"] == pytest.approx(expected["task"], rel=1e-5)
+
+
+def prepare(folder, monkeypatch, source, room=2**40):
+    model = Pi0Config.dummy().create(nnx.Rngs(0))
+    monkeypatch.setattr(setup, "base_model", lambda _: (model, ""))
+    monkeypatch.setattr(preflight, "available_bytes", lambda: room)
+    evaluation = dataclasses.replace(CONFIG.evaluation, execute_steps=1)
+    data = DataConfig(source=str(source))
+    config = dataclasses.replace(CONFIG, data=data, evaluation=evaluation)
+    return setup.prepare(config, folder, Console(file=io.StringIO()), time.perf_counter())
+
+
+def test_prepared(tmp_path, monkeypatch):
+    group = random_episodes("press", 0)
+    group.save(tmp_path / "press.npz")
+    run = prepare(tmp_path, monkeypatch, tmp_path / "press.npz")
+    assert (run.config.tasks, run.config.robot, run.simulated) == (("press",), "piper", True)
+    assert not run.streams
+    expected = flatten([group])
+    for name in ("state", "action", "end", "instruction"):
+        np.testing.assert_array_equal(getattr(run.steps, name), getattr(expected, name))
+    known = run.policy.processor.statistics.action
+    slots = np.array(run.policy.processor.robot_slots)
+    np.testing.assert_allclose(known["mean"][slots], expected.action.mean(0), atol=1e-6)
+    small = 2**21
+    monkeypatch.setattr(
+        preflight, "choose_remat", lambda *_: ("none", preflight.Memory(*5 * [0.0]))
+    )
+    assert not prepare(tmp_path, monkeypatch, "gone, but cached", small).streams
+    assert prepare(tmp_path, monkeypatch, "gone, but cached", small // 64).streams
+
+
+def test_without_simulation_there_is_a_report(tmp_path):
+    run = make_run(tmp_path / "run")
+    with run.timed("train"):
+        pass
+    write_json(run.folder / "config.json", to_json(run.config))
+    (run.folder / "metrics.jsonl").write_text('{"step": 2, "task": 0.5, "active_rank/vision": 3}\n')
+    NoEvaluation().on_end(run)
+    found = json.loads((run.folder / "results.json").read_text())
+    assert found["tasks"] == found["active_rank"] == {}
+    assert found["trainable_parameters"] > 0
+    page = write_report(run.folder).read_text()
+    assert "Training" in page
+    assert "Active rank" in page
+    assert "Success" not in page
+    assert "sees and does" not in page
