@@ -106,7 +106,8 @@ class LeRobot:
             widths = " and ".join(f"{len(c)} for {name}" for name, c in self._columns.items())
             raise ValueError(
                 f"state and action need as many numbers, joints and gripper, but {self.path} has "
-                f"{widths}: choose among {self._names('state')} and {self._names('action')}"
+                f"{widths}: choose state_numbers among {', '.join(self._names('state'))} and "
+                f"action_numbers among {', '.join(self._names('action'))}"
             )
         pictures = [key for key in self.cameras.values() if not self._is_film(key)]
         self._needed = [self.keys.state, self.keys.action, *_COLUMNS, *pictures]

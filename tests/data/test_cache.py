@@ -184,6 +184,20 @@ def test_every_damage_is_one_sentence(simulated, tmp_path):
             assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("place", [20, 40, 75, -3])
+@pytest.mark.parametrize("name", cache.ROWS)
+def test_flipped_bits_are_noticed(name, place, simulated, tmp_path):
+    """In the header and in the numbers."""
+    folder = shutil.copytree(simulated[1].path, tmp_path / "cache")
+    path = folder / f"{name}.npy"
+    content = bytearray(path.read_bytes())
+    content[place] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=rf"{name}\.npy is damaged") as caught:
+        cache.Cache(folder)
+    assert "\n" not in str(caught.value)
+
+
 def test_any_change_of_the_header_is_read_or_refused(simulated, tmp_path):
     folder = shutil.copytree(simulated[1].path, tmp_path / "cache")
     path = folder / "cache.json"

@@ -86,7 +86,9 @@ def test_numbers_are_chosen_and_converted(tmp_path):
 
     edit_rows(folder, widen)
     edit_info(folder, describe)
-    with pytest.raises(ValueError, match=r"8 for state and 7 for action: choose among .*'torque'"):
+    with pytest.raises(
+        ValueError, match=r"8 for state and 7 for action: choose .*3\.pos, torque, j"
+    ):
         LeRobot(folder)
     joints = tuple(f"joint_{i + 1}.pos" for i in range(6))
     for chosen in ((*joints, "gripper.pos"), ("0", "1", "2", "4", "5", "6", "7")):
