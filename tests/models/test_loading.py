@@ -75,7 +75,7 @@ def test_openpi(tmp_path):
 
 def test_ours_and_the_hub(tmp_path, monkeypatch):
     models.save(tmp_path, models.load(pi0.GOLDEN / "orbax"))
-    monkeypatch.setattr(places, "_from_hub", lambda name, only: tmp_path)
+    monkeypatch.setattr(places, "_from_hub", lambda *_: tmp_path)
     assert models.load_config("me/pi0") == pi0.CONFIG
     assert models.weights_hash(models.load("me/pi0")) == models.weights_hash(tmp_path)
 

@@ -70,7 +70,7 @@ def test_a_folder_and_the_offline_tokenizer(tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(places, "_from_hub", lambda *args: asked.append(args) or tmp_path)
     assert tokenizer.load("owner/name").vocabulary
-    assert asked == [("owner/name", ["tokenizer.json", "*.model"])]
+    assert asked == [("owner/name", ["tokenizer.json", "*.model"], "model")]
 
 
 def test_what_is_no_tokenizer_is_one_sentence(tmp_path):
