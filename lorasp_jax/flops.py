@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+from jax.interpreters import partial_eval
 
 PEAK = {"NVIDIA H200": 989e12, "NVIDIA H100": 989e12, "NVIDIA A100": 312e12, "TPU v5p": 459e12}
 """Dense bf16 operations a second by how a device's name begins (NVIDIA's and Google's data sheets,
@@ -21,13 +22,14 @@ fifth repeats one)."""
 
 
 def count(function: Callable, *arguments: Any) -> float:
-    """Operations of one call, two for each multiplication and addition.
+    """Operations of one call, two for each multiplication and addition; none for what is not used.
 
     Args:
       function: what `jax.jit` takes.
       arguments: arrays, or `jax.ShapeDtypeStruct`s; only shapes are read.
     """
-    return _of_jaxpr(jax.make_jaxpr(function)(*arguments).jaxpr)
+    jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
+    return _of_jaxpr(partial_eval.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))[0])
 
 
 def utilisation(operations: float, seconds: float) -> float | None:

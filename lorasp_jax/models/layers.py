@@ -194,7 +194,7 @@ def scan_depth(
         return jax.lax.scan(layer, x, (state, per_layer))
     states = [nnx.state(block) for block in blocks] if one_by_one else _layers_of(state)
     others = [None] * len(states) if per_layer is None else _layers_of(per_layer)
-    layer, kept = jax.jit(layer), []  # traced once
+    layer, kept = jax.jit(layer, inline=True), []  # traced once
     for own, other in zip(states, others, strict=True):
         x, keep = layer(x, (own, other))
         kept.append(keep)
