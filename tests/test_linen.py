@@ -81,6 +81,7 @@ def test_every_method_starts_at_the_base(published, ids, name):
         jax.tree.map(np.testing.assert_array_equal, variables["params"], published["params"])
 
 
+@pytest.mark.slow
 def test_init_is_the_models_own(ids):
     adapter = LinenAdapter(Net(), [(".*", LoRA(rank=2))])
     variables = jax.jit(adapter.init)(jax.random.key(0), ids)

@@ -188,6 +188,7 @@ def test_hugging_face(case, choice):
     np.testing.assert_allclose(model(golden["x"]), expected, rtol=0, atol=atol)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mostly_slow([n for n in METHODS if n != "full"], ["lora_sp"]))
 def test_half_of_an_adapter_is_half_of_what_it_changes(name):
     model = trained(("inp", METHODS[name]), seed=6)

@@ -56,6 +56,7 @@ def test_chunks_stay_in_their_episode(tmp_path):
         np.testing.assert_array_equal(actions[count:], normal[[ends[n] - 1] * (4 - count)])
 
 
+@pytest.mark.slow
 def test_noise_touches_the_robots_slots_only(tmp_path):
     run = make_run(tmp_path / "run", CONFIG)
     steps = flatten(list(run.episodes.values()))

@@ -237,6 +237,7 @@ def test_brax_success_is_rewarded_once(env, wrapped, first, pressed):
     assert (state.reward.tolist(), state.done.tolist()) == ([0, 0], [1, 0])
 
 
+@pytest.mark.slow
 def test_brax_broken_worlds_are_done(wrapped, first):
     action = jnp.zeros((B, 7)).at[1].set(jnp.nan)
     state = wrapped[2](first, action)

@@ -88,6 +88,7 @@ def test_another_environment_is_traced(env, cache, change):
     assert len(results[1]) == options["num_envs"]
 
 
+@pytest.mark.slow
 def test_another_scene_is_traced(env, cache):
     new_process(env, KEY, 0.5)
     options = {"num_envs": 3, "image_size": 8, "backend": "jax"}
@@ -107,6 +108,7 @@ def test_other_arguments_are_traced(env, cache):
     assert new_process(env, KEY, jnp.ones(env.num_joints))[1]
 
 
+@pytest.mark.slow
 def test_another_setting_is_traced(env, cache, monkeypatch):
     new_process(env, KEY, 0.5)
     with jax.default_matmul_precision("float32"):  # of this thread alone

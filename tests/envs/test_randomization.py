@@ -157,6 +157,7 @@ def test_other_ranges_compile_nothing(env):
     assert env._resets._cache_size() == compiled
 
 
+@pytest.mark.slow
 def test_the_model_is_what_mujoco_would_compile(env):
     """Grown and heavier bodies against a model to which MuJoCo itself applied the same."""
     draw = jax.tree.map(
@@ -201,6 +202,7 @@ def test_senseless_ranges_are_refused(env, ranges, message):
         )
 
 
+@pytest.mark.slow
 def test_reset_done_wants_the_ranges_of_reset(env):
     key, ranges = jax.random.key(0), Randomization()
     for first, second in ((None, ranges), (ranges, None)):

@@ -190,6 +190,7 @@ def test_batch_equals_single_worlds(built, poses):
         assert np.mean(difference > 1) < 1e-3  # rounding may move an edge by a pixel
 
 
+@pytest.mark.slow
 def test_sizes_differ_from_world_to_world(shapes, built, poses):
     size = np.stack([built.size, built.size * 1.5, built.size])
     size[2, :, 1] *= 0.5  # half the length of capsules and cylinders, other boxes and ellipsoids

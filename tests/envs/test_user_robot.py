@@ -12,6 +12,7 @@ import pytest
 import envs
 from envs import mjcf, render, robots, scene
 from envs.tasks import press
+from tests.cases import mostly_slow
 from tests.envs.user_arm import HALF, JOINTS, write
 
 
@@ -74,7 +75,7 @@ def test_start_pose_is_that_of_all_robots(robot, model):
     assert robot.home[2] > 0.5  # as in the keyframe
 
 
-@pytest.mark.parametrize("name", ["piper", "panda"])
+@pytest.mark.parametrize("name", mostly_slow(["piper", "panda"], ["piper"]))
 def test_lean_and_tilt_of_known_robots_are_found(name):
     known = getattr(robots, name).ROBOT
     turned = known.tool @ robots.rotation("z", np.pi)
@@ -137,6 +138,7 @@ def test_actuators_hold_what_they_are_told(robot, model):
     np.testing.assert_allclose(model.actuator("robot/yaw").gainprm[0], 150)
 
 
+@pytest.mark.slow
 def test_hand_is_found_without_a_site(file, robot):
     found = mjcf.load(str(file))
     assert (found.name, found.lean, found.tilt_side) == (str(file), robot.lean, robot.tilt_side)
@@ -186,6 +188,7 @@ def test_small_meshes_are_not_drawn(tmp_path):
     assert not np.any(model.geom_type[list(drawn)] == mujoco.mjtGeom.mjGEOM_MESH)
 
 
+@pytest.mark.slow
 def test_limits_are_also_those_of_the_actuators(tmp_path):
     edit = ('<position name="yaw" joint="yaw"', '<position name="yaw" joint="yaw" ctrlrange="-1 9"')
     robot = mjcf.load(write(tmp_path, edit))

@@ -141,6 +141,7 @@ def test_missing_file_is_named():
         envs.make("press", "nowhere.xml")
 
 
+@pytest.mark.slow
 def test_a_reach_that_is_short_is_said(tmp_path):
     file = write(tmp_path, ('range="-150 150"', 'range="-15 15"'))
     with pytest.warns(UserWarning, match="misses parts of the table by up to"):

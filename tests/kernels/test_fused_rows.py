@@ -90,6 +90,7 @@ def test_stores_the_rows_and_what_is_kept_alone(shared):
     assert stored <= {(32, 48), (32, 32), (32, 1), (16, 32), (32,)}
 
 
+@pytest.mark.slow
 def test_vmap_is_a_loop(shared):
     rows = jax.random.normal(jax.random.key(1), (3, 40, 48))
     counts = jax.random.bernoulli(jax.random.key(2), 0.7, (3, 40, 1))

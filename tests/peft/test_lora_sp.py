@@ -125,7 +125,10 @@ def test_losses_of_uniform_and_concentrated_routing():
     assert spectral == pytest.approx(0.05)
 
 
-@pytest.mark.parametrize(("masked", "few"), [(False, 0), (True, 0), (True, fused_rows.FEW_ROWS)])
+@pytest.mark.parametrize(
+    ("masked", "few"),
+    [pytest.param(False, 0, marks=pytest.mark.slow), (True, 0), (True, fused_rows.FEW_ROWS)],
+)
 def test_one_kernel_equals_the_equations(x, monkeypatch, masked, few):
     """The fused chain, run by Triton on a GPU and by its interpreter elsewhere."""
     interpret = jax.default_backend() != "gpu"

@@ -56,6 +56,7 @@ def test_a_streamed_run_resumes_to_the_bit(tmp_path, monkeypatch):
         assert (value != leaves(before)[name]).any()
 
 
+@pytest.mark.slow
 def test_every_step_of_a_stretch_has_the_next_batch(tmp_path):
     """From the step on at which a run continues, however stretches are cut."""
     run = streamed(tmp_path / "run")

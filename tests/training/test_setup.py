@@ -136,6 +136,7 @@ def test_a_pi05_of_the_command_line_trains_and_acts(config, tmp_path, monkeypatc
     np.testing.assert_allclose(again, actions, atol=0.05)  # the file is bf16
 
 
+@pytest.mark.slow
 def test_eva_of_the_command_line_sees_the_demonstrations(config, tmp_path):
     run = setup.prepare(config, tmp_path, Console(file=io.StringIO()), time.perf_counter())
     found = adaptation.methods(run.policy.model)
