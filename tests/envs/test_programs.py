@@ -71,12 +71,12 @@ def test_a_process_asks_once(env, cache, monkeypatch):
 @pytest.mark.parametrize(
     "change",
     [
-        {"num_envs": 4},
+        pytest.param({"num_envs": 4}, marks=pytest.mark.slow),
         {"image_size": 9},
         {"antialias": 2},
         {"control_dt": 0.2},
         {"distractors": 1},
-        {"actions": "delta_joint"},
+        pytest.param({"actions": "delta_joint"}, marks=pytest.mark.slow),
     ],
     ids=str,
 )

@@ -4,11 +4,13 @@ import types
 
 import av
 import jax
+import pytest
 
 import envs
 from lorasp_jax.evaluation import callback, video
 
 
+@pytest.mark.slow
 def test_a_film_has_its_own_size(tmp_path):
     env = envs.make("press", num_envs=2, image_size=16, backend="jax")
     data = env.reset(jax.random.key(0)).data
