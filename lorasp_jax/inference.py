@@ -12,6 +12,7 @@ training, where the copies of W would cost more than they save.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -68,7 +69,8 @@ def call(
     layers: list[Dense] = [getattr(module, name) for name in names]
     joined: Joined = ready.get_value()[names]
     method, _ = layers[0].carried()
-    tokens, n, outs = x.shape[:-1], len(names), joined.write.shape[1]
+    tokens, n, ends = x.shape[:-1], len(names), list(itertools.accumulate(map(_outputs, layers)))
+    outs = ends[-1]
     read = layers[0].as_input(x) @ joined.read
     rows = read[..., outs : outs + n * _rows(layers[0])].reshape(*tokens, n, -1)
     z, aux = jax.vmap(
@@ -77,7 +79,6 @@ def call(
     z = jnp.moveaxis(z, 0, -2).reshape(*tokens, -1).astype(read.dtype)
     y = read[..., :outs] + z @ joined.write
     y = y if joined.bias is None else y + joined.bias
-    ends = [sum(layer.kernel_matrices().shape[1] for layer in layers[: i + 1]) for i in range(n)]
     aux = [jax.tree.map(lambda a, i=i: a[i], aux) for i in range(n)]
     reports = [dataclasses.replace(one, token_mask=token_mask) for one in aux]
     return list(zip(jnp.split(y, ends[:-1], axis=-1), reports, strict=True))
@@ -89,7 +90,7 @@ def _can_join(layer: Any) -> bool:
         return False
     method, _ = layer.carried()
     plain = type(method).apply is Method.apply and not method.reads_in_fp32
-    return plain and layer.kernel_matrices().ndim == 2
+    return plain and len(layer.kernel_matrices().shape) == 2  # a quantised one has no ndim
 
 
 def _one_kind(layers: dict[str, Dense], names: Names) -> bool:
@@ -104,10 +105,14 @@ def _rows(layer: Dense) -> int:
     return jax.eval_shape(method.down, params).shape[1]
 
 
+def _outputs(layer: Dense) -> int:
+    """O."""
+    return layer.kernel_matrices().shape[1]
+
+
 def _join(layers: Sequence[Dense]) -> Joined:
     method, _ = layers[0].carried()
     params = [layer.carried()[1] for layer in layers]
-    outs = [layer.kernel_matrices().shape[1] for layer in layers]
 
     def stacked(*leaves: jax.Array) -> jax.Array | None:
         return jnp.stack(leaves) if len({leaf.shape for leaf in leaves}) == 1 else None
@@ -116,13 +121,13 @@ def _join(layers: Sequence[Dense]) -> Joined:
     kernels = [layer.kernel_matrices().astype(dtype) for layer in layers]
     downs = [method.down(p).astype(dtype) for p in params]
     biases = [
-        jnp.zeros(o, dtype) if layer.bias is None else layer.bias.get_value().astype(dtype)
-        for o, layer in zip(outs, layers, strict=True)
+        jnp.zeros(_outputs(layer), dtype) if layer.bias is None else layer.bias.get_value()
+        for layer in layers
     ]
     has_bias = any(layer.bias is not None for layer in layers)
     return Joined(
         params=jax.tree.map(stacked, *params),
         read=aligned(jnp.concatenate(kernels + downs, axis=1)),
         write=jax.scipy.linalg.block_diag(*(method.up(p).astype(dtype) for p in params)),
-        bias=jnp.concatenate(biases) if has_bias else None,
+        bias=jnp.concatenate(biases).astype(dtype) if has_bias else None,
     )

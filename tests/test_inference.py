@@ -10,6 +10,7 @@ from lorasp_jax import inference
 from lorasp_jax.dense import Dense
 from lorasp_jax.models import pi0, smolvla
 from lorasp_jax.models.layers import Linears
+from lorasp_jax.quantization import quantize
 from tests import quick
 from tests.cases import mostly_slow
 from tests.models.drawn import drawn, observation
@@ -59,6 +60,13 @@ def test_computes_the_same(name):
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
     assert jax.tree.structure(other) == jax.tree.structure(aux)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), other, aux)
+
+
+def test_a_quantised_base_computes_the_same():
+    model = quantize(adapted(METHODS["lora"], "float32"), [(".*", "int8")]).model
+    prepared, x = ready(model), jnp.sin(jnp.arange(48.0)).reshape(6, 8)
+    assert set(prepared.ready.get_value()) == {("first", "second"), ("third",)}
+    np.testing.assert_allclose(prepared(x)[0], model(x)[0], rtol=1e-4, atol=1e-4)
 
 
 def test_layers_of_one_input_are_two_products():
