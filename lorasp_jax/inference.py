@@ -31,7 +31,7 @@ class Joined(NamedTuple):
     """Layers of one method that read the same input."""
 
     params: Any
-    """Adapters' parameters of the n layers, [n, ...]; None where their shapes differ."""
+    """What f needs of the adapters of the n layers, [n, ...]; None where shapes differ."""
     read: jax.Array
     """[W, P], [I, sum of O and of Q or a little more]."""
     write: jax.Array
@@ -126,7 +126,7 @@ def _join(layers: Sequence[Dense]) -> Joined:
     ]
     has_bias = any(layer.bias is not None for layer in layers)
     return Joined(
-        params=jax.tree.map(stacked, *params),
+        params=jax.tree.map(stacked, *map(method.for_rows, params)),
         read=aligned(jnp.concatenate(kernels + downs, axis=1)),
         write=jax.scipy.linalg.block_diag(*(method.up(p).astype(dtype) for p in params)),
         bias=jnp.concatenate(biases).astype(dtype) if has_bias else None,

@@ -1,5 +1,7 @@
 """Joined layers compute what they did, with fewer products."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +12,7 @@ from lorasp_jax import inference
 from lorasp_jax.dense import Dense
 from lorasp_jax.models import pi0, smolvla
 from lorasp_jax.models.layers import Linears
+from lorasp_jax.peft import LoRASP, lora_sp
 from lorasp_jax.quantization import quantize
 from tests import quick
 from tests.cases import mostly_slow
@@ -60,6 +63,19 @@ def test_computes_the_same(name):
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
     assert jax.tree.structure(other) == jax.tree.structure(aux)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), other, aux)
+
+
+def test_a_kernel_gets_the_routers_numbers_joined_once(monkeypatch):
+    kernel = functools.partial(lora_sp.fused_rows, interpret=True)
+    monkeypatch.setattr(lora_sp, "fused_rows", kernel)
+    model = adapted(LoRASP(rank=32, hidden_width=16, gate="pallas"), "float32")
+    x = jnp.sin(jnp.arange(96.0)).reshape(2, 6, 8)
+    prepared = ready(model)
+    params = prepared.ready.get_value()["first", "second"].params
+    assert [leaf.shape for leaf in jax.tree.leaves(params)] == [(2, 16 * 32 + 16 + 32)]
+    run = quick.jit(lambda model, x: model(x))
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-4)
+    jax.tree.map(close, run(prepared, x), run(model, x))
 
 
 def test_a_quantised_base_computes_the_same():

@@ -13,13 +13,13 @@ from lorasp_jax import inference
 from lorasp_jax.dense import Dense
 from lorasp_jax.models import flow_matching
 from lorasp_jax.models.config import BackboneConfig
+from lorasp_jax.models.depth import unstacked
 from lorasp_jax.models.layers import (
     LayerAux,
     Linears,
     block_mask,
     positions,
     time_embedding,
-    unstacked,
 )
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.siglip import SigLIP

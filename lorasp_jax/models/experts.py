@@ -16,6 +16,7 @@ from flax import nnx
 from lorasp_jax.dense import Dense
 from lorasp_jax.models.attention import attention
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig
+from lorasp_jax.models.depth import scan_depth, stack
 from lorasp_jax.models.layers import (
     AdaptiveRMSNorm,
     LayerAux,
@@ -23,8 +24,6 @@ from lorasp_jax.models.layers import (
     RMSNorm,
     rope,
     rope_table,
-    scan_depth,
-    stack,
 )
 
 KeysValues = tuple[jax.Array, jax.Array]

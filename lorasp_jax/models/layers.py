@@ -1,8 +1,7 @@
-"""What the backbones share: norms, rotary positions, attention, masks, and the scan over depth."""
+"""What the backbones share: norms, calls of dense layers, rotary positions and masks."""
 
 import math
-from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,24 +10,9 @@ from flax import nnx
 
 from lorasp_jax import inference
 from lorasp_jax.dense import Dense, dense_together
-from lorasp_jax.models.config import Remat
 from lorasp_jax.peft import Aux
 
-_SLOW_TO_REPEAT = ("dot_product_attention_fwd_wrapper", "pallas_call")
-"""Primitives of cuDNN's attention and of the adapters' kernel."""
-
-
-def _keep_products(primitive: Any, *shapes: Any, **params: Any) -> Any:
-    """Results of matrix products are stored, and what is slow to repeat."""
-    if primitive.name in _SLOW_TO_REPEAT:
-        return True
-    return jax.checkpoint_policies.dots_with_no_batch_dims_saveable(primitive, *shapes, **params)
-
-
-_KEPT = {"products": _keep_products, "full": None}
-
 LayerAux = dict[str, Aux]
-Block = TypeVar("Block", bound=nnx.Module)
 
 
 def normalized(x: jax.Array, eps: float) -> jax.Array:
@@ -151,70 +135,6 @@ class Linears:
         modulation, aux = norm.dense(condition, token_mask=every, return_aux=True)
         self.aux[f"{name}/dense"] = aux
         return norm(x, modulation)
-
-
-def stack(make: Callable[[nnx.Rngs], Block], depth: int, rngs: nnx.Rngs) -> Block:
-    """`depth` independently drawn blocks as one module whose parameters have a leading axis L."""
-    keys = jax.random.split(rngs.params(), depth)
-    return jax.vmap(lambda key: make(nnx.Rngs(params=key)))(keys)
-
-
-def scan_depth(
-    blocks: Block,
-    call: Callable[[Block, jax.Array, Any], tuple[jax.Array, Any]],
-    x: jax.Array,
-    per_layer: Any = None,
-    *,
-    remat: Remat = "none",
-    unroll: bool = False,
-) -> tuple[jax.Array, Any]:
-    """Run x through stacked blocks.
-
-    Args:
-        blocks: from `stack` or `unstacked`.
-        call: (block, x, its slice of `per_layer`) -> (x, what to keep).
-        x: `[B, T, D]`.
-        per_layer: pytree with a leading axis L, or None.
-        remat: what of a block is computed again in the backward pass instead of stored.
-        unroll: straight-line code instead of a loop.
-
-    Returns:
-        `[B, T, D]`, and what the blocks gave to keep, stacked to `[L, ...]`.
-    """
-    one_by_one = isinstance(blocks, nnx.List)
-    graphdef, state = nnx.split(blocks[0] if one_by_one else blocks)
-
-    def layer(x: jax.Array, scanned: tuple[Any, Any]) -> tuple[jax.Array, Any]:
-        block: Any = nnx.merge(graphdef, scanned[0])
-        return call(block, x, scanned[1])
-
-    if remat != "none":
-        layer = jax.checkpoint(layer, prevent_cse=unroll, policy=_KEPT[remat])
-    if not one_by_one and not unroll:
-        return jax.lax.scan(layer, x, (state, per_layer))
-    states = [nnx.state(block) for block in blocks] if one_by_one else _layers_of(state)
-    others = [None] * len(states) if per_layer is None else _layers_of(per_layer)
-    layer, kept = jax.jit(layer, inline=True), []  # traced once
-    for own, other in zip(states, others, strict=True):
-        x, keep = layer(x, (own, other))
-        kept.append(keep)
-    return x, jax.tree.map(lambda *layers: jnp.stack(layers), *kept)
-
-
-def _layers_of(stacked: Any) -> list[Any]:
-    """Each layer's part of arrays [L, ...]; their gradients are stacked, not added up."""
-    leaves, structure = jax.tree.flatten(stacked)
-    parts = zip(*(jax.lax.split(leaf, [1] * len(leaf)) for leaf in leaves), strict=True)
-    return [
-        jax.tree.unflatten(structure, [jax.lax.squeeze(part, [0]) for part in layer])
-        for layer in parts
-    ]
-
-
-def unstacked(blocks: nnx.Module) -> nnx.List:
-    """Stacked blocks one by one: a loop around them then slices no weights."""
-    graphdef, state = nnx.split(blocks)
-    return nnx.List([nnx.merge(graphdef, layer) for layer in _layers_of(state)])
 
 
 def positions(valid: jax.Array) -> jax.Array:

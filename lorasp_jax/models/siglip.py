@@ -7,7 +7,8 @@ from flax import nnx
 from lorasp_jax.dense import Dense
 from lorasp_jax.models.attention import attention
 from lorasp_jax.models.config import BackboneConfig
-from lorasp_jax.models.layers import LayerAux, LayerNorm, Linears, scan_depth, stack
+from lorasp_jax.models.depth import scan_depth, stack
+from lorasp_jax.models.layers import LayerAux, LayerNorm, Linears
 
 
 class VisionBlock(nnx.Module):

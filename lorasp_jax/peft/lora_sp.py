@@ -29,7 +29,7 @@ from lorasp_jax.kernels.energy_gate import (
     energy_gate,
     exact_ratio,
 )
-from lorasp_jax.kernels.fused_rows import fused_rows
+from lorasp_jax.kernels.fused_rows import InARow, fused_rows
 from lorasp_jax.peft.method import Aux, Method, Params, kaiming_uniform
 from lorasp_jax.routing import router_scores
 
@@ -194,13 +194,24 @@ class LoRASP(Method):
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
         """z = scale Σ(x) V x of eq. (9), with the gate's statistics and losses."""
-        router = {name: p for name, p in params["router"].items() if name != "w1"}
         tokens = rows.shape[:-1]
         counts = jnp.ones(tokens, bool) if token_mask is None else token_mask
         routed = self._route_released if self.rule == "release" else self._route
-        z, losses, usage, statistics = routed({**params, "router": router}, rows, counts)
+        z, losses, usage, statistics = routed(self._routing(params), rows, counts)
         active_rank, energy = (column.reshape(tokens) for column in statistics)
         return z.reshape(*tokens, self.rank), Aux(active_rank, energy, losses, usage=usage)
+
+    def for_rows(self, params: Params) -> Params:
+        """The parameters without [V, W1] and U, and for the kernel the router's in a row."""
+        params = {name: p for name, p in self._routing(params).items() if name != "bank"}
+        return params | ({"router": InARow.of(params["router"])} if self._is_fused() else {})
+
+    def _routing(self, params: Params) -> Params:
+        """The parameters with the router's but for W1, unless they are in a row."""
+        router = params["router"]
+        if isinstance(router, InARow):
+            return params
+        return {**params, "router": {name: p for name, p in router.items() if name != "w1"}}
 
     def up(self, params: Params) -> jax.Array:
         """U."""
@@ -211,27 +222,38 @@ class LoRASP(Method):
 
     def _route(self, params: Params, rows: jax.Array, counts: jax.Array) -> routing.Routed:
         """`route` of x [V W1], [...tokens, R + H], where possible in one kernel."""
-        gate = self.gate or default_implementation(self.scored)
         router, widths = params["router"], (self.rank, self.hidden_width)
         function = functools.partial(
             routing.route, energy_target=self.energy_target, scale=self.scale
         )
         kept = self._shared_mask(params, rows, counts)
         rows, counts = rows.reshape(-1, rows.shape[-1]), counts.reshape(-1, 1)
-        plain = (self.router, self.score_function) == ("gelu", "softplus") and kept is None
-        if gate == "pallas" and plain and all(map(_fits_triton, widths)):
+        if self._is_fused():
             function = functools.partial(function, gate="block")
             z, sums, statistics = fused_rows(function, router, rows, widths, counts)
         else:
-            columns = jnp.split(rows, widths[:1], axis=1)
+            columns, gate = jnp.split(rows, widths[:1], axis=1), self._gate()
             z, sums, _, statistics = function(
                 router, columns, counts, kept, gate=gate, score_function=self.score_function
             )
         return z, routing.losses(sums), sums.kept, statistics
 
+    def _gate(self) -> Implementation:
+        return self.gate or default_implementation(self.scored)
+
+    def _gates_alone(self) -> bool:
+        """Whether the mask of a row takes no more than its scores."""
+        return (self.granularity, self.energy_start, self.pruned) == ("token", None, 0)
+
+    def _is_fused(self) -> bool:
+        """Whether all between the matrices is one kernel."""
+        plain = (self.router, self.score_function, self.rule) == ("gelu", "softplus", "paper")
+        fits = _fits_triton(self.rank) and _fits_triton(self.hidden_width)
+        return self._gate() == "pallas" and plain and self._gates_alone() and fits
+
     def _shared_mask(self, params: Params, rows: jax.Array, counts: jax.Array) -> jax.Array | None:
         """The mask, bool [T, R], where it takes more than each row's scores; else None."""
-        if (self.granularity, self.energy_start, self.pruned) == ("token", None, 0):
+        if self._gates_alone():
             return None
         scores, _ = router_scores(params["router"], rows[..., self.rank :], self.score_function)
         pooled = routing.pooled_scores(scores, counts, self.granularity)

@@ -140,6 +140,10 @@ class Method:
         """
         raise NotImplementedError
 
+    def for_rows(self, params: Params) -> Params:
+        """What `between` takes in place of `params`, for many calls: work on these done once."""
+        return params
+
     def up(self, params: Params) -> jax.Array:
         """U [R, O], the matrix that writes y."""
         raise NotImplementedError

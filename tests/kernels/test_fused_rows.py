@@ -82,12 +82,29 @@ def test_types_are_those_of_the_function(shared):
     assert d_rows.dtype == jnp.bfloat16
 
 
-def test_stores_the_rows_and_what_is_kept_alone(shared):
+def test_stores_the_rows_and_the_bits_of_what_is_kept_alone(shared):
     rows, counts = jnp.ones((32, 48)), jnp.ones((32, 1), bool)
     call = lambda rows: kernels.fused_rows(gated, shared, rows, WIDTHS, counts, interpret=True)[0]  # noqa: E731
     _, pull_back = jax.eval_shape(lambda rows: jax.vjp(call, rows), rows)
     stored = {leaf.shape for leaf in jax.tree.leaves(pull_back) if leaf.shape}
-    assert stored <= {(32, 48), (32, 32), (32, 1), (16, 32), (32,)}
+    assert stored <= {(32, 48), (32, 32 // 8), (32, 1), (16 * 32 + 32,)}
+
+
+def test_what_is_shared_may_be_in_a_row_already(shared):
+    rows, counts = jnp.sin(jnp.arange(16.0 * 48)).reshape(16, 48), jnp.ones((16, 1), bool)
+    row = kernels.InARow.of(shared)
+    assert row.values.shape == (16 * 32 + 32,)
+    jax.tree.map(np.testing.assert_array_equal, row.tree(), shared)
+    expected, (d_shared, d_rows) = run(True, shared, rows, counts)
+    found, (d_row, others) = run(True, row, rows, counts)
+    jax.tree.map(close, (found, d_row.tree(), others), (expected, d_shared, d_rows))
+
+
+def test_bits_are_the_bools():
+    kept = jax.random.bernoulli(jax.random.key(0), 0.5, (16, 128))
+    packed = kernels._packed(kept)
+    assert packed.dtype == jnp.uint8
+    np.testing.assert_array_equal(kernels._unpacked(packed), kept)
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from flax import nnx
 
 from lorasp_jax.models.attention import attention
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig
+from lorasp_jax.models.depth import scan_depth, stack
 from lorasp_jax.models.experts import GATED, ExpertBlock, KeysValues, LanguageExpert
 from lorasp_jax.models.layers import (
     LayerAux,
@@ -21,8 +22,6 @@ from lorasp_jax.models.layers import (
     positions,
     rope,
     rope_table,
-    scan_depth,
-    stack,
 )
 
 

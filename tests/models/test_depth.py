@@ -1,0 +1,89 @@
+"""Straight-line code over a stack of layers against the loop: values, gradients, what is stored."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from lorasp_jax import adaptation
+from lorasp_jax.dense import Dense
+from lorasp_jax.models.depth import scan_depth, stack
+from tests import quick
+from tests.nets import METHODS, trained
+
+DEPTH, TOKENS, WIDTH, INNER = 3, 5, 8, 12
+
+
+class Net(nnx.Module):
+    """Residual layers in a stack."""
+
+    def __init__(self):
+        self.blocks = stack(lambda rngs: Layer(rngs=rngs), DEPTH, nnx.Rngs(0))
+
+
+class Layer(nnx.Module):
+    def __init__(self, *, rngs):
+        self.up = Dense(WIDTH, INNER, rngs=rngs)
+        self.down = Dense(INNER, WIDTH, rngs=rngs)
+
+    def __call__(self, x):
+        return x + self.down(jnp.tanh(self.up(x)))
+
+
+@pytest.fixture(scope="module")
+def split():
+    return adaptation.split(trained((".*", METHODS["lora"]), seed=1, net=Net()))
+
+
+def loss_of(graphdef, frozen, **options):
+    x = jnp.sin(jnp.arange(TOKENS * WIDTH)).reshape(1, TOKENS, WIDTH)
+
+    def loss(adapters):
+        blocks = nnx.merge(graphdef, adapters, frozen).blocks
+        y, kept = scan_depth(blocks, lambda block, x, _: (block(x), x.sum()), x, **options)
+        return (y**2).sum() + (kept * jnp.arange(DEPTH)).sum()
+
+    return loss
+
+
+def close(found, expected):
+    assert np.linalg.norm(found - expected) <= 1e-3 * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("remat", ["none", "products"])
+def test_straight_line_code_has_the_loops_gradients(split, remat):
+    graphdef, adapters, frozen = split
+    expected, found = (
+        quick.jit(jax.value_and_grad(loss_of(graphdef, frozen, remat=remat, unroll=unroll)))(
+            adapters
+        )
+        for unroll in (False, True)
+    )
+    jax.tree.map(close, found, expected)
+
+
+def test_straight_line_code_stores_no_layers_weights_and_stacks_gradients(split):
+    graphdef, adapters, frozen = split
+
+    def stored(adapters, frozen):
+        return jax.vjp(loss_of(graphdef, frozen, remat="products", unroll=True), adapters)[1]
+
+    jaxpr = jax.make_jaxpr(stored)(adapters, frozen).jaxpr
+    shapes = {v.aval.shape for v in jaxpr.outvars if v not in jaxpr.invars}
+    assert (1, TOKENS, INNER) in shapes
+    weights = {leaf.shape[1:] for leaf in jax.tree.leaves((adapters, frozen))}
+    assert not shapes & weights
+    gradient = jax.make_jaxpr(jax.grad(loss_of(graphdef, frozen, unroll=True)))(adapters)
+    assert "dynamic_update_slice" not in str(gradient)
+
+
+@pytest.mark.parametrize("unroll", [False, True])
+def test_a_stack_in_which_nothing_trains(unroll):
+    blocks, x = Net().blocks, jnp.ones((1, TOKENS, WIDTH))
+    run = lambda x: scan_depth(blocks, lambda block, x, _: (block(x), None), x, unroll=unroll)[0]  # noqa: E731
+    expected = x
+    for i in range(DEPTH):
+        graphdef, state = nnx.split(blocks)
+        expected = nnx.merge(graphdef, jax.tree.map(lambda a, i=i: a[i], state))(expected)
+    np.testing.assert_allclose(run(x), expected, rtol=1e-5)
