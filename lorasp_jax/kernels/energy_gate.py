@@ -20,12 +20,14 @@ row that reaches the target exactly is not lost to the rounding of 0.9.
 import decimal
 import fractions
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.experimental import pallas as pl
+
+from lorasp_jax.kernels.by_rows import by_rows
 
 Implementation = Literal["pairwise", "sort", "bisection", "block", "pallas"]
 
@@ -91,17 +93,11 @@ def energy_gate(
 
 
 def default_implementation(rank: int) -> Implementation:
-    """Pallas on one NVIDIA GPU, pairwise for a small bank on CPU, bisection in XLA elsewhere.
-
-    Over several devices (of the mesh that is set, or else all there are) XLA partitions the
-    bisection by rows; for a Pallas call it would gather the scores first.
-    """
-    mesh = jax.sharding.get_abstract_mesh()
-    devices = jax.device_count() if mesh.empty else mesh.size
+    """Pallas on NVIDIA GPUs, pairwise for a small bank on CPU, bisection in XLA elsewhere."""
     backend = jax.default_backend()
     if backend == "cpu" and rank <= PAIRWISE_RANK:
         return "pairwise"
-    return "pallas" if devices == 1 and backend == "gpu" else "bisection"
+    return "pallas" if backend == "gpu" else "bisection"
 
 
 def _finder(implementation: str) -> Callable[[jax.Array, Ratio], jax.Array]:
@@ -275,23 +271,29 @@ def _sorted_row_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
 
 def _pallas_boundary(scores: jax.Array, ratio: Ratio, *, interpret: bool = False) -> Boundary:
     """The bisection as a Triton kernel; R is padded with zeros, which are never kept."""
-    from jax.experimental.pallas import triton  # absent from builds without NVIDIA support
-
     *leading, rank = scores.shape
     width = max(pl.next_power_of_2(rank), 2)
     rows = jnp.pad(scores.reshape(-1, rank), ((0, 0), (0, width - rank)))
-    column = pl.BlockSpec((1, 1), lambda i: (i, 0))
-    score, index = pl.pallas_call(
+    (score, index), _ = by_rows(functools.partial(_call_kernel, ratio, interpret), [], [rows])
+    return Boundary(score.reshape(*leading, 1), index.reshape(*leading, 1))
+
+
+def _call_kernel(ratio: Ratio, interpret: bool, _: Any, arrays: Sequence[jax.Array]) -> tuple:
+    """The two columns of `Boundary`, and no sums, for rows of scores."""
+    from jax.experimental.pallas import triton  # absent from builds without NVIDIA support
+
+    (rows,), column = arrays, pl.BlockSpec((1, 1), lambda i: (i, 0))
+    columns = pl.pallas_call(
         functools.partial(_boundary_kernel, ratio=ratio),
         grid=(len(rows),),  # one row and one warp to a program: the fastest measured
-        in_specs=[pl.BlockSpec((1, width), lambda i: (i, 0))],
+        in_specs=[pl.BlockSpec((1, rows.shape[1]), lambda i: (i, 0))],
         out_specs=[column, column],
         out_shape=[jax.ShapeDtypeStruct((len(rows), 1), t) for t in (jnp.float32, jnp.int32)],
         compiler_params=triton.CompilerParams(num_warps=1, num_stages=1),
         interpret=interpret,
         name="energy_gate",
     )(rows)
-    return Boundary(score.reshape(*leading, 1), index.reshape(*leading, 1))
+    return columns, []
 
 
 def _boundary_kernel(scores: Any, score: Any, index: Any, *, ratio: Ratio) -> None:

@@ -14,12 +14,14 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.experimental import pallas as pl
+
+from lorasp_jax.kernels.by_rows import by_rows
 
 
 class Launch(NamedTuple):
@@ -102,14 +104,10 @@ def fused_rows(
     Returns:
       output [T, O], sums, statistics [T, 1]. Gradients reach `shared` and `rows`.
     """
-    num_rows = len(rows)
-    launches = (FEW, FEW) if num_rows <= FEW_ROWS else (FORWARD, BACKWARD)
-    fill = ((0, -num_rows % math.lcm(*(launch.rows for launch in launches))), (0, 0))
-    rows, counts = jnp.pad(rows, fill), jnp.pad(counts, fill).astype(jnp.int8)
-    row = InARow.of(shared)
-    found: Any = _fused((function, widths, launches, interpret), row, rows, counts)
-    output, sums, statistics = found
-    return output[:num_rows], sums, [column[:num_rows] for column in statistics]
+    launches = (FEW, FEW) if len(rows) <= FEW_ROWS else (FORWARD, BACKWARD)
+    static = function, widths, launches, interpret
+    found: Any = _fused(static, InARow.of(shared), rows, counts.astype(jnp.int8))
+    return found
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -154,50 +152,78 @@ def _backward(static: tuple, residuals: tuple, cotangents: tuple) -> tuple:
 _fused.defvjp(_forward, _backward)
 
 
+class _Blocks(NamedTuple):
+    """How the kernel works: what it does with a block of rows, and what goes in and comes out."""
+
+    body: Body
+    launch: Launch
+    widths: list[Widths]
+    """Of the columns of each input."""
+    out_types: list[Any]
+    out_widths: list[Widths]
+    shared_tree: Callable[[Callable], Any]
+    sums: Any
+    """Shapes of what adds up over rows."""
+
+
 def _map_blocks(
     body: Body,
     shared: InARow,
     inputs: list[tuple[jax.Array, Widths]],
     launch: Launch,
     interpret: bool,
-) -> tuple[list[jax.Array], InARow]:
-    """body(shared, columns of each input) -> (columns of each output, sums), in one kernel.
-
-    Every program takes a stretch of blocks and adds up their sums; XLA adds up the programs'.
-    """
-    from jax.experimental.pallas import triton  # absent from builds without NVIDIA support
-
-    arrays = [array for array, _ in inputs]
-    widths = [widths for _, widths in inputs]
-    blocks = len(arrays[0]) // launch.rows
-    most = pl.cdiv(blocks, launch.programs)
-    stretch = next(n for n in range(most, 0, -1) if blocks % n == 0)
-    programs = blocks // stretch
+) -> tuple[Sequence[jax.Array], InARow]:
+    """body(shared, columns of each input) -> (columns of each output, sums), in one kernel."""
     columns, sums = jax.eval_shape(
         lambda row, *columns: body(row.tree(), *columns),
         shared,
         *([_shape(array.dtype, launch.rows, width) for width in w] for array, w in inputs),
     )
-    out_widths = [tuple(column.shape[1] for column in output) for output in columns]
-    rows = [
-        _shape(output[0].dtype, len(arrays[0]), sum(w))
-        for output, w in zip(columns, out_widths, strict=True)
-    ]
-    sizes = tuple(math.prod(leaf.shape) for leaf in jax.tree.leaves(sums))
-    kernel = functools.partial(
-        _kernel, body, launch.rows, stretch, widths, out_widths, shared.tree, sums
+    blocks = _Blocks(
+        body,
+        launch,
+        widths=[widths for _, widths in inputs],
+        out_types=[output[0].dtype for output in columns],
+        out_widths=[tuple(column.shape[1] for column in output) for output in columns],
+        shared_tree=shared.tree,
+        sums=sums,
     )
+    call = functools.partial(_call, blocks, interpret)
+    outputs, (added,) = by_rows(call, [shared.values], [array for array, _ in inputs])
+    leaves, structure = jax.tree.flatten(sums)
+    return outputs, InARow(added, structure, tuple(leaf.shape for leaf in leaves))
+
+
+def _call(
+    blocks: _Blocks, interpret: bool, shared: Sequence[jax.Array], arrays: Sequence[jax.Array]
+) -> tuple[list[jax.Array], list[jax.Array]]:
+    """Outputs, and the sums in a row.
+
+    Every program takes a stretch of blocks and adds up their sums; XLA adds up the programs'.
+    """
+    from jax.experimental.pallas import triton  # absent from builds without NVIDIA support
+
+    (values,), launch, num_rows = shared, blocks.launch, len(arrays[0])
+    fill = -num_rows % launch.rows
+    arrays = [jnp.pad(array, ((0, fill), (0, 0))) for array in arrays]
+    number = len(arrays[0]) // launch.rows
+    most = pl.cdiv(number, launch.programs)
+    stretch = next(n for n in range(most, 0, -1) if number % n == 0)
+    rows = [
+        _shape(dtype, len(arrays[0]), sum(widths))
+        for dtype, widths in zip(blocks.out_types, blocks.out_widths, strict=True)
+    ]
+    size = sum(leaf.size for leaf in jax.tree.leaves(blocks.sums))
     outputs, partial_sums = pl.pallas_call(
-        kernel,
-        grid=(programs,),
-        out_shape=(rows, _shape(jnp.float32, programs, sum(sizes))),
+        functools.partial(_kernel, blocks, stretch),
+        grid=(number // stretch,),
+        out_shape=(rows, _shape(jnp.float32, number // stretch, size)),
         compiler_params=triton.CompilerParams(num_warps=launch.warps, num_stages=1),
         interpret=interpret,
         name="fused_rows",
-    )(shared.values, arrays)
-    leaves, structure = jax.tree.flatten(sums)
+    )(values, arrays)
     # One array of all sums: XLA adds it up in one kernel for all.
-    return outputs, InARow(partial_sums.sum(0), structure, tuple(leaf.shape for leaf in leaves))
+    return [output[:num_rows] for output in outputs], [partial_sums.sum(0)]
 
 
 def _packed(kept: jax.Array) -> jax.Array:
@@ -224,35 +250,25 @@ def _shape(dtype: Any, *sides: int) -> jax.ShapeDtypeStruct:
 
 
 def _kernel(
-    body: Body,
-    num_rows: int,
-    stretch: int,
-    widths: list[Widths],
-    out_widths: list[Widths],
-    shared_tree: Callable[[Callable], Any],
-    sums: Any,
-    shared_ref: Any,
-    input_refs: Any,
-    output_refs: Any,
-    sum_ref: Any,
+    blocks: _Blocks, stretch: int, shared_ref: Any, input_refs: Any, output_refs: Any, sum_ref: Any
 ) -> None:
-    """One program: `stretch` blocks of `num_rows`, one after the other."""
-    shared = shared_tree(lambda *place: shared_ref[pl.ds(*place)])
-    program = pl.program_id(0)
+    """One program: `stretch` blocks, one after the other."""
+    shared = blocks.shared_tree(lambda *place: shared_ref[pl.ds(*place)])
+    program, num_rows = pl.program_id(0), blocks.launch.rows
 
     def block(i: jax.Array, sums: Any) -> Any:
         at = pl.ds((program * stretch + i) * num_rows, num_rows)
         loaded = [
-            [ref[at, pl.ds(*place)] for place in _places(w)]
-            for ref, w in zip(input_refs, widths, strict=True)
+            [ref[at, pl.ds(*place)] for place in _places(widths)]
+            for ref, widths in zip(input_refs, blocks.widths, strict=True)
         ]
-        outputs, more = body(shared, *loaded)
-        for ref, w, columns in zip(output_refs, out_widths, outputs, strict=True):
-            for place, column in zip(_places(w), columns, strict=True):
+        outputs, more = blocks.body(shared, *loaded)
+        for ref, widths, columns in zip(output_refs, blocks.out_widths, outputs, strict=True):
+            for place, column in zip(_places(widths), columns, strict=True):
                 ref[at, pl.ds(*place)] = column
         return jax.tree.map(jnp.add, sums, more)
 
-    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), sums)
+    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), blocks.sums)
     found = jax.lax.fori_loop(0, stretch, block, zeros)
     leaves = jax.tree.leaves(found)
     for place, leaf in zip(_places(tuple(leaf.size for leaf in leaves)), leaves, strict=True):

@@ -11,8 +11,8 @@ from flax import nnx
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.models.config import Remat
 
-_SLOW_TO_REPEAT = ("dot_product_attention_fwd_wrapper", "pallas_call")
-"""Primitives of cuDNN's attention and of the adapters' kernel."""
+_SLOW_TO_REPEAT = ("dot_product_attention_fwd_wrapper", "custom_vmap_call")
+"""Primitives of cuDNN's attention and of the adapters' kernel (`lorasp_jax.kernels.by_rows`)."""
 
 
 def _keep_products(primitive: Any, *shapes: Any, **params: Any) -> Any:
