@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
 from jax.experimental import pallas as pl
 
 
@@ -67,6 +68,9 @@ class InARow:
         leaves = [read(*p).reshape(shape) for p, shape in zip(places, self.shapes, strict=True)]
         return jax.tree.unflatten(self.structure, leaves)
 
+
+SUMS = "fused_rows_sums"
+"""Name of the sums for policies of `jax.checkpoint`: they need not store each program's."""
 
 Columns = list[jax.Array]
 """Arrays [n, width] that lie side by side in one [n, sum of widths]."""
@@ -197,7 +201,8 @@ def _map_blocks(
     )(shared.values, arrays)
     leaves, structure = jax.tree.flatten(sums)
     # One array of all sums: XLA adds it up in one kernel for all.
-    return outputs, InARow(partial_sums.sum(0), structure, tuple(leaf.shape for leaf in leaves))
+    added = checkpoint_name(partial_sums.sum(0), SUMS)
+    return outputs, InARow(added, structure, tuple(leaf.shape for leaf in leaves))
 
 
 def _packed(kept: jax.Array) -> jax.Array:
