@@ -13,6 +13,7 @@ training, where the copies of W would cost more than they save.
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -25,6 +26,11 @@ from lorasp_jax.kernels.low_rank_matmul import aligned
 from lorasp_jax.peft import Aux, Method
 
 Names = tuple[str, ...]
+
+TILE, PROGRAMS = 64, 256
+"""Side of the tiles of a product's result, and how many of them at once keep a GPU busy."""
+LONG_SUM, SHORTEST_SUM = 2048, 512
+"""Inputs from which on a product is worth parts, and the least to a part."""
 
 
 class Joined(NamedTuple):
@@ -71,7 +77,7 @@ def call(
     method, _ = layers[0].carried()
     tokens, n, ends = x.shape[:-1], len(names), list(itertools.accumulate(map(_outputs, layers)))
     outs = ends[-1]
-    read = layers[0].as_input(x) @ joined.read
+    read = product(layers[0].as_input(x), joined.read)
     rows = read[..., outs : outs + n * _rows(layers[0])].reshape(*tokens, n, -1)
     z, aux = jax.vmap(
         lambda params, rows: method.between(params, rows, token_mask), in_axes=(0, -2)
@@ -82,6 +88,35 @@ def call(
     aux = [jax.tree.map(lambda a, i=i: a[i], aux) for i in range(n)]
     reports = [dataclasses.replace(one, token_mask=token_mask) for one in aux]
     return list(zip(jnp.split(y, ends[:-1], axis=-1), reports, strict=True))
+
+
+def product(x: jax.Array, matrix: jax.Array) -> jax.Array:
+    """x @ matrix in the type of x, as a sum over parts where that fills a GPU better.
+
+    A GPU computes tiles of the result side by side, and each sums over all inputs one after the
+    other. A few rows times a narrow matrix with a long sum keep few of its processors busy.
+
+    Args:
+      x: [..., I].
+      matrix: [I, O].
+    """
+    d_in, d_out = matrix.shape
+    parts = _parts(math.prod(x.shape[:-1]), d_in, d_out)
+    if parts == 1:
+        return x @ matrix
+    x = x.reshape(*x.shape[:-1], parts, d_in // parts)
+    matrix = matrix.reshape(parts, d_in // parts, d_out)
+    wide = jnp.einsum("...pi,pio->p...o", x, matrix, preferred_element_type=jnp.float32)
+    return wide.sum(0).astype(x.dtype)
+
+
+def _parts(rows: int, d_in: int, d_out: int) -> int:
+    """How many parts [rows, I] @ [I, O] is best summed over: a power of two that divides I."""
+    tiles = math.ceil(rows / TILE) * math.ceil(d_out / TILE)
+    parts = 1
+    while 2 * parts * tiles <= PROGRAMS and d_in % (2 * parts * SHORTEST_SUM) == 0:
+        parts *= 2
+    return parts if d_in >= LONG_SUM else 1
 
 
 def _can_join(layer: Any) -> bool:

@@ -85,6 +85,32 @@ def test_a_quantised_base_computes_the_same():
     np.testing.assert_allclose(prepared(x)[0], model(x)[0], rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("rows", "d_in", "d_out", "parts"),
+    [
+        (51, 4096, 1184, 8),  # the action expert's last product
+        (51, 2048, 1184, 4),
+        (51, 1024, 8512, 1),  # not long
+        (816, 4096, 2208, 1),  # many tiles
+        (51, 2050, 64, 1),  # does not divide
+    ],
+)
+def test_a_long_sum_of_few_rows_is_split(rows, d_in, d_out, parts):
+    assert inference._parts(rows, d_in, d_out) == parts
+
+
+def test_a_sum_over_parts_is_the_product():
+    keys = jax.random.split(jax.random.key(0))
+    x, matrix = (
+        jax.random.normal(k, s) for k, s in zip(keys, ((2, 3, 4096), (4096, 8)), strict=True)
+    )
+    assert "reduce_sum" in str(jax.make_jaxpr(inference.product)(x, matrix))
+    np.testing.assert_allclose(inference.product(x, matrix), x @ matrix, rtol=1e-4, atol=1e-3)
+    half = inference.product(x.astype(jnp.bfloat16), matrix.astype(jnp.bfloat16))
+    assert half.dtype == jnp.bfloat16
+    np.testing.assert_allclose(half.astype(jnp.float32), x @ matrix, atol=1)
+
+
 def test_layers_of_one_input_are_two_products():
     model, x = adapted(METHODS["lora"]), jnp.ones((2, 8), jnp.bfloat16)
     products = lambda model: str(jax.make_jaxpr(lambda x: model(x)[0])(x)).count("dot_general")  # noqa: E731

@@ -7,17 +7,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
+from jax.ad_checkpoint import checkpoint_name
 
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.models.config import Remat
 
 _SLOW_TO_REPEAT = ("dot_product_attention_fwd_wrapper", "custom_vmap_call")
 """Primitives of cuDNN's attention and of the adapters' kernel (`lorasp_jax.kernels.by_rows`)."""
+_NAMED = "stored"
+
+
+def stored(x: jax.Array) -> jax.Array:
+    """x, which a layer stores for its backward pass instead of the products it was made of."""
+    return checkpoint_name(x, _NAMED)
 
 
 def _keep_products(primitive: Any, *shapes: Any, **params: Any) -> Any:
-    """Results of matrix products are stored, and what is slow to repeat."""
-    if primitive.name in _SLOW_TO_REPEAT:
+    """Results of matrix products are stored, what is slow to repeat, and what has a name."""
+    if primitive.name in _SLOW_TO_REPEAT or params.get("name") == _NAMED:
         return True
     return jax.checkpoint_policies.dots_with_no_batch_dims_saveable(primitive, *shapes, **params)
 

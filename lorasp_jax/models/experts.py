@@ -16,7 +16,7 @@ from flax import nnx
 from lorasp_jax.dense import Dense
 from lorasp_jax.models.attention import attention
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig
-from lorasp_jax.models.depth import scan_depth, stack
+from lorasp_jax.models.depth import scan_depth, stack, stored
 from lorasp_jax.models.layers import (
     AdaptiveRMSNorm,
     LayerAux,
@@ -99,7 +99,7 @@ class ExpertBlock(nnx.Module):
         read = linear.together(QKV, h)
         q, k, v = (y.reshape(heads) for y in read)
         q, k = rope(q, table, scale=self.head_dim**-0.5), rope(k, table)
-        keys, values = k, v
+        keys, values = k, v = stored(k), stored(v)
         if cache is not None:
             keys = jnp.concatenate([cache[0], k], axis=1)
             values = jnp.concatenate([cache[1], v], axis=1)

@@ -85,7 +85,8 @@ class SigLIP(nnx.Module):
             unroll=self.config.unroll,
         )
         side = self.config.image_size // self.config.vision.patch
-        grid = self.norm(x).reshape(x.shape[0], side, side, -1)
+        norm = self.norm if self.config.remat == "none" else jax.checkpoint(self.norm)
+        grid = norm(x).reshape(x.shape[0], side, side, -1)
         head = Linears(self, mask[:, : self.config.image_tokens])
         x = head("head", patches(grid, self.config.vision.shuffle))
         return x, {**aux, **linear.aux, **head.aux}

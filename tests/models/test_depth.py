@@ -8,7 +8,8 @@ from flax import nnx
 
 from lorasp_jax import adaptation
 from lorasp_jax.dense import Dense
-from lorasp_jax.models.depth import scan_depth, stack
+from lorasp_jax.models.depth import scan_depth, stack, stored
+from lorasp_jax.peft import LoRASP
 from tests import quick
 from tests.nets import METHODS, trained
 
@@ -66,16 +67,34 @@ def test_straight_line_code_has_the_loops_gradients(split, remat):
 def test_straight_line_code_stores_no_layers_weights_and_stacks_gradients(split):
     graphdef, adapters, frozen = split
 
-    def stored(adapters, frozen):
+    def residuals(adapters, frozen):
         return jax.vjp(loss_of(graphdef, frozen, remat="products", unroll=True), adapters)[1]
 
-    jaxpr = jax.make_jaxpr(stored)(adapters, frozen).jaxpr
+    jaxpr = jax.make_jaxpr(residuals)(adapters, frozen).jaxpr
     shapes = {v.aval.shape for v in jaxpr.outvars if v not in jaxpr.invars}
     assert (1, TOKENS, INNER) in shapes
     weights = {leaf.shape[1:] for leaf in jax.tree.leaves((adapters, frozen))}
     assert not shapes & weights
     gradient = jax.make_jaxpr(jax.grad(loss_of(graphdef, frozen, unroll=True)))(adapters)
     assert "dynamic_update_slice" not in str(gradient)
+
+
+def test_what_has_a_name_is_stored_in_place_of_its_products():
+    class Sum(nnx.Module):
+        def __init__(self, *, rngs):
+            self.first, self.second = Dense(WIDTH, INNER, rngs=rngs), Dense(WIDTH, INNER, rngs=rngs)
+
+        def __call__(self, x, keep):
+            return x + jnp.cos(keep(self.first(x) + self.second(x))).sum(-1, keepdims=True)
+
+    blocks = stack(lambda rngs: Sum(rngs=rngs), DEPTH, nnx.Rngs(0))
+
+    def inner(keep):
+        run = lambda x: scan_depth(blocks, lambda b, x, _: (b(x, keep), None), x, remat="products")  # noqa: E731
+        pull_back = jax.eval_shape(lambda x: jax.vjp(run, x)[1], jnp.ones((1, TOKENS, WIDTH)))
+        return sum(leaf.shape[-2:] == (TOKENS, INNER) for leaf in jax.tree.leaves(pull_back))
+
+    assert (inner(lambda x: x), inner(stored)) == (2, 1)
 
 
 @pytest.mark.parametrize("unroll", [False, True])
@@ -87,3 +106,21 @@ def test_a_stack_in_which_nothing_trains(unroll):
         graphdef, state = nnx.split(blocks)
         expected = nnx.merge(graphdef, jax.tree.map(lambda a, i=i: a[i], state))(expected)
     np.testing.assert_allclose(run(x), expected, rtol=1e-5)
+
+
+def test_the_adapters_kernel_runs_once_each_way():
+    method = LoRASP(rank=16, hidden_width=16, gate="pallas")
+    blocks = stack(lambda rngs: Dense(WIDTH, WIDTH, method=method, rngs=rngs), DEPTH, nnx.Rngs(0))
+    graphdef, adapters, frozen = adaptation.split(blocks)
+
+    def loss(adapters):
+        layer = lambda block, x, _: block(x, return_aux=True)  # noqa: E731
+        blocks = nnx.merge(graphdef, adapters, frozen)
+        return scan_depth(blocks, layer, jnp.ones((1, 16, WIDTH)), remat="products")[0].sum()
+
+    def calls(jaxpr):
+        inner = (getattr(value, "jaxpr", value) for e in jaxpr.eqns for value in e.params.values())
+        own = sum(e.primitive.name == "custom_vmap_call" for e in jaxpr.eqns)
+        return own + sum(calls(j) for j in inner if hasattr(j, "eqns"))
+
+    assert calls(jax.make_jaxpr(jax.grad(loss))(adapters).jaxpr) == 2
