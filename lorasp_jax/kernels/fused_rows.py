@@ -83,7 +83,7 @@ Widths = tuple[int, ...]
 class Side(NamedTuple):
     """An array [T, ...] and where in it n functions find the columns they take."""
 
-    array: jax.Array
+    array: Any
     widths: Widths
     """Of the columns of one function."""
     start: int = 0
