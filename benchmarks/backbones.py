@@ -21,6 +21,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import nnx
+from jax.sharding import Mesh
 from rich.console import Console
 
 from benchmarks.measuring import best, machine, print_table
@@ -29,6 +30,7 @@ from lorasp_jax.config import Config, OptimConfig
 from lorasp_jax.models import backbone
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
+from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training import preflight
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
 from lorasp_jax.training.preflight import GIB, REMATS, abstract_batch, expected
@@ -57,7 +59,7 @@ def run_config(method: peft.Method, targets: tuple[str, ...], batch: int) -> Con
 
 
 def arrays(config: BackboneConfig, run: Config | None) -> tuple[Any, Any, Any]:
-    """Graph, adapters and frozen arrays, drawn on the device; no adapters without a run."""
+    """Graph, adapters and frozen arrays to sample with; no adapters without a run."""
 
     def model(key: jax.Array) -> Backbone:
         return preflight.adapted(run, config, key) if run else config.create(nnx.Rngs(key))
@@ -79,32 +81,50 @@ def noise(shapes: Any) -> Any:
 
 
 class Step:
-    """A compiled training step with what it needs."""
+    """A compiled training step, and after `draw` what it needs.
 
-    def __init__(self, config: BackboneConfig, run: Config) -> None:
-        graphdef, adapters, self.frozen = arrays(config, run)
+    Args:
+        config: of the backbone.
+        run: whose batch is that of all devices.
+        mesh: of the devices; by default the first alone.
+    """
+
+    def __init__(self, config: BackboneConfig, run: Config, mesh: Mesh | None = None) -> None:
+        mesh = mesh or meshes.make_mesh(devices=jax.devices()[:1])
         optimizer = make_optimizer(run.optim, {run.peft})
-        weights = auxiliary_weights(run.auxiliary, run.optim.steps)
-        self.batch = noise(abstract_batch(config, run.optim.batch_size))
-        self.key = jax.random.key(1)
-        self.state = jax.jit(functools.partial(init_state, optimizer=optimizer))(adapters)
-        step = functools.partial(
-            train_step, graphdef=graphdef, optimizer=optimizer, weights=weights
-        )
-        lowered = jax.jit(step, donate_argnums=0).lower(*self._arguments())
-        self.compiled = lowered.compile()
+        graphdef = adaptation.split(preflight.abstract_model(run, config))[0]
 
-    def _arguments(self) -> tuple:
-        return self.state, self.frozen, self.batch, self.key
+        def drawn(key: jax.Array) -> tuple:
+            _, adapters, frozen = adaptation.split(preflight.adapted(run, config, key))
+            batch = noise(abstract_batch(config, run.optim.batch_size))
+            return init_state(adapters, optimizer), frozen, batch, jax.random.key(1)
+
+        shapes, whole = jax.eval_shape(drawn, jax.random.key(0)), meshes.replicated(mesh)
+        frozen = jax.tree.map(lambda array: meshes.frozen_sharding(array, mesh), shapes[1])
+        placed = whole, frozen, meshes.batch_sharding(mesh), whole
+        self._drawn = jax.jit(drawn, out_shardings=placed)
+        step = functools.partial(
+            train_step,
+            graphdef=graphdef,
+            optimizer=optimizer,
+            weights=auxiliary_weights(run.auxiliary, run.optim.steps),
+        )
+        jitted = jax.jit(step, donate_argnums=0, in_shardings=placed, out_shardings=whole)
+        self.compiled = jitted.lower(*shapes).compile()
+
+    def draw(self) -> "Step":
+        """Itself, with random arrays."""
+        self.state, *self.others = self._drawn(jax.random.key(0, impl="rbg"))
+        return self
 
     def __call__(self) -> Any:
         """The next step's metrics."""
-        self.state, metrics = self.compiled(*self._arguments())
+        self.state, metrics = self.compiled(self.state, *self.others)
         return metrics
 
     @property
     def bytes(self) -> float:
-        """What the program needs with its arguments."""
+        """What the program needs on each device, with its arguments."""
         needed: Any = self.compiled.memory_analysis()
         return needed.argument_size_in_bytes + needed.temp_size_in_bytes
 
@@ -119,7 +139,7 @@ def work(config: BackboneConfig, run: Config) -> float:
 def training(name: str, label: str, run: Config, options: argparse.Namespace, remat: Remat) -> Any:
     """The row of one way to train."""
     config = sized(name, options, remat)
-    step, size = Step(config, run), run.optim.batch_size
+    step, size = Step(config, run).draw(), run.optim.batch_size
     seconds = best(step, calls=options.calls)
     operations = work(sized(name, options), run)
     share = flops.utilisation(operations, seconds)

@@ -75,14 +75,12 @@ def call(
     layers: list[Dense] = [getattr(module, name) for name in names]
     joined: Joined = ready.get_value()[names]
     method, _ = layers[0].carried()
-    tokens, n, ends = x.shape[:-1], len(names), list(itertools.accumulate(map(_outputs, layers)))
+    n, ends = len(names), list(itertools.accumulate(map(_outputs, layers)))
     outs = ends[-1]
     read = product(layers[0].as_input(x), joined.read)
-    rows = read[..., outs : outs + n * _rows(layers[0])].reshape(*tokens, n, -1)
-    z, aux = jax.vmap(
-        lambda params, rows: method.between(params, rows, token_mask), in_axes=(0, -2)
-    )(joined.params, rows)
-    z = jnp.moveaxis(z, 0, -2).reshape(*tokens, -1).astype(read.dtype)
+    columns = range(outs, outs + n * (width := _rows(layers[0])), width)
+    z, aux = method.between_all(joined.params, read, columns, token_mask)
+    z = z.astype(read.dtype)
     y = read[..., :outs] + z @ joined.write
     y = y if joined.bias is None else y + joined.bias
     aux = [jax.tree.map(lambda a, i=i: a[i], aux) for i in range(n)]

@@ -49,30 +49,51 @@ class InARow:
     """A tree of fp32 arrays as one array, which costs a kernel, and XLA before it, one step."""
 
     values: jax.Array
-    """[n], all numbers."""
+    """All numbers, [N], or [n, N] of n such trees."""
     structure: Any
     shapes: tuple[tuple[int, ...], ...]
 
     @classmethod
-    def of(cls, tree: Any) -> "InARow":
-        """The tree, or what it is already."""
+    def of(cls, tree: Any, axes: int = 0) -> "InARow":
+        """The tree, whose leaves have so many leading axes, or what is in a row already."""
         if isinstance(tree, cls):
             return tree
         leaves, structure = jax.tree.flatten(tree)
-        values = jnp.concatenate([leaf.reshape(-1) for leaf in leaves])
-        return cls(values, structure, tuple(leaf.shape for leaf in leaves))
+        flat = [leaf.reshape(*leaf.shape[:axes], -1) for leaf in leaves]
+        shapes = tuple(leaf.shape[axes:] for leaf in leaves)
+        return cls(jnp.concatenate(flat, axis=-1), structure, shapes)
 
     def tree(self, part: Callable[[int, int], jax.Array] | None = None) -> Any:
-        """The tree; `part`, (start, size) -> [size], says how a stretch of the row is read."""
-        read = part or (lambda start, size: self.values[start : start + size])
-        places = _places(tuple(map(math.prod, self.shapes)))
-        leaves = [read(*p).reshape(shape) for p, shape in zip(places, self.shapes, strict=True)]
+        """The tree; `part`, (start, size) -> [..., size], says how a stretch of the row is read."""
+        read = part or (lambda start, size: self.values[..., start : start + size])
+        parts = [read(*place) for place in _places(tuple(map(math.prod, self.shapes)))]
+        leaves = [
+            p.reshape(*p.shape[:-1], *shape) for p, shape in zip(parts, self.shapes, strict=True)
+        ]
         return jax.tree.unflatten(self.structure, leaves)
 
 
 Columns = list[jax.Array]
 """Arrays [n, width] that lie side by side in one [n, sum of widths]."""
 Widths = tuple[int, ...]
+
+
+class Side(NamedTuple):
+    """An array [T, ...] and where in it n functions find the columns they take."""
+
+    array: Any
+    widths: Widths
+    """Of the columns of one function."""
+    start: int = 0
+    """Where those of the first function begin."""
+    stride: int = 0
+    """How much further those of the next; 0: all take the same."""
+
+    def places(self, i: Any) -> list[tuple[Any, int]]:
+        """(start, width) of each of the i-th function's columns."""
+        return [(self.start + i * self.stride + at, size) for at, size in _places(self.widths)]
+
+
 Function = Callable[[Any, Columns, jax.Array, jax.Array | None], tuple]
 Body = Callable[..., tuple[list[Columns], Any]]
 
@@ -84,9 +105,12 @@ def fused_rows(
     widths: Widths,
     counts: jax.Array,
     *,
+    start: int = 0,
     interpret: bool = False,
 ) -> tuple[jax.Array, Any, Columns]:
     """`function` of all rows in one kernel, its gradient in another.
+
+    With n trees in `shared` it is n functions, each of the next columns of `rows`.
 
     Args:
       function: (shared, columns, counts, kept) -> (output, sums, kept, statistics), for n rows, one
@@ -95,19 +119,24 @@ def fused_rows(
         gradient takes as given (None on the way forward), statistics a list of [n, 1] without
         gradient. It may use what Triton has: sides are powers of two, in a matrix product at
         least 16.
-      shared: pytree of small fp32 arrays that every row uses, or the same as `InARow`.
-      rows: [T, sum of widths].
+      shared: pytree of small fp32 arrays that every row uses, or the same as `InARow`, or n of it.
+      rows: [T, sum of widths, n times, or more].
       widths: of the columns that `function` takes.
       counts: bool [T, 1].
+      start: which column is the first.
       interpret: run the kernels' bodies without a GPU, slowly.
 
     Returns:
-      output [T, O], sums, statistics [T, 1]. Gradients reach `shared` and `rows`.
+      output [T, O], sums, statistics [T, 1]. Gradients reach `shared` and `rows`. With n trees in
+      `shared` [T, n O], sums with a leading axis n, and [T, n].
     """
     launches = (FEW, FEW) if len(rows) <= FEW_ROWS else (FORWARD, BACKWARD)
-    static = function, widths, launches, interpret
-    found: Any = _fused(static, InARow.of(shared), rows, counts.astype(jnp.int8))
-    return found
+    row, counts = InARow.of(shared), counts.astype(jnp.int8)
+    alone = row.values.ndim == 1
+    row = dataclasses.replace(row, values=jnp.atleast_2d(row.values))
+    found: Any = _fused((function, widths, start, launches, interpret), row, rows, counts)
+    output, sums, statistics = found
+    return output, jax.tree.map(lambda leaf: leaf[0], sums) if alone else sums, statistics
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -116,19 +145,19 @@ def _fused(static: tuple, row: InARow, rows: jax.Array, counts: jax.Array) -> tu
 
 
 def _forward(static: tuple, row: InARow, rows: jax.Array, counts: jax.Array) -> tuple:
-    function, widths, (launch, _), interpret = static
+    function, widths, start, (launch, _), interpret = static
 
     def block(shared: Any, columns: Columns, counts: Columns) -> tuple[list[Columns], Any]:
         output, sums, kept, statistics = function(shared, columns, counts[0] != 0, None)
         return [[output], [_packed(kept)], *([column] for column in statistics)], sums
 
-    inputs = [(rows, widths), (counts, (1,))]
+    inputs = [Side(rows, widths, start, sum(widths)), Side(counts, (1,))]
     (output, kept, *statistics), sums = _map_blocks(block, row, inputs, launch, interpret)
     return (output, sums.tree(), statistics), (row, rows, counts, kept)
 
 
 def _backward(static: tuple, residuals: tuple, cotangents: tuple) -> tuple:
-    function, widths, (_, launch), interpret = static
+    function, widths, start, (_, launch), interpret = static
     row, rows, counts, kept = residuals
     d_output, d_sums, _ = cotangents
 
@@ -143,55 +172,50 @@ def _backward(static: tuple, residuals: tuple, cotangents: tuple) -> tuple:
         d_shared, d_columns = pull_back((d_output, d_sums))
         return [d_columns], d_shared
 
-    inputs = [(rows, widths), *((a, (a.shape[1],)) for a in (counts, kept, d_output))]
-    given = InARow.of((row.tree(), d_sums))
+    each = [array.shape[1] // len(row.values) for array in (kept, d_output)]
+    inputs = [Side(rows, widths, start, sum(widths)), Side(counts, (1,))]
+    inputs += [Side(a, (w,), stride=w) for a, w in zip((kept, d_output), each, strict=True)]
+    given = InARow.of((row.tree(), d_sums), axes=1)
     (d_rows,), d_row = _map_blocks(block, given, inputs, launch, interpret)
-    return d_row, d_rows, None
+    behind = rows.shape[1] - start - d_rows.shape[1]
+    return d_row, jnp.pad(d_rows, ((0, 0), (start, behind))), None
 
 
 _fused.defvjp(_forward, _backward)
 
 
 class _Blocks(NamedTuple):
-    """How the kernel works: what it does with a block of rows, and what goes in and comes out."""
+    """What the kernel does with a block of rows, and where it finds and leaves its columns."""
 
     body: Body
     launch: Launch
-    widths: list[Widths]
-    """Of the columns of each input."""
-    out_types: list[Any]
-    out_widths: list[Widths]
     shared_tree: Callable[[Callable], Any]
+    inputs: list[Side]
+    outputs: list[Side]
+    """Both with the arrays' types in place of the arrays."""
     sums: Any
     """Shapes of what adds up over rows."""
 
 
 def _map_blocks(
-    body: Body,
-    shared: InARow,
-    inputs: list[tuple[jax.Array, Widths]],
-    launch: Launch,
-    interpret: bool,
+    body: Body, shared: InARow, inputs: list[Side], launch: Launch, interpret: bool
 ) -> tuple[Sequence[jax.Array], InARow]:
     """body(shared, columns of each input) -> (columns of each output, sums), in one kernel."""
     columns, sums = jax.eval_shape(
-        lambda row, *columns: body(row.tree(), *columns),
-        shared,
-        *([_shape(array.dtype, launch.rows, width) for width in w] for array, w in inputs),
+        lambda values, *columns: body(dataclasses.replace(shared, values=values).tree(), *columns),
+        shared.values[0],
+        *([_shape(s.array.dtype, launch.rows, width) for width in s.widths] for s in inputs),
     )
-    blocks = _Blocks(
-        body,
-        launch,
-        widths=[widths for _, widths in inputs],
-        out_types=[output[0].dtype for output in columns],
-        out_widths=[tuple(column.shape[1] for column in output) for output in columns],
-        shared_tree=shared.tree,
-        sums=sums,
-    )
+    outputs = []
+    for output in columns:
+        widths = tuple(column.shape[1] for column in output)
+        outputs.append(Side(output[0].dtype, widths, stride=sum(widths)))
+    types = [side._replace(array=side.array.dtype) for side in inputs]
+    blocks = _Blocks(body, launch, shared.tree, types, outputs, sums)
     call = functools.partial(_call, blocks, interpret)
-    outputs, (added,) = by_rows(call, [shared.values], [array for array, _ in inputs])
+    found, (added,) = by_rows(call, [shared.values], [side.array for side in inputs])
     leaves, structure = jax.tree.flatten(sums)
-    return outputs, InARow(added, structure, tuple(leaf.shape for leaf in leaves))
+    return found, InARow(added, structure, tuple(leaf.shape for leaf in leaves))
 
 
 def _call(
@@ -199,25 +223,22 @@ def _call(
 ) -> tuple[list[jax.Array], list[jax.Array]]:
     """Outputs, and the sums in a row.
 
-    Every program takes a stretch of blocks and adds up their sums; XLA adds up the programs'.
+    Every program takes a stretch of one function's blocks and adds up their sums; XLA adds up the
+    programs'.
     """
     from jax.experimental.pallas import triton  # absent from builds without NVIDIA support
 
     (values,), launch, num_rows = shared, blocks.launch, len(arrays[0])
-    fill = -num_rows % launch.rows
-    arrays = [jnp.pad(array, ((0, fill), (0, 0))) for array in arrays]
-    number = len(arrays[0]) // launch.rows
+    arrays = [jnp.pad(array, ((0, -num_rows % launch.rows), (0, 0))) for array in arrays]
+    number, num = len(arrays[0]) // launch.rows, len(values)
     most = pl.cdiv(number, launch.programs)
     stretch = next(n for n in range(most, 0, -1) if number % n == 0)
-    rows = [
-        _shape(dtype, len(arrays[0]), sum(widths))
-        for dtype, widths in zip(blocks.out_types, blocks.out_widths, strict=True)
-    ]
-    size = sum(leaf.size for leaf in jax.tree.leaves(blocks.sums))
+    programs, size = number // stretch, sum(leaf.size for leaf in jax.tree.leaves(blocks.sums))
+    rows = [_shape(s.array, len(arrays[0]), num * sum(s.widths)) for s in blocks.outputs]
     outputs, partial_sums = pl.pallas_call(
         functools.partial(_kernel, blocks, stretch),
-        grid=(number // stretch,),
-        out_shape=(rows, _shape(jnp.float32, number // stretch, size)),
+        grid=(programs, num),
+        out_shape=(rows, _shape(jnp.float32, programs, num, size)),
         compiler_params=triton.CompilerParams(num_warps=launch.warps, num_stages=1),
         interpret=interpret,
         name="fused_rows",
@@ -252,27 +273,27 @@ def _shape(dtype: Any, *sides: int) -> jax.ShapeDtypeStruct:
 def _kernel(
     blocks: _Blocks, stretch: int, shared_ref: Any, input_refs: Any, output_refs: Any, sum_ref: Any
 ) -> None:
-    """One program: `stretch` blocks, one after the other."""
-    shared = blocks.shared_tree(lambda *place: shared_ref[pl.ds(*place)])
-    program, num_rows = pl.program_id(0), blocks.launch.rows
+    """One program: `stretch` blocks of one function, one after the other."""
+    program, function = pl.program_id(0), pl.program_id(1)
+    shared = blocks.shared_tree(lambda *place: shared_ref[function, pl.ds(*place)])
+    num_rows = blocks.launch.rows
 
     def block(i: jax.Array, sums: Any) -> Any:
         at = pl.ds((program * stretch + i) * num_rows, num_rows)
         loaded = [
-            [ref[at, pl.ds(*place)] for place in _places(widths)]
-            for ref, widths in zip(input_refs, blocks.widths, strict=True)
+            [ref[at, pl.ds(*place)] for place in side.places(function)]
+            for ref, side in zip(input_refs, blocks.inputs, strict=True)
         ]
-        outputs, more = blocks.body(shared, *loaded)
-        for ref, widths, columns in zip(output_refs, blocks.out_widths, outputs, strict=True):
-            for place, column in zip(_places(widths), columns, strict=True):
+        found, more = blocks.body(shared, *loaded)
+        for ref, side, columns in zip(output_refs, blocks.outputs, found, strict=True):
+            for place, column in zip(side.places(function), columns, strict=True):
                 ref[at, pl.ds(*place)] = column
         return jax.tree.map(jnp.add, sums, more)
 
     zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), blocks.sums)
-    found = jax.lax.fori_loop(0, stretch, block, zeros)
-    leaves = jax.tree.leaves(found)
+    leaves = jax.tree.leaves(jax.lax.fori_loop(0, stretch, block, zeros))
     for place, leaf in zip(_places(tuple(leaf.size for leaf in leaves)), leaves, strict=True):
-        sum_ref[program, pl.ds(*place)] = leaf.reshape(-1)
+        sum_ref[program, function, pl.ds(*place)] = leaf.reshape(-1)
 
 
 def _places(widths: Widths) -> list[tuple[int, int]]:

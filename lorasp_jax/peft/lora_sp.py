@@ -201,6 +201,27 @@ class LoRASP(Method):
         active_rank, energy = (column.reshape(tokens) for column in statistics)
         return z.reshape(*tokens, self.rank), Aux(active_rank, energy, losses, usage=usage)
 
+    def between_all(
+        self, params: Params, read: jax.Array, columns: range, token_mask: jax.Array | None
+    ) -> tuple[jax.Array, Aux]:
+        """`between` of n layers, where possible in one kernel that finds its columns in `read`."""
+        if not self._is_fused():
+            return super().between_all(params, read, columns, token_mask)
+        tokens, n = read.shape[:-1], len(columns)
+        counts = jnp.ones(tokens, bool) if token_mask is None else token_mask
+        z, sums, statistics = self._fused(params["router"], read, counts, columns.start)
+        active_rank, energy = (column.T.reshape(n, *tokens) for column in statistics)
+        aux = Aux(active_rank, energy, jax.vmap(routing.losses)(sums), usage=sums.kept)
+        return z.reshape(*tokens, -1), aux
+
+    def _fused(self, router: Any, rows: jax.Array, counts: jax.Array, start: int = 0) -> tuple:
+        """z, sums and statistics of `route`, in one kernel."""
+        function = functools.partial(
+            routing.route, energy_target=self.energy_target, scale=self.scale, gate="block"
+        )
+        flat, widths = rows.reshape(-1, rows.shape[-1]), (self.rank, self.hidden_width)
+        return fused_rows(function, router, flat, widths, counts.reshape(-1, 1), start=start)
+
     def for_rows(self, params: Params) -> Params:
         """The parameters without [V, W1] and U, and for the kernel the router's in a row."""
         params = {name: p for name, p in self._routing(params).items() if name != "bank"}
@@ -222,19 +243,21 @@ class LoRASP(Method):
 
     def _route(self, params: Params, rows: jax.Array, counts: jax.Array) -> routing.Routed:
         """`route` of x [V W1], [...tokens, R + H], where possible in one kernel."""
-        router, widths = params["router"], (self.rank, self.hidden_width)
-        function = functools.partial(
-            routing.route, energy_target=self.energy_target, scale=self.scale
-        )
-        kept = self._shared_mask(params, rows, counts)
-        rows, counts = rows.reshape(-1, rows.shape[-1]), counts.reshape(-1, 1)
+        router = params["router"]
         if self._is_fused():
-            function = functools.partial(function, gate="block")
-            z, sums, statistics = fused_rows(function, router, rows, widths, counts)
+            z, sums, statistics = self._fused(router, rows, counts)
         else:
-            columns, gate = jnp.split(rows, widths[:1], axis=1), self._gate()
-            z, sums, _, statistics = function(
-                router, columns, counts, kept, gate=gate, score_function=self.score_function
+            kept = self._shared_mask(params, rows, counts)
+            columns = jnp.split(rows.reshape(-1, rows.shape[-1]), [self.rank], axis=1)
+            z, sums, _, statistics = routing.route(
+                router,
+                columns,
+                counts.reshape(-1, 1),
+                kept,
+                energy_target=self.energy_target,
+                scale=self.scale,
+                gate=self._gate(),
+                score_function=self.score_function,
             )
         return z, routing.losses(sums), sums.kept, statistics
 

@@ -144,6 +144,29 @@ class Method:
         """What `between` takes in place of `params`, for many calls: work on these done once."""
         return params
 
+    def between_all(
+        self, params: Params, read: jax.Array, columns: range, token_mask: jax.Array | None
+    ) -> tuple[jax.Array, Aux]:
+        """`between` of n layers whose rows lie side by side.
+
+        Args:
+          params: of `for_rows`, [n, ...].
+          read: [...tokens, C], which holds the rows.
+          columns: the first column of each layer's Q.
+          token_mask: as for `delta`.
+
+        Returns:
+          z of all layers side by side [...tokens, n R], and aux [n, ...] without its token_mask.
+        """
+        tokens, (n, width) = read.shape[:-1], (len(columns), columns.step)
+        rows = read[..., columns.start : columns.stop].reshape(*tokens, n, width)
+
+        def one(params: Params, rows: jax.Array) -> tuple[jax.Array, Aux]:
+            return self.between(params, rows, token_mask)
+
+        z, aux = jax.vmap(one, in_axes=(0, -2), out_axes=(-2, 0))(params, rows)
+        return z.reshape(*tokens, -1), aux
+
     def up(self, params: Params) -> jax.Array:
         """U [R, O], the matrix that writes y."""
         raise NotImplementedError

@@ -130,10 +130,14 @@ def adapted(config: Config, wanted: BackboneConfig, key: jax.Array) -> Backbone:
     return adaptation.adapt(wanted.create(base), rules, rngs=adapters)
 
 
+def abstract_model(config: Config, wanted: BackboneConfig) -> Backbone:
+    """The shapes of `adapted`."""
+    return nnx.eval_shape(lambda: adapted(config, wanted, jax.random.key(0)))
+
+
 def abstract_step(config: Config, wanted: BackboneConfig, batch_size: int) -> AbstractStep:
     """The loss of a run, whose auxiliary losses weigh nothing, and shapes of what it takes."""
-    model = nnx.eval_shape(lambda: adapted(config, wanted, jax.random.key(0)))
-    graphdef, adapters, frozen = adaptation.split(model)
+    graphdef, adapters, frozen = adaptation.split(abstract_model(config, wanted))
     weights: Any = dict.fromkeys(auxiliary_weights(config.auxiliary, 1), 0.0)
 
     def loss(adapters: Any, frozen: Any, batch: Batch) -> tuple[jax.Array, Metrics]:

@@ -87,7 +87,7 @@ def test_stores_the_rows_and_the_bits_of_what_is_kept_alone(shared):
     call = lambda rows: kernels.fused_rows(gated, shared, rows, WIDTHS, counts, interpret=True)[0]  # noqa: E731
     _, pull_back = jax.eval_shape(lambda rows: jax.vjp(call, rows), rows)
     stored = {leaf.shape for leaf in jax.tree.leaves(pull_back) if leaf.shape}
-    assert stored <= {(32, 48), (32, 32 // 8), (32, 1), (16 * 32 + 32,)}
+    assert stored <= {(32, 48), (32, 32 // 8), (32, 1), (1, 16 * 32 + 32)}
 
 
 def test_what_is_shared_may_be_in_a_row_already(shared):
@@ -98,6 +98,39 @@ def test_what_is_shared_may_be_in_a_row_already(shared):
     expected, (d_shared, d_rows) = run(True, shared, rows, counts)
     found, (d_row, others) = run(True, row, rows, counts)
     jax.tree.map(close, (found, d_row.tree(), others), (expected, d_shared, d_rows))
+
+
+@pytest.mark.parametrize("few", [0, pytest.param(kernels.FEW_ROWS, marks=pytest.mark.slow)])
+def test_functions_side_by_side(shared, few, monkeypatch):
+    """Two functions in one kernel, of columns behind others, against each alone."""
+    monkeypatch.setattr(kernels, "FEW_ROWS", few)
+    trees = [shared, jax.tree.map(jnp.negative, shared)]
+    pair = jax.tree.map(lambda *rows: jnp.stack(rows), *map(kernels.InARow.of, trees))
+    rows = jax.random.normal(jax.random.key(1), (20, 8 + 2 * 48 + 3))
+    counts = jax.random.bernoulli(jax.random.key(2), 0.7, (20, 1))
+
+    def together(pair, rows):
+        output, sums, (number,) = kernels.fused_rows(
+            gated, pair, rows, WIDTHS, counts, start=8, interpret=True
+        )
+        return jnp.sin(output).sum() + sums["squares"].sum(), (output, sums, number)
+
+    def alone(trees, rows):
+        starts = (8, 8 + 48)
+        found = [
+            gated(tree, [rows[:, at : at + 32], rows[:, at + 32 : at + 48]], counts, None)
+            for tree, at in zip(trees, starts, strict=True)
+        ]
+        output = jnp.concatenate([one[0] for one in found], axis=1)
+        sums = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(one[1] for one in found))
+        number = jnp.concatenate([one[3][0] for one in found], axis=1)
+        return jnp.sin(output).sum() + sums["squares"].sum(), (output, sums, number)
+
+    run = lambda f: jax.jit(jax.value_and_grad(f, argnums=(0, 1), has_aux=True))  # noqa: E731
+    (_, found), (d_pair, d_rows) = run(together)(pair, rows)
+    (_, expected), (d_trees, others) = run(alone)(trees, rows)
+    d_stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *d_trees)
+    jax.tree.map(close, (found, d_pair.tree(), d_rows), (expected, d_stacked, others))
 
 
 def test_bits_are_the_bools():

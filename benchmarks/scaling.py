@@ -1,0 +1,94 @@
+"""Training on 1, 2 and 4 devices of one host: LoRA-SP on every linear layer, random weights.
+
+    python -m benchmarks.scaling --devices 1 2 4 --json scaling.json
+    python -m benchmarks.scaling --devices 1 2 --sizes nano --batch 4 --rank 8 --dtype float32
+
+Every device has the same share of the batch, whatever their number ("batch"). "data": each device
+holds the whole frozen base; "fsdp": all of them hold it together, and gather each layer's weights
+when they come to it. Adapters and their optimizer's state are on every device. "of linear" is the
+rate over that of as many devices alone, and GiB what the program needs on each device.
+"""
+
+import argparse
+import dataclasses
+import json
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import jax
+from rich.console import Console
+
+from benchmarks import backbones
+from benchmarks.measuring import best, machine, print_table
+from lorasp_jax import peft
+from lorasp_jax.training import mesh as meshes
+from lorasp_jax.training.preflight import GIB, REMATS
+
+BATCH = {"nano": 512, "small": 512, "base": 32}
+
+
+def layouts(devices: list[int]) -> list[tuple[str, int]]:
+    """Which are measured, one device first."""
+    several = sorted(set(devices) - {1})
+    return [("data", 1), *((name, n) for n in several for name in ("data", "fsdp"))]
+
+
+def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """One for each layout; all of them are compiled at once."""
+    each = options.batch or BATCH[options.size]
+    config = backbones.sized(options.backbone, options, options.remat)
+    method = peft.LoRASP(rank=options.rank)
+
+    def compiled(layout: tuple[str, int]) -> backbones.Step:
+        name, number = layout
+        mesh = meshes.make_mesh(number if name == "fsdp" else 1, jax.devices()[:number])
+        run = backbones.run_config(method, ("all-linear",), number * each)
+        return backbones.Step(config, dataclasses.replace(run, fsdp=mesh.shape["fsdp"]), mesh)
+
+    wanted = layouts(options.devices)
+    with ThreadPoolExecutor(options.threads) as pool:
+        steps = dict(zip(wanted, pool.map(compiled, wanted), strict=True))
+    alone = None
+    for name, number in wanted:
+        step = steps.pop((name, number))
+        rate = number * each / best(step.draw(), calls=options.calls)
+        alone = alone or rate
+        yield {
+            "backbone": options.backbone,
+            "size": options.size,
+            "devices": number,
+            "layout": name,
+            "batch": each,
+            "samples/s": rate,
+            "of linear": rate / number / alone,
+            "GiB": step.bytes / GIB,
+        }
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--backbone", default="pi0")
+    parser.add_argument("--sizes", nargs="+", default=["small", "base"])
+    parser.add_argument("--devices", type=int, nargs="+", default=[1, 2, 4])
+    parser.add_argument("--batch", type=int, help="windows a device; default: by size")
+    parser.add_argument("--rank", type=int, default=128)
+    parser.add_argument("--remat", choices=REMATS, default="products")
+    parser.add_argument("--dtype", default="bfloat16")
+    parser.add_argument("--calls", type=int, default=5, help="steps queued together")
+    parser.add_argument("--threads", type=int, default=8, help="that compile")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    options = parser.parse_args()
+    console, found = Console(soft_wrap=True), dict[str, Any](machine=machine("jax"))
+    console.print(f"{found['machine']}, rank {options.rank}, {options.dtype}")
+    for options.size in options.sizes:
+        found[options.size] = [*rows(options)]
+        print_table(console, found[options.size])
+        if options.json:
+            options.json.write_text(json.dumps(found, indent=1))
+
+
+if __name__ == "__main__":
+    main()
