@@ -18,7 +18,7 @@ from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.prompt_table import PromptTable
 from lorasp_jax.peft import LoRASP
-from lorasp_jax.training.loop import Callback, Run
+from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.setup import processor
 
 CONFIG = Config(

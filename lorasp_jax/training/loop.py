@@ -2,24 +2,18 @@
 
 import contextlib
 import functools
-import json
 import math
-import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import nnx
-from rich.console import Console
 
-from envs.episodes import Episodes
 from lorasp_jax import adaptation
 from lorasp_jax.config import Config
-from lorasp_jax.data.batches import Raw, Steps, encode, flatten, sample_batch
+from lorasp_jax.data.batches import Raw, Steps, encode, sample_batch
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.training import mesh as meshes
@@ -27,81 +21,13 @@ from lorasp_jax.training.checkpoint import Checkpoints
 from lorasp_jax.training.interrupt import deferred
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
 from lorasp_jax.training.progress import bars
-from lorasp_jax.training.run_folder import MetricsLog, write_json
+from lorasp_jax.training.run import Callback, Run
+from lorasp_jax.training.run_folder import MetricsLog
 from lorasp_jax.training.step import TrainState, init_state, train_step
 
 
 class RunError(ValueError):
     """The run cannot go on; the message says why and what to do, in one sentence."""
-
-
-@dataclass
-class Run:
-    """A run as its callbacks see it.
-
-    Attributes:
-        config: what was asked for.
-        folder: where everything is written.
-        console: where to print.
-        base_hash: hash of the frozen base.
-        episodes: demonstrations by task; of a dataset, without all its pictures.
-        dataset: the steps of a dataset, in files; None: those of `episodes`.
-        streams: whether the steps of a dataset are read from there step by step, because the device
-            has no room for them.
-        simulated: whether the tasks can be evaluated in simulation.
-        policy: the policy before the first step or after the last; in between, training owns its
-            memory.
-        started: `time.perf_counter()` when this process began.
-        seconds: time spent by phase, and "total", over all processes that worked on this run.
-    """
-
-    config: Config
-    folder: Path
-    console: Console
-    base_hash: str
-    started: float = field(default_factory=time.perf_counter)
-    episodes: dict[str, Episodes] = field(default_factory=dict)
-    dataset: Steps | None = None
-    streams: bool = False
-    simulated: bool = True
-    policy: Policy = field(init=False)
-    seconds: dict[str, float] = field(init=False)
-
-    def __post_init__(self) -> None:
-        """Takes over the time that earlier processes spent."""
-        path = self.folder / "seconds.json"
-        self.seconds = json.loads(path.read_text()) if path.exists() else {"total": 0.0}
-        self._before = self.seconds["total"]
-
-    @property
-    def steps(self) -> Steps:
-        """All steps that are trained on."""
-        return self.dataset or flatten(list(self.episodes.values()))
-
-    @contextlib.contextmanager
-    def timed(self, phase: str) -> Iterator[None]:
-        """Add the time spent in this block to `seconds[phase]`, also if it is interrupted."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            now = time.perf_counter()
-            self.seconds[phase] = self.seconds.get(phase, 0.0) + now - start
-            self.seconds["total"] = self._before + now - self.started
-            write_json(self.folder / "seconds.json", self.seconds)
-
-
-class Callback:
-    """Hooks into a run; override what is needed."""
-
-    def on_start(self, run: Run) -> None:
-        """Before the first step, with the policy as it comes; not called again on resume."""
-
-    def on_log(self, run: Run, step: int, metrics: dict[str, float]) -> None:
-        """After every logged stretch of steps."""
-
-    def on_end(self, run: Run) -> None:
-        """After the last step, with the trained policy."""
 
 
 def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False) -> None:

@@ -31,8 +31,8 @@ from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.processing import Processor, Statistics, check_delta, robot_slots, to_delta
 from lorasp_jax.models.prompt_table import PromptTable
 from lorasp_jax.training import preflight
-from lorasp_jax.training.loop import Run
 from lorasp_jax.training.progress import bars
+from lorasp_jax.training.run import Run
 
 STATISTICS_BATCHES = 8
 """Batches that an initialization from data looks at."""

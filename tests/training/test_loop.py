@@ -10,7 +10,8 @@ import pytest
 
 from lorasp_jax import adaptation
 from lorasp_jax.training import mesh as meshes
-from lorasp_jax.training.loop import Callback, RunError, _Stretches, train
+from lorasp_jax.training.loop import RunError, _Stretches, train
+from lorasp_jax.training.run import Callback
 from lorasp_jax.training.run_folder import read_metrics
 from tests.runs import CONFIG, Terminate, leaves, make_run
 

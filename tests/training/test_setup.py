@@ -25,8 +25,9 @@ from lorasp_jax.models.tokenizer import Offline
 from lorasp_jax.peft import FullFineTuning, LoRA
 from lorasp_jax.training import export, setup
 from lorasp_jax.training import mesh as meshes
-from lorasp_jax.training.loop import Run, train
+from lorasp_jax.training.loop import train
 from lorasp_jax.training.overrides import override
+from lorasp_jax.training.run import Run
 from tests import quick
 from tests.data.lerobots import golden
 from tests.runs import CONFIG, leaves, random_episodes
