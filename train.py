@@ -10,6 +10,7 @@ from rich.console import Console
 
 from envs import physics
 
+RUNS = Path("runs")
 STOPPED = 130
 """Exit code after a signal, as shells have it."""
 
@@ -25,8 +26,14 @@ def main(arguments: list[str]) -> int:
     from lorasp_jax.training.run_folder import open_run
 
     try:
-        config, resume = parse(arguments)
-        folder = open_run(config, Path("runs"), resume=resume)
+        command = parse(arguments)
+        config, resume = command.config, command.resume
+        if command.dry_run:
+            from lorasp_jax.training.dry_run import dry_run
+
+            dry_run(config, RUNS / config.name, console)
+            return 0
+        folder = open_run(config, RUNS, resume=resume)
         report = folder / "report.html"
         if resume and report.exists():
             console.print(f"this run is finished: {report}", markup=False)

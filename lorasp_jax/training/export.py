@@ -4,9 +4,9 @@ import json
 from typing import Any
 
 from lorasp_jax import adaptation, adapter_io, models
+from lorasp_jax.training.base import TRAINING
 from lorasp_jax.training.run import Run
 from lorasp_jax.training.run_folder import write_json
-from lorasp_jax.training.setup import TRAINING
 
 
 def write(run: Run) -> None:

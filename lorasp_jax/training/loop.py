@@ -49,7 +49,7 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
     checkpoints = Checkpoints(run.folder, run.base_hash)
     restored = checkpoints.restore(state) if resume else None
     state = restored or state
-    jitted = _jitted(run, graphdef, optimizer, mesh)
+    jitted = jit_stretch(run, graphdef, optimizer, mesh)
     if run.streams:
         many = _Streamed(jitted, frozen, _batches(run, mesh, int(state.step)))
     else:
@@ -68,7 +68,7 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
         callback.on_end(run)
 
 
-def _jitted(run: Run, graphdef: Any, optimizer: Any, mesh: jax.sharding.Mesh) -> Callable:
+def jit_stretch(run: Run, graphdef: Any, optimizer: Any, mesh: jax.sharding.Mesh) -> Callable:
     """The jitted stretch of steps: (frozen, data, state, key, count) -> state, metrics.
 
     Data are all steps, or one raw batch.

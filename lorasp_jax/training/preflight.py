@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 from flax import nnx
 
-from lorasp_jax import adaptation
+from lorasp_jax import adaptation, flops
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Batch
 from lorasp_jax.models import presets
@@ -140,6 +140,13 @@ def abstract_step(config: Config, wanted: BackboneConfig, batch_size: int) -> Ab
         return loss_fn(adapters, frozen, graphdef, batch, jax.random.key(0), weights)
 
     return AbstractStep(loss, adapters, frozen, abstract_batch(wanted, batch_size))
+
+
+def operations(config: Config, wanted: BackboneConfig) -> float:
+    """Floating-point operations of one training step over all devices, nothing counted twice."""
+    step = abstract_step(config, dataclasses.replace(wanted, remat="none"), config.optim.batch_size)
+    gradient = jax.grad(step.loss, has_aux=True)
+    return flops.count(gradient, step.adapters, step.frozen, step.batch)
 
 
 def abstract_batch(config: BackboneConfig, size: int) -> Batch:
