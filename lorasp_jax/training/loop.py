@@ -11,18 +11,20 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax import adaptation
+from lorasp_jax import adaptation, flops
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Raw, Steps, encode, sample_batch
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.training import mesh as meshes
+from lorasp_jax.training import preflight
 from lorasp_jax.training.checkpoint import Checkpoints
 from lorasp_jax.training.interrupt import deferred
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
 from lorasp_jax.training.progress import bars
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import MetricsLog
+from lorasp_jax.training.speed import Speed
 from lorasp_jax.training.step import TrainState, init_state, train_step
 
 
@@ -49,11 +51,12 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
     checkpoints = Checkpoints(run.folder, run.base_hash)
     restored = checkpoints.restore(state) if resume else None
     state = restored or state
-    jitted = jit_stretch(run, graphdef, optimizer, mesh)
+    jitted, speed = jit_stretch(run, graphdef, optimizer, mesh), _speed(run)
     if run.streams:
-        many = _Streamed(jitted, frozen, _batches(run, mesh, int(state.step)))
+        many = _Streamed(jitted, frozen, _batches(run, mesh, int(state.step)), speed)
     else:
-        many = _Stretches(jitted, frozen, jax.device_put(run.steps, meshes.replicated(mesh)))
+        steps = jax.device_put(run.steps, meshes.replicated(mesh))
+        many = _Stretches(jitted, frozen, steps, speed)
     if restored is None:
         many.compile(state, _stretch(run.config, int(state.step)))  # beside what the callbacks do
         for callback in callbacks:
@@ -100,7 +103,7 @@ def jit_stretch(run: Run, graphdef: Any, optimizer: Any, mesh: jax.sharding.Mesh
         state, metrics = jax.lax.scan(
             lambda state, _: one(state, frozen, data, key), state, length=count
         )
-        return state, jax.tree.map(jnp.mean, metrics)
+        return state, jax.tree.map(lambda values: values.mean(0), metrics)
 
     return many
 
@@ -108,8 +111,8 @@ def jit_stretch(run: Run, graphdef: Any, optimizer: Any, mesh: jax.sharding.Mesh
 class _Stretches:
     """Stretches of steps, (state, key, count) -> state, metrics, each length compiled once."""
 
-    def __init__(self, jitted: Callable, frozen: Any, data: Steps | Raw) -> None:
-        self._jitted, self._frozen, self._data = jitted, frozen, data
+    def __init__(self, jitted: Callable, frozen: Any, data: Steps | Raw, speed: Speed) -> None:
+        self._jitted, self._frozen, self._data, self.speed = jitted, frozen, data, speed
         self._compiled: dict[int, Future] = {}
 
     def compile(self, state: TrainState, count: int) -> Future:
@@ -124,14 +127,15 @@ class _Stretches:
 
     def __call__(self, state: TrainState, key: jax.Array, count: int) -> tuple[TrainState, Any]:
         run = self.compile(state, count).result()
+        self.speed.begin()
         return run(self._frozen, self._data, state, key)
 
 
 class _Streamed(_Stretches):
     """Stretches of steps whose batches come from files, one always on its way to the device."""
 
-    def __init__(self, jitted: Callable, frozen: Any, batches: Iterator[Raw]) -> None:
-        super().__init__(jitted, frozen, next(batches))
+    def __init__(self, jitted: Callable, frozen: Any, batches: Iterator[Raw], speed: Speed) -> None:
+        super().__init__(jitted, frozen, next(batches), speed)
         self._batches = batches
 
     def compile(self, state: TrainState, count: int) -> Future:  # noqa: ARG002
@@ -141,9 +145,10 @@ class _Streamed(_Stretches):
         found = []
         for _ in range(count):
             state, metrics = super().__call__(state, key, 1)
-            self._data = next(self._batches)
+            with self.speed.waiting(metrics):
+                self._data = next(self._batches)
             found.append(metrics)
-        return state, jax.tree.map(lambda *values: jnp.stack(values).mean(), *found)
+        return state, jax.tree.map(lambda *values: jnp.stack(values).mean(0), *found)
 
 
 def _batches(run: Run, mesh: jax.sharding.Mesh, start: int) -> Iterator[Raw]:
@@ -160,13 +165,21 @@ def _batches(run: Run, mesh: jax.sharding.Mesh, start: int) -> Iterator[Raw]:
     return (jax.tree.map(put, raw) for raw in stream)
 
 
+def _speed(run: Run) -> Speed:
+    """The run's clock; operations are counted where it is known how many there could be."""
+    size = run.config.optim.batch_size
+    if flops.peak() is None:
+        return Speed(size, None)
+    return Speed(size, preflight.operations(run.config, run.policy.model.config))
+
+
 def _stretch(config: Config, done: int) -> int:
     """Steps until the next log line or the end."""
     return min(config.log_every, config.optim.steps - done)
 
 
 def _loop(
-    run: Run, state: TrainState, many: Callable, checkpoints: Checkpoints, callbacks: Any
+    run: Run, state: TrainState, many: _Stretches, checkpoints: Checkpoints, callbacks: Any
 ) -> TrainState:
     """Stretch after stretch until the last step, a signal or a loss that is not finite."""
     config = run.config
@@ -181,10 +194,12 @@ def _loop(
         while (done := int(state.step)) < total and not stop.requested:
             count = _stretch(config, done)
             state, metrics = many(state, key, count)
-            values = {name: float(value) for name, value in metrics.items()}
+            found = jax.device_get(metrics)
+            values = {name: float(value.mean()) for name, value in found.items()}
             _check_finite(values, done, done + count, saved)
             done += count
-            log.write(done, values)
+            values |= many.speed.end(count)
+            log.write(done, values, {name: x for name, x in found.items() if x.ndim})
             progress.update(bar, completed=done, description=f"training, loss {values['task']:.4f}")
             for callback in callbacks:
                 callback.on_log(run, done, values)

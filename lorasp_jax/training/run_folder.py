@@ -5,8 +5,10 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 from tensorboardX import SummaryWriter
 
 from lorasp_jax.config import Config
@@ -99,12 +101,19 @@ class MetricsLog:
         _write_text(self.path, "".join(json.dumps(row) + "\n" for row in kept))
         self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=start_step + 1)
 
-    def write(self, step: int, values: Mapping[str, float]) -> None:
-        """Record scalars at `step`."""
+    def write(
+        self,
+        step: int,
+        values: Mapping[str, float],
+        histograms: Mapping[str, np.ndarray] = MappingProxyType({}),
+    ) -> None:
+        """Record scalars at `step`, and for TensorBoard alone histograms of arrays."""
         with self.path.open("a") as file:
             file.write(json.dumps({"step": step, **values}) + "\n")
         for name, value in values.items():
             self._board.add_scalar(name, value, step)
+        for name, array in histograms.items():
+            self._board.add_histogram(name, array, step)
 
     def close(self) -> None:
         """Flush the event file."""

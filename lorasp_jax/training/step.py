@@ -11,6 +11,7 @@ from flax import nnx
 from lorasp_jax import adaptation
 from lorasp_jax.data.batches import Batch
 from lorasp_jax.peft import Aux
+from lorasp_jax.peft.method import masked_mean
 
 Metrics = dict[str, jax.Array]
 
@@ -51,13 +52,26 @@ def auxiliary_losses(aux: Any) -> Metrics:
     }
 
 
-def mean_active_rank(aux: dict[str, dict[str, Aux]]) -> Metrics:
-    """Active rank averaged over valid tokens, then over adapted layers, by tower."""
-    ranks = {
-        tower: [rank for a in linears.values() if (rank := a.mean_active_rank()) is not None]
-        for tower, linears in aux.items()
-    }
-    return {f"active_rank/{tower}": jnp.stack(r).mean() for tower, r in ranks.items() if r}
+def active_ranks(aux: dict[str, dict[str, Aux]]) -> Metrics:
+    """Active rank averaged over valid tokens, as a mean by tower and as `[L]` by linear map."""
+    found: Metrics = {}
+    for tower, linears in aux.items():
+        ranks = {
+            f"active_rank/{tower}/{name}": _layer_ranks(a.active_rank, a.token_mask)
+            for name, a in linears.items()
+            if a.active_rank is not None
+        }
+        if ranks:
+            found |= {f"active_rank/{tower}": jnp.stack([r.mean() for r in ranks.values()]).mean()}
+            found |= ranks
+    return found
+
+
+def _layer_ranks(rank: jax.Array, mask: jax.Array | None) -> jax.Array:
+    """`[L]` means over the valid tokens of `[..., B, T]`; L is 1 without leading axes."""
+    mask = jnp.ones((), bool) if mask is None else mask
+    tokens = (x.reshape(-1, *rank.shape[-2:]) for x in (rank, jnp.broadcast_to(mask, rank.shape)))
+    return jax.vmap(masked_mean)(*tokens)
 
 
 def loss_fn(
@@ -75,7 +89,7 @@ def loss_fn(
     task = jnp.sum(per_element * mask) / jnp.maximum(jnp.sum(mask), 1)
     losses = auxiliary_losses(aux) | adaptation.penalties(model)
     total = task + sum(weights[name] * value for name, value in losses.items())
-    return total, {"loss": total, "task": task, **losses, **mean_active_rank(aux)}
+    return total, {"loss": total, "task": task, **losses, **active_ranks(aux)}
 
 
 def train_step(
