@@ -29,11 +29,13 @@ class Command:
         config: the experiment.
         resume: whether to go on with the run of this name.
         dry_run: whether to stop before anything is collected, trained or written.
+        wandb: project of Weights & Biases, or None.
     """
 
     config: Config
-    resume: bool
-    dry_run: bool
+    resume: bool = False
+    dry_run: bool = False
+    wandb: str | None = None
 
 
 def parse(arguments: Sequence[str]) -> Command:
@@ -59,7 +61,7 @@ def parse(arguments: Sequence[str]) -> Command:
         parser.print_help()
     if known.resume and known.dry_run:
         raise ValueError("a run is either resumed or tried dry: leave --resume or --dry-run out")
-    return Command(override(config, rest), known.resume, known.dry_run)
+    return Command(override(config, rest), known.resume, known.dry_run, known.wandb)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -77,6 +79,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--resume", action="store_true", help="continue the run of this name")
     parser.add_argument(
         "--dry-run", action="store_true", help="print sizes and memory, compile, stop"
+    )
+    parser.add_argument(
+        "--wandb", metavar="PROJECT", help="log to Weights & Biases, too; needs pip install wandb"
     )
     return parser
 
