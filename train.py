@@ -34,9 +34,10 @@ def main(arguments: list[str]) -> int:
             dry_run(command.config, RUNS / command.config.name, console)
             return 0
         folder = open_run(command.config, RUNS, resume=command.resume)
-        report = folder / "report.html"
-        if command.resume and report.exists():
-            console.print(f"this run is finished: {report}", markup=False)
+        if command.resume and (folder / "results.json").exists():
+            from lorasp_jax.report.html import write_report
+
+            console.print(f"this run is finished: {write_report(folder)}", markup=False)
             return 0
         with sigterm_as_interrupt():
             run(command, folder, console, started)
@@ -54,8 +55,9 @@ def main(arguments: list[str]) -> int:
 def run(command, folder: Path, console: Console, started: float) -> None:
     """Train with evaluation before and after, export the adapters and write the report."""
     from lorasp_jax.evaluation.callback import Evaluation, NoEvaluation
-    from lorasp_jax.report.html import write_report
-    from lorasp_jax.training import export, loop, setup
+    from lorasp_jax.report.callback import Report
+    from lorasp_jax.training import loop, setup
+    from lorasp_jax.training.export import Export
     from lorasp_jax.training.weights_and_biases import WeightsAndBiases
 
     with contextlib.ExitStack() as stack:
@@ -66,9 +68,9 @@ def run(command, folder: Path, console: Console, started: float) -> None:
             ]
         prepared = setup.prepare(command.config, folder, console, started)
         evaluation = Evaluation() if prepared.simulated else NoEvaluation()
-        loop.train(prepared, [evaluation, *callbacks], resume=command.resume)
-    export.write(prepared)
-    report = write_report(folder)
+        callbacks = [Export(), evaluation, Report(), *callbacks]
+        loop.train(prepared, callbacks, resume=command.resume)
+    report = folder / "report.html"
     console.print(f"finished in {prepared.seconds['total']:.0f} s: {report}", markup=False)
 
 

@@ -85,6 +85,8 @@ def test_finished_run_is_not_run_again(capsys):
     assert train.main([*MULTITASK, "--model.checkpoint", "nowhere"]) == 2
     record = json.loads(Path("runs/multitask/config.json").read_text())
     assert record["peft"]["method"] == "LoRASP"
-    Path("runs/multitask/report.html").write_text("done")
+    results = {"seconds": {}, "tasks": {}, "layer_active_rank": {}}
+    Path("runs/multitask/results.json").write_text(json.dumps(results))
     assert train.main([*MULTITASK, "--model.checkpoint", "nowhere", "--resume"]) == 0
-    assert "this run is finished" in capsys.readouterr().out
+    assert "this run is finished: runs/multitask/report.html" in capsys.readouterr().out
+    assert "The run goes on" not in Path("runs/multitask/report.html").read_text()

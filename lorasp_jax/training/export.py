@@ -5,8 +5,16 @@ from typing import Any
 
 from lorasp_jax import adaptation, adapter_io, models
 from lorasp_jax.training.base import TRAINING
-from lorasp_jax.training.run import Run
+from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import write_json
+
+
+class Export(Callback):
+    """`write` after the last step."""
+
+    def on_end(self, run: Run) -> None:
+        """Write the trained policy."""
+        write(run)
 
 
 def write(run: Run) -> None:

@@ -25,10 +25,10 @@ def to_json(config: Config) -> dict[str, Any]:
 
 def write_json(path: Path, value: Any) -> None:
     """Write JSON so that readers never see half of it."""
-    _write_text(path, json.dumps(value, indent=2) + "\n")
+    write_text(path, json.dumps(value, indent=2) + "\n")
 
 
-def _write_text(path: Path, text: str) -> None:
+def write_text(path: Path, text: str) -> None:
     """Write a whole file under a temporary name, then give it its own."""
     temporary = path.with_suffix(".tmp")
     temporary.write_text(text)
@@ -98,7 +98,7 @@ class MetricsLog:
         """Open the log of the run in `folder`, which continues at `start_step`."""
         self.path = folder / "metrics.jsonl"
         kept = [row for row in read_metrics(folder) if row["step"] <= start_step]
-        _write_text(self.path, "".join(json.dumps(row) + "\n" for row in kept))
+        write_text(self.path, "".join(json.dumps(row) + "\n" for row in kept))
         self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=start_step + 1)
 
     def write(
