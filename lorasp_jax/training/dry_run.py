@@ -106,7 +106,9 @@ def _lowered(run: Run, data: Steps | Raw) -> Any:
     optimizer = make_optimizer(config.optim, adaptation.methods(model).values())
     mesh = meshes.make_mesh(config.fsdp)
     graphdef, adapters, frozen = adaptation.split(model)
-    state = jax.eval_shape(functools.partial(init_state, optimizer=optimizer), adapters)
+    state = jax.eval_shape(
+        functools.partial(init_state, optimizer=optimizer, ema=config.optim.ema > 0), adapters
+    )
     frozen = jax.tree.map(lambda x: _placed(x, meshes.frozen_sharding(x, mesh)), frozen)
     state = _placed(state, meshes.replicated(mesh))
     count = 1 if isinstance(data, Raw) else min(config.log_every, config.optim.steps)

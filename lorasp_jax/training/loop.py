@@ -43,8 +43,7 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
     optimizer = make_optimizer(run.config.optim, methods)
     mesh = meshes.make_mesh(run.config.fsdp)
     graphdef, adapters, frozen = adaptation.split(run.policy.model)
-    # A copy: every call of the step takes its state's memory over.
-    state = init_state(jax.tree.map(jnp.copy, adapters), optimizer)
+    state = init_state(adapters, optimizer, ema=run.config.optim.ema > 0)
     state = jax.device_put(state, meshes.replicated(mesh))
     frozen = meshes.place_frozen(frozen, mesh)
     run.policy = Policy(nnx.merge(graphdef, state.adapters, frozen), run.policy.processor)
@@ -66,7 +65,7 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
             state = _loop(run, state, many, checkpoints, callbacks)
     finally:
         checkpoints.close()
-    run.policy = Policy(nnx.merge(graphdef, state.adapters, frozen), run.policy.processor)
+    run.policy = Policy(nnx.merge(graphdef, state.best, frozen), run.policy.processor)
     for callback in callbacks:
         callback.on_end(run)
 
@@ -81,6 +80,14 @@ def jit_stretch(run: Run, graphdef: Any, optimizer: Any, mesh: jax.sharding.Mesh
     weights = auxiliary_weights(run.config.auxiliary, optim.steps)
     sharding = meshes.batch_sharding(mesh)
 
+    step = functools.partial(
+        train_step,
+        graphdef=graphdef,
+        optimizer=optimizer,
+        weights=weights,
+        parts=optim.accumulate,
+        ema=optim.ema,
+    )
     draw = functools.partial(sample_batch, batch_size=optim.batch_size, chunk=chunk)
 
     def one(state: TrainState, frozen: Any, data: Steps | Raw, key: jax.Array) -> Any:
@@ -88,9 +95,7 @@ def jit_stretch(run: Run, graphdef: Any, optimizer: Any, mesh: jax.sharding.Mesh
         make: Any = encode if isinstance(data, Raw) else draw
         batch = make(batch_key, data, processor, state_noise=optim.state_noise)
         batch = jax.lax.with_sharding_constraint(batch, sharding)
-        return train_step(
-            state, frozen, batch, loss_key, graphdef=graphdef, optimizer=optimizer, weights=weights
-        )
+        return step(state, frozen, batch, loss_key)
 
     # The state comes back placed as it went in, so that nothing compiles a second time.
     @functools.partial(

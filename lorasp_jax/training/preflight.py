@@ -6,6 +6,7 @@ runs comes on top: `HEADROOM`.
 """
 
 import dataclasses
+import functools
 import math
 import os
 from collections.abc import Callable
@@ -22,7 +23,7 @@ from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.models.observation import abstract_observation
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
-from lorasp_jax.training.step import Metrics, loss_fn
+from lorasp_jax.training.step import Metrics, init_state, loss_fn
 
 HEADROOM = 1.1
 """Factor on the sum for what is not counted: temporary arrays, the compiled program, fragments."""
@@ -88,6 +89,9 @@ def _refusal(config: Config, memory: Memory, remat: Remat, available: float) -> 
     fitting = math.floor(batch * (available - fixed) / (memory.peak - fixed))
     fitting -= fitting % jax.device_count()
     hints = [f"--optim.batch-size {fitting}"] if 0 < fitting < batch else []
+    parts = 2 * config.optim.accumulate
+    if batch % (jax.device_count() * parts) == 0:
+        hints += [f"--optim.accumulate {parts}"]
     hints += ["--model.remat full"] if remat != "full" else []
     hints += ["--model.param-dtype bfloat16"] if config.model.param_dtype != "bfloat16" else []
     hints += [f"--fsdp {2 * config.fsdp} on as many devices"]
@@ -104,8 +108,11 @@ def expected(config: Config, wanted: BackboneConfig) -> Memory:
         config: the run.
         wanted: the backbone's config.
     """
-    step = abstract_step(config, wanted, max(1, config.optim.batch_size // jax.device_count()))
+    own = max(1, config.optim.batch_size // jax.device_count())
+    step = abstract_step(config, wanted, max(1, own // config.optim.accumulate))
     optimizer = make_optimizer(config.optim, {config.peft.as_saved})
+
+    start = functools.partial(init_state, optimizer=optimizer, ema=config.optim.ema > 0)
 
     def stored(adapters: Any, frozen: Any, batch: Batch) -> Any:
         return jax.vjp(lambda a: step.loss(a, frozen, batch), adapters, has_aux=True)[1]
@@ -117,9 +124,9 @@ def expected(config: Config, wanted: BackboneConfig) -> Memory:
     return Memory(
         base=_bytes(step.frozen) / config.fsdp,
         adapters=_bytes(step.adapters),
-        gradients=_bytes(step.adapters),
-        optimizer=_bytes(jax.eval_shape(optimizer.init, step.adapters)),
-        activations=_bytes(list(kept.values())) + _bytes(step.batch),
+        gradients=_bytes(step.adapters) * (1 if config.optim.accumulate == 1 else 2),
+        optimizer=_bytes(jax.eval_shape(start, step.adapters)) - _bytes(step.adapters),
+        activations=_bytes(list(kept.values())) + _bytes(abstract_batch(wanted, own)),
     )
 
 

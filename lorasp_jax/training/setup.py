@@ -155,11 +155,14 @@ def _check_sizes(config: Config, chunk: int) -> None:
         raise ValueError(
             f"execute_steps must be 1 to the chunk, {chunk}, got {config.evaluation.execute_steps}"
         )
-    if config.optim.batch_size % jax.device_count():
+    optim, devices = config.optim, jax.device_count()
+    if optim.batch_size % (devices * optim.accumulate):
+        parts = f" times {optim.accumulate} parts" if optim.accumulate > 1 else ""
         raise ValueError(
-            f"batch_size must be a multiple of the {jax.device_count()} devices, "
-            f"got {config.optim.batch_size}"
+            f"batch_size must be a multiple of the {devices} devices{parts}, got {optim.batch_size}"
         )
+    if optim.ema and isinstance(config.peft, peft.AdaLoRA):
+        raise ValueError("an average has no budget: leave --optim.ema out with ada_lora")
 
 
 def _adapted(
