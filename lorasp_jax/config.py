@@ -172,7 +172,8 @@ class Config:
     control_dt: float = 0.1
     """Seconds between two actions; demonstrations and base must agree."""
     fsdp: int = 1
-    """Devices over which large frozen arrays are split; the rest of the mesh is data parallel."""
+    """Devices over which large arrays are split: the base's, and what trains with its optimizer's
+    state, if that is as large; the rest of the mesh is data parallel."""
     log_every: int = 50
     """Steps per compiled call, and between log lines."""
     checkpoint_every: int = 1000

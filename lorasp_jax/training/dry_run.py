@@ -109,10 +109,11 @@ def _lowered(run: Run, data: Steps | Raw) -> Any:
     state = jax.eval_shape(
         functools.partial(init_state, optimizer=optimizer, ema=config.optim.ema > 0), adapters
     )
-    frozen = jax.tree.map(lambda x: _placed(x, meshes.frozen_sharding(x, mesh)), frozen)
-    state = _placed(state, meshes.replicated(mesh))
+    placed = meshes.shardings(state, mesh)
+    frozen = jax.tree.map(_placed, frozen, meshes.shardings(frozen, mesh))
+    state = jax.tree.map(_placed, state, placed)
     count = 1 if isinstance(data, Raw) else min(config.log_every, config.optim.steps)
-    stretch = loop.jit_stretch(run, graphdef, optimizer, mesh)
+    stretch = loop.jit_stretch(run, graphdef, optimizer, placed)
     return stretch.lower(frozen, data, state, jax.random.key(0), count)
 
 

@@ -44,13 +44,14 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
     mesh = meshes.make_mesh(run.config.fsdp)
     graphdef, adapters, frozen = adaptation.split(run.policy.model)
     state = init_state(adapters, optimizer, ema=run.config.optim.ema > 0)
-    state = jax.device_put(state, meshes.replicated(mesh))
-    frozen = meshes.place_frozen(frozen, mesh)
+    placed = meshes.shardings(state, mesh)
+    state = jax.device_put(state, placed)
+    frozen = jax.device_put(frozen, meshes.shardings(frozen, mesh))
     run.policy = Policy(nnx.merge(graphdef, state.adapters, frozen), run.policy.processor)
     checkpoints = Checkpoints(run.folder, run.base_hash)
     restored = checkpoints.restore(state) if resume else None
     state = restored or state
-    jitted, speed = jit_stretch(run, graphdef, optimizer, mesh), _speed(run)
+    jitted, speed = jit_stretch(run, graphdef, optimizer, placed), _speed(run)
     if run.streams:
         many = _Streamed(jitted, frozen, _batches(run, mesh, int(state.step)), speed)
     else:
@@ -70,14 +71,15 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
         callback.on_end(run)
 
 
-def jit_stretch(run: Run, graphdef: Any, optimizer: Any, mesh: jax.sharding.Mesh) -> Callable:
+def jit_stretch(run: Run, graphdef: Any, optimizer: Any, placed: TrainState) -> Callable:
     """The jitted stretch of steps: (frozen, data, state, key, count) -> state, metrics.
 
-    Data are all steps, or one raw batch.
+    Data are all steps, or one raw batch. The state lies as `placed` says, its `meshes.shardings`.
     """
     optim, processor = run.config.optim, run.policy.processor
     chunk = run.policy.model.config.chunk
     weights = auxiliary_weights(run.config.auxiliary, optim.steps)
+    mesh = placed.step.mesh
     sharding = meshes.batch_sharding(mesh)
 
     step = functools.partial(
@@ -102,7 +104,7 @@ def jit_stretch(run: Run, graphdef: Any, optimizer: Any, mesh: jax.sharding.Mesh
         jax.jit,
         static_argnames="count",
         donate_argnames="state",
-        out_shardings=meshes.replicated(mesh),
+        out_shardings=(placed, meshes.replicated(mesh)),
     )
     def many(frozen: Any, data: Steps | Raw, state: TrainState, key: jax.Array, count: int) -> Any:
         state, metrics = jax.lax.scan(

@@ -22,6 +22,7 @@ from lorasp_jax.models import presets
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.models.observation import abstract_observation
+from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
 from lorasp_jax.training.step import Metrics, init_state, loss_fn
 
@@ -102,7 +103,7 @@ def _refusal(config: Config, memory: Memory, remat: Remat, available: float) -> 
 
 
 def expected(config: Config, wanted: BackboneConfig) -> Memory:
-    """Memory of one training step; the base is split over `config.fsdp` devices.
+    """Memory of one training step; large arrays are split over `config.fsdp` devices.
 
     Args:
         config: the run.
@@ -121,11 +122,13 @@ def expected(config: Config, wanted: BackboneConfig) -> Memory:
     kept = {id(v): v.aval for v in jaxpr.outvars}
     for variable in (*jaxpr.invars, *jaxpr.constvars):  # there anyway
         kept.pop(id(variable), None)
+    held = functools.partial(meshes.bytes_on_device, fsdp=config.fsdp)
+    adapters = held(step.adapters)
     return Memory(
-        base=_bytes(step.frozen) / config.fsdp,
-        adapters=_bytes(step.adapters),
-        gradients=_bytes(step.adapters) * (1 if config.optim.accumulate == 1 else 2),
-        optimizer=_bytes(jax.eval_shape(start, step.adapters)) - _bytes(step.adapters),
+        base=held(step.frozen),
+        adapters=adapters,
+        gradients=adapters * (1 if config.optim.accumulate == 1 else 2),
+        optimizer=held(jax.eval_shape(start, step.adapters)) - adapters,
         activations=_bytes(list(kept.values())) + _bytes(abstract_batch(wanted, own)),
     )
 
