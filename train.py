@@ -1,5 +1,6 @@
 """Adapt a policy to a robot: `python train.py --config configs/multitask.py`."""
 
+import contextlib
 import os
 import shlex
 import sys
@@ -10,6 +11,7 @@ from rich.console import Console
 
 from envs import physics
 
+RUNS = Path("runs")
 STOPPED = 130
 """Exit code after a signal, as shells have it."""
 
@@ -25,14 +27,20 @@ def main(arguments: list[str]) -> int:
     from lorasp_jax.training.run_folder import open_run
 
     try:
-        config, resume = parse(arguments)
-        folder = open_run(config, Path("runs"), resume=resume)
-        report = folder / "report.html"
-        if resume and report.exists():
-            console.print(f"this run is finished: {report}", markup=False)
+        command = parse(arguments)
+        if command.dry_run:
+            from lorasp_jax.training.dry_run import dry_run
+
+            dry_run(command.config, RUNS / command.config.name, console)
+            return 0
+        folder = open_run(command.config, RUNS, resume=command.resume)
+        if command.resume and (folder / "results.json").exists():
+            from lorasp_jax.report.html import write_report
+
+            console.print(f"this run is finished: {write_report(folder)}", markup=False)
             return 0
         with sigterm_as_interrupt():
-            run(config, folder, console, started, resume=resume)
+            run(command, folder, console, started)
     except ValueError as error:
         errors.print(f"error: {error}", style="red", soft_wrap=True, highlight=False, markup=False)
         return 2
@@ -44,17 +52,25 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
-def run(config, folder: Path, console: Console, started: float, *, resume: bool) -> None:
+def run(command, folder: Path, console: Console, started: float) -> None:
     """Train with evaluation before and after, export the adapters and write the report."""
     from lorasp_jax.evaluation.callback import Evaluation, NoEvaluation
-    from lorasp_jax.report.html import write_report
-    from lorasp_jax.training import export, loop, setup
+    from lorasp_jax.report.callback import Report
+    from lorasp_jax.training import loop, setup
+    from lorasp_jax.training.export import Export
+    from lorasp_jax.training.weights_and_biases import WeightsAndBiases
 
-    prepared = setup.prepare(config, folder, console, started)
-    evaluation = Evaluation() if prepared.simulated else NoEvaluation()
-    loop.train(prepared, [evaluation], resume=resume)
-    export.write(prepared)
-    report = write_report(folder)
+    with contextlib.ExitStack() as stack:
+        callbacks = []
+        if command.wandb:
+            callbacks += [
+                stack.enter_context(WeightsAndBiases(command.wandb, command.config, folder))
+            ]
+        prepared = setup.prepare(command.config, folder, console, started)
+        evaluation = Evaluation() if prepared.simulated else NoEvaluation()
+        callbacks = [Export(), evaluation, Report(), *callbacks]
+        loop.train(prepared, callbacks, resume=command.resume)
+    report = folder / "report.html"
     console.print(f"finished in {prepared.seconds['total']:.0f} s: {report}", markup=False)
 
 

@@ -129,19 +129,12 @@ class Step:
         return needed.argument_size_in_bytes + needed.temp_size_in_bytes
 
 
-def work(config: BackboneConfig, run: Config) -> float:
-    """Operations of one step."""
-    step = preflight.abstract_step(run, config, run.optim.batch_size)
-    gradient = jax.grad(step.loss, has_aux=True)
-    return flops.count(gradient, step.adapters, step.frozen, step.batch)
-
-
 def training(name: str, label: str, run: Config, options: argparse.Namespace, remat: Remat) -> Any:
     """The row of one way to train."""
     config = sized(name, options, remat)
     step, size = Step(config, run).draw(), run.optim.batch_size
     seconds = best(step, calls=options.calls)
-    operations = work(sized(name, options), run)
+    operations = preflight.operations(run, sized(name, options))
     share = flops.utilisation(operations, seconds)
     return {
         "backbone": name,

@@ -87,12 +87,20 @@ class OptimConfig:
     """Decay of the second moment."""
     clip_norm: float = 1.0
     """Largest global gradient norm."""
+    accumulate: int = 1
+    """Parts of a batch that a step takes one after the other, to need less memory; the task loss is
+    that of the whole batch, the auxiliary ones are means over the parts."""
+    ema: float = 0.0
+    """Decay a step of the moving average of what trains, which is then what is evaluated and
+    exported, such as 0.999; 0: no average."""
     state_noise: float = 0.02
     """Standard deviation of the noise on normalised robot states while training."""
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
-        _at_least_one(self, "steps", "batch_size")
+        _at_least_one(self, "steps", "batch_size", "accumulate")
+        if not 0 <= self.ema < 1:
+            raise ValueError(f"ema must lie in [0, 1), got {self.ema}")
 
 
 @dataclass(frozen=True)
@@ -164,7 +172,8 @@ class Config:
     control_dt: float = 0.1
     """Seconds between two actions; demonstrations and base must agree."""
     fsdp: int = 1
-    """Devices over which large frozen arrays are split; the rest of the mesh is data parallel."""
+    """Devices over which large arrays are split: the base's, and what trains with its optimizer's
+    state, if that is as large; the rest of the mesh is data parallel."""
     log_every: int = 50
     """Steps per compiled call, and between log lines."""
     checkpoint_every: int = 1000

@@ -34,9 +34,14 @@ def count(function: Callable, *arguments: Any) -> float:
 
 def utilisation(operations: float, seconds: float) -> float | None:
     """Share of the first device's peak, or None where that is not known."""
+    fastest = peak()
+    return fastest and operations / seconds / fastest
+
+
+def peak() -> float | None:
+    """Operations a second that the first device can do, see `PEAK`; None where not known."""
     kind = jax.devices()[0].device_kind
-    peak = next((peak for name, peak in PEAK.items() if kind.startswith(name)), None)
-    return peak and operations / seconds / peak
+    return next((value for name, value in PEAK.items() if kind.startswith(name)), None)
 
 
 def _of_jaxpr(jaxpr: Any) -> float:

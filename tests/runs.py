@@ -18,8 +18,11 @@ from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.prompt_table import PromptTable
 from lorasp_jax.peft import LoRASP
-from lorasp_jax.training.loop import Callback, Run
+from lorasp_jax.training.run import Callback, Run
+from lorasp_jax.training.run_folder import read_metrics
 from lorasp_jax.training.setup import processor
+
+TIMED = ("speed/", "memory/")
 
 CONFIG = Config(
     name="test",
@@ -82,6 +85,12 @@ def make_run(folder: Path, config: Config = CONFIG) -> Run:
     prompts = PromptTable.of(tokenizer.Offline(), phrases, model.config, num_joints=6)
     run.policy = Policy(model, processor(groups, model.config, prompts))
     return run
+
+
+def repeatable(folder: Path) -> list[dict[str, float]]:
+    """The logged metrics but those that depend on the clock."""
+    rows = read_metrics(folder)
+    return [{k: v for k, v in row.items() if not k.startswith(TIMED)} for row in rows]
 
 
 def leaves(tree) -> dict[str, np.ndarray]:

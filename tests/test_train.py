@@ -47,6 +47,12 @@ def files():
         ([*MULTITASK, *NANO, "--evaluation.execute-steps", "11"], "must be 1 to the chunk, 10"),
         ([*MULTITASK, *NANO, "--evaluation.episodes", "12"], "must be a multiple of num_envs"),
         ([*MULTITASK, *NANO, "--optim.batch-size", "9"], "multiple of the 8 devices"),
+        (
+            [*MULTITASK, *NANO, "--optim.batch-size", "24", "--optim.accumulate", "2"],
+            "multiple of the 8 devices times 2 parts, got 24",
+        ),
+        ([*MULTITASK, *NANO, "--optim.ema", "1"], "ema must lie in [0, 1), got 1"),
+        ([*MULTITASK, *NANO, "--method", "ada_lora", "--optim.ema", "0.9"], "has no budget"),
         ([*MULTITASK, *NANO, "--checkpoint-every", "0"], "must be at least 1, got 0"),
         ([*MULTITASK, *NANO, "--model.dtype", "float99"], "float99"),
         ([*MULTITASK, *NANO, "--name", "../up"], "must be a plain folder name"),
@@ -85,6 +91,8 @@ def test_finished_run_is_not_run_again(capsys):
     assert train.main([*MULTITASK, "--model.checkpoint", "nowhere"]) == 2
     record = json.loads(Path("runs/multitask/config.json").read_text())
     assert record["peft"]["method"] == "LoRASP"
-    Path("runs/multitask/report.html").write_text("done")
+    results = {"seconds": {}, "tasks": {}, "layer_active_rank": {}}
+    Path("runs/multitask/results.json").write_text(json.dumps(results))
     assert train.main([*MULTITASK, "--model.checkpoint", "nowhere", "--resume"]) == 0
-    assert "this run is finished" in capsys.readouterr().out
+    assert "this run is finished: runs/multitask/report.html" in capsys.readouterr().out
+    assert "The run goes on" not in Path("runs/multitask/report.html").read_text()

@@ -19,8 +19,8 @@ from lorasp_jax import adaptation
 from lorasp_jax.data.demonstrations import side_by_side
 from lorasp_jax.evaluation import video
 from lorasp_jax.evaluation.rollout import Result, evaluate, make_rollout
-from lorasp_jax.training.loop import Callback, Run
 from lorasp_jax.training.progress import bars
+from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import write_json
 
 TOWERS = ("vision", "language", "action")

@@ -22,6 +22,13 @@ def sample_time(key: jax.Array, batch: int) -> jax.Array:
     return 0.999 * jax.random.uniform(key, (batch,)) ** (1 / 1.5) + 0.001
 
 
+def draw(key: jax.Array, actions: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Noise `[B, C, A]` f32 and flow times `[B]` for actions `[B, C, A]`; `key` is consumed."""
+    noise_key, time_key = jax.random.split(key)
+    noise = jax.random.normal(noise_key, actions.shape)
+    return noise, sample_time(time_key, actions.shape[0])
+
+
 def interpolate(
     noise: jax.Array, actions: jax.Array, flow_time: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
@@ -59,12 +66,11 @@ def loss(
     Returns:
         `[B, C, A]` f32, and the model's aux.
     """
-    noise_key, time_key = jax.random.split(key)
     actions = actions.astype(jnp.float32)
-    if noise is None:
-        noise = jax.random.normal(noise_key, actions.shape)
-    if flow_time is None:
-        flow_time = sample_time(time_key, actions.shape[0])
+    if noise is None or flow_time is None:
+        drawn = draw(key, actions)
+        noise = drawn[0] if noise is None else noise
+        flow_time = drawn[1] if flow_time is None else flow_time
     x_t, u_t = interpolate(noise, actions, flow_time)
     v_t, aux = velocity(_hold(x_t, slots), flow_time)
     return jnp.square(v_t.astype(jnp.float32) - u_t), aux

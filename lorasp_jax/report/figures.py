@@ -20,18 +20,21 @@ _STYLE: Any = {
     "svg.hashsalt": "lorasp_jax",
 }
 
+_BARS = {"before": (-0.18, "before"), "after": (0.18, "vision")}
+"""Where a bar lies, and its color."""
+
 Rows = Sequence[dict[str, float]]
 
 
 def success(results: dict[str, Any]) -> str:
-    """Bars of success before and after with their 95 % intervals."""
+    """Bars of success before and, at the end of a run, after with their 95 % intervals."""
     tasks = results["tasks"]
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(6, 1.1 + 0.8 * len(tasks)), layout="constrained")
         axes = figure.subplots()
         for row, task in enumerate(tasks):
-            for name, offset, color in (("before", -0.18, "before"), ("after", 0.18, "vision")):
-                value = tasks[task][name]
+            for name, value in tasks[task].items():
+                offset, color = _BARS[name]
                 low, high = value["ci95"]
                 rate = value["success"]
                 axes.barh(row + offset, 100 * rate, height=0.32, color=COLORS[color])

@@ -5,10 +5,13 @@ import html
 import json
 from collections.abc import Collection, Iterable
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from lorasp_jax.report import figures
-from lorasp_jax.training.run_folder import read_metrics
+from lorasp_jax.training.run_folder import read_metrics, write_text
+
+_REFRESH = "<meta http-equiv=refresh content=30>"
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #1b1e23; max-width: 60rem; margin: 2rem auto;
@@ -26,20 +29,25 @@ pre { background: #f4f5f7; padding: 1rem; overflow-x: auto; font-size: 13px; }
 def write_report(folder: Path) -> Path:
     """Write `folder`/report.html from its results.json, metrics.jsonl, config.json and videos.
 
+    Of a run without results.json it has what there is so far, and loads itself again and again.
+
     Raises:
-        FileNotFoundError: the run has not finished, so a file is missing.
+        FileNotFoundError: the folder holds no run.
     """
-    results = json.loads((folder / "results.json").read_text())
     config = json.loads((folder / "config.json").read_text())
+    finished = _read(folder / "results.json")
+    results = finished or _unfinished(folder)
     rows = read_metrics(folder)
     parts = [
         f"<h1>{html.escape(config['name'])}</h1>",
         f"<p class=muted>{_subtitle(config, results)}</p>",
+        *(() if finished else (_progress(config, rows), _REFRESH)),
         *_success(results),
         "<h2>Training</h2>",
-        _image(figures.losses(rows)),
+        _image(figures.losses(rows)) if rows else "<p>Nothing is logged yet.</p>",
+        *_speed(rows),
         *_active_rank(results, rows, config["peft"].get("rank")),
-        *_media(folder, results["tasks"]),
+        *_media(folder, results["tasks"] if finished else ()),
         "<h2>Time</h2>",
         _table(("phase", "seconds"), ((k, f"{v:.1f}") for k, v in results["seconds"].items())),
         "<h2>Settings</h2>",
@@ -52,19 +60,41 @@ def write_report(folder: Path) -> Path:
         + "</html>\n"
     )
     path = folder / "report.html"
-    path.write_text(page, encoding="utf-8")
+    write_text(path, page)
     return path
 
 
+def _read(path: Path) -> dict[str, Any]:
+    """JSON of a file; nothing without it."""
+    return json.loads(path.read_text()) if path.exists() else {}
+
+
+def _unfinished(folder: Path) -> dict[str, Any]:
+    """What results.json will have, as far as it is known."""
+    before = _read(folder / "before.json").items()
+    return {
+        "seconds": _read(folder / "seconds.json"),
+        "tasks": {task: {"before": value} for task, value in before},
+        "layer_active_rank": {},
+    }
+
+
+def _progress(config: dict[str, Any], rows: figures.Rows) -> str:
+    done, steps = rows[-1]["step"] if rows else 0, config["optim"]["steps"]
+    return f"<p>The run goes on: step {done:.0f} of {steps}.</p>"
+
+
 def _subtitle(config: dict[str, Any], results: dict[str, Any]) -> str:
-    """One line: method, backbone, robot, parameters."""
-    trainable, total = results["trainable_parameters"], results["total_parameters"]
-    return html.escape(
+    """One line: method, backbone, robot, at the end of a run parameters, scale."""
+    line = (
         f"{config['peft']['method']} on {config['model']['backbone']} {config['model']['size']}, "
-        f"robot {config['robot']}: "
-        f"{trainable:,} trainable of {total:,} parameters ({100 * trainable / total:.1f} %), "
-        f"scale {results['scale']}"
+        f"robot {config['robot']}"
     )
+    if "total_parameters" in results:
+        trainable, total = results["trainable_parameters"], results["total_parameters"]
+        share = 100 * trainable / total
+        line += f": {trainable:,} trainable of {total:,} parameters ({share:.1f} %)"
+    return html.escape(f"{line}, scale {config['scale']}")
 
 
 def _success(results: dict[str, Any]) -> Iterable[str]:
@@ -77,15 +107,39 @@ def _success(results: dict[str, Any]) -> Iterable[str]:
 
 def _success_table(results: dict[str, Any]) -> str:
     """Task, before, after, with intervals."""
-
-    def cell(value: dict[str, Any]) -> str:
-        low, high = value["ci95"]
-        rate = f"{100 * value['success']:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
-        return f"{rate} of {value['episodes']}"
-
     tasks = results["tasks"].items()
-    rows = ((task, cell(value["before"]), cell(value["after"])) for task, value in tasks)
-    return _table(("task", "before", "after"), rows)
+    rows = ((task, *map(success_cell, value.values())) for task, value in tasks)
+    return _table(("task", *next(iter(results["tasks"].values()))), rows)
+
+
+def success_cell(value: dict[str, Any]) -> str:
+    """A success rate with its interval."""
+    low, high = value["ci95"]
+    rate = f"{100 * value['success']:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
+    return f"{rate} of {value['episodes']}"
+
+
+def _speed(rows: figures.Rows) -> Iterable[str]:
+    """What was measured beside the losses; nothing for a run that logged none of it."""
+    found = speed(rows)
+    if found:
+        yield _table(("median over the run", ""), found.items())
+
+
+def speed(rows: figures.Rows) -> dict[str, str]:
+    """Medians over a run's rows, of memory the highest, with their units, by what they are."""
+    known = {
+        "samples a second": ("speed/samples_per_second", median, "{:,.4g}"),
+        "FLOP utilisation": ("speed/flop_utilisation", median, "{:.1%}"),
+        "time waiting for data": ("speed/data_wait", median, "{:.1%}"),
+        "memory at its highest": ("memory/peak_gib", max, "{:.2f} GiB"),
+    }
+    found = {}
+    for label, (name, middle, form) in known.items():
+        values = [row[name] for row in rows if name in row]
+        if values:
+            found[label] = form.format(middle(values))
+    return found
 
 
 def _active_rank(results: dict[str, Any], rows: figures.Rows, rank: Any) -> Iterable[str]:

@@ -4,9 +4,17 @@ import json
 from typing import Any
 
 from lorasp_jax import adaptation, adapter_io, models
-from lorasp_jax.training.loop import Run
+from lorasp_jax.training.base import TRAINING
+from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import write_json
-from lorasp_jax.training.setup import TRAINING
+
+
+class Export(Callback):
+    """`write` after the last step."""
+
+    def on_end(self, run: Run) -> None:
+        """Write the trained policy."""
+        write(run)
 
 
 def write(run: Run) -> None:

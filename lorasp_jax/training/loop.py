@@ -2,106 +2,34 @@
 
 import contextlib
 import functools
-import json
 import math
-import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import nnx
-from rich.console import Console
 
-from envs.episodes import Episodes
-from lorasp_jax import adaptation
+from lorasp_jax import adaptation, flops
 from lorasp_jax.config import Config
-from lorasp_jax.data.batches import Raw, Steps, encode, flatten, sample_batch
+from lorasp_jax.data.batches import Raw, Steps, encode, sample_batch
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.training import mesh as meshes
+from lorasp_jax.training import preflight
 from lorasp_jax.training.checkpoint import Checkpoints
 from lorasp_jax.training.interrupt import deferred
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
 from lorasp_jax.training.progress import bars
-from lorasp_jax.training.run_folder import MetricsLog, write_json
+from lorasp_jax.training.run import Callback, Run
+from lorasp_jax.training.run_folder import MetricsLog
+from lorasp_jax.training.speed import Speed
 from lorasp_jax.training.step import TrainState, init_state, train_step
 
 
 class RunError(ValueError):
     """The run cannot go on; the message says why and what to do, in one sentence."""
-
-
-@dataclass
-class Run:
-    """A run as its callbacks see it.
-
-    Attributes:
-        config: what was asked for.
-        folder: where everything is written.
-        console: where to print.
-        base_hash: hash of the frozen base.
-        episodes: demonstrations by task; of a dataset, without all its pictures.
-        dataset: the steps of a dataset, in files; None: those of `episodes`.
-        streams: whether the steps of a dataset are read from there step by step, because the device
-            has no room for them.
-        simulated: whether the tasks can be evaluated in simulation.
-        policy: the policy before the first step or after the last; in between, training owns its
-            memory.
-        started: `time.perf_counter()` when this process began.
-        seconds: time spent by phase, and "total", over all processes that worked on this run.
-    """
-
-    config: Config
-    folder: Path
-    console: Console
-    base_hash: str
-    started: float = field(default_factory=time.perf_counter)
-    episodes: dict[str, Episodes] = field(default_factory=dict)
-    dataset: Steps | None = None
-    streams: bool = False
-    simulated: bool = True
-    policy: Policy = field(init=False)
-    seconds: dict[str, float] = field(init=False)
-
-    def __post_init__(self) -> None:
-        """Takes over the time that earlier processes spent."""
-        path = self.folder / "seconds.json"
-        self.seconds = json.loads(path.read_text()) if path.exists() else {"total": 0.0}
-        self._before = self.seconds["total"]
-
-    @property
-    def steps(self) -> Steps:
-        """All steps that are trained on."""
-        return self.dataset or flatten(list(self.episodes.values()))
-
-    @contextlib.contextmanager
-    def timed(self, phase: str) -> Iterator[None]:
-        """Add the time spent in this block to `seconds[phase]`, also if it is interrupted."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            now = time.perf_counter()
-            self.seconds[phase] = self.seconds.get(phase, 0.0) + now - start
-            self.seconds["total"] = self._before + now - self.started
-            write_json(self.folder / "seconds.json", self.seconds)
-
-
-class Callback:
-    """Hooks into a run; override what is needed."""
-
-    def on_start(self, run: Run) -> None:
-        """Before the first step, with the policy as it comes; not called again on resume."""
-
-    def on_log(self, run: Run, step: int, metrics: dict[str, float]) -> None:
-        """After every logged stretch of steps."""
-
-    def on_end(self, run: Run) -> None:
-        """After the last step, with the trained policy."""
 
 
 def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False) -> None:
@@ -115,19 +43,20 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
     optimizer = make_optimizer(run.config.optim, methods)
     mesh = meshes.make_mesh(run.config.fsdp)
     graphdef, adapters, frozen = adaptation.split(run.policy.model)
-    # A copy: every call of the step takes its state's memory over.
-    state = init_state(jax.tree.map(jnp.copy, adapters), optimizer)
-    state = jax.device_put(state, meshes.replicated(mesh))
-    frozen = meshes.place_frozen(frozen, mesh)
+    state = init_state(adapters, optimizer, ema=run.config.optim.ema > 0)
+    placed = meshes.shardings(state, mesh)
+    state = jax.device_put(state, placed)
+    frozen = jax.device_put(frozen, meshes.shardings(frozen, mesh))
     run.policy = Policy(nnx.merge(graphdef, state.adapters, frozen), run.policy.processor)
     checkpoints = Checkpoints(run.folder, run.base_hash)
     restored = checkpoints.restore(state) if resume else None
     state = restored or state
-    jitted = _jitted(run, graphdef, optimizer, mesh)
+    jitted, speed = jit_stretch(run, graphdef, optimizer, placed), _speed(run)
     if run.streams:
-        many = _Streamed(jitted, frozen, _batches(run, mesh, int(state.step)))
+        many = _Streamed(jitted, frozen, _batches(run, mesh, int(state.step)), speed)
     else:
-        many = _Stretches(jitted, frozen, jax.device_put(run.steps, meshes.replicated(mesh)))
+        steps = jax.device_put(run.steps, meshes.replicated(mesh))
+        many = _Stretches(jitted, frozen, steps, speed)
     if restored is None:
         many.compile(state, _stretch(run.config, int(state.step)))  # beside what the callbacks do
         for callback in callbacks:
@@ -137,21 +66,30 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
             state = _loop(run, state, many, checkpoints, callbacks)
     finally:
         checkpoints.close()
-    run.policy = Policy(nnx.merge(graphdef, state.adapters, frozen), run.policy.processor)
+    run.policy = Policy(nnx.merge(graphdef, state.best, frozen), run.policy.processor)
     for callback in callbacks:
         callback.on_end(run)
 
 
-def _jitted(run: Run, graphdef: Any, optimizer: Any, mesh: jax.sharding.Mesh) -> Callable:
+def jit_stretch(run: Run, graphdef: Any, optimizer: Any, placed: TrainState) -> Callable:
     """The jitted stretch of steps: (frozen, data, state, key, count) -> state, metrics.
 
-    Data are all steps, or one raw batch.
+    Data are all steps, or one raw batch. The state lies as `placed` says, its `meshes.shardings`.
     """
     optim, processor = run.config.optim, run.policy.processor
     chunk = run.policy.model.config.chunk
     weights = auxiliary_weights(run.config.auxiliary, optim.steps)
+    mesh = placed.step.mesh
     sharding = meshes.batch_sharding(mesh)
 
+    step = functools.partial(
+        train_step,
+        graphdef=graphdef,
+        optimizer=optimizer,
+        weights=weights,
+        parts=optim.accumulate,
+        ema=optim.ema,
+    )
     draw = functools.partial(sample_batch, batch_size=optim.batch_size, chunk=chunk)
 
     def one(state: TrainState, frozen: Any, data: Steps | Raw, key: jax.Array) -> Any:
@@ -159,22 +97,20 @@ def _jitted(run: Run, graphdef: Any, optimizer: Any, mesh: jax.sharding.Mesh) ->
         make: Any = encode if isinstance(data, Raw) else draw
         batch = make(batch_key, data, processor, state_noise=optim.state_noise)
         batch = jax.lax.with_sharding_constraint(batch, sharding)
-        return train_step(
-            state, frozen, batch, loss_key, graphdef=graphdef, optimizer=optimizer, weights=weights
-        )
+        return step(state, frozen, batch, loss_key)
 
     # The state comes back placed as it went in, so that nothing compiles a second time.
     @functools.partial(
         jax.jit,
         static_argnames="count",
         donate_argnames="state",
-        out_shardings=meshes.replicated(mesh),
+        out_shardings=(placed, meshes.replicated(mesh)),
     )
     def many(frozen: Any, data: Steps | Raw, state: TrainState, key: jax.Array, count: int) -> Any:
         state, metrics = jax.lax.scan(
             lambda state, _: one(state, frozen, data, key), state, length=count
         )
-        return state, jax.tree.map(jnp.mean, metrics)
+        return state, jax.tree.map(lambda values: values.mean(0), metrics)
 
     return many
 
@@ -182,8 +118,8 @@ def _jitted(run: Run, graphdef: Any, optimizer: Any, mesh: jax.sharding.Mesh) ->
 class _Stretches:
     """Stretches of steps, (state, key, count) -> state, metrics, each length compiled once."""
 
-    def __init__(self, jitted: Callable, frozen: Any, data: Steps | Raw) -> None:
-        self._jitted, self._frozen, self._data = jitted, frozen, data
+    def __init__(self, jitted: Callable, frozen: Any, data: Steps | Raw, speed: Speed) -> None:
+        self._jitted, self._frozen, self._data, self.speed = jitted, frozen, data, speed
         self._compiled: dict[int, Future] = {}
 
     def compile(self, state: TrainState, count: int) -> Future:
@@ -198,14 +134,15 @@ class _Stretches:
 
     def __call__(self, state: TrainState, key: jax.Array, count: int) -> tuple[TrainState, Any]:
         run = self.compile(state, count).result()
+        self.speed.begin()
         return run(self._frozen, self._data, state, key)
 
 
 class _Streamed(_Stretches):
     """Stretches of steps whose batches come from files, one always on its way to the device."""
 
-    def __init__(self, jitted: Callable, frozen: Any, batches: Iterator[Raw]) -> None:
-        super().__init__(jitted, frozen, next(batches))
+    def __init__(self, jitted: Callable, frozen: Any, batches: Iterator[Raw], speed: Speed) -> None:
+        super().__init__(jitted, frozen, next(batches), speed)
         self._batches = batches
 
     def compile(self, state: TrainState, count: int) -> Future:  # noqa: ARG002
@@ -215,9 +152,10 @@ class _Streamed(_Stretches):
         found = []
         for _ in range(count):
             state, metrics = super().__call__(state, key, 1)
-            self._data = next(self._batches)
+            with self.speed.waiting(metrics):
+                self._data = next(self._batches)
             found.append(metrics)
-        return state, jax.tree.map(lambda *values: jnp.stack(values).mean(), *found)
+        return state, jax.tree.map(lambda *values: jnp.stack(values).mean(0), *found)
 
 
 def _batches(run: Run, mesh: jax.sharding.Mesh, start: int) -> Iterator[Raw]:
@@ -234,13 +172,21 @@ def _batches(run: Run, mesh: jax.sharding.Mesh, start: int) -> Iterator[Raw]:
     return (jax.tree.map(put, raw) for raw in stream)
 
 
+def _speed(run: Run) -> Speed:
+    """The run's clock; operations are counted where it is known how many there could be."""
+    size = run.config.optim.batch_size
+    if flops.peak() is None:
+        return Speed(size, None)
+    return Speed(size, preflight.operations(run.config, run.policy.model.config))
+
+
 def _stretch(config: Config, done: int) -> int:
     """Steps until the next log line or the end."""
     return min(config.log_every, config.optim.steps - done)
 
 
 def _loop(
-    run: Run, state: TrainState, many: Callable, checkpoints: Checkpoints, callbacks: Any
+    run: Run, state: TrainState, many: _Stretches, checkpoints: Checkpoints, callbacks: Any
 ) -> TrainState:
     """Stretch after stretch until the last step, a signal or a loss that is not finite."""
     config = run.config
@@ -255,10 +201,12 @@ def _loop(
         while (done := int(state.step)) < total and not stop.requested:
             count = _stretch(config, done)
             state, metrics = many(state, key, count)
-            values = {name: float(value) for name, value in metrics.items()}
+            found = jax.device_get(metrics)
+            values = {name: float(value.mean()) for name, value in found.items()}
             _check_finite(values, done, done + count, saved)
             done += count
-            log.write(done, values)
+            values |= many.speed.end(count)
+            log.write(done, values, {name: x for name, x in found.items() if x.ndim})
             progress.update(bar, completed=done, description=f"training, loss {values['task']:.4f}")
             for callback in callbacks:
                 callback.on_log(run, done, values)

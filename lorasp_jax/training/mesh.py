@@ -39,19 +39,39 @@ def batch_sharding(mesh: Mesh) -> NamedSharding:
     return NamedSharding(mesh, PartitionSpec(("data", "fsdp")))
 
 
-def frozen_sharding(array: Any, mesh: Mesh, minimum: int = MINIMUM_SHARDED_BYTES) -> NamedSharding:
-    """Split the largest divisible axis of a large array over "fsdp", replicate small ones."""
-    fsdp = mesh.shape["fsdp"]
-    divisible = [axis for axis, size in enumerate(array.shape) if size % fsdp == 0]
-    if fsdp == 1 or not divisible or array.size * array.dtype.itemsize < minimum:
-        return replicated(mesh)
-    largest = max(divisible, key=lambda axis: array.shape[axis])
-    spec: list[str | None] = [None] * array.ndim
-    spec[largest] = "fsdp"
-    return NamedSharding(mesh, PartitionSpec(*spec))
+def split_axis(shape: Sequence[int], size: int, fsdp: int, minimum: int) -> int | None:
+    """The axis of an array of `size` bytes that is split over `fsdp` devices; None: it is whole.
+
+    The largest that can be, of an array of at least `minimum` bytes.
+    """
+    divisible = [axis for axis, length in enumerate(shape) if length % fsdp == 0]
+    if fsdp == 1 or not divisible or size < minimum:
+        return None
+    return max(divisible, key=lambda axis: shape[axis])
 
 
-def place_frozen(frozen: Any, mesh: Mesh, minimum: int = MINIMUM_SHARDED_BYTES) -> Any:
-    """Put the frozen base on the mesh, large arrays split over "fsdp"."""
-    shardings = jax.tree.map(lambda array: frozen_sharding(array, mesh, minimum), frozen)
-    return jax.device_put(frozen, shardings)
+def shardings(tree: Any, mesh: Mesh, minimum: int = MINIMUM_SHARDED_BYTES) -> Any:
+    """Where each array of a tree lies: large ones split over "fsdp", others on every device.
+
+    It follows from shapes alone, so that moments and averages lie as their parameters do.
+    """
+
+    def place(array: Any) -> NamedSharding:
+        size, spec = array.size * array.dtype.itemsize, [None] * array.ndim
+        axis = split_axis(array.shape, size, mesh.shape["fsdp"], minimum)
+        names = ("fsdp" if axis == own else None for own, _ in enumerate(spec))
+        return NamedSharding(mesh, PartitionSpec(*names) if axis is not None else PartitionSpec())
+
+    return jax.tree.map(place, tree)
+
+
+def bytes_on_device(tree: Any, fsdp: int, minimum: int = MINIMUM_SHARDED_BYTES) -> float:
+    """What one device holds of a tree that lies as `shardings` says."""
+
+    def held(array: Any) -> float:
+        size = array.size * array.dtype.itemsize
+        whole = split_axis(array.shape, size, fsdp, minimum) is None
+        return size if whole else size / fsdp
+
+    leaves = [leaf for leaf in jax.tree.leaves(tree) if hasattr(leaf, "dtype")]
+    return float(sum(held(leaf) for leaf in leaves))

@@ -16,35 +16,74 @@ import tyro
 
 from lorasp_jax import peft
 from lorasp_jax.config import SCALES, Config
+from lorasp_jax.peft import LoRASP
+
+HELP = {"-h", "--help"}
 
 
-def parse(arguments: Sequence[str]) -> tuple[Config, bool]:
-    """The config that `arguments` ask for, and whether to resume.
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """What the command line asks for.
+
+    Attributes:
+        config: the experiment.
+        resume: whether to go on with the run of this name.
+        dry_run: whether to stop before anything is collected, trained or written.
+        wandb: project of Weights & Biases, or None.
+    """
+
+    config: Config
+    resume: bool = False
+    dry_run: bool = False
+    wandb: str | None = None
+
+
+def parse(arguments: Sequence[str]) -> Command:
+    """What `arguments` ask for.
 
     Raises:
         ValueError: an unknown config, scale, method or field, or a value that does not fit.
         SystemExit: help was asked for and printed.
     """
+    parser = _parser()
+    known, rest = parser.parse_known_args(arguments)
+    wants_help = bool(HELP & set(rest))
+    if known.config is not None:
+        config = load(Path(known.config), choose_scale(known.scale))
+    elif wants_help:
+        config = Config(name="NAME", scale=known.scale, peft=LoRASP())
+    else:
+        parser.print_help()
+        raise ValueError("no experiment was named: add --config, such as configs/multitask.py")
+    if known.method is not None:
+        config = dataclasses.replace(config, peft=_switch(config.peft, known.method))
+    if wants_help:
+        parser.print_help()
+    if known.resume and known.dry_run:
+        raise ValueError("a run is either resumed or tried dry: leave --resume or --dry-run out")
+    return Command(override(config, rest), known.resume, known.dry_run, known.wandb)
+
+
+def _parser() -> argparse.ArgumentParser:
+    """The options that are no fields of a config."""
     parser = argparse.ArgumentParser(
         prog="train.py",
         add_help=False,
         allow_abbrev=False,
-        epilog="With --config FILE --help, every field of that experiment is listed.",
+        usage="python train.py --config FILE [options] [fields]",
+        epilog="With --help, the fields follow; with --config FILE --help, as that file has them.",
     )
     parser.add_argument("--config", help="experiment file, such as configs/multitask.py")
-    parser.add_argument("--scale", default="auto", help=f"auto, {', '.join(SCALES)}")
+    parser.add_argument("--scale", default="auto", help=f"auto (the default), {', '.join(SCALES)}")
     parser.add_argument("--method", help=f"adapter method: {', '.join(peft.names())}")
     parser.add_argument("--resume", action="store_true", help="continue the run of this name")
-    known, rest = parser.parse_known_args(arguments)
-    if known.config is None:
-        parser.print_help()
-        if {"-h", "--help"} & set(rest):
-            raise SystemExit(0)
-        raise ValueError("no experiment was named: add --config, such as configs/multitask.py")
-    config = load(Path(known.config), choose_scale(known.scale))
-    if known.method is not None:
-        config = dataclasses.replace(config, peft=_switch(config.peft, known.method))
-    return override(config, rest), known.resume
+    parser.add_argument(
+        "--dry-run", action="store_true", help="print sizes and memory, compile, stop"
+    )
+    parser.add_argument(
+        "--wandb", metavar="PROJECT", help="log to Weights & Biases, too; needs pip install wandb"
+    )
+    return parser
 
 
 def choose_scale(scale: str) -> str:
@@ -77,15 +116,18 @@ def override(config: Config, arguments: Sequence[str]) -> Config:
     for argument in arguments:
         name = argument.split("=")[0].replace("_", "-")
         if name.startswith("--") and name not in (*fields, "--help"):
-            close = difflib.get_close_matches(name, fields, n=1, cutoff=0.5)
+            others = ["--" + name.replace("_", "-") for name in vars(_parser().parse_args([]))]
+            close = difflib.get_close_matches(name, fields + others, n=1, cutoff=0.5)
             hint = f": did you mean {close[0]}?" if close else f": fields are {' '.join(fields)}"
             raise ValueError(f"unknown option {name}{hint}")
-    wants_help = bool({"-h", "--help"} & set(arguments))
+    wants_help = bool(HELP & set(arguments))
     printed = io.StringIO()
     quiet = contextlib.nullcontext() if wants_help else contextlib.redirect_stderr(printed)
     try:
         with quiet:
-            chosen = tyro.cli(_concrete(config), default=config, args=list(arguments))
+            chosen = tyro.cli(
+                _concrete(config), default=config, args=list(arguments), prog="python train.py"
+            )
     except SystemExit as error:
         if wants_help:
             raise

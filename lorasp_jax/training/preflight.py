@@ -6,6 +6,7 @@ runs comes on top: `HEADROOM`.
 """
 
 import dataclasses
+import functools
 import math
 import os
 from collections.abc import Callable
@@ -14,15 +15,16 @@ from typing import Any, NamedTuple
 import jax
 from flax import nnx
 
-from lorasp_jax import adaptation
+from lorasp_jax import adaptation, flops
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Batch
 from lorasp_jax.models import presets
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.models.observation import abstract_observation
+from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
-from lorasp_jax.training.step import Metrics, loss_fn
+from lorasp_jax.training.step import Metrics, init_state, loss_fn
 
 HEADROOM = 1.1
 """Factor on the sum for what is not counted: temporary arrays, the compiled program, fragments."""
@@ -88,6 +90,9 @@ def _refusal(config: Config, memory: Memory, remat: Remat, available: float) -> 
     fitting = math.floor(batch * (available - fixed) / (memory.peak - fixed))
     fitting -= fitting % jax.device_count()
     hints = [f"--optim.batch-size {fitting}"] if 0 < fitting < batch else []
+    parts = 2 * config.optim.accumulate
+    if batch % (jax.device_count() * parts) == 0:
+        hints += [f"--optim.accumulate {parts}"]
     hints += ["--model.remat full"] if remat != "full" else []
     hints += ["--model.param-dtype bfloat16"] if config.model.param_dtype != "bfloat16" else []
     hints += [f"--fsdp {2 * config.fsdp} on as many devices"]
@@ -98,14 +103,17 @@ def _refusal(config: Config, memory: Memory, remat: Remat, available: float) -> 
 
 
 def expected(config: Config, wanted: BackboneConfig) -> Memory:
-    """Memory of one training step; the base is split over `config.fsdp` devices.
+    """Memory of one training step; large arrays are split over `config.fsdp` devices.
 
     Args:
         config: the run.
         wanted: the backbone's config.
     """
-    step = abstract_step(config, wanted, max(1, config.optim.batch_size // jax.device_count()))
+    own = max(1, config.optim.batch_size // jax.device_count())
+    step = abstract_step(config, wanted, max(1, own // config.optim.accumulate))
     optimizer = make_optimizer(config.optim, {config.peft.as_saved})
+
+    start = functools.partial(init_state, optimizer=optimizer, ema=config.optim.ema > 0)
 
     def stored(adapters: Any, frozen: Any, batch: Batch) -> Any:
         return jax.vjp(lambda a: step.loss(a, frozen, batch), adapters, has_aux=True)[1]
@@ -114,12 +122,14 @@ def expected(config: Config, wanted: BackboneConfig) -> Memory:
     kept = {id(v): v.aval for v in jaxpr.outvars}
     for variable in (*jaxpr.invars, *jaxpr.constvars):  # there anyway
         kept.pop(id(variable), None)
+    held = functools.partial(meshes.bytes_on_device, fsdp=config.fsdp)
+    adapters = held(step.adapters)
     return Memory(
-        base=_bytes(step.frozen) / config.fsdp,
-        adapters=_bytes(step.adapters),
-        gradients=_bytes(step.adapters),
-        optimizer=_bytes(jax.eval_shape(optimizer.init, step.adapters)),
-        activations=_bytes(list(kept.values())) + _bytes(step.batch),
+        base=held(step.frozen),
+        adapters=adapters,
+        gradients=adapters * (1 if config.optim.accumulate == 1 else 2),
+        optimizer=held(jax.eval_shape(start, step.adapters)) - adapters,
+        activations=_bytes(list(kept.values())) + _bytes(abstract_batch(wanted, own)),
     )
 
 
@@ -144,6 +154,13 @@ def abstract_step(config: Config, wanted: BackboneConfig, batch_size: int) -> Ab
         return loss_fn(adapters, frozen, graphdef, batch, jax.random.key(0), weights)
 
     return AbstractStep(loss, adapters, frozen, abstract_batch(wanted, batch_size))
+
+
+def operations(config: Config, wanted: BackboneConfig) -> float:
+    """Floating-point operations of one training step over all devices, nothing counted twice."""
+    step = abstract_step(config, dataclasses.replace(wanted, remat="none"), config.optim.batch_size)
+    gradient = jax.grad(step.loss, has_aux=True)
+    return flops.count(gradient, step.adapters, step.frozen, step.batch)
 
 
 def abstract_batch(config: BackboneConfig, size: int) -> Batch:

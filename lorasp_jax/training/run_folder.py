@@ -5,8 +5,10 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 from tensorboardX import SummaryWriter
 
 from lorasp_jax.config import Config
@@ -23,10 +25,10 @@ def to_json(config: Config) -> dict[str, Any]:
 
 def write_json(path: Path, value: Any) -> None:
     """Write JSON so that readers never see half of it."""
-    _write_text(path, json.dumps(value, indent=2) + "\n")
+    write_text(path, json.dumps(value, indent=2) + "\n")
 
 
-def _write_text(path: Path, text: str) -> None:
+def write_text(path: Path, text: str) -> None:
     """Write a whole file under a temporary name, then give it its own."""
     temporary = path.with_suffix(".tmp")
     temporary.write_text(text)
@@ -96,15 +98,22 @@ class MetricsLog:
         """Open the log of the run in `folder`, which continues at `start_step`."""
         self.path = folder / "metrics.jsonl"
         kept = [row for row in read_metrics(folder) if row["step"] <= start_step]
-        _write_text(self.path, "".join(json.dumps(row) + "\n" for row in kept))
+        write_text(self.path, "".join(json.dumps(row) + "\n" for row in kept))
         self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=start_step + 1)
 
-    def write(self, step: int, values: Mapping[str, float]) -> None:
-        """Record scalars at `step`."""
+    def write(
+        self,
+        step: int,
+        values: Mapping[str, float],
+        histograms: Mapping[str, np.ndarray] = MappingProxyType({}),
+    ) -> None:
+        """Record scalars at `step`, and for TensorBoard alone histograms of arrays."""
         with self.path.open("a") as file:
             file.write(json.dumps({"step": step, **values}) + "\n")
         for name, value in values.items():
             self._board.add_scalar(name, value, step)
+        for name, array in histograms.items():
+            self._board.add_histogram(name, array, step)
 
     def close(self) -> None:
         """Flush the event file."""

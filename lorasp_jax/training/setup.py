@@ -1,7 +1,6 @@
 """From a config to a run that is ready to train: base, adapters, demonstrations, processor."""
 
 import dataclasses
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -17,34 +16,64 @@ from rich.progress import TaskID
 import envs
 from envs.env import Env
 from envs.episodes import Episodes
-from lorasp_jax import adaptation, calibration, models, peft, tables
+from lorasp_jax import adaptation, calibration, peft, tables
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Batch, encode, flatten, sample_batch, windows
 from lorasp_jax.data.demonstrations import demonstrations
 from lorasp_jax.data.imported import cached, is_simulated, opened, outline
 from lorasp_jax.data.source import Source
 from lorasp_jax.data.stream import Stream
-from lorasp_jax.models import backbone, loading, places, presets, tokenizer
+from lorasp_jax.models import presets, tokenizer
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.processing import Processor, Statistics, check_delta, robot_slots, to_delta
 from lorasp_jax.models.prompt_table import PromptTable
 from lorasp_jax.training import preflight
-from lorasp_jax.training.loop import Run
+from lorasp_jax.training.base import base_model, changed
 from lorasp_jax.training.progress import bars
+from lorasp_jax.training.run import Run
 
 STATISTICS_BATCHES = 8
 """Batches that an initialization from data looks at."""
-SIZES = ("nano", "small", "base", "nano_pi05", "base_pi05")
-TRAINING = "training.json"
-"""File beside base weights: what they were trained on, with the control period."""
 
 
-def prepare(config: Config, folder: Path, console: Console, started: float) -> Run:
-    """Load or create the base, attach the adapters, get the demonstrations.
+@dataclasses.dataclass(frozen=True)
+class Built:
+    """A run before it has demonstrations.
 
-    What can be wrong with a config is found before anything long begins.
+    Attributes:
+        base: the frozen base, with the rematerialisation that was chosen.
+        base_hash: its hash.
+        model: the base with adapters; of a method that starts from data, as they are saved.
+        prompts: of all instructions.
+        joints: J of the robot.
+        worlds: an environment a task; none with a dataset.
+        source: the dataset; None: the expert.
+        memory: what a step is expected to need.
+        available: bytes of memory that a device has.
+    """
+
+    base: Backbone
+    base_hash: str
+    model: Backbone
+    prompts: PromptTable
+    joints: int
+    worlds: Sequence[Env]
+    source: Source | None
+    memory: preflight.Memory
+    available: float
+
+    @property
+    def room(self) -> float:
+        """Bytes of a device that a step leaves."""
+        return self.available - self.memory.peak
+
+
+def build(config: Config, folder: Path) -> Built:
+    """Load or create the base and attach the adapters; writes nothing.
+
+    What can be wrong with a config is found here, before anything long begins.
 
     Raises:
         ValueError: an unknown task, robot, backbone or size, a base or a tokenizer that does not
@@ -55,33 +84,51 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
     worlds = [envs.make(task, robot=config.robot, **sizes) for task in tasks]
     words = tokenizer.load(config.model.tokenizer)
     base, base_hash = base_model(config)
-    base = _changed(base, max_tokens=config.model.max_tokens or base.config.max_tokens)
+    base = changed(base, max_tokens=config.model.max_tokens or base.config.max_tokens)
     source = opened(config, base.config, folder) if config.data.source else None
     prompts, joints = _told(source, worlds, words, base.config)
     _check_sizes(config, base.config.chunk)
     check_delta(base.config.inputs.delta, joints)
     available = preflight.available_bytes()
     remat, memory = preflight.choose_remat(config, base.config, available)
-    base = _changed(base, remat=remat)
+    base = changed(base, remat=remat)
     model = _adapted(config, base, config.peft.as_saved)
+    return Built(base, base_hash, model, prompts, joints, worlds, source, memory, available)
+
+
+def prepare(config: Config, folder: Path, console: Console, started: float) -> Run:
+    """`build`, then get the demonstrations.
+
+    Raises:
+        ValueError: as `build`; a dataset or the expert that fails.
+    """
+    built = build(config, folder)
+    base, model = built.base, built.model
+    console.print(headline(config, model))
     console.print(
-        f"scale {config.scale}: {type(config.peft).__name__} on {config.model.backbone} "
-        f"{config.model.size}, {tables.trained_share(model)}"
+        f"memory by device in GiB: {built.memory}; rematerialisation: {base.config.remat}"
     )
-    console.print(f"memory by device in GiB: {memory}; rematerialisation: {remat}")
-    run = Run(config, folder, console, base_hash, started)
+    run = Run(config, folder, console, built.base_hash, started)
     with run.timed("collect"):
-        if source:
-            _import(run, source, available - memory.peak)
+        if built.source:
+            _import(run, built.source, built.room)
         else:
-            run.episodes = _collect(run, prompts.instructions)
+            run.episodes = _collect(run, built.prompts.instructions)
     relative = config.model.relative_actions
-    found = processor([*run.episodes.values()], model.config, prompts, relative=relative)
+    found = processor([*run.episodes.values()], model.config, built.prompts, relative=relative)
     if config.peft.needs_statistics:
         statistics = input_moments(run, base, found)
         model = _adapted(config, base, config.peft, statistics)
     run.policy = Policy(model, found)
     return run
+
+
+def headline(config: Config, model: Backbone) -> str:
+    """One line: scale, method, backbone and what trains."""
+    return (
+        f"scale {config.scale}: {type(config.peft).__name__} on {config.model.backbone} "
+        f"{config.model.size}, {tables.trained_share(model)}"
+    )
 
 
 def _told(
@@ -108,11 +155,14 @@ def _check_sizes(config: Config, chunk: int) -> None:
         raise ValueError(
             f"execute_steps must be 1 to the chunk, {chunk}, got {config.evaluation.execute_steps}"
         )
-    if config.optim.batch_size % jax.device_count():
+    optim, devices = config.optim, jax.device_count()
+    if optim.batch_size % (devices * optim.accumulate):
+        parts = f" times {optim.accumulate} parts" if optim.accumulate > 1 else ""
         raise ValueError(
-            f"batch_size must be a multiple of the {jax.device_count()} devices, "
-            f"got {config.optim.batch_size}"
+            f"batch_size must be a multiple of the {devices} devices{parts}, got {optim.batch_size}"
         )
+    if optim.ema and isinstance(config.peft, peft.AdaLoRA):
+        raise ValueError("an average has no budget: leave --optim.ema out with ada_lora")
 
 
 def _adapted(
@@ -153,55 +203,6 @@ def _drawing(run: Run, processor: Processor, chunk: int) -> Callable[[jax.Array]
             key, steps, processor, batch_size=size, chunk=chunk, state_noise=noise
         )
     )
-
-
-def base_model(config: Config) -> tuple[Backbone, str]:
-    """The frozen base and its hash: loaded from the checkpoint, or random where none is named.
-
-    Raises:
-        ValueError: an unknown backbone or size, or a base of another one.
-    """
-    chosen, kind = config.model, backbone.find(config.model.backbone)
-    sizes = [size for size in SIZES if hasattr(kind, size)]
-    if chosen.size not in sizes:
-        raise ValueError(f"unknown size {chosen.size!r}: it is one of {', '.join(sizes)}")
-    wanted: BackboneConfig = getattr(kind, chosen.size)()
-    wanted = dataclasses.replace(wanted, dtype=chosen.dtype, param_dtype=chosen.param_dtype)
-    if not wanted.inputs.masks_missing:
-        wanted = dataclasses.replace(wanted, cameras=wanted.cameras[: len(envs.Env.cameras)])
-    if chosen.source:
-        folder = places.local(chosen.source)
-        inputs = loading.lerobot_inputs(folder) or wanted.inputs
-        wanted = dataclasses.replace(wanted, inputs=inputs)
-        model = models.load(folder, wanted)
-        if loading.is_own(folder):
-            _check_time(folder, config.control_dt)
-        return model, models.weights_hash(model)
-    key = jax.random.fold_in(jax.random.key(config.seed), 4)
-    model = wanted.create(nnx.Rngs(key))
-    return model, models.weights_hash(model)
-
-
-def _changed(model: Backbone, **changes: Any) -> Backbone:
-    """The same parameters in a model whose config differs in what no parameter depends on."""
-    wanted = dataclasses.replace(model.config, **changes)
-    if wanted == model.config:
-        return model
-    abstract = nnx.eval_shape(lambda: wanted.create(nnx.Rngs(0)))
-    return nnx.merge(nnx.graphdef(abstract), nnx.state(model))
-
-
-def _check_time(folder: Path, control_dt: float) -> None:
-    """Raise ValueError unless the base in a folder was trained at this control period."""
-    path = folder / TRAINING
-    try:
-        found = json.loads(path.read_text())["control_dt"]
-    except (OSError, KeyError, ValueError) as error:
-        raise ValueError(f"{path} does not say the control_dt that the base needs") from error
-    if found != control_dt:
-        raise ValueError(
-            f"{folder} was trained with control_dt {found} s, this run has {control_dt}"
-        )
 
 
 def processor(

@@ -10,7 +10,9 @@ from flax import nnx
 
 from lorasp_jax import adaptation
 from lorasp_jax.data.batches import Batch
+from lorasp_jax.models import flow_matching
 from lorasp_jax.peft import Aux
+from lorasp_jax.peft.method import masked_mean
 
 Metrics = dict[str, jax.Array]
 
@@ -24,16 +26,27 @@ class TrainState:
         step: `[]` int32, optimizer steps taken.
         adapters: trainable part of the model, an `nnx.State` of `AdapterParam`.
         opt_state: state of the optimizer.
+        average: moving average of the adapters, or None.
     """
 
     step: jax.Array
     adapters: Any
     opt_state: Any
+    average: Any = None
+
+    @property
+    def best(self) -> Any:
+        """The adapters to use: their average, where there is one."""
+        return self.adapters if self.average is None else self.average
 
 
-def init_state(adapters: Any, optimizer: optax.GradientTransformation) -> TrainState:
-    """The state before the first step."""
-    return TrainState(jnp.zeros((), jnp.int32), adapters, optimizer.init(adapters))
+def init_state(
+    adapters: Any, optimizer: optax.GradientTransformation, *, ema: bool = False
+) -> TrainState:
+    """The state before the first step, of copies: a step takes its state's memory over."""
+    adapters = jax.tree.map(jnp.copy, adapters)
+    average = jax.tree.map(jnp.copy, adapters) if ema else None
+    return TrainState(jnp.zeros((), jnp.int32), adapters, optimizer.init(adapters), average)
 
 
 def auxiliary_losses(aux: Any) -> Metrics:
@@ -51,31 +64,93 @@ def auxiliary_losses(aux: Any) -> Metrics:
     }
 
 
-def mean_active_rank(aux: dict[str, dict[str, Aux]]) -> Metrics:
-    """Active rank averaged over valid tokens, then over adapted layers, by tower."""
-    ranks = {
-        tower: [rank for a in linears.values() if (rank := a.mean_active_rank()) is not None]
-        for tower, linears in aux.items()
-    }
-    return {f"active_rank/{tower}": jnp.stack(r).mean() for tower, r in ranks.items() if r}
+def active_ranks(aux: dict[str, dict[str, Aux]]) -> Metrics:
+    """Active rank averaged over valid tokens, as a mean by tower and as `[L]` by linear map."""
+    found: Metrics = {}
+    for tower, linears in aux.items():
+        ranks = {
+            f"active_rank/{tower}/{name}": _layer_ranks(a.active_rank, a.token_mask)
+            for name, a in linears.items()
+            if a.active_rank is not None
+        }
+        if ranks:
+            found |= {f"active_rank/{tower}": jnp.stack([r.mean() for r in ranks.values()]).mean()}
+            found |= ranks
+    return found
+
+
+def _layer_ranks(rank: jax.Array, mask: jax.Array | None) -> jax.Array:
+    """`[L]` means over the valid tokens of `[..., B, T]`; L is 1 without leading axes."""
+    mask = jnp.ones((), bool) if mask is None else mask
+    tokens = (x.reshape(-1, *rank.shape[-2:]) for x in (rank, jnp.broadcast_to(mask, rank.shape)))
+    return jax.vmap(masked_mean)(*tokens)
 
 
 def loss_fn(
-    adapters: Any, frozen: Any, graphdef: Any, batch: Batch, key: jax.Array, weights: Metrics
+    adapters: Any,
+    frozen: Any,
+    graphdef: Any,
+    batch: Batch,
+    key: jax.Array,
+    weights: Metrics,
+    *,
+    valid: jax.Array | None = None,
+    noise: jax.Array | None = None,
+    flow_time: jax.Array | None = None,
 ) -> tuple[jax.Array, Metrics]:
     """Eq. 14 of arXiv 2603.07404: flow-matching loss plus weighted auxiliary losses.
 
-    The task loss is the mean over the elements that `batch.action_mask` marks as valid.
+    The task loss is the mean over the elements that `batch.action_mask` marks as valid; `valid`
+    takes the place of their number, `noise` and `flow_time` of what is drawn.
     """
-    model = nnx.merge(graphdef, adapters, frozen)
+    model, mask = nnx.merge(graphdef, adapters, frozen), batch.action_mask
+    valid = jnp.sum(mask) if valid is None else valid
     per_element, aux = model.loss(
-        key, batch.observation, batch.actions, action_mask=batch.action_mask
+        key,
+        batch.observation,
+        batch.actions,
+        action_mask=mask,
+        noise=noise,
+        flow_time=flow_time,
     )
-    mask = batch.action_mask
-    task = jnp.sum(per_element * mask) / jnp.maximum(jnp.sum(mask), 1)
+    task = jnp.sum(per_element * mask) / jnp.maximum(valid, 1)
     losses = auxiliary_losses(aux) | adaptation.penalties(model)
     total = task + sum(weights[name] * value for name, value in losses.items())
-    return total, {"loss": total, "task": task, **losses, **mean_active_rank(aux)}
+    return total, {"loss": total, "task": task, **losses, **active_ranks(aux)}
+
+
+def gradients(
+    adapters: Any,
+    frozen: Any,
+    graphdef: Any,
+    batch: Batch,
+    key: jax.Array,
+    weights: Metrics,
+    parts: int = 1,
+) -> tuple[Any, Metrics]:
+    """Gradient of `loss_fn` and its metrics, from equal parts of the batch one after the other.
+
+    The task loss is that of the whole batch, up to rounding; auxiliary losses and active ranks are
+    means over the parts.
+    """
+    gradient = jax.grad(loss_fn, has_aux=True)
+    if parts == 1:
+        return gradient(adapters, frozen, graphdef, batch, key, weights)
+    # Every part has rows of all devices, so that none moves: rows 0, n, 2n, ... are the first part.
+    split = lambda x: jnp.swapaxes(x.reshape(-1, parts, *x.shape[1:]), 0, 1)  # noqa: E731
+    valid = jnp.sum(batch.action_mask) / parts
+
+    def add(total: Any, part: Any) -> tuple[Any, Metrics]:
+        rows, (noise, flow_time) = part
+        given = {"valid": valid, "noise": noise, "flow_time": flow_time}
+        grads, metrics = gradient(adapters, frozen, graphdef, rows, key, weights, **given)
+        return jax.tree.map(jnp.add, total, grads), metrics
+
+    zeros = jax.tree.map(jnp.zeros_like, adapters)
+    each = jax.tree.map(split, (batch, flow_matching.draw(key, batch.actions)))
+    total, metrics = jax.lax.scan(add, zeros, each)
+    mean = lambda tree: jax.tree.map(lambda x: x.mean(0), tree)  # noqa: E731
+    return jax.tree.map(lambda x: x / parts, total), mean(metrics)
 
 
 def train_step(
@@ -87,12 +162,19 @@ def train_step(
     graphdef: Any,
     optimizer: optax.GradientTransformation,
     weights: dict[str, optax.Schedule],
+    parts: int = 1,
+    ema: float = 0.0,
 ) -> tuple[TrainState, Metrics]:
-    """One optimizer step on the global batch; `key` is consumed."""
+    """One optimizer step on the global batch, taken in `parts`; `key` is consumed.
+
+    Where the state has an average, it decays by `ema`.
+    """
     now = {name: jnp.asarray(schedule(state.step)) for name, schedule in weights.items()}
-    gradient = jax.value_and_grad(loss_fn, has_aux=True)
-    (_, metrics), grads = gradient(state.adapters, frozen, graphdef, batch, key, now)
+    grads, metrics = gradients(state.adapters, frozen, graphdef, batch, key, now, parts)
     updates, opt_state = optimizer.update(grads, state.opt_state, state.adapters)
     adapters = optax.apply_updates(state.adapters, updates)
     metrics |= {"grad_norm": optax.tree.norm(grads), "update_norm": optax.tree.norm(updates)}
-    return TrainState(state.step + 1, adapters, opt_state), metrics
+    average = state.average
+    if average is not None:
+        average = optax.incremental_update(adapters, average, 1 - ema)
+    return TrainState(state.step + 1, adapters, opt_state, average), metrics

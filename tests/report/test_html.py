@@ -70,10 +70,39 @@ def test_full_fine_tuning_has_no_ranks(folder):
     assert "Active rank" not in write_report(folder).read_text()
 
 
-def test_unfinished_run(folder):
-    (folder / "results.json").unlink()
+def test_a_run_that_goes_on(folder):
+    """From the first moment on there is a page, with what is known."""
+    before = {"press": RESULTS["tasks"]["press"]["before"]}
+    for name in ("results.json", "rollout_press.mp4", "cameras_press.png"):
+        (folder / name).unlink()
+    (folder / "before.json").write_text(json.dumps(before))
+    page = write_report(folder).read_text()
+    assert "The run goes on: step 4 of 4." in page
+    assert "http-equiv=refresh" in page
+    assert "3.1 % [0.9, 10.7] of 64" in page
+    assert "<th>before</th></tr>" in page
+    assert page.count("image/svg") == 3
+    for name in ("before.json", "metrics.jsonl"):
+        (folder / name).unlink()
+    page = write_report(folder).read_text()
+    assert "step 0 of 4" in page
+    assert "Nothing is logged yet" in page
+    assert "image/svg" not in page
+    (folder / "config.json").unlink()
     with pytest.raises(FileNotFoundError):
         write_report(folder)
+
+
+def test_speed_is_the_middle_and_memory_the_highest(folder):
+    assert "samples a second" not in write_report(folder).read_text()
+    log = MetricsLog(folder)
+    for step, (rate, used) in enumerate([(1.0, 2.0), (30.0, 3.5), (20.0, 1.0)]):
+        log.write(step, {"task": 1.0, "speed/samples_per_second": rate, "memory/peak_gib": used})
+    log.close()
+    page = write_report(folder).read_text()
+    assert "samples a second</td><td class=number>20<" in page
+    assert "3.50 GiB" in page
+    assert "waiting" not in page
 
 
 def test_video_can_be_read_back(folder):

@@ -50,7 +50,7 @@ def one_device(make):
 
 @pytest.mark.parametrize("name", backbone.names())
 def test_published_sizes_are_configs_of_their_own(name):
-    config, _ = parse(["--config", f"{ROOT}/configs/multitask_{name}.py", "--scale", "smoke"])
+    config = parse(["--config", f"{ROOT}/configs/multitask_{name}.py", "--scale", "smoke"]).config
     assert (config.model.backbone, config.model.size) == (name, "base")
     assert config.targets == ("paper",)
     assert isinstance(config.peft, peft.LoRASP)
@@ -58,9 +58,9 @@ def test_published_sizes_are_configs_of_their_own(name):
 
 
 def test_a_task_by_its_name():
-    config, _ = parse(["--config", f"{ROOT}/configs/single_task.py", "--tasks", "pour"])
+    config = parse(["--config", f"{ROOT}/configs/single_task.py", "--tasks", "pour"]).config
     assert config.tasks == ("pour",)
-    assert config.peft == parse(["--config", f"{ROOT}/configs/multitask.py"])[0].peft
+    assert config.peft == parse(["--config", f"{ROOT}/configs/multitask.py"]).config.peft
 
 
 @pytest.mark.slow

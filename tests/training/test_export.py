@@ -16,7 +16,7 @@ from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.processing import Statistics
 from lorasp_jax.peft import FullFineTuning
-from lorasp_jax.training import export, setup
+from lorasp_jax.training import base, export, setup
 from tests.runs import CONFIG, leaves, make_run
 
 
@@ -58,7 +58,7 @@ def test_base(tmp_path):
     expected = leaves(nnx.state(adaptation.merge(run.policy.model), nnx.Param))
     for name, value in leaves(nnx.state(loaded, nnx.Param)).items():
         np.testing.assert_array_equal(value, expected[name].astype(jnp.bfloat16).astype(np.float32))
-    assert json.loads((folder / setup.TRAINING).read_text()) == {
+    assert json.loads((folder / base.TRAINING).read_text()) == {
         "robot": "piper",
         "tasks": ["press", "pick_place"],
         "control_dt": 0.1,

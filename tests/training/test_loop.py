@@ -10,9 +10,10 @@ import pytest
 
 from lorasp_jax import adaptation
 from lorasp_jax.training import mesh as meshes
-from lorasp_jax.training.loop import Callback, RunError, _Stretches, train
+from lorasp_jax.training.loop import RunError, _Stretches, train
+from lorasp_jax.training.run import Callback
 from lorasp_jax.training.run_folder import read_metrics
-from tests.runs import CONFIG, Terminate, leaves, make_run
+from tests.runs import CONFIG, Terminate, leaves, make_run, repeatable
 
 
 @pytest.fixture(autouse=True)
@@ -39,7 +40,8 @@ def test_resume_is_bit_exact_and_frozen_stays_frozen(tmp_path):
     _, resumed, _ = adaptation.split(halved.policy.model)
     for name, value in leaves(resumed).items():
         np.testing.assert_array_equal(value, leaves(adapters)[name], err_msg=name)
-    assert read_metrics(whole.folder) == read_metrics(halved.folder)
+    assert repeatable(whole.folder) == repeatable(halved.folder)
+    assert read_metrics(whole.folder)[-1]["speed/samples_per_second"] > 0
     for name, value in leaves(frozen).items():
         np.testing.assert_array_equal(value, leaves(frozen_before)[name], err_msg=name)
     moved = [

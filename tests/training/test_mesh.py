@@ -1,16 +1,23 @@
 """One device and eight agree; large frozen arrays are split."""
 
+import dataclasses
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from jax.sharding import PartitionSpec
 
 from lorasp_jax import adaptation
 from lorasp_jax.data.batches import flatten, sample_batch
+from lorasp_jax.peft import FullFineTuning
 from lorasp_jax.training import mesh as meshes
-from lorasp_jax.training.step import loss_fn
-from tests.runs import leaves, make_run
+from lorasp_jax.training.loop import train
+from lorasp_jax.training.run_folder import read_metrics
+from lorasp_jax.training.step import init_state, loss_fn
+from tests.runs import CONFIG, Terminate, leaves, make_run
 
 
 def test_one_and_eight_devices_agree(tmp_path):
@@ -33,7 +40,7 @@ def test_one_and_eight_devices_agree(tmp_path):
         place = meshes.replicated(mesh)
         return jax.jit(jax.value_and_grad(loss_fn, has_aux=True), static_argnums=2)(
             jax.device_put(adapters, place),
-            meshes.place_frozen(frozen, mesh, minimum=1024),
+            jax.device_put(frozen, meshes.shardings(frozen, mesh, minimum=1024)),
             graphdef,
             jax.device_put(batch, meshes.batch_sharding(mesh)),
             jax.device_put(jax.random.key(1), place),
@@ -56,10 +63,42 @@ def test_sharding_rule():
     mesh = meshes.make_mesh(4)
     assert dict(mesh.shape) == {"data": 2, "fsdp": 4}
     big, odd, little = jnp.zeros((6, 4096, 1024)), jnp.zeros((1025, 1025)), jnp.zeros((8, 8))
-    assert meshes.frozen_sharding(big, mesh).spec == PartitionSpec(None, "fsdp", None)
-    assert meshes.frozen_sharding(odd, mesh).spec == PartitionSpec()
-    assert meshes.frozen_sharding(little, mesh).spec == PartitionSpec()
-    assert meshes.frozen_sharding(little, mesh, minimum=1).spec == PartitionSpec("fsdp", None)
+    state = init_state({"big": big, "odd": odd, "little": little}, optax.adam(0.1), ema=True)
+    found = meshes.shardings(state, mesh)
+    for tree in (found.adapters, found.opt_state[0].mu, found.opt_state[0].nu, found.average):
+        assert tree["big"].spec == PartitionSpec(None, "fsdp", None)
+        assert tree["odd"].spec == tree["little"].spec == PartitionSpec()
+    assert meshes.shardings(little, mesh, minimum=1).spec == PartitionSpec("fsdp", None)
+    placed = jax.device_put(state, found)
+    on_one = sum(x.addressable_shards[0].data.nbytes for x in jax.tree.leaves(placed))
+    assert meshes.bytes_on_device(state, fsdp=4) == on_one < 0.3 * meshes.bytes_on_device(state, 1)
+
+
+@pytest.mark.slow
+def test_full_fine_tuning_is_split_and_the_numbers_are_those_of_one_device(tmp_path, monkeypatch):
+    """What trains, its moments and its average; a run in another mesh goes on with them."""
+    split = functools.partial(meshes.shardings, minimum=1024)
+    monkeypatch.setattr(meshes, "shardings", split)
+    optim = dataclasses.replace(CONFIG.optim, ema=0.5)
+    config = dataclasses.replace(
+        CONFIG, peft=FullFineTuning(), targets=("action",), fsdp=2, optim=optim
+    )
+    many = make_run(tmp_path / "many", config)
+    with pytest.raises(KeyboardInterrupt):
+        train(many, [Terminate()])
+    many = make_run(tmp_path / "many", dataclasses.replace(config, fsdp=4))
+    train(many, resume=True)
+    trained = jax.tree.leaves(adaptation.split(many.policy.model)[1])
+    shares = [x.addressable_shards[0].data.size / x.size for x in trained]
+    assert shares.count(0.25) > 5
+    mesh = meshes.make_mesh(1, jax.devices()[:1])
+    monkeypatch.setattr(meshes, "make_mesh", lambda fsdp: mesh)
+    one = make_run(tmp_path / "one", config)
+    train(one)
+    rows = zip(read_metrics(one.folder), read_metrics(many.folder), strict=True)
+    for expected, found in rows:
+        assert found["task"] == pytest.approx(expected["task"], rel=1e-4)
+        assert found["grad_norm"] == pytest.approx(expected["grad_norm"], rel=1e-3)
 
 
 def test_fsdp_must_divide_the_devices():

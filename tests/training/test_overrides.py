@@ -21,8 +21,8 @@ def test_dotted_overrides():
 
 
 def test_scale_is_chosen_by_backend_and_can_be_forced():
-    assert parse(MULTITASK)[0].scale == "cpu"
-    assert parse([*MULTITASK, "--scale", "accelerator"])[0].model.size == "small"
+    assert parse(MULTITASK).config.scale == "cpu"
+    assert parse([*MULTITASK, "--scale", "accelerator"]).config.model.size == "small"
 
 
 def test_every_variant_of_lora_sp_is_an_option():
@@ -41,11 +41,13 @@ def test_every_variant_of_lora_sp_is_an_option():
 
 
 def test_method_by_name_keeps_the_rank():
-    config, resume = parse([*MULTITASK, "--method", "lora", "--resume", "--peft.alpha", "7"])
+    command = parse([*MULTITASK, "--method", "lora", "--resume", "--peft.alpha", "7"])
+    config = command.config
     assert isinstance(config.peft, LoRA)
-    assert config.peft.rank == parse(MULTITASK)[0].peft.rank
+    assert config.peft.rank == parse(MULTITASK).config.peft.rank
     assert config.peft.alpha == 7
-    assert resume
+    assert command.resume
+    assert not command.dry_run
 
 
 @pytest.mark.parametrize(
@@ -56,6 +58,8 @@ def test_method_by_name_keeps_the_rank():
         ([*MULTITASK, "--scale", "gpu"], "unknown scale 'gpu': it is one of auto, smoke"),
         ([*MULTITASK, "--method", "lorra"], "lorra.*lora_sp"),
         ([*MULTITASK, "--peft.rnk", "4"], "unknown option --peft.rnk: did you mean --peft.rank?"),
+        ([*MULTITASK, "--dry-runn"], "unknown option --dry-runn: did you mean --dry-run?"),
+        ([*MULTITASK, "--dry-run", "--resume"], "leave --resume or --dry-run out"),
         ([*MULTITASK, "--optim.steps", "many"], "--optim.steps.*'many'"),
         ([*MULTITASK, "--peft.energy-target", "1.5"], "1.5"),
         ([*MULTITASK, "--peft.energy-target", "0"], "0"),
@@ -69,13 +73,17 @@ def test_mistakes_are_one_sentence(arguments, message, capsys):
     assert not re.search("Traceback|╭", text + capsys.readouterr().err)
 
 
-def test_help_lists_every_field(capsys):
+@pytest.mark.parametrize("config", [[], MULTITASK])
+def test_help_lists_every_field_and_option(config, capsys):
     with pytest.raises(SystemExit) as caught:
-        parse([*MULTITASK, "--help"])
+        parse([*config, "--help"])
     assert caught.value.code == 0
     printed = capsys.readouterr().out
     for name in ("--peft.energy-target", "--optim.learning-rate", "--evaluation.episodes"):
         assert name in printed
+    for name in ("--config", "--method", "--resume", "--dry-run"):
+        assert name in printed
+    assert re.search(r"--optim.b2 FLOAT +Decay of the second moment. \(default: 0.95\)", printed)
 
 
 def test_a_file_without_get_config(tmp_path):

@@ -40,6 +40,15 @@ def test_activations_grow_with_the_batch_and_shrink_with_remat(memory):
     assert twice.activations == pytest.approx(2 * none, rel=0.1)
 
 
+def test_parts_of_a_batch_and_an_average(memory):
+    none = memory["none"]
+    optim = dataclasses.replace(CONFIG.optim, accumulate=4, ema=0.5)
+    found = preflight.expected(dataclasses.replace(CONFIG, optim=optim), TINY)
+    assert found.gradients == 2 * none.gradients  # of a part, and their sum
+    assert found.optimizer == none.optimizer + none.adapters
+    assert found.activations < 0.5 * none.activations
+
+
 def test_the_first_that_fits_is_chosen(memory):
     for remat in preflight.REMATS:
         assert preflight.choose_remat(CONFIG, TINY, memory[remat].peak)[0] == remat
@@ -51,6 +60,7 @@ def test_what_cannot_fit_is_refused_with_a_batch_that_does(memory):
     room = (memory["full"].peak + preflight.HEADROOM * memory["full"].base) / 2
     with pytest.raises(ValueError, match=r"needs about .* try --optim.batch-size") as caught:
         preflight.choose_remat(CONFIG, TINY, room)
+    assert "--optim.accumulate 2, " in str(caught.value)
     assert "--fsdp 2" in str(caught.value)
     assert "\n" not in str(caught.value)
     size = int(str(caught.value).partition("--optim.batch-size ")[2].partition(",")[0])

@@ -25,8 +25,9 @@ from lorasp_jax.models.tokenizer import Offline
 from lorasp_jax.peft import FullFineTuning, LoRA
 from lorasp_jax.training import export, setup
 from lorasp_jax.training import mesh as meshes
-from lorasp_jax.training.loop import Run, train
+from lorasp_jax.training.loop import train
 from lorasp_jax.training.overrides import override
+from lorasp_jax.training.run import Run
 from tests import quick
 from tests.data.lerobots import golden
 from tests.runs import CONFIG, leaves, random_episodes
@@ -87,8 +88,8 @@ def test_policies_of_lerobot_are_fed_as_they_say(config, tmp_path, monkeypatch):
         "output_features": {"action": {"shape": [3]}},
     }
     (tmp_path / "config.json").write_text(json.dumps(fields))
-    monkeypatch.setattr(setup.models, "load", lambda _, wanted: SimpleNamespace(config=wanted))
-    monkeypatch.setattr(setup.models, "weights_hash", lambda _: "")
+    monkeypatch.setattr(models, "load", lambda _, wanted: SimpleNamespace(config=wanted))
+    monkeypatch.setattr(models, "weights_hash", lambda _: "")
     model = ModelConfig(size="base", checkpoint=str(tmp_path))
     wanted = dataclasses.replace(
         inputs.LEROBOT_CENTRED, state="quantile10", action="min_max", delta=(True, True, False)

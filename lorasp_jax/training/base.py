@@ -1,0 +1,69 @@
+"""The frozen base of a run: loaded from a checkpoint, or random."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+from flax import nnx
+
+import envs
+from lorasp_jax import models
+from lorasp_jax.config import Config
+from lorasp_jax.models import backbone, loading, places
+from lorasp_jax.models.backbone import Backbone
+from lorasp_jax.models.config import BackboneConfig
+
+SIZES = ("nano", "small", "base", "nano_pi05", "base_pi05")
+TRAINING = "training.json"
+"""File beside base weights: what they were trained on, with the control period."""
+
+
+def base_model(config: Config) -> tuple[Backbone, str]:
+    """The frozen base and its hash: loaded from the checkpoint, or random where none is named.
+
+    Raises:
+        ValueError: an unknown backbone or size, or a base of another one.
+    """
+    chosen, kind = config.model, backbone.find(config.model.backbone)
+    sizes = [size for size in SIZES if hasattr(kind, size)]
+    if chosen.size not in sizes:
+        raise ValueError(f"unknown size {chosen.size!r}: it is one of {', '.join(sizes)}")
+    wanted: BackboneConfig = getattr(kind, chosen.size)()
+    wanted = dataclasses.replace(wanted, dtype=chosen.dtype, param_dtype=chosen.param_dtype)
+    if not wanted.inputs.masks_missing:
+        wanted = dataclasses.replace(wanted, cameras=wanted.cameras[: len(envs.Env.cameras)])
+    if chosen.source:
+        folder = places.local(chosen.source)
+        inputs = loading.lerobot_inputs(folder) or wanted.inputs
+        wanted = dataclasses.replace(wanted, inputs=inputs)
+        model = models.load(folder, wanted)
+        if loading.is_own(folder):
+            _check_time(folder, config.control_dt)
+        return model, models.weights_hash(model)
+    key = jax.random.fold_in(jax.random.key(config.seed), 4)
+    model = wanted.create(nnx.Rngs(key))
+    return model, models.weights_hash(model)
+
+
+def changed(model: Backbone, **changes: Any) -> Backbone:
+    """The same parameters in a model whose config differs in what no parameter depends on."""
+    wanted = dataclasses.replace(model.config, **changes)
+    if wanted == model.config:
+        return model
+    abstract = nnx.eval_shape(lambda: wanted.create(nnx.Rngs(0)))
+    return nnx.merge(nnx.graphdef(abstract), nnx.state(model))
+
+
+def _check_time(folder: Path, control_dt: float) -> None:
+    """Raise ValueError unless the base in a folder was trained at this control period."""
+    path = folder / TRAINING
+    try:
+        found = json.loads(path.read_text())["control_dt"]
+    except (OSError, KeyError, ValueError) as error:
+        raise ValueError(f"{path} does not say the control_dt that the base needs") from error
+    if found != control_dt:
+        raise ValueError(
+            f"{folder} was trained with control_dt {found} s, this run has {control_dt}"
+        )

@@ -1,0 +1,57 @@
+"""The report grows while a run goes on, and its end is a table in the terminal."""
+
+import io
+import json
+from types import SimpleNamespace
+
+import pytest
+from rich.console import Console
+
+from lorasp_jax.report import callback
+from tests.report.test_html import RESULTS, folder  # noqa: F401
+
+
+@pytest.fixture
+def run(folder, monkeypatch):  # noqa: F811
+    (folder / "results.json").unlink()
+    monkeypatch.setattr(callback, "EVERY", 0.0)
+    return SimpleNamespace(folder=folder, console=Console(file=io.StringIO(), width=150))
+
+
+def test_it_grows(run):
+    report, path = callback.Report(), run.folder / "report.html"
+    report.on_start(run)
+    report._last.result()
+    assert "step 4 of 4" in path.read_text()
+    with (run.folder / "metrics.jsonl").open("a") as file:
+        file.write('{"step": 5, "task": 0.125}\n')
+    report.on_log(run, 5, {})
+    report._last.result()
+    assert "step 5 of 4" in path.read_text()
+    (run.folder / "results.json").write_text(json.dumps(RESULTS))
+    report.on_end(run)
+    assert "75.0 %" in path.read_text()
+    printed = run.console.file.getvalue()
+    rows = [line.strip("│ ").split("│") for line in printed.splitlines()]
+    cells = {row[0].strip(): [cell.strip() for cell in row[1:]] for row in rows}
+    assert cells["press"] == ["3.1 % [0.9, 10.7] of 64", "75.0 % [63.2, 84.0] of 64"]
+    assert cells["flow-matching loss at steps 2 and 5"] == ["0.5000", "0.1250"]
+    assert cells["active rank, mean"][1] == "3.1"
+    assert cells["parameters that train"][1] == "10 of 1,000"
+    assert cells["time, total"][1] == "7 s"
+
+
+def test_training_does_not_wait_and_hears_of_failures(run, monkeypatch):
+    report, written = callback.Report(), []
+    monkeypatch.setattr(callback, "write_report", written.append)
+    monkeypatch.setattr(callback, "EVERY", 100.0)
+    report.on_start(run)
+    report.on_log(run, 2, {})
+    report._last.result()
+    assert written == [run.folder]  # the next one is not due yet
+    monkeypatch.setattr(callback, "EVERY", 0.0)
+    (run.folder / "config.json").unlink()
+    monkeypatch.undo()
+    report._begin(run.folder)
+    with pytest.raises(FileNotFoundError):
+        report._begin(run.folder)

@@ -1,0 +1,90 @@
+"""Throughput, waiting, memory: what a stretch of steps reports beside its losses."""
+
+import struct
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+from tensorboardX.proto.event_pb2 import Event
+
+from lorasp_jax import flops
+from lorasp_jax.training import speed
+from lorasp_jax.training.run_folder import MetricsLog, read_metrics
+from lorasp_jax.training.speed import Speed
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that is set by hand."""
+    now = SimpleNamespace(seconds=100.0)
+    monkeypatch.setattr(speed.time, "perf_counter", lambda: now.seconds)
+    return now
+
+
+def device(**memory):
+    return [SimpleNamespace(device_kind="NVIDIA H100 80GB HBM3", memory_stats=lambda: memory)]
+
+
+def test_a_stretch(clock, monkeypatch):
+    monkeypatch.setattr(jax, "devices", device)
+    monkeypatch.setattr(jax, "device_count", lambda: 2)
+    peak = flops.PEAK["NVIDIA H100"]
+    timer = Speed(batch_size=8, operations=0.5 * peak)
+    for stretch in range(2):
+        clock.seconds += 7 * stretch  # between two stretches
+        timer.begin()
+        clock.seconds += 5
+        timer.begin()  # the next step of the same stretch
+        clock.seconds += 5
+        found = timer.end(20)
+        assert found["speed/samples_per_second"] == 20 * 8 / 10
+        assert found["speed/flop_utilisation"] == pytest.approx(20 * 0.5 / 2 / 10)
+        assert "speed/data_wait" not in found
+
+
+def test_waiting_counts_where_the_device_had_nothing_to_do(clock):
+    timer = Speed(batch_size=8, operations=None)
+    for times in range(2):
+        timer.begin()
+        for ready in (False, True, False):
+            with timer.waiting(SimpleNamespace(is_ready=lambda ready=ready: ready)):
+                clock.seconds += 2
+        found = timer.end(3)
+        assert found["speed/data_wait"] == pytest.approx(2 / 6), times
+        assert "speed/flop_utilisation" not in found
+
+
+def test_memory_where_it_is_reported(monkeypatch):
+    assert speed.memory() == {}  # a CPU
+    memory = device(bytes_in_use=2**30, peak_bytes_in_use=3 * 2**29, num_allocs=4)
+    monkeypatch.setattr(jax, "local_devices", lambda: memory)
+    assert speed.memory() == {"memory/in_use_gib": 1.0, "memory/peak_gib": 1.5}
+    monkeypatch.setattr(jax, "local_devices", device)
+    assert speed.memory() == {}
+
+
+def events(folder):
+    """What is in TensorBoard's files: length, checksum, event, checksum, and so on."""
+    for path in sorted(Path(folder, "tensorboard").iterdir()):
+        data, position = path.read_bytes(), 0
+        while position < len(data):
+            (length,) = struct.unpack_from("<Q", data, position)
+            event = Event()
+            event.ParseFromString(data[position + 12 : position + 12 + length])
+            yield from ((event.step, value) for value in event.summary.value)
+            position += 16 + length
+
+
+def test_histograms_are_for_tensorboard_alone(tmp_path):
+    log = MetricsLog(tmp_path)
+    ranks = np.array([1.0, 2.0, 2.0, 8.0])
+    log.write(3, {"active_rank/vision/fc1": 3.25}, {"active_rank/vision/fc1": ranks})
+    log.close()
+    assert read_metrics(tmp_path) == [{"step": 3, "active_rank/vision/fc1": 3.25}]
+    found = {value.WhichOneof("value"): (step, value) for step, value in events(tmp_path)}
+    step, value = found["simple_value"]
+    assert (step, value.tag, value.simple_value) == (3, "active_rank/vision/fc1", 3.25)
+    step, value = found["histo"]
+    assert (step, value.histo.num, value.histo.sum, value.histo.max) == (3, 4, 13, 8)

@@ -1,0 +1,112 @@
+"""A training step: what it reports, and that its parts are the whole."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from lorasp_jax import adaptation
+from lorasp_jax.data.batches import flatten, sample_batch
+from lorasp_jax.peft import Aux
+from lorasp_jax.training import mesh as meshes
+from lorasp_jax.training.loop import train
+from lorasp_jax.training.step import active_ranks, gradients, init_state, train_step
+from tests import quick
+from tests.runs import CONFIG, Terminate, leaves, make_run
+
+
+def test_active_ranks_by_tower_and_by_layer():
+    rank = jnp.arange(12.0).reshape(2, 2, 3)  # layers, windows, tokens
+    mask = jnp.array([[True, True, False], [True, False, False]])
+    aux = {
+        "vision": {"fc1": Aux(rank, token_mask=mask), "fc2": Aux(rank + 1)},
+        "action": {"out": Aux(jnp.full((2, 3), 5.0)), "frozen": Aux()},
+        "language": {"q_proj": Aux()},
+    }
+    found = active_ranks(aux)
+    assert set(found) == {
+        "active_rank/vision",
+        "active_rank/vision/fc1",
+        "active_rank/vision/fc2",
+        "active_rank/action",
+        "active_rank/action/out",
+    }
+    first, second = (0 + 1 + 3) / 3, (6 + 7 + 9) / 3
+    np.testing.assert_allclose(found["active_rank/vision/fc1"], [first, second])
+    np.testing.assert_allclose(found["active_rank/vision/fc2"], [3.5, 9.5])
+    np.testing.assert_allclose(found["active_rank/vision"], ((first + second) / 2 + 6.5) / 2)
+    np.testing.assert_allclose(found["active_rank/action/out"], [5.0])
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A run with few adapters, their values as after some training, and a batch."""
+    config = dataclasses.replace(CONFIG, targets=("fc1", "action_out_proj"))
+    run = make_run(tmp_path_factory.mktemp("run") / "run", config)
+    graphdef, adapters, frozen = adaptation.split(run.policy.model)
+    keys = iter(jax.random.split(jax.random.key(3), 1000))
+    adapters = jax.tree.map(lambda x: x + 0.1 * jax.random.normal(next(keys), x.shape), adapters)
+    steps, chunk = flatten(list(run.episodes.values())), run.policy.model.config.chunk
+    sizes = {"batch_size": 16, "chunk": chunk, "state_noise": 0.0}
+    batch = sample_batch(jax.random.key(0), steps, run.policy.processor, **sizes)
+    return graphdef, adapters, frozen, batch
+
+
+def test_a_batch_in_parts_is_the_whole_batch(small):
+    """Also where parts have unequal numbers of valid elements; auxiliary losses where not."""
+    graphdef, adapters, frozen, ragged = small
+    counts = ragged.action_mask.sum((1, 2)).reshape(-1, 4).sum(0)
+    assert counts.min() < counts.max()
+    even = dataclasses.replace(ragged, action_mask=jnp.ones_like(ragged.action_mask))
+    gradient, key = quick.jit(gradients, static_argnums=(2, 6)), jax.random.key(1)
+    for batch, auxiliary in ((ragged, 0.0), (even, 1e-2)):
+        weights = {"spectral": auxiliary, "balance": 0.0, "z": auxiliary}
+        given = adapters, frozen, graphdef, batch, key, weights
+        (whole, expected), (parts, found) = gradient(*given, 1), gradient(*given, 4)
+        for name in ("task", "loss", *(("spectral", "z") if auxiliary else ())):
+            np.testing.assert_allclose(found[name], expected[name], rtol=1e-5, err_msg=name)
+        for name, value in leaves(whole).items():
+            near = {"atol": 1e-4 * np.abs(value).max(), "rtol": 0, "err_msg": name}
+            assert near["atol"] > 0, name
+            np.testing.assert_allclose(leaves(parts)[name], value, **near)
+
+
+def test_the_average_follows_and_is_what_is_used(small):
+    graphdef, adapters, frozen, batch = small
+    optimizer = optax.sgd(0.1)
+    state = init_state(adapters, optimizer, ema=True)
+    weights = dict.fromkeys(("spectral", "balance", "z"), optax.constant_schedule(0.0))
+    options = {"graphdef": graphdef, "optimizer": optimizer, "weights": weights}
+    step = quick.jit(lambda *given: train_step(*given, **options, ema=0.75)[0])
+    after = step(state, frozen, batch, jax.random.key(0))
+    moved = leaves(after.adapters)
+    for name, old in leaves(adapters).items():
+        expected = 0.75 * old + 0.25 * moved[name]
+        np.testing.assert_allclose(leaves(after.average)[name], expected, atol=1e-6)
+        assert (moved[name] != old).any()
+    assert after.best is after.average
+    assert init_state(adapters, optimizer).best is not None
+
+
+@pytest.mark.slow
+def test_a_run_in_parts_with_an_average_resumes_to_the_bit(tmp_path, monkeypatch):
+    mesh = meshes.make_mesh(1, jax.devices()[:1])
+    monkeypatch.setattr(meshes, "make_mesh", lambda fsdp: mesh)
+    optim = dataclasses.replace(CONFIG.optim, accumulate=2, ema=0.5)
+    config = dataclasses.replace(CONFIG, optim=optim, targets=("action_out_proj",))
+    whole, plain = make_run(tmp_path / "whole", config), make_run(tmp_path / "plain", config)
+    plain.config = dataclasses.replace(config, optim=dataclasses.replace(optim, ema=0.0))
+    train(whole)
+    train(plain)
+    halved = tmp_path / "halved"
+    with pytest.raises(KeyboardInterrupt):
+        train(make_run(halved, config), [Terminate()])
+    resumed = make_run(halved, config)
+    train(resumed, resume=True)
+    ends = [leaves(adaptation.split(run.policy.model)[1]) for run in (whole, resumed, plain)]
+    for name, value in ends[0].items():
+        np.testing.assert_array_equal(ends[1][name], value, err_msg=name)
+        assert (ends[2][name] != value).any()

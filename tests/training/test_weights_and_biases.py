@@ -1,0 +1,88 @@
+"""What Weights & Biases is sent, by a module in its place."""
+
+import contextlib
+import json
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+import train
+from lorasp_jax.training.weights_and_biases import WeightsAndBiases
+from tests.runs import CONFIG
+from tests.test_train import MULTITASK
+
+
+class Fake:
+    """The part of the package that is used; it keeps what it is given."""
+
+    class Error(Exception):
+        pass
+
+    def __init__(self):
+        self.begun, self.rows, self.codes, self.metrics = [], [], [], []
+
+    def init(self, **options):
+        if options["project"] == "refused":
+            raise self.Error("not\nlogged in")
+        self.begun.append(options)
+        return SimpleNamespace(
+            id=options["id"] or f"id {len(self.begun)}",
+            log=self.rows.append,
+            finish=lambda *, exit_code: self.codes.append(exit_code),
+            define_metric=lambda name, step_metric: self.metrics.append((name, step_metric)),
+        )
+
+    def Video(self, path):
+        return "video", path
+
+
+@pytest.fixture
+def fake(monkeypatch):
+    module = Fake()
+    monkeypatch.setitem(sys.modules, "wandb", module)
+    return module
+
+
+def test_a_run_and_its_continuation(fake, tmp_path):
+    folder = tmp_path / "test"
+    folder.mkdir()
+    run = SimpleNamespace(folder=folder, config=CONFIG)
+    (folder / "before.json").write_text(json.dumps({"press": {"success": 0.25}}))
+    with contextlib.suppress(KeyboardInterrupt), WeightsAndBiases("arms", CONFIG, folder) as first:
+        assert list(folder.iterdir()) == [folder / "before.json"]  # nothing to lose yet
+        first.on_start(run)
+        first.on_log(run, 2, {"loss": 0.5})
+        raise KeyboardInterrupt
+    with WeightsAndBiases("arms", CONFIG, folder) as callback:
+        callback.on_log(run, 2, {"loss": 0.4})
+        results = {"tasks": {"press": {"before": {}, "after": {"success": 0.75}}}}
+        (folder / "results.json").write_text(json.dumps(results))
+        callback.on_end(run)
+    assert [(b["project"], b["id"], b["name"]) for b in fake.begun] == [
+        ("arms", None, "test"),
+        ("arms", "id 1", "test"),
+    ]
+    assert fake.begun[0]["config"]["peft"]["method"] == "LoRASP"
+    assert fake.begun[0]["dir"] == str(tmp_path)
+    assert fake.codes == [1, 0]
+    assert fake.metrics == 2 * [("*", "step")]
+    assert fake.rows == [
+        {"step": 0, "success/press": 0.25},
+        {"step": 2, "loss": 0.5},
+        {"step": 2, "loss": 0.4},
+        {"step": 4, "success/press": 0.75},
+        {"step": 4, "rollout/press": ("video", str(folder / "rollout_press.mp4"))},
+    ]
+
+
+@pytest.mark.parametrize("project", ["arms", "refused"])
+def test_what_is_missing_is_one_sentence(project, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "wandb", None if project == "arms" else Fake())
+    assert train.main([*MULTITASK, "--wandb", project]) == 2
+    printed = capsys.readouterr().err
+    expected = {"arms": "--wandb needs a package: pip install wandb", "refused": "not logged in"}
+    assert expected[project] in printed
+    assert printed.count("\n") == 1
+    assert [path.name for path in tmp_path.rglob("*.json")] == ["config.json"]
