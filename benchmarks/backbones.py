@@ -100,8 +100,8 @@ class Step:
             return init_state(adapters, optimizer), frozen, batch, jax.random.key(1)
 
         shapes, whole = jax.eval_shape(drawn, jax.random.key(0)), meshes.replicated(mesh)
-        frozen = jax.tree.map(lambda array: meshes.frozen_sharding(array, mesh), shapes[1])
-        placed = whole, frozen, meshes.batch_sharding(mesh), whole
+        state, frozen = (meshes.shardings(tree, mesh) for tree in shapes[:2])
+        placed = state, frozen, meshes.batch_sharding(mesh), whole
         self._drawn = jax.jit(drawn, out_shardings=placed)
         step = functools.partial(
             train_step,
@@ -109,7 +109,7 @@ class Step:
             optimizer=optimizer,
             weights=auxiliary_weights(run.auxiliary, run.optim.steps),
         )
-        jitted = jax.jit(step, donate_argnums=0, in_shardings=placed, out_shardings=whole)
+        jitted = jax.jit(step, donate_argnums=0, in_shardings=placed, out_shardings=(state, whole))
         self.compiled = jitted.lower(*shapes).compile()
 
     def draw(self) -> "Step":

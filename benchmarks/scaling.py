@@ -4,9 +4,9 @@
     python -m benchmarks.scaling --devices 1 2 --sizes nano --batch 4 --rank 8 --dtype float32
 
 Every device has the same share of the batch, whatever their number ("batch"). "data": each device
-holds the whole frozen base; "fsdp": all of them hold it together, and gather each layer's weights
-when they come to it. Adapters and their optimizer's state are on every device. "of linear" is the
-rate over that of as many devices alone, and GiB what the program needs on each device.
+holds everything; "fsdp": all of them together hold the base, the adapters and the optimizer's state,
+and gather each layer's weights when they come to it. "of linear" is the rate over that of as many
+devices alone, and GiB what the program needs on each device.
 """
 
 import argparse
