@@ -49,6 +49,7 @@ def sized(name: str, options: argparse.Namespace, remat: Remat = "none") -> Back
         dtype=options.dtype,
         param_dtype=options.dtype,
         remat=remat,
+        unroll=config.unroll if options.unroll is None else options.unroll == "yes",
     )
 
 
@@ -189,6 +190,7 @@ def main() -> None:
     parser.add_argument("--sampled", type=int, nargs="+", default=[1, 8], help="batches")
     parser.add_argument("--rank", type=int, default=128)
     parser.add_argument("--remat", choices=REMATS, default="products")
+    parser.add_argument("--unroll", choices=["yes", "no"], help="default: what the size has")
     parser.add_argument("--dtype", default="bfloat16")
     parser.add_argument("--gib", type=float, default=24, help="memory for the largest batch")
     parser.add_argument("--calls", type=int, default=5, help="steps queued together")

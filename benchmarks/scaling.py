@@ -76,6 +76,7 @@ def main() -> None:
     parser.add_argument("--batch", type=int, help="windows a device; default: by size")
     parser.add_argument("--rank", type=int, default=128)
     parser.add_argument("--remat", choices=REMATS, default="products")
+    parser.add_argument("--unroll", choices=["yes", "no"], help="default: what the size has")
     parser.add_argument("--dtype", default="bfloat16")
     parser.add_argument("--calls", type=int, default=5, help="steps queued together")
     parser.add_argument("--threads", type=int, default=8, help="that compile")

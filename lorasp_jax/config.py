@@ -41,6 +41,9 @@ class ModelConfig:
     remat: Literal["auto", "none", "products", "full"] = "auto"
     """What the backward pass computes again to save memory: nothing, all but matrix products, or
     all inside a layer; auto is the first of these that fits into the device."""
+    unroll: bool | None = None
+    """Layers as straight-line code, not as a loop: faster steps of the same memory, but a longer
+    compilation; None: what the size has."""
 
     @property
     def source(self) -> str:

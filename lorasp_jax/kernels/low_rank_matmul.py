@@ -28,7 +28,13 @@ import jax.numpy as jnp
 
 from lorasp_jax.kernels.quantized import QuantizedKernel
 
-Between = Callable[[Any, jax.Array, jax.Array | None], tuple[jax.Array, Any]]
+Rows = Callable[[Any, jax.Array, jax.Array | None], tuple[jax.Array, Any]]
+"""f of one layer: (params, rows [..., Q], token_mask) -> z [..., R] and a pytree."""
+Between = Callable[
+    [Sequence[Any], jax.Array, Sequence[int], jax.Array | None], list[tuple[jax.Array, Any]]
+]
+"""f of all layers: (params of each, rows of all side by side, their widths, token_mask) -> z, aux
+of each. There may be columns behind the rows."""
 
 
 class LowRankLayer(NamedTuple):
@@ -44,9 +50,24 @@ class LowRankLayer(NamedTuple):
     """U [R, O], fp32, used in the type of x."""
 
 
+def one_by_one(functions: Sequence[Rows]) -> Between:
+    """f of all layers from those of each."""
+
+    def between(
+        params: Sequence[Any],
+        read: jax.Array,
+        widths: Sequence[int],
+        token_mask: jax.Array | None,
+    ) -> list[tuple[jax.Array, Any]]:
+        rows = _split(widths, read)
+        return [f(p, r, token_mask) for f, p, r in zip(functions, params, rows, strict=True)]
+
+    return between
+
+
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def low_rank_matmul(
-    between: Sequence[Between],
+    between: Between,
     rows_dtype: Any,
     layers: Sequence[LowRankLayer],
     x: jax.Array,
@@ -55,7 +76,7 @@ def low_rank_matmul(
     """Of each layer x W + z U in the type of x and aux, with z, aux = f(params, x P, token_mask).
 
     Args:
-      between: f of each layer. It gets rows [..., Q] and returns z [..., R] and a pytree.
+      between: f.
       rows_dtype: type of the rows, which are summed in fp32.
       layers: arrays of each layer.
       x: [..., I].
@@ -65,21 +86,21 @@ def low_rank_matmul(
 
 
 def _forward(
-    between: Sequence[Between],
+    between: Between,
     rows_dtype: Any,
     layers: Sequence[LowRankLayer],
     x: jax.Array,
     token_mask: jax.Array | None,
 ) -> tuple:
     read = jnp.matmul(x, _side_by_side(layers, x), preferred_element_type=rows_dtype)
-    found, pull_backs, written = [], [], []
-    for f, layer, rows in zip(between, layers, _split(layers, read), strict=True):
 
-        def inner(params: Any, rows: jax.Array, f: Between = f) -> tuple[jax.Array, Any]:
-            z, aux = f(params, rows, token_mask)
-            return z.astype(x.dtype), aux
+    def inner(params: list[Any], read: jax.Array) -> list[tuple[jax.Array, Any]]:
+        found = between(params, read, _widths(layers), token_mask)
+        return [(z.astype(x.dtype), aux) for z, aux in found]
 
-        (z, aux), pull_back = jax.vjp(inner, layer.params, rows)
+    written, pull_back = jax.vjp(inner, [layer.params for layer in layers], read)
+    found = []
+    for layer, (z, aux) in zip(layers, written, strict=True):
         w, u = layer.kernel.astype(x.dtype), layer.up.astype(x.dtype)
         d_in, d_out = layer.kernel.shape
         if d_out >= d_in and _joins(layer, x):
@@ -87,31 +108,28 @@ def _forward(
         else:
             y = x @ w + z @ u
         found.append((y, aux))
-        pull_backs.append(pull_back)
-        written.append(z)
-    return found, (layers, x, pull_backs, written)
+    return found, (layers, x, pull_back, [z for z, _ in written])
 
 
 def _backward(
-    between: Sequence[Between], rows_dtype: Any, residuals: tuple, cotangents: Sequence[tuple]
+    between: Between, rows_dtype: Any, residuals: tuple, cotangents: Sequence[tuple]
 ) -> tuple:
     del between, rows_dtype
-    layers, x, pull_backs, written = residuals
+    layers, x, pull_back, written = residuals
     gradients = [g for g, _ in cotangents]
-    through_bases, d_params, d_rows = [], [], []
-    for layer, pull_back, (g, d_aux) in zip(layers, pull_backs, cotangents, strict=True):
+    through_bases, d_written = [], []
+    for layer, (g, d_aux) in zip(layers, cotangents, strict=True):
         d_in, d_out = layer.kernel.shape
         w, u = layer.kernel.astype(x.dtype), layer.up.astype(x.dtype)
         through_base, dz = None, None
         if d_out > 2 * d_in and _joins(layer, x):
             through_base, dz = jnp.split(g @ jnp.concatenate([w, u]).T, [d_in], axis=-1)
-        of_params, of_rows = pull_back((g @ u.T if dz is None else dz, d_aux))
         through_bases.append(through_base)
-        d_params.append(of_params)
-        d_rows.append(of_rows.astype(x.dtype))
-    q = aligned(jnp.concatenate(d_rows, axis=-1))
+        d_written.append((g @ u.T if dz is None else dz, d_aux))
+    d_params, d_read = pull_back(d_written)
+    q = d_read.astype(x.dtype)
     dx = _gradient_of_input(layers, x, gradients, through_bases, q)
-    d_downs = _split(layers, _outer(x, q, layers[0].down.dtype))
+    d_downs = _split(_widths(layers), _outer(x, q, layers[0].down.dtype))
     d_layers = [
         LowRankLayer(of_params, None, d_down, _outer(z, g, layer.up.dtype))
         for layer, of_params, d_down, z, g in zip(
@@ -149,10 +167,14 @@ def _side_by_side(layers: Sequence[LowRankLayer], x: jax.Array) -> jax.Array:
     return aligned(jnp.concatenate([layer.down.astype(x.dtype) for layer in layers], axis=1))
 
 
-def _split(layers: Sequence[LowRankLayer], columns: jax.Array) -> list[jax.Array]:
+def _widths(layers: Sequence[LowRankLayer]) -> list[int]:
+    """Q of each."""
+    return [layer.down.shape[1] for layer in layers]
+
+
+def _split(widths: Sequence[int], columns: jax.Array) -> list[jax.Array]:
     """Each layer's share [..., Q] of columns [..., ΣQ or more]."""
-    ends = list(itertools.accumulate(layer.down.shape[1] for layer in layers))
-    return jnp.split(columns, ends, axis=-1)[:-1]
+    return jnp.split(columns, list(itertools.accumulate(widths)), axis=-1)[:-1]
 
 
 def aligned(matrix: jax.Array) -> jax.Array:

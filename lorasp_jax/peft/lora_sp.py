@@ -205,7 +205,7 @@ class LoRASP(Method):
         self, params: Params, read: jax.Array, columns: range, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
         """`between` of n layers, where possible in one kernel that finds its columns in `read`."""
-        if not self._is_fused():
+        if not self.gains_together:
             return super().between_all(params, read, columns, token_mask)
         tokens, n = read.shape[:-1], len(columns)
         counts = jnp.ones(tokens, bool) if token_mask is None else token_mask
@@ -225,7 +225,7 @@ class LoRASP(Method):
     def for_rows(self, params: Params) -> Params:
         """The parameters without [V, W1] and U, and for the kernel the router's in a row."""
         params = {name: p for name, p in self._routing(params).items() if name != "bank"}
-        return params | ({"router": InARow.of(params["router"])} if self._is_fused() else {})
+        return params | ({"router": InARow.of(params["router"])} if self.gains_together else {})
 
     def _routing(self, params: Params) -> Params:
         """The parameters with the router's but for W1, unless they are in a row."""
@@ -244,7 +244,7 @@ class LoRASP(Method):
     def _route(self, params: Params, rows: jax.Array, counts: jax.Array) -> routing.Routed:
         """`route` of x [V W1], [...tokens, R + H], where possible in one kernel."""
         router = params["router"]
-        if self._is_fused():
+        if self.gains_together:
             z, sums, statistics = self._fused(router, rows, counts)
         else:
             kept = self._shared_mask(params, rows, counts)
@@ -268,7 +268,8 @@ class LoRASP(Method):
         """Whether the mask of a row takes no more than its scores."""
         return (self.granularity, self.energy_start, self.pruned) == ("token", None, 0)
 
-    def _is_fused(self) -> bool:
+    @property
+    def gains_together(self) -> bool:
         """Whether all between the matrices is one kernel."""
         plain = (self.router, self.score_function, self.rule) == ("gelu", "softplus", "paper")
         fits = _fits_triton(self.rank) and _fits_triton(self.hidden_width)

@@ -31,7 +31,9 @@ def base_model(config: Config) -> tuple[Backbone, str]:
     if chosen.size not in sizes:
         raise ValueError(f"unknown size {chosen.size!r}: it is one of {', '.join(sizes)}")
     wanted: BackboneConfig = getattr(kind, chosen.size)()
-    wanted = dataclasses.replace(wanted, dtype=chosen.dtype, param_dtype=chosen.param_dtype)
+    unroll = wanted.unroll if chosen.unroll is None else chosen.unroll
+    kinds = {"dtype": chosen.dtype, "param_dtype": chosen.param_dtype, "unroll": unroll}
+    wanted = dataclasses.replace(wanted, **kinds)
     if not wanted.inputs.masks_missing:
         wanted = dataclasses.replace(wanted, cameras=wanted.cameras[: len(envs.Env.cameras)])
     if chosen.source:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul
+from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul, one_by_one
 
 # Every way to multiply 10 tokens: wide outputs, far wider ones, square and wide inputs; then the
 # same with more inputs than tokens.
@@ -42,7 +42,7 @@ MASK = jnp.arange(10).reshape(2, 5) != 3
 
 def ours(params, x, kernel, down, up, mask=MASK):
     layers = [LowRankLayer(params, kernel, down, up)]
-    return low_rank_matmul((between,), x.dtype, layers, x, mask)[0]
+    return low_rank_matmul(one_by_one([between]), x.dtype, layers, x, mask)[0]
 
 
 def reference(params, x, kernel, down, up, mask=MASK):
@@ -79,7 +79,7 @@ def test_several_layers_of_one_input(d_outs):
 
     def together(params, x, layers):
         layers = [layer._replace(params=p) for p, layer in zip(params, layers, strict=True)]
-        return low_rank_matmul((between,) * len(layers), x.dtype, layers, x, MASK)
+        return low_rank_matmul(one_by_one([between] * len(layers)), x.dtype, layers, x, MASK)
 
     def apart(params, x, layers):
         return [reference(p, x, *layer[1:]) for p, layer in zip(params, layers, strict=True)]
@@ -105,7 +105,9 @@ def test_several_layers_of_one_input(d_outs):
 def test_several_layers_read_once():
     params, x, *_ = inputs(9, 1)
     layers = [LowRankLayer(params, *inputs(9, d_out)[2:]) for d_out in (4, 3, 2)]
-    program = jax.make_jaxpr(lambda x: low_rank_matmul((between,) * 3, x.dtype, layers, x, MASK))(x)
+    program = jax.make_jaxpr(
+        lambda x: low_rank_matmul(one_by_one([between] * 3), x.dtype, layers, x, MASK)
+    )(x)
     products = [line for line in str(program).splitlines() if "dot_general" in line]
     assert len(products) == 1 + 3 * 2  # x P; x W and z U of each
 
@@ -139,7 +141,9 @@ def test_types():
     assert (of_x.dtype, of_down.dtype, of_up.dtype) == (jnp.bfloat16, jnp.float32, jnp.float32)
     params, x, *matrices = arguments
     layers = [LowRankLayer(params, *matrices)]
-    exact = jax.jit(lambda x: low_rank_matmul((between,), jnp.float32, layers, x, MASK)[0])
+    exact = jax.jit(
+        lambda x: low_rank_matmul(one_by_one([between]), jnp.float32, layers, x, MASK)[0]
+    )
     expected = x.astype(jnp.float32) @ matrices[1].astype(jnp.bfloat16).astype(jnp.float32)
     statistic = exact(x)[1]["statistic"]
     assert statistic.dtype == jnp.float32

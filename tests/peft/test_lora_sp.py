@@ -11,6 +11,7 @@ import pytest
 from lorasp_jax import routing
 from lorasp_jax.kernels import fused_rows
 from lorasp_jax.peft import LoRA, LoRASP, lora_sp
+from lorasp_jax.peft.method import apply_together
 
 D_IN, D_OUT = 24, 40
 KERNEL = jax.ShapeDtypeStruct((D_IN, D_OUT), jnp.float32)
@@ -153,6 +154,41 @@ def test_one_kernel_equals_the_equations(x, monkeypatch, masked, few):
     for f, e in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         error = np.asarray(f, float) - np.asarray(e, float)
         assert np.linalg.norm(error) <= 1e-5 * np.linalg.norm(e)
+
+
+def test_layers_of_one_input_are_one_kernel(x, monkeypatch):
+    kernel = functools.partial(lora_sp.fused_rows, interpret=True)
+    monkeypatch.setattr(lora_sp, "fused_rows", kernel)
+    method = LoRASP(rank=32, hidden_width=16, energy_target=0.7, gate="pallas")
+    params = [initial(method, key) for key in (1, 2)]
+    for i, p in enumerate(params):
+        p["bank"]["u"] = jax.random.normal(jax.random.key(i), (32, D_OUT))
+        p["router"]["w2"] = jax.random.normal(jax.random.key(i + 3), (16, 32))
+    weights = jax.random.normal(jax.random.key(9), (2, D_IN, D_OUT))
+    mask = jax.random.bernoulli(jax.random.key(4), 0.6, x.shape[:2])
+
+    def together(params, x):
+        layers = [(method, p, w) for p, w in zip(params, weights, strict=True)]
+        return apply_together(layers, x, token_mask=mask)
+
+    def alone(params, x):
+        pairs = zip(params, weights, strict=True)
+        return [method.apply(p, x, w, token_mask=mask) for p, w in pairs]
+
+    def everything(layers):
+        def loss(params, x):
+            found = layers(params, x)
+            losses = sum(i * v for _, aux in found for i, v in enumerate(aux.losses.values()))
+            return sum(jnp.sin(y).sum() for y, _ in found) + losses, found
+
+        return jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
+
+    found, expected = (jax.jit(everything(f))(params, x) for f in (together, alone))
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3), found, expected
+    )
+    programs = [str(jax.make_jaxpr(everything(f))(params, x)) for f in (together, alone)]
+    assert [text.count("pallas_call[") for text in programs] == [2, 4]
 
 
 @pytest.mark.parametrize("method", [LoRASP(rank=48), LoRASP.paper(rank=64), LoRASP(hidden_width=8)])

@@ -107,6 +107,15 @@ def test_policies_of_lerobot_are_fed_as_they_say(config, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
+def test_straight_line_code_is_chosen_on_the_command_line(monkeypatch):
+    monkeypatch.setattr(setup, "SIZES", ("dummy",))
+    monkeypatch.setattr(Pi0Config, "create", lambda config, _: config)
+    monkeypatch.setattr(setup.models, "weights_hash", lambda _: "")
+    unroll = lambda *words: BASE_MODEL(override(CONFIG, [*words]))[0].unroll  # noqa: E731
+    assert not unroll()
+    assert unroll("--model.unroll", "True")
+
+
 def test_a_pi05_of_the_command_line_trains_and_acts(config, tmp_path, monkeypatch):
     """And its base, trained in full, loads again; prompts with another state are others."""
     monkeypatch.setattr(setup, "base_model", BASE_MODEL)
