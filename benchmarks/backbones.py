@@ -181,6 +181,22 @@ def sampling(name: str, label: str, run: Config | None, options: argparse.Namesp
         yield {"backbone": name, "adapters": label, "batch": batch, "ms": 1e3 * seconds}
 
 
+def rows(name: str, table: str, options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Those of one backbone in one table."""
+    method = peft.LoRASP(rank=options.rank)
+    everywhere = run_config(method, ("all-linear",), options.batch)
+    if table == "training":
+        expert = run_config(peft.FullFineTuning(), ("expert-only",), options.batch)
+        yield training(name, "LoRA-SP", everywhere, options, options.remat)
+        yield training(name, "expert only", expert, options, options.remat)
+    elif table == "largest":
+        run = run_config(method, ("all-linear",), largest(name, everywhere, options))
+        yield training(name, f"LoRA-SP, {options.gib:g} GiB", run, options, "full")
+    else:
+        yield from sampling(name, "none", None, options)
+        yield from sampling(name, "LoRA-SP", everywhere, options)
+
+
 def main() -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
@@ -200,24 +216,13 @@ def main() -> None:
     console, found = Console(soft_wrap=True), {"machine": machine("jax")}
     console.print(f"{found['machine']}; {options.size}, rank {options.rank}, {options.dtype}")
     tables: dict[str, list] = {"training": [], "largest": [], "sampling": []}
-    method = peft.LoRASP(rank=options.rank)
-    everywhere = run_config(method, ("all-linear",), options.batch)
-    ways = {"LoRA-SP": everywhere}
-    ways["expert only"] = run_config(peft.FullFineTuning(), ("expert-only",), options.batch)
     for name in options.backbones:
         for table in [options.only] if options.only else tables:
-            if table == "training":
-                rows = [training(name, k, run, options, options.remat) for k, run in ways.items()]
-            elif table == "largest":
-                run = run_config(method, ("all-linear",), largest(name, everywhere, options))
-                rows = [training(name, f"LoRA-SP, {options.gib:g} GiB", run, options, "full")]
-            else:
-                rows = [*sampling(name, "none", None, options)]
-                rows += sampling(name, "LoRA-SP", everywhere, options)
-            tables[table] += rows
-            print_table(console, rows)
-            if options.json:
-                options.json.write_text(json.dumps(found | tables, indent=1))
+            for row in rows(name, table, options):
+                tables[table].append(row)
+                if options.json:
+                    options.json.write_text(json.dumps(found | tables, indent=1))
+            print_table(console, [row for row in tables[table] if row["backbone"] == name])
 
 
 if __name__ == "__main__":

@@ -4,8 +4,8 @@
     python -m benchmarks.scaling --devices 1 2 --sizes nano --batch 4 --rank 8 --dtype float32
 
 Every device has the same share of the batch, whatever their number ("batch"). "data": each device
-holds everything; "fsdp": all of them together hold the base, the adapters and the optimizer's state,
-and gather each layer's weights when they come to it. "of linear" is the rate over that of as many
+holds everything; "fsdp": all of them together hold base, adapters and the optimizer's state, and
+gather each layer's weights when they come to it. "of linear" is the rate over that of as many
 devices alone, and GiB what the program needs on each device.
 """
 
@@ -84,9 +84,10 @@ def main() -> None:
     options = parser.parse_args()
     console, found = Console(soft_wrap=True), dict[str, Any](machine=machine("jax"))
     console.print(f"{found['machine']}, rank {options.rank}, {options.dtype}")
-    for options.size in options.sizes:
-        found[options.size] = [*rows(options)]
-        print_table(console, found[options.size])
+    for size in options.sizes:
+        options.size = size
+        found[size] = [*rows(options)]
+        print_table(console, found[size])
         if options.json:
             options.json.write_text(json.dumps(found, indent=1))
 
