@@ -59,7 +59,7 @@ def layers(rank: int) -> Iterator[tuple[str, Layer, Any]]:
 
         def layer(params: Any, x: jax.Array, kernel: jax.Array, method: Any = method) -> Any:
             y, aux = method.apply(params, x, kernel)
-            return y, aux.losses
+            return y, dict(aux.losses)
 
         yield name, layer, method
 
@@ -131,7 +131,8 @@ def measure_together(
 def _summed(layers: Callable[..., Any], *arguments: Any) -> tuple[list[jax.Array], Any]:
     """The outputs of several layers, and their losses under the names of one."""
     found = layers(*arguments)
-    return [y for y, _ in found], jax.tree.map(lambda *x: sum(x), *(aux.losses for _, aux in found))
+    losses = (dict(aux.losses) for _, aux in found)
+    return [y for y, _ in found], jax.tree.map(lambda *x: sum(x), *losses)
 
 
 def measure(options: argparse.Namespace, shape: tuple[int, int]) -> Iterator[dict[str, Any]]:

@@ -4,7 +4,9 @@ One function per equation of the paper (arXiv 2603.07404), all in fp32; `lorasp_
 puts them together. Padding stays out of everything that is summed over tokens.
 """
 
+import dataclasses
 import math
+from collections.abc import Iterator, Mapping
 from typing import Literal, NamedTuple
 
 import jax
@@ -20,7 +22,7 @@ from lorasp_jax.kernels.energy_gate import (
 ScoreFunction = Literal["softplus", "relu", "softmax"]
 Granularity = Literal["token", "sample", "layer"]
 
-Routed = tuple[jax.Array, dict[str, jax.Array], jax.Array, list[jax.Array]]
+Routed = tuple[jax.Array, Mapping[str, jax.Array], jax.Array, list[jax.Array]]
 """z, losses, how often each direction was kept, and active rank and kept energy by token."""
 
 SOFTPLUS_INVERSE_OF_ONE = math.log(math.e - 1)
@@ -167,13 +169,30 @@ def loss_sums(
     )
 
 
-def losses(sums: LossSums) -> dict[str, jax.Array]:
-    """The auxiliary losses of eq. (14) by name, f32 scalars."""
-    return {"spectral": spectral_loss(sums), "balance": balance_loss(sums), "z": z_loss(sums)}
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Losses(Mapping[str, jax.Array]):
+    """The auxiliary losses of eq. (14) by name, f32, of one layer or of several, [L].
+
+    They are computed where they are asked for: of stacked layers all at once, not in each layer in
+    a dozen steps on a few numbers.
+    """
+
+    sums: LossSums
+    """[L, ...] for several layers."""
+
+    def __getitem__(self, name: str) -> jax.Array:
+        return _LOSSES[name](self.sums)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(_LOSSES)
+
+    def __len__(self) -> int:
+        return len(_LOSSES)
 
 
 def spectral_loss(sums: LossSums) -> jax.Array:
-    """Eq. (13): 1 - E_k, averaged over valid rows, f32 scalar."""
+    """Eq. (13): 1 - E_k, averaged over valid rows."""
     return _mean(sums.spectral, sums)
 
 
@@ -184,8 +203,8 @@ def balance_loss(sums: LossSums) -> jax.Array:
     is direction i's share of all kept places (no gradient), P_i its mean share of the energy.
     """
     kept = jax.lax.stop_gradient(sums.kept)
-    used = kept / jnp.maximum(kept.sum(), 1)
-    return len(kept) * _mean(jnp.sum(used * sums.share, keepdims=True), sums)
+    used = kept / jnp.maximum(kept.sum(-1, keepdims=True), 1)
+    return kept.shape[-1] * _mean(jnp.sum(used * sums.share, -1, keepdims=True), sums)
 
 
 def z_loss(sums: LossSums) -> jax.Array:
@@ -197,5 +216,8 @@ def z_loss(sums: LossSums) -> jax.Array:
     return _mean(sums.z, sums)
 
 
+_LOSSES = {"spectral": spectral_loss, "balance": balance_loss, "z": z_loss}
+
+
 def _mean(total: jax.Array, sums: LossSums) -> jax.Array:
-    return total[0] / jnp.maximum(sums.rows[0], 1)
+    return total[..., 0] / jnp.maximum(sums.rows[..., 0], 1)

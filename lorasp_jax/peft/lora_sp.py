@@ -211,7 +211,7 @@ class LoRASP(Method):
         counts = jnp.ones(tokens, bool) if token_mask is None else token_mask
         z, sums, statistics = self._fused(params["router"], read, counts, columns.start)
         active_rank, energy = (column.T.reshape(n, *tokens) for column in statistics)
-        aux = Aux(active_rank, energy, jax.vmap(routing.losses)(sums), usage=sums.kept)
+        aux = Aux(active_rank, energy, routing.Losses(sums), usage=sums.kept)
         return z.reshape(*tokens, -1), aux
 
     def _fused(self, router: Any, rows: jax.Array, counts: jax.Array, start: int = 0) -> tuple:
@@ -259,7 +259,7 @@ class LoRASP(Method):
                 gate=self._gate(),
                 score_function=self.score_function,
             )
-        return z, routing.losses(sums), sums.kept, statistics
+        return z, routing.Losses(sums), sums.kept, statistics
 
     def _gate(self) -> Implementation:
         return self.gate or default_implementation(self.scored)

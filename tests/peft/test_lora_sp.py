@@ -246,3 +246,15 @@ def test_bad_fields(fields, message):
 def test_scale_follows_alpha():
     assert LoRASP().scale == LoRASP(rank=16).scale == 2
     assert dataclasses.replace(LoRASP(), alpha=64.0).scale == 0.5
+
+
+def test_losses_of_stacked_layers_are_those_of_each():
+    def sums(key):
+        one = lambda key, size: jax.random.uniform(key, (size,), minval=1, maxval=3)  # noqa: E731
+        return routing.LossSums(*map(one, jax.random.split(key, 5), (1, 1, 1, 8, 8)))
+
+    each = [sums(key) for key in jax.random.split(jax.random.key(0), 3)]
+    stacked = routing.Losses(jax.tree.map(lambda *leaves: jnp.stack(leaves), *each))
+    assert [*stacked] == ["spectral", "balance", "z"]
+    for name, values in stacked.items():
+        np.testing.assert_allclose(values, [routing.Losses(one)[name] for one in each], rtol=1e-6)
