@@ -3,13 +3,19 @@
 `create("lora_sp", rank=64)` finds a method by its file's name; a new file is a new method.
 """
 
+import dataclasses
+import difflib
+import importlib
+import pkgutil
+from typing import Any
+
 from lorasp_jax.peft.ada_lora import AdaLoRA
 from lorasp_jax.peft.dora import DoRA
 from lorasp_jax.peft.full import FullFineTuning
 from lorasp_jax.peft.lora import LoRA
 from lorasp_jax.peft.lora_moe import LoRAMoE
 from lorasp_jax.peft.lora_sp import LoRASP
-from lorasp_jax.peft.method import Aux, Method, create, find, names
+from lorasp_jax.peft.method import Aux, Method
 
 __all__ = [
     "AdaLoRA",
@@ -24,3 +30,38 @@ __all__ = [
     "find",
     "names",
 ]
+
+
+def names() -> list[str]:
+    """Names of the methods: the files of this package but `method`."""
+    return sorted(m.name for m in pkgutil.iter_modules(__path__) if m.name != "method")
+
+
+def find(name: str) -> type[Method]:
+    """The method class in the file `name`.
+
+    Raises:
+      ValueError: there is no such file; lists what exists.
+    """
+    if name not in names():
+        close = difflib.get_close_matches(name, names(), n=1)
+        hint = f" (did you mean {close[0]!r}?)" if close else ""
+        raise ValueError(f"unknown method {name!r}{hint}; valid are {', '.join(names())}.")
+    module = importlib.import_module(f"{__name__}.{name}")
+    classes = [c for c in vars(module).values() if isinstance(c, type) and issubclass(c, Method)]
+    (cls,) = [c for c in classes if c.__module__ == module.__name__]
+    return cls
+
+
+def create(name: str, **fields: Any) -> Method:
+    """The method `name` (a file name: lora, lora_sp, full) with some fields set.
+
+    Raises:
+      ValueError: unknown method, unknown field or a bad value.
+    """
+    cls = find(name)
+    valid = [field.name for field in dataclasses.fields(cls)]  # pyright: ignore[reportArgumentType]
+    for field in fields:
+        if field not in valid:
+            raise ValueError(f"{name} has no field {field!r}; valid are {', '.join(valid)}.")
+    return cls(**fields)

@@ -1,4 +1,4 @@
-"""What an adapter method is, and how one is found by its file's name.
+"""What an adapter method is.
 
 A method is a frozen dataclass that is its own configuration. It holds no arrays: `init` makes its
 parameters, a pytree, and the other methods are pure functions of them. It knows no framework; the
@@ -6,9 +6,6 @@ shells for NNX and Linen are in `lorasp_jax.dense`.
 """
 
 import dataclasses
-import difflib
-import importlib
-import pkgutil
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, TypeAlias
 
@@ -17,8 +14,6 @@ import jax.numpy as jnp
 import optax
 
 from lorasp_jax.kernels.low_rank_matmul import Between, LowRankLayer, low_rank_matmul, one_by_one
-
-PACKAGE = __name__.rpartition(".")[0]
 
 Params: TypeAlias = Any
 Kernel: TypeAlias = jax.Array | jax.ShapeDtypeStruct
@@ -310,39 +305,3 @@ def kaiming_uniform(key: jax.Array, shape: tuple[int, int]) -> jax.Array:
     """U(±1/√I) for an [I, R] matrix: Kaiming-uniform with a = √5, as in torch and PEFT."""
     bound = shape[0] ** -0.5
     return jax.random.uniform(key, shape, jnp.float32, -bound, bound)
-
-
-def names() -> list[str]:
-    """Names of the methods: the files of this package but this one."""
-    here = importlib.import_module(PACKAGE).__path__
-    return sorted(module.name for module in pkgutil.iter_modules(here) if module.name != "method")
-
-
-def find(name: str) -> type[Method]:
-    """The method class in the file `name`.
-
-    Raises:
-      ValueError: there is no such file; lists what exists.
-    """
-    if name not in names():
-        close = difflib.get_close_matches(name, names(), n=1)
-        hint = f" (did you mean {close[0]!r}?)" if close else ""
-        raise ValueError(f"unknown method {name!r}{hint}; valid are {', '.join(names())}.")
-    module = importlib.import_module(f"{PACKAGE}.{name}")
-    classes = [c for c in vars(module).values() if isinstance(c, type) and issubclass(c, Method)]
-    (cls,) = [c for c in classes if c.__module__ == module.__name__]
-    return cls
-
-
-def create(name: str, **fields: Any) -> Method:
-    """The method `name` (a file name: lora, lora_sp, full) with some fields set.
-
-    Raises:
-      ValueError: unknown method, unknown field or a bad value.
-    """
-    cls = find(name)
-    valid = [field.name for field in dataclasses.fields(cls)]  # pyright: ignore[reportArgumentType]
-    for field in fields:
-        if field not in valid:
-            raise ValueError(f"{name} has no field {field!r}; valid are {', '.join(valid)}.")
-    return cls(**fields)
