@@ -1,12 +1,15 @@
 """The benchmarks' own arithmetic; what they measure is measured by running them."""
 
+import argparse
 import io
 
 import pytest
 from rich.console import Console
 
-from benchmarks import data, long_run, measuring
+from benchmarks import data, long_run, measuring, scaling
 from lorasp_jax.data.cache import Cache
+from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.training import mesh as meshes
 
 
 def part(broken=0, **memory):
@@ -83,3 +86,20 @@ def test_what_data_imports(tmp_path):
     row = data.importing(tmp_path, 64)
     assert row["kept as"] == "64x48"
     assert row["pictures/s"] == 2 * row["steps/s"]
+
+
+@pytest.mark.slow
+def test_scaling(monkeypatch):
+    """One device, then two that hold everything or half of the base; with a share each."""
+    tiny = Pi0Config.dummy()
+    monkeypatch.setattr(scaling.backbones, "sized", lambda *_: tiny)
+    monkeypatch.setattr(meshes, "MINIMUM_SHARDED_BYTES", 1024)
+    options = argparse.Namespace(
+        backbone="pi0", size="nano", devices=[1, 2], batch=2, rank=4, remat="none", calls=1
+    )
+    options.threads = 1
+    rows = list(scaling.rows(options))
+    assert [(row["layout"], row["devices"]) for row in rows] == [("data", 1), ("data", 2), ("fsdp", 2)]
+    assert rows[0]["of linear"] == 1
+    assert all(row["samples/s"] > 0 for row in rows)
+    assert rows[2]["GiB"] < rows[1]["GiB"]
