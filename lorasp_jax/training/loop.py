@@ -17,7 +17,7 @@ from lorasp_jax.data.batches import Raw, Steps, encode, sample_batch
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.training import mesh as meshes
-from lorasp_jax.training import preflight
+from lorasp_jax.training import preflight, processes
 from lorasp_jax.training.checkpoint import Checkpoints
 from lorasp_jax.training.interrupt import deferred
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
@@ -45,8 +45,8 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
     graphdef, adapters, frozen = adaptation.split(run.policy.model)
     state = init_state(adapters, optimizer, ema=run.config.optim.ema > 0)
     placed = meshes.shardings(state, mesh)
-    state = jax.device_put(state, placed)
-    frozen = jax.device_put(frozen, meshes.shardings(frozen, mesh))
+    state = processes.put(state, placed)
+    frozen = processes.put(frozen, meshes.shardings(frozen, mesh))
     run.policy = Policy(nnx.merge(graphdef, state.adapters, frozen), run.policy.processor)
     checkpoints = Checkpoints(run.folder, run.base_hash)
     restored = checkpoints.restore(state) if resume else None
@@ -55,20 +55,27 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
     if run.streams:
         many = _Streamed(jitted, frozen, _batches(run, mesh, int(state.step)), speed)
     else:
-        steps = jax.device_put(run.steps, meshes.replicated(mesh))
+        steps = processes.put(run.steps, meshes.replicated(mesh))
         many = _Stretches(jitted, frozen, steps, speed)
     if restored is None:
         many.compile(state, _stretch(run.config, int(state.step)))  # beside what the callbacks do
-        for callback in callbacks:
-            callback.on_start(run)
+        _tell(callbacks, run, "on_start")
     try:
         with run.timed("train"):
             state = _loop(run, state, many, checkpoints, callbacks)
     finally:
         checkpoints.close()
     run.policy = Policy(nnx.merge(graphdef, state.best, frozen), run.policy.processor)
+    _tell(callbacks, run, "on_end")
+
+
+def _tell(callbacks: Sequence[Callback], run: Run, hook: str) -> None:
+    """Call one hook of all callbacks, with a policy on this process's own device."""
+    everywhere, run.policy = run.policy, processes.own(run.policy)
     for callback in callbacks:
-        callback.on_end(run)
+        getattr(callback, hook)(run)
+    run.policy = everywhere
+    processes.wait(hook)
 
 
 def jit_stretch(run: Run, graphdef: Any, optimizer: Any, placed: TrainState) -> Callable:
@@ -198,7 +205,8 @@ def _loop(
         bars(run.console, "samples", per_step=config.optim.batch_size) as progress,
     ):
         bar = progress.add_task("compiling train step ...", total=total, completed=saved)
-        while (done := int(state.step)) < total and not stop.requested:
+        stopped = False
+        while (done := int(state.step)) < total and not stopped:
             count = _stretch(config, done)
             state, metrics = many(state, key, count)
             found = jax.device_get(metrics)
@@ -213,8 +221,9 @@ def _loop(
             if done // config.checkpoint_every > saved // config.checkpoint_every:
                 checkpoints.save(state)
                 saved = done
+            stopped = processes.anywhere(stop.requested)
         checkpoints.save(state)
-    if stop.requested:
+    if stopped:
         raise KeyboardInterrupt
     return state
 

@@ -13,6 +13,7 @@ from envs.episodes import Episodes
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Steps, flatten
 from lorasp_jax.models.policy import Policy
+from lorasp_jax.training import processes
 from lorasp_jax.training.run_folder import write_json
 
 
@@ -69,7 +70,8 @@ class Run:
             now = time.perf_counter()
             self.seconds[phase] = self.seconds.get(phase, 0.0) + now - start
             self.seconds["total"] = self._before + now - self.started
-            write_json(self.folder / "seconds.json", self.seconds)
+            if processes.is_first():
+                write_json(self.folder / "seconds.json", self.seconds)
 
 
 class Callback:

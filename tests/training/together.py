@@ -1,0 +1,52 @@
+"""One of several processes that train together; see test_processes.py.
+
+python -m tests.training.together FOLDER STREAMS
+"""
+
+import dataclasses
+import functools
+import os
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from envs import physics
+from lorasp_jax.data.batches import flatten
+from lorasp_jax.peft import FullFineTuning
+from lorasp_jax.training import mesh, processes
+from lorasp_jax.training.loop import train
+from lorasp_jax.training.run import Callback
+from tests.runs import CONFIG, make_run
+
+
+class Look(Callback):
+    """Evaluation needs the whole policy on devices of its own process."""
+
+    def on_start(self, run):
+        assert all(x.is_fully_addressable for x in jax.tree.leaves(run.policy))
+
+    def on_end(self, run):
+        self.on_start(run)
+        assert processes.is_first()
+        (run.folder / "ended").touch()
+
+
+def main(folder: str, streams: str) -> None:
+    """Two parts of the run, the second one resumed; large arrays are those over 1 KiB."""
+    physics.enable_fast_cpu()
+    if "JAX_PROCESS_ID" in os.environ:
+        processes.initialize()
+    mesh.shardings = functools.partial(mesh.shardings, minimum=1024)
+    config = dataclasses.replace(
+        CONFIG, peft=FullFineTuning(), targets=("action_out_proj", "fc1"), fsdp=2
+    )
+    run = make_run(Path(folder), config)
+    if streams == "True":
+        run.dataset, run.streams = jax.tree.map(np.asarray, flatten([*run.episodes.values()])), True
+    train(run, [Look()] if processes.is_first() else [])
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
