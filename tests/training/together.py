@@ -3,6 +3,7 @@
 python -m tests.training.together FOLDER STREAMS
 """
 
+import contextlib
 import dataclasses
 import functools
 import os
@@ -17,8 +18,8 @@ from lorasp_jax.data.batches import flatten
 from lorasp_jax.peft import FullFineTuning
 from lorasp_jax.training import mesh, processes
 from lorasp_jax.training.loop import train
-from lorasp_jax.training.run import Callback
-from tests.runs import CONFIG, make_run
+from lorasp_jax.training.run import Callback, Run
+from tests.runs import CONFIG, Terminate, make_run
 
 
 class Look(Callback):
@@ -34,7 +35,7 @@ class Look(Callback):
 
 
 def main(folder: str, streams: str) -> None:
-    """Two parts of the run, the second one resumed; large arrays are those over 1 KiB."""
+    """A run in two parts; large arrays are those over 1 KiB."""
     physics.enable_fast_cpu()
     if "JAX_PROCESS_ID" in os.environ:
         processes.initialize()
@@ -42,10 +43,19 @@ def main(folder: str, streams: str) -> None:
     config = dataclasses.replace(
         CONFIG, peft=FullFineTuning(), targets=("action_out_proj", "fc1"), fsdp=2
     )
-    run = make_run(Path(folder), config)
-    if streams == "True":
-        run.dataset, run.streams = jax.tree.map(np.asarray, flatten([*run.episodes.values()])), True
-    train(run, [Look()] if processes.is_first() else [])
+    first = processes.is_first()
+
+    def run() -> Run:
+        made = make_run(Path(folder), config)
+        if streams == "True":
+            steps = flatten([*made.episodes.values()])
+            made.dataset, made.streams = jax.tree.map(np.asarray, steps), True
+        return made
+
+    with contextlib.suppress(KeyboardInterrupt):
+        train(run(), [Look(), Terminate()] if first else [])  # a signal to one of them
+        raise AssertionError("it went on")
+    train(run(), [Look()] if first else [], resume=True)
 
 
 if __name__ == "__main__":
