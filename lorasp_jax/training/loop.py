@@ -47,7 +47,9 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
     placed = meshes.shardings(state, mesh)
     state = processes.put(state, placed)
     frozen = processes.put(frozen, meshes.shardings(frozen, mesh))
-    run.policy = Policy(nnx.merge(graphdef, state.adapters, frozen), run.policy.processor)
+    processor = run.policy.processor
+    policy = lambda state: Policy(nnx.merge(graphdef, state.best, frozen), processor)  # noqa: E731
+    run.policy = policy(state)
     checkpoints = Checkpoints(run.folder, run.base_hash)
     restored = checkpoints.restore(state) if resume else None
     state = restored or state
@@ -62,10 +64,10 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
         _tell(callbacks, run, "on_start")
     try:
         with run.timed("train"):
-            state = _loop(run, state, many, checkpoints, callbacks)
+            state = _loop(run, state, many, checkpoints, callbacks, policy)
     finally:
         checkpoints.close()
-    run.policy = Policy(nnx.merge(graphdef, state.best, frozen), run.policy.processor)
+    run.policy = policy(state)
     _tell(callbacks, run, "on_end")
 
 
@@ -193,7 +195,12 @@ def _stretch(config: Config, done: int) -> int:
 
 
 def _loop(
-    run: Run, state: TrainState, many: _Stretches, checkpoints: Checkpoints, callbacks: Any
+    run: Run,
+    state: TrainState,
+    many: _Stretches,
+    checkpoints: Checkpoints,
+    callbacks: Sequence[Callback],
+    policy: Callable[[TrainState], Policy],
 ) -> TrainState:
     """Stretch after stretch until the last step, a signal or a loss that is not finite."""
     config = run.config
@@ -214,10 +221,11 @@ def _loop(
             _check_finite(values, done, done + count, saved)
             done += count
             values |= many.speed.end(count)
-            log.write(done, values, {name: x for name, x in found.items() if x.ndim})
             progress.update(bar, completed=done, description=f"training, loss {values['task']:.4f}")
+            run.policy = policy(state)
             for callback in callbacks:
-                callback.on_log(run, done, values)
+                values |= callback.on_log(run, done, values) or {}
+            log.write(done, values, {name: x for name, x in found.items() if x.ndim})
             if done // config.checkpoint_every > saved // config.checkpoint_every:
                 checkpoints.save(state)
                 saved = done
