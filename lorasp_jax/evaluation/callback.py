@@ -56,7 +56,7 @@ class Evaluation(Callback):
         every, before = run.config.evaluation.every, step - run.config.log_every
         if not every or step // every == before // every or step == run.config.optim.steps:
             return {}
-        results = self._measure(run, "before", run.config.evaluation.worlds)
+        results = self._measure(run, f"at step {step}", run.config.evaluation.worlds)
         if self._filming:
             self._filming.result()
         self._filming = self._films.submit(self._record, run, results)
@@ -107,7 +107,7 @@ class Evaluation(Callback):
         episodes = episodes or run.config.evaluation.episodes
         bar = progress.add_task(f"compiling evaluation of {task} ...", total=episodes)
         env, rollout = self._compiled(run, task)
-        number = 2 * run.config.tasks.index(task) + ("before", "after").index(when)
+        number = 2 * run.config.tasks.index(task) + (when == "after")
         return evaluate(
             run.policy,
             env,

@@ -49,6 +49,7 @@ def test_every_hundred_steps_at_the_next_log_line(run, monkeypatch):
     assert {step for step, value in found.items() if value} == {120}
     assert found[120] == {"success/press": 0.5, "success/pick_place": 0.5}
     assert sorted(asked) == [("pick_place", 4), ("press", 4)]  # one batch of worlds
+    assert "press at step 120: 50.0 % success" in run.console.file.getvalue()
     assert not filmed  # and yet training went on
     go.set()
     found = {step: evaluation.on_log(run, step, {}) for step in steps[3:]}
