@@ -22,18 +22,25 @@ def main(arguments: list[str]) -> int:
     console, errors = Console(), Console(stderr=True)
     physics.enable_fast_cpu()  # before anything starts a JAX backend
     physics.enable_compilation_cache()
+    from lorasp_jax.training import processes
     from lorasp_jax.training.interrupt import sigterm_as_interrupt
     from lorasp_jax.training.overrides import parse
     from lorasp_jax.training.run_folder import open_run
 
     try:
+        if "--distributed" in arguments:
+            processes.initialize()
+            console.quiet = not processes.is_first()
         command = parse(arguments)
         if command.dry_run:
             from lorasp_jax.training.dry_run import dry_run
 
             dry_run(command.config, RUNS / command.config.name, console)
             return 0
-        folder = open_run(command.config, RUNS, resume=command.resume)
+        folder = RUNS / command.config.name
+        with processes.first_goes_ahead("opened"):
+            if processes.is_first():
+                open_run(command.config, RUNS, resume=command.resume)
         if command.resume and (folder / "results.json").exists():
             from lorasp_jax.report.html import write_report
 
@@ -56,20 +63,21 @@ def run(command, folder: Path, console: Console, started: float) -> None:
     """Train with evaluation before and after, export the adapters and write the report."""
     from lorasp_jax.evaluation.callback import Evaluation, NoEvaluation
     from lorasp_jax.report.callback import Report
-    from lorasp_jax.training import loop, setup
+    from lorasp_jax.training import loop, processes, setup
     from lorasp_jax.training.export import Export
     from lorasp_jax.training.weights_and_biases import WeightsAndBiases
 
     with contextlib.ExitStack() as stack:
         callbacks = []
-        if command.wandb:
+        if command.wandb and processes.is_first():
             callbacks += [
                 stack.enter_context(WeightsAndBiases(command.wandb, command.config, folder))
             ]
         prepared = setup.prepare(command.config, folder, console, started)
         evaluation = Evaluation() if prepared.simulated else NoEvaluation()
         callbacks = [Export(), evaluation, Report(), *callbacks]
-        loop.train(prepared, callbacks, resume=command.resume)
+        first = processes.is_first()
+        loop.train(prepared, callbacks if first else [], resume=command.resume)
     report = folder / "report.html"
     console.print(f"finished in {prepared.seconds['total']:.0f} s: {report}", markup=False)
 

@@ -134,11 +134,21 @@ class EvaluationConfig:
     """Actions of a chunk that are executed before the policy looks again."""
     denoise_steps: int = 10
     """Euler steps of the flow-matching sampler."""
+    every: int = 0
+    """Steps between evaluations while training, at the log line that follows, each in num_envs
+    episodes a task; 0: only before and after."""
+
+    @property
+    def worlds(self) -> int:
+        """Worlds that are simulated at a time."""
+        return min(self.episodes, self.num_envs)
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
         _at_least_one(self, "episodes", "num_envs", "execute_steps", "denoise_steps")
-        if self.episodes % min(self.episodes, self.num_envs):
+        if self.every < 0:
+            raise ValueError(f"evaluation.every must be at least 0, got {self.every}")
+        if self.episodes % self.worlds:
             raise ValueError(
                 f"episodes must be a multiple of num_envs, got {self.episodes} and {self.num_envs}"
             )

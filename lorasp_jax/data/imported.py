@@ -46,10 +46,11 @@ def opened(config: Config, model: BackboneConfig, folder: Path) -> Source:
 
 
 def cached(source: Source, folder: Path, progress: Progress) -> Cache:
-    """A dataset as a cache in the folder of a run, unless it is one."""
+    """A dataset as a cache in the folder of a run, unless it is one or another process made it."""
     if isinstance(source, Cache):
         return source
-    cache.write([source], folder / _CACHE, progress)
+    if not (folder / _CACHE).exists():
+        cache.write([source], folder / _CACHE, progress)
     return Cache(folder / _CACHE)
 
 

@@ -2,8 +2,8 @@
 
     for raw in Stream(Cache("my_cache").steps, batch_size=32, chunk=50, seed=0, start=1000):
 
-A batch is a function of seed and position alone. All processes together see the same batches
-however many they are, so a run may go on with another number of them.
+A batch is a function of seed and position alone. All processes together see the same batches, row
+for row, however many they are, so a run may go on with another number of them.
 """
 
 from typing import Any
@@ -54,11 +54,14 @@ class Stream:
             )
         self.position = start
 
+        share = batch_size // count
+        rows = slice(index * share, (index + 1) * share)
+
         def read(start: np.ndarray) -> Raw:
-            return gather(steps, start, chunk)
+            return gather(steps, start[rows], chunk)
 
         order: Any = grain.MapDataset.range(len(steps.end)).seed(seed).shuffle().repeat()
-        batches = order[index::count].batch(batch_size // count).map(read)
+        batches = order.batch(batch_size).map(read)
         ahead = grain.ReadOptions(num_threads=_THREADS, prefetch_buffer_size=_AHEAD)
         self._iterator: Any = iter(batches.to_iter_dataset(ahead))
         self._iterator.set_state({"next_index": start})

@@ -1,9 +1,11 @@
-"""Success in simulation before and after training, with a video of each task."""
+"""Success in simulation before, while and after training, with a video of each task."""
 
 import dataclasses
 import functools
 import json
+import os
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -27,37 +29,65 @@ TOWERS = ("vision", "language", "action")
 
 
 class Evaluation(Callback):
-    """Measures every task of a run before the first and after the last step.
+    """Measures every task of a run before the first and after the last step, and in between.
 
-    Adapters start at exactly zero, so the policy before the first step is the unadapted base; the
-    two measurements share one compilation, their layouts differ.
+    Adapters start at exactly zero, so the policy before the first step is the unadapted base; all
+    measurements share one compilation, the layouts of the last one differ from the others'.
+    Training goes on while videos are made.
     """
 
     def __init__(self) -> None:
         """Nothing is compiled yet."""
         self._tasks: dict[str, tuple[Env, Callable]] = {}
+        self._films = ThreadPoolExecutor(1)
+        self._filming: Future | None = None
 
     def on_start(self, run: Run) -> None:
         """Measure the base and record it, for a resumed run too."""
         results = self._measure(run, "before")
         write_json(run.folder / "before.json", {t: success(r) for t, r in results.items()})
 
+    def on_log(self, run: Run, step: int, metrics: dict[str, float]) -> dict[str, float]:  # noqa: ARG002
+        """Measure the policy in one batch of episodes a task, if it is time to; film it.
+
+        Returns:
+            `success/<task>`.
+        """
+        every, before = run.config.evaluation.every, step - run.config.log_every
+        if not every or step // every == before // every or step == run.config.optim.steps:
+            return {}
+        results = self._measure(run, f"at step {step}", run.config.evaluation.worlds)
+        if self._filming:
+            self._filming.result()
+        self._filming = self._films.submit(self._record, run, results)
+        return {f"success/{task}": result.success for task, result in results.items()}
+
     def on_end(self, run: Run) -> None:
         """Measure the trained policy and write results.json and the videos."""
         results = self._measure(run, "after")
-        with bars(run.console, "videos") as progress:
-            bar = progress.add_task("rendering videos ...", total=len(results))
-            for task, result in results.items():
-                _film(self._tasks[task][0], result, run.folder / f"rollout_{task}.mp4")
-                first = {name: np.asarray(i[0, 0]) for name, i in run.episodes[task].image.items()}
-                video.write_picture(run.folder / f"cameras_{task}.png", video.side_by_side(first))
-                progress.advance(bar)
+        if self._filming:
+            self._filming.result()
+        self._films.shutdown()
+        with run.console.status("rendering videos ..."):
+            self._record(run, results)
         write_json(run.folder / "results.json", summarise(run, results))
 
-    def _measure(self, run: Run, when: str) -> dict[str, Result]:
-        """Results by task; compilations run side by side."""
-        with run.timed("evaluate"), bars(run.console, "episodes") as progress:
-            one = functools.partial(self._measure_task, run, when, progress)
+    def _record(self, run: Run, results: dict[str, Result]) -> None:
+        """Write a video and the first pictures of each task."""
+        for task, result in results.items():
+            first = {name: np.asarray(i[0, 0]) for name, i in run.episodes[task].image.items()}
+            video.write_picture(run.folder / f"cameras_{task}.png", video.side_by_side(first))
+            unfinished = run.folder / f"unfinished_{task}.mp4"  # a report may read the one before
+            _film(self._tasks[task][0], result, unfinished)
+            os.replace(unfinished, run.folder / f"rollout_{task}.mp4")
+
+    def _measure(self, run: Run, when: str, episodes: int = 0) -> dict[str, Result]:
+        """Results by task, of the config's number of episodes or another; compilations run side by
+        side.
+        """
+        shown = bars(run.console, "episodes", shown=not episodes)
+        with run.timed("evaluate"), shown as progress:
+            one = functools.partial(self._measure_task, run, when, episodes, progress)
             tasks = run.config.tasks
             # Warp is not for threads.
             each = map if physics.default_backend() == "warp" else side_by_side
@@ -70,12 +100,14 @@ class Evaluation(Callback):
             )
         return results
 
-    def _measure_task(self, run: Run, when: str, progress: Progress, task: str) -> Result:
+    def _measure_task(
+        self, run: Run, when: str, episodes: int, progress: Progress, task: str
+    ) -> Result:
         """The result of one task, with a progress bar."""
-        episodes = run.config.evaluation.episodes
+        episodes = episodes or run.config.evaluation.episodes
         bar = progress.add_task(f"compiling evaluation of {task} ...", total=episodes)
         env, rollout = self._compiled(run, task)
-        number = 2 * run.config.tasks.index(task) + ("before", "after").index(when)
+        number = 2 * run.config.tasks.index(task) + (when == "after")
         return evaluate(
             run.policy,
             env,
@@ -94,7 +126,7 @@ class Evaluation(Callback):
             env = envs.make(
                 task,
                 robot=config.robot,
-                num_envs=min(config.evaluation.num_envs, config.evaluation.episodes),
+                num_envs=config.evaluation.worlds,
                 image_size=config.image_size,
                 control_dt=config.control_dt,
             )

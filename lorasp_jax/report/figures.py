@@ -71,6 +71,21 @@ def losses(rows: Rows) -> str:
         return _svg(figure)
 
 
+def success_over_steps(rows: Rows) -> str:
+    """Success of each task while training."""
+    names = sorted({name for row in rows for name in row if name.startswith("success/")})
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(9, 3), layout="constrained")
+        axes = figure.subplots()
+        for number, name in enumerate(names):
+            _line(axes, rows, name, f"C{number}", name.removeprefix("success/"))
+        axes.set_ylim(0, 1.03)
+        axes.set_xlabel("step")
+        axes.set_title("success while training, in fewer episodes than at the end", loc="left")
+        axes.legend(frameon=False, loc="lower right")
+        return _svg(figure)
+
+
 def active_rank(rows: Rows, rank: int) -> str:
     """Active rank of each tower over training."""
     with mpl.rc_context(_STYLE):

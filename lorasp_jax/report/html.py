@@ -45,9 +45,10 @@ def write_report(folder: Path) -> Path:
         *_success(results),
         "<h2>Training</h2>",
         _image(figures.losses(rows)) if rows else "<p>Nothing is logged yet.</p>",
+        *_while_training(rows),
         *_speed(rows),
         *_active_rank(results, rows, config["peft"].get("rank")),
-        *_media(folder, results["tasks"] if finished else ()),
+        *_media(folder, [t for t in results["tasks"] if finished or _filmed(folder, t).exists()]),
         "<h2>Time</h2>",
         _table(("phase", "seconds"), ((k, f"{v:.1f}") for k, v in results["seconds"].items())),
         "<h2>Settings</h2>",
@@ -103,6 +104,12 @@ def _success(results: dict[str, Any]) -> Iterable[str]:
         yield "<h2>Success before and after</h2>"
         yield _image(figures.success(results))
         yield _success_table(results)
+
+
+def _while_training(rows: figures.Rows) -> Iterable[str]:
+    """Success over the steps; nothing for a run that did not measure it."""
+    if any(name.startswith("success/") for row in rows for name in row):
+        yield _image(figures.success_over_steps(rows))
 
 
 def _success_table(results: dict[str, Any]) -> str:
@@ -173,12 +180,17 @@ def _image(svg: str) -> str:
     return f'<img alt="figure" src="data:image/svg+xml;base64,{data}">'
 
 
+def _filmed(folder: Path, task: str) -> Path:
+    """The video of a task."""
+    return folder / f"rollout_{task}.mp4"
+
+
 def _media(folder: Path, tasks: Collection[str]) -> Iterable[str]:
     """Video and first camera pictures of every task."""
     if tasks:
         yield "<h2>What the policy sees and does</h2>"
     for task in tasks:
-        picture, video = folder / f"cameras_{task}.png", folder / f"rollout_{task}.mp4"
+        picture, video = folder / f"cameras_{task}.png", _filmed(folder, task)
         shown = base64.b64encode(picture.read_bytes()).decode()
         played = base64.b64encode(video.read_bytes()).decode()
         yield (
@@ -189,5 +201,6 @@ def _media(folder: Path, tasks: Collection[str]) -> Iterable[str]:
             "</figure>"
             "<figure><video width=400 controls autoplay loop muted "
             f'src="data:video/mp4;base64,{played}"></video>'
-            "<figcaption class=muted>one closed-loop episode after adaptation</figcaption></figure>"
+            "<figcaption class=muted>one closed-loop episode of the adapted policy</figcaption>"
+            "</figure>"
         )

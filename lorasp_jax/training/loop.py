@@ -17,7 +17,7 @@ from lorasp_jax.data.batches import Raw, Steps, encode, sample_batch
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.training import mesh as meshes
-from lorasp_jax.training import preflight
+from lorasp_jax.training import preflight, processes
 from lorasp_jax.training.checkpoint import Checkpoints
 from lorasp_jax.training.interrupt import deferred
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
@@ -45,9 +45,11 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
     graphdef, adapters, frozen = adaptation.split(run.policy.model)
     state = init_state(adapters, optimizer, ema=run.config.optim.ema > 0)
     placed = meshes.shardings(state, mesh)
-    state = jax.device_put(state, placed)
-    frozen = jax.device_put(frozen, meshes.shardings(frozen, mesh))
-    run.policy = Policy(nnx.merge(graphdef, state.adapters, frozen), run.policy.processor)
+    state = processes.put(state, placed)
+    frozen = processes.put(frozen, meshes.shardings(frozen, mesh))
+    processor = run.policy.processor
+    policy = lambda state: Policy(nnx.merge(graphdef, state.best, frozen), processor)  # noqa: E731
+    run.policy = policy(state)
     checkpoints = Checkpoints(run.folder, run.base_hash)
     restored = checkpoints.restore(state) if resume else None
     state = restored or state
@@ -55,20 +57,27 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
     if run.streams:
         many = _Streamed(jitted, frozen, _batches(run, mesh, int(state.step)), speed)
     else:
-        steps = jax.device_put(run.steps, meshes.replicated(mesh))
+        steps = processes.put(run.steps, meshes.replicated(mesh))
         many = _Stretches(jitted, frozen, steps, speed)
     if restored is None:
         many.compile(state, _stretch(run.config, int(state.step)))  # beside what the callbacks do
-        for callback in callbacks:
-            callback.on_start(run)
+        _tell(callbacks, run, "on_start")
     try:
         with run.timed("train"):
-            state = _loop(run, state, many, checkpoints, callbacks)
+            state = _loop(run, state, many, checkpoints, callbacks, policy)
     finally:
         checkpoints.close()
-    run.policy = Policy(nnx.merge(graphdef, state.best, frozen), run.policy.processor)
+    run.policy = policy(state)
+    _tell(callbacks, run, "on_end")
+
+
+def _tell(callbacks: Sequence[Callback], run: Run, hook: str) -> None:
+    """Call one hook of all callbacks, with a policy on this process's own device."""
+    everywhere, run.policy = run.policy, processes.own(run.policy)
     for callback in callbacks:
-        callback.on_end(run)
+        getattr(callback, hook)(run)
+    run.policy = everywhere
+    processes.wait(hook)
 
 
 def jit_stretch(run: Run, graphdef: Any, optimizer: Any, placed: TrainState) -> Callable:
@@ -186,7 +195,12 @@ def _stretch(config: Config, done: int) -> int:
 
 
 def _loop(
-    run: Run, state: TrainState, many: _Stretches, checkpoints: Checkpoints, callbacks: Any
+    run: Run,
+    state: TrainState,
+    many: _Stretches,
+    checkpoints: Checkpoints,
+    callbacks: Sequence[Callback],
+    policy: Callable[[TrainState], Policy],
 ) -> TrainState:
     """Stretch after stretch until the last step, a signal or a loss that is not finite."""
     config = run.config
@@ -198,7 +212,8 @@ def _loop(
         bars(run.console, "samples", per_step=config.optim.batch_size) as progress,
     ):
         bar = progress.add_task("compiling train step ...", total=total, completed=saved)
-        while (done := int(state.step)) < total and not stop.requested:
+        stopped = False
+        while (done := int(state.step)) < total and not stopped:
             count = _stretch(config, done)
             state, metrics = many(state, key, count)
             found = jax.device_get(metrics)
@@ -206,15 +221,17 @@ def _loop(
             _check_finite(values, done, done + count, saved)
             done += count
             values |= many.speed.end(count)
-            log.write(done, values, {name: x for name, x in found.items() if x.ndim})
             progress.update(bar, completed=done, description=f"training, loss {values['task']:.4f}")
+            run.policy = policy(state)
             for callback in callbacks:
-                callback.on_log(run, done, values)
+                values |= callback.on_log(run, done, values) or {}
+            log.write(done, values, {name: x for name, x in found.items() if x.ndim})
             if done // config.checkpoint_every > saved // config.checkpoint_every:
                 checkpoints.save(state)
                 saved = done
+            stopped = processes.anywhere(stop.requested)
         checkpoints.save(state)
-    if stop.requested:
+    if stopped:
         raise KeyboardInterrupt
     return state
 

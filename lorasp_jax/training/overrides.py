@@ -83,6 +83,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--wandb", metavar="PROJECT", help="log to Weights & Biases, too; needs pip install wandb"
     )
+    parser.add_argument(
+        "--distributed",
+        action="store_true",
+        help="train together with the other processes of the launcher, see docs/launch.md",
+    )
     return parser
 
 

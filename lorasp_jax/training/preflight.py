@@ -174,7 +174,7 @@ def abstract_batch(config: BackboneConfig, size: int) -> Batch:
 
 def available_bytes() -> float:
     """Memory of the first device that JAX may use; of the machine on a CPU, shared by devices."""
-    stats = jax.devices()[0].memory_stats()
+    stats = jax.local_devices()[0].memory_stats()
     if stats and "bytes_limit" in stats:
         return float(stats["bytes_limit"])
     machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")

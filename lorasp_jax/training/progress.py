@@ -5,16 +5,17 @@ from rich.progress import Progress, ProgressColumn, Task
 from rich.text import Text
 
 
-def bars(console: Console, unit: str, *, per_step: int = 1) -> Progress:
+def bars(console: Console, unit: str, *, per_step: int = 1, shown: bool = True) -> Progress:
     """Bars that show, beside share and remaining time, a rate.
 
     Args:
         console: where they are drawn.
         unit: what is counted, such as "episodes".
         per_step: units to a step of the bar.
+        shown: False while other bars are; a terminal shows one group at a time.
     """
     columns = (*Progress.get_default_columns(), _Rate(unit, per_step))
-    return Progress(*columns, console=console)
+    return Progress(*columns, console=console, disable=not shown)
 
 
 class _Rate(ProgressColumn):

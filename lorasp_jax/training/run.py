@@ -13,6 +13,7 @@ from envs.episodes import Episodes
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Steps, flatten
 from lorasp_jax.models.policy import Policy
+from lorasp_jax.training import processes
 from lorasp_jax.training.run_folder import write_json
 
 
@@ -30,8 +31,7 @@ class Run:
         streams: whether the steps of a dataset are read from there step by step, because the device
             has no room for them.
         simulated: whether the tasks can be evaluated in simulation.
-        policy: the policy before the first step or after the last; in between, training owns its
-            memory.
+        policy: the policy as it is while a callback runs; in between, training owns its memory.
         started: `time.perf_counter()` when this process began.
         seconds: time spent by phase, and "total", over all processes that worked on this run.
     """
@@ -61,15 +61,21 @@ class Run:
 
     @contextlib.contextmanager
     def timed(self, phase: str) -> Iterator[None]:
-        """Add the time spent in this block to `seconds[phase]`, also if it is interrupted."""
-        start = time.perf_counter()
+        """Add the time spent in this block to `seconds[phase]`, also if it is interrupted.
+
+        Time of another phase inside this block is that phase's.
+        """
+        others = lambda: sum(self.seconds.values()) - self.seconds["total"]  # noqa: E731
+        start, before = time.perf_counter(), others()
         try:
             yield
         finally:
             now = time.perf_counter()
-            self.seconds[phase] = self.seconds.get(phase, 0.0) + now - start
+            spent = now - start - (others() - before)
+            self.seconds[phase] = self.seconds.get(phase, 0.0) + spent
             self.seconds["total"] = self._before + now - self.started
-            write_json(self.folder / "seconds.json", self.seconds)
+            if processes.is_first():
+                write_json(self.folder / "seconds.json", self.seconds)
 
 
 class Callback:
@@ -78,8 +84,12 @@ class Callback:
     def on_start(self, run: Run) -> None:
         """Before the first step, with the policy as it comes; not called again on resume."""
 
-    def on_log(self, run: Run, step: int, metrics: dict[str, float]) -> None:
-        """After every logged stretch of steps."""
+    def on_log(self, run: Run, step: int, metrics: dict[str, float]) -> dict[str, float] | None:
+        """After every logged stretch of steps, with the policy as it is then.
+
+        Returns:
+            Further scalars to log at this step.
+        """
 
     def on_end(self, run: Run) -> None:
         """After the last step, with the trained policy."""

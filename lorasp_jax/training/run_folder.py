@@ -12,6 +12,7 @@ import numpy as np
 from tensorboardX import SummaryWriter
 
 from lorasp_jax.config import Config
+from lorasp_jax.training import processes
 
 RECORD, CLOCK = "config.json", "seconds.json"
 """All that a run leaves which failed before it had anything."""
@@ -91,12 +92,14 @@ class MetricsLog:
     """Appends scalars to `metrics.jsonl` and to TensorBoard event files.
 
     A resumed run drops the lines past the step it continues from, so that the file reads like that
-    of an uninterrupted run.
+    of an uninterrupted run. Of several processes the first one alone writes.
     """
 
     def __init__(self, folder: Path, start_step: int = 0) -> None:
         """Open the log of the run in `folder`, which continues at `start_step`."""
-        self.path = folder / "metrics.jsonl"
+        self.path, self._writes = folder / "metrics.jsonl", processes.is_first()
+        if not self._writes:
+            return
         kept = [row for row in read_metrics(folder) if row["step"] <= start_step]
         write_text(self.path, "".join(json.dumps(row) + "\n" for row in kept))
         self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=start_step + 1)
@@ -108,6 +111,8 @@ class MetricsLog:
         histograms: Mapping[str, np.ndarray] = MappingProxyType({}),
     ) -> None:
         """Record scalars at `step`, and for TensorBoard alone histograms of arrays."""
+        if not self._writes:
+            return
         with self.path.open("a") as file:
             file.write(json.dumps({"step": step, **values}) + "\n")
         for name, value in values.items():
@@ -117,7 +122,8 @@ class MetricsLog:
 
     def close(self) -> None:
         """Flush the event file."""
-        self._board.close()
+        if self._writes:
+            self._board.close()
 
 
 def read_metrics(folder: Path) -> list[dict[str, float]]:

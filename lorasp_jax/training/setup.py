@@ -29,7 +29,7 @@ from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.processing import Processor, Statistics, check_delta, robot_slots, to_delta
 from lorasp_jax.models.prompt_table import PromptTable
-from lorasp_jax.training import preflight
+from lorasp_jax.training import preflight, processes
 from lorasp_jax.training.base import base_model, changed
 from lorasp_jax.training.progress import bars
 from lorasp_jax.training.run import Run
@@ -109,7 +109,7 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
         f"memory by device in GiB: {built.memory}; rematerialisation: {base.config.remat}"
     )
     run = Run(config, folder, console, built.base_hash, started)
-    with run.timed("collect"):
+    with run.timed("collect"), processes.first_goes_ahead("collected"):
         if built.source:
             _import(run, built.source, built.room)
         else:
@@ -161,6 +161,8 @@ def _check_sizes(config: Config, chunk: int) -> None:
         raise ValueError(
             f"batch_size must be a multiple of the {devices} devices{parts}, got {optim.batch_size}"
         )
+    if config.evaluation.every and jax.process_count() > 1:
+        raise ValueError("evaluation.every needs one process: leave it out, or --distributed")
     if optim.ema and isinstance(config.peft, peft.AdaLoRA):
         raise ValueError("an average has no budget: leave --optim.ema out with ada_lora")
 

@@ -36,6 +36,14 @@ def test_success(drawn):
     assert "after 75 %" in {text.get_text() for text in axes.texts}
 
 
+def test_success_over_steps(drawn):
+    rows = [{"step": 2.0, "success/press": 0.25}, {"step": 4.0, "task": 1.0}]
+    rows += [{"step": 6.0, "success/press": 0.5, "success/pour": 1.0}]
+    (axes,) = figures.success_over_steps(rows).axes
+    found = {line.get_label(): line.get_xydata().tolist() for line in axes.lines}
+    assert found == {"press": [[2, 0.25], [6, 0.5]], "pour": [[6, 1]]}
+
+
 def test_losses_are_drawn_where_they_were_recorded(drawn):
     task, auxiliary = figures.losses(ROWS).axes
     np.testing.assert_array_equal(task.lines[0].get_xydata(), [[2, 1], [4, 0.5]])

@@ -93,6 +93,20 @@ def test_a_run_that_goes_on(folder):
         write_report(folder)
 
 
+def test_a_run_that_is_evaluated_while_it_goes_on(folder):
+    (folder / "results.json").unlink()
+    (folder / "before.json").write_text(
+        json.dumps(dict.fromkeys(("press", "pour"), RESULTS["tasks"]["press"]["before"]))
+    )
+    log = MetricsLog(folder)
+    log.write(6, {"task": 0.1, "success/press": 0.5})
+    log.close()
+    page = write_report(folder).read_text()
+    assert page.count("image/svg") == 3  # success before, losses, success over the steps
+    assert page.count("<video") == 1  # pour is not filmed yet
+    assert "<h3>pour" not in page
+
+
 def test_speed_is_the_middle_and_memory_the_highest(folder):
     assert "samples a second" not in write_report(folder).read_text()
     log = MetricsLog(folder)

@@ -75,8 +75,18 @@ def test_loss_that_is_not_finite_stops_and_keeps_the_last_checkpoint(tmp_path):
 
 
 def test_signal_handlers_are_put_back(tmp_path):
-    before = signal.getsignal(signal.SIGTERM)
-    train(make_run(tmp_path / "run"))
+    """And callbacks see the policy as it is at each log line, and add to it."""
+
+    class Look(Callback):
+        def on_log(self, run, step, metrics):
+            adapters = leaves(adaptation.split(run.policy.model)[1]).values()
+            return {"size": float(sum(np.abs(x).sum() for x in adapters))}
+
+    before, run = signal.getsignal(signal.SIGTERM), make_run(tmp_path / "run")
+    train(run, [Look()])
+    last = {"size": Look().on_log(run, 4, {})["size"]}
+    first, second = read_metrics(run.folder)
+    assert second["size"] == last["size"] != first["size"] > 0
     assert signal.getsignal(signal.SIGTERM) == before
     assert jax.device_count() == 8
 

@@ -1,0 +1,62 @@
+"""One of several processes that train together; see test_processes.py.
+
+python -m tests.training.together FOLDER STREAMS
+"""
+
+import contextlib
+import dataclasses
+import functools
+import os
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from envs import physics
+from lorasp_jax.data.batches import flatten
+from lorasp_jax.peft import FullFineTuning
+from lorasp_jax.training import mesh, processes
+from lorasp_jax.training.loop import train
+from lorasp_jax.training.run import Callback, Run
+from tests.runs import CONFIG, Terminate, make_run
+
+
+class Look(Callback):
+    """Evaluation needs the whole policy on devices of its own process."""
+
+    def on_start(self, run):
+        assert all(x.is_fully_addressable for x in jax.tree.leaves(run.policy))
+
+    def on_end(self, run):
+        self.on_start(run)
+        assert processes.is_first()
+        (run.folder / "ended").touch()
+
+
+def main(folder: str, streams: str) -> None:
+    """A run in two parts; large arrays are those over 1 KiB."""
+    physics.enable_fast_cpu()
+    if "JAX_PROCESS_ID" in os.environ:
+        processes.initialize()
+    mesh.shardings = functools.partial(mesh.shardings, minimum=1024)
+    config = dataclasses.replace(
+        CONFIG, peft=FullFineTuning(), targets=("action_out_proj", "fc1"), fsdp=2
+    )
+    first = processes.is_first()
+
+    def run() -> Run:
+        made = make_run(Path(folder), config)
+        if streams == "True":
+            steps = flatten([*made.episodes.values()])
+            made.dataset, made.streams = jax.tree.map(np.asarray, steps), True
+        return made
+
+    with contextlib.suppress(KeyboardInterrupt):
+        train(run(), [Look(), Terminate()] if first else [])  # a signal to one of them
+        raise AssertionError("it went on")
+    train(run(), [Look()] if first else [], resume=True)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
