@@ -7,25 +7,27 @@ that adapters write:
     [x W, x P] = x [W, P]         for the W and P of all layers
     y = x W + z diag(U)           with z = f(x P)
 
-Their chains f between the matrices run as one. `lorasp_jax.kernels.low_rank_matmul` is the same for
-training, where the copies of W would cost more than they save.
+Their chains f between the matrices run as one. Stacked layers that are called once, as those that
+read the pictures, get P and U alone, in the type in which they compute: a copy of W would cost more
+than it saves. For training there is `lorasp_jax.kernels.low_rank_matmul`.
 """
 
 import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 from flax import nnx
 
 from lorasp_jax.dense import Dense
-from lorasp_jax.kernels.low_rank_matmul import aligned
+from lorasp_jax.kernels.low_rank_matmul import aligned, two_products
 from lorasp_jax.peft import Aux, Method
 
 Names = tuple[str, ...]
+Block = TypeVar("Block", bound=nnx.Module)
 
 TILE, PROGRAMS = 64, 256
 """Side of the tiles of a product's result, and how many of them at once keep a GPU busy."""
@@ -46,23 +48,46 @@ class Joined(NamedTuple):
     """[sum of O], None if no layer has one."""
 
 
+class Apart(NamedTuple):
+    """The same for layers whose W are read where they are."""
+
+    params: Any
+    """As in `Joined`."""
+    read: jax.Array
+    """P of all layers, [I, sum of Q or a little more]."""
+    write: list[jax.Array]
+    """U [R, O] of each layer."""
+
+
 class Ready(nnx.Variable):
-    """What `prepare` leaves in a module: `Joined` by the names of the layers."""
+    """What `prepare` leaves in a module: `Joined` or `Apart` by the names of the layers."""
 
 
-def prepare(module: nnx.Module) -> None:
+def prepare(module: nnx.Module, *, copy_kernels: bool = True) -> None:
     """Joins the adapted layers that are attributes of the module; it then computes the same.
 
     `module.together`, if there is one, names layers that read the same input. Layers of the kind
     `Dense` with a type of their own are joined, if their method is x W + z U; the others stay.
+    `copy_kernels` is for modules that are called again and again.
     """
     layers = {name: layer for name, layer in vars(module).items() if _can_join(layer)}
     groups = [names for names in getattr(module, "together", ()) if _one_kind(layers, names)]
     grouped = {name for names in groups for name in names}
     groups += [(name,) for name in layers if name not in grouped]
     if groups:
-        joined = {names: _join([layers[name] for name in names]) for names in groups}
+        join = _join if copy_kernels else _cast
+        joined = {names: join([layers[name] for name in names]) for names in groups}
         module.ready = Ready(joined)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def prepared_stack(blocks: Block) -> Block:
+    """Stacked blocks [L, ...] for one run through them, adapters' matrices cast all at once."""
+
+    def prepared(block: Block) -> Block:
+        prepare(block, copy_kernels=False)
+        return block
+
+    return jax.vmap(prepared)(blocks)
 
 
 def call(
@@ -73,19 +98,52 @@ def call(
     if ready is None or names not in ready.get_value():
         return None
     layers: list[Dense] = [getattr(module, name) for name in names]
-    joined: Joined = ready.get_value()[names]
-    method, _ = layers[0].carried()
-    n, ends = len(names), list(itertools.accumulate(map(_outputs, layers)))
-    outs = ends[-1]
-    read = product(layers[0].as_input(x), joined.read)
-    columns = range(outs, outs + n * (width := _rows(layers[0])), width)
-    z, aux = method.between_all(joined.params, read, columns, token_mask)
-    z = z.astype(read.dtype)
-    y = read[..., :outs] + z @ joined.write
+    compute = _call_joined if isinstance(ready.get_value()[names], Joined) else _call_apart
+    ys, aux = compute(ready.get_value()[names], layers, layers[0].as_input(x), token_mask)
+    of_each = [jax.tree.map(lambda a, i=i: a[i], aux) for i in range(len(names))]
+    reports = [dataclasses.replace(one, token_mask=token_mask) for one in of_each]
+    return list(zip(ys, reports, strict=True))
+
+
+def _call_joined(
+    joined: Joined, layers: Sequence[Dense], x: jax.Array, token_mask: jax.Array | None
+) -> tuple[Sequence[jax.Array], Aux]:
+    """y of each layer, and aux [n, ...]."""
+    ends = list(itertools.accumulate(map(_outputs, layers)))
+    read = product(x, joined.read)
+    z, aux = _between(joined, layers, read, ends[-1], token_mask)
+    y = read[..., : ends[-1]] + z @ joined.write
     y = y if joined.bias is None else y + joined.bias
-    aux = [jax.tree.map(lambda a, i=i: a[i], aux) for i in range(n)]
-    reports = [dataclasses.replace(one, token_mask=token_mask) for one in aux]
-    return list(zip(jnp.split(y, ends[:-1], axis=-1), reports, strict=True))
+    return jnp.split(y, ends[:-1], axis=-1), aux
+
+
+def _call_apart(
+    apart: Apart, layers: Sequence[Dense], x: jax.Array, token_mask: jax.Array | None
+) -> tuple[Sequence[jax.Array], Aux]:
+    """What `_call_joined` returns."""
+    # XLA would make one product of x W and x P, for which it copies W.
+    read = product(jax.lax.optimization_barrier(x), apart.read)
+    z, aux = _between(apart, layers, read, 0, token_mask)
+    ys = []
+    for layer, own, up in zip(layers, jnp.split(z, len(layers), axis=-1), apart.write, strict=True):
+        y = two_products(x, own, layer.kernel_matrices().astype(x.dtype), up)
+        ys.append(y if layer.bias is None else y + layer.bias.get_value().astype(y.dtype))
+    return ys, aux
+
+
+def _between(
+    ready: Joined | Apart,
+    layers: Sequence[Dense],
+    read: jax.Array,
+    start: int,
+    token_mask: jax.Array | None,
+) -> tuple[jax.Array, Aux]:
+    """z of all layers side by side, in the type of `read`, whose rows begin at a column; aux."""
+    method, _ = layers[0].carried()
+    width = _rows(layers[0])
+    columns = range(start, start + len(layers) * width, width)
+    z, aux = method.between_all(ready.params, read, columns, token_mask)
+    return z.astype(read.dtype), aux
 
 
 def product(x: jax.Array, matrix: jax.Array) -> jax.Array:
@@ -143,13 +201,30 @@ def _outputs(layer: Dense) -> int:
     return layer.kernel_matrices().shape[1]
 
 
-def _join(layers: Sequence[Dense]) -> Joined:
+def _cast(layers: Sequence[Dense]) -> Apart:
     method, _ = layers[0].carried()
+    dtype = layers[0].dtype
     params = [layer.carried()[1] for layer in layers]
+    return Apart(
+        params=_params(layers),
+        read=aligned(jnp.concatenate([method.down(p).astype(dtype) for p in params], axis=1)),
+        write=[method.up(p).astype(dtype) for p in params],
+    )
+
+
+def _params(layers: Sequence[Dense]) -> Any:
+    """What f needs, [n, ...]; None where shapes differ."""
+    method, _ = layers[0].carried()
 
     def stacked(*leaves: jax.Array) -> jax.Array | None:
         return jnp.stack(leaves) if len({leaf.shape for leaf in leaves}) == 1 else None
 
+    return jax.tree.map(stacked, *(method.for_rows(layer.carried()[1]) for layer in layers))
+
+
+def _join(layers: Sequence[Dense]) -> Joined:
+    method, _ = layers[0].carried()
+    params = [layer.carried()[1] for layer in layers]
     dtype = layers[0].dtype
     kernels = [layer.kernel_matrices().astype(dtype) for layer in layers]
     downs = [method.down(p).astype(dtype) for p in params]
@@ -159,7 +234,7 @@ def _join(layers: Sequence[Dense]) -> Joined:
     ]
     has_bias = any(layer.bias is not None for layer in layers)
     return Joined(
-        params=jax.tree.map(stacked, *map(method.for_rows, params)),
+        params=_params(layers),
         read=aligned(jnp.concatenate(kernels + downs, axis=1)),
         write=jax.scipy.linalg.block_diag(*(method.up(p).astype(dtype) for p in params)),
         bias=jnp.concatenate(biases).astype(dtype) if has_bias else None,

@@ -65,6 +65,36 @@ def test_computes_the_same(name):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), other, aux)
 
 
+@pytest.mark.parametrize("name", mostly_slow(JOINED, ["lora_sp"]))
+def test_a_stack_computes_the_same(name):
+    """On rows fewer and more than inputs, for which W and U are joined."""
+    model = adapted(METHODS[name], "float32")
+    stack = jax.tree.map(lambda leaf: jnp.stack([leaf, 0.5 * leaf]), model)
+    run = quick.jit(jax.vmap(lambda model, x: model(x), in_axes=(0, None)))
+    prepared = inference.prepared_stack(stack)
+    for rows in (4, 12):
+        x = jnp.sin(jnp.arange(8.0 * rows)).reshape(1, rows, 8)
+        (expected, aux), (found, other) = run(stack, x), run(prepared, x)
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
+        assert jax.tree.structure(other) == jax.tree.structure(aux)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), other, aux)
+
+
+def test_a_stacks_adapters_are_cast_before_the_loop():
+    stack = jax.tree.map(lambda leaf: leaf[None], adapted(METHODS["lora"]))
+    x = jnp.ones((2, 8), jnp.bfloat16)
+
+    def in_loop(primitive, stack):
+        run = lambda x, stack: jax.lax.scan(lambda x, model: (model(x)[0], None), x, stack)  # noqa: E731
+        (loop,) = (e for e in jax.make_jaxpr(run)(x, stack).eqns if e.primitive.name == "scan")
+        return str(loop.params["jaxpr"]).count(primitive)
+
+    prepared = inference.prepared_stack(stack)
+    casts = [in_loop("convert_element_type", one) for one in (stack, prepared)]
+    assert casts[0] - casts[1] >= 6  # P and U of three layers
+    assert in_loop("optimization_barrier", prepared) == 2  # one for each input
+
+
 def test_a_kernel_gets_the_routers_numbers_joined_once(monkeypatch):
     kernel = functools.partial(lora_sp.fused_rows, interpret=True)
     monkeypatch.setattr(lora_sp, "fused_rows", kernel)

@@ -101,14 +101,17 @@ def _forward(
     written, pull_back = jax.vjp(inner, [layer.params for layer in layers], read)
     found = []
     for layer, (z, aux) in zip(layers, written, strict=True):
-        w, u = layer.kernel.astype(x.dtype), layer.up.astype(x.dtype)
-        d_in, d_out = layer.kernel.shape
-        if d_out >= d_in and _joins(layer, x):
-            y = jnp.concatenate([x, z], axis=-1) @ jnp.concatenate([w, u])
-        else:
-            y = x @ w + z @ u
+        y = two_products(x, z, layer.kernel.astype(x.dtype), layer.up.astype(x.dtype))
         found.append((y, aux))
     return found, (layers, x, pull_back, [z for z, _ in written])
+
+
+def two_products(x: jax.Array, z: jax.Array, w: jax.Array, u: jax.Array) -> jax.Array:
+    """x W + z U, [..., O], of x [..., I] and z [..., R]."""
+    d_in, d_out = w.shape
+    if d_out >= d_in and _joins(w, x):
+        return jnp.concatenate([x, z], axis=-1) @ jnp.concatenate([w, u])
+    return x @ w + z @ u
 
 
 def _backward(
@@ -122,7 +125,7 @@ def _backward(
         d_in, d_out = layer.kernel.shape
         w, u = layer.kernel.astype(x.dtype), layer.up.astype(x.dtype)
         through_base, dz = None, None
-        if d_out > 2 * d_in and _joins(layer, x):
+        if d_out > 2 * d_in and _joins(w, x):
             through_base, dz = jnp.split(g @ jnp.concatenate([w, u]).T, [d_in], axis=-1)
         through_bases.append(through_base)
         d_written.append((g @ u.T if dz is None else dz, d_aux))
@@ -149,7 +152,7 @@ def _gradient_of_input(
     """Σ g Wᵀ + q Pᵀ, [..., I]; `through_bases` holds those g Wᵀ that are there already."""
     p = _side_by_side(layers, x)
     w = [layer.kernel.astype(x.dtype) for layer in layers]
-    if sum(g.shape[-1] for g in gradients) <= x.shape[-1] and _joins(layers[0], x):
+    if sum(g.shape[-1] for g in gradients) <= x.shape[-1] and _joins(w[0], x):
         return jnp.concatenate([*gradients, q], axis=-1) @ jnp.concatenate([*w, p], axis=1).T
     dx = q @ p.T
     for g, kernel, through_base in zip(gradients, w, through_bases, strict=True):
@@ -157,9 +160,9 @@ def _gradient_of_input(
     return dx
 
 
-def _joins(layer: LowRankLayer, x: jax.Array) -> bool:
+def _joins(w: jax.Array, x: jax.Array) -> bool:
     """Whether there are so many tokens that copying W next to U costs less than it saves."""
-    return math.prod(x.shape[:-1]) >= layer.kernel.shape[0]
+    return math.prod(x.shape[:-1]) >= w.shape[0]
 
 
 def _side_by_side(layers: Sequence[LowRankLayer], x: jax.Array) -> jax.Array:

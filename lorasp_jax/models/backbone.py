@@ -56,6 +56,8 @@ class Backbone(nnx.Module):
 
     config: BackboneConfig
     vision: SigLIP
+    language: Any
+    """The language model, with stacked `blocks`."""
     action: Any
     """The action expert, with stacked `blocks`."""
 
@@ -190,7 +192,7 @@ class Backbone(nnx.Module):
         if noise is None:
             shape = (obs.state.shape[0], self.config.chunk, self.config.action_dim)
             noise = jax.random.normal(key, shape)
-        prefix, aux = self.run_prefix(obs)
+        prefix, aux = self._reading().run_prefix(obs)
         acting = self._acting()
         actions, action_aux = flow_matching.sample(
             lambda x_t, t: acting.run_suffix(prefix, obs, x_t, t),
@@ -204,6 +206,13 @@ class Backbone(nnx.Module):
             lambda a: jnp.broadcast_to(a, (num_steps, *a.shape)), aux.get("action", {})
         )
         return actions, _with_action({**aux, "action": once}, action_aux)
+
+    def _reading(self) -> Self:
+        """A copy for a prefix without gradient, in which no loop copies each layer's weights."""
+        model = nnx.merge(*nnx.split(self))
+        for tower in (model.vision, model.language):
+            tower.blocks = unstacked(inference.prepared_stack(tower.blocks))
+        return model
 
     def _acting(self) -> Self:
         """A copy for the steps of a flow, in which nothing depends on weights alone any more."""

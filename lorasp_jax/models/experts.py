@@ -18,6 +18,7 @@ from lorasp_jax.models.attention import attention
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig
 from lorasp_jax.models.depth import scan_depth, stack, stored
 from lorasp_jax.models.layers import (
+    QKV,
     AdaptiveRMSNorm,
     LayerAux,
     Linears,
@@ -30,7 +31,6 @@ KeysValues = tuple[jax.Array, jax.Array]
 """Keys after the rotation and values, each `[B, S, K, H]`, or `[L, B, S, K, H]` for all layers."""
 
 
-QKV = ("q_proj", "k_proj", "v_proj")
 GATED = ("gate_proj", "up_proj")
 
 

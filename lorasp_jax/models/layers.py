@@ -14,6 +14,9 @@ from lorasp_jax.peft import Aux
 
 LayerAux = dict[str, Aux]
 
+QKV = ("q_proj", "k_proj", "v_proj")
+"""Layers of an attention that read one input."""
+
 
 def normalized(x: jax.Array, eps: float) -> jax.Array:
     """x / sqrt(mean(x^2) + eps) over the last axis, in fp32."""

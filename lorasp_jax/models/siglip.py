@@ -8,11 +8,13 @@ from lorasp_jax.dense import Dense
 from lorasp_jax.models.attention import attention
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.depth import scan_depth, stack
-from lorasp_jax.models.layers import LayerAux, LayerNorm, Linears
+from lorasp_jax.models.layers import QKV, LayerAux, LayerNorm, Linears
 
 
 class VisionBlock(nnx.Module):
     """Pre-norm transformer layer: x + attention(norm(x)), x + mlp(norm(x)), tanh-GELU, biases."""
+
+    together = (QKV,)
 
     def __init__(self, config: BackboneConfig, *, rngs: nnx.Rngs) -> None:
         width, mlp = config.vision.width, config.vision.mlp
@@ -32,7 +34,7 @@ class VisionBlock(nnx.Module):
         linear = Linears(self, token_mask)
         heads = (*x.shape[:2], self.heads, -1)
         h = self.layer_norm1(x)
-        read = linear.together(("q_proj", "k_proj", "v_proj"), h)
+        read = linear.together(QKV, h)
         q, k, v = (y.reshape(heads) for y in read)
         x = x + linear("out_proj", attention(q * q.shape[-1] ** -0.5, k, v, None))
         h = jax.nn.gelu(linear("fc1", self.layer_norm2(x)), approximate=True)
