@@ -12,6 +12,9 @@ CUDNN_TOKENS, CUDNN_WIDTH = 256, 64
 """Fewest queries and narrowest heads for which attention goes through cuDNN: those of published
 sizes, while the miniatures repeat themselves bit for bit."""
 
+ALIGNED, LONG = 128, 512
+"""What the number of keys is made a multiple of, and from how many on."""
+
 
 def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) -> jax.Array:
     """Grouped-query attention, softmax in fp32; long bf16 sequences through cuDNN on NVIDIA GPUs.
@@ -32,6 +35,7 @@ def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) 
         allowed = None if mask is None else mask[:, None]
         attend = functools.partial(jax.nn.dot_product_attention, implementation="cudnn")
         return attend(q, k, v, mask=allowed, scale=1.0).reshape(batch, tokens, heads * size)
+    k, v, mask = _aligned(k, v, mask)
     # With K = 1 no axis of q, weights or result moves in memory.
     q = q.reshape(batch, tokens, k.shape[2], -1, size)
     logits = jnp.einsum("BTKGH,BSKH->BKTGS", q, k, preferred_element_type=jnp.float32)
@@ -39,6 +43,17 @@ def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) 
         logits = jnp.where(mask[:, None, :, None, :], logits, MASKED)
     weights = jax.nn.softmax(logits, axis=-1).astype(v.dtype)
     return jnp.einsum("BKTGS,BSKH->BTKGH", weights, v).reshape(batch, tokens, heads * size)
+
+
+def _aligned(
+    k: jax.Array, v: jax.Array, mask: jax.Array | None
+) -> tuple[jax.Array, jax.Array, jax.Array | None]:
+    """Forbidden keys behind the others: XLA would write the weights once more to pad them."""
+    more = -k.shape[1] % ALIGNED
+    if mask is None or more == 0 or k.shape[1] < LONG:
+        return k, v, mask
+    k, v = (jnp.pad(a, ((0, 0), (0, more), (0, 0), (0, 0))) for a in (k, v))
+    return k, v, jnp.pad(mask, ((0, 0), (0, 0), (0, more)))
 
 
 def _suits_cudnn(q: jax.Array, k: jax.Array) -> bool:
