@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,6 +17,8 @@ from lorasp_jax.training import processes
 
 RECORD, CLOCK = "config.json", "seconds.json"
 """All that a run leaves which failed before it had anything."""
+STOPPED = "stopped.json"
+"""Why training could not go on, until it does."""
 
 
 def to_json(config: Config) -> dict[str, Any]:
@@ -110,9 +113,13 @@ class MetricsLog:
         values: Mapping[str, float],
         histograms: Mapping[str, np.ndarray] = MappingProxyType({}),
     ) -> None:
-        """Record scalars at `step`, and for TensorBoard alone histograms of arrays."""
+        """Record scalars at `step`, and for TensorBoard alone histograms of arrays.
+
+        JSON has no numbers that are not finite: they are left out.
+        """
         if not self._writes:
             return
+        values = {name: value for name, value in values.items() if math.isfinite(value)}
         with self.path.open("a") as file:
             file.write(json.dumps({"step": step, **values}) + "\n")
         for name, value in values.items():

@@ -52,6 +52,13 @@ def test_log_continues_like_an_uninterrupted_one(tmp_path):
     assert list((tmp_path / "tensorboard").iterdir())
 
 
+def test_json_has_no_numbers_that_are_not_finite(tmp_path):
+    log = MetricsLog(tmp_path)
+    log.write(2, {"loss": float("nan"), "grad_norm": float("inf"), "skipped": 2.0})
+    log.close()
+    assert read_metrics(tmp_path) == [{"step": 2, "skipped": 2.0}]
+
+
 def test_name_is_free_after_a_run_that_failed_before_it_had_anything(tmp_path):
     """As with an expert that fails under too much noise."""
     noisy = dataclasses.replace(CONFIG, data=DataConfig(action_noise=0.1))
