@@ -51,7 +51,7 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
     processor = run.policy.processor
     policy = lambda state: Policy(nnx.merge(graphdef, state.best, frozen), processor)  # noqa: E731
     run.policy = policy(state)
-    checkpoints = Checkpoints(run.folder, run.base_hash)
+    checkpoints = Checkpoints(run.folder, run.base_hash, run.console)
     restored = checkpoints.restore(state) if resume else None
     state = restored or state
     jitted, speed = jit_stretch(run, graphdef, optimizer, placed), _speed(run)
