@@ -17,7 +17,10 @@ STOPPED = 130
 
 
 def main(arguments: list[str]) -> int:
-    """Run one experiment; returns the exit code: 0 done, 2 bad input, 130 stopped by a signal."""
+    """Run one experiment; returns the exit code.
+
+    0: done, 2: bad input or a run that cannot go on, 130: stopped by a signal.
+    """
     started = time.perf_counter()
     console, errors = Console(), Console(stderr=True)
     physics.enable_fast_cpu()  # before anything starts a JAX backend
@@ -25,7 +28,7 @@ def main(arguments: list[str]) -> int:
     from lorasp_jax.training import processes
     from lorasp_jax.training.interrupt import sigterm_as_interrupt
     from lorasp_jax.training.overrides import parse
-    from lorasp_jax.training.run_folder import open_run
+    from lorasp_jax.training.run_folder import DISK_FULL, open_run
 
     try:
         if "--distributed" in arguments:
@@ -38,25 +41,35 @@ def main(arguments: list[str]) -> int:
             dry_run(command.config, RUNS / command.config.name, console)
             return 0
         folder = RUNS / command.config.name
-        with processes.first_goes_ahead("opened"):
-            if processes.is_first():
-                open_run(command.config, RUNS, resume=command.resume)
-        if command.resume and (folder / "results.json").exists():
-            from lorasp_jax.report.html import write_report
+        with contextlib.ExitStack() as stack:
+            with processes.first_goes_ahead("opened"):
+                if processes.is_first():
+                    stack.enter_context(open_run(command.config, RUNS, resume=command.resume))
+            if command.resume and (folder / "results.json").exists():
+                from lorasp_jax.report.html import write_report
 
-            console.print(f"this run is finished: {write_report(folder)}", markup=False)
-            return 0
-        with sigterm_as_interrupt():
+                console.print(f"this run is finished: {write_report(folder)}", markup=False)
+                return 0
+            stack.enter_context(sigterm_as_interrupt())
             run(command, folder, console, started)
     except ValueError as error:
-        errors.print(f"error: {error}", style="red", soft_wrap=True, highlight=False, markup=False)
-        return 2
+        return failed(error, errors)
+    except OSError as error:
+        if error.errno not in DISK_FULL:
+            raise
+        return failed(f"{error.strerror}: make room and add --resume", errors)
     except KeyboardInterrupt:
         again = shlex.join(argument for argument in arguments if argument != "--resume")
         message = f"stopped; to go on: python train.py {again} --resume"
         errors.print(message, soft_wrap=True, highlight=False, markup=False)
         return STOPPED
     return 0
+
+
+def failed(reason: object, errors: Console) -> int:
+    """Say why in one sentence; returns the exit code."""
+    errors.print(f"error: {reason}", style="red", soft_wrap=True, highlight=False, markup=False)
+    return 2
 
 
 def run(command, folder: Path, console: Console, started: float) -> None:

@@ -1,5 +1,6 @@
 """What a run is: frozen dataclasses, one instance per experiment file in `configs/`."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -98,10 +99,17 @@ class OptimConfig:
     exported, such as 0.999; 0: no average."""
     state_noise: float = 0.02
     """Standard deviation of the noise on normalised robot states while training."""
+    max_skipped: int = 10
+    """Steps in a row whose loss or gradient is not finite, or a spike, before the run stops."""
+    spike: float = 0.0
+    """Skip a step whose loss or gradient norm is beyond this factor times its running mean; 0: only
+    one that is not finite."""
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
-        _at_least_one(self, "steps", "batch_size", "accumulate")
+        _at_least_one(self, "steps", "batch_size", "accumulate", "max_skipped")
+        if self.spike and not 1 < self.spike < math.inf:
+            raise ValueError(f"spike must be 0 or more than 1, got {self.spike}")
         if not 0 <= self.ema < 1:
             raise ValueError(f"ema must lie in [0, 1), got {self.ema}")
 

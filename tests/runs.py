@@ -1,11 +1,13 @@
-"""A run that needs no simulation: random episodes and the dummy backbone."""
+"""A run that needs no simulation: random episodes and a backbone of no size."""
 
 import io
 import os
 import signal
 from pathlib import Path
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from rich.console import Console
@@ -13,6 +15,7 @@ from rich.console import Console
 from envs.episodes import Episodes
 from lorasp_jax import adaptation
 from lorasp_jax.config import Config, ModelConfig, OptimConfig
+from lorasp_jax.dense import Dense
 from lorasp_jax.models import tokenizer
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.policy import Policy
@@ -36,6 +39,21 @@ CONFIG = Config(
     log_every=2,
     checkpoint_every=2,
 )
+
+
+class Miniature(nnx.Module):
+    """What a run needs of a backbone, in two layers: a process that trains it starts at once."""
+
+    def __init__(self):
+        self.config = Pi0Config.dummy()
+        rngs, size = nnx.Rngs(0), self.config.action_dim
+        self.inp, self.out = Dense(size, 64, rngs=rngs), Dense(64, size, rngs=rngs)
+
+    def loss(self, key, observation, actions, **_):
+        noise = jax.random.normal(key, actions.shape)
+        hidden, first = self.inp(noise + observation.state[:, None], return_aux=True)
+        found, second = self.out(jnp.tanh(hidden), return_aux=True)
+        return (found - actions) ** 2, {"action": {"inp": first, "out": second}}
 
 
 class Terminate(Callback):
@@ -72,9 +90,10 @@ def random_episodes(task: str, seed: int) -> Episodes:
     )
 
 
-def make_run(folder: Path, config: Config = CONFIG) -> Run:
+def make_run(folder: Path, config: Config = CONFIG, model: Any = None) -> Run:
+    """By default on the dummy backbone."""
     folder.mkdir(exist_ok=True)
-    model = Pi0Config.dummy().create(nnx.Rngs(0))
+    model = model or Pi0Config.dummy().create(nnx.Rngs(0))
     model = adaptation.adapt(
         model, [(path, config.peft) for path in config.targets], rngs=nnx.Rngs(1)
     )

@@ -99,7 +99,11 @@ def test_scaling(monkeypatch):
     )
     options.threads = 1
     rows = list(scaling.rows(options))
-    assert [(row["layout"], row["devices"]) for row in rows] == [("data", 1), ("data", 2), ("fsdp", 2)]
+    assert [(row["layout"], row["devices"]) for row in rows] == [
+        ("data", 1),
+        ("data", 2),
+        ("fsdp", 2),
+    ]
     assert rows[0]["of linear"] == 1
     assert all(row["samples/s"] > 0 for row in rows)
     assert rows[2]["GiB"] < rows[1]["GiB"]

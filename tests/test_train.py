@@ -1,5 +1,6 @@
 """The command: every kind of bad input is one sentence and exit code 2, and changes nothing."""
 
+import errno
 import json
 import os
 import shutil
@@ -20,7 +21,9 @@ def elsewhere(tmp_path, monkeypatch):
 
 
 def files():
-    return {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()}
+    """What there is, but for locks, which lie beside the folders of runs."""
+    found = {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()}
+    return {path: content for path, content in found.items() if path.suffix != ".lock"}
 
 
 @pytest.mark.parametrize(
@@ -78,6 +81,15 @@ def test_folder_of_another_run_is_left_alone(capsys):
     assert train.main([*MULTITASK, *NANO, "--resume"]) == 2
     assert "holds no run to resume" in capsys.readouterr().err
     assert files() == before
+
+
+def test_full_disk(capsys, monkeypatch):
+    def write(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(train, "run", write)
+    assert train.main([*MULTITASK, *NANO]) == 2
+    assert capsys.readouterr().err == "error: No space left on device: make room and add --resume\n"
 
 
 def test_base_without_its_control_period(capsys):

@@ -9,7 +9,7 @@ from rich.table import Table
 
 from lorasp_jax.report.html import speed, success_cell, write_report
 from lorasp_jax.training.run import Callback, Run
-from lorasp_jax.training.run_folder import read_metrics
+from lorasp_jax.training.run_folder import STOPPED, read_metrics, write_json
 
 EVERY = 20.0
 """Seconds from one report to the next; one takes about half a second of a core."""
@@ -33,6 +33,7 @@ class Report(Callback):
 
     def on_log(self, run: Run, step: int, metrics: dict[str, float]) -> None:  # noqa: ARG002
         """What is new, if the last report is some time ago."""
+        (run.folder / STOPPED).unlink(missing_ok=True)
         if time.perf_counter() - self._written > EVERY and (not self._last or self._last.done()):
             self._begin(run.folder)
 
@@ -41,6 +42,12 @@ class Report(Callback):
         self._begin(run.folder).result()
         self._pool.shutdown()
         run.console.print(final_table(run.folder))
+
+    def on_stop(self, run: Run, reason: str) -> None:
+        """The last report, which says why there is no more."""
+        write_json(run.folder / STOPPED, {"reason": reason})
+        run.console.print(f"what led to it: {self._begin(run.folder).result()}", markup=False)
+        self._pool.shutdown()
 
     def _begin(self, folder: Path) -> Future:
         """Begin a report once the one before is written; raises what went wrong with that."""
@@ -53,7 +60,7 @@ class Report(Callback):
 def final_table(folder: Path) -> Table:
     """Success, loss, speed, active rank and time of the finished run in a folder."""
     results = json.loads((folder / "results.json").read_text())
-    rows = read_metrics(folder)
+    rows = [row for row in read_metrics(folder) if "task" in row]  # not all steps were skipped
     table = Table("", "before", "after", title=folder.name)
     for task, value in results["tasks"].items():
         table.add_row(task, success_cell(value["before"]), success_cell(value["after"]))

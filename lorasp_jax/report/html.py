@@ -9,7 +9,7 @@ from statistics import median
 from typing import Any
 
 from lorasp_jax.report import figures
-from lorasp_jax.training.run_folder import read_metrics, write_text
+from lorasp_jax.training.run_folder import STOPPED, read_metrics, write_text
 
 _REFRESH = "<meta http-equiv=refresh content=30>"
 
@@ -41,10 +41,11 @@ def write_report(folder: Path) -> Path:
     parts = [
         f"<h1>{html.escape(config['name'])}</h1>",
         f"<p class=muted>{_subtitle(config, results)}</p>",
-        *(() if finished else (_progress(config, rows), _REFRESH)),
+        *(() if finished else _progress(folder, config, rows)),
         *_success(results),
         "<h2>Training</h2>",
         _image(figures.losses(rows)) if rows else "<p>Nothing is logged yet.</p>",
+        *_skipped(rows),
         *_while_training(rows),
         *_speed(rows),
         *_active_rank(results, rows, config["peft"].get("rank")),
@@ -80,9 +81,26 @@ def _unfinished(folder: Path) -> dict[str, Any]:
     }
 
 
-def _progress(config: dict[str, Any], rows: figures.Rows) -> str:
+def _progress(folder: Path, config: dict[str, Any], rows: figures.Rows) -> Iterable[str]:
+    """How far a run is that is not finished; or why it stopped."""
+    stopped = _read(folder / STOPPED)
+    if stopped:
+        yield f"<p><b>The run stopped:</b> {html.escape(stopped['reason'])}.</p>"
+        return
     done, steps = rows[-1]["step"] if rows else 0, config["optim"]["steps"]
-    return f"<p>The run goes on: step {done:.0f} of {steps}.</p>"
+    yield f"<p>The run goes on: step {done:.0f} of {steps}.</p>"
+    yield _REFRESH
+
+
+def _skipped(rows: figures.Rows) -> Iterable[str]:
+    """How many steps were skipped, if any were."""
+    found = [(row["step"], row["skipped"]) for row in rows if row.get("skipped")]
+    if found:
+        yield (
+            f"<p>{sum(count for _, count in found):.0f} steps were skipped, as loss or gradient "
+            f"was not finite or a spike: the first up to step {found[0][0]:.0f}, the last up to "
+            f"{found[-1][0]:.0f}.</p>"
+        )
 
 
 def _subtitle(config: dict[str, Any], results: dict[str, Any]) -> str:
@@ -151,7 +169,7 @@ def speed(rows: figures.Rows) -> dict[str, str]:
 
 def _active_rank(results: dict[str, Any], rows: figures.Rows, rank: Any) -> Iterable[str]:
     """Active rank in training and in closed loop; nothing for a method without one."""
-    if not any(name.startswith("active_rank/") for name in (rows[-1] if rows else ())):
+    if not any(name.startswith("active_rank/") for row in rows for name in row):
         return
     yield "<h2>Active rank</h2>"
     yield _image(figures.active_rank(rows, rank))

@@ -12,13 +12,14 @@ import jax.numpy as jnp
 from flax import nnx
 
 from lorasp_jax import adaptation, flops
-from lorasp_jax.config import Config
+from lorasp_jax.config import Config, OptimConfig
 from lorasp_jax.data.batches import Raw, Steps, encode, sample_batch
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training import preflight, processes
 from lorasp_jax.training.checkpoint import Checkpoints
+from lorasp_jax.training.guard import summarise
 from lorasp_jax.training.interrupt import deferred
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
 from lorasp_jax.training.progress import bars
@@ -36,7 +37,7 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
     """Train the adapters of `run.policy` and leave the trained policy there.
 
     Raises:
-        RunError: the loss is not finite; the last checkpoint before stays.
+        RunError: too many steps in a row were skipped; the last checkpoint before stays.
         KeyboardInterrupt: a signal asked to stop; the state is saved.
     """
     methods = adaptation.methods(run.policy.model).values()
@@ -50,7 +51,7 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
     processor = run.policy.processor
     policy = lambda state: Policy(nnx.merge(graphdef, state.best, frozen), processor)  # noqa: E731
     run.policy = policy(state)
-    checkpoints = Checkpoints(run.folder, run.base_hash)
+    checkpoints = Checkpoints(run.folder, run.base_hash, run.console)
     restored = checkpoints.restore(state) if resume else None
     state = restored or state
     jitted, speed = jit_stretch(run, graphdef, optimizer, placed), _speed(run)
@@ -65,6 +66,10 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
     try:
         with run.timed("train"):
             state = _loop(run, state, many, checkpoints, callbacks, policy)
+    except RunError as error:
+        for callback in callbacks:
+            callback.on_stop(run, str(error))
+        raise
     finally:
         checkpoints.close()
     run.policy = policy(state)
@@ -81,7 +86,7 @@ def _tell(callbacks: Sequence[Callback], run: Run, hook: str) -> None:
 
 
 def jit_stretch(run: Run, graphdef: Any, optimizer: Any, placed: TrainState) -> Callable:
-    """The jitted stretch of steps: (frozen, data, state, key, count) -> state, metrics.
+    """The jitted stretch of steps: (frozen, data, state, key, count) -> state, metrics of each.
 
     Data are all steps, or one raw batch. The state lies as `placed` says, its `meshes.shardings`.
     """
@@ -98,6 +103,7 @@ def jit_stretch(run: Run, graphdef: Any, optimizer: Any, placed: TrainState) -> 
         weights=weights,
         parts=optim.accumulate,
         ema=optim.ema,
+        spike=optim.spike,
     )
     draw = functools.partial(sample_batch, batch_size=optim.batch_size, chunk=chunk)
 
@@ -116,16 +122,13 @@ def jit_stretch(run: Run, graphdef: Any, optimizer: Any, placed: TrainState) -> 
         out_shardings=(placed, meshes.replicated(mesh)),
     )
     def many(frozen: Any, data: Steps | Raw, state: TrainState, key: jax.Array, count: int) -> Any:
-        state, metrics = jax.lax.scan(
-            lambda state, _: one(state, frozen, data, key), state, length=count
-        )
-        return state, jax.tree.map(lambda values: values.mean(0), metrics)
+        return jax.lax.scan(lambda state, _: one(state, frozen, data, key), state, length=count)
 
     return many
 
 
 class _Stretches:
-    """Stretches of steps, (state, key, count) -> state, metrics, each length compiled once."""
+    """Stretches of steps, (state, key, count) -> state, metrics; each length is compiled once."""
 
     def __init__(self, jitted: Callable, frozen: Any, data: Steps | Raw, speed: Speed) -> None:
         self._jitted, self._frozen, self._data, self.speed = jitted, frozen, data, speed
@@ -164,7 +167,7 @@ class _Streamed(_Stretches):
             with self.speed.waiting(metrics):
                 self._data = next(self._batches)
             found.append(metrics)
-        return state, jax.tree.map(lambda *values: jnp.stack(values).mean(0), *found)
+        return state, jax.tree.map(lambda *values: jnp.concatenate(values), *found)
 
 
 def _batches(run: Run, mesh: jax.sharding.Mesh, start: int) -> Iterator[Raw]:
@@ -202,7 +205,7 @@ def _loop(
     callbacks: Sequence[Callback],
     policy: Callable[[TrainState], Policy],
 ) -> TrainState:
-    """Stretch after stretch until the last step, a signal or a loss that is not finite."""
+    """Stretch after stretch until the last step or a signal."""
     config = run.config
     key = jax.random.fold_in(jax.random.key(config.seed), 2)
     total, saved = config.optim.steps, int(state.step)
@@ -216,12 +219,18 @@ def _loop(
         while (done := int(state.step)) < total and not stopped:
             count = _stretch(config, done)
             state, metrics = many(state, key, count)
-            found = jax.device_get(metrics)
+            rows = jax.device_get(metrics)
+            found, done = summarise(rows), done + count
             values = {name: float(value.mean()) for name, value in found.items()}
-            _check_finite(values, done, done + count, saved)
-            done += count
             values |= many.speed.end(count)
-            progress.update(bar, completed=done, description=f"training, loss {values['task']:.4f}")
+            if reason := _stopping(config.optim, rows, values, done):
+                log.write(done, values)
+                raise RunError(
+                    f"{reason}: nothing after step {saved} was saved; try a lower "
+                    "--optim.learning-rate"
+                )
+            loss = values.get("task", math.nan)
+            progress.update(bar, completed=done, description=f"training, loss {loss:.4f}")
             run.policy = policy(state)
             for callback in callbacks:
                 values |= callback.on_log(run, done, values) or {}
@@ -236,11 +245,25 @@ def _loop(
     return state
 
 
-def _check_finite(values: dict[str, float], start: int, end: int, saved: int) -> None:
-    """Stop before a state that is not finite is saved."""
-    for name in ("loss", "grad_norm", "update_norm"):
-        if not math.isfinite(values[name]):
-            raise RunError(
-                f"the {name} became {values[name]} between steps {start} and {end}: nothing after "
-                f"step {saved} was saved; try a lower --optim.learning-rate"
-            )
+def _stopping(
+    optim: OptimConfig, rows: dict[str, Any], values: dict[str, float], done: int
+) -> str | None:
+    """Why a run stops after a stretch, if it has to: only steps to skip, or a state to throw away.
+
+    Args:
+        optim: what is allowed.
+        rows: metrics of each step, `[count, ...]`.
+        values: what is logged of them.
+        done: steps up to the end of the stretch.
+    """
+    if (skipped := rows["in_a_row"].max()) >= optim.max_skipped:
+        last = int(rows["in_a_row"].argmax())
+        usual = f", or beyond {optim.spike:g} times its mean," if optim.spike else ""
+        return (
+            f"loss or gradient was not finite{usual} in {skipped} steps in a row (at step "
+            f"{done - len(rows['loss']) + last + 1} the loss was {rows['loss'][last]:.3g}, the "
+            f"gradient's norm {rows['grad_norm'][last]:.3g})"
+        )
+    if not math.isfinite(values.get("update_norm", 0.0)):
+        return f"an update was not finite up to step {done} though its gradient was"
+    return None

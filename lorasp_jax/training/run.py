@@ -93,3 +93,6 @@ class Callback:
 
     def on_end(self, run: Run) -> None:
         """After the last step, with the trained policy."""
+
+    def on_stop(self, run: Run, reason: str) -> None:
+        """When training cannot go on, in place of `on_end`; there is no policy then."""

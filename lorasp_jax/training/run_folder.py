@@ -1,21 +1,34 @@
 """The folder of one run: its config, its logs, and the rule that nothing is overwritten."""
 
+import contextlib
 import dataclasses
+import errno
+import fcntl
 import json
+import math
 import os
-from collections.abc import Mapping
+import platform
+import time
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from tensorboardX import SummaryWriter
+from tensorboardX import summary
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto.event_pb2 import Event, SessionLog
+from tensorboardX.proto.summary_pb2 import Summary
 
 from lorasp_jax.config import Config
 from lorasp_jax.training import processes
 
 RECORD, CLOCK = "config.json", "seconds.json"
 """All that a run leaves which failed before it had anything."""
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Numbers of the errors of a write for which there is no room."""
+STOPPED = "stopped.json"
+"""Why training could not go on, until it does."""
 
 
 def to_json(config: Config) -> dict[str, Any]:
@@ -36,33 +49,66 @@ def write_text(path: Path, text: str) -> None:
     os.replace(temporary, path)
 
 
-def open_run(config: Config, root: Path, *, resume: bool) -> Path:
-    """Create the run's folder, or with `resume` check that it holds this very run.
+@contextlib.contextmanager
+def open_run(config: Config, root: Path, *, resume: bool) -> Iterator[Path]:
+    """The run's folder, for this process alone as long as it is open.
+
+    It is created, or with `resume` checked to hold this very run.
 
     Raises:
-        ValueError: the name is not one folder's, the folder holds a run and `resume` is off, holds
-            none and `resume` is on, or holds a run with another config.
+        ValueError: the name is not one folder's; another process works on the folder; it holds a
+            run and `resume` is off, holds none and `resume` is on, or holds a run with another
+            config.
     """
     if config.name in ("", ".", "..") or Path(config.name).name != config.name:
         raise ValueError(f"--name must be a plain folder name, got {config.name!r}")
     folder = root / config.name
-    if resume:
-        changed = _differences(_recorded(folder), to_json(config))
-        if changed:
-            raise ValueError(
-                f"{folder} holds a run with other settings ({', '.join(changed)}): resume with the "
-                "settings it was started with, or give this run another --name"
-            )
-        return folder
+    with _locked(folder):
+        if resume:
+            changed = _differences(_recorded(folder), to_json(config))
+            if changed:
+                raise ValueError(
+                    f"{folder} holds a run with other settings ({', '.join(changed)}): resume with "
+                    "the settings it was started with, or give this run another --name"
+                )
+        else:
+            _begin(config, folder)
+        yield folder
+
+
+def _begin(config: Config, folder: Path) -> None:
+    """Record a new run in a folder that holds none."""
     if folder.exists() and any(path.name not in (RECORD, CLOCK) for path in folder.iterdir()):
         raise ValueError(
             f"{folder} already holds a run: add --resume to continue it, "
             "or give this one another --name"
         )
-    folder.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(exist_ok=True)
     (folder / CLOCK).unlink(missing_ok=True)
     write_json(folder / RECORD, to_json(config))
-    return folder
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Keep other processes out of a folder, by a file beside it.
+
+    The operating system lets go of the lock when the process ends, in whatever way: the file that a
+    killed run leaves stops nobody.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with (folder.parent / f".{folder.name}.lock").open("a+") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            file.seek(0)
+            raise ValueError(
+                f"{folder} is in use by {file.read().strip() or 'another process'}: wait for that "
+                "run or stop it, or give this one another --name"
+            ) from error
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {platform.node()}\n")
+        file.flush()
+        yield
 
 
 def _recorded(folder: Path) -> dict[str, Any]:
@@ -102,7 +148,12 @@ class MetricsLog:
             return
         kept = [row for row in read_metrics(folder) if row["step"] <= start_step]
         write_text(self.path, "".join(json.dumps(row) + "\n" for row in kept))
-        self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=start_step + 1)
+        board = folder / "tensorboard"
+        board.mkdir(exist_ok=True)
+        # Not SummaryWriter: when its thread cannot write, whoever adds to its queue waits for ever.
+        self._board = EventsWriter(str(board / "events"))
+        start = SessionLog(status=SessionLog.START)  # drop what was drawn from this step on
+        self._add(start_step + 1, session_log=start)
 
     def write(
         self,
@@ -110,18 +161,26 @@ class MetricsLog:
         values: Mapping[str, float],
         histograms: Mapping[str, np.ndarray] = MappingProxyType({}),
     ) -> None:
-        """Record scalars at `step`, and for TensorBoard alone histograms of arrays."""
+        """Record scalars at `step`, and for TensorBoard alone histograms of arrays.
+
+        JSON has no numbers that are not finite: they are left out.
+        """
         if not self._writes:
             return
+        values = {name: value for name, value in values.items() if math.isfinite(value)}
         with self.path.open("a") as file:
             file.write(json.dumps({"step": step, **values}) + "\n")
-        for name, value in values.items():
-            self._board.add_scalar(name, value, step)
-        for name, array in histograms.items():
-            self._board.add_histogram(name, array, step)
+        drawn = [summary.scalar(name, value) for name, value in values.items()]
+        drawn += [summary.histogram(name, a, "auto") for name, a in histograms.items()]
+        self._add(step, summary=Summary(value=[value for one in drawn for value in one.value]))
+
+    def _add(self, step: int, **content: Any) -> None:
+        """Put an event where TensorBoard finds it."""
+        self._board.write_event(Event(wall_time=time.time(), step=step, **content))
+        self._board.flush()
 
     def close(self) -> None:
-        """Flush the event file."""
+        """Close the event file."""
         if self._writes:
             self._board.close()
 

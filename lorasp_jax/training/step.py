@@ -1,5 +1,6 @@
 """The training step: pure functions from state and batch to state and metrics."""
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +14,8 @@ from lorasp_jax.data.batches import Batch
 from lorasp_jax.models import flow_matching
 from lorasp_jax.peft import Aux
 from lorasp_jax.peft.method import masked_mean
+from lorasp_jax.training import guard as guards
+from lorasp_jax.training.guard import Guard
 
 Metrics = dict[str, jax.Array]
 
@@ -23,15 +26,17 @@ class TrainState:
     """What changes from step to step; the frozen base is not part of it.
 
     Attributes:
-        step: `[]` int32, optimizer steps taken.
+        step: `[]` int32, steps taken, skipped ones included.
         adapters: trainable part of the model, an `nnx.State` of `AdapterParam`.
         opt_state: state of the optimizer.
+        guard: what decides whether a step is skipped.
         average: moving average of the adapters, or None.
     """
 
     step: jax.Array
     adapters: Any
     opt_state: Any
+    guard: Guard
     average: Any = None
 
     @property
@@ -46,7 +51,8 @@ def init_state(
     """The state before the first step, of copies: a step takes its state's memory over."""
     adapters = jax.tree.map(jnp.copy, adapters)
     average = jax.tree.map(jnp.copy, adapters) if ema else None
-    return TrainState(jnp.zeros((), jnp.int32), adapters, optimizer.init(adapters), average)
+    step = jnp.zeros((), jnp.int32)
+    return TrainState(step, adapters, optimizer.init(adapters), Guard.initial(), average)
 
 
 def auxiliary_losses(aux: Any) -> Metrics:
@@ -164,17 +170,27 @@ def train_step(
     weights: dict[str, optax.Schedule],
     parts: int = 1,
     ema: float = 0.0,
+    spike: float = 0.0,
 ) -> tuple[TrainState, Metrics]:
-    """One optimizer step on the global batch, taken in `parts`; `key` is consumed.
+    """One step on the global batch, taken in `parts`; `key` is consumed.
 
-    Where the state has an average, it decays by `ema`.
+    Where the state has an average, it decays by `ema`. A step that `guard.judge` does not let count
+    changes only the step number and the guard.
     """
     now = {name: jnp.asarray(schedule(state.step)) for name, schedule in weights.items()}
     grads, metrics = gradients(state.adapters, frozen, graphdef, batch, key, now, parts)
+    grad_norm = optax.tree.norm(grads)
+    counts, guard = guards.judge(state.guard, metrics["loss"], grad_norm, spike)
     updates, opt_state = optimizer.update(grads, state.opt_state, state.adapters)
     adapters = optax.apply_updates(state.adapters, updates)
-    metrics |= {"grad_norm": optax.tree.norm(grads), "update_norm": optax.tree.norm(updates)}
     average = state.average
     if average is not None:
         average = optax.incremental_update(adapters, average, 1 - ema)
-    return TrainState(state.step + 1, adapters, opt_state, average), metrics
+    metrics |= {
+        "grad_norm": grad_norm,
+        "update_norm": optax.tree.norm(updates),
+        "in_a_row": guard.in_a_row,
+    }
+    after = TrainState(state.step + 1, adapters, opt_state, guard, average)
+    before = dataclasses.replace(state, step=after.step, guard=guard)
+    return guards.select(counts, after, before), metrics

@@ -41,6 +41,18 @@ def test_it_grows(run):
     assert cells["time, total"][1] == "7 s"
 
 
+def test_a_run_that_stops_has_a_last_report(run):
+    report, path = callback.Report(), run.folder / "report.html"
+    report.on_start(run)
+    report.on_stop(run, "the loss was nan")
+    assert "The run stopped:</b> the loss was nan" in path.read_text()
+    assert f"what led to it: {path}" in run.console.file.getvalue().replace("\n", "")
+    resumed = callback.Report()
+    resumed.on_log(run, 6, {})
+    resumed._last.result()
+    assert "The run goes on" in path.read_text()
+
+
 def test_training_does_not_wait_and_hears_of_failures(run, monkeypatch):
     report, written = callback.Report(), []
     monkeypatch.setattr(callback, "write_report", written.append)

@@ -8,7 +8,7 @@ import pytest
 
 from lorasp_jax.evaluation import video
 from lorasp_jax.report.html import write_report
-from lorasp_jax.training.run_folder import MetricsLog, to_json
+from lorasp_jax.training.run_folder import STOPPED, MetricsLog, to_json
 from tests.runs import CONFIG
 
 RESULTS = {
@@ -91,6 +91,22 @@ def test_a_run_that_goes_on(folder):
     (folder / "config.json").unlink()
     with pytest.raises(FileNotFoundError):
         write_report(folder)
+
+
+def test_a_run_that_stopped_says_why(folder):
+    assert "were skipped" not in write_report(folder).read_text()
+    results = (folder / "results.json").read_text()
+    (folder / "results.json").unlink()
+    (folder / STOPPED).write_text(json.dumps({"reason": "the loss was <nan>"}))
+    with (folder / "metrics.jsonl").open("a") as file:
+        file.writelines(json.dumps({"step": s, "skipped": 2.0}) + "\n" for s in (6, 8))
+    page = write_report(folder).read_text()
+    assert "<b>The run stopped:</b> the loss was &lt;nan&gt;." in page
+    assert "4 steps were skipped" in page
+    assert "the first up to step 6, the last up to 8" in page
+    assert "http-equiv=refresh" not in page
+    (folder / "results.json").write_text(results)  # resumed and finished after all
+    assert "stopped" not in write_report(folder).read_text()
 
 
 def test_a_run_that_is_evaluated_while_it_goes_on(folder):

@@ -7,6 +7,7 @@ import json
 import time
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
@@ -67,14 +68,15 @@ def test_every_step_of_a_stretch_has_the_next_batch(tmp_path):
     @functools.partial(jax.jit, static_argnames="count")
     def note(frozen, raw, state, key, count):
         assert count == 1
-        return state + 1, {"seen": raw.state.sum() + frozen}
+        return state + 1, {"seen": jnp.atleast_1d(raw.state.sum() + frozen)}
 
     def seen(start, *stretches):
         many = _Streamed(note, 1.0, _batches(run, mesh, start), Speed(8, None))
         state, found = start, []
         for count in stretches:
             state, metrics = many(state, jax.random.key(0), count)
-            found += [count * float(metrics["seen"])]
+            assert metrics["seen"].shape == (count,)
+            found += [float(metrics["seen"].sum())]
         assert state == start + sum(stretches)
         return found
 

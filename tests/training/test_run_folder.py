@@ -1,15 +1,30 @@
-"""Run folders: nothing is overwritten, logs continue."""
+"""Run folders: nothing is overwritten, two runs are kept apart, logs continue."""
 
 import dataclasses
 import json
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
+from tensorboardX.proto.event_pb2 import Event, SessionLog
 
 from lorasp_jax.config import Config, DataConfig
 from lorasp_jax.peft import LoRASP
-from lorasp_jax.training.run_folder import MetricsLog, open_run, read_metrics
+from lorasp_jax.training import run_folder
+from lorasp_jax.training.run_folder import MetricsLog, read_metrics
 
+ROOT = Path(__file__).parents[2]
 CONFIG = Config(name="a", scale="cpu", peft=LoRASP(rank=8))
+
+
+def open_run(*arguments, **options):
+    """The folder of a run that is opened and closed."""
+    with run_folder.open_run(*arguments, **options) as folder:
+        return folder
 
 
 def test_second_run_in_one_folder_is_refused(tmp_path):
@@ -18,6 +33,37 @@ def test_second_run_in_one_folder_is_refused(tmp_path):
     with pytest.raises(ValueError, match="already holds a run"):
         open_run(CONFIG, tmp_path, resume=False)
     assert (folder / "metrics.jsonl").read_text() == "kept"
+
+
+def test_two_runs_do_not_share_a_folder(tmp_path):
+    """And who has it is said; the other's name is free, as this one is again later."""
+    with run_folder.open_run(CONFIG, tmp_path, resume=False) as folder:
+        before = (folder / "config.json").read_bytes()
+        for resume in (False, True):
+            with pytest.raises(
+                ValueError, match=rf"is in use by process {os.getpid()} on \S+: wait"
+            ):
+                open_run(dataclasses.replace(CONFIG, seed=1), tmp_path, resume=resume)
+        assert (folder / "config.json").read_bytes() == before
+        open_run(dataclasses.replace(CONFIG, name="b"), tmp_path, resume=False)
+    open_run(CONFIG, tmp_path, resume=True)
+
+
+def test_a_killed_run_blocks_nobody(tmp_path):
+    hold = (
+        "import os, sys; from pathlib import Path; from tests.training.test_run_folder import *\n"
+        "with run_folder.open_run(CONFIG, Path(sys.argv[1]), resume=False):\n"
+        "    print('held', flush=True)\n"
+        "    sys.stdin.read()\n"
+    )
+    command = [sys.executable, "-c", hold, str(tmp_path)]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen(command, cwd=ROOT, **pipes) as other:
+        assert other.stdout.readline() == b"held\n"
+        with pytest.raises(ValueError, match=f"is in use by process {other.pid} on"):
+            open_run(CONFIG, tmp_path, resume=True)
+        other.kill()
+    assert open_run(CONFIG, tmp_path, resume=True) == tmp_path / "a"
 
 
 def test_resume_needs_the_same_settings(tmp_path):
@@ -50,6 +96,55 @@ def test_log_continues_like_an_uninterrupted_one(tmp_path):
     log.close()
     assert [row["loss"] for row in read_metrics(tmp_path)] == [2.0, 4.0, -6.0]
     assert list((tmp_path / "tensorboard").iterdir())
+
+
+@pytest.mark.timeout(60)
+def test_a_full_disk_stops_the_log_at_once(tmp_path):
+    log = MetricsLog(tmp_path)
+
+    def fill():
+        for step in range(1000):
+            log.write(step, {"loss": 1.0, "grad_norm": 2.0})
+
+    _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))
+    try:
+        with pytest.raises(OSError, match="File too large") as caught:
+            fill()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+        log.close()
+    assert caught.value.errno in run_folder.DISK_FULL
+    assert len(read_metrics(tmp_path)) > 10
+
+
+def test_tensorboard_finds_the_numbers(tmp_path):
+    """Each record is its length, a checksum, an event and a checksum."""
+    for start, steps in ((0, (2, 4)), (2, (4,))):
+        log = MetricsLog(tmp_path, start)
+        for step in steps:
+            log.write(step, {"loss": step / 2}, {"active_rank/vision": np.array([2.0, 4.0])})
+        log.close()
+        (file,) = (tmp_path / "tensorboard").iterdir()
+        content, events = file.read_bytes(), []
+        while content:
+            size = int.from_bytes(content[:8], "little")
+            events.append(Event.FromString(content[12 : 12 + size]))
+            content = content[16 + size :]
+        assert events[0].file_version == "brain.Event:2"
+        assert (events[1].step, events[1].session_log.status) == (start + 1, SessionLog.START)
+        for step, event in zip(steps, events[2:], strict=True):
+            loss, ranks = event.summary.value
+            assert (event.step, loss.tag, loss.simple_value) == (step, "loss", step / 2)
+            assert (ranks.tag, ranks.histo.num, ranks.histo.max) == ("active_rank/vision", 2, 4)
+        file.unlink()
+
+
+def test_json_has_no_numbers_that_are_not_finite(tmp_path):
+    log = MetricsLog(tmp_path)
+    log.write(2, {"loss": float("nan"), "grad_norm": float("inf"), "skipped": 2.0})
+    log.close()
+    assert read_metrics(tmp_path) == [{"step": 2, "skipped": 2.0}]
 
 
 def test_name_is_free_after_a_run_that_failed_before_it_had_anything(tmp_path):

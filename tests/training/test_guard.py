@@ -1,0 +1,198 @@
+"""Steps that are skipped: what they leave alone, how they are counted, when a run stops."""
+
+import dataclasses
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from lorasp_jax import adaptation
+from lorasp_jax.config import OptimConfig
+from lorasp_jax.training import guard as guards
+from lorasp_jax.training import mesh as meshes
+from lorasp_jax.training import step as steps
+from lorasp_jax.training.loop import RunError, train
+from lorasp_jax.training.run import Callback
+from lorasp_jax.training.run_folder import read_metrics
+from tests.runs import CONFIG, Miniature, leaves, make_run
+
+OPTIMIZER = optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(lambda count: 0.1 + count))
+GOOD, TINY = 1.0, 1e-6
+
+
+def loss(adapters, frozen, graphdef, batch, key, weights, **_):
+    """w² b, whose gradient's norm overflows before it does."""
+    value = sum((w**2).sum() for w in jax.tree.leaves(adapters)) * batch
+    return value, {"loss": value}
+
+
+@pytest.fixture
+def step(monkeypatch):
+    """A jitted training step of `loss`, (state, batch) -> state, metrics."""
+    monkeypatch.setattr(steps, "loss_fn", loss)
+
+    def make(spike=0.0):
+        one = functools.partial(
+            steps.train_step, graphdef=None, optimizer=OPTIMIZER, weights={}, spike=spike, ema=0.5
+        )
+        return jax.jit(lambda state, batch: one(state, None, batch, jax.random.key(0)))
+
+    return make
+
+
+def begin():
+    return steps.init_state({"w": jnp.arange(1.0, 4.0)}, OPTIMIZER, ema=True)
+
+
+def kept(state):
+    """All that a skipped step leaves alone."""
+    return leaves((state.adapters, state.opt_state, state.average))
+
+
+def after(step, state, *batches):
+    for batch in batches:
+        state, _ = step(state, batch)
+    return state
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, 1e30])
+def test_a_skipped_step_changes_nothing_but_the_count(step, bad):
+    step = step()
+    before = after(step, begin(), GOOD)
+    skipped, metrics = step(before, bad)
+    assert math.isfinite(metrics["loss"]) == (bad == 1e30)
+    assert not math.isfinite(metrics["grad_norm"])
+    for name, value in kept(skipped).items():
+        np.testing.assert_array_equal(value, kept(before)[name], err_msg=name)
+    assert (int(skipped.step), int(skipped.guard.in_a_row), int(metrics["in_a_row"])) == (2, 1, 1)
+    assert int(skipped.guard.counted) == 1
+    good = after(step, skipped, GOOD)  # as if it had never been
+    assert int(good.guard.in_a_row) == 0
+    for name, value in kept(good).items():
+        np.testing.assert_array_equal(value, kept(after(step, before, GOOD))[name])
+        assert (value != kept(before)[name]).any(), name
+
+
+def test_running_means_are_those_of_the_steps_that_counted(step, monkeypatch):
+    monkeypatch.setattr(guards, "WINDOW", 2)
+    guard, seen = guards.Guard.initial(), []
+    for value in (3.0, math.nan, 5.0, 8.0):
+        counts, guard = guards.judge(guard, jnp.float32(value), jnp.float32(10 * value), 0.0)
+        seen.append(bool(counts))
+    assert seen == [True, False, True, True]
+    assert int(guard.counted) == 3
+    assert float(guard.loss) == ((3 + 5) / 2 + 8) / 2
+    assert float(guard.grad_norm) == 10 * float(guard.loss)
+
+
+@pytest.mark.parametrize(
+    ("loss", "norm", "counts"), [(1.0, 1.0, True), (3.1, 1.0, False), (1.0, 3.1, False)]
+)
+def test_a_spike_is_skipped_once_enough_is_known(loss, norm, counts, monkeypatch):
+    monkeypatch.setattr(guards, "WINDOW", 2)
+    known = guards.Guard(jnp.int32(2), jnp.int32(0), jnp.float32(1), jnp.float32(1))
+    asked = jnp.float32(loss), jnp.float32(norm)
+    assert bool(guards.judge(known, *asked, 3.0)[0]) == counts
+    assert bool(guards.judge(known, *asked, 0.0)[0])
+    early = dataclasses.replace(known, counted=jnp.int32(1))
+    assert bool(guards.judge(early, *asked, 3.0)[0])
+
+
+def test_the_loop_s_step_looks_for_spikes_where_asked(step, monkeypatch):
+    monkeypatch.setattr(guards, "WINDOW", 2)
+    for spike, skipped in ((0.0, 0), (50.0, 1)):
+        state = after(step(spike), begin(), TINY, TINY, GOOD)
+        assert int(state.guard.in_a_row) == skipped
+
+
+def test_no_second_copy_of_the_state_is_needed(step, monkeypatch):
+    """Deciding by the updates, which is what the loss and the norm are taken for, needs one."""
+    leaf = 1 << 16
+    state = jax.eval_shape(
+        lambda: steps.init_state({str(i): jnp.ones(leaf) for i in range(16)}, OPTIMIZER, ema=True)
+    )
+    copy = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state.opt_state))
+
+    def temporary(select):
+        monkeypatch.setattr(guards, "select", select)
+        lowered = jax.jit(step(), donate_argnums=0).lower(state, GOOD)
+        return lowered.compile().memory_analysis().temp_size_in_bytes
+
+    select = guards.select
+
+    def by_update(counts, after, before):
+        updates = jax.tree.map(jnp.subtract, after, before)
+        changed = optax.tree.norm(getattr(updates, "adapters", updates))
+        return select(counts & jnp.isfinite(changed), after, before)
+
+    least, ours = temporary(lambda _, after, __: after), temporary(select)
+    assert ours - least < copy / 4
+    assert temporary(by_update) - least > copy / 2
+
+
+def test_summary():
+    loss, in_a_row = np.array([1.0, np.nan, np.inf, 3.0]), np.array([0, 1, 2, 0])
+    rows = {"loss": loss, "ranks": np.stack([loss, 2 * loss], -1), "in_a_row": in_a_row}
+    found = {name: value.tolist() for name, value in guards.summarise(rows).items()}
+    assert found == {"loss": 2.0, "ranks": [2.0, 4.0], "skipped": 2}
+    assert guards.summarise({name: v[1:3] for name, v in rows.items()}) == {"skipped": 2}
+
+
+@pytest.mark.parametrize("bad", [{"max_skipped": 0}, {"spike": 1.0}, {"spike": math.nan}])
+def test_numbers_that_make_no_sense(bad):
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        OptimConfig(**bad)
+
+
+@pytest.fixture
+def one_device(monkeypatch):
+    """Compiles in a quarter of the time."""
+    mesh = meshes.make_mesh(1, jax.devices()[:1])
+    monkeypatch.setattr(meshes, "make_mesh", lambda fsdp: mesh)
+
+
+def spoiled(folder, episodes, at, **optim):
+    """A run whose demonstrations of a task have NaN for the state somewhere."""
+    optim = dataclasses.replace(CONFIG.optim, **optim)
+    config = dataclasses.replace(CONFIG, optim=optim, targets=("inp", "out"))
+    run = make_run(folder, config, Miniature())
+    run.episodes["press"].state[episodes, at] = np.nan
+    return run
+
+
+def test_a_run_of_skipped_steps_stops_and_says_so(tmp_path, one_device):
+    class Note(Callback):
+        def on_stop(self, run, reason):
+            self.reason = reason
+
+    note, run = Note(), spoiled(tmp_path / "run", slice(None), slice(None), max_skipped=3)
+    before = leaves(adaptation.split(run.policy.model)[1])
+    message = (
+        r"not finite in 4 steps in a row \(at step 4 the loss was nan, the gradient's norm nan\): "
+        "nothing after step 2 was saved; try a lower --optim.learning-rate"
+    )
+    with pytest.raises(RunError, match=message) as caught:
+        train(run, [note])
+    assert note.reason == str(caught.value)
+    assert [(row["step"], row["skipped"]) for row in read_metrics(run.folder)] == [(2, 2), (4, 2)]
+    assert "task" not in read_metrics(run.folder)[0]
+    assert [path.name for path in (run.folder / "checkpoints").glob("*")] == ["2"]
+    again = spoiled(tmp_path / "run", slice(None), slice(None), steps=2)
+    train(again, resume=True)  # leaves what was saved
+    for name, value in leaves(adaptation.split(again.policy.model)[1]).items():
+        np.testing.assert_array_equal(value, before[name], err_msg=name)
+
+
+def test_some_skipped_steps_are_counted_and_the_others_train(tmp_path, one_device):
+    run = spoiled(tmp_path / "run", 0, 0)
+    run.config = dataclasses.replace(run.config, seed=1)
+    train(run)
+    rows = read_metrics(run.folder)
+    assert 0 < sum(row["skipped"] for row in rows) < 4
+    _, adapters, _ = adaptation.split(run.policy.model)
+    assert all(np.isfinite(value).all() for value in leaves(adapters).values())
+    assert all("task" in row for row in rows)

@@ -1,0 +1,158 @@
+"""Processes that are really stopped, and runs that go on elsewhere."""
+
+import contextlib
+import json
+import os
+import random
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from lorasp_jax import adaptation
+from lorasp_jax.training import mesh as meshes
+from lorasp_jax.training import processes
+from lorasp_jax.training.checkpoint import WRITTEN
+from lorasp_jax.training.run_folder import read_metrics
+from tests.runs import leaves, repeatable
+from tests.training.worker import work
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def use(monkeypatch):
+    """Chooses how many of the eight devices this process uses."""
+    make = meshes.make_mesh
+
+    def choose(count):
+        monkeypatch.setattr(meshes, "make_mesh", lambda _: make(1, jax.devices()[:count]))
+
+    return choose
+
+
+@contextlib.contextmanager
+def started(folder, environment=None, **options):
+    """A worker, which does not outlive this block."""
+    command = [sys.executable, "-u", "-m", "tests.training.worker", str(folder)]
+    for name, value in options.items():
+        command += [f"--{name}", str(value)]
+    environment = os.environ | (environment or {})
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, cwd=ROOT, env=environment, stdout=pipe, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def wait_for(process, beginning):
+    """The first line that begins so."""
+    for line in process.stdout:
+        if line.startswith(beginning):
+            return line
+    pytest.fail(f"the process ended with {process.wait()} and never said {beginning!r}")
+
+
+def saved(folder, step):
+    """What identifies every bit of the state at a step."""
+    return json.loads((folder / f"checkpoints/{step}/meta/metadata").read_text())["digest"]
+
+
+def kill(folder, steps, chance):
+    """Begin or go on, and kill -9 while it begins, restores, trains or saves."""
+    with started(folder, steps=steps, mesh=1) as process:
+        wait_for(process, "started")
+        for _ in range(chance.choice((0, 3, 4, 5))):
+            wait_for(process, "step")
+        time.sleep(chance.uniform(0, 0.1))
+
+
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("times", [2, pytest.param(20, marks=pytest.mark.slow)])
+def test_a_killed_run_resumes_to_the_bit(times, tmp_path, use, capsys):
+    use(1)
+    steps, chance = 12 * times, random.Random(times)
+    work(tmp_path / "whole", steps)
+    killed = tmp_path / "killed"
+    for _ in range(times):
+        kill(killed, steps, chance)
+    newest = max(int(path.parent.name) for path in killed.glob(f"checkpoints/*/{WRITTEN}"))
+    assert newest < steps  # else nothing is left to do
+    capsys.readouterr()
+    work(killed, steps)
+    assert f"started\nstep {newest + 1}\n" in capsys.readouterr().out
+    assert saved(killed, steps) == saved(tmp_path / "whole", steps)
+    assert repeatable(killed) == repeatable(tmp_path / "whole")
+
+
+def test_a_signal_to_another_process_stops_this_one_too(tmp_path, use, monkeypatch):
+    use(1)
+    asked = iter([False, True])  # at steps 1 and 2
+    monkeypatch.setattr(processes, "anywhere", lambda _: next(asked))
+    assert work(tmp_path / "run", 6) is None
+    assert sorted(os.listdir(tmp_path / "run/checkpoints")) == ["1", "2"]
+
+
+def adapters(run):
+    return leaves(adaptation.split(run.policy.model)[1])
+
+
+def assert_same(found, expected):
+    """To rounding: sums over a batch on other devices are in another order."""
+    for name, value in expected.items():
+        np.testing.assert_allclose(
+            found[name], value, atol=1e-5 * np.abs(value).max(), err_msg=name
+        )
+
+
+def test_a_run_goes_on_with_another_number_of_devices(tmp_path, use):
+    use(1)
+    whole = adapters(work(tmp_path / "whole", 6))
+    moved = tmp_path / "moved"
+    for count, until in ((4, 2), (1, 4), (8, None)):
+        use(count)
+        run = work(moved, 6, until)
+    assert_same(adapters(run), whole)
+
+
+@pytest.mark.slow
+def test_a_run_goes_on_in_processes_with_other_devices(tmp_path):
+    """4 -> 1 -> 8, each all that its process has."""
+    moved = tmp_path / "moved"
+    for count, until, end in ((4, 4, "stopped"), (1, 8, "stopped"), (8, 99, "finished")):
+        with started(moved, devices=count, until=until) as process:
+            wait_for(process, end)
+            assert process.wait(60) == 0
+    assert (moved / "checkpoints/12").exists()
+    assert_same(adapters(work(moved, 12)), adapters(work(tmp_path / "whole", 12)))
+
+
+@pytest.mark.slow
+def test_a_signal_to_one_of_two_processes_saves_on_both(tmp_path):
+    """2 processes of 2 devices; then one process of 8 goes on."""
+    folder = tmp_path / "run"
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    known = {"JAX_COORDINATOR_ADDRESS": address, "JAX_NUM_PROCESSES": "2"}
+    one, other = (
+        started(folder, known | {"JAX_PROCESS_ID": number}, steps=40, devices=2)
+        for number in ("0", "1")
+    )
+    with one as first, other as second:
+        for process in (first, second):
+            wait_for(process, "step 3")
+        second.terminate()
+        for process in (first, second):
+            wait_for(process, "stopped")
+            assert process.wait(60) == 0
+    stopped_at = max(int(path.name) for path in (folder / "checkpoints").iterdir())
+    assert [row["step"] for row in read_metrics(folder)] == list(range(1, stopped_at + 1))
+    assert 3 <= stopped_at < 40
+    assert_same(adapters(work(folder, 40)), adapters(work(tmp_path / "whole", 40)))

@@ -1,0 +1,80 @@
+"""A process that works on a run, to be stopped: python -m tests.training.worker FOLDER."""
+
+import argparse
+import dataclasses
+import os
+import signal
+from pathlib import Path
+
+
+def arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--steps", type=int, default=12)
+    parser.add_argument("--until", type=int, help="step at which a signal comes")
+    parser.add_argument("--devices", type=int, default=8, help="of this process")
+    parser.add_argument("--mesh", type=int, help="how many of them are used; all unless said")
+    return parser.parse_args()
+
+
+def main(args: argparse.Namespace) -> None:
+    os.environ["JAX_PLATFORMS"] = "cpu"
+    os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={args.devices}"
+    import jax
+
+    from envs import physics
+
+    physics.enable_fast_cpu()
+    physics.enable_compilation_cache()
+    jax.config.update("jax_default_matmul_precision", "highest")
+    from lorasp_jax.training import mesh as meshes
+    from lorasp_jax.training import processes
+
+    if "JAX_PROCESS_ID" in os.environ:
+        processes.initialize()
+
+    devices = jax.devices()[: args.mesh]
+    meshes.make_mesh = lambda _, make=meshes.make_mesh: make(1, devices)
+    work(args.folder, args.steps, args.until)
+
+
+def prepare(folder: Path, steps: int):
+    """A run that logs and saves at every step."""
+    from tests.runs import CONFIG, Miniature, make_run
+
+    config = dataclasses.replace(
+        CONFIG,
+        optim=dataclasses.replace(CONFIG.optim, steps=steps),
+        targets=("inp", "out"),
+        log_every=1,
+        checkpoint_every=1,
+    )
+    return make_run(folder, config, Miniature())
+
+
+def work(folder: Path, steps: int, until: int | None = None):
+    """Begin the run or go on with it; it is returned if it is finished."""
+    from lorasp_jax.training.interrupt import sigterm_as_interrupt
+    from lorasp_jax.training.loop import train
+    from lorasp_jax.training.run import Callback
+
+    class Tell(Callback):
+        def on_log(self, run, step, metrics):
+            print("step", step, flush=True)
+            if step == until:
+                signal.raise_signal(signal.SIGTERM)
+
+    with sigterm_as_interrupt():
+        run = prepare(folder, steps)
+        print("started", flush=True)
+        try:
+            train(run, [Tell()], resume=True)
+        except KeyboardInterrupt:
+            print("stopped", flush=True)
+            return None
+    print("finished", flush=True)
+    return run
+
+
+if __name__ == "__main__":
+    main(arguments())
