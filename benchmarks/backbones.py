@@ -60,7 +60,7 @@ def run_config(method: peft.Method, targets: tuple[str, ...], batch: int) -> Con
 
 
 def arrays(config: BackboneConfig, run: Config | None) -> tuple[Any, Any, Any]:
-    """Graph, adapters and frozen arrays to sample with; no adapters without a run."""
+    """Graph, adapters and frozen arrays, drawn on a device; no adapters without a run."""
 
     def model(key: jax.Array) -> Backbone:
         return preflight.adapted(run, config, key) if run else config.create(nnx.Rngs(key))
@@ -82,7 +82,7 @@ def noise(shapes: Any) -> Any:
 
 
 class Step:
-    """A compiled training step, and after `draw` what it needs.
+    """A compiled training step, and after `load` what it needs.
 
     Args:
         config: of the backbone.
@@ -93,29 +93,28 @@ class Step:
     def __init__(self, config: BackboneConfig, run: Config, mesh: Mesh | None = None) -> None:
         mesh = mesh or meshes.make_mesh(devices=jax.devices()[:1])
         optimizer = make_optimizer(run.optim, {run.peft})
-        graphdef = adaptation.split(preflight.abstract_model(run, config))[0]
-
-        def drawn(key: jax.Array) -> tuple:
-            _, adapters, frozen = adaptation.split(preflight.adapted(run, config, key))
-            batch = noise(abstract_batch(config, run.optim.batch_size))
-            return init_state(adapters, optimizer), frozen, batch, jax.random.key(1)
-
-        shapes, whole = jax.eval_shape(drawn, jax.random.key(0)), meshes.replicated(mesh)
-        state, frozen = (meshes.shardings(tree, mesh) for tree in shapes[:2])
-        placed = state, frozen, meshes.batch_sharding(mesh), whole
-        self._drawn = jax.jit(drawn, out_shardings=placed)
+        graphdef, adapters, frozen = adaptation.split(preflight.abstract_model(run, config))
+        self._initial = functools.partial(init_state, optimizer=optimizer)
+        self._batch = abstract_batch(config, run.optim.batch_size)
+        key = jax.eval_shape(jax.random.key, 1)
+        shapes = jax.eval_shape(self._initial, adapters), frozen, self._batch, key
+        state, base = (meshes.shardings(tree, mesh) for tree in shapes[:2])
+        whole = meshes.replicated(mesh)
+        self._placed = state, base, meshes.batch_sharding(mesh), whole
         step = functools.partial(
             train_step,
             graphdef=graphdef,
             optimizer=optimizer,
             weights=auxiliary_weights(run.auxiliary, run.optim.steps),
         )
-        jitted = jax.jit(step, donate_argnums=0, in_shardings=placed, out_shardings=(state, whole))
+        out = state, whole
+        jitted = jax.jit(step, donate_argnums=0, in_shardings=self._placed, out_shardings=out)
         self.compiled = jitted.lower(*shapes).compile()
 
-    def draw(self) -> "Step":
-        """Itself, with random arrays."""
-        self.state, *self.others = self._drawn(jax.random.key(0, impl="rbg"))
+    def load(self, adapters: Any, frozen: Any) -> "Step":
+        """Itself, with copies of these arrays where they belong."""
+        found = self._initial(adapters), frozen, noise(self._batch), jax.random.key(1)
+        self.state, *self.others = jax.device_put(found, self._placed)
         return self
 
     def __call__(self) -> Any:
@@ -133,7 +132,7 @@ class Step:
 def training(name: str, label: str, run: Config, options: argparse.Namespace, remat: Remat) -> Any:
     """The row of one way to train."""
     config = sized(name, options, remat)
-    step, size = Step(config, run).draw(), run.optim.batch_size
+    step, size = Step(config, run).load(*arrays(config, run)[1:]), run.optim.batch_size
     seconds = best(step, calls=options.calls)
     operations = preflight.operations(run, sized(name, options))
     share = flops.utilisation(operations, seconds)

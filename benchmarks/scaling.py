@@ -39,22 +39,23 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """One for each layout; all of them are compiled at once."""
     each = options.batch or BATCH[options.size]
     config = backbones.sized(options.backbone, options, options.remat)
-    method = peft.LoRASP(rank=options.rank)
+    alone = backbones.run_config(peft.LoRASP(rank=options.rank), ("all-linear",), each)
 
     def compiled(layout: tuple[str, int]) -> backbones.Step:
         name, number = layout
-        mesh = meshes.make_mesh(number if name == "fsdp" else 1, jax.devices()[:number])
-        run = backbones.run_config(method, ("all-linear",), number * each)
-        return backbones.Step(config, dataclasses.replace(run, fsdp=mesh.shape["fsdp"]), mesh)
+        fsdp = number if name == "fsdp" else 1
+        mesh = meshes.make_mesh(fsdp, jax.devices()[:number])
+        optim = dataclasses.replace(alone.optim, batch_size=number * each)
+        return backbones.Step(config, dataclasses.replace(alone, optim=optim, fsdp=fsdp), mesh)
 
-    wanted = layouts(options.devices)
+    wanted, one = layouts(options.devices), None
     with ThreadPoolExecutor(options.threads) as pool:
+        drawn = pool.submit(backbones.arrays, config, alone)
         steps = dict(zip(wanted, pool.map(compiled, wanted), strict=True))
-    alone = None
     for name, number in wanted:
-        step = steps.pop((name, number))
-        rate = number * each / best(step.draw(), calls=options.calls)
-        alone = alone or rate
+        step = steps.pop((name, number)).load(*drawn.result()[1:])
+        rate = number * each / best(step, calls=options.calls)
+        one = one or rate
         yield {
             "backbone": options.backbone,
             "size": options.size,
@@ -62,7 +63,7 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
             "layout": name,
             "batch": each,
             "samples/s": rate,
-            "of linear": rate / number / alone,
+            "of linear": rate / number / one,
             "GiB": step.bytes / GIB,
         }
 
