@@ -19,15 +19,32 @@ from lorasp_jax.kernels.energy_gate import (
     kept_energy,
 )
 
+Router = Literal["gelu", "softmax", "linear"]
 ScoreFunction = Literal["softplus", "relu", "softmax"]
 Granularity = Literal["token", "sample", "layer"]
 
 Routed = tuple[jax.Array, Mapping[str, jax.Array], jax.Array, list[jax.Array]]
 """z, losses, how often each direction was kept, and active rank and kept energy by token."""
 
+SCORE_INIT_STD = 0.01
 SOFTPLUS_INVERSE_OF_ONE = math.log(math.e - 1)
 UNIT_LOGIT: dict[str, float] = {"softplus": SOFTPLUS_INVERSE_OF_ONE, "relu": 1.0, "softmax": 0.0}
 """The logit, the same for all directions, at which each score function gives 1."""
+
+
+def init_scores(
+    key: jax.Array, router: Router, score_function: ScoreFunction, hidden_width: int, rank: int
+) -> dict[str, jax.Array]:
+    """A router's second layer, w2 [H, R], and the biases of both; what it has of them."""
+    if router == "linear":
+        return {}
+    if router == "softmax":
+        return {"w2": jnp.repeat(jnp.eye(hidden_width), rank // hidden_width, axis=1)}
+    return {
+        "b1": jnp.zeros(hidden_width),
+        "w2": SCORE_INIT_STD * jax.random.normal(key, (hidden_width, rank)),
+        "b2": jnp.full(rank, UNIT_LOGIT[score_function], jnp.float32),
+    }
 
 
 def route(

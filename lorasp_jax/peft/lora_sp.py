@@ -33,12 +33,9 @@ from lorasp_jax.kernels.fused_rows import InARow, fused_rows
 from lorasp_jax.peft.method import Aux, Method, Params, kaiming_uniform
 from lorasp_jax.routing import router_scores
 
-SCORE_INIT_STD = 0.01
-
-Router = Literal["gelu", "softmax", "linear"]
 Rule = Literal["paper", "release"]
 _CHOICES: dict[str, Any] = {
-    "router": Router,
+    "router": routing.Router,
     "rule": Rule,
     "score_function": routing.ScoreFunction,
     "granularity": routing.Granularity,
@@ -68,7 +65,7 @@ class LoRASP(Method):
     """α of the scale α/R; None is 2 R."""
     hidden_width: int = 32
     """H, width of the router's hidden layer."""
-    router: Router = "gelu"
+    router: routing.Router = "gelu"
     """"gelu": GELU, biases, s = 1 at init. "softmax": softmax over H, no biases, second layer
     starting as the 0/1 matrix that spreads H values over R (paper's Table I). "linear": one layer
     of signed scores, for the rule of the release."""
@@ -169,22 +166,11 @@ class LoRASP(Method):
         v, w1 = jnp.split(inputs, [self.rank], axis=1)
         bank_key = jax.random.fold_in(key, 1)
         bank = init_bank(bank_key, v, d_out, normalized=self.normalized_bank)
-        params = {"bank": bank, "router": {"w1": w1, **self._init_scores(score_key)}}
+        sides = self.hidden_width, self.scored
+        scores = routing.init_scores(score_key, self.router, self.score_function, *sides)
+        params = {"bank": bank, "router": {"w1": w1, **scores}}
         moves = self.energy_start is not None
         return params | ({energy_schedule.PROGRESS: jnp.zeros(())} if moves else {})
-
-    def _init_scores(self, key: jax.Array) -> dict[str, jax.Array]:
-        """The router's second layer, and the biases of both."""
-        shape = (self.hidden_width, self.scored)
-        if self.router == "linear":
-            return {}
-        if self.router == "softmax":
-            return {"w2": jnp.repeat(jnp.eye(shape[0]), shape[1] // shape[0], axis=1)}
-        return {
-            "b1": jnp.zeros(self.hidden_width),
-            "w2": SCORE_INIT_STD * jax.random.normal(key, shape),
-            "b2": jnp.full(self.scored, routing.UNIT_LOGIT[self.score_function], jnp.float32),
-        }
 
     def down(self, params: Params) -> jax.Array:
         """[V, W1]."""
