@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax.scipy.special import ndtri
 
-from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul
+from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul, one_by_one
 from lorasp_jax.kernels.quantized import KINDS, NF4, quantized
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "quantized_kernels.npz"
@@ -92,7 +92,7 @@ def test_a_stack_is_its_layers(kind):
 
 def product(x, kernel, p, u):
     """x W + (x P) U."""
-    between = (lambda _, rows, __: (rows, ()),)
+    between = one_by_one([lambda _, rows, __: (rows, ())])
     return low_rank_matmul(between, x.dtype, [LowRankLayer((), kernel, p, u)], x, None)[0][0]
 
 
