@@ -10,8 +10,8 @@ def check_fields(owner: Any, prefix: str = "") -> None:
     """Compares a dataclass with its annotations; an int is a float, a bool is no number.
 
     Args:
-        owner: an instance; fields of other types than numbers, texts, flags, `Literal`, tuples of
-            these and None are not looked at.
+        owner: an instance; of its fields' types, classes, unions, `Literal` and tuples of one type
+            are looked at.
         prefix: what the fields' names begin with, such as "optim.".
 
     Raises:
@@ -35,9 +35,9 @@ def _fits(value: Any, kind: Any) -> bool:
         return isinstance(value, tuple) and all(_fits(item, arguments[0]) for item in value)
     if kind is float:
         return isinstance(value, int | float) and type(value) is not bool and math.isfinite(value)
-    if kind in (int, bool, str, type(None)):
-        return type(value) is kind
-    return True
+    if kind is int:
+        return isinstance(value, int) and type(value) is not bool
+    return isinstance(value, kind) if isinstance(kind, type) else True
 
 
 def _called(kind: Any) -> str:

@@ -1,7 +1,8 @@
-"""Ways to spoil a good input: each a name and a function of the folder that holds the input."""
+"""Ways to spoil a good input, each a name and a function of its folder; and what a refusal is."""
 
 import json
 import random
+import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import safetensors.numpy
 
+ROOT = Path(__file__).parent.parent
 Damage = Callable[[Path], None]
 Cases = Iterator[tuple[str, Damage]]
 ABSENT = object()
@@ -158,3 +160,14 @@ def with_nan(values: list[float]) -> list[float]:
 
 def with_infinity(values: list[float]) -> list[float]:
     return [*values[:-1], float("inf")]
+
+
+def check_refusal(error: BaseException, *names: str) -> None:
+    """It is ours, one sentence, and says what it is about."""
+    assert type(error) in (ValueError, FileNotFoundError), repr(error)
+    raised = Path(traceback.extract_tb(error.__traceback__)[-1].filename)
+    assert raised.is_relative_to(ROOT), f"{error!r} was raised in {raised}"
+    text = str(error)
+    assert "\n" not in text
+    assert "Traceback" not in text
+    assert any(name in text for name in names), text

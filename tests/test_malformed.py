@@ -4,7 +4,6 @@ import dataclasses
 import hashlib
 import json
 import shutil
-import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,10 +22,9 @@ from lorasp_jax.hugging_face import load_peft
 from lorasp_jax.peft import LoRASP
 from tests import malformed
 from tests.data.lerobots import GOLDEN, digest, golden
-from tests.malformed import ABSENT, HUGE, TENSORS, Cases, Damage
+from tests.malformed import ABSENT, HUGE, TENSORS, Cases, Damage, check_refusal
 from tests.runs import random_episodes
 
-ROOT = Path(__file__).parent.parent
 NAN = float("nan")
 DATA = "data/**/*.parquet"
 
@@ -242,17 +240,6 @@ def _marked(cases: list[Any], every: int) -> list[Any]:
         pytest.param(*case, id=f"{case[0]} {case[1]}", marks=[pytest.mark.slow] * (n % every > 0))
         for n, case in enumerate(cases)
     ]
-
-
-def check_refusal(error: BaseException, *names: str) -> None:
-    """It is ours, one sentence, and says what it is about."""
-    assert type(error) in (ValueError, FileNotFoundError), repr(error)
-    raised = Path(traceback.extract_tb(error.__traceback__)[-1].filename)
-    assert raised.is_relative_to(ROOT), f"{error!r} was raised in {raised}"
-    text = str(error)
-    assert "\n" not in text
-    assert "Traceback" not in text
-    assert any(name in text for name in names), text
 
 
 @pytest.mark.parametrize(("kind", "name", "damage"), _marked(CASES, QUICK))
