@@ -121,6 +121,28 @@ def _cache() -> Cases:
     yield from malformed.fields(cache.HEADER, facts)
 
 
+def _npz() -> Cases:
+    yield from malformed.files("*.npz")
+    yield from malformed.flips("*.npz", (0, 30, 3000, -30))
+    changes: dict[str, Any] = {
+        "state": [None, "x", np.zeros(3), np.full((3, 9, 7), NAN, np.float32)],
+        "action": [None, np.zeros((3, 9, 7)), np.zeros((3, 9, 6), np.float32)],
+        "length": [None, np.array([5, 0, 7]), np.array([5, 10, 7]), np.array([5, 9, 7.5])],
+        "image/side": [np.zeros((3, 9, 8, 8, 3)), np.zeros((3, 8, 8, 8, 3), np.uint8)],
+    }
+    for name, values in changes.items():
+        for number, value in enumerate(values):
+
+            def spoil(folder: Path, name: str = name, value: Any = value) -> None:
+                path = malformed.first(folder, "*.npz")
+                with np.load(path) as file:
+                    arrays = dict(file)
+                del arrays[name]
+                np.savez(path, **arrays | ({} if value is None else {name: np.asarray(value)}))
+
+            yield f"*.npz {name} {number}", spoil
+
+
 def _rehashed(damage: Damage) -> Damage:
     """A foreign file that states its tensors' checksum."""
 
@@ -209,9 +231,11 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     at = tmp_path_factory.mktemp("good")
     rlds.write(_episodes(), at / "rlds")
     cache.write([open_source(at / "rlds")], at / "cache", lambda done, total: None)
+    (at / "npz").mkdir()
+    _episodes().save(at / "npz" / "episodes.npz")
     model = adaptation.adapt(Net(), [(".*", LoRASP(rank=8, hidden_width=4))], rngs=nnx.Rngs(0))
     save_adapters(at / "adapter", model)
-    folders = {name: at / name for name in ("rlds", "cache", "adapter")}
+    folders = {name: at / name for name in ("rlds", "cache", "adapter", "npz")}
     folders |= {f"lerobot {version}": golden(version) for version in ("v21", "v3")}
     return folders | {"peft": GOLDEN / "adapter_lora"}
 
@@ -227,6 +251,7 @@ KINDS = {
     "lerobot v3": (lambda: _lerobot("v3"), _read),
     "rlds": (_rlds, _read),
     "cache": (_cache, _read),
+    "npz": (_npz, lambda folder: _read(folder / "episodes.npz")),
     "adapter": (_adapter, lambda folder: load_adapters(folder, Net())),
     "peft": (_peft, lambda folder: load_peft(folder, Net())),
 }
