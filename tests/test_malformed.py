@@ -136,9 +136,11 @@ def _npz() -> Cases:
             def spoil(folder: Path, name: str = name, value: Any = value) -> None:
                 path = malformed.first(folder, "*.npz")
                 with np.load(path) as file:
-                    arrays = dict(file)
+                    arrays: dict[str, Any] = dict(file)
                 del arrays[name]
-                np.savez(path, **arrays | ({} if value is None else {name: np.asarray(value)}))
+                if value is not None:
+                    arrays[name] = np.asarray(value)
+                np.savez(path, **arrays)
 
             yield f"*.npz {name} {number}", spoil
 
