@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import functools
 import json
+import math
 import os
 import shutil
 import zipfile
@@ -150,6 +151,8 @@ class Episodes:
             raise ValueError(f"state must have shape [E, T, J + 1], not {self.state.shape}")
         steps = self.state.shape[:2]
         self._validate_action()
+        if not 0 < self.control_dt < math.inf:
+            raise ValueError(f"control_dt must be above 0 s, not {self.control_dt}")
         for name, low, high in (
             ("length", 1, steps[1]),
             ("instruction", 0, len(self.instructions) - 1),

@@ -21,6 +21,7 @@ METADATA = "metadata.json"
 THREADS = ThreadPoolExecutor(8)
 """Shared by all datasets that are made at once: more threads would only wait for Python's lock."""
 _FAILURES = (OSError, RuntimeError, ValueError, LookupError, TypeError, AttributeError, ParseError)
+_FAILURES += (ArithmeticError, SyntaxError)  # of numbers that are infinite; of PNG
 _FAILURES += (ImportError,)  # what tfds says of features that would need TensorFlow
 
 
@@ -52,7 +53,7 @@ def metadata(path: Path) -> dict[str, Any]:
         facts = json.loads((path / METADATA).read_text())
         if facts["format"] != FORMAT:
             raise KeyError("format")
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{path} is not a folder of {FORMAT} episodes") from error
     return facts
 

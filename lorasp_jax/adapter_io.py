@@ -20,7 +20,7 @@ import numpy as np
 import safetensors.numpy
 from flax import nnx
 
-from lorasp_jax import adaptation, peft
+from lorasp_jax import adaptation, kinds, peft
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.peft import Method
 
@@ -141,8 +141,12 @@ def _settings(method: Method) -> Settings:
 
 
 def _method(settings: Settings) -> Method:
+    if not isinstance(settings, dict) or not isinstance(settings.get("method"), str):
+        raise ValueError(f"an adapter has settings {settings!r}, which name no method.")
     fields = {name: value for name, value in settings.items() if name != "method"}
-    return peft.create(settings["method"], **fields)
+    method = peft.create(settings["method"], **fields)
+    kinds.check_fields(method)
+    return method
 
 
 def write_whole(path: pathlib.Path, data: bytes) -> None:
@@ -150,6 +154,24 @@ def write_whole(path: pathlib.Path, data: bytes) -> None:
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     temporary.write_bytes(data)
     temporary.replace(path)
+
+
+def read_tensors(path: pathlib.Path, data: bytes) -> dict[str, np.ndarray]:
+    """The tensors in a safetensors file's bytes, by name.
+
+    Raises:
+      ValueError: they are damaged, or one is not of finite floating point numbers.
+    """
+    try:
+        tensors = dict(sorted(safetensors.numpy.load(data).items()))
+    except (ValueError, KeyError, TypeError, safetensors.SafetensorError) as error:
+        raise ValueError(f"{path} is damaged or no safetensors file: {error}") from error
+    for name, tensor in tensors.items():
+        if not jnp.issubdtype(tensor.dtype, jnp.floating):
+            raise ValueError(f"{path} holds {name!r} as {tensor.dtype}, not as real numbers.")
+        if not np.isfinite(tensor.astype(np.float32)).all():
+            raise ValueError(f"{path} holds numbers that are not finite in {name!r}.")
+    return tensors
 
 
 def _read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -169,4 +191,4 @@ def _read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         raise ValueError(f"{folder / DESCRIPTION} is not a {FORMAT} of version {VERSION}.")
     if not same:
         raise ValueError(f"{folder / TENSORS} is damaged or belongs to another {DESCRIPTION}.")
-    return description, safetensors.numpy.load(data)
+    return description, read_tensors(folder / TENSORS, data)

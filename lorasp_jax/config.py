@@ -4,16 +4,17 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
+from lorasp_jax import kinds
 from lorasp_jax.peft import Method
 
 SCALES = ("smoke", "cpu", "accelerator")
 
 
-def _at_least_one(owner: object, *names: str) -> None:
-    """Raise ValueError unless these fields are at least 1."""
+def _at_least(low: int, owner: object, *names: str) -> None:
+    """Raise ValueError unless these fields are at least so much."""
     for name in names:
-        if getattr(owner, name) < 1:
-            raise ValueError(f"{name} must be at least 1, got {getattr(owner, name)}")
+        if getattr(owner, name) < low:
+            raise ValueError(f"{name} must be at least {low}, got {getattr(owner, name)}")
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,11 @@ class ModelConfig:
         """`checkpoint` with the names filled in."""
         return self.checkpoint.replace("{backbone}", self.backbone).replace("{size}", self.size)
 
+    def __post_init__(self) -> None:
+        """Checks the fields."""
+        kinds.check_fields(self)
+        _at_least(0, self, "max_tokens")
+
 
 @dataclass(frozen=True)
 class DataConfig:
@@ -68,7 +74,9 @@ class DataConfig:
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
-        _at_least_one(self, "episodes", "num_envs")
+        kinds.check_fields(self)
+        _at_least(1, self, "episodes", "num_envs")
+        _at_least(0, self, "action_noise")
 
 
 @dataclass(frozen=True)
@@ -107,7 +115,14 @@ class OptimConfig:
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
-        _at_least_one(self, "steps", "batch_size", "accumulate", "max_skipped")
+        kinds.check_fields(self)
+        _at_least(1, self, "steps", "batch_size", "accumulate", "max_skipped")
+        _at_least(0, self, "learning_rate", "final_learning_rate", "warmup_steps")
+        _at_least(0, self, "weight_decay", "state_noise")
+        if self.clip_norm <= 0:
+            raise ValueError(f"clip_norm must be above 0, got {self.clip_norm}")
+        if not 0 <= self.b2 < 1:
+            raise ValueError(f"b2 must lie in [0, 1), got {self.b2}")
         if self.spike and not 1 < self.spike < math.inf:
             raise ValueError(f"spike must be 0 or more than 1, got {self.spike}")
         if not 0 <= self.ema < 1:
@@ -128,6 +143,13 @@ class AuxiliaryConfig:
     """Weight of AdaLoRA's orthogonality penalty, eq. 4 of arXiv 2303.10512."""
     warmup: float = 0.02
     """Share of the steps over which the weights rise linearly from zero."""
+
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        kinds.check_fields(self)
+        _at_least(0, self, "spectral", "balance", "z", "orthogonality")
+        if not 0 <= self.warmup <= 1:
+            raise ValueError(f"warmup must lie in [0, 1], got {self.warmup}")
 
 
 @dataclass(frozen=True)
@@ -153,7 +175,8 @@ class EvaluationConfig:
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
-        _at_least_one(self, "episodes", "num_envs", "execute_steps", "denoise_steps")
+        kinds.check_fields(self)
+        _at_least(1, self, "episodes", "num_envs", "execute_steps", "denoise_steps")
         if self.every < 0:
             raise ValueError(f"evaluation.every must be at least 0, got {self.every}")
         if self.episodes % self.worlds:
@@ -204,6 +227,13 @@ class Config:
 
     def __post_init__(self) -> None:
         """Checks what no single field shows."""
-        _at_least_one(self, "fsdp", "log_every", "checkpoint_every", "image_size")
+        kinds.check_fields(self)
+        kinds.check_fields(self.peft, "peft.")
+        _at_least(1, self, "fsdp", "log_every", "checkpoint_every", "image_size")
+        if self.control_dt <= 0 or not 0 <= self.seed < 2**32:
+            raise ValueError(
+                f"control_dt must be above 0 and seed in 0 to 2**32 - 1, got {self.control_dt} "
+                f"and {self.seed}"
+            )
         if not self.tasks or len(set(self.tasks)) < len(self.tasks):
             raise ValueError(f"tasks must be different and at least one, got {self.tasks}")

@@ -22,7 +22,7 @@ import safetensors.numpy
 from flax import nnx
 
 from lorasp_jax import adaptation, paths
-from lorasp_jax.adapter_io import write_whole
+from lorasp_jax.adapter_io import read_tensors, write_whole
 from lorasp_jax.dense import AdaptedLayer, Dense
 from lorasp_jax.peft import AdaLoRA, DoRA, LoRA
 
@@ -145,15 +145,13 @@ def _read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter]]:
     """The configuration, and by module lora_A, lora_B in our layout, the scale among them."""
     for name in (CONFIG, TENSORS):
         if not (folder / name).is_file():
-            raise ValueError(
-                f"{folder} holds no {name}; a PEFT adapter is a folder with both files."
-            )
+            raise ValueError(f"{folder} holds no {name}; a PEFT adapter is a folder with both.")
     try:
         config = json.loads((folder / CONFIG).read_bytes())
-        tensors = safetensors.numpy.load_file(folder / TENSORS)
         kind = config["peft_type"]
-    except (ValueError, KeyError, TypeError, safetensors.SafetensorError) as error:
-        raise ValueError(f"{folder} is damaged or no PEFT adapter: {error}") from error
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise ValueError(f"{folder / CONFIG} is damaged or no PEFT adapter: {error}") from error
+    tensors = read_tensors(folder / TENSORS, (folder / TENSORS).read_bytes())
     if kind not in ("LORA", "ADALORA"):
         raise ValueError(f"{folder} holds {kind}; LORA and ADALORA can be loaded.")
     if asked := [name for name in _UNKNOWN if config.get(name) not in _NOTHING]:
@@ -170,7 +168,10 @@ def _read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter]]:
         if not (match := _TENSOR.fullmatch(name)):
             raise ValueError(f"{folder} holds {name!r}, which belongs to no LoRA.")
         modules[match[1]][match[2]] = tensor.astype(np.float32)
-    return config, {name: _imported(config, name, found) for name, found in modules.items()}
+    try:
+        return config, {name: _imported(config, name, found) for name, found in modules.items()}
+    except (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, re.error) as error:
+        raise ValueError(f"{folder} is no PEFT adapter that can be read: {error}") from error
 
 
 def _imported(config: Mapping[str, Any], module: str, found: Adapter) -> Adapter:
@@ -190,6 +191,8 @@ def _imported(config: Mapping[str, Any], module: str, found: Adapter) -> Adapter
     else:
         rank = a.shape[1]
         scale = alpha / (math.sqrt(rank) if config.get("use_rslora") else rank)
+    if not math.isfinite(scale):
+        raise ValueError(f"the adapter of {module} has the scale {scale}.")
     adapter = {"lora_a": a, "lora_b": b, "scale": np.float32(scale)}
     if "lora_magnitude_vector" in found:
         adapter["magnitude"] = found["lora_magnitude_vector"].reshape(-1)

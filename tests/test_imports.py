@@ -8,6 +8,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 ROOMS = [
     "envs",
+    "lorasp_jax.kinds",
     "lorasp_jax.kernels",
     "lorasp_jax.energy_schedule",
     "lorasp_jax.routing",

@@ -11,6 +11,7 @@ pixels 37,000 windows/s, 224 x 168 18,000; from array_record files of raw pictur
 
 import contextlib
 import json
+import math
 import os
 import tokenize
 import zlib
@@ -37,6 +38,7 @@ _KINDS = {"robot": str, "actions": str, "control_dt": float, "physics_dt": float
 _KINDS |= {"numbers": int, "cameras": dict, "crc32": dict, "tasks": list, "instructions": list}
 _FAILURES = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError)
 _FAILURES += (SyntaxError, tokenize.TokenError)  # of NumPy, which parses a file's header
+_FAILURES += (ArithmeticError, RecursionError)  # of JSON and its numbers
 
 
 def write(sources: Sequence[Source], path: str | os.PathLike[str], progress: Progress) -> None:
@@ -196,7 +198,11 @@ class Cache:
             self.num_steps: int = self.facts["steps"]
             self.instructions = tuple(self.facts["instructions"])
             width = self.facts["numbers"]
-        rows = {_IMAGE + name: (self.num_steps, *size, 3) for name, size in self.cameras.items()}
+            if not (0 < self.control_dt < math.inf and width > 0):
+                raise ValueError(f"control_dt is {self.control_dt} and numbers {width}")
+            if not all(isinstance(x, str) for x in (*self.facts["tasks"], *self.instructions)):
+                raise ValueError("tasks and instructions are no texts")
+            rows = {_IMAGE + n: (self.num_steps, *size, 3) for n, size in self.cameras.items()}
         rows |= {"state": (self.num_steps, width), "action": (self.num_steps, None)}
         self._columns = {name: self._mapped(name, shape) for name, shape in rows.items()}
         self._columns |= {name: self._mapped(name, (None,)) for name in ROWS[2:]}

@@ -33,7 +33,7 @@ class Film:
         try:
             self._container: Any = av.open(str(path))
             self._stream = self._container.streams.video[0]
-        except (av.error.FFmpegError, OSError, IndexError) as error:
+        except (av.error.FFmpegError, OSError, ValueError, IndexError) as error:
             raise ValueError(f"{path} is no whole video ({reason(error)})") from error
         self._stream.thread_type = "AUTO"
         self._frames: Iterator[Any] = self._container.decode(self._stream)
@@ -59,8 +59,7 @@ class Film:
         """
         tolerance, pictures = _TOLERANCE / fps, np.empty(0)
         if abs(start - self._end) > tolerance:
-            self._container.seek(round(start / self._stream.time_base), stream=self._stream)
-            self._frames = self._container.decode(self._stream)
+            self._seek(start)
         for number in range(length):
             frame = self._next(start - tolerance, number, length)
             wanted = start + number / fps
@@ -76,6 +75,14 @@ class Film:
                 pictures[number // every] = picture
         self._end = start + length / fps
         return pictures
+
+    def _seek(self, start: float) -> None:
+        """Goes to the last key frame before a time [s]."""
+        try:
+            self._container.seek(round(start / self._stream.time_base), stream=self._stream)
+        except (av.error.FFmpegError, OSError, OverflowError) as error:
+            raise ValueError(f"{self.path} has nothing at {start:g} s ({reason(error)})") from error
+        self._frames = self._container.decode(self._stream)
 
     def _next(self, earliest: float, number: int, length: int) -> Any:
         """The next frame that is not before a time [s]."""
@@ -102,7 +109,7 @@ def decoded(file: bytes, image_size: int = 0) -> np.ndarray:
     try:
         with Image.open(io.BytesIO(file)) as picture:
             return reduced(np.asarray(picture.convert("RGB")), image_size)
-    except OSError as error:
+    except (OSError, SyntaxError, Image.DecompressionBombError) as error:  # the second: of PNG
         raise ValueError(f"a picture is damaged ({reason(error)})") from error
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
@@ -185,7 +186,7 @@ class LeRobot:
             (width,) = map(int, feature["shape"])
             names = feature.get("names")
             while isinstance(names, Mapping):  # {"motors": [...]}
-                names = next(iter(names.values()))
+                names = next(iter(names.values()), None)
         if isinstance(names, list) and len(names) == width:
             return [str(name) for name in names]
         return [str(i) for i in range(width)]
@@ -216,7 +217,7 @@ class LeRobot:
             table = self._table[1]
             table = table.filter(pc.equal(table["episode_index"], number))
             frames = table["frame_index"].to_numpy()
-            times = table["timestamp"].to_numpy()
+            times = table["timestamp"].cast(pa.float64()).to_numpy()
         if len(frames) != recording.length or np.any(frames != np.arange(recording.length)):
             raise ValueError(
                 f"{path} must have frames 0 to {recording.length - 1} of episode {number} in "
@@ -238,7 +239,7 @@ class LeRobot:
             column = table[key].combine_chunks()
             width = len(self._names(kind))
             widths = set(pc.list_value_length(column).to_pylist())
-            values = column.flatten().to_numpy(zero_copy_only=False)
+            values = column.flatten().cast(pa.float64()).to_numpy(zero_copy_only=False)
         if widths != {width}:
             raise ValueError(
                 f"{path} has {sorted(map(str, widths))} numbers in {key} of episode "

@@ -148,6 +148,9 @@ def _check(folder: Path, info: Mapping[str, Any], recordings: Sequence[Recording
     """Raise ValueError unless these are all the episodes there should be, none of them empty."""
     if not recordings:
         raise ValueError(f"{folder} holds no episode")
+    numbers = [recording.number for recording in recordings]
+    if len(set(numbers)) < len(numbers):
+        raise ValueError(f"{folder} lists an episode twice: its numbers are {numbers}")
     empty = [recording.number for recording in recordings if recording.length < 1]
     if empty:
         raise ValueError(f"episode {empty[0]} of {folder} is empty")
@@ -179,5 +182,7 @@ def damage(path: Path) -> Iterator[None]:
         TypeError,
         AttributeError,
         IndexError,
+        ArithmeticError,  # of numbers that are 0 or infinite
+        RecursionError,  # of JSON
     ) as error:
         raise ValueError(f"{path} is damaged ({reason(error)})") from error

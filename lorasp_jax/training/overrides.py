@@ -46,7 +46,10 @@ def parse(arguments: Sequence[str]) -> Command:
         SystemExit: help was asked for and printed.
     """
     parser = _parser()
-    known, rest = parser.parse_known_args(arguments)
+    try:
+        known, rest = parser.parse_known_args(arguments)
+    except argparse.ArgumentError as error:
+        raise ValueError(str(error)) from error
     wants_help = bool(HELP & set(rest))
     if known.config is not None:
         config = load(Path(known.config), choose_scale(known.scale))
@@ -69,6 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="train.py",
         add_help=False,
+        exit_on_error=False,
         allow_abbrev=False,
         usage="python train.py --config FILE [options] [fields]",
         epilog="With --help, the fields follow; with --config FILE --help, as that file has them.",
@@ -101,7 +105,11 @@ def choose_scale(scale: str) -> str:
 
 
 def load(path: Path, scale: str) -> Config:
-    """What the experiment file's `get_config(scale)` returns."""
+    """What the experiment file's `get_config(scale)` returns.
+
+    Raises:
+        ValueError: there is no such file, its code fails, or it returns something else.
+    """
     if not path.is_file():
         found = ", ".join(str(file) for file in sorted(path.parent.glob("*.py")))
         raise ValueError(f"there is no config {path}" + (f": found {found}" if found else ""))
@@ -109,10 +117,17 @@ def load(path: Path, scale: str) -> Config:
     if spec is None or spec.loader is None:
         raise ValueError(f"{path} is not a Python file")
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    if not hasattr(module, "get_config"):
-        raise ValueError(f"{path} has no function get_config(scale)")
-    return module.get_config(scale)
+    try:
+        spec.loader.exec_module(module)
+        if not hasattr(module, "get_config"):
+            raise ValueError("it has no function get_config(scale)")
+        config = module.get_config(scale)
+    except Exception as error:  # whatever a file's code raises
+        reason = str(error).partition("\n")[0]
+        raise ValueError(f"{path} gives no config ({type(error).__name__}: {reason})") from error
+    if not isinstance(config, Config):
+        raise ValueError(f"{path} gives {type(config).__name__} in place of a Config")
+    return config
 
 
 def override(config: Config, arguments: Sequence[str]) -> Config:

@@ -89,5 +89,5 @@ def test_help_lists_every_field_and_option(config, capsys):
 def test_a_file_without_get_config(tmp_path):
     file = tmp_path / "empty.py"
     file.write_text("")
-    with pytest.raises(ValueError, match="has no function get_config"):
+    with pytest.raises(ValueError, match=r"gives no config .*no function get_config"):
         load(file, "cpu")

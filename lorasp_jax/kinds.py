@@ -1,0 +1,49 @@
+"""Whether the values of a dataclass are of the kinds that its fields state."""
+
+import math
+import types
+import typing
+from typing import Any
+
+
+def check_fields(owner: Any, prefix: str = "") -> None:
+    """Compares a dataclass with its annotations; an int is a float, a bool is no number.
+
+    Args:
+        owner: an instance; of its fields' types, classes, unions, `Literal` and tuples of one type
+            are looked at.
+        prefix: what the fields' names begin with, such as "optim.".
+
+    Raises:
+        ValueError: a value of another kind, or a number that is not finite.
+    """
+    for name, kind in typing.get_type_hints(type(owner)).items():
+        if typing.get_origin(kind) is typing.ClassVar:
+            continue
+        value = getattr(owner, name)
+        if not _fits(value, kind):
+            raise ValueError(f"{prefix}{name} must be {_called(kind)}, got {value!r}")
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (typing.Union, types.UnionType):
+        return any(_fits(value, one) for one in arguments)
+    if origin is typing.Literal:
+        return any(type(value) is type(one) and value == one for one in arguments)
+    if origin is tuple:
+        return isinstance(value, tuple) and all(_fits(item, arguments[0]) for item in value)
+    if kind is float:
+        return isinstance(value, int | float) and type(value) is not bool and math.isfinite(value)
+    if kind is int:
+        return isinstance(value, int) and type(value) is not bool
+    return isinstance(value, kind) if isinstance(kind, type) else True
+
+
+def _called(kind: Any) -> str:
+    """A kind in words."""
+    if typing.get_origin(kind) is typing.Literal:
+        return f"one of {', '.join(map(repr, typing.get_args(kind)))}"
+    if kind is float:
+        return "a finite number"
+    return kind.__name__ if isinstance(kind, type) else str(kind).replace("typing.", "")

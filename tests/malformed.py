@@ -1,0 +1,173 @@
+"""Ways to spoil a good input, each a name and a function of its folder; and what a refusal is."""
+
+import json
+import random
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import safetensors.numpy
+
+ROOT = Path(__file__).parent.parent
+Damage = Callable[[Path], None]
+Cases = Iterator[tuple[str, Damage]]
+ABSENT = object()
+HUGE = 1e999  # infinity, as JSON spells it
+
+
+def first(folder: Path, pattern: str) -> Path:
+    return sorted(folder.rglob(pattern))[0]
+
+
+def _noise(data: bytes) -> bytes:
+    return random.Random(0).randbytes(len(data))
+
+
+_BYTES = {"empty": lambda data: b"", "half": lambda data: data[: len(data) // 2], "noise": _noise}
+
+
+def files(*patterns: str) -> Cases:
+    """A file that is missing, empty, cut in half, or noise."""
+    for pattern in patterns:
+        yield f"{pattern} missing", lambda folder, p=pattern: first(folder, p).unlink()
+        for name, change in _BYTES.items():
+
+            def spoil(folder: Path, p: str = pattern, change: Any = change) -> None:
+                path = first(folder, p)
+                path.write_bytes(change(path.read_bytes()))
+
+            yield f"{pattern} {name}", spoil
+
+
+def flips(pattern: str, places: tuple[int, ...]) -> Cases:
+    """A file with one byte changed."""
+    for place in places:
+
+        def spoil(folder: Path, place: int = place) -> None:
+            path = first(folder, pattern)
+            data = bytearray(path.read_bytes())
+            data[place] ^= 0xFF
+            path.write_bytes(data)
+
+        yield f"{pattern} byte {place}", spoil
+
+
+def fields(pattern: str, values: dict[str, list[Any]], line: int | None = None) -> Cases:
+    """A JSON file, or a line of one, with a field of another value; a field is a/b/c."""
+    for place, bad in values.items():
+        for value in bad:
+
+            def spoil(folder: Path, place: str = place, value: Any = value) -> None:
+                path = first(folder, pattern)
+                lines = path.read_text().splitlines() if line is not None else [path.read_text()]
+                content = json.loads(lines[line or 0])
+                *above, key = place.split("/")
+                owner = content
+                for name in above:
+                    owner = owner[name]
+                if value is ABSENT:
+                    del owner[key]
+                else:
+                    owner[key] = value
+                lines[line or 0] = json.dumps(content)
+                path.write_text("\n".join(lines))
+
+            shown = "absent" if value is ABSENT else repr(value)
+            yield f"{pattern} {place} {shown}", spoil
+
+
+def columns(pattern: str, values: dict[str, list[Any]], row: int = 3) -> Cases:
+    """A parquet file with a column left out, or with another value in a row; `all` means in all."""
+    for column, bad in values.items():
+        for value in bad:
+
+            def spoil(folder: Path, column: str = column, value: Any = value) -> None:
+                path = first(folder, pattern)
+                table = pq.read_table(path)
+                if value is ABSENT:
+                    pq.write_table(table.drop_columns(column), path)
+                    return
+                rows = table[column].to_pylist()
+                if isinstance(value, str | list):  # of another type: all rows
+                    rows = pa.array([value] * len(rows))
+                else:
+                    rows[row] = value(rows[row]) if callable(value) else value
+                    kind = table[column].type
+                    ragged = isinstance(rows[row], list)
+                    rows = pa.array(rows, pa.list_(pa.float32()) if ragged else kind)
+                place = table.column_names.index(column)
+                pq.write_table(table.set_column(place, column, rows), path)
+
+            shown = getattr(value, "__name__", repr(value))
+            yield f"{pattern} {column} {'absent' if value is ABSENT else shown}", spoil
+
+
+def tensors(pattern: str, changes: dict[str, Callable[[dict[str, np.ndarray]], Any]]) -> Cases:
+    """A safetensors file with other tensors."""
+    for name, change in changes.items():
+
+        def spoil(folder: Path, change: Any = change) -> None:
+            path = first(folder, pattern)
+            path.write_bytes(safetensors.numpy.save(change(safetensors.numpy.load_file(path))))
+
+        yield f"{pattern} {name}", spoil
+
+
+def _on_first(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[dict[str, Any]], Any]:
+    """A change of the first tensor alone."""
+
+    def changed(found: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        name = min(found)
+        return found | {name: np.ascontiguousarray(change(found[name]))}
+
+    return changed
+
+
+def _one_nan(array: np.ndarray) -> np.ndarray:
+    array = array.copy()
+    array.flat[0] = np.nan
+    return array
+
+
+TENSORS: dict[str, Callable[[dict[str, np.ndarray]], Any]] = {
+    "none": lambda found: {},
+    "one missing": lambda found: {n: x for n, x in found.items() if n != min(found)},
+    "one more": lambda found: found | {"other": np.zeros(3, np.float32)},
+    "one renamed": lambda found: {n if n != min(found) else f"{n}_": x for n, x in found.items()},
+    "flat": _on_first(np.ravel),
+    "scalar": _on_first(lambda x: np.ones((), np.float32)),
+    "shorter": _on_first(lambda x: x[..., :-1]),
+    "of rank 0": _on_first(lambda x: x[:0]),
+    "transposed": _on_first(lambda x: x.T),
+    "integers": _on_first(lambda x: x.astype(np.int32)),
+    "flags": _on_first(lambda x: x > 0),
+    "nan": _on_first(_one_nan),
+    "infinite": _on_first(lambda x: x * np.inf),
+}
+
+
+def drop_last(values: list[float]) -> list[float]:
+    return values[:-1]
+
+
+def with_nan(values: list[float]) -> list[float]:
+    return [*values[:-1], float("nan")]
+
+
+def with_infinity(values: list[float]) -> list[float]:
+    return [*values[:-1], float("inf")]
+
+
+def check_refusal(error: BaseException, *names: str) -> None:
+    """It is ours, one sentence, and says what it is about."""
+    assert type(error) in (ValueError, FileNotFoundError), repr(error)
+    raised = Path(traceback.extract_tb(error.__traceback__)[-1].filename)
+    assert raised.is_relative_to(ROOT), f"{error!r} was raised in {raised}"
+    text = str(error)
+    assert "\n" not in text
+    assert "Traceback" not in text
+    assert any(name in text for name in names), text
