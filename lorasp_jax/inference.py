@@ -201,15 +201,19 @@ def _outputs(layer: Dense) -> int:
     return layer.kernel_matrices().shape[1]
 
 
-def _cast(layers: Sequence[Dense]) -> Apart:
+def _matrices(layers: Sequence[Dense]) -> tuple[list[jax.Array], list[jax.Array]]:
+    """P and U of each layer, in the type in which they compute."""
     method, _ = layers[0].carried()
-    dtype = layers[0].dtype
-    params = [layer.carried()[1] for layer in layers]
-    return Apart(
-        params=_params(layers),
-        read=aligned(jnp.concatenate([method.down(p).astype(dtype) for p in params], axis=1)),
-        write=[method.up(p).astype(dtype) for p in params],
+    params, dtype = [layer.carried()[1] for layer in layers], layers[0].dtype
+    return (
+        [method.down(p).astype(dtype) for p in params],
+        [method.up(p).astype(dtype) for p in params],
     )
+
+
+def _cast(layers: Sequence[Dense]) -> Apart:
+    downs, ups = _matrices(layers)
+    return Apart(_params(layers), aligned(jnp.concatenate(downs, axis=1)), ups)
 
 
 def _params(layers: Sequence[Dense]) -> Any:
@@ -223,11 +227,9 @@ def _params(layers: Sequence[Dense]) -> Any:
 
 
 def _join(layers: Sequence[Dense]) -> Joined:
-    method, _ = layers[0].carried()
-    params = [layer.carried()[1] for layer in layers]
+    downs, ups = _matrices(layers)
     dtype = layers[0].dtype
     kernels = [layer.kernel_matrices().astype(dtype) for layer in layers]
-    downs = [method.down(p).astype(dtype) for p in params]
     biases = [
         jnp.zeros(_outputs(layer), dtype) if layer.bias is None else layer.bias.get_value()
         for layer in layers
@@ -236,6 +238,6 @@ def _join(layers: Sequence[Dense]) -> Joined:
     return Joined(
         params=_params(layers),
         read=aligned(jnp.concatenate(kernels + downs, axis=1)),
-        write=jax.scipy.linalg.block_diag(*(method.up(p).astype(dtype) for p in params)),
+        write=jax.scipy.linalg.block_diag(*ups),
         bias=jnp.concatenate(biases).astype(dtype) if has_bias else None,
     )

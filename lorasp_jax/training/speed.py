@@ -11,8 +11,7 @@ from typing import Any
 import jax
 
 from lorasp_jax import flops
-
-GIB = 2**30
+from lorasp_jax.training.preflight import GIB
 
 
 class Speed:
