@@ -196,6 +196,16 @@ def rows(name: str, table: str, options: argparse.Namespace) -> Iterator[dict[st
         yield from sampling(name, "LoRA-SP", everywhere, options)
 
 
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """What says how a step is made and measured."""
+    parser.add_argument("--rank", type=int, default=128)
+    parser.add_argument("--remat", choices=REMATS, default="products")
+    parser.add_argument("--unroll", choices=["yes", "no"], help="default: what the size has")
+    parser.add_argument("--dtype", default="bfloat16")
+    parser.add_argument("--calls", type=int, default=5, help="steps queued together")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+
+
 def main() -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
@@ -203,14 +213,9 @@ def main() -> None:
     parser.add_argument("--size", default="base", help="nano, small or base")
     parser.add_argument("--batch", type=int, default=32)
     parser.add_argument("--sampled", type=int, nargs="+", default=[1, 8], help="batches")
-    parser.add_argument("--rank", type=int, default=128)
-    parser.add_argument("--remat", choices=REMATS, default="products")
-    parser.add_argument("--unroll", choices=["yes", "no"], help="default: what the size has")
-    parser.add_argument("--dtype", default="bfloat16")
     parser.add_argument("--gib", type=float, default=24, help="memory for the largest batch")
-    parser.add_argument("--calls", type=int, default=5, help="steps queued together")
     parser.add_argument("--only", choices=["training", "largest", "sampling"])
-    parser.add_argument("--json", type=Path, help="file for the figures")
+    add_options(parser)
     options = parser.parse_args()
     console, found = Console(soft_wrap=True), {"machine": machine("jax")}
     console.print(f"{found['machine']}; {options.size}, rank {options.rank}, {options.dtype}")

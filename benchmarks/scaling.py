@@ -14,7 +14,6 @@ import dataclasses
 import json
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -24,7 +23,7 @@ from benchmarks import backbones
 from benchmarks.measuring import best, machine, print_table
 from lorasp_jax import peft
 from lorasp_jax.training import mesh as meshes
-from lorasp_jax.training.preflight import GIB, REMATS
+from lorasp_jax.training.preflight import GIB
 
 BATCH = {"nano": 512, "small": 512, "base": 32}
 
@@ -75,13 +74,8 @@ def main() -> None:
     parser.add_argument("--sizes", nargs="+", default=["small", "base"])
     parser.add_argument("--devices", type=int, nargs="+", default=[1, 2, 4])
     parser.add_argument("--batch", type=int, help="windows a device; default: by size")
-    parser.add_argument("--rank", type=int, default=128)
-    parser.add_argument("--remat", choices=REMATS, default="products")
-    parser.add_argument("--unroll", choices=["yes", "no"], help="default: what the size has")
-    parser.add_argument("--dtype", default="bfloat16")
-    parser.add_argument("--calls", type=int, default=5, help="steps queued together")
     parser.add_argument("--threads", type=int, default=8, help="that compile")
-    parser.add_argument("--json", type=Path, help="file for the figures")
+    backbones.add_options(parser)
     options = parser.parse_args()
     console, found = Console(soft_wrap=True), dict[str, Any](machine=machine("jax"))
     console.print(f"{found['machine']}, rank {options.rank}, {options.dtype}")
