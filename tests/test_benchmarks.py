@@ -1,6 +1,7 @@
 """The benchmarks' own arithmetic; what they measure is measured by running them."""
 
 import argparse
+import functools
 import io
 
 import pytest
@@ -93,7 +94,7 @@ def test_scaling(monkeypatch):
     """One device, then two that hold everything or half of the base; with a share each."""
     tiny = Pi0Config.dummy()
     monkeypatch.setattr(scaling.backbones, "sized", lambda *_: tiny)
-    monkeypatch.setattr(meshes, "MINIMUM_SHARDED_BYTES", 1024)
+    monkeypatch.setattr(meshes, "shardings", functools.partial(meshes.shardings, minimum=1024))
     options = argparse.Namespace(
         backbone="pi0", size="nano", devices=[1, 2], batch=2, rank=4, remat="none", calls=1
     )
