@@ -151,7 +151,7 @@ def energy_share(scores: jax.Array) -> jax.Array:
     """Share of each direction in its row's energy, for f32 scores [..., R]; 0 in a row of zeros."""
     energy = _energy(scores)
     total = energy.sum(-1, keepdims=True)
-    return energy / jnp.where(total == 0, 1, total)
+    return energy * (1 / jnp.where(total == 0, 1, total))
 
 
 def _energy(scores: jax.Array) -> jax.Array:

@@ -8,12 +8,15 @@ import jax.numpy as jnp
 MASKED = -2.3819763e38
 """Logit of a forbidden key; finite, so a row without any key gets a uniform softmax, not NaN."""
 
-CUDNN_TOKENS, CUDNN_WIDTH = 256, 64
+CUDNN_TOKENS, CUDNN_WIDTH = 128, 64
 """Fewest queries and narrowest heads for which attention goes through cuDNN: those of published
 sizes, while the miniatures repeat themselves bit for bit."""
 
 ALIGNED, LONG = 128, 512
 """What the number of keys is made a multiple of, and from how many on."""
+
+CUDNN_ALIGNED = 8
+"""What cuDNN gets a multiple of, queries and keys: 16 bytes of a mask."""
 
 
 def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) -> jax.Array:
@@ -31,10 +34,10 @@ def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) 
         `[B, T, N H]`.
     """
     batch, tokens, heads, size = q.shape
-    if _suits_cudnn(q, k):
-        allowed = None if mask is None else mask[:, None]
-        attend = functools.partial(jax.nn.dot_product_attention, implementation="cudnn")
-        return attend(q, k, v, mask=allowed, scale=1.0).reshape(batch, tokens, heads * size)
+    if _suits_cudnn(q, k, mask):
+        attend = functools.partial(jax.nn.dot_product_attention, implementation="cudnn", scale=1.0)
+        y = attend(q, k, v) if mask is None else attend(*_filled_up(q, k, v, mask))
+        return y[:, :tokens].reshape(batch, tokens, heads * size)
     k, v, mask = _aligned(k, v, mask)
     # With K = 1 no axis of q, weights or result moves in memory.
     q = q.reshape(batch, tokens, k.shape[2], -1, size)
@@ -52,13 +55,30 @@ def _aligned(
     more = -k.shape[1] % ALIGNED
     if mask is None or more == 0 or k.shape[1] < LONG:
         return k, v, mask
-    k, v = (jnp.pad(a, ((0, 0), (0, more), (0, 0), (0, 0))) for a in (k, v))
-    return k, v, jnp.pad(mask, ((0, 0), (0, 0), (0, more)))
+    return _longer(k, more), _longer(v, more), jnp.pad(mask, ((0, 0), (0, 0), (0, more)))
 
 
-def _suits_cudnn(q: jax.Array, k: jax.Array) -> bool:
+def _suits_cudnn(q: jax.Array, k: jax.Array, mask: jax.Array | None) -> bool:
     """Whether cuDNN takes these arrays and is worth its launch."""
     tokens, size, others = q.shape[1], q.shape[3], k.shape[1]
     half = q.dtype in (jnp.bfloat16, jnp.float16)
-    fits = CUDNN_WIDTH <= size <= 256 and size % 8 == 0 and tokens % 2 == 0 and others % 2 == 0
+    even = mask is not None or (tokens % 2 == 0 and others % 2 == 0)
+    fits = CUDNN_WIDTH <= size <= 256 and size % 8 == 0 and even
     return jax.default_backend() == "gpu" and half and fits and tokens >= CUDNN_TOKENS
+
+
+def _filled_up(
+    q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array, None, jax.Array]:
+    """What `jax.nn.dot_product_attention` takes, with numbers of queries and keys that cuDNN takes.
+
+    The further keys are forbidden, and so are all of a further query, whose result is not read.
+    """
+    queries, keys = (-a.shape[1] % CUDNN_ALIGNED for a in (q, k))
+    q, k, v = (_longer(a, more) for a, more in ((q, queries), (k, keys), (v, keys)))
+    return q, k, v, None, jnp.pad(mask, ((0, 0), (0, queries), (0, keys)))[:, None]
+
+
+def _longer(x: jax.Array, more: int) -> jax.Array:
+    """x `[B, T, N, H]` with zeros behind the T tokens."""
+    return jnp.pad(x, ((0, 0), (0, more), (0, 0), (0, 0))) if more else x
