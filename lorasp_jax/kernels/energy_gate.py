@@ -38,8 +38,8 @@ PAIRWISE_RANK = 32
 class Boundary(NamedTuple):
     """The last kept position of each row: keep s > score, and s == score up to `index`."""
 
-    score: jax.Array  # f32 [..., 1]; NaN where nothing is kept
-    index: jax.Array  # int32 [..., 1]
+    score: jax.Array  # f32 [..., 1], of one row alone []; NaN where nothing is kept
+    index: jax.Array  # int32, the same
 
 
 class Ratio(NamedTuple):
@@ -105,7 +105,7 @@ def _finder(implementation: str) -> Callable[[jax.Array, Ratio], jax.Array]:
     boundaries = {
         "sort": _sorted_boundary,
         "bisection": bisected_boundary,
-        "block": functools.partial(bisected_boundary, is_block=True),
+        "block": _block_boundary,
         "pallas": _pallas_boundary,
     }
     if implementation == "pairwise":
@@ -160,7 +160,7 @@ def _energy(scores: jax.Array) -> jax.Array:
     The scaling is exact, E_k does not depend on it, and squares neither under- nor overflow. For a
     maximum with exponent field e it is 2^(126 - e), with field 253 - e (at least 1: normal).
     """
-    largest = jax.lax.stop_gradient(scores).max(-1, keepdims=True)
+    largest = jax.lax.stop_gradient(scores).max(-1, keepdims=scores.ndim > 1)
     exponent = jax.lax.shift_right_logical(_bits(largest), 23)
     scale = _float(jax.lax.shift_left(jnp.maximum(253 - exponent, 1), 23))
     return jnp.square(scores * scale)
@@ -191,21 +191,24 @@ def bisected_boundary(scores: jax.Array, ratio: Ratio, *, is_block: bool = False
     Only elementwise work and row sums: the XLA implementation is also the Pallas kernel's body. A
     few rows, a block, stop as soon as they know (11 steps of 31 for softplus scores, R = 128). For
     many rows in XLA there is nothing to gain, and devices that share them would ask one another.
+    One row, [R], has scalars, whose comparison costs a kernel nothing.
     """
     energy = _energy(scores)
-    target = ratio.numerator * energy.sum(-1, keepdims=True)
+    keepdims = scores.ndim > 1
+    total, largest = (functools.partial(f, axis=-1, keepdims=keepdims) for f in (jnp.sum, jnp.max))
+    target = ratio.numerator * total(energy)
 
     def halve(bracket: _Bracket) -> _Bracket:
         middle = bracket.low + jax.lax.shift_right_logical(bracket.high - bracket.low, 1)
         chosen = scores >= _float(middle)
-        number = chosen.astype(jnp.int32).sum(-1, keepdims=True, dtype=jnp.int32)
-        reached = jnp.where(chosen, energy, 0).sum(-1, keepdims=True)
+        number = total(chosen.astype(jnp.int32), dtype=jnp.int32)
+        reached = total(jnp.where(chosen, energy, 0))
         is_low = ratio.denominator * reached >= target
         upper = bracket._replace(low=middle, num_low=number)
         lower = bracket._replace(high=middle, num_high=number)
         return jax.tree.map(functools.partial(jnp.where, is_low), upper, lower)
 
-    lowest, highest = (_bits(f(scores, axis=-1, keepdims=True)) for f in (jnp.min, jnp.max))
+    lowest, highest = (_bits(f(scores, axis=-1, keepdims=keepdims)) for f in (jnp.min, jnp.max))
     none = jnp.zeros_like(lowest)
     bracket = _Bracket(lowest, highest + 1, none + scores.shape[-1], none)
     if is_block:
@@ -215,12 +218,18 @@ def bisected_boundary(scores: jax.Array, ratio: Ratio, *, is_block: bool = False
     else:
         bracket = jax.lax.fori_loop(0, 31, lambda _, b: halve(b), bracket)
     # What is left in the bracket is one score, or ties.
-    score = jnp.where(scores < _float(bracket.high), scores, -1).max(-1, keepdims=True)
+    score = largest(jnp.where(scores < _float(bracket.high), scores, -1))
     index = functools.partial(_last_tie, scores, energy, score, target, ratio)
     if is_block:
         several = _any(bracket.num_low - bracket.num_high > 1)
         index = functools.partial(jax.lax.cond, several, index, lambda: none + scores.shape[-1])
     return Boundary(jnp.where(target > 0, score, jnp.nan), index())
+
+
+def _block_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
+    """`bisected_boundary` of a block of rows, [n, R] or, of one, [R]."""
+    rows = scores.reshape(-1) if len(scores) == 1 else scores
+    return bisected_boundary(rows, ratio, is_block=True)
 
 
 def _last_tie(
@@ -230,15 +239,16 @@ def _last_tie(
 
     Ties share one energy; one is kept while the energy before it falls short of the target.
     """
-    above = jnp.where(scores > score, energy, 0).sum(-1, keepdims=True)
+    keepdims = scores.ndim > 1
+    above = jnp.where(scores > score, energy, 0).sum(-1, keepdims=keepdims)
     tied = scores == score
-    each = jnp.where(tied, energy, 0).max(-1, keepdims=True)
+    each = jnp.where(tied, energy, 0).max(-1, keepdims=keepdims)
     position = jax.lax.broadcasted_iota(jnp.int32, scores.shape, scores.ndim - 1)
     num_bits = (scores.shape[-1] - 1).bit_length()
 
     def step(i: jax.Array, found: jax.Array) -> jax.Array:
         candidate = found | jax.lax.shift_left(jnp.int32(1), num_bits - 1 - i)
-        before = (tied & (position < candidate)).astype(jnp.float32).sum(-1, keepdims=True)
+        before = (tied & (position < candidate)).astype(jnp.float32).sum(-1, keepdims=keepdims)
         falls_short = ratio.denominator * (above + before * each) < target
         return jnp.where(falls_short, candidate, found)
 
@@ -298,4 +308,5 @@ def _call_kernel(ratio: Ratio, interpret: bool, _: Any, arrays: Sequence[jax.Arr
 
 def _boundary_kernel(scores: Any, score: Any, index: Any, *, ratio: Ratio) -> None:
     """One program: references to scores [rows, width] in, to the two columns of `Boundary` out."""
-    score[...], index[...] = bisected_boundary(scores[...], ratio, is_block=True)
+    for ref, found in zip((score, index), _block_boundary(scores[...], ratio), strict=True):
+        ref[...] = jnp.broadcast_to(found, ref.shape)

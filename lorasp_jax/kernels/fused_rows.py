@@ -141,19 +141,29 @@ def fused_rows(
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _fused(static: tuple, row: InARow, rows: jax.Array, counts: jax.Array) -> tuple:
-    return _forward(static, row, rows, counts)[0]
+    return _results(static, row, rows, counts, keeps=False)[0]
 
 
 def _forward(static: tuple, row: InARow, rows: jax.Array, counts: jax.Array) -> tuple:
+    results, kept = _results(static, row, rows, counts, keeps=True)
+    return results, (row, rows, counts, *kept)
+
+
+def _results(
+    static: tuple, row: InARow, rows: jax.Array, counts: jax.Array, *, keeps: bool
+) -> tuple[tuple, Sequence[jax.Array]]:
+    """What `fused_rows` returns; [what its gradient takes as given] or []."""
     function, widths, start, (launch, _), interpret = static
 
     def block(shared: Any, columns: Columns, counts: Columns) -> tuple[list[Columns], Any]:
         output, sums, kept, statistics = function(shared, columns, counts[0] != 0, None)
-        return [[output], [_packed(kept)], *([column] for column in statistics)], sums
+        columns = [output, *statistics, *([_packed(kept)] if keeps else [])]
+        return [[column] for column in columns], sums
 
     inputs = [Side(rows, widths, start, sum(widths)), Side(counts, (1,))]
-    (output, kept, *statistics), sums = _map_blocks(block, row, inputs, launch, interpret)
-    return (output, sums.tree(), statistics), (row, rows, counts, kept)
+    (output, *others), sums = _map_blocks(block, row, inputs, launch, interpret)
+    end = len(others) - keeps
+    return (output, sums.tree(), others[:end]), others[end:]
 
 
 def _backward(static: tuple, residuals: tuple, cotangents: tuple) -> tuple:
