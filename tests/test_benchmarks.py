@@ -82,11 +82,13 @@ def test_what_data_measures(tmp_path):
 
 
 @pytest.mark.slow
-def test_what_data_imports(tmp_path):
-    data.record(tmp_path / "recorded", 1)
-    row = data.importing(tmp_path, 64)
+@pytest.mark.parametrize(("codec", "size"), [("AV1", 13), ("H.264", 5)])
+def test_what_data_imports(tmp_path, codec, size):
+    data.record(tmp_path / codec, 2, codec)
+    row = data.importing(tmp_path, codec, 64)
     assert row["kept as"] == "64x48"
     assert row["pictures/s"] == 2 * row["steps/s"]
+    assert data.decoding(tmp_path, codec)["kB/picture"] == pytest.approx(size, rel=0.3)
 
 
 @pytest.mark.slow

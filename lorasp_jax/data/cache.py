@@ -16,6 +16,7 @@ import os
 import tokenize
 import zlib
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Self
 
@@ -54,11 +55,23 @@ def write(sources: Sequence[Source], path: str | os.PathLike[str], progress: Pro
         OSError: there is no room for it.
     """
     total = sum(source.num_steps for source in sources)
-    with creating(path) as folder, Writer(folder) as writer:
-        for source in sources:
-            for number in range(len(source)):
-                writer.append(source.episode(number))
-                progress(writer.num_steps, total)
+    with creating(path) as folder, Writer(folder) as writer, ThreadPoolExecutor(1) as reader:
+        for episode in _ahead(sources, reader):
+            writer.append(episode)
+            progress(writer.num_steps, total)
+
+
+def _ahead(sources: Sequence[Source], reader: ThreadPoolExecutor) -> Iterator[Episodes]:
+    """All episodes, each read while the one before is written: two are in memory at a time."""
+    coming = None
+    for source in sources:
+        for number in range(len(source)):
+            ready = coming and coming.result()
+            coming = reader.submit(source.episode, number)
+            if ready:
+                yield ready
+    if coming:
+        yield coming.result()
 
 
 class Writer:
@@ -84,14 +97,15 @@ class Writer:
             return
         if not self.num_steps:
             raise ValueError("there is no episode to write")
-        state, action = (np.load(self._folder / f"{name}.npy") for name in ROWS[:2])
+        rows = {name: np.load(self._folder / f"{name}.npy") for name in ROWS}
         if self._facts["actions"] == "joint":
-            width, every = state.shape[1], np.ones(len(state), bool)
+            width, every = rows["state"].shape[1], np.ones(self.num_steps, bool)
+            state, action = rows["state"], rows["action"]
             found = Statistics.measure(state, action, every, slots=range(width), dim=width)
             (self._folder / STATISTICS).write_text(found.to_json())
         facts = {"format": FORMAT, **self._facts, "steps": self.num_steps}
         facts |= {"tasks": self._tasks, "instructions": self._instructions}
-        facts["crc32"] = {name: self._columns[name].crc32 for name in ROWS}
+        facts["crc32"] = {name: zlib.crc32(array.data) for name, array in rows.items()}
         (self._folder / HEADER).write_text(json.dumps(facts, indent=1))
 
     def append(self, episode: Episodes) -> None:
@@ -140,13 +154,12 @@ class _Column:
     def __init__(self, path: Path, like: np.ndarray) -> None:
         self._file = path.open("wb")
         self._kind = {"descr": np.lib.format.dtype_to_descr(like.dtype), "fortran_order": False}
-        self._row, self._length, self.crc32 = like.shape[1:], 0, 0
+        self._row, self._length = like.shape[1:], 0
         self._write_header()
 
     def append(self, rows: np.ndarray) -> None:
         rows = np.ascontiguousarray(rows)
         self._file.write(rows.data)
-        self.crc32 = zlib.crc32(rows.data, self.crc32)
         self._length += len(rows)
 
     def close(self) -> None:

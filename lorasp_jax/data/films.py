@@ -9,6 +9,7 @@ from typing import Any
 import av
 import av.error
 import numpy as np
+from av.video.reformatter import VideoReformatter
 from PIL import Image
 
 _TOLERANCE = 0.25
@@ -37,6 +38,9 @@ class Film:
             raise ValueError(f"{path} is no whole video ({reason(error)})") from error
         self._stream.thread_type = "AUTO"
         self._frames: Iterator[Any] = self._container.decode(self._stream)
+        # One for all frames, and no threads of its own: a frame's own one takes as long to set up
+        # as to run.
+        self._colours = VideoReformatter()
         self._end = 0.0  # of what has been decoded [s]
 
     def read(
@@ -69,7 +73,8 @@ class Film:
                     f"{wanted:.3f} s: it does not run at the dataset's {fps:g} frames a second"
                 )
             if number % every == 0:
-                picture = reduced(frame.to_ndarray(format="rgb24"), image_size)
+                rgb = self._colours.reformat(frame, format="rgb24", threads=1)
+                picture = reduced(rgb.to_ndarray(), image_size)
                 if not number:  # into one array at once: a list to stack would be as much again
                     pictures = np.empty((-(-length // every), *picture.shape), np.uint8)
                 pictures[number // every] = picture
