@@ -146,7 +146,7 @@ def encode(path: Path, rng: np.random.Generator, codec: str) -> None:
 
 
 def texture(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
-    """f32 `[H, W, 3]` with detail of all sizes: AV1 takes 13 kB for a picture of it, as of rooms."""
+    """f32 `[H, W, 3]` with detail of all sizes; AV1 takes 13 kB for it at 640 x 480."""
     frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width))
     frequency[0, 0] = np.inf
     noise = np.fft.fft2(rng.standard_normal((4, height, width))) / frequency**1.6

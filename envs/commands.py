@@ -17,6 +17,7 @@ import envs
 from envs import collection, places, recipes, rlds, videos
 from envs.bars import Report, bars
 from envs.episodes import Episodes, replacing
+from envs.locks import alone
 from envs.making import names
 
 WORLDS = 4
@@ -34,7 +35,7 @@ def collect(options: argparse.Namespace, console: Console) -> None:
     scenes = [_scene(options, task) for task in tasks]  # bad input shows before any work
     with contextlib.ExitStack() as locks:
         for file in files:
-            locks.enter_context(places.alone(file))
+            locks.enter_context(alone(file))
             places.recover(file)
         left = {f: e for f, e in zip(files, scenes, strict=True) if not _is_done(options, e, f)}
         try:

@@ -234,13 +234,18 @@ def replacing(file: Path) -> Iterator[Path]:
 def creating(path: str | os.PathLike) -> Iterator[Path]:
     """A temporary folder that takes the path's place when all went well, else nothing is left.
 
+    One process at a time may create the path, see `envs.locks`. What one left that was killed is
+    deleted.
+
     Raises:
         ValueError: if the path exists already.
     """
     path = Path(path)
     if path.exists():
         raise ValueError(f"{path} exists already: choose another path")
-    folder = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    folder = path.with_name(f".{path.name}.tmp")
+    if folder.exists():
+        shutil.rmtree(folder)
     try:
         folder.mkdir(parents=True)
         yield folder

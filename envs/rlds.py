@@ -23,6 +23,7 @@ from array_record.python import array_record_module
 
 from envs import rlds_schema
 from envs.episodes import SHARED, Episodes, creating, replacing
+from envs.locks import alone
 from envs.rlds_reading import (
     FORMAT,
     METADATA,
@@ -55,10 +56,11 @@ def write(episodes: Episodes, path: str | os.PathLike) -> None:
         path: the folder to make.
 
     Raises:
-        ValueError: if the path exists already or the arrays do not fit one another.
+        ValueError: if the path exists already, another process is writing it, or the arrays do
+            not fit one another.
         OSError: if there is no room for it.
     """
-    with creating(path) as folder:
+    with alone(Path(path)), creating(path) as folder:
         parts = Parts(folder, {})
         parts.append(episodes)
         parts.complete()

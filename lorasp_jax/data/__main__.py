@@ -1,8 +1,9 @@
 """Command line: `python -m lorasp_jax.data inspect | convert --help`."""
 
 import argparse
+import functools
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -49,11 +50,12 @@ def convert(options: argparse.Namespace, console: Console) -> None:
     sources = [open_source(path, keys) for path in options.paths]
     if options.to == "rlds" and len(sources) > 1:
         raise ValueError(f"an RLDS dataset is made of one dataset, not of {len(sources)}")
-    with _bar(f"writing {options.out.name}") as progress:
+    with _bar(f"writing {options.out.name}") as (progress, say):
         if options.to == "rlds":
             conversion.to_rlds(sources[0], options.out, progress)
         else:
-            cache.write(sources, options.out, progress)
+            wait = f"another process is writing {options.out}: waiting for it"
+            cache.write(sources, options.out, progress, waiting=lambda: say(wait))
     episodes = sum(len(source) for source in sources)
     console.print(f"{options.out}: {episodes} episodes", soft_wrap=True, highlight=False)
 
@@ -121,12 +123,15 @@ def _camera(text: str) -> tuple[str, str]:
 
 
 @contextmanager
-def _bar(title: str) -> Iterator[Report]:
-    """A progress bar, and what moves it."""
+def _bar(title: str) -> Iterator[tuple[Report, Callable[[str], None]]]:
+    """A progress bar: what moves it, and what prints a sentence above it."""
     columns = (*Progress.get_default_columns(), MofNCompleteColumn(), TextColumn("steps"))
     with Progress(*columns, console=Console(stderr=True)) as progress:
         bar = progress.add_task(title, total=None)
-        yield lambda done, total: progress.update(bar, completed=done, total=total)
+        say = functools.partial(
+            progress.console.print, soft_wrap=True, highlight=False, markup=False
+        )
+        yield lambda done, total: progress.update(bar, completed=done, total=total), say
 
 
 if __name__ == "__main__":

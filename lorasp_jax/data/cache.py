@@ -15,7 +15,7 @@ import math
 import os
 import tokenize
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Self
@@ -23,7 +23,9 @@ from typing import Any, Self
 import numpy as np
 
 from envs.episodes import SHARED, Episodes, creating
+from envs.locks import alone
 from lorasp_jax.data.batches import Steps
+from lorasp_jax.data.columns import Column
 from lorasp_jax.data.source import Progress, Source
 from lorasp_jax.models.statistics import Statistics
 
@@ -42,23 +44,48 @@ _FAILURES += (SyntaxError, tokenize.TokenError)  # of NumPy, which parses a file
 _FAILURES += (ArithmeticError, RecursionError)  # of JSON and its numbers
 
 
-def write(sources: Sequence[Source], path: str | os.PathLike[str], progress: Progress) -> None:
+def write(
+    sources: Sequence[Source],
+    path: str | os.PathLike[str],
+    progress: Progress,
+    waiting: Callable[[], None] | None = None,
+) -> None:
     """Writes a cache folder, which is there only when all of it is.
 
     Args:
         sources: datasets of one robot with pictures of one size; they are not changed.
         path: the folder to make.
         progress: told of the steps.
+        waiting: called once if another process is writing this folder; it is then waited for, and
+            what it wrote is kept if it is of these datasets. None: that is an error.
 
     Raises:
-        ValueError: the path exists already, or an episode is not as the others or damaged.
+        ValueError: the path exists already, or is another process's; or an episode is not as the
+            others or damaged.
         OSError: there is no room for it.
     """
-    total = sum(source.num_steps for source in sources)
-    with creating(path) as folder, Writer(folder) as writer, ThreadPoolExecutor(1) as reader:
-        for episode in _ahead(sources, reader):
-            writer.append(episode)
-            progress(writer.num_steps, total)
+    path, total = Path(path), sum(source.num_steps for source in sources)
+    there = path.exists()
+    with alone(path, waiting):
+        if path.exists() and not there:
+            _check(Cache(path), sources, total)
+            return
+        with creating(path) as folder, Writer(folder) as writer, ThreadPoolExecutor(1) as reader:
+            for episode in _ahead(sources, reader):
+                writer.append(episode)
+                progress(writer.num_steps, total)
+
+
+def _check(found: "Cache", sources: Sequence[Source], steps: int) -> None:
+    """Raise ValueError unless size and first episode of a cache are as of these datasets."""
+    first, wanted = found.episode(0), sources[0].episode(0)
+    length = int(wanted.length[0])
+    same = found.num_steps == steps and _facts(first) == _facts(wanted)
+    for name in ("state", "action"):
+        rows = getattr(wanted, name)[:, :length]
+        same = same and np.array_equal(getattr(first, name), rows)
+    if not same:
+        raise ValueError(f"another process has written {found.path}, of something else")
 
 
 def _ahead(sources: Sequence[Source], reader: ThreadPoolExecutor) -> Iterator[Episodes]:
@@ -83,7 +110,7 @@ class Writer:
         self._folder, self._facts = folder, {}
         self._tasks: list[str] = []
         self._instructions: list[str] = []
-        self._columns: dict[str, _Column] = {}
+        self._columns: dict[str, Column] = {}
 
     def __enter__(self) -> Self:
         """Nothing is open yet."""
@@ -115,9 +142,7 @@ class Writer:
             ValueError: its arrays do not fit one another or the episodes before.
         """
         episode.validate()
-        facts = {name: getattr(episode, name) for name in FACTS}
-        facts["cameras"] = {name: list(x.shape[2:4]) for name, x in sorted(episode.image.items())}
-        facts["numbers"] = episode.state.shape[2]
+        facts = _facts(episode)
         self._facts = self._facts or facts
         for name, value in facts.items():
             if value != self._facts[name]:
@@ -144,35 +169,16 @@ class Writer:
 
     def _extend(self, name: str, rows: np.ndarray) -> None:
         if name not in self._columns:
-            self._columns[name] = _Column(self._folder / f"{name}.npy", rows)
+            self._columns[name] = Column(self._folder / f"{name}.npy", rows)
         self._columns[name].append(rows)
 
 
-class _Column:
-    """An .npy file that grows."""
-
-    def __init__(self, path: Path, like: np.ndarray) -> None:
-        self._file = path.open("wb")
-        self._kind = {"descr": np.lib.format.dtype_to_descr(like.dtype), "fortran_order": False}
-        self._row, self._length = like.shape[1:], 0
-        self._write_header()
-
-    def append(self, rows: np.ndarray) -> None:
-        rows = np.ascontiguousarray(rows)
-        self._file.write(rows.data)
-        self._length += len(rows)
-
-    def close(self) -> None:
-        self._file.seek(0)
-        self._write_header()
-        self._file.flush()
-        os.fsync(self._file.fileno())  # before the folder gets its name
-        self._file.close()
-
-    def _write_header(self) -> None:
-        # NumPy leaves room for the first axis to grow.
-        header = self._kind | {"shape": (self._length, *self._row)}
-        np.lib.format.write_array_header_1_0(self._file, header)
+def _facts(episode: Episodes) -> dict[str, Any]:
+    """What all episodes of a cache must have in common."""
+    facts = {name: getattr(episode, name) for name in FACTS}
+    facts["cameras"] = {name: list(x.shape[2:4]) for name, x in sorted(episode.image.items())}
+    facts["numbers"] = episode.state.shape[2]
+    return facts
 
 
 class Cache:

@@ -1,9 +1,11 @@
 """Any dataset in RLDS form, for whoever reads that; `cache.write` is what training needs."""
 
 import os
+from pathlib import Path
 
 from envs import rlds
 from envs.episodes import concatenate, creating
+from envs.locks import alone
 from lorasp_jax.data.source import Progress, Source
 
 _TOGETHER = 16  # episodes in a file
@@ -18,10 +20,11 @@ def to_rlds(source: Source, path: str | os.PathLike[str], progress: Progress) ->
         progress: told of the steps.
 
     Raises:
-        ValueError: the path exists already, or the episodes differ in more than their steps.
+        ValueError: the path exists already, another process is writing it, or the episodes differ
+            in more than their steps.
         OSError: there is no room for it.
     """
-    with creating(path) as folder:
+    with alone(Path(path)), creating(path) as folder:
         parts, done = rlds.Parts(folder, {}), 0
         for first in range(0, len(source), _TOGETHER):
             numbers = range(first, min(first + _TOGETHER, len(source)))

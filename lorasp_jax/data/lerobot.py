@@ -111,7 +111,8 @@ class LeRobot:
                 f"action_numbers among {', '.join(self._names('action'))}"
             )
         pictures = [key for key in self.cameras.values() if not self._is_film(key)]
-        self._needed = [self.keys.state, self.keys.action, *_COLUMNS, *pictures]
+        needed = (self.keys.state, self.keys.action, *_COLUMNS, *pictures)
+        self._needed = list(dict.fromkeys(needed))  # state and action may be the same
         self._films: dict[str, Film] = {}
         self._table: tuple[Path | None, Any] = None, None
 

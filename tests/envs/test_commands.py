@@ -11,7 +11,7 @@ from PIL import Image
 
 import envs
 from envs import __main__ as command_line
-from envs import collection, places, rlds
+from envs import collection, locks, places, rlds
 from envs.episodes import Episodes
 from tests.cases import mostly_slow
 from tests.envs import user_arm
@@ -260,10 +260,10 @@ def test_an_edited_robot_is_another(tmp_path, run, fake):
 
 def test_a_second_process_is_refused(tmp_path, run, fake):
     out = tmp_path / "press"
-    with places.alone(out):
+    with locks.alone(out):
         code, said = run(COLLECT, "--out", out)
         assert code == 2
-        assert said.endswith(f"another process is collecting into {out}")
+        assert said.endswith(f"another process is writing {out}")
         assert not out.with_name("press.partial").exists()
     assert run(COLLECT, "--out", out)[0] == 0
     assert os.listdir(tmp_path) == ["press"]

@@ -1,24 +1,12 @@
-"""Where collections end up: nothing is taken from another process, nothing is lost by a kill."""
+"""Where collections end up: nothing is lost by a kill."""
 
 import os
 import shutil
-import signal
-import subprocess
-import sys
 
 import pytest
 
 from envs import places, rlds
 from tests.envs.test_episodes import make
-
-HOLD = """
-import os, pathlib, sys
-from envs import places
-
-with places.alone(pathlib.Path(sys.argv[1])):
-    print("held", flush=True)
-    sys.stdin.read()
-"""
 
 
 @pytest.fixture
@@ -58,33 +46,3 @@ def test_a_kill_while_a_dataset_is_replaced(tmp_path, path, monkeypatch, owner, 
     assert rlds.read(path).num_episodes == (3 if name == "rmtree" else 2)
     places.recover(path)  # does nothing where all is well
     assert rlds.read(path).num_episodes == (3 if name == "rmtree" else 2)
-
-
-def test_one_process_at_a_time(path):
-    child = subprocess.Popen(
-        [sys.executable, "-c", HOLD, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    )
-    with child:
-        assert child.stdout
-        assert child.stdout.readline() == b"held\n"
-        with (
-            pytest.raises(ValueError, match=r"another process is collecting into .*press$"),
-            places.alone(path),
-        ):
-            pass
-        child.send_signal(signal.SIGKILL)
-    with places.alone(path):  # what a killed process leaves is in nobody's way
-        assert path.parent.exists()
-    assert not list(path.parent.iterdir())
-
-
-def test_a_lock_that_was_deleted_meanwhile_is_none(path, monkeypatch):
-    lock, flock = path.with_name(".press.lock"), places.fcntl.flock
-
-    def late(file, how):
-        lock.unlink()
-        flock(file, how)
-
-    monkeypatch.setattr(places.fcntl, "flock", late)
-    with pytest.raises(ValueError, match="another process"), places.alone(path):
-        pass

@@ -1,0 +1,53 @@
+"""A file or folder that one process at a time makes."""
+
+import contextlib
+import fcntl
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TextIO
+
+
+@contextlib.contextmanager
+def alone(path: Path, waiting: Callable[[], None] | None = None) -> Iterator[None]:
+    """Keeps other processes from making the same file or folder meanwhile.
+
+    A lock file beside it is what they share. The operating system unlocks it when a process ends,
+    however it ends.
+
+    Args:
+        path: the file or folder.
+        waiting: called once if another process is at it, whose end is then waited for; None: not
+            waited for.
+
+    Raises:
+        ValueError: if another process is at it and is not waited for.
+    """
+    lock = path.with_name(f".{path.name}.lock")
+    lock.parent.mkdir(parents=True, exist_ok=True)
+    how = fcntl.LOCK_EX | fcntl.LOCK_NB
+    while True:
+        with lock.open("w") as held:
+            try:
+                fcntl.flock(held, how)
+            except BlockingIOError as error:
+                if waiting is None:
+                    raise ValueError(f"another process is writing {path}") from error
+                waiting()
+                how = fcntl.LOCK_EX
+                continue
+            if _was_deleted(held, lock):  # by the process that had it, since it was opened
+                continue
+            try:
+                yield
+            finally:
+                lock.unlink(missing_ok=True)
+            return
+
+
+def _was_deleted(file: TextIO, path: Path) -> bool:
+    """Whether an open file is no longer the one at its path."""
+    try:
+        return not os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except FileNotFoundError:
+        return True

@@ -1,0 +1,102 @@
+"""`convert` in several processes, and killed: there is no cache or a whole one."""
+
+import os
+import random
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from envs.locks import alone
+from lorasp_jax.data import cache
+from lorasp_jax.data.__main__ import main
+from lorasp_jax.data.cache import Cache
+from lorasp_jax.data.lerobot import Keys, LeRobot
+from tests.cases import mostly_slow
+from tests.data.lerobots import golden
+
+KILLS = 12
+
+
+def convert(out):
+    """A process that is on its way."""
+    command = [sys.executable, "-m", "lorasp_jax.data", "convert", golden("v3"), "--out", out]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+
+
+def files(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """What a conversion that nothing disturbs writes."""
+    path = tmp_path_factory.mktemp("whole") / "cache"
+    cache.write([LeRobot(golden("v3"), Keys(image_size=224))], path, lambda *_: None)
+    return files(path)
+
+
+def test_one_writes_and_the_others_wait(whole, tmp_path):
+    out = tmp_path / "cache"
+    sentence = f"another process is writing {out}: waiting for it\n"
+    with alone(out):
+        children = [convert(out), convert(out)]
+        assert [child.stderr.readline() for child in children] == [sentence, sentence]
+    said = [child.communicate()[1] for child in children]
+    assert [child.returncode for child in children] == [0, 0]
+    assert sorted("126/126 steps" in text for text in said) == [False, True]
+    assert not any("another" in text for text in said)
+    assert os.listdir(tmp_path) == ["cache"]
+    assert files(out) == whole
+
+
+@pytest.mark.parametrize("seed", mostly_slow(range(KILLS), [2, 6]))
+def test_killed_at_any_moment(whole, tmp_path, seed):
+    """From the first file to a little after the last one."""
+    out, part = tmp_path / "cache", (seed + random.random()) / KILLS
+    child = convert(out)
+    while not list(tmp_path.iterdir()):
+        time.sleep(0.001)
+    time.sleep(0.2 * part)  # s; about half of them come to an end
+    child.kill()
+    child.communicate()
+    if not out.exists():
+        assert main(["convert", str(golden("v3")), "--out", str(out)]) == 0
+        assert os.listdir(tmp_path) == ["cache"]
+    assert files(out) == whole
+
+
+@pytest.mark.parametrize(
+    ("keys", "fits"),
+    [
+        ({}, True),
+        ({"image_size": 64}, False),
+        ({"cameras": {"side": "observation.images.side"}}, False),
+        ({"every": 2}, False),
+        ({"gripper": "millimetres"}, False),
+        ({"action": "observation.state"}, False),
+    ],
+)
+def test_what_another_one_wrote_must_be_the_same(tmp_path, keys, fits):
+    out, asked = tmp_path / "cache", threading.Event()
+    cache.write([LeRobot(golden("v3"))], tmp_path / "other", lambda *_: None)
+    with ThreadPoolExecutor() as pool:
+        with alone(out):
+            mine = LeRobot(golden("v3"), Keys(**keys))
+            waiting = pool.submit(cache.write, [mine], out, lambda *_: None, asked.set)
+            assert asked.wait(60)
+            (tmp_path / "other").rename(out)
+        error = waiting.exception()
+    assert (error is None) == fits
+    assert fits or "has written" in str(error)
+    assert len(Cache(out)) == 4
+
+
+def test_who_does_not_wait_is_refused(tmp_path):
+    out = tmp_path / "cache"
+    with alone(out), pytest.raises(ValueError, match=r"another process is writing .*cache$"):
+        cache.write([LeRobot(golden("v3"))], out, lambda *_: None)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,88 @@
+"""Locks between processes, which end with them."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from envs import locks
+
+HOLD = """
+import os, pathlib, sys
+from envs import locks
+
+with locks.alone(pathlib.Path(sys.argv[1])):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "new folder" / "press"
+
+
+def test_one_process_at_a_time(path):
+    child = subprocess.Popen(
+        [sys.executable, "-c", HOLD, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    with child:
+        assert child.stdout
+        assert child.stdout.readline() == b"held\n"
+        with (
+            pytest.raises(ValueError, match=r"another process is writing .*press$"),
+            locks.alone(path),
+        ):
+            pass
+        kill = threading.Thread(target=child.send_signal, args=(signal.SIGKILL,))
+        with locks.alone(path, kill.start):  # waits for it
+            assert kill.ident
+            assert child.wait(60) == -signal.SIGKILL
+    with locks.alone(path):  # what a killed process leaves is in nobody's way
+        assert path.parent.exists()
+    assert not list(path.parent.iterdir())
+
+
+def test_all_who_wait_get_their_turn(path):
+    """Each one's lock file is deleted by the one before, which never lets two in."""
+    inside, turns, told = [], [], []
+
+    def work(number):
+        with locks.alone(path, lambda: told.append(number)):
+            inside.append(number)
+            assert inside == [number]
+            turns.append(number)
+            inside.remove(number)
+
+    with ThreadPoolExecutor(8) as pool:
+        with locks.alone(path):
+            waiting = [pool.submit(work, number) for number in range(8)]
+            while len(told) < 8:
+                pass
+        for one in waiting:
+            one.result()
+    assert sorted(turns) == sorted(told) == list(range(8))  # each is told once
+    assert not os.listdir(path.parent)
+
+
+@pytest.mark.parametrize("anew", [False, True])
+def test_a_lock_that_was_deleted_meanwhile_is_none(path, monkeypatch, anew):
+    lock, flock, calls = path.with_name(".press.lock"), locks.fcntl.flock, []
+
+    def late(file, how):
+        if not calls:
+            lock.unlink()
+            if anew:
+                lock.touch()
+        calls.append(how)
+        flock(file, how)
+
+    monkeypatch.setattr(locks.fcntl, "flock", late)
+    with locks.alone(path):
+        assert len(calls) == 2
+        with pytest.raises(ValueError, match="another process"), locks.alone(path):
+            pass
