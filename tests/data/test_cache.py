@@ -134,11 +134,11 @@ def test_all_or_nothing(tmp_path, simulated):
 
 
 def test_no_room(tmp_path, monkeypatch):
-    class Full(cache._Column):
+    class Full(cache.Column):
         def append(self, rows):
             raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(cache, "_Column", Full)
+    monkeypatch.setattr(cache, "Column", Full)
     with pytest.raises(OSError, match="No space left"):
         written(tmp_path / "cache", Broken(one()))
     assert not list(tmp_path.iterdir())
