@@ -7,7 +7,8 @@ A training step is this project's own, with AdamW and the auxiliary losses, on a
 the device; its state is donated. GiB is what the compiled program needs with its arguments, MFU the
 matrix products of loss and gradients (`lorasp_jax.flops`, nothing that is computed twice) a second
 over the device's bf16 peak. Sampling is ten denoising steps in one program, from pictures to action
-chunk. "largest" is the largest batch whose step is expected to need at most 24 GiB.
+chunk, by the model's `sampler`, which was made before. "largest" is the largest batch whose step is
+expected to need at most 24 GiB.
 """
 
 import argparse
@@ -28,7 +29,7 @@ from benchmarks.measuring import best, machine, print_table
 from lorasp_jax import adaptation, flops, peft
 from lorasp_jax.config import Config, OptimConfig
 from lorasp_jax.models import backbone
-from lorasp_jax.models.backbone import Backbone
+from lorasp_jax.models.backbone import Backbone, Sampler
 from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training import preflight
@@ -166,17 +167,16 @@ def largest(name: str, run: Config, options: argparse.Namespace) -> int:
 def sampling(name: str, label: str, run: Config | None, options: argparse.Namespace) -> Iterator:
     """Rows of drawing action chunks."""
     config = sized(name, options)
-    graphdef, adapters, frozen = arrays(config, run)
+    sampler = nnx.merge(*arrays(config, run)).sampler()
     observation = noise(abstract_batch(config, 1).observation)
 
     @jax.jit
-    def sample(adapters: Any, frozen: Any, observation: Any) -> jax.Array:
-        model = nnx.merge(graphdef, adapters, frozen)
-        return model.sample_actions(jax.random.key(0), observation, num_steps=STEPS)
+    def sample(sampler: Sampler, observation: Any) -> jax.Array:
+        return sampler.sample_actions(jax.random.key(0), observation, num_steps=STEPS)
 
     for batch in options.sampled:
         seen = jax.tree.map(functools.partial(jnp.repeat, repeats=batch, axis=0), observation)
-        seconds = best(functools.partial(sample, adapters, frozen, seen), calls=1, repeats=10)
+        seconds = best(functools.partial(sample, sampler, seen), calls=1, repeats=10)
         yield {"backbone": name, "adapters": label, "batch": batch, "ms": 1e3 * seconds}
 
 

@@ -9,10 +9,11 @@ that adapters write:
 
 Their chains f between the matrices run as one. Stacked layers that are called once, as those that
 read the pictures, get P and U alone, in the type in which they compute: a copy of W would cost more
-than it saves. For training there is `lorasp_jax.kernels.low_rank_matmul`.
+than it saves. The layers themselves go. For training there is `lorasp_jax.kernels.low_rank_matmul`.
 """
 
 import dataclasses
+import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -35,9 +36,25 @@ LONG_SUM, SHORTEST_SUM = 2048, 512
 """Inputs from which on a product is worth parts, and the least to a part."""
 
 
-class Joined(NamedTuple):
+class Chain(NamedTuple):
+    """f of n layers."""
+
+    method: Method
+    width: int
+    """Q, the columns of P of one layer."""
+    sizes: tuple[int, ...]
+    """O of each layer."""
+
+
+_pytree = functools.partial(jax.tree_util.register_dataclass, meta_fields=["chain"])
+
+
+@functools.partial(_pytree, data_fields=["params", "read", "write", "bias"])
+@dataclasses.dataclass(frozen=True)
+class Joined:
     """Layers of one method that read the same input."""
 
+    chain: Chain
     params: Any
     """What f needs of the adapters of the n layers, [n, ...]; None where shapes differ."""
     read: jax.Array
@@ -48,15 +65,22 @@ class Joined(NamedTuple):
     """[sum of O], None if no layer has one."""
 
 
-class Apart(NamedTuple):
+@functools.partial(_pytree, data_fields=["params", "read", "write", "kernels", "biases"])
+@dataclasses.dataclass(frozen=True)
+class Apart:
     """The same for layers whose W are read where they are."""
 
+    chain: Chain
     params: Any
     """As in `Joined`."""
     read: jax.Array
     """P of all layers, [I, sum of Q or a little more]."""
     write: list[jax.Array]
     """U [R, O] of each layer."""
+    kernels: list[jax.Array]
+    """W [I, O] of each layer."""
+    biases: list[jax.Array | None]
+    """[O] of each layer."""
 
 
 class Ready(nnx.Variable):
@@ -64,7 +88,7 @@ class Ready(nnx.Variable):
 
 
 def prepare(module: nnx.Module, *, copy_kernels: bool = True) -> None:
-    """Joins the adapted layers that are attributes of the module; it then computes the same.
+    """Joins adapted layers that are attributes of the module, which `call` then finds in `ready`.
 
     `module.together`, if there is one, names layers that read the same input. Layers of the kind
     `Dense` with a type of their own are joined, if their method is x W + z U; the others stay.
@@ -75,9 +99,11 @@ def prepare(module: nnx.Module, *, copy_kernels: bool = True) -> None:
     grouped = {name for names in groups for name in names}
     groups += [(name,) for name in layers if name not in grouped]
     if groups:
-        join = _join if copy_kernels else _cast
+        join = _join if copy_kernels else _apart
         joined = {names: join([layers[name] for name in names]) for names in groups}
         module.ready = Ready(joined)  # pyright: ignore[reportAttributeAccessIssue]
+        for name in itertools.chain(*groups):
+            delattr(module, name)
 
 
 def prepared_stack(blocks: Block) -> Block:
@@ -97,51 +123,46 @@ def call(
     ready = getattr(module, "ready", None)
     if ready is None or names not in ready.get_value():
         return None
-    layers: list[Dense] = [getattr(module, name) for name in names]
-    compute = _call_joined if isinstance(ready.get_value()[names], Joined) else _call_apart
-    ys, aux = compute(ready.get_value()[names], layers, layers[0].as_input(x), token_mask)
+    joined = ready.get_value()[names]
+    x = x.astype(joined.read.dtype)
+    ys, aux = (_call_joined if isinstance(joined, Joined) else _call_apart)(joined, x, token_mask)
     of_each = [jax.tree.map(lambda a, i=i: a[i], aux) for i in range(len(names))]
     reports = [dataclasses.replace(one, token_mask=token_mask) for one in of_each]
     return list(zip(ys, reports, strict=True))
 
 
 def _call_joined(
-    joined: Joined, layers: Sequence[Dense], x: jax.Array, token_mask: jax.Array | None
+    joined: Joined, x: jax.Array, token_mask: jax.Array | None
 ) -> tuple[Sequence[jax.Array], Aux]:
     """y of each layer, and aux [n, ...]."""
-    ends = list(itertools.accumulate(map(_outputs, layers)))
+    ends = list(itertools.accumulate(joined.chain.sizes))
     read = product(x, joined.read)
-    z, aux = _between(joined, layers, read, ends[-1], token_mask)
+    z, aux = _between(joined, read, ends[-1], token_mask)
     y = read[..., : ends[-1]] + z @ joined.write
     y = y if joined.bias is None else y + joined.bias
     return jnp.split(y, ends[:-1], axis=-1), aux
 
 
 def _call_apart(
-    apart: Apart, layers: Sequence[Dense], x: jax.Array, token_mask: jax.Array | None
+    apart: Apart, x: jax.Array, token_mask: jax.Array | None
 ) -> tuple[Sequence[jax.Array], Aux]:
     """What `_call_joined` returns."""
     # XLA would make one product of x W and x P, for which it copies W.
     read = product(jax.lax.optimization_barrier(x), apart.read)
-    z, aux = _between(apart, layers, read, 0, token_mask)
-    ys = []
-    for layer, own, up in zip(layers, jnp.split(z, len(layers), axis=-1), apart.write, strict=True):
-        y = two_products(x, own, layer.kernel_matrices().astype(x.dtype), up)
-        ys.append(y if layer.bias is None else y + layer.bias.get_value().astype(y.dtype))
+    z, aux = _between(apart, read, 0, token_mask)
+    ys, zs = [], jnp.split(z, len(apart.write), axis=-1)
+    for own, kernel, up, bias in zip(zs, apart.kernels, apart.write, apart.biases, strict=True):
+        y = two_products(x, own, kernel, up)
+        ys.append(y if bias is None else y + bias)
     return ys, aux
 
 
 def _between(
-    ready: Joined | Apart,
-    layers: Sequence[Dense],
-    read: jax.Array,
-    start: int,
-    token_mask: jax.Array | None,
+    ready: Joined | Apart, read: jax.Array, start: int, token_mask: jax.Array | None
 ) -> tuple[jax.Array, Aux]:
     """z of all layers side by side, in the type of `read`, whose rows begin at a column; aux."""
-    method, _ = layers[0].carried()
-    width = _rows(layers[0])
-    columns = range(start, start + len(layers) * width, width)
+    method, width, sizes = ready.chain
+    columns = range(start, start + len(sizes) * width, width)
     z, aux = method.between_all(ready.params, read, columns, token_mask)
     return z.astype(read.dtype), aux
 
@@ -190,54 +211,49 @@ def _one_kind(layers: dict[str, Dense], names: Names) -> bool:
     return len(found) == len(names) and len({(a.method, a.dtype) for a in found}) == 1
 
 
-def _rows(layer: Dense) -> int:
-    """Q, the width of P."""
-    method, params = layer.carried()
-    return jax.eval_shape(method.down, params).shape[1]
-
-
-def _outputs(layer: Dense) -> int:
-    """O."""
-    return layer.kernel_matrices().shape[1]
-
-
-def _matrices(layers: Sequence[Dense]) -> tuple[list[jax.Array], list[jax.Array]]:
-    """P and U of each layer, in the type in which they compute."""
+def _matrices(
+    layers: Sequence[Dense],
+) -> tuple[list[jax.Array], list[jax.Array], list[jax.Array], list[jax.Array | None]]:
+    """W, P, U and bias of each layer, in the type in which they compute."""
     method, _ = layers[0].carried()
     params, dtype = [layer.carried()[1] for layer in layers], layers[0].dtype
+    biases = [None if layer.bias is None else layer.bias.get_value() for layer in layers]
     return (
+        [layer.kernel_matrices().astype(dtype) for layer in layers],
         [method.down(p).astype(dtype) for p in params],
         [method.up(p).astype(dtype) for p in params],
+        [None if bias is None else bias.astype(dtype) for bias in biases],
     )
 
 
-def _cast(layers: Sequence[Dense]) -> Apart:
-    downs, ups = _matrices(layers)
-    return Apart(_params(layers), aligned(jnp.concatenate(downs, axis=1)), ups)
-
-
-def _params(layers: Sequence[Dense]) -> Any:
-    """What f needs, [n, ...]; None where shapes differ."""
+def _chain(layers: Sequence[Dense], downs: Sequence[jax.Array]) -> tuple[Chain, Any]:
+    """f, and what it needs, [n, ...]; None where shapes differ."""
     method, _ = layers[0].carried()
 
     def stacked(*leaves: jax.Array) -> jax.Array | None:
         return jnp.stack(leaves) if len({leaf.shape for leaf in leaves}) == 1 else None
 
-    return jax.tree.map(stacked, *(method.for_rows(layer.carried()[1]) for layer in layers))
+    params = jax.tree.map(stacked, *(method.for_rows(layer.carried()[1]) for layer in layers))
+    sizes = tuple(layer.kernel_matrices().shape[1] for layer in layers)
+    return Chain(method, downs[0].shape[1], sizes), params
+
+
+def _apart(layers: Sequence[Dense]) -> Apart:
+    kernels, downs, ups, biases = _matrices(layers)
+    read = aligned(jnp.concatenate(downs, axis=1))
+    return Apart(*_chain(layers, downs), read, ups, kernels, biases)
 
 
 def _join(layers: Sequence[Dense]) -> Joined:
-    downs, ups = _matrices(layers)
-    dtype = layers[0].dtype
-    kernels = [layer.kernel_matrices().astype(dtype) for layer in layers]
-    biases = [
-        jnp.zeros(_outputs(layer), dtype) if layer.bias is None else layer.bias.get_value()
-        for layer in layers
+    kernels, downs, ups, biases = _matrices(layers)
+    filled = [
+        jnp.zeros(kernel.shape[1], kernel.dtype) if bias is None else bias
+        for kernel, bias in zip(kernels, biases, strict=True)
     ]
-    has_bias = any(layer.bias is not None for layer in layers)
+    has_bias = any(bias is not None for bias in biases)
     return Joined(
-        params=_params(layers),
+        *_chain(layers, downs),
         read=aligned(jnp.concatenate(kernels + downs, axis=1)),
         write=jax.scipy.linalg.block_diag(*ups),
-        bias=jnp.concatenate(biases).astype(dtype) if has_bias else None,
+        bias=jnp.concatenate(filled) if has_bias else None,
     )

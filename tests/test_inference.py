@@ -178,4 +178,5 @@ def test_sampling_follows_the_velocity(backbone):
     sample = quick.jit(
         lambda model: model.sample_actions(jax.random.key(0), obs, num_steps=2, noise=noise)
     )
-    np.testing.assert_allclose(sample(model), expected, rtol=1e-4, atol=1e-5)
+    for ready_or_not in (model, model.sampler()):
+        np.testing.assert_allclose(sample(ready_or_not), expected, rtol=1e-4, atol=1e-5)

@@ -1,8 +1,10 @@
 """What every backbone does: look at pictures, match flows, draw action chunks."""
 
+import dataclasses
+import functools
 import importlib
 import pkgutil
-from typing import Any, Self
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -165,6 +167,39 @@ class Backbone(nnx.Module):
         )
         return per_element, _with_action(aux, action_aux)
 
+    def sample_actions(self, key: jax.Array, obs: Observation, **options: Any) -> Any:
+        """Draw action chunks: `Sampler.sample_actions`, whose options it takes."""
+        return self.sampler().sample_actions(key, obs, **options)
+
+    def sampler(self) -> "Sampler":
+        """Itself for many calls of `sample_actions`."""
+        return Sampler.of(self)
+
+
+@functools.partial(
+    jax.tree_util.register_dataclass, data_fields=["weights"], meta_fields=["structure", "config"]
+)
+@dataclasses.dataclass(frozen=True, eq=False)
+class Sampler:
+    """A backbone that draws action chunks, with what depends on weights alone computed once.
+
+    That takes the memory of the backbone's weights once more if nobody lets go of the backbone. Its
+    arrays are a plain list: to give `jax.jit` a module of a thousand takes longer than some robots
+    have.
+    """
+
+    weights: list[jax.Array]
+    structure: Any
+    """Graph and tree that make the modules of the weights."""
+    config: BackboneConfig
+
+    @classmethod
+    def of(cls, model: Backbone) -> "Sampler":
+        """The sampler of a backbone, which stays as it is."""
+        graphdef, state = nnx.split((_reading(model), _acting(model)))
+        weights, tree = jax.tree.flatten(state)
+        return cls(weights, (graphdef, tree), model.config)
+
     def sample_actions(
         self,
         key: jax.Array,
@@ -192,8 +227,9 @@ class Backbone(nnx.Module):
         if noise is None:
             shape = (obs.state.shape[0], self.config.chunk, self.config.action_dim)
             noise = jax.random.normal(key, shape)
-        prefix, aux = self._reading().run_prefix(obs)
-        acting = self._acting()
+        graphdef, tree = self.structure
+        reading, acting = nnx.merge(graphdef, jax.tree.unflatten(tree, self.weights))
+        prefix, aux = reading.run_prefix(obs)
         actions, action_aux = flow_matching.sample(
             lambda x_t, t: acting.run_suffix(prefix, obs, x_t, t),
             noise,
@@ -207,20 +243,23 @@ class Backbone(nnx.Module):
         )
         return actions, _with_action({**aux, "action": once}, action_aux)
 
-    def _reading(self) -> Self:
-        """A copy for a prefix without gradient, in which no loop copies each layer's weights."""
-        model = nnx.merge(*nnx.split(self))
-        for tower in (model.vision, model.language):
-            tower.blocks = unstacked(inference.prepared_stack(tower.blocks))
-        return model
 
-    def _acting(self) -> Self:
-        """A copy for the steps of a flow, in which nothing depends on weights alone any more."""
-        model = nnx.merge(*nnx.split(self))
-        model.action.blocks = unstacked(model.action.blocks)
-        for module in (model, *(module for _, module in nnx.iter_modules(model.action))):
-            inference.prepare(module)
-        return model
+def _reading(model: Backbone) -> Backbone:
+    """A copy for a prefix without gradient, in which no loop copies each layer's weights."""
+    model = nnx.merge(*nnx.split(model))
+    for tower in (model.vision, model.language):
+        tower.blocks = unstacked(inference.prepared_stack(tower.blocks))
+    return model
+
+
+def _acting(model: Backbone) -> Backbone:
+    """A copy for the steps of a flow, in which nothing depends on weights alone any more."""
+    model = nnx.merge(*nnx.split(model))
+    del model.vision, model.language
+    model.action.blocks = unstacked(model.action.blocks)
+    for module in (model, *(module for _, module in nnx.iter_modules(model.action))):
+        inference.prepare(module)
+    return model
 
 
 def action_tokens(linear: Linears, x_t: jax.Array, flow_time: jax.Array) -> jax.Array:

@@ -134,9 +134,9 @@ class Linears:
         norm = getattr(self._module, name)
         if condition is None:
             return norm(x), 1
-        every = jnp.ones(condition.shape[:2], bool)
-        modulation, aux = norm.dense(condition, token_mask=every, return_aux=True)
-        self.aux[f"{name}/dense"] = aux
+        linear = Linears(norm, jnp.ones(condition.shape[:2], bool))
+        modulation = linear("dense", condition)
+        self.aux |= {f"{name}/{layer}": aux for layer, aux in linear.aux.items()}
         return norm(x, modulation)
 
 
