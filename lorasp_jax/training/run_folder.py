@@ -56,12 +56,9 @@ def open_run(config: Config, root: Path, *, resume: bool) -> Iterator[Path]:
     It is created, or with `resume` checked to hold this very run.
 
     Raises:
-        ValueError: the name is not one folder's; another process works on the folder; it holds a
-            run and `resume` is off, holds none and `resume` is on, or holds a run with another
-            config.
+        ValueError: another process works on the folder; it holds a run and `resume` is off, holds
+            none and `resume` is on, or holds a run with another config.
     """
-    if config.name in ("", ".", "..") or Path(config.name).name != config.name:
-        raise ValueError(f"--name must be a plain folder name, got {config.name!r}")
     folder = root / config.name
     with _locked(folder):
         if resume:
