@@ -242,13 +242,10 @@ class LoRASP(Method):
                 kept,
                 energy_target=self.energy_target,
                 scale=self.scale,
-                gate=self._gate(),
+                gate=self.gate,
                 score_function=self.score_function,
             )
         return z, routing.Losses(sums), sums.kept, statistics
-
-    def _gate(self) -> Implementation:
-        return self.gate or default_implementation(self.scored)
 
     def _gates_alone(self) -> bool:
         """Whether the mask of a row takes no more than its scores."""
@@ -260,15 +257,15 @@ class LoRASP(Method):
         plain = (self.router, self.score_function, self.rule) == ("gelu", "softplus", "paper")
         # Triton's blocks have sides that are powers of two, its matrix product 16 at least.
         fits = all(side >= 16 and side.bit_count() == 1 for side in (self.rank, self.hidden_width))
-        return self._gate() == "pallas" and plain and self._gates_alone() and fits
+        gate = self.gate or default_implementation(self.scored)
+        return gate == "pallas" and plain and self._gates_alone() and fits
 
     def _shared_mask(self, params: Params, rows: jax.Array, counts: jax.Array) -> jax.Array | None:
         """The mask, bool [T, R], where it takes more than each row's scores; else None."""
         if self._gates_alone():
             return None
-        scores, _ = routing.router_scores(
-            params["router"], rows[..., self.rank :], self.score_function
-        )
+        hidden = rows[..., self.rank :]
+        scores, _ = routing.router_scores(params["router"], hidden, self.score_function)
         pooled = routing.pooled_scores(scores, counts, self.granularity)
         if self.energy_start is None:
             mask, _, _ = energy_gate(pooled, self.energy_target, implementation=self.gate)
