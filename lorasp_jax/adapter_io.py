@@ -92,30 +92,43 @@ def load_adapters(
     wanted = description["methods"]
     present = {path: _settings(method) for path, method in adaptation.methods(model).items()}
     if not present:
-        model = _adapt(model, wanted, folder)
+        model = _adapted(model, wanted, tensors, folder)
     elif present != wanted:
         differing = sorted(p for p in present | wanted if present.get(p) != wanted.get(p))
         raise ValueError(f"{folder} has other adapters than the model, first at {differing[0]!r}.")
     graphdef, adapters, frozen = adaptation.split(model)
-    return nnx.merge(graphdef, _filled(adapters, tensors, folder), frozen)
+    expected = _fitting(adapters, tensors, folder)
+    values = [jnp.asarray(tensors[name], leaf.dtype) for name, leaf in expected.items()]
+    return nnx.merge(graphdef, jax.tree.unflatten(jax.tree.structure(adapters), values), frozen)
 
 
-def _adapt(
-    model: adaptation.Model, wanted: Mapping[str, Settings], folder: pathlib.Path
+def _adapted(
+    model: adaptation.Model,
+    wanted: Mapping[str, Settings],
+    tensors: Mapping[str, np.ndarray],
+    folder: pathlib.Path,
 ) -> adaptation.Model:
-    """The bare model with the adapters that a file lists, by exact paths."""
+    """The bare model with the adapters that a file lists, by exact paths.
+
+    They are made as shapes first: what is asked for may be larger than any memory.
+    """
     try:
         methods = {path: _method(settings) for path, settings in wanted.items()}
         # A parameter trained in full may sit in a layer with an adapter: such rules go first.
         paths = sorted(methods, key=lambda path: not methods[path].trains_base)
         rules = [(f"^{re.escape(path)}$", methods[path]) for path in paths]
-        return adaptation.adapt(model, rules, rngs=nnx.Rngs(0))
-    except (ValueError, TypeError) as error:
+        adapt = lambda: adaptation.adapt(model, rules, rngs=nnx.Rngs(0))  # noqa: E731
+        adapters = adaptation.split(nnx.eval_shape(adapt))[1]
+    except (ValueError, TypeError, OverflowError) as error:
         raise ValueError(f"{folder} does not fit the model: {error}") from error
+    _fitting(adapters, tensors, folder)
+    return adapt()
 
 
-def _filled(adapters: nnx.State, tensors: Mapping[str, Any], folder: pathlib.Path) -> nnx.State:
-    """The state with every leaf taken from the tensors."""
+def _fitting(
+    adapters: nnx.State, tensors: Mapping[str, np.ndarray], folder: pathlib.Path
+) -> dict[str, Any]:
+    """The leaves of a state by name, of which each has a tensor of its shape."""
     expected = _named(adapters)
     if differing := sorted(expected.keys() ^ tensors.keys()):
         raise ValueError(f"{folder} and the model differ in tensors, first {differing[0]!r}.")
@@ -123,8 +136,7 @@ def _filled(adapters: nnx.State, tensors: Mapping[str, Any], folder: pathlib.Pat
         if tensors[name].shape != leaf.shape:
             shapes = f"{tensors[name].shape} in {folder}, {leaf.shape} in the model"
             raise ValueError(f"tensor {name!r} has shape {shapes}.")
-    values = [jnp.asarray(tensors[name], leaf.dtype) for name, leaf in expected.items()]
-    return jax.tree.unflatten(jax.tree.structure(adapters), values)
+    return expected
 
 
 def _named(adapters: nnx.State) -> dict[str, jax.Array]:

@@ -8,6 +8,8 @@ from lorasp_jax import kinds
 from lorasp_jax.peft import Method
 
 SCALES = ("smoke", "cpu", "accelerator")
+LONGEST_NAME = 200
+"""Bytes of a run's name; file systems take 255, and the name of a run's lock is longer."""
 
 
 def _at_least(low: int, owner: object, *names: str) -> None:
@@ -15,6 +17,15 @@ def _at_least(low: int, owner: object, *names: str) -> None:
     for name in names:
         if getattr(owner, name) < low:
             raise ValueError(f"{name} must be at least {low}, got {getattr(owner, name)}")
+
+
+def _check_name(name: str) -> None:
+    """Raise ValueError unless it is that of a folder inside another one."""
+    plain = name not in ("", ".", "..") and "/" not in name and name.isprintable()
+    if not plain or len(name.encode()) > LONGEST_NAME:
+        raise ValueError(
+            f"name must be a plain folder name of at most {LONGEST_NAME} bytes, got {name!r}"
+        )
 
 
 @dataclass(frozen=True)
@@ -229,6 +240,7 @@ class Config:
         """Checks what no single field shows."""
         kinds.check_fields(self)
         kinds.check_fields(self.peft, "peft.")
+        _check_name(self.name)
         _at_least(1, self, "fsdp", "log_every", "checkpoint_every", "image_size")
         if self.control_dt <= 0 or not 0 <= self.seed < 2**32:
             raise ValueError(

@@ -10,9 +10,12 @@ ln(1 + lse), cut to lse in [-1, 10], which is -inf at the lower end.
 Unlike there, padding stays out and everything is in fp32.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 
+from lorasp_jax.auxiliary import masked_mean
 from lorasp_jax.kernels.energy_gate import kept_energy
 from lorasp_jax.routing import Routed, select
 
@@ -71,11 +74,7 @@ def release_losses(scores: jax.Array, mask: jax.Array, valid: jax.Array) -> dict
       mask: bool [...tokens, R], from `release_gate`.
       valid: bool [...tokens], False for padding.
     """
-
-    def mean(values: jax.Array) -> jax.Array:
-        total = jnp.where(valid, values, 0).sum()
-        return total / jnp.maximum(valid.sum(), 1)
-
+    mean = functools.partial(masked_mean, mask=valid)
     by_direction = jax.vmap(mean, in_axes=-1)
     energy = jnp.square(scores).sum(-1)
     kept = jnp.square(jnp.where(mask, scores, 0)).sum(-1)

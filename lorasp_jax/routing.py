@@ -61,7 +61,7 @@ def route(
     *,
     energy_target: float,
     scale: float,
-    gate: Implementation,
+    gate: Implementation | None,
     score_function: ScoreFunction = "softplus",
 ) -> tuple[jax.Array, "LossSums", jax.Array, list[jax.Array]]:
     """Everything between the two matrix products with the bank, row by row.
@@ -73,7 +73,7 @@ def route(
       kept: bool [n, R], the gate's mask where it is known already; it has no gradient.
       energy_target: η.
       scale: α/R.
-      gate: implementation of the energy gate.
+      gate: implementation of the energy gate, None: the backend's default.
       score_function: of a router with biases.
 
     Returns:

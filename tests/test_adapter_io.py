@@ -82,6 +82,20 @@ def test_models_that_do_not_fit(saved):
         load_adapters(saved, other)
 
 
+@pytest.mark.parametrize("field", ["rank", "hidden_width", "pruned"])
+@pytest.mark.parametrize("size", [10**12, 10**30])
+def test_sizes_beyond_any_memory(saved, field, size):
+    """Are compared with the tensors before anything is made."""
+    path = saved / "adapter.json"
+    description = json.loads(path.read_text())
+    for settings in description["methods"].values():
+        settings[field] = size
+    path.write_text(json.dumps(description))
+    with pytest.raises(ValueError, match=r"does not fit|has shape") as caught:
+        load_adapters(saved, Net(nnx.Rngs(0)))
+    assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize(
     ("name", "damage", "message"),
     [

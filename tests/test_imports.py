@@ -12,6 +12,7 @@ ROOMS = [
     "lorasp_jax.kernels",
     "lorasp_jax.energy_schedule",
     "lorasp_jax.routing",
+    "lorasp_jax.auxiliary",
     "lorasp_jax.release",
     "lorasp_jax.bank",
     "lorasp_jax.peft",

@@ -173,7 +173,7 @@ def _adapter() -> Cases:
         "methods": [ABSENT, [], None, {}, {"lin/0": None}, {"lin/0": {}}, {"nowhere": {}}],
         "methods/lin~0": [ABSENT],
         "methods/lin~0/method": [ABSENT, "lorra", 3, None, []],
-        "methods/lin~0/rank": ["8", None, 0, -1, 1.5, NAN, [8], 4],
+        "methods/lin~0/rank": ["8", None, 0, -1, 1.5, NAN, [8], 4, 10**9],
         "methods/lin~0/energy_target": ["x", NAN, 2.0, None],
         "methods/lin~0/score_function": ["x", None, []],
         "methods/lin~0/unknown": [1],

@@ -50,6 +50,7 @@ def files():
         ([*MULTITASK, *NANO, "--evaluation.execute-steps", "11"], "must be 1 to the chunk, 10"),
         ([*MULTITASK, *NANO, "--evaluation.episodes", "12"], "must be a multiple of num_envs"),
         ([*MULTITASK, *NANO, "--optim.batch-size", "9"], "multiple of the 8 devices"),
+        ([*MULTITASK, *NANO, "--fsdp", "3"], "fsdp = 3 does not divide the 8 devices"),
         (
             [*MULTITASK, *NANO, "--optim.batch-size", "24", "--optim.accumulate", "2"],
             "multiple of the 8 devices times 2 parts, got 24",
@@ -92,9 +93,12 @@ def test_full_disk(capsys, monkeypatch):
     assert capsys.readouterr().err == "error: No space left on device: make room and add --resume\n"
 
 
-def test_base_without_its_control_period(capsys):
+@pytest.mark.parametrize("content", [None, "{", "[]", "{}"])
+def test_base_without_its_control_period(content, capsys):
     shutil.copytree(ROOT / "assets" / "pi0_nano", "base")
     os.remove("base/training.json")
+    if content is not None:
+        Path("base/training.json").write_text(content)
     assert train.main([*MULTITASK, "--model.checkpoint", "base"]) == 2
     assert "does not say the control_dt" in capsys.readouterr().err
 

@@ -9,13 +9,14 @@ import importlib
 import pkgutil
 from typing import Any
 
+from lorasp_jax.auxiliary import Aux
 from lorasp_jax.peft.ada_lora import AdaLoRA
 from lorasp_jax.peft.dora import DoRA
 from lorasp_jax.peft.full import FullFineTuning
 from lorasp_jax.peft.lora import LoRA
 from lorasp_jax.peft.lora_moe import LoRAMoE
 from lorasp_jax.peft.lora_sp import LoRASP
-from lorasp_jax.peft.method import Aux, Method
+from lorasp_jax.peft.method import Method
 
 __all__ = [
     "AdaLoRA",

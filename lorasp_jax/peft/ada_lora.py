@@ -21,7 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from lorasp_jax.peft.method import Aux, Method, Params
+from lorasp_jax.auxiliary import Aux
+from lorasp_jax.peft.method import Method, Params
 
 _INIT_STD = 0.02  # of A and B in PEFT
 _NAMES = {"lora_a", "lora_e", "lora_b"}

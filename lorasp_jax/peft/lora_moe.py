@@ -15,7 +15,8 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 
-from lorasp_jax.peft.method import Aux, Method, Params, kaiming_uniform, masked_mean
+from lorasp_jax.auxiliary import Aux, masked_mean
+from lorasp_jax.peft.method import Method, Params, kaiming_uniform
 
 
 @dataclasses.dataclass(frozen=True)

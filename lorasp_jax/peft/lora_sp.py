@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import optax
 
 from lorasp_jax import energy_schedule, release, routing
+from lorasp_jax.auxiliary import Aux
 from lorasp_jax.bank import init_bank, normalized_bank
 from lorasp_jax.kernels.energy_gate import (
     Implementation,
@@ -30,8 +31,7 @@ from lorasp_jax.kernels.energy_gate import (
     exact_ratio,
 )
 from lorasp_jax.kernels.fused_rows import InARow, fused_rows
-from lorasp_jax.peft.method import Aux, Method, Params, kaiming_uniform
-from lorasp_jax.routing import router_scores
+from lorasp_jax.peft.method import Method, Params, kaiming_uniform
 
 Rule = Literal["paper", "release"]
 _CHOICES: dict[str, Any] = {
@@ -242,13 +242,10 @@ class LoRASP(Method):
                 kept,
                 energy_target=self.energy_target,
                 scale=self.scale,
-                gate=self._gate(),
+                gate=self.gate,
                 score_function=self.score_function,
             )
         return z, routing.Losses(sums), sums.kept, statistics
-
-    def _gate(self) -> Implementation:
-        return self.gate or default_implementation(self.scored)
 
     def _gates_alone(self) -> bool:
         """Whether the mask of a row takes no more than its scores."""
@@ -258,14 +255,17 @@ class LoRASP(Method):
     def gains_together(self) -> bool:
         """Whether all between the matrices is one kernel."""
         plain = (self.router, self.score_function, self.rule) == ("gelu", "softplus", "paper")
-        fits = _fits_triton(self.rank) and _fits_triton(self.hidden_width)
-        return self._gate() == "pallas" and plain and self._gates_alone() and fits
+        # Triton's blocks have sides that are powers of two, its matrix product 16 at least.
+        fits = all(side >= 16 and side.bit_count() == 1 for side in (self.rank, self.hidden_width))
+        gate = self.gate or default_implementation(self.scored)
+        return gate == "pallas" and plain and self._gates_alone() and fits
 
     def _shared_mask(self, params: Params, rows: jax.Array, counts: jax.Array) -> jax.Array | None:
         """The mask, bool [T, R], where it takes more than each row's scores; else None."""
         if self._gates_alone():
             return None
-        scores, _ = router_scores(params["router"], rows[..., self.rank :], self.score_function)
+        hidden = rows[..., self.rank :]
+        scores, _ = routing.router_scores(params["router"], hidden, self.score_function)
         pooled = routing.pooled_scores(scores, counts, self.granularity)
         if self.energy_start is None:
             mask, _, _ = energy_gate(pooled, self.energy_target, implementation=self.gate)
@@ -297,8 +297,3 @@ class LoRASP(Method):
             "LoRA-SP chooses its directions per input and cannot be merged into one kernel; "
             "prune it (drop directions that stay inactive) or distill it into a LoRA first."
         )
-
-
-def _fits_triton(side: int) -> bool:
-    """Whether a side of an array suits Triton's blocks and matrix product."""
-    return side >= 16 and side.bit_count() == 1

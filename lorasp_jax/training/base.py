@@ -63,7 +63,7 @@ def _check_time(folder: Path, control_dt: float) -> None:
     path = folder / TRAINING
     try:
         found = json.loads(path.read_text())["control_dt"]
-    except (OSError, KeyError, ValueError) as error:
+    except (OSError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} does not say the control_dt that the base needs") from error
     if found != control_dt:
         raise ValueError(

@@ -54,12 +54,8 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
     checkpoints = Checkpoints(run.folder, run.base_hash, run.console)
     restored = checkpoints.restore(state) if resume else None
     state = restored or state
-    jitted, speed = jit_stretch(run, graphdef, optimizer, placed), _speed(run)
-    if run.streams:
-        many = _Streamed(jitted, frozen, _batches(run, mesh, int(state.step)), speed)
-    else:
-        steps = processes.put(run.steps, meshes.replicated(mesh))
-        many = _Stretches(jitted, frozen, steps, speed)
+    jitted = jit_stretch(run, graphdef, optimizer, placed)
+    many = _stretches(run, jitted, frozen, mesh, int(state.step))
     if restored is None:
         many.compile(state, _stretch(run.config, int(state.step)))  # beside what the callbacks do
         _tell(callbacks, run, "on_start")
@@ -168,6 +164,16 @@ class _Streamed(_Stretches):
                 self._data = next(self._batches)
             found.append(metrics)
         return state, jax.tree.map(lambda *values: jnp.concatenate(values), *found)
+
+
+def _stretches(
+    run: Run, jitted: Callable, frozen: Any, mesh: jax.sharding.Mesh, start: int
+) -> _Stretches:
+    """Stretches of steps from one on, on data from where the run has it."""
+    if run.streams:
+        return _Streamed(jitted, frozen, _batches(run, mesh, start), _speed(run))
+    steps = processes.put(run.steps, meshes.replicated(mesh))
+    return _Stretches(jitted, frozen, steps, _speed(run))
 
 
 def _batches(run: Run, mesh: jax.sharding.Mesh, start: int) -> Iterator[Raw]:

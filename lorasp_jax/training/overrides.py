@@ -56,6 +56,7 @@ def parse(arguments: Sequence[str]) -> Command:
     elif wants_help:
         config = Config(name="NAME", scale=known.scale, peft=LoRASP())
     else:
+        _check_names(rest, Config(name="NAME", scale=known.scale, peft=LoRASP()))
         parser.print_help()
         raise ValueError("no experiment was named: add --config, such as configs/multitask.py")
     if known.method is not None:
@@ -132,14 +133,7 @@ def load(path: Path, scale: str) -> Config:
 
 def override(config: Config, arguments: Sequence[str]) -> Config:
     """Apply dotted overrides such as `--peft.rank 64 --optim.steps 100`."""
-    fields = ["--" + name for name in _names(config)]
-    for argument in arguments:
-        name = argument.split("=")[0].replace("_", "-")
-        if name.startswith("--") and name not in (*fields, "--help"):
-            others = ["--" + name.replace("_", "-") for name in vars(_parser().parse_args([]))]
-            close = difflib.get_close_matches(name, fields + others, n=1, cutoff=0.5)
-            hint = f": did you mean {close[0]}?" if close else f": fields are {' '.join(fields)}"
-            raise ValueError(f"unknown option {name}{hint}")
+    _check_names(arguments, config)
     wants_help = bool(HELP & set(arguments))
     printed = io.StringIO()
     quiet = contextlib.nullcontext() if wants_help else contextlib.redirect_stderr(printed)
@@ -156,11 +150,23 @@ def override(config: Config, arguments: Sequence[str]) -> Config:
     return Config(**{name: getattr(chosen, name) for name in names})
 
 
+def _check_names(arguments: Sequence[str], config: Config) -> None:
+    """Raise ValueError for an option that is neither a field nor one of ours."""
+    fields = ["--" + name for name in _names(config)]
+    for argument in arguments:
+        name = argument.split("=")[0].replace("_", "-")
+        if name.startswith("--") and name not in (*fields, "--help"):
+            others = ["--" + name.replace("_", "-") for name in vars(_parser().parse_args([]))]
+            close = difflib.get_close_matches(name, fields + others, n=1, cutoff=0.5)
+            hint = f": did you mean {close[0]}?" if close else f": fields are {' '.join(fields)}"
+            raise ValueError(f"unknown option {name}{hint}")
+
+
 def _sentence(message: str) -> str:
     """The first paragraph under the heading of tyro's framed error message, as one line."""
     lines = [line.strip(" │╭╮╰╯─-") for line in message.splitlines()]
     body = itertools.takewhile(bool, itertools.dropwhile(lambda line: not line, lines[1:]))
-    return " ".join(body)
+    return " ".join(body).removeprefix("Error parsing Config: ")
 
 
 def _switch(current: peft.Method, name: str) -> peft.Method:

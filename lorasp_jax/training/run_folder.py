@@ -56,12 +56,9 @@ def open_run(config: Config, root: Path, *, resume: bool) -> Iterator[Path]:
     It is created, or with `resume` checked to hold this very run.
 
     Raises:
-        ValueError: the name is not one folder's; another process works on the folder; it holds a
-            run and `resume` is off, holds none and `resume` is on, or holds a run with another
-            config.
+        ValueError: the folder cannot be made; another process works on it; it holds a run and
+            `resume` is off, holds none and `resume` is on, or holds a run with another config.
     """
-    if config.name in ("", ".", "..") or Path(config.name).name != config.name:
-        raise ValueError(f"--name must be a plain folder name, got {config.name!r}")
     folder = root / config.name
     with _locked(folder):
         if resume:
@@ -78,6 +75,8 @@ def open_run(config: Config, root: Path, *, resume: bool) -> Iterator[Path]:
 
 def _begin(config: Config, folder: Path) -> None:
     """Record a new run in a folder that holds none."""
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder} is a file: remove it, or give this run another --name")
     if folder.exists() and any(path.name not in (RECORD, CLOCK) for path in folder.iterdir()):
         raise ValueError(
             f"{folder} already holds a run: add --resume to continue it, "
@@ -95,8 +94,12 @@ def _locked(folder: Path) -> Iterator[None]:
     The operating system lets go of the lock when the process ends, in whatever way: the file that a
     killed run leaves stops nobody.
     """
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with (folder.parent / f".{folder.name}.lock").open("a+") as file:
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        opened = (folder.parent / f".{folder.name}.lock").open("a+")
+    except OSError as error:
+        raise ValueError(f"{error.filename} cannot be opened: {error.strerror}") from error
+    with opened as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
@@ -117,8 +120,8 @@ def _recorded(folder: Path) -> dict[str, Any]:
     if not record.exists():
         raise ValueError(f"{folder} holds no run to resume: start it without --resume")
     try:
-        return json.loads(record.read_text())
-    except json.JSONDecodeError as error:
+        return dict(json.loads(record.read_text()))
+    except (ValueError, TypeError) as error:
         raise ValueError(f"{record} is damaged ({error}): the run cannot be resumed") from error
 
 

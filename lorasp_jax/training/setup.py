@@ -29,6 +29,7 @@ from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.processing import Processor, Statistics, check_delta, robot_slots, to_delta
 from lorasp_jax.models.prompt_table import PromptTable
+from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training import preflight, processes
 from lorasp_jax.training.base import base_model, changed
 from lorasp_jax.training.progress import bars
@@ -150,7 +151,8 @@ def _told(
 
 
 def _check_sizes(config: Config, chunk: int) -> None:
-    """Raise ValueError unless chunk and batch fit."""
+    """Raise ValueError unless chunk, batch and devices fit."""
+    meshes.make_mesh(config.fsdp)
     if config.evaluation.execute_steps > chunk:
         raise ValueError(
             f"execute_steps must be 1 to the chunk, {chunk}, got {config.evaluation.execute_steps}"

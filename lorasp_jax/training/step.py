@@ -10,10 +10,9 @@ import optax
 from flax import nnx
 
 from lorasp_jax import adaptation
+from lorasp_jax.auxiliary import Aux, masked_mean
 from lorasp_jax.data.batches import Batch
 from lorasp_jax.models import flow_matching
-from lorasp_jax.peft import Aux
-from lorasp_jax.peft.method import masked_mean
 from lorasp_jax.training import guard as guards
 from lorasp_jax.training.guard import Guard
 

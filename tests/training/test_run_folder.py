@@ -77,9 +77,22 @@ def test_resume_needs_the_same_settings(tmp_path):
     assert json.loads((folder / "config.json").read_text())["peft"]["rank"] == 8
 
 
-def test_damaged_record(tmp_path):
+@pytest.mark.parametrize("place", ["", "a", ".a.lock/"])
+def test_something_else_is_where_the_folder_should_be(tmp_path, place):
+    root = tmp_path / "runs"
+    if place.endswith("/"):
+        (root / place).mkdir(parents=True)
+    else:
+        (root / place).parent.mkdir(exist_ok=True)
+        (root / place).write_text("a file")
+    with pytest.raises(ValueError, match=r"is a file|cannot be opened"):
+        open_run(CONFIG, root, resume=False)
+
+
+@pytest.mark.parametrize("content", [b"{", b"[3]", b"3", b"\xff"])
+def test_damaged_record(tmp_path, content):
     folder = open_run(CONFIG, tmp_path, resume=False)
-    (folder / "config.json").write_text("{")
+    (folder / "config.json").write_bytes(content)
     with pytest.raises(ValueError, match="is damaged"):
         open_run(CONFIG, tmp_path, resume=True)
 
