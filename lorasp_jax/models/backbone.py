@@ -190,15 +190,15 @@ class Sampler:
 
     weights: list[jax.Array]
     structure: Any
-    """Graph and tree that make the modules of the weights."""
+    """Graphs and tree that make modules of the weights."""
     config: BackboneConfig
 
     @classmethod
     def of(cls, model: Backbone) -> "Sampler":
         """The sampler of a backbone, which stays as it is."""
-        graphdef, state = nnx.split((_reading(model), _acting(model)))
-        weights, tree = jax.tree.flatten(state)
-        return cls(weights, (graphdef, tree), model.config)
+        graphdefs, states = zip(*map(nnx.split, (_reading(model), _acting(model))), strict=True)
+        weights, tree = jax.tree.flatten(states)
+        return cls(weights, (graphdefs, tree), model.config)
 
     def sample_actions(
         self,
@@ -227,8 +227,8 @@ class Sampler:
         if noise is None:
             shape = (obs.state.shape[0], self.config.chunk, self.config.action_dim)
             noise = jax.random.normal(key, shape)
-        graphdef, tree = self.structure
-        reading, acting = nnx.merge(graphdef, jax.tree.unflatten(tree, self.weights))
+        graphdefs, tree = self.structure
+        reading, acting = map(nnx.merge, graphdefs, jax.tree.unflatten(tree, self.weights))
         prefix, aux = reading.run_prefix(obs)
         actions, action_aux = flow_matching.sample(
             lambda x_t, t: acting.run_suffix(prefix, obs, x_t, t),

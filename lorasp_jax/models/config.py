@@ -70,7 +70,7 @@ class BackboneConfig:
     """What the backward pass computes again: nothing; all but the results of matrix products
     ("products": half the memory, a few percent more work); everything inside a layer ("full": the
     least memory, a third more work)."""
-    unroll: bool = False
+    unroll: bool = True
     """Straight-line code instead of a loop over layers: faster, the most for small ones (a loop
     copies what the backward pass needs into stacks and out again), but two to three times as long
     to compile."""
