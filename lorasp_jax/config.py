@@ -56,7 +56,7 @@ class ModelConfig:
     all inside a layer; auto is the first of these that fits into the device."""
     unroll: bool | None = None
     """Layers as straight-line code, not as a loop: faster steps of the same memory, but a longer
-    compilation; None: what the size has."""
+    compilation; None: unless remat is full."""
 
     @property
     def source(self) -> str:

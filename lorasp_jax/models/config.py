@@ -70,10 +70,10 @@ class BackboneConfig:
     """What the backward pass computes again: nothing; all but the results of matrix products
     ("products": half the memory, a few percent more work); everything inside a layer ("full": the
     least memory, a third more work)."""
-    unroll: bool = True
+    unroll: bool | None = None
     """Straight-line code instead of a loop over layers: faster, the most for small ones (a loop
     copies what the backward pass needs into stacks and out again), but two to three times as long
-    to compile."""
+    to compile. None: unless `remat` is "full", of which XLA keeps to the order in a loop alone."""
 
     def __post_init__(self) -> None:
         """Checks that the parts fit."""
@@ -102,7 +102,7 @@ class BackboneConfig:
         image_size: int = 64,
         max_tokens: int = 10,
         chunk: int = 10,
-        unroll: bool = True,
+        unroll: bool | None = None,
     ) -> Self:
         """A config for simulation: its two cameras, the offline tokenizer's words, a robot arm."""
         return cls(
@@ -117,6 +117,11 @@ class BackboneConfig:
             action_dim=8,
             unroll=unroll,
         )
+
+    @property
+    def straight_line(self) -> bool:
+        """Whether layers are straight-line code."""
+        return self.remat != "full" if self.unroll is None else self.unroll
 
     @property
     def patches(self) -> int:

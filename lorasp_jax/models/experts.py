@@ -166,7 +166,7 @@ class Expert(nnx.Module):
             x.astype(self.config.dtype),
             cache,
             remat=self.config.remat,
-            unroll=self.config.unroll,
+            unroll=self.config.straight_line,
         )
         linear = Linears(self, None)
         x, _ = linear.norm("norm", x, condition)

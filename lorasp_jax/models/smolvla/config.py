@@ -56,7 +56,6 @@ class SmolVLAConfig(BackboneConfig):
             action_dim=32,
             inputs=LEROBOT,
             dtype="bfloat16",
-            unroll=True,
         )
 
     @classmethod

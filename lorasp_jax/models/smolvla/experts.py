@@ -112,7 +112,7 @@ class ActionExpert(nnx.Module):
             valid,
             odd,
             remat=self.config.remat,
-            unroll=self.config.unroll,
+            unroll=self.config.straight_line,
         )
         return even, cross, _named("cross_layer", aux)
 
@@ -156,7 +156,7 @@ class ActionExpert(nnx.Module):
             x.astype(self.config.dtype),
             (cache, cross),
             remat=self.config.remat,
-            unroll=self.config.unroll,
+            unroll=self.config.straight_line,
         )
         return self.norm(x), aux
 
