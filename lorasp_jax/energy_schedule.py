@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from lorasp_jax.kernels.energy_gate import Ratio, bisected_boundary, kept_mask
+from lorasp_jax.kernels.bisection import Ratio, bisected_boundary
+from lorasp_jax.kernels.energy_gate import kept_mask
 
 Curve = Literal["linear", "cosine"]
 PROGRESS = "progress"

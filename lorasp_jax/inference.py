@@ -16,7 +16,7 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -123,9 +123,9 @@ def call(
     ready = getattr(module, "ready", None)
     if ready is None or names not in ready.get_value():
         return None
-    joined = ready.get_value()[names]
-    x = x.astype(joined.read.dtype)
-    ys, aux = (_call_joined if isinstance(joined, Joined) else _call_apart)(joined, x, token_mask)
+    found: Joined | Apart = ready.get_value()[names]
+    compute: Callable = _call_joined if isinstance(found, Joined) else _call_apart
+    ys, aux = compute(found, x.astype(found.read.dtype), token_mask)
     of_each = [jax.tree.map(lambda a, i=i: a[i], aux) for i in range(len(names))]
     reports = [dataclasses.replace(one, token_mask=token_mask) for one in of_each]
     return list(zip(ys, reports, strict=True))

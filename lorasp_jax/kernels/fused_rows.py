@@ -12,8 +12,6 @@ on an H200 (35k bf16 rows, R = 64, H = 32): 180 us, 500 us in XLA.
 
 import dataclasses
 import functools
-import itertools
-import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -22,6 +20,7 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 
 from lorasp_jax.kernels.by_rows import by_rows
+from lorasp_jax.kernels.in_a_row import InARow, places
 
 
 class Launch(NamedTuple):
@@ -39,38 +38,6 @@ FORWARD = Launch(16, 2, 816)
 BACKWARD = Launch(16, 4, 512)
 FEW, FEW_ROWS = Launch(1, 1, 8192), 1024
 """Both ways for up to so many rows, where what counts is how long one takes: a warp to a row."""
-
-
-@functools.partial(
-    jax.tree_util.register_dataclass, data_fields=["values"], meta_fields=["structure", "shapes"]
-)
-@dataclasses.dataclass(frozen=True)
-class InARow:
-    """A tree of fp32 arrays as one array, which costs a kernel, and XLA before it, one step."""
-
-    values: jax.Array
-    """All numbers, [N], or [n, N] of n such trees."""
-    structure: Any
-    shapes: tuple[tuple[int, ...], ...]
-
-    @classmethod
-    def of(cls, tree: Any, axes: int = 0) -> "InARow":
-        """The tree, whose leaves have so many leading axes, or what is in a row already."""
-        if isinstance(tree, cls):
-            return tree
-        leaves, structure = jax.tree.flatten(tree)
-        flat = [leaf.reshape(*leaf.shape[:axes], -1) for leaf in leaves]
-        shapes = tuple(leaf.shape[axes:] for leaf in leaves)
-        return cls(jnp.concatenate(flat, axis=-1), structure, shapes)
-
-    def tree(self, part: Callable[[int, int], jax.Array] | None = None) -> Any:
-        """The tree; `part`, (start, size) -> [..., size], says how a stretch of the row is read."""
-        read = part or (lambda start, size: self.values[..., start : start + size])
-        parts = [read(*place) for place in _places(tuple(map(math.prod, self.shapes)))]
-        leaves = [
-            p.reshape(*p.shape[:-1], *shape) for p, shape in zip(parts, self.shapes, strict=True)
-        ]
-        return jax.tree.unflatten(self.structure, leaves)
 
 
 Columns = list[jax.Array]
@@ -91,7 +58,7 @@ class Side(NamedTuple):
 
     def places(self, i: Any) -> list[tuple[Any, int]]:
         """(start, width) of each of the i-th function's columns."""
-        return [(self.start + i * self.stride + at, size) for at, size in _places(self.widths)]
+        return [(self.start + i * self.stride + at, size) for at, size in places(self.widths)]
 
 
 Function = Callable[[Any, Columns, jax.Array, jax.Array | None], tuple]
@@ -302,10 +269,5 @@ def _kernel(
 
     zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), blocks.sums)
     leaves = jax.tree.leaves(jax.lax.fori_loop(0, stretch, block, zeros))
-    for place, leaf in zip(_places(tuple(leaf.size for leaf in leaves)), leaves, strict=True):
+    for place, leaf in zip(places(tuple(leaf.size for leaf in leaves)), leaves, strict=True):
         sum_ref[program, function, pl.ds(*place)] = leaf.reshape(-1)
-
-
-def _places(widths: Widths) -> list[tuple[int, int]]:
-    """(start, width) of columns side by side."""
-    return list(zip(itertools.accumulate(widths[:-1], initial=0), widths, strict=True))

@@ -30,7 +30,8 @@ from lorasp_jax.kernels.energy_gate import (
     energy_gate,
     exact_ratio,
 )
-from lorasp_jax.kernels.fused_rows import InARow, fused_rows
+from lorasp_jax.kernels.fused_rows import fused_rows
+from lorasp_jax.kernels.in_a_row import InARow
 from lorasp_jax.peft.method import Method, Params, kaiming_uniform
 
 Rule = Literal["paper", "release"]

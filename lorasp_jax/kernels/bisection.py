@@ -1,0 +1,131 @@
+"""The search for the last score that an energy gate keeps, without a sort.
+
+Numbers >= 0 in fp32 are ordered as their bit patterns, so a binary search on those bits finds the
+threshold by comparisons and row sums alone: one function for XLA and for the body of a kernel.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+
+class Boundary(NamedTuple):
+    """The last kept position of each row: keep s > score, and s == score up to `index`."""
+
+    score: jax.Array  # f32 [..., 1], of one row alone []; NaN where nothing is kept
+    index: jax.Array  # int32, the same
+
+
+class Ratio(NamedTuple):
+    """η as numerator / denominator, in [0, 1], exact in fp32 for decimals of up to 7 digits."""
+
+    numerator: float | jax.Array  # an array where η is one
+    denominator: float
+
+
+def energies(scores: jax.Array) -> jax.Array:
+    """s² of rows scaled by the power of two that brings their maximum into [1/2, 1).
+
+    The scaling is exact, E_k does not depend on it, and squares neither under- nor overflow. For a
+    maximum with exponent field e it is 2^(126 - e), with field 253 - e (at least 1: normal).
+    """
+    largest = jax.lax.stop_gradient(scores).max(-1, keepdims=scores.ndim > 1)
+    exponent = jax.lax.shift_right_logical(_bits(largest), 23)
+    scale = _float(jax.lax.shift_left(jnp.maximum(253 - exponent, 1), 23))
+    return jnp.square(scores * scale)
+
+
+def _bits(x: jax.Array) -> jax.Array:
+    return jax.lax.bitcast_convert_type(x, jnp.int32)
+
+
+def _float(bits: jax.Array) -> jax.Array:
+    return jax.lax.bitcast_convert_type(bits, jnp.float32)
+
+
+class _Bracket(NamedTuple):
+    """Bits of scores, int32 [..., 1]: those from `low` on reach the target, from `high` on not."""
+
+    low: jax.Array
+    high: jax.Array
+    num_low: jax.Array
+    """How many scores there are from `low` on."""
+    num_high: jax.Array
+
+
+def bisected_boundary(scores: jax.Array, ratio: Ratio, *, is_block: bool = False) -> Boundary:
+    """A binary search for the largest score that reaches the target together with all above it, and
+    one for the last tie of it that is needed.
+
+    Only elementwise work and row sums: the XLA implementation is also the Pallas kernel's body. A
+    few rows, a block, stop as soon as they know (11 steps of 31 for softplus scores, R = 128). For
+    many rows in XLA there is nothing to gain, and devices that share them would ask one another.
+    One row, [R], has scalars, whose comparison costs a kernel nothing.
+    """
+    energy = energies(scores)
+    keepdims = scores.ndim > 1
+    total, largest = (functools.partial(f, axis=-1, keepdims=keepdims) for f in (jnp.sum, jnp.max))
+    target = ratio.numerator * total(energy)
+
+    def halve(bracket: _Bracket) -> _Bracket:
+        middle = bracket.low + jax.lax.shift_right_logical(bracket.high - bracket.low, 1)
+        chosen = scores >= _float(middle)
+        number = total(chosen.astype(jnp.int32), dtype=jnp.int32)
+        reached = total(jnp.where(chosen, energy, 0))
+        is_low = ratio.denominator * reached >= target
+        upper = bracket._replace(low=middle, num_low=number)
+        lower = bracket._replace(high=middle, num_high=number)
+        return jax.tree.map(functools.partial(jnp.where, is_low), upper, lower)
+
+    lowest, highest = (_bits(f(scores, axis=-1, keepdims=keepdims)) for f in (jnp.min, jnp.max))
+    none = jnp.zeros_like(lowest)
+    bracket = _Bracket(lowest, highest + 1, none + scores.shape[-1], none)
+    if is_block:
+        bracket = jax.lax.while_loop(
+            lambda b: _any((b.high - b.low > 1) & (b.num_low - b.num_high > 1)), halve, bracket
+        )
+    else:
+        bracket = jax.lax.fori_loop(0, 31, lambda _, b: halve(b), bracket)
+    # What is left in the bracket is one score, or ties.
+    score = largest(jnp.where(scores < _float(bracket.high), scores, -1))
+    index = functools.partial(_last_tie, scores, energy, score, target, ratio)
+    if is_block:
+        several = _any(bracket.num_low - bracket.num_high > 1)
+        index = functools.partial(jax.lax.cond, several, index, lambda: none + scores.shape[-1])
+    return Boundary(jnp.where(target > 0, score, jnp.nan), index())
+
+
+def block_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
+    """`bisected_boundary` of a block of rows, [n, R] or, of one, [R]."""
+    rows = scores.reshape(-1) if len(scores) == 1 else scores
+    return bisected_boundary(rows, ratio, is_block=True)
+
+
+def _last_tie(
+    scores: jax.Array, energy: jax.Array, score: jax.Array, target: jax.Array, ratio: Ratio
+) -> jax.Array:
+    """Index of the last position of `score` that is needed, int32 [..., 1].
+
+    Ties share one energy; one is kept while the energy before it falls short of the target.
+    """
+    keepdims = scores.ndim > 1
+    above = jnp.where(scores > score, energy, 0).sum(-1, keepdims=keepdims)
+    tied = scores == score
+    each = jnp.where(tied, energy, 0).max(-1, keepdims=keepdims)
+    position = jax.lax.broadcasted_iota(jnp.int32, scores.shape, scores.ndim - 1)
+    num_bits = (scores.shape[-1] - 1).bit_length()
+
+    def step(i: jax.Array, found: jax.Array) -> jax.Array:
+        candidate = found | jax.lax.shift_left(jnp.int32(1), num_bits - 1 - i)
+        before = (tied & (position < candidate)).astype(jnp.float32).sum(-1, keepdims=keepdims)
+        falls_short = ratio.denominator * (above + before * each) < target
+        return jnp.where(falls_short, candidate, found)
+
+    return jax.lax.fori_loop(0, num_bits, step, jnp.zeros_like(score, jnp.int32))
+
+
+def _any(condition: jax.Array) -> jax.Array:
+    """Whether it holds in any row; Triton reduces numbers."""
+    return condition.astype(jnp.int32).max() > 0
