@@ -82,12 +82,17 @@ class DataConfig:
     """Worlds simulated at a time while collecting."""
     action_noise: float = 0.005
     """Standard deviation of the noise on executed joint targets [rad]; recorded ones are clean."""
+    fresh_every: int = 0
+    """Steps after which as many other demonstrations take the place of the old, collected on the
+    device while these train; a multiple of log_every. 0: the same throughout."""
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
         kinds.check_fields(self)
         _at_least(1, self, "episodes", "num_envs")
-        _at_least(0, self, "action_noise")
+        _at_least(0, self, "action_noise", "fresh_every")
+        if self.fresh_every and self.source:
+            raise ValueError("a dataset has no fresh demonstrations: leave out data.fresh_every")
 
 
 @dataclass(frozen=True)
@@ -246,6 +251,11 @@ class Config:
             raise ValueError(
                 f"control_dt must be above 0 and seed in 0 to 2**32 - 1, got {self.control_dt} "
                 f"and {self.seed}"
+            )
+        if self.data.fresh_every % self.log_every:
+            raise ValueError(
+                f"data.fresh_every must be a multiple of log_every, got {self.data.fresh_every} "
+                f"and {self.log_every}"
             )
         if not self.tasks or len(set(self.tasks)) < len(self.tasks):
             raise ValueError(f"tasks must be different and at least one, got {self.tasks}")

@@ -5,6 +5,7 @@ gather. What a step trains on is a function of the run's key or seed and the ste
 the data position of a run is one integer.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -98,6 +99,15 @@ def flatten(episodes: Sequence[Episodes]) -> Steps:
         offset += int(length.sum())
         phrase += len(group.instructions)
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+
+
+def of_size(steps: Steps, size: int) -> Steps:
+    """Exactly so many steps: what is too much is cut off, what is missing are the first again."""
+    number = len(steps.end)
+    taken = np.arange(size) % number
+    found = jax.tree.map(lambda array: array[taken], steps)
+    end = found.end + np.int32(number) * (np.arange(size, dtype=np.int32) // number)
+    return dataclasses.replace(found, end=jnp.minimum(end, size))
 
 
 def windows(steps: Steps, start: Array, chunk: int) -> tuple[Array, Array]:

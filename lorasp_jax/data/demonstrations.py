@@ -18,10 +18,23 @@ Progress = Callable[[str, int, int], None]
 
 def demonstrations(config: Config, folder: Path, progress: Progress) -> dict[str, Episodes]:
     """Episodes of every task of `config`, from `folder`/cache where they are already there."""
-    keys = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 1), len(config.tasks))
     paths = [folder / "cache" / f"{task}.npz" for task in config.tasks]
     one = functools.partial(_task_demonstrations, config, progress=progress)
-    return dict(zip(config.tasks, side_by_side(one, paths, config.tasks, keys), strict=True))
+    return dict(
+        zip(config.tasks, side_by_side(one, paths, config.tasks, _keys(config)), strict=True)
+    )
+
+
+def fresh_demonstrations(config: Config, generation: int) -> dict[str, Episodes]:
+    """Other episodes of every task for each generation, 1 and on, which no file ever holds."""
+    keys = jax.vmap(lambda key: jax.random.fold_in(key, generation))(_keys(config))
+    one = functools.partial(_collected, config)
+    return dict(zip(config.tasks, side_by_side(one, config.tasks, keys), strict=True))
+
+
+def _keys(config: Config) -> jax.Array:
+    """One for each task."""
+    return jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 1), len(config.tasks))
 
 
 def side_by_side(function: Callable, *arguments: Iterable[Any]) -> list[Any]:
@@ -39,7 +52,18 @@ def _task_demonstrations(
     """Episodes of one task."""
     if path.exists():
         return Episodes.load(path, control_dt=config.control_dt)
-    episodes = envs.collect(
+    told = lambda done, total: progress(task, done, total)  # noqa: E731
+    episodes = _collected(config, task, key, told)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    episodes.save(path)
+    return episodes
+
+
+def _collected(
+    config: Config, task: str, key: jax.Array, progress: Callable[[int, int], None] | None = None
+) -> Episodes:
+    """Episodes of one task from the expert."""
+    return envs.collect(
         task,
         robot=config.robot,
         num_episodes=config.data.episodes,
@@ -48,8 +72,5 @@ def _task_demonstrations(
         control_dt=config.control_dt,
         num_envs=config.data.num_envs,
         action_noise=config.data.action_noise,
-        progress=lambda done, total: progress(task, done, total),
+        progress=progress,
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    episodes.save(path)
-    return episodes

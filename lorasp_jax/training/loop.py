@@ -3,21 +3,18 @@
 import contextlib
 import functools
 import math
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax import adaptation, flops
+from lorasp_jax import adaptation
 from lorasp_jax.config import Config, OptimConfig
 from lorasp_jax.data.batches import Raw, Steps, encode, sample_batch
-from lorasp_jax.data.stream import Stream
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.training import mesh as meshes
-from lorasp_jax.training import preflight, processes
+from lorasp_jax.training import processes
 from lorasp_jax.training.checkpoint import Checkpoints
 from lorasp_jax.training.guard import summarise
 from lorasp_jax.training.interrupt import deferred
@@ -25,8 +22,8 @@ from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
 from lorasp_jax.training.progress import bars
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import MetricsLog
-from lorasp_jax.training.speed import Speed
 from lorasp_jax.training.step import TrainState, init_state, train_step
+from lorasp_jax.training.stretches import Stretches, stretches
 
 
 class RunError(ValueError):
@@ -55,7 +52,7 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
     restored = checkpoints.restore(state) if resume else None
     state = restored or state
     jitted = jit_stretch(run, graphdef, optimizer, placed)
-    many = _stretches(run, jitted, frozen, mesh, int(state.step))
+    many = stretches(run, jitted, frozen, mesh, int(state.step))
     if restored is None:
         many.compile(state, _stretch(run.config, int(state.step)))  # beside what the callbacks do
         _tell(callbacks, run, "on_start")
@@ -123,81 +120,6 @@ def jit_stretch(run: Run, graphdef: Any, optimizer: Any, placed: TrainState) -> 
     return many
 
 
-class _Stretches:
-    """Stretches of steps, (state, key, count) -> state, metrics; each length is compiled once."""
-
-    def __init__(self, jitted: Callable, frozen: Any, data: Steps | Raw, speed: Speed) -> None:
-        self._jitted, self._frozen, self._data, self.speed = jitted, frozen, data, speed
-        self._compiled: dict[int, Future] = {}
-
-    def compile(self, state: TrainState, count: int) -> Future:
-        """Begin to compile in a thread, unless that was done."""
-        if count not in self._compiled:
-            key = jax.random.key(0)
-            lower = lambda: self._jitted.lower(self._frozen, self._data, state, key, count)  # noqa: E731
-            pool = ThreadPoolExecutor(1)
-            self._compiled[count] = pool.submit(lambda: lower().compile())
-            pool.shutdown(wait=False)
-        return self._compiled[count]
-
-    def __call__(self, state: TrainState, key: jax.Array, count: int) -> tuple[TrainState, Any]:
-        run = self.compile(state, count).result()
-        self.speed.begin()
-        return run(self._frozen, self._data, state, key)
-
-
-class _Streamed(_Stretches):
-    """Stretches of steps whose batches come from files, one always on its way to the device."""
-
-    def __init__(self, jitted: Callable, frozen: Any, batches: Iterator[Raw], speed: Speed) -> None:
-        super().__init__(jitted, frozen, next(batches), speed)
-        self._batches = batches
-
-    def compile(self, state: TrainState, count: int) -> Future:  # noqa: ARG002
-        return super().compile(state, 1)
-
-    def __call__(self, state: TrainState, key: jax.Array, count: int) -> tuple[TrainState, Any]:
-        found = []
-        for _ in range(count):
-            state, metrics = super().__call__(state, key, 1)
-            with self.speed.waiting(metrics):
-                self._data = next(self._batches)
-            found.append(metrics)
-        return state, jax.tree.map(lambda *values: jnp.concatenate(values), *found)
-
-
-def _stretches(
-    run: Run, jitted: Callable, frozen: Any, mesh: jax.sharding.Mesh, start: int
-) -> _Stretches:
-    """Stretches of steps from one on, on data from where the run has it."""
-    if run.streams:
-        return _Streamed(jitted, frozen, _batches(run, mesh, start), _speed(run))
-    steps = processes.put(run.steps, meshes.replicated(mesh))
-    return _Stretches(jitted, frozen, steps, _speed(run))
-
-
-def _batches(run: Run, mesh: jax.sharding.Mesh, start: int) -> Iterator[Raw]:
-    """Batches of a dataset from a step on, split over the devices."""
-    stream = Stream(
-        run.steps,
-        batch_size=run.config.optim.batch_size,
-        chunk=run.policy.model.config.chunk,
-        seed=run.config.seed,
-        start=start,
-        process=(jax.process_index(), jax.process_count()),
-    )
-    put = functools.partial(jax.make_array_from_process_local_data, meshes.batch_sharding(mesh))
-    return (jax.tree.map(put, raw) for raw in stream)
-
-
-def _speed(run: Run) -> Speed:
-    """The run's clock; operations are counted where it is known how many there could be."""
-    size = run.config.optim.batch_size
-    if flops.peak() is None:
-        return Speed(size, None)
-    return Speed(size, preflight.operations(run.config, run.policy.model.config))
-
-
 def _stretch(config: Config, done: int) -> int:
     """Steps until the next log line or the end."""
     return min(config.log_every, config.optim.steps - done)
@@ -206,7 +128,7 @@ def _stretch(config: Config, done: int) -> int:
 def _loop(
     run: Run,
     state: TrainState,
-    many: _Stretches,
+    many: Stretches,
     checkpoints: Checkpoints,
     callbacks: Sequence[Callback],
     policy: Callable[[TrainState], Policy],

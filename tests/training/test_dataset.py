@@ -21,9 +21,10 @@ from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.report.html import write_report
 from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training import preflight, setup
-from lorasp_jax.training.loop import _batches, _Streamed, train
+from lorasp_jax.training.loop import train
 from lorasp_jax.training.run_folder import read_metrics, to_json, write_json
 from lorasp_jax.training.speed import Speed
+from lorasp_jax.training.stretches import Streamed, _batches
 from tests.runs import CONFIG, Terminate, leaves, make_run, random_episodes, repeatable
 
 
@@ -71,7 +72,7 @@ def test_every_step_of_a_stretch_has_the_next_batch(tmp_path):
         return state + 1, {"seen": jnp.atleast_1d(raw.state.sum() + frozen)}
 
     def seen(start, *stretches):
-        many = _Streamed(note, 1.0, _batches(run, mesh, start), Speed(8, None))
+        many = Streamed(note, 1.0, _batches(run, mesh, start), Speed(8, None))
         state, found = start, []
         for count in stretches:
             state, metrics = many(state, jax.random.key(0), count)

@@ -10,9 +10,10 @@ import pytest
 
 from lorasp_jax import adaptation
 from lorasp_jax.training import mesh as meshes
-from lorasp_jax.training.loop import RunError, _Stretches, train
+from lorasp_jax.training.loop import RunError, train
 from lorasp_jax.training.run import Callback
 from lorasp_jax.training.run_folder import read_metrics
+from lorasp_jax.training.stretches import Stretches
 from tests.runs import CONFIG, Terminate, leaves, make_run, repeatable
 
 
@@ -94,13 +95,13 @@ def test_signal_handlers_are_put_back(tmp_path):
 @pytest.mark.slow
 def test_each_length_of_stretch_compiles_once_and_beside_the_callbacks(tmp_path, monkeypatch):
     compiled = []
-    begin = _Stretches.compile
+    begin = Stretches.compile
 
     def compile_and_note(self, state, count):
         compiled.append((count, count in self._compiled))
         return begin(self, state, count)
 
-    monkeypatch.setattr(_Stretches, "compile", compile_and_note)
+    monkeypatch.setattr(Stretches, "compile", compile_and_note)
 
     class Look(Callback):
         def on_start(self, run):

@@ -1,0 +1,85 @@
+"""Demonstrations that are replaced while a run goes on."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from lorasp_jax.data import demonstrations
+from lorasp_jax.data.batches import flatten, of_size, windows
+from lorasp_jax.training import mesh as meshes
+from lorasp_jax.training import stretches
+from lorasp_jax.training.loop import train
+from tests.runs import CONFIG, Miniature, Terminate, make_run, random_episodes, repeatable
+
+SAME = dataclasses.replace(CONFIG, targets=("inp", "out"))
+FRESH = dataclasses.replace(SAME, data=dataclasses.replace(SAME.data, fresh_every=2))
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """Which generations were; without simulation and on one device."""
+    found = []
+
+    def collect(config, generation):
+        found.append(generation)
+        return {task: random_episodes(task, 10 * generation) for task in config.tasks}
+
+    mesh = meshes.make_mesh(1, jax.devices()[:1])
+    monkeypatch.setattr(meshes, "make_mesh", lambda _: mesh)
+    monkeypatch.setattr(stretches, "fresh_demonstrations", collect)
+    return found
+
+
+def run(folder, config=FRESH):
+    return make_run(folder, config, Miniature())
+
+
+def test_generations_train_one_after_the_other(asked, tmp_path):
+    """The first as without, the next on others; a run that goes on repeats them to the bit."""
+    same, whole = run(tmp_path / "same", SAME), run(tmp_path / "whole")
+    train(same)
+    assert asked == []
+    train(whole)
+    assert asked == [*range(1, CONFIG.optim.steps // 2)]
+    first, *others = zip(repeatable(same.folder), repeatable(whole.folder), strict=True)
+    assert first[0] == first[1]
+    assert all(without != fresh for without, fresh in others)
+    halved = run(tmp_path / "halved")
+    with pytest.raises(KeyboardInterrupt):
+        train(halved, [Terminate()])
+    asked.clear()
+    halved = run(tmp_path / "halved")
+    train(halved, [Terminate()], resume=True)
+    assert asked == [*range(1, CONFIG.optim.steps // 2)]
+    assert repeatable(halved.folder) == repeatable(whole.folder)
+
+
+@pytest.mark.parametrize("size", [13, 21, 50])
+def test_of_size(size):
+    """Windows stay within their episode, also where one is cut off or comes again."""
+    steps = flatten([random_episodes("press", 0)])  # 5, 9 and 7 steps
+    found = of_size(steps, size)
+    start = np.arange(size)
+    window, inside = windows(found, start, 4)
+    assert len(found.end) == size
+    assert window.max() == size - 1
+    expected, _ = windows(steps, start % 21, 4)
+    np.testing.assert_array_equal(found.action[window][inside], steps.action[expected][inside])
+    if size == 21:
+        np.testing.assert_array_equal(found.end, steps.end)
+
+
+def test_each_generation_has_its_own_layouts(monkeypatch):
+    monkeypatch.setattr(demonstrations.envs, "collect", lambda _, key, **others: key)
+    keys = [demonstrations.fresh_demonstrations(CONFIG, number) for number in (1, 1, 2)]
+    data = [jax.random.key_data(found[CONFIG.tasks[0]]).tolist() for found in keys]
+    assert data[0] == data[1] != data[2]
+
+
+def test_what_does_not_go_together():
+    with pytest.raises(ValueError, match="a dataset has no fresh demonstrations"):
+        dataclasses.replace(FRESH.data, source="somewhere")
+    with pytest.raises(ValueError, match="multiple of log_every, got 3 and 2"):
+        dataclasses.replace(FRESH, data=dataclasses.replace(FRESH.data, fresh_every=3))
