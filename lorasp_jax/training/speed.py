@@ -54,8 +54,8 @@ class Speed:
         Returns:
             `speed/samples_per_second`; `speed/flop_utilisation`, where operations are counted and
             the device's peak is known; `speed/data_wait`, share of the time in which the device
-            waited for a batch, of runs that stream; `memory/in_use_gib` and `memory/peak_gib` of
-            the first device of this process, where it reports them.
+            waited for data, of runs that stream or replace them; `memory/in_use_gib` and
+            `memory/peak_gib` of the first device of this process, where it reports them.
         """
         assert self._began is not None
         seconds = time.perf_counter() - self._began
