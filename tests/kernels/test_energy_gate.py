@@ -74,6 +74,15 @@ def test_special_rows(implementation):
     assert np.isnan(run(rows.astype(np.float32) + np.float32("nan"))[2]).all()
 
 
+@pytest.mark.parametrize("shape", [(7,), (1, 7), (1, 1, 7), (1, 5, 7)])
+def test_a_block_takes_any_shape(shape):
+    """One row has scalars, several behind an axis of one are several."""
+    scores = scores_like(shape)
+    found, expected = (gate.energy_gate(scores, 0.9, implementation=i) for i in ("block", "sort"))
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
 @pytest.mark.parametrize("shape", [(3, 1), (2, 5, 100)])
 def test_pallas_takes_any_shape(shape):
     scores, ratio = scores_like(shape), gate.exact_ratio(0.9)
