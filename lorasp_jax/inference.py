@@ -118,15 +118,24 @@ def prepared_stack(blocks: Block) -> Block:
 
 def call(
     module: nnx.Module, names: Names, x: jax.Array, token_mask: jax.Array | None
-) -> list[tuple[jax.Array, Aux]] | None:
-    """y and aux of each layer for the same x `[..., I]`, or None if they are not joined."""
+) -> dict[str, tuple[jax.Array, Aux]]:
+    """y and aux for the same x `[..., I]`, by name, of those of the layers that `ready` holds."""
     ready = getattr(module, "ready", None)
-    if ready is None or names not in ready.get_value():
-        return None
-    found: Joined | Apart = ready.get_value()[names]
-    compute: Callable = _call_joined if isinstance(found, Joined) else _call_apart
-    ys, aux = compute(found, x.astype(found.read.dtype), token_mask)
-    of_each = [jax.tree.map(lambda a, i=i: a[i], aux) for i in range(len(names))]
+    groups: dict[Names, Joined | Apart] = {} if ready is None else ready.get_value()
+    found = {}
+    for group, joined in groups.items():
+        if set(group) <= set(names):
+            found |= zip(group, _call(joined, x, token_mask), strict=True)
+    return found
+
+
+def _call(
+    joined: Joined | Apart, x: jax.Array, token_mask: jax.Array | None
+) -> list[tuple[jax.Array, Aux]]:
+    """y and aux of each layer."""
+    compute: Callable = _call_joined if isinstance(joined, Joined) else _call_apart
+    ys, aux = compute(joined, x.astype(joined.read.dtype), token_mask)
+    of_each = [jax.tree.map(lambda a, i=i: a[i], aux) for i in range(len(ys))]
     reports = [dataclasses.replace(one, token_mask=token_mask) for one in of_each]
     return list(zip(ys, reports, strict=True))
 

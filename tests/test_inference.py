@@ -155,13 +155,17 @@ def test_what_cannot_be_joined_stays(name, dtype):
     assert not hasattr(ready(adapted(METHODS[name], dtype)), "ready")
 
 
-@pytest.mark.slow
-def test_layers_of_two_methods_are_joined_alone():
-    model = adapted(METHODS["lora"], "float32")
-    model.second = adapted(METHODS["lora_sp"], "float32").second
-    prepared, x = ready(model), jnp.ones((2, 8))
-    assert set(prepared.ready.get_value()) == {("first",), ("second",), ("third",)}
-    np.testing.assert_allclose(prepared(x)[0], model(x)[0], rtol=1e-4)
+@pytest.mark.parametrize("second", ["ada_lora", "dora", None])
+def test_layers_of_two_methods_are_joined_alone(second):
+    """Or left as they are: the last two."""
+    rules = [("second", second and METHODS[second]), (".*", METHODS["lora"])]
+    model, x = trained(*rules, seed=1, net=Readers("float32")), jnp.ones((2, 8))
+    prepared = ready(model)
+    joined = {"first", "third"} | ({"second"} if second == "ada_lora" else set())
+    assert set(prepared.ready.get_value()) == {(name,) for name in joined}
+    (found, other), (expected, aux) = prepared(x), model(x)
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
+    assert jax.tree.structure(other) == jax.tree.structure(aux)
 
 
 @pytest.mark.parametrize(

@@ -98,8 +98,8 @@ def bisected_boundary(scores: jax.Array, ratio: Ratio, *, is_block: bool = False
 
 
 def block_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
-    """`bisected_boundary` of a block of rows, [n, R] or, of one, [R]."""
-    rows = scores.reshape(-1) if len(scores) == 1 else scores
+    """`bisected_boundary` of a block of rows [..., R], which for one of them has scalars."""
+    rows = scores.reshape(-1) if scores.size == scores.shape[-1] else scores
     return bisected_boundary(rows, ratio, is_block=True)
 
 

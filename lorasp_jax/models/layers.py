@@ -113,12 +113,13 @@ class Linears:
 
     def together(self, names: tuple[str, ...], x: jax.Array) -> list[jax.Array]:
         """y of each layer for the same x `[B, T, I]`, which adapters of `Dense` read once."""
-        mask = self._token_mask
-        found = inference.call(self._module, names, x, mask) or self._together(names, x)
-        self.aux |= {name: aux for name, (_, aux) in zip(names, found, strict=True)}
-        return [y for y, _ in found]
+        found = inference.call(self._module, names, x, self._token_mask)
+        if others := [name for name in names if name not in found]:
+            found |= zip(others, self._together(others, x), strict=True)
+        self.aux |= {name: found[name][1] for name in names}
+        return [found[name][0] for name in names]
 
-    def _together(self, names: tuple[str, ...], x: jax.Array) -> list[tuple[jax.Array, Aux]]:
+    def _together(self, names: list[str], x: jax.Array) -> list[tuple[jax.Array, Aux]]:
         layers = [getattr(self._module, name) for name in names]
         inputs = [layer.as_input(x) for layer in layers if type(layer) is Dense]
         mask = self._token_mask

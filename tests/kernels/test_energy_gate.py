@@ -74,6 +74,13 @@ def test_special_rows(implementation):
     assert np.isnan(run(rows.astype(np.float32) + np.float32("nan"))[2]).all()
 
 
+def test_a_block_is_rows_behind_any_axes():
+    scores = scores_like((1, 5, 7))
+    run = jax.jit(lambda s, name: gate.energy_gate(s, 0.9, implementation=name), static_argnums=1)
+    for found, expected in zip(run(scores, "block"), run(scores, "pairwise"), strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
 @pytest.mark.parametrize("shape", [(3, 1), (2, 5, 100)])
 def test_pallas_takes_any_shape(shape):
     scores, ratio = scores_like(shape), gate.exact_ratio(0.9)
