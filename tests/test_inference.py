@@ -11,6 +11,7 @@ from flax import nnx
 from lorasp_jax import inference
 from lorasp_jax.dense import Dense
 from lorasp_jax.models import pi0, smolvla
+from lorasp_jax.models.backbone import Sampler
 from lorasp_jax.models.layers import Linears
 from lorasp_jax.peft import LoRASP, lora_sp
 from lorasp_jax.quantization import quantize
@@ -179,8 +180,13 @@ def test_sampling_follows_the_velocity(backbone):
     velocity = quick.jit(lambda model, x, t: model.velocity(obs, x, jnp.full(2, t)))
     expected = noise - velocity(model, noise, 1.0) / 2
     expected -= velocity(model, expected, 0.5) / 2
-    sample = quick.jit(
-        lambda model: model.sample_actions(jax.random.key(0), obs, num_steps=2, noise=noise)
-    )
-    for ready_or_not in (model, model.sampler()):
+    traced = []
+
+    @quick.jit
+    def sample(model):
+        traced.append(type(model))
+        return model.sample_actions(jax.random.key(0), obs, num_steps=2, noise=noise)
+
+    for ready_or_not in (model, model.sampler(), model.sampler()):
         np.testing.assert_allclose(sample(ready_or_not), expected, rtol=1e-4, atol=1e-5)
+    assert traced == [type(model), Sampler]  # two samplers of one model share a program

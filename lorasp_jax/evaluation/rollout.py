@@ -14,6 +14,7 @@ from envs.randomization import Randomization
 from envs.state import State
 from lorasp_jax import adaptation
 from lorasp_jax.evaluation import metrics
+from lorasp_jax.models.backbone import Sampler
 from lorasp_jax.models.policy import Policy
 
 FILMED_WORLDS = 8
@@ -165,7 +166,9 @@ def _look(
 
 def _largest_bank(policy: Policy) -> int:
     """R of the widest adapter; 0 if no method has a rank."""
-    methods = adaptation.methods(policy.model).values()
+    model = policy.model
+    is_ready = isinstance(model, Sampler)
+    methods = model.methods if is_ready else adaptation.methods(model).values()
     return max((getattr(method, "rank", 0) for method in methods), default=0)
 
 

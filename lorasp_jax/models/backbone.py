@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax import inference
+from lorasp_jax import adaptation, inference
 from lorasp_jax.dense import Dense
 from lorasp_jax.models import flow_matching
 from lorasp_jax.models.config import BackboneConfig
@@ -25,6 +25,7 @@ from lorasp_jax.models.layers import (
 )
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.siglip import SigLIP
+from lorasp_jax.peft import Method
 
 _PACKAGE = __name__.rpartition(".")[0]
 
@@ -177,7 +178,9 @@ class Backbone(nnx.Module):
 
 
 @functools.partial(
-    jax.tree_util.register_dataclass, data_fields=["weights"], meta_fields=["structure", "config"]
+    jax.tree_util.register_dataclass,
+    data_fields=["weights"],
+    meta_fields=["structure", "config", "methods"],
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sampler:
@@ -192,13 +195,16 @@ class Sampler:
     structure: Any
     """Graphs and tree that make modules of the weights."""
     config: BackboneConfig
+    methods: tuple[Method, ...]
+    """Of the backbone's adapters, each once."""
 
     @classmethod
     def of(cls, model: Backbone) -> "Sampler":
         """The sampler of a backbone, which stays as it is."""
         graphdefs, states = zip(*map(nnx.split, (_reading(model), _acting(model))), strict=True)
         weights, tree = jax.tree.flatten(states)
-        return cls(weights, (graphdefs, tree), model.config)
+        methods = dict.fromkeys(adaptation.methods(model).values())
+        return cls(weights, (graphdefs, tree), model.config, tuple(methods))
 
     def sample_actions(
         self,

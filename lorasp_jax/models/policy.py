@@ -17,7 +17,7 @@ class Policy:
     """From raw observations to commands. A pytree: `jax.jit`, `scan` and `device_put` take it.
 
     Attributes:
-        model: backbone with `sample_actions`.
+        model: backbone, or its `sampler()` for many calls: what has `sample_actions`.
         processor: what stands between the robot and the backbone.
     """
 

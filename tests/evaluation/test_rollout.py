@@ -85,6 +85,15 @@ def test_evaluate_reports_what_happened(env, tmp_path):
         evaluate(policy, env, jax.random.key(0), 3, rollout=rollout)
 
 
+def test_a_sampler_reports_what_its_backbone_does(env, tmp_path):
+    policy = _told(policy_with(tmp_path / "run", env), env)
+    sampler = dataclasses.replace(policy, model=policy.model.sampler())
+    rollout = make_rollout(env, execute_steps=4, denoise_steps=1)
+    one, other = (jax.eval_shape(rollout, each, jax.random.key(0)) for each in (policy, sampler))
+    assert one == other
+    assert one.active_rank_histogram["action"].shape[-1] == 9
+
+
 def test_methods_without_a_choice(tmp_path):
     lora = make_run(tmp_path / "lora", dataclasses.replace(CONFIG, peft=LoRA(rank=5))).policy
     full = make_run(tmp_path / "full", dataclasses.replace(CONFIG, peft=FullFineTuning())).policy
