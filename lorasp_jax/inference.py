@@ -25,6 +25,7 @@ from flax import nnx
 
 from lorasp_jax.dense import Dense
 from lorasp_jax.kernels.low_rank_matmul import aligned, two_products
+from lorasp_jax.kernels.quantized import QuantizedKernel
 from lorasp_jax.peft import Aux, Method
 
 Names = tuple[str, ...]
@@ -77,8 +78,8 @@ class Apart:
     """P of all layers, [I, sum of Q or a little more]."""
     write: list[jax.Array]
     """U [R, O] of each layer."""
-    kernels: list[jax.Array]
-    """W [I, O] of each layer."""
+    kernels: list[jax.Array | QuantizedKernel]
+    """W [I, O] of each layer; a quantised one stays so."""
     biases: list[jax.Array | None]
     """[O] of each layer."""
 
@@ -161,7 +162,7 @@ def _call_apart(
     z, aux = _between(apart, read, 0, token_mask)
     ys, zs = [], jnp.split(z, len(apart.write), axis=-1)
     for own, kernel, up, bias in zip(zs, apart.kernels, apart.write, apart.biases, strict=True):
-        y = two_products(x, own, kernel, up)
+        y = two_products(x, own, kernel.astype(x.dtype), up)
         ys.append(y if bias is None else y + bias)
     return ys, aux
 
@@ -248,7 +249,9 @@ def _chain(layers: Sequence[Dense], downs: Sequence[jax.Array]) -> tuple[Chain, 
 
 
 def _apart(layers: Sequence[Dense]) -> Apart:
-    kernels, downs, ups, biases = _matrices(layers)
+    wide, downs, ups, biases = _matrices(layers)
+    own = [layer.kernel_matrices() for layer in layers]
+    kernels = [k if isinstance(k, QuantizedKernel) else w for k, w in zip(own, wide, strict=True)]
     read = aligned(jnp.concatenate(downs, axis=1))
     return Apart(*_chain(layers, downs), read, ups, kernels, biases)
 

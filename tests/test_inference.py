@@ -116,6 +116,15 @@ def test_a_quantised_base_computes_the_same():
     np.testing.assert_allclose(prepared(x)[0], model(x)[0], rtol=1e-4, atol=1e-4)
 
 
+def test_a_quantised_base_stays_so_where_it_is_not_copied():
+    model = quantize(adapted(METHODS["lora"], "float32"), [(".*", "int8")]).model
+    expected, x = model(jnp.ones((6, 8)))[0], jnp.ones((6, 8))
+    inference.prepare(model, copy_kernels=False)
+    codes = [leaf for leaf in jax.tree.leaves(nnx.state(model)) if leaf.dtype == jnp.int8]
+    assert len(codes) == 3
+    np.testing.assert_allclose(model(x)[0], expected, rtol=1e-4, atol=1e-4)
+
+
 @pytest.mark.parametrize(
     ("rows", "d_in", "d_out", "parts"),
     [
