@@ -29,8 +29,9 @@ from benchmarks.measuring import best, machine, print_table
 from lorasp_jax import adaptation, flops, peft
 from lorasp_jax.config import Config, OptimConfig
 from lorasp_jax.models import backbone
-from lorasp_jax.models.backbone import Backbone, Sampler
+from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
+from lorasp_jax.models.sampling import Sampler
 from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training import preflight
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer

@@ -11,8 +11,8 @@ from flax import nnx
 from lorasp_jax import inference
 from lorasp_jax.dense import Dense
 from lorasp_jax.models import pi0, smolvla
-from lorasp_jax.models.backbone import Sampler
 from lorasp_jax.models.layers import Linears
+from lorasp_jax.models.sampling import Sampler
 from lorasp_jax.peft import LoRASP, lora_sp
 from lorasp_jax.quantization import quantize
 from tests import quick

@@ -14,8 +14,8 @@ from envs.randomization import Randomization
 from envs.state import State
 from lorasp_jax import adaptation
 from lorasp_jax.evaluation import metrics
-from lorasp_jax.models.backbone import Sampler
 from lorasp_jax.models.policy import Policy
+from lorasp_jax.models.sampling import Sampler
 
 FILMED_WORLDS = 8
 """Worlds whose poses are kept, to choose one of them for the video."""

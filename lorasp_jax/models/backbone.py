@@ -1,7 +1,5 @@
 """What every backbone does: look at pictures, match flows, draw action chunks."""
 
-import dataclasses
-import functools
 import importlib
 import pkgutil
 from typing import Any
@@ -11,11 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax import adaptation, inference
 from lorasp_jax.dense import Dense
 from lorasp_jax.models import flow_matching
 from lorasp_jax.models.config import BackboneConfig
-from lorasp_jax.models.depth import unstacked
 from lorasp_jax.models.layers import (
     LayerAux,
     Linears,
@@ -24,13 +20,10 @@ from lorasp_jax.models.layers import (
     time_embedding,
 )
 from lorasp_jax.models.observation import Observation
+from lorasp_jax.models.sampling import ModelAux, Sampler, with_action
 from lorasp_jax.models.siglip import SigLIP
-from lorasp_jax.peft import Method
 
 _PACKAGE = __name__.rpartition(".")[0]
-
-ModelAux = dict[str, LayerAux]
-"""Adapters' reports by tower ("vision", "language", "action") and layer name."""
 
 
 def names() -> list[str]:
@@ -166,106 +159,15 @@ class Backbone(nnx.Module):
             noise=noise,
             flow_time=flow_time,
         )
-        return per_element, _with_action(aux, action_aux)
+        return per_element, with_action(aux, action_aux)
 
     def sample_actions(self, key: jax.Array, obs: Observation, **options: Any) -> Any:
         """Draw action chunks: `Sampler.sample_actions`, whose options it takes."""
         return self.sampler().sample_actions(key, obs, **options)
 
-    def sampler(self) -> "Sampler":
+    def sampler(self) -> Sampler:
         """Itself for many calls of `sample_actions`."""
         return Sampler.of(self)
-
-
-@functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["weights"],
-    meta_fields=["structure", "config", "methods"],
-)
-@dataclasses.dataclass(frozen=True, eq=False)
-class Sampler:
-    """A backbone that draws action chunks, with what depends on weights alone computed once.
-
-    That takes the memory of the backbone's weights once more if nobody lets go of the backbone. Its
-    arrays are a plain list: to give `jax.jit` a module of a thousand takes longer than some robots
-    have.
-    """
-
-    weights: list[jax.Array]
-    structure: Any
-    """Graphs and tree that make modules of the weights."""
-    config: BackboneConfig
-    methods: tuple[Method, ...]
-    """Of the backbone's adapters, each once."""
-
-    @classmethod
-    def of(cls, model: Backbone) -> "Sampler":
-        """The sampler of a backbone, which stays as it is."""
-        graphdefs, states = zip(*map(nnx.split, (_reading(model), _acting(model))), strict=True)
-        weights, tree = jax.tree.flatten(states)
-        methods = dict.fromkeys(adaptation.methods(model).values())
-        return cls(weights, (graphdefs, tree), model.config, tuple(methods))
-
-    def sample_actions(
-        self,
-        key: jax.Array,
-        obs: Observation,
-        *,
-        num_steps: int = 10,
-        noise: jax.Array | None = None,
-        slots: jax.Array | None = None,
-        return_aux: bool = False,
-    ) -> Any:
-        """Draw action chunks; the key is consumed for `noise` if that is not given.
-
-        Args:
-            key: typed random key.
-            obs: what the policy sees.
-            num_steps: Euler steps.
-            noise: `[B, C, A]` start of the flow.
-            slots: `[A]` bool, the robot's slots; the others stay zero. None: all.
-            return_aux: also return the adapters' reports; those of "action" get a leading axis of
-                steps, before the layers'. What ran once counts as if it had run in every step.
-
-        Returns:
-            `[B, C, A]` f32 normalised actions, or (actions, aux).
-        """
-        if noise is None:
-            shape = (obs.state.shape[0], self.config.chunk, self.config.action_dim)
-            noise = jax.random.normal(key, shape)
-        graphdefs, tree = self.structure
-        reading, acting = map(nnx.merge, graphdefs, jax.tree.unflatten(tree, self.weights))
-        prefix, aux = reading.run_prefix(obs)
-        actions, action_aux = flow_matching.sample(
-            lambda x_t, t: acting.run_suffix(prefix, obs, x_t, t),
-            noise,
-            num_steps=num_steps,
-            slots=slots,
-        )
-        if not return_aux:
-            return actions
-        once = jax.tree.map(
-            lambda a: jnp.broadcast_to(a, (num_steps, *a.shape)), aux.get("action", {})
-        )
-        return actions, _with_action({**aux, "action": once}, action_aux)
-
-
-def _reading(model: Backbone) -> Backbone:
-    """A copy for a prefix without gradient, in which no loop copies each layer's weights."""
-    model = nnx.merge(*nnx.split(model))
-    for tower in (model.vision, model.language):
-        tower.blocks = unstacked(inference.prepared_stack(tower.blocks))
-    return model
-
-
-def _acting(model: Backbone) -> Backbone:
-    """A copy for the steps of a flow, in which nothing depends on weights alone any more."""
-    model = nnx.merge(*nnx.split(model))
-    del model.vision, model.language
-    model.action.blocks = unstacked(model.action.blocks)
-    for module in (model, *(module for _, module in nnx.iter_modules(model.action))):
-        inference.prepare(module)
-    return model
 
 
 def action_tokens(linear: Linears, x_t: jax.Array, flow_time: jax.Array) -> jax.Array:
@@ -300,8 +202,3 @@ def suffix_view(
     seen = np.concatenate([prefix_block, block])
     mask = block_mask(block, seen, valid, jnp.concatenate([prefix_valid, valid], axis=1))
     return mask, jnp.sum(prefix_valid, axis=1, dtype=jnp.int32)[:, None] + positions(valid)
-
-
-def _with_action(aux: ModelAux, action: LayerAux) -> ModelAux:
-    """Reports with those of the action expert's steps next to what it did in the prefix."""
-    return {**aux, "action": {**aux.get("action", {}), **action}}
