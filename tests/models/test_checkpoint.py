@@ -32,14 +32,14 @@ def parameters(model: nnx.Module) -> dict:
 
 
 def test_round_trip_is_exact_in_bfloat16(folder, model):
-    loaded = models.load(folder)
-    assert loaded.config == CONFIG
+    loaded, kept = models.load(folder), dataclasses.replace(CONFIG, unroll=None)
+    assert loaded.config == kept
     jax.tree.map(
         lambda a, b: np.testing.assert_array_equal(a, b.astype(jnp.bfloat16).astype(jnp.float32)),
         parameters(loaded),
         parameters(model),
     )
-    assert models.load_config(folder) == CONFIG
+    assert models.load_config(folder) == kept
 
 
 def test_types_are_as_asked(folder):
