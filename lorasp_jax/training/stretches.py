@@ -76,10 +76,11 @@ class Fresh(Stretches):
     def __init__(
         self, jitted: Callable, frozen: Any, run: Run, put: Callable, start: int, speed: Speed
     ) -> None:
-        self._config, self._put, self._size = run.config, put, len(run.steps.end)
-        self._generation = self._of(start)
-        steps = self._made(self._generation) if self._generation else put(run.steps)
-        super().__init__(jitted, frozen, steps, speed)
+        steps = run.steps
+        self._config, self._put, self._size = run.config, put, len(steps.end)
+        self._generation = self._of(min(start, run.config.optim.steps - 1))
+        first = self._made(self._generation) if self._generation else put(steps)
+        super().__init__(jitted, frozen, first, speed)
         self._prepare()
 
     def __call__(self, state: TrainState, key: jax.Array, count: int) -> tuple[TrainState, Any]:
