@@ -85,6 +85,7 @@ def test_evaluate_reports_what_happened(env, tmp_path):
         evaluate(policy, env, jax.random.key(0), 3, rollout=rollout)
 
 
+@pytest.mark.slow
 def test_a_sampler_reports_what_its_backbone_does(env, tmp_path):
     policy = _told(policy_with(tmp_path / "run", env), env)
     sampler = dataclasses.replace(policy, model=policy.model.sampler())
