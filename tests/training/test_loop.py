@@ -14,7 +14,7 @@ from lorasp_jax.training.loop import RunError, train
 from lorasp_jax.training.run import Callback
 from lorasp_jax.training.run_folder import read_metrics
 from lorasp_jax.training.stretches import Stretches
-from tests.runs import CONFIG, Terminate, leaves, make_run, repeatable
+from tests.runs import CONFIG, Miniature, Terminate, leaves, make_run, repeatable
 
 
 @pytest.fixture(autouse=True)
@@ -24,8 +24,13 @@ def one_device(monkeypatch):
     monkeypatch.setattr(meshes, "make_mesh", lambda fsdp: mesh)
 
 
+def quick_run(folder):
+    """Of no size: a whole backbone resumes in test_dataset."""
+    return make_run(folder, dataclasses.replace(CONFIG, targets=("inp", "out")), Miniature())
+
+
 def test_resume_is_bit_exact_and_frozen_stays_frozen(tmp_path):
-    whole, halved = make_run(tmp_path / "whole"), make_run(tmp_path / "halved")
+    whole, halved = quick_run(tmp_path / "whole"), quick_run(tmp_path / "halved")
     _, adapters_before, frozen_before = adaptation.split(whole.policy.model)
     train(whole)
 
@@ -33,7 +38,7 @@ def test_resume_is_bit_exact_and_frozen_stays_frozen(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         train(halved, [callback])
     assert [row["step"] for row in read_metrics(halved.folder)] == [2]
-    halved = make_run(tmp_path / "halved")  # as a new process would
+    halved = quick_run(tmp_path / "halved")  # as a new process would
     train(halved, [callback], resume=True)
     assert callback.started == 1
 
@@ -52,9 +57,9 @@ def test_resume_is_bit_exact_and_frozen_stays_frozen(tmp_path):
 
 
 def test_other_base_is_refused(tmp_path):
-    run = make_run(tmp_path / "run")
+    run = quick_run(tmp_path / "run")
     train(run)
-    other = make_run(tmp_path / "run")
+    other = quick_run(tmp_path / "run")
     other.base_hash = "hash of another base"
     with pytest.raises(ValueError, match="trained on another base"):
         train(other, resume=True)
@@ -83,7 +88,7 @@ def test_signal_handlers_are_put_back(tmp_path):
             adapters = leaves(adaptation.split(run.policy.model)[1]).values()
             return {"size": float(sum(np.abs(x).sum() for x in adapters))}
 
-    before, run = signal.getsignal(signal.SIGTERM), make_run(tmp_path / "run")
+    before, run = signal.getsignal(signal.SIGTERM), quick_run(tmp_path / "run")
     train(run, [Look()])
     last = {"size": Look().on_log(run, 4, {})["size"]}
     first, second = read_metrics(run.folder)

@@ -116,6 +116,7 @@ def test_straight_line_code_is_chosen_on_the_command_line(monkeypatch):
     assert unroll("--model.unroll", "True")
 
 
+@pytest.mark.slow
 def test_a_pi05_of_the_command_line_trains_and_acts(config, tmp_path, monkeypatch):
     """And its base, trained in full, loads again; prompts with another state are others."""
     monkeypatch.setattr(setup, "base_model", BASE_MODEL)
