@@ -5,7 +5,8 @@ threshold by comparisons and row sums alone: one function for XLA and for the bo
 """
 
 import functools
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,10 +32,15 @@ def energies(scores: jax.Array) -> jax.Array:
     The scaling is exact, E_k does not depend on it, and squares neither under- nor overflow. For a
     maximum with exponent field e it is 2^(126 - e), with field 253 - e (at least 1: normal).
     """
-    largest = jax.lax.stop_gradient(scores).max(-1, keepdims=scores.ndim > 1)
+    largest = _by_row(jnp.max, jax.lax.stop_gradient(scores))
     exponent = jax.lax.shift_right_logical(_bits(largest), 23)
     scale = _float(jax.lax.shift_left(jnp.maximum(253 - exponent, 1), 23))
     return jnp.square(scores * scale)
+
+
+def _by_row(reduce: Callable, rows: jax.Array, **options: Any) -> jax.Array:
+    """A number of each row [..., R]: [..., 1], of one row alone []."""
+    return reduce(rows, axis=-1, keepdims=rows.ndim > 1, **options)
 
 
 def _bits(x: jax.Array) -> jax.Array:
@@ -65,21 +71,19 @@ def bisected_boundary(scores: jax.Array, ratio: Ratio, *, is_block: bool = False
     One row, [R], has scalars, whose comparison costs a kernel nothing.
     """
     energy = energies(scores)
-    keepdims = scores.ndim > 1
-    total, largest = (functools.partial(f, axis=-1, keepdims=keepdims) for f in (jnp.sum, jnp.max))
-    target = ratio.numerator * total(energy)
+    target = ratio.numerator * _by_row(jnp.sum, energy)
 
     def halve(bracket: _Bracket) -> _Bracket:
         middle = bracket.low + jax.lax.shift_right_logical(bracket.high - bracket.low, 1)
         chosen = scores >= _float(middle)
-        number = total(chosen.astype(jnp.int32), dtype=jnp.int32)
-        reached = total(jnp.where(chosen, energy, 0))
+        number = _by_row(jnp.sum, chosen.astype(jnp.int32), dtype=jnp.int32)
+        reached = _by_row(jnp.sum, jnp.where(chosen, energy, 0))
         is_low = ratio.denominator * reached >= target
         upper = bracket._replace(low=middle, num_low=number)
         lower = bracket._replace(high=middle, num_high=number)
         return jax.tree.map(functools.partial(jnp.where, is_low), upper, lower)
 
-    lowest, highest = (_bits(f(scores, axis=-1, keepdims=keepdims)) for f in (jnp.min, jnp.max))
+    lowest, highest = (_bits(_by_row(f, scores)) for f in (jnp.min, jnp.max))
     none = jnp.zeros_like(lowest)
     bracket = _Bracket(lowest, highest + 1, none + scores.shape[-1], none)
     if is_block:
@@ -89,7 +93,7 @@ def bisected_boundary(scores: jax.Array, ratio: Ratio, *, is_block: bool = False
     else:
         bracket = jax.lax.fori_loop(0, 31, lambda _, b: halve(b), bracket)
     # What is left in the bracket is one score, or ties.
-    score = largest(jnp.where(scores < _float(bracket.high), scores, -1))
+    score = _by_row(jnp.max, jnp.where(scores < _float(bracket.high), scores, -1))
     index = functools.partial(_last_tie, scores, energy, score, target, ratio)
     if is_block:
         several = _any(bracket.num_low - bracket.num_high > 1)
@@ -110,16 +114,15 @@ def _last_tie(
 
     Ties share one energy; one is kept while the energy before it falls short of the target.
     """
-    keepdims = scores.ndim > 1
-    above = jnp.where(scores > score, energy, 0).sum(-1, keepdims=keepdims)
+    above = _by_row(jnp.sum, jnp.where(scores > score, energy, 0))
     tied = scores == score
-    each = jnp.where(tied, energy, 0).max(-1, keepdims=keepdims)
+    each = _by_row(jnp.max, jnp.where(tied, energy, 0))
     position = jax.lax.broadcasted_iota(jnp.int32, scores.shape, scores.ndim - 1)
     num_bits = (scores.shape[-1] - 1).bit_length()
 
     def step(i: jax.Array, found: jax.Array) -> jax.Array:
         candidate = found | jax.lax.shift_left(jnp.int32(1), num_bits - 1 - i)
-        before = (tied & (position < candidate)).astype(jnp.float32).sum(-1, keepdims=keepdims)
+        before = _by_row(jnp.sum, (tied & (position < candidate)).astype(jnp.float32))
         falls_short = ratio.denominator * (above + before * each) < target
         return jnp.where(falls_short, candidate, found)
 

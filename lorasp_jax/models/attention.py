@@ -36,7 +36,9 @@ def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) 
     batch, tokens, heads, size = q.shape
     if _suits_cudnn(q, k, mask):
         attend = functools.partial(jax.nn.dot_product_attention, implementation="cudnn", scale=1.0)
-        y = attend(q, k, v) if mask is None else attend(*_filled_up(q, k, v, mask))
+        if mask is not None:
+            q, k, v, mask = _filled_up(q, k, v, mask)
+        y = attend(q, k, v, mask=None if mask is None else mask[:, None])
         return y[:, :tokens].reshape(batch, tokens, heads * size)
     k, v, mask = _aligned(k, v, mask)
     # With K = 1 no axis of q, weights or result moves in memory.
@@ -69,14 +71,14 @@ def _suits_cudnn(q: jax.Array, k: jax.Array, mask: jax.Array | None) -> bool:
 
 def _filled_up(
     q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array, None, jax.Array]:
-    """What `jax.nn.dot_product_attention` takes, with numbers of queries and keys that cuDNN takes.
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """The same with numbers of queries and keys that cuDNN takes.
 
     The further keys are forbidden, and so are all of a further query, whose result is not read.
     """
     queries, keys = (-a.shape[1] % CUDNN_ALIGNED for a in (q, k))
     q, k, v = (_longer(a, more) for a, more in ((q, queries), (k, keys), (v, keys)))
-    return q, k, v, None, jnp.pad(mask, ((0, 0), (0, queries), (0, keys)))[:, None]
+    return q, k, v, jnp.pad(mask, ((0, 0), (0, queries), (0, keys)))
 
 
 def _longer(x: jax.Array, more: int) -> jax.Array:
