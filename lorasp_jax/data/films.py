@@ -62,7 +62,7 @@ class Film:
             ValueError: the film ends too early, is damaged, or runs at another rate.
         """
         tolerance, pictures = _TOLERANCE / fps, np.empty(0)
-        if abs(start - self._end) > tolerance:
+        if not abs(start - self._end) <= tolerance:  # so also after a read that failed
             self._seek(start)
         for number in range(length):
             frame = self._next(start - tolerance, number, length)
