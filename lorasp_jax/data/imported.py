@@ -13,6 +13,7 @@ from lorasp_jax.data.lerobot import Keys
 from lorasp_jax.data.opening import open_source
 from lorasp_jax.data.source import Progress, Source
 from lorasp_jax.models.config import BackboneConfig
+from lorasp_jax.models.processing import robot_slots
 
 _CACHE = Path("cache", "steps")
 _SAME_TIME = 0.01  # relative; a rate of 30 Hz has no short decimals
@@ -42,7 +43,24 @@ def opened(config: Config, model: BackboneConfig, folder: Path) -> Source:
             f"{where} has the cameras {', '.join(source.cameras)}, the backbone places for "
             f"{len(model.cameras)}: choose with python -m lorasp_jax.data convert --cameras"
         )
+    _check_numbers(source.episode(0, ()), model, where)
     return source
+
+
+def _check_numbers(first: Episodes, model: BackboneConfig, where: object) -> None:
+    """Raise ValueError unless an episode's numbers are what a policy learns."""
+    if first.actions != "joint":
+        raise ValueError(
+            f"{where} has actions of the kind {first.actions}, policies learn joint targets: "
+            "collect with --actions joint"
+        )
+    try:
+        robot_slots(first.state.shape[-1] - 1, model.inputs)
+    except ValueError as error:
+        raise ValueError(
+            f"{where} does not fit the backbone: {error} Choose with python -m lorasp_jax.data "
+            "convert --state-numbers and --action-numbers"
+        ) from error
 
 
 def cached(source: Source, folder: Path, progress: Progress) -> Cache:
@@ -91,6 +109,10 @@ def _padded(found: Cache, episodes: list[Episodes], first: int) -> Episodes:
 
 
 def is_simulated(found: Cache) -> bool:
-    """Whether all of a dataset's tasks and its robot can be simulated here."""
+    """Whether a dataset is of simulated tasks and a robot that can be simulated here.
+
+    A real robot's recordings may be called as a task is, but show and say other things.
+    """
     known = set(making.names("task")), set(making.names("robot"))
-    return set(found.facts["tasks"]) <= known[0] and found.facts["robot"] in known[1]
+    is_known = set(found.facts["tasks"]) <= known[0] and found.facts["robot"] in known[1]
+    return is_known and found.facts["physics_dt"] > 0

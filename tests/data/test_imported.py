@@ -69,6 +69,23 @@ def test_what_does_not_fit_is_said_at_once(changes, model, sentence, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"actions": "delta_joint"}, "has actions of the kind delta_joint, policies learn joint"),
+        (
+            dict.fromkeys(("state", "action"), np.zeros((3, 9, 14), np.float32)),
+            "1 to 7 joints here, got 13. Choose with .* --state-numbers",
+        ),
+    ],
+)
+def test_numbers_that_no_policy_learns(changes, sentence, tmp_path):
+    path = tmp_path / "recorded.npz"
+    dataclasses.replace(random_episodes("press", 0), **changes).save(path)
+    with pytest.raises(ValueError, match=sentence):
+        imported.opened(config(path), MODEL, tmp_path / "run")
+
+
 def test_outline(simulated):
     """The numbers are those of the episodes; one picture stands for all."""
     found = imported.outline(simulated)
@@ -95,7 +112,8 @@ def test_outline(simulated):
 def test_what_can_be_simulated(simulated):
     assert imported.is_simulated(simulated)
     facts = dict(simulated.facts)
-    for changed in ({"robot": "so101"}, {"tasks": ["press", "fold"]}):
+    # The last: recordings of a real robot.
+    for changed in ({"robot": "so101"}, {"tasks": ["press", "fold"]}, {"physics_dt": 0.0}):
         simulated.facts = facts | changed
         assert not imported.is_simulated(simulated)
     simulated.facts = facts
