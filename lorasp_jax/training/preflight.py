@@ -88,7 +88,7 @@ def _refusal(config: Config, memory: Memory, remat: Remat, available: float) -> 
     """Why a run cannot begin, and what would help."""
     batch, fixed = config.optim.batch_size, memory.peak - HEADROOM * memory.activations
     fitting = math.floor(batch * (available - fixed) / (memory.peak - fixed))
-    fitting -= fitting % jax.device_count()
+    fitting -= fitting % (jax.device_count() * config.optim.accumulate)
     hints = [f"--optim.batch-size {fitting}"] if 0 < fitting < batch else []
     parts = 2 * config.optim.accumulate
     if batch % (jax.device_count() * parts) == 0:

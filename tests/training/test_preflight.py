@@ -69,5 +69,17 @@ def test_what_cannot_fit_is_refused_with_a_batch_that_does(memory):
     assert preflight.choose_remat(smaller, TINY, room)[0] == "full"
 
 
+def test_a_batch_is_proposed_that_its_parts_can_share(memory, monkeypatch):
+    monkeypatch.setattr(preflight, "expected", lambda *_: memory["full"])
+    optim = OptimConfig(batch_size=64, accumulate=4)
+    config = dataclasses.replace(CONFIG, optim=optim, model=ModelConfig(remat="full"))
+    fixed = memory["full"].peak - preflight.HEADROOM * memory["full"].activations
+    with pytest.raises(ValueError, match="needs about") as caught:
+        preflight.choose_remat(config, TINY, 0.75 * memory["full"].peak + 0.25 * fixed)
+    assert f"--optim.batch-size {48 // (4 * jax.device_count()) * 4 * jax.device_count()}," in str(
+        caught.value
+    )
+
+
 def test_a_device_has_memory():
     assert 2**28 < preflight.available_bytes() < 2**50
