@@ -23,8 +23,8 @@ from tensorboardX.proto.summary_pb2 import Summary
 from lorasp_jax.config import Config
 from lorasp_jax.training import processes
 
-RECORD, CLOCK = "config.json", "seconds.json"
-"""All that a run leaves which failed before it had anything."""
+RECORD, CLOCK, DATASET = "config.json", "seconds.json", "dataset.json"
+"""All files that a run leaves which failed before it had anything."""
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Numbers of the errors of a write for which there is no room."""
 STOPPED = "stopped.json"
@@ -77,14 +77,41 @@ def _begin(config: Config, folder: Path) -> None:
     """Record a new run in a folder that holds none."""
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file: remove it, or give this run another --name")
-    if folder.exists() and any(path.name not in (RECORD, CLOCK) for path in folder.iterdir()):
+    allowed = {folder / name for name in (RECORD, CLOCK, DATASET)}
+    if any(path not in allowed for path in folder.rglob("*") if not path.is_dir()):
         raise ValueError(
             f"{folder} already holds a run: add --resume to continue it, "
             "or give this one another --name"
         )
     folder.mkdir(exist_ok=True)
-    (folder / CLOCK).unlink(missing_ok=True)
+    for name in (CLOCK, DATASET):
+        (folder / name).unlink(missing_ok=True)
     write_json(folder / RECORD, to_json(config))
+
+
+def record_dataset(folder: Path, facts: Mapping[str, Any], *, streams: bool) -> bool:
+    """Whether a run's dataset streams: where it did when the run began, it goes on to.
+
+    Streamed batches are others than those that are drawn on the device.
+
+    Args:
+        folder: the run's, which keeps all this.
+        facts: JSON values by which the dataset is known again.
+        streams: whether it has to, now.
+
+    Raises:
+        ValueError: the run began with another dataset.
+    """
+    path, now = folder / DATASET, {"facts": dict(facts), "streams": streams}
+    if not path.exists():
+        write_json(path, now)
+    before = json.loads(path.read_text())
+    if before["facts"] != now["facts"]:
+        raise ValueError(
+            f"the dataset is not the one that {folder} began with: put that back where it was, or "
+            "give this run another --name"
+        )
+    return streams or before["streams"]
 
 
 @contextlib.contextmanager

@@ -34,6 +34,7 @@ from lorasp_jax.training import preflight, processes
 from lorasp_jax.training.base import base_model, changed
 from lorasp_jax.training.progress import bars
 from lorasp_jax.training.run import Run
+from lorasp_jax.training.run_folder import record_dataset
 
 STATISTICS_BATCHES = 8
 """Batches that an initialization from data looks at."""
@@ -90,6 +91,7 @@ def build(config: Config, folder: Path) -> Built:
     prompts, joints = _told(source, worlds, words, base.config)
     _check_sizes(config, base.config.chunk)
     check_delta(base.config.inputs.delta, joints)
+    robot_slots(joints, base.config.inputs)
     available = preflight.available_bytes()
     remat, memory = preflight.choose_remat(config, base.config, available)
     base = changed(base, remat=remat)
@@ -257,7 +259,9 @@ def _import(run: Run, source: Source, room: float) -> None:
         progress.update(bar, completed=found.num_steps, total=found.num_steps)
     facts = found.facts
     run.dataset, run.episodes, run.simulated = found.steps, outline(found), is_simulated(found)
-    run.streams = sum(x.nbytes for x in jax.tree.leaves(run.dataset)) > room
+    known = {name: facts[name] for name in ("crc32", "instructions")}
+    streams = sum(x.nbytes for x in jax.tree.leaves(run.dataset)) > room
+    run.streams = record_dataset(run.folder, known, streams=streams)
     run.config = dataclasses.replace(run.config, robot=facts["robot"], tasks=tuple(facts["tasks"]))
     place = "in files" if run.streams else "on the device"
     run.console.print(f"{found.num_steps} steps of {len(found)} episodes, {place}")

@@ -129,7 +129,9 @@ def test_prepared(tmp_path, monkeypatch):
         preflight, "choose_remat", lambda *_: ("none", preflight.Memory(*5 * [0.0]))
     )
     assert not prepare(tmp_path, monkeypatch, "gone, but cached", small).streams
+    (tmp_path / "dataset.json").unlink()
     assert prepare(tmp_path, monkeypatch, "gone, but cached", small // 64).streams
+    assert prepare(tmp_path, monkeypatch, "gone, but cached", small).streams  # as it began
 
 
 def test_without_simulation_there_is_a_report(tmp_path):

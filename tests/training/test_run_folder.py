@@ -15,7 +15,7 @@ from tensorboardX.proto.event_pb2 import Event, SessionLog
 from lorasp_jax.config import Config, DataConfig
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.training import run_folder
-from lorasp_jax.training.run_folder import MetricsLog, read_metrics
+from lorasp_jax.training.run_folder import MetricsLog, read_metrics, record_dataset
 
 ROOT = Path(__file__).parents[2]
 CONFIG = Config(name="a", scale="cpu", peft=LoRASP(rank=8))
@@ -165,9 +165,24 @@ def test_name_is_free_after_a_run_that_failed_before_it_had_anything(tmp_path):
     noisy = dataclasses.replace(CONFIG, data=DataConfig(action_noise=0.1))
     folder = open_run(noisy, tmp_path, resume=False)
     (folder / "seconds.json").write_text('{"collect": 9.0, "total": 9.0}')
+    record_dataset(folder, {"crc32": 1}, streams=True)
+    (folder / "cache").mkdir()  # of a dataset that turned out to be damaged
     assert open_run(CONFIG, tmp_path, resume=False) == folder
-    assert [path.name for path in folder.iterdir()] == ["config.json"]  # the clock starts anew
+    files = [path.name for path in folder.iterdir() if path.is_file()]
+    assert files == ["config.json"]  # the clock starts anew
     assert json.loads((folder / "config.json").read_text())["data"]["action_noise"] == 0.005
+
+
+def test_a_dataset_stays_what_and_where_it_was(tmp_path):
+    facts = {"crc32": {"state": 1}, "instructions": ["press"]}
+    assert not record_dataset(tmp_path, facts, streams=False)
+    assert not record_dataset(tmp_path, facts, streams=False)
+    assert record_dataset(tmp_path, facts, streams=True)
+    (tmp_path / "dataset.json").unlink()
+    assert record_dataset(tmp_path, facts, streams=True)
+    assert record_dataset(tmp_path, facts, streams=False)
+    with pytest.raises(ValueError, match="the dataset is not the one that .* began with"):
+        record_dataset(tmp_path, facts | {"crc32": {"state": 2}}, streams=True)
 
 
 @pytest.mark.parametrize("more", ["cache/pick_place.npz", "before.json"])
