@@ -181,7 +181,7 @@ def test_a_dataset_stays_what_and_where_it_was(tmp_path):
     (tmp_path / "dataset.json").unlink()
     assert record_dataset(tmp_path, facts, streams=True)
     assert record_dataset(tmp_path, facts, streams=False)
-    with pytest.raises(ValueError, match="the dataset is not the one that .* began with"):
+    with pytest.raises(ValueError, match=r"the dataset is not the one that .* began with"):
         record_dataset(tmp_path, facts | {"crc32": {"state": 2}}, streams=True)
 
 
