@@ -27,6 +27,8 @@ RECORD, CLOCK, DATASET = "config.json", "seconds.json", "dataset.json"
 """All files that a run leaves which failed before it had anything."""
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Numbers of the errors of a write for which there is no room."""
+WILDCARDS = frozenset("*?[\\")
+"""Orbax takes paths for patterns: below a folder with one of these it finds no checkpoint again."""
 STOPPED = "stopped.json"
 """Why training could not go on, until it does."""
 
@@ -56,10 +58,16 @@ def open_run(config: Config, root: Path, *, resume: bool) -> Iterator[Path]:
     It is created, or with `resume` checked to hold this very run.
 
     Raises:
-        ValueError: the folder cannot be made; another process works on it; it holds a run and
-            `resume` is off, holds none and `resume` is on, or holds a run with another config.
+        ValueError: the folder cannot be made or has a wildcard in its path; another process works
+            on it; it holds a run and `resume` is off, holds none and `resume` is on, or holds a run
+            with another config.
     """
     folder = root / config.name
+    if found := WILDCARDS & set(str(folder.absolute())):
+        raise ValueError(
+            f"checkpoints cannot be read again from {folder.absolute()}, because of the "
+            f"{' '.join(sorted(found))} in it: choose another --name or place"
+        )
     with _locked(folder):
         if resume:
             changed = _differences(_recorded(folder), to_json(config))

@@ -35,6 +35,15 @@ def test_second_run_in_one_folder_is_refused(tmp_path):
     assert (folder / "metrics.jsonl").read_text() == "kept"
 
 
+@pytest.mark.parametrize("character", "[*?\\")
+def test_a_place_where_no_checkpoint_would_be_found_again_is_refused(tmp_path, character):
+    with pytest.raises(ValueError, match=r"cannot be read again from .*choose another --name"):
+        open_run(dataclasses.replace(CONFIG, name=f"a{character}"), tmp_path, resume=False)
+    with pytest.raises(ValueError, match="cannot be read again"):
+        open_run(CONFIG, tmp_path / f"b{character}", resume=False)
+    assert not list(tmp_path.iterdir())
+
+
 def test_two_runs_do_not_share_a_folder(tmp_path):
     """And who has it is said; the other's name is free, as this one is again later."""
     with run_folder.open_run(CONFIG, tmp_path, resume=False) as folder:
