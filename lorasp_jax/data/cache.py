@@ -66,6 +66,9 @@ def write(
     """
     path, total = Path(path), sum(source.num_steps for source in sources)
     there = path.exists()
+    kind = _facts(sources[0].episode(0)) if sources[1:] else {}
+    for source in sources[1:]:  # now, not when hours of the first one's pictures are read
+        _check_kind(kind, source.episode(0))
     with alone(path, waiting):
         if path.exists() and not there:
             _check(Cache(path), sources, total)
@@ -82,8 +85,7 @@ def _check(found: "Cache", sources: Sequence[Source], steps: int) -> None:
     length = int(wanted.length[0])
     same = found.num_steps == steps and _facts(first) == _facts(wanted)
     for name in ("state", "action"):
-        rows = getattr(wanted, name)[:, :length]
-        same = same and np.array_equal(getattr(first, name), rows)
+        same = same and np.array_equal(getattr(first, name), getattr(wanted, name)[:, :length])
     if not same:
         raise ValueError(f"another process has written {found.path}, of something else")
 
@@ -142,20 +144,12 @@ class Writer:
             ValueError: its arrays do not fit one another or the episodes before.
         """
         episode.validate()
-        facts = _facts(episode)
-        self._facts = self._facts or facts
-        for name, value in facts.items():
-            if value != self._facts[name]:
-                raise ValueError(
-                    f"a cache holds episodes of one kind, but {name} is {self._facts[name]!r} in "
-                    f"the first one and {value!r} in one of {episode.task}"
-                )
+        self._facts = self._facts or _facts(episode)
+        _check_kind(self._facts, episode)
         length = int(episode.length[0])
         phrase = episode.instructions[int(episode.instruction[0])]
-        for known, new in (
-            (self._tasks, [episode.task]),
-            (self._instructions, episode.instructions),
-        ):
+        lists = (self._tasks, [episode.task]), (self._instructions, episode.instructions)
+        for known, new in lists:
             known += [text for text in new if text not in known]
         steps = {"state": episode.state, "action": episode.action}
         steps |= {_IMAGE + name: picture for name, picture in episode.image.items()}
@@ -171,6 +165,16 @@ class Writer:
         if name not in self._columns:
             self._columns[name] = Column(self._folder / f"{name}.npy", rows)
         self._columns[name].append(rows)
+
+
+def _check_kind(facts: dict[str, Any], episode: Episodes) -> None:
+    """Raise ValueError unless these are the facts of an episode."""
+    for name, value in _facts(episode).items():
+        if value != facts[name]:
+            raise ValueError(
+                f"a cache holds episodes of one kind, but {name} is {facts[name]!r} in the first "
+                f"one and {value!r} in one of {episode.task}"
+            )
 
 
 def _facts(episode: Episodes) -> dict[str, Any]:

@@ -160,6 +160,14 @@ def test_episodes_of_another_kind(changes, sentence, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_datasets_of_another_kind_are_refused_before_the_first_is_read(tmp_path):
+    sources, told = [Broken(one(), one()), Broken(one(robot="panda"))], []
+    with pytest.raises(ValueError, match="robot is 'piper' in the first one and 'panda'"):
+        cache.write(sources, tmp_path / "cache", lambda *steps: told.append(steps))
+    assert not told
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_broken_dataset_leaves_no_cache(tmp_path):
     folder = copied("v3", tmp_path)
     edit_rows(folder, set_value("action", 100, lambda x: [np.nan] * len(x)))
