@@ -122,6 +122,8 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
     if config.peft.needs_statistics:
         statistics = input_moments(run, base, found)
         model = _adapted(config, base, config.peft, statistics)
+    if built.source:
+        console.print(_seen(run, found), markup=False, soft_wrap=True)
     run.policy = Policy(model, found)
     return run
 
@@ -132,6 +134,18 @@ def headline(config: Config, model: Backbone) -> str:
         f"scale {config.scale}: {type(config.peft).__name__} on {config.model.backbone} "
         f"{config.model.size}, {tables.trained_share(model)}"
     )
+
+
+def _seen(run: Run, processor: Processor) -> str:
+    """One line: which of a dataset's cameras takes which of the backbone's places."""
+    pictures = next(iter(run.episodes.values())).image
+    taken = [
+        f"{name} ({pictures[name].shape[3]} x {pictures[name].shape[2]}) as {place}"
+        for place, name in processor.cameras
+        if name
+    ]
+    size = processor.image_size
+    return f"cameras: {', '.join(taken)}; the backbone sees {size} x {size}"
 
 
 def _told(

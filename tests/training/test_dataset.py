@@ -118,6 +118,9 @@ def test_prepared(tmp_path, monkeypatch):
     run = prepare(tmp_path, monkeypatch, tmp_path / "press.npz")
     assert (run.config.tasks, run.config.robot, run.simulated) == (("press",), "piper", True)
     assert not run.streams
+    places = [place for place, _ in run.policy.processor.cameras]
+    said = f"cameras: side (32 x 32) as {places[0]}, wrist (32 x 32) as {places[1]}; the backbone "
+    assert said in run.console.file.getvalue()
     expected = flatten([group])
     for name in ("state", "action", "end", "instruction"):
         np.testing.assert_array_equal(getattr(run.steps, name), getattr(expected, name))
