@@ -27,6 +27,7 @@ def write(run: Run) -> None:
         (folder / "statistics.json").write_text(statistics + "\n")
         write_json(folder / TRAINING, _facts(run))
         return
+    processor = run.policy.processor
     adapter_io.save_adapters(
         run.folder,
         run.policy.model,
@@ -34,7 +35,10 @@ def write(run: Run) -> None:
         metadata={
             "base": config.model.source,
             **_facts(run),
-            "statistics": json.loads(run.policy.processor.statistics.to_json()),
+            "instructions": list(processor.prompts.instructions),
+            "cameras": {place: name for place, name in processor.cameras if name},
+            "relative": list(processor.inputs.delta),
+            "statistics": json.loads(processor.statistics.to_json()),
         },
     )
 

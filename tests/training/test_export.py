@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,8 @@ from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.processing import Statistics
 from lorasp_jax.peft import FullFineTuning
 from lorasp_jax.training import base, export, setup
-from tests.runs import CONFIG, leaves, make_run
+from tests.runs import CONFIG, leaves, make_run, random_episodes
+from tests.test_docs import BLOCK, ROOT
 
 
 def moved(run):
@@ -44,6 +46,29 @@ def test_adapters(tmp_path):
         np.testing.assert_array_equal(value, expected[name], err_msg=name)
     with pytest.raises(ValueError, match="was trained on base"):
         adapter_io.load_adapters(run.folder, bare, base="another")
+
+
+@pytest.mark.slow
+def test_the_policy_of_the_page_on_datasets_is_the_run_s(tmp_path):
+    base = Pi0Config.dummy().create(nnx.Rngs(0))
+    models.save(tmp_path / "base", base)
+    base = models.load(tmp_path / "base")
+    model = dataclasses.replace(CONFIG.model, checkpoint=str(tmp_path / "base"))
+    run = moved(make_run(tmp_path / "run", dataclasses.replace(CONFIG, model=model), base))
+    run.base_hash = models.weights_hash(base)
+    export.write(run)
+    program: dict[str, Any] = {}
+    page = ROOT / "docs" / "datasets.md"
+    (code,) = [code for code in BLOCK.findall(page.read_text()) if "def load_policy" in code]
+    exec(compile(code, str(page), "exec"), program)
+    loaded = program["load_policy"](run.folder, 6, max_tokens=base.config.max_tokens)
+    group = random_episodes("press", 0)
+    seen = {"image": {name: x[:, 0] for name, x in group.image.items()}, "state": group.state[:, 0]}
+    rows = np.array([0, 1, 3])
+    found, expected = (
+        policy.sample(jax.random.key(0), seen, rows, num_steps=2) for policy in (loaded, run.policy)
+    )
+    np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
 @pytest.mark.slow
