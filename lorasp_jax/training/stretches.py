@@ -78,8 +78,10 @@ class Fresh(Stretches):
     ) -> None:
         steps = run.steps
         self._config, self._put, self._size = run.config, put, len(steps.end)
-        self._generation = self._of(min(start, run.config.optim.steps - 1))
-        first = self._made(self._generation) if self._generation else put(steps)
+        last = run.config.optim.steps - 1
+        self._generation = self._of(min(start, last))
+        is_first = not self._generation or start > last  # or nothing trains any more
+        first = put(steps) if is_first else self._made(self._generation)
         super().__init__(jitted, frozen, first, speed)
         self._prepare()
 

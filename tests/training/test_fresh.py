@@ -54,6 +54,9 @@ def test_generations_train_one_after_the_other(asked, tmp_path):
     train(halved, [Terminate()], resume=True)
     assert asked == [*range(1, CONFIG.optim.steps // 2)]
     assert repeatable(halved.folder) == repeatable(whole.folder)
+    asked.clear()
+    train(run(tmp_path / "whole"), resume=True)  # as one that was stopped in the last evaluation
+    assert asked == []
 
 
 @pytest.mark.parametrize("size", [13, 21, 50])
