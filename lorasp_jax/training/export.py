@@ -1,12 +1,24 @@
-"""What a finished run hands on: adapters, or with full fine-tuning a new base."""
+"""What a finished run hands on, adapters or with full fine-tuning a new base, and its way back."""
 
+import dataclasses
 import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from lorasp_jax import adaptation, adapter_io, models
+from lorasp_jax.models import backbone, tokenizer
+from lorasp_jax.models.policy import Policy
+from lorasp_jax.models.processing import Processor
+from lorasp_jax.models.prompt_table import PromptTable
+from lorasp_jax.models.statistics import Statistics
 from lorasp_jax.training.base import TRAINING
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import write_json
+
+BASE = "base"
+"""Folder of a base that was trained itself."""
 
 
 class Export(Callback):
@@ -19,36 +31,83 @@ class Export(Callback):
 
 def write(run: Run) -> None:
     """Write adapter.safetensors and adapter.json, or `base` if the base itself was trained."""
-    config = run.config
+    config, facts = run.config, _facts(run)
     if config.peft.trains_base:
-        folder = run.folder / "base"
+        folder = run.folder / BASE
         models.save(folder, adaptation.merge(run.policy.model))
         statistics = run.policy.processor.statistics.to_json()
         (folder / "statistics.json").write_text(statistics + "\n")
-        write_json(folder / TRAINING, _facts(run))
+        write_json(folder / TRAINING, facts)
         return
-    processor = run.policy.processor
-    adapter_io.save_adapters(
-        run.folder,
-        run.policy.model,
-        base=run.base_hash,
-        metadata={
-            "base": config.model.source,
-            **_facts(run),
-            "instructions": list(processor.prompts.instructions),
-            "cameras": {place: name for place, name in processor.cameras if name},
-            "relative": list(processor.inputs.delta),
-            "statistics": json.loads(processor.statistics.to_json()),
-        },
-    )
+    metadata = {"base": config.model.source, **facts}
+    adapter_io.save_adapters(run.folder, run.policy.model, base=run.base_hash, metadata=metadata)
 
 
 def _facts(run: Run) -> dict[str, Any]:
-    """What the weights were trained on."""
+    """What the weights were trained on, and what their policy needs beside them."""
     config, first = run.config, next(iter(run.episodes.values()))
+    processor = run.policy.processor
     return {
         "robot": config.robot,
         "tasks": list(config.tasks),
         "control_dt": first.control_dt,
         "physics_dt": first.physics_dt,
+        "policy": {
+            "backbone": config.model.backbone,
+            "config": dataclasses.asdict(run.policy.model.config),
+            "tokenizer": config.model.tokenizer,
+            "instructions": list(processor.prompts.instructions),
+            "num_joints": len(processor.robot_slots) - 1,
+            "cameras": {place: name for place, name in processor.cameras if name},
+            "relative": list(processor.inputs.delta),
+            "statistics": json.loads(processor.statistics.to_json()),
+        },
     }
+
+
+def load_policy(folder: str | os.PathLike[str], *, base: str = "", words: str = "") -> Policy:
+    """The policy that a finished run left.
+
+    Args:
+        folder: of the run.
+        base: where the frozen base is now, see `models.load`; by default where it was.
+        words: likewise the tokenizer.
+
+    Returns:
+        The policy; `Policy.sample` takes the rows of `processor.prompts.instructions`.
+
+    Raises:
+        ValueError: no finished run, or damaged files; a base that is not there or not the run's.
+    """
+    folder = Path(folder)
+    trained = (folder / BASE).is_dir()
+    path = folder / BASE / TRAINING if trained else folder / adapter_io.DESCRIPTION
+    try:
+        told = json.loads(path.read_bytes())
+        told = told if trained else told["metadata"]
+        config = backbone.find(told["policy"]["backbone"]).from_dict(told["policy"]["config"])
+        source = folder / BASE if trained else base or told["base"]
+    except FileNotFoundError as error:
+        raise ValueError(f"{folder} has no policy: no run finished there") from error
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} does not say what its policy needs") from error
+    if not source:
+        raise ValueError(f"the base of {folder} was random, and nothing keeps it")
+    model = models.load(source, config)
+    if not trained:
+        model = adapter_io.load_adapters(folder, model, base=models.weights_hash(model))
+    return Policy(model, _processor(told["policy"], config, words))
+
+
+def _processor(told: Mapping[str, Any], config: Any, words: str) -> Processor:
+    """The processor of an exported policy."""
+    joints = told["num_joints"]
+    found = tokenizer.load(words or told["tokenizer"])
+    return Processor.of(
+        config,
+        Statistics.from_json(json.dumps(told["statistics"])),
+        PromptTable.of(found, told["instructions"], config, num_joints=joints),
+        num_joints=joints,
+        cameras=told["cameras"],
+        delta=told["relative"],
+    )
