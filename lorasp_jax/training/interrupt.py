@@ -1,10 +1,13 @@
 """Ctrl-C and SIGTERM: save first, then stop."""
 
 import contextlib
+import os
 import signal
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import FrameType
+
+_SAID = b"stopping after this stretch of steps; once more stops at once\n"
 
 
 @dataclass
@@ -26,7 +29,7 @@ def deferred() -> Iterator[Stop]:
         if stop.requested:
             raise KeyboardInterrupt
         stop.requested = True
-        print("stopping after this stretch of steps; once more stops at once", flush=True)
+        os.write(1, _SAID)  # print raises where the signal finds this thread printing
 
     with _handlers(handle):
         yield stop

@@ -117,6 +117,7 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
             _import(run, built.source, built.room)
         else:
             run.episodes = _collect(run, built.prompts.instructions)
+    run.streams = processes.anywhere(run.streams)  # all or none: they share every batch
     relative = config.model.relative_actions
     found = processor([*run.episodes.values()], model.config, built.prompts, relative=relative)
     if config.peft.needs_statistics:

@@ -11,14 +11,14 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 @pytest.mark.parametrize("first", SIGNALS)
-def test_first_signal_is_noted_and_second_interrupts(first, capsys):
+def test_first_signal_is_noted_and_second_interrupts(first, capfd):
     with deferred() as stop:
         assert not stop.requested
         signal.raise_signal(first)
         assert stop.requested
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGTERM)
-    assert capsys.readouterr().out.count("once more stops at once") == 1
+    assert capfd.readouterr().out.count("once more stops at once") == 1
 
 
 def test_sigterm_is_like_ctrl_c():
