@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import json
 import os
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -23,7 +22,7 @@ from lorasp_jax.evaluation import video
 from lorasp_jax.evaluation.rollout import Result, evaluate, make_rollout
 from lorasp_jax.training.progress import bars
 from lorasp_jax.training.run import Callback, Run
-from lorasp_jax.training.run_folder import write_json
+from lorasp_jax.training.run_folder import read_json, write_json
 
 TOWERS = ("vision", "language", "action")
 
@@ -156,7 +155,7 @@ def success(result: Result) -> dict[str, Any]:
 
 def summarise(run: Run, after: dict[str, Result]) -> dict[str, Any]:
     """The content of results.json."""
-    before = json.loads((run.folder / "before.json").read_text()) if after else {}
+    before = read_json(run.folder / "before.json") if after else {}
     layers = _mean([result.active_rank for result in after.values()])
     modules = {
         tower: float(np.mean(np.concatenate(list(layers[tower].values()))))

@@ -9,7 +9,14 @@ from statistics import median
 from typing import Any
 
 from lorasp_jax.report import figures
-from lorasp_jax.training.run_folder import STOPPED, read_metrics, write_text
+from lorasp_jax.training.run_folder import (
+    CLOCK,
+    RECORD,
+    STOPPED,
+    read_json,
+    read_metrics,
+    write_text,
+)
 
 _REFRESH = "<meta http-equiv=refresh content=30>"
 
@@ -34,8 +41,8 @@ def write_report(folder: Path) -> Path:
     Raises:
         FileNotFoundError: the folder holds no run.
     """
-    config = json.loads((folder / "config.json").read_text())
-    finished = _read(folder / "results.json")
+    config = json.loads((folder / RECORD).read_text())
+    finished = read_json(folder / "results.json")
     results = finished or _unfinished(folder)
     rows = read_metrics(folder)
     parts = [
@@ -66,16 +73,11 @@ def write_report(folder: Path) -> Path:
     return path
 
 
-def _read(path: Path) -> dict[str, Any]:
-    """JSON of a file; nothing without it."""
-    return json.loads(path.read_text()) if path.exists() else {}
-
-
 def _unfinished(folder: Path) -> dict[str, Any]:
     """What results.json will have, as far as it is known."""
-    before = _read(folder / "before.json").items()
+    before = read_json(folder / "before.json").items()
     return {
-        "seconds": _read(folder / "seconds.json"),
+        "seconds": read_json(folder / CLOCK),
         "tasks": {task: {"before": value} for task, value in before},
         "layer_active_rank": {},
     }
@@ -83,7 +85,7 @@ def _unfinished(folder: Path) -> dict[str, Any]:
 
 def _progress(folder: Path, config: dict[str, Any], rows: figures.Rows) -> Iterable[str]:
     """How far a run is that is not finished; or why it stopped."""
-    stopped = _read(folder / STOPPED)
+    stopped = read_json(folder / STOPPED)
     if stopped:
         yield f"<p><b>The run stopped:</b> {html.escape(stopped['reason'])}.</p>"
         return

@@ -1,7 +1,6 @@
 """A run as its parts see it, and the hooks into it."""
 
 import contextlib
-import json
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -14,7 +13,7 @@ from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Steps, flatten
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.training import processes
-from lorasp_jax.training.run_folder import write_json
+from lorasp_jax.training.run_folder import CLOCK, read_json, write_json
 
 
 @dataclass
@@ -50,8 +49,7 @@ class Run:
 
     def __post_init__(self) -> None:
         """Takes over the time that earlier processes spent."""
-        path = self.folder / "seconds.json"
-        self.seconds = json.loads(path.read_text()) if path.exists() else {"total": 0.0}
+        self.seconds = {"total": 0.0, **read_json(self.folder / CLOCK)}
         self._before = self.seconds["total"]
 
     @property
@@ -75,7 +73,7 @@ class Run:
             self.seconds[phase] = self.seconds.get(phase, 0.0) + spent
             self.seconds["total"] = self._before + now - self.started
             if processes.is_first():
-                write_json(self.folder / "seconds.json", self.seconds)
+                write_json(self.folder / CLOCK, self.seconds)
 
 
 class Callback:

@@ -47,8 +47,23 @@ def write_json(path: Path, value: Any) -> None:
 def write_text(path: Path, text: str) -> None:
     """Write a whole file under a temporary name, then give it its own."""
     temporary = path.with_suffix(".tmp")
-    temporary.write_text(text)
+    with temporary.open("w") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())  # or a power cut could leave the name without the text
     os.replace(temporary, path)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """What `write_json` wrote of an object; nothing without a file.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    try:
+        return dict(json.loads(path.read_bytes())) if path.exists() else {}
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path} is damaged ({error}): put back a whole one") from error
 
 
 @contextlib.contextmanager
@@ -113,7 +128,7 @@ def record_dataset(folder: Path, facts: Mapping[str, Any], *, streams: bool) -> 
     path, now = folder / DATASET, {"facts": dict(facts), "streams": streams}
     if not path.exists():
         write_json(path, now)
-    before = json.loads(path.read_text())
+    before = read_json(path)
     if before["facts"] != now["facts"]:
         raise ValueError(
             f"the dataset is not the one that {folder} began with: put that back where it was, or "
@@ -151,13 +166,9 @@ def _locked(folder: Path) -> Iterator[None]:
 
 def _recorded(folder: Path) -> dict[str, Any]:
     """The config of the run in `folder`."""
-    record = folder / RECORD
-    if not record.exists():
+    if not (folder / RECORD).exists():
         raise ValueError(f"{folder} holds no run to resume: start it without --resume")
-    try:
-        return dict(json.loads(record.read_text()))
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{record} is damaged ({error}): the run cannot be resumed") from error
+    return read_json(folder / RECORD)
 
 
 def _differences(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> list[str]:

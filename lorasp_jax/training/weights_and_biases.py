@@ -1,13 +1,12 @@
 """Weights & Biases, if it is installed and asked for: `--wandb PROJECT`."""
 
-import json
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from lorasp_jax.config import Config
 from lorasp_jax.training.run import Callback, Run
-from lorasp_jax.training.run_folder import to_json, write_json
+from lorasp_jax.training.run_folder import read_json, to_json, write_json
 
 RECORD = "wandb.json"
 """File of a run's folder with its id there, under which it goes on."""
@@ -31,7 +30,7 @@ class WeightsAndBiases(Callback):
         except ImportError as error:
             raise ValueError("--wandb needs a package: pip install wandb") from error
         self._wandb, record = wandb, folder / RECORD
-        known = json.loads(record.read_text())["id"] if record.exists() else None
+        known = read_json(record).get("id")
         try:
             self._run = wandb.init(
                 project=project,
@@ -63,7 +62,7 @@ class WeightsAndBiases(Callback):
         write_json(run.folder / RECORD, {"id": self._run.id})
         before = run.folder / "before.json"
         if before.exists():
-            self._success(0, json.loads(before.read_text()))
+            self._success(0, read_json(before))
 
     def on_log(self, run: Run, step: int, metrics: dict[str, float]) -> None:  # noqa: ARG002
         """Send the metrics."""
@@ -71,7 +70,7 @@ class WeightsAndBiases(Callback):
 
     def on_end(self, run: Run) -> None:
         """Send success after the last step and the videos."""
-        results = json.loads((run.folder / "results.json").read_text())
+        results = read_json(run.folder / "results.json")
         after = {task: result["after"] for task, result in results["tasks"].items()}
         self._success(run.config.optim.steps, after)
         videos = {

@@ -10,11 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 
 from lorasp_jax.config import Config, DataConfig
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.training import run_folder
+from lorasp_jax.training.run import Run
 from lorasp_jax.training.run_folder import MetricsLog, read_metrics, record_dataset
 
 ROOT = Path(__file__).parents[2]
@@ -180,6 +182,12 @@ def test_name_is_free_after_a_run_that_failed_before_it_had_anything(tmp_path):
     files = [path.name for path in folder.iterdir() if path.is_file()]
     assert files == ["config.json"]  # the clock starts anew
     assert json.loads((folder / "config.json").read_text())["data"]["action_noise"] == 0.005
+
+
+def test_a_damaged_clock_is_named(tmp_path):
+    (tmp_path / "seconds.json").write_text("")
+    with pytest.raises(ValueError, match=r"seconds\.json is damaged"):
+        Run(CONFIG, tmp_path, Console(), "hash")
 
 
 def test_a_dataset_stays_what_and_where_it_was(tmp_path):
