@@ -150,23 +150,34 @@ def _speed(rows: figures.Rows) -> Iterable[str]:
     """What was measured beside the losses; nothing for a run that logged none of it."""
     found = speed(rows)
     if found:
-        yield _table(("median over the run", ""), found.items())
+        yield _table(("over the run", ""), found.items())
 
 
 def speed(rows: figures.Rows) -> dict[str, str]:
-    """Medians over a run's rows, of memory the highest, with their units, by what they are."""
+    """What a run's rows say of its speed and memory, with units, by what it is.
+
+    Medians; of waiting the share of all time, of memory the highest.
+    """
     known = {
         "samples a second": ("speed/samples_per_second", median, "{:,.4g}"),
         "FLOP utilisation": ("speed/flop_utilisation", median, "{:.1%}"),
-        "time waiting for data": ("speed/data_wait", median, "{:.1%}"),
+        "time waiting for data": ("waited", sum, "{:.1%}"),
         "memory at its highest": ("memory/peak_gib", max, "{:.2f} GiB"),
     }
-    found = {}
-    for label, (name, middle, form) in known.items():
+    found, rows = {}, [*_waited(rows)]
+    for label, (name, summary, form) in known.items():
         values = [row[name] for row in rows if name in row]
         if values:
-            found[label] = form.format(middle(values))
+            found[label] = form.format(summary(values))
     return found
+
+
+def _waited(rows: figures.Rows) -> Iterable[dict[str, float]]:
+    """The rows, with "waited": the share of the run's time that passed waiting in theirs."""
+    rate, wait = "speed/samples_per_second", "speed/data_wait"
+    every = sum(1 / row[rate] for row in rows if rate in row)
+    for row in rows:
+        yield row | {"waited": row[wait] / row[rate] / every} if wait in row else row
 
 
 def _active_rank(results: dict[str, Any], rows: figures.Rows, rank: Any) -> Iterable[str]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lorasp_jax.evaluation import video
-from lorasp_jax.report.html import write_report
+from lorasp_jax.report.html import speed, write_report
 from lorasp_jax.training.run_folder import STOPPED, MetricsLog, to_json
 from tests.runs import CONFIG
 
@@ -133,6 +133,12 @@ def test_speed_is_the_middle_and_memory_the_highest(folder):
     assert "samples a second</td><td class=number>20<" in page
     assert "3.50 GiB" in page
     assert "waiting" not in page
+
+
+def test_waiting_is_a_share_of_all_time():
+    rate, wait = "speed/samples_per_second", "speed/data_wait"
+    rows = [{rate: 10.0}, {rate: 10.0, wait: 0.0}, {rate: 5.0, wait: 0.5}]  # 1, 1 and 2 seconds
+    assert speed(rows)["time waiting for data"] == "25.0%"
 
 
 def test_video_can_be_read_back(folder):
