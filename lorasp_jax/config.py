@@ -241,6 +241,11 @@ class Config:
     seed: int = 0
     """Seed of every random stream of the run."""
 
+    def evaluates(self, step: int) -> bool:
+        """Whether the policy is evaluated at the log line after so many steps, not the last."""
+        every, before = self.evaluation.every, step - self.log_every
+        return bool(every) and step // every > before // every and step < self.optim.steps
+
     def __post_init__(self) -> None:
         """Checks what no single field shows."""
         kinds.check_fields(self)

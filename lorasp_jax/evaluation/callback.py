@@ -52,8 +52,7 @@ class Evaluation(Callback):
         Returns:
             `success/<task>`.
         """
-        every, before = run.config.evaluation.every, step - run.config.log_every
-        if not every or step // every == before // every or step == run.config.optim.steps:
+        if not run.config.evaluates(step):
             return {}
         results = self._measure(run, f"at step {step}", run.config.evaluation.worlds)
         if self._filming:

@@ -78,6 +78,23 @@ def _tell(callbacks: Sequence[Callback], run: Run, hook: str) -> None:
     processes.wait(hook)
 
 
+def _log(
+    callbacks: Sequence[Callback], run: Run, done: int, values: dict[str, float]
+) -> dict[str, float]:
+    """What is known after a stretch, with what callbacks add to it.
+
+    If they evaluate the policy, it lies on this process's own device, and the others wait.
+    """
+    evaluated = run.config.evaluates(done)
+    if evaluated:
+        run.policy = processes.own(run.policy)
+    for callback in callbacks:
+        values = values | (callback.on_log(run, done, values) or {})
+    if evaluated:
+        processes.wait(f"evaluated at step {done}")
+    return values
+
+
 def jit_stretch(run: Run, graphdef: Any, optimizer: Any, placed: TrainState) -> Callable:
     """The jitted stretch of steps: (frozen, data, state, key, count) -> state, metrics of each.
 
@@ -160,8 +177,7 @@ def _loop(
             loss = values.get("task", math.nan)
             progress.update(bar, completed=done, description=f"training, loss {loss:.4f}")
             run.policy = policy(state)
-            for callback in callbacks:
-                values |= callback.on_log(run, done, values) or {}
+            values = _log(callbacks, run, done, values)
             log.write(done, values, {name: x for name, x in found.items() if x.ndim})
             if done // config.checkpoint_every > saved // config.checkpoint_every:
                 checkpoints.save(state)

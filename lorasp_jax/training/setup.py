@@ -180,11 +180,8 @@ def _check_sizes(config: Config, chunk: int) -> None:
         raise ValueError(
             f"batch_size must be a multiple of the {devices} devices{parts}, got {optim.batch_size}"
         )
-    if jax.process_count() > 1 and (config.evaluation.every or config.data.fresh_every):
-        raise ValueError(
-            "evaluation.every and data.fresh_every need one process: leave them out, or "
-            "--distributed"
-        )
+    if jax.process_count() > 1 and config.data.fresh_every:
+        raise ValueError("data.fresh_every needs one process: leave it out, or --distributed")
     if optim.ema and isinstance(config.peft, peft.AdaLoRA):
         raise ValueError("an average has no budget: leave --optim.ema out with ada_lora")
 

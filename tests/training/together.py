@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from envs import physics
+from lorasp_jax.config import EvaluationConfig
 from lorasp_jax.data.batches import flatten
 from lorasp_jax.peft import FullFineTuning
 from lorasp_jax.training import mesh, processes
@@ -28,6 +29,11 @@ class Look(Callback):
     def on_start(self, run):
         assert all(x.is_fully_addressable for x in jax.tree.leaves(run.policy))
 
+    def on_log(self, run, step, metrics):
+        assert run.config.evaluates(step) == (step == 2)
+        if step == 2:
+            self.on_start(run)
+
     def on_end(self, run):
         self.on_start(run)
         assert processes.is_first()
@@ -41,7 +47,11 @@ def main(folder: str, streams: str) -> None:
         processes.initialize()
     mesh.shardings = functools.partial(mesh.shardings, minimum=1024)
     config = dataclasses.replace(
-        CONFIG, peft=FullFineTuning(), targets=("action_out_proj", "fc1"), fsdp=2
+        CONFIG,
+        peft=FullFineTuning(),
+        targets=("action_out_proj", "fc1"),
+        fsdp=2,
+        evaluation=EvaluationConfig(every=2),
     )
     first = processes.is_first()
 
