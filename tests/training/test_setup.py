@@ -23,7 +23,7 @@ from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.prompt_table import PromptTable
 from lorasp_jax.models.tokenizer import Offline
 from lorasp_jax.peft import FullFineTuning, LoRA
-from lorasp_jax.training import export, setup
+from lorasp_jax.training import base, export, setup
 from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.overrides import override
@@ -106,11 +106,10 @@ def test_policies_of_lerobot_are_fed_as_they_say(config, tmp_path, monkeypatch):
         setup.prepare(config, tmp_path, Console(file=io.StringIO()), time.perf_counter())
 
 
-@pytest.mark.slow
 def test_straight_line_code_is_chosen_on_the_command_line(monkeypatch):
-    monkeypatch.setattr(setup, "SIZES", ("dummy",))
+    monkeypatch.setattr(base, "SIZES", ("dummy",))
     monkeypatch.setattr(Pi0Config, "create", lambda config, _: config)
-    monkeypatch.setattr(setup.models, "weights_hash", lambda _: "")
+    monkeypatch.setattr(base.models, "weights_hash", lambda _: "")
     unroll = lambda *words: BASE_MODEL(override(CONFIG, [*words]))[0].unroll  # noqa: E731
     assert not unroll()
     assert unroll("--model.unroll", "True")
