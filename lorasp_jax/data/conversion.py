@@ -20,10 +20,13 @@ def to_rlds(source: Source, path: str | os.PathLike[str], progress: Progress) ->
         progress: told of the steps.
 
     Raises:
-        ValueError: the path exists already, another process is writing it, or the episodes differ
-            in more than their steps.
+        ValueError: the path exists already, another process is writing it, there are several tasks,
+            or the episodes differ in more than their steps.
         OSError: there is no room for it.
     """
+    tasks = sorted({source.episode(number, ()).task for number in range(len(source))})
+    if len(tasks) > 1:  # now, not when hours of pictures are written
+        raise ValueError(f"an RLDS folder holds one task, not {', '.join(tasks)}")
     with alone(Path(path)), creating(path) as folder:
         parts, done = rlds.Parts(folder, {}), 0
         for first in range(0, len(source), _TOGETHER):

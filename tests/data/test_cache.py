@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from envs.episodes import Episodes
-from lorasp_jax.data import cache
+from lorasp_jax.data import cache, conversion
 from lorasp_jax.data.batches import flatten, gather
 from lorasp_jax.data.lerobot import Keys, LeRobot
 from lorasp_jax.data.opening import open_source
@@ -36,6 +36,11 @@ def simulated(tmp_path_factory):
         parts[-1].save(folder / f"{task}.npz")
     sources = [open_source(folder / f"{part.task}.npz") for part in parts]
     return parts, written(folder / "cache", *sources)
+
+
+def test_two_tasks_are_no_rlds_folder(simulated, tmp_path):
+    with pytest.raises(ValueError, match="one task, not pour, press"):
+        conversion.to_rlds(simulated[1], tmp_path / "rlds", pytest.fail)
 
 
 @pytest.mark.parametrize("version", VERSIONS)
