@@ -66,13 +66,13 @@ def write(
     """
     path, total = Path(path), sum(source.num_steps for source in sources)
     there = path.exists()
-    kind = _facts(sources[0].episode(0)) if sources[1:] else {}
-    for source in sources[1:]:  # now, not when hours of the first one's pictures are read
-        _check_kind(kind, source.episode(0))
     with alone(path, waiting):
         if path.exists() and not there:
             _check(Cache(path), sources, total)
             return
+        kind = _facts(sources[0].episode(0)) if sources[1:] else {}
+        for source in sources[1:]:  # now, not when hours of the first one's pictures are read
+            _check_kind(kind, source.episode(0))
         with creating(path) as folder, Writer(folder) as writer, ThreadPoolExecutor(1) as reader:
             for episode in _ahead(sources, reader):
                 writer.append(episode)

@@ -24,8 +24,8 @@ def to_rlds(source: Source, path: str | os.PathLike[str], progress: Progress) ->
             or the episodes differ in more than their steps.
         OSError: there is no room for it.
     """
-    tasks = sorted({source.episode(number, ()).task for number in range(len(source))})
-    if len(tasks) > 1:  # now, not when hours of pictures are written
+    tasks = sorted({source.episode(number, ()).task for number in (0, len(source) - 1)})
+    if len(tasks) > 1:  # now, not when hours of the first one's pictures are written
         raise ValueError(f"an RLDS folder holds one task, not {', '.join(tasks)}")
     with alone(Path(path)), creating(path) as folder:
         parts, done = rlds.Parts(folder, {}), 0

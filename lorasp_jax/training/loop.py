@@ -3,7 +3,7 @@
 import contextlib
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -70,29 +70,30 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
 
 
 def _tell(callbacks: Sequence[Callback], run: Run, hook: str) -> None:
-    """Call one hook of all callbacks, with a policy on this process's own device."""
-    everywhere, run.policy = run.policy, processes.own(run.policy)
-    for callback in callbacks:
-        getattr(callback, hook)(run)
-    run.policy = everywhere
-    processes.wait(hook)
+    """Call one hook of all callbacks."""
+    with _own_policy(run, hook):
+        for callback in callbacks:
+            getattr(callback, hook)(run)
 
 
 def _log(
     callbacks: Sequence[Callback], run: Run, done: int, values: dict[str, float]
 ) -> dict[str, float]:
-    """What is known after a stretch, with what callbacks add to it.
-
-    If they evaluate the policy, it lies on this process's own device, and the others wait.
-    """
-    evaluated = run.config.evaluates(done)
-    if evaluated:
-        run.policy = processes.own(run.policy)
-    for callback in callbacks:
-        values = values | (callback.on_log(run, done, values) or {})
-    if evaluated:
-        processes.wait(f"evaluated at step {done}")
+    """What is known after a stretch, with what callbacks add to it, which may evaluate."""
+    evaluated = _own_policy(run, f"evaluated at step {done}")
+    with evaluated if run.config.evaluates(done) else contextlib.nullcontext():
+        for callback in callbacks:
+            values = values | (callback.on_log(run, done, values) or {})
     return values
+
+
+@contextlib.contextmanager
+def _own_policy(run: Run, name: str) -> Iterator[None]:
+    """In this block the run's policy is on this process's own device; at its end all wait."""
+    everywhere, run.policy = run.policy, processes.own(run.policy)
+    yield
+    run.policy = everywhere
+    processes.wait(name)
 
 
 def jit_stretch(run: Run, graphdef: Any, optimizer: Any, placed: TrainState) -> Callable:

@@ -126,9 +126,9 @@ def record_dataset(folder: Path, facts: Mapping[str, Any], *, streams: bool) -> 
         ValueError: the run began with another dataset.
     """
     path, now = folder / DATASET, {"facts": dict(facts), "streams": streams}
-    if not path.exists():
+    before = read_json(path) or now
+    if before is now:
         write_json(path, now)
-    before = read_json(path)
     if before["facts"] != now["facts"]:
         raise ValueError(
             f"the dataset is not the one that {folder} began with: put that back where it was, or "
