@@ -21,7 +21,7 @@ from rich.console import Console
 
 import envs
 from benchmarks import measuring
-from envs import Randomization, experts, physics
+from envs import Randomization, compilation_cache, experts, physics
 from envs.env import Env
 from envs.state import State
 
@@ -112,7 +112,7 @@ def main(arguments: list[str] | None = None) -> int:
     if options.episodes < PARTS:
         parser.error(f"--episodes must be at least {PARTS}, to see whether memory grows")
     physics.enable_fast_cpu()
-    physics.enable_compilation_cache()
+    compilation_cache.enable()
     backend: Any = options.backend or physics.default_backend()
     console, good = Console(soft_wrap=True), True
     for task in options.tasks:

@@ -10,7 +10,7 @@ from typing import Any
 
 from rich.console import Console
 
-from envs import actions, commands, distractors, making, physics
+from envs import actions, commands, compilation_cache, distractors, making, physics
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -21,7 +21,7 @@ def main(arguments: Sequence[str]) -> int:
     # half a minute.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     physics.enable_fast_cpu()  # before anything starts a JAX backend
-    physics.enable_compilation_cache()
+    compilation_cache.enable()
     try:
         options.command(options, console)
     except (ValueError, OSError) as error:

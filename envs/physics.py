@@ -81,14 +81,6 @@ def enable_fast_cpu() -> None:
     os.environ["XLA_FLAGS"] = f"{flags} {_FAST_CPU_FLAG}".strip()
 
 
-def enable_compilation_cache() -> None:
-    """Keep compiled programs between processes, in JAX_COMPILATION_CACHE_DIR or ~/.cache."""
-    if jax.config.jax_compilation_cache_dir is None:
-        folder = os.path.join(os.path.expanduser("~"), ".cache", "lorasp_jax", "xla")
-        jax.config.update("jax_compilation_cache_dir", folder)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
-
-
 def default_backend() -> str:
     """warp on one NVIDIA GPU where warp-lang is installed, else jax."""
     nvidia = jax.default_backend() == "gpu" and "cuda" in jax.devices()[0].client.platform_version

@@ -9,8 +9,8 @@ os.environ["XLA_FLAGS"] = (
 
 import jax
 
-from envs import physics
+from envs import compilation_cache, physics
 
 physics.enable_fast_cpu()
-physics.enable_compilation_cache()
+compilation_cache.enable()
 jax.config.update("jax_default_matmul_precision", "highest")

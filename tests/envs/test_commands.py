@@ -40,8 +40,9 @@ def fake(monkeypatch):
 @pytest.fixture
 def run(capsys, monkeypatch):
     """Runs a command; returns its exit code and what it said."""
-    for switch in ("enable_fast_cpu", "enable_compilation_cache"):  # these act on the process
-        monkeypatch.setattr(command_line.physics, switch, lambda: None)
+    # These act on the process.
+    monkeypatch.setattr(command_line.physics, "enable_fast_cpu", lambda: None)
+    monkeypatch.setattr(command_line.compilation_cache, "enable", lambda: None)
 
     def run(text, *more):
         code = command_line.main([*text.split(), *map(str, more)])

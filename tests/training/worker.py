@@ -22,10 +22,10 @@ def main(args: argparse.Namespace) -> None:
     os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={args.devices}"
     import jax
 
-    from envs import physics
+    from envs import compilation_cache, physics
 
     physics.enable_fast_cpu()
-    physics.enable_compilation_cache()
+    compilation_cache.enable()
     jax.config.update("jax_default_matmul_precision", "highest")
     from lorasp_jax.training import mesh as meshes
     from lorasp_jax.training import processes
