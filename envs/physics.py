@@ -102,8 +102,9 @@ class Physics:
         """
         _check_backend(backend)
         self.backend = backend
-        self._model = mjx.put_model(model, impl="jax")
-        data = mjx.make_data(model, impl="jax")
+        own = jax.local_devices()[0]  # MJX would take the first of all processes
+        self._model = mjx.put_model(model, impl="jax", device=own)
+        data = mjx.make_data(model, impl="jax", device=own)
         self._data = jax.device_put(jax.tree.map(np.asarray, data))  # strongly typed
         self._posed = jax.jit(self._posed)  # traced once for a start and a step
         self._simulate = self._mjx_steps

@@ -1,0 +1,19 @@
+"""Each of several processes has environments of its own."""
+
+from tests.several import start
+
+ONE_OF_THEM = """
+import jax
+import envs
+from lorasp_jax.training import processes
+
+processes.initialize()
+env = envs.make("press", num_envs=2, image_size=16)
+assert env.physics._model.opt.timestep.devices() == {jax.local_devices()[0]}
+assert jax.process_count() == 2
+"""
+
+
+def test_every_process_makes_environments():
+    children = start(2, "-c", ONE_OF_THEM)
+    assert [child.wait() for child in children] == [0, 0]

@@ -1,0 +1,38 @@
+"""Several processes of one run, on this machine."""
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+NAMES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
+
+
+def free_address() -> str:
+    """An address on this machine where nobody listens."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return f"127.0.0.1:{free.getsockname()[1]}"
+
+
+def environments(count: int, devices: int = 1) -> Iterator[dict[str, str]]:
+    """Of each of `count` processes that are to find one another, with so many CPU devices each."""
+    flags = f"--xla_force_host_platform_device_count={devices}"
+    everyone = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
+    address = free_address()
+    for number in range(count):
+        own = zip(NAMES, (address, str(count), str(number)), strict=True) if count > 1 else ()
+        yield everyone | dict(own)
+
+
+def start(count: int, *arguments: Any, devices: int = 1, **options: Any) -> list[subprocess.Popen]:
+    """`count` processes `python ARGUMENTS`, which find one another."""
+    command = [sys.executable, *map(str, arguments)]
+    return [
+        subprocess.Popen(command, env=own, cwd=ROOT, text=True, **options)
+        for own in environments(count, devices)
+    ]
