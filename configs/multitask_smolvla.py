@@ -20,8 +20,8 @@ def get_config(scale: str) -> Config:
     model = dataclasses.replace(
         config.model,
         backbone="smolvla",
-        checkpoint="lerobot/smolvla_base",
+        checkpoint="hf://lerobot/smolvla_base",
         relative_actions=False,
-        tokenizer="HuggingFaceTB/SmolVLM2-500M-Video-Instruct",
+        tokenizer="hf://HuggingFaceTB/SmolVLM2-500M-Video-Instruct",
     )
     return dataclasses.replace(config, name="multitask_smolvla", model=model, image_size=256)

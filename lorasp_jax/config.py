@@ -38,10 +38,10 @@ class ModelConfig:
     """nano for a CPU, small for one accelerator, base as published; of pi0 also nano_pi05 and
     base_pi05."""
     checkpoint: str = "assets/{backbone}_{size}"
-    """Where the base weights are: a folder, an id on Hugging Face's hub, a bucket; empty for random
-    ones. {backbone} and {size} stand for those fields."""
+    """Where the base weights are: a folder, hf://owner/name, a bucket; empty for random ones. A
+    shipped base is found from any folder. {backbone} and {size} stand for those fields."""
     tokenizer: str = ""
-    """A SentencePiece .model or tokenizer.json, on this machine or the hub; empty: the offline one
+    """A SentencePiece .model or tokenizer.json, a file or hf://owner/name; empty: the offline one
     of nano and small."""
     max_tokens: int = 0
     """Longest instruction [tokens]; 0: what the size has."""
@@ -74,7 +74,7 @@ class DataConfig:
     """Demonstrations: made by the scripted expert, or a dataset."""
 
     source: str = ""
-    """A dataset in place of the expert: LeRobot (folder or id on the hub), RLDS, or a cache
+    """A dataset in place of the expert: LeRobot (folder or hf://owner/name), RLDS, or a cache
     (python -m lorasp_jax.data convert); it says robot and tasks. Empty: the expert."""
     episodes: int = 512
     """Successful demonstrations per task."""

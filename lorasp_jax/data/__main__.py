@@ -63,7 +63,7 @@ def convert(options: argparse.Namespace, console: Console) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m lorasp_jax.data", description=__doc__)
     subparsers = parser.add_subparsers(required=True, metavar="command")
-    where = "a LeRobot dataset (folder or id on the hub), an RLDS one, a cache or an .npz file"
+    where = "a LeRobot dataset (folder or hf://owner/name), an RLDS one, a cache or an .npz file"
 
     text = inspect.__doc__
     sub = subparsers.add_parser("inspect", help=text, description=text)

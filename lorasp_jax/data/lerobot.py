@@ -1,6 +1,6 @@
 """Datasets of LeRobot, versions 2.0, 2.1 and 3.0, without LeRobot and without torch.
 
-    dataset = LeRobot("lerobot/some_dataset", Keys(angles="degrees", gripper="millimetres"))
+    dataset = LeRobot("hf://lerobot/some_dataset", Keys(angles="degrees", gripper="millimetres"))
     episodes = dataset.episode(0)
 
 Numbers are columns of parquet files, pictures are frames of videos or PNG in such columns. An
@@ -89,7 +89,7 @@ class LeRobot:
         """Opens a dataset.
 
         Args:
-            where: a folder, or an id on the hub, from where it is fetched.
+            where: a folder, or hf://owner/name, which is fetched from the hub.
             keys: which of its features are what.
             name: what it is called; empty: what the folder or the repository is.
 

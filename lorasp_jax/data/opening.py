@@ -18,7 +18,7 @@ def open_source(where: str | os.PathLike[str], keys: Keys | None = None) -> Sour
     """A dataset of LeRobot or RLDS, a cache, or a file of episodes.
 
     Args:
-        where: a path, or a LeRobot dataset's id on the hub.
+        where: a path, or hf://owner/name of a LeRobot dataset on the hub.
         keys: what is what in a LeRobot dataset; the others say it themselves.
 
     Raises:

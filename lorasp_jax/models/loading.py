@@ -19,7 +19,7 @@ def load(where: str | os.PathLike[str], config: Any = None) -> Any:
     the policy's type, openpi's Orbax folder `params`.
 
     Args:
-        where: a folder; "owner/name" on the hub; "gs://bucket/folder", see `places.local`.
+        where: a folder; "hf://owner/name"; "gs://bucket/folder", see `places.local`.
         config: sizes of the model, and the types to compute and to store in. None takes the sizes
             from LeRobot's or this project's config.json, and those of pi0 as published for openpi.
 

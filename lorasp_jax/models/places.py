@@ -1,4 +1,8 @@
-"""Files of models wherever they are: on this machine, on Hugging Face's hub, in a bucket."""
+"""Files of models wherever they are: on this machine, on Hugging Face's hub, in a bucket.
+
+Only what begins with hf:// is asked of the hub: a folder that is not there never becomes somebody's
+repository of the same name.
+"""
 
 import os
 import re
@@ -6,6 +10,12 @@ import shutil
 from pathlib import Path
 from typing import Literal
 
+ROOT = Path(__file__).resolve().parents[2]
+"""The folder that the package lies in: of a checkout, its root."""
+SHIPPED = "assets"
+"""Folder of a checkout with the bases that it ships, found from wherever a program is started."""
+HUB = "hf://"
+"""How a repository on the hub begins, as in hf://owner/name."""
 REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 """A repository's id on the hub, owner/name."""
 LEFT_OUT = ("train_state/*", "*.bin", "*.pt", "*.pth", "*.onnx", "*.gguf", "*.msgpack", "*.h5")
@@ -21,8 +31,9 @@ def local(
     """The file or folder on this machine; it is downloaded first if it is somewhere else.
 
     Args:
-        where: a path; or the id of a repository on the hub, kept in its own cache; or a URL of a
-            bucket, gs://bucket/folder, kept below the user's cache folder, lorasp_jax/.
+        where: a path; or a repository on the hub, hf://owner/name, kept in its own cache; or a URL
+            of a bucket, gs://bucket/folder, kept below the user's cache folder, lorasp_jax/. A
+            shipped base, assets/pi0_nano, is found beside the package, too.
         only: patterns of the files that are wanted from a repository; None: all but `LEFT_OUT`.
         repository: what kind of repository on the hub.
 
@@ -30,18 +41,54 @@ def local(
         ValueError: it is not there, or cannot be reached.
     """
     name, path = os.fspath(where), Path(where)
-    if path.exists():
-        return path
+    if name.startswith(HUB):
+        return _from_hub(name.removeprefix(HUB), only, repository)
     if "://" in name:
         return _from_bucket(name)
+    for found in (path, ROOT / path) if _is_shipped(path) else (path,):
+        if os.path.exists(found):  # Path.exists raises where a name is too long
+            return found
+    raise ValueError(_nowhere(name, path))
+
+
+def lasting(where: str) -> str:
+    """A place as it is written down, for `found_again` from any other folder; empty stays empty."""
+    if not where or "://" in where:
+        return where
+    path = Path(where)
+    if not os.path.exists(path) and _is_shipped(path):
+        return where
+    path = path.resolve()
+    inside = path.is_relative_to(ROOT) and _is_shipped(path.relative_to(ROOT))
+    return path.relative_to(ROOT).as_posix() if inside else str(path)
+
+
+def found_again(where: str) -> str:
+    """What `lasting` wrote down, for `local`: no other folder takes the place of a shipped base."""
+    return str(ROOT / where) if _is_shipped(Path(where)) else where
+
+
+def _is_shipped(path: Path) -> bool:
+    """Whether a relative path is one of a shipped base."""
+    return path.parts[:1] == (SHIPPED,) and len(path.parts) > 1 and ".." not in path.parts
+
+
+def _nowhere(name: str, path: Path) -> str:
+    """Why a path leads nowhere, and what else may have been meant."""
+    inside = path.relative_to(ROOT) if path.is_relative_to(ROOT) else path
+    if _is_shipped(inside):
+        return (
+            f"{name} is not there: a checkout of the project has such bases beside the package, in "
+            f"{ROOT / SHIPPED}; an installed package has none: name the folder of a base"
+        )
     if REPOSITORY.fullmatch(name):
-        return _from_hub(name, only, repository)
-    raise ValueError(
-        f"{name} does not exist, and is no owner/name on the hub nor gs://bucket/path."
-    )
+        return f"there is no folder {name}; a repository on the hub is written {HUB}{name}"
+    return f"{name} does not exist, and is no {HUB}owner/name on the hub nor gs://bucket/path."
 
 
 def _from_hub(name: str, only: list[str] | None, repository: str) -> Path:
+    if not REPOSITORY.fullmatch(name):
+        raise ValueError(f"{HUB}{name} is no repository on the hub: that is {HUB}owner/name.")
     import huggingface_hub
     from huggingface_hub.errors import HfHubHTTPError
 
@@ -52,8 +99,8 @@ def _from_hub(name: str, only: list[str] | None, repository: str) -> Path:
         return Path(found)
     except (OSError, ValueError, HfHubHTTPError) as error:
         raise ValueError(
-            f"there is no folder {name}, and the hub did not give a repository of that name, for "
-            f"want of it, of a permission or of a connection ({_first_line(error)})."
+            f"the hub did not give {HUB}{name}, for want of it, of a permission or of a connection "
+            f"({_first_line(error)})."
         ) from error
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lorasp_jax import adaptation, adapter_io, models
-from lorasp_jax.models import backbone, tokenizer
+from lorasp_jax.models import backbone, places, tokenizer
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.processing import Processor
 from lorasp_jax.models.prompt_table import PromptTable
@@ -39,7 +39,7 @@ def write(run: Run) -> None:
         (folder / "statistics.json").write_text(statistics + "\n")
         write_json(folder / TRAINING, facts)
         return
-    metadata = {"base": config.model.source, **facts}
+    metadata = {"base": places.lasting(config.model.source), **facts}
     adapter_io.save_adapters(run.folder, run.policy.model, base=run.base_hash, metadata=metadata)
 
 
@@ -55,7 +55,7 @@ def _facts(run: Run) -> dict[str, Any]:
         "policy": {
             "backbone": config.model.backbone,
             "config": dataclasses.asdict(run.policy.model.config),
-            "tokenizer": config.model.tokenizer,
+            "tokenizer": places.lasting(config.model.tokenizer),
             "instructions": list(processor.prompts.instructions),
             "num_joints": len(processor.robot_slots) - 1,
             "cameras": {place: name for place, name in processor.cameras if name},
@@ -86,14 +86,18 @@ def load_policy(folder: str | os.PathLike[str], *, base: str = "", words: str = 
         told = json.loads(path.read_bytes())
         told = told if trained else told["metadata"]
         config = backbone.find(told["policy"]["backbone"]).from_dict(told["policy"]["config"])
-        source = folder / BASE if trained else base or told["base"]
+        source = folder / BASE if trained else base or places.found_again(told["base"])
     except FileNotFoundError as error:
         raise ValueError(f"{folder} has no policy: no run finished there") from error
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} does not say what its policy needs") from error
     if not source:
         raise ValueError(f"the base of {folder} was random, and nothing keeps it")
-    model = models.load(source, config)
+    try:
+        model = models.load(source, config)
+    except ValueError as error:
+        hint = "" if trained else f" (base= says where the base of {folder} is now)"
+        raise ValueError(f"{error}{hint}") from error
     if not trained:
         model = adapter_io.load_adapters(folder, model, base=models.weights_hash(model))
     return Policy(model, _processor(told["policy"], config, words))
@@ -102,7 +106,10 @@ def load_policy(folder: str | os.PathLike[str], *, base: str = "", words: str = 
 def _processor(told: Mapping[str, Any], config: Any, words: str) -> Processor:
     """The processor of an exported policy."""
     joints = told["num_joints"]
-    found = tokenizer.load(words or told["tokenizer"])
+    try:
+        found = tokenizer.load(words or places.found_again(told["tokenizer"]))
+    except ValueError as error:
+        raise ValueError(f"{error} (words= says where the policy's tokenizer is now)") from error
     return Processor.of(
         config,
         Statistics.from_json(json.dumps(told["statistics"])),

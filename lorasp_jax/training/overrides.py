@@ -7,6 +7,7 @@ import difflib
 import importlib.util
 import io
 import itertools
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ from lorasp_jax.config import SCALES, Config
 from lorasp_jax.peft import LoRASP
 
 HELP = {"-h", "--help"}
+SHIPPED = Path(__file__).parents[2] / "configs"
+"""The experiments of a checkout."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,8 +114,9 @@ def load(path: Path, scale: str) -> Config:
     Raises:
         ValueError: there is no such file, its code fails, or it returns something else.
     """
-    if not path.is_file():
-        found = ", ".join(str(file) for file in sorted(path.parent.glob("*.py")))
+    if not os.path.isfile(path):  # Path.is_file raises where a name is too long
+        folder = path.parent if os.path.isdir(path.parent) else SHIPPED
+        found = ", ".join(str(file) for file in sorted(folder.glob("*.py")))
         raise ValueError(f"there is no config {path}" + (f": found {found}" if found else ""))
     spec = importlib.util.spec_from_file_location(path.stem, path)
     if spec is None or spec.loader is None:

@@ -76,8 +76,8 @@ def test_openpi(tmp_path):
 def test_ours_and_the_hub(tmp_path, monkeypatch):
     models.save(tmp_path, models.load(pi0.GOLDEN / "orbax"))
     monkeypatch.setattr(places, "_from_hub", lambda *_: tmp_path)
-    assert models.load_config("me/pi0") == pi0.CONFIG
-    assert models.weights_hash(models.load("me/pi0")) == models.weights_hash(tmp_path)
+    assert models.load_config("hf://me/pi0") == pi0.CONFIG
+    assert models.weights_hash(models.load("hf://me/pi0")) == models.weights_hash(tmp_path)
 
 
 def test_bad_folders_are_one_sentence(lerobot, tmp_path):

@@ -1,5 +1,7 @@
 """Nothing here touches a network: the hub is replaced, the bucket lies in memory."""
 
+import re
+
 import fsspec
 import huggingface_hub
 import pytest
@@ -23,11 +25,11 @@ def test_hub(tmp_path, monkeypatch):
         return str(tmp_path)
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
-    assert places.local("lerobot/smolvla_base", only=["*.json"]) == tmp_path
+    assert places.local("hf://lerobot/smolvla_base", only=["*.json"]) == tmp_path
     assert (asked["name"], asked["allow_patterns"]) == ("lerobot/smolvla_base", ["*.json"])
     assert "train_state/*" in asked["ignore_patterns"]
     assert asked["repo_type"] == "model"
-    places.local("lerobot/pusht", repository="dataset")
+    places.local("hf://lerobot/pusht", repository="dataset")
     assert asked["repo_type"] == "dataset"
 
 
@@ -36,12 +38,56 @@ def test_offline_is_one_sentence(monkeypatch):
         raise LocalEntryNotFoundError("Got: no connection\nand a page of explanations")
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
-    with pytest.raises(ValueError, match=r"there is no folder a/b, .*no connection\)\.$") as caught:
-        places.local("a/b")
+    with pytest.raises(ValueError, match=r"did not give hf://a/b, .*no connection\)\.$") as caught:
+        places.local("hf://a/b")
     assert "\n" not in str(caught.value)
-    for name in ("/a/b", "a", "a/b/c"):
-        with pytest.raises(ValueError, match=f"^{name} does not exist"):
+
+
+@pytest.mark.parametrize("name", ["/a/b", "a", "a/b/c", "n" * 300, "/" + "n" * 300, "a\0b"])
+def test_nowhere(name, no_hub):
+    with pytest.raises(ValueError, match=f"^{re.escape(name)} does not exist"):
+        places.local(name)
+
+
+@pytest.mark.parametrize("name", ["runs/base", "lerobot/smolvla_base"])
+def test_a_folder_that_is_not_there_is_never_asked_of_the_hub(name, tmp_path, monkeypatch, no_hub):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=f"no folder {name}; .* is written hf://{name}$"):
+        places.local(name)
+    with pytest.raises(ValueError, match=r"is no repository on the hub: that is hf://owner/name"):
+        places.local("hf://too/many/parts")
+
+
+@pytest.fixture
+def no_hub(monkeypatch):
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda *_, **__: 1 / 0)
+
+
+def test_shipped_bases_are_found_from_any_folder(tmp_path, monkeypatch, no_hub):
+    monkeypatch.chdir(tmp_path)
+    assert (places.local("assets/pi0_nano") / "config.json").is_file()
+    for name in ("assets/pi0_nan", "assets/../runs/pi0"):
+        with pytest.raises(ValueError, match=r"is not there: a checkout|does not exist"):
             places.local(name)
+    monkeypatch.setattr(places, "ROOT", tmp_path / "site-packages")
+    with pytest.raises(
+        ValueError, match=r"site-packages/assets; an installed package has none: name"
+    ):
+        places.local("assets/pi0_nano")
+
+
+def test_what_is_written_down_is_found_from_any_other_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine").mkdir()
+    for where in ("mine", str(tmp_path / "mine")):
+        assert places.lasting(where) == str(tmp_path / "mine")
+    for where in ("assets/pi0_nano", str(places.ROOT / "assets" / "pi0_nano")):
+        assert places.lasting(where) == "assets/pi0_nano"
+    for where in ("", "gs://bucket/folder", "hf://owner/name"):
+        assert places.found_again(places.lasting(where)) == where
+    (tmp_path / "assets" / "pi0_nano").mkdir(parents=True)
+    assert places.lasting("assets/pi0_nano") == str(tmp_path / "assets" / "pi0_nano")
+    assert places.found_again("assets/pi0_nano") == str(places.ROOT / "assets" / "pi0_nano")
 
 
 @pytest.fixture

@@ -69,7 +69,7 @@ def test_a_folder_and_the_offline_tokenizer(tmp_path, monkeypatch):
         np.testing.assert_array_equal(found, wanted)
     asked = []
     monkeypatch.setattr(places, "_from_hub", lambda *args: asked.append(args) or tmp_path)
-    assert tokenizer.load("owner/name").vocabulary
+    assert tokenizer.load("hf://owner/name").vocabulary
     assert asked == [("owner/name", ["tokenizer.json", "*.model"], "model")]
 
 

@@ -14,7 +14,6 @@ from lorasp_jax.training.overrides import parse
 from lorasp_jax.training.run_folder import read_metrics
 
 ROOT = Path(__file__).parents[2]
-ASSETS = f"{ROOT}/assets/{{backbone}}_{{size}}"
 COMMAND = ["--config", f"{ROOT}/configs/multitask.py", "--scale", "smoke", "--tasks", "press"]
 
 
@@ -35,7 +34,7 @@ def test_twenty_steps(name, method, demonstrations, tmp_path, monkeypatch):
     monkeypatch.setattr(setup, "demonstrations", lambda c, _, p: collect(c, demonstrations, p))
     monkeypatch.setattr(meshes, "make_mesh", one_device(meshes.make_mesh))
     monkeypatch.chdir(tmp_path)
-    chosen = ["--model.backbone", name, "--model.checkpoint", ASSETS, "--method", method]
+    chosen = ["--model.backbone", name, "--method", method]
     assert train.main([*COMMAND, *chosen, "--optim.steps", "20"]) == 0
     rows = read_metrics(Path("runs/multitask"))
     assert rows[-1]["step"] == 20
@@ -70,7 +69,7 @@ def test_a_lerobot_dataset(version, tmp_path, monkeypatch):
     monkeypatch.setattr(meshes, "make_mesh", one_device(meshes.make_mesh))
     monkeypatch.chdir(tmp_path)
     source = str(ROOT / "tests" / "golden" / f"lerobot_{version}" / "dataset")
-    chosen = ["--model.checkpoint", ASSETS, "--model.max-tokens", "16", "--data.source", source]
+    chosen = ["--model.max-tokens", "16", "--data.source", source]
     assert train.main([*COMMAND, *chosen, "--optim.steps", "20"]) == 0
     first, *_, last = read_metrics(Path("runs/multitask"))
     assert last["task"] < first["task"]

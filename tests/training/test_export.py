@@ -2,6 +2,9 @@
 
 import dataclasses
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -71,6 +74,57 @@ def test_a_policy_comes_back(tmp_path, method):
     found, expected = (leaves(nnx.state(x.model, nnx.Param)) for x in (loaded, run.policy))
     for name, value in found.items():
         np.testing.assert_array_equal(value, expected[name], err_msg=name)
+
+
+ELSEWHERE = """
+import sys, huggingface_hub
+huggingface_hub.snapshot_download = lambda *_, **__: sys.exit("the hub was asked")
+from lorasp_jax import models
+from lorasp_jax.training.export import load_policy
+print(models.weights_hash(load_policy(sys.argv[1]).model))
+"""
+
+
+@pytest.mark.parametrize("kind", ["shipped", "folder"])
+def test_a_policy_comes_back_in_another_folder(tmp_path, monkeypatch, kind):
+    """In a process of its own, which finds there something else of the base's name."""
+    if kind == "shipped":
+        chosen = ModelConfig()
+    else:
+        monkeypatch.chdir(tmp_path)
+        models.save("base", Pi0Config.dummy().create(nnx.Rngs(0)))
+        chosen = dataclasses.replace(CONFIG.model, checkpoint="base")
+    model = models.load(chosen.source)
+    run = make_run(tmp_path / "run", dataclasses.replace(CONFIG, model=chosen), model)
+    run.base_hash = models.weights_hash(model)
+    export.write(run)
+    elsewhere = tmp_path / "elsewhere"
+    models.save(elsewhere / chosen.source, Pi0Config.dummy().create(nnx.Rngs(1)))
+    command = [sys.executable, "-c", ELSEWHERE, str(run.folder)]
+    env = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    found = subprocess.run(
+        command, check=False, cwd=elsewhere, env=env, capture_output=True, text=True
+    )
+    assert found.stdout.split() == [run.base_hash], found.stderr
+
+
+def test_a_base_that_is_gone_is_named_with_the_way_out(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    models.save("base", Pi0Config.dummy().create(nnx.Rngs(0)))
+    chosen = dataclasses.replace(CONFIG.model, checkpoint="base")
+    run = make_run(tmp_path / "run", dataclasses.replace(CONFIG, model=chosen), models.load("base"))
+    run.base_hash = models.weights_hash("base")
+    export.write(run)
+    (tmp_path / "base").rename("moved")
+    message = (
+        rf"^{tmp_path / 'base'} does not exist.* \(base= says where the base of .*run is now\)"
+    )
+    with pytest.raises(ValueError, match=message):
+        export.load_policy("run")
+    assert export.load_policy("run", base="moved").model
+    models.save("moved", Pi0Config.dummy().create(nnx.Rngs(1)))
+    with pytest.raises(ValueError, match="was trained on base"):
+        export.load_policy("run", base="moved")
 
 
 @pytest.mark.parametrize("changes", [{"policy": {}}, {"policy": {"backbone": "pi9"}}, {"base": ""}])
