@@ -2,7 +2,8 @@
 
 Large models are cut into shards with the index that Hugging Face uses. Tensor names are "/"-joined
 paths; a stacked layer's tensors keep their leading layer axis. The hash in config.json binds the
-files together, so a folder that is damaged or half written is not loaded.
+files together, sizes included, so a folder that is damaged or half written is not loaded, nor one
+whose matrices would be split into other heads.
 """
 
 import dataclasses
@@ -45,14 +46,14 @@ def save(folder: Folder, model: Any) -> None:
         model: a backbone, with `config`.
 
     Raises:
-        ValueError: the model has adapters or quantised kernels.
+        ValueError: the model has adapters or quantised kernels, or is not as its config says.
     """
     arrays = {name: a.astype(jnp.bfloat16) for name, a in base_arrays(model).items()}
     description = {
         "backbone": type(model).__module__.split(".")[-2],
         "config": _sizes(model.config),
-        "sha256": _hash(arrays),
     }
+    description["sha256"] = _digest(description, arrays)
     shards = _shards(arrays)
     names = [f"model-{i + 1:05}-of-{len(shards):05}.safetensors" for i in range(len(shards))]
     names = names if len(shards) > 1 else [SINGLE]
@@ -69,7 +70,7 @@ def base_arrays(model: nnx.Module) -> dict[str, np.ndarray]:
     """Every parameter of a model by "/"-joined path, in its stored type.
 
     Raises:
-        ValueError: the model has adapters or quantised kernels.
+        ValueError: the model has adapters or quantised kernels, or is not as its config says.
     """
     if jax.tree.leaves(nnx.state(model, (AdapterParam, SetParam))):
         raise ValueError(
@@ -77,7 +78,15 @@ def base_arrays(model: nnx.Module) -> dict[str, np.ndarray]:
         )
     if is_quantized(model):
         raise ValueError("models.save takes whole kernels: save a base before quantising it.")
-    return {name: np.asarray(leaf) for name, leaf in named_arrays(model).items()}
+    arrays = named_arrays(model)
+    wanted = _shapes(named_arrays(nnx.eval_shape(lambda: model.config.create(nnx.Rngs(0)))))
+    if other := sorted(wanted.items() ^ _shapes(arrays).items()):
+        raise ValueError(f"the model is not as its config says: see {other[0][0]}.")
+    return {name: np.asarray(leaf) for name, leaf in arrays.items()}
+
+
+def _shapes(arrays: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
+    return {name: array.shape for name, array in arrays.items()}
 
 
 def _write(folder: pathlib.Path, files: Mapping[str, bytes]) -> None:
@@ -110,8 +119,8 @@ def load(folder: Folder, config: Any = None) -> Any:
     if type(config) is not type(stored) or _sizes(config) != _sizes(stored):
         raise ValueError(f"{folder} does not fit the model: {_difference(stored, config)}.")
     arrays = TensorFiles(weight_files(folder))
-    if _hash(arrays) != description["sha256"]:  # before the model needs the memory
-        raise ValueError(f"{folder} is damaged: the weights do not have the hash in {CONFIG}.")
+    if _digest(description, arrays) != description["sha256"]:  # before the model needs the memory
+        raise ValueError(f"{folder} is damaged: weights and sizes lack the hash in {CONFIG}.")
     model = nnx.eval_shape(lambda: config.create(nnx.Rngs(0)))
     try:
         model = set_arrays(model, arrays)
@@ -185,6 +194,12 @@ def by_path(tree: Any) -> dict[str, Any]:
     """Leaves of a tree by "/"-joined path, in its order."""
     leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
+
+
+def _digest(description: Mapping[str, Any], arrays: Mapping[str, Any]) -> str:
+    """SHA-256 of what a folder holds: the backbone's name, every size, and the weights."""
+    said = json.dumps([description["backbone"], description["config"]], sort_keys=True)
+    return hashlib.sha256(f"{said}{_hash(arrays)}".encode()).hexdigest()
 
 
 def _hash(arrays: Mapping[str, Any]) -> str:

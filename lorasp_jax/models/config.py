@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any, Literal, Self
 
@@ -9,6 +10,20 @@ from lorasp_jax.models.inputs import OURS, InputConfig
 from lorasp_jax.models.tokenizer import VOCABULARY_SIZE
 
 Remat = Literal["none", "products", "full"]
+_LARGEST = 2**24
+"""Of any size, far beyond every model there is: what a file says is bounded before it is used."""
+_DEEPEST = 1000
+
+
+def _check_sizes(part: Any) -> None:
+    """Raise ValueError where a size is not a positive whole number, or is absurd."""
+    for field in dataclasses.fields(part):
+        value = getattr(part, field.name)
+        largest = _DEEPEST if field.name == "depth" else _LARGEST
+        if field.type == "int" and not (type(value) is int and 0 < value <= largest):
+            raise ValueError(
+                f"{field.name} must be a whole number from 1 to {largest}, not {value!r}."
+            )
 
 
 @dataclass(frozen=True)
@@ -24,6 +39,15 @@ class VisionConfig:
     shuffle: int = 1
     """Height and width of the square of tokens that the head reads as one [tokens]."""
 
+    def __post_init__(self) -> None:
+        """Checks the sizes."""
+        _check_sizes(self)
+
+    @property
+    def matrices(self) -> tuple[int, ...]:
+        """What the shapes of the matrices tell, heads left out."""
+        return self.width, self.depth, self.mlp, self.patch, self.shuffle
+
 
 @dataclass(frozen=True)
 class ExpertConfig:
@@ -35,6 +59,16 @@ class ExpertConfig:
     heads: int
     kv_heads: int
     head_dim: int
+
+    def __post_init__(self) -> None:
+        """Checks the sizes."""
+        _check_sizes(self)
+
+    @property
+    def matrices(self) -> tuple[int, ...]:
+        """What the shapes of the matrices tell: heads and their size only as a product."""
+        inner, context = self.heads * self.head_dim, self.kv_heads * self.head_dim
+        return self.width, self.depth, self.mlp, inner, context
 
 
 @dataclass(frozen=True)
@@ -77,6 +111,7 @@ class BackboneConfig:
 
     def __post_init__(self) -> None:
         """Checks that the parts fit."""
+        _check_sizes(self)
         language, action = self.language, self.action
         for name in ("depth", "heads", "kv_heads", "head_dim"):
             a, b = getattr(language, name), getattr(action, name)

@@ -1,7 +1,8 @@
 """Other projects' layouts of a model's parameters: names and shapes, in and out.
 
 A layout is a list of rules; each says how some of their leaves become some of ours and back. Values
-are only sliced, transposed, stacked and reshaped, so they stay exact.
+are only sliced, transposed, stacked and reshaped, so they stay exact. A leaf of another shape is
+refused before it is rearranged: as many values would fit into other heads, too.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
@@ -9,12 +10,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+Shape = tuple[int, ...]
+
+
+class OtherModelError(ValueError):
+    """The leaves are those of another model, or of one of other sizes."""
+
 
 class Rule(NamedTuple):
     """Some of our leaves and some of theirs that hold the same values."""
 
     ours: tuple[str, ...]
     theirs: tuple[str, ...]
+    shapes: Callable[..., Sequence[Shape]]
+    """Shapes of ours -> shapes of theirs."""
     load: Callable[[Iterator[np.ndarray]], Sequence[np.ndarray]]
     """Their arrays, read as they are asked for -> ours."""
     save: Callable[..., Sequence[np.ndarray]]
@@ -23,16 +32,15 @@ class Rule(NamedTuple):
 
 def copied(ours: str, theirs: str) -> Rule:
     """The same array under two names."""
-    return Rule((ours,), (theirs,), list, lambda a: [a])
+    return Rule((ours,), (theirs,), lambda shape: [shape], list, lambda a: [a])
 
 
-def reshaped(
-    ours: str, theirs: str, ours_shape: Sequence[int], theirs_shape: Sequence[int]
-) -> Rule:
-    """The same values in the same order; shapes may hold one -1."""
+def reshaped(ours: str, theirs: str, ours_shape: Shape, theirs_shape: Shape) -> Rule:
+    """The same values in the same order."""
     return Rule(
         (ours,),
         (theirs,),
+        lambda _: [theirs_shape],
         lambda arrays: [a.reshape(ours_shape) for a in arrays],
         lambda a: [a.reshape(theirs_shape)],
     )
@@ -40,7 +48,13 @@ def reshaped(
 
 def transposed(ours: str, theirs: str) -> Rule:
     """A matrix [I, O] that is theirs [O, I], as PyTorch's linear layers have it."""
-    return Rule((ours,), (theirs,), lambda arrays: [a.T for a in arrays], lambda a: [a.T])
+    return Rule(
+        (ours,),
+        (theirs,),
+        lambda shape: [shape[::-1]],
+        lambda arrays: [a.T for a in arrays],
+        lambda a: [a.T],
+    )
 
 
 def stacked(ours: str, theirs: Iterable[str], *, transpose: bool = False) -> Rule:
@@ -58,12 +72,16 @@ def stacked(ours: str, theirs: Iterable[str], *, transpose: bool = False) -> Rul
     def turned(array: np.ndarray) -> np.ndarray:
         return array.T if transpose else array
 
-    return Rule((ours,), names, load, lambda a: [turned(layer) for layer in a])
+    def shapes(shape: Shape) -> list[Shape]:
+        return [shape[:0:-1] if transpose else shape[1:]] * len(names)
+
+    return Rule((ours,), names, shapes, load, lambda a: [turned(layer) for layer in a])
 
 
 def read(
     rules: Sequence[Rule],
     theirs: MutableMapping[str, Any],
+    shapes: Mapping[str, Shape],
     whose: str,
     place: Callable[[str, np.ndarray], Any],
 ) -> dict[str, Any]:
@@ -72,6 +90,7 @@ def read(
     Args:
         rules: the layout.
         theirs: their leaves by name; those that are used are taken out, to free their memory.
+        shapes: of our leaves, by path in our model.
         whose: what to call them in an error.
         place: what to keep of each of our leaves (name, array), called as soon as it is read.
 
@@ -79,19 +98,25 @@ def read(
         What `place` gave, by path in our model.
 
     Raises:
-        ValueError: a leaf is missing, some are left over, or one cannot be reshaped.
+        OtherModelError: a leaf is missing, some are left over, or one has another shape.
     """
     missing = [name for rule in rules for name in rule.theirs if name not in theirs]
     unexpected = theirs.keys() - {name for rule in rules for name in rule.theirs}
     for problem, names in (("lacks", missing), ("has, beyond this model,", sorted(unexpected))):
         if names:
-            raise ValueError(f"{whose} {problem} {_some(names)}.")
+            raise OtherModelError(f"{whose} {problem} {_some(names)}.")
+
+    def taken(name: str, shape: Shape) -> np.ndarray:
+        array = np.asarray(theirs.pop(name))
+        if array.shape != shape:
+            found = f"{whose} has {name} of shape {array.shape}"
+            raise OtherModelError(f"{found}, the model needs {shape}.")
+        return array
+
     found: dict[str, Any] = {}
     for rule in rules:
-        try:
-            ours = rule.load(np.asarray(theirs.pop(name)) for name in rule.theirs)
-        except (ValueError, IndexError) as error:
-            raise ValueError(f"{whose} has another shape of {rule.theirs[0]}: {error}.") from error
+        wanted = rule.shapes(*(shapes[name] for name in rule.ours))
+        ours = rule.load(taken(*each) for each in zip(rule.theirs, wanted, strict=True))
         found |= {name: place(name, a) for name, a in zip(rule.ours, ours, strict=True)}
         del ours  # or it would stay beside what the next rule reads
     return found

@@ -15,6 +15,7 @@ from lorasp_jax.models.inputs import Mode
 
 Fields = Mapping[str, Any]
 _IMAGES = ("observation.images.", "observation.")
+_FOREIGN = (AttributeError, KeyError, OverflowError, TypeError)
 _MODES = {mode.upper(): mode for mode in get_args(Mode)}
 # What this project's backbones do, and LeRobot's may do otherwise.
 _FIXED: Fields = {"min_period": 4e-3, "max_period": 4.0, "adapt_to_pi_aloha": False}
@@ -29,14 +30,26 @@ def config_of(fields: Fields) -> BackboneConfig:
     Raises:
         ValueError: a type that no backbone has, or something that no config here can say.
     """
+    config = towers_of(fields)
+    require(fields, _FIXED)
+    try:
+        return dataclasses.replace(config, **_shared(config, fields))
+    except _FOREIGN as error:
+        raise ValueError(f"it is not as LeRobot writes it ({error!r})") from error
+
+
+def towers_of(fields: Fields) -> BackboneConfig:
+    """A config with the policy's towers; all but these is as published.
+
+    Raises:
+        ValueError: a type that no backbone has, or towers that no config here can say.
+    """
     kind, types = str(fields.get("type")), _types()
     if kind not in types:
         raise ValueError(f"a policy of type {kind!r} is not one of {', '.join(types)}")
-    require(fields, _FIXED)
     try:
-        config = types[kind](fields)
-        return dataclasses.replace(config, **_shared(config, fields))
-    except (AttributeError, KeyError, TypeError) as error:
+        return types[kind](fields)
+    except _FOREIGN as error:
         raise ValueError(f"it is not as LeRobot writes it ({error!r})") from error
 
 

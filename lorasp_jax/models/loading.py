@@ -3,11 +3,14 @@
 import json
 import logging
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from lorasp_jax.models import backbone, checkpoint, lerobot_config, places, published
 from lorasp_jax.models.inputs import InputConfig
+from lorasp_jax.models.layouts import OtherModelError
+from lorasp_jax.models.tensor_files import weight_files
 
 _log = logging.getLogger(__name__)
 
@@ -31,7 +34,14 @@ def load(where: str | os.PathLike[str], config: Any = None) -> Any:
     fields = _fields(folder)
     if "backbone" in fields:
         return checkpoint.load(folder, config)
-    model, unused = published.load(folder, config or _config(folder, fields))
+    if config is not None and "type" in fields and not published.orbax_folder(folder):
+        _require_same_heads(config, folder, fields)
+    try:
+        model, unused = published.load(folder, config or _config(folder, fields))
+    except OtherModelError as error:
+        if config is not None:
+            raise
+        raise ValueError(f"{error} {_whence(folder, fields)}") from error
     if unused:
         _log.info("%s: nothing reads %s, left out", where, ", ".join(unused))
     return model
@@ -83,14 +93,52 @@ def _fields(folder: Path) -> dict[str, Any]:
 def _config(folder: Path, fields: dict[str, Any]) -> Any:
     if published.orbax_folder(folder):
         return backbone.find("pi0").base()
+    config = folder / checkpoint.CONFIG
+    if not fields and any(path.exists() for path in weight_files(folder)):
+        raise ValueError(
+            f"{folder} holds weights, but no {config.name} that says their sizes: pass a config."
+        )
     if not fields:
         raise ValueError(
-            f"{folder} holds no model: there is no {checkpoint.CONFIG} of this project or LeRobot, "
+            f"{folder} holds no model: there is no {config.name} of this project or LeRobot, "
             "and no params/_METADATA of openpi."
         )
+    if "type" not in fields:
+        raise ValueError(
+            f"{config} is neither this project's, which names a backbone, nor LeRobot's, "
+            "which names the policy's type."
+        )
+    return _of_lerobot(lerobot_config.config_of, folder, fields)
+
+
+def _of_lerobot(read: Callable[[dict[str, Any]], Any], folder: Path, fields: dict[str, Any]) -> Any:
     try:
-        return lerobot_config.config_of(fields)
+        return read(fields)
     except ValueError as error:
         raise ValueError(
             f"{folder / checkpoint.CONFIG} fits no backbone: {str(error).rstrip('.')}."
         ) from error
+
+
+def _whence(folder: Path, fields: dict[str, Any]) -> str:
+    """Where the sizes come from, for whoever gave none."""
+    if published.orbax_folder(folder):
+        return (
+            "Nothing in a folder of openpi's says its sizes, so the published pi0's were taken: "
+            "pass a config."
+        )
+    return f"So says {folder / checkpoint.CONFIG}, of a policy of type {fields['type']!r}."
+
+
+def _require_same_heads(config: Any, folder: Path, fields: dict[str, Any]) -> None:
+    """Refuse what tensors of LeRobot's do not tell: other heads of the same matrices."""
+    stored = _of_lerobot(lerobot_config.towers_of, folder, fields)
+    if not isinstance(config, type(stored)):
+        found, wanted = (type(each).__name__ for each in (stored, config))
+        raise ValueError(f"{folder / checkpoint.CONFIG} is of a {found}, not of a {wanted}.")
+    for name in ("vision", "language", "action"):
+        one, other = getattr(stored, name), getattr(config, name)
+        if one.matrices == other.matrices and one != other:
+            raise ValueError(
+                f"{folder} does not fit the model: heads of {name} are {one}, not {other}."
+            )

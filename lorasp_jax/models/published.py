@@ -50,7 +50,8 @@ def load(folder: Path, config: Any) -> tuple[Any, list[str]]:
         `statistics_files` reads.
 
     Raises:
-        ValueError: neither layout; damaged files; leaves missing, left over or of other shapes.
+        ValueError: neither layout, or damaged files.
+        OtherModelError: leaves are missing, left over or of other shapes; a ValueError, too.
     """
     weights = _weights(config)
     layout, theirs = _open(folder, weights.canonical_name)
@@ -64,14 +65,15 @@ def load(folder: Path, config: Any) -> tuple[Any, list[str]]:
             del theirs[name]
     lora = openpi_lora.taken(theirs) if layout == "openpi" else {}
     model = nnx.eval_shape(lambda: config.create(nnx.Rngs(0)))
-    dtypes = {name: leaf.dtype for name, leaf in named_arrays(model).items()}
+    leaves = named_arrays(model)
 
     def place(name: str, array: np.ndarray) -> jax.Array:
         # Converted by numpy: JAX would hold a second copy, and return before it is gone.
-        return jnp.asarray(np.asarray(array, dtypes[name]))
+        return jnp.asarray(np.asarray(array, leaves[name].dtype))
 
     rules = weights.LAYOUTS[layout](config)
-    arrays = layouts.read(rules, theirs, f"{folder} (layout {layout})", place)
+    shapes = {name: leaf.shape for name, leaf in leaves.items()}
+    arrays = layouts.read(rules, theirs, shapes, f"{folder} (layout {layout})", place)
     model = set_arrays(model, arrays)
     return openpi_lora.adapted(model, lora) if lora else model, unused
 
@@ -86,7 +88,8 @@ def save(folder: Path, model: Any, layout: str, dtypes: Mapping[str, Any] | None
         dtypes: type of each of their leaves, as `stored_dtypes` tells; None: the model's types.
 
     Raises:
-        ValueError: unknown layout, adapters or quantised kernels, or something is there already.
+        ValueError: unknown layout, adapters or quantised kernels, parameters of other shapes than
+            the model's config says, or something is there already.
     """
     weights = _weights(model.config)
     if layout not in weights.LAYOUTS:

@@ -30,7 +30,7 @@ def siglip(theirs: str, size: VisionConfig) -> list[Rule]:
     """The tower "vision" without its head."""
     patches, norm = f"{theirs}.embeddings.patch_embedding", f"{theirs}.post_layernorm"
     rules = [
-        _patches("vision/patch_embed/kernel", f"{patches}.weight", size.patch),
+        _patches("vision/patch_embed/kernel", f"{patches}.weight", size),
         copied("vision/patch_embed/bias", f"{patches}.bias"),
         copied("vision/position_embedding", f"{theirs}.embeddings.position_embedding.weight"),
         copied("vision/norm/scale", f"{norm}.weight"),
@@ -60,11 +60,13 @@ def decoder(ours: str, theirs: str, layers: Iterable[int], *, adaptive: bool = F
     return rules
 
 
-def _patches(ours: str, theirs: str, patch: int) -> Rule:
+def _patches(ours: str, theirs: str, size: VisionConfig) -> Rule:
     """`[O, rgb, y, x]`, ours `[y x rgb, O]`."""
+    patch = size.patch
     return Rule(
         (ours,),
         (theirs,),
+        lambda _: [(size.width, 3, patch, patch)],
         lambda arrays: [w.transpose(2, 3, 1, 0).reshape(-1, len(w)) for w in arrays],
         lambda kernel: [kernel.reshape(patch, patch, 3, -1).transpose(3, 2, 0, 1)],
     )

@@ -61,7 +61,7 @@ def test_lerobot(lerobot, caplog):
     assert_same(model, published.load(smolvla.GOLDEN, smolvla.CONFIG)[0])
     (lerobot / "config.json").unlink()
     assert_same(models.load(lerobot, smolvla.CONFIG), model)
-    with pytest.raises(ValueError, match=r"holds no model: there is no config\.json"):
+    with pytest.raises(ValueError, match=r"holds weights, but no config\.json"):
         models.load(lerobot)
 
 

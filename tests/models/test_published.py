@@ -167,7 +167,9 @@ def test_what_does_not_fit_is_named(model, tensors, tmp_path):
     with pytest.raises(ValueError, match=r"lacks .*layers\.1\.mlp\.up_proj\.weight"):
         published.load(write(tmp_path / "less", less), CONFIG)
     other = dataclasses.replace(CONFIG, action_dim=7)
-    with pytest.raises(ValueError, match=r"action_in_proj/kernel has shape \(32, 64\)"):
+    with pytest.raises(
+        ValueError, match=r"has state_proj/kernel of shape \(32, 64\), the model needs \(7, 64\)"
+    ):
         published.load(OPENPI, other)
     twice = {**tensors, "state_proj.bias": np.zeros(64, np.float32)}
     with pytest.raises(ValueError, match="one tensor under two names"):

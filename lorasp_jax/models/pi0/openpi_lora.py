@@ -19,6 +19,8 @@ import numpy as np
 from flax import nnx
 
 from lorasp_jax.dense import AdapterParam
+from lorasp_jax.models.config import ExpertConfig
+from lorasp_jax.models.layouts import OtherModelError
 from lorasp_jax.peft import LoRA
 
 _LAYERS = "PaliGemma/llm/layers"
@@ -49,17 +51,14 @@ def adapted(model: Any, leaves: Mapping[str, np.ndarray], *, scale: float = 1.0)
     pairs, left = {}, dict(leaves)
     for tower, suffix in _TOWERS.items():
         if any(f"einsum{suffix}/lora_" in name for name in leaves):
-            pairs |= _expert(left, f"{tower}/blocks", suffix)
+            pairs |= _expert(left, getattr(model.config, tower), f"{tower}/blocks", suffix)
     if left or not pairs:
         raise ValueError(f"openpi's LoRA has no leaves {', '.join(sorted(left)[:8]) or 'at all'}.")
     model = nnx.clone(model)
     for path, (a, b) in pairs.items():
         tower, _, name = path.split("/")
         layer = getattr(getattr(model, tower).blocks, name)
-        *stack, d_in, d_out = layer.kernel_matrices().shape
         rank = a.shape[-1]
-        if (a.shape, b.shape) != ((*stack, d_in, rank), (*stack, rank, d_out)):
-            raise ValueError(f"openpi's LoRA does not fit {path}: {a.shape}, {b.shape}.")
         layer.method = LoRA(rank, alpha=rank * (scale if _attends(name) else 1.0))
         values = {"lora_a": jnp.asarray(a, jnp.float32), "lora_b": jnp.asarray(b, jnp.float32)}
         layer.adapter = AdapterParam(values)
@@ -70,19 +69,21 @@ def _attends(name: str) -> bool:
     return name in ("q_proj", "k_proj", "v_proj", "o_proj")
 
 
-def _expert(left: dict[str, np.ndarray], ours: str, suffix: str) -> dict[str, Pair]:
+def _expert(
+    left: dict[str, np.ndarray], size: ExpertConfig, ours: str, suffix: str
+) -> dict[str, Pair]:
     """Pairs by path of our layer; takes what they are made of out of `left`."""
+    layers, width, mlp = size.depth, size.width, size.mlp
+    heads, kv_heads, head_dim = size.heads, size.kv_heads, size.head_dim
 
-    def pair(name: str) -> Pair:
-        names = f"{_LAYERS}/{name}lora_a", f"{_LAYERS}/{name}lora_b"
-        for each in names:
-            if each not in left:
-                raise ValueError(f"openpi's LoRA lacks {each}.")
-        return left.pop(names[0]), left.pop(names[1])
+    def pair(name: str, *kernel: int) -> Pair:
+        return _pair(left, f"{_LAYERS}/{name}", (layers, *kernel))
 
-    q, out = pair(f"attn/q_einsum{suffix}/"), pair(f"attn/attn_vec_einsum{suffix}/")
-    keys_values = pair(f"attn/kv_einsum{suffix}/")
-    gating, down = pair(f"mlp{suffix}/gating_einsum_"), pair(f"mlp{suffix}/linear_")
+    q = pair(f"attn/q_einsum{suffix}/", heads, width, head_dim)
+    keys_values = pair(f"attn/kv_einsum{suffix}/", 2, kv_heads, width, head_dim)
+    out = pair(f"attn/attn_vec_einsum{suffix}/", heads, head_dim, width)
+    gating = pair(f"mlp{suffix}/gating_einsum_", 2, width, mlp)
+    down = pair(f"mlp{suffix}/linear_", mlp, width)
     (k, v), (gate, up) = ([(a[:, i], b[:, i]) for i in (0, 1)] for a, b in (keys_values, gating))
     return {
         f"{ours}/q_proj": _per_head(*q),
@@ -93,6 +94,23 @@ def _expert(left: dict[str, np.ndarray], ours: str, suffix: str) -> dict[str, Pa
         f"{ours}/up_proj": up,
         f"{ours}/down_proj": down,
     }
+
+
+def _pair(left: dict[str, np.ndarray], name: str, kernel: tuple[int, ...]) -> Pair:
+    """A [..., I, R] and B [..., R, O] of a kernel [..., I, O], taken out of `left`."""
+    names = f"{name}lora_a", f"{name}lora_b"
+    for each in names:
+        if each not in left:
+            raise ValueError(f"openpi's LoRA lacks {each}.")
+    a, b = (left.pop(each) for each in names)
+    *outer, d_in, d_out = kernel
+    rank = a.shape[-1] if a.ndim else 0
+    if (a.shape, b.shape) != ((*outer, d_in, rank), (*outer, rank, d_out)):
+        raise OtherModelError(
+            f"openpi's LoRA has {names[0]} and lora_b of shapes {a.shape} and {b.shape}, "
+            f"but the model's kernel is {kernel}."
+        )
+    return a, b
 
 
 def _per_head(a: np.ndarray, b: np.ndarray) -> Pair:

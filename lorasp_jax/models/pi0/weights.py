@@ -45,10 +45,13 @@ def _openpi_vision(config: Pi0Config) -> list[Rule]:
     block, ours = f"{_IMG}/Transformer/encoderblock", "vision/blocks"
     attention = f"{block}/MultiHeadDotProductAttention_0"
     embedding, matrix = (patch, patch, 3, width), (layers, width, width)
+    pixels, places = patch * patch * 3, (config.patches, width)
     rules = [
-        reshaped("vision/patch_embed/kernel", f"{_IMG}/embedding/kernel", (-1, width), embedding),
+        reshaped(
+            "vision/patch_embed/kernel", f"{_IMG}/embedding/kernel", (pixels, width), embedding
+        ),
         copied("vision/patch_embed/bias", f"{_IMG}/embedding/bias"),
-        reshaped("vision/position_embedding", f"{_IMG}/pos_embedding", (-1, width), (1, -1, width)),
+        reshaped("vision/position_embedding", f"{_IMG}/pos_embedding", places, (1, *places)),
         reshaped(
             f"{ours}/out_proj/kernel", f"{attention}/out/kernel", matrix, (layers, *heads, width)
         ),
@@ -79,37 +82,40 @@ def _openpi_vision(config: Pi0Config) -> list[Rule]:
 def _openpi_expert(tower: str, size: ExpertConfig, suffix: str) -> list[Rule]:
     """One expert; openpi marks the action expert's leaves with "_1"."""
     layers, ours = f"{_LLM}/layers", f"{tower}/blocks"
-    heads, kv_heads = size.heads, size.kv_heads
+    depth, width, heads, kv_heads = size.depth, size.width, size.heads, size.kv_heads
+    inner = heads * size.head_dim
 
     def kernel(name: str) -> str:
         return f"{ours}/{name}/kernel"
 
-    out = (size.depth, heads, size.head_dim, size.width)
     return [
         # [L, N, D, H]; keys and values [L, 2, K, D, H]; gate and up [L, 2, D, F].
         Rule(
             (kernel("q_proj"),),
             (f"{layers}/attn/q_einsum{suffix}/w",),
+            lambda _: [(depth, heads, width, size.head_dim)],
             lambda arrays: [_heads_last(w) for w in arrays],
             lambda q: [_heads_first(q, heads)],
         ),
         Rule(
             (kernel("k_proj"), kernel("v_proj")),
             (f"{layers}/attn/kv_einsum{suffix}/w",),
+            lambda *_: [(depth, 2, kv_heads, width, size.head_dim)],
             lambda arrays: [_heads_last(a) for w in arrays for a in (w[:, 0], w[:, 1])],
             lambda k, v: [np.stack([_heads_first(a, kv_heads) for a in (k, v)], axis=1)],
         ),
         Rule(
             (kernel("gate_proj"), kernel("up_proj")),
             (f"{layers}/mlp{suffix}/gating_einsum",),
+            lambda *_: [(depth, 2, width, size.mlp)],
             lambda arrays: [a for w in arrays for a in (w[:, 0], w[:, 1])],
             lambda gate, up: [np.stack([gate, up], axis=1)],
         ),
         reshaped(
             kernel("o_proj"),
             f"{layers}/attn/attn_vec_einsum{suffix}/w",
-            (size.depth, -1, size.width),
-            out,
+            (depth, inner, width),
+            (depth, heads, size.head_dim, width),
         ),
         copied(kernel("down_proj"), f"{layers}/mlp{suffix}/linear"),
     ]
