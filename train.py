@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from envs import compilation_cache, physics
+from envs import compilation_cache
 
 RUNS = Path("runs")
 STOPPED = 130
@@ -23,7 +23,6 @@ def main(arguments: list[str]) -> int:
     """
     started = time.perf_counter()
     console, errors = Console(), Console(stderr=True)
-    physics.enable_fast_cpu()  # before anything starts a JAX backend
     compilation_cache.enable()
     from lorasp_jax.training import processes
     from lorasp_jax.training.interrupt import sigterm_as_interrupt

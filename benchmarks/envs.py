@@ -181,7 +181,6 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1, help="programs to compile at once")
     parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args()
-    physics.enable_fast_cpu()
     options.backends = options.backends or sorted({"jax", physics.default_backend()})
     console = Console()
     machine = measuring.machine("jax", "mujoco", "mujoco-mjx")

@@ -111,7 +111,6 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.episodes < PARTS:
         parser.error(f"--episodes must be at least {PARTS}, to see whether memory grows")
-    physics.enable_fast_cpu()
     compilation_cache.enable()
     backend: Any = options.backend or physics.default_backend()
     console, good = Console(soft_wrap=True), True

@@ -5,6 +5,7 @@ env = envs.make("press", robot="piper", num_envs=64, image_size=64)
 episodes = envs.collect("press", robot="panda", num_episodes=512, key=jax.random.key(0))
 """
 
+import envs.fast_cpu  # first: it must come before anything starts JAX
 import envs.robots.panda
 import envs.robots.piper  # noqa: F401  envs.robots.piper.forward_kinematics is public
 from envs.collection import collect, expert_success

@@ -10,7 +10,7 @@ from typing import Any
 
 from rich.console import Console
 
-from envs import actions, commands, compilation_cache, distractors, making, physics
+from envs import actions, commands, compilation_cache, distractors, making
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -20,7 +20,6 @@ def main(arguments: Sequence[str]) -> int:
     # JAX would reserve most of a GPU at its start, which takes a second (measured) for a command of
     # half a minute.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-    physics.enable_fast_cpu()  # before anything starts a JAX backend
     compilation_cache.enable()
     try:
         options.command(options, console)

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs import actions, distractors, placing, randomization, scene
+from envs import actions, distractors, fast_cpu, placing, randomization, scene
 from envs.physics import Physics
 from envs.randomization import Draw, Randomization
 from envs.render import Look, Renderer, RenderModel
@@ -121,7 +121,7 @@ class Env:
         # A weakly typed action, such as jnp.full(shape, 0.0), would compile all anew.
         return self._steps(state, jax.lax.convert_element_type(action, jnp.float32))
 
-    @functools.partial(jax.jit, static_argnums=0)
+    @functools.partial(fast_cpu.jit, static_argnums=0)
     def observe(self, state: State) -> dict[str, Any]:
         """What a policy may see.
 
@@ -198,11 +198,11 @@ class Env:
         pictures = self.renderer((geom_xpos, geom_xmat, cam_xpos, cam_xmat), look, size)
         return {name: pictures[:, i] for i, name in enumerate(self.cameras)}
 
-    @functools.partial(jax.jit, static_argnums=0)
+    @functools.partial(fast_cpu.jit, static_argnums=0)
     def _steps(self, state: State, action: jax.Array) -> State:
         return jax.vmap(self._step)(state, action)
 
-    @functools.partial(jax.jit, static_argnums=0)
+    @functools.partial(fast_cpu.jit, static_argnums=0)
     def _resets(self, key: jax.Array, ranges: Randomization | None) -> State:
         keys = jax.random.split(key, self.num_envs)
         return jax.vmap(functools.partial(self._reset, ranges))(keys)

@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 import mujoco
 
 import envs.distractors
-from envs import mjcf, physics, render, scene
+from envs import fast_cpu, mjcf, physics, render, scene
 from envs.actions import MODES, TARGET_DT, Mode
 from envs.env import Env
 from envs.physics import Backend
@@ -53,6 +53,7 @@ def make(
         ValueError: for an unknown name (the known ones are listed), a robot that lacks something,
             or a number out of range.
     """
+    fast_cpu.warn_if_late()
     found_task, found_robot = _find("task", task), _find_robot(robot)
     _check_counts(num_envs=num_envs, image_size=image_size, antialias=antialias)
     _check_options(control_dt, actions, distractors)

@@ -7,10 +7,8 @@ import contextlib
 import dataclasses
 import importlib.util
 import io
-import os
 import sys
 import types
-import warnings
 from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
@@ -18,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jax._src import xla_bridge  # there is no public way to ask whether a backend has started
 
 from envs.state import MOVING, Changes, Data
 
@@ -27,7 +24,6 @@ BACKENDS: tuple[str, ...] = get_args(Backend)
 """jax runs everywhere; warp on NVIDIA, much faster there, and for tests on CPU, slowly."""
 
 MOST_GROWTH = 1.25  # of a geom that differs in size from its model
-_FAST_CPU_FLAG = "--xla_cpu_use_fusion_emitters=false"
 
 
 def _import_mjx() -> Any:
@@ -59,26 +55,6 @@ def _sum_in_order(values: jax.Array, segments: np.ndarray, number: int) -> jax.A
 
 
 mjx = _import_mjx()
-
-
-def enable_fast_cpu() -> None:
-    """Make MJX fast on CPU with JAX < 0.11 (measured: 15 times); does nothing on newer versions.
-
-    Sets an XLA flag, which XLA reads when JAX starts its backend: call this first in a program. If
-    a CPU backend has already started without the flag, one warning says so.
-    """
-    flags = os.environ.get("XLA_FLAGS", "")
-    if jax.__version_info__ >= (0, 11) or _FAST_CPU_FLAG in flags:
-        return  # newer versions need no flag and abort on this one
-    if xla_bridge.backends_are_initialized():
-        if jax.default_backend() == "cpu":
-            warnings.warn(
-                f"JAX started before envs.physics.enable_fast_cpu(): simulation on CPU will be "
-                f"about 15 times slower; set XLA_FLAGS={_FAST_CPU_FLAG}",
-                stacklevel=2,
-            )
-        return
-    os.environ["XLA_FLAGS"] = f"{flags} {_FAST_CPU_FLAG}".strip()
 
 
 def default_backend() -> str:

@@ -22,7 +22,7 @@ import mujoco
 import numpy as np
 from jax import export
 
-from envs import tasks
+from envs import fast_cpu, tasks
 from envs.env import Env
 from envs.episodes import replacing
 from envs.render import RayRenderer
@@ -45,7 +45,7 @@ def kept(function: Callable[..., Any]) -> Callable[..., Any]:
         function: of an `Env` and trees of arrays, in this package; returns arrays in dicts, lists
             and tuples.
     """
-    jitted = jax.jit(function, static_argnums=0)
+    jitted = fast_cpu.jit(function, static_argnums=0)
 
     @functools.lru_cache(maxsize=32)
     def program(
@@ -59,7 +59,7 @@ def kept(function: Callable[..., Any]) -> Callable[..., Any]:
         if (exported := _load(file)) is None:
             exported = export.export(jax.jit(run))(*kinds)
             _save(file, exported.serialize())
-        return jax.jit(exported.call)
+        return fast_cpu.jit(exported.call)
 
     @functools.wraps(function)
     def call(env: Env, *arguments: Any) -> Any:

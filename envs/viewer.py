@@ -10,7 +10,7 @@ import mujoco
 import mujoco.viewer
 import numpy as np
 
-from envs import experts, placing
+from envs import experts, fast_cpu, placing
 from envs.env import Env
 
 _TRIES = 8  # calls, of all worlds each
@@ -70,5 +70,5 @@ def show(model: mujoco.MjModel, positions: np.ndarray, seconds: float) -> None:
                 return
 
 
-_plan = jax.jit(experts.plan, static_argnums=0)
-_act = jax.jit(experts.act, static_argnums=0)
+_plan = fast_cpu.jit(experts.plan, static_argnums=0)
+_act = fast_cpu.jit(experts.act, static_argnums=0)

@@ -9,8 +9,7 @@ os.environ["XLA_FLAGS"] = (
 
 import jax
 
-from envs import compilation_cache, physics
+from envs import compilation_cache
 
-physics.enable_fast_cpu()
 compilation_cache.enable()
 jax.config.update("jax_default_matmul_precision", "highest")

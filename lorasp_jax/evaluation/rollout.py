@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs import fast_cpu
 from envs.env import Env
 from envs.randomization import Randomization
 from envs.state import State
@@ -134,7 +135,7 @@ def evaluate(
             f"{num_episodes} episodes are not a positive multiple of the {env.num_envs} worlds"
         )
     policy = _told(policy, env)
-    rollout = rollout or jax.jit(make_rollout(env))
+    rollout = rollout or fast_cpu.jit(make_rollout(env))
     runs: list[Rollout] = []
     for batch_key in jax.random.split(key, batches):
         runs.append(jax.block_until_ready(rollout(policy, batch_key)))

@@ -41,7 +41,6 @@ def fake(monkeypatch):
 def run(capsys, monkeypatch):
     """Runs a command; returns its exit code and what it said."""
     # These act on the process.
-    monkeypatch.setattr(command_line.physics, "enable_fast_cpu", lambda: None)
     monkeypatch.setattr(command_line.compilation_cache, "enable", lambda: None)
 
     def run(text, *more):

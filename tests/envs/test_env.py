@@ -204,18 +204,3 @@ def test_import_starts_no_backend_and_prints_nothing():
     root = os.path.dirname(os.path.dirname(envs.__file__))
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, cwd=root, check=True)
     assert done.stdout == b""
-
-
-@pytest.mark.skipif(jax.__version_info__ >= (0, 11), reason="newer versions need no flag")
-def test_fast_cpu_warns_when_late():
-    code = (
-        "import jax, warnings\n"
-        "from envs import physics\n"
-        "jax.devices()\n"
-        "with warnings.catch_warnings(record=True) as caught:\n"
-        "    physics.enable_fast_cpu()\n"
-        "assert len(caught) == 1 and '15 times slower' in str(caught[0].message), caught"
-    )
-    flags = os.environ | {"XLA_FLAGS": ""}
-    root = os.path.dirname(os.path.dirname(envs.__file__))
-    subprocess.run([sys.executable, "-c", code], cwd=root, env=flags, check=True)

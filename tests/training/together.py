@@ -13,7 +13,6 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from envs import physics
 from lorasp_jax.config import EvaluationConfig
 from lorasp_jax.data.batches import flatten
 from lorasp_jax.peft import FullFineTuning
@@ -42,7 +41,6 @@ class Look(Callback):
 
 def main(folder: str, streams: str) -> None:
     """A run in two parts; large arrays are those over 1 KiB."""
-    physics.enable_fast_cpu()
     if "JAX_PROCESS_ID" in os.environ:
         processes.initialize()
     mesh.shardings = functools.partial(mesh.shardings, minimum=1024)

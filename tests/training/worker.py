@@ -22,9 +22,8 @@ def main(args: argparse.Namespace) -> None:
     os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={args.devices}"
     import jax
 
-    from envs import compilation_cache, physics
+    from envs import compilation_cache
 
-    physics.enable_fast_cpu()
     compilation_cache.enable()
     jax.config.update("jax_default_matmul_precision", "highest")
     from lorasp_jax.training import mesh as meshes

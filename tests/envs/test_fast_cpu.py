@@ -1,0 +1,75 @@
+"""The XLA flag that MJX needs on CPU with old JAX, each time in a fresh process."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import pytest
+
+import envs
+
+OLD = jax.__version_info__ < (0, 11)
+old = pytest.mark.skipif(not OLD, reason="newer versions need no flag")
+
+
+def python(code, flags=""):
+    """Runs code in a new process, where warnings are errors."""
+    root = os.path.dirname(os.path.dirname(envs.__file__))
+    environment = os.environ | {"XLA_FLAGS": flags}
+    subprocess.run(
+        [sys.executable, "-W", "error::UserWarning", "-c", code],
+        cwd=root,
+        env=environment,
+        check=True,
+    )
+
+
+@pytest.mark.parametrize("flags", ["", "--xla_force_host_platform_device_count=3"])
+def test_an_import_is_enough(flags):
+    python(
+        "import os, jax, envs\n"
+        f"assert ('--xla_cpu_use_fusion_emitters=false' in os.environ['XLA_FLAGS']) == {OLD}\n"
+        "envs.make('press')\n"
+        f"assert jax.device_count() == {3 if flags else 1}",
+        flags,
+    )
+
+
+@old
+def test_what_the_user_says_stays():
+    flags = "--xla_cpu_use_fusion_emitters=true"
+    python(f"import os, envs\nassert os.environ['XLA_FLAGS'] == {flags!r}", flags)
+
+
+@old
+def test_flags_that_were_replaced_get_it_again():
+    python(
+        "import os, envs\n"
+        "os.environ['XLA_FLAGS'] = '--xla_force_host_platform_device_count=2'\n"
+        "envs.make('press')\n"
+        "assert '--xla_cpu_use_fusion_emitters=false' in os.environ['XLA_FLAGS']"
+    )
+
+
+@old
+def test_too_late_is_one_warning_and_our_own_programs_are_fast():
+    python(
+        "import time, warnings, jax\n"
+        "jax.devices()\n"
+        "import envs, envs.compilation_cache\n"
+        "envs.compilation_cache.enable()\n"
+        "with warnings.catch_warnings(record=True) as caught:\n"
+        "    warnings.simplefilter('always')\n"
+        "    env = [envs.make('press'), envs.make('press')][0]\n"
+        "(said,) = map(str, [w.message for w in caught if w.category is UserWarning])\n"
+        "assert '15 to 400 times slower' in said and 'import envs before' in said, said\n"
+        "state = env.reset(jax.random.key(0))\n"
+        "state = env.step(state, state.info['command'])\n"
+        "jax.eval_shape(jax.jit(env.step), state, state.info['command'])\n"
+        "start = time.process_time()\n"
+        "for _ in range(10):\n"
+        "    state = env.step(state, state.info['command'])\n"
+        "jax.block_until_ready(state)\n"
+        "assert time.process_time() - start < 1.5"  # else 10 s
+    )
