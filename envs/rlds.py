@@ -23,6 +23,7 @@ from array_record.python import array_record_module
 
 from envs import rlds_schema
 from envs.episodes import SHARED, Episodes, creating, replacing
+from envs.files import regular
 from envs.locks import alone
 from envs.rlds_reading import (
     FORMAT,
@@ -43,7 +44,6 @@ _DESCRIPTIONS = {
     True: "Scripted expert episodes of {task} by {robot} in simulation.",
     False: "Recorded episodes of {task} by {robot}.",
 }
-_FILES = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_INDEX}"  # as tfds.core.SequentialWriter calls them
 # One episode is read at a time, and PNG does not shrink any further (measured: 7 times as fast).
 _RECORDS = "group_size:1,uncompressed"
 
@@ -148,10 +148,12 @@ class Parts:
             data_dir=str(self.folder),
             module_name="",
         )
+        with damage_in_one_sentence(self.folder, ": delete it to start anew"):
+            features = rlds_schema.stored(self.folder)
         info = tfds.core.DatasetInfo(
             builder=identity,
             description=_DESCRIPTIONS[bool(self.facts["physics_dt"])].format(**self.facts),
-            features=tfds.features.FeaturesDict.from_config(str(self.folder)),
+            features=features,
         )
         info.set_file_format(tfds.core.FileFormat.ARRAY_RECORD)
         split = tfds.core.SplitInfo(
@@ -176,7 +178,7 @@ class Parts:
     def _template(self) -> tfds.core.ShardedFileTemplate:
         return tfds.core.ShardedFileTemplate(
             data_dir=tfds.core.Path(self.folder),
-            template=_FILES,
+            template=rlds_schema.FILES,
             dataset_name=self._name,
             split=SPLIT,
             filetype_suffix=tfds.core.FileFormat.ARRAY_RECORD.file_suffix,
@@ -209,8 +211,8 @@ def _write_records(file: Path, records: Iterable[bytes]) -> None:
 def _check_whole(file: Path, episodes: int) -> None:
     """Raises a ValueError if a part is damaged; every record has a checksum."""
     with damage_in_one_sentence(file, f": delete {file.parent} to start anew"):
-        reader = array_record_module.ArrayRecordReader(str(file))
-        if len(reader.read_all()) != episodes:
+        reader = array_record_module.ArrayRecordReader(str(regular(file, file.parent)))
+        if reader.num_records() != episodes or len(reader.read_all()) != episodes:
             raise ValueError(f"it holds {reader.num_records()} episodes, not {episodes}")
         reader.close()
 

@@ -1,7 +1,6 @@
 """Datasets in RLDS form, read without TensorFlow; `envs.rlds` writes them."""
 
 import contextlib
-import json
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -10,10 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import tensorflow_datasets as tfds
+from array_record.python import array_record_module
 from google.protobuf.json_format import ParseError
 
 from envs import rlds_schema
 from envs.episodes import SHARED, Episodes, concatenate
+from envs.files import RefusedError, read_json, regular, whole
 
 FORMAT, SPLIT = "envs-rlds-1", "train"
 METADATA = "metadata.json"
@@ -50,10 +51,12 @@ def metadata(path: Path) -> dict[str, Any]:
     if not path.exists():
         raise FileNotFoundError(f"there is no dataset {path}")
     try:
-        facts = json.loads((path / METADATA).read_text())
+        facts = read_json(path / METADATA, path)
         if facts["format"] != FORMAT:
             raise KeyError("format")
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except RefusedError:
+        raise
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path} is not a folder of {FORMAT} episodes") from error
     return facts
 
@@ -84,10 +87,10 @@ class Reader:
         with damage_in_one_sentence(self.path):
             self.cameras = {name: rlds_schema.picture_name(name) for name in self.facts["cameras"]}
             self.control_dt = float(self.facts["control_dt"])
-            self.num_steps = int(self.facts["steps"])
+            self.num_steps = whole(self.facts["steps"])
             self._shared: dict[str, Any] = {name: self.facts[name] for name in SHARED}
             self._shared |= {"instructions": tuple(self.facts["instructions"]), "attempted": 1}
-            builder: Any = tfds.builder_from_directory(self.path)
+            builder = _builder(self.path, self.facts["parts"])
             # Decoding is left to the schema: tfds would decode one picture after the other.
             encoded = {name: tfds.decode.SkipDecoding() for name in self.cameras.values()}
             decoders = {"steps": {"observation": encoded}}
@@ -110,20 +113,40 @@ class Reader:
         with damage_in_one_sentence(self.path):
             names = self.cameras if cameras is None else cameras
             wanted = {name: self.cameras[name] for name in names}
-            found = rlds_schema.episode(self._source[number], wanted, self._shared)
+            sizes = self.facts["cameras"]
+            found = rlds_schema.episode(self._source[number], wanted, sizes, self._shared)
             found.validate_numbers()
             return found
 
 
+def _builder(folder: Path, parts: Sequence[int]) -> Any:
+    """What reads a folder of parts of so many episodes, once its files are what they should be."""
+    rlds_schema.check_description(folder, rlds_schema.FEATURES, rlds_schema.INFO)
+    builder: Any = tfds.builder_from_directory(folder)
+    split = builder.info.splits[SPLIT]
+    if builder.info.file_format != tfds.core.FileFormat.ARRAY_RECORD:
+        raise ValueError(f"it holds files of {builder.info.file_format}")
+    if list(split.shard_lengths) != list(parts):
+        raise ValueError(f"it describes {sum(split.shard_lengths)} episodes, not {sum(parts)}")
+    for file, episodes in zip(split.filepaths, parts, strict=True):
+        reader = array_record_module.ArrayRecordReader(str(regular(Path(file), folder)))
+        if reader.num_records() != episodes:
+            raise ValueError(f"{file} holds {reader.num_records()} episodes, not {episodes}")
+        reader.close()
+    return builder
+
+
 @contextlib.contextmanager
 def damage_in_one_sentence(path: Path, remedy: str = "") -> Iterator[None]:
-    """What goes wrong inside becomes one ValueError about this path."""
+    """What goes wrong inside becomes one ValueError about this path; a refusal is one already."""
     try:
         yield
+    except RefusedError:
+        raise
     except _FAILURES as error:
         raise ValueError(f"{path} is damaged ({reason(error)}){remedy}") from error
 
 
 def reason(error: Exception) -> str:
     """What the libraries say can be long; its beginning says what is wrong."""
-    return str(error).split("; ")[0].split("\n")[0]
+    return str(error).split("; ")[0].split("\n")[0][:200]

@@ -6,7 +6,8 @@ The names are those of Open X-Embodiment.
 import io
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,12 @@ from PIL import Image
 from tensorflow_datasets.core.example_serializer import ExampleSerializer
 
 from envs.episodes import Episodes
+from envs.files import RefusedError, read_json
 
+FEATURES, INFO = "features.json", "dataset_info.json"
+"""Files in a dataset's folder in which tfds keeps its description."""
+FILES = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_INDEX}"
+"""What the files of records are called, as tfds.core.SequentialWriter calls them."""
 _MAIN = {"side": "image"}  # the main camera's pictures; those of the others are <name>_image
 _COMPRESSION = 1  # of zlib, the fastest
 _ACTION = {
@@ -24,6 +30,29 @@ _ACTION = {
     "end_effector": "change of the tool's position x, y, z [m] and its rotation vector x, y, z "
     "[rad] along the axes of the base, gripper opening [m]",
 }
+
+
+_CLASSES = [
+    f"{kind.__module__}.{kind.__name__}"
+    for kind in (
+        tfds.features.FeaturesDict,
+        tfds.features.Dataset,
+        tfds.features.Image,
+        tfds.features.Tensor,
+        tfds.features.Text,
+        tfds.features.Scalar,
+    )
+]
+_NAMES = {
+    "pythonClassName": _CLASSES,
+    "python_class_name": _CLASSES,
+    "filepathTemplate": [FILES],
+    "filepath_template": [FILES],
+    "jsonFeature": [],
+    "json_feature": [],
+}
+"""Fields by which a description names something, as tfds and protobuf spell them -> what they may
+say. The last two, and an outermost "type", hold features of old forms, with classes of their own."""
 
 
 def features(episodes: Episodes) -> tfds.features.FeaturesDict:
@@ -73,6 +102,46 @@ def _metadata() -> tfds.features.FeaturesDict:
     return of.FeaturesDict(metadata)
 
 
+def stored(folder: Path) -> tfds.features.FeaturesDict:
+    """The features that a folder describes.
+
+    Raises:
+        ValueError: as `check_description`, or they are damaged.
+    """
+    check_description(folder, FEATURES)
+    found: Any = tfds.features.FeaturesDict.from_config(str(folder))
+    return found
+
+
+def check_description(folder: Path, *names: str) -> None:
+    """Raise unless tfds may read these files: it imports the modules and formats the names in them.
+
+    Raises:
+        RefusedError: a file names another class than those of `features`, or other files of records
+            than `FILES`.
+        ValueError: a file is damaged.
+        OSError: there is none.
+    """
+    for path in (folder / name for name in names):
+        description = read_json(path, folder)
+        fields = _NAMES | ({"type": ()} if path.name == FEATURES and "type" in description else {})
+        for field, value in _named(description, fields):
+            if value not in fields[field]:
+                raise RefusedError(
+                    f"{path} has {field} {str(value)[:80]!r}: it may be "
+                    f"{' or '.join(fields[field]) or 'absent only'}"
+                )
+
+
+def _named(value: Any, fields: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Values of these fields anywhere in a JSON value."""
+    if isinstance(value, dict):
+        yield from ((field, value[field]) for field in fields if field in value)
+        value = list(value.values())
+    for item in value if isinstance(value, list) else ():
+        yield from _named(item, fields)
+
+
 def serializer(form: tfds.features.FeaturesDict) -> ExampleSerializer:
     """What `record` needs of the features.
 
@@ -113,26 +182,32 @@ def record(to: ExampleSerializer, episodes: Episodes, number: int, episode_id: i
 
 
 def episode(
-    example: Mapping[str, Any], cameras: Mapping[str, str], facts: Mapping[str, Any]
+    example: Mapping[str, Any],
+    cameras: Mapping[str, str],
+    sizes: Mapping[str, Any],
+    facts: Mapping[str, Any],
 ) -> Episodes:
     """One episode, in host memory.
 
     Args:
         example: what tfds gives, pictures not decoded.
         cameras: name of a camera -> name of its pictures.
+        sizes: name of a camera -> height and width of its pictures.
         facts: what the episode does not hold itself: the facts of `Episodes`.
     """
     steps = list(example["steps"])
     seen = [step["observation"] for step in steps]
     return Episodes(
         image={
-            camera: np.stack([_decode(observation[name]) for observation in seen])[None]
+            camera: np.stack([_decode(observation[name], sizes[camera]) for observation in seen])[
+                None
+            ]
             for camera, name in cameras.items()
         },
         state=np.stack([observation["state"] for observation in seen])[None],
         action=np.stack([step["action"] for step in steps])[None],
         length=np.array([len(steps)], np.int32),
-        instruction=np.array([example["episode_metadata"]["instruction"]], np.int32),
+        instruction=np.array([int(example["episode_metadata"]["instruction"])], np.int32),
         **facts,
     )
 
@@ -165,7 +240,9 @@ def _chunk(kind: bytes, data: bytes) -> bytes:
     return struct.pack(">I", length) + kind + data + struct.pack(">I", check)
 
 
-def _decode(file: bytes) -> np.ndarray:
-    """A uint8 `[H, W, 3]` picture."""
-    with Image.open(io.BytesIO(file)) as picture:
+def _decode(file: bytes, size: Any) -> np.ndarray:
+    """A uint8 `[H, W, 3]` picture; raises a ValueError if its H and W are others than these."""
+    with Image.open(io.BytesIO(file), formats=("PNG",)) as picture:
+        if [picture.height, picture.width] != list(size):  # nothing is decoded so far
+            raise ValueError(f"a picture has {picture.height} x {picture.width} pixels, not {size}")
         return np.asarray(picture)

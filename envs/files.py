@@ -1,0 +1,125 @@
+"""Files of others, of which nothing is trusted: where they are, what they are, how large they are.
+
+A name in a dataset may be a URL, lead out of its folder or be that of a pipe; a size in it may be
+more than any memory. Whoever opens such a file asks here first.
+"""
+
+import json
+import os
+import re
+import stat
+from pathlib import Path
+from typing import Any
+
+TEXT_BYTES = 2**30
+"""Largest file of text that is read: a million episodes take a tenth of it."""
+_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
+_KINDS = ((stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a pipe"), (stat.S_ISSOCK, "a socket"))
+
+
+class RefusedError(ValueError):
+    """A file or a name that is not trusted; the message is a whole sentence."""
+
+
+def inside(folder: Path, name: object) -> Path:
+    """The path in a folder that a name of others stands for, by the name alone.
+
+    Raises:
+        RefusedError: the name is no relative path that stays in the folder.
+    """
+    if not isinstance(name, str) or not name or "\0" in name:
+        raise RefusedError(f"{folder} names a file {name!r}, which is no name of a file")
+    if _URL.match(name) or os.path.isabs(name) or ".." in re.split(r"[/\\]", name):
+        raise RefusedError(
+            f"{folder} names a file {name!r}: names must be relative and stay in the folder"
+        )
+    return folder / name
+
+
+def regular(path: Path, folder: Path | None = None) -> Path:
+    """The same path, if a file is there that has an end and can be read.
+
+    Args:
+        path: may be a link.
+        folder: where the file must lie, links followed; None: anywhere. Of a snapshot in the cache
+            of Hugging Face's hub the files are links to where the cache keeps them.
+
+    Raises:
+        RefusedError: it is no regular file, or lies outside of the folder.
+        OSError: there is none, or it must not be read.
+    """
+    real = Path(os.path.realpath(path, strict=True))
+    mode = real.stat().st_mode
+    if not stat.S_ISREG(mode):
+        kind = next((name for test, name in _KINDS if test(mode)), "a device")
+        raise RefusedError(f"{path} must be a file, but is {kind}")
+    if folder is not None and not any(real.is_relative_to(home) for home in _homes(folder)):
+        raise RefusedError(f"{path} leads to {real}, out of {folder}: put the file itself there")
+    if not os.access(real, os.R_OK):
+        raise PermissionError(13, os.strerror(13), str(path))
+    return path
+
+
+def read_text(path: Path, folder: Path | None = None) -> str:
+    """The text of a file that `regular` lets pass.
+
+    Raises:
+        RefusedError: as `regular`; or it is larger than `TEXT_BYTES`.
+        OSError: as `regular`.
+        ValueError: it is no UTF-8.
+    """
+    if (size := regular(path, folder).stat().st_size) > TEXT_BYTES:
+        raise RefusedError(f"{path} has {size} bytes; a text may have {TEXT_BYTES}")
+    return path.read_text(encoding="utf-8")
+
+
+def read_json(path: Path, folder: Path | None = None) -> Any:
+    """The JSON value in a file, see `read_text`.
+
+    Raises:
+        RefusedError: as `read_text`.
+        OSError: as `regular`.
+        ValueError: it is no JSON, or nested too deeply.
+    """
+    try:
+        return json.loads(read_text(path, folder))
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+
+
+def check_memory(size: int, what: object) -> None:
+    """Raise RefusedError if so many bytes are more than this machine's memory has in all."""
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if size > memory:
+        raise RefusedError(
+            f"{what} would take {size / 2**30:.3g} GiB of memory, of which there are "
+            f"{memory / 2**30:.3g}"
+        )
+
+
+def whole(number: Any) -> int:
+    """A number of a table as an integer: tables with gaps hold integers as floats.
+
+    Raises:
+        ValueError: it is none, or not below 2^63.
+    """
+    is_number = isinstance(number, int | float) and not isinstance(number, bool)
+    if not is_number or not abs(number) < 2**63 or number != int(number):
+        raise ValueError(f"{str(number)[:40]!r} is no whole number")
+    return int(number)
+
+
+def _homes(folder: Path) -> list[Path]:
+    """Where the files of a folder may lie.
+
+    The hub's cache is cache/datasets--OWNER--NAME/snapshots/REVISION/, whose files are links into
+    the blobs/ of the dataset, and those perhaps into the blobs/ of the cache (huggingface_hub
+    2.4.0, file_download.py and utils/_shared_blobs.py).
+    """
+    folder = Path(os.path.realpath(folder))
+    homes = [folder]
+    for place in (folder, *folder.parents):
+        repository = place.parent.parent
+        if place.parent.name == "snapshots" and "--" in repository.name:
+            homes += [repository / "blobs", repository.parent / "blobs"]
+    return homes

@@ -1,0 +1,130 @@
+"""An RLDS dataset runs no code, leaves its folder nowhere, and takes no more than it holds."""
+
+import json
+import os
+import shutil
+import sys
+
+import pytest
+
+from envs import rlds
+from tests.envs.test_episodes import make
+
+EVIL = "evil_of_a_dataset.Evil"
+DICT = "tensorflow_datasets.core.features.features_dict.FeaturesDict"
+TEXT = "tensorflow_datasets.core.features.text_feature.Text"
+
+
+@pytest.fixture
+def path(tmp_path, monkeypatch):
+    """A dataset whose folder is where Python looks for modules, as the working folder is."""
+    rlds.write(make(), tmp_path / "press")
+    (tmp_path / "press" / "evil_of_a_dataset.py").write_text("open('harm', 'w')\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path / "press")
+    yield tmp_path / "press"
+    assert "evil_of_a_dataset" not in sys.modules
+    assert not (tmp_path / "harm").exists()
+
+
+def edit(file, change):
+    found = json.loads(file.read_text())
+    file.write_text(json.dumps(change(found) or found))
+
+
+def inner(found):
+    return found["featuresDict"]["features"]["episode_metadata"]["featuresDict"]["features"]
+
+
+def legacy(kind):
+    return {"type": kind, "content": {}}
+
+
+FORMS = {
+    "outermost": lambda found: found.update(pythonClassName=EVIL),
+    "inside": lambda found: inner(found)["task"].update(pythonClassName=EVIL),
+    "another spelling": lambda found: inner(found).update(
+        task={"python_class_name": EVIL, "text": {}}
+    ),
+    "one more": lambda found: inner(found).update(x={"pythonClassName": EVIL, "text": {}}),
+    "of a sequence": lambda found: found["featuresDict"]["features"]["steps"]["sequence"][
+        "feature"
+    ].update(pythonClassName=EVIL),
+    "as before tfds 4.5": lambda found: legacy(EVIL),
+    "as before tfds 4.5, inside": lambda found: {"type": DICT, "content": {"a": legacy(EVIL)}},
+    "as text": lambda found: {
+        "pythonClassName": DICT,
+        "jsonFeature": {"json": json.dumps({"a": legacy(EVIL)})},
+    },
+    "as text inside": lambda found: inner(found).update(
+        x={"python_class_name": DICT, "json_feature": {"json": json.dumps({"a": legacy(EVIL)})}}
+    ),
+    "another one of tfds": lambda found: inner(found)["task"].update(
+        pythonClassName="tensorflow_datasets.core.features.audio_feature.Audio"
+    ),
+    "no name": lambda found: inner(found)["task"].update(pythonClassName=3),
+    "a list": lambda found: [found],
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_no_module_is_imported(form, path):
+    edit(path / "features.json", FORMS[form])
+    with pytest.raises(ValueError, match=r"press[^ ]* (has|is damaged)"):
+        rlds.read(path)
+    with pytest.raises(ValueError, match=r"press[^ ]* (has|is damaged)"):
+        rlds.Parts(path, {}).complete()
+
+
+@pytest.mark.parametrize(
+    ("where", "value", "sentence"),
+    [
+        ("filepathTemplate", "../{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_INDEX}", "it may be"),
+        ("filepathTemplate", "{DATASET:>0999999999}", "it may be"),
+        ("filepathTemplate", "{DATASET.__class__}", "it may be"),
+        ("shardLengths", ["999999999999"], "describes 999999999999 episodes, not 3"),
+        ("shardLengths", [], "describes 0 episodes"),
+        ("name", "test", "damaged"),
+    ],
+)
+def test_names_and_numbers_of_files(where, value, sentence, path):
+    edit(path / "dataset_info.json", lambda found: found["splits"][0].update({where: value}))
+    with pytest.raises(ValueError, match=sentence):
+        rlds.Reader(path)
+
+
+def test_a_name_that_leaves_the_folder(path, tmp_path):
+    (file,) = path.glob("*array_record*")
+    shutil.copy(file, tmp_path / "x-train.array_record-00000")
+    edit(path / "dataset_info.json", lambda found: found.update(name="../x"))
+    with pytest.raises(ValueError, match=r"x-train.array_record-00000|damaged"):
+        rlds.Reader(path)
+
+
+def test_more_episodes_than_there_are(path):
+    edit(path / "metadata.json", lambda found: found.update(parts=[10**12]))
+    edit(path / "dataset_info.json", lambda i: i["splits"][0].update(shardLengths=[str(10**12)]))
+    with pytest.raises(ValueError, match="holds 3 episodes, not 1000000000000"):
+        rlds.Reader(path)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["metadata.json", "features.json", "dataset_info.json", "press_piper-train.array_record-00000"],
+)
+def test_links_and_pipes(name, path, tmp_path):
+    (path / name).rename(tmp_path / "outside")
+    (path / name).symlink_to(tmp_path / "outside")
+    with pytest.raises(ValueError, match=f"{name} leads to .*outside, out of .*press"):
+        rlds.Reader(path)
+    (path / name).unlink()
+    os.mkfifo(path / name)
+    with pytest.raises(ValueError, match=f"{name} must be a file, but is a pipe"):
+        rlds.Reader(path)
+
+
+def test_pictures_of_another_size(path):
+    """They are refused before they are decoded."""
+    edit(path / "metadata.json", lambda found: found["cameras"].update(side=[60, 80]))
+    with pytest.raises(ValueError, match=r"a picture has 6 x 8 pixels, not \[60, 80\]"):
+        rlds.read(path)
