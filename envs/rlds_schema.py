@@ -52,7 +52,7 @@ _NAMES = {
     "json_feature": [],
 }
 """Fields by which a description names something, as tfds and protobuf spell them -> what they may
-say. The last two, and an outermost "type", hold features of old forms, with classes of their own."""
+say. The last two, and an outermost "type", hold features of older forms, which name classes too."""
 
 
 def features(episodes: Episodes) -> tfds.features.FeaturesDict:

@@ -1,6 +1,7 @@
 """Pictures of a dataset as files have them: frames of a video, encoded pictures."""
 
 import io
+import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +13,12 @@ import numpy as np
 from av.video.reformatter import VideoReformatter
 from PIL import Image
 
+from envs.files import check_memory
+
+# What a file may be: FFmpeg itself also reads playlists, which name other files and addresses.
+_CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
+_OPTIONS = {"format_whitelist": _CONTAINERS, "protocol_whitelist": "file"}
+_PICTURES = ("PNG", "JPEG")
 _TOLERANCE = 0.25
 """Share of a frame's time by which it may be early or late: the next frame is never taken for it,
 and a video of another rate is found out within its first frames."""
@@ -32,7 +39,7 @@ class Film:
         """
         self.path = path
         try:
-            self._container: Any = av.open(str(path))
+            self._container: Any = av.open(f"file:{path}", container_options=_OPTIONS)
             self._stream = self._container.streams.video[0]
         except (av.error.FFmpegError, OSError, ValueError, IndexError) as error:
             raise ValueError(f"{path} is no whole video ({reason(error)})") from error
@@ -76,7 +83,9 @@ class Film:
                 rgb = self._colours.reformat(frame, format="rgb24", threads=1)
                 picture = reduced(rgb.to_ndarray(), image_size)
                 if not number:  # into one array at once: a list to stack would be as much again
-                    pictures = np.empty((-(-length // every), *picture.shape), np.uint8)
+                    shape = (-(-length // every), *picture.shape)
+                    check_memory(math.prod(shape), f"an episode in {self.path}")
+                    pictures = np.empty(shape, np.uint8)
                 pictures[number // every] = picture
         self._end = start + length / fps
         return pictures
@@ -106,15 +115,17 @@ class Film:
 
 
 def decoded(file: bytes, image_size: int = 0) -> np.ndarray:
-    """An encoded picture, such as PNG, as uint8 `[H, W, 3]`; see `reduced`.
+    """A PNG or JPEG picture as uint8 `[H, W, 3]`; see `reduced`.
 
     Raises:
-        ValueError: it is damaged.
+        ValueError: it is damaged, or has too many pixels for a picture.
     """
     try:
-        with Image.open(io.BytesIO(file)) as picture:
+        with Image.open(io.BytesIO(file), formats=_PICTURES) as picture:
+            if picture.width * picture.height > (Image.MAX_IMAGE_PIXELS or math.inf):
+                raise ValueError(f"it has {picture.width} x {picture.height} pixels")
             return reduced(np.asarray(picture.convert("RGB")), image_size)
-    except (OSError, SyntaxError, Image.DecompressionBombError) as error:  # the second: of PNG
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise ValueError(f"a picture is damaged ({reason(error)})") from error
 
 

@@ -17,14 +17,15 @@ from typing import Any, Literal
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from envs.episodes import Episodes
+from envs.files import check_memory, regular, whole
 from lorasp_jax.data.films import Film, decoded
-from lorasp_jax.data.lerobot_files import Recording, damage, read_index
+from lorasp_jax.data.lerobot_files import Recording, damage, read_index, read_table
 from lorasp_jax.models import places
 
 _COLUMNS = ("timestamp", "frame_index", "episode_index", "task_index")
+_WIDTH = 10_000  # numbers that a state or an action may have
 _TIME = 0.25
 """Share of a frame's time by which a timestamp may be off, as of `films`."""
 
@@ -184,7 +185,9 @@ class LeRobot:
         key = getattr(self.keys, kind)
         with damage(self.path / "meta" / "info.json"):
             feature = self.index.features[key]
-            (width,) = map(int, feature["shape"])
+            (width,) = map(whole, feature["shape"])
+            if not 0 < width <= _WIDTH:
+                raise ValueError(f"{key} has {width} numbers, not 1 to {_WIDTH}")
             names = feature.get("names")
             while isinstance(names, Mapping):  # {"motors": [...]}
                 names = next(iter(names.values()), None)
@@ -210,11 +213,7 @@ class LeRobot:
         path, number = recording.rows, recording.number
         with damage(path):
             if self._table[0] != path:
-                there = pq.read_schema(path).names
-                for name in self._needed:
-                    if name not in there:
-                        raise KeyError(name)
-                self._table = path, pq.read_table(path, columns=self._needed)
+                self._table = path, read_table(path, self.path, self._needed)
             table = self._table[1]
             table = table.filter(pc.equal(table["episode_index"], number))
             frames = table["frame_index"].to_numpy()
@@ -279,7 +278,9 @@ class LeRobot:
         else:
             with damage(recording.rows):
                 files = [row["bytes"] for row in table[key].to_pylist()[::every]]
-                pictures = np.stack([decoded(file, size) for file in files])
+                first = decoded(files[0], size)
+                check_memory(len(files) * first.nbytes, f"an episode in {recording.rows}")
+                pictures = np.stack([first, *(decoded(file, size) for file in files[1:])])
         return pictures
 
     def _film(self, camera: str, path: Path) -> Film:
@@ -288,5 +289,7 @@ class LeRobot:
         if film is None or film.path != path:
             if film is not None:
                 film.close()
+            with damage(path):
+                regular(path, self.path)
             film = self._films[camera] = Film(path)
         return film

@@ -191,7 +191,7 @@ BROKEN = {
     "cut json": (lambda f: cut(f, "info.json", 0.7), "info.json is damaged"),
     "no info": (lambda f: (f / "meta" / "info.json").unlink(), "not a LeRobot dataset"),
     "cut video": (lambda f: cut(f, "*.mp4", 0.6), "mp4 (is no whole video|gives)"),
-    "no video": (lambda f: next(iter(f.rglob("*.mp4"))).unlink(), "mp4 is no whole video"),
+    "no video": (lambda f: next(iter(f.rglob("*.mp4"))).unlink(), "mp4 is missing"),
 }
 
 

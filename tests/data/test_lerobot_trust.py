@@ -1,0 +1,175 @@
+"""A LeRobot dataset asks nobody, leaves its folder nowhere, and takes no more than it holds."""
+
+import json
+import os
+import shutil
+import socket
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from lorasp_jax.data.films import Film, decoded
+from lorasp_jax.data.lerobot import LeRobot
+from lorasp_jax.data.lerobot_files import read_table
+from tests.data.lerobots import VERSIONS, copied, digest, edit_info, edit_rows, golden
+
+
+@pytest.fixture(autouse=True)
+def _offline(monkeypatch):
+    def refuse(*arguments, **options):
+        raise AssertionError("a request")
+
+    monkeypatch.setattr(socket.socket, "connect", refuse)
+
+
+def read(folder):
+    found = LeRobot(folder)
+    return [found.episode(number) for number in range(len(found))]
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize("of", ["video_path", "data_path"])
+@pytest.mark.parametrize(
+    ("path", "sentence"),
+    [
+        ("http://localhost:9/x.mp4", "names must be relative and stay in the folder"),
+        ("/etc/passwd", "names must be relative"),
+        ("../../{episode_index}", "names must be relative|lacks 'episode_index'"),
+        ("{episode_index:0999999999d}", "is no template of a path"),
+        ("{chunk_index:0999999999d}", "is no template of a path"),
+        ("{video_key.__class__}", "is no template of a path"),
+        ("{episode_index!r}", "is no template of a path"),
+        ("{0}", "lacks '0'"),
+        ("{{}}", "is no template of a path"),
+        ({"a": 1}, "is no template of a path"),
+        ("", "no name of a file"),
+    ],
+)
+def test_paths(version, of, path, sentence, tmp_path):
+    folder = copied(version, tmp_path)
+    edit_info(folder, lambda info: info.update({of: path}))
+    with pytest.raises(ValueError, match=sentence):
+        LeRobot(folder)
+
+
+def test_the_name_of_a_camera(tmp_path):
+    """It is part of the path of its films."""
+    folder = copied("v21", tmp_path)
+    edit_info(folder, lambda i: i["features"].update({"../../x": {"dtype": "video"}}))
+    with pytest.raises(ValueError, match="names must be relative and stay"):
+        LeRobot(folder)
+
+
+@pytest.mark.parametrize("pattern", ["meta/info.json", "data/**/*.parquet", "videos/**/*.mp4"])
+@pytest.mark.parametrize("version", VERSIONS)
+def test_links_and_pipes(version, pattern, tmp_path):
+    folder = copied(version, tmp_path)
+    path = sorted(folder.glob(pattern))[0]
+    (tmp_path / "outside").write_bytes(path.read_bytes())
+    path.unlink()
+    path.symlink_to(tmp_path / "outside")
+    with pytest.raises(ValueError, match=f"{path.name} leads to .*outside, out of .*dataset"):
+        read(folder)
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(ValueError, match=f"{path.name} must be a file, but is a pipe|no meta/info"):
+        read(folder) if "info" not in pattern else LeRobot(folder)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_snapshot_of_the_hub(version, tmp_path):
+    """Its files are links into the cache's blobs."""
+    folder = tmp_path / "datasets--owner--dataset" / "snapshots" / "0123"
+    blobs = folder.parent.parent / "blobs"
+    shutil.copytree(golden(version), folder)
+    blobs.mkdir()
+    for number, path in enumerate(sorted(p for p in folder.rglob("*") if p.is_file())):
+        path.rename(blobs / f"{number:x}")
+        path.symlink_to(os.path.relpath(blobs / f"{number:x}", path.parent))
+    wanted = LeRobot(golden(version))
+    found = LeRobot(folder, name="dataset")
+    np.testing.assert_array_equal(found.episode(1).action, wanted.episode(1).action)
+    np.testing.assert_array_equal(found.episode(1).image["side"], wanted.episode(1).image["side"])
+
+
+def test_a_playlist_is_no_film(tmp_path):
+    """FFmpeg would read what it names, wherever that is."""
+    for number, text in enumerate(
+        (
+            "#EXTM3U\n#EXTINF:1,\nhttp://localhost:9/x.ts\n#EXT-X-ENDLIST\n",
+            f"ffconcat version 1.0\nfile '{golden('v21')}'\n",
+        )
+    ):
+        path = tmp_path / f"{number}.mp4"
+        path.write_text(text)
+        with pytest.raises(ValueError, match=f"{number}.mp4 is no whole video"):
+            Film(path)
+
+
+def test_kinds_of_pictures():
+    """The library would run a program for PostScript."""
+    with pytest.raises(ValueError, match="a picture is damaged"):
+        decoded(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n")
+
+
+def test_many_equal_rows(tmp_path):
+    """Few bytes in a file, many in memory."""
+    column = pa.DictionaryArray.from_arrays(pa.array([0] * 10**6, pa.int8()), pa.array([1.5]))
+    path = tmp_path / "many.parquet"
+    table = pa.table({"action": column})
+    with pq.ParquetWriter(path, table.schema) as writer:
+        for _ in range(10):
+            writer.write_table(table)
+    assert path.stat().st_size < 10**5
+    monkey = pytest.MonkeyPatch()
+    with monkey.context() as patch:
+        patch.setattr(os, "sysconf", lambda name: 7000)  # 47 MiB of memory
+        with pytest.raises(ValueError, match=r"many.parquet would take 0.0745 GiB of memory"):
+            read_table(path, tmp_path)
+    assert read_table(path, tmp_path).num_rows == 10**7
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_width(version, tmp_path):
+    folder = copied(version, tmp_path)
+    edit_info(folder, lambda i: i["features"]["action"].update(shape=[10**12]))
+    with pytest.raises(ValueError, match="action has 1000000000000 numbers, not 1 to 10000"):
+        LeRobot(folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("length", 10**12), ("length", True), ("episode_index", "0"), ("data/chunk_index", 2.5)),
+        ("data/file_index", float("nan")),
+        ("videos/observation.images.side/from_timestamp", float("nan")),
+        ("videos/observation.images.side/from_timestamp", -1.0),
+    ],
+)
+def test_numbers_of_the_index(name, value, tmp_path):
+    folder = copied("v3", tmp_path)
+    before = digest(folder / "data")
+
+    def change(table):
+        place, rows = table.column_names.index(name), table[name].to_pylist()
+        return table.set_column(place, name, pa.array([value] * len(rows)))
+
+    edit_rows(folder, change, of="meta/episodes")
+    edit_info(folder, lambda info: info.pop("total_frames"))
+    with pytest.raises(ValueError, match=r"is no whole number|begins at|must have frames") as found:
+        read(folder)
+    assert "\n" not in str(found.value)
+    assert digest(folder / "data") == before
+
+
+def test_lines_of_the_index(tmp_path):
+    folder = copied("v21", tmp_path)
+    path = folder / "meta" / "episodes.jsonl"
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    for name, value in (("length", 25.5), ("length", float("inf")), ("episode_index", "1")):
+        broken = [lines[0] | {name: value}, *lines[1:]]
+        path.write_text("\n".join(map(json.dumps, broken)))
+        with pytest.raises(ValueError, match=r"episodes.jsonl is damaged .*is no whole number"):
+            LeRobot(folder)
