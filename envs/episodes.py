@@ -7,7 +7,10 @@ import json
 import math
 import os
 import shutil
+import struct
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
@@ -17,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.actions import MODES
+from envs.files import RefusedError, check_memory, regular
 
 Array = jax.Array | np.ndarray
 
@@ -26,6 +30,13 @@ SHARED = ("task", "robot", "control_dt", "physics_dt", "actions", "instructions"
 _ARRAYS = ("state", "action", "length", "instruction")
 _FACTS = (*SHARED, "attempted")
 _IMAGE = "image/"
+_HEADERS: Any = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+_FAILURES = (zipfile.BadZipFile, zlib.error, struct.error, NotImplementedError, RuntimeError)
+_FAILURES += (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError)
+_FAILURES += (SyntaxError, tokenize.TokenError)  # of NumPy, which parses an array's header
 
 
 @functools.partial(
@@ -107,24 +118,24 @@ class Episodes:
             FileNotFoundError: if there is no such file.
             ValueError: if the file is damaged, not of this format, or of another control period.
         """
-        arrays = _read(path)
+        arrays = _read(Path(path))
         try:
             facts = {"actions": "joint"}  # the only ones there were before it was written down
             facts |= json.loads(arrays.pop("header").tobytes())
             if facts.pop("format") != _FORMAT:
                 raise KeyError("format")
-        except (KeyError, ValueError, TypeError, AttributeError) as error:
+        except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
             raise ValueError(f"{path} is an .npz file, but holds no {_FORMAT} header") from error
         missing = {*_ARRAYS} - arrays.keys() | {*_FACTS} - facts.keys()
         if missing:
             raise ValueError(f"{path} lacks {', '.join(sorted(missing))}")
-        facts["instructions"] = tuple(facts["instructions"])
         image: Any = {k.removeprefix(_IMAGE): v for k, v in arrays.items() if k.startswith(_IMAGE)}
         fields: dict[str, Any] = {name: arrays[name] for name in _ARRAYS}
-        episodes = cls(image=image, **fields, **{name: facts[name] for name in _FACTS})
         try:
+            facts["instructions"] = tuple(facts["instructions"])
+            episodes = cls(image=image, **fields, **{name: facts[name] for name in _FACTS})
             episodes.validate()
-        except ValueError as error:
+        except (ValueError, TypeError) as error:
             raise ValueError(f"{path} is not valid: {error}") from error
         if control_dt is not None and abs(episodes.control_dt - control_dt) > 1e-9:
             raise ValueError(
@@ -254,10 +265,26 @@ def creating(path: str | os.PathLike) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _read(path: str | os.PathLike) -> dict[str, np.ndarray]:
+def _read(path: Path) -> dict[str, np.ndarray]:
     """All arrays of an .npz file."""
     try:
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except (zipfile.BadZipFile, ValueError, EOFError, AttributeError, TypeError) as error:
-        raise ValueError(f"{path} is damaged or not an .npz file of episodes: {error}") from error
+        with zipfile.ZipFile(regular(path)) as archive:
+            members = archive.infolist()
+            check_memory(sum(member.file_size for member in members), path)
+            return {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}
+    except (FileNotFoundError, RefusedError):
+        raise
+    except _FAILURES as error:
+        raise ValueError(
+            f"{path} is damaged or not an .npz file of episodes: {str(error)[:200]}"
+        ) from error
+
+
+def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    """One array, of which there are as many bytes as its header says: NumPy would not ask."""
+    with archive.open(member) as file:
+        shape, _, dtype = _HEADERS[np.lib.format.read_magic(file)](file)
+        if math.prod(shape) * dtype.itemsize != member.file_size - file.tell():
+            raise ValueError(f"{member.filename} does not hold {dtype} {list(shape)}")
+    with archive.open(member) as file:
+        return np.lib.format.read_array(file, allow_pickle=False)

@@ -23,6 +23,7 @@ from typing import Any, Self
 import numpy as np
 
 from envs.episodes import SHARED, Episodes, creating
+from envs.files import RefusedError, read_json, read_text, regular
 from envs.locks import alone
 from lorasp_jax.data.batches import Steps
 from lorasp_jax.data.columns import Column
@@ -210,7 +211,7 @@ class Cache:
         if not header.is_file():
             raise ValueError(f"{path} is not a cache: there is no {HEADER} in it")
         with _damage(header):
-            self.facts: dict[str, Any] = json.loads(header.read_text())
+            self.facts: dict[str, Any] = read_json(header, self.path)
             if self.facts["format"] != FORMAT:
                 raise ValueError(f"it is of format {self.facts['format']!r}, not {FORMAT!r}")
             for name, kind in _KINDS.items():
@@ -233,8 +234,9 @@ class Cache:
         if self._end[-1] != self.num_steps:
             raise ValueError(f"{path} has episodes of {self._end[-1]} steps, not {self.num_steps}")
         for name, texts in (("task", self.facts["tasks"]), ("instruction", self.instructions)):
-            if max(self._columns[name]) >= len(texts):
-                raise ValueError(f"{path} is damaged (it has {name} {max(self._columns[name])})")
+            low, high = min(self._columns[name]), max(self._columns[name])
+            if low < 0 or high >= len(texts):
+                raise ValueError(f"{path} is damaged (it has {name} {low} to {high})")
         self.statistics = self._statistics()
 
     def __len__(self) -> int:
@@ -274,7 +276,7 @@ class Cache:
         """An array in a file, whose shape must be this one where it is given."""
         path = self.path / f"{name}.npy"
         with _damage(path):
-            array = np.load(path, mmap_mode="r").view(np.ndarray)
+            array = np.load(regular(path, self.path), mmap_mode="r").view(np.ndarray)
             wanted = tuple(n if n else m for n, m in zip(shape, array.shape, strict=True))
             if array.shape != wanted or array.dtype.char not in _TYPES:
                 raise ValueError(f"it is {array.dtype} {array.shape}, not {wanted}")
@@ -287,14 +289,16 @@ class Cache:
         if self.facts["actions"] != "joint":
             return None
         with _damage(path):
-            return Statistics.from_json(path.read_text())
+            return Statistics.from_json(read_text(path, self.path))
 
 
 @contextlib.contextmanager
 def _damage(path: Path) -> Iterator[None]:
-    """What goes wrong inside becomes one ValueError about this file."""
+    """What goes wrong inside becomes one ValueError about this file; a refusal is one already."""
     try:
         yield
+    except RefusedError:
+        raise
     except _FAILURES as error:
         why = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
         raise ValueError(f"{path} is damaged ({why.partition(chr(10))[0]})") from error
