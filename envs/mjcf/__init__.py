@@ -33,6 +33,7 @@ def load(
     tcp: str | None = None,
     speed: float | Sequence[float] = _SPEED,
     gripper_speed: float = _GRIPPER_SPEED,
+    folder: str | os.PathLike[str] | None = None,
 ) -> Robot:
     """A robot for `envs.make`.
 
@@ -46,13 +47,15 @@ def load(
             fingers end.
         speed: joint speed limit, one for all or one each [rad/s]; MJCF has none.
         gripper_speed: largest change of the opening [m/s].
+        folder: where all files must lie that the file names, such as meshes, links followed. None:
+            the folder of the file.
 
     Raises:
-        ValueError: if the file cannot be read, or lacks something that the tasks need: the message
-            says what, and what there is instead.
+        ValueError: if the file cannot be read, names files elsewhere, or lacks something that the
+            tasks need: the message says what, and what there is instead.
     """
     try:
-        robot = _found(path, tcp, speed, gripper_speed)
+        robot = _found(path, tcp, speed, gripper_speed, folder)
         scene.build("", robot)  # what MuJoCo refuses is said here, not when a task is made
         return posing.posed(robot)
     except ValueError as error:
@@ -60,10 +63,14 @@ def load(
 
 
 def _found(
-    path: str | os.PathLike[str], tcp: str | None, speed: float | Sequence[float], gripper: float
+    path: str | os.PathLike[str],
+    tcp: str | None,
+    speed: float | Sequence[float],
+    gripper: float,
+    folder: str | os.PathLike[str] | None,
 ) -> Robot:
     """What the file says of a robot; its home is a guess, its lean and tilt side are unknown."""
-    spec, model = reading.read(path)
+    spec, model = reading.read(path, folder)
     arm = reading.find_arm(model)
     hand = hands.find(model, arm, tcp)
     lower, upper = reading.find_limits(model, arm)

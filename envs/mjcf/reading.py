@@ -8,6 +8,8 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from envs.mjcf import sources
+
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _KINDS = ("free", "ball", "slide", "hinge")
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
@@ -31,16 +33,28 @@ class Gripper(NamedTuple):
     force: float  # N, infinite where there is no limit
 
 
-def read(path: str | os.PathLike[str]) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
+def read(
+    path: str | os.PathLike[str], folder: str | os.PathLike[str] | None = None
+) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
     """An MJCF file, also compiled.
 
+    Args:
+        path: the file.
+        folder: where all files must lie that it names; None: where the file is.
+
     Raises:
-        ValueError: if there is none, or MuJoCo does not take it.
+        ValueError: if there is none, MuJoCo does not take it, or it names files elsewhere.
     """
-    if not Path(path).is_file():
+    path = Path(path).absolute()
+    if not path.is_file():
         raise ValueError("there is no such file")
     try:
+        sources.check(path, Path(folder or path.parent))
+    except (SyntaxError, RecursionError, OSError) as error:  # the first: of XML
+        raise ValueError(f"MuJoCo cannot read it: {error}") from error
+    try:
         spec = mujoco.MjSpec.from_file(str(path))
+        spec.memory = -1  # as MuJoCo likes: nothing of the file itself is ever simulated
         # Bodies and geoms keep their numbers.
         spec.compiler.fusestatic = spec.compiler.discardvisual = False
         return spec, spec.compile()

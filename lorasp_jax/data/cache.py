@@ -234,7 +234,7 @@ class Cache:
         if self._end[-1] != self.num_steps:
             raise ValueError(f"{path} has episodes of {self._end[-1]} steps, not {self.num_steps}")
         for name, texts in (("task", self.facts["tasks"]), ("instruction", self.instructions)):
-            low, high = min(self._columns[name]), max(self._columns[name])
+            low, high = self._columns[name].min(), self._columns[name].max()
             if low < 0 or high >= len(texts):
                 raise ValueError(f"{path} is damaged (it has {name} {low} to {high})")
         self.statistics = self._statistics()

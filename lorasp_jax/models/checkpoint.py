@@ -239,12 +239,14 @@ def _difference(stored: Any, wanted: Any) -> str:
 
 def _description(folder: pathlib.Path) -> dict[str, Any]:
     foreign = f"{folder / CONFIG} is damaged or was not written by this project."
+    if (folder / CONFIG).exists() and not (folder / CONFIG).is_file():
+        raise ValueError(foreign)
     try:
         found = json.loads((folder / CONFIG).read_bytes())
         valid = isinstance(found["config"], dict) and isinstance(found["sha256"], str)
     except FileNotFoundError as error:
         raise ValueError(f"{folder} holds no model: there is no {CONFIG}.") from error
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(foreign) from error
     if not valid:
         raise ValueError(foreign)

@@ -82,8 +82,10 @@ def _fields(folder: Path) -> dict[str, Any]:
     """The content of config.json, empty where there is none."""
     path = folder / checkpoint.CONFIG
     try:
+        if path.exists() and not path.is_file():
+            raise ValueError("it is no file")
         found = json.loads(path.read_bytes()) if path.exists() else {}
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path} is damaged.") from error
     if not isinstance(found, dict):
         raise ValueError(f"{path} is damaged.")

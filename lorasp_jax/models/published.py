@@ -12,6 +12,7 @@ little more host memory than the model itself.
 """
 
 import importlib
+import math
 import re
 from collections.abc import Callable, Mapping, MutableMapping
 from pathlib import Path
@@ -31,6 +32,7 @@ from lorasp_jax.models.checkpoint import base_arrays, by_path, named_arrays, set
 from lorasp_jax.models.pi0 import openpi_lora
 from lorasp_jax.models.tensor_files import INDEX, SINGLE, TensorFiles, weight_files
 
+_DENSITY, _SMALL = 20, 2**30  # bytes of arrays in a byte of files; bytes that do no harm
 _READ_AHEAD = 1  # GB that Orbax reads at once, beside the result
 _PREFIX = "model."  # of all tensors in a LeRobot policy's file
 _STATISTIC = re.compile(r"(?:un)?normalize_(?:inputs|targets|outputs)\.")  # of older policies
@@ -159,6 +161,7 @@ def _restored(place: Path) -> dict[str, np.ndarray]:
     try:
         found: Any = checkpointer.metadata(place.absolute())
         tree = found.item_metadata.tree
+        _check_size(place, tree)
         as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), tree)
         restored = checkpointer.restore(place.absolute(), restore_args=as_numpy)
     except Exception as error:  # Orbax and its C++ parts raise many kinds
@@ -167,3 +170,11 @@ def _restored(place: Path) -> dict[str, np.ndarray]:
         name.removeprefix("params/").removesuffix("/value"): leaf
         for name, leaf in by_path(restored).items()
     }
+
+
+def _check_size(place: Path, tree: Any) -> None:
+    """Raise ValueError if the arrays are far larger than the files: they may be all zeros."""
+    claimed = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
+    there = sum(path.stat().st_size for path in place.rglob("*") if path.is_file())
+    if claimed > max(_SMALL, _DENSITY * there):
+        raise ValueError(f"{claimed} bytes of arrays cannot be in {there} bytes of files")

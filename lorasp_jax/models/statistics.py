@@ -109,7 +109,9 @@ class Statistics:
             for key, values in json.loads(text).items():
                 kind, _, name = key.partition("_")
                 both[kind][name] = np.asarray(values, np.float32)
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
+        except (
+            AttributeError, KeyError, TypeError, ValueError, OverflowError, RecursionError
+        ) as error:  # fmt: skip
             raise ValueError(
                 f"statistics need lists of numbers state_NAME and action_NAME, got {text[:80]!r}."
             ) from error

@@ -24,6 +24,7 @@ import safetensors
 
 from lorasp_jax.models import places
 from lorasp_jax.models.statistics import NAMES, Statistics, checked
+from lorasp_jax.models.tensor_files import beside
 
 OURS, OPENPI, DATASET = "statistics.json", "norm_stats.json", "stats.json"
 PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")
@@ -33,7 +34,8 @@ TENSOR = re.compile(
 )
 """A statistic's name in LeRobot's safetensors."""
 _UNREADABLE = (
-    OSError, AttributeError, KeyError, TypeError, ValueError, safetensors.SafetensorError,
+    OSError, AttributeError, KeyError, TypeError, ValueError, OverflowError, RecursionError,
+    safetensors.SafetensorError,
 )  # fmt: skip
 Known = dict[str, dict[str, np.ndarray]]  # by kind, state or action, and name
 
@@ -53,7 +55,7 @@ def read(where: str | os.PathLike[str], *, dataset: str = "") -> Statistics:
     """
     path = places.local(where)
     for pattern, reader in _READERS.items():
-        found = [path] if path.is_file() else sorted(path.glob(pattern))
+        found = [path] if path.is_file() else _files(path, pattern)
         if found and found[0].match(pattern.rpartition("/")[2]):
             try:
                 groups = reader(found)
@@ -99,7 +101,7 @@ def _policy(files: list[Path]) -> dict[str, Known]:
     for pipeline in (files[0].with_name(name) for name in PIPELINES):
         for step in json.loads(pipeline.read_text())["steps"]:
             if "normalizer" in step.get("registry_name", "") and "state_file" in step:
-                tensors += _tensors(pipeline.with_name(step["state_file"]))
+                tensors += _tensors(beside(pipeline, step["state_file"]))
     return _grouped(tensors)
 
 
@@ -116,6 +118,11 @@ _READERS: dict[str, Callable[[list[Path]], dict[str, Known]]] = {
     PIPELINES[0]: _policy,
     "*.safetensors": _weights,
 }
+
+
+def _files(folder: Path, pattern: str) -> list[Path]:
+    """Files, not what only has such a name."""
+    return [path for path in sorted(folder.glob(pattern)) if path.is_file()]
 
 
 def _arrays(known: Mapping[str, Any]) -> dict[str, np.ndarray]:

@@ -15,15 +15,29 @@ def weight_files(folder: Path) -> list[Path]:
     """The one safetensors file of a folder, or the shards that its index lists.
 
     Raises:
-        ValueError: the index is damaged.
+        ValueError: the index is damaged, or names files elsewhere.
     """
+    index = folder / INDEX
+    if not index.exists():
+        return [folder / SINGLE]
     try:
-        if (folder / INDEX).exists():
-            where = json.loads((folder / INDEX).read_bytes())["weight_map"]
-            return [folder / name for name in sorted(set(where.values()))]
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{folder / INDEX} is damaged.") from error
-    return [folder / SINGLE]
+        where = json.loads(beside(index, INDEX).read_bytes())["weight_map"]
+        names = sorted(set(where.values()))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{index} is damaged.") from error
+    return [beside(index, name) for name in names]
+
+
+def beside(file: Path, name: Any) -> Path:
+    """The path of a file that another one names, which must lie beside it.
+
+    Raises:
+        ValueError: the name leads elsewhere, or to something that is no file.
+    """
+    path = file.parent / str(name)
+    if Path(str(name)).name != name or (path.exists() and not path.is_file()):
+        raise ValueError(f"{file} names {name!r}, which is no file beside it.")
+    return path
 
 
 class TensorFiles(MutableMapping[str, np.ndarray]):
@@ -41,6 +55,8 @@ class TensorFiles(MutableMapping[str, np.ndarray]):
         self._found: dict[str, tuple[Any, str]] = {}
         for path in files:
             try:
+                if path.exists() and not path.is_file():
+                    raise OSError("it is no file")
                 file = safetensors.safe_open(path, framework="np")
             except FileNotFoundError as error:
                 raise ValueError(f"{path.parent} lacks {path.name}.") from error

@@ -97,7 +97,7 @@ def load(where: str | os.PathLike[str]) -> Tokenizer:
     path = places.local(where, only=["tokenizer.json", "*.model"])
     files = [path] if path.is_file() else [*path.glob("tokenizer.json"), *path.glob("*.model")]
     for file in files:
-        if file.suffix in (".json", ".model"):
+        if file.is_file() and file.suffix in (".json", ".model"):
             return (TokenizersFile if file.suffix == ".json" else SentencePiece)(file)
     raise ValueError(f"{where} holds no tokenizer.json and no .model of SentencePiece.")
 

@@ -1,7 +1,10 @@
 """Episodes on disk and in memory."""
 
 import dataclasses
+import io
 import json
+import os
+import zipfile
 
 import jax
 import numpy as np
@@ -200,3 +203,45 @@ def test_concatenate_refuses_mixtures(changes):
         concatenate([make(), make(**changes)])
     with pytest.raises(ValueError, match="empty"):
         concatenate([])
+
+
+def _npy(shape: tuple, data: bytes) -> bytes:
+    file = io.BytesIO()
+    header = {"descr": "<f4", "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(file, header)
+    return file.getvalue() + data
+
+
+@pytest.mark.parametrize(
+    "member",
+    [
+        _npy((10**6, 10**6), b"0" * 40),
+        _npy((-2, -5), b"0" * 40),
+        _npy((), b""),
+        b"\x93NUMPY\x09\x00",
+        b"\x93NUMPY\x01\x00\x20\x00{'descr': '<f4', 'shape': (((((",
+        b"\x93NUMPY\x01\x00\x04\x00\x00'''",
+        b"",
+    ],
+)
+def test_an_array_that_is_not_what_its_header_says(member, tmp_path):
+    """Least of all is memory taken for it."""
+    path = tmp_path / "x.npz"
+    make().save(path)
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("image/other.npy", member)
+    with pytest.raises(ValueError, match=r"x.npz is damaged or not an .npz file of episodes"):
+        Episodes.load(path)
+
+
+def test_more_than_the_memory(tmp_path, monkeypatch):
+    make().save(tmp_path / "x.npz")
+    monkeypatch.setattr(os, "sysconf", lambda name: 30)  # 900 bytes
+    with pytest.raises(ValueError, match=r"x.npz would take .* GiB of memory"):
+        Episodes.load(tmp_path / "x.npz")
+
+
+def test_a_pipe(tmp_path):
+    os.mkfifo(tmp_path / "x.npz")
+    with pytest.raises(ValueError, match=r"x.npz must be a file, but is a pipe"):
+        Episodes.load(tmp_path / "x.npz")

@@ -1,0 +1,108 @@
+"""What an MJCF file names and how much it asks for, checked before MuJoCo opens and makes it.
+
+MuJoCo looks for a file in several places: beside the main file, beside the one that includes the
+element, and below meshdir, texturedir and assetdir from there. Whatever lies in any of them counts.
+"""
+
+import itertools
+import math
+import os
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree import ElementTree
+
+from envs.files import check_memory, read_text, regular
+
+_FOLDERS = ("assetdir", "meshdir", "texturedir")  # attributes of compiler
+_DESCRIPTIONS = ("include", "model")  # elements that name another description
+_MOST_COPIES, _MOST_ENTRIES, _MOST_PLACES = 10_000, 10**6, 10**5
+_BYTES = ("memory", "nstack")  # attributes of size that `reading` leaves out
+_PIXEL_BYTES = 4
+_PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def check(path: Path, folder: Path) -> None:
+    """Raises a ValueError unless all that a file names is in a folder and of a possible size.
+
+    Args:
+        path: the MJCF file.
+        folder: where all files must lie that it names, links followed.
+    """
+    descriptions = _all_descriptions(path, folder)
+    for root in descriptions.values():
+        _check_sizes(root, 1)
+    for named in _named(descriptions, path.parent, ()):
+        _check_picture(regular(named, folder))
+
+
+def _all_descriptions(path: Path, folder: Path) -> dict[Path, ElementTree.Element]:
+    """The XML of a file and of all that it includes."""
+    regular(path)
+    main, known, new = path.parent, {}, [path]
+    while new:
+        for each in new:
+            text = read_text(each, folder if known else None)
+            known[each] = ElementTree.fromstring(text)  # whose parser bounds what entities become
+        new = [p for p in _named(known, main, _DESCRIPTIONS) if p not in known]
+    return known
+
+
+def _named(
+    descriptions: dict[Path, ElementTree.Element], main: Path, kinds: tuple[str, ...]
+) -> Iterator[Path]:
+    """Everything on the disk that elements of some kinds, or of all, may stand for."""
+    elements = [element for root in descriptions.values() for element in root.iter()]
+    below = {_portable(e.get(name, "")) for e in elements for name in _FOLDERS}
+    homes = {main, *(path.parent for path in descriptions)}
+    names = {
+        _portable(value)
+        for element in elements
+        for attribute, value in element.attrib.items()
+        if attribute.startswith("file") and (not kinds or element.tag in kinds)
+    }
+    names |= {os.path.basename(name) for name in names}  # of strippath
+    parts = homes, below, {os.path.relpath(home, main) for home in homes}, names
+    if math.prod(map(len, parts)) > _MOST_PLACES:
+        raise ValueError("it names more files in more folders than any robot has")
+    found = {os.path.normpath(os.path.join(*place)) for place in itertools.product(*parts)}
+    yield from (Path(p) for p in sorted(found) if os.path.lexists(p) and not os.path.isdir(p))
+
+
+def _portable(name: str) -> str:
+    """MuJoCo takes both kinds of slashes."""
+    return name.replace("\\", "/")
+
+
+def _check_sizes(element: ElementTree.Element, copies: float) -> None:
+    """Raises a ValueError if an element makes something that is too large."""
+    copies *= math.prod(_numbers(element, "count"))
+    grid = math.prod([*_numbers(element, "nrow"), *_numbers(element, "ncol")])
+    picture = math.prod([*_numbers(element, "width"), *_numbers(element, "height")])
+    if element.tag == "size":
+        numbers = [_numbers(element, name) for name in element.attrib.keys() - set(_BYTES)]
+        entries = max(itertools.chain(*numbers), default=0)
+        if entries > _MOST_ENTRIES:
+            raise ValueError(f"its size has {entries:g} of something; at most are {_MOST_ENTRIES}")
+    if copies > _MOST_COPIES:
+        raise ValueError(f"{element.tag} makes {copies:g} copies; at most are {_MOST_COPIES}")
+    check_memory(int(min(_PIXEL_BYTES * max(grid, picture), 1e30)), f"its {element.tag}")
+    for child in element:
+        _check_sizes(child, copies)
+
+
+def _numbers(element: ElementTree.Element, attribute: str) -> list[float]:
+    """The numbers in an attribute; MuJoCo says what is wrong with what is none."""
+    try:
+        return [max(1.0, float(text)) for text in element.get(attribute, "").split()]
+    except ValueError:
+        return []
+
+
+def _check_picture(path: Path) -> None:
+    """Raises a ValueError if a PNG file says that it is larger than any memory."""
+    with path.open("rb") as file:
+        head = file.read(24)
+    if head.startswith(_PNG) and len(head) == 24:
+        width, height = struct.unpack(">2I", head[16:])
+        check_memory(_PIXEL_BYTES * width * height, path)

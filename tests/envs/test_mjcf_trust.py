@@ -1,0 +1,152 @@
+"""A robot's MJCF reads nothing outside of its folder, hangs nobody and fills no memory."""
+
+import os
+import re
+import struct
+
+import pytest
+
+from envs import mjcf
+from envs.mjcf import reading, sources
+
+_MESH = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
+
+
+@pytest.fixture
+def robots(tmp_path):
+    """A folder with meshes, and one beside it."""
+    for folder in ("robot/meshes", "robot/parts", "other"):
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / "a.obj").write_text(_MESH)
+        (tmp_path / folder / "a.xml").write_text("<mujoco/>")
+    return tmp_path
+
+
+def model(robots, asset, compiler="", body='<geom type="mesh" mesh="a"/>'):
+    path = robots / "robot" / "x.xml"
+    path.write_text(f"<mujoco><compiler {compiler}/>{asset}<worldbody>{body}</worldbody></mujoco>")
+    return path
+
+
+def mesh(name):
+    return f'<asset><mesh name="a" file="{name}"/></asset>'
+
+
+@pytest.mark.parametrize(
+    ("name", "compiler"),
+    [
+        ("meshes/a.obj", ""),
+        ("a.obj", 'meshdir="meshes"'),
+        ("../meshes/a.obj", 'assetdir="parts"'),
+        ("/nowhere/a.obj", 'meshdir="meshes" strippath="true"'),
+    ],
+)
+def test_meshes_inside(name, compiler, robots):
+    assert reading.read(model(robots, mesh(name), compiler))[1].nmesh == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "compiler"),
+    [
+        ("../other/a.obj", ""),
+        ("..\\other\\a.obj", ""),
+        ("a.obj", 'meshdir="../other"'),
+        ("../../other/a.obj", 'assetdir="meshes"'),
+        ("{root}/other/a.obj", ""),
+        ("x/{root}/other/a.obj", 'meshdir="{root}/other" strippath="true"'),
+        ("link.obj", ""),
+        ("linked/a.obj", ""),
+    ],
+)
+def test_meshes_outside(name, compiler, robots):
+    (robots / "robot" / "link.obj").symlink_to("../other/a.obj")
+    (robots / "robot" / "linked").symlink_to("../other")
+    path = model(robots, mesh(name.format(root=robots)), compiler.format(root=robots))
+    with pytest.raises(ValueError, match=r"leads to .*other/a.obj, out of .*robot"):
+        reading.read(path)
+    assert reading.read(path, robots)[1].nmesh == 1
+
+
+def test_the_whole_way(robots):
+    path = model(robots, mesh("../other/a.obj"))
+    with pytest.raises(ValueError, match=r"robot .*x.xml: .*a.obj leads to .*, out of .*robot"):
+        mjcf.load(path)
+    with pytest.raises(ValueError, match="two slide joints are needed"):
+        mjcf.load(path, folder=robots)
+
+
+@pytest.mark.parametrize(
+    "asset",
+    [
+        '<include file="../other/a.xml"/>',
+        '<include file="parts/b.xml"/>',
+        '<asset><model name="m" file="../other/a.xml"/></asset>',
+        '<asset><texture name="t" type="cube" fileright="../other/a.obj"/></asset>',
+        '<asset><hfield name="t" size="1 1 1 1" file="../other/a.obj"/></asset>',
+    ],
+)
+def test_other_files_outside(asset, robots):
+    (robots / "robot" / "parts" / "b.xml").write_text(
+        '<mujoco><include file="../../other/a.xml"/></mujoco>'
+    )
+    with pytest.raises(ValueError, match=r"leads to .*other/a\.\w+, out of .*robot"):
+        reading.read(model(robots, asset, body=""))
+
+
+@pytest.mark.parametrize("name", ["a.obj", "a.stl", "a.png", "a.xml"])
+def test_pipes(name, robots):
+    os.mkfifo(robots / "robot" / name)
+    asset = f'<include file="{name}"/>' if name == "a.xml" else mesh(name)
+    with pytest.raises(ValueError, match=f"{name} must be a file, but is a pipe"):
+        reading.read(model(robots, asset))
+
+
+@pytest.mark.parametrize(
+    ("asset", "body", "sentence"),
+    [
+        ('<size nkey="1000000000"/>', "", "its size has 1e+09 of something"),
+        ("", '<replicate count="1000000000"><site/></replicate>', "replicate makes 1e+09 copies"),
+        (
+            "",
+            '<replicate count="1000"><replicate count="1000"><site/></replicate></replicate>',
+            "replicate makes 1e+06 copies",
+        ),
+        ("", '<flexcomp name="f" count="999 999 9"/>', "flexcomp makes 8.98201e+06 copies"),
+        (
+            '<asset><hfield name="h" nrow="9999999" ncol="9999999" size="1 1 1 1"/></asset>',
+            "",
+            "its hfield would take",
+        ),
+        (
+            '<asset><texture name="t" builtin="flat" width="9999999" height="9999999"/></asset>',
+            "",
+            "its texture would take",
+        ),
+        ('<asset><texture name="t" type="2d" file="t.png"/></asset>', "", "t.png would take"),
+        ("<a>" * 5000 + "</a>" * 5000, "", "MuJoCo cannot read it"),
+        ("".join(f'<compiler meshdir="{i}"/><mesh file="{i}"/>' for i in range(999)), "", "more"),
+        ("<!DOCTYPE x>&nothing;", "", "MuJoCo cannot read it"),
+    ],
+)
+def test_sizes(asset, body, sentence, robots):
+    head = b"\x89PNG\r\n\x1a\n" + b"\0\0\0\rIHDR" + struct.pack(">2I", 2**31 - 1, 2**31 - 1)
+    (robots / "robot" / "t.png").write_bytes(head)
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        reading.read(model(robots, asset, body=body))
+
+
+def test_memory_of_the_simulation_is_not_kept(robots):
+    path = model(robots, mesh("a.obj") + '<size memory="100T"/>', 'meshdir="meshes"')
+    assert reading.read(path)[0].memory == -1
+
+
+def test_each_file_is_read_once(robots, monkeypatch):
+    """Files may include one another."""
+    read, count = sources.read_text, []
+    monkeypatch.setattr(sources, "read_text", lambda *a: count.append(a) or read(*a))
+    for name, other in (("b", "c"), ("c", "b")):
+        text = f'<mujoco><include file="{other}.xml"/></mujoco>'
+        (robots / "robot" / f"{name}.xml").write_text(text)
+    with pytest.raises(ValueError, match="MuJoCo cannot read it"):
+        reading.read(model(robots, '<include file="b.xml"/>', body=""))
+    assert len(count) == 3

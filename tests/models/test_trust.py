@@ -1,0 +1,66 @@
+"""Folders of models name nothing elsewhere, hang nobody, and take no more memory than they hold."""
+
+import json
+import os
+
+import numpy as np
+import orbax.checkpoint as ocp
+import pytest
+
+from lorasp_jax.models import checkpoint, loading, published, statistics_files, tokenizer
+from lorasp_jax.models.tensor_files import INDEX, SINGLE, TensorFiles, weight_files
+
+READERS = {
+    "config.json": [loading.load_config, checkpoint.load_config],
+    SINGLE: [lambda folder: TensorFiles(weight_files(folder)), statistics_files.read],
+    INDEX: [weight_files],
+    "tokenizer.json": [tokenizer.load],
+    "x.model": [tokenizer.load],
+    "norm_stats.json": [statistics_files.read],
+}
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_a_pipe_hangs_nobody(name, tmp_path):
+    os.mkfifo(tmp_path / name)
+    for read in READERS[name]:
+        with pytest.raises(ValueError, match=str(tmp_path)):
+            read(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["../x.safetensors", "/etc/passwd", "a/b", "", "..", ".", 3])
+def test_what_files_name_lies_beside_them(name, tmp_path):
+    (tmp_path / "x.safetensors").write_bytes(b"")
+    folder = tmp_path / "model"
+    folder.mkdir()
+    (folder / INDEX).write_text(json.dumps({"weight_map": {"a": name}}))
+    with pytest.raises(ValueError, match=f"{INDEX} (names .* no file beside it|is damaged)"):
+        weight_files(folder)
+    steps = [{"registry_name": "normalizer_processor", "state_file": name}]
+    for pipeline in statistics_files.PIPELINES:
+        (folder / pipeline).write_text(json.dumps({"steps": steps}))
+    with pytest.raises(ValueError, match=r"the statistics of .*model cannot be read"):
+        statistics_files.read(folder)
+
+
+def test_arrays_larger_than_their_files(tmp_path):
+    """Arrays of zeros have no bytes on disk."""
+    handler = ocp.PyTreeCheckpointHandler(use_ocdbt=False)
+    tree = {"params": {"a": np.ones((2, 3), np.float32)}}
+    ocp.Checkpointer(handler).save(tmp_path / "params", tree)
+    assert published._restored(tmp_path / "params")["a"].shape == (2, 3)
+    (header,) = (tmp_path / "params").rglob(".zarray")
+    header.write_text(json.dumps(json.loads(header.read_text()) | {"shape": [10**6, 10**6]}))
+    with pytest.raises(ValueError, match="params is damaged or no Orbax checkpoint"):
+        published._restored(tmp_path / "params")
+
+
+def test_deep_and_large_numbers(tmp_path):
+    """They are no traceback of Python's."""
+    for text in ("[" * 100_000, '{"state_mean": [' + "9" * 400 + "]}"):
+        (tmp_path / "statistics.json").write_text(text)
+        with pytest.raises(ValueError, match=r"statistics.* cannot be read"):
+            statistics_files.read(tmp_path)
+        (tmp_path / "config.json").write_text("[" * 100_000)
+        with pytest.raises(ValueError, match=r"config.json is damaged"):
+            loading.load_config(tmp_path)
