@@ -12,6 +12,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import safetensors.numpy
 
+from envs.files import RefusedError
+
 ROOT = Path(__file__).parent.parent
 Damage = Callable[[Path], None]
 Cases = Iterator[tuple[str, Damage]]
@@ -146,7 +148,7 @@ TENSORS: dict[str, Callable[[dict[str, np.ndarray]], Any]] = {
     "integers": _on_first(lambda x: x.astype(np.int32)),
     "flags": _on_first(lambda x: x > 0),
     "nan": _on_first(_one_nan),
-    "infinite": _on_first(lambda x: x * np.inf),
+    "infinite": _on_first(lambda x: np.full_like(x, np.inf)),
 }
 
 
@@ -164,7 +166,7 @@ def with_infinity(values: list[float]) -> list[float]:
 
 def check_refusal(error: BaseException, *names: str) -> None:
     """It is ours, one sentence, and says what it is about."""
-    assert type(error) in (ValueError, FileNotFoundError), repr(error)
+    assert type(error) in (ValueError, FileNotFoundError, RefusedError), repr(error)
     raised = Path(traceback.extract_tb(error.__traceback__)[-1].filename)
     assert raised.is_relative_to(ROOT), f"{error!r} was raised in {raised}"
     text = str(error)

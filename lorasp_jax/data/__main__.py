@@ -36,9 +36,9 @@ def main(arguments: Sequence[str]) -> int:
 def inspect(options: argparse.Namespace, console: Console) -> None:
     """Prints what is in a dataset and writes a picture of it."""
     source = open_source(options.path, _keys(options))
-    path: Path = options.out or Path(f"{Path(options.path).absolute().name}.png")
-    if path.exists() and not options.overwrite:
-        raise ValueError(f"{path} exists already: add --overwrite or choose another --out")
+    if options.out and options.out.exists() and not options.overwrite:
+        raise ValueError(f"{options.out} exists already: add --overwrite or choose another --out")
+    path = options.out or inspection.place(options.path)
     inspection.report(source, console)
     inspection.write_contact_sheet(source, path)
     console.print(f"pictures: {path}", soft_wrap=True, highlight=False, markup=False)
@@ -69,7 +69,9 @@ def _parser() -> argparse.ArgumentParser:
     sub = subparsers.add_parser("inspect", help=text, description=text)
     sub.set_defaults(command=inspect)
     sub.add_argument("path", help=where)
-    sub.add_argument("--out", type=Path, help=".png file (default: the dataset's name)")
+    sub.add_argument(
+        "--out", type=Path, help=".png file (default: one for each dataset in ~/.cache/lorasp_jax)"
+    )
     sub.add_argument("--overwrite", action="store_true", help="replace the .png file")
     _add_keys(sub)
 

@@ -2,7 +2,9 @@
 
 import collections
 import dataclasses
+import hashlib
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +13,16 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from envs.episodes import replacing
+from envs.episodes import Episodes, replacing
 from envs.videos import side_by_side
 from lorasp_jax.data.films import reduced
+from lorasp_jax.data.lerobot import LeRobot
 from lorasp_jax.data.source import Source
 
 EPISODES, FRAMES, TILE, LINE = 6, 5, 128, 14
 """Of the contact sheet: rows, pictures a row, a picture's longer side, a text's height [pixels]."""
 _PHRASES = 10  # that are printed
+_TOOL = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")  # of end-effector actions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,6 +33,7 @@ class Summary:
         state: f32 `[N, J+1]` of all episodes, one after the other.
         action: f32 `[N, A]`.
         length: int `[E]` steps of each episode.
+        names: "state" and "action" -> what its numbers are called.
         phrases: instruction -> number of episodes.
         robot: its name.
         tasks: their names.
@@ -37,6 +42,7 @@ class Summary:
     state: np.ndarray
     action: np.ndarray
     length: np.ndarray
+    names: dict[str, list[str]]
     phrases: dict[str, int]
     robot: str
     tasks: tuple[str, ...]
@@ -54,10 +60,18 @@ def summarise(source: Source) -> Summary:
         state=np.concatenate([np.asarray(e.state[0]) for e in episodes]),
         action=np.concatenate([np.asarray(e.action[0]) for e in episodes]),
         length=np.array([e.num_steps for e in episodes]),
+        names=source.names if isinstance(source, LeRobot) else _names(episodes[0]),
         phrases=dict(phrases.most_common()),
         robot=episodes[0].robot,
         tasks=tuple(dict.fromkeys(e.task for e in episodes)),
     )
+
+
+def _names(episode: Episodes) -> dict[str, list[str]]:
+    """What the numbers are called in datasets of this project's kinds."""
+    joints = [f"joint_{i + 1}" for i in range(episode.state.shape[2] - 1)]
+    moved = _TOOL if episode.actions == "end_effector" else joints
+    return {"state": [*joints, "gripper"], "action": [*moved, "gripper"]}
 
 
 def report(source: Source, console: Console) -> None:
@@ -106,14 +120,16 @@ def _sizes(source: Source) -> list[str]:
 def _numbers(found: Summary) -> Table:
     """A line for each number of state and action."""
     table = Table(box=None, padding=(0, 1, 0, 0))
-    for title in ("", "min", "max", "mean", "std"):
+    table.add_column("")
+    for title in ("min", "max", "mean", "std"):
         table.add_column(title, justify="right", no_wrap=True)
     for name, rows in (("state", found.state), ("action", found.action)):
         values = rows.astype(np.float64)
         statistics = (values.min(0), values.max(0), values.mean(0), values.std(0))
-        for number, column in enumerate(zip(*statistics, strict=True)):
-            title = escape(f"{name}[{number}]")
-            table.add_row(title, *(f"{value:.4f}" for value in column))
+        columns = zip(found.names[name], *statistics, strict=True)
+        for number, (called, *column) in enumerate(columns):
+            title = f"{name}[{number}]" + f" {called}" * (called != str(number))
+            table.add_row(escape(title), *(f"{value:.4f}" for value in column))
     return table
 
 
@@ -129,9 +145,22 @@ def contact_sheet(source: Source) -> np.ndarray:
     return np.concatenate(padded)
 
 
+def place(where: str) -> Path:
+    """Where the pictures of a dataset go by default: a file for each, in the user's cache.
+
+    Args:
+        where: the dataset's path or id.
+    """
+    path = Path(os.path.realpath(where))
+    known = hashlib.sha256(str(path if path.exists() else where).encode()).hexdigest()[:8]
+    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    return cache / "lorasp_jax" / "inspect" / f"{path.name}-{known}.png"
+
+
 def write_contact_sheet(source: Source, path: Path) -> None:
     """Writes `contact_sheet` as a PNG file; the file is replaced when all is written."""
     picture = Image.fromarray(contact_sheet(source))
+    path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as unfinished:
         picture.save(unfinished, format="png")
 

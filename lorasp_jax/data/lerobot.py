@@ -82,6 +82,8 @@ class LeRobot:
         keys: which of its features are what.
         cameras: name here -> feature.
         control_dt: time between two steps [s].
+        names: "state" and "action" -> what its numbers are called, in order; an index where they
+            have no names.
     """
 
     def __init__(
@@ -104,6 +106,10 @@ class LeRobot:
         self.cameras = self._cameras()
         self.control_dt = self.keys.every / self.index.fps
         self._columns = {"state": self._chosen("state"), "action": self._chosen("action")}
+        self.names = {
+            kind: [self._names(kind)[column] for column in columns]
+            for kind, columns in self._columns.items()
+        }
         if len(set(map(len, self._columns.values()))) > 1:
             widths = " and ".join(f"{len(c)} for {name}" for name, c in self._columns.items())
             raise ValueError(

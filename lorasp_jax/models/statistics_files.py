@@ -4,6 +4,7 @@ statistics.json           ours
 norm_stats.json           openpi: {"norm_stats": {"state": {"mean": [...], ...}, "actions": ...}},
                           in a checkpoint below assets/<name of the data>/
 meta/stats.json           a LeRobot dataset: {"observation.state": {...}, "action": {...}, ...}
+meta/episodes_stats.jsonl one of version 2.1: such an object for each episode, below "stats"
 policy_preprocessor.json  a LeRobot policy: its steps, of which the normaliser's and, from
                           policy_postprocessor.json, the unnormaliser's name a safetensors file
                           with tensors "observation.state.mean" and so on
@@ -27,12 +28,14 @@ from lorasp_jax.models.statistics import NAMES, Statistics, checked
 from lorasp_jax.models.tensor_files import beside
 
 OURS, OPENPI, DATASET = "statistics.json", "norm_stats.json", "stats.json"
+EPISODES = "episodes_stats.jsonl"
 PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")
 TENSOR = re.compile(
     r"(?:(?:un)?normalize_\w+\.)?(?:(?:(?P<dataset>.+)[._])?buffer[._])?"
     r"(?P<kind>observation[._]state|action)\.(?P<name>\w+)"
 )
 """A statistic's name in LeRobot's safetensors."""
+_OF_EPISODES = ("count", "mean", "std", "min", "max")
 _UNREADABLE = (
     OSError, AttributeError, KeyError, TypeError, ValueError, OverflowError, RecursionError,
     safetensors.SafetensorError,
@@ -96,6 +99,25 @@ def _dataset(files: list[Path]) -> dict[str, Known]:
     return {"": {"state": _arrays(known["observation.state"]), "action": _arrays(known["action"])}}
 
 
+def _episodes(files: list[Path]) -> dict[str, Known]:
+    lines = files[0].read_text().splitlines()
+    rows = [json.loads(line)["stats"] for line in lines if line.strip()]
+    kinds = {"state": "observation.state", "action": "action"}
+    return {"": {kind: _joined([row[name] for row in rows]) for kind, name in kinds.items()}}
+
+
+def _joined(episodes: list[Mapping[str, Any]]) -> dict[str, np.ndarray]:
+    """As LeRobot joins them (compute_stats.py, aggregate_feature_stats, at 0.3.3): no quantiles."""
+    values = {name: np.array([known[name] for known in episodes], float) for name in _OF_EPISODES}
+    mean, std = values["mean"], values["std"]
+    with np.errstate(all="ignore"):  # what is not finite is refused later
+        share = values["count"] / values["count"].sum()
+        whole = (share * mean).sum(axis=0)
+        spread = np.sqrt((share * (std**2 + (mean - whole) ** 2)).sum(axis=0))
+        low, high = values["min"].min(axis=0), values["max"].max(axis=0)
+        return _arrays({"mean": whole, "std": spread, "min": low, "max": high})
+
+
 def _policy(files: list[Path]) -> dict[str, Known]:
     tensors: list[tuple[str, np.ndarray]] = []
     for pipeline in (files[0].with_name(name) for name in PIPELINES):
@@ -115,6 +137,8 @@ _READERS: dict[str, Callable[[list[Path]], dict[str, Known]]] = {
     f"assets/**/{OPENPI}": _openpi,
     f"meta/{DATASET}": _dataset,
     DATASET: _dataset,
+    f"meta/{EPISODES}": _episodes,
+    EPISODES: _episodes,
     PIPELINES[0]: _policy,
     "*.safetensors": _weights,
 }

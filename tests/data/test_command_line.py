@@ -1,6 +1,8 @@
 """`python -m lorasp_jax.data`, without the interpreter around it."""
 
 import json
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,6 +26,7 @@ def run(capsys, *arguments):
 
 def test_inspect(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     before = digest(golden("v3"))
     code, out, _ = run(capsys, "inspect", golden("v3"))
     assert code == 0
@@ -33,15 +36,30 @@ def test_inspect(capsys, tmp_path, monkeypatch):
         "4, of 25 to 40 steps",
         "126 at 10 Hz",
         "2  press the green button",
-        "action[6]",
+        "state[0] joint_1",
+        "action[6] gripper",
     ):
         assert text in out
-    with Image.open("dataset.png") as picture:
+    (sheet,) = tmp_path.rglob("*.png")
+    assert f"pictures: {sheet}" in out
+    with Image.open(sheet) as picture:
         assert picture.size[1] > 100
-    code, _, err = run(capsys, "inspect", golden("v3"))
-    assert (code, "dataset.png exists already" in err) == (2, True)
-    assert run(capsys, "inspect", golden("v3"), "--overwrite")[0] == 0
+    sheet.write_bytes(b"")
+    for folder in (golden("v3"), golden("v21"), Path(os.path.relpath(golden("v3")))):
+        assert run(capsys, "inspect", folder)[0] == 0  # again, and another one of this name
+    assert len(list(tmp_path.rglob("*.png"))) == 2
+    assert sheet.stat().st_size > 1000
+    assert [path.name for path in tmp_path.iterdir()] == ["cache"]
     assert digest(golden("v3")) == before
+
+
+def test_where_pictures_go(capsys, tmp_path):
+    """A file of the user's is not replaced unless they say so."""
+    out = tmp_path / "new" / "sheet.png"
+    assert run(capsys, "inspect", golden("v3"), "--out", out)[0] == 0
+    code, text, err = run(capsys, "inspect", golden("v3"), "--out", out)
+    assert (code, text, "sheet.png exists already: add --overwrite" in err) == (2, "", True)
+    assert run(capsys, "inspect", golden("v3"), "--out", out, "--overwrite")[0] == 0
 
 
 def test_convert_to_all_kinds_and_back(capsys, tmp_path):

@@ -29,6 +29,18 @@ def test_summary(source):
     assert not inspection.hints(found)
 
 
+@pytest.mark.parametrize("actions", ["joint", "end_effector"])
+def test_numbers_have_names(actions, source):
+    episode = dataclasses.replace(source.episode(0, ()), actions=actions)
+    joints = [f"joint_{number}" for number in range(1, 7)]
+    found = inspection._names(episode)
+    assert found["state"] == [*joints, "gripper"]
+    assert found["action"] == [*(joints if actions == "joint" else inspection._TOOL), "gripper"]
+    assert inspection.summarise(source).names["action"] == [*joints, "gripper"]
+    chosen = LeRobot(golden("v3"), Keys(state_numbers=("gripper", "0"), action_numbers=("6", "1")))
+    assert chosen.names == {"state": ["gripper", "joint_1"], "action": ["gripper", "joint_2"]}
+
+
 def test_units_are_doubted(source):
     found = inspection.summarise(source)
     scale = np.array([57.3] * 6 + [1000], np.float32)

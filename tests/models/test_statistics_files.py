@@ -8,6 +8,7 @@ import safetensors.numpy
 
 from lorasp_jax.models import statistics_files
 from lorasp_jax.models.statistics import NAMES, Statistics
+from tests.data.lerobots import golden
 
 RNG = np.random.default_rng(0)
 STATE, ACTION = RNG.normal(size=(2, len(NAMES), 7)).astype(np.float32)
@@ -53,6 +54,29 @@ def test_openpi(tmp_path):
     old["norm_stats"]["actions"] |= {"q01": None, "q99": None}
     file.write_text(json.dumps(old))
     assert_found(statistics_files.read(file), names[:2])
+
+
+def test_a_dataset_of_lerobot_by_episodes():
+    """Version 2.1 has statistics of each episode; joined they are those of the same data in 3.0."""
+    found, wanted = (statistics_files.read(golden(version)) for version in ("v21", "v3"))
+    for kind in ("state", "action"):
+        known = getattr(found, kind)
+        assert set(known) == {"mean", "std", "min", "max"}
+        for name, array in known.items():
+            np.testing.assert_allclose(array, getattr(wanted, kind)[name], rtol=2e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"count": [0]}, {"count": [1e999]}, {"mean": [0.0]}, {"std": ["x"] * 7}, {"min": None}],
+)
+def test_damaged_episodes_of_lerobot(change, tmp_path):
+    (row,) = (golden("v21") / "meta" / "episodes_stats.jsonl").read_text().splitlines()[:1]
+    row = json.loads(row)
+    row["stats"]["action"] |= change
+    (tmp_path / "episodes_stats.jsonl").write_text(json.dumps(row))
+    with pytest.raises(ValueError, match=r"^(the )?statistics "):
+        statistics_files.read(tmp_path)
 
 
 def test_a_dataset_of_lerobot(tmp_path):
