@@ -200,7 +200,8 @@ class MetricsLog:
         board = folder / "tensorboard"
         board.mkdir(exist_ok=True)
         # Not SummaryWriter: when its thread cannot write, whoever adds to its queue waits for ever.
-        self._board = EventsWriter(str(board / "events"))
+        # The name has whole seconds: with the step, no other log is written over.
+        self._board = EventsWriter(str(board / "events"), f".{start_step:09}")
         start = SessionLog(status=SessionLog.START)  # drop what was drawn from this step on
         self._add(start_step + 1, session_log=start)
 
@@ -210,7 +211,7 @@ class MetricsLog:
         values: Mapping[str, float],
         histograms: Mapping[str, np.ndarray] = MappingProxyType({}),
     ) -> None:
-        """Record scalars at `step`, and for TensorBoard alone histograms of arrays.
+        """Record scalars at `step`, and for TensorBoard alone histograms of arrays over layers.
 
         JSON has no numbers that are not finite: they are left out.
         """
@@ -220,7 +221,8 @@ class MetricsLog:
         with self.path.open("a") as file:
             file.write(json.dumps({"step": step, **values}) + "\n")
         drawn = [summary.scalar(name, value) for name, value in values.items()]
-        drawn += [summary.histogram(name, a, "auto") for name, a in histograms.items()]
+        # TensorBoard drops all but the first kind of a tag.
+        drawn += [summary.histogram(f"{name}/layers", a, "auto") for name, a in histograms.items()]
         self._add(step, summary=Summary(value=[value for one in drawn for value in one.value]))
 
     def _add(self, step: int, **content: Any) -> None:

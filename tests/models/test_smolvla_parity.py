@@ -183,7 +183,9 @@ def test_stored_types_are_kept(tensors, tmp_path):
 
 
 def test_other_sizes_raise():
-    with pytest.raises(ValueError, match=r"language/embedding has shape \(101, 64\)"):
+    with pytest.raises(
+        ValueError, match=r"embed_tokens.weight of shape \(101, 64\), the model needs \(100, 64\)"
+    ):
         published.load(GOLDEN, dataclasses.replace(CONFIG, vocabulary=100))
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rich.console import Console
-from tensorboardX.proto.event_pb2 import Event, SessionLog
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from lorasp_jax.config import Config, DataConfig
 from lorasp_jax.peft import LoRASP
@@ -142,26 +142,28 @@ def test_a_full_disk_stops_the_log_at_once(tmp_path):
     assert len(read_metrics(tmp_path)) > 10
 
 
-def test_tensorboard_finds_the_numbers(tmp_path):
-    """Each record is its length, a checksum, an event and a checksum."""
-    for start, steps in ((0, (2, 4)), (2, (4,))):
+def test_tensorboards_own_reader_finds_every_number(tmp_path):
+    """A scalar and a histogram of one name, of a run that went on from step 2."""
+    name = "active_rank/vision/fc1"
+    for start, steps in ((0, (2, 4)), (2, (4, 6))):
         log = MetricsLog(tmp_path, start)
         for step in steps:
-            log.write(step, {"loss": step / 2}, {"active_rank/vision": np.array([2.0, 4.0])})
+            ranks = np.array([start, step], np.float32)
+            log.write(step, {"loss": start + step / 2, name: float(ranks.mean())}, {name: ranks})
         log.close()
-        (file,) = (tmp_path / "tensorboard").iterdir()
-        content, events = file.read_bytes(), []
-        while content:
-            size = int.from_bytes(content[:8], "little")
-            events.append(Event.FromString(content[12 : 12 + size]))
-            content = content[16 + size :]
-        assert events[0].file_version == "brain.Event:2"
-        assert (events[1].step, events[1].session_log.status) == (start + 1, SessionLog.START)
-        for step, event in zip(steps, events[2:], strict=True):
-            loss, ranks = event.summary.value
-            assert (event.step, loss.tag, loss.simple_value) == (step, "loss", step / 2)
-            assert (ranks.tag, ranks.histo.num, ranks.histo.max) == ("active_rank/vision", 2, 4)
-        file.unlink()
+    assert read_metrics(tmp_path)[0] == {"step": 2, "loss": 1.0, name: 1.0}
+    board = EventAccumulator(str(tmp_path / "tensorboard"), {"histograms": 0}).Reload()
+    tags = board.Tags()
+    assert (tags["scalars"], tags["histograms"]) == (["loss", name], [f"{name}/layers"])
+    found = [(event.step, event.value) for event in board.Scalars("loss")]
+    assert found == [(2, 1.0), (4, 4.0), (6, 5.0)]
+    assert [event.value for event in board.Scalars(name)] == [1.0, 3.0, 4.0]
+    values = [event.histogram_value for event in board.Histograms(f"{name}/layers")]
+    assert [(value.num, value.min, value.max) for value in values] == [
+        (2, 0, 2),
+        (2, 2, 4),
+        (2, 2, 6),
+    ]
 
 
 def test_json_has_no_numbers_that_are_not_finite(tmp_path):

@@ -1,17 +1,12 @@
 """Throughput, waiting, memory: what a stretch of steps reports beside its losses."""
 
-import struct
-from pathlib import Path
 from types import SimpleNamespace
 
 import jax
-import numpy as np
 import pytest
-from tensorboardX.proto.event_pb2 import Event
 
 from lorasp_jax import flops
 from lorasp_jax.training import speed
-from lorasp_jax.training.run_folder import MetricsLog, read_metrics
 from lorasp_jax.training.speed import Speed
 
 
@@ -63,28 +58,3 @@ def test_memory_where_it_is_reported(monkeypatch):
     assert speed.memory() == {"memory/in_use_gib": 1.0, "memory/peak_gib": 1.5}
     monkeypatch.setattr(jax, "local_devices", device)
     assert speed.memory() == {}
-
-
-def events(folder):
-    """What is in TensorBoard's files: length, checksum, event, checksum, and so on."""
-    for path in sorted(Path(folder, "tensorboard").iterdir()):
-        data, position = path.read_bytes(), 0
-        while position < len(data):
-            (length,) = struct.unpack_from("<Q", data, position)
-            event = Event()
-            event.ParseFromString(data[position + 12 : position + 12 + length])
-            yield from ((event.step, value) for value in event.summary.value)
-            position += 16 + length
-
-
-def test_histograms_are_for_tensorboard_alone(tmp_path):
-    log = MetricsLog(tmp_path)
-    ranks = np.array([1.0, 2.0, 2.0, 8.0])
-    log.write(3, {"active_rank/vision/fc1": 3.25}, {"active_rank/vision/fc1": ranks})
-    log.close()
-    assert read_metrics(tmp_path) == [{"step": 3, "active_rank/vision/fc1": 3.25}]
-    found = {value.WhichOneof("value"): (step, value) for step, value in events(tmp_path)}
-    step, value = found["simple_value"]
-    assert (step, value.tag, value.simple_value) == (3, "active_rank/vision/fc1", 3.25)
-    step, value = found["histo"]
-    assert (step, value.histo.num, value.histo.sum, value.histo.max) == (3, 4, 13, 8)
