@@ -6,8 +6,9 @@ episodes = envs.collect("press", robot="panda", num_episodes=512, key=jax.random
 """
 
 import envs.fast_cpu  # first: it must come before anything starts JAX
+import envs.ids
 import envs.robots.panda
-import envs.robots.piper  # noqa: F401  envs.robots.piper.forward_kinematics is public
+import envs.robots.piper  # envs.robots.piper.forward_kinematics is public
 from envs.collection import collect, expert_success
 from envs.env import Env
 from envs.episodes import Episodes
@@ -25,3 +26,5 @@ __all__ = [
     "expert_success",
     "make",
 ]
+
+envs.ids.register()

@@ -18,7 +18,16 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs import actions, distractors, fast_cpu, placing, randomization, scene
+from envs import (
+    actions,
+    distractors,
+    fast_cpu,
+    observations,
+    placing,
+    randomization,
+    rewards,
+    scene,
+)
 from envs.physics import Physics
 from envs.randomization import Draw, Randomization
 from envs.render import Look, Renderer, RenderModel
@@ -40,6 +49,8 @@ class Env:
     distractors: int
     control_dt: float
     actions: actions.Mode
+    reward: rewards.Reward
+    discount: float
     model: mujoco.MjModel
     physics: Physics
     render_model: RenderModel
@@ -179,6 +190,25 @@ class Env:
         fingers = state.data.qpos[:, self.num_joints : self.num_joints + 2]
         return jnp.concatenate([joints, jnp.sum(fingers, axis=1, keepdims=True)], axis=1)
 
+    @functools.partial(jax.jit, static_argnums=0)
+    def full_state(self, state: State) -> jax.Array:
+        """All that a learner may know beside pictures, f32 [W, D]; `full_state_layout` says what.
+
+        Joints, speeds and last targets of the robot, where its tool is, and relative to that where
+        the task's objects are and how they move: see `envs.observations.parts`.
+        """
+        find = functools.partial(observations.parts, self.model, bodies=self._placed)
+
+        def one(data: Data, command: jax.Array) -> jax.Array:
+            return jnp.concatenate([*find(data, command).values()])
+
+        return jax.vmap(one)(state.data, state.info["command"])
+
+    @functools.cached_property
+    def full_state_layout(self) -> dict[str, slice]:
+        """Name -> where it lies in the last axis of `full_state`."""
+        return observations.layout(self.model, self.num_joints, self._placed)
+
     def render(
         self,
         geom_xpos: jax.Array,
@@ -235,9 +265,16 @@ class Env:
             "layout": layout,
             "draw": draw,
         }
-        return State(data, jnp.zeros((), jnp.float32), false, metrics, info)
+        state = State(data, jnp.zeros((), jnp.float32), false, metrics, info)
+        return state if self.reward == "sparse" else rewards.started(state, self._stages(state))
 
     def _step(self, state: State, action: jax.Array) -> State:
+        after = self._move(state, action)
+        if self.reward == "sparse":
+            return after
+        return rewards.earned(state, after, self._stages(after), self.discount)
+
+    def _move(self, state: State, action: jax.Array) -> State:
         info = state.info
         reach = jnp.asarray(self.robot.action_speed) * self.control_dt
         action = jnp.clip(action, self.action_low, self.action_high)
@@ -258,7 +295,7 @@ class Env:
             data=data,
             reward=success.astype(jnp.float32),
             done=success | (steps >= self.max_steps),
-            metrics=metrics,
+            metrics=state.metrics | metrics,
             info=info
             | {"success": success, "steps": steps, "held": held}
             | {"command": target, "earlier": info["command"]},
@@ -282,9 +319,13 @@ class Env:
     @functools.cached_property
     def _objects(self) -> np.ndarray:
         """Which bodies the task and its distractors are made of, bool [bodies]."""
-        names = [*jax.eval_shape(self.task.place, jax.random.key(0))]
-        names += distractors.names(self.distractors)
+        names = [*self._placed, *distractors.names(self.distractors)]
         return randomization.belonging(self.model, names)
+
+    @functools.cached_property
+    def _placed(self) -> list[str]:
+        """Names of the bodies that the task places."""
+        return sorted(jax.eval_shape(self.task.place, jax.random.key(0)))
 
     def _looks(self, draw: Draw) -> tuple[Look, jax.Array]:
         """Look of one world, and the sizes of its geoms."""
@@ -295,4 +336,10 @@ class Env:
         return randomization.move_cameras(draw, data) if draw else data
 
     def _check(self, draw: Draw | None, data: Data) -> tuple[jax.Array, dict[str, jax.Array]]:
-        return self.task.check(View(self.model, data, draw.size if draw else 1.0))
+        return self.task.check(self._view(draw, data))
+
+    def _stages(self, state: State) -> dict[str, jax.Array]:
+        return self.task.stages(self._view(state.info["draw"], state.data))
+
+    def _view(self, draw: Draw | None, data: Data) -> View:
+        return View(self.model, data, draw.size if draw else 1.0)

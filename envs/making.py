@@ -13,6 +13,7 @@ from envs import fast_cpu, mjcf, physics, render, scene
 from envs.actions import MODES, TARGET_DT, Mode
 from envs.env import Env
 from envs.physics import Backend
+from envs.rewards import REWARDS, Reward
 from envs.robots import Robot
 
 AnyRobot = str | os.PathLike[str] | Robot
@@ -29,6 +30,8 @@ def make(
     antialias: int = 1,
     control_dt: float = 0.1,
     actions: Mode = "joint",
+    reward: Reward = "sparse",
+    discount: float = 0.99,
     distractors: int = 0,
     backend: Backend | None = None,
     renderer: RendererName = "rays",
@@ -44,6 +47,9 @@ def make(
         antialias: n for smooth edges by n x n rays a pixel, which take n squared times as long.
         control_dt: seconds between two actions, a multiple of 0.02.
         actions: what an action means: joint, delta_joint or end_effector, see `envs.actions`.
+        reward: sparse, 1 for success, or dense, which also says how far the task has come: see
+            `envs.rewards`.
+        discount: of the learner, for the dense reward, 0 to 1.
         distractors: other things on the table, up to 4.
         backend: of the physics, jax or warp; None takes the fastest there is.
         renderer: rays, the ray caster that runs anywhere, or warp, MuJoCo Warp's, which also draws
@@ -57,6 +63,7 @@ def make(
     found_task, found_robot = _find("task", task), _find_robot(robot)
     _check_counts(num_envs=num_envs, image_size=image_size, antialias=antialias)
     _check_options(control_dt, actions, distractors)
+    _check_reward(reward, discount)
     things = found_task.scene + envs.distractors.mjcf(distractors)
     model = scene.build(things, found_robot)
     rays = render.RayRenderer(render.build(model, scene.CAMERAS), image_size, antialias)
@@ -66,6 +73,8 @@ def make(
         num_envs=num_envs,
         control_dt=control_dt,
         actions=actions,
+        reward=reward,
+        discount=discount,
         distractors=distractors,
         model=model,
         physics=physics.Physics(model, backend or physics.default_backend()),
@@ -105,6 +114,13 @@ def _check_options(control_dt: float, actions: str, distractors: int) -> None:
     most = envs.distractors.MOST
     if not 0 <= distractors <= most:
         raise ValueError(f"distractors must be 0 to {most}, got {distractors}")
+
+
+def _check_reward(reward: str, discount: float) -> None:
+    if reward not in REWARDS:
+        raise ValueError(f"unknown reward {reward!r}: choose from {', '.join(REWARDS)}")
+    if not 0 < discount <= 1:
+        raise ValueError(f"discount must lie above 0 and at most at 1, got {discount}")
 
 
 def _find_robot(robot: AnyRobot) -> Robot:

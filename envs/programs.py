@@ -121,7 +121,7 @@ def _name(env: Env, tree: Any, kinds: tuple[Any, ...], settings: tuple[Any, ...]
         digest(env),
         env.task.name,
         (env.num_envs, env.image_size, env.antialias),
-        (env.control_dt, env.actions, env.distractors),
+        (env.control_dt, env.actions, env.distractors, env.reward, env.discount),
         (tree, kinds, settings, jax.default_backend()),
         [importlib.metadata.version(name) for name in _VERSIONED],
         _sources(),

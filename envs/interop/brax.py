@@ -16,7 +16,6 @@ import jax.numpy as jnp
 from envs.env import Env
 from envs.randomization import Randomization
 from envs.state import State
-from envs.tasks import View
 
 try:
     from brax.envs import base
@@ -27,17 +26,15 @@ except ImportError as error:
 class BraxEnv(base.Env):
     """One world of a task behind Brax's interface; Brax's wrappers batch, time and restart it.
 
-    Observations, float32: measured joint angles [rad] and gripper opening [m], position of the tool
-    centre [3] in m, then position [3] in m and unit quaternion [4] of every body that the task
-    places, ordered by name. There are no speeds and no pictures in them: `state.pipeline_state` is
-    the `envs.State` of one world, which has the former and from which `env.observe` makes the
-    latter.
+    Observations are those of `Env.full_state`, float32 [D]. There are no pictures in them:
+    `state.pipeline_state` is the `envs.State` of one world, from which `env.observe` makes them.
 
     Actions, [A] in [-1, 1], span `action_low` to `action_high` of the environment inside. The
-    reward is 1 once, when the task is done, so the return of an episode is its success. `done`
-    means success or broken physics. Time is left to Brax: an episode lasts as long as the wrapper
-    says (`env.max_steps` is the task's own limit), and its end is a truncation. Brax's
-    AutoResetWrapper restarts a world as it first was, the layout included.
+    sparse reward is 1 once, when the task is done, so the return of an episode is its success; the
+    dense one wants `action_repeat=1`, for a wrapper that repeats actions adds rewards without
+    discount. `done` means success or broken physics. Time is left to Brax: an episode lasts as long
+    as the wrapper says (`env.max_steps` is the task's own limit), and its end is a truncation.
+    Brax's AutoResetWrapper restarts a world as it first was, the layout included.
 
     Attributes:
         env: the environment inside, of one world.
@@ -94,13 +91,9 @@ class BraxEnv(base.Env):
 
     def _seen(self, world: State) -> dict[str, Any]:
         """The fields of Brax's state that say how the world is now."""
-        view = View(self.env.model, jax.tree.map(lambda x: x[0], world.data))
-        parts = [self.env.proprio(world)[0], view.tcp]
-        for name in sorted(world.info["layout"]):
-            parts += [view.position(name), view.data.xquat[view.model.body(name).id]]
         return {
             "pipeline_state": world,
-            "obs": jnp.concatenate(parts),
+            "obs": self.env.full_state(world)[0],
             "done": world.done[0].astype(jnp.float32),
         }
 

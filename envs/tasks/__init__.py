@@ -1,7 +1,8 @@
 """Manipulation tasks: one file a task, found by its name.
 
 A task says what lies on the table and where (`place`), what counts as success (`check`), how people
-ask for it (`instructions`) and how a hand does it (`waypoints`). It knows nothing of robots.
+ask for it (`instructions`), how a hand does it (`waypoints`) and how far it has come on that way
+(`stages`). It knows nothing of robots.
 
 Contact masks of the scenes, one bit of contype for each part played: 1 objects that are carried,
 2 finger tips, 4 what only finger pads hold, 8 feet that stand on something. Whatever they may touch
@@ -17,6 +18,8 @@ import jax.numpy as jnp
 import mujoco
 
 from envs.robots import TIP_LENGTH, multiply
+
+_ALMOST = 0.99  # share of a stage that is not passed yet
 
 Layout = dict[str, jax.Array]
 """Body name -> where it is at reset: [4], x, y, z in m and the turn about z in rad."""
@@ -41,6 +44,11 @@ class View:
     def upright(self, body: str) -> jax.Array:
         """Cosine of the angle between a body's z axis and the vertical."""
         return self.data.xmat[self.model.body(body).id].reshape(3, 3)[2, 2]
+
+    def on(self, body: str, height: float) -> jax.Array:
+        """Point [3] in m of a body, `height` [m] up its own z axis."""
+        axis = self.data.xmat[self.model.body(body).id].reshape(3, 3)[:, 2]
+        return self.position(body) + self.size * height * axis
 
     def speed(self, body: str) -> jax.Array:
         """Linear speed of a free body in m/s."""
@@ -68,6 +76,21 @@ class View:
         """
         wider = self.opening > width * self.size + 0.005
         return wider | (jnp.linalg.norm(grip - self.tcp) > away)
+
+    def reaching(self, grip: jax.Array) -> jax.Array:
+        """Share of a stage that ends with the tool centre at grip [3], within 15 mm."""
+        return near(jnp.linalg.norm(grip - self.tcp), within=0.015)
+
+    def grasping(self, grip: jax.Array, width: float) -> jax.Array:
+        """Share of a stage that ends with the fingers closed around what is `width` [m] wide."""
+        gap = self.opening - width * self.size
+        return gate(self.reaching(grip) >= 1, near(gap, within=0.005, scale=0.02))
+
+    def releasing(self, grip: jax.Array, width: float, away: float = 0.06) -> jax.Array:
+        """Share of a stage that ends with `released`, whose arguments these are."""
+        gap = width * self.size + 0.005 - self.opening
+        share = jnp.minimum(near(gap, scale=0.02), _ALMOST)
+        return jnp.where(self.released(grip, width, away), 1.0, share)
 
     @property
     def tcp(self) -> jax.Array:
@@ -129,6 +152,9 @@ class Task:
         place: key -> random layout.
         check: view -> (bool scalar, metrics): the goal is met now.
         waypoints: layout -> the way a hand does it.
+        stages: view -> name of each stage of that way, first to last, and the share of it that is
+            done, f32 0 to 1; 1 passes it and all before it. Dense rewards are made of them, see
+            `envs.rewards`.
     """
 
     name: str
@@ -140,6 +166,17 @@ class Task:
     place: Callable[[jax.Array], Layout]
     check: Callable[[View], tuple[jax.Array, dict[str, jax.Array]]]
     waypoints: Callable[[Layout], Waypoints]
+    stages: Callable[[View], dict[str, jax.Array]]
+
+
+def near(distance: jax.Array, within: float = 0.0, scale: float = 0.1) -> jax.Array:
+    """Share of a stage that ends where a distance [m] is `within`; a third is left at `scale`."""
+    return jnp.exp(-jnp.maximum(distance - within, 0.0) / scale)
+
+
+def gate(condition: jax.Array, share: jax.Array) -> jax.Array:
+    """Share of a stage that begins where a condition holds."""
+    return jnp.where(condition, share, 0.0)
 
 
 def azimuth(position: jax.Array) -> jax.Array:

@@ -6,7 +6,18 @@ Numbers without a source are own choices that work with both arms.
 import jax
 import jax.numpy as jnp
 
-from envs.tasks import Layout, Task, View, Waypoints, open_box, raised, route, scatter
+from envs.tasks import (
+    Layout,
+    Task,
+    View,
+    Waypoints,
+    gate,
+    near,
+    open_box,
+    raised,
+    route,
+    scatter,
+)
 
 _INSIDE, _WALL, _HEIGHT = 0.043, 0.005, 0.055  # m, of the pot: half the inner width, half a wall
 _FOOT = 0.005  # m, radius of the lid's feet, which stand in the middle of the walls
@@ -17,6 +28,8 @@ _BESIDE = 0.175  # m from pot to lid, to the right as the robot sees it
 
 _STEEL, _RED = 'rgba=".55 .57 .60 1"', 'rgba=".62 .20 .16 1"'
 _RIM = _INSIDE + _WALL
+_BARELY_BESIDE = _LID + _RIM + _WALL  # m from pot to lid
+_CLEAR = 0.020  # m, of the lid above the pot when it is lifted off
 _FEET = "".join(
     f'<geom type="sphere" size="{_FOOT}" pos="{x} {y} {_FOOT}" contype="8" condim="4" mass=".005" '
     f'friction="1 .02 .001" solref=".01 1" {_STEEL}/>'
@@ -47,10 +60,28 @@ def _check(view: View) -> tuple[jax.Array, dict[str, jax.Array]]:
     lid = view.position("lid")
     apart = view.apart("lid", "pot")
     on_table = (lid[2] < 0.01) & (view.upright("lid") > 0.97)
-    beside = apart > (_LID + _RIM + _WALL) * view.size
+    beside = apart > _BARELY_BESIDE * view.size
     at_rest = view.speed("lid") < 0.05
     released = view.released(view.above("lid", _KNOB_HEIGHT), 2 * _KNOB)
     return on_table & beside & at_rest & released, {"lid_to_pot": apart}
+
+
+def _stages(view: View) -> dict[str, jax.Array]:
+    knob, lid = view.on("lid", _KNOB_HEIGHT), view.position("lid")
+    held = view.grasping(knob, 2 * _KNOB)
+    risen = (lid[2] - _HEIGHT * view.size) / _CLEAR
+    level = view.upright("lid") > 0.97
+    missing = (_BARELY_BESIDE + 0.005) * view.size - view.apart("lid", "pot")
+    beside = gate(level, near(missing))
+    down = gate(beside >= 1, near(lid[2], within=0.008))
+    return {
+        "reach": view.reaching(knob),
+        "grasp": held,
+        "lift": gate(held >= 1, jnp.clip(risen, 0.0, 1.0)),
+        "carry": beside,
+        "lower": down,
+        "release": gate(down >= 1, view.releasing(knob, 2 * _KNOB)),
+    }
 
 
 def _waypoints(layout: Layout) -> Waypoints:
@@ -85,4 +116,5 @@ TASK = Task(
     place=_place,
     check=_check,
     waypoints=_waypoints,
+    stages=_stages,
 )

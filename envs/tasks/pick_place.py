@@ -4,13 +4,26 @@ Numbers without a source are own choices that work with both arms.
 """
 
 import jax
+import jax.numpy as jnp
 
-from envs.tasks import Layout, Task, View, Waypoints, open_box, raised, route, scatter
+from envs.tasks import (
+    Layout,
+    Task,
+    View,
+    Waypoints,
+    gate,
+    near,
+    open_box,
+    raised,
+    route,
+    scatter,
+)
 
 _RADIUS = 0.015  # m, a large table grape (12 g)
 _INSIDE = 0.046  # m, half the inner width of the basket
 _WALL = 0.003  # m, half the thickness of its walls
 _HEIGHT = 0.045  # m, of its walls
+_CLEAR = 0.080  # m, of the grape above the table: over the basket's walls
 _GRAPE, _GRAPE_RANGE = (0.36, -0.08), (0.06, 0.10)  # m, of the random position
 _BASKET, _BASKET_RANGE = (0.36, 0.155), (0.035, 0.035)  # m
 
@@ -41,6 +54,22 @@ def _check(view: View) -> tuple[jax.Array, dict[str, jax.Array]]:
     at_rest = view.speed("grape") < 0.05
     released = view.released(view.position("grape"), 2 * _RADIUS)
     return inside & at_rest & released, {"grape_to_basket": view.apart("grape", "basket")}
+
+
+def _stages(view: View) -> dict[str, jax.Array]:
+    grape = view.position("grape")
+    height = grape[2] - _RADIUS * view.size
+    held = view.grasping(grape, 2 * _RADIUS)
+    over = near(view.apart("grape", "basket"), within=0.03)
+    low = gate(over >= 1, near(height, within=_HEIGHT, scale=0.05))
+    return {
+        "reach": view.reaching(grape),
+        "grasp": held,
+        "lift": gate(held >= 1, jnp.clip(height / _CLEAR, 0.0, 1.0)),
+        "carry": over,
+        "lower": low,
+        "release": gate(low >= 1, view.releasing(grape, 2 * _RADIUS)),
+    }
 
 
 def _waypoints(layout: Layout) -> Waypoints:
@@ -74,4 +103,5 @@ TASK = Task(
     place=_place,
     check=_check,
     waypoints=_waypoints,
+    stages=_stages,
 )

@@ -6,15 +6,32 @@ Numbers without a source are own choices that work with both arms.
 import math
 
 import jax
+import jax.numpy as jnp
 
-from envs.tasks import Layout, Task, View, Waypoints, azimuth, open_box, raised, route, scatter
+from envs.tasks import (
+    Layout,
+    Task,
+    View,
+    Waypoints,
+    azimuth,
+    gate,
+    near,
+    open_box,
+    raised,
+    route,
+    scatter,
+)
 
 _BLOCK = 0.010  # m, radius of the sphere that stands for the block where it touches things
 _BOTTOM = 0.014  # m, half the inner width of the cup at its bottom
 _FLARE = math.radians(20.0)  # of the two walls over which the block can leave
 _HEIGHT, _THICK, _FOOT = 0.050, 0.002, 0.004  # m: of the cup, half a wall, a foot's radius
 _SIDE = 0.022  # m from the cup's middle to its upright walls
+_WIDTH = 2 * (_SIDE + 0.003)  # m, of the cup where it is held
+_CLEAR = 0.060  # m, of the cup above the table when it is lifted
 _GRIP = 0.033  # m, height at which the cup is held
+# The hand turns about a point above the cup's mouth: from there the block falls straight down.
+_REACH = _HEIGHT - _GRIP + 0.03  # m from the grip
 _CUP, _CUP_RANGE = (0.33, -0.09), (0.03, 0.05)  # m, of the random position
 _INSIDE, _WALL, _BASKET_HEIGHT = 0.050, 0.003, 0.045  # m, of the basket, as in pick_place
 _BASKET, _BASKET_RANGE = (0.37, 0.12), (0.03, 0.03)  # m
@@ -78,15 +95,37 @@ def _check(view: View) -> tuple[jax.Array, dict[str, jax.Array]]:
     inside = view.inside("block", "basket", _INSIDE, _BASKET_HEIGHT)
     standing = (view.upright("cup") > 0.97) & (cup[2] < 0.01)
     at_rest = (view.speed("block") < 0.05) & (view.speed("cup") < 0.05)
-    released = view.released(view.above("cup", _GRIP), 2 * (_SIDE + 0.003), away=0.08)
+    released = view.released(view.above("cup", _GRIP), _WIDTH, away=0.08)
     done = inside & standing & at_rest & released
     return done, {"block_to_basket": view.apart("block", "basket")}
 
 
+def _stages(view: View) -> dict[str, jax.Array]:
+    grip, cup = view.on("cup", _GRIP), view.position("cup")
+    held = view.grasping(grip, _WIDTH)
+    mouth = view.on("cup", _GRIP + _REACH)
+    loaded = jnp.linalg.norm(view.position("block") - view.on("cup", _CENTRE)) < _HEIGHT
+    carried = gate(
+        loaded, near(jnp.linalg.norm(mouth[:2] - view.position("basket")[:2]), within=0.04)
+    )
+    over = jnp.maximum(carried, near(view.apart("block", "basket"), within=0.04))
+    inside = view.inside("block", "basket", _INSIDE, _BASKET_HEIGHT)
+    tilted = jnp.clip((1 - view.upright("cup")) / 2, 0.0, 0.9)
+    level = jnp.clip(view.upright("cup") / 0.9, 0.0, 1.0)  # it may lean while it is held
+    standing = gate(inside, level * near(cup[2], within=0.009))
+    return {
+        "reach": view.reaching(grip),
+        "grasp": held,
+        "lift": gate(held >= 1, jnp.clip(cup[2] / _CLEAR, 0.0, 1.0)),
+        "carry": over,
+        "pour": jnp.where(inside, 1.0, gate(over >= 1, tilted)),
+        "put_back": standing,
+        "release": gate(standing >= 1, view.releasing(grip, _WIDTH, away=0.08)),
+    }
+
+
 def _waypoints(layout: Layout) -> Waypoints:
-    # The hand turns about a point above the cup's mouth: from there the block falls straight down.
-    reach = _HEIGHT - _GRIP + 0.03
-    cup, basket = (raised(layout[name], _GRIP + reach) for name in ("cup", "basket"))
+    cup, basket = (raised(layout[name], _GRIP + _REACH) for name in ("cup", "basket"))
     wide, closed = 0.066, 0.030  # m
     # An arm that cannot point straight down high above the table may lean a little while it moves.
     carry, level = math.radians(25.0), math.radians(94.0)
@@ -105,7 +144,7 @@ def _waypoints(layout: Layout) -> Waypoints:
         (cup, (0.0, 0.0, 0.001), wide, 0.6, 0.0),
         (cup, (0.0, 0.0, 0.080), wide, 0.8, 0.006),
         lean=0.0,
-        reach=reach,
+        reach=_REACH,
         tilt=(carry, 0, 0, 0, carry, carry, level, level, carry, carry, 0, 0, carry),
     )
 
@@ -126,4 +165,5 @@ TASK = Task(
     place=_place,
     check=_check,
     waypoints=_waypoints,
+    stages=_stages,
 )

@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 
 from envs.robots import TIP_LENGTH
-from envs.tasks import Layout, Task, View, Waypoints, raised, route, scatter
+from envs.tasks import Layout, Task, View, Waypoints, gate, near, raised, route, scatter
 
 _STROKE = 0.012  # m
 _TOP = 0.040  # m, height of the cap at rest
 _RADIUS = 0.024  # m, of the cap
+_DEEP = 0.75 * _STROKE  # how far it must go
 _CENTRE, _RANGE = (0.36, 0.0), (0.04, 0.04)  # m, of the random position
 
 # A spring of 150 N/m: 1.8 N at full stroke, far more than the cap's weight (compensated anyway).
@@ -36,9 +37,26 @@ def _place(key: jax.Array) -> Layout:
 
 def _check(view: View) -> tuple[jax.Array, dict[str, jax.Array]]:
     depth = view.joint("button")
-    offset = view.tip - view.above("button", _TOP) + depth * jnp.array([0.0, 0.0, 1.0])
-    touching = (jnp.linalg.norm(offset[:2]) < _RADIUS * view.size) & (jnp.abs(offset[2]) < 0.01)
-    return (depth > 0.75 * _STROKE) & touching, {"button_depth": depth}
+    return (depth > _DEEP) & _touching(view), {"button_depth": depth}
+
+
+def _stages(view: View) -> dict[str, jax.Array]:
+    depth = jnp.clip(view.joint("button") / _DEEP, 0.0, 1.0)
+    return {
+        "reach": near(jnp.linalg.norm(_offset(view)), within=0.01),
+        "press": gate(_touching(view), depth),
+    }
+
+
+def _offset(view: View) -> jax.Array:
+    """From the top of the cap, wherever it is, to the tips of the fingers, [3] in m."""
+    down = view.joint("button") * jnp.array([0.0, 0.0, 1.0])
+    return view.tip - view.above("button", _TOP) + down
+
+
+def _touching(view: View) -> jax.Array:
+    offset = _offset(view)
+    return (jnp.linalg.norm(offset[:2]) < _RADIUS * view.size) & (jnp.abs(offset[2]) < 0.01)
 
 
 def _waypoints(layout: Layout) -> Waypoints:
@@ -67,4 +85,5 @@ TASK = Task(
     place=_place,
     check=_check,
     waypoints=_waypoints,
+    stages=_stages,
 )

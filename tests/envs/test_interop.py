@@ -5,17 +5,20 @@ import importlib
 import sys
 
 import brax.envs
+import gymnasium
 import gymnasium.wrappers.vector as wrappers
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
-from envs import experts
+import envs
+from envs import experts, making
 from envs.interop.brax import BraxEnv
-from envs.interop.gymnasium import VectorEnv
+from envs.interop.gymnasium import OBSERVATIONS, SingleEnv, VectorEnv
 
 W = 4
 B = 2
@@ -23,13 +26,13 @@ B = 2
 
 @pytest.fixture
 def vector(env):
-    return VectorEnv(env, pictures=False)
+    return VectorEnv(env, observation="state")
 
 
 @pytest.fixture(scope="module")
 def pressed(env):
     """An expert through the Gymnasium interface: the first success, and the worlds before it."""
-    vector = VectorEnv(env, pictures=False)
+    vector = VectorEnv(env, observation="state")
     vector.reset(seed=0)
     plan = experts.plan(env, vector.state, jax.random.key(1))
     act = jax.jit(lambda state: experts.act(env, plan, state))
@@ -79,17 +82,20 @@ def test_a_missing_package_is_one_sentence(name, monkeypatch):
         importlib.import_module(f"envs.interop.{name}")
 
 
-@pytest.mark.parametrize("pictures", [True, False])
-def test_spaces_hold_what_is_seen(env, pictures):
-    vector = VectorEnv(env, pictures=pictures)
+@pytest.mark.parametrize("observation", OBSERVATIONS)
+def test_spaces_hold_what_is_seen(env, observation):
+    vector = VectorEnv(env, observation=observation)
     assert (vector.num_envs, vector.action_space.shape) == (W, (W, 7))
     assert vector.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
     np.testing.assert_array_equal(vector.single_action_space.high, env.action_high)
     np.testing.assert_array_equal(vector.single_action_space.low, env.action_low)
     seen, info = vector.reset(seed=0)
     assert vector.observation_space.contains(seen)
-    assert ("image" in seen) == pictures
-    np.testing.assert_array_equal(seen["state"], env.proprio(vector.state))
+    assert ("image" in seen) == (observation == "pictures")
+    known = {"state": env.proprio(vector.state)}
+    if observation == "full_state":
+        seen, known = {"state": seen}, {"state": env.full_state(vector.state)}
+    np.testing.assert_array_equal(seen["state"], known["state"])
     assert all(leaf.flags.writeable for leaf in jax.tree.leaves(seen))
     numbers = np.asarray(vector.state.info["instruction"])
     assert info["instruction"].tolist() == [env.instructions[i] for i in numbers]
@@ -182,17 +188,9 @@ def test_gymnasium_wrappers(vector):
 
 def test_brax_observation(env, wrapped, first):
     found = wrapped[0]
-    # Joints and gripper, tool centre, pose of the button.
-    assert (found.observation_size, found.action_size, found.backend) == (7 + 3 + 7, 7, "mjx")
-    assert first.obs.shape == (B, found.observation_size)
-    world = first.pipeline_state
-    np.testing.assert_allclose(first.obs[:, :7], world.info["command"][:, 0], atol=1e-6)
-    site = env.model.site("tcp").id
-    np.testing.assert_array_equal(first.obs[:, 7:10], world.data.site_xpos[:, 0, site])
-    place = np.asarray(world.info["layout"]["button"])[:, 0]
-    np.testing.assert_allclose(first.obs[:, 10:13], place[:, :3], atol=1e-6)
-    upright = np.stack([np.cos(place[:, 3] / 2), *np.zeros((2, B)), np.sin(place[:, 3] / 2)], 1)
-    np.testing.assert_allclose(first.obs[:, 13:], upright, atol=1e-6)
+    assert (found.observation_size, found.action_size, found.backend) == (41, 7, "mjx")
+    worlds = jax.tree.map(lambda x: x[:, 0], first.pipeline_state)
+    np.testing.assert_allclose(first.obs, env.full_state(worlds), atol=1e-6)
     assert np.any(first.obs[0] != first.obs[1])
 
 
@@ -243,3 +241,44 @@ def test_brax_broken_worlds_are_done(wrapped, first):
     state = wrapped[2](first, action)
     assert (state.done.tolist(), state.reward.tolist()) == ([0, 1], [0, 0])
     assert np.all(np.isfinite(state.obs))
+
+
+def test_import_registers_every_task_and_robot():
+    registered = {name for name in gymnasium.registry if name.startswith("lorasp_jax/")}
+    assert registered == {
+        f"lorasp_jax/{task}-{robot}-v0"
+        for task in making.names("task")
+        for robot in making.names("robot")
+    }
+    with pytest.raises(gymnasium.error.NameNotFound, match="prss"):
+        gymnasium.make_vec("lorasp_jax/prss-piper-v0")
+
+
+def test_make_vec_takes_the_options_of_both():
+    ranges = envs.Randomization.typical()
+    options = {"reward": "dense", "discount": 0.9, "actions": "end_effector", "ranges": ranges}
+    vector = gymnasium.make_vec("lorasp_jax/pour-panda-v0", num_envs=3, **options)
+    env = vector.env
+    assert (env.task.name, env.robot.name, env.num_envs) == ("pour", "panda", 3)
+    assert (env.reward, env.discount, env.actions) == ("dense", 0.9, "end_effector")
+    assert vector.ranges is ranges
+    assert vector.single_observation_space.shape == (72,)
+    seen = gymnasium.make_vec("lorasp_jax/press-piper-v0", observation="pictures")
+    assert seen.observation_space["image"]["wrist"].shape == (1, 64, 64, 3)
+    with pytest.raises(ValueError, match="choose from pictures, state, full_state"):
+        gymnasium.make_vec("lorasp_jax/press-piper-v0", observation="image")
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*Box observation space (min|max)imum value is")
+def test_gymnasiums_own_checker_passes():
+    env = gymnasium.make("lorasp_jax/press-piper-v0", image_size=16, reward="dense")
+    check_env(env.unwrapped)
+    env.reset(seed=0)
+    world = env.unwrapped.vector
+    at_step(world, 79)
+    assert env.step(commands(world)[0])[2:4] == (False, True)
+    with pytest.raises(ResetNeeded, match="the episode has ended: call reset"):
+        env.step(commands(world)[0])
+    with pytest.raises(ValueError, match="unknown render_mode 'human': choose from rgb_array"):
+        SingleEnv(world.env, render_mode="human")

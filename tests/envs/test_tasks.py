@@ -10,22 +10,7 @@ import pytest
 
 from envs import experts, robots
 from envs.tasks import View, route
-
-
-def world(scene, key: int = 0) -> mujoco.MjData:
-    """MuJoCo data of a random layout, robot at home; moves the model's fixed bodies."""
-    data = mujoco.MjData(scene.model)
-    data.qpos[: scene.num_joints] = scene.robot.home
-    for name, (*position, yaw) in scene.task.place(jax.random.key(key)).items():
-        body = scene.model.body(name)
-        turn = np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)
-        if body.jntnum[0]:
-            start = scene.model.jnt_qposadr[body.jntadr[0]]
-            data.qpos[start : start + 7] = *position, *turn
-        else:
-            scene.model.body_pos[body.id], scene.model.body_quat[body.id] = position, turn
-    mujoco.mj_forward(scene.model, data)
-    return data
+from tests.envs.expert_in_c import world
 
 
 def succeeds(scene, data) -> bool:

@@ -1,0 +1,24 @@
+"""Gymnasium's ids of every task and robot: `lorasp_jax/<task>-<robot>-v0`.
+
+import gymnasium, envs
+worlds = gymnasium.make_vec("lorasp_jax/press-piper-v0", num_envs=4, reward="dense")
+"""
+
+import itertools
+
+from envs.making import names
+
+
+def register() -> None:
+    """Registers them where Gymnasium is installed; what they stand for is imported when made."""
+    try:
+        import gymnasium
+    except ImportError:
+        return
+    for task, robot in itertools.product(names("task"), names("robot")):
+        gymnasium.register(
+            f"lorasp_jax/{task}-{robot}-v0",
+            entry_point="envs.interop.gymnasium:make",
+            vector_entry_point="envs.interop.gymnasium:make_vec",
+            kwargs={"task": task, "robot": robot},
+        )

@@ -1,0 +1,69 @@
+"""What an expert does, in MuJoCo's own engine: no scene has to be compiled for it."""
+
+import functools
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from envs import actions, experts
+from envs.tasks import View
+
+
+def world(scene, key: int = 0) -> mujoco.MjData:
+    """MuJoCo data of a random layout, robot at home; moves the model's fixed bodies."""
+    return _placed(scene, scene.task.place(jax.random.key(key)))
+
+
+def episode(scene, key: int = 0) -> Iterator[mujoco.MjData]:
+    """The same world, at first and after each control step of the expert's, until success."""
+    layout = scene.task.place(jax.random.key(key))
+    data = _placed(scene, layout)
+    command = jnp.append(jnp.asarray(scene.robot.home, jnp.float32), 0.04)  # m, gripper
+    data.qpos[scene.num_joints : scene.num_joints + 2] = 0.02
+    mujoco.mj_forward(scene.model, data)
+    yield data
+    knots, times = _plan(scene, layout, command, jax.random.key(key))
+    commands, held = [command, command], 0
+    for step in range(1, scene.expert_steps + 1):
+        commands.append(_target(knots, times, step * scene.control_dt))
+        for control in _controls(jnp.stack(commands[-3:]), scene.control_dt):
+            data.ctrl[:] = control
+            mujoco.mj_step(scene.model, data)
+        mujoco.mj_forward(scene.model, data)
+        yield data
+        held = held + 1 if scene.task.check(View(scene.model, data))[0] else 0
+        if held >= scene.task.hold_steps:
+            return
+    raise AssertionError("the expert did not succeed")
+
+
+def _placed(scene, layout) -> mujoco.MjData:
+    data = mujoco.MjData(scene.model)
+    data.qpos[: scene.num_joints] = scene.robot.home
+    for name, (*position, yaw) in layout.items():
+        body = scene.model.body(name)
+        turn = np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)
+        if body.jntnum[0]:
+            start = scene.model.jnt_qposadr[body.jntadr[0]]
+            data.qpos[start : start + 7] = *position, *turn
+        else:
+            scene.model.body_pos[body.id], scene.model.body_quat[body.id] = position, turn
+    mujoco.mj_forward(scene.model, data)
+    return data
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _plan(scene, layout, command, key):
+    plan = experts._plan(scene, {"layout": layout, "command": command, "draw": None}, key)
+    return plan.knots, plan.times
+
+
+_target = jax.jit(experts._interpolate)
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _controls(commands, control_dt):
+    return actions.interpolate(commands, control_dt, 0.0)

@@ -1,0 +1,194 @@
+"""Dense rewards: laws of the potential, which hold for every task, and how they become a reward."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import envs
+from envs import experts, rewards
+from envs.rewards import potential
+from envs.state import State
+from envs.tasks import View
+from tests.envs import expert_in_c
+
+EPISODES = 4
+
+
+def stages(scene, data, size=1.0) -> np.ndarray:
+    found = scene.task.stages(View(scene.model, data, size))
+    return np.array([*map(float, found.values())])
+
+
+def potentials(scene, key) -> np.ndarray:
+    """[T + 1] along an expert's episode."""
+    every = [stages(scene, data) for data in expert_in_c.episode(scene, key)]
+    return np.asarray(potential(dict(enumerate(np.stack(every).T))))
+
+
+@pytest.mark.parametrize(
+    ("shares", "expected"),
+    [
+        ([0.0, 0.0, 0.0], 0.0),
+        ([0.6, 0.0, 0.0], 0.2),
+        ([0.6, 0.9, 0.9], 0.2),  # later stages have not begun
+        ([1.0, 0.5, 0.0], 0.5),
+        ([0.1, 1.0, 0.5], 2.5 / 3),  # a passed stage stands for those before it
+        ([0.0, 0.0, 1.0], 1.0),
+        ([1.0, 1.0, 1.0], 1.0),
+    ],
+)
+def test_potential(shares, expected):
+    found = potential({str(i): jnp.array([share]) for i, share in enumerate(shares)})
+    np.testing.assert_allclose(found, [expected], rtol=1e-6)
+
+
+def test_every_stage_has_its_name(scene):
+    names = [*scene.task.stages(View(scene.model, expert_in_c.world(scene)))]
+    assert len(names) >= 2
+    assert all(name.isidentifier() for name in names)
+
+
+@pytest.mark.parametrize("robot_name", ["piper", pytest.param("panda", marks=pytest.mark.slow)])
+def test_potential_rises_along_expert_episodes(scene):
+    """From near 0 to 1; a slip of the hand may cost one stage, and not in most episodes."""
+    count = len(stages(scene, expert_in_c.world(scene)))
+    falls = []
+    for key in range(EPISODES):
+        found = potentials(scene, key)
+        assert found[0] < 0.25
+        assert found[-1] == 1
+        assert len(np.unique(found.round(3))) > 10  # no long plateaus
+        falls.append(-np.minimum(np.diff(found), 0).sum())
+    assert max(falls) < 1 / count
+    assert np.median(falls) < 0.03
+
+
+def test_stages_are_bounded_wherever_things_are(scene):
+    rng = np.random.default_rng(0)
+    data = expert_in_c.world(scene)
+    for _ in range(50):
+        data.qpos[:] += rng.normal(0, 0.3, scene.model.nq)
+        mujoco.mj_kinematics(scene.model, data)
+        found = stages(scene, data, rng.uniform(0.8, 1.25))
+        assert np.all((found >= 0) & (found <= 1))
+
+
+def world(shares, *, success=False, done=False, before=None, discount=0.9) -> State:
+    """One world at these stages, that of `before` a step later."""
+    info = {"success": jnp.array(success)}
+    state = State(None, jnp.float32(0), jnp.array(done or success), {"depth": 1.0}, info)
+    named = {f"s{i}": jnp.float32(share) for i, share in enumerate(shares)}
+    if before is None:
+        return rewards.started(state, named)
+    return rewards.earned(before, state, named, discount)
+
+
+PATH = [[0.2, 0.0], [0.7, 0.0], [1.0, 0.4], [0.5, 0.3], [1.0, 0.9]]
+
+
+def episode(*, discount, **last):
+    """The states of a walk through PATH, the last one with these facts."""
+    states = [world(PATH[0])]
+    for shares in PATH[1:-1]:
+        states.append(world(shares, before=states[-1], discount=discount))
+    return [*states, world(PATH[-1], before=states[-1], discount=discount, **last)]
+
+
+def discounted(states, discount) -> float:
+    return sum(discount**i * float(state.reward) for i, state in enumerate(states[1:]))
+
+
+@pytest.mark.parametrize("discount", [0.9, 1.0])
+def test_rewards_telescope(discount):
+    """A learner's return differs from the sparse one by what no action changes."""
+    start = 0.1  # potential
+    length = len(PATH) - 1
+    won = episode(discount=discount, success=True)
+    sparse = discount ** (length - 1)
+    assert discounted(won, discount) == pytest.approx(sparse - start)
+    # Time that is up leaves a state that the learner bootstraps from: its potential stays.
+    late = episode(discount=discount, done=True)
+    assert discounted(late, discount) == pytest.approx(discount**length * 0.95 - start)
+
+
+def test_closed_loops_earn_nothing():
+    states = [world(PATH[0])]
+    for shares in [*PATH[1:], PATH[0]]:
+        states.append(world(shares, before=states[-1], discount=1.0))
+    assert discounted(states, 1.0) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_metrics_are_the_terms():
+    before, after = episode(discount=0.9, success=True)[-2:]
+    found = {name: float(value) for name, value in after.metrics.items()}
+    shaping = -float(before.metrics["potential"])
+    assert found == pytest.approx(
+        {"depth": 1, "stage_s0": 1, "stage_s1": 0.9, "potential": 0.95}
+        | {"reward_success": 1, "reward_shaping": shaping}
+    )
+    assert float(after.reward) == pytest.approx(1 + shaping)
+
+
+@pytest.mark.parametrize("success", [True, False])
+def test_done_worlds_earn_nothing(success):
+    end = world([1.0, 1.0], success=success, done=True)
+    again = world([1.0, 1.0], success=success, done=True, before=end)
+    assert float(again.reward) == 0
+    assert float(again.metrics["reward_shaping"]) == float(again.metrics["reward_success"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"reward": "shaped"}, "unknown reward 'shaped': choose from sparse, dense"),
+        ({"reward": "dense", "discount": 0.0}, "discount must lie above 0 and at most at 1"),
+        ({"reward": "dense", "discount": float("nan")}, "discount must lie above 0"),
+    ],
+)
+def test_bad_arguments(options, message):
+    with pytest.raises(ValueError, match=message):
+        envs.make("press", **options)
+
+
+@pytest.mark.slow
+def test_an_environment_with_dense_rewards(task_name):
+    """Randomised worlds move as with the sparse reward, and what they earn telescopes."""
+    options = {"num_envs": 4, "image_size": 16}
+    sparse = envs.make(task_name, **options)
+    dense = envs.make(task_name, reward="dense", discount=0.95, **options)
+    ranges = envs.Randomization.typical()
+    one, two = (env.reset(jax.random.key(0), ranges) for env in (sparse, dense))
+    start = np.asarray(two.metrics["potential"])
+    plan = experts.plan(dense, two, jax.random.key(1))
+    act = jax.jit(lambda state: experts.act(dense, plan, state))
+    returns = np.zeros(4)
+    for step in range(dense.expert_steps):
+        action = act(two)
+        before, one, two = two, sparse.step(one, action), dense.step(two, action)
+        returns += 0.95**step * np.asarray(two.reward)
+        assert np.all(np.isfinite(two.reward))
+        ended = np.asarray(before.done)
+        assert not np.any(np.asarray(two.reward)[ended])
+        jax.tree.map(np.testing.assert_array_equal, one.data, two.data)
+        if np.all(two.done):
+            break
+    won = np.asarray(two.info["success"])
+    assert won.any()
+    sparse_return = 0.95 ** (np.asarray(two.info["steps"]) - 1.0)
+    np.testing.assert_allclose(returns[won], (sparse_return - start)[won], atol=1e-5)
+    again = dense.reset_done(two, jax.random.key(2), ranges)
+    assert not np.any(np.asarray(again.reward)[np.asarray(two.done)])
+
+
+@pytest.mark.slow
+def test_broken_worlds_stand_still():
+    env = envs.make("press", num_envs=2, reward="dense", discount=0.9)
+    start = env.reset(jax.random.key(0))
+    after = env.step(start, start.info["command"].at[1].set(jnp.nan))
+    assert after.done.tolist() == [False, True]
+    np.testing.assert_allclose(after.reward[1], -0.1 * start.metrics["potential"][1], rtol=1e-5)
+    again = env.step(after, start.info["command"])
+    assert again.reward[1] == 0
+    assert env.reset_done(again, jax.random.key(1)).reward[1] == 0
