@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from tests import xla
+
 ROOT = Path(__file__).parents[1]
 NAMES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 
@@ -21,8 +23,7 @@ def free_address() -> str:
 
 def environments(count: int, devices: int = 1) -> Iterator[dict[str, str]]:
     """Of each of `count` processes that are to find one another, with so many CPU devices each."""
-    flags = f"--xla_force_host_platform_device_count={devices}"
-    everyone = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
+    everyone = {**os.environ, "XLA_FLAGS": xla.flags(devices), "JAX_PLATFORMS": "cpu"}
     address = free_address()
     for number in range(count):
         own = zip(NAMES, (address, str(count), str(number)), strict=True) if count > 1 else ()

@@ -15,7 +15,6 @@ from lorasp_jax.models.layers import Linears
 from lorasp_jax.models.sampling import Sampler
 from lorasp_jax.peft import LoRASP, lora_sp
 from lorasp_jax.quantization import quantize
-from tests import quick
 from tests.cases import mostly_slow
 from tests.models.drawn import drawn, observation
 from tests.nets import METHODS, trained
@@ -56,7 +55,7 @@ def ready(model):
 def test_computes_the_same(name):
     model, x = adapted(METHODS[name], "float32"), jnp.sin(jnp.arange(96.0)).reshape(2, 6, 8)
     mask = jnp.arange(12).reshape(2, 6) % 5 != 0
-    run = quick.jit(lambda model, x: model(x, mask))
+    run = jax.jit(lambda model, x: model(x, mask))
     expected, aux = run(model, x)
     prepared = ready(model)
     assert set(prepared.ready.get_value()) == {("first", "second"), ("third",)}
@@ -71,7 +70,7 @@ def test_a_stack_computes_the_same(name):
     """On rows fewer and more than inputs, for which W and U are joined."""
     model = adapted(METHODS[name], "float32")
     stack = jax.tree.map(lambda leaf: jnp.stack([leaf, 0.5 * leaf]), model)
-    run = quick.jit(jax.vmap(lambda model, x: model(x), in_axes=(0, None)))
+    run = jax.jit(jax.vmap(lambda model, x: model(x), in_axes=(0, None)))
     prepared = inference.prepared_stack(stack)
     for rows in (4, 12):
         x = jnp.sin(jnp.arange(8.0 * rows)).reshape(1, rows, 8)
@@ -104,7 +103,7 @@ def test_a_kernel_gets_the_routers_numbers_joined_once(monkeypatch):
     prepared = ready(model)
     params = prepared.ready.get_value()["first", "second"].params
     assert [leaf.shape for leaf in jax.tree.leaves(params)] == [(2, 16 * 32 + 16 + 32)]
-    run = quick.jit(lambda model, x: model(x))
+    run = jax.jit(lambda model, x: model(x))
     close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-4)
     jax.tree.map(close, run(prepared, x), run(model, x))
 
@@ -186,12 +185,12 @@ def test_sampling_follows_the_velocity(backbone):
     model = trained((".*_proj", METHODS["lora"]), seed=1, net=drawn(config))
     obs = observation(config, 2)
     noise = jax.random.normal(jax.random.key(0), (2, config.chunk, config.action_dim))
-    velocity = quick.jit(lambda model, x, t: model.velocity(obs, x, jnp.full(2, t)))
+    velocity = jax.jit(lambda model, x, t: model.velocity(obs, x, jnp.full(2, t)))
     expected = noise - velocity(model, noise, 1.0) / 2
     expected -= velocity(model, expected, 0.5) / 2
     traced = []
 
-    @quick.jit
+    @jax.jit
     def sample(sampler):
         traced.append(type(sampler))
         return sampler.sample_actions(jax.random.key(0), obs, num_steps=2, noise=noise)

@@ -10,7 +10,6 @@ from lorasp_jax.models import tokenizer
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.prompt_table import PromptTable
 from lorasp_jax.training.setup import processor
-from tests import quick
 from tests.runs import random_episodes
 
 
@@ -76,11 +75,11 @@ def test_a_streamed_window_trains_as_one_on_the_device():
     steps, table = flatten(parts), processor(parts, Pi0Config.dummy(), prompts)
     key = jax.random.key(0)
     sizes = {"batch_size": 6, "chunk": 4, "state_noise": 0.1}
-    batch = quick.jit(lambda key: sample_batch(key, steps, table, **sizes))(key)
+    batch = jax.jit(lambda key: sample_batch(key, steps, table, **sizes))(key)
     start_key, noise_key = jax.random.split(key)
     start = np.asarray(jax.random.randint(start_key, (6,), 0, 42))
     windows = gather(jax.tree.map(np.asarray, steps), start, 4)
-    found = quick.jit(lambda key, w: encode(key, w, table, state_noise=0.1))(noise_key, windows)
+    found = jax.jit(lambda key, w: encode(key, w, table, state_noise=0.1))(noise_key, windows)
     jax.tree.map(np.testing.assert_array_equal, found, batch)
 
 

@@ -1,5 +1,6 @@
 """Processes that share a compilation cache read whole programs only."""
 
+import os
 import subprocess
 import sys
 import threading
@@ -58,7 +59,7 @@ def test_programs_are_kept_and_read(tmp_path):
         "assert type(theirs._cache) is compilation_cache.WholeFiles\n"
         "print('/jax/compilation_cache/cache_hits' in hits)"
     )
-    env = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path), "JAX_PLATFORMS": "cpu"}
+    env = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path), "JAX_PLATFORMS": "cpu"}
     said = [
         subprocess.run([sys.executable, "-c", code], env=env, check=True, capture_output=True)
         for _ in range(2)

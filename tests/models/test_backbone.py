@@ -12,7 +12,6 @@ from flax import nnx
 import lorasp_jax
 from lorasp_jax.models import pi0, smolvla
 from lorasp_jax.peft import LoRA, LoRASP
-from tests import quick
 from tests.models.drawn import drawn, observation
 
 BATCH, RANK, STEPS = 2, 4, 2
@@ -52,7 +51,7 @@ def actions(config):
 @pytest.fixture(scope="module")
 def velocity(model):
     """Compiled once: (obs, x_t) -> v_t at time 0.4."""
-    return quick.jit(lambda obs, x_t: model.velocity(obs, x_t, jnp.full(BATCH, 0.4)))
+    return jax.jit(lambda obs, x_t: model.velocity(obs, x_t, jnp.full(BATCH, 0.4)))
 
 
 def test_missing_camera_and_wrong_size_raise(model, obs):
@@ -103,7 +102,7 @@ def trained(adapted, obs, actions, mask):
         per_element, aux = model.loss(jax.random.key(2), obs, actions, action_mask=mask)
         return jnp.mean(per_element, where=mask), (per_element, aux)
 
-    (_, (per_element, aux)), grads = quick.jit(jax.value_and_grad(loss, has_aux=True))(adapters)
+    (_, (per_element, aux)), grads = jax.jit(jax.value_and_grad(loss, has_aux=True))(adapters)
     return per_element, aux, nnx.to_pure_dict(grads)
 
 
@@ -119,9 +118,7 @@ def test_every_dense_layer_is_reached(trained, backbone, actions):
 
 
 def test_adapters_change_nothing_at_the_start(trained, model, obs, actions, mask):
-    plain = quick.jit(
-        lambda model: model.loss(jax.random.key(2), obs, actions, action_mask=mask)[0]
-    )
+    plain = jax.jit(lambda model: model.loss(jax.random.key(2), obs, actions, action_mask=mask)[0])
     np.testing.assert_allclose(trained[0], plain(model), rtol=1e-4, atol=1e-5)
 
 
@@ -162,7 +159,7 @@ def test_unused_slots_do_not_matter(adapted, config, obs, actions):
     """x_t is held at zero there, in sampling as in training."""
     slots = np.arange(config.action_dim) < 5
 
-    @quick.jit
+    @jax.jit
     def sample(noise: jax.Array):
         fixed = {"noise": noise, "slots": slots, "num_steps": STEPS}
         return adapted.sample_actions(jax.random.key(0), obs, **fixed, return_aux=True)
@@ -199,7 +196,7 @@ def test_remat_changes_nothing(model, loss_of):
     parameters = nnx.split(model)[1]
     close = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5)
     plain, *others = (
-        quick.jit(jax.value_and_grad(loss_of(remat=remat)))(parameters)
+        jax.jit(jax.value_and_grad(loss_of(remat=remat)))(parameters)
         for remat in ("none", "products", "full")
     )
     for remat in others:
@@ -219,9 +216,9 @@ def test_remat_stores_less(model, loss_of):
 
 def test_unroll_and_bfloat16_hardly_change_the_loss(model, loss_of):
     parameters = nnx.split(model)[1]
-    plain = quick.jit(loss_of())(parameters)
-    np.testing.assert_allclose(quick.jit(loss_of(unroll=True))(parameters), plain, rtol=1e-5)
-    half = quick.jit(loss_of(dtype="bfloat16"))(parameters)
+    plain = jax.jit(loss_of())(parameters)
+    np.testing.assert_allclose(jax.jit(loss_of(unroll=True))(parameters), plain, rtol=1e-5)
+    half = jax.jit(loss_of(dtype="bfloat16"))(parameters)
     assert half != plain
     np.testing.assert_allclose(half, plain, rtol=0.02)
 

@@ -10,7 +10,6 @@ from lorasp_jax import adaptation
 from lorasp_jax.dense import Dense
 from lorasp_jax.models.depth import scan_depth, stack, stored
 from lorasp_jax.peft import LoRASP
-from tests import quick
 from tests.nets import METHODS, trained
 
 DEPTH, TOKENS, WIDTH, INNER = 3, 5, 8, 12
@@ -56,9 +55,7 @@ def close(found, expected):
 def test_straight_line_code_has_the_loops_gradients(split, remat):
     graphdef, adapters, frozen = split
     expected, found = (
-        quick.jit(jax.value_and_grad(loss_of(graphdef, frozen, remat=remat, unroll=unroll)))(
-            adapters
-        )
+        jax.jit(jax.value_and_grad(loss_of(graphdef, frozen, remat=remat, unroll=unroll)))(adapters)
         for unroll in (False, True)
     )
     jax.tree.map(close, found, expected)

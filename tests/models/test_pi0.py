@@ -10,7 +10,6 @@ from flax import nnx
 
 from lorasp_jax.models.layers import block_mask
 from lorasp_jax.models.pi0 import Pi0Config
-from tests import quick
 from tests.models.drawn import drawn, observation
 
 CONFIG = Pi0Config.dummy()
@@ -61,7 +60,7 @@ def test_config_says_what_is_wrong():
 
 def test_every_action_sees_every_action(model, obs):
     time = jnp.full(BATCH, 0.4)
-    velocity = quick.jit(lambda x_t: model.velocity(obs, x_t, time))
+    velocity = jax.jit(lambda x_t: model.velocity(obs, x_t, time))
     x_t = actions()
     last = np.abs(velocity(x_t.at[:, -1].add(1.0)) - velocity(x_t))
     assert (last.max(axis=-1) > 1e-6).all()
@@ -81,5 +80,5 @@ def test_state_does_not_see_actions(model, obs):
         position = jnp.broadcast_to(jnp.arange(tokens.shape[1]), tokens.shape[:2])
         return model.action(tokens, position, mask, prefix.cache, token_mask=valid)[0][:, 0]
 
-    row = quick.jit(state_row)
+    row = jax.jit(state_row)
     np.testing.assert_array_equal(row(actions(1)), row(actions(2)))

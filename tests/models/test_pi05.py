@@ -13,7 +13,6 @@ import lorasp_jax
 from lorasp_jax.models import checkpoint, layouts, presets, published
 from lorasp_jax.models.pi0 import Pi0Config, weights
 from lorasp_jax.peft import LoRA
-from tests import quick
 from tests.models.drawn import drawn, observation
 
 CONFIG = dataclasses.replace(Pi0Config.dummy(), pi05=True)
@@ -110,7 +109,7 @@ def test_dense_of_a_norm_is_transposed_for_lerobot(model):
 def test_cached_path_is_one_pass_over_the_whole_sequence(model, obs, actions):
     """Against both experts in joint attention, layer by layer, in fp64 (facts of openpi's code)."""
     time = jnp.array([0.3, 0.9])
-    found, (tokens, valid) = quick.jit(
+    found, (tokens, valid) = jax.jit(
         lambda obs, x_t: (model.velocity(obs, x_t, time), model.embed_prefix(obs)[:2])
     )(obs, actions)
     p = {n: np.asarray(a, np.float64) for n, a in checkpoint.named_arrays(model).items()}
@@ -121,7 +120,7 @@ def test_cached_path_is_one_pass_over_the_whole_sequence(model, obs, actions):
     drawn_actions = jax.eval_shape(lambda: model.sample_actions(jax.random.key(0), obs))
     assert drawn_actions.shape == actions.shape
     blind = dataclasses.replace(obs, state=obs.state + 1)
-    np.testing.assert_array_equal(quick.jit(model.velocity)(blind, actions, time), found)
+    np.testing.assert_array_equal(jax.jit(model.velocity)(blind, actions, time), found)
 
 
 def joint_pass(p, prefix, valid, x_t, time):
@@ -210,7 +209,7 @@ def test_a_step_trains_adapters_on_every_dense_layer(model, obs, actions):
     adapted = lorasp_jax.adapt(model, rules, rngs=nnx.Rngs(1))
     graphdef, adapters, frozen = lorasp_jax.adaptation.split(adapted)
 
-    @quick.jit
+    @jax.jit
     def step(adapters):
         def loss(adapters):
             found = nnx.merge(graphdef, adapters, frozen).loss(jax.random.key(2), obs, actions)

@@ -12,7 +12,6 @@ from lorasp_jax.models import published
 from lorasp_jax.models.layers import block_mask, positions
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.pi0 import ExpertConfig, Pi0Config, VisionConfig
-from tests import quick
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "pi0_tiny"
 EXPERT = ExpertConfig(width=64, depth=4, mlp=128, heads=8, kv_heads=1, head_dim=16)
@@ -78,12 +77,12 @@ def loss_and_grad(model, obs, inputs):
         )
         return per_element.mean(), per_element.mean(axis=-1)
 
-    compiled = quick.jit(jax.value_and_grad(mean_loss, has_aux=True))
+    compiled = jax.jit(jax.value_and_grad(mean_loss, has_aux=True))
     return lambda noise, time: compiled(parameters, jnp.asarray(noise), jnp.asarray(time))
 
 
 def test_prefix(model, obs, expected):
-    both = quick.jit(lambda model, obs: (model.embed_prefix(obs)[:2], model.run_prefix(obs)[0]))
+    both = jax.jit(lambda model, obs: (model.embed_prefix(obs)[:2], model.run_prefix(obs)[0]))
     (tokens, valid), prefix = both(model, obs)
     assert np.array_equal(valid, expected["prefix_mask"])
     close(tokens, expected["prefix_tokens"], 1e-5 * np.abs(expected["prefix_tokens"]).max())
@@ -93,7 +92,7 @@ def test_prefix(model, obs, expected):
 
 def test_suffix_and_velocity(model, obs, inputs, expected):
     x_t, time = jnp.asarray(expected["x_t"]), jnp.asarray(inputs["time"])
-    tokens, v_t = quick.jit(
+    tokens, v_t = jax.jit(
         lambda model: (model.embed_suffix(obs, x_t, time)[0], model.velocity(obs, x_t, time))
     )(model)
     close(tokens, expected["suffix_tokens"], 5e-5)

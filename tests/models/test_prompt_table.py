@@ -12,7 +12,6 @@ import pytest
 from lorasp_jax.models import prompts, tokenizer
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.prompt_table import PromptTable
-from tests import quick
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "tokenizers"
 SMOLVLM = GOLDEN / "smolvlm_like_tokenizer.json"
@@ -55,7 +54,7 @@ def test_prompts_with_a_state_are_the_tokenizers(words, numbers):
     state[256], state[257] = -3, 3
     row = rng.integers(0, 2, 300)
     texts = [prompts.pi05(TEXTS[i], own) for i, own in zip(row, state, strict=True)]
-    found = quick.jit(PromptTable.encode)(table, jnp.asarray(row), jnp.asarray(state))
+    found = jax.jit(PromptTable.encode)(table, jnp.asarray(row), jnp.asarray(state))
     for mine, theirs in zip(found, words.encode(texts, 100, complete=True), strict=True):
         np.testing.assert_array_equal(mine, theirs)
 

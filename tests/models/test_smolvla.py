@@ -13,7 +13,6 @@ from lorasp_jax.models.layers import rope, rope_table
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.siglip import patches
 from lorasp_jax.models.smolvla import SmolVLAConfig, weights
-from tests import quick
 from tests.models.drawn import drawn
 
 CONFIG = SmolVLAConfig.dummy()
@@ -127,7 +126,7 @@ def test_actions_see_earlier_ones_only(model):
         token_mask=jnp.ones((BATCH, CONFIG.max_tokens), bool),
         state=normal(2, BATCH, CONFIG.action_dim),
     )
-    velocity = quick.jit(lambda x_t: model.velocity(obs, x_t, jnp.full(BATCH, 0.4)))
+    velocity = jax.jit(lambda x_t: model.velocity(obs, x_t, jnp.full(BATCH, 0.4)))
     x_t = normal(3, BATCH, CONFIG.chunk, CONFIG.action_dim)
     change = np.abs(velocity(x_t.at[:, 1].add(1.0)) - velocity(x_t)).max(axis=-1)
     assert not change[:, 0].any()

@@ -22,7 +22,6 @@ from lorasp_jax.models.layers import block_mask, positions
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.smolvla import SmolVLAConfig, weights
 from lorasp_jax.peft import LoRA
-from tests import quick
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "smolvla_tiny"
 CONFIG = SmolVLAConfig(
@@ -80,7 +79,7 @@ def close(found, wanted, atol):
 
 
 def test_prefix(model, obs, expected):
-    both = quick.jit(lambda model: (model.look(obs)[0], model.embed_prefix(obs)[:2]))
+    both = jax.jit(lambda model: (model.look(obs)[0], model.embed_prefix(obs)[:2]))
     seen, (tokens, valid) = both(model)
     wanted = [expected[f"image_tokens_unscaled/{name}"] for name in CONFIG.cameras]
     close(seen, np.concatenate(wanted, axis=1), 1e-5)
@@ -90,7 +89,7 @@ def test_prefix(model, obs, expected):
 
 def test_suffix_and_velocity(model, obs, inputs, expected):
     """At the recorded time, and at the first and the last step of the sampler."""
-    compiled = quick.jit(
+    compiled = jax.jit(
         lambda x_t, t: (model.embed_suffix(obs, x_t, t)[0], model.velocity(obs, x_t, t))
     )
     tokens, v_t = compiled(jnp.asarray(expected["x_t"]), inputs["time"])
@@ -126,7 +125,7 @@ def test_loss_and_gradients(model, obs, inputs, expected):
         )
         return per_element.mean(), per_element
 
-    (mean, loss), grads = quick.jit(jax.value_and_grad(mean_loss, has_aux=True))(parameters)
+    (mean, loss), grads = jax.jit(jax.value_and_grad(mean_loss, has_aux=True))(parameters)
     close(loss, expected["loss"], 3e-4)
     close(mean, expected["mean_loss"], 3e-4)
     grads = checkpoint.base_arrays(nnx.merge(graphdef, grads))

@@ -28,7 +28,6 @@ from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.overrides import override
 from lorasp_jax.training.run import Run
-from tests import quick
 from tests.data.lerobots import golden
 from tests.runs import CONFIG, leaves, random_episodes
 
@@ -136,7 +135,7 @@ def test_a_pi05_of_the_command_line_trains_and_acts(config, tmp_path, monkeypatc
     }
     tokens = run.policy.processor.encode(raw, jnp.zeros(3, int)).tokens
     assert (tokens[0] != tokens[1]).any()
-    sample = quick.jit(Policy.sample)
+    sample = jax.jit(Policy.sample)
     actions = sample(run.policy, jax.random.key(0), raw, jnp.zeros(3, int))
     assert jnp.isfinite(actions).all()
     export.write(run)

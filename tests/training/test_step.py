@@ -14,7 +14,6 @@ from lorasp_jax.peft import Aux
 from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.step import active_ranks, gradients, init_state, train_step
-from tests import quick
 from tests.runs import CONFIG, Terminate, leaves, make_run
 
 
@@ -61,7 +60,7 @@ def test_a_batch_in_parts_is_the_whole_batch(small):
     counts = ragged.action_mask.sum((1, 2)).reshape(-1, 4).sum(0)
     assert counts.min() < counts.max()
     even = dataclasses.replace(ragged, action_mask=jnp.ones_like(ragged.action_mask))
-    gradient, key = quick.jit(gradients, static_argnums=(2, 6)), jax.random.key(1)
+    gradient, key = jax.jit(gradients, static_argnums=(2, 6)), jax.random.key(1)
     for batch, auxiliary in ((ragged, 0.0), (even, 1e-2)):
         weights = {"spectral": auxiliary, "balance": 0.0, "z": auxiliary}
         given = adapters, frozen, graphdef, batch, key, weights
@@ -80,7 +79,7 @@ def test_the_average_follows_and_is_what_is_used(small):
     state = init_state(adapters, optimizer, ema=True)
     weights = dict.fromkeys(("spectral", "balance", "z"), optax.constant_schedule(0.0))
     options = {"graphdef": graphdef, "optimizer": optimizer, "weights": weights}
-    step = quick.jit(lambda *given: train_step(*given, **options, ema=0.75)[0])
+    step = jax.jit(lambda *given: train_step(*given, **options, ema=0.75)[0])
     after = step(state, frozen, batch, jax.random.key(0))
     moved = leaves(after.adapters)
     for name, old in leaves(adapters).items():

@@ -6,6 +6,8 @@ import os
 import signal
 from pathlib import Path
 
+from tests import xla
+
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser()
@@ -19,7 +21,7 @@ def arguments() -> argparse.Namespace:
 
 def main(args: argparse.Namespace) -> None:
     os.environ["JAX_PLATFORMS"] = "cpu"
-    os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={args.devices}"
+    os.environ["XLA_FLAGS"] = xla.flags(args.devices)
     import jax
 
     from envs import compilation_cache
