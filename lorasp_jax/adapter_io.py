@@ -1,8 +1,9 @@
 """Adapters on disk: a folder with adapter.safetensors (what trains) and adapter.json (what it is).
 
-The JSON holds the method of every adapted path, the identity of the base as the caller states it,
-free metadata, and the checksum that binds it to its tensors. Tensor names are "/"-joined paths; a
-stacked layer's tensors keep their leading layer axes.
+The JSON holds the method of every adapted path, the identity of the base (fingerprints of its
+weights, and its name if the caller gives one), free metadata, the checksum that binds it to its
+tensors, and its own digest. Tensor names are "/"-joined paths; a stacked layer's tensors keep their
+leading layer axes.
 """
 
 import dataclasses
@@ -20,12 +21,13 @@ import numpy as np
 import safetensors.numpy
 from flax import nnx
 
-from lorasp_jax import adaptation, kinds, peft
+from lorasp_jax import adaptation, digest, kinds, peft
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.peft import Method
 
 TENSORS, DESCRIPTION = "adapter.safetensors", "adapter.json"
-FORMAT, VERSION = "lorasp_jax adapter", 1
+FORMAT, VERSION = "lorasp_jax adapter", 2
+FIELDS = {"base": str, "weights": dict, "sha256": str, "methods": dict, "metadata": dict}
 Settings = dict[str, Any]
 
 
@@ -43,7 +45,7 @@ def save_adapters(
     Args:
       folder: made if absent.
       model: an adapted model.
-      base: identity of the frozen base, for instance a hash of its weights.
+      base: name of the frozen base, if it has one; its weights are known by themselves.
       metadata: anything JSON can hold.
 
     Raises:
@@ -59,11 +61,14 @@ def save_adapters(
         "format": FORMAT,
         "version": VERSION,
         "base": base,
+        "weights": digest.fingerprints(_frozen_weights(model)),
         "sha256": hashlib.sha256(data).hexdigest(),
         "methods": {path: _settings(m) for path, m in adaptation.methods(model).items()},
         "metadata": dict(metadata or {}),
     }
-    text = json.dumps(description, indent=2)  # before anything is written: it may raise
+    text = json.dumps(
+        digest.sealed(description), indent=2
+    )  # before anything is written: it may raise
     folder = pathlib.Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / TENSORS, data)
@@ -71,7 +76,11 @@ def save_adapters(
 
 
 def load_adapters(
-    folder: str | os.PathLike, model: adaptation.Model, *, base: str | None = None
+    folder: str | os.PathLike,
+    model: adaptation.Model,
+    *,
+    base: str | None = None,
+    any_base: bool = False,
 ) -> adaptation.Model:
     """The model with the adapters of a folder.
 
@@ -80,7 +89,10 @@ def load_adapters(
     Args:
       folder: written by `save_adapters`.
       model: left untouched.
-      base: if given, must equal the base that the adapters were saved for.
+      base: if given, must equal the name of the base that the adapters were saved for.
+      any_base: take the adapters onto other weights, too. Otherwise each array of the base must be
+        the one they were trained on, up to rounding to bf16; what is quantised on one side only, or
+        lacks the part that an adapter holds, is not compared.
 
     Raises:
       ValueError: missing, damaged or foreign files, another base, or adapters that do not fit.
@@ -96,6 +108,8 @@ def load_adapters(
     elif present != wanted:
         differing = sorted(p for p in present | wanted if present.get(p) != wanted.get(p))
         raise ValueError(f"{folder} has other adapters than the model, first at {differing[0]!r}.")
+    if not any_base:
+        _check_weights(model, description["weights"], folder)
     graphdef, adapters, frozen = adaptation.split(model)
     expected = _fitting(adapters, tensors, folder)
     values = [jnp.asarray(tensors[name], leaf.dtype) for name, leaf in expected.items()]
@@ -123,6 +137,30 @@ def _adapted(
         raise ValueError(f"{folder} does not fit the model: {error}") from error
     _fitting(adapters, tensors, folder)
     return adapt()
+
+
+def _frozen_weights(model: nnx.Module) -> dict[str, jax.Array]:
+    """By path, the base's parameters that adapters leave as they are and that have values."""
+    split = [path for path, method in adaptation.methods(model).items() if method.splits_kernel]
+    found = _named(nnx.state(model, nnx.All(nnx.Param, nnx.Not(AdapterParam))))
+    return {
+        name: leaf
+        for name, leaf in found.items()
+        if not any(name.startswith(f"{path}/") for path in split)
+        and isinstance(leaf, (jax.Array, np.ndarray))
+        and not isinstance(leaf, jax.core.Tracer)
+    }
+
+
+def _check_weights(model: nnx.Module, saved: Mapping[str, str], folder: pathlib.Path) -> None:
+    """Raises a ValueError if the base has other weights than those saved."""
+    common = {n: leaf for n, leaf in _frozen_weights(model).items() if n in saved}
+    found = digest.fingerprints(common)
+    if others := [name for name in found if found[name] != saved[name]]:
+        raise ValueError(
+            f"{folder} was trained on another base: of {len(found)} arrays {len(others)} differ, "
+            f"first {others[0]!r}; any_base=True takes the adapters all the same."
+        )
 
 
 def _fitting(
@@ -192,15 +230,29 @@ def _read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         if not (folder / name).is_file():
             raise ValueError(f"{folder} holds no {name}; an adapter is a folder with both files.")
     data = (folder / TENSORS).read_bytes()
-    try:
-        description = json.loads((folder / DESCRIPTION).read_bytes())
-        known = (description["format"], description["version"]) == (FORMAT, VERSION)
-        complete = isinstance(description["methods"], dict) and "base" in description
-        same = description["sha256"] == hashlib.sha256(data).hexdigest()
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{folder / DESCRIPTION} is damaged or no adapter description.") from error
-    if not (known and complete):
-        raise ValueError(f"{folder / DESCRIPTION} is not a {FORMAT} of version {VERSION}.")
-    if not same:
+    description = read_description(folder)
+    if description["sha256"] != hashlib.sha256(data).hexdigest():
         raise ValueError(f"{folder / TENSORS} is damaged or belongs to another {DESCRIPTION}.")
     return description, read_tensors(folder / TENSORS, data)
+
+
+def read_description(folder: pathlib.Path) -> dict[str, Any]:
+    """adapter.json of a folder, as it was written.
+
+    Raises:
+      ValueError: it is missing, damaged, or of another format.
+    """
+    path = folder / DESCRIPTION
+    try:
+        found = json.loads(path.read_bytes())
+        known = (found["format"], found["version"]) == (FORMAT, VERSION)
+        if known:
+            found = digest.unsealed(found)
+            wrong = [name for name, kind in FIELDS.items() if not isinstance(found[name], kind)]
+            if wrong:
+                raise ValueError(f"its {wrong[0]} is {found[wrong[0]]!r}")
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise ValueError(f"{path} is damaged or no adapter description ({error}).") from error
+    if not known:
+        raise ValueError(f"{path} is not a {FORMAT} of version {VERSION}.")
+    return found

@@ -71,7 +71,7 @@ def unmerge(merged: Model, adapted: nnx.Module) -> Model:
     Args:
       merged: from `merge`; left untouched.
       adapted: a model with the adapters, of which nothing else is read: for a saved adapter,
-        `load_adapters(folder, merged)`, unless it holds a part of its kernel.
+        `load_adapters(folder, merged, any_base=True)`, unless it holds a part of its kernel.
 
     Raises:
       ValueError: the merged model has adapters, lacks a layer or has one of another class; or an

@@ -3,6 +3,7 @@
 import json
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
@@ -10,6 +11,7 @@ from flax import nnx
 from lorasp_jax import adaptation, peft
 from lorasp_jax.adapter_io import load_adapters, save_adapters
 from lorasp_jax.dense import Dense
+from lorasp_jax.digest import sealed
 from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP
 
 SP = LoRASP(rank=8, hidden_width=4, energy_target=0.8)
@@ -71,6 +73,34 @@ def test_another_base(saved):
         load_adapters(saved, Net(nnx.Rngs(0)), base="xyz")
 
 
+def with_other(model, change):
+    """The model with another number in the kernel that is first by path."""
+    graphdef, adapters, frozen = adaptation.split(model)
+    first, *others = jax.tree.leaves(frozen)
+    frozen = jax.tree.unflatten(jax.tree.structure(frozen), [change(first), *others])
+    return nnx.merge(graphdef, adapters, frozen)
+
+
+@pytest.mark.parametrize("bare", [True, False])
+def test_other_weights_of_the_same_shapes(saved, bare):
+    model = Net(nnx.Rngs(0)) if bare else adapted((".*", SP))
+    other = with_other(model, lambda kernel: kernel.at[0, 0].add(0.5))
+    with pytest.raises(
+        ValueError, match=r"another base: .* 1 differ, first 'blocks.*any_base=True"
+    ):
+        load_adapters(saved, other)
+    kept = load_adapters(saved, other, any_base=True)
+    assert_same(kept, with_other(load_adapters(saved, model), lambda k: k.at[0, 0].add(0.5)))
+
+
+def test_the_same_weights_in_another_type(saved):
+    half = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), Net(nnx.Rngs(0)))
+    load_adapters(saved, half)
+    mesh = jax.make_mesh((2,), ("data",), devices=jax.devices()[:2])
+    spread = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec(None))
+    load_adapters(saved, jax.device_put(Net(nnx.Rngs(0)), spread))
+
+
 def test_models_that_do_not_fit(saved):
     with pytest.raises(ValueError, match="other adapters than the model, first at 'blocks'"):
         load_adapters(saved, adapted((".*", LoRA(rank=2))))
@@ -88,12 +118,24 @@ def test_sizes_beyond_any_memory(saved, field, size):
     """Are compared with the tensors before anything is made."""
     path = saved / "adapter.json"
     description = json.loads(path.read_text())
+    del description["digest"]
     for settings in description["methods"].values():
         settings[field] = size
-    path.write_text(json.dumps(description))
+    path.write_text(json.dumps(sealed(description)))
     with pytest.raises(ValueError, match=r"does not fit|has shape") as caught:
         load_adapters(saved, Net(nnx.Rngs(0)))
     assert "\n" not in str(caught.value)
+
+
+def resealed(old, new):
+    """A change by somebody who knows of the digest."""
+
+    def damage(data):
+        facts = json.loads(data.replace(old, new))
+        del facts["digest"]
+        return json.dumps(sealed(facts)).encode()
+
+    return damage
 
 
 @pytest.mark.parametrize(
@@ -103,10 +145,12 @@ def test_sizes_beyond_any_memory(saved, field, size):
         ("adapter.safetensors", lambda _: b"", "is damaged or belongs to another"),
         ("adapter.json", lambda data: data[:50], "is damaged or no adapter description"),
         ("adapter.json", lambda _: b'{"r": 8}', "is damaged or no adapter description"),
+        ("adapter.json", lambda data: data.replace(b"0.8", b"0.9"), "digest is another one"),
+        ("adapter.json", lambda data: data.replace(b'"abc"', b'"abd"'), "digest is another one"),
         ("adapter.json", lambda _: b"[1]", "is damaged or no adapter description"),
-        ("adapter.json", lambda d: d.replace(b'"version": 1', b'"version": 9'), "of version 1"),
-        ("adapter.json", lambda d: d.replace(b"lora_sp", b"lora_ps"), "did you mean 'lora_sp'"),
-        ("adapter.json", lambda d: d.replace(b'"rank": 8', b'"rank": "8"'), "does not fit"),
+        ("adapter.json", lambda d: d.replace(b'"version": 2', b'"version": 9'), "of version 2"),
+        ("adapter.json", resealed(b"lora_sp", b"lora_ps"), "did you mean 'lora_sp'"),
+        ("adapter.json", resealed(b'"rank": 8', b'"rank": "8"'), "does not fit"),
     ],
 )
 def test_damaged_files(saved, name, damage, message):

@@ -9,6 +9,7 @@ ROOT = Path(__file__).parent.parent
 ROOMS = [
     "envs",
     "lorasp_jax.kinds",
+    "lorasp_jax.digest",
     "lorasp_jax.kernels",
     "lorasp_jax.energy_schedule",
     "lorasp_jax.routing",

@@ -18,6 +18,7 @@ from lorasp_jax import adaptation
 from lorasp_jax.adapter_io import load_adapters, save_adapters
 from lorasp_jax.data import cache
 from lorasp_jax.data.opening import open_source
+from lorasp_jax.digest import sealed
 from lorasp_jax.hugging_face import load_peft
 from lorasp_jax.peft import LoRASP
 from tests import malformed
@@ -152,8 +153,9 @@ def _rehashed(damage: Damage) -> Damage:
         damage(folder)
         description = json.loads((folder / "adapter.json").read_text())
         data = (folder / "adapter.safetensors").read_bytes()
+        del description["digest"]
         description["sha256"] = hashlib.sha256(data).hexdigest()
-        (folder / "adapter.json").write_text(json.dumps(description))
+        (folder / "adapter.json").write_text(json.dumps(sealed(description)))
 
     return spoil
 
@@ -167,8 +169,9 @@ def _adapter() -> Cases:
     yield from ((f"{name}, rehashed", _rehashed(damage)) for name, damage in whole)
     values: dict[str, list[Any]] = {
         "format": [ABSENT, 3],
-        "version": [ABSENT, 2, "1"],
-        "base": [ABSENT],
+        "version": [ABSENT, 1, "2"],
+        "base": [ABSENT, 3],
+        "weights": [ABSENT, []],
         "sha256": [ABSENT, None],
         "methods": [ABSENT, [], None, {}, {"lin/0": None}, {"lin/0": {}}, {"nowhere": {}}],
         "methods/lin~0": [ABSENT],
@@ -189,6 +192,7 @@ def _escaped(values: dict[str, list[Any]]) -> Cases:
             def spoil(folder: Path, place: str = place, value: Any = value) -> None:
                 path = folder / "adapter.json"
                 content = json.loads(path.read_text())
+                del content["digest"]
                 *above, key = (name.replace("~", "/") for name in place.split("/"))
                 owner = content
                 for name in above:
@@ -196,7 +200,7 @@ def _escaped(values: dict[str, list[Any]]) -> Cases:
                 owner[key] = value
                 if value is ABSENT:
                     del owner[key]
-                path.write_text(json.dumps(content))
+                path.write_text(json.dumps(sealed(content)))
 
             yield f"{place} {'absent' if value is ABSENT else value!r}", spoil
 

@@ -16,8 +16,8 @@ import jax
 import orbax.checkpoint as ocp
 from rich.console import Console
 
+from lorasp_jax.digest import digest
 from lorasp_jax.training import processes
-from lorasp_jax.training.digest import digest
 from lorasp_jax.training.run_folder import DISK_FULL
 from lorasp_jax.training.step import TrainState
 

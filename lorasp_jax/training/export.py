@@ -65,13 +65,16 @@ def _facts(run: Run) -> dict[str, Any]:
     }
 
 
-def load_policy(folder: str | os.PathLike[str], *, base: str = "", words: str = "") -> Policy:
+def load_policy(
+    folder: str | os.PathLike[str], *, base: str = "", words: str = "", any_base: bool = False
+) -> Policy:
     """The policy that a finished run left.
 
     Args:
         folder: of the run.
         base: where the frozen base is now, see `models.load`; by default where it was.
         words: likewise the tokenizer.
+        any_base: whether other weights than those trained on will do, see `load_adapters`.
 
     Returns:
         The policy; `Policy.sample` takes the rows of `processor.prompts.instructions`.
@@ -99,7 +102,7 @@ def load_policy(folder: str | os.PathLike[str], *, base: str = "", words: str = 
         hint = "" if trained else f" (base= says where the base of {folder} is now)"
         raise ValueError(f"{error}{hint}") from error
     if not trained:
-        model = adapter_io.load_adapters(folder, model, base=models.weights_hash(model))
+        model = adapter_io.load_adapters(folder, model, any_base=any_base)
     return Policy(model, _processor(told["policy"], config, words))
 
 
