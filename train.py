@@ -10,6 +10,7 @@ from pathlib import Path
 from rich.console import Console
 
 from envs import compilation_cache
+from envs.refusals import refused
 
 RUNS = Path("runs")
 STOPPED = 130
@@ -27,7 +28,7 @@ def main(arguments: list[str]) -> int:
     from lorasp_jax.training import processes
     from lorasp_jax.training.interrupt import sigterm_as_interrupt
     from lorasp_jax.training.overrides import parse
-    from lorasp_jax.training.run_folder import DISK_FULL, open_run
+    from lorasp_jax.training.run_folder import open_run
 
     try:
         if "--distributed" in arguments:
@@ -51,24 +52,14 @@ def main(arguments: list[str]) -> int:
                 return 0
             stack.enter_context(sigterm_as_interrupt())
             run(command, folder, console, started)
-    except ValueError as error:
-        return failed(error, errors)
-    except OSError as error:
-        if error.errno not in DISK_FULL:
-            raise
-        return failed(f"{error.strerror}: make room and add --resume", errors)
+    except Exception as error:  # the input's fault is told in one sentence, ours is raised again
+        return refused(error, errors, ": make room and add --resume")
     except KeyboardInterrupt:
         again = shlex.join(argument for argument in arguments if argument != "--resume")
         message = f"stopped; to go on: python train.py {again} --resume"
         errors.print(message, soft_wrap=True, highlight=False, markup=False)
         return STOPPED
     return 0
-
-
-def failed(reason: object, errors: Console) -> int:
-    """Say why in one sentence; returns the exit code."""
-    errors.print(f"error: {reason}", style="red", soft_wrap=True, highlight=False, markup=False)
-    return 2
 
 
 def run(command, folder: Path, console: Console, started: float) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 from rich.console import Console
 
 from envs import actions, commands, compilation_cache, distractors, making
+from envs.refusals import refused
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -23,9 +24,8 @@ def main(arguments: Sequence[str]) -> int:
     compilation_cache.enable()
     try:
         options.command(options, console)
-    except (ValueError, OSError) as error:
-        console.print(f"error: {error}", style="red", soft_wrap=True, highlight=False)
-        return 2
+    except Exception as error:
+        return refused(error, console)
     except KeyboardInterrupt as stop:
         console.print(f"stopped: {str(stop) or 'no unfinished file is left'}", soft_wrap=True)
         return 130

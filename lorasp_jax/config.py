@@ -238,7 +238,7 @@ class Config:
     """Steps per compiled call, and between log lines."""
     checkpoint_every: int = 1000
     """Steps between checkpoints."""
-    seed: int = 0
+    seed: int = field(default=0, metadata={"most": 2**32 - 1})
     """Seed of every random stream of the run."""
 
     def evaluates(self, step: int) -> bool:

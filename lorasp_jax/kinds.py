@@ -1,9 +1,14 @@
 """Whether the values of a dataclass are of the kinds that its fields state."""
 
+import dataclasses
 import math
+import numbers
 import types
 import typing
 from typing import Any
+
+LARGEST = 2**31 - 1
+"""Largest whole number that arrays and their sizes take everywhere."""
 
 
 def check_fields(owner: Any, prefix: str = "") -> None:
@@ -15,14 +20,31 @@ def check_fields(owner: Any, prefix: str = "") -> None:
         prefix: what the fields' names begin with, such as "optim.".
 
     Raises:
-        ValueError: a value of another kind, or a number that is not finite.
+        ValueError: a value of another kind, a number that is not finite, or a whole one beyond
+            `LARGEST`, or beyond what its field's metadata gives as "most".
     """
+    fields = dataclasses.fields(owner) if dataclasses.is_dataclass(owner) else ()
+    most = {field.name: field.metadata.get("most", LARGEST) for field in fields}
     for name, kind in typing.get_type_hints(type(owner)).items():
         if typing.get_origin(kind) is typing.ClassVar:
             continue
         value = getattr(owner, name)
         if not _fits(value, kind):
             raise ValueError(f"{prefix}{name} must be {_called(kind)}, got {value!r}")
+        if type(value) is int and abs(value) > most.get(name, LARGEST):
+            raise ValueError(f"{prefix}{name} must be at most {most[name]}, got {value}")
+
+
+def check_numbers(owner: Any) -> None:
+    """Raises ValueError where a field that is a number, or None, holds something else.
+
+    What is wrong with a number is left to the dataclass itself.
+    """
+    for name, kind in typing.get_type_hints(type(owner)).items():
+        kinds, value = {kind, *typing.get_args(kind)}, getattr(owner, name, None)
+        wanted = kinds & {int, float} and not (value is None and type(None) in kinds)
+        if wanted and not isinstance(value, numbers.Number):
+            raise ValueError(f"{name} must be {_called(kind)}, got {value!r}")
 
 
 def _fits(value: Any, kind: Any) -> bool:

@@ -3,12 +3,14 @@
 import errno
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 
 import pytest
 
 import train
+from lorasp_jax.training.run_folder import write_json
 
 ROOT = Path(__file__).parent.parent
 MULTITASK = ["--config", str(ROOT / "configs" / "multitask.py"), "--scale", "smoke"]
@@ -93,14 +95,42 @@ def test_full_disk(capsys, monkeypatch):
     assert capsys.readouterr().err == "error: No space left on device: make room and add --resume\n"
 
 
-@pytest.mark.parametrize("content", [None, "{", "[]", "{}"])
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("results.json", '{"tasks": 5}'),
+        ("results.json", "5"),
+        ("metrics.jsonl", "5\n"),
+        ("metrics.jsonl", '{"step": 2, "task": 0.5}\n'),
+        ("config.json", "[" * 100_000),
+    ],
+)
+def test_damaged_files_of_a_finished_run(name, content, capsys):
+    assert train.main([*MULTITASK, "--model.checkpoint", "nowhere"]) == 2
+    folder = Path("runs/multitask")
+    write_json(folder / "results.json", {"seconds": {}, "tasks": {}, "layer_active_rank": {}})
+    (folder / name).write_text(content)
+    capsys.readouterr()
+    assert train.main([*MULTITASK, "--model.checkpoint", "nowhere", "--resume"]) == 2
+    printed = capsys.readouterr().err
+    assert f"{folder / name} is damaged" in printed
+    assert printed.count("\n") == 1
+    assert (folder / name).read_text() == content
+
+
+@pytest.mark.parametrize(
+    "content", [None, {}, {"control_dt": 0.2}, "{", "[]", "{}", '{"control_dt": 0.1}']
+)
 def test_base_without_its_control_period(content, capsys):
     shutil.copytree(ROOT / "assets" / "pi0_nano", "base")
     os.remove("base/training.json")
-    if content is not None:
+    if isinstance(content, str):
         Path("base/training.json").write_text(content)
+    elif content is not None:
+        write_json(Path("base/training.json"), content)
     assert train.main([*MULTITASK, "--model.checkpoint", "base"]) == 2
-    assert "does not say the control_dt" in capsys.readouterr().err
+    message = r"does not say the control_dt|training.json is damaged|trained with control_dt 0.2"
+    assert re.search(message, capsys.readouterr().err)
 
 
 def test_finished_run_is_not_run_again(capsys):
@@ -108,7 +138,7 @@ def test_finished_run_is_not_run_again(capsys):
     record = json.loads(Path("runs/multitask/config.json").read_text())
     assert record["peft"]["method"] == "LoRASP"
     results = {"seconds": {}, "tasks": {}, "layer_active_rank": {}}
-    Path("runs/multitask/results.json").write_text(json.dumps(results))
+    write_json(Path("runs/multitask/results.json"), results)
     assert train.main([*MULTITASK, "--model.checkpoint", "nowhere", "--resume"]) == 0
     assert "this run is finished: runs/multitask/report.html" in capsys.readouterr().out
     assert "The run goes on" not in Path("runs/multitask/report.html").read_text()

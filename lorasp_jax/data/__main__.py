@@ -11,6 +11,7 @@ import jax
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TextColumn
 
+from envs.refusals import refused
 from lorasp_jax.data import cache, conversion, inspection
 from lorasp_jax.data.lerobot import Keys
 from lorasp_jax.data.opening import open_source
@@ -24,9 +25,8 @@ def main(arguments: Sequence[str]) -> int:
     errors = Console(stderr=True)
     try:
         options.command(options, Console())
-    except (ValueError, OSError) as error:
-        errors.print(f"error: {error}", style="red", soft_wrap=True, highlight=False, markup=False)
-        return 2
+    except Exception as error:
+        return refused(error, errors)
     except KeyboardInterrupt:
         errors.print("stopped: no unfinished file is left")
         return 130

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lorasp_jax.digest import DIGEST, sealed, unsealed
 from lorasp_jax.models.normalization import SMALLEST_SPREAD
 
 NAMES = ("mean", "std", "min", "max", "q01", "q99", "q10", "q90")
@@ -87,7 +88,7 @@ class Statistics:
         return Statistics(place(self.state), place(self.action))
 
     def to_json(self) -> str:
-        """JSON object of lists, "state_mean" and so on; exact in fp32."""
+        """JSON object of lists, "state_mean" and so on, exact in fp32, and their digest."""
         both = {"state": self.state, "action": self.action}
         found = {
             f"{kind}_{name}": np.asarray(known[name]).tolist()
@@ -95,25 +96,27 @@ class Statistics:
             for name in NAMES
             if name in known
         }
-        return json.dumps(found, indent=1)
+        return json.dumps(sealed(found), indent=1)
 
     @classmethod
     def from_json(cls, text: str) -> "Statistics":
-        """What `to_json` wrote.
+        """What `to_json` wrote, or somebody else, without a digest.
 
         Raises:
-            ValueError: not such an object.
+            ValueError: not such an object, or not as it was written.
         """
         both: dict[str, dict[str, np.ndarray]] = {"state": {}, "action": {}}
         try:
-            for key, values in json.loads(text).items():
+            found = json.loads(text)
+            for key, values in (unsealed(found) if DIGEST in found else found).items():
                 kind, _, name = key.partition("_")
                 both[kind][name] = np.asarray(values, np.float32)
         except (
             AttributeError, KeyError, TypeError, ValueError, OverflowError, RecursionError
         ) as error:  # fmt: skip
             raise ValueError(
-                f"statistics need lists of numbers state_NAME and action_NAME, got {text[:80]!r}."
+                f"statistics need lists of numbers state_NAME and action_NAME, got {text[:80]!r} "
+                f"({error})."
             ) from error
         return checked(both, "this JSON")
 

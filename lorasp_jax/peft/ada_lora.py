@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from lorasp_jax import kinds
 from lorasp_jax.auxiliary import Aux
 from lorasp_jax.peft.method import Method, Params
 
@@ -60,6 +61,7 @@ class AdaLoRA(Method):
 
     def __post_init__(self) -> None:
         """Checks the fields."""
+        kinds.check_numbers(self)
         if self.rank < 1 or not 1 <= self.final_rank <= self.rank or self.interval < 1:
             raise ValueError(
                 "target_rank must be 1 to rank and interval at least 1, got "

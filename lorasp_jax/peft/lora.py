@@ -11,6 +11,7 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
+from lorasp_jax import kinds
 from lorasp_jax.auxiliary import Aux
 from lorasp_jax.peft.method import Kernel, Method, Params, check_matrix, kaiming_uniform
 
@@ -43,6 +44,7 @@ class LoRA(Method):
 
     def __post_init__(self) -> None:
         """Checks the fields."""
+        kinds.check_numbers(self)
         if self.rank < 1:
             raise ValueError(f"rank must be at least 1, got {self.rank}.")
         if self.initialization not in ("kaiming", "gaussian", *_SPLITS, "eva"):

@@ -15,6 +15,7 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 
+from lorasp_jax import kinds
 from lorasp_jax.auxiliary import Aux, masked_mean
 from lorasp_jax.peft.method import Method, Params, kaiming_uniform
 
@@ -45,6 +46,7 @@ class LoRAMoE(Method):
 
     def __post_init__(self) -> None:
         """Checks the fields."""
+        kinds.check_numbers(self)
         if self.experts < 1 or self.rank < 1:
             raise ValueError(
                 f"experts and rank must be at least 1, got {self.experts}, {self.rank}."

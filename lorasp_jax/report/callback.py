@@ -1,6 +1,5 @@
 """report.html while a run goes on, and what it came to in the terminal at its end."""
 
-import json
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -9,7 +8,7 @@ from rich.table import Table
 
 from lorasp_jax.report.html import speed, success_cell, write_report
 from lorasp_jax.training.run import Callback, Run
-from lorasp_jax.training.run_folder import STOPPED, read_metrics, write_json
+from lorasp_jax.training.run_folder import STOPPED, read_json, read_metrics, write_json
 
 EVERY = 20.0
 """Seconds from one report to the next; one takes about half a second of a core."""
@@ -59,7 +58,7 @@ class Report(Callback):
 
 def final_table(folder: Path) -> Table:
     """Success, loss, speed, active rank and time of the finished run in a folder."""
-    results = json.loads((folder / "results.json").read_text())
+    results = read_json(folder / "results.json")
     rows = [row for row in read_metrics(folder) if "task" in row]  # not all steps were skipped
     table = Table("", "before", "after", title=folder.name)
     for task, value in results["tasks"].items():

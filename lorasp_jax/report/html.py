@@ -39,9 +39,11 @@ def write_report(folder: Path) -> Path:
     Of a run without results.json it has what there is so far, and loads itself again and again.
 
     Raises:
-        FileNotFoundError: the folder holds no run.
+        ValueError: the folder holds no run, or damaged files.
     """
-    config = json.loads((folder / RECORD).read_text())
+    config = read_json(folder / RECORD)
+    if not config:
+        raise ValueError(f"{folder} holds no run: there is no {RECORD}")
     finished = read_json(folder / "results.json")
     results = finished or _unfinished(folder)
     rows = read_metrics(folder)
@@ -222,6 +224,10 @@ def _media(folder: Path, tasks: Collection[str]) -> Iterable[str]:
         yield "<h2>What the policy sees and does</h2>"
     for task in tasks:
         picture, video = folder / f"cameras_{task}.png", _filmed(folder, task)
+        if missing := [path.name for path in (picture, video) if not path.is_file()]:
+            gone = html.escape(" and ".join(missing))
+            yield f"<h3>{html.escape(task)}</h3><p>{gone} missing.</p>"
+            continue
         shown = base64.b64encode(picture.read_bytes()).decode()
         played = base64.b64encode(video.read_bytes()).decode()
         yield (

@@ -1,7 +1,6 @@
 """The frozen base of a run: loaded from a checkpoint, or random."""
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from lorasp_jax.config import Config
 from lorasp_jax.models import backbone, loading, places
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig
+from lorasp_jax.training.run_folder import read_json
 
 SIZES = ("nano", "small", "base", "nano_pi05", "base_pi05")
 TRAINING = "training.json"
@@ -61,10 +61,9 @@ def changed(model: Backbone, **changes: Any) -> Backbone:
 def _check_time(folder: Path, control_dt: float) -> None:
     """Raise ValueError unless the base in a folder was trained at this control period."""
     path = folder / TRAINING
-    try:
-        found = json.loads(path.read_text())["control_dt"]
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} does not say the control_dt that the base needs") from error
+    if "control_dt" not in (told := read_json(path)):
+        raise ValueError(f"{path} does not say the control_dt that the base needs")
+    found = told["control_dt"]
     if found != control_dt:
         raise ValueError(
             f"{folder} was trained with control_dt {found} s, this run has {control_dt}"

@@ -6,6 +6,7 @@ these three restore a run to the bit. The base is recorded by its hash, the valu
 
 import contextlib
 import itertools
+import logging
 import os
 import shutil
 from collections.abc import Iterator
@@ -16,9 +17,9 @@ import jax
 import orbax.checkpoint as ocp
 from rich.console import Console
 
+from envs.refusals import DISK_FULL
 from lorasp_jax.digest import digest
 from lorasp_jax.training import processes
-from lorasp_jax.training.run_folder import DISK_FULL
 from lorasp_jax.training.step import TrainState
 
 WRITTEN = "commit_success.txt"
@@ -30,6 +31,7 @@ class Checkpoints:
 
     def __init__(self, folder: Path, base_hash: str, console: Console) -> None:
         """Open `folder`/checkpoints for a run on the base identified by `base_hash`."""
+        logging.getLogger("absl").addFilter(_is_news)
         atomic = ocp.options.AtomicityOptions(mode=ocp.options.AtomicityMode.COMMIT_FILE)
         options = ocp.CheckpointManagerOptions(max_to_keep=2, atomicity_options=atomic)
         self._folder = (folder / "checkpoints").absolute()
@@ -170,6 +172,13 @@ class Checkpoints:
 
 class _DamagedError(Exception):
     """A checkpoint is not what was saved; the message says how that shows."""
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    """Whether a log record says more than an exception will: of a failed write Orbax logs one
+    traceback a thread, and raises it.
+    """
+    return not (record.exc_info and "orbax" in record.pathname)
 
 
 def _suffixes() -> Iterator[str]:

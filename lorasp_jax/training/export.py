@@ -15,7 +15,7 @@ from lorasp_jax.models.prompt_table import PromptTable
 from lorasp_jax.models.statistics import Statistics
 from lorasp_jax.training.base import TRAINING
 from lorasp_jax.training.run import Callback, Run
-from lorasp_jax.training.run_folder import write_json
+from lorasp_jax.training.run_folder import read_json, write_json
 
 BASE = "base"
 """Folder of a base that was trained itself."""
@@ -85,14 +85,13 @@ def load_policy(
     folder = Path(folder)
     trained = (folder / BASE).is_dir()
     path = folder / BASE / TRAINING if trained else folder / adapter_io.DESCRIPTION
+    if not path.is_file():
+        raise ValueError(f"{folder} has no policy: no run finished there")
+    told = read_json(path) if trained else adapter_io.read_description(folder)["metadata"]
     try:
-        told = json.loads(path.read_bytes())
-        told = told if trained else told["metadata"]
         config = backbone.find(told["policy"]["backbone"]).from_dict(told["policy"]["config"])
         source = folder / BASE if trained else base or places.found_again(told["base"])
-    except FileNotFoundError as error:
-        raise ValueError(f"{folder} has no policy: no run finished there") from error
-    except (OSError, KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} does not say what its policy needs") from error
     if not source:
         raise ValueError(f"the base of {folder} was random, and nothing keeps it")

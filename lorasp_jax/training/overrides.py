@@ -127,7 +127,7 @@ def load(path: Path, scale: str) -> Config:
         if not hasattr(module, "get_config"):
             raise ValueError("it has no function get_config(scale)")
         config = module.get_config(scale)
-    except Exception as error:  # whatever a file's code raises
+    except (Exception, SystemExit) as error:  # whatever a file's code raises
         reason = str(error).partition("\n")[0]
         raise ValueError(f"{path} gives no config ({type(error).__name__}: {reason})") from error
     if not isinstance(config, Config):

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import errno
 import fcntl
 import json
 import math
@@ -21,12 +20,11 @@ from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.proto.summary_pb2 import Summary
 
 from lorasp_jax.config import Config
+from lorasp_jax.digest import sealed, unsealed
 from lorasp_jax.training import processes
 
 RECORD, CLOCK, DATASET = "config.json", "seconds.json", "dataset.json"
 """All files that a run leaves which failed before it had anything."""
-DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Numbers of the errors of a write for which there is no room."""
 WILDCARDS = frozenset("*?[\\")
 """Orbax takes paths for patterns: below a folder with one of these it finds no checkpoint again."""
 STOPPED = "stopped.json"
@@ -39,9 +37,9 @@ def to_json(config: Config) -> dict[str, Any]:
     return {**plain, "peft": {"method": type(config.peft).__name__, **plain["peft"]}}
 
 
-def write_json(path: Path, value: Any) -> None:
-    """Write JSON so that readers never see half of it."""
-    write_text(path, json.dumps(value, indent=2) + "\n")
+def write_json(path: Path, value: Mapping[str, Any]) -> None:
+    """Write a JSON object with its digest so that readers never see half of it."""
+    write_text(path, json.dumps(sealed(value), indent=2) + "\n")
 
 
 def write_text(path: Path, text: str) -> None:
@@ -55,14 +53,14 @@ def write_text(path: Path, text: str) -> None:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """What `write_json` wrote of an object; nothing without a file.
+    """What `write_json` wrote; nothing without a file.
 
     Raises:
         ValueError: the file is damaged.
     """
     try:
-        return dict(json.loads(path.read_bytes())) if path.exists() else {}
-    except (ValueError, TypeError) as error:
+        return unsealed(json.loads(path.read_bytes())) if path.exists() else {}
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is damaged ({error}): put back a whole one") from error
 
 
@@ -196,7 +194,7 @@ class MetricsLog:
         if not self._writes:
             return
         kept = [row for row in read_metrics(folder) if row["step"] <= start_step]
-        write_text(self.path, "".join(json.dumps(row) + "\n" for row in kept))
+        write_text(self.path, "".join(map(_line, kept)))
         board = folder / "tensorboard"
         board.mkdir(exist_ok=True)
         # Not SummaryWriter: when its thread cannot write, whoever adds to its queue waits for ever.
@@ -219,7 +217,7 @@ class MetricsLog:
             return
         values = {name: value for name, value in values.items() if math.isfinite(value)}
         with self.path.open("a") as file:
-            file.write(json.dumps({"step": step, **values}) + "\n")
+            file.write(_line({"step": step, **values}))
         drawn = [summary.scalar(name, value) for name, value in values.items()]
         # TensorBoard drops all but the first kind of a tag.
         drawn += [summary.histogram(f"{name}/layers", a, "auto") for name, a in histograms.items()]
@@ -237,10 +235,23 @@ class MetricsLog:
 
 
 def read_metrics(folder: Path) -> list[dict[str, float]]:
-    """The rows of `metrics.jsonl`; a last line cut off by a crash is dropped."""
+    """The rows of `metrics.jsonl`; a last line cut off by a crash is dropped.
+
+    Raises:
+        ValueError: a row is not as it was written.
+    """
     path = folder / "metrics.jsonl"
-    if not path.exists():
-        return []
-    text = path.read_text()
-    complete = text[: text.rfind("\n") + 1]
-    return [json.loads(line) for line in complete.splitlines()]
+    lines = path.read_bytes().split(b"\n")[:-1] if path.exists() else []
+    rows = []
+    for number, line in enumerate(lines, 1):
+        try:
+            rows.append(unsealed(json.loads(line)))
+        except (ValueError, RecursionError) as error:
+            raise ValueError(
+                f"line {number} of {path} is damaged ({error}): put back a whole one, or remove it"
+            ) from error
+    return rows
+
+
+def _line(row: Mapping[str, float]) -> str:
+    return json.dumps(sealed(row)) + "\n"

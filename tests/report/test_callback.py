@@ -7,7 +7,9 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
+from lorasp_jax.digest import sealed
 from lorasp_jax.report import callback
+from lorasp_jax.training.run_folder import write_json
 from tests.report.test_html import RESULTS, folder  # noqa: F401
 
 
@@ -24,11 +26,11 @@ def test_it_grows(run):
     report._last.result()
     assert "step 4 of 4" in path.read_text()
     with (run.folder / "metrics.jsonl").open("a") as file:
-        file.write('{"step": 5, "task": 0.125}\n')
+        file.write(json.dumps(sealed({"step": 5, "task": 0.125})) + "\n")
     report.on_log(run, 5, {})
     report._last.result()
     assert "step 5 of 4" in path.read_text()
-    (run.folder / "results.json").write_text(json.dumps(RESULTS))
+    write_json(run.folder / "results.json", RESULTS)
     report.on_end(run)
     assert "75.0 %" in path.read_text()
     printed = run.console.file.getvalue()
@@ -65,5 +67,5 @@ def test_training_does_not_wait_and_hears_of_failures(run, monkeypatch):
     (run.folder / "config.json").unlink()
     monkeypatch.undo()
     report._begin(run.folder)
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(ValueError, match="holds no run"):
         report._begin(run.folder)

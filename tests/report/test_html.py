@@ -6,9 +6,10 @@ import re
 import numpy as np
 import pytest
 
+from lorasp_jax.digest import sealed
 from lorasp_jax.evaluation import video
 from lorasp_jax.report.html import speed, write_report
-from lorasp_jax.training.run_folder import STOPPED, MetricsLog, to_json
+from lorasp_jax.training.run_folder import STOPPED, MetricsLog, to_json, write_json
 from tests.runs import CONFIG
 
 RESULTS = {
@@ -30,8 +31,8 @@ RESULTS = {
 @pytest.fixture
 def folder(tmp_path):
     config = to_json(CONFIG)
-    (tmp_path / "config.json").write_text(json.dumps({**config, "name": "<b>run</b>"}))
-    (tmp_path / "results.json").write_text(json.dumps(RESULTS))
+    write_json(tmp_path / "config.json", {**config, "name": "<b>run</b>"})
+    write_json(tmp_path / "results.json", RESULTS)
     log = MetricsLog(tmp_path)
     for step in (2, 4):
         log.write(step, {"task": 1 / step, "spectral": 0.1, "active_rank/vision": 4.0})
@@ -57,16 +58,16 @@ def test_report_shows_the_results_and_needs_no_other_file(folder):
 
 def test_histogram_is_drawn_where_it_was_recorded(folder):
     results = {**RESULTS, "active_rank_histogram": {"vision": [0, 3, 1], "action": [0, 0, 4]}}
-    (folder / "results.json").write_text(json.dumps(results))
+    write_json(folder / "results.json", results)
     assert write_report(folder).read_text().count("image/svg") == 5
 
 
 def test_full_fine_tuning_has_no_ranks(folder):
     config = {**to_json(CONFIG), "peft": {"method": "FullFineTuning"}}
-    (folder / "config.json").write_text(json.dumps(config))
+    write_json(folder / "config.json", config)
     results = {**RESULTS, "active_rank": {}, "layer_active_rank": {"vision": {}}}
-    (folder / "results.json").write_text(json.dumps(results))
-    (folder / "metrics.jsonl").write_text(json.dumps({"step": 2, "task": 0.5}) + "\n")
+    write_json(folder / "results.json", results)
+    (folder / "metrics.jsonl").write_text(json.dumps(sealed({"step": 2, "task": 0.5})) + "\n")
     assert "Active rank" not in write_report(folder).read_text()
 
 
@@ -75,7 +76,7 @@ def test_a_run_that_goes_on(folder):
     before = {"press": RESULTS["tasks"]["press"]["before"]}
     for name in ("results.json", "rollout_press.mp4", "cameras_press.png"):
         (folder / name).unlink()
-    (folder / "before.json").write_text(json.dumps(before))
+    write_json(folder / "before.json", before)
     page = write_report(folder).read_text()
     assert "The run goes on: step 4 of 4." in page
     assert "http-equiv=refresh" in page
@@ -89,7 +90,7 @@ def test_a_run_that_goes_on(folder):
     assert "Nothing is logged yet" in page
     assert "image/svg" not in page
     (folder / "config.json").unlink()
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(ValueError, match="holds no run"):
         write_report(folder)
 
 
@@ -97,9 +98,10 @@ def test_a_run_that_stopped_says_why(folder):
     assert "were skipped" not in write_report(folder).read_text()
     results = (folder / "results.json").read_text()
     (folder / "results.json").unlink()
-    (folder / STOPPED).write_text(json.dumps({"reason": "the loss was <nan>"}))
+    write_json(folder / STOPPED, {"reason": "the loss was <nan>"})
     with (folder / "metrics.jsonl").open("a") as file:
-        file.writelines(json.dumps({"step": s, "skipped": 2.0}) + "\n" for s in (6, 8))
+        rows = [sealed({"step": s, "skipped": 2.0}) for s in (6, 8)]
+        file.writelines(json.dumps(row) + "\n" for row in rows)
     page = write_report(folder).read_text()
     assert "<b>The run stopped:</b> the loss was &lt;nan&gt;." in page
     assert "4 steps were skipped" in page
@@ -111,9 +113,8 @@ def test_a_run_that_stopped_says_why(folder):
 
 def test_a_run_that_is_evaluated_while_it_goes_on(folder):
     (folder / "results.json").unlink()
-    (folder / "before.json").write_text(
-        json.dumps(dict.fromkeys(("press", "pour"), RESULTS["tasks"]["press"]["before"]))
-    )
+    before = RESULTS["tasks"]["press"]["before"]
+    write_json(folder / "before.json", dict.fromkeys(("press", "pour"), before))
     log = MetricsLog(folder)
     log.write(6, {"task": 0.1, "success/press": 0.5})
     log.close()
@@ -148,3 +149,11 @@ def test_video_can_be_read_back(folder):
         stream = container.streams.video[0]
         assert (stream.width, stream.height, stream.codec_context.pix_fmt) == (64, 32, "yuv420p")
         assert sum(1 for _ in container.decode(stream)) == 4
+
+
+@pytest.mark.parametrize("name", ["cameras_press.png", "rollout_press.mp4"])
+def test_pictures_that_are_gone_are_named(folder, name):
+    (folder / name).unlink()
+    page = write_report(folder).read_text()
+    assert f"{name} missing." in page
+    assert "75.0 % [63.2, 84.0] of 64" in page

@@ -158,7 +158,7 @@ def test_half_written_and_empty_folders_are_removed(folder):
     assert restore(folder) == (None, "")
 
 
-def test_a_full_disk_leaves_the_checkpoint_before(folder):
+def test_a_full_disk_leaves_the_checkpoint_before(folder, caplog):
     """Files may not be as large as one of the state's."""
     checkpoints = Checkpoints(folder, "base", Console(file=io.StringIO()))
     message = r"could not be written \(File too large\), the one at step 2 stays: make room for"
@@ -171,6 +171,7 @@ def test_a_full_disk_leaves_the_checkpoint_before(folder):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
     assert "\n" not in str(caught.value)
+    assert not [record for record in caplog.records if record.exc_info]
     assert names(folder) == ["1", "2"]
     assert restore(folder) == (2, "")
 

@@ -16,6 +16,7 @@ from rich.console import Console
 from lorasp_jax import adaptation
 from lorasp_jax.config import DataConfig
 from lorasp_jax.data.batches import flatten
+from lorasp_jax.digest import sealed
 from lorasp_jax.evaluation.callback import NoEvaluation
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.report.html import write_report
@@ -142,7 +143,8 @@ def test_without_simulation_there_is_a_report(tmp_path):
     with run.timed("train"):
         pass
     write_json(run.folder / "config.json", to_json(run.config))
-    (run.folder / "metrics.jsonl").write_text('{"step": 2, "task": 0.5, "active_rank/vision": 3}\n')
+    row = sealed({"step": 2, "task": 0.5, "active_rank/vision": 3})
+    (run.folder / "metrics.jsonl").write_text(json.dumps(row) + "\n")
     NoEvaluation().on_end(run)
     found = json.loads((run.folder / "results.json").read_text())
     assert found["tasks"] == found["active_rank"] == {}

@@ -15,6 +15,7 @@ from flax import nnx
 
 from lorasp_jax import adaptation, adapter_io, models
 from lorasp_jax.config import ModelConfig
+from lorasp_jax.digest import sealed
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.processing import Statistics
@@ -135,7 +136,9 @@ def test_a_policy_that_cannot_come_back(tmp_path, changes):
         "base": "somewhere",
         "policy": {"backbone": "pi0", "config": dataclasses.asdict(config)},
     }
-    (tmp_path / "adapter.json").write_text(json.dumps({"metadata": told | changes}))
+    facts = {"format": adapter_io.FORMAT, "version": adapter_io.VERSION, "metadata": told | changes}
+    facts |= {"base": "", "weights": {}, "methods": {}, "sha256": ""}
+    (tmp_path / "adapter.json").write_text(json.dumps(sealed(facts)))
     with pytest.raises(ValueError, match=r"does not say what its policy needs|was random"):
         export.load_policy(tmp_path)
 

@@ -8,7 +8,17 @@ from lorasp_jax.training.overrides import parse
 from tests.malformed import ROOT, check_refusal
 
 OPTIONS = {
-    "optim.steps": ["many", "0", "-3", "1.5", "", "nan", None],
+    "optim.steps": [
+        "many",
+        "99999999999999999999999",
+        "3000000000",
+        "0",
+        "-3",
+        "1.5",
+        "",
+        "nan",
+        None,
+    ],
     "optim.learning-rate": ["fast", "-1", "nan", "inf", None],
     "optim.warmup-steps": ["-1"],
     "optim.weight-decay": ["-0.1", "nan"],
@@ -28,7 +38,7 @@ OPTIONS = {
     "model.max-tokens": ["-1"],
     "model.unroll": ["maybe"],
     "model.remat": ["all"],
-    "peft.rank": ["0", "x", "2.5", None],
+    "peft.rank": ["99999999999999999999999", "0", "x", "2.5", None],
     "peft.alpha": ["nan", "x"],
     "peft.energy-target": ["0", "1.5", "nan"],
     "peft.score-function": ["x"],
@@ -50,7 +60,7 @@ OPTIONS = {
     ],
     "scale": ["gpu", None],
     "method": ["lorra", None],
-    "config": ["nowhere.py", None],
+    "config": ["nowhere.py", "n" * 300, None],
     "nme": ["x"],
 }
 MULTITASK = ["--config", str(ROOT / "configs" / "multitask.py"), "--scale", "smoke"]
@@ -74,6 +84,8 @@ PROGRAMS = {
     "no syntax": "def get_config(",
     "null byte": "a\0b",
     "no function": "",
+    "leaves": "import sys\nsys.exit()",
+    "leaves with a reason": "import sys\ndef get_config(scale): sys.exit('no')",
     "no such module": "import nowhere_at_all",
     "no such name": "def get_config(scale): return nothing",
     "division": "def get_config(scale): return 1 / 0",
@@ -95,6 +107,9 @@ PROGRAMS = {
     "method": CONFIG + "def get_config(scale): return Config(name='a', scale=scale, peft='lora')",
     "part": GET.format("", "optim={'steps': 3}"),
 }
+FIELDS = {"rank": "rank must be int, got '8'", "alpha": "alpha must be float | None, got '8'"}
+FIELDS |= {"method": "peft must be Method", "part": "optim must be OptimConfig"}
+FIELDS |= {"text for a number": "learning_rate must be a finite number"}
 
 
 @pytest.mark.parametrize("name", PROGRAMS)
@@ -105,4 +120,5 @@ def test_config_files_are_refused_in_one_sentence(name: str, tmp_path: Path) -> 
     with pytest.raises(Exception) as caught:  # noqa: PT011 (which one is checked)
         parse(["--config", str(path), "--scale", "smoke"])
     check_refusal(caught.value, str(path))
+    assert FIELDS.get(name, "") in str(caught.value)
     assert path.read_bytes() == before

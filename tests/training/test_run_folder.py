@@ -13,6 +13,7 @@ import pytest
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from envs.refusals import DISK_FULL
 from lorasp_jax.config import Config, DataConfig
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.training import run_folder
@@ -138,7 +139,7 @@ def test_a_full_disk_stops_the_log_at_once(tmp_path):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
         log.close()
-    assert caught.value.errno in run_folder.DISK_FULL
+    assert caught.value.errno in DISK_FULL
     assert len(read_metrics(tmp_path)) > 10
 
 
