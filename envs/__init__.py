@@ -5,16 +5,20 @@ env = envs.make("press", robot="piper", num_envs=64, image_size=64)
 episodes = envs.collect("press", robot="panda", num_episodes=512, key=jax.random.key(0))
 """
 
-import envs.fast_cpu  # first: it must come before anything starts JAX
-import envs.ids
-import envs.robots.panda
-import envs.robots.piper  # envs.robots.piper.forward_kinematics is public
-from envs.collection import collect, expert_success
-from envs.env import Env
-from envs.episodes import Episodes
-from envs.making import make
-from envs.randomization import Randomization
-from envs.state import State, Trajectory
+import importlib
+import importlib.util
+from typing import TYPE_CHECKING, Any
+
+import envs.fast_cpu  # noqa: F401  first: it must come before anything starts JAX
+
+if TYPE_CHECKING:
+    from envs import robots  # noqa: F401  envs.robots.piper is public
+    from envs.collection import collect, expert_success
+    from envs.env import Env
+    from envs.episodes import Episodes
+    from envs.making import make
+    from envs.randomization import Randomization
+    from envs.state import State, Trajectory
 
 __all__ = [
     "Env",
@@ -27,4 +31,26 @@ __all__ = [
     "make",
 ]
 
-envs.ids.register()
+_HOMES = {
+    "Env": "env",
+    "Episodes": "episodes",
+    "Randomization": "randomization",
+    "State": "state",
+    "Trajectory": "state",
+    "collect": "collection",
+    "expert_success": "collection",
+    "make": "making",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Public names and modules, imported when asked for: MJX takes seconds, `--help` needs none."""
+    if name in _HOMES:
+        return getattr(importlib.import_module(f"envs.{_HOMES[name]}"), name)
+    if importlib.util.find_spec(f"envs.{name}") is None:
+        raise AttributeError(f"module 'envs' has no attribute {name!r}")
+    return importlib.import_module(f"envs.{name}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -218,7 +218,8 @@ class Config:
     tasks: tuple[str, ...] = ("open_pot", "pour", "press", "pick_place")
     """Tasks trained together; the default are the paper's four."""
     targets: tuple[str, ...] = (".*",)
-    """What the method is attached to: presets (models/presets.py), regular expressions of paths."""
+    """What the method is attached to: presets (paper, all-linear, openpi, expert-only, vision,
+    language, action) and regular expressions of layers' paths."""
     image_size: int = 64
     """Height and width of the simulated cameras' pictures [pixels]; a backbone resizes them."""
     data: DataConfig = field(default_factory=DataConfig)

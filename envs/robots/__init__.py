@@ -7,6 +7,9 @@ That lets the tasks and the expert talk about hands without knowing the robot.
 """
 
 import dataclasses
+import importlib
+import importlib.util
+from types import ModuleType
 from typing import Protocol
 
 import jax
@@ -26,6 +29,13 @@ WRIST_AXES = (0.0, -1.0, 0.0, -0.9272, 0.0, 0.3746)  # its x and y, in the frame
 _DAMPING, _ROTATION_WEIGHT, _MAX_STEP = 0.03, 0.3, 0.3
 _ITERATIONS = 60
 _POSTURE_GAIN = 0.1  # pull of spare joints towards home, a fraction of the way an iteration
+
+
+def __getattr__(name: str) -> ModuleType:
+    """A robot's module, so that `import envs` makes `envs.robots.piper` public."""
+    if importlib.util.find_spec(f"envs.robots.{name}") is None:
+        raise AttributeError(f"module 'envs.robots' has no attribute {name!r}")
+    return importlib.import_module(f"envs.robots.{name}")
 
 
 class Body(Protocol):

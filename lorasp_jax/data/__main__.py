@@ -6,21 +6,23 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import jax
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TextColumn
 
 from envs.refusals import refused
-from lorasp_jax.data import cache, conversion, inspection
-from lorasp_jax.data.lerobot import Keys
-from lorasp_jax.data.opening import open_source
-from lorasp_jax.data.source import Progress as Report
+from lorasp_jax.data.keys import Keys
+
+if TYPE_CHECKING:
+    from lorasp_jax.data.source import Progress as Report
 
 
 def main(arguments: Sequence[str]) -> int:
     """Runs one command; returns the exit code: 0 done, 2 bad input, 130 stopped."""
-    options = _parser().parse_args(arguments)
+    options = _parser().parse_args(arguments)  # before the slow imports, which help does not need
+    import jax
+
     jax.config.update("jax_platforms", "cpu")  # nothing here is worth taking an accelerator
     errors = Console(stderr=True)
     try:
@@ -35,6 +37,9 @@ def main(arguments: Sequence[str]) -> int:
 
 def inspect(options: argparse.Namespace, console: Console) -> None:
     """Prints what is in a dataset and writes a picture of it."""
+    from lorasp_jax.data import inspection
+    from lorasp_jax.data.opening import open_source
+
     source = open_source(options.path, _keys(options))
     if options.out and options.out.exists() and not options.overwrite:
         raise ValueError(f"{options.out} exists already: add --overwrite or choose another --out")
@@ -46,6 +51,9 @@ def inspect(options: argparse.Namespace, console: Console) -> None:
 
 def convert(options: argparse.Namespace, console: Console) -> None:
     """Writes datasets as a cache, which training reads, or one as an RLDS dataset."""
+    from lorasp_jax.data import cache, conversion
+    from lorasp_jax.data.opening import open_source
+
     keys = _keys(options)
     sources = [open_source(path, keys) for path in options.paths]
     if options.to == "rlds" and len(sources) > 1:
@@ -125,7 +133,7 @@ def _camera(text: str) -> tuple[str, str]:
 
 
 @contextmanager
-def _bar(title: str) -> Iterator[tuple[Report, Callable[[str], None]]]:
+def _bar(title: str) -> Iterator[tuple["Report", Callable[[str], None]]]:
     """A progress bar: what moves it, and what prints a sentence above it."""
     columns = (*Progress.get_default_columns(), MofNCompleteColumn(), TextColumn("steps"))
     with Progress(*columns, console=Console(stderr=True)) as progress:

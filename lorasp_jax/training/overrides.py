@@ -18,6 +18,7 @@ import tyro
 from lorasp_jax import peft
 from lorasp_jax.config import SCALES, Config
 from lorasp_jax.peft import LoRASP
+from lorasp_jax.training.scales import differences
 
 HELP = {"-h", "--help"}
 SHIPPED = Path(__file__).parents[2] / "configs"
@@ -54,6 +55,8 @@ def parse(arguments: Sequence[str]) -> Command:
     except argparse.ArgumentError as error:
         raise ValueError(str(error)) from error
     wants_help = bool(HELP & set(rest))
+    if wants_help and known.scale == "auto":
+        known.scale = "cpu"  # to look at the devices, JAX would have to start
     if known.config is not None:
         config = load(Path(known.config), choose_scale(known.scale))
     elif wants_help:
@@ -62,28 +65,36 @@ def parse(arguments: Sequence[str]) -> Command:
         _check_names(rest, Config(name="NAME", scale=known.scale, peft=LoRASP()))
         parser.print_help()
         raise ValueError("no experiment was named: add --config, such as configs/multitask.py")
+    if wants_help:
+        _parser(type(config.peft).__module__.rpartition(".")[2]).print_help()
+        print(f"\n{_on_scales(known.config, known.scale)}")
     if known.method is not None:
         config = dataclasses.replace(config, peft=_switch(config.peft, known.method))
-    if wants_help:
-        parser.print_help()
     if known.resume and known.dry_run:
         raise ValueError("a run is either resumed or tried dry: leave --resume or --dry-run out")
     return Command(override(config, rest), known.resume, known.dry_run, known.wandb)
 
 
-def _parser() -> argparse.ArgumentParser:
-    """The options that are no fields of a config."""
+def _parser(method: str = "") -> argparse.ArgumentParser:
+    """The options that are no fields of a config.
+
+    Args:
+        method: the experiment's, for its help.
+    """
     parser = argparse.ArgumentParser(
         prog="train.py",
         add_help=False,
         exit_on_error=False,
         allow_abbrev=False,
         usage="python train.py --config FILE [options] [fields]",
-        epilog="With --help, the fields follow; with --config FILE --help, as that file has them.",
     )
     parser.add_argument("--config", help="experiment file, such as configs/multitask.py")
-    parser.add_argument("--scale", default="auto", help=f"auto (the default), {', '.join(SCALES)}")
-    parser.add_argument("--method", help=f"adapter method: {', '.join(peft.names())}")
+    auto = "auto (the default: cpu on a CPU, accelerator elsewhere)"
+    parser.add_argument("--scale", default="auto", help=f"{auto}, {', '.join(SCALES)}")
+    methods = ", ".join(peft.names())
+    parser.add_argument(
+        "--method", help=f"adapter method: {methods} (default: the experiment's, {method})"
+    )
     parser.add_argument("--resume", action="store_true", help="continue the run of this name")
     parser.add_argument(
         "--dry-run", action="store_true", help="print sizes and memory, compile, stop"
@@ -97,6 +108,14 @@ def _parser() -> argparse.ArgumentParser:
         help="train together with the other processes of the launcher, see docs/launch.md",
     )
     return parser
+
+
+def _on_scales(path: str | None, scale: str) -> str:
+    """Which scale the fields in a help are of, and what another one would change."""
+    if path is None:
+        return "the fields below have their own defaults; with --config FILE, the experiment's"
+    changed = differences(lambda scale: load(Path(path), scale))
+    return f"{changed}the defaults below are those of --scale {scale}"
 
 
 def choose_scale(scale: str) -> str:

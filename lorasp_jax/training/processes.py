@@ -11,7 +11,6 @@ from typing import Any
 
 import jax
 import numpy as np
-import orbax.checkpoint as ocp
 from jax.experimental import multihost_utils
 
 _LONGEST_WAIT = 24 * 3600 * 1000  # ms; the first process may collect and evaluate for hours
@@ -49,6 +48,8 @@ def is_first() -> bool:
 
 def wait(name: str) -> None:
     """Wait until all processes are here; on the host, as devices do not wait for hours."""
+    import orbax.checkpoint as ocp
+
     ocp.multihost.get_barrier_sync_fn()(key=name, timeout_ms=_LONGEST_WAIT)
 
 

@@ -6,6 +6,7 @@ import re
 import pytest
 
 from lorasp_jax.config import Config
+from lorasp_jax.models.presets import PRESETS
 from lorasp_jax.peft import LoRA, LoRASP
 from lorasp_jax.training.overrides import load, override, parse
 
@@ -86,6 +87,19 @@ def test_help_lists_every_field_and_option(config, capsys):
     for name in ("--config", "--method", "--resume", "--dry-run"):
         assert name in printed
     assert re.search(r"--optim.b2 FLOAT +Decay of the second moment. \(default: 0.95\)", printed)
+    words = " ".join(printed.replace("│", " ").split())
+    assert "lora_moe, lora_sp (default: the experiment's, lora_sp)" in words
+    assert f"presets ({', '.join(PRESETS)}) and regular expressions" in words
+
+
+def test_help_says_what_the_scales_change(capsys):
+    with pytest.raises(SystemExit):
+        parse([*MULTITASK, "--help"])
+    printed = capsys.readouterr().out
+    assert re.search(r"\n  --scale +smoke +cpu +accelerator\n", printed)
+    assert re.search(r"\n  --peft.rank +8 +16 +64\n", printed)
+    assert "the defaults below are those of --scale cpu\n" in printed
+    assert "--seed " not in printed.partition("usage: python train.py [-h]")[0]
 
 
 def test_a_file_without_get_config(tmp_path):

@@ -1,0 +1,36 @@
+"""What an experiment's scales change, for its help."""
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from lorasp_jax.config import SCALES, Config
+
+
+def differences(at: Callable[[str], Config]) -> str:
+    """A table of the fields in which an experiment's scales differ; empty if in none.
+
+    Args:
+        at: the experiment at a scale.
+    """
+    configs = [dict(_values(at(scale))) for scale in SCALES]
+    names = dict.fromkeys(name for config in configs for name in config)
+    rows = [(name, *(config.get(name, "-") for config in configs)) for name in names]
+    rows = [row for row in rows if len(set(row[1:])) > 1]
+    if not rows:
+        return ""
+    table = [("--scale", *SCALES), *rows]
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    lines = ("  ".join(map(str.ljust, row, widths)).rstrip() for row in table)
+    return "what the scales change:\n" + "".join(f"  {line}\n" for line in lines)
+
+
+def _values(config: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Fields as their options spell them, with their values."""
+    for field in dataclasses.fields(config):
+        value, name = getattr(config, field.name), prefix + field.name.replace("_", "-")
+        if dataclasses.is_dataclass(value):
+            yield from _values(value, f"{name}.")
+        elif name != "scale":
+            text = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+            yield f"--{name}", text or "(empty)"
