@@ -238,11 +238,13 @@ class Losses(Mapping[str, jax.Array]):
         return len(_LOSSES)
 
 
+@jax.jit
 def spectral_loss(sums: LossSums) -> jax.Array:
     """Eq. (13): 1 - E_k, averaged over valid rows."""
     return _mean(sums.spectral, sums)
 
 
+@jax.jit
 def balance_loss(sums: LossSums) -> jax.Array:
     """Balance term of eq. (14): R Σ_i f_i P_i, 1 where all directions are used alike.
 
@@ -254,6 +256,7 @@ def balance_loss(sums: LossSums) -> jax.Array:
     return kept.shape[-1] * _mean(jnp.sum(used * sums.share, -1, keepdims=True), sums)
 
 
+@jax.jit
 def z_loss(sums: LossSums) -> jax.Array:
     """z term of eq. (14): (logsumexp(logits) - ln n)², n = logits' width, over valid rows.
 

@@ -12,7 +12,8 @@ cost, since at these sizes each pass over a wide array takes as long as the adap
 - where the input is at least as wide as the outputs, the gradient of x is one product,
   [g, q] [W, P]ᵀ with q the gradient of x P.
 
-The last three only where there are more tokens than inputs: for few, the copy of W is what costs.
+The last three only where there are more tokens than inputs: for few, the copy of W is what costs;
+and not on a CPU, which multiplies both as fast and takes three times as long to compile the copies.
 W is cast to the type of x in each pass and kept between them as it came, so a quantised one is not
 widened in memory for long.
 """
@@ -65,7 +66,8 @@ def one_by_one(functions: Sequence[Rows]) -> Between:
     return between
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+# Traced and lowered once for all equal layers of a model.
+@functools.partial(jax.jit, static_argnums=(0, 1))
 def low_rank_matmul(
     between: Between,
     rows_dtype: Any,
@@ -76,12 +78,23 @@ def low_rank_matmul(
     """Of each layer x W + z U in the type of x and aux, with z, aux = f(params, x P, token_mask).
 
     Args:
-      between: f.
+      between: f, hashable; equal ones are taken to do the same.
       rows_dtype: type of the rows, which are summed in fp32.
       layers: arrays of each layer.
       x: [..., I].
       token_mask: handed to each f.
     """
+    return _product(between, rows_dtype, layers, x, token_mask)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def _product(
+    between: Between,
+    rows_dtype: Any,
+    layers: Sequence[LowRankLayer],
+    x: jax.Array,
+    token_mask: jax.Array | None,
+) -> list[tuple[jax.Array, Any]]:
     return _forward(between, rows_dtype, layers, x, token_mask)[0]
 
 
@@ -161,8 +174,8 @@ def _gradient_of_input(
 
 
 def _joins(w: jax.Array, x: jax.Array) -> bool:
-    """Whether there are so many tokens that copying W next to U costs less than it saves."""
-    return math.prod(x.shape[:-1]) >= w.shape[0]
+    """Whether copying W next to U costs less than it saves: so many tokens, and no CPU."""
+    return math.prod(x.shape[:-1]) >= w.shape[0] and jax.default_backend() != "cpu"
 
 
 def _side_by_side(layers: Sequence[LowRankLayer], x: jax.Array) -> jax.Array:
@@ -190,4 +203,4 @@ def _outer(left: jax.Array, right: jax.Array, dtype: Any) -> jax.Array:
     return jnp.einsum("...m,...n->mn", left, right, preferred_element_type=dtype)
 
 
-low_rank_matmul.defvjp(_forward, _backward)
+_product.defvjp(_forward, _backward)

@@ -42,6 +42,10 @@ _CHOICES: dict[str, Any] = {
     "granularity": routing.Granularity,
     "energy_curve": energy_schedule.Curve,
 }
+# Traced and lowered once for all equal layers of a model, with and without its gradient.
+_route_once = jax.jit(
+    routing.route, static_argnames=("energy_target", "scale", "gate", "score_function")
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -237,7 +241,7 @@ class LoRASP(Method):
         else:
             kept = self._shared_mask(params, rows, counts)
             columns = jnp.split(rows.reshape(-1, rows.shape[-1]), [self.rank], axis=1)
-            z, sums, _, statistics = routing.route(
+            z, sums, _, statistics = _route_once(
                 router,
                 columns,
                 counts.reshape(-1, 1),

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optax
 
 from lorasp_jax.auxiliary import Aux
-from lorasp_jax.kernels.low_rank_matmul import Between, LowRankLayer, low_rank_matmul, one_by_one
+from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul, one_by_one
 
 Params: TypeAlias = Any
 Kernel: TypeAlias = jax.Array | jax.ShapeDtypeStruct
@@ -235,30 +235,34 @@ def _apply_fused(
         LowRankLayer(params, kernel, method.down(params), method.up(params))
         for method, params, kernel in layers
     ]
-    between = _between([method for method, _, _ in layers])
+    between = _Between(tuple(method for method, _, _ in layers))
     found: Any = low_rank_matmul(between, rows_dtype, arrays, x, token_mask)
     return [(y, dataclasses.replace(aux, token_mask=token_mask)) for y, aux in found]
 
 
-def _between(methods: Sequence[Method]) -> Between:
+@dataclasses.dataclass(frozen=True)
+class _Between:
     """`between` of all layers, in one call where they have one method that gains by it."""
-    first, n = methods[0], len(methods)
-    if n == 1 or not first.gains_together or any(method != first for method in methods):
-        return one_by_one([method.between for method in methods])
 
-    def between(
+    methods: tuple[Method, ...]
+
+    def __call__(
+        self,
         params: Sequence[Params],
         read: jax.Array,
         widths: Sequence[int],
         token_mask: jax.Array | None,
     ) -> list[tuple[jax.Array, Aux]]:
+        """z and aux of each; arguments as for `low_rank_matmul.Between`."""
+        first, n = self.methods[0], len(self.methods)
+        if n == 1 or not first.gains_together or any(method != first for method in self.methods):
+            each = one_by_one([method.between for method in self.methods])
+            return each(params, read, widths, token_mask)
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(first.for_rows, params))
         columns = range(0, sum(widths), widths[0])
         z, aux = first.between_all(stacked, read, columns, token_mask)
         of_each = [jax.tree.map(lambda a, i=i: a[i], aux) for i in range(n)]
         return list(zip(jnp.split(z, n, axis=-1), of_each, strict=True))
-
-    return between
 
 
 def check_matrix(kernel: Kernel) -> None:

@@ -17,8 +17,9 @@ READ, RANK = 4, 3
 
 
 @pytest.fixture(autouse=True)
-def full_precision():
-    """A GPU would multiply in TF32."""
+def full_precision(monkeypatch):
+    """A GPU would multiply in TF32, and a CPU joins no matrices."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     with jax.default_matmul_precision("highest"):
         yield
 
@@ -168,3 +169,34 @@ def test_kernels_are_copied_for_many_tokens_only(shape):
     joined = re.findall(r"f32\[(\d+),(\d+)\] = concatenate", program)
     copies = [sides for sides in joined if math.prod(map(int, sides)) > math.prod(shape)]
     assert bool(copies) == (shape[0] <= 10)
+
+
+def test_a_cpu_copies_no_kernel(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    program = str(jax.make_jaxpr(lambda *a: jax.vjp(ours, *a)[0])(*inputs(9, 20)))
+    assert "dot_general" in program
+    assert not re.search(r"f32\[\d+,20\] = concatenate", program)
+
+
+def test_equal_layers_are_traced_once():
+    calls = []
+
+    def counting(params, rows, token_mask):
+        calls.append(rows.shape)
+        return between(params, rows, token_mask)
+
+    function, arguments = one_by_one([counting]), inputs(9, 9)
+    params, x, *rest = arguments
+
+    def loss(params, x, several):
+        for _ in range(several):
+            ((x, aux),) = low_rank_matmul(function, x.dtype, [LowRankLayer(params, *rest)], x, MASK)
+        return x.sum() + aux["loss"]
+
+    traced = []
+    for several in (2, 6):  # the first input has no gradient
+        jax.clear_caches()
+        calls.clear()
+        jax.jit(jax.grad(loss), static_argnums=2).lower(params, x, several)
+        traced.append(len(calls))
+    assert traced[0] == traced[1]
