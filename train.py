@@ -1,7 +1,6 @@
 """Adapt a policy to a robot: `python train.py --config configs/multitask.py`."""
 
 import contextlib
-import os
 import shlex
 import sys
 import time
@@ -23,18 +22,20 @@ def main(arguments: list[str]) -> int:
     0: done, 2: bad input or a run that cannot go on, 130: stopped by a signal.
     """
     started = time.perf_counter()
-    console, errors = Console(), Console(stderr=True)
     compilation_cache.enable()
     from lorasp_jax.training import processes
     from lorasp_jax.training.interrupt import sigterm_as_interrupt
     from lorasp_jax.training.overrides import parse
-    from lorasp_jax.training.run_folder import open_run
+    from lorasp_jax.training.run_folder import open_run, to_json
 
+    console, errors = Console(), processes.LastWords(stderr=True)
     try:
         if "--distributed" in arguments:
-            processes.initialize()
+            processes.initialize(console, f"to go on: {resuming(arguments)}")
             console.quiet = not processes.is_first()
         command = parse(arguments)
+        options = {"resume": command.resume, "dry_run": command.dry_run}
+        processes.agree("settings", to_json(command.config) | options)
         if command.dry_run:
             from lorasp_jax.training.dry_run import dry_run
 
@@ -48,18 +49,24 @@ def main(arguments: list[str]) -> int:
             if command.resume and (folder / "results.json").exists():
                 from lorasp_jax.report.html import write_report
 
-                console.print(f"this run is finished: {write_report(folder)}", markup=False)
+                if processes.is_first():
+                    console.print(f"this run is finished: {write_report(folder)}", markup=False)
                 return 0
             stack.enter_context(sigterm_as_interrupt())
             run(command, folder, console, started)
     except Exception as error:  # the input's fault is told in one sentence, ours is raised again
         return refused(error, errors, ": make room and add --resume")
     except KeyboardInterrupt:
-        again = shlex.join(argument for argument in arguments if argument != "--resume")
-        message = f"stopped; to go on: python train.py {again} --resume"
+        message = f"stopped; to go on: {resuming(arguments)}"
         errors.print(message, soft_wrap=True, highlight=False, markup=False)
         return STOPPED
     return 0
+
+
+def resuming(arguments: list[str]) -> str:
+    """The command that goes on with this run."""
+    resumes = any(argument.startswith("--resume") for argument in arguments)
+    return shlex.join(["python", "train.py", *arguments, *([] if resumes else ["--resume"])])
 
 
 def run(command, folder: Path, console: Console, started: float) -> None:
@@ -80,7 +87,7 @@ def run(command, folder: Path, console: Console, started: float) -> None:
         evaluation = Evaluation() if prepared.simulated else NoEvaluation()
         callbacks = [Export(), evaluation, Report(), *callbacks]
         first = processes.is_first()
-        loop.train(prepared, callbacks if first else [], resume=command.resume)
+        loop.train(prepared, callbacks if first else [], resume=bool(command.resume))
     report = folder / "report.html"
     console.print(f"finished in {prepared.seconds['total']:.0f} s: {report}", markup=False)
 
@@ -88,5 +95,6 @@ def run(command, folder: Path, console: Console, started: float) -> None:
 if __name__ == "__main__":
     code = main(sys.argv[1:])
     if code:
-        sys.stdout.flush()
-        os._exit(code)  # threads that still compile cannot be stopped, and would be waited for
+        from lorasp_jax.training import processes
+
+        processes.leave(code)  # not waiting for threads that still compile, which cannot be stopped

@@ -62,6 +62,7 @@ def train(run: Run, callbacks: Sequence[Callback] = (), *, resume: bool = False)
     except RunError as error:
         for callback in callbacks:
             callback.on_stop(run, str(error))
+        processes.wait("stopped")  # or the first one might be ended before it has told
         raise
     finally:
         checkpoints.close()

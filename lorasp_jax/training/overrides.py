@@ -10,7 +10,7 @@ import itertools
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import tyro
@@ -31,13 +31,13 @@ class Command:
 
     Attributes:
         config: the experiment.
-        resume: whether to go on with the run of this name.
+        resume: whether to go on with the run of this name; "auto": if there is one.
         dry_run: whether to stop before anything is collected, trained or written.
         wandb: project of Weights & Biases, or None.
     """
 
     config: Config
-    resume: bool = False
+    resume: bool | Literal["auto"] = False
     dry_run: bool = False
     wandb: str | None = None
 
@@ -95,7 +95,14 @@ def _parser(method: str = "") -> argparse.ArgumentParser:
     parser.add_argument(
         "--method", help=f"adapter method: {methods} (default: the experiment's, {method})"
     )
-    parser.add_argument("--resume", action="store_true", help="continue the run of this name")
+    parser.add_argument(
+        "--resume",
+        nargs="?",
+        const=True,
+        default=False,
+        choices=["auto"],
+        help="continue the run of this name; with auto, start it if there is none",
+    )
     parser.add_argument(
         "--dry-run", action="store_true", help="print sizes and memory, compile, stop"
     )

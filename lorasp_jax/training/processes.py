@@ -4,41 +4,168 @@ All train; the first one alone collects, evaluates, prints and writes. The folde
 one that all of them see. With one process nothing here does anything.
 """
 
+import atexit
 import contextlib
+import ctypes
+import hashlib
+import importlib.metadata
+import importlib.util
 import os
-from collections.abc import Iterator
-from typing import Any
+import platform
+import signal
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NoReturn
 
 import jax
 import numpy as np
+from jax._src import clusters  # there is no public way to ask where the others are
 from jax.experimental import multihost_utils
+from rich.console import Console
+
+from lorasp_jax.training import peers
+from lorasp_jax.training.meeting import PATIENCE, Meeting
 
 _LONGEST_WAIT = 24 * 3600 * 1000  # ms; the first process may collect and evaluate for hours
+_NAMES = ("JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
+_VERSIONED = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "mujoco", "mujoco-mjx")
+_FAILED = "ended by an error, its traceback is in its output"
+
+_others: peers.Peers | None = None
 
 
-def initialize() -> None:
+def initialize(console: Console, advice: str) -> None:
     """Join the other processes; before JAX starts its backend.
 
-    JAX finds them itself under Slurm, Open MPI, Kubernetes and on TPU pods. Elsewhere
-    JAX_COORDINATOR_ADDRESS (host:port of the first process), JAX_NUM_PROCESSES and JAX_PROCESS_ID
-    say it.
+    From then on all of them end when one does, unless all have finished. JAX finds the address
+    itself under Slurm, Open MPI, Kubernetes and on TPU pods. Elsewhere JAX_COORDINATOR_ADDRESS
+    (host:port of the first process), JAX_NUM_PROCESSES and JAX_PROCESS_ID say it.
+
+    Args:
+        console: where the first process says whom it waits for.
+        advice: what to do when another one is gone.
 
     Raises:
-        ValueError: nothing says where the others are, or they cannot be reached.
+        ValueError: nothing says where the others are, they cannot be reached, or another one runs
+            other versions.
     """
-    names = {"num_processes": "JAX_NUM_PROCESSES", "process_id": "JAX_PROCESS_ID"}
+    global _others  # noqa: PLW0603
+    address, count, number = _whereabouts()
+    if number == 0:
+        listener = peers.listen(address)
+        console.print(f"waiting for {count} processes at {address}", highlight=False)
+        Meeting(listener, address, count, advice)
+    _others = peers.Peers(address, number, count, _say, advice)
+    _others.agree("versions", _versions())
+    if os.environ.get("JAX_PLATFORMS") == "cpu":
+        jax.config.update("jax_cpu_collectives_implementation", "gloo")
+    jax.config.update("jax_enable_preemption_service", False)  # signals are `interrupt`'s
+    jax.distributed.initialize(address, count, number)
+    _abort_slowly()
+    atexit.register(_others.leave, 0)  # before JAX, which waits for the others
+    sys.excepthook = _fail
+
+
+def _whereabouts() -> tuple[str, int, int]:
+    """The address where all meet, how many they are, and this one's number.
+
+    Raises:
+        ValueError: nothing says it, or something wrong.
+    """
     try:
-        given: Any = {
-            key: int(os.environ[name]) for key, name in names.items() if name in os.environ
-        }
-        if os.environ.get("JAX_PLATFORMS") == "cpu":
-            jax.config.update("jax_cpu_collectives_implementation", "gloo")
-        jax.distributed.initialize(**given)
+        count, number = (int(os.environ[name]) if name in os.environ else None for name in _NAMES)
+        address, count, number, _ = clusters.ClusterEnv.auto_detect_unset_distributed_params(
+            os.environ.get("JAX_COORDINATOR_ADDRESS"), count, number, None, None, int(PATIENCE)
+        )
+        if address is None or count is None or number is None:
+            raise ValueError("nothing says where they are")
     except (ValueError, RuntimeError) as error:
         raise ValueError(
             "--distributed found no other processes: start it by Slurm, Open MPI or on a TPU pod, "
-            f"or set JAX_COORDINATOR_ADDRESS, {' and '.join(names.values())} ({error})"
+            f"or set JAX_COORDINATOR_ADDRESS, {' and '.join(_NAMES)} ({error})"
         ) from error
+    if not 0 <= number < count:
+        raise ValueError(f"JAX_PROCESS_ID must be 0 to {count - 1}, got {number}")
+    return address, count, number
+
+
+def _versions() -> dict[str, str]:
+    """What must be the same for all to compute the same."""
+    found = {name: importlib.metadata.version(name) for name in _VERSIONED}
+    sources = hashlib.sha256()
+    for package in ("envs", "lorasp_jax"):
+        spec = importlib.util.find_spec(package)
+        folder = Path(str(spec and spec.origin)).parent
+        for file in sorted(folder.rglob("*.py")):
+            sources.update(f"{file.relative_to(folder)}\n".encode() + file.read_bytes())
+    own = {"Python": platform.python_version(), "source of lorasp_jax": sources.hexdigest()[:12]}
+    return found | own
+
+
+def _abort_slowly() -> None:
+    """Give a process that JAX aborts, because the first one is gone, the time to say so.
+
+    A handler of SIGABRT in Python would never run. C's `sleep` may be one, as it is safe in signal
+    handlers: it is called with the signal's number, 6, for seconds.
+    """
+    library = ctypes.CDLL(None)
+    library.signal.argtypes = (ctypes.c_int, ctypes.c_void_p)
+    library.signal(signal.SIGABRT, ctypes.cast(library.sleep, ctypes.c_void_p))
+
+
+def agree(topic: str, facts: Mapping[str, Any]) -> None:
+    """Wait until all processes have said the same.
+
+    Args:
+        topic: what the facts are, in the plural.
+        facts: JSON values by name; values may be such mappings again.
+
+    Raises:
+        ValueError: another process says something else.
+    """
+    if _others is not None:
+        _others.agree(topic, facts)
+
+
+class LastWords(Console):
+    """Where a process says why it ends; of several, the first one says it for all."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """As rich has it."""
+        if _others is not None:
+            _others.give_way()
+            _others.last_words = " ".join(map(str, objects))
+        if _others is None or _others.number == 0:
+            super().print(*objects, **options)
+
+
+def leave(code: int) -> NoReturn:
+    """End this process at once, with all its threads, and the others with it."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    if _others is not None:
+        _others.leave(code)
+    os._exit(code)
+
+
+def _say(text: str) -> None:
+    """Print what was heard of the others."""
+    errors = Console(stderr=True)
+    errors.show_cursor()  # which a progress bar hides
+    errors.print(text, style="red", soft_wrap=True, highlight=False, markup=False)
+
+
+def _fail(
+    kind: type[BaseException], error: BaseException, traceback: TracebackType | None
+) -> NoReturn:
+    """End by an error that nobody caught; JAX would wait for the others first."""
+    if _others is not None:
+        _others.give_way()
+        _others.last_words = _FAILED
+    sys.__excepthook__(kind, error, traceback)
+    leave(1)
 
 
 def is_first() -> bool:

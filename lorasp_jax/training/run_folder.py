@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from tensorboardX import summary
@@ -65,10 +65,11 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def open_run(config: Config, root: Path, *, resume: bool) -> Iterator[Path]:
+def open_run(config: Config, root: Path, *, resume: bool | Literal["auto"]) -> Iterator[Path]:
     """The run's folder, for this process alone as long as it is open.
 
-    It is created, or with `resume` checked to hold this very run.
+    It is created, or with `resume` checked to hold this very run; "auto" is that of the two which
+    fits.
 
     Raises:
         ValueError: the folder cannot be made or has a wildcard in its path; another process works
@@ -82,7 +83,7 @@ def open_run(config: Config, root: Path, *, resume: bool) -> Iterator[Path]:
             f"{' '.join(sorted(found))} in it: choose another --name or place"
         )
     with _locked(folder):
-        if resume:
+        if (folder / RECORD).exists() if resume == "auto" else resume:
             changed = _differences(_recorded(folder), to_json(config))
             if changed:
                 raise ValueError(

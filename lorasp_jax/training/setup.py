@@ -107,6 +107,7 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
     """
     built = build(config, folder)
     base, model = built.base, built.model
+    processes.agree("bases", {"base": built.base_hash, "remat": base.config.remat})
     console.print(headline(config, model))
     console.print(
         f"memory by device in GiB: {built.memory}; rematerialisation: {base.config.remat}"

@@ -4,10 +4,12 @@ from tests.several import start
 
 ONE_OF_THEM = """
 import jax
+from rich.console import Console
+
 import envs
 from lorasp_jax.training import processes
 
-processes.initialize()
+processes.initialize(Console(), "add --resume")
 env = envs.make("press", num_envs=2, image_size=16)
 assert env.physics._model.opt.timestep.devices() == {jax.local_devices()[0]}
 assert jax.process_count() == 2

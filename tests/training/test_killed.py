@@ -4,7 +4,6 @@ import contextlib
 import json
 import os
 import random
-import socket
 import subprocess
 import sys
 import time
@@ -20,6 +19,7 @@ from lorasp_jax.training import processes
 from lorasp_jax.training.checkpoint import WRITTEN
 from lorasp_jax.training.run_folder import read_metrics
 from tests.runs import leaves, repeatable
+from tests.several import environments
 from tests.training.worker import work
 
 ROOT = Path(__file__).parents[2]
@@ -137,14 +137,7 @@ def test_a_run_goes_on_in_processes_with_other_devices(tmp_path):
 def test_a_signal_to_one_of_two_processes_saves_on_both(tmp_path):
     """2 processes of 2 devices; then one process of 8 goes on."""
     folder = tmp_path / "run"
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
-    known = {"JAX_COORDINATOR_ADDRESS": address, "JAX_NUM_PROCESSES": "2"}
-    one, other = (
-        started(folder, known | {"JAX_PROCESS_ID": number}, steps=40, devices=2)
-        for number in ("0", "1")
-    )
+    one, other = (started(folder, own, steps=40, devices=2) for own in environments(2))
     with one as first, other as second:
         for process in (first, second):
             wait_for(process, "step 3")

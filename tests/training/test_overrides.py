@@ -47,8 +47,11 @@ def test_method_by_name_keeps_the_rank():
     assert isinstance(config.peft, LoRA)
     assert config.peft.rank == parse(MULTITASK).config.peft.rank
     assert config.peft.alpha == 7
-    assert command.resume
+    assert command.resume is True
     assert not command.dry_run
+    for auto in (["--resume", "auto"], ["--resume=auto"]):
+        assert parse([*MULTITASK, *auto, "--method", "lora"]).resume == "auto"
+    assert parse(MULTITASK).resume is False
 
 
 @pytest.mark.parametrize(
@@ -63,6 +66,7 @@ def test_method_by_name_keeps_the_rank():
         ([*MULTITASK, "--peft.rnk", "4"], "unknown option --peft.rnk: did you mean --peft.rank?"),
         ([*MULTITASK, "--dry-runn"], "unknown option --dry-runn: did you mean --dry-run?"),
         ([*MULTITASK, "--dry-run", "--resume"], "leave --resume or --dry-run out"),
+        ([*MULTITASK, "--resume", "always"], "--resume: invalid choice: 'always'.*auto"),
         ([*MULTITASK, "--optim.steps", "many"], "--optim.steps.*'many'"),
         ([*MULTITASK, "--peft.energy-target", "1.5"], "1.5"),
         ([*MULTITASK, "--peft.energy-target", "0"], "0"),

@@ -1,35 +1,21 @@
 """Several processes train as one does, and only the first one writes."""
 
-import os
 import socket
 import subprocess
 import sys
-from pathlib import Path
+import time
 
-import jax
 import numpy as np
 import pytest
 from jax.sharding import PartitionSpec as P
+from rich.console import Console
 
 from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training import processes
 from tests.runs import repeatable
+from tests.several import NAMES, ROOT, environments, start
 
-ROOT = Path(__file__).parents[2]
-NAMES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
-
-
-def start(folder, count, streams):
-    """`count` processes, of four devices together, in one folder."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
-    flags = f"--xla_force_host_platform_device_count={4 // count}"
-    everyone = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
-    for number in range(count):
-        own = zip(NAMES, (address, str(count), str(number)), strict=True) if count > 1 else ()
-        command = [sys.executable, "-m", "tests.training.together", folder, str(streams)]
-        yield subprocess.Popen(command, env=everyone | dict(own), cwd=ROOT)
+WORKER = ("-u", "-m", "tests.training.worker")
 
 
 @pytest.mark.slow
@@ -38,8 +24,9 @@ def test_two_processes_train_as_one(streams, tmp_path):
     """Stopped by a signal to one of them, and resumed."""
     folders = {count: tmp_path / str(count) for count in (1, 2)}
     for count, folder in folders.items():
-        codes = [process.wait() for process in list(start(folder, count, streams))]
-        assert codes == [0] * count
+        arguments = ("-m", "tests.training.together", folder, streams)
+        children = start(count, *arguments, devices=4 // count)
+        assert [child.wait() for child in children] == [0] * count
         assert (folder / "ended").exists()
         assert len(list((folder / "tensorboard").iterdir())) == 2
     one, two = map(repeatable, folders.values())
@@ -62,18 +49,81 @@ def test_alone_nothing_is_waited_for():
     assert processes.own(placed) is placed
 
 
-def test_nobody_there_is_one_sentence(monkeypatch):
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [0, 1])
+def test_when_one_is_killed_the_last_line_of_the_other_names_resume(number, tmp_path):
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    children = start(2, *WORKER, tmp_path / "run", "--steps", 4000, **pipes)
+    for child in children:
+        while child.stdout.readline() not in ("", "step 3\n"):
+            pass
+    killed, other = children[number], children[1 - number]
+    killed.kill()
+    began = time.monotonic()
+    last = other.communicate(timeout=60)[0].splitlines()[-1]
+    assert time.monotonic() - began < 20
+    assert other.returncode == 1
+    assert "is gone without a word: it was killed" in last
+    assert last.endswith("add --resume")
+    killed.communicate()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [0, 1])
+def test_an_error_in_one_ends_the_other_in_seconds(number, tmp_path):
+    """Without waiting for it, as JAX would, and without any noise over the traceback."""
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    command = [*WORKER, tmp_path / "run", "--steps", 4000]
+    children = [
+        subprocess.Popen(
+            [sys.executable, *map(str, command), *(["--fails", "3"] if i == number else [])],
+            env=own,
+            cwd=ROOT,
+            text=True,
+            **pipes,
+        )
+        for i, own in enumerate(environments(2))
+    ]
+    failed, other = children[number], children[1 - number]
+    said = failed.communicate(timeout=120)[1]
+    began = time.monotonic()
+    heard = other.communicate(timeout=60)[1]
+    assert time.monotonic() - began < 20
+    assert [child.returncode for child in children] == [1, 1]
+    assert said.endswith("RuntimeError: nobody catches this\n")
+    assert heard.count("\n") == (number == 1)
+    assert number == 0 or heard.startswith("process 1 on ")
+
+
+def joined(*environment, monkeypatch):
+    """Where this process would find the others."""
     for name in NAMES:
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(
-        jax.distributed, "initialize", lambda **_: (_ for _ in ()).throw(ValueError("no address"))
-    )
-    before = jax.config.jax_cpu_collectives_implementation
-    with pytest.raises(ValueError, match="found no other processes: start it by Slurm") as caught:
-        processes.initialize()
-    jax.config.update("jax_cpu_collectives_implementation", before)
+    for name, value in zip(NAMES, environment, strict=True):
+        if value is not None:
+            monkeypatch.setenv(name, value)
+    processes.initialize(Console(), "add --resume")
+
+
+@pytest.mark.parametrize(
+    ("environment", "reason"),
+    [
+        ((None, None, None), "found no other processes: start it by Slurm.*nothing says where"),
+        (("10.0.0.1:1", None, "0"), "or set JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and"),
+        (("10.0.0.1:1", "2", "second"), "JAX_PROCESS_ID .*'second'"),
+        (("10.0.0.1:1", "2", "2"), "JAX_PROCESS_ID must be 0 to 1, got 2"),
+        (("localhost", "2", "0"), "must be host:port, such as 10.0.0.1:1234, got 'localhost'"),
+        (("localhost", "2", "1"), "must be host:port, such as 10.0.0.1:1234, got 'localhost'"),
+    ],
+)
+def test_where_the_others_cannot_be_is_one_sentence(environment, reason, monkeypatch):
+    with pytest.raises(ValueError, match=reason) as caught:
+        joined(*environment, monkeypatch=monkeypatch)
     assert "\n" not in str(caught.value)
-    monkeypatch.setenv("JAX_PROCESS_ID", "second")
-    with pytest.raises(ValueError, match="JAX_PROCESS_ID"):
-        processes.initialize()
-    jax.config.update("jax_cpu_collectives_implementation", before)
+
+
+def test_a_port_in_use_is_one_sentence(monkeypatch):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(ValueError, match=r"port \d+ of .* cannot be had .Address already in"):
+            joined(address, "2", "0", monkeypatch=monkeypatch)

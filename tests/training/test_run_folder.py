@@ -89,6 +89,18 @@ def test_resume_needs_the_same_settings(tmp_path):
     assert json.loads((folder / "config.json").read_text())["peft"]["rank"] == 8
 
 
+def test_resume_auto_starts_or_goes_on(tmp_path):
+    folder = open_run(CONFIG, tmp_path, resume="auto")
+    (folder / "metrics.jsonl").write_text("precious\n")
+    assert open_run(CONFIG, tmp_path, resume="auto") == folder
+    assert (folder / "metrics.jsonl").read_text() == "precious\n"
+    with pytest.raises(ValueError, match=r"other settings \(seed"):
+        open_run(dataclasses.replace(CONFIG, seed=3), tmp_path, resume="auto")
+    (folder / "config.json").unlink()
+    with pytest.raises(ValueError, match="already holds a run"):
+        open_run(CONFIG, tmp_path, resume="auto")
+
+
 @pytest.mark.parametrize("place", ["", "a", ".a.lock/"])
 def test_something_else_is_where_the_folder_should_be(tmp_path, place):
     root = tmp_path / "runs"

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from rich.console import Console
 
 from lorasp_jax.config import EvaluationConfig
 from lorasp_jax.data.batches import flatten
@@ -42,7 +43,7 @@ class Look(Callback):
 def main(folder: str, streams: str) -> None:
     """A run in two parts; large arrays are those over 1 KiB."""
     if "JAX_PROCESS_ID" in os.environ:
-        processes.initialize()
+        processes.initialize(Console(), "add --resume")
     mesh.shardings = functools.partial(mesh.shardings, minimum=1024)
     config = dataclasses.replace(
         CONFIG,

@@ -14,6 +14,9 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--steps", type=int, default=12)
     parser.add_argument("--until", type=int, help="step at which a signal comes")
+    parser.add_argument(
+        "--fails", type=int, help="step at which an error comes that nobody catches"
+    )
     parser.add_argument("--devices", type=int, default=8, help="of this process")
     parser.add_argument("--mesh", type=int, help="how many of them are used; all unless said")
     return parser.parse_args()
@@ -23,6 +26,7 @@ def main(args: argparse.Namespace) -> None:
     os.environ["JAX_PLATFORMS"] = "cpu"
     os.environ["XLA_FLAGS"] = xla.flags(args.devices)
     import jax
+    from rich.console import Console
 
     from envs import compilation_cache
 
@@ -32,11 +36,11 @@ def main(args: argparse.Namespace) -> None:
     from lorasp_jax.training import processes
 
     if "JAX_PROCESS_ID" in os.environ:
-        processes.initialize()
+        processes.initialize(Console(), "add --resume")
 
     devices = jax.devices()[: args.mesh]
     meshes.make_mesh = lambda _, make=meshes.make_mesh: make(1, devices)
-    work(args.folder, args.steps, args.until)
+    work(args.folder, args.steps, args.until, args.fails)
 
 
 def prepare(folder: Path, steps: int):
@@ -53,7 +57,7 @@ def prepare(folder: Path, steps: int):
     return make_run(folder, config, Miniature())
 
 
-def work(folder: Path, steps: int, until: int | None = None):
+def work(folder: Path, steps: int, until: int | None = None, fails: int | None = None):
     """Begin the run or go on with it; it is returned if it is finished."""
     from lorasp_jax.training.interrupt import sigterm_as_interrupt
     from lorasp_jax.training.loop import train
@@ -62,6 +66,8 @@ def work(folder: Path, steps: int, until: int | None = None):
     class Tell(Callback):
         def on_log(self, run, step, metrics):
             print("step", step, flush=True)
+            if step == fails:
+                raise RuntimeError("nobody catches this")
             if step == until:
                 signal.raise_signal(signal.SIGTERM)
 
