@@ -85,10 +85,10 @@ def test_an_error_in_one_ends_the_other_in_seconds(number, tmp_path):
         for i, own in enumerate(environments(2))
     ]
     failed, other = children[number], children[1 - number]
-    said = failed.communicate(timeout=120)[1]
+    said = failed.communicate(timeout=400)[1]
     began = time.monotonic()
     heard = other.communicate(timeout=60)[1]
-    assert time.monotonic() - began < 20
+    assert time.monotonic() - began < 30  # 8 s alone
     assert [child.returncode for child in children] == [1, 1]
     assert said.endswith("RuntimeError: nobody catches this\n")
     assert heard.count("\n") == (number == 1)

@@ -1,0 +1,179 @@
+"""The commands of docs/launch.md on a real Slurm of one node, which this test starts."""
+
+import contextlib
+import getpass
+import json
+import os
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+
+from lorasp_jax.training.run_folder import read_metrics
+from tests.several import ROOT
+
+PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "scancel", "scontrol")
+MISSING = [name for name in PROGRAMS if not shutil.which(name)]
+STEPS = 40
+OPTIONS = (
+    *("--config", "configs/multitask.py", "--scale", "smoke", "--tasks", "press"),
+    *("--optim.steps", str(STEPS), "--log-every", "1", "--checkpoint-every", "1000"),
+    *("--data.episodes", "2", "--data.num-envs", "2"),
+    *("--evaluation.episodes", "2", "--evaluation.num-envs", "2"),
+)
+SIZES = ("--nodes=1", "--ntasks-per-node=2", "--gpus-per-node=2", "--cpus-per-task=1")
+CONFIG = """
+ClusterName=test
+SlurmctldHost={host}(127.0.0.1)
+SlurmctldPort={ports[0]}
+SlurmdPort={ports[1]}
+SlurmUser={user}
+SlurmdUser={user}
+AuthInfo=socket={folder}/munge.socket
+StateSaveLocation={folder}/state
+SlurmdSpoolDir={folder}/spool
+SlurmctldPidFile={folder}/slurmctld.pid
+SlurmdPidFile={folder}/slurmd.pid
+SlurmctldLogFile={folder}/slurmctld.log
+SlurmdLogFile={folder}/slurmd.log
+ProctrackType=proctrack/linuxproc
+TaskPlugin=task/none
+MpiDefault=none
+SlurmdParameters=config_overrides
+SelectType=select/cons_tres
+GresTypes=gpu
+NodeName=localhost NodeHostname={host} NodeAddr=127.0.0.1 CPUs=2 Gres=gpu:2
+PartitionName=all Nodes=ALL Default=YES
+"""
+
+
+def free_ports(count):
+    with contextlib.ExitStack() as stack:
+        taken = [stack.enter_context(socket.create_server(("", 0))) for _ in range(count)]
+        return [one.getsockname()[1] for one in taken]
+
+
+@contextlib.contextmanager
+def running(*command, environment):
+    """A daemon in the foreground, as long as this block lasts."""
+    nowhere = subprocess.DEVNULL
+    with subprocess.Popen(command, env=environment, stdout=nowhere, stderr=nowhere) as process:
+        try:
+            yield
+        finally:
+            process.terminate()
+
+
+@pytest.fixture
+def slurm(tmp_path):
+    """Runs a command of Slurm's in a working copy; gives what it prints."""
+    folder = tmp_path / "slurm"
+    for name in ("state", "spool"):
+        (folder / name).mkdir(parents=True)
+    folder.chmod(0o755)  # munged's socket has to be reachable
+    key = folder / "munge.key"
+    key.write_bytes(os.urandom(64))
+    key.chmod(0o400)
+    host = socket.gethostname().partition(".")[0]
+    known = {"host": host, "user": getpass.getuser(), "folder": folder, "ports": free_ports(2)}
+    (folder / "slurm.conf").write_text(CONFIG.format(**known))
+    (folder / "gres.conf").write_text("Name=gpu File=/dev/null\nName=gpu File=/dev/zero\n")
+    environment = {
+        **os.environ,
+        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+        "SLURM_CONF": str(folder / "slurm.conf"),
+        "JAX_PLATFORMS": "cpu",
+        "XLA_FLAGS": "--xla_force_host_platform_device_count=1",
+        "JAX_COMPILATION_CACHE_DIR": str(tmp_path / "programs"),
+    }
+    for name in ("train.py", "configs"):
+        (tmp_path / name).symlink_to(ROOT / name)
+
+    def run(*command, **changes):
+        done = subprocess.run(  # noqa: PLW1510
+            command, env=environment | changes, cwd=tmp_path, text=True, capture_output=True
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    munged = ["munged", "--foreground", "--force", f"--key-file={key}"]
+    munged += [f"--{what}-file={folder}/munge.{what}" for what in ("log", "pid", "seed")]
+    munged.append(f"--socket={folder}/munge.socket")
+    with (
+        running(*munged, environment=environment),
+        running("slurmctld", "-D", environment=environment),
+        running("slurmd", "-D", "-N", "localhost", environment=environment),
+    ):
+        yield run
+
+
+def page():
+    """`job.sh` of the page and its commands, by name."""
+    text = (ROOT / "docs/launch.md").read_text()
+    blocks = re.findall(r"^```\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    job = next(block for block in blocks if "srun" in block and "--distributed" in block)
+    lines = next(block for block in blocks if "scancel" in block).splitlines()
+    return job, {line.split()[0]: line.partition("#")[0].split() for line in lines}
+
+
+def wait_for(what, seconds=900):
+    """Poll until it gives something."""
+    end = time.monotonic() + seconds
+    while not (found := what()):
+        assert time.monotonic() < end, what
+        time.sleep(0.2)
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.skipif(bool(MISSING), reason=f"not installed: {', '.join(MISSING)}")
+def test_a_run_under_slurm_stops_goes_on_and_equals_one_process(slurm, tmp_path):
+    job, commands = page()
+    (tmp_path / "job.sh").write_text(job)
+    whole, folder = (tmp_path / "runs" / name for name in ("whole", "slurm"))
+    two = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+    slurm("python", "train.py", *OPTIONS, "--name", "whole", **two)
+
+    def number(name):
+        return lambda: re.search(rf"{name}=(\S+)", slurm("scontrol", "show", "job", job_id))[1]
+
+    submit = commands["sbatch"][:2]
+    wait_for(lambda: "idle" in slurm("sinfo", "--noheader"))
+    sbatch = [submit[0], *SIZES, f"--output={tmp_path}/log", *submit[1:]]
+    job_id = slurm(*sbatch, *OPTIONS, "--name", "slurm").split()[-1]
+    told = lambda name: [word.replace("JOBID", job_id) for word in commands[name]]  # noqa: E731
+    wait_for(lambda: read_metrics(folder))
+    slurm(*told("scancel"))
+    wait_for(lambda: number("JobState")() == "FAILED")
+    assert number("ExitCode")() == "130:0"
+    log = (tmp_path / "log").read_text()
+    assert "waiting for 2 processes at localhost:" in log
+    assert log.count("stopped; to go on: python train.py --distributed --resume auto") == 1
+    assert 0 < len(read_metrics(folder)) < STEPS
+    slurm(*told("scontrol"))
+    slurm("scontrol", "update", f"jobid={job_id}", "StartTime=now")
+    wait_for(lambda: number("JobState")() == "COMPLETED")
+    assert number("Restarts")() == "1"
+    assert not re.search("Traceback|without a word", (tmp_path / "log").read_text())
+    assert_same(folder, whole)
+
+
+def assert_same(found, expected):
+    """To rounding, as sums over a batch are in another order."""
+    rows = [[row["task"] for row in read_metrics(folder)] for folder in (found, expected)]
+    assert len(rows[0]) == STEPS
+    np.testing.assert_allclose(*rows, rtol=1e-3)
+    results = [json.loads((folder / "results.json").read_text()) for folder in (found, expected)]
+    assert results[0]["trainable_parameters"] == results[1]["trainable_parameters"]
+    one, other = (load_file(folder / "adapter.safetensors") for folder in (found, expected))
+    assert one.keys() == other.keys()
+    for name, value in other.items():
+        np.testing.assert_allclose(one[name], value, atol=1e-3 * abs(value).max(), err_msg=name)
