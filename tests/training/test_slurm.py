@@ -117,7 +117,7 @@ def slurm(tmp_path):
 def page():
     """`job.sh` of the page and its commands, by name."""
     text = (ROOT / "docs/launch.md").read_text()
-    blocks = re.findall(r"^```\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    blocks = re.findall(r"^```\w*\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     job = next(block for block in blocks if "srun" in block and "--distributed" in block)
     lines = next(block for block in blocks if "scancel" in block).splitlines()
     return job, {line.split()[0]: line.partition("#")[0].split() for line in lines}
