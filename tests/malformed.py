@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import safetensors.numpy
 
 from envs.files import RefusedError
+from lorasp_jax.digest import DIGEST, sealed
 
 ROOT = Path(__file__).parent.parent
 Damage = Callable[[Path], None]
@@ -75,6 +76,8 @@ def fields(pattern: str, values: dict[str, list[Any]], line: int | None = None) 
                     del owner[key]
                 else:
                     owner[key] = value
+                if isinstance(content, dict) and content.pop(DIGEST, None):
+                    content = sealed(content)  # what is wrong shows behind the digest, too
                 lines[line or 0] = json.dumps(content)
                 path.write_text("\n".join(lines))
 

@@ -4,16 +4,15 @@
     steps = cache.Cache("my_cache").steps
 
 A folder of plain .npy files that are mapped into memory, raw pictures among them; cache.json with
-what all episodes share and checksums of all but the pictures; statistics.json. A batch is one
-gather per file. Measured on two cores, 64 windows of two cameras at a time, shuffled: 128 x 128
-pixels 37,000 windows/s, 224 x 168 18,000; from array_record files of raw pictures 6,500 and 3,800.
+what all episodes share and the files' checksums; statistics.json. Pictures have a checksum each, in
+files of their own, and are compared when they are first read. A batch is one gather per file.
+Measured on two cores, 64 windows of two cameras at a time, shuffled: 128 x 128 pixels 37,000
+windows/s, 224 x 168 18,000; from array_record files of raw pictures 6,500 and 3,800.
 """
 
-import contextlib
 import json
 import math
 import os
-import tokenize
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -23,26 +22,26 @@ from typing import Any, Self
 import numpy as np
 
 from envs.episodes import SHARED, Episodes, creating
-from envs.files import RefusedError, read_json, read_text, regular
+from envs.files import read_json, read_text
 from envs.locks import alone
 from lorasp_jax.data.batches import Steps
-from lorasp_jax.data.columns import Column
+from lorasp_jax.data.columns import Column, damage, mapped
+from lorasp_jax.data.pictures import Pictures, checksum
 from lorasp_jax.data.source import Progress, Source
+from lorasp_jax.digest import DIGEST, sealed, unsealed
 from lorasp_jax.models.statistics import Statistics
 
 FORMAT = "lorasp-cache-1"
 HEADER, STATISTICS = "cache.json", "statistics.json"
 ROWS = ("state", "action", "length", "instruction", "task")
 """Files beside those of the cameras: of steps, of steps, of episodes, of episodes, of episodes."""
-_IMAGE = "image_"
-_TYPES = "fiB"  # numbers, indices, pixels
+_IMAGE, _CHECKSUM = "image_", "crc32_"
+_KIND = {"state": np.float32, "action": np.float32, "image": np.uint8, "crc32": np.uint32}
 FACTS = tuple(name for name in SHARED if name not in ("task", "instructions"))
 """What the episodes of a cache have in common."""
 _KINDS = {"robot": str, "actions": str, "control_dt": float, "physics_dt": float, "steps": int}
 _KINDS |= {"numbers": int, "cameras": dict, "crc32": dict, "tasks": list, "instructions": list}
-_FAILURES = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError)
-_FAILURES += (SyntaxError, tokenize.TokenError)  # of NumPy, which parses a file's header
-_FAILURES += (ArithmeticError, RecursionError)  # of JSON and its numbers
+_KNOWN = {*_KINDS, "format", DIGEST}
 
 
 def write(
@@ -127,7 +126,8 @@ class Writer:
             return
         if not self.num_steps:
             raise ValueError("there is no episode to write")
-        rows = {name: np.load(self._folder / f"{name}.npy") for name in ROWS}
+        checksums = [name for name in self._columns if name.startswith(_CHECKSUM)]
+        rows = {name: np.load(self._folder / f"{name}.npy") for name in (*ROWS, *checksums)}
         if self._facts["actions"] == "joint":
             width, every = rows["state"].shape[1], np.ones(self.num_steps, bool)
             state, action = rows["state"], rows["action"]
@@ -136,7 +136,7 @@ class Writer:
         facts = {"format": FORMAT, **self._facts, "steps": self.num_steps}
         facts |= {"tasks": self._tasks, "instructions": self._instructions}
         facts["crc32"] = {name: zlib.crc32(array.data) for name, array in rows.items()}
-        (self._folder / HEADER).write_text(json.dumps(facts, indent=1))
+        (self._folder / HEADER).write_text(json.dumps(sealed(facts), indent=1))
 
     def append(self, episode: Episodes) -> None:
         """Adds an `Episodes` of one.
@@ -156,6 +156,9 @@ class Writer:
         steps |= {_IMAGE + name: picture for name, picture in episode.image.items()}
         for name, array in steps.items():
             self._extend(name, np.asarray(array)[0, :length])
+        for name, pictures in episode.image.items():
+            found = [checksum(picture) for picture in np.asarray(pictures)[0, :length]]
+            self._extend(_CHECKSUM + name, np.array(found, np.uint32))
         one = {"length": length, "instruction": self._instructions.index(phrase)}
         one["task"] = self._tasks.index(episode.task)
         for name, value in one.items():
@@ -210,8 +213,12 @@ class Cache:
         header = self.path / HEADER
         if not header.is_file():
             raise ValueError(f"{path} is not a cache: there is no {HEADER} in it")
-        with _damage(header):
+        with damage(header):
             self.facts: dict[str, Any] = read_json(header, self.path)
+            if DIGEST in self.facts:
+                self.facts = unsealed(self.facts)
+            if unknown := sorted(self.facts.keys() - _KNOWN):
+                raise ValueError(f"it has a field {unknown[0]!r}")
             if self.facts["format"] != FORMAT:
                 raise ValueError(f"it is of format {self.facts['format']!r}, not {FORMAT!r}")
             for name, kind in _KINDS.items():
@@ -226,8 +233,13 @@ class Cache:
                 raise ValueError(f"control_dt is {self.control_dt} and numbers {width}")
             if not all(isinstance(x, str) for x in (*self.facts["tasks"], *self.instructions)):
                 raise ValueError("tasks and instructions are no texts")
-            rows = {_IMAGE + n: (self.num_steps, *size, 3) for n, size in self.cameras.items()}
-        rows |= {"state": (self.num_steps, width), "action": (self.num_steps, None)}
+            sizes = {name: tuple(size) for name, size in self.cameras.items()}
+            if not self.facts["crc32"].keys() >= {*ROWS}:
+                raise ValueError("it lacks checksums")
+        self._images: dict[str, Any] = {
+            name: self._pictures(name, size) for name, size in sizes.items()
+        }
+        rows = {"state": (self.num_steps, width), "action": (self.num_steps, None)}
         self._columns = {name: self._mapped(name, shape) for name, shape in rows.items()}
         self._columns |= {name: self._mapped(name, (None,)) for name in ROWS[2:]}
         self._end = np.cumsum(self._columns["length"], dtype=np.int64)
@@ -248,7 +260,7 @@ class Cache:
         """All steps, in files: indexing reads them."""
         length = self._columns["length"]
         return Steps(
-            image={name: self._columns[_IMAGE + name] for name in self.cameras},
+            image={**self._images},
             state=self._columns["state"],
             action=self._columns["action"],
             end=np.repeat(self._end, length).astype(np.int32),
@@ -261,7 +273,7 @@ class Cache:
         one = slice(number, number + 1)
         wanted = self.cameras if cameras is None else cameras
         return Episodes(
-            image={name: self._columns[_IMAGE + name][None, here] for name in wanted},
+            image={name: self._images[name][here][None] for name in wanted},
             state=self._columns["state"][None, here],
             action=self._columns["action"][None, here],
             length=self._columns["length"][one],
@@ -274,31 +286,20 @@ class Cache:
 
     def _mapped(self, name: str, shape: tuple[int | None, ...]) -> np.ndarray:
         """An array in a file, whose shape must be this one where it is given."""
-        path = self.path / f"{name}.npy"
-        with _damage(path):
-            array = np.load(regular(path, self.path), mmap_mode="r").view(np.ndarray)
-            wanted = tuple(n if n else m for n, m in zip(shape, array.shape, strict=True))
-            if array.shape != wanted or array.dtype.char not in _TYPES:
-                raise ValueError(f"it is {array.dtype} {array.shape}, not {wanted}")
-            if name in ROWS and zlib.crc32(array.data) != self.facts["crc32"][name]:
-                raise ValueError("its checksum is another one")
-        return array
+        path, kind = self.path / f"{name}.npy", _KIND.get(name.partition("_")[0], np.int32)
+        return mapped(path, kind, shape, self.facts["crc32"].get(name))
+
+    def _pictures(self, name: str, size: Sequence[int]) -> np.ndarray | Pictures:
+        """Those of a camera; caches of old have no checksums of them."""
+        array = self._mapped(_IMAGE + name, (self.num_steps, *size, 3))
+        if _CHECKSUM + name not in self.facts["crc32"]:
+            return array
+        checksums = self._mapped(_CHECKSUM + name, (None,))
+        return Pictures(self.path / f"{_IMAGE}{name}.npy", array, checksums)
 
     def _statistics(self) -> Statistics | None:
         path = self.path / STATISTICS
         if self.facts["actions"] != "joint":
             return None
-        with _damage(path):
+        with damage(path):
             return Statistics.from_json(read_text(path, self.path))
-
-
-@contextlib.contextmanager
-def _damage(path: Path) -> Iterator[None]:
-    """What goes wrong inside becomes one ValueError about this file; a refusal is one already."""
-    try:
-        yield
-    except RefusedError:
-        raise
-    except _FAILURES as error:
-        why = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
-        raise ValueError(f"{path} is damaged ({why.partition(chr(10))[0]})") from error

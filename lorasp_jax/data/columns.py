@@ -1,9 +1,20 @@
-"""Arrays in files that grow."""
+"""Arrays in files: written row by row, and mapped into memory again."""
 
+import contextlib
 import os
+import tokenize
+import zlib
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+
+from envs.files import RefusedError, regular
+
+_FAILURES = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError)
+_FAILURES += (SyntaxError, tokenize.TokenError)  # of NumPy, which parses a file's header
+_FAILURES += (ArithmeticError, RecursionError)  # of JSON and its numbers
 
 
 class Column:
@@ -34,3 +45,42 @@ class Column:
         # NumPy leaves room for the first axis to grow.
         header = self._kind | {"shape": (self._length, *self._row)}
         np.lib.format.write_array_header_1_0(self._file, header)
+
+
+def mapped(
+    path: Path, kind: Any, shape: tuple[int | None, ...], crc32: int | None = None
+) -> np.ndarray:
+    """The array in a file, which nothing has read where there is no checksum.
+
+    Args:
+        path: of the .npy file.
+        kind: the type it must have.
+        shape: likewise, where it is given.
+        crc32: of its bytes in memory, if it is known.
+
+    Raises:
+        ValueError: it is missing or damaged.
+    """
+    with damage(path):
+        array: Any = np.load(regular(path, path.parent), mmap_mode="r")
+        wanted = tuple(n if n else m for n, m in zip(shape, array.shape, strict=True))
+        if array.shape != wanted or array.dtype != np.dtype(kind) or not array.flags.c_contiguous:
+            order = "" if array.flags.c_contiguous else ", column by column"
+            raise ValueError(f"it is {array.dtype.str} {array.shape}{order}, not {kind} {wanted}")
+        if path.stat().st_size != array.offset + array.nbytes:
+            raise ValueError(f"it holds other bytes than those of {wanted}")
+        if crc32 is not None and zlib.crc32(array.data) != crc32:
+            raise ValueError("its checksum is another one")
+        return array.view(np.ndarray)
+
+
+@contextlib.contextmanager
+def damage(path: Path) -> Iterator[None]:
+    """What goes wrong inside becomes one ValueError about this file; a refusal is one already."""
+    try:
+        yield
+    except RefusedError:
+        raise
+    except _FAILURES as error:
+        why = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
+        raise ValueError(f"{path} is damaged ({why.partition(chr(10))[0]})") from error

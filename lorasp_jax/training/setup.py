@@ -21,6 +21,7 @@ from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Batch, encode, flatten, sample_batch, windows
 from lorasp_jax.data.demonstrations import demonstrations
 from lorasp_jax.data.imported import cached, is_simulated, opened, outline
+from lorasp_jax.data.pictures import loaded
 from lorasp_jax.data.source import Source
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.models import presets, tokenizer
@@ -219,7 +220,7 @@ def _drawing(run: Run, processor: Processor, chunk: int) -> Callable[[jax.Array]
     if run.streams:
         stream = Stream(run.steps, batch_size=size, chunk=chunk, seed=run.config.seed)
         return lambda key: encode(key, next(stream), processor, state_noise=noise)
-    steps = jax.device_put(run.steps)
+    steps = jax.device_put(loaded(run.steps))
     return jax.jit(
         lambda key: sample_batch(
             key, steps, processor, batch_size=size, chunk=chunk, state_noise=noise

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from lorasp_jax import flops
 from lorasp_jax.data.batches import Raw, Steps, flatten, of_size
 from lorasp_jax.data.demonstrations import fresh_demonstrations
+from lorasp_jax.data.pictures import loaded
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training import preflight, processes
@@ -76,7 +77,7 @@ class Fresh(Stretches):
     def __init__(
         self, jitted: Callable, frozen: Any, run: Run, put: Callable, start: int, speed: Speed
     ) -> None:
-        steps = run.steps
+        steps = loaded(run.steps)
         self._config, self._put, self._size = run.config, put, len(steps.end)
         last = run.config.optim.steps - 1
         self._generation = self._of(min(start, last))
@@ -119,7 +120,7 @@ def stretches(
     put = lambda steps: processes.put(steps, meshes.replicated(mesh))  # noqa: E731
     if run.config.data.fresh_every:
         return Fresh(jitted, frozen, run, put, start, _speed(run))
-    return Stretches(jitted, frozen, put(run.steps), _speed(run))
+    return Stretches(jitted, frozen, put(loaded(run.steps)), _speed(run))
 
 
 def _batches(run: Run, mesh: jax.sharding.Mesh, start: int) -> Iterator[Raw]:

@@ -1,0 +1,179 @@
+"""One flipped bit in a file that a run, a policy or a cache is made of: harmless, or refused."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from flax import nnx
+
+from envs.episodes import Episodes
+from lorasp_jax import adaptation, models
+from lorasp_jax.adapter_io import load_adapters, read_description, save_adapters
+from lorasp_jax.data import cache
+from lorasp_jax.data.opening import open_source
+from lorasp_jax.models import statistics_files
+from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.models.statistics import Statistics
+from lorasp_jax.peft import LoRASP
+from lorasp_jax.training.base import TRAINING
+from lorasp_jax.training.run_folder import MetricsLog, read_json, read_metrics, write_json
+from tests.runs import leaves, random_episodes
+
+HEADERS = 200
+"""Bytes at the beginning of a large file, where it says what it is."""
+
+
+def net() -> nnx.Module:
+    return nnx.Dict(lin=nnx.Linear(3, 4, rngs=nnx.Rngs(0)))
+
+
+def adapter(folder: Path) -> None:
+    rules = [(".*", LoRASP(rank=4, hidden_width=2, energy_target=0.9))]
+    model = adaptation.adapt(net(), rules, rngs=nnx.Rngs(1))
+    told = {"instructions": ["press the button"], "statistics": {"state_mean": [0.25]}}
+    save_adapters(folder, model, base="abc", metadata=told)
+
+
+def read_adapter(folder: Path) -> Any:
+    told = read_description(folder)
+    model = load_adapters(folder, net(), base="abc")
+    return told, {path: str(m) for path, m in adaptation.methods(model).items()}, leaves(model)
+
+
+def run(folder: Path) -> None:
+    result = {"before": {"success": 0.5, "episodes": 8, "ci95": [0.2, 0.8]}}
+    for name in ("config", "seconds", "dataset", "before", "results", "stopped"):
+        write_json(folder / f"{name}.json", {"tasks": {"press": result}, "total": 7.5})
+    log = MetricsLog(folder)
+    for step in (2, 4):
+        log.write(step, {"loss": 1 / step, "task": 0.125})
+    log.close()
+    for path in (folder / "tensorboard").iterdir():  # for the eye alone
+        path.unlink()
+
+
+def read_run(folder: Path) -> Any:
+    return {p.name: read_json(p) for p in folder.glob("*.json")}, read_metrics(folder)
+
+
+def base(folder: Path) -> None:
+    models.save(folder, Pi0Config.dummy().create(nnx.Rngs(0)))
+    state = np.random.default_rng(0).normal(size=(9, 7))
+    known = Statistics.measure(state, state, np.ones(9, bool), slots=range(7), dim=8)
+    (folder / "statistics.json").write_text(known.to_json() + "\n")
+    write_json(folder / TRAINING, {"control_dt": 0.1, "tasks": ["press"]})
+
+
+def read_base(folder: Path) -> Any:
+    known = statistics_files.read(folder)
+    model = models.load_config(folder), models.load(folder)
+    return str(model[0]), leaves(nnx.state(model[1])), leaves(known), read_json(folder / TRAINING)
+
+
+def dataset(folder: Path) -> None:
+    random_episodes("press", 0).save(folder.parent / "press.npz")
+    folder.rmdir()
+    cache.write([open_source(folder.parent / "press.npz")], folder, lambda done, total: None)
+
+
+def read_dataset(folder: Path) -> Any:
+    found = cache.Cache(folder)
+    return (
+        found.facts,
+        [leaves(found.episode(n)) for n in range(len(found))],
+        leaves(found.statistics),
+    )
+
+
+def demonstrations(folder: Path) -> None:
+    episodes = random_episodes("press", 0)
+    small = {name: image[:, :, :4, :4] for name, image in episodes.image.items()}
+    Episodes(**{**vars(episodes), "image": small}).save(folder / "press.npz")
+
+
+def read_demonstrations(folder: Path) -> Any:
+    found = Episodes.load(folder / "press.npz")
+    return leaves(found), {k: v for k, v in vars(found).items() if isinstance(v, (str, int, float))}
+
+
+KINDS: dict[str, tuple[Callable[[Path], None], Callable[[Path], Any], int]] = {
+    "adapter": (adapter, read_adapter, 5),
+    "run": (run, read_run, 3),
+    "base": (base, read_base, 61),
+    "cache": (dataset, read_dataset, 17),
+    "demonstrations": (demonstrations, read_demonstrations, 5),
+}
+"""What is written, how it is read, and how many bytes lie between two that are flipped."""
+
+
+def same(one: Any, other: Any) -> bool:
+    found, wanted = (jax.tree.flatten(value) for value in (one, other))
+    return found[1] == wanted[1] and all(map(np.array_equal, found[0], wanted[0]))
+
+
+def places(content: bytes, step: int) -> list[int]:
+    """Of a large file the header, its end and a few in between."""
+    if len(content) < 20_000:
+        return list(range(0, len(content), step))
+    middle = range(HEADERS, len(content), max(1, len(content) // 20))
+    return [*range(0, HEADERS, step), *middle, len(content) - 1]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_flipped_bit_is_harmless_or_refused(kind, tmp_path):
+    write, read, step = KINDS[kind]
+    folder = tmp_path / kind
+    folder.mkdir()
+    write(folder)
+    expected, refused = read(folder), []
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        content = path.read_bytes()
+        for place in places(content, step):
+            flipped = bytearray(content)
+            flipped[place] ^= 1 << (place // step % 8)
+            path.write_bytes(flipped)
+            try:
+                found = read(folder)
+            except ValueError as error:
+                refused.append(str(error))
+            else:
+                assert same(found, expected), (path.name, place, bytes(flipped[place - 20 :][:40]))
+        path.write_bytes(content)
+    assert len(refused) > 20
+    assert not [sentence for sentence in refused if "\n" in sentence]
+    assert same(read(folder), expected)
+
+
+def test_a_digest_that_is_gone_is_missed(tmp_path):
+    adapter(tmp_path / "adapter")
+    path = tmp_path / "adapter" / "adapter.json"
+    facts = json.loads(path.read_text())
+    del facts["digest"]
+    path.write_text(json.dumps(facts))
+    with pytest.raises(ValueError, match="it has no digest"):
+        read_description(path.parent)
+
+
+@pytest.mark.parametrize("reading", ["episode", "steps", "device"])
+def test_a_pixel_is_looked_at_when_it_is_first_read(tmp_path, reading):
+    (tmp_path / "cache").mkdir()
+    dataset(tmp_path / "cache")
+    path = tmp_path / "cache" / "image_side.npy"
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 1
+    path.write_bytes(content)
+    found = cache.Cache(tmp_path / "cache")
+    assert found.episode(0).num_steps == 5
+    pictures = found.steps.image["side"]
+    assert pictures[np.arange(20)].shape == (20, 32, 32, 3)
+    last = found.num_steps - 1
+    with pytest.raises(ValueError, match=rf"side\.npy is damaged \(picture {last} has another"):
+        {
+            "episode": lambda: found.episode(2),
+            "steps": lambda: pictures[np.array([3, last])],
+            "device": lambda: np.asarray(pictures),
+        }[reading]()
