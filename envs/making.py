@@ -2,6 +2,7 @@
 
 import importlib
 import math
+import numbers
 import os
 import pkgutil
 from typing import Any, Literal, get_args
@@ -119,8 +120,8 @@ def _check_options(control_dt: float, actions: str, distractors: int) -> None:
 def _check_reward(reward: str, discount: float) -> None:
     if reward not in REWARDS:
         raise ValueError(f"unknown reward {reward!r}: choose from {', '.join(REWARDS)}")
-    if not 0 < discount <= 1:
-        raise ValueError(f"discount must lie above 0 and at most at 1, got {discount}")
+    if not isinstance(discount, numbers.Real) or not 0 < discount <= 1:
+        raise ValueError(f"discount must be a number above 0 and at most 1, got {discount!r}")
 
 
 def _find_robot(robot: AnyRobot) -> Robot:

@@ -271,6 +271,7 @@ def test_make_vec_takes_the_options_of_both():
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*Box observation space (min|max)imum value is")
+@pytest.mark.filterwarnings("ignore:.*we recommend using a symmetric and normalized space")
 def test_gymnasiums_own_checker_passes():
     env = gymnasium.make("lorasp_jax/press-piper-v0", image_size=16, reward="dense")
     check_env(env.unwrapped)
