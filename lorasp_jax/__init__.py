@@ -10,16 +10,27 @@ Axis letters used in every docstring and einsum of this package:
 """
 
 from lorasp_jax import dense, hugging_face, named, peft
-from lorasp_jax.adaptation import adapt, merge
+from lorasp_jax.adaptation import adapt, merge, split
+from lorasp_jax.adapter_io import load_adapters, save_adapters
 from lorasp_jax.compaction import distill, prune
 from lorasp_jax.fusion import fuse, unmerge
+from lorasp_jax.hugging_face import load_peft, save_peft
 from lorasp_jax.linen import LinenAdapter
 from lorasp_jax.named import choose, combine, extract, swap
+from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA, LoRAMoE, LoRASP
 from lorasp_jax.quantization import quantize
 from lorasp_jax.tables import collect_aux, summary
 
+__version__ = "0.1.0"
+
 __all__ = [
+    "AdaLoRA",
+    "DoRA",
+    "FullFineTuning",
     "LinenAdapter",
+    "LoRA",
+    "LoRAMoE",
+    "LoRASP",
     "adapt",
     "choose",
     "collect_aux",
@@ -29,11 +40,16 @@ __all__ = [
     "extract",
     "fuse",
     "hugging_face",
+    "load_adapters",
+    "load_peft",
     "merge",
     "named",
     "peft",
     "prune",
     "quantize",
+    "save_adapters",
+    "save_peft",
+    "split",
     "summary",
     "swap",
     "unmerge",

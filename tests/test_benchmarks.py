@@ -3,11 +3,13 @@
 import argparse
 import functools
 import io
+import json
 
 import pytest
 from rich.console import Console
 
-from benchmarks import data, long_run, measuring, scaling
+from benchmarks import compile_time, data, long_run, measuring, scaling
+from lorasp_jax import peft
 from lorasp_jax.data.cache import Cache
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.training import mesh as meshes
@@ -110,3 +112,13 @@ def test_scaling(monkeypatch):
     assert rows[0]["of linear"] == 1
     assert all(row["samples/s"] > 0 for row in rows)
     assert rows[2]["GiB"] < rows[1]["GiB"]
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # qwix uses what Flax gives up
+def test_compile_time(tmp_path, capsys):
+    sizes = ["--depth", "2", "--width", "16", "--tokens", "8", "--rank", "4", "--repeats", "1"]
+    compile_time.main([*sizes, "--json", str(tmp_path / "found.json")])
+    rows = json.loads((tmp_path / "found.json").read_text())["rows"]
+    assert {"bare", *peft.names()} <= {row["model"] for row in rows}
+    assert rows[0]["ratio"] == 1
+    assert "lora_sp" in capsys.readouterr().out

@@ -173,3 +173,24 @@ def test_compute_type(x, dtype, kind, expected):
 def test_wrong_input_width(net):
     with pytest.raises(ValueError, match=r"input of width 7 meets a kernel \(5, 6\)"):
         net(jnp.ones((2, 7)))
+
+
+@pytest.mark.parametrize(("method", "most"), [(LoRA(rank=4), 50), (LoRASP(rank=4), 160)])
+def test_what_one_more_layer_adds_to_a_program(method, most):
+    """Lines of the lowered gradient: equal layers share what they are made of."""
+
+    def lines(depth):
+        rngs = nnx.Rngs(0)
+        model = nnx.List([Dense(8, 8, method=method, rngs=rngs) for _ in range(depth)])
+        graphdef, adapters, frozen = nnx.split(model, AdapterParam, ...)
+
+        def loss(adapters, x):
+            total = 0.0
+            for layer in nnx.merge(graphdef, adapters, frozen):
+                x, aux = layer(x, return_aux=True)
+                total += sum(aux.losses.values())
+            return x.sum() + total
+
+        return jax.jit(jax.grad(loss)).lower(adapters, jnp.ones((5, 8))).as_text().count(" = ")
+
+    assert (lines(6) - lines(3)) / 3 <= most

@@ -1,0 +1,134 @@
+"""How long an adapted model takes to compile: a stack of dense layers, bare and adapted, next to
+qwix's LoRA where that is installed (`pip install qwix`).
+
+    JAX_PLATFORMS=cpu python -m benchmarks.compile_time
+
+What is compiled is a training step's gradient with respect to the adapters, the losses that the
+adapters report taken along. Seconds are those of the process on all its cores, which other programs
+on the machine hardly change, the least of several repeats; the ratios are to qwix's LoRA in the
+same run, or without it to the bare model.
+"""
+
+import argparse
+import importlib.util
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+from rich.console import Console
+
+import lorasp_jax
+from benchmarks.measuring import machine, print_table
+from lorasp_jax import peft
+from lorasp_jax.adaptation import adapt
+
+LOSS_WEIGHT = 1e-2
+PARTS = ("trace s", "lower s", "compile s", "total s")
+
+
+class Stack(nnx.Module):
+    """Dense layers one after the other, written out."""
+
+    def __init__(self, depth: int, width: int, dtype: Any) -> None:
+        """Draws the weights."""
+        options = {"dtype": dtype, "param_dtype": dtype, "rngs": nnx.Rngs(0)}
+        self.layers = nnx.List([nnx.Linear(width, width, **options) for _ in range(depth)])
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """The last layer's output [T, D]."""
+        for layer in self.layers:
+            x = nnx.relu(layer(x))
+        return x
+
+
+def models(base: Stack, x: jax.Array, rank: int) -> Iterator[tuple[str, Any, Any]]:
+    """Name, model and the type of variable that trains; what the ratios are to comes first."""
+    if importlib.util.find_spec("qwix"):
+        import qwix  # pyright: ignore[reportMissingImports]
+
+        provider = qwix.LoraProvider(module_path=".*", rank=rank, alpha=2.0 * rank)
+        yield (
+            "qwix LoRA",
+            qwix.apply_lora_to_model(base, provider, x, rngs=nnx.Rngs(0)),
+            nnx.LoRAParam,
+        )
+    yield "bare", base, nnx.Param
+    for name in peft.names():
+        fields = {} if name == "full" else {"rank": rank}
+        rules = [("layers", peft.create(name, **fields))]
+        yield name, adapt(base, rules, rngs=nnx.Rngs(0)), nnx.LoRAParam
+
+
+def gradient(model: nnx.Module, kind: Any) -> tuple[Callable[..., Any], tuple[Any, Any]]:
+    """The function to be compiled and its first two arguments."""
+    graphdef, trained, frozen = nnx.split(nnx.clone(model), kind, ...)
+
+    def loss(trained: Any, frozen: Any, x: jax.Array) -> jax.Array:
+        model: Any = nnx.merge(graphdef, trained, frozen)
+        total = jnp.square(model(x)).mean()
+        if nnx.state(model, lorasp_jax.dense.AdapterAux):
+            for aux in lorasp_jax.collect_aux(model).values():
+                total += LOSS_WEIGHT * sum(aux.losses.values())
+        return total
+
+    return jax.value_and_grad(loss), (trained, frozen)
+
+
+def seconds(function: Callable[..., Any], *arguments: Any) -> tuple[float, ...]:
+    """Of the processor, for each of `PARTS`."""
+    jax.clear_caches()
+    times = [time.process_time()]
+    traced = jax.jit(function).trace(*arguments)
+    times.append(time.process_time())
+    lowered = traced.lower()
+    times.append(time.process_time())
+    lowered.compile()
+    times.append(time.process_time())
+    return times[1] - times[0], times[2] - times[1], times[3] - times[2], times[3] - times[0]
+
+
+def measure(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """One row a model; the models take turns, so that all see the same machine."""
+    x = jnp.ones((options.tokens, options.width), options.dtype)
+    base = Stack(options.depth, options.width, options.dtype)
+    found: dict[str, list[tuple[float, ...]]] = {}
+    functions = {name: gradient(m, kind) for name, m, kind in models(base, x, options.rank)}
+    for _ in range(options.repeats):
+        for name, (function, arguments) in functions.items():
+            found.setdefault(name, []).append(seconds(function, *arguments, x))
+    least = {name: min(rows, key=lambda row: row[-1]) for name, rows in found.items()}
+    first = next(iter(least.values()))[-1]
+    for name, row in least.items():
+        yield {"model": name, **dict(zip(PARTS, row, strict=True)), "ratio": row[-1] / first}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__.partition(":")[0] if __doc__ else None)
+    parser.add_argument("--depth", type=int, default=12)
+    parser.add_argument("--width", type=int, default=512)
+    parser.add_argument("--tokens", type=int, default=1024)
+    parser.add_argument("--rank", type=int, default=16)
+    parser.add_argument("--dtype", default="float32")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    options = parser.parse_args(arguments)
+    jax.config.update("jax_enable_compilation_cache", False)
+    console, name = Console(soft_wrap=True), machine("jax")
+    console.print(
+        f"{name}; {options.depth} layers of width {options.width}, {options.tokens} tokens, "
+        f"rank {options.rank}, {options.dtype}"
+    )
+    rows = list(measure(options))
+    print_table(console, rows)
+    if options.json:
+        options.json.write_text(json.dumps({"machine": name, "rows": rows}, indent=1))
+
+
+if __name__ == "__main__":
+    main()
