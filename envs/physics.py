@@ -5,6 +5,7 @@ Worlds are batched by `jax.vmap`. What a world keeps between two steps is the sa
 
 import contextlib
 import dataclasses
+import functools
 import importlib.util
 import io
 import sys
@@ -17,6 +18,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from envs.kinematics import Kinematics
 from envs.state import MOVING, Changes, Data
 
 Backend = Literal["jax", "warp"]
@@ -26,7 +28,9 @@ BACKENDS: tuple[str, ...] = get_args(Backend)
 MOST_GROWTH = 1.25  # of a geom that differs in size from its model
 
 
-def _import_mjx() -> Any:
+@functools.cache
+def _mjx() -> Any:
+    """MJX, imported when the first environment is made: it takes seconds, which no help needs."""
     if importlib.util.find_spec("warp"):
         import warp
 
@@ -54,9 +58,6 @@ def _sum_in_order(values: jax.Array, segments: np.ndarray, number: int) -> jax.A
     return jnp.stack([sum((values[i] for i in row), jnp.zeros_like(values[0])) for row in rows])
 
 
-mjx = _import_mjx()
-
-
 def default_backend() -> str:
     """warp on one NVIDIA GPU where warp-lang is installed, else jax."""
     nvidia = jax.default_backend() == "gpu" and "cuda" in jax.devices()[0].client.platform_version
@@ -78,10 +79,12 @@ class Physics:
         """
         _check_backend(backend)
         self.backend = backend
+        mjx = _mjx()
         own = jax.local_devices()[0]  # MJX would take the first of all processes
         self._model = mjx.put_model(model, impl="jax", device=own)
         data = mjx.make_data(model, impl="jax", device=own)
         self._data = jax.device_put(jax.tree.map(np.asarray, data))  # strongly typed
+        self._kinematics = Kinematics(model)
         self._posed = jax.jit(self._posed)  # traced once for a start and a step
         self._simulate = self._mjx_steps
         if backend == "warp":
@@ -115,7 +118,7 @@ class Physics:
 
         def body(moving: Sequence[jax.Array], control: jax.Array) -> tuple[Any, None]:
             now = dict(zip(MOVING, moving, strict=True))
-            data = mjx.step(model, self._data.replace(ctrl=control, **now))
+            data = self._step(model, self._data.replace(ctrl=control, **now))
             return [getattr(data, name) for name in MOVING], None
 
         # Nothing else is carried: `vmap` traces a scan once more if part of its carry starts out
@@ -123,12 +126,24 @@ class Physics:
         with _full_precision():
             return jax.lax.scan(body, [getattr(start, name) for name in MOVING], controls)[0]
 
+    def _step(self, model: Any, data: Any) -> Any:
+        """`mjx.step`, of what the scenes have: no tendons, no sensors, no mocap bodies."""
+        mjx = _mjx()
+        data = mjx.com_pos(model, self._kinematics(model, data))
+        data = mjx.factor_m(model, mjx.crb(model, data))
+        data = mjx.make_constraint(model, mjx.collision(model, data))
+        data = mjx.transmission(model, data)
+        data = mjx.fwd_velocity(model, data)
+        data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
+        return mjx.implicit(model, mjx.solve(model, data))
+
     def _posed(self, changes: Changes, moving: Sequence[jax.Array]) -> Data:
         """A world with all poses that follow from its joint positions."""
         model = self._model.replace(**changes)
         data = self._data.replace(**dict(zip(MOVING, moving, strict=True)))
+        mjx = _mjx()
         with _full_precision():
-            data = mjx.camlight(model, mjx.com_pos(model, mjx.kinematics(model, data)))
+            data = mjx.camlight(model, mjx.com_pos(model, self._kinematics(model, data)))
         return Data(**{field.name: getattr(data, field.name) for field in dataclasses.fields(Data)})
 
 

@@ -1,11 +1,12 @@
-"""Physics: sums in a fixed order, so that accelerators give the same again."""
+"""Physics: as MuJoCo's, and sums in a fixed order, so that accelerators give the same again."""
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
-from envs import physics
+from envs import actions, experts, physics, placing
 
 
 @pytest.mark.parametrize(
@@ -60,3 +61,28 @@ def test_unordered_sums_would_be_found(env):
         )
 
     assert len(unordered(jax.jit(loop), jnp.ones(3))) == 1
+
+
+def test_a_control_step_is_that_of_mujoco(env):
+    """All of `mj_step` that a scene has is there: forces, limits, contacts, the equality."""
+    start = env.reset(jax.random.key(3))
+    plan = experts.plan(env, start, jax.random.key(1))
+    act = jax.jit(lambda state: experts.act(env, plan, state))
+    state = after = start
+    rest = start.metrics["button_depth"][0]
+    while after.metrics["button_depth"][0] < rest + 0.002:  # until the button is touched
+        assert not after.done[0]
+        state, after = after, env.step(after, act(after))
+    model = placing.placed(env.model, start.info["layout"], 0)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = state.data.qpos[0], state.data.qvel[0]
+    data.qacc_warmstart[:] = state.data.qacc_warmstart[0]
+    commands = jnp.stack([s.info["command"][0] for s in (state, state, after)])
+    contacts = 0
+    for control in np.asarray(actions.interpolate(commands, env.control_dt, 0.0)):
+        data.ctrl[:] = control
+        mujoco.mj_step(model, data)
+        contacts += data.ncon
+    assert contacts
+    np.testing.assert_allclose(after.data.qpos[0], data.qpos, atol=2e-5)
+    np.testing.assert_allclose(after.data.qvel[0], data.qvel, atol=2e-3)
