@@ -19,6 +19,15 @@ Report = Callable[[int, int], None]
 """Called with the episodes that are done and those that are wanted."""
 
 
+def _rate(episodes: int, seconds: float) -> str:
+    """Episodes a second, or seconds an episode where those are more."""
+    if not episodes:
+        return ""
+    if episodes < seconds:
+        return f"{seconds / episodes:.1f} s an episode"
+    return f"{episodes / seconds:.1f} episodes/s"
+
+
 @contextlib.contextmanager
 def bars(console: Console, stop: threading.Event) -> Iterator[Callable[[str, str], Report]]:
     """Progress bars: a function that makes one for a task and a robot, and gives what moves it.
@@ -46,9 +55,8 @@ def bars(console: Console, stop: threading.Event) -> Iterator[Callable[[str, str
                 progress.update(bar, completed=done, total=total)
                 begun.append(done)
                 if len(begun) > 1:
-                    rate = (done - begun[0]) / (progress.tasks[bar].elapsed or 1)
-                    text = f"{task}, {robot}: collecting"
-                    progress.update(bar, description=text, rate=f"{rate:.1f} episodes/s")
+                    text, seconds = f"{task}, {robot}: collecting", progress.tasks[bar].elapsed or 1
+                    progress.update(bar, description=text, rate=_rate(done - begun[0], seconds))
 
             return report
 

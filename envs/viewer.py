@@ -55,7 +55,8 @@ def show(model: mujoco.MjModel, positions: np.ndarray, seconds: float) -> None:
     """
     data = mujoco.MjData(model)
     try:
-        window = mujoco.viewer.launch_passive(model, data)
+        # Its panels would take two thirds of the window.
+        window = mujoco.viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
     except RuntimeError as error:  # on macOS, where a window needs mjpython
         raise ValueError(f"no window can be opened ({error}): add --out FILE.mp4") from error
     with window:

@@ -50,7 +50,7 @@ class Body(Protocol):
         ...
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Robot:
     """One arm with a two-finger gripper; J joints. Positions in m, angles in rad.
 
@@ -82,6 +82,9 @@ class Robot:
     stroke: float
     gripper_speed: float
     body: Body
+
+    def __repr__(self) -> str:
+        return f"<Robot {self.name!r}: {self.num_joints} joints, opens {1000 * self.stroke:.0f} mm>"
 
     @property
     def num_joints(self) -> int:

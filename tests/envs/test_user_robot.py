@@ -65,6 +65,10 @@ def test_numbers_come_from_the_file(robot):
     assert robot.action_low.shape == (7,)
 
 
+def test_a_robot_is_one_line(robot):
+    assert repr(robot) == f"<Robot {robot.name!r}: 6 joints, opens {1000 * robot.stroke:.0f} mm>"
+
+
 def test_start_pose_is_that_of_all_robots(robot, model):
     data = at(model, robot.home)
     np.testing.assert_allclose(data.site("tcp").xpos, [0.34, 0, 0.18], atol=1e-3)

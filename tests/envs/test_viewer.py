@@ -43,7 +43,9 @@ class Window:
 def test_play_repeats_an_episode_until_the_window_closes(env, monkeypatch):
     opened, slept = [], []
 
-    def launch(model, data):
+    def launch(model, data, *, show_left_ui, show_right_ui):
+        assert not show_left_ui
+        assert not show_right_ui
         opened.append(Window(model, data, pictures=60))
         return opened[0]
 
@@ -73,7 +75,7 @@ def test_without_a_display_it_says_what_to_do(monkeypatch):
 
 
 def test_where_windows_need_another_interpreter(env, monkeypatch):
-    def launch(model, data):
+    def launch(model, data, **panels):
         raise RuntimeError("`launch_passive` requires mjpython on macOS")
 
     monkeypatch.setattr(viewer.mujoco.viewer, "launch_passive", launch)
