@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs import experts, programs
+from envs import checks, experts, programs
 from envs.env import Env
 from envs.episodes import Episodes, concatenate
 from envs.making import AnyRobot, make
@@ -23,6 +23,7 @@ _NUM_ENVS = {"cpu": 32, "gpu": 256, "tpu": 256}
 # Below this share of successes, once so many attempts were made, something is broken, and going on
 # would only waste time.
 _LEAST_SUCCESS, _PATIENCE = 0.5, 16
+_MOST_EPISODES = 10**9
 
 
 @jax.tree_util.register_dataclass
@@ -112,6 +113,7 @@ def collect(
         **options: others of `envs.make`; the backend is jax unless they say otherwise.
 
     Raises:
+        TypeError: for what is no number or no key.
         ValueError: for bad names or numbers, or if the expert fails far too often.
     """
     env = make_repeatable(task, robot, num_envs=worlds(num_episodes, num_envs), **options)
@@ -135,6 +137,7 @@ def expert_success(
     """
     env = make_repeatable(task, robot, num_envs=worlds(num_episodes, num_envs), **options)
     ranges = prepared(ranges, env.control_dt)
+    checks.key(key)
     calls = -(-num_episodes // env.num_envs)
     results = [_attempt(env, chunk_key, ranges) for chunk_key in jax.random.split(key, calls)]
     return jnp.concatenate(results)[:num_episodes]
@@ -168,6 +171,9 @@ def gather(
         ValueError: if the expert fails far too often.
     """
     ranges = prepared(ranges, env.control_dt)
+    checks.key(key)
+    if checks.number("action_noise", action_noise) < 0:
+        raise ValueError(f"action_noise must be at least 0, got {action_noise}")
     for _ in range(attempted // env.num_envs):
         key, _ = jax.random.split(key)
     tried = 0  # since the last success
@@ -252,8 +258,7 @@ def _attempt(env: Env, key: jax.Array, ranges: Randomization | None) -> jax.Arra
 
 def worlds(num_episodes: int, num_envs: int | None) -> int:
     """Worlds at once for so many episodes, where `num_envs` does not say it."""
-    if num_episodes < 1:
-        raise ValueError(f"num_episodes must be at least 1, got {num_episodes}")
+    num_episodes = checks.count("num_episodes", num_episodes, _MOST_EPISODES)
     if num_envs is not None:
         return num_envs
     return min(num_episodes, _NUM_ENVS.get(jax.default_backend(), 256))

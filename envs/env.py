@@ -20,6 +20,8 @@ import numpy as np
 
 from envs import (
     actions,
+    checks,
+    compiling,
     distractors,
     fast_cpu,
     observations,
@@ -107,9 +109,12 @@ class Env:
             ranges: what else differs from world to world; None for nothing.
 
         Raises:
+            TypeError: if the key is none.
             ValueError: if the ranges make no sense.
         """
-        return self._resets(key, randomization.prepared(ranges, self.control_dt))
+        ranges = randomization.prepared(ranges, self.control_dt)
+        with self._calls.first("reset", ranges is None):
+            return self._resets(checks.key(key), ranges)
 
     def step(self, state: State, action: jax.Array) -> State:
         """Simulate one control step.
@@ -124,22 +129,32 @@ class Env:
             The worlds `control_dt` later. Worlds that were done have not moved.
 
         Raises:
-            ValueError: if the action has another shape.
+            TypeError: if the action is no array of numbers, or the state none.
+            ValueError: if the action has another shape, or the state other worlds.
         """
-        expected = (self.num_envs, len(self.action_low))
-        if action.shape != expected:
-            raise ValueError(f"action must have shape {expected}, got {action.shape}")
+        self._check_worlds(state)
+        action = checks.action(action, (self.num_envs, len(self.action_low)))
         # A weakly typed action, such as jnp.full(shape, 0.0), would compile all anew.
-        return self._steps(state, jax.lax.convert_element_type(action, jnp.float32))
+        action = jax.lax.convert_element_type(action, jnp.float32)
+        with self._calls.first("step", state.info["draw"] is None):
+            return self._steps(state, action)
 
-    @functools.partial(fast_cpu.jit, static_argnums=0)
     def observe(self, state: State) -> dict[str, Any]:
         """What a policy may see.
 
         Returns:
             `image`: camera name -> uint8 [W, image_size, image_size, 3]; `state`: f32 [W, J + 1]
             measured joint angles [rad] and gripper opening [m].
+
+        Raises:
+            TypeError, ValueError: as `step`, for the state.
         """
+        self._check_worlds(state)
+        with self._calls.first("pictures", state.info["draw"] is None):
+            return self._observes(state)
+
+    @functools.partial(fast_cpu.jit, static_argnums=0)
+    def _observes(self, state: State) -> dict[str, Any]:
         data = state.data
         poses = (data.geom_xpos, data.geom_xmat, data.cam_xpos, data.cam_xmat)
         return {
@@ -160,7 +175,14 @@ class Env:
                 `instruction` int32 [W]; pictures that the policy does not read are not rendered.
             key: all randomness.
             ranges: as for `reset`.
+
+        Raises:
+            TypeError, ValueError: as `reset` and `step`, or if the policy cannot be called.
         """
+        if not callable(policy):
+            what = checks.short(policy)
+            raise TypeError(f"policy must be a function (observation, key) -> action, got {what}")
+        checks.key(key)
         reset_key, policy_key = jax.random.split(key)
 
         def body(state: State, key: jax.Array) -> tuple[State, Trajectory]:
@@ -170,7 +192,9 @@ class Env:
             return after, Trajectory(seen["state"], action, after.reward, after.done)
 
         keys = jax.random.split(policy_key, self.max_steps)
-        return jax.lax.scan(body, self.reset(reset_key, ranges), keys)
+        start = self.reset(reset_key, ranges)
+        with self._calls.said("rollout"):  # always: JAX knows no policy again
+            return jax.lax.scan(body, start, keys)
 
     def reset_done(
         self, state: State, key: jax.Array, ranges: Randomization | None = None
@@ -178,8 +202,10 @@ class Env:
         """The same worlds, those that are done started afresh, with the ranges of their `reset`.
 
         Raises:
+            TypeError: as `reset` and `step`.
             ValueError: if only one of the two had ranges, or they make no sense.
         """
+        self._check_worlds(state)
         if (ranges is None) != (state.info["draw"] is None):
             raise ValueError("reset_done needs ranges if, and only if, reset was given some")
         return jax.jit(where)(state.done, self.reset(key, ranges), state)
@@ -227,6 +253,17 @@ class Env:
         look, size = jax.vmap(self._looks)(draw) if draw else (None, None)
         pictures = self.renderer((geom_xpos, geom_xmat, cam_xpos, cam_xmat), look, size)
         return {name: pictures[:, i] for i, name in enumerate(self.cameras)}
+
+    def _check_worlds(self, state: Any) -> None:
+        checks.instance("state", state, State, "what reset gave")
+        if state.done.shape != (self.num_envs,):
+            found = state.done.shape[0] if state.done.shape else "no axis of"
+            raise ValueError(f"state has {found} worlds, this environment {self.num_envs}")
+
+    @functools.cached_property
+    def _calls(self) -> compiling.Calls:
+        worlds = "one world" if self.num_envs == 1 else f"{self.num_envs} worlds"
+        return compiling.Calls(f"{self.task.name}, {worlds}")
 
     @functools.partial(fast_cpu.jit, static_argnums=0)
     def _steps(self, state: State, action: jax.Array) -> State:

@@ -1,7 +1,6 @@
 """Making an environment from the names of a task and a robot, which are those of their files."""
 
 import importlib
-import math
 import numbers
 import os
 import pkgutil
@@ -10,7 +9,7 @@ from typing import Any, Literal, get_args
 import mujoco
 
 import envs.distractors
-from envs import fast_cpu, mjcf, physics, render, scene
+from envs import checks, fast_cpu, mjcf, physics, render, scene
 from envs.actions import MODES, TARGET_DT, Mode
 from envs.env import Env
 from envs.physics import Backend
@@ -20,6 +19,8 @@ from envs.robots import Robot
 AnyRobot = str | os.PathLike[str] | Robot
 RendererName = Literal["rays", "warp"]
 RENDERERS: tuple[str, ...] = get_args(RendererName)
+# What nobody means, and no device has memory for.
+_MOST = {"num_envs": 2**20, "image_size": 2**12, "antialias": 16}
 
 
 def make(
@@ -57,13 +58,24 @@ def make(
             meshes and textures.
 
     Raises:
+        TypeError: for what is no number, or no robot.
         ValueError: for an unknown name (the known ones are listed), a robot that lacks something,
             or a number out of range.
     """
     fast_cpu.warn_if_late()
     found_task, found_robot = _find("task", task), _find_robot(robot)
-    _check_counts(num_envs=num_envs, image_size=image_size, antialias=antialias)
-    _check_options(control_dt, actions, distractors)
+    num_envs, image_size, antialias = (
+        checks.count(name, value, _MOST[name])
+        for name, value in (
+            ("num_envs", num_envs),
+            ("image_size", image_size),
+            ("antialias", antialias),
+        )
+    )
+    distractors = checks.count("distractors", distractors, envs.distractors.MOST, least=0)
+    control_dt = _checked_dt(control_dt, found_task.time_limit)
+    if actions not in MODES:
+        raise ValueError(f"unknown actions {actions!r}: choose from {', '.join(MODES)}")
     _check_reward(reward, discount)
     things = found_task.scene + envs.distractors.mjcf(distractors)
     model = scene.build(things, found_robot)
@@ -98,23 +110,17 @@ def _renderer(
     return WarpRenderer(model, rays, num_envs)
 
 
-def _check_counts(**counts: int) -> None:
-    for name, value in counts.items():
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
-
-
-def _check_options(control_dt: float, actions: str, distractors: int) -> None:
+def _checked_dt(given: float, time_limit: float) -> float:
+    control_dt = checks.number("control_dt", given)
     moves = control_dt / TARGET_DT
-    if not math.isfinite(moves) or round(moves) < 1 or abs(moves - round(moves)) > 1e-6:
+    if round(moves) < 1 or abs(moves - round(moves)) > 1e-6:
         raise ValueError(
             f"control_dt must be a positive multiple of {TARGET_DT} s, got {control_dt}"
         )
-    if actions not in MODES:
-        raise ValueError(f"unknown actions {actions!r}: choose from {', '.join(MODES)}")
-    most = envs.distractors.MOST
-    if not 0 <= distractors <= most:
-        raise ValueError(f"distractors must be 0 to {most}, got {distractors}")
+    if control_dt > time_limit:
+        limit = f"the time limit of the task, {time_limit} s"
+        raise ValueError(f"control_dt must be at most {limit}, got {control_dt}")
+    return control_dt
 
 
 def _check_reward(reward: str, discount: float) -> None:
@@ -127,9 +133,11 @@ def _check_reward(reward: str, discount: float) -> None:
 def _find_robot(robot: AnyRobot) -> Robot:
     if isinstance(robot, Robot):
         return robot
-    if os.fspath(robot).endswith(".xml"):
-        return mjcf.load(robot)
-    return _find("robot", os.fspath(robot))
+    path = os.fspath(robot) if isinstance(robot, str | os.PathLike) else None
+    if not isinstance(path, str):
+        what = f"one of {', '.join(names('robot'))}, the path of an MJCF file or a Robot"
+        raise TypeError(f"robot must be {what}, got {checks.short(robot)}")
+    return mjcf.load(path) if path.endswith(".xml") else _find("robot", path)
 
 
 def names(kind: str) -> list[str]:

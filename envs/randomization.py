@@ -9,13 +9,14 @@ traced: other numbers compile nothing anew.
 
 import dataclasses
 from collections.abc import Iterable
-from typing import Self
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from envs import checks
 from envs.physics import MOST_GROWTH
 from envs.render import Look
 from envs.robots import multiply, turn
@@ -85,7 +86,7 @@ class Randomization:
     def check(self, control_dt: float) -> None:
         """Raises a ValueError for ranges that make no sense; `control_dt` in s."""
         for name, given in vars(self).items():
-            if np.shape(given) != (2,) or not np.all(np.isfinite(given)) or given[0] > given[1]:
+            if not _is_range(given):
                 raise ValueError(f"{name} must be two finite numbers (low, high), got {given}")
             if name in _POSITIVE and given[0] <= 0:
                 raise ValueError(f"{name} is a factor and must be above 0, got {given}")
@@ -130,9 +131,25 @@ class Draw:
 def prepared(ranges: Randomization | None, control_dt: float) -> Randomization | None:
     """The ranges as strongly typed arrays, checked; those already traced are taken as they are."""
     leaves = jax.tree.leaves(ranges)
+    if ranges is not None:
+        checks.instance("ranges", ranges, Randomization, "an envs.Randomization or None")
     if ranges and not any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
         ranges.check(control_dt)
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), ranges)
+
+
+def _is_range(given: Any) -> bool:
+    """Whether it is two finite numbers in single precision, the lower first."""
+    if isinstance(given, tuple | list):
+        given = [np.asarray(x) for x in given]
+        if not all(x.shape == () and checks.is_numeric(x) for x in given):
+            return False
+        given = np.array(given)
+    if not checks.is_numeric(given) or given.shape != (2,):
+        return False
+    with np.errstate(over="ignore"):
+        low, high = np.asarray(given, np.float32)
+    return bool(np.isfinite([low, high]).all() and given[0] <= given[1])
 
 
 def draw(

@@ -13,8 +13,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from envs import checks
 from envs.env import Env
-from envs.randomization import Randomization
+from envs.randomization import Randomization, prepared
 from envs.state import State
 
 try:
@@ -47,9 +48,14 @@ class BraxEnv(base.Env):
         Args:
             env: what `envs.make` gave; its number of worlds does not matter.
             ranges: as for `Env.reset`, for every episode.
+
+        Raises:
+            TypeError: if it is no environment.
+            ValueError: if the ranges make no sense.
         """
+        checks.instance("env", env, Env, "what envs.make gave")
         self.env = dataclasses.replace(env, num_envs=1)
-        self.ranges = ranges
+        self.ranges = prepared(ranges, env.control_dt)
 
     def reset(self, rng: jax.Array) -> base.State:
         """One fresh world, all from the key `rng`."""

@@ -14,9 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs import checks
 from envs.env import Env
 from envs.making import make as make_env
-from envs.randomization import Randomization
+from envs.randomization import Randomization, prepared
 from envs.state import State
 
 try:
@@ -71,11 +72,13 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             ranges: as for `Env.reset`, for every episode.
 
         Raises:
-            ValueError: for an unknown observation.
+            TypeError: if it is no environment.
+            ValueError: for an unknown observation, or if the ranges make no sense.
         """
+        checks.instance("env", env, Env, "what envs.make gave")
         self.env = env
         self.observation = observation
-        self.ranges = ranges
+        self.ranges = prepared(ranges, env.control_dt)
         self.state: State | None = None
         self.num_envs = env.num_envs
         self.single_action_space = spaces.Box(env.action_low, env.action_high)
@@ -115,10 +118,11 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
         Raises:
             gymnasium.error.ResetNeeded: before the first `reset`.
-            ValueError: if the actions have another shape.
+            TypeError, ValueError: if the actions are no numbers, or have another shape.
         """
         if self.state is None:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
+        actions = checks.action(np.asarray(actions), (self.num_envs, len(self.env.action_low)))
         self.state = state = self._advance(self.state, jnp.asarray(actions, jnp.float32))
         done, success = np.asarray(state.done), np.asarray(state.info["success"])
         observation, reward = self._observation(state), np.array(state.reward)

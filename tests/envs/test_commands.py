@@ -63,7 +63,7 @@ def test_bad_input_is_one_sentence(tmp_path, run):
         (f"collect --randomize --control-dt 0.02 {press}", tmp_path / "new", "latency must lie in"),
         (f"collect --control-dt 0.03 {press}", tmp_path / "new", "multiple of 0.02 s"),
         (f"collect --actions voltage {press}", tmp_path / "new", "joint, delta_joint, end_eff"),
-        (f"collect --distractors 5 {press}", tmp_path / "new", "distractors must be 0 to 4"),
+        (f"collect --distractors 5 {press}", tmp_path / "new", "distractors must be at most 4"),
         ("collect --task press dance --robot piper --out", tmp_path / "new", "dance"),
         ("collect --task all --robot piper --out", tmp_path / "e.npz", "e.npz can hold one task"),
         (f"play --image-size 33 {press}", tmp_path / "a.mp4", "even --image-size"),

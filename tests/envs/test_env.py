@@ -34,27 +34,6 @@ def take(state, worlds):
     return jax.tree.map(lambda x: np.asarray(x)[worlds], state)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"task": "prss"}, "unknown task 'prss': choose from open_pot, pick_place, pour, press"),
-        ({"robot": "pipe"}, "unknown robot 'pipe': choose from panda, piper"),
-        ({"num_envs": 0}, "num_envs must be at least 1, got 0"),
-        ({"image_size": 0}, "image_size must be at least 1, got 0"),
-        ({"control_dt": 0.03}, "control_dt must be a positive multiple of 0.02 s, got 0.03"),
-        ({"control_dt": 0.0}, "control_dt must be a positive multiple of 0.02 s, got 0.0"),
-    ],
-)
-def test_bad_arguments(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        envs.make(**{"task": "press", **arguments})
-
-
-def test_wrong_action_shape(env, start):
-    with pytest.raises(ValueError, match=r"action must have shape \(4, 7\), got \(4, 6\)"):
-        env.step(start, jnp.zeros((4, 6)))
-
-
 def test_time(env):
     assert (env.physics_dt, env.control_dt, env.max_steps) == (0.005, 0.1, 80)
     assert env.expert_steps <= env.max_steps
@@ -195,11 +174,12 @@ def test_lowers_for_every_accelerator(env):
         assert "f64" not in text
 
 
-def test_import_starts_no_backend_and_prints_nothing():
+def test_import_is_light():
     code = (
-        "import envs, jax, sys\n"
+        "import envs, envs.__main__, jax, sys\n"
         "from jax._src import xla_bridge\n"
-        "sys.exit(xla_bridge.backends_are_initialized())"
+        "heavy = {'mujoco.mjx', 'warp', 'scipy.optimize'} & set(sys.modules)\n"
+        "sys.exit(str(heavy or 'JAX') if heavy or xla_bridge.backends_are_initialized() else 0)"
     )
     root = os.path.dirname(os.path.dirname(envs.__file__))
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, cwd=root, check=True)

@@ -1,0 +1,92 @@
+"""What callers hand over: one sentence for what cannot be meant, before anything is computed."""
+
+import math
+import numbers
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def count(name: str, value: Any, most: int, least: int = 1) -> int:
+    """A whole number.
+
+    Raises:
+        TypeError: if it is none.
+        ValueError: if it is out of range.
+    """
+    if isinstance(value, bool | np.bool_) or not isinstance(value, numbers.Integral):
+        raise TypeError(f"{name} must be a whole number, got {value!r}")
+    whole = int(value)
+    if whole < least:
+        raise ValueError(f"{name} must be at least {least}, got {whole}")
+    if whole > most:
+        raise ValueError(f"{name} must be at most {most:,}, got {whole:,}")
+    return whole
+
+
+def number(name: str, value: Any) -> float:
+    """A finite real number, also as an array without axes.
+
+    Raises:
+        TypeError: if it is none.
+        ValueError: if it is not finite.
+    """
+    real = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    if not real and not (is_numeric(value) and value.shape == ()):
+        raise TypeError(f"{name} must be a number, got {value!r}")
+    if not math.isfinite(value):
+        raise ValueError(f"{name} must be finite, got {value!r}")
+    return float(value)
+
+
+def key(value: Any) -> Any:
+    """One key of `jax.random`, as it is; also one of `jax.random.PRNGKey`.
+
+    Raises:
+        TypeError: if it is something else, or several keys.
+    """
+    dtype, shape = getattr(value, "dtype", None), getattr(value, "shape", None)
+    if dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key):
+        if shape != ():
+            raise TypeError(f"key must be one key, got an array of keys of shape {shape}")
+    elif dtype != jnp.uint32 or shape not in ((2,), (4,)):  # raw, threefry's or rbg's
+        raise TypeError(f"key must be a key such as jax.random.key(0), got {short(value)}")
+    return value
+
+
+def action(value: Any, shape: tuple[int, ...]) -> Any:
+    """Numbers of the right shape, as they are.
+
+    Raises:
+        TypeError: if it is no array of numbers.
+        ValueError: if it has another shape.
+    """
+    if not is_numeric(value):
+        raise TypeError(f"action must be an array of numbers, {list(shape)}, got {short(value)}")
+    if value.shape != shape:
+        raise ValueError(f"action must have shape {shape}, got {value.shape}")
+    return value
+
+
+def instance(name: str, value: Any, kind: type, where: str) -> None:
+    """Raises a TypeError for what is not of a kind; `where` says how one gets it."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} must be {where}, got {short(value)}")
+
+
+def is_numeric(value: Any) -> bool:
+    """Whether it is an array of real numbers; lists are none."""
+    dtype = getattr(value, "dtype", None)
+    return dtype is not None and (
+        jnp.issubdtype(dtype, jnp.integer) or jnp.issubdtype(dtype, jnp.floating)
+    )
+
+
+def short(value: Any) -> str:
+    """What a message says of a value, in a few words."""
+    if hasattr(value, "dtype"):
+        return f"an array of {value.dtype}, shape {getattr(value, 'shape', ())}"
+    text = repr(value)
+    return text if len(text) <= 40 else f"a {type(value).__name__}"

@@ -1,0 +1,56 @@
+"""A line where something compiles for long, none where it does not."""
+
+import time
+
+import jax
+import pytest
+
+import envs
+from envs import compiling
+
+
+@pytest.fixture
+def impatient(monkeypatch):
+    monkeypatch.setattr(compiling, "PATIENCE", 0.05)
+
+
+def test_long_work_is_said_while_it_goes_on(impatient, capsys):
+    with compiling.said("the world"):
+        time.sleep(0.3)
+        assert capsys.readouterr() == ("", "compiling the world ...\n")
+    assert capsys.readouterr().err.startswith("compiled the world in 0 s, once for this")
+
+
+def test_short_work_is_not_said(capsys):
+    with compiling.said("the world"):
+        pass
+    assert capsys.readouterr() == ("", "")
+
+
+def test_an_error_is_not_called_done(impatient, capsys):
+    def fail():
+        with compiling.said("the world"):
+            time.sleep(0.3)
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail()
+    assert capsys.readouterr().err == "compiling the world ...\n"
+
+
+def test_the_first_process_alone_says_it(impatient, capsys, monkeypatch):
+    monkeypatch.setattr(jax, "process_index", lambda: 1)
+    with compiling.said("the world"):
+        time.sleep(0.2)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_an_environment_says_it_once(impatient, capsys):
+    env = envs.make("press", num_envs=2, image_size=8)
+    jax.eval_shape(env.reset, jax.random.key(0))  # nothing is compiled
+    assert capsys.readouterr().err == ""
+    env.reset(jax.random.key(0))
+    said = capsys.readouterr().err
+    assert said.startswith("compiling reset of press, 2 worlds ...\ncompiled reset of press")
+    env.reset(jax.random.key(1))
+    assert capsys.readouterr().err == ""
