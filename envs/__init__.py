@@ -9,7 +9,8 @@ import importlib
 import importlib.util
 from typing import TYPE_CHECKING, Any
 
-import envs.fast_cpu  # noqa: F401  first: it must come before anything starts JAX
+import envs.fast_cpu  # first: it must come before anything starts JAX
+import envs.ids
 
 if TYPE_CHECKING:
     from envs import robots  # noqa: F401  envs.robots.piper is public
@@ -41,6 +42,8 @@ _HOMES = {
     "expert_success": "collection",
     "make": "making",
 }
+
+envs.ids.register()
 
 
 def __getattr__(name: str) -> Any:

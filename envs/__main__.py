@@ -10,7 +10,8 @@ from typing import Any
 
 from rich.console import Console
 
-from envs import actions, commands, compilation_cache, distractors, making
+from envs import actions, commands, compilation_cache, distractors
+from envs.names import names
 from envs.refusals import refused
 
 
@@ -35,8 +36,8 @@ def main(arguments: Sequence[str]) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m envs", description="Scripted expert episodes.")
     subparsers = parser.add_subparsers(required=True, metavar="command")
-    tasks = ", ".join(making.names("task"))
-    robots = f"{', '.join(making.names('robot'))}, or the path of an MJCF file"
+    tasks = ", ".join(names("task"))
+    robots = f"{', '.join(names('robot'))}, or the path of an MJCF file"
 
     def add(command: Callable[..., None], image_size: int, of: str = "") -> Callable[..., Any]:
         text = command.__doc__

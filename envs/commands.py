@@ -18,7 +18,7 @@ from envs import collection, places, recipes, rlds, videos
 from envs.bars import Report, bars
 from envs.episodes import Episodes, replacing
 from envs.locks import alone
-from envs.making import names
+from envs.names import names
 
 WORLDS = 4
 """Tries at once where one episode is wanted: the expert may fail in one."""

@@ -6,7 +6,7 @@ worlds = gymnasium.make_vec("lorasp_jax/press-piper-v0", num_envs=4, reward="den
 
 import itertools
 
-from envs.making import names
+from envs.names import names
 
 
 def register() -> None:

@@ -3,7 +3,6 @@
 import importlib
 import numbers
 import os
-import pkgutil
 from typing import Any, Literal, get_args
 
 import mujoco
@@ -12,6 +11,7 @@ import envs.distractors
 from envs import checks, fast_cpu, mjcf, physics, render, scene
 from envs.actions import MODES, TARGET_DT, Mode
 from envs.env import Env
+from envs.names import names
 from envs.physics import Backend
 from envs.rewards import REWARDS, Reward
 from envs.robots import Robot
@@ -138,12 +138,6 @@ def _find_robot(robot: AnyRobot) -> Robot:
         what = f"one of {', '.join(names('robot'))}, the path of an MJCF file or a Robot"
         raise TypeError(f"robot must be {what}, got {checks.short(robot)}")
     return mjcf.load(path) if path.endswith(".xml") else _find("robot", path)
-
-
-def names(kind: str) -> list[str]:
-    """The names of all of a kind, task or robot: those of their files."""
-    package = importlib.import_module(f"envs.{kind}s")
-    return sorted(module.name for module in pkgutil.iter_modules(package.__path__))
 
 
 def _find(kind: str, name: str) -> Any:

@@ -55,7 +55,8 @@ class BraxEnv(base.Env):
         """
         checks.instance("env", env, Env, "what envs.make gave")
         self.env = dataclasses.replace(env, num_envs=1)
-        self.ranges = prepared(ranges, env.control_dt)
+        prepared(ranges, env.control_dt)
+        self.ranges = ranges
 
     def reset(self, rng: jax.Array) -> base.State:
         """One fresh world, all from the key `rng`."""

@@ -78,7 +78,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         checks.instance("env", env, Env, "what envs.make gave")
         self.env = env
         self.observation = observation
-        self.ranges = prepared(ranges, env.control_dt)
+        prepared(ranges, env.control_dt)
+        self.ranges = ranges
         self.state: State | None = None
         self.num_envs = env.num_envs
         self.single_action_space = spaces.Box(env.action_low, env.action_high)
@@ -179,6 +180,7 @@ class SingleEnv(gymnasium.Env):
         """
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"unknown render_mode {render_mode!r}: choose from rgb_array")
+        checks.instance("env", env, Env, "what envs.make gave")
         self.render_mode = render_mode
         self.metadata = self.metadata | {"render_fps": round(1 / env.control_dt)}
         self.vector = VectorEnv(dataclasses.replace(env, num_envs=1), **options)

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from envs import making
 from envs.episodes import Episodes
+from envs.names import names
 from lorasp_jax.config import Config
 from lorasp_jax.data import cache
 from lorasp_jax.data.cache import Cache
@@ -113,6 +113,6 @@ def is_simulated(found: Cache) -> bool:
 
     A real robot's recordings may be called as a task is, but show and say other things.
     """
-    known = set(making.names("task")), set(making.names("robot"))
+    known = set(names("task")), set(names("robot"))
     is_known = set(found.facts["tasks"]) <= known[0] and found.facts["robot"] in known[1]
     return is_known and found.facts["physics_dt"] > 0

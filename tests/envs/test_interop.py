@@ -16,9 +16,10 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import envs
-from envs import experts, making
+from envs import experts
 from envs.interop.brax import BraxEnv
 from envs.interop.gymnasium import OBSERVATIONS, SingleEnv, VectorEnv
+from envs.names import names
 
 W = 4
 B = 2
@@ -246,9 +247,7 @@ def test_brax_broken_worlds_are_done(wrapped, first):
 def test_import_registers_every_task_and_robot():
     registered = {name for name in gymnasium.registry if name.startswith("lorasp_jax/")}
     assert registered == {
-        f"lorasp_jax/{task}-{robot}-v0"
-        for task in making.names("task")
-        for robot in making.names("robot")
+        f"lorasp_jax/{task}-{robot}-v0" for task in names("task") for robot in names("robot")
     }
     with pytest.raises(gymnasium.error.NameNotFound, match="prss"):
         gymnasium.make_vec("lorasp_jax/prss-piper-v0")

@@ -1,0 +1,10 @@
+"""The names of tasks and robots: those of their files, which nobody has to import for that."""
+
+import pkgutil
+from pathlib import Path
+
+
+def names(kind: str) -> list[str]:
+    """The names of all of a kind, task or robot."""
+    folder = Path(__file__).parent / f"{kind}s"
+    return sorted(module.name for module in pkgutil.iter_modules([str(folder)]))
