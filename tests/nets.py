@@ -76,12 +76,17 @@ def call(model, x):
 
 
 def trained(*rules, seed, net=NET):
-    """An adapted model whose adapters have moved off their start."""
+    """An adapted model whose adapters have moved off their start.
+
+    NumPy draws: JAX would compile a program for every shape.
+    """
     model = adaptation.adapt(net, rules, rngs=nnx.Rngs(seed))
     graphdef, adapters, frozen = adaptation.split(model)
     leaves, structure = jax.tree.flatten(adapters)
-    keys = jax.random.split(jax.random.key(seed), len(leaves))
-    moved = [x + 0.5 * jax.random.normal(k, x.shape) for k, x in zip(keys, leaves, strict=True)]
+    rng = np.random.default_rng(seed)
+    moved = [
+        jnp.asarray(x + 0.5 * rng.normal(size=x.shape), x.dtype) for x in map(np.asarray, leaves)
+    ]
     return nnx.merge(graphdef, jax.tree.unflatten(structure, moved), frozen)
 
 

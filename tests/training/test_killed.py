@@ -74,7 +74,7 @@ def kill(folder, steps, chance):
 
 
 @pytest.mark.timeout(1800)
-@pytest.mark.parametrize("times", [2, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("times", [1, pytest.param(20, marks=pytest.mark.slow)])
 def test_a_killed_run_resumes_to_the_bit(times, tmp_path, use, capsys):
     use(1)
     steps, chance = 12 * times, random.Random(times)
