@@ -1,12 +1,13 @@
 """Whether the values of a dataclass are of the kinds that its fields state."""
 
 import dataclasses
-import math
 import numbers
 import types
 import typing
 from typing import Any
 
+LARGEST_REAL = (2 - 2**-23) * 2.0**127
+"""Largest number of fp32."""
 LARGEST = 2**31 - 1
 """Largest whole number that arrays and their sizes take everywhere."""
 
@@ -56,7 +57,8 @@ def _fits(value: Any, kind: Any) -> bool:
     if origin is tuple:
         return isinstance(value, tuple) and all(_fits(item, arguments[0]) for item in value)
     if kind is float:
-        return isinstance(value, int | float) and type(value) is not bool and math.isfinite(value)
+        real = isinstance(value, int | float) and type(value) is not bool
+        return real and abs(value) <= LARGEST_REAL
     if kind is int:
         return isinstance(value, int) and type(value) is not bool
     return isinstance(value, kind) if isinstance(kind, type) else True

@@ -7,7 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+
 from lorasp_jax import adaptation, adapter_io, models
+from lorasp_jax.digest import digest
 from lorasp_jax.models import backbone, places, tokenizer
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.processing import Processor
@@ -56,6 +60,7 @@ def _facts(run: Run) -> dict[str, Any]:
             "backbone": config.model.backbone,
             "config": dataclasses.asdict(run.policy.model.config),
             "tokenizer": places.lasting(config.model.tokenizer),
+            "prompts": _prompts_digest(processor.prompts),
             "instructions": list(processor.prompts.instructions),
             "num_joints": len(processor.robot_slots) - 1,
             "cameras": {place: name for place, name in processor.cameras if name},
@@ -102,7 +107,10 @@ def load_policy(
         raise ValueError(f"{error}{hint}") from error
     if not trained:
         model = adapter_io.load_adapters(folder, model, any_base=any_base)
-    return Policy(model, _processor(told["policy"], config, words))
+    try:
+        return Policy(model, _processor(told["policy"], config, words))
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{path} does not say what its policy needs") from error
 
 
 def _processor(told: Mapping[str, Any], config: Any, words: str) -> Processor:
@@ -112,11 +120,23 @@ def _processor(told: Mapping[str, Any], config: Any, words: str) -> Processor:
         found = tokenizer.load(words or places.found_again(told["tokenizer"]))
     except ValueError as error:
         raise ValueError(f"{error} (words= says where the policy's tokenizer is now)") from error
+    prompts = PromptTable.of(found, told["instructions"], config, num_joints=joints)
+    if _prompts_digest(prompts) != told["prompts"]:
+        raise ValueError(
+            f"the tokenizer {words or told['tokenizer'] or 'of this version'} gives other tokens "
+            "than the policy was trained on: words= says where its own is now"
+        )
     return Processor.of(
         config,
         Statistics.from_json(json.dumps(told["statistics"])),
-        PromptTable.of(found, told["instructions"], config, num_joints=joints),
+        prompts,
         num_joints=joints,
         cameras=told["cameras"],
         delta=told["relative"],
     )
+
+
+def _prompts_digest(prompts: PromptTable) -> str:
+    """The identity of a tokenizer, as far as a policy sees it: the tokens of its prompts."""
+    leaves = jax.tree_util.tree_leaves_with_path(prompts)
+    return digest({jax.tree_util.keystr(path): jnp.asarray(leaf) for path, leaf in leaves})

@@ -54,6 +54,8 @@ def parse(arguments: Sequence[str]) -> Command:
         known, rest = parser.parse_known_args(arguments)
     except argparse.ArgumentError as error:
         raise ValueError(str(error)) from error
+    if bare := [name for name, value in vars(known).items() if isinstance(value, list)]:
+        raise ValueError(f"--{bare[0]} needs a value, not --")  # which argparse drops
     wants_help = bool(HELP & set(rest))
     if wants_help and known.scale == "auto":
         known.scale = "cpu"  # to look at the devices, JAX would have to start

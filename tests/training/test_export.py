@@ -16,6 +16,7 @@ from flax import nnx
 from lorasp_jax import adaptation, adapter_io, models
 from lorasp_jax.config import ModelConfig
 from lorasp_jax.digest import sealed
+from lorasp_jax.models import tokenizer
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.processing import Statistics
@@ -127,6 +128,23 @@ def test_a_base_that_is_gone_is_named_with_the_way_out(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="was trained on another base"):
         export.load_policy("run", base="moved")
     assert export.load_policy("run", base="moved", any_base=True).model
+
+
+def test_another_tokenizer_is_refused(tmp_path, monkeypatch):
+    models.save(tmp_path / "base", Pi0Config.dummy().create(nnx.Rngs(0)))
+    chosen = dataclasses.replace(CONFIG.model, checkpoint=str(tmp_path / "base"))
+    config = dataclasses.replace(CONFIG, model=chosen)
+    run = make_run(tmp_path / "run", config, models.load(tmp_path / "base"))
+    export.write(run)
+    encode = tokenizer.Offline.encode
+
+    def other(self, texts, *args, **kwargs):
+        ids, valid = encode(self, texts, *args, **kwargs)
+        return np.where(valid, (ids + 1) % 300, 0), valid
+
+    monkeypatch.setattr(tokenizer.Offline, "encode", other)
+    with pytest.raises(ValueError, match=r"gives other tokens than .*: words= says"):
+        export.load_policy(run.folder)
 
 
 @pytest.mark.parametrize("changes", [{"policy": {}}, {"policy": {"backbone": "pi9"}}, {"base": ""}])

@@ -39,7 +39,7 @@ OPTIONS = {
     "model.unroll": ["maybe"],
     "model.remat": ["all"],
     "peft.rank": ["99999999999999999999999", "0", "x", "2.5", None],
-    "peft.alpha": ["nan", "x"],
+    "peft.alpha": ["nan", "x", "1e300"],
     "peft.energy-target": ["0", "1.5", "nan"],
     "peft.score-function": ["x"],
     "control-dt": ["0", "-0.1", "nan"],
@@ -60,7 +60,7 @@ OPTIONS = {
     ],
     "scale": ["gpu", None],
     "method": ["lorra", None],
-    "config": ["nowhere.py", "n" * 300, None],
+    "config": ["nowhere.py", "n" * 300, "--", None],
     "nme": ["x"],
 }
 MULTITASK = ["--config", str(ROOT / "configs" / "multitask.py"), "--scale", "smoke"]
