@@ -5,7 +5,9 @@ import dataclasses
 import functools
 import json
 import math
+import numbers
 import os
+import re
 import shutil
 import struct
 import tokenize
@@ -30,6 +32,7 @@ SHARED = ("task", "robot", "control_dt", "physics_dt", "actions", "instructions"
 _ARRAYS = ("state", "action", "length", "instruction")
 _FACTS = (*SHARED, "attempted")
 _IMAGE = "image/"
+_CAMERA = re.compile(r"[\w-][\w .-]{0,99}")
 _HEADERS: Any = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
@@ -150,6 +153,10 @@ class Episodes:
         if not self.image:
             raise ValueError("image holds no camera, but at least one is needed")
         for name, picture in self.image.items():
+            if not _CAMERA.fullmatch(name):  # files are called after it
+                raise ValueError(
+                    f"a camera is called {name[:80]!r}: valid are letters, digits and - _ ."
+                )
             if picture.shape[:2] != steps or picture.shape[4:] != (3,) or picture.dtype != np.uint8:
                 raise ValueError(
                     f"image {name!r} must be uint8 [{steps[0]}, {steps[1]}, H, W, 3], "
@@ -158,12 +165,11 @@ class Episodes:
 
     def validate_numbers(self) -> None:
         """`validate` without the pictures."""
+        self._validate_facts()
         if self.state.ndim != 3 or not self.state.size:
             raise ValueError(f"state must have shape [E, T, J + 1], not {self.state.shape}")
         steps = self.state.shape[:2]
         self._validate_action()
-        if not 0 < self.control_dt < math.inf:
-            raise ValueError(f"control_dt must be above 0 s, not {self.control_dt}")
         for name, low, high in (
             ("length", 1, steps[1]),
             ("instruction", 0, len(self.instructions) - 1),
@@ -177,6 +183,19 @@ class Episodes:
                 raise ValueError(
                     f"{name} must lie in {low} to {high}, not {values.min()} to {values.max()}"
                 )
+
+    def _validate_facts(self) -> None:
+        texts = {"task": self.task, "robot": self.robot, "actions": self.actions}
+        texts |= {f"instruction {i}": text for i, text in enumerate(self.instructions)}
+        for name, text in texts.items():
+            if not isinstance(text, str):
+                raise ValueError(f"{name} must be a text, not {text!r}")
+        for name in ("control_dt", "physics_dt"):
+            time = getattr(self, name)
+            if not isinstance(time, numbers.Real) or not 0 <= float(time) < math.inf:
+                raise ValueError(f"{name} must be a time in s, not {time!r}")
+        if not self.control_dt:
+            raise ValueError("control_dt must be above 0 s")
 
     def _validate_action(self) -> None:
         if self.actions not in MODES:

@@ -79,12 +79,14 @@ def read_json(path: Path, folder: Path | None = None) -> Any:
     Raises:
         RefusedError: as `read_text`.
         OSError: as `regular`.
-        ValueError: it is no JSON, or nested too deeply.
+        ValueError: it is no JSON, nested too deeply, or has half a character in a text.
     """
     try:
-        return json.loads(read_text(path, folder))
+        value = json.loads(read_text(path, folder))
+        json.dumps(value, ensure_ascii=False).encode()  # raises where a text is no Unicode
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
+    return value
 
 
 def check_memory(size: int, what: object) -> None:

@@ -27,7 +27,7 @@ def alone(path: Path, waiting: Callable[[], None] | None = None) -> Iterator[Non
     lock.parent.mkdir(parents=True, exist_ok=True)
     how = fcntl.LOCK_EX | fcntl.LOCK_NB
     while True:
-        with lock.open("w") as held:
+        with lock.open("a") as held:
             try:
                 fcntl.flock(held, how)
             except BlockingIOError as error:

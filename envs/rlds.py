@@ -13,6 +13,7 @@ import contextlib
 import functools
 import json
 import os
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -163,6 +164,7 @@ class Parts:
             filename_template=self._template,
         )
         info.set_splits(tfds.core.SplitDict([split]))
+        (self.folder / rlds_schema.INFO).unlink(missing_ok=True)  # of a process that was killed
         info.write_to_directory(self.folder)
 
     def _save(self) -> None:
@@ -172,7 +174,8 @@ class Parts:
     @property
     def _name(self) -> str:
         robot = Path(self.facts["robot"]).stem  # a user's is a path
-        return f"{self.facts['task']}_{robot}"
+        name = f"{self.facts['task']}_{robot}"
+        return re.sub(r"[^\w.-]", "_", name)[:100]  # a part of the names of files
 
     @property
     def _template(self) -> tfds.core.ShardedFileTemplate:

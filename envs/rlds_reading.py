@@ -21,6 +21,10 @@ METADATA = "metadata.json"
 """File in a dataset's folder, where tfds looks for it, too."""
 THREADS = ThreadPoolExecutor(8)
 """Shared by all datasets that are made at once: more threads would only wait for Python's lock."""
+# Of metadata, in a folder that was begun, and where there are parts.
+_BEGUN: dict[str, Any] = {"options": dict, "parts": list, "steps": int, "attempted": int}
+_FILLED: dict[str, Any] = {"task": str, "robot": str, "actions": str, "instructions": list}
+_FILLED |= {"cameras": dict, "control_dt": int | float, "physics_dt": int | float}
 _FAILURES = (OSError, RuntimeError, ValueError, LookupError, TypeError, AttributeError, ParseError)
 _FAILURES += (ArithmeticError, SyntaxError)  # of numbers that are infinite; of PNG
 _FAILURES += (ImportError,)  # what tfds says of features that would need TensorFlow
@@ -54,10 +58,15 @@ def metadata(path: Path) -> dict[str, Any]:
         facts = read_json(path / METADATA, path)
         if facts["format"] != FORMAT:
             raise KeyError("format")
+        kinds = _BEGUN | (_FILLED if facts["parts"] else {})
+        wrong = [name for name, kind in kinds.items() if not isinstance(facts.get(name), kind)]
     except RefusedError:
         raise
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path} is not a folder of {FORMAT} episodes") from error
+    if wrong:
+        value = repr(facts.get(wrong[0]))[:80]
+        raise ValueError(f"{path} is damaged ({METADATA} has {wrong[0]} {value})")
     return facts
 
 

@@ -48,6 +48,10 @@ _NAMES = {
     "python_class_name": _CLASSES,
     "filepathTemplate": [FILES],
     "filepath_template": [FILES],
+    "dtype": ["float32", "int64", "bool", "uint8"],
+    "encoding": ["none"],
+    "encodingFormat": ["png"],
+    "encoding_format": ["png"],
     "jsonFeature": [],
     "json_feature": [],
 }

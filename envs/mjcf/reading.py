@@ -1,7 +1,9 @@
 """Finding an arm, its hand and its actuators in a MuJoCo model, and saying what is missing."""
 
+import contextlib
 import os
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -53,13 +55,27 @@ def read(
     except (SyntaxError, RecursionError, OSError) as error:  # the first: of XML
         raise ValueError(f"MuJoCo cannot read it: {error}") from error
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        spec.memory = -1  # as MuJoCo likes: nothing of the file itself is ever simulated
-        # Bodies and geoms keep their numbers.
-        spec.compiler.fusestatic = spec.compiler.discardvisual = False
-        return spec, spec.compile()
+        with _warnings_of_python():
+            spec = mujoco.MjSpec.from_file(str(path))
+            spec.memory = -1  # as MuJoCo likes: nothing of the file itself is ever simulated
+            # Bodies and geoms keep their numbers.
+            spec.compiler.fusestatic = spec.compiler.discardvisual = False
+            return spec, spec.compile()
     except ValueError as error:
         raise ValueError(f"MuJoCo cannot read it: {error}") from error
+
+
+@contextlib.contextmanager
+def _warnings_of_python() -> Iterator[None]:
+    """MuJoCo's own go to a file in the working folder."""
+    before, said = mujoco.get_mju_user_warning(), []
+    mujoco.set_mju_user_warning(said.append)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+    for text in said:
+        warnings.warn(f"MuJoCo says: {text}", stacklevel=2)
 
 
 def find_arm(model: mujoco.MjModel) -> Arm:

@@ -241,10 +241,11 @@ class Cache:
         }
         rows = {"state": (self.num_steps, width), "action": (self.num_steps, None)}
         self._columns = {name: self._mapped(name, shape) for name, shape in rows.items()}
-        self._columns |= {name: self._mapped(name, (None,)) for name in ROWS[2:]}
-        self._end = np.cumsum(self._columns["length"], dtype=np.int64)
-        if self._end[-1] != self.num_steps:
-            raise ValueError(f"{path} has episodes of {self._end[-1]} steps, not {self.num_steps}")
+        length = self._columns["length"] = self._mapped("length", (None,))
+        self._columns |= {name: self._mapped(name, length.shape) for name in ROWS[3:]}
+        self._end = np.cumsum(length, dtype=np.int64)
+        if not len(length) or length.min() < 1 or self._end[-1] != self.num_steps:
+            raise ValueError(f"{path} has episodes of {length} steps, not {self.num_steps} in all")
         for name, texts in (("task", self.facts["tasks"]), ("instruction", self.instructions)):
             low, high = self._columns[name].min(), self._columns[name].max()
             if low < 0 or high >= len(texts):

@@ -145,4 +145,4 @@ def reduced(picture: np.ndarray, image_size: int) -> np.ndarray:
 def reason(error: BaseException) -> str:
     """What a library says of an error, without its further lines and the path, which we name."""
     text = str(getattr(error, "strerror", None) or error) or type(error).__name__
-    return text.partition("\n")[0].rstrip(".").replace(os.linesep, " ")
+    return text.partition("\n")[0].rstrip(".").replace(os.linesep, " ")[:200]

@@ -181,7 +181,7 @@ class LeRobot:
                 self._table = path, read_table(path, self.path, self._needed)
             table = self._table[1]
             table = table.filter(pc.equal(table["episode_index"], number))
-            frames = table["frame_index"].to_numpy()
+            frames = table["frame_index"].cast(pa.int64()).to_numpy()
             times = table["timestamp"].cast(pa.float64()).to_numpy()
         if len(frames) != recording.length or np.any(frames != np.arange(recording.length)):
             raise ValueError(
@@ -228,7 +228,7 @@ class LeRobot:
         if len(found) != 1 or found[0] not in self.index.tasks:
             raise ValueError(
                 f"episode {recording.number} of {self.path} needs one task that meta lists, "
-                f"not {found}"
+                f"not {str(found)[:80]}"
             )
         return sorted(self.index.tasks).index(found[0])
 

@@ -24,6 +24,7 @@ from lorasp_jax.adapter_set import SetParam
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.models import backbone
 from lorasp_jax.models.tensor_files import INDEX, SINGLE, TensorFiles, weight_files
+from lorasp_jax.models.untrusted import read_text
 from lorasp_jax.quantization import is_quantized
 
 CONFIG = "config.json"
@@ -239,10 +240,8 @@ def _difference(stored: Any, wanted: Any) -> str:
 
 def _description(folder: pathlib.Path) -> dict[str, Any]:
     foreign = f"{folder / CONFIG} is damaged or was not written by this project."
-    if (folder / CONFIG).exists() and not (folder / CONFIG).is_file():
-        raise ValueError(foreign)
     try:
-        found = json.loads((folder / CONFIG).read_bytes())
+        found = json.loads(read_text(folder / CONFIG))
         valid = isinstance(found["config"], dict) and isinstance(found["sha256"], str)
     except FileNotFoundError as error:
         raise ValueError(f"{folder} holds no model: there is no {CONFIG}.") from error

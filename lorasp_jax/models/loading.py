@@ -11,6 +11,7 @@ from lorasp_jax.models import backbone, checkpoint, lerobot_config, places, publ
 from lorasp_jax.models.inputs import InputConfig
 from lorasp_jax.models.layouts import OtherModelError
 from lorasp_jax.models.tensor_files import weight_files
+from lorasp_jax.models.untrusted import read_text
 
 _log = logging.getLogger(__name__)
 
@@ -82,9 +83,7 @@ def _fields(folder: Path) -> dict[str, Any]:
     """The content of config.json, empty where there is none."""
     path = folder / checkpoint.CONFIG
     try:
-        if path.exists() and not path.is_file():
-            raise ValueError("it is no file")
-        found = json.loads(path.read_bytes()) if path.exists() else {}
+        found = json.loads(read_text(path)) if path.exists() else {}
     except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path} is damaged.") from error
     if not isinstance(found, dict):

@@ -110,7 +110,8 @@ class Statistics:
             found = json.loads(text)
             for key, values in (unsealed(found) if DIGEST in found else found).items():
                 kind, _, name = key.partition("_")
-                both[kind][name] = np.asarray(values, np.float32)
+                with np.errstate(over="ignore"):  # what is infinite then is refused
+                    both[kind][name] = np.asarray(values, np.float32)
         except (
             AttributeError, KeyError, TypeError, ValueError, OverflowError, RecursionError
         ) as error:  # fmt: skip

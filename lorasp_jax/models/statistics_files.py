@@ -25,7 +25,7 @@ import safetensors
 
 from lorasp_jax.models import places
 from lorasp_jax.models.statistics import NAMES, Statistics, checked
-from lorasp_jax.models.tensor_files import beside
+from lorasp_jax.models.untrusted import beside, read_text
 
 OURS, OPENPI, DATASET = "statistics.json", "norm_stats.json", "stats.json"
 EPISODES = "episodes_stats.jsonl"
@@ -63,7 +63,8 @@ def read(where: str | os.PathLike[str], *, dataset: str = "") -> Statistics:
             try:
                 groups = reader(found)
             except _UNREADABLE as error:
-                raise ValueError(f"the statistics of {where} cannot be read: {error!r}.") from error
+                why = f"{type(error).__name__}: {str(error)[:200]}"
+                raise ValueError(f"the statistics of {where} cannot be read ({why}).") from error
             return checked(_chosen(groups, dataset, str(where)), str(where))
     raise ValueError(f"{where} holds no statistics: none of {', '.join(_READERS)}.")
 
@@ -81,26 +82,26 @@ def _chosen(groups: Mapping[str, Known], dataset: str, where: str) -> Known:
 
 
 def _ours(files: list[Path]) -> dict[str, Known]:
-    found = Statistics.from_json(files[0].read_text())
+    found = Statistics.from_json(read_text(files[0]))
     return {"": {"state": _arrays(found.state), "action": _arrays(found.action)}}
 
 
 def _openpi(files: list[Path]) -> dict[str, Known]:
     groups = {}
     for file in files:
-        known = json.loads(file.read_text())["norm_stats"]
+        known = json.loads(read_text(file))["norm_stats"]
         name = file.parent.as_posix().rpartition("/assets/")[2]
         groups[name] = {"state": _arrays(known["state"]), "action": _arrays(known["actions"])}
     return groups
 
 
 def _dataset(files: list[Path]) -> dict[str, Known]:
-    known = json.loads(files[0].read_text())
+    known = json.loads(read_text(files[0]))
     return {"": {"state": _arrays(known["observation.state"]), "action": _arrays(known["action"])}}
 
 
 def _episodes(files: list[Path]) -> dict[str, Known]:
-    lines = files[0].read_text().splitlines()
+    lines = read_text(files[0]).splitlines()
     rows = [json.loads(line)["stats"] for line in lines if line.strip()]
     kinds = {"state": "observation.state", "action": "action"}
     return {"": {kind: _joined([row[name] for row in rows]) for kind, name in kinds.items()}}
@@ -121,7 +122,7 @@ def _joined(episodes: list[Mapping[str, Any]]) -> dict[str, np.ndarray]:
 def _policy(files: list[Path]) -> dict[str, Known]:
     tensors: list[tuple[str, np.ndarray]] = []
     for pipeline in (files[0].with_name(name) for name in PIPELINES):
-        for step in json.loads(pipeline.read_text())["steps"]:
+        for step in json.loads(read_text(pipeline))["steps"]:
             if "normalizer" in step.get("registry_name", "") and "state_file" in step:
                 tensors += _tensors(beside(pipeline, step["state_file"]))
     return _grouped(tensors)
@@ -151,9 +152,12 @@ def _files(folder: Path, pattern: str) -> list[Path]:
 
 def _arrays(known: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """What has a name of ours and a value."""
-    return {
-        name: np.asarray(known[name], np.float32) for name in NAMES if known.get(name) is not None
-    }
+    with np.errstate(over="ignore"):  # what is infinite then is refused
+        return {
+            name: np.asarray(known[name], np.float32)
+            for name in NAMES
+            if known.get(name) is not None
+        }
 
 
 def _tensors(file: Path) -> list[tuple[str, np.ndarray]]:

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import safetensors
 
+from lorasp_jax.models.untrusted import beside, read_text
+
 SINGLE, INDEX = "model.safetensors", "model.safetensors.index.json"
 
 
@@ -21,23 +23,11 @@ def weight_files(folder: Path) -> list[Path]:
     if not index.exists():
         return [folder / SINGLE]
     try:
-        where = json.loads(beside(index, INDEX).read_bytes())["weight_map"]
+        where = json.loads(read_text(index))["weight_map"]
         names = sorted(set(where.values()))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{index} is damaged.") from error
     return [beside(index, name) for name in names]
-
-
-def beside(file: Path, name: Any) -> Path:
-    """The path of a file that another one names, which must lie beside it.
-
-    Raises:
-        ValueError: the name leads elsewhere, or to something that is no file.
-    """
-    path = file.parent / str(name)
-    if Path(str(name)).name != name or (path.exists() and not path.is_file()):
-        raise ValueError(f"{file} names {name!r}, which is no file beside it.")
-    return path
 
 
 class TensorFiles(MutableMapping[str, np.ndarray]):

@@ -150,3 +150,13 @@ def test_each_file_is_read_once(robots, monkeypatch):
     with pytest.raises(ValueError, match="MuJoCo cannot read it"):
         reading.read(model(robots, '<include file="b.xml"/>', body=""))
     assert len(count) == 3
+
+
+def test_warnings_are_of_python(robots, monkeypatch):
+    """MuJoCo would write them to a file in the working folder."""
+    monkeypatch.chdir(robots)
+    before = sorted(robots.rglob("*"))
+    path = model(robots, "", body='<geom size="1" pos="nan 0 0"/>')
+    with pytest.warns(UserWarning, match="MuJoCo says: XML contains a 'NaN'"):
+        reading.read(path)
+    assert sorted(robots.rglob("*")) == sorted([*before, path])

@@ -1,5 +1,6 @@
 """An RLDS dataset runs no code, leaves its folder nowhere, and takes no more than it holds."""
 
+import dataclasses
 import json
 import os
 import shutil
@@ -128,3 +129,21 @@ def test_pictures_of_another_size(path):
     edit(path / "metadata.json", lambda found: found["cameras"].update(side=[60, 80]))
     with pytest.raises(ValueError, match=r"a picture has 6 x 8 pixels, not \[60, 80\]"):
         rlds.read(path)
+
+
+@pytest.mark.parametrize("name", ["../../harm", "/tmp/harm", "a/b", "é" * 300, "x" * 300, ""])
+def test_names_of_tasks_and_robots_are_no_paths(name, path, tmp_path):
+    before = sorted(tmp_path.iterdir())
+    rlds.write(make(task=name, robot=name), tmp_path / "other")
+    assert sorted(tmp_path.iterdir()) == sorted([*before, tmp_path / "other"])
+    assert len(list((tmp_path / "other").iterdir())) == 4
+    assert rlds.read(tmp_path / "other").task == name
+
+
+@pytest.mark.parametrize("name", ["../x", "a/b", "", ".x", "x" * 101, "a\\b"])
+def test_names_of_cameras_are_no_paths(name, tmp_path):
+    episodes = make()
+    images = {name: episodes.image["side"]}
+    with pytest.raises(ValueError, match="a camera is called"):
+        rlds.write(dataclasses.replace(episodes, image=images), tmp_path / "other")
+    assert not list(tmp_path.iterdir())

@@ -9,6 +9,7 @@ import pytest
 
 from lorasp_jax.models import checkpoint, loading, published, statistics_files, tokenizer
 from lorasp_jax.models.tensor_files import INDEX, SINGLE, TensorFiles, weight_files
+from lorasp_jax.models.untrusted import TEXT_BYTES
 
 READERS = {
     "config.json": [loading.load_config, checkpoint.load_config],
@@ -64,3 +65,11 @@ def test_deep_and_large_numbers(tmp_path):
         (tmp_path / "config.json").write_text("[" * 100_000)
         with pytest.raises(ValueError, match=r"config.json is damaged"):
             loading.load_config(tmp_path)
+
+
+def test_files_larger_than_any_text(tmp_path):
+    for name, read in (("config.json", loading.load_config), (INDEX, weight_files)):
+        with (tmp_path / name).open("wb") as file:
+            file.truncate(TEXT_BYTES + 1)  # a hole: takes no place
+        with pytest.raises(ValueError, match=f"{name} is damaged"):
+            read(tmp_path)

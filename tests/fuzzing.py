@@ -1,0 +1,180 @@
+"""Random changes of a folder's files; each is a function of a generator and of the files."""
+
+import contextlib
+import copy
+import json
+import os
+import random
+import re
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+Change = Callable[[random.Random, list[Path]], None]
+VALUES: list[Any] = [
+    *(None, True, 0, -1, 2.5, 1e300, 1e999, float("nan"), 10**30, -(2**63), 2**31),
+    *("", "x", "9" * 5000, "../../x", "/etc/passwd", "http://localhost:9/x", "\0", "\ud800"),
+    *("{0.__class__}", "{x:0999999999}", "é" * 300, [], {}, [None], [[]], [1e999], {"": None}),
+]
+NUMBERS = ["", "x", "nan", "inf", "-1", "0", "1e300", "99999999999999", "1 2", "../x", "/dev/zero"]
+ELEMENTS = [
+    '<replicate count="100000000"><geom size="1"/></replicate>',
+    '<include file="/etc/passwd"/>',
+    '<flexcomp name="q" type="grid" count="1000 1000 1000" spacing="1 1 1"/>',
+    '<size nkey="100000000"/>',
+    '<hfield name="u" nrow="100000" ncol="100000" size="1 1 1 1"/>',
+    '<plugin plugin="x"/>',
+    '<attach model="x" body="y" prefix="z"/>',
+    '<option timestep="0"/>',
+]
+TYPES = [pa.string(), pa.int8(), pa.float64(), pa.list_(pa.float64()), pa.bool_(), pa.binary()]
+
+
+def described(r: random.Random, files: list[Path]) -> None:
+    """A value in a JSON file is another one, or gone; of lines, in one of them."""
+    file = r.choice([file for file in files if file.suffix in (".json", ".jsonl")])
+    lines = file.read_text().splitlines() if file.suffix == ".jsonl" else [file.read_text()]
+    number = r.randrange(len(lines))
+    value = {"": json.loads(lines[number])}
+    owner, key = r.choice(list(_places(value)))
+    if r.random() < 0.85:
+        owner[key] = copy.deepcopy(r.choice(VALUES))
+    else:
+        del owner[key]
+    lines[number] = json.dumps(value.get("", {}))
+    file.write_text("\n".join(lines))
+
+
+def _places(value: Any) -> Iterator[tuple[Any, Any]]:
+    """All that a JSON value holds, as owner and key."""
+    keys = value if isinstance(value, dict) else range(min(len(value), 6))
+    for key in keys:
+        yield value, key
+        if isinstance(value[key], dict | list):
+            yield from _places(value[key])
+
+
+def damaged(r: random.Random, files: list[Path]) -> None:
+    """A file is cut, or has other bits, more or fewer bytes."""
+    file = r.choice(files)
+    data = bytearray(file.read_bytes())
+    place, size = r.randrange(len(data) + 1), r.choice([1, 8, 100])
+    match r.choice(["cut", "flip", "noise", "empty", "insert", "remove"]):
+        case "cut":
+            del data[place:]
+        case "flip":
+            data[place - 1] ^= 1 << r.randrange(8)
+        case "noise":
+            data = bytearray(r.randbytes(len(data)))
+        case "empty":
+            data.clear()
+        case "insert":
+            data[place:place] = r.randbytes(size)
+        case "remove":
+            del data[place : place + size]
+    file.write_bytes(data)
+
+
+def replaced(r: random.Random, files: list[Path]) -> None:
+    """A file is another one, or something else of that name."""
+    file, other = r.choice(files), r.choice(files)
+    mine = file.read_bytes()
+    file.unlink()
+    match r.choice(["swap", "folder", "pipe", "out", "loop", "hole", "zero"]):
+        case "swap":
+            file.write_bytes(mine if other == file else other.read_bytes())
+            other.write_bytes(mine)
+        case "folder":
+            file.mkdir()
+        case "pipe":
+            os.mkfifo(file)
+        case "out":
+            file.symlink_to("/etc/passwd")
+        case "loop":
+            file.symlink_to(file.name)
+        case "hole":
+            file.touch()
+            os.truncate(file, 2**40)
+        case "zero":
+            file.symlink_to("/dev/zero")
+
+
+def tabled(r: random.Random, files: list[Path]) -> None:
+    """A parquet file has another value or type in a column, or lacks it."""
+    file = r.choice([file for file in files if file.suffix == ".parquet"])
+    table = pq.read_table(file)
+    name = r.choice(table.column_names)
+    place, rows = table.column_names.index(name), table[name].to_pylist()
+    value = r.choice(VALUES)
+    changes = [
+        lambda: table.drop_columns(name),
+        lambda: table.append_column(name, table[name]),
+        lambda: table.slice(0, len(rows) // 2),
+        lambda: table.set_column(place, name, pa.array(rows, r.choice(TYPES))),
+        lambda: table.set_column(place, name, pa.array([value, *rows[1:]])),
+        lambda: table.set_column(place, name, pa.array([value] * len(rows))),
+    ]
+    with contextlib.suppress(pa.ArrowException, OverflowError, ValueError, TypeError):
+        pq.write_table(r.choice(changes)(), file)  # what pyarrow cannot write nobody reads
+
+
+def array(r: random.Random, found: np.ndarray) -> np.ndarray:
+    """Another one."""
+    with np.errstate(all="ignore"):
+        changes = [
+            lambda: found.astype(r.choice(["f2", "f8", ">f4", "i8", "?", "U5", "S3"])),
+            lambda: np.where(np.arange(found.size).reshape(found.shape), found, r.choice([-1, 99])),
+            lambda: found.reshape(-1),
+            lambda: found[:-1],
+            lambda: found[:0],
+            lambda: found[None],
+            lambda: np.asfortranarray(found),
+        ]
+        return r.choice(changes)()
+
+
+def mapped(r: random.Random, files: list[Path]) -> None:
+    """An array of a cache is another one; mostly its checksum is, too."""
+    file = r.choice([file for file in files if file.suffix == ".npy"])
+    found = array(r, np.load(file))
+    np.save(file, found)
+    header = file.parent / "cache.json"
+    facts = json.loads(header.read_text())
+    if file.stem in facts["crc32"] and r.random() < 0.8:
+        facts["crc32"][file.stem] = zlib.crc32(found.tobytes())
+    header.write_text(json.dumps(facts))
+
+
+def zipped(r: random.Random, files: list[Path]) -> None:
+    """An array in an .npz file is another one; or a value in its header."""
+    (file,) = files
+    with np.load(file) as archive:
+        arrays: dict[str, Any] = dict(archive)
+    name = r.choice(list(arrays))
+    if name == "header":
+        header = file.with_name("header.json")
+        header.write_bytes(arrays[name].tobytes())
+        described(r, [header])
+        arrays[name] = np.frombuffer(header.read_bytes(), np.uint8)
+        header.unlink()
+    else:
+        arrays[name] = array(r, arrays[name])
+    np.savez(file, **arrays)
+
+
+def drawn(r: random.Random, files: list[Path]) -> None:
+    """An MJCF file has another value of an attribute, or one element more or less."""
+    (file,) = files
+    text = file.read_text()
+    if r.random() < 0.5:
+        start, end = r.choice(list(re.finditer(r'(?<==")[^"]*(?=")', text))).span()
+        new = r.choice(NUMBERS)
+    else:
+        start, end = r.choice(list(re.finditer(r"<[^<>/]+/>", text))).span()
+        new = r.choice(["", 2 * text[start:end], text[start:end] + r.choice(ELEMENTS)])
+    file.write_text(text[:start] + new + text[end:])

@@ -1,0 +1,107 @@
+"""Random changes of data: each is read or refused in one sentence, soon and without a trace."""
+
+import contextlib
+import io
+import random
+import shutil
+import socket
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from envs import mjcf, rlds
+from lorasp_jax.data import cache, inspection
+from lorasp_jax.data.opening import open_source
+from lorasp_jax.models import statistics_files
+from tests import fuzzing
+from tests.data.lerobots import golden
+from tests.envs.test_episodes import make
+from tests.envs.user_arm import write
+from tests.malformed import check_refusal
+
+SEEDS, SLOW_SEEDS = 12, 200
+DEAR = {"mjcf": 4}  # how many times as much time a kind takes
+
+
+def read(folder: Path) -> None:
+    source = open_source(folder)
+    for number in range(len(source)):
+        source.episode(number).validate()
+    inspection.report(source, Console(file=io.StringIO()))
+
+
+def go_on(folder: Path) -> None:
+    """As a collection does that was interrupted."""
+    rlds.Parts(folder, {}).complete()
+
+
+FILES: list[fuzzing.Change] = [fuzzing.damaged, fuzzing.replaced]
+KINDS: dict[str, tuple[Callable[[Path], Any], list[fuzzing.Change]]] = {
+    "rlds": (read, [*FILES, *[fuzzing.described] * 4]),
+    "rlds, gone on with": (go_on, [fuzzing.damaged, *[fuzzing.described] * 4]),
+    "cache": (read, [*FILES, fuzzing.described, *[fuzzing.mapped] * 2]),
+    "npz": (lambda folder: read(folder / "episodes.npz"), [*FILES, *[fuzzing.zipped] * 3]),
+    "lerobot v21": (read, [*FILES, *[fuzzing.described] * 2, *[fuzzing.tabled] * 2]),
+    "lerobot v3": (read, [*FILES, *[fuzzing.described] * 2, *[fuzzing.tabled] * 2]),
+    "statistics": (statistics_files.read, [*FILES, fuzzing.described]),
+    "mjcf": (lambda folder: mjcf.load(folder / "arm.xml"), [*FILES, *[fuzzing.drawn] * 4]),
+}
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A folder of each kind."""
+    at = tmp_path_factory.mktemp("good")
+    rlds.write(make(), at / "rlds")
+    cache.write([open_source(at / "rlds")], at / "cache", lambda done, total: None)
+    make().save(at / "npz" / "episodes.npz")
+    (at / "mjcf").mkdir()
+    write(at / "mjcf")
+    found = {name: at / name for name in ("rlds", "cache", "npz", "mjcf")}
+    found |= {"rlds, gone on with": at / "rlds", "statistics": golden("v21") / "meta"}
+    return found | {f"lerobot {version}": golden(version) for version in ("v21", "v3")}
+
+
+def check(kind: str, seeds: range, good: dict[str, Path], tmp_path: Path) -> None:
+    reader, changes = KINDS[kind]
+    for seed in seeds:
+        folder = Path(shutil.copytree(good[kind], tmp_path / f"{seed}" / "input"))
+        r = random.Random(f"{kind} {seed}")
+        r.choice(changes)(r, sorted(path for path in folder.rglob("*") if path.is_file()))
+        error = None
+        with contextlib.suppress(IsADirectoryError):  # where a file is to be written
+            try:
+                reader(folder)
+            except Exception as found:
+                error = found
+        if error is not None:
+            error.add_note(f"{kind} {seed}")
+            check_refusal(error, str(folder))
+        assert [path.name for path in folder.parent.iterdir()] == ["input"]
+        shutil.rmtree(folder.parent)
+
+
+@pytest.fixture(autouse=True)
+def _offline(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*arguments: Any) -> None:
+        raise AssertionError("a request")
+
+    monkeypatch.setattr(socket.socket, "connect", refuse)
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.filterwarnings("ignore:robot .* misses parts of the table", "ignore:MuJoCo says")
+@pytest.mark.parametrize("kind", KINDS)
+def test_read_or_refused(kind: str, good: dict[str, Path], tmp_path: Path) -> None:
+    check(kind, range(SEEDS // DEAR.get(kind, 1)), good, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@pytest.mark.filterwarnings("ignore:robot .* misses parts of the table", "ignore:MuJoCo says")
+@pytest.mark.parametrize("kind", KINDS)
+def test_many(kind: str, good: dict[str, Path], tmp_path: Path) -> None:
+    check(kind, range(SEEDS, SLOW_SEEDS // DEAR.get(kind, 1)), good, tmp_path)
