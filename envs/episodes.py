@@ -153,10 +153,7 @@ class Episodes:
         if not self.image:
             raise ValueError("image holds no camera, but at least one is needed")
         for name, picture in self.image.items():
-            if not _CAMERA.fullmatch(name):  # files are called after it
-                raise ValueError(
-                    f"a camera is called {name[:80]!r}: valid are letters, digits and - _ ."
-                )
+            check_camera(name)
             if picture.shape[:2] != steps or picture.shape[4:] != (3,) or picture.dtype != np.uint8:
                 raise ValueError(
                     f"image {name!r} must be uint8 [{steps[0]}, {steps[1]}, H, W, 3], "
@@ -214,6 +211,14 @@ class Episodes:
                 raise ValueError(
                     f"{name} is not finite in number {number} at step {step} of episode {episode}"
                 )
+
+
+def check_camera(name: str) -> None:
+    """Raises a ValueError unless files can be called after a camera of this name."""
+    if not _CAMERA.fullmatch(name):
+        raise ValueError(
+            f"a camera is called {name[:80]!r}: valid are letters, digits, - _ . and spaces"
+        )
 
 
 def concatenate(parts: Sequence[Episodes]) -> Episodes:

@@ -21,7 +21,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from envs.episodes import SHARED, Episodes, creating
+from envs.episodes import SHARED, Episodes, check_camera, creating
 from envs.files import read_json, read_text
 from envs.locks import alone
 from lorasp_jax.data.batches import Steps
@@ -234,6 +234,8 @@ class Cache:
             if not all(isinstance(x, str) for x in (*self.facts["tasks"], *self.instructions)):
                 raise ValueError("tasks and instructions are no texts")
             sizes = {name: tuple(size) for name, size in self.cameras.items()}
+            for name in sizes:
+                check_camera(name)
             if not self.facts["crc32"].keys() >= {*ROWS}:
                 raise ValueError("it lacks checksums")
         self._images: dict[str, Any] = {
@@ -250,6 +252,11 @@ class Cache:
             low, high = self._columns[name].min(), self._columns[name].max()
             if low < 0 or high >= len(texts):
                 raise ValueError(f"{path} is damaged (it has {name} {low} to {high})")
+        with damage(header):
+            self.episode(0, ()).validate_numbers()
+            for name in ("state", "action"):
+                if not np.isfinite(self._columns[name]).all():
+                    raise ValueError(f"{name} holds numbers that are not finite")
         self.statistics = self._statistics()
 
     def __len__(self) -> int:

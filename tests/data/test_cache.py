@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import json
 import shutil
+import zlib
 
 import jax
 import numpy as np
@@ -242,3 +243,33 @@ def test_opening(tmp_path, simulated):
             open_source(where)
     with pytest.raises(ValueError, match="is no LeRobot dataset: it says itself"):
         open_source(simulated[1].path, Keys(angles="degrees"))
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "sentence"),
+    [
+        ("state", lambda x: x.astype(">f4"), "it is >f4"),
+        ("state", np.asfortranarray, "not float32"),
+        ("action", lambda x: x * np.float32(np.nan), "not finite"),
+        ("length", lambda x: x[:0], "has episodes of"),
+        (
+            "length",
+            lambda x: x * np.where(np.arange(len(x)), 1, -1).astype(np.int32),
+            "has episodes of",
+        ),
+        ("task", lambda x: x[:-1], "not int32"),
+        ("instruction", lambda x: x - np.int32(9), "it has instruction -"),
+    ],
+)
+def test_arrays_of_others(name, change, sentence, simulated, tmp_path):
+    """Also where their checksum is right."""
+    folder = shutil.copytree(simulated[1].path, tmp_path / "cache")
+    path = folder / f"{name}.npy"
+    array = change(np.load(path))
+    np.save(path, array)
+    header = folder / cache.HEADER
+    facts = json.loads(header.read_text())
+    facts["crc32"][name] = zlib.crc32(array.tobytes())
+    header.write_text(json.dumps(facts))
+    with pytest.raises(ValueError, match=sentence):
+        cache.Cache(folder)
