@@ -66,7 +66,9 @@ def mapped(
         wanted = tuple(n if n else m for n, m in zip(shape, array.shape, strict=True))
         if array.shape != wanted or array.dtype != np.dtype(kind) or not array.flags.c_contiguous:
             order = "" if array.flags.c_contiguous else ", column by column"
-            raise ValueError(f"it is {array.dtype.str} {array.shape}{order}, not {kind} {wanted}")
+            raise ValueError(
+                f"it is {array.dtype.str} {array.shape}{order}, not {np.dtype(kind).str} {wanted}"
+            )
         if path.stat().st_size != array.offset + array.nbytes:
             raise ValueError(f"it holds other bytes than those of {wanted}")
         if crc32 is not None and zlib.crc32(array.data) != crc32:
