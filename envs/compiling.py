@@ -36,8 +36,8 @@ def said(what: str) -> Iterator[None]:
     if seconds > PATIENCE:
         config = jax.config
         kept = config.jax_enable_compilation_cache and config.jax_compilation_cache_dir is not None
-        where = "machine" if kept else "process; envs.compilation_cache.enable() keeps it for all"
-        _say(f"compiled {what} in {seconds:.0f} s, once for this {where}")
+        hint = "" if kept else "; envs.compilation_cache.enable() keeps it for the next start"
+        _say(f"compiled {what} in {seconds:.0f} s{hint}")
 
 
 def _say(line: str) -> None:
