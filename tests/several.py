@@ -4,8 +4,9 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from tests import xla
@@ -30,10 +31,25 @@ def environments(count: int, devices: int = 1) -> Iterator[dict[str, str]]:
         yield everyone | dict(own)
 
 
-def start(count: int, *arguments: Any, devices: int = 1, **options: Any) -> list[subprocess.Popen]:
-    """`count` processes `python ARGUMENTS`, which find one another."""
-    command = [sys.executable, *map(str, arguments)]
+def start(
+    count: int,
+    *arguments: Any,
+    own: Mapping[int, Sequence[Any]] = MappingProxyType({}),
+    devices: int = 1,
+    **options: Any,
+) -> list[subprocess.Popen]:
+    """`count` processes `python ARGUMENTS`, which find one another.
+
+    Args:
+        arguments: of all.
+        own: further ones, by a process's number.
+        devices: of each.
+        options: of `Popen`.
+    """
     return [
-        subprocess.Popen(command, env=own, cwd=ROOT, text=True, **options)
-        for own in environments(count, devices)
+        subprocess.Popen(
+            [sys.executable, *map(str, [*arguments, *own.get(number, ())])],
+            **{"env": environment, "cwd": ROOT, "text": True, **options},
+        )
+        for number, environment in enumerate(environments(count, devices))
     ]

@@ -11,7 +11,6 @@ import hashlib
 import importlib.metadata
 import importlib.util
 import os
-import platform
 import signal
 import sys
 from collections.abc import Iterator, Mapping
@@ -100,8 +99,7 @@ def _versions() -> dict[str, str]:
         folder = Path(str(spec and spec.origin)).parent
         for file in sorted(folder.rglob("*.py")):
             sources.update(f"{file.relative_to(folder)}\n".encode() + file.read_bytes())
-    own = {"Python": platform.python_version(), "source of lorasp_jax": sources.hexdigest()[:12]}
-    return found | own
+    return found | {"source of lorasp_jax": sources.hexdigest()[:12]}
 
 
 def _abort_slowly() -> None:

@@ -2,7 +2,6 @@
 
 import socket
 import subprocess
-import sys
 import time
 
 import numpy as np
@@ -13,7 +12,7 @@ from rich.console import Console
 from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training import processes
 from tests.runs import repeatable
-from tests.several import NAMES, ROOT, environments, start
+from tests.several import NAMES, start
 
 WORKER = ("-u", "-m", "tests.training.worker")
 
@@ -72,18 +71,9 @@ def test_when_one_is_killed_the_last_line_of_the_other_names_resume(number, tmp_
 @pytest.mark.parametrize("number", [0, 1])
 def test_an_error_in_one_ends_the_other_in_seconds(number, tmp_path):
     """Without waiting for it, as JAX would, and without any noise over the traceback."""
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    command = [*WORKER, tmp_path / "run", "--steps", 4000]
-    children = [
-        subprocess.Popen(
-            [sys.executable, *map(str, command), *(["--fails", "3"] if i == number else [])],
-            env=own,
-            cwd=ROOT,
-            text=True,
-            **pipes,
-        )
-        for i, own in enumerate(environments(2))
-    ]
+    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+    command = (*WORKER, tmp_path / "run", "--steps", 4000)
+    children = start(2, *command, own={number: ("--fails", 3)}, **pipes)
     failed, other = children[number], children[1 - number]
     said = failed.communicate(timeout=400)[1]
     began = time.monotonic()

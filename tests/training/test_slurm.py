@@ -1,4 +1,7 @@
-"""The commands of docs/launch.md on a real Slurm of one node, which this test starts."""
+"""The commands of docs/launch.md on a real Slurm of one node, which this test starts.
+
+Debian has it in the packages slurmctld, slurmd, slurm-client and munge.
+"""
 
 import contextlib
 import getpass
@@ -91,7 +94,6 @@ def slurm(tmp_path):
         "SLURM_CONF": str(folder / "slurm.conf"),
         "JAX_PLATFORMS": "cpu",
         "XLA_FLAGS": "--xla_force_host_platform_device_count=1",
-        "JAX_COMPILATION_CACHE_DIR": str(tmp_path / "programs"),
     }
     for name in ("train.py", "configs"):
         (tmp_path / name).symlink_to(ROOT / name)

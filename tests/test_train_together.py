@@ -1,0 +1,74 @@
+"""`train.py` in two processes: they do what one does, or say in one sentence why not."""
+
+import subprocess
+
+import numpy as np
+import pytest
+from flax import nnx
+from safetensors.numpy import load_file
+
+from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.training import mesh as meshes
+from tests.runs import repeatable
+from tests.several import ROOT, start
+
+COMMAND = (
+    *(ROOT / "train.py", "--config", ROOT / "configs/multitask.py", "--scale", "smoke"),
+    *("--tasks", "press", "--data.episodes", 2, "--data.num-envs", 2),
+    *("--evaluation.episodes", 2, "--evaluation.num-envs", 2),
+)
+SPLIT = (
+    *("--model.size", "small", "--model.unroll", "False", "--method", "full", "--fsdp", 2),
+    *("--targets", "action.*(gate_proj|down_proj)", "--optim.steps", 2, "--log-every", 1),
+)
+
+
+def ended(children):
+    """Exit codes and what was printed, together and as errors."""
+    said = [child.communicate() for child in children]
+    return [child.returncode for child in children], said
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_two_processes_with_simulated_tasks_train_as_one(tmp_path):
+    """With a base, and adapters, that are really split over both."""
+    shapes = nnx.state(nnx.eval_shape(lambda: Pi0Config.small().create(nnx.Rngs(0))))
+    assert meshes.bytes_on_device(shapes, fsdp=2) < meshes.bytes_on_device(shapes, fsdp=1)
+    folders = []
+    for count in (1, 2):
+        options = (*COMMAND, *SPLIT, "--name", f"of{count}")
+        joint = ("--distributed",) if count > 1 else ()
+        codes, _ = ended(start(count, *options, *joint, devices=2 // count, cwd=tmp_path))
+        assert codes == [0] * count
+        folders.append(tmp_path / "runs" / f"of{count}")
+    for expected, found in zip(*map(repeatable, folders), strict=True):
+        for name, value in expected.items():
+            assert found[name] == pytest.approx(value, rel=1e-4), name
+    one, two = (load_file(folder / "adapter.safetensors") for folder in folders)
+    assert one.keys() == two.keys()
+    for name, value in one.items():
+        np.testing.assert_allclose(two[name], value, atol=1e-5 * abs(value).max(), err_msg=name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("own", "reason"),
+    [
+        ({1: ("--seed", 5)}, "has other settings than the first one (seed is 5, not 0): start"),
+        ({1: ("--resume", "auto")}, "(resume is 'auto', not False): start all processes alike"),
+        ({1: ("--seed", "x")}, ": error: "),
+        ({}, "error: runs/multitask already holds a run: add --resume"),
+    ],
+)
+def test_a_refusal_is_one_sentence_of_the_first_process(own, reason, tmp_path):
+    (tmp_path / "runs/multitask").mkdir(parents=True)
+    (tmp_path / "runs/multitask/metrics.jsonl").write_text("precious\n")
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    codes, said = ended(start(2, *COMMAND, "--distributed", own=own, cwd=tmp_path, **pipes))
+    assert codes == [2, 2]
+    (out, sentence), other = said
+    assert out.startswith("waiting for 2 processes at 127.0.0.1:")
+    assert reason in sentence
+    assert sentence.count("\n") == 1
+    assert other == ("", "")
