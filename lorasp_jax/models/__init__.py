@@ -3,8 +3,10 @@
 from lorasp_jax.models import pi0, published, smolvla
 from lorasp_jax.models.checkpoint import save, set_arrays, weights_hash
 from lorasp_jax.models.loading import load, load_config
+from lorasp_jax.models.observation import Observation
 
 __all__ = [
+    "Observation",
     "load",
     "load_config",
     "pi0",
