@@ -1,5 +1,6 @@
 """Success in simulation before, while and after training, with a video of each task."""
 
+import contextlib
 import dataclasses
 import functools
 import os
@@ -13,7 +14,7 @@ import numpy as np
 from rich.progress import Progress
 
 import envs
-from envs import physics
+from envs import compiling, physics
 from envs.env import Env
 from envs.render import RayRenderer
 from lorasp_jax import adaptation
@@ -104,18 +105,19 @@ class Evaluation(Callback):
         """The result of one task, with a progress bar."""
         episodes = episodes or run.config.evaluation.episodes
         bar = progress.add_task(f"compiling evaluation of {task} ...", total=episodes)
-        env, rollout = self._compiled(run, task)
         number = 2 * run.config.tasks.index(task) + (when == "after")
-        return evaluate(
-            run.policy,
-            env,
-            jax.random.fold_in(jax.random.key(run.config.seed), 10 + number),
-            episodes,
-            rollout=rollout,
-            progress=lambda done, _: progress.update(
-                bar, completed=done, description=f"evaluating {task} {when}"
-            ),
-        )
+        key = jax.random.fold_in(jax.random.key(run.config.seed), 10 + number)
+        with contextlib.ExitStack() as compiles:
+            if task not in self._tasks:
+                what = f"the evaluation of {task}, its first episodes included"
+                compiles.enter_context(compiling.said(what))
+
+            def report(done: int, _: int) -> None:
+                compiles.close()
+                progress.update(bar, completed=done, description=f"evaluating {task} {when}")
+
+            env, rollout = self._compiled(run, task)
+            return evaluate(run.policy, env, key, episodes, rollout=rollout, progress=report)
 
     def _compiled(self, run: Run, task: str) -> tuple[Env, Callable]:
         """The environment and jitted rollout of a task, made once."""

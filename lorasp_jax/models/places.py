@@ -86,6 +86,11 @@ def _nowhere(name: str, path: Path) -> str:
     return f"{name} does not exist, and is no {HUB}owner/name on the hub nor gs://bucket/path."
 
 
+def is_elsewhere(where: str | os.PathLike[str]) -> bool:
+    """Whether a place is the hub or a bucket, from which `local` downloads."""
+    return "://" in os.fspath(where)
+
+
 def _from_hub(name: str, only: list[str] | None, repository: str) -> Path:
     if not REPOSITORY.fullmatch(name):
         raise ValueError(f"{HUB}{name} is no repository on the hub: that is {HUB}owner/name.")
@@ -122,6 +127,8 @@ def _from_bucket(url: str) -> Path:
             file.parent.mkdir(parents=True, exist_ok=True)
             store.get_file(name, str(file))
         unfinished.rename(target)
+    except ImportError as error:  # fsspec's own sentence names the store's package alone
+        raise ValueError(f'{url} needs a package: pip install "lorasp_jax[buckets]"') from error
     except Exception as error:  # every store raises its own kinds
         raise ValueError(f"{url} cannot be fetched: {_first_line(error)}.") from error
     finally:

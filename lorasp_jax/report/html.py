@@ -21,15 +21,24 @@ from lorasp_jax.training.run_folder import (
 _REFRESH = "<meta http-equiv=refresh content=30>"
 
 _STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #1b1e23; max-width: 60rem; margin: 2rem auto;
-       padding: 0 1rem; }
-h1 { margin-bottom: 0; } h2 { margin-top: 2.2rem; } .muted { color: #6b7280; }
-table { border-collapse: collapse; } th, td { padding: .25rem .9rem .25rem 0; text-align: left; }
-th { border-bottom: 1px solid #c9ced6; font-weight: 600; }
+:root { color-scheme: light dark; --text: #1b1e23; --muted: #626977; --line: #c9ced6;
+        --back: #fff; --box: #f4f5f7; }
+@media (prefers-color-scheme: dark) {
+  :root { --text: #e3e6ea; --muted: #9aa2ae; --line: #474e58; --back: #16191d; --box: #22262c; }
+  img[alt=figure] { filter: invert(.9) hue-rotate(180deg); }
+}
+body { font: 15px/1.5 system-ui, sans-serif; color: var(--text); background: var(--back);
+       max-width: 60rem; margin: 2rem auto; padding: 0 1rem; }
+h1 { margin-bottom: 0; overflow-wrap: anywhere; } h2 { margin-top: 2.2rem; }
+.muted { color: var(--muted); }
+table { border-collapse: collapse; display: block; overflow-x: auto; }
+th, td { padding: .25rem .9rem .25rem 0; text-align: left; }
+th { border-bottom: 1px solid var(--line); font-weight: 600; }
 td.number { text-align: right; font-variant-numeric: tabular-nums; }
-img, video { max-width: 100%; } figure { display: inline-block; margin: 0 1rem 1rem 0; }
-video, .camera { image-rendering: pixelated; background: #eee; }
-pre { background: #f4f5f7; padding: 1rem; overflow-x: auto; font-size: 13px; }
+img, video { max-width: 100%; height: auto; }
+figure { display: inline-block; margin: 0 1rem 1rem 0; max-width: 100%; }
+video, .camera { image-rendering: pixelated; background: var(--box); }
+pre { background: var(--box); padding: 1rem; overflow-x: auto; font-size: 13px; }
 """
 
 
@@ -66,6 +75,7 @@ def write_report(folder: Path) -> Path:
     ]
     page = (
         "<!doctype html><html lang=en><meta charset=utf-8>"
+        "<meta name=viewport content='width=device-width, initial-scale=1'>"
         f"<title>{html.escape(config['name'])}</title><style>{_STYLE}</style>"
         + "\n".join(parts)
         + "</html>\n"
@@ -161,17 +171,22 @@ def speed(rows: figures.Rows) -> dict[str, str]:
     Medians; of waiting the share of all time, of memory the highest.
     """
     known = {
-        "samples a second": ("speed/samples_per_second", median, "{:,.4g}"),
-        "FLOP utilisation": ("speed/flop_utilisation", median, "{:.1%}"),
-        "time waiting for data": ("waited", sum, "{:.1%}"),
-        "memory at its highest": ("memory/peak_gib", max, "{:.2f} GiB"),
+        "samples a second": ("speed/samples_per_second", median, "{:,.4g}".format),
+        "FLOP utilisation": ("speed/flop_utilisation", median, "{:.1%}".format),
+        "time waiting for data": ("waited", sum, "{:.1%}".format),
+        "memory at its highest": ("memory/peak_gib", max, _memory),
     }
     found, rows = {}, [*_waited(rows)]
     for label, (name, summary, form) in known.items():
         values = [row[name] for row in rows if name in row]
         if values:
-            found[label] = form.format(summary(values))
+            found[label] = form(summary(values))
     return found
+
+
+def _memory(gib: float) -> str:
+    """Memory in a unit that suits it."""
+    return f"{gib:.2f} GiB" if gib >= 1 else f"{1024 * gib:.1f} MiB"
 
 
 def _waited(rows: figures.Rows) -> Iterable[dict[str, float]]:

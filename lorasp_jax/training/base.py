@@ -20,8 +20,12 @@ TRAINING = "training.json"
 """File beside base weights: what they were trained on, with the control period."""
 
 
-def base_model(config: Config) -> tuple[Backbone, str]:
+def base_model(config: Config, *, shapes: bool = False) -> tuple[Backbone, str]:
     """The frozen base and its hash: loaded from the checkpoint, or random where none is named.
+
+    Args:
+        config: of the run.
+        shapes: what would be drawn or downloaded is abstract, without a hash.
 
     Raises:
         ValueError: an unknown backbone or size, or a base of another one.
@@ -36,6 +40,8 @@ def base_model(config: Config) -> tuple[Backbone, str]:
     wanted = dataclasses.replace(wanted, **kinds)
     if not wanted.inputs.masks_missing:
         wanted = dataclasses.replace(wanted, cameras=wanted.cameras[: len(envs.Env.cameras)])
+    if shapes and (not chosen.source or places.is_elsewhere(chosen.source)):
+        return nnx.eval_shape(lambda: wanted.create(nnx.Rngs(0))), ""
     if chosen.source:
         folder = places.local(chosen.source)
         inputs = loading.lerobot_inputs(folder) or wanted.inputs

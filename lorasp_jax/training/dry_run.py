@@ -1,4 +1,4 @@
-"""What a run will need, from all of it but the demonstrations: sizes, memory, work of a step."""
+"""What a run will need, from shapes alone: sizes, memory, work of a step."""
 
 import dataclasses
 import functools
@@ -18,11 +18,12 @@ from lorasp_jax import adaptation
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Raw, Steps, flatten, gather
 from lorasp_jax.dense import AdaptedLayer
+from lorasp_jax.models import places
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.training import loop, preflight, setup
 from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.optim import make_optimizer
-from lorasp_jax.training.preflight import GIB, HEADROOM
+from lorasp_jax.training.preflight import HEADROOM, unit_of
 from lorasp_jax.training.run import Run
 from lorasp_jax.training.step import init_state
 
@@ -38,7 +39,10 @@ def dry_run(config: Config, folder: Path, console: Console) -> None:
     Raises:
         ValueError: as `setup.build`.
     """
-    built = setup.build(config, folder)
+    built = setup.build(config, folder, shapes=True)
+    remote = (config.model.source, config.model.tokenizer)
+    if names := [name for name in remote if places.is_elsewhere(name)]:
+        console.print(f"not downloaded, its shapes suffice: {', '.join(names)}", soft_wrap=True)
     console.print(setup.headline(config, built.model))
     console.print(_parameters(built.model))
     run = Run(config, folder, console, built.base_hash)
@@ -147,7 +151,7 @@ def _parameters(model: nnx.Module) -> Table:
 
 
 def _memory(built: setup.Built, data: float, program: Any) -> Table:
-    """What was expected beside what the compiled program takes, by device in GiB.
+    """What was expected beside what the compiled program takes, by device.
 
     Args:
         built: what was expected.
@@ -164,20 +168,22 @@ def _memory(built: setup.Built, data: float, program: Any) -> Table:
         takes, needs = program.argument_size_in_bytes, program.temp_size_in_bytes
         more = program.output_size_in_bytes - program.alias_size_in_bytes
         found = [takes, needs + more, takes + needs + more]
-    table = _table(f"of {built.available / GIB:.2f} GiB a device", "expected", "compiled")
-    for name in kept:
-        table.add_row(f"  {name}", _gib(expected[name]), "")
-    table.add_row("arguments", _gib(arguments), _gib(found[0]))
-    for name in ("gradients", "activations"):
-        table.add_row(f"  {name}", _gib(expected[name]), "")
-    table.add_row("  headroom", _gib(headroom), "")
-    table.add_row("temporary", _gib(temporaries + headroom), _gib(found[1]))
-    table.add_row("peak", _gib(arguments + temporaries + headroom), _gib(found[2]))
+    peak = arguments + temporaries + headroom
+    unit, name = unit_of(max(peak, found[2] or 0))
+
+    def add(part: str, *values: float | None) -> None:
+        table.add_row(part, *("not reported" if v is None else f"{v / unit:.3f}" for v in values))
+
+    table = _table(f"{name} of {built.available / unit:,.0f} a device", "expected", "compiled")
+    for part in kept:
+        add(f"  {part}", expected[part])
+    add("arguments", arguments, found[0])
+    for part in ("gradients", "activations"):
+        add(f"  {part}", expected[part])
+    add("  headroom", headroom)
+    add("temporary", temporaries + headroom, found[1])
+    add("peak", peak, found[2])
     return table
-
-
-def _gib(value: float | None) -> str:
-    return "not reported" if value is None else f"{value / GIB:.3f}"
 
 
 def _table(first: str, *numbers: str) -> Table:

@@ -29,7 +29,12 @@ from lorasp_jax.training.step import Metrics, init_state, loss_fn
 HEADROOM = 1.1
 """Factor on the sum for what is not counted: temporary arrays, the compiled program, fragments."""
 REMATS: tuple[Remat, ...] = ("none", "products", "full")
-GIB = 2**30
+GIB, MIB = 2**30, 2**20
+
+
+def unit_of(size: float) -> tuple[int, str]:
+    """In what to tell so many bytes, and its name: GiB, or MiB where that would be mostly zeros."""
+    return (GIB, "GiB") if size >= GIB else (MIB, "MiB")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,9 +53,10 @@ class Memory:
         return HEADROOM * sum(dataclasses.astuple(self))
 
     def __str__(self) -> str:
-        """All parts in GiB."""
-        parts = [f"{name} {value / GIB:.2f}" for name, value in dataclasses.asdict(self).items()]
-        return f"{', '.join(parts)}, peak {self.peak / GIB:.2f} GiB"
+        """All parts, in the unit that suits the sum."""
+        unit, name = unit_of(self.peak)
+        parts = [f"{part} {value / unit:.2f}" for part, value in dataclasses.asdict(self).items()]
+        return f"{', '.join(parts)}, peak {self.peak / unit:.2f} {name}"
 
 
 class AbstractStep(NamedTuple):

@@ -24,7 +24,7 @@ from lorasp_jax.data.imported import cached, is_simulated, opened, outline
 from lorasp_jax.data.pictures import loaded
 from lorasp_jax.data.source import Source
 from lorasp_jax.data.stream import Stream
-from lorasp_jax.models import presets, tokenizer
+from lorasp_jax.models import places, presets, tokenizer
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.policy import Policy
@@ -73,10 +73,16 @@ class Built:
         return self.available - self.memory.peak
 
 
-def build(config: Config, folder: Path) -> Built:
+def build(config: Config, folder: Path, *, shapes: bool = False) -> Built:
     """Load or create the base and attach the adapters; writes nothing.
 
     What can be wrong with a config is found here, before anything long begins.
+
+    Args:
+        config: of the run.
+        folder: the run's.
+        shapes: for a look at it: the model is abstract, and nothing is downloaded; the offline
+            tokenizer stands for another one.
 
     Raises:
         ValueError: an unknown task, robot, backbone or size, a base or a tokenizer that does not
@@ -85,8 +91,9 @@ def build(config: Config, folder: Path) -> Built:
     sizes = {"image_size": config.image_size, "control_dt": config.control_dt}
     tasks = () if config.data.source else config.tasks
     worlds = [envs.make(task, robot=config.robot, **sizes) for task in tasks]
-    words = tokenizer.load(config.model.tokenizer)
-    base, base_hash = base_model(config)
+    stands_in = shapes and places.is_elsewhere(config.model.tokenizer)
+    words = tokenizer.load("" if stands_in else config.model.tokenizer)
+    base, base_hash = base_model(config, shapes=shapes)
     base = changed(base, max_tokens=config.model.max_tokens or base.config.max_tokens)
     source = opened(config, base.config, folder) if config.data.source else None
     prompts, joints = _told(source, worlds, words, base.config)
@@ -96,7 +103,11 @@ def build(config: Config, folder: Path) -> Built:
     available = preflight.available_bytes()
     remat, memory = preflight.choose_remat(config, base.config, available)
     base = changed(base, remat=remat)
-    model = _adapted(config, base, config.peft.as_saved)
+    model = (
+        preflight.abstract_model(config, base.config)
+        if shapes
+        else _adapted(config, base, config.peft.as_saved)
+    )
     return Built(base, base_hash, model, prompts, joints, worlds, source, memory, available)
 
 
@@ -110,9 +121,7 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
     base, model = built.base, built.model
     processes.agree("bases", {"base": built.base_hash, "remat": base.config.remat})
     console.print(headline(config, model))
-    console.print(
-        f"memory by device in GiB: {built.memory}; rematerialisation: {base.config.remat}"
-    )
+    console.print(f"memory by device: {built.memory}; rematerialisation: {base.config.remat}")
     run = Run(config, folder, console, built.base_hash, started)
     with run.timed("collect"), processes.first_goes_ahead("collected"):
         if built.source:

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from envs import compiling
 from lorasp_jax import flops
 from lorasp_jax.data.batches import Raw, Steps, flatten, of_size
 from lorasp_jax.data.demonstrations import fresh_demonstrations
@@ -31,9 +32,13 @@ class Stretches:
         """Begin to compile in a thread, unless that was done."""
         if count not in self._compiled:
             key = jax.random.key(0)
-            lower = lambda: self._jitted.lower(self._frozen, self._data, state, key, count)  # noqa: E731
+
+            def compiled() -> Any:
+                with compiling.said("the training step"):
+                    return self._jitted.lower(self._frozen, self._data, state, key, count).compile()
+
             pool = ThreadPoolExecutor(1)
-            self._compiled[count] = pool.submit(lambda: lower().compile())
+            self._compiled[count] = pool.submit(compiled)
             pool.shutdown(wait=False)
         return self._compiled[count]
 

@@ -126,3 +126,12 @@ def test_bucket_that_cannot_be_read(bucket, tmp_path, monkeypatch):
     assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".")]
     with pytest.raises(ValueError, match="cannot be fetched"):
         places.local("nothing://models/pi0")
+
+
+def test_a_store_whose_package_is_missing_names_our_extra(monkeypatch):
+    def url_to_fs(url):
+        raise ImportError("Please install gcsfs to access Google Storage")
+
+    monkeypatch.setattr("fsspec.core.url_to_fs", url_to_fs)
+    with pytest.raises(ValueError, match=r'needs a package: pip install "lorasp_jax\[buckets\]"'):
+        places.local("gs://openpi-assets/no-such")

@@ -136,6 +136,19 @@ def test_speed_is_the_middle_and_memory_the_highest(folder):
     assert "waiting" not in page
 
 
+def test_small_memory_is_not_zero(folder):
+    assert speed([{"memory/peak_gib": 3 / 1024}]) == {"memory at its highest": "3.0 MiB"}
+
+
+def test_a_phone_shows_the_page_at_its_own_width_light_or_dark(folder):
+    page = write_report(folder).read_text()
+    assert "<meta name=viewport content='width=device-width, initial-scale=1'>" in page
+    style = page.partition("<style>")[2].partition("</style>")[0]
+    assert "color-scheme: light dark" in style
+    assert "@media (prefers-color-scheme: dark)" in style
+    assert not re.search(r"#[0-9a-f]{3,6}", style.partition("body {")[2])  # only by name below
+
+
 def test_waiting_is_a_share_of_all_time():
     rate, wait = "speed/samples_per_second", "speed/data_wait"
     rows = [{rate: 10.0}, {rate: 10.0, wait: 0.0}, {rate: 5.0, wait: 0.5}]  # 1, 1 and 2 seconds

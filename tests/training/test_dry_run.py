@@ -1,6 +1,7 @@
 """A dry run says what the run will need, and leaves nothing behind."""
 
 import dataclasses
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -12,14 +13,16 @@ import train
 from lorasp_jax import adaptation
 from lorasp_jax.config import DataConfig
 from lorasp_jax.data.batches import Raw, flatten
+from lorasp_jax.models import places
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import LoRA
 from lorasp_jax.training import dry_run, preflight, setup
 from lorasp_jax.training import mesh as meshes
-from lorasp_jax.training.overrides import Command
+from lorasp_jax.training.overrides import Command, load
 from lorasp_jax.training.run import Run
 from tests.runs import CONFIG, random_episodes
 
+ROOT = Path(__file__).parents[2]
 LIMIT, EPISODES = 50, 6
 
 
@@ -35,7 +38,9 @@ def config(monkeypatch):
     mesh = meshes.make_mesh(1, jax.devices()[:1])
     monkeypatch.setattr(meshes, "make_mesh", lambda fsdp: mesh)
     monkeypatch.setattr(setup.envs, "make", lambda *_, **__: world)
-    monkeypatch.setattr(setup, "base_model", lambda _: (Pi0Config.dummy().create(nnx.Rngs(0)), ""))
+    monkeypatch.setattr(
+        setup, "base_model", lambda *_, **__: (Pi0Config.dummy().create(nnx.Rngs(0)), "")
+    )
     monkeypatch.setattr(setup, "demonstrations", lambda *_: pytest.fail("it collects"))
     evaluation = dataclasses.replace(CONFIG.evaluation, execute_steps=1)
     data = DataConfig(episodes=EPISODES)
@@ -47,10 +52,9 @@ def config(monkeypatch):
 
 def test_what_is_printed_is_what_the_program_takes(config, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(preflight, "GIB", 1)
-    monkeypatch.setattr(dry_run, "GIB", 1)
+    monkeypatch.setattr(preflight, "MIB", 1)
     built, build = [], setup.build
-    monkeypatch.setattr(setup, "build", lambda *a: built.append(build(*a)) or built[0])
+    monkeypatch.setattr(setup, "build", lambda *a, **k: built.append(build(*a, **k)) or built[0])
     monkeypatch.setattr(train, "Console", lambda **_: Console(width=150))
     monkeypatch.setattr(
         "lorasp_jax.training.overrides.parse", lambda _: Command(config, dry_run=True)
@@ -69,6 +73,25 @@ def test_what_is_printed_is_what_the_program_takes(config, tmp_path, monkeypatch
     trained, total = adaptation.count(built[0].model)
     assert [int(number) for number in table["all"][:2]] == [total, trained]
     assert "TFLOP" in printed
+
+
+@pytest.mark.parametrize("file", ["multitask_pi0", "multitask_smolvla"])
+def test_published_models_need_no_download(file, monkeypatch):
+    """Their shapes suffice."""
+    for place in ("_from_hub", "_from_bucket"):
+        monkeypatch.setattr(places, place, lambda *_: pytest.fail("it downloads"))
+    config = load(ROOT / "configs" / f"{file}.py", "smoke")
+    assert all(places.is_elsewhere(x) for x in (config.model.source, config.model.tokenizer))
+    model = dataclasses.replace(config.model, size="nano")
+    optim = dataclasses.replace(config.optim, batch_size=jax.device_count())
+    config = dataclasses.replace(config, model=model, optim=optim, tasks=("press",))
+    config = dataclasses.replace(
+        config, evaluation=dataclasses.replace(config.evaluation, execute_steps=1)
+    )
+    built = setup.build(config, ROOT / "nowhere", shapes=True)
+    leaves = jax.tree.leaves(nnx.state(built.model, nnx.Param))
+    assert {type(leaf) for leaf in leaves} == {jax.ShapeDtypeStruct}
+    assert adaptation.count(built.model).trainable > 0
 
 
 def test_a_dataset_without_room_streams(config, tmp_path):

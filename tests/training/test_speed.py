@@ -1,13 +1,16 @@
 """Throughput, waiting, memory: what a stretch of steps reports beside its losses."""
 
+import re
 from types import SimpleNamespace
 
 import jax
 import pytest
 
+from envs import compiling
 from lorasp_jax import flops
 from lorasp_jax.training import speed
 from lorasp_jax.training.speed import Speed
+from lorasp_jax.training.stretches import Stretches
 
 
 @pytest.fixture
@@ -58,3 +61,15 @@ def test_memory_where_it_is_reported(monkeypatch):
     assert speed.memory() == {"memory/in_use_gib": 1.0, "memory/peak_gib": 1.5}
     monkeypatch.setattr(jax, "local_devices", device)
     assert speed.memory() == {}
+
+
+def test_the_terminal_tells_what_compiles(capsys, monkeypatch):
+    """In words, for how long, and that it is the first time only."""
+    monkeypatch.setattr(compiling, "PATIENCE", 0.0)
+    many = jax.jit(lambda frozen, data, state, key, count: state + count, static_argnums=4)
+    run = Stretches(many, jax.numpy.ones(2), jax.numpy.ones(2), Speed(1, None))
+    for _ in range(2):
+        run(jax.numpy.ones(2), jax.random.key(0), 3)
+    told = capsys.readouterr().err
+    assert told.count("compiling the training step ...") == 1
+    assert re.search(r"compiled the training step in \d+ s, once for this (machine|process)", told)
