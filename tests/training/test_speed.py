@@ -72,4 +72,4 @@ def test_the_terminal_tells_what_compiles(capsys, monkeypatch):
         run(jax.numpy.ones(2), jax.random.key(0), 3)
     told = capsys.readouterr().err
     assert told.count("compiling the training step ...") == 1
-    assert re.search(r"compiled the training step in \d+ s, once for this (machine|process)", told)
+    assert re.search(r"compiled the training step in \d+ s", told)
