@@ -23,7 +23,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
-from flax import nnx
+from flax import linen, nnx
 
 from lorasp_jax import layers, paths
 from lorasp_jax.dense import AdaptedLayer, AdapterAux, AdapterParam
@@ -53,8 +53,8 @@ def adapt(
 
     Adapters apply to every `Dense`, `nnx.Linear` (which becomes a `Dense`), `nnx.LinearGeneral` and
     `nnx.Einsum` at its path, for instance "language/gate_proj"; LoRA to `nnx.Embed` and `nnx.Conv`
-    too. A stacked kernel [L, I, O] gets stacked adapters. The layer's own weights are frozen, and
-    an adapter it already had is replaced. Subclasses that are called differently are left alone.
+    too. A stacked kernel [L, I, O] gets stacked adapters. The layer's own weights are frozen.
+    Subclasses that are called differently are left alone.
     `FullFineTuning` applies to every parameter under the paths it matches, norms, embeddings and
     biases included, which becomes an fp32 `AdapterParam` in its place.
 
@@ -72,10 +72,10 @@ def adapt(
 
     Raises:
       ValueError: a rule that is no regular expression or governs nothing that it applies to (lists
-        near misses), or a layer that an adapter cannot take over.
+        near misses), a layer that an adapter cannot take over, or one that has an adapter already.
     """
-    paths.check_patterns(pattern for pattern, _ in rules)
-    holder, key = _copy(model), rngs.params()
+    paths.check_method_rules(rules)
+    holder, key = _copy(model), _key(rngs)
     used = _attach_all(holder, rules, key, einsums, statistics) | _free_all(holder, rules)
     for i, (pattern, _) in enumerate(rules):
         if i not in used:
@@ -155,11 +155,14 @@ def attach(
       statistics: [..., I, I] of the layer's inputs, where the method starts from them.
 
     Raises:
-      ValueError: a method that the layer cannot carry, a layer whose adapter holds a part of its
-        kernel, or a quantised kernel of which the method would take a part.
+      ValueError: a method that the layer cannot carry, a layer that has an adapter, or a quantised
+        kernel of which the method would take a part.
     """
-    if layer.adapter is not None and layer.method is not None and layer.method.splits_kernel:
-        raise ValueError("an adapter that holds a part of its kernel cannot be replaced: merge it.")
+    if layer.adapter is not None and layer.method is not None:
+        raise ValueError(
+            f"its {layer.method.name} adapter would be lost: adapt the base instead, merge the "
+            "model first, or leave this layer out by a rule with None in front."
+        )
     if method.splits_kernel and isinstance(layer.kernel_matrices(), QuantizedKernel):
         raise ValueError("a quantised kernel cannot be split: adapt first, then quantise the rest.")
     _retype(
@@ -173,11 +176,25 @@ def attach(
     layer.adapter = AdapterParam(params)
 
 
+def _key(rngs: Any) -> jax.Array:
+    """A key for the adapters; raises a ValueError for what is not `nnx.Rngs` with such a stream."""
+    if not isinstance(rngs, nnx.Rngs) or not {"params", "default"} & set(rngs):
+        given = list(rngs) if isinstance(rngs, nnx.Rngs) else type(rngs).__name__
+        raise ValueError(f"rngs must be nnx.Rngs(a seed or key) with params, got {given}.")
+    return rngs.params()
+
+
 def _copy(model: nnx.Module) -> nnx.List:
     """A holder of one copy of the model that shares its arrays, free of what layers kept.
 
     The holder gives a model that is itself one layer a parent to be replaced in.
+
+    Raises:
+      ValueError: no NNX module.
     """
+    if not isinstance(model, nnx.Module):
+        hint = "; LinenAdapter takes Linen's" if isinstance(model, linen.Module) else ""
+        raise ValueError(f"the model must be an NNX module, got {type(model).__name__}{hint}.")
     model = nnx.clone(model)
     nnx.pop(model, AdapterAux)
     return nnx.List([model])

@@ -15,7 +15,7 @@ from lorasp_jax.bank import normalized_bank
 from lorasp_jax.kernels.energy_gate import energy_gate
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.peft.method import Params
-from lorasp_jax.routing import router_scores
+from lorasp_jax.routing import router_scores, select
 
 
 class DecodingParams(NamedTuple):
@@ -72,8 +72,8 @@ def decode(
             f"{list(x.shape)} and {capacity}."
         )
     scores, _ = router_scores(params.router, x @ params.w1, method.score_function)
-    mask, _, _ = energy_gate(scores, method.energy_target, implementation=method.gate)
+    mask, _, energy = energy_gate(scores, method.energy_target, implementation=method.gate)
     mask, scores = mask[: method.rank], scores[: method.rank]
     largest, index = jax.lax.top_k(jnp.where(mask, scores, 0), capacity)
-    z = (params.v[index] @ x) * (method.scale * largest).astype(x.dtype)
+    z = select(params.v[index] @ x, method.scale * largest, largest > 0, energy)
     return z @ params.u[index], jnp.maximum(mask.sum() - capacity, 0)

@@ -1,7 +1,6 @@
 """Whether the values of a dataclass are of the kinds that its fields state."""
 
 import dataclasses
-import numbers
 import types
 import typing
 from typing import Any
@@ -36,18 +35,6 @@ def check_fields(owner: Any, prefix: str = "") -> None:
             raise ValueError(f"{prefix}{name} must be at most {most[name]}, got {value}")
 
 
-def check_numbers(owner: Any) -> None:
-    """Raises ValueError where a field that is a number, or None, holds something else.
-
-    What is wrong with a number is left to the dataclass itself.
-    """
-    for name, kind in typing.get_type_hints(type(owner)).items():
-        kinds, value = {kind, *typing.get_args(kind)}, getattr(owner, name, None)
-        wanted = kinds & {int, float} and not (value is None and type(None) in kinds)
-        if wanted and not isinstance(value, numbers.Number):
-            raise ValueError(f"{name} must be {_called(kind)}, got {value!r}")
-
-
 def _fits(value: Any, kind: Any) -> bool:
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
@@ -66,6 +53,10 @@ def _fits(value: Any, kind: Any) -> bool:
 
 def _called(kind: Any) -> str:
     """A kind in words."""
+    if typing.get_origin(kind) in (typing.Union, types.UnionType):
+        return " or ".join(map(_called, typing.get_args(kind)))
+    if kind is types.NoneType:
+        return "None"
     if typing.get_origin(kind) is typing.Literal:
         return f"one of {', '.join(map(repr, typing.get_args(kind)))}"
     if kind is float:

@@ -24,7 +24,7 @@ from lorasp_jax import layers
 from lorasp_jax.adaptation import init_stack, over_stack
 from lorasp_jax.dense import KEPT
 from lorasp_jax.linen_layers import Einsums, kind, layer_map, with_lora
-from lorasp_jax.paths import Rules, governing, near_misses
+from lorasp_jax.paths import Rules, check_method_rules, governing, near_misses
 from lorasp_jax.peft import Method
 
 ADAPTER = "lorasp_adapter"  # name of an adapter among its layer's parameters
@@ -55,6 +55,15 @@ class LinenAdapter:
     model: nn.Module
     rules: Rules
     einsums: Einsums = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Raises a ValueError for what is no Linen module or no rules."""
+        check_method_rules(self.rules)
+        if not isinstance(self.model, nn.Module):
+            raise ValueError(
+                f"the model must be a Linen module, got {type(self.model).__name__}; `adapt` takes "
+                "NNX modules."
+            )
 
     def init(self, key: Any, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """Variables of the model, as from its own `init`, and the collection "adapters".

@@ -2,7 +2,7 @@
 
 import difflib
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -56,13 +56,40 @@ def multiplying(holder: nnx.List) -> list[Place]:
     return [place for place in found if not isinstance(place.child, nnx.Embed | nnx.Conv)]
 
 
-def check_patterns(patterns: Iterable[str]) -> None:
-    """Raises a ValueError for a pattern that is no regular expression."""
-    for pattern in patterns:
+def check_rules(rules: Any, valid: Callable[[Any], bool], what: str) -> None:
+    """Raises a ValueError unless these are rules of regular expressions.
+
+    Args:
+      rules: what somebody gave.
+      valid: whether something can be in the second place.
+      what: such things in words.
+    """
+    pairs = f"rules are a list of (pattern, {what}) pairs"
+    if isinstance(rules, Mapping):
+        raise ValueError(f"{pairs}, got a {type(rules).__name__}: give list(rules.items()).")
+    if not isinstance(rules, Sequence) or isinstance(rules, str) or not rules:
+        shown = "none" if rules == [] or rules == () else repr(rules)
+        raise ValueError(f"{pairs}, at least one, got {shown}.")
+    if isinstance(rules[0], str):
+        raise ValueError(f"{pairs}, got {rules!r}: one rule alone is [(pattern, ...)].")
+    for rule in rules:
+        if not isinstance(rule, tuple | list) or len(rule) != 2 or not isinstance(rule[0], str):
+            raise ValueError(f"{pairs}, got {rule!r} among them.")
+        pattern, value = rule
+        if isinstance(value, type):
+            name = value.__name__
+            raise ValueError(f"rule {pattern!r} has the class {name}: write {name}().")
+        if not valid(value):
+            raise ValueError(f"rule {pattern!r} has {value!r} where {what} belongs.")
         try:
             re.compile(pattern)
-        except re.error as error:
+        except (re.error, OverflowError, RecursionError) as error:
             raise ValueError(f"rule {pattern!r} is no regular expression: {error}.") from error
+
+
+def check_method_rules(rules: Any) -> None:
+    """`check_rules` for rules that attach methods."""
+    check_rules(rules, lambda m: m is None or isinstance(m, Method), "method or None")
 
 
 def governing(rules: Rules, *paths: str) -> int | None:

@@ -21,7 +21,7 @@ from flax import nnx
 
 from lorasp_jax import adaptation, layers, paths
 from lorasp_jax.dense import AdaptedLayer, AdapterParam
-from lorasp_jax.kernels.quantized import Kind, QuantizedKernel, quantized
+from lorasp_jax.kernels.quantized import KINDS, Kind, QuantizedKernel, quantized
 
 # By identity of a variable, equation and kind: what replaces it, the variable itself, which so
 # stays alive, and the error.
@@ -54,7 +54,8 @@ def quantize(model: nnx.Module, rules: Sequence[tuple[str, Kind | None]]) -> Qua
       ValueError: a rule that governs no layer (lists near misses), an unknown kind, or a kernel
         that trains, is quantised already or is not finite.
     """
-    paths.check_patterns(pattern for pattern, _ in rules)
+    kinds = " or ".join(map(repr, (*KINDS, None)))
+    paths.check_rules(rules, lambda kind: kind in (*KINDS, None), kinds)
     holder, errors, used = nnx.List([nnx.merge(*adaptation.split(model))]), {}, set()
     shared: Shared = {}
     known = paths.multiplying(holder)

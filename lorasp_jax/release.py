@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from lorasp_jax.auxiliary import masked_mean
 from lorasp_jax.kernels.energy_gate import kept_energy
-from lorasp_jax.routing import Routed, select
+from lorasp_jax.routing import Routed, bounded, select
 
 
 def release_route(
@@ -42,14 +42,15 @@ def release_route(
     mask = release_gate(scores, energy_target)
     mask &= jnp.arange(mask.shape[-1]) < projected.shape[-1]
     usage = (mask & counts[..., None]).reshape(-1, mask.shape[-1]).astype(jnp.float32).sum(0)
-    statistics = [mask.astype(jnp.float32).sum(-1), kept_energy(jnp.abs(scores), mask)]
-    z = select(projected, scale * scores, mask)
+    energy = kept_energy(scores, mask)
+    statistics = [mask.astype(jnp.float32).sum(-1), energy]
+    z = select(projected, scale * scores, mask, energy[..., None])
     return z, release_losses(scores, mask, counts), usage, statistics
 
 
 def release_scores(router: dict[str, jax.Array], hidden: jax.Array) -> jax.Array:
     """Signed scores f32 [..., R]: x W1 itself, or softmax(x W1) W2 where there is a w2 [H, R]."""
-    hidden = hidden.astype(jnp.float32)
+    hidden = bounded(hidden)
     return jax.nn.softmax(hidden) @ router["w2"] if "w2" in router else hidden
 
 

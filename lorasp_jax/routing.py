@@ -33,6 +33,12 @@ SOFTPLUS_INVERSE_OF_ONE = math.log(math.e - 1)
 UNIT_LOGIT: dict[str, float] = {"softplus": SOFTPLUS_INVERSE_OF_ONE, "relu": 1.0, "softmax": 0.0}
 """The logit, the same for all directions, at which each score function gives 1."""
 
+LARGEST_HIDDEN = 2.0**40
+"""|x W1| from which on it counts as this much. A score grows with x, so the delta with its square:
+beyond 1e19 it would exceed fp32, and U = 0 would make NaN of that."""
+LARGEST_READ = 2.0**120
+"""The same for z, which leaves its sum over a bank room below 2^128."""
+
 _RATIO = np.polynomial.Chebyshev.interpolate(lambda e: np.log1p(e) / e, 8, domain=[0, 1])
 _LOG1P = _RATIO.convert(kind=np.polynomial.Polynomial).coef[::-1].tolist()
 """log(1 + e) / e for e in [0, 1] as a polynomial, highest power first; off by 4e-8."""
@@ -84,7 +90,7 @@ def route(
     scores, logits = router_scores(router, hidden, score_function)
     mask = energy_gate(scores, energy_target, implementation=gate)[0] if kept is None else kept
     energy = kept_energy(scores, mask)[:, None]
-    z = select(projected, scale * scores, mask)
+    z = select(projected, scale * scores, mask, energy)
     active_rank = mask.astype(jnp.float32).sum(-1, keepdims=True)
     return z, loss_sums(scores, logits, mask, energy, counts), mask, [active_rank, energy]
 
@@ -107,13 +113,18 @@ def router_scores(
       scores f32 [..., R], and the logits the z-loss acts on: the score function's input [..., R] or
       the softmax' input [..., H].
     """
-    hidden = hidden.astype(jnp.float32)
+    hidden = bounded(hidden)
     if "b1" not in router:
         return jax.nn.relu(jax.nn.softmax(hidden) @ router["w2"]), hidden
     logits = _product(gelu(hidden + router["b1"]), router["w2"]) + router["b2"]
     if score_function == "softmax":
         return logits.shape[-1] * jax.nn.softmax(logits), logits
     return (softplus if score_function == "softplus" else jax.nn.relu)(logits), logits
+
+
+def bounded(hidden: jax.Array) -> jax.Array:
+    """x W1 in fp32, in ±LARGEST_HIDDEN: scores, losses and gradients stay finite where x does."""
+    return jnp.clip(hidden.astype(jnp.float32), -LARGEST_HIDDEN, LARGEST_HIDDEN)
 
 
 def gelu(x: jax.Array) -> jax.Array:
@@ -170,14 +181,20 @@ def pooled_scores(scores: jax.Array, valid: jax.Array, granularity: Granularity)
     return jnp.sqrt(total / jnp.maximum(valid.sum(axes, keepdims=True), 1))
 
 
-def select(projected: jax.Array, scores: jax.Array, mask: jax.Array) -> jax.Array:
+def select(
+    projected: jax.Array, scores: jax.Array, mask: jax.Array, energy: jax.Array
+) -> jax.Array:
     """Eq. (11): Σ(x) V x with the pruned scores at zero, in the type of `projected` [..., n].
 
-    Scores and mask may be wider; what is beyond n has no direction any more.
+    Scores and mask may be wider; what is beyond n has no direction any more. NaN scores keep no
+    direction, and show all the same: a row whose energy [..., 1] is NaN is all NaN.
     """
-    if (here := projected.shape[-1]) < scores.shape[-1]:
+    here, dtype = projected.shape[-1], projected.dtype
+    if here < scores.shape[-1]:
         scores, mask = scores[..., :here], mask[..., :here]
-    return projected * jnp.where(mask, scores, 0).astype(projected.dtype)
+    largest = min(LARGEST_READ, float(jnp.finfo(dtype).max))
+    product = jnp.clip(projected.astype(jnp.float32) * scores, -largest, largest)
+    return jnp.where(mask, product, 0 * jax.lax.stop_gradient(energy)).astype(dtype)
 
 
 class LossSums(NamedTuple):

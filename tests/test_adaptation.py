@@ -151,15 +151,24 @@ def test_full_fine_tuning_frees_everything_under_a_path(x):
     assert set(adaptation.methods(with_bias)) == {"inp/bias", "blocks/bias", "blocks"}
 
 
-def test_adapting_again_replaces_and_freezes(net):
+def test_adapting_what_trained_in_full_freezes_it(net):
     full = adapted(net, (".*", FullFineTuning()))
     model = adapted(full, ("inp", LoRA(rank=2)), (".*", None))
     assert isinstance(model.inp, nnx.Linear) or model.inp.method == LoRA(rank=2)
     assert not isinstance(model.inp.kernel, AdapterParam)
-    again = adapted(model, ("inp", LoRA(rank=3)))
-    assert again.inp.adapter.get_value()["lora_a"].shape == (5, 3)
     with pytest.raises(ValueError, match="inp/kernel cannot train in full under"):
         adapted(net, ("kernel$", FullFineTuning()), ("inp", LoRA(rank=2)))
+
+
+def test_an_adapter_is_never_replaced(net, x):
+    """It may have been trained; what stays beside a new one is untouched."""
+    model = trained(adapted(net, ("inp", LoRA(rank=2))), x)
+    with pytest.raises(ValueError, match="cannot adapt inp: its lora adapter would be lost"):
+        adapted(model, (".*", LoRA(rank=3)))
+    both = adapted(model, ("inp", None), (".*", LoRA(rank=3)))
+    np.testing.assert_allclose(call(both, x)[0], call(model, x)[0], rtol=1e-5, atol=1e-6)
+    merged = adapted(lorasp_jax.merge(model), (".*", LoRA(rank=3)))
+    np.testing.assert_allclose(call(merged, x)[0], call(model, x)[0], rtol=1e-4, atol=1e-5)
 
 
 def test_rules_that_apply_to_nothing(net):

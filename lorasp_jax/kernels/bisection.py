@@ -31,11 +31,14 @@ def energies(scores: jax.Array) -> jax.Array:
 
     The scaling is exact, E_k does not depend on it, and squares neither under- nor overflow. For a
     maximum with exponent field e it is 2^(126 - e), with field 253 - e (at least 1: normal).
+
+    Of a row with infinite scores it is the limit: these have energy 1, all others 0.
     """
-    largest = _by_row(jnp.max, jax.lax.stop_gradient(scores))
+    largest = _by_row(jnp.max, jnp.abs(jax.lax.stop_gradient(scores)))
     exponent = jax.lax.shift_right_logical(_bits(largest), 23)
     scale = _float(jax.lax.shift_left(jnp.maximum(253 - exponent, 1), 23))
-    return jnp.square(scores * scale)
+    infinite = (jnp.abs(scores) == jnp.inf).astype(jnp.float32)
+    return jnp.square(jnp.where(largest == jnp.inf, infinite, scores * scale))
 
 
 def _by_row(reduce: Callable, rows: jax.Array, **options: Any) -> jax.Array:
@@ -93,7 +96,7 @@ def bisected_boundary(scores: jax.Array, ratio: Ratio, *, is_block: bool = False
     else:
         bracket = jax.lax.fori_loop(0, 31, lambda _, b: halve(b), bracket)
     # What is left in the bracket is one score, or ties.
-    score = _by_row(jnp.max, jnp.where(scores < _float(bracket.high), scores, -1))
+    score = _by_row(jnp.max, jnp.where(scores <= _float(bracket.high - 1), scores, -1))
     index = functools.partial(_last_tie, scores, energy, score, target, ratio)
     if is_block:
         several = _any(bracket.num_low - bracket.num_high > 1)

@@ -15,6 +15,12 @@ row to its `Boundary`, the last kept (score, index) in that order; the mask foll
 
 η is the decimal that was written: 0.9 means 9/10, and E_k >= 9/10 is tested as 10 Σ_k >= 9 Σ, so a
 row that reaches the target exactly is not lost to the rounding of 0.9.
+
+What all implementations give where fp32 ends:
+
+- The first direction alone holds at least 1/R of the energy, so every η up to 1/R keeps one.
+- Infinite scores share the energy equally, and finite ones beside them have none.
+- A row with NaN keeps nothing and has kept_energy NaN.
 """
 
 import decimal
@@ -38,6 +44,9 @@ from lorasp_jax.kernels.by_rows import by_rows
 
 Implementation = Literal["pairwise", "sort", "bisection", "block", "pallas"]
 
+SMALLEST_TARGET = 2.0**-64
+"""Every smaller η is as this one, since no bank has 2^64 directions; in fp32 it could be zero."""
+
 PAIRWISE_RANK = 32
 """Largest R for which pairwise is the default on CPU: the crossing of both on two cores."""
 
@@ -54,6 +63,7 @@ def exact_ratio(energy_target: float) -> Ratio:
         ratio = fractions.Fraction(0)
     if not 0 < ratio <= 1:
         raise ValueError(f"energy_target must lie in (0, 1], got {energy_target!r}.")
+    ratio = max(ratio, fractions.Fraction(SMALLEST_TARGET))
     power = 2 ** ratio.denominator.bit_length()  # scales both without rounding
     return Ratio(ratio.numerator / power, ratio.denominator / power)
 
@@ -67,7 +77,7 @@ def energy_gate(
     zeros keeps nothing and has `kept_energy` 1. At η = 1 every positive score is kept.
 
     Args:
-      scores: [..., R], non-negative and finite; computed in fp32.
+      scores: [..., R], non-negative; computed in fp32. Of a negative one the magnitude counts.
       energy_target: η in (0, 1], a Python number, read as an exact decimal.
       implementation: how to find the mask; None takes `default_implementation(R)`.
 
@@ -80,8 +90,9 @@ def energy_gate(
     ratio = exact_ratio(energy_target)
     find = _finder(implementation or default_implementation(scores.shape[-1]))
     scores = scores.astype(jnp.float32)
-    constant = jax.lax.stop_gradient(scores)
-    mask = constant > 0 if ratio.numerator == ratio.denominator else find(constant, ratio)
+    constant = jnp.abs(jax.lax.stop_gradient(scores))  # no -0, which the bits would put below all
+    whole = ratio.numerator == ratio.denominator
+    mask = positive(constant) if whole else find(constant, ratio)
     return mask, mask.sum(-1).astype(jnp.float32), kept_energy(scores, mask)
 
 
@@ -108,6 +119,11 @@ def _finder(implementation: str) -> Callable[[jax.Array, Ratio], jax.Array]:
         raise ValueError(f"unknown gate {implementation!r}; valid are {valid}.")
     boundary = boundaries[implementation]
     return lambda scores, ratio: kept_mask(scores, boundary(scores, ratio))
+
+
+def positive(scores: jax.Array) -> jax.Array:
+    """The mask at η = 1, bool [..., R]: every score that is not zero, none in a row with NaN."""
+    return (scores > 0) & (scores.sum(-1, keepdims=True) > 0)
 
 
 def _pairwise_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:

@@ -7,6 +7,7 @@ A preset is some regular expressions over layer paths, as `lorasp_jax.adapt` tak
 says what `FullFineTuning` frees, norms and embeddings included. What no rule names stays frozen.
 """
 
+import difflib
 import re
 from collections.abc import Sequence
 
@@ -33,6 +34,7 @@ PRESETS: dict[str, tuple[str, ...]] = {
 """Regular expressions over layer paths by the preset's name."""
 
 _NAME = re.compile(r"[a-z]+(-[a-z]+)+")  # in no path there is a hyphen
+_WORD = re.compile(r"[A-Za-z_ -]+")
 
 
 def patterns(targets: str | Sequence[str]) -> list[str]:
@@ -42,13 +44,27 @@ def patterns(targets: str | Sequence[str]) -> list[str]:
         targets: names of presets and regular expressions over layer paths, in any mixture.
 
     Raises:
-        ValueError: a hyphenated word that names no preset.
+        ValueError: a hyphenated word that names no preset, or a word that is nearly the name of one
+            and no part of it.
     """
     targets = [targets] if isinstance(targets, str) else targets
     for target in targets:
-        if target not in PRESETS and _NAME.fullmatch(target):
-            raise ValueError(f"there is no preset {target!r}: it is one of {', '.join(PRESETS)}.")
+        close = _meant(target)
+        if target not in PRESETS and (close or _NAME.fullmatch(target)):
+            hint = f" (did you mean {close!r}?)" if close else ""
+            raise ValueError(
+                f"there is no preset {target!r}{hint}: it is one of {', '.join(PRESETS)}."
+            )
     return [pattern for target in targets for pattern in PRESETS.get(target, (target,))]
+
+
+def _meant(target: str) -> str | None:
+    """The preset whose name is misspelt here; a part of a name is a good regular expression."""
+    parts = (part for name, patterns in PRESETS.items() for part in (name, *patterns))
+    if not _WORD.fullmatch(target) or any(target in part for part in parts):
+        return None
+    known = difflib.get_close_matches(target.lower(), PRESETS, n=1, cutoff=0.8)
+    return known[0] if known else None
 
 
 def rules(targets: str | Sequence[str], method: Method | None) -> Rules:

@@ -21,7 +21,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from lorasp_jax import kinds
 from lorasp_jax.auxiliary import Aux
 from lorasp_jax.peft.method import Method, Params
 
@@ -61,7 +60,7 @@ class AdaLoRA(Method):
 
     def __post_init__(self) -> None:
         """Checks the fields."""
-        kinds.check_numbers(self)
+        super().__post_init__()
         if self.rank < 1 or not 1 <= self.final_rank <= self.rank or self.interval < 1:
             raise ValueError(
                 "target_rank must be 1 to rank and interval at least 1, got "
@@ -71,6 +70,11 @@ class AdaLoRA(Method):
             raise ValueError(
                 "warmup and final are shares of the steps that leave some between them, got "
                 f"{self.warmup}, {self.final}."
+            )
+        if not (0 <= self.importance_decay < 1 and 0 <= self.uncertainty_decay < 1):
+            raise ValueError(
+                "importance_decay and uncertainty_decay must lie in [0, 1), got "
+                f"{self.importance_decay}, {self.uncertainty_decay}."
             )
 
     @property

@@ -11,7 +11,6 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
-from lorasp_jax import kinds
 from lorasp_jax.auxiliary import Aux
 from lorasp_jax.peft.method import Kernel, Method, Params, check_matrix, kaiming_uniform
 
@@ -44,7 +43,7 @@ class LoRA(Method):
 
     def __post_init__(self) -> None:
         """Checks the fields."""
-        kinds.check_numbers(self)
+        super().__post_init__()
         if self.rank < 1:
             raise ValueError(f"rank must be at least 1, got {self.rank}.")
         if self.initialization not in ("kaiming", "gaussian", *_SPLITS, "eva"):
@@ -52,6 +51,8 @@ class LoRA(Method):
                 "initialization must be 'kaiming', 'gaussian', 'pissa', 'olora' or 'eva', got "
                 f"{self.initialization!r}."
             )
+        if self.initialization == "pissa" and self.scale < 0:
+            raise ValueError(f"'pissa' takes roots of W / scale: alpha {self.alpha} is negative.")
 
     @property
     def splits_kernel(self) -> bool:
@@ -88,9 +89,10 @@ class LoRA(Method):
             return super().init(key, kernel, statistics=statistics)
         check_matrix(kernel)
         if isinstance(kernel, jax.ShapeDtypeStruct) or self.rank > min(kernel.shape):
+            has = "a shape" if isinstance(kernel, jax.ShapeDtypeStruct) else "a kernel"
             raise ValueError(
                 f"{self.initialization!r} splits a kernel, so it needs its values and a rank up to "
-                f"its smaller side, got rank {self.rank} and {kernel}."
+                f"its smaller side, got rank {self.rank} and {has} {list(kernel.shape)}."
             )
         part = principal_part if self.initialization == "pissa" else orthogonal_part
         a, b = part(kernel.astype(jnp.float32), self.rank, self.scale)

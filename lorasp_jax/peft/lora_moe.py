@@ -15,9 +15,9 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 
-from lorasp_jax import kinds
 from lorasp_jax.auxiliary import Aux, masked_mean
 from lorasp_jax.peft.method import Method, Params, kaiming_uniform
+from lorasp_jax.routing import bounded
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +46,7 @@ class LoRAMoE(Method):
 
     def __post_init__(self) -> None:
         """Checks the fields."""
-        kinds.check_numbers(self)
+        super().__post_init__()
         if self.experts < 1 or self.rank < 1:
             raise ValueError(
                 f"experts and rank must be at least 1, got {self.experts}, {self.rank}."
@@ -88,6 +88,7 @@ class LoRAMoE(Method):
         """z = scale w(x) x A, each weight over its expert's R columns; the router's losses."""
         del params
         projected, logits = jnp.split(rows, [self.experts * self.rank], axis=-1)
+        logits = bounded(logits)
         probabilities = jax.nn.softmax(logits)
         columns = jnp.repeat(self.scale * self._weights(probabilities), self.rank, axis=-1)
         z = projected * columns

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from lorasp_jax import energy_schedule, kinds, release, routing
+from lorasp_jax import energy_schedule, release, routing
 from lorasp_jax.auxiliary import Aux
 from lorasp_jax.bank import init_bank, normalized_bank
 from lorasp_jax.kernels.energy_gate import (
@@ -98,7 +98,7 @@ class LoRASP(Method):
 
     def __post_init__(self) -> None:
         """Checks the fields."""
-        kinds.check_numbers(self)
+        super().__post_init__()
         exact_ratio(self.energy_target)
         if self.energy_start is not None:
             exact_ratio(self.energy_start)

@@ -6,6 +6,7 @@ shells for NNX and Linen are in `lorasp_jax.dense`.
 """
 
 import dataclasses
+import difflib
 from collections.abc import Sequence
 from typing import Any, ClassVar, TypeAlias
 
@@ -13,11 +14,17 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from lorasp_jax import kinds
 from lorasp_jax.auxiliary import Aux
 from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul, one_by_one
 
 Params: TypeAlias = Any
 Kernel: TypeAlias = jax.Array | jax.ShapeDtypeStruct
+
+LARGEST_SIZE = 2**20
+"""Of a rank, a width and the like: what is larger is a mistake, and would ask for all memory."""
+LARGEST_ALPHA = 1e30
+"""Of α and 1/α: α/R is then neither infinite nor zero in fp32."""
 
 
 class Method:
@@ -27,6 +34,22 @@ class Method:
 
     x is [...tokens, I], a kernel [I, O]; the result has the type of x. Parameters are fp32.
     """
+
+    def __new__(cls, *values: Any, **fields: Any) -> "Method":
+        """Raises a ValueError for a field that there is not, before Python's own TypeError."""
+        check_names(cls, values, fields)
+        return super().__new__(cls)
+
+    def __post_init__(self) -> None:
+        """Raises a ValueError for a field of another type, or a number that no method can use."""
+        for field in dataclasses.fields(self):  # pyright: ignore[reportArgumentType]
+            value = getattr(self, field.name)
+            if type(value) is int and value > LARGEST_SIZE:
+                raise ValueError(f"{field.name} must be at most {LARGEST_SIZE}, got {value}.")
+        kinds.check_fields(self)
+        alpha = getattr(self, "alpha", None)
+        if alpha is not None and not 1 / LARGEST_ALPHA <= abs(alpha) <= LARGEST_ALPHA:
+            raise ValueError(f"alpha must not be 0 nor beyond {LARGEST_ALPHA:g}, got {alpha}.")
 
     trains_base: ClassVar[bool] = False
     """True if the base weights themselves are what trains."""
@@ -263,6 +286,19 @@ class _Between:
         z, aux = first.between_all(stacked, read, columns, token_mask)
         of_each = [jax.tree.map(lambda a, i=i: a[i], aux) for i in range(n)]
         return list(zip(jnp.split(z, n, axis=-1), of_each, strict=True))
+
+
+def check_names(cls: type[Method], values: Sequence[Any], fields: Sequence[str] | dict) -> None:
+    """Raises a ValueError unless these are values and names for a method's fields."""
+    valid = [field.name for field in dataclasses.fields(cls)]  # pyright: ignore[reportArgumentType]
+    name = cls.__module__.rpartition(".")[2]
+    if len(values) > len(valid):
+        raise ValueError(f"{name} has {len(valid)} fields, not {len(values)}: {', '.join(valid)}.")
+    for field in fields:
+        if field not in valid:
+            close = difflib.get_close_matches(field, valid, n=1, cutoff=0.4)
+            hint = f" (did you mean {close[0]!r}?)" if close else ""
+            raise ValueError(f"{name} has no field {field!r}{hint}; valid are {', '.join(valid)}.")
 
 
 def check_matrix(kernel: Kernel) -> None:

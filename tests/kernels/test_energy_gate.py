@@ -74,6 +74,35 @@ def test_special_rows(implementation):
     assert np.isnan(run(rows.astype(np.float32) + np.float32("nan"))[2]).all()
 
 
+INF, NAN = np.inf, np.nan
+
+
+@pytest.mark.usefixtures("interpret")
+@pytest.mark.parametrize("implementation", ["pairwise", "sort", "bisection", "block", "pallas"])
+@pytest.mark.parametrize(
+    ("eta", "expected"),
+    [
+        (1e-300, [1, 1, 1, 1, 1, 0]),  # a row's largest share is at least 1/R
+        (0.5, [2, 1, 1, 1, 1, 0]),
+        (0.9, [4, 2, 1, 2, 3, 0]),
+        (1.0, [4, 3, 1, 2, 4, 0]),
+    ],
+)
+def test_where_fp32_ends(implementation, eta, expected):
+    """Infinite scores share the energy, NaN keeps nothing, -0 is 0, magnitudes count."""
+    rows = [[INF] * 4, [INF, 1, INF, 0], [0, 0, 3e38, -0.0], [-0.0, 1, 1, 0]]
+    rows = np.array([*rows, [-3, 1, 2, -4], [NAN, 1, INF, 2]], np.float32)
+    run = jax.jit(lambda s: gate.energy_gate(s, eta, implementation=implementation))
+    mask, rank, kept = run(rows)
+    np.testing.assert_array_equal(rank, expected)
+    np.testing.assert_array_equal(mask.sum(1), expected)
+    assert (mask <= (rows != 0)).all()
+    assert np.isfinite(kept[:-1]).all()
+    assert np.isnan(kept[-1])
+    gradient = jax.jit(jax.grad(lambda s: gate.energy_gate(s, eta)[2].sum()))(rows[:-1])
+    assert np.isfinite(gradient).all()
+
+
 def test_a_block_is_rows_behind_any_axes():
     scores = scores_like((1, 5, 7))
     run = jax.jit(lambda s, name: gate.energy_gate(s, 0.9, implementation=name), static_argnums=1)

@@ -102,6 +102,16 @@ def test_what_is_frozen_is_said():
     assert tables.trained_share(bare).startswith("0.00% of all parameters train, 0 of ")
 
 
-def test_a_wrong_name():
-    with pytest.raises(ValueError, match=r"no preset 'expert-onyl': it is one of paper, all-lin"):
-        presets.rules(["q_proj", "expert-onyl"], LoRA())
+@pytest.mark.parametrize(
+    ("wrong", "meant"),
+    [("expert-onyl", "expert-only"), ("expert_only", "expert-only"), ("Vision", "vision")],
+)
+def test_a_wrong_name(wrong, meant):
+    message = f"no preset {wrong!r} (did you mean {meant!r}?): it is one of paper, all-linear"
+    with pytest.raises(ValueError, match=re.escape(message)):
+        presets.rules(["q_proj", wrong], LoRA())
+
+
+@pytest.mark.parametrize("pattern", ["visio", "action_out", "action_in_proj", "q_proj", "head"])
+def test_parts_of_paths_are_patterns(pattern):
+    assert presets.patterns(pattern) == [pattern]

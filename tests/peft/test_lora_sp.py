@@ -107,8 +107,9 @@ def test_pruned_directions_get_no_task_gradient(x):
 
     def task(shift):
         scores = scores_of(params["router"], x)[0] + shift
-        mask, _, _ = lora_sp.energy_gate(scores, 0.5)
-        return routing.select(x @ params["bank"]["v"], scores, mask).sum(), mask
+        mask, _, energy = lora_sp.energy_gate(scores, 0.5)
+        z = routing.select(x @ params["bank"]["v"], scores, mask, energy[..., None])
+        return z.sum(), mask
 
     gradient, mask = jax.jit(jax.grad(task, has_aux=True))(jnp.zeros((3, 7, 16)))
     np.testing.assert_array_equal(gradient != 0, mask)

@@ -74,6 +74,23 @@ def test_starts_as_the_base(method, kernel, x):
         np.testing.assert_array_equal(delta(method, params, x)[0], 0)
 
 
+@pytest.mark.parametrize("size", [1e15, 1e25, 1e35])
+def test_huge_inputs_leave_the_base_as_it_is(method, kernel, x, size):
+    """Where the bare layer is finite, so are the adapted one, its losses and its gradients."""
+    params = initial(method, jax.random.key(0), kernel)
+
+    @jax.jit
+    def loss(params):
+        y, aux = method.apply(params, size * x, kernel)
+        return y.mean() / size + sum(aux.losses.values()), (y, aux.losses)
+
+    gradients, (y, losses) = jax.grad(loss, has_aux=True)(params)
+    np.testing.assert_allclose(y, size * x @ kernel, rtol=1e-5, atol=1e-5 * size)
+    assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves((losses, gradients)))
+    y, _ = apply(method, trained(method, kernel), size * x, kernel)
+    assert jnp.isfinite(y).all()
+
+
 def test_init_depends_on_key_and_shape_alone(method, kernel):
     if not method.additive:
         pytest.skip("starts from the kernel's values")
@@ -187,5 +204,8 @@ def test_unknown_names():
         match=r"did you mean 'lora_sp'.*valid are ada_lora, dora, full, lora, lora_moe, lora_sp",
     ):
         peft.create("lora_ps")
-    with pytest.raises(ValueError, match="lora has no field 'rnk'; valid are rank, alpha"):
+    with pytest.raises(
+        ValueError,
+        match=r"lora has no field 'rnk' \(did you mean 'rank'\?\); valid are rank, alpha",
+    ):
         peft.create("lora", rnk=4)
