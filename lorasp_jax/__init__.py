@@ -12,6 +12,7 @@ Axis letters used in every docstring and einsum of this package:
 from lorasp_jax import dense, hugging_face, named, peft
 from lorasp_jax.adaptation import adapt, merge, split
 from lorasp_jax.adapter_io import load_adapters, save_adapters
+from lorasp_jax.auxiliary import auxiliary_losses
 from lorasp_jax.compaction import distill, prune
 from lorasp_jax.fusion import fuse, unmerge
 from lorasp_jax.hugging_face import load_peft, save_peft
@@ -32,6 +33,7 @@ __all__ = [
     "LoRAMoE",
     "LoRASP",
     "adapt",
+    "auxiliary_losses",
     "choose",
     "collect_aux",
     "combine",

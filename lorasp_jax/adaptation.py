@@ -75,6 +75,7 @@ def adapt(
         near misses), a layer that an adapter cannot take over, or one that has an adapter already.
     """
     paths.check_method_rules(rules)
+    layers.check_einsums(einsums)
     holder, key = _copy(model), _key(rngs)
     used = _attach_all(holder, rules, key, einsums, statistics) | _free_all(holder, rules)
     for i, (pattern, _) in enumerate(rules):
@@ -86,7 +87,11 @@ def adapt(
 def split(model: nnx.Module) -> tuple[nnx.GraphDef, nnx.State, nnx.State]:
     """(graphdef, adapters, frozen): the structure, what trains, and everything else.
 
-    `nnx.merge(graphdef, adapters, frozen)` gives the model back, also inside jit and grad.
+    A step takes its gradient with respect to `adapters` alone. In a model trained as a whole,
+    biases and layers without an adapter would train too.
+
+    `nnx.merge(graphdef, adapters, frozen, copy=True)` gives the model back, also inside jit and
+    grad. Without `copy`, a model whose code has `nnx.scan` or `nnx.remat` cannot be called there.
     """
     graphdef, adapters, frozen = nnx.split(_copy(model)[0], AdapterParam, ...)
     return graphdef, adapters, frozen
@@ -184,18 +189,20 @@ def _key(rngs: Any) -> jax.Array:
     return rngs.params()
 
 
+def checked_module(model: Any) -> Any:
+    """The model; raises a ValueError for what is no NNX module."""
+    if not isinstance(model, nnx.Module):
+        hint = "; see LinenAdapter for Linen's" if isinstance(model, linen.Module) else ""
+        raise ValueError(f"the model must be an NNX module, got {type(model).__name__}{hint}.")
+    return model
+
+
 def _copy(model: nnx.Module) -> nnx.List:
     """A holder of one copy of the model that shares its arrays, free of what layers kept.
 
     The holder gives a model that is itself one layer a parent to be replaced in.
-
-    Raises:
-      ValueError: no NNX module.
     """
-    if not isinstance(model, nnx.Module):
-        hint = "; LinenAdapter takes Linen's" if isinstance(model, linen.Module) else ""
-        raise ValueError(f"the model must be an NNX module, got {type(model).__name__}{hint}.")
-    model = nnx.clone(model)
+    model = nnx.clone(checked_module(model))
     nnx.pop(model, AdapterAux)
     return nnx.List([model])
 
@@ -208,7 +215,7 @@ def _attach_all(
     statistics: Mapping[str, jax.Array],
 ) -> set[int]:
     """Attaches adapters in place; returns the rules that were used."""
-    used = set()
+    used, attached = set(), set()
     for path, parent, name, layer in paths.layer_places(holder, einsums):
         i = paths.governing(rules, path)
         method = None if i is None else rules[i][1]
@@ -216,7 +223,9 @@ def _attach_all(
             own_key = jax.random.fold_in(key, zlib.crc32(path.encode()))
             try:
                 layer = layers.adapted(layer, einsums)
-                attach(layer, method, own_key, statistics.get(path))
+                if layer not in attached:  # it may hang in several places
+                    attach(layer, method, own_key, statistics.get(path))
+                attached.add(layer)
             except ValueError as error:
                 raise ValueError(f"cannot adapt {path or 'the model'}: {error}") from error
             setattr(parent, name, layer)
@@ -289,8 +298,9 @@ def over_stack(function: Callable[..., Any], kernel: jax.Array) -> Callable[...,
 
 def _no_match(pattern: str, holder: nnx.List, einsums: layers.Einsums) -> str:
     known = [place.path for place in paths.layer_places(holder, einsums)]
-    close = paths.near_misses(pattern, known) or "none"
-    return f"rule {pattern!r} applies to nothing; layers here: {close}."
+    others = paths.other_places(holder, einsums)
+    classes = {p.path.rpartition("/")[0]: type(p.parent).__name__ for p in others}
+    return paths.no_match(pattern, known, classes)
 
 
 def _size(tree: Any) -> int:

@@ -13,6 +13,7 @@ import os
 import pathlib
 import re
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -21,7 +22,7 @@ import numpy as np
 import safetensors.numpy
 from flax import nnx
 
-from lorasp_jax import adaptation, digest, kinds, peft
+from lorasp_jax import adaptation, digest, kinds, layers, peft
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.peft import Method
 
@@ -81,6 +82,7 @@ def load_adapters(
     *,
     base: str | None = None,
     any_base: bool = False,
+    einsums: layers.Einsums = MappingProxyType({}),
 ) -> adaptation.Model:
     """The model with the adapters of a folder.
 
@@ -93,6 +95,7 @@ def load_adapters(
       any_base: take the adapters onto other weights, too. Otherwise each array of the base must be
         the one they were trained on, up to rounding to bf16; what is quantised on one side only, or
         lacks the part that an adapter holds, is not compared.
+      einsums: those that `adapt` was given.
 
     Raises:
       ValueError: missing, damaged or foreign files, another base, or adapters that do not fit.
@@ -104,7 +107,7 @@ def load_adapters(
     wanted = description["methods"]
     present = {path: _settings(method) for path, method in adaptation.methods(model).items()}
     if not present:
-        model = _adapted(model, wanted, tensors, folder)
+        model = _adapted(model, wanted, tensors, folder, einsums)
     elif present != wanted:
         differing = sorted(p for p in present | wanted if present.get(p) != wanted.get(p))
         raise ValueError(f"{folder} has other adapters than the model, first at {differing[0]!r}.")
@@ -121,6 +124,7 @@ def _adapted(
     wanted: Mapping[str, Settings],
     tensors: Mapping[str, np.ndarray],
     folder: pathlib.Path,
+    einsums: layers.Einsums,
 ) -> adaptation.Model:
     """The bare model with the adapters that a file lists, by exact paths.
 
@@ -131,7 +135,7 @@ def _adapted(
         # A parameter trained in full may sit in a layer with an adapter: such rules go first.
         paths = sorted(methods, key=lambda path: not methods[path].trains_base)
         rules = [(f"^{re.escape(path)}$", methods[path]) for path in paths]
-        adapt = lambda: adaptation.adapt(model, rules, rngs=nnx.Rngs(0))  # noqa: E731
+        adapt = lambda: adaptation.adapt(model, rules, rngs=nnx.Rngs(0), einsums=einsums)  # noqa: E731
         adapters = adaptation.split(nnx.eval_shape(adapt))[1]
     except (ValueError, TypeError, OverflowError) as error:
         raise ValueError(f"{folder} does not fit the model: {error}") from error

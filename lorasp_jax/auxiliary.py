@@ -41,3 +41,20 @@ def masked_mean(values: jax.Array, mask: jax.Array | None) -> jax.Array:
     if mask is None:
         return values.mean()
     return jnp.where(mask, values, 0).sum() / jnp.maximum(mask.sum(), 1)
+
+
+def auxiliary_losses(aux: Any) -> dict[str, jax.Array]:
+    """Each auxiliary loss averaged over the adapted layers that have it, f32 scalars by name.
+
+    Args:
+      aux: any tree of `Aux`, such as what `collect_aux` gives. One that a scan over depth stacked
+        holds a value of each layer, and counts as so many.
+    """
+    layers = jax.tree.leaves(aux, is_leaf=lambda node: isinstance(node, Aux))
+    names = sorted({name for layer in layers for name in layer.losses})
+    return {
+        name: jnp.concatenate(
+            [jnp.ravel(layer.losses[name]) for layer in layers if name in layer.losses]
+        ).mean()
+        for name in names
+    }

@@ -8,7 +8,7 @@ Called as a drop-in, where `layer(x)` gives `y` alone, a layer keeps what it wou
 function that gets the model as an argument or merges it itself,
 
     def loss(adapters):
-        model = nnx.merge(graphdef, adapters, frozen)
+        model = nnx.merge(graphdef, adapters, frozen, copy=True)
         y = model(x)
         aux = lorasp_jax.collect_aux(model)
 

@@ -8,11 +8,11 @@ one, "a/0/b" is "a.0.b". (Format as PEFT 0.21.2 writes it.)
 
 import collections
 import json
-import math
 import os
 import pathlib
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -21,29 +21,13 @@ import numpy as np
 import safetensors.numpy
 from flax import nnx
 
-from lorasp_jax import adaptation, paths
-from lorasp_jax.adapter_io import read_tensors, write_whole
-from lorasp_jax.dense import AdaptedLayer, Dense
+from lorasp_jax import adaptation, layers, paths
+from lorasp_jax.adapter_io import write_whole
+from lorasp_jax.dense import AdaptedLayer
 from lorasp_jax.peft import AdaLoRA, DoRA, LoRA
-
-CONFIG, TENSORS = "adapter_config.json", "adapter_model.safetensors"
-_PREFIX = "base_model.model."
-_TENSOR = re.compile(
-    rf"{re.escape(_PREFIX)}(.+)\.(lora_A|lora_B|lora_E|lora_magnitude_vector)(\.weight)?"
-)
-_ADA_CONSTANT = 1e-5  # AdaLoRA's scale is α/(r + this)
-# What a folder may ask for beyond its tensors, and the values that ask for nothing.
-_NOTHING = (None, False, [], {}, "none")
-# Initialisations that leave the base as it is. After the others (PiSSA, OLoRA, CorDA, LoRA-GA,
-# LoftQ) A and B belong to what was left of the base.
-_WHOLE_BASE = (None, True, False, "gaussian", "orthogonal", "eva", "mica")
-_UNKNOWN = (
-    "bias", "lora_bias", "modules_to_save", "fan_in_fan_out", "layer_replication", "use_qalora",
-    "target_parameters", "trainable_token_indices", "use_bdlora", "alora_invocation_tokens",
-)  # fmt: skip
+from lorasp_jax.peft_folders import CONFIG, PREFIX, TENSORS, Adapter, read
 
 Names = Callable[[str, tuple[int, ...]], str]
-Adapter = dict[str, np.ndarray]
 
 
 def dotted(path: str, index: tuple[int, ...]) -> str:
@@ -58,45 +42,73 @@ def dotted(path: str, index: tuple[int, ...]) -> str:
 
 
 def load_peft(
-    folder: str | os.PathLike, model: adaptation.Model, *, names: Names = dotted
+    folder: str | os.PathLike,
+    model: adaptation.Model,
+    *,
+    names: Names = dotted,
+    einsums: layers.Einsums = MappingProxyType({}),
 ) -> adaptation.Model:
     """The model with the adapters of a folder of Hugging Face PEFT.
 
-    AdaLoRA comes as the LoRA that it has become. Zeros make up for different ranks in a stack.
+    They go to dense layers and einsums, `nnx.MultiHeadAttention`'s among them, whose kernels stand
+    for torch's with all heads side by side. AdaLoRA comes as the LoRA that it has become. Zeros
+    make up for different ranks in a stack.
 
     Args:
       folder: with adapter_config.json and adapter_model.safetensors.
       model: left untouched; adapters that it has elsewhere than the folder stay.
       names: module of the layer at a path and an index in its stack, () outside of stacks.
+      einsums: as for `adapt`.
 
     Raises:
       ValueError: missing or damaged files, an adapter of another kind, modules that the model does
         not have, or adapters that do not fit their layers.
     """
+    holder = nnx.List([adaptation.checked_module(model)])
+    shapes = {
+        place.path: layers.matrices_shape(place.child, einsums)
+        for place in paths.multiplying(holder, einsums)
+    }
+    rules, values = matched(folder, shapes, names)
+    adapted = adaptation.adapt(model, rules, rngs=nnx.Rngs(0), einsums=einsums)
+    for place in paths.places(nnx.List([adapted]), AdaptedLayer):
+        if place.path in values:
+            place.child.adapter.set_value(jax.tree.map(jnp.asarray, values[place.path]))
+    return adapted
+
+
+def matched(
+    folder: str | os.PathLike, shapes: Mapping[str, Sequence[int]], names: Names
+) -> tuple[paths.Rules, dict[str, Adapter]]:
+    """The rules and, by path, the parameters that give a model the adapters of a folder.
+
+    Args:
+      folder: as for `load_peft`.
+      shapes: by path of a layer, [..., I, O] of its kernel matrices.
+      names: as for `load_peft`.
+
+    Raises:
+      ValueError: as for `load_peft`.
+    """
     folder = pathlib.Path(folder)
-    config, modules = _read(folder)
+    config, modules = read(folder)
     kind = DoRA if config.get("use_dora") else LoRA
     left, known, rules, values = dict(modules), [], [], {}
-    for place in paths.places(nnx.List([model]), (Dense, nnx.Linear)):
-        *leading, d_in, d_out = place.child.kernel.get_value().shape
-        wanted = [names(place.path, index) for index in np.ndindex(*leading)]
+    for path, (*leading, d_in, d_out) in shapes.items():
+        wanted = [names(path, index) for index in np.ndindex(*leading)]
         known += wanted
         found = [left.pop(name) for name in wanted if name in left]
         if not found:
             continue
         if len(found) < len(wanted):
-            raise ValueError(f"{folder} adapts only some of the layers of the stack {place.path}.")
+            raise ValueError(f"{folder} adapts only some of the layers of the stack {path}.")
         for name, adapter in zip(wanted, found, strict=True):
             _check_fits(folder, name, adapter, d_in, d_out)
-        scale, values[place.path] = _stacked(found, leading)
-        rank = values[place.path]["lora_a"].shape[-1]
-        rules.append((f"^{re.escape(place.path)}$", kind(rank=rank, alpha=scale * rank)))
+        scale, values[path] = _stacked(found, leading)
+        rank = values[path]["lora_a"].shape[-1]
+        rules.append((f"^{re.escape(path)}$", kind(rank=rank, alpha=scale * rank)))
     _check_used(folder, modules, left, known)
-    adapted = adaptation.adapt(model, rules, rngs=nnx.Rngs(0))
-    for place in paths.places(nnx.List([adapted]), Dense):
-        if place.path in values:
-            place.child.adapter.set_value(jax.tree.map(jnp.asarray, values[place.path]))
-    return adapted
+    return rules, values
 
 
 def save_peft(
@@ -120,16 +132,18 @@ def save_peft(
     known = {path for path, method in adaptation.methods(model).items() if _is_known(path, method)}
     for place in paths.places(nnx.List([model]), AdaptedLayer):
         if place.path in known:
-            if not isinstance(place.child, Dense):
-                raise ValueError(f"{place.path} is no dense layer: it cannot be in a PEFT folder.")
+            if isinstance(place.child, layers.LoRALayer):
+                raise ValueError(
+                    f"{place.path} is neither dense nor an einsum: it cannot be in a PEFT folder."
+                )
             kinds.add(isinstance(place.child.method, DoRA))
-            shape = place.child.kernel.get_value().shape[:-2]
+            shape = place.child.kernel_matrices().shape[:-2]
             for index in np.ndindex(*shape):
                 modules[names(place.path, index)] = _exported(place.child, index)
     if len(kinds) != 1:
         raise ValueError("a PEFT folder holds either LoRA or DoRA, and at least one adapter.")
     tensors = {
-        f"{_PREFIX}{module}.{name}": value
+        f"{PREFIX}{module}.{name}": value
         for module, (_, adapter) in modules.items()
         for name, value in adapter.items()
     }
@@ -139,72 +153,6 @@ def save_peft(
     write_whole(folder / TENSORS, data)
     text = json.dumps(_config(modules, dora=kinds.pop(), base=base), indent=2)
     write_whole(folder / CONFIG, text.encode())
-
-
-def _read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter]]:
-    """The configuration, and by module lora_A, lora_B in our layout, the scale among them."""
-    for name in (CONFIG, TENSORS):
-        if not (folder / name).is_file():
-            raise ValueError(f"{folder} holds no {name}; a PEFT adapter is a folder with both.")
-    try:
-        config = json.loads((folder / CONFIG).read_bytes())
-        kind = config["peft_type"]
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ValueError(f"{folder / CONFIG} is damaged or no PEFT adapter: {error}") from error
-    tensors = read_tensors(folder / TENSORS, (folder / TENSORS).read_bytes())
-    if kind not in ("LORA", "ADALORA"):
-        raise ValueError(f"{folder} holds {kind}; LORA and ADALORA can be loaded.")
-    if asked := [name for name in _UNKNOWN if config.get(name) not in _NOTHING]:
-        raise ValueError(
-            f"{folder} sets {asked[0]} to {config[asked[0]]!r}, which is not supported."
-        )
-    if (start := config.get("init_lora_weights")) not in _WHOLE_BASE:
-        raise ValueError(
-            f"{folder} was trained on what {start!r} left of its base: save it in PEFT with "
-            "path_initial_model_for_weight_conversion, which makes a plain LoRA of it."
-        )
-    modules: dict[str, Adapter] = collections.defaultdict(dict)
-    for name, tensor in tensors.items():
-        if not (match := _TENSOR.fullmatch(name)):
-            raise ValueError(f"{folder} holds {name!r}, which belongs to no LoRA.")
-        modules[match[1]][match[2]] = tensor.astype(np.float32)
-    try:
-        return config, {name: _imported(config, name, found) for name, found in modules.items()}
-    except (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, re.error) as error:
-        raise ValueError(f"{folder} is no PEFT adapter that can be read: {error}") from error
-
-
-def _imported(config: Mapping[str, Any], module: str, found: Adapter) -> Adapter:
-    """lora_a, lora_b, perhaps magnitude, and scale, in our layout."""
-    ada = config["peft_type"] == "ADALORA"
-    needed = {"lora_A", "lora_B"} | ({"lora_E"} if ada else set())
-    needed |= {"lora_magnitude_vector"} if config.get("use_dora") else set()
-    if missing := needed - found.keys():
-        raise ValueError(f"the adapter of {module} lacks {min(missing)}.")
-    a, b = found["lora_A"].T, found["lora_B"].T
-    alpha = _pattern(config.get("alpha_pattern"), module, config.get("lora_alpha"))
-    if not alpha or (ada and not config.get("init_r")):
-        raise ValueError(f"the adapter of {module} lacks lora_alpha or init_r, which scale it.")
-    if ada:
-        scale = alpha / (config["init_r"] + _ADA_CONSTANT)
-        a = a * found["lora_E"][:, 0]
-    else:
-        rank = a.shape[1]
-        scale = alpha / (math.sqrt(rank) if config.get("use_rslora") else rank)
-    if not math.isfinite(scale):
-        raise ValueError(f"the adapter of {module} has the scale {scale}.")
-    adapter = {"lora_a": a, "lora_b": b, "scale": np.float32(scale)}
-    if "lora_magnitude_vector" in found:
-        adapter["magnitude"] = found["lora_magnitude_vector"].reshape(-1)
-    return adapter
-
-
-def _pattern(pattern: Mapping[str, Any] | None, module: str, default: Any) -> Any:
-    """The value of the first regular expression that the end of the module's name matches."""
-    for key, value in (pattern or {}).items():
-        if re.match(rf"(.*\.)?({key})$", module):
-            return value
-    return default
 
 
 def _check_fits(folder: pathlib.Path, module: str, adapter: Adapter, d_in: int, d_out: int) -> None:
@@ -255,7 +203,7 @@ def _is_known(path: str, method: Any) -> bool:
     return True
 
 
-def _exported(layer: Dense, index: tuple[int, ...]) -> tuple[float, Adapter]:
+def _exported(layer: AdaptedLayer, index: tuple[int, ...]) -> tuple[float, Adapter]:
     """Scale and tensors of one module, in PEFT's names and layout."""
     assert layer.adapter is not None
     params = {k: np.asarray(v[index], np.float32) for k, v in layer.adapter.get_value().items()}

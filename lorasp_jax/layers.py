@@ -18,8 +18,9 @@ from lorasp_jax.dense import AdaptedLayer, Dense, refuse_sharding, with_value
 from lorasp_jax.kernels.quantized import QuantizedKernel
 from lorasp_jax.peft import LoRA, Method
 
-Einsums = Mapping[type[nnx.Module], Callable[[Any], tuple[str, str]]]
-"""By layer class: a function of the layer that gives the name of its kernel and its equation."""
+Einsums = Mapping[type, Callable[[Any], tuple[str, str | None]]]
+"""By layer class, of NNX or Linen: a function of the layer that gives the name of its kernel and
+its equation; None where the equation comes with the call, as a text, which only Linen's may."""
 
 EINSUMS: Einsums = {
     nnx.LinearGeneral: lambda layer: (
@@ -205,9 +206,7 @@ def adapted(layer: nnx.Module, einsums: Einsums) -> AdaptedLayer:
         mixin, name = (ConvLayer, "kernel") if known is nnx.Conv else (EmbedLayer, "embedding")
         settings = {"kernel_name": name}
     else:
-        assert known is not None
-        mixin, (name, equation) = EinsumLayer, {**EINSUMS, **einsums}[known](layer)
-        einsum.parse(equation)
+        mixin, (name, equation) = EinsumLayer, kernel_and_equation(layer, known, einsums)
         settings = {"kernel_name": name, "kernel_equation": equation}
     return _dressed(layer, mixin, settings)
 
@@ -238,6 +237,64 @@ def kind(layer: Any, einsums: Einsums) -> type[nnx.Module] | None:
     known = (nnx.Linear, nnx.Embed, nnx.Conv, *EINSUMS, *einsums)
     calls = (cls for cls in known if isinstance(layer, cls))
     return next((cls for cls in calls if type(layer).__call__ is cls.__call__), None)
+
+
+def kernel_and_equation(layer: Any, known: type | None, einsums: Einsums) -> tuple[str, str]:
+    """The name of an einsum layer's kernel and its equation.
+
+    Raises:
+      ValueError: an equation that is no adaptable map, or no such kernel.
+    """
+    assert known is not None
+    name, equation = described({**EINSUMS, **einsums}[known], layer)
+    if equation is None:
+        raise ValueError(f"the equation of a {type(layer).__name__} must be known before its call.")
+    if not isinstance(getattr(layer, name, None), nnx.Param):
+        raise ValueError(f"a {type(layer).__name__} has no parameter {name!r}.")
+    einsum.parse(equation)
+    return name, equation
+
+
+def check_einsums(einsums: Any) -> None:
+    """Raises a ValueError unless these are layer classes with a function each."""
+    pairs = einsums.items() if isinstance(einsums, Mapping) else [(None, None)]
+    if not all(isinstance(cls, type) and callable(describe) for cls, describe in pairs):
+        raise ValueError(
+            "einsums are {layer class: function of a layer that gives (its kernel's name, "
+            f"equation)}}, got {einsums!r}."
+        )
+
+
+def described(describe: Callable[[Any], Any], layer: Any) -> tuple[str, str | None]:
+    """What a function of `Einsums` says of a layer; raises a ValueError if that is nothing."""
+    try:
+        name, equation = describe(layer)
+    except (TypeError, ValueError, AttributeError) as error:
+        raise ValueError(f"einsums cannot describe a {type(layer).__name__}: {error}") from error
+    if not isinstance(name, str) or not isinstance(equation, str | None):
+        raise ValueError(f"einsums give (name, equation), got {(name, equation)!r}.")
+    return name, equation
+
+
+def matrices_shape(layer: Any, einsums: Einsums) -> tuple[int, ...]:
+    """[..., *batch, I, O], the shape of a layer's kernel as an adapter sees it.
+
+    Args:
+      layer: dense or an einsum, adapted or not.
+      einsums: further layer classes that are einsums.
+
+    Raises:
+      ValueError: an equation that is no adaptable map.
+    """
+    if isinstance(layer, AdaptedLayer):
+        return tuple(layer.kernel_matrices().shape)
+    known = kind(layer, einsums)
+    if known is nnx.Linear:
+        return layer.kernel.get_value().shape
+    name, equation = kernel_and_equation(layer, known, einsums)
+    value = getattr(layer, name).get_value()
+    shaped = jax.ShapeDtypeStruct(value.shape, value.dtype)
+    return jax.eval_shape(lambda kernel: einsum.to_matrices(equation, kernel), shaped).shape
 
 
 def kernel_of(layer: Any) -> nnx.Param:

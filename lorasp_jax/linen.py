@@ -11,6 +11,7 @@ whatever the model does to those (scan, remat, vmap), happens to the adapter too
 
 import dataclasses
 import functools
+import operator
 from collections.abc import Callable, Mapping
 from typing import Any, cast
 
@@ -23,8 +24,10 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from lorasp_jax import layers
 from lorasp_jax.adaptation import init_stack, over_stack
 from lorasp_jax.dense import KEPT
-from lorasp_jax.linen_layers import Einsums, kind, layer_map, with_lora
-from lorasp_jax.paths import Rules, check_method_rules, governing, near_misses
+from lorasp_jax.einsum import to_matrices
+from lorasp_jax.layers import Einsums
+from lorasp_jax.linen_layers import kind, layer_map, with_lora
+from lorasp_jax.paths import Rules, check_method_rules, governing, no_match
 from lorasp_jax.peft import Method
 
 ADAPTER = "lorasp_adapter"  # name of an adapter among its layer's parameters
@@ -49,7 +52,8 @@ class LinenAdapter:
       model: any Linen module; for a Flax model of Hugging Face, its `.module`.
       rules: (pattern, method or None) pairs, first match wins.
       einsums: further layer classes that do nothing but an einsum of their input and a parameter,
-        as in {gemma.Einsum: lambda layer, equation, x: (x, "w", equation)}.
+        each with a function of the layer that gives the parameter's name and the equation, as for
+        `adapt`; {gemma.Einsum: lambda layer: ("w", None)} if the equation comes with the call.
     """
 
     model: nn.Module
@@ -59,6 +63,7 @@ class LinenAdapter:
     def __post_init__(self) -> None:
         """Raises a ValueError for what is no Linen module or no rules."""
         check_method_rules(self.rules)
+        layers.check_einsums(self.einsums)
         if not isinstance(self.model, nn.Module):
             raise ValueError(
                 f"the model must be a Linen module, got {type(self.model).__name__}; `adapt` takes "
@@ -102,8 +107,7 @@ class LinenAdapter:
         base, trained = self._divided(flatten_dict(params), record)
         for i, (pattern, _) in enumerate(self.rules):
             if i not in record.used:
-                close = near_misses(pattern, record.seen) or "none"
-                raise ValueError(f"rule {pattern!r} applies to nothing; layers here: {close}.")
+                raise ValueError(no_match(pattern, record.seen, record.others))
         trained = flatten_dict(variables.get("adapters", {})) | trained
         return {**variables, "params": unflatten_dict(base), "adapters": unflatten_dict(trained)}
 
@@ -151,7 +155,7 @@ class LinenAdapter:
 
         def interceptor(run: Next, args: Any, kwargs: Any, context: nn.module.InterceptorContext):
             y = run(*args, **kwargs)
-            if context.method_name == "__call__" and self._kind(context.module):
+            if context.method_name == "__call__" and _is_ours(context.module):
                 visit(context.module, args, kwargs)
             return y
 
@@ -159,10 +163,34 @@ class LinenAdapter:
             _, changed = _apply(self.model, variables, *args, mutable=True, **kwargs)
         return flax.core.unfreeze(changed["params"])
 
+    def kernel_shapes(
+        self, variables: Mapping[str, Any], *args: Any, **kwargs: Any
+    ) -> dict[str, tuple[int, ...]]:
+        """[..., *batch, I, O] by path of each layer that multiplies its input by a kernel.
+
+        Args:
+          variables: of the bare model.
+          *args: as for a call of the model, which tells what its layers do.
+          **kwargs: as for a call of the model.
+        """
+        found: dict[str, tuple[int, ...]] = {}
+
+        def visit(module: nn.Module, args: Any, kwargs: Any) -> None:
+            view = layer_map(module, self.einsums, args, kwargs) if self._kind(module) else None
+            if view is None or view.equation is None:
+                return
+            own = functools.reduce(operator.getitem, module.path, variables["params"])
+            kernel = nn.meta.unbox(own[view.name])  # with the axes of a scanned stack
+            shaped = jax.ShapeDtypeStruct(kernel.shape, kernel.dtype)
+            matrices = functools.partial(to_matrices, view.equation)
+            found["/".join(module.path)] = jax.eval_shape(matrices, shaped).shape
+
+        self._visited(visit, variables, *args, **kwargs)
+        return found
+
     def _kind(self, module: nn.Module) -> type[nn.Module] | None:
         """The known class that a layer of the model is called as."""
-        ours = module.scope is not None and module.scope.has_flag(OURS)
-        return kind(module, self.einsums) if ours else None
+        return kind(module, self.einsums) if _is_ours(module) else None
 
     def _method(self, module: nn.Module) -> tuple[int, Method] | None:
         """The rule that gives the layer an adapter, and its method."""
@@ -173,6 +201,11 @@ class LinenAdapter:
     def _attach(self, record: "_Record", module: nn.Module, args: Any, kwargs: Any) -> None:
         """Puts an adapter among the layer's parameters, if the rules say so."""
         path = "/".join(module.path)
+        if not self._kind(module):
+            own = module.variables.get("params", {})
+            matrices = [n for n, value in own.items() if len(getattr(value, "shape", ())) > 1]
+            record.others |= {path: type(module).__name__} if matrices else {}
+            return
         record.seen.append(path)
         found = self._method(module)
         if found is None or module.has_variable("params", ADAPTER):
@@ -254,11 +287,18 @@ class LinenAdapter:
 
 @dataclasses.dataclass
 class _Record:
-    """What a visit found: rules used, paths of layers, kernels that have an adapter."""
+    """What a visit found: rules used, paths of layers, classes of other modules with matrices by
+    path, kernels that have an adapter."""
 
     used: set[int] = dataclasses.field(default_factory=set)
     seen: list[str] = dataclasses.field(default_factory=list)
+    others: dict[str, str] = dataclasses.field(default_factory=dict)
     kernels: set[tuple[str, ...]] = dataclasses.field(default_factory=set)
+
+
+def _is_ours(module: nn.Module) -> bool:
+    """Whether a module belongs to the model, and not to another that its code applies."""
+    return module.scope is not None and module.scope.has_flag(OURS)
 
 
 def _apply(model: nn.Module, variables: Any, *args: Any, method: Any = None, **kwargs: Any) -> Any:

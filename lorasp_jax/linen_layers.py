@@ -1,41 +1,34 @@
 """What the layers of Linen models do with their kernels, seen from one call of a layer."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from lorasp_jax import layers
 from lorasp_jax.einsum import LINEAR, einsum, from_matrices, general_equation, to_matrices
 from lorasp_jax.peft import Aux, Method
 
-Einsums = Mapping[type[nn.Module], Callable[..., tuple[jax.Array, str, str]]]
-"""By layer class: a function of the layer and the arguments of its call that gives the input, the
-name of the kernel and the equation."""
 
-
-def _dense(_: nn.Module, inputs: jax.Array) -> tuple[jax.Array, str, str]:
-    return inputs, "kernel", LINEAR
-
-
-def _general(layer: Any, inputs: jax.Array) -> tuple[jax.Array, str, str]:
+def _general(layer: Any) -> tuple[str, str]:
     axis, batch, features = (
         (value,) if isinstance(value, int) else tuple(value)
         for value in (layer.axis, layer.batch_dims, layer.features)
     )
-    return inputs, "kernel", general_equation(axis, batch, len(features))
+    return "kernel", general_equation(axis, batch, len(features))
 
 
-def _einsum(layer: Any, inputs: jax.Array, einsum_str: str = "") -> tuple[jax.Array, str, str]:
-    return inputs, "kernel", einsum_str or layer.einsum_str
+EINSUMS: layers.Einsums = {
+    nn.Dense: lambda _: ("kernel", LINEAR),
+    nn.DenseGeneral: _general,
+    nn.Einsum: lambda layer: ("kernel", layer.einsum_str),
+}
 
 
-EINSUMS: Einsums = {nn.Dense: _dense, nn.DenseGeneral: _general, nn.Einsum: _einsum}
-
-
-def kind(module: nn.Module, einsums: Einsums) -> type[nn.Module] | None:
+def kind(module: nn.Module, einsums: layers.Einsums) -> type[nn.Module] | None:
     """The known class that the layer is called as; a subclass with a call of its own has none."""
     known = (nn.Embed, nn.Conv, *EINSUMS, *einsums)
     calls = (cls for cls in known if isinstance(module, cls))
@@ -94,7 +87,7 @@ class LayerMap(NamedTuple):
         return einsum(self.equation, self.x.astype(dtype), kernel, bias, params, method)
 
 
-def layer_map(module: nn.Module, einsums: Einsums, args: Any, kwargs: Any) -> LayerMap:
+def layer_map(module: nn.Module, einsums: layers.Einsums, args: Any, kwargs: Any) -> LayerMap:
     """What a layer of a known kind does in a call with these arguments.
 
     Raises:
@@ -105,8 +98,16 @@ def layer_map(module: nn.Module, einsums: Einsums, args: Any, kwargs: Any) -> La
         return LayerMap(module, "embedding" if known is nn.Embed else "kernel")
     assert known is not None
     layers.check_plain(module)
-    x, name, equation = {**EINSUMS, **einsums}[known](module, *args, **kwargs)
-    return LayerMap(module, name, equation, x)
+    name, equation = layers.described({**EINSUMS, **einsums}[known], module)
+    given = [*args, *kwargs.values()]
+    texts = [value for value in given if isinstance(value, str)]
+    arrays = [value for value in given if isinstance(value, jax.Array | np.ndarray)]
+    if equation is None and not texts:
+        raise ValueError(f"a {known.__name__} was called without the equation it was to get.")
+    if not arrays or not module.has_variable("params", name):
+        lacks = f"parameter {name!r}" if arrays else "input"
+        raise ValueError(f"a {known.__name__} has no {lacks}.")
+    return LayerMap(module, name, equation or texts[0], arrays[0])
 
 
 def with_lora(

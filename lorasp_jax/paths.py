@@ -50,9 +50,9 @@ def layer_places(holder: nnx.List, einsums: layers.Einsums = MappingProxyType({}
     ]
 
 
-def multiplying(holder: nnx.List) -> list[Place]:
+def multiplying(holder: nnx.List, einsums: layers.Einsums = MappingProxyType({})) -> list[Place]:
     """The layers that multiply their input by matrices: dense ones and einsums, adapted or not."""
-    found = layer_places(holder)
+    found = layer_places(holder, einsums)
     return [place for place in found if not isinstance(place.child, nnx.Embed | nnx.Conv)]
 
 
@@ -96,6 +96,42 @@ def governing(rules: Rules, *paths: str) -> int | None:
     """Index of the first rule that matches one of the paths."""
     hits = (i for i, (pattern, _) in enumerate(rules) if any(re.search(pattern, p) for p in paths))
     return next(hits, None)
+
+
+def other_places(holder: nnx.List, einsums: layers.Einsums = MappingProxyType({})) -> list[Place]:
+    """Parameters of two axes or more of modules that no adapter applies to; norms' are no matrices,
+    though a stack gives them an axis."""
+    known = {id(place.child) for place in layer_places(holder, einsums)}
+    return [
+        place
+        for place in places(holder, nnx.Param)
+        if id(place.parent) not in known and len(getattr(place.child.get_value(), "shape", ())) > 1
+        if not isinstance(place.parent, AdaptedLayer) and place.name not in ("scale", "bias")
+    ]
+
+
+def no_match(pattern: str, known: Sequence[str], others: Mapping[str, str]) -> str:
+    """What to say of a rule that applies to nothing.
+
+    Args:
+      pattern: of the rule.
+      known: paths of the layers that adapters apply to.
+      others: class by path of other modules that hold matrices.
+    """
+    text = (
+        f"rule {pattern!r} applies to nothing; layers here: {near_misses(pattern, known) or 'none'}"
+    )
+    if not others:
+        return f"{text}."
+    close = difflib.get_close_matches(pattern, others, n=3, cutoff=0.3) or list(others)[:3]
+    listed = ", ".join(f"{path or 'the model'} ({others[path]})" for path in close)
+    return f"{text}; of other classes: {listed}. {REACHED}."
+
+
+REACHED = (
+    "Where such a class is an einsum of input and parameter, einsums={Class: lambda layer: (name, "
+    "equation)} takes it; FullFineTuning takes all"
+)
 
 
 def near_misses(wanted: str, known: Sequence[str]) -> str:

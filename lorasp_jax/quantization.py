@@ -4,8 +4,8 @@
 
 The kernels of dense layers and einsums shrink to 8 or 4.5 bits a weight, an einsum's with inputs
 flattened; adapters, biases, norms, embeddings and convolutions stay. Everything else works as
-before: gradients reach x and the adapters, adapters are saved alone and can be attached, replaced
-and combined. `merge` gives the layers it merges a whole kernel again, that of the quantised layer
+before: gradients reach x and the adapters, adapters are saved alone and can be attached and
+combined. `merge` gives the layers it merges a whole kernel again, that of the quantised layer
 with the delta added.
 
 Adapters that take a part of a kernel (PiSSA, OLoRA) come first, and what they leave is quantised.

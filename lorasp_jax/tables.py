@@ -1,5 +1,6 @@
 """What an adapted model consists of, as a table, and what its layers reported."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,14 +10,14 @@ from flax import nnx
 from lorasp_jax.adaptation import Counts, count
 from lorasp_jax.dense import KEPT, AdapterAux, AdapterParam
 from lorasp_jax.layers import kernel_of
-from lorasp_jax.paths import layer_places, places
+from lorasp_jax.paths import REACHED, layer_places, other_places, places
 from lorasp_jax.peft import Aux
 
 Row = tuple[str, ...]
 
 
 def summary(model: nnx.Module, aux: Mapping[str, Aux] | None = None) -> str:
-    """A table of the layers and of every other parameter that trains, with totals.
+    """A table of the layers, of every other parameter that trains and every other matrix.
 
     Columns: path, method, kernel shape, rank, parameters (base and adapter), trainable ones, and
     with `aux` the mean active rank. Below it, the share that trains and what is frozen.
@@ -41,7 +42,8 @@ def summary(model: nnx.Module, aux: Mapping[str, Aux] | None = None) -> str:
     widths = [max(len(row[i]) for row in table) for i in range(columns)]
     lines = ["  ".join(_align(row, widths)).rstrip() for row in table]
     rule = "-" * max(map(len, lines))
-    return "\n".join([lines[0], rule, *lines[1:-1], rule, lines[-1], trained_share(model)])
+    below = [lines[-1], trained_share(model), *_others(model)]
+    return "\n".join([lines[0], rule, *lines[1:-1], rule, *below])
 
 
 def trained_share(model: nnx.Module) -> str:
@@ -58,7 +60,7 @@ def trained_share(model: nnx.Module) -> str:
 
 
 def _rows(model: nnx.Module) -> list[Row]:
-    """Of each layer, and of each other parameter that trains."""
+    """Of each layer, each other parameter that trains, and each matrix outside of such layers."""
     holder, rows, inside = nnx.List([model]), [], set()
     for path, _, _, layer in layer_places(holder):
         inside |= {id(v) for v in vars(layer).values() if isinstance(v, nnx.Variable)}
@@ -70,7 +72,20 @@ def _rows(model: nnx.Module) -> list[Row]:
         if id(variable) not in inside:
             counts = Counts(variable.get_value().size, variable.get_value().size)
             rows.append(_row(path, "full", variable.get_value(), "-", counts))
+    for path, _, _, variable in other_places(holder):
+        if not isinstance(variable, AdapterParam):
+            value = variable.get_value()
+            rows.append(_row(path, "-", value, "-", Counts(0, math.prod(value.shape))))
     return rows
+
+
+def _others(model: nnx.Module) -> list[str]:
+    """A line on the classes that adapters do not apply to, if there are matrices in some."""
+    found = other_places(nnx.List([model]))
+    classes = dict.fromkeys(type(place.parent).__name__ for place in found)
+    if not classes:
+        return []
+    return [f"no adapter applies by itself to {', '.join(classes)}. {REACHED}."]
 
 
 def _active_rank(aux: Aux | None) -> str:

@@ -101,7 +101,7 @@ def test_progress_has_no_gradient_and_only_a_moving_target_has_it():
     [
         ({"energy_start": 0.0}, r"energy_target must lie in \(0, 1\], got 0.0"),
         ({"energy_start": 0.5, "energy_share": 0.0}, r"energy_share must lie in \(0, 1\]"),
-        ({"energy_curve": "square"}, "energy_curve must be one of linear, cosine"),
+        ({"energy_curve": "square"}, "energy_curve must be one of 'linear', 'cosine'"),
     ],
 )
 def test_bad_fields(fields, message):

@@ -10,10 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import safetensors.numpy
+from flax import linen as nn
 from flax import nnx
+from flax.traverse_util import flatten_dict, unflatten_dict
 
 from lorasp_jax import adaptation, hugging_face
 from lorasp_jax.dense import Dense
+from lorasp_jax.hugging_face_linen import load_peft_linen
 from lorasp_jax.peft import AdaLoRA, DoRA, LoRA, LoRASP
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -225,7 +228,16 @@ def test_stacks(tmp_path):
         ({"modules_to_save": ["head"]}, r"sets modules_to_save to \['head'\]"),
         ({"use_dora": True}, "adapter of lin.0 lacks lora_magnitude_vector"),
         ({"peft_type": "ADALORA"}, "adapter of lin.0 lacks lora_E"),
-        ({"lora_alpha": 0}, "lacks lora_alpha or init_r, which scale it"),
+        ({"lora_alpha": None}, "lacks lora_alpha or init_r, which scale it"),
+        ({"lora_alpha": 0}, "lora_alpha must be a number other than 0"),
+        ({"lora_alpha": 1e308}, "lora_alpha must be a number other than 0"),
+        ({"lora_alpha": True}, "lora_alpha must be a number"),
+        ({"use_rslora": "x"}, "use_rslora must be true or false, got 'x'"),
+        ({"use_dora": 1}, "use_dora must be true or false, got 1"),
+        ({"alpha_pattern": {"lin.0": "8"}}, "alpha_pattern must be an object of such numbers"),
+        ({"r": 8.5}, "r must be a whole number from 1"),
+        ({"target_modules": 3}, "target_modules must be a text or a list of texts"),
+        ({"bias": 0}, "bias must be a text"),
         ({"init_lora_weights": "pissa"}, "trained on what 'pissa' left of its base"),
     ],
 )
@@ -233,6 +245,97 @@ def test_folders_that_ask_for_more(copy, changes, message):
     edit(copy, **changes)
     with pytest.raises(ValueError, match=message):
         hugging_face.load_peft(copy, Net())
+
+
+class Attention(nnx.Module):
+    """Flax's own attention, whose kernels have axes of heads, and a layer of another class."""
+
+    def __init__(self):
+        self.attn = nnx.MultiHeadAttention(2, 6, decode=False, rngs=nnx.Rngs(0))
+        self.own = Own()
+
+    def __call__(self, x):
+        return self.own(self.attn(x))
+
+
+class Own(nnx.Module):
+    """An einsum of somebody's own."""
+
+    def __init__(self):
+        self.w = nnx.Param(jax.random.normal(jax.random.key(3), (6, 4)))
+
+    def __call__(self, x):
+        return jnp.einsum("...i,io->...o", x, self.w[...])
+
+
+def torch_names(path, index):
+    return "model." + {"attn/query": "q_proj", "attn/out": "out_proj", "own": "head"}.get(
+        path, path
+    )
+
+
+def attention_folder(folder):
+    """As PEFT writes it for torch's [out, in] weights; and the updates [in, out] by module."""
+    rng, tensors, updates = np.random.default_rng(0), {}, {}
+    for name, d_out in (("q_proj", 6), ("out_proj", 6), ("head", 4)):
+        a, b = (rng.normal(size=s).astype(np.float32) for s in ((2, 6), (d_out, 2)))
+        tensors |= {
+            f"base_model.model.model.{name}.lora_{k}.weight": v for k, v in (("A", a), ("B", b))
+        }
+        updates[name] = 2 * (b @ a).T
+    safetensors.numpy.save_file(tensors, folder / hugging_face.TENSORS)
+    config = {"peft_type": "LORA", "lora_alpha": 4, "r": 2}
+    (folder / hugging_face.CONFIG).write_text(json.dumps(config))
+    return updates
+
+
+def test_attention_with_axes_of_heads_and_own_classes(tmp_path):
+    """Kernels [D, N, H] and [N, H, D] are torch's with all heads side by side."""
+    updates, base = attention_folder(tmp_path), Attention()
+    einsums = {Own: lambda layer: ("w", "...i,io->...o")}
+    model = hugging_face.load_peft(tmp_path, base, names=torch_names, einsums=einsums)
+    merged = adaptation.merge(model)
+    changes = {
+        "q_proj": (merged.attn.query.kernel, base.attn.query.kernel),
+        "out_proj": (merged.attn.out.kernel, base.attn.out.kernel),
+        "head": (merged.own.w, base.own.w),
+    }
+    for name, (after, before) in changes.items():
+        change = (after[...] - before[...]).reshape(updates[name].shape)
+        np.testing.assert_allclose(change, updates[name], atol=1e-5)
+    hugging_face.save_peft(tmp_path / "again", model, names=torch_names)
+    ours, theirs = (
+        safetensors.numpy.load_file(folder / hugging_face.TENSORS)
+        for folder in (tmp_path / "again", tmp_path)
+    )
+    assert ours.keys() == theirs.keys()
+    for name, value in theirs.items():
+        np.testing.assert_array_equal(ours[name], value)
+    with pytest.raises(ValueError, match=r"'model.head', which the model lacks; it has model\."):
+        hugging_face.load_peft(tmp_path, base, names=torch_names)
+
+
+def test_linen_attention_takes_the_same_folder(tmp_path):
+    """Its layers are known from a call; outputs are those of merged parameters."""
+
+    class Linen(nn.Module):
+        @nn.compact
+        def __call__(self, x):
+            x = nn.MultiHeadDotProductAttention(2, name="attn")(x)
+            return nn.Dense(4, use_bias=False, name="own")(x)
+
+    updates, x = attention_folder(tmp_path), jax.random.normal(jax.random.key(0), (1, 5, 6))
+    variables = Linen().init(jax.random.key(1), x)
+    adapter, loaded = load_peft_linen(tmp_path, Linen(), variables, x, names=torch_names)
+    by_path = {("attn", "query"): "q_proj", ("attn", "out"): "out_proj", ("own",): "head"}
+    flat = flatten_dict(variables["params"])
+    for path, name in by_path.items():
+        kernel = flat[(*path, "kernel")]
+        flat[(*path, "kernel")] = kernel + updates[name].reshape(kernel.shape)
+    expected = Linen().apply({"params": unflatten_dict(flat)}, x)
+    np.testing.assert_allclose(adapter.apply(loaded, x), expected, rtol=1e-4, atol=1e-4)
+    with pytest.raises(ValueError, match="must be an NNX module, got Linen; see LinenAdapter"):
+        hugging_face.load_peft(tmp_path, Linen())
 
 
 def renamed(tensors):

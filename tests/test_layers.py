@@ -108,8 +108,6 @@ def test_shapes_counts_and_paths(heads):
     assert shapes == {"split": (6, 2), "experts": (2, 3, 2), "join": (6, 2), "blocks": (3, 6, 2)}
     assert adaptation.count(model).trainable == 24 + 2 * 12 + 24 + 3 * 24
     assert set(adaptation.methods(model)) == set(shapes)
-    again = adapted(model, ("split", LoRA(rank=3)), (".*", None))
-    assert again.split.adapter.get_value()["lora_a"].shape == (6, 3)
 
 
 def layers(model):
@@ -227,17 +225,33 @@ class Product(nnx.Module):
         return self.w.get_value().shape[0]
 
 
+WRONG_EINSUMS = [
+    ({Product: lambda layer, x: ("w", x)}, "einsums cannot describe a Product: .* missing 1"),
+    ({Product: lambda layer: ("kernel", "ab,bc->ac")}, "a Product has no parameter 'kernel'"),
+    ({Product: lambda layer: ("w", None)}, "equation of a Product must be known before its call"),
+    ({Product: lambda layer: "w"}, "einsums cannot describe a Product: not enough values"),
+    ([Product], "einsums are {layer class: function of a layer"),
+]
+
+
 @pytest.mark.slow
-def test_layers_described_by_the_user(x):
+def test_layers_described_by_the_user(x, tmp_path):
     product = Product("bd,ndh->nbh", (2, 6, 3), nnx.Rngs(0))
     einsums = {Product: lambda layer: ("w", layer.einsum_str)}
+    for wrong, message in WRONG_EINSUMS:
+        with pytest.raises(ValueError, match=message):
+            adapted(product, ("", SP), einsums=wrong)
+    with pytest.raises(ValueError, match=r"of other classes: the model \(Product\)\. Where such"):
+        adapted(product, ("", SP))
+    assert "no adapter applies by itself to Product" in lorasp_jax.summary(product)
     model = adapted(product, ("", SP), einsums=einsums)
+    save_adapters(tmp_path, model)
+    loaded = load_adapters(tmp_path, product, einsums=einsums)
+    np.testing.assert_array_equal(loaded(x), model(x))
     np.testing.assert_allclose(model(x), product(x), rtol=1e-5, atol=1e-6)
     assert (model.width, isinstance(model, Product)) == (2, True)
     with pytest.raises(ValueError, match="w cannot train in full under the layer's adapter"):
         adapted(product, ("w", FullFineTuning()), ("", LoRA(rank=2)), einsums=einsums)
-    with pytest.raises(ValueError, match="rule '' applies to nothing; layers here: none"):
-        adapted(product, ("", SP))
     free = adapted(product, ("w", FullFineTuning()))
     assert isinstance(free.w, AdapterParam)
 

@@ -57,7 +57,7 @@ def test_rngs(rngs, given):
 
 
 def test_models_of_another_library():
-    with pytest.raises(ValueError, match="got Dense; LinenAdapter takes Linen's"):
+    with pytest.raises(ValueError, match="got Dense; see LinenAdapter for Linen's"):
         lorasp_jax.adapt(nn.Dense(3), [("inp", METHOD)], rngs=nnx.Rngs(0))
     with pytest.raises(ValueError, match="must be an NNX module, got dict"):
         lorasp_jax.adapt({"inp": NET.inp}, [("inp", METHOD)], rngs=nnx.Rngs(0))

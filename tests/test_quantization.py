@@ -160,7 +160,7 @@ def test_rules():
             r"rule 'blcks' governs nothing; dense layers and einsums here: blocks",
         ),
         ([("", "nf4"), ("out", "int8")], "rule 'out' governs nothing"),
-        ([("out", "fp4")], "cannot quantise out: kernels can be int8 or nf4, got 'fp4'"),
+        ([("out", "fp4")], "rule 'out' has 'fp4' where 'int8' or 'nf4' or None belongs"),
         ([("(", "nf4")], r"rule '\(' is no regular expression"),
     ):
         with pytest.raises(ValueError, match=message):

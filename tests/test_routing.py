@@ -123,8 +123,8 @@ def test_usage_counts_valid_tokens(x):
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"score_function": "gelu"}, "score_function must be one of softplus, relu, softmax"),
-        ({"granularity": "batch"}, "granularity must be one of token, sample, layer"),
+        ({"score_function": "gelu"}, "score_function must be one of 'softplus', 'relu', 'softmax'"),
+        ({"granularity": "batch"}, "granularity must be one of 'token', 'sample', 'layer'"),
         ({"router": "softmax", "score_function": "relu"}, "only a 'gelu' router"),
     ],
 )

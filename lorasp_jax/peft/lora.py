@@ -46,11 +46,6 @@ class LoRA(Method):
         super().__post_init__()
         if self.rank < 1:
             raise ValueError(f"rank must be at least 1, got {self.rank}.")
-        if self.initialization not in ("kaiming", "gaussian", *_SPLITS, "eva"):
-            raise ValueError(
-                "initialization must be 'kaiming', 'gaussian', 'pissa', 'olora' or 'eva', got "
-                f"{self.initialization!r}."
-            )
         if self.initialization == "pissa" and self.scale < 0:
             raise ValueError(f"'pissa' takes roots of W / scale: alpha {self.alpha} is negative.")
 

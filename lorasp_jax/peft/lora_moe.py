@@ -51,12 +51,6 @@ class LoRAMoE(Method):
             raise ValueError(
                 f"experts and rank must be at least 1, got {self.experts}, {self.rank}."
             )
-        if self.routing not in ("weighted", "top1"):
-            raise ValueError(f"routing must be 'weighted' or 'top1', got {self.routing!r}.")
-        if self.gate_gradient not in ("hard", "switch"):
-            raise ValueError(
-                f"gate_gradient must be 'hard' or 'switch', got {self.gate_gradient!r}."
-            )
         if self.gate_gradient == "switch" and self.routing != "top1":
             raise ValueError(f"gate_gradient 'switch' needs routing 'top1', got {self.routing!r}.")
 

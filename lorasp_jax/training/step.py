@@ -10,7 +10,7 @@ import optax
 from flax import nnx
 
 from lorasp_jax import adaptation
-from lorasp_jax.auxiliary import Aux, masked_mean
+from lorasp_jax.auxiliary import Aux, auxiliary_losses, masked_mean
 from lorasp_jax.data.batches import Batch
 from lorasp_jax.models import flow_matching
 from lorasp_jax.training import guard as guards
@@ -52,21 +52,6 @@ def init_state(
     average = jax.tree.map(jnp.copy, adapters) if ema else None
     step = jnp.zeros((), jnp.int32)
     return TrainState(step, adapters, optimizer.init(adapters), Guard.initial(), average)
-
-
-def auxiliary_losses(aux: Any) -> Metrics:
-    """Each auxiliary loss averaged over the adapted layers that have it.
-
-    `aux` is any tree of `Aux`; leaves stacked by a scan over depth hold one value a layer.
-    """
-    layers = [a for a in jax.tree.leaves(aux, is_leaf=lambda a: isinstance(a, Aux))]
-    names = sorted({name for layer in layers for name in layer.losses})
-    return {
-        name: jnp.concatenate(
-            [jnp.ravel(layer.losses[name]) for layer in layers if name in layer.losses]
-        ).mean()
-        for name in names
-    }
 
 
 def active_ranks(aux: dict[str, dict[str, Aux]]) -> Metrics:

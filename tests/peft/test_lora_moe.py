@@ -210,8 +210,8 @@ def test_merge_says_what_to_do_instead():
     [
         ({"experts": 0}, "experts and rank must be at least 1, got 0, 32"),
         ({"rank": 0}, "experts and rank must be at least 1, got 4, 0"),
-        ({"routing": "top2"}, "routing must be 'weighted' or 'top1', got 'top2'"),
-        ({"gate_gradient": "soft"}, "gate_gradient must be 'hard' or 'switch', got 'soft'"),
+        ({"routing": "top2"}, "routing must be one of 'weighted', 'top1', got 'top2'"),
+        ({"gate_gradient": "soft"}, "gate_gradient must be one of 'hard', 'switch', got 'soft'"),
         ({"gate_gradient": "switch"}, "'switch' needs routing 'top1', got 'weighted'"),
     ],
 )

@@ -236,7 +236,7 @@ def test_a_broken_router_is_not_hidden(x):
         ({"energy_target": 0.0}, r"energy_target must lie in \(0, 1\], got 0.0"),
         ({"energy_target": 1.5}, r"energy_target must lie in \(0, 1\], got 1.5"),
         ({"rank": 0}, "at least 1"),
-        ({"router": "relu"}, "router must be one of gelu, softmax, linear, got 'relu'"),
+        ({"router": "relu"}, "router must be one of 'gelu', 'softmax', 'linear', got 'relu'"),
         ({"router": "softmax", "hidden_width": 5}, "divisible by its width, got 128 and 5"),
     ],
 )
