@@ -77,7 +77,7 @@ def adapt(
     paths.check_method_rules(rules)
     layers.check_einsums(einsums)
     holder, key = _copy(model), _key(rngs)
-    used = _attach_all(holder, rules, key, einsums, statistics) | _free_all(holder, rules)
+    used = _attach_all(holder, rules, key, einsums, statistics) | free_all(holder, rules)
     for i, (pattern, _) in enumerate(rules):
         if i not in used:
             raise ValueError(_no_match(pattern, holder, einsums))
@@ -233,7 +233,7 @@ def _attach_all(
     return used
 
 
-def _free_all(holder: nnx.List, rules: paths.Rules) -> set[int]:
+def free_all(holder: nnx.List, rules: paths.Rules) -> set[int]:
     """Makes base parameters trainable in place; returns the rules that were used."""
     used, freed = set(), []
     for place in paths.places(holder, nnx.Param):

@@ -4,6 +4,7 @@
 the best one of a smaller rank, with the error that this makes. `unmerge` is the inverse of `merge`.
 """
 
+import re
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ from flax import nnx
 from lorasp_jax import adaptation, layers, named, paths
 from lorasp_jax.adaptation import Model
 from lorasp_jax.dense import AdaptedLayer, AdapterParam
-from lorasp_jax.peft import LoRA
+from lorasp_jax.peft import FullFineTuning, LoRA
 from lorasp_jax.peft.method import Params
 
 
@@ -66,7 +67,8 @@ def unmerge(merged: Model, adapted: nnx.Module) -> Model:
     """The adapted model that `merge` made the merged one of, from the adapters alone.
 
     What they added is subtracted in fp32 and rounded to the kernel's type, so that a kernel comes
-    back up to eps/2 (|W + ΔW| + |W|), entry by entry (eps 1.2e-7 in fp32, 7.8e-3 in bf16).
+    back up to eps/2 (|W + ΔW| + |W|), entry by entry (eps 1.2e-7 in fp32, 7.8e-3 in bf16). Weights
+    that train in full, biases for instance, are those of the adapted model and train again.
 
     Args:
       merged: from `merge`; left untouched.
@@ -74,27 +76,37 @@ def unmerge(merged: Model, adapted: nnx.Module) -> Model:
         `load_adapters(folder, merged, any_base=True)`, unless it holds a part of its kernel.
 
     Raises:
-      ValueError: the merged model has adapters, lacks a layer or has one of another class; or an
+      ValueError: the merged model has adapters, lacks a layer or has one of another class, or an
         adapter that did not just add a constant: DoRA rescaled the kernel, and what it was before
         is not in the result.
     """
-    adapters = named.adapters_by_path("the model to unmerge by", adapted)
+    if named.sets(adapted):
+        raise ValueError("the model to unmerge by has named adapters: extract one of them.")
+    adapters = named.own_adapters(adapted)
+    own = {p.path: p.child.get_value() for p in paths.places(nnx.List([adapted]), AdapterParam)}
+    freed = [path for path in adaptation.methods(adapted) if path not in adapters]
     if has := adaptation.methods(merged):
         raise ValueError(f"{min(has)} of the merged model has an adapter.")
     holder = nnx.List([nnx.merge(*adaptation.split(merged))])
     for place in paths.places(holder, nnx.Module):
         if place.path not in adapters:
             continue
-        own = adapters.pop(place.path)
+        by = adapters.pop(place.path)
         if getattr(place.child, "adapter", None) is not None:
             continue  # it hangs in several places, and it was taken apart at another one
         try:
-            layer = _unmerged(place.child, own)
+            layer = _unmerged(place.child, by)
         except (ValueError, TypeError) as error:
             raise ValueError(f"cannot unmerge {place.path}: {error}") from error
         setattr(place.parent, place.name, layer)
     if adapters:
         raise ValueError(f"the merged model has no layer {min(adapters)}.")
+    full = [(f"^{re.escape(path)}$", FullFineTuning()) for path in freed]
+    for i in set(range(len(full))) - adaptation.free_all(holder, full):
+        raise ValueError(f"the merged model has no parameter {freed[i]}.")
+    for place in paths.places(holder, AdapterParam):
+        if place.path in freed:
+            place.child.set_value(own[place.path])
     return holder[0]
 
 

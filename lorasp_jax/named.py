@@ -204,11 +204,16 @@ def adapters_by_path(name: str, model: nnx.Module) -> Adapters:
     """
     if sets(model):
         raise ValueError(f"{name} has named adapters already: extract one of them.")
-    places = paths.places(nnx.List([model]), AdaptedLayer)
-    found = {p.path: p.child for p in places if isinstance(p.child.adapter, AdapterParam)}
+    found = own_adapters(model)
     if beyond := sorted(adaptation.methods(model).keys() - found.keys()):
         raise ValueError(f"{name} trains {beyond[0]}; only adapters of layers have names.")
     return found
+
+
+def own_adapters(model: nnx.Module) -> Adapters:
+    """The layers with an adapter of their own, by path."""
+    places = paths.places(nnx.List([model]), AdaptedLayer)
+    return {p.path: p.child for p in places if isinstance(p.child.adapter, AdapterParam)}
 
 
 def _check_same(one: nnx.Module, name: str, two: nnx.Module, other: str) -> None:

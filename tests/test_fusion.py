@@ -125,6 +125,18 @@ def test_unmerge_by_a_file(tmp_path):
     assert_close(back.blocks.kernel.get_value(), NET.blocks.kernel.get_value())
 
 
+def test_unmerge_what_also_trains_in_full():
+    """Biases come back as what they are: trained, and training."""
+    rules = [("bias|out", FullFineTuning()), ("blocks", LoRA(rank=2))]
+    model = trained(*rules, seed=4)
+    back = lorasp_jax.unmerge(lorasp_jax.merge(model), model)
+    assert adaptation.methods(back) == adaptation.methods(model)
+    assert_close(call(back, X), call(model, X))
+    assert_close(back.blocks.kernel.get_value(), NET.blocks.kernel.get_value())
+    with pytest.raises(ValueError, match="the merged model has no parameter "):
+        lorasp_jax.unmerge(nnx.Dict(blocks=lorasp_jax.merge(model).blocks), model)
+
+
 def test_what_does_not_unmerge():
     model = trained(("blocks", LoRA(rank=2)), seed=4)
     merged = lorasp_jax.merge(model)
@@ -132,7 +144,6 @@ def test_what_does_not_unmerge():
         (DoRA(rank=2), r"cannot unmerge blocks: DoRA.* did not just add"),
         (SP, "cannot unmerge blocks: LoRA-SP chooses its directions per input"),
         (LoRAMoE(experts=2, rank=2), "cannot unmerge blocks: LoRA-MoE's delta depends"),
-        (FullFineTuning(), "the model to unmerge by trains blocks/bias"),
     ):
         with pytest.raises(ValueError, match=message):
             lorasp_jax.unmerge(merged, trained(("blocks", method), seed=4))
