@@ -11,6 +11,7 @@ import json
 import math
 import pathlib
 import re
+import reprlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -51,15 +52,15 @@ def read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter]]:
         raise ValueError(f"{folder / CONFIG} is damaged or no PEFT adapter: {error}") from error
     tensors = read_tensors(folder / TENSORS, (folder / TENSORS).read_bytes())
     if kind not in ("LORA", "ADALORA"):
-        raise ValueError(f"{folder} holds {kind}; LORA and ADALORA can be loaded.")
+        raise ValueError(f"{folder} holds {str(kind)[:40]}; LORA and ADALORA can be loaded.")
     if asked := [name for name in _UNKNOWN if config.get(name) not in _NOTHING]:
         raise ValueError(
-            f"{folder} sets {asked[0]} to {config[asked[0]]!r}, which is not supported."
+            f"{folder} sets {asked[0]} to {reprlib.repr(config[asked[0]])}, which is not supported."
         )
     if (start := config.get("init_lora_weights")) not in _WHOLE_BASE:
         raise ValueError(
-            f"{folder} was trained on what {start!r} left of its base: save it in PEFT with "
-            "path_initial_model_for_weight_conversion, which makes a plain LoRA of it."
+            f"{folder} was trained on what {reprlib.repr(start)} left of its base: save it in PEFT "
+            "with path_initial_model_for_weight_conversion, which makes a plain LoRA of it."
         )
     modules: dict[str, Adapter] = collections.defaultdict(dict)
     for name, tensor in tensors.items():
@@ -161,4 +162,4 @@ def _check(config: Mapping[str, Any]) -> None:
         for name in names:
             value = config.get(name)
             if value is not None and not fits(value):
-                raise ValueError(f"{name} must be {words}, got {value!r}")
+                raise ValueError(f"{name} must be {words}, got {reprlib.repr(value)}")

@@ -30,8 +30,8 @@ VARIANTS = [
 IDS = ["default", "sample", "softmax", "normalized", "release"]
 
 
-def noisy(model, seed=0):
-    """All adapters moved off their start, scores unlike each other."""
+def noisy(model, seed=0, size=1.0):
+    """All adapters moved off their start, scores unlike each other; `size` is of their deltas."""
     for i, place in enumerate(paths.places(nnx.List([model]), Dense)):
         if place.child.adapter is not None:
             params = place.child.adapter.get_value()
@@ -40,6 +40,7 @@ def noisy(model, seed=0):
             pairs = zip(keys, leaves, strict=True)
             moved = [p if p.ndim < 1 else p + jax.random.normal(k, p.shape) for k, p in pairs]
             params = jax.tree.unflatten(structure, moved)
+            params["bank"]["u"] *= size
             if "gain" in params["bank"]:
                 params["bank"]["gain"] += 0.3
             place.child.adapter = AdapterParam(params)
@@ -47,8 +48,11 @@ def noisy(model, seed=0):
 
 
 def model_of(method, seed=0):
+    """Of deltas about as large as what they are added to: with far larger ones three blocks and
+    heads make a thousand times as much of the rounding of the first."""
     net = Net(nnx.Rngs(0))
-    return noisy(adaptation.adapt(net, [("blocks|heads", method)], rngs=nnx.Rngs(1)), seed)
+    model = adaptation.adapt(net, [("blocks|heads", method)], rngs=nnx.Rngs(1))
+    return noisy(model, seed, size=0.1)
 
 
 @pytest.fixture(scope="module")
