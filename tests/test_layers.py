@@ -274,8 +274,8 @@ def test_what_cannot_be_adapted(heads, vision, tmp_path):
         adapted(exact, ("", LoRA(rank=2)))
     with pytest.raises(ValueError, match="applies to nothing"):  # called differently, so unknown
         adapted(Scaled(2, 3, rngs=nnx.Rngs(0)), ("", LoRA(rank=2)))
-    with pytest.raises(ValueError, match="split is no dense layer: it cannot be in a PEFT folder"):
-        save_peft(tmp_path, adapted(heads, ("split", LoRA(rank=2))))
+    with pytest.raises(ValueError, match="embed is neither dense nor an einsum: it cannot be in a"):
+        save_peft(tmp_path, adapted(vision, ("embed", LoRA(rank=2))))
     with pytest.raises(ValueError, match="an adapted layer takes no out_sharding"):
         adapted(heads, ("split", SP)).split(jnp.ones((1, 6)), out_sharding=object())
 
