@@ -11,7 +11,7 @@ import json
 import os
 import pathlib
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -23,11 +23,10 @@ from flax import nnx
 
 from lorasp_jax import adaptation, layers, paths
 from lorasp_jax.adapter_io import write_whole
-from lorasp_jax.dense import AdaptedLayer
-from lorasp_jax.peft import AdaLoRA, DoRA, LoRA
+from lorasp_jax.dense import AdaptedLayer, AdapterParam
+from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA
 from lorasp_jax.peft_folders import CONFIG, PREFIX, TENSORS, Adapter, read
-
-Names = Callable[[str, tuple[int, ...]], str]
+from lorasp_jax.peft_whole import Names, exported_whole, whole_parameters
 
 
 def dotted(path: str, index: tuple[int, ...]) -> str:
@@ -50,12 +49,14 @@ def load_peft(
 ) -> adaptation.Model:
     """The model with the adapters of a folder of Hugging Face PEFT.
 
-    They go to dense layers and einsums, `nnx.MultiHeadAttention`'s among them, whose kernels stand
-    for torch's with all heads side by side. AdaLoRA comes as the LoRA that it has become. Zeros
-    make up for different ranks in a stack.
+    Biases and modules that the folder trained in full (`bias`, `modules_to_save`) train in full
+    here, too. Adapters go to dense layers and einsums, `nnx.MultiHeadAttention`'s among them, whose
+    kernels stand for torch's with all heads side by side. AdaLoRA comes as the LoRA that it has
+    become. Zeros make up for different ranks in a stack.
 
     Args:
-      folder: with adapter_config.json and adapter_model.safetensors.
+      folder: with adapter_config.json and adapter_model.safetensors; or a repository on the hub,
+        hf://owner/name, of which only these two files are fetched.
       model: left untouched; adapters that it has elsewhere than the folder stay.
       names: module of the layer at a path and an index in its stack, () outside of stacks.
       einsums: as for `adapt`.
@@ -69,8 +70,12 @@ def load_peft(
         place.path: layers.matrices_shape(place.child, einsums)
         for place in paths.multiplying(holder, einsums)
     }
-    rules, values = matched(folder, shapes, names)
+    sizes = {p.path: p.child.get_value().shape for p in paths.places(holder, nnx.Param)}
+    rules, values, whole = matched(folder, shapes, sizes, names)
     adapted = adaptation.adapt(model, rules, rngs=nnx.Rngs(0), einsums=einsums)
+    for place in paths.places(nnx.List([adapted]), AdapterParam):
+        if place.path in whole:
+            place.child.set_value(jnp.asarray(whole[place.path]))
     for place in paths.places(nnx.List([adapted]), AdaptedLayer):
         if place.path in values:
             place.child.adapter.set_value(jax.tree.map(jnp.asarray, values[place.path]))
@@ -78,20 +83,25 @@ def load_peft(
 
 
 def matched(
-    folder: str | os.PathLike, shapes: Mapping[str, Sequence[int]], names: Names
-) -> tuple[paths.Rules, dict[str, Adapter]]:
-    """The rules and, by path, the parameters that give a model the adapters of a folder.
+    folder: str | os.PathLike,
+    shapes: Mapping[str, Sequence[int]],
+    sizes: Mapping[str, Sequence[int]],
+    names: Names,
+) -> tuple[paths.Rules, dict[str, Adapter], Adapter]:
+    """The rules that give a model what is in a folder, and by path the parameters of its adapters
+    and those that it trained in full.
 
     Args:
       folder: as for `load_peft`.
       shapes: by path of a layer, [..., I, O] of its kernel matrices.
+      sizes: by path of a parameter, its shape.
       names: as for `load_peft`.
 
     Raises:
       ValueError: as for `load_peft`.
     """
-    folder = pathlib.Path(folder)
-    config, modules = read(folder)
+    folder = _at_hand(folder)
+    config, modules, full = read(folder)
     kind = DoRA if config.get("use_dora") else LoRA
     left, known, rules, values = dict(modules), [], [], {}
     for path, (*leading, d_in, d_out) in shapes.items():
@@ -108,7 +118,19 @@ def matched(
         rank = values[path]["lora_a"].shape[-1]
         rules.append((f"^{re.escape(path)}$", kind(rank=rank, alpha=scale * rank)))
     _check_used(folder, modules, left, known)
-    return rules, values
+    whole = whole_parameters(folder, full, shapes, sizes, names)
+    # Of a layer with an adapter the bias may train in full: such rules go first.
+    free = [(f"^{re.escape(path)}$", FullFineTuning()) for path in whole]
+    return [*free, *rules], values, whole
+
+
+def _at_hand(folder: str | os.PathLike) -> pathlib.Path:
+    """The folder on this machine; only what begins with hf:// is asked of the hub."""
+    if "://" not in os.fspath(folder):
+        return pathlib.Path(folder)
+    from lorasp_jax.models import places  # with all backbones, which nothing else here needs
+
+    return places.local(folder, only=[CONFIG, TENSORS])
 
 
 def save_peft(
@@ -120,7 +142,8 @@ def save_peft(
 
     Args:
       folder: made if absent; an adapter in it is replaced.
-      model: adapted by LoRA and AdaLoRA, or by DoRA, and nothing else.
+      model: adapted by LoRA and AdaLoRA, or by DoRA; what trains in full, too, becomes PEFT's
+        `bias` and `modules_to_save`.
       names: as for `load_peft`.
       base: what the folder says of its base model.
 
@@ -129,7 +152,8 @@ def save_peft(
     """
     modules: dict[str, tuple[float, Adapter]] = {}
     kinds = set()
-    known = {path for path, method in adaptation.methods(model).items() if _is_known(path, method)}
+    methods = adaptation.methods(model).items()
+    known = {p for p, method in methods if not method.trains_base and _is_known(p, method)}
     for place in paths.places(nnx.List([model]), AdaptedLayer):
         if place.path in known:
             if isinstance(place.child, layers.LoRALayer):
@@ -147,11 +171,12 @@ def save_peft(
         for module, (_, adapter) in modules.items()
         for name, value in adapter.items()
     }
-    data = safetensors.numpy.save(tensors, {"format": "pt"})
+    whole, said = exported_whole(model, known, names)
+    data = safetensors.numpy.save(tensors | whole, {"format": "pt"})
     folder = pathlib.Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / TENSORS, data)
-    text = json.dumps(_config(modules, dora=kinds.pop(), base=base), indent=2)
+    text = json.dumps(_config(modules, dora=kinds.pop(), base=base) | said, indent=2)
     write_whole(folder / CONFIG, text.encode())
 
 

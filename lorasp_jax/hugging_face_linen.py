@@ -43,11 +43,15 @@ def load_peft_linen(
     """
     bare = LinenAdapter(model, [(".*", None)], einsums)
     shapes = bare.kernel_shapes(variables, *args, **kwargs)
-    rules, values = matched(folder, shapes, names)
+    flat: dict[Any, Any] = {**flatten_dict(variables["params"])}
+    sizes = {"/".join(path): jnp.shape(parameter) for path, parameter in flat.items()}
+    rules, values, whole = matched(folder, shapes, sizes, names)
     adapter = LinenAdapter(model, rules, einsums)
     attached = adapter.attach(jax.random.key(0), variables, *args, **kwargs)
     trained: dict[Any, Any] = {**flatten_dict(attached["adapters"])}
     for path, params in values.items():
         for name, value in params.items():
             trained[(*filter(None, path.split("/")), ADAPTER, name)] = jnp.asarray(value)
+    for path, value in whole.items():
+        trained[tuple(path.split("/"))] = jnp.asarray(value)
     return adapter, attached | {"adapters": unflatten_dict(trained)}

@@ -25,6 +25,7 @@ PREFIX = "base_model.model."
 _TENSOR = re.compile(
     rf"{re.escape(PREFIX)}(.+)\.(lora_A|lora_B|lora_E|lora_magnitude_vector)(\.weight)?"
 )
+_WHOLE = re.compile(rf"{re.escape(PREFIX)}(.+?)(\.base_layer)?\.(weight|bias)")
 _ADA_CONSTANT = 1e-5  # AdaLoRA's scale is α/(r + this)
 # What a folder may ask for beyond its tensors, and the values that ask for nothing.
 _NOTHING = (None, False, [], {}, "none")
@@ -32,15 +33,18 @@ _NOTHING = (None, False, [], {}, "none")
 # LoftQ) A and B belong to what was left of the base.
 _WHOLE_BASE = (None, True, False, "gaussian", "orthogonal", "eva", "mica")
 _UNKNOWN = (
-    "bias", "lora_bias", "modules_to_save", "fan_in_fan_out", "layer_replication", "use_qalora",
-    "target_parameters", "trainable_token_indices", "use_bdlora", "alora_invocation_tokens",
+    "lora_bias", "fan_in_fan_out", "layer_replication", "use_qalora", "target_parameters",
+    "trainable_token_indices", "use_bdlora", "alora_invocation_tokens",
 )  # fmt: skip
 
 Adapter = dict[str, np.ndarray]
+Whole = dict[tuple[str, str], np.ndarray]
+"""What trains in full, by module and "weight" or "bias", in torch's layout."""
 
 
-def read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter]]:
-    """The configuration, and by module lora_A, lora_B in our layout, the scale among them."""
+def read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter], Whole]:
+    """The configuration, by module lora_A, lora_B in our layout, the scale among them, and biases
+    and modules that were trained in full."""
     for name in (CONFIG, TENSORS):
         if not (folder / name).is_file():
             raise ValueError(f"{folder} holds no {name}; a PEFT adapter is a folder with both.")
@@ -62,15 +66,25 @@ def read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter]]:
             f"{folder} was trained on what {reprlib.repr(start)} left of its base: save it in PEFT "
             "with path_initial_model_for_weight_conversion, which makes a plain LoRA of it."
         )
-    modules: dict[str, Adapter] = collections.defaultdict(dict)
+    modules, whole = collections.defaultdict(dict), {}
     for name, tensor in tensors.items():
-        if not (match := _TENSOR.fullmatch(name)):
+        if match := _TENSOR.fullmatch(name):
+            modules[match[1]][match[2]] = tensor.astype(np.float32)
+        elif (match := _WHOLE.fullmatch(name)) and _trains(config, match[1], match[3]):
+            whole[match[1], match[3]] = tensor.astype(np.float32)
+        else:
             raise ValueError(f"{folder} holds {name!r}, which belongs to no LoRA.")
-        modules[match[1]][match[2]] = tensor.astype(np.float32)
     try:
-        return config, {name: _imported(config, name, found) for name, found in modules.items()}
+        imported = {name: _imported(config, name, found) for name, found in modules.items()}
+        return config, imported, whole
     except (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, re.error) as error:
         raise ValueError(f"{folder} is no PEFT adapter that can be read: {error}") from error
+
+
+def _trains(config: Mapping[str, Any], module: str, kind: str) -> bool:
+    """Whether a folder may hold a whole weight or bias."""
+    saved = any(f".{name}." in f".{module}." for name in config.get("modules_to_save") or ())
+    return saved or (kind == "bias" and config.get("bias") in ("all", "lora_only"))
 
 
 def _imported(config: Mapping[str, Any], module: str, found: Adapter) -> Adapter:
@@ -141,7 +155,11 @@ _KINDS: dict[str, tuple[Callable[[Any], bool], tuple[str, ...]]] = {
     ),
     "a text": (
         lambda value: isinstance(value, str),
-        ("peft_type", "base_model_name_or_path", "bias", "revision", "task_type"),
+        ("peft_type", "base_model_name_or_path", "revision", "task_type"),
+    ),
+    "'none', 'all' or 'lora_only'": (
+        lambda value: value in ("none", "all", "lora_only"),
+        ("bias",),
     ),
     "a text or a list of texts": (
         lambda value: isinstance(value, str) or _are_texts(value),

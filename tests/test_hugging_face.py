@@ -224,8 +224,7 @@ def test_stacks(tmp_path):
     ("changes", "message"),
     [
         ({"peft_type": "LOHA"}, "holds LOHA; LORA and ADALORA can be loaded"),
-        ({"bias": "all"}, "sets bias to 'all', which is not supported"),
-        ({"modules_to_save": ["head"]}, r"sets modules_to_save to \['head'\]"),
+        ({"lora_bias": True}, "sets lora_bias to True, which is not supported"),
         ({"use_dora": True}, "adapter of lin.0 lacks lora_magnitude_vector"),
         ({"peft_type": "ADALORA"}, "adapter of lin.0 lacks lora_E"),
         ({"lora_alpha": None}, "lacks lora_alpha or init_r, which scale it"),
@@ -237,7 +236,7 @@ def test_stacks(tmp_path):
         ({"alpha_pattern": {"lin.0": "8"}}, "alpha_pattern must be an object of such numbers"),
         ({"r": 8.5}, "r must be a whole number from 1"),
         ({"target_modules": 3}, "target_modules must be a text or a list of texts"),
-        ({"bias": 0}, "bias must be a text"),
+        ({"bias": 0}, "bias must be 'none', 'all' or 'lora_only', got 0"),
         ({"init_lora_weights": "pissa"}, "trained on what 'pissa' left of its base"),
     ],
 )

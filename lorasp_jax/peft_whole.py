@@ -1,0 +1,99 @@
+"""Biases and modules that Hugging Face PEFT trains in full, and how its folders hold them.
+
+`bias` "all" and "lora_only" free biases: those of layers with an adapter are named
+<module>.base_layer.bias, others <module>.bias. `modules_to_save` frees whole modules, whose weights
+are in torch's layout, a dense layer's [out, in].
+"""
+
+import math
+import pathlib
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from flax import nnx
+
+from lorasp_jax import paths
+from lorasp_jax.dense import AdapterParam, Dense
+from lorasp_jax.peft_folders import PREFIX, Adapter, Whole
+
+Names = Callable[[str, tuple[int, ...]], str]
+_TORCH_NAMES = {"kernel": "weight", "embedding": "weight", "scale": "weight", "bias": "bias"}
+
+
+def whole_parameters(
+    folder: pathlib.Path,
+    full: Whole,
+    shapes: Mapping[str, Sequence[int]],
+    sizes: Mapping[str, Sequence[int]],
+    names: Names,
+) -> Adapter:
+    """By path, the parameters that a folder trained in full, in the model's layout.
+
+    Raises:
+      ValueError: one that the model lacks or has in another shape.
+    """
+    found, left = {}, dict(full)
+    for path, size in sizes.items() if full else ():
+        module, _, name = path.rpartition("/")
+        kind = _TORCH_NAMES.get(name, "")
+        leading = tuple(shapes[module][:-2]) if module in shapes else ()
+        wanted = [(names(module, index), kind) for index in np.ndindex(*leading)]
+        parts = [left.pop(key) for key in wanted if key in left]
+        if not parts:
+            continue
+        if len(parts) < len(wanted):
+            raise ValueError(f"{folder} holds {kind} of only some layers of the stack {module}.")
+        value = np.stack([part.T if name == "kernel" else part for part in parts])
+        rows = value.shape[1:] if name == "kernel" else (value[0].size,)
+        own = tuple(size[len(leading) :])
+        if rows != (own if name == "kernel" else (math.prod(own),)):
+            raise ValueError(f"{folder} holds {path} as {rows}, the model as {own}.")
+        found[path] = value.reshape(tuple(size))
+    if left:
+        module, kind = min(left)
+        raise ValueError(f"{folder} holds the {kind} of {module!r}, which the model lacks.")
+    return found
+
+
+def exported_whole(
+    model: nnx.Module, adapted: Collection[str], names: Names
+) -> tuple[Adapter, dict[str, Any]]:
+    """Tensors of what trains in full in a model, by PEFT's name, and what its config says of them.
+
+    Raises:
+      ValueError: a parameter that PEFT has no counterpart for.
+    """
+    places = [p for p in paths.places(nnx.List([model]), nnx.Param) if p.name != "adapter"]
+    free = [place for place in places if isinstance(place.child, AdapterParam)]
+    saved = {_module(place) for place in free if place.name != "bias"}
+    biases = {_module(place) for place in free} - saved
+    tensors: Adapter = {}
+    for place in places:
+        module = _module(place)
+        if module in saved or place in free:
+            middle = ".base_layer" if module in adapted else ""
+            for index, value in _parts(place):
+                name = f"{names(module, index)}{middle}.{_TORCH_NAMES[place.name]}"
+                tensors[PREFIX + name] = value
+    stems = {name.removeprefix(PREFIX).rpartition(".")[0] for name in tensors}
+    kept = sorted(stem for stem in stems if f"{PREFIX}{stem}.weight" in tensors)
+    bias = "none" if not biases else "lora_only" if biases <= set(adapted) else "all"
+    return tensors, {"bias": bias, "modules_to_save": kept or None}
+
+
+def _module(place: paths.Place) -> str:
+    return place.path.rpartition("/")[0]
+
+
+def _parts(place: paths.Place) -> list[tuple[tuple[int, ...], np.ndarray]]:
+    """Index in a stack and value in torch's layout, of each layer that shares a parameter."""
+    value = np.asarray(place.child.get_value(), np.float32)
+    dense = isinstance(place.parent, nnx.Linear | Dense)
+    if place.name not in _TORCH_NAMES or (place.name == "kernel" and not dense):
+        raise ValueError(f"{place.path} trains in full, which a PEFT folder cannot hold.")
+    leading = place.parent.kernel.get_value().shape[:-2] if dense else ()
+    parts = [(index, value[index]) for index in np.ndindex(*leading)]
+    return [
+        (i, np.ascontiguousarray(part.T if place.name == "kernel" else part)) for i, part in parts
+    ]
