@@ -7,6 +7,7 @@ import pytest
 
 from lorasp_jax.evaluation import Result
 from lorasp_jax.evaluation.callback import success, summarise
+from lorasp_jax.training.run_folder import read_json, write_json
 from tests.runs import make_run
 
 RANKS = {"vision": {"fc1": [4.0, 6.0]}, "language": {}, "action": {"q_proj": [1.0]}}
@@ -20,7 +21,7 @@ def result(rate, ranks):
 def test_summary(tmp_path):
     run = make_run(tmp_path / "run")
     before = {task: success(result(0.1, {})) for task in run.config.tasks}
-    (run.folder / "before.json").write_text(json.dumps(before))
+    write_json(run.folder / "before.json", before)
     with run.timed("train"):
         pass
     after = {"press": result(0.9, RANKS), "pick_place": result(0.5, RANKS)}
@@ -42,10 +43,10 @@ def test_time_adds_up_over_processes(tmp_path):
     run = make_run(tmp_path / "run")
     with pytest.raises(KeyboardInterrupt), run.timed("train"):
         raise KeyboardInterrupt
-    (run.folder / "seconds.json").write_text(json.dumps({"train": 100.0, "total": 200.0}))
+    write_json(run.folder / "seconds.json", {"train": 100.0, "total": 200.0})
     again = make_run(tmp_path / "run")
     with again.timed("train"):
         pass
-    recorded = json.loads((run.folder / "seconds.json").read_text())
+    recorded = read_json(run.folder / "seconds.json")
     assert 100 < recorded["train"] < 110
     assert 200 < recorded["total"] < 260

@@ -105,7 +105,7 @@ def test_a_streamed_run_on_eight_devices(tmp_path, monkeypatch):
 
 def prepare(folder, monkeypatch, source, room=2**40):
     model = Pi0Config.dummy().create(nnx.Rngs(0))
-    monkeypatch.setattr(setup, "base_model", lambda _: (model, ""))
+    monkeypatch.setattr(setup, "base_model", lambda *_, **__: (model, ""))
     monkeypatch.setattr(preflight, "available_bytes", lambda: room)
     evaluation = dataclasses.replace(CONFIG.evaluation, execute_steps=1)
     data = DataConfig(source=str(source))

@@ -107,7 +107,10 @@ PROGRAMS = {
     "method": CONFIG + "def get_config(scale): return Config(name='a', scale=scale, peft='lora')",
     "part": GET.format("", "optim={'steps': 3}"),
 }
-FIELDS = {"rank": "rank must be int, got '8'", "alpha": "alpha must be float | None, got '8'"}
+FIELDS = {
+    "rank": "rank must be int, got '8'",
+    "alpha": "alpha must be a finite number or None, got '8'",
+}
 FIELDS |= {"method": "peft must be Method", "part": "optim must be OptimConfig"}
 FIELDS |= {"text for a number": "learning_rate must be a finite number"}
 

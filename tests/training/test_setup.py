@@ -44,7 +44,9 @@ def config(monkeypatch):
     """No simulation, and the dummy backbone."""
     worlds = world(*random_episodes("", 0).instructions)
     monkeypatch.setattr(setup.envs, "make", lambda *_, **__: worlds)
-    monkeypatch.setattr(setup, "base_model", lambda _: (Pi0Config.dummy().create(nnx.Rngs(0)), ""))
+    monkeypatch.setattr(
+        setup, "base_model", lambda *_, **__: (Pi0Config.dummy().create(nnx.Rngs(0)), "")
+    )
     monkeypatch.setattr(
         setup, "demonstrations", lambda c, *_: {t: random_episodes(t, 0) for t in c.tasks}
     )
@@ -100,7 +102,7 @@ def test_policies_of_lerobot_are_fed_as_they_say(config, tmp_path, monkeypatch):
     assert found.config.inputs == inputs.OPENPI
     two_arms = dataclasses.replace(inputs.OURS, delta=(True,) * 14)
     found = dataclasses.replace(Pi0Config.dummy(), inputs=two_arms).create(nnx.Rngs(0))
-    monkeypatch.setattr(setup, "base_model", lambda _: (found, ""))
+    monkeypatch.setattr(setup, "base_model", lambda *_, **__: (found, ""))
     with pytest.raises(ValueError, match="said of 14 numbers, the robot has 7"):
         setup.prepare(config, tmp_path, Console(file=io.StringIO()), time.perf_counter())
 

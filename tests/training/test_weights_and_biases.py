@@ -1,13 +1,13 @@
 """What Weights & Biases is sent, by a module in its place."""
 
 import contextlib
-import json
 import sys
 from types import SimpleNamespace
 
 import pytest
 
 import train
+from lorasp_jax.training.run_folder import write_json
 from lorasp_jax.training.weights_and_biases import WeightsAndBiases
 from tests.runs import CONFIG
 from tests.test_train import MULTITASK
@@ -48,7 +48,7 @@ def test_a_run_and_its_continuation(fake, tmp_path):
     folder = tmp_path / "test"
     folder.mkdir()
     run = SimpleNamespace(folder=folder, config=CONFIG)
-    (folder / "before.json").write_text(json.dumps({"press": {"success": 0.25}}))
+    write_json(folder / "before.json", {"press": {"success": 0.25}})
     with contextlib.suppress(KeyboardInterrupt), WeightsAndBiases("arms", CONFIG, folder) as first:
         assert list(folder.iterdir()) == [folder / "before.json"]  # nothing to lose yet
         first.on_start(run)
@@ -57,7 +57,7 @@ def test_a_run_and_its_continuation(fake, tmp_path):
     with WeightsAndBiases("arms", CONFIG, folder) as callback:
         callback.on_log(run, 2, {"loss": 0.4})
         results = {"tasks": {"press": {"before": {}, "after": {"success": 0.75}}}}
-        (folder / "results.json").write_text(json.dumps(results))
+        write_json(folder / "results.json", results)
         callback.on_end(run)
     assert [(b["project"], b["id"], b["name"]) for b in fake.begun] == [
         ("arms", None, "test"),
