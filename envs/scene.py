@@ -1,5 +1,9 @@
 """The MuJoCo scene of a task: table, cameras and light, the same for every robot and task."""
 
+import contextlib
+import warnings
+from collections.abc import Iterator
+
 import mujoco
 import numpy as np
 
@@ -70,9 +74,23 @@ _SIDE_EYE, _SIDE_TARGET = (0.76, -0.49, 0.42), (0.34, 0.0, 0.065)  # m
 
 def build(objects: str, robot: Robot) -> mujoco.MjModel:
     """The model of a robot, base at the origin, at a table z = 0 with a task's objects on it."""
-    spec = mujoco.MjSpec.from_string(mjcf(objects, robot))
-    robot.body.attach(robot, spec)
-    return spec.compile()
+    with warnings_of_python():
+        spec = mujoco.MjSpec.from_string(mjcf(objects, robot))
+        robot.body.attach(robot, spec)
+        return spec.compile()
+
+
+@contextlib.contextmanager
+def warnings_of_python() -> Iterator[None]:
+    """MuJoCo's own go to a file in the working folder."""
+    before, said = mujoco.get_mju_user_warning(), []
+    mujoco.set_mju_user_warning(said.append)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+    for text in said:
+        warnings.warn(f"MuJoCo says: {' '.join(text.split())}", stacklevel=3)
 
 
 def mjcf(objects: str, robot: Robot) -> str:

@@ -1,15 +1,14 @@
 """Finding an arm, its hand and its actuators in a MuJoCo model, and saying what is missing."""
 
-import contextlib
 import os
-import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
+from envs import scene
 from envs.mjcf import sources
 
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
@@ -55,7 +54,7 @@ def read(
     except (SyntaxError, RecursionError, OSError) as error:  # the first: of XML
         raise ValueError(f"MuJoCo cannot read it: {error}") from error
     try:
-        with _warnings_of_python():
+        with scene.warnings_of_python():
             spec = mujoco.MjSpec.from_file(str(path))
             spec.memory = -1  # as MuJoCo likes: nothing of the file itself is ever simulated
             # Bodies and geoms keep their numbers.
@@ -63,19 +62,6 @@ def read(
             return spec, spec.compile()
     except ValueError as error:
         raise ValueError(f"MuJoCo cannot read it: {error}") from error
-
-
-@contextlib.contextmanager
-def _warnings_of_python() -> Iterator[None]:
-    """MuJoCo's own go to a file in the working folder."""
-    before, said = mujoco.get_mju_user_warning(), []
-    mujoco.set_mju_user_warning(said.append)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(before)
-    for text in said:
-        warnings.warn(f"MuJoCo says: {text}", stacklevel=2)
 
 
 def find_arm(model: mujoco.MjModel) -> Arm:

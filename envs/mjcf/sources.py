@@ -4,6 +4,7 @@ MuJoCo looks for a file in several places: beside the main file, beside the one 
 element, and below meshdir, texturedir and assetdir from there. Whatever lies in any of them counts.
 """
 
+import graphlib
 import itertools
 import math
 import os
@@ -17,6 +18,8 @@ from envs.files import check_memory, read_text, regular
 _FOLDERS = ("assetdir", "meshdir", "texturedir")  # attributes of compiler
 _DESCRIPTIONS = ("include", "model")  # elements that name another description
 _MOST_COPIES, _MOST_ENTRIES, _MOST_PLACES = 10_000, 10**6, 10**5
+_ENTRIES = {"dim", "num", "nsample"}  # attributes of sensors and actuators
+_MOST_RINGS = 300  # of a mesh that MuJoCo makes, whose vertices are as many squared
 _BYTES = ("memory", "nstack")  # attributes of size that `reading` leaves out
 _PIXEL_BYTES = 4
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -45,7 +48,23 @@ def _all_descriptions(path: Path, folder: Path) -> dict[Path, ElementTree.Elemen
             text = read_text(each, folder if known else None)
             known[each] = ElementTree.fromstring(text)  # whose parser bounds what entities become
         new = [p for p in _named(known, main, _DESCRIPTIONS) if p not in known]
+    _check_circles(known, main)
     return known
+
+
+def _check_circles(descriptions: dict[Path, ElementTree.Element], main: Path) -> None:
+    """Raises a ValueError if a description holds itself: MuJoCo would end this process."""
+    held: dict[Path, set[Path]] = {}
+    for path, root in descriptions.items():
+        names = [_portable(e.get("file", "")) for e in root.iter() if e.tag in _DESCRIPTIONS]
+        homes = (main, path.parent)
+        held[path] = {
+            Path(os.path.normpath(home / name)) for home in homes for name in names if name
+        }
+    try:
+        graphlib.TopologicalSorter(held).prepare()
+    except graphlib.CycleError as error:
+        raise ValueError(f"{error.args[1][0]} holds itself, by its includes and models") from None
 
 
 def _named(
@@ -79,11 +98,18 @@ def _check_sizes(element: ElementTree.Element, copies: float) -> None:
     copies *= math.prod(_numbers(element, "count"))
     grid = math.prod([*_numbers(element, "nrow"), *_numbers(element, "ncol")])
     picture = math.prod([*_numbers(element, "width"), *_numbers(element, "height")])
+    counted = element.attrib.keys() & _ENTRIES
     if element.tag == "size":
-        numbers = [_numbers(element, name) for name in element.attrib.keys() - set(_BYTES)]
-        entries = max(itertools.chain(*numbers), default=0)
-        if entries > _MOST_ENTRIES:
-            raise ValueError(f"its size has {entries:g} of something; at most are {_MOST_ENTRIES}")
+        counted = element.attrib.keys() - set(_BYTES)
+    if element.tag == "numeric":
+        counted = {"size"}
+    entries = max(itertools.chain(*(_numbers(element, name) for name in counted)), default=0)
+    if entries > _MOST_ENTRIES:
+        raise ValueError(
+            f"its {element.tag} has {entries:g} of something; at most are {_MOST_ENTRIES}"
+        )
+    if max(_numbers(element, "params"), default=0) > _MOST_RINGS:
+        raise ValueError(f"its {element.tag} is finer than {_MOST_RINGS} rings of vertices")
     if copies > _MOST_COPIES:
         raise ValueError(f"{element.tag} makes {copies:g} copies; at most are {_MOST_COPIES}")
     check_memory(int(min(_PIXEL_BYTES * max(grid, picture), 1e30)), f"its {element.tag}")

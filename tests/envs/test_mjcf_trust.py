@@ -8,6 +8,7 @@ import pytest
 
 from envs import mjcf
 from envs.mjcf import reading, sources
+from tests.envs.user_arm import write
 
 _MESH = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
 
@@ -123,6 +124,15 @@ def test_pipes(name, robots):
             "its texture would take",
         ),
         ('<asset><texture name="t" type="2d" file="t.png"/></asset>', "", "t.png would take"),
+        (
+            '<asset><mesh name="m" builtin="cone" params="1000000000 1"/></asset>',
+            "",
+            "its mesh is finer",
+        ),
+        ('<sensor><user dim="500000000"/></sensor>', "", "its user has 5e+08 of something"),
+        ('<custom><numeric name="n" size="500000000"/></custom>', "", "its numeric has 5e+08"),
+        ('<asset><model name="m" file="x.xml"/></asset>', "", "x.xml holds itself"),
+        ('<asset><model name="m" file="circle.xml"/></asset>', "", "holds itself"),
         ("<a>" * 5000 + "</a>" * 5000, "", "MuJoCo cannot read it"),
         ("".join(f'<compiler meshdir="{i}"/><mesh file="{i}"/>' for i in range(999)), "", "more"),
         ("<!DOCTYPE x>&nothing;", "", "MuJoCo cannot read it"),
@@ -131,6 +141,8 @@ def test_pipes(name, robots):
 def test_sizes(asset, body, sentence, robots):
     head = b"\x89PNG\r\n\x1a\n" + b"\0\0\0\rIHDR" + struct.pack(">2I", 2**31 - 1, 2**31 - 1)
     (robots / "robot" / "t.png").write_bytes(head)
+    circle = '<mujoco><include file="x.xml"/></mujoco>'
+    (robots / "robot" / "circle.xml").write_text(circle)
     with pytest.raises(ValueError, match=re.escape(sentence)):
         reading.read(model(robots, asset, body=body))
 
@@ -147,7 +159,7 @@ def test_each_file_is_read_once(robots, monkeypatch):
     for name, other in (("b", "c"), ("c", "b")):
         text = f'<mujoco><include file="{other}.xml"/></mujoco>'
         (robots / "robot" / f"{name}.xml").write_text(text)
-    with pytest.raises(ValueError, match="MuJoCo cannot read it"):
+    with pytest.raises(ValueError, match="holds itself"):
         reading.read(model(robots, '<include file="b.xml"/>', body=""))
     assert len(count) == 3
 
@@ -160,3 +172,11 @@ def test_warnings_are_of_python(robots, monkeypatch):
     with pytest.warns(UserWarning, match="MuJoCo says: XML contains a 'NaN'"):
         reading.read(path)
     assert sorted(robots.rglob("*")) == sorted([*before, path])
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_no_log_in_the_working_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = write(tmp_path, ("</mujoco>", '<size nuser_body="3"/></mujoco>'))
+    mjcf.load(path)
+    assert os.listdir(tmp_path) == ["arm.xml"]
