@@ -24,8 +24,11 @@ def said(what: str) -> Iterator[None]:
     Args:
         what: what is compiled, in words.
     """
+    config = jax.config
+    kept = config.jax_enable_compilation_cache and config.jax_compilation_cache_dir is not None
     begun = time.monotonic()
-    line = threading.Timer(PATIENCE, _say, [f"compiling {what} ..."])
+    once = " (long the first time only)" if kept else ""
+    line = threading.Timer(PATIENCE, _say, [f"compiling {what}{once} ..."])
     line.daemon = True
     line.start()
     try:
@@ -34,8 +37,6 @@ def said(what: str) -> Iterator[None]:
         line.cancel()
     seconds = time.monotonic() - begun
     if seconds > PATIENCE:
-        config = jax.config
-        kept = config.jax_enable_compilation_cache and config.jax_compilation_cache_dir is not None
         hint = "" if kept else "; envs.compilation_cache.enable() keeps it for the next start"
         _say(f"compiled {what} in {seconds:.0f} s{hint}")
 

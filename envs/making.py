@@ -11,7 +11,7 @@ import envs.distractors
 from envs import checks, fast_cpu, mjcf, physics, render, scene
 from envs.actions import MODES, TARGET_DT, Mode
 from envs.env import Env
-from envs.names import names
+from envs.names import check, names
 from envs.physics import Backend
 from envs.rewards import REWARDS, Reward
 from envs.robots import Robot
@@ -141,6 +141,5 @@ def _find_robot(robot: AnyRobot) -> Robot:
 
 
 def _find(kind: str, name: str) -> Any:
-    if name not in names(kind):
-        raise ValueError(f"unknown {kind} {name!r}: choose from {', '.join(names(kind))}")
+    check(kind, name)
     return getattr(importlib.import_module(f"envs.{kind}s.{name}"), kind.upper())

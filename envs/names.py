@@ -8,3 +8,9 @@ def names(kind: str) -> list[str]:
     """The names of all of a kind, task or robot."""
     folder = Path(__file__).parent / f"{kind}s"
     return sorted(module.name for module in pkgutil.iter_modules([str(folder)]))
+
+
+def check(kind: str, name: str) -> None:
+    """Raise ValueError, listing the known names, unless there is a task or robot of this name."""
+    if name not in names(kind):
+        raise ValueError(f"unknown {kind} {name!r}: choose from {', '.join(names(kind))}")

@@ -1,18 +1,22 @@
 """What a command says of what it cannot use: one sentence, while our own mistakes keep a traceback.
 
 Bad input raises ValueError everywhere in the project. A file that cannot be opened, read or written
-and memory that does not suffice are the machine's.
+and memory that does not suffice are the machine's. Who stops reading has nothing to be told.
 """
 
 import errno
 import os
+import select
 
 from rich.console import Console
 
 REFUSED = 2
 """Exit code after bad input."""
+UNREAD = 141
+"""Exit code after the reader of what is printed left, as shells have it of SIGPIPE."""
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Numbers of the errors of a write for which there is no room."""
+_STDOUT = 1
 
 
 def refused(error: Exception, errors: Console, remedy: str = "") -> int:
@@ -26,6 +30,8 @@ def refused(error: Exception, errors: Console, remedy: str = "") -> int:
     Returns:
         The exit code.
     """
+    if isinstance(error, BrokenPipeError) and _reader_left():
+        return UNREAD
     if (reason := sentence(error, remedy)) is None:
         raise error
     # A name on the command line need not be text.
@@ -47,6 +53,18 @@ def sentence(error: Exception, remedy: str = "") -> str | None:
         return _line(error)
     named = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
     return f"{named}{error.strerror}{remedy if error.errno in DISK_FULL else ''}"
+
+
+def _reader_left() -> bool:
+    """Whether nobody reads what this process prints, which is then dropped."""
+    poll = select.poll()
+    poll.register(_STDOUT, select.POLLOUT)
+    if not any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0)):
+        return False
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, _STDOUT)  # Python tries once more at its end, and complains
+    os.close(nowhere)
+    return True
 
 
 def _exhausted(error: Exception) -> bool:

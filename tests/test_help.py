@@ -1,5 +1,6 @@
 """What `--help` prints needs nothing that is slow to import or to start."""
 
+import os
 import re
 import subprocess
 import sys
@@ -45,13 +46,52 @@ else:
 """
 
 
+def assert_light(found):
+    assert re.search(r"^slow:$", found.stdout, re.MULTILINE), found.stdout.splitlines()[-1]
+
+
+def run(arguments):
+    program = PROGRAM.format(slow=SLOW, arguments=arguments)
+    return subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_is_light(name):
     arguments, option = COMMANDS[name]
-    program = PROGRAM.format(slow=SLOW, arguments=arguments)
-    found = subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False
-    )
+    found = run(arguments)
     assert found.returncode == 0, found.stderr
     assert option in found.stdout
-    assert re.search(r"^slow:$", found.stdout, re.MULTILINE), found.stdout.splitlines()[-1]
+    assert_light(found)
+
+
+@pytest.mark.parametrize("option", ["--tasks", "--robot"])
+def test_an_unknown_name_is_refused_before_slow_imports(option):
+    parse = "from lorasp_jax.training.overrides import parse; parse"
+    named = f"['--config', 'configs/multitask.py', '--scale', 'smoke', '{option}', 'juggle']"
+    program = PROGRAM.partition("sys.argv")[0].format(slow=SLOW)
+    found = subprocess.run(
+        [sys.executable, "-c", f"{program}\n{parse}({named})"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "'juggle': choose from" in found.stderr
+    assert_light(found)
+
+
+def test_a_reader_that_leaves_is_told_nothing():
+    reading, writing = os.pipe()
+    os.close(reading)
+    found = subprocess.run(
+        [sys.executable, "train.py", "--help"],
+        cwd=ROOT,
+        stdout=writing,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+    )
+    os.close(writing)
+    assert (found.returncode, found.stderr) == (141, "")

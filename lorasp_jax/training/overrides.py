@@ -15,6 +15,7 @@ from typing import Any, Literal
 import jax
 import tyro
 
+from envs.names import check
 from lorasp_jax import peft
 from lorasp_jax.config import SCALES, Config
 from lorasp_jax.peft import LoRASP
@@ -46,7 +47,8 @@ def parse(arguments: Sequence[str]) -> Command:
     """What `arguments` ask for.
 
     Raises:
-        ValueError: an unknown config, scale, method or field, or a value that does not fit.
+        ValueError: an unknown config, scale, method, field, task or robot, or a value that does
+            not fit.
         SystemExit: help was asked for and printed.
     """
     parser = _parser()
@@ -74,7 +76,9 @@ def parse(arguments: Sequence[str]) -> Command:
         config = dataclasses.replace(config, peft=_switch(config.peft, known.method))
     if known.resume and known.dry_run:
         raise ValueError("a run is either resumed or tried dry: leave --resume or --dry-run out")
-    return Command(override(config, rest), known.resume, known.dry_run, known.wandb)
+    config = override(config, rest)
+    _check_simulated(config)
+    return Command(config, known.resume, known.dry_run, known.wandb)
 
 
 def _parser(method: str = "") -> argparse.ArgumentParser:
@@ -192,6 +196,19 @@ def _check_names(arguments: Sequence[str], config: Config) -> None:
             close = difflib.get_close_matches(name, fields + others, n=1, cutoff=0.5)
             hint = f": did you mean {close[0]}?" if close else f": fields are {' '.join(fields)}"
             raise ValueError(f"unknown option {name}{hint}")
+
+
+def _check_simulated(config: Config) -> None:
+    """Raise ValueError for an unknown task or robot, before what simulates them is imported.
+
+    A dataset says its own.
+    """
+    if config.data.source:
+        return
+    for task in config.tasks:
+        check("task", task)
+    if not config.robot.endswith(".xml"):  # a user's own
+        check("robot", config.robot)
 
 
 def _sentence(message: str) -> str:

@@ -11,7 +11,12 @@ from envs import compiling
 
 @pytest.fixture
 def impatient(monkeypatch):
+    """Where nothing is kept for the next start."""
     monkeypatch.setattr(compiling, "PATIENCE", 0.05)
+    before = jax.config.jax_enable_compilation_cache
+    jax.config.update("jax_enable_compilation_cache", False)
+    yield
+    jax.config.update("jax_enable_compilation_cache", before)
 
 
 def test_long_work_is_said_while_it_goes_on(impatient, capsys):
@@ -19,6 +24,14 @@ def test_long_work_is_said_while_it_goes_on(impatient, capsys):
         time.sleep(0.3)
         assert capsys.readouterr() == ("", "compiling the world ...\n")
     assert capsys.readouterr().err.startswith("compiled the world in 0 s")
+
+
+def test_where_programs_are_kept_it_is_long_the_first_time_only(impatient, capsys):
+    jax.config.update("jax_enable_compilation_cache", True)
+    with compiling.said("the world"):
+        time.sleep(0.3)
+    told = "compiling the world (long the first time only) ...\ncompiled the world in 0 s\n"
+    assert capsys.readouterr().err == told
 
 
 def test_short_work_is_not_said(capsys):
