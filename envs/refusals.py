@@ -14,6 +14,8 @@ REFUSED = 2
 """Exit code after bad input."""
 UNREAD = 141
 """Exit code after the reader of what is printed left, as shells have it of SIGPIPE."""
+LONGEST = 1000
+"""Characters of a reason that are said."""
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Numbers of the errors of a write for which there is no room."""
 _STDOUT = 1
@@ -73,4 +75,6 @@ def _exhausted(error: Exception) -> bool:
 
 
 def _line(error: Exception) -> str:
-    return " ".join(str(error).split())
+    """Its text on one line, of a long one the two ends: it quotes what may be a whole file."""
+    text = " ".join(str(error).split())
+    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"

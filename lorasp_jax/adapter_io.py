@@ -210,6 +210,18 @@ def write_whole(path: pathlib.Path, data: bytes) -> None:
     temporary.replace(path)
 
 
+def read_whole(path: pathlib.Path) -> bytes:
+    """The bytes of a file.
+
+    Raises:
+      ValueError: it has more than this machine's memory.
+    """
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if (size := path.stat().st_size) > memory:
+        raise ValueError(f"{path} has {size} bytes, more than this machine's memory")
+    return path.read_bytes()
+
+
 def read_tensors(path: pathlib.Path, data: bytes) -> dict[str, np.ndarray]:
     """The tensors in a safetensors file's bytes, by name.
 
@@ -233,7 +245,7 @@ def _read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     for name in (DESCRIPTION, TENSORS):
         if not (folder / name).is_file():
             raise ValueError(f"{folder} holds no {name}; an adapter is a folder with both files.")
-    data = (folder / TENSORS).read_bytes()
+    data = read_whole(folder / TENSORS)
     description = read_description(folder)
     if description["sha256"] != hashlib.sha256(data).hexdigest():
         raise ValueError(f"{folder / TENSORS} is damaged or belongs to another {DESCRIPTION}.")
@@ -248,7 +260,7 @@ def read_description(folder: pathlib.Path) -> dict[str, Any]:
     """
     path = folder / DESCRIPTION
     try:
-        found = json.loads(path.read_bytes())
+        found = json.loads(read_whole(path))
         known = (found["format"], found["version"]) == (FORMAT, VERSION)
         if known:
             found = digest.unsealed(found)

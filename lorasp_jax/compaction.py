@@ -7,6 +7,7 @@ that LoRA-SP works on, dense or einsum; an einsum's batch axes count as those of
 
 import dataclasses
 import functools
+import numbers
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -63,8 +64,8 @@ def prune(
     Raises:
       ValueError: a tolerance outside [0, 1), or a model without LoRA-SP.
     """
-    if not 0 <= tolerance < 1:
-        raise ValueError(f"tolerance must lie in [0, 1), got {tolerance}.")
+    if not (isinstance(tolerance, numbers.Real) and 0 <= tolerance < 1):
+        raise ValueError(f"tolerance must lie in [0, 1), got {tolerance!r:.80}.")
     layers = _lora_sp_layers(model)
     sums = calibration.observe(model, batches, dict.fromkeys(layers, _usage), forward)
     changed: Changed = {}
@@ -101,8 +102,8 @@ def distill(
     Raises:
       ValueError: a rank below 1, or a model without LoRA-SP.
     """
-    if rank is not None and rank < 1:
-        raise ValueError(f"rank must be at least 1, got {rank}.")
+    if rank is not None and not (type(rank) is int and rank >= 1):
+        raise ValueError(f"rank must be a whole number, at least 1, or None, got {rank!r:.80}.")
     layers = _lora_sp_layers(model)
     sums = calibration.observe(model, batches, dict.fromkeys(layers, _regression), forward)
     changed: Changed = {}

@@ -70,7 +70,8 @@ def load_peft(
         place.path: layers.matrices_shape(place.child, einsums)
         for place in paths.multiplying(holder, einsums)
     }
-    sizes = {p.path: p.child.get_value().shape for p in paths.places(holder, nnx.Param)}
+    parameters = [p for p in paths.places(holder, nnx.Param) if p.name != "adapter"]
+    sizes = {place.path: place.child.get_value().shape for place in parameters}
     rules, values, whole = matched(folder, shapes, sizes, names)
     adapted = adaptation.adapt(model, rules, rngs=nnx.Rngs(0), einsums=einsums)
     for place in paths.places(nnx.List([adapted]), AdapterParam):

@@ -7,6 +7,8 @@ from typing import Any
 
 LARGEST_REAL = (2 - 2**-23) * 2.0**127
 """Largest number of fp32."""
+LONGEST = 300
+"""Characters that are quoted of a value."""
 LARGEST = 2**31 - 1
 """Largest whole number that arrays and their sizes take everywhere."""
 
@@ -30,9 +32,14 @@ def check_fields(owner: Any, prefix: str = "") -> None:
             continue
         value = getattr(owner, name)
         if not _fits(value, kind):
-            raise ValueError(f"{prefix}{name} must be {_called(kind)}, got {value!r}")
+            raise ValueError(f"{prefix}{name} must be {_called(kind)}, got {_shown(value)}")
         if type(value) is int and abs(value) > most.get(name, LARGEST):
             raise ValueError(f"{prefix}{name} must be at most {most[name]}, got {value}")
+
+
+def _shown(value: Any) -> str:
+    """It on one line, cut where it is long: it may be a model or a file."""
+    return " ".join(repr(value).split())[:LONGEST]
 
 
 def _fits(value: Any, kind: Any) -> bool:

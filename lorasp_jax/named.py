@@ -13,6 +13,8 @@ array has the batch's axis too). One adapter alone is `extract(model, "pour")`, 
 `lorasp_jax.adapter_set` has the maths.
 """
 
+import math
+import numbers
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias, TypeGuard
 
@@ -27,7 +29,7 @@ from lorasp_jax.adapter_set import AdapterChoice, AdapterSet, NamedAdapters, emp
 from lorasp_jax.dense import AdaptedLayer, AdapterParam
 from lorasp_jax.paths import Place
 from lorasp_jax.peft import LoRA, Method
-from lorasp_jax.peft.method import Params
+from lorasp_jax.peft.method import LARGEST_SIZE, Params
 
 One: TypeAlias = str | Mapping[str, float] | None
 Adapters: TypeAlias = dict[str, AdaptedLayer]
@@ -49,8 +51,10 @@ def combine(models: Mapping[str, Model], *, rank: int | None = None) -> Model:
       ValueError: no models, another base, a base weight that trains, an adapter that holds a part
         of its kernel, or a LoRA that exceeds `rank`.
     """
-    if not models:
-        raise ValueError("there are no models to combine.")
+    if not isinstance(models, Mapping) or not models:
+        raise ValueError("models to combine are a mapping by name, and at least one.")
+    if rank is not None and not (type(rank) is int and 0 <= rank <= LARGEST_SIZE):
+        raise ValueError(f"rank must be a whole number up to {LARGEST_SIZE} or None, got {rank!r}.")
     known = tuple(models)
     bases = {name: bare(model) for name, model in models.items()}
     adapters = {name: adapters_by_path(name, model) for name, model in models.items()}
@@ -97,8 +101,14 @@ def weights(model: nnx.Module, choice: One | Sequence[One] | jax.Array | np.ndar
         found = choice
     elif choice is None or isinstance(choice, str | Mapping):
         found = np.array(_row(known, choice))
-    else:
+    elif isinstance(choice, Sequence) and all(
+        one is None or isinstance(one, str | Mapping) for one in choice
+    ):
         found = np.array([_row(known, one) for one in choice])
+    else:
+        raise ValueError(
+            f"a choice is a name, weights by name, None, or a list of these, got {choice!r:.80}."
+        )
     size = len(known)
     if found.ndim not in (1, 2) or found.shape[-1] != size or found.dtype.kind != "f":
         raise ValueError(
@@ -286,13 +296,15 @@ def _row(known: tuple[str, ...], one: One) -> list[float]:
     row = [0.0] * len(known)
     chosen = {one: 1.0} if isinstance(one, str) else one or {}
     for name, weight in chosen.items():
-        row[index_of(known, name)] = weight
+        if not isinstance(weight, numbers.Real) or not math.isfinite(weight):
+            raise ValueError(f"the weight of {name!r} must be a finite number, got {weight!r:.80}.")
+        row[index_of(known, name)] = float(weight)
     return row
 
 
 def index_of(known: tuple[str, ...], name: str) -> int:
     """The place of a name; raises a ValueError that lists near misses for an unknown one."""
     if name not in known:
-        close = paths.near_misses(name, known)
+        close = paths.near_misses(str(name), known)
         raise ValueError(f"there is no adapter {name!r}; the model has {close}.")
     return known.index(name)

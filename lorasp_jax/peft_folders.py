@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from lorasp_jax.adapter_io import read_tensors
+from lorasp_jax.adapter_io import read_tensors, read_whole
 from lorasp_jax.peft.method import LARGEST_ALPHA, LARGEST_SIZE
 
 CONFIG, TENSORS = "adapter_config.json", "adapter_model.safetensors"
@@ -49,12 +49,12 @@ def read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter], Whol
         if not (folder / name).is_file():
             raise ValueError(f"{folder} holds no {name}; a PEFT adapter is a folder with both.")
     try:
-        config = json.loads((folder / CONFIG).read_bytes())
+        config = json.loads(read_whole(folder / CONFIG))
         kind = config["peft_type"]
         _check(config)
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{folder / CONFIG} is damaged or no PEFT adapter: {error}") from error
-    tensors = read_tensors(folder / TENSORS, (folder / TENSORS).read_bytes())
+    tensors = read_tensors(folder / TENSORS, read_whole(folder / TENSORS))
     if kind not in ("LORA", "ADALORA"):
         raise ValueError(f"{folder} holds {str(kind)[:40]}; LORA and ADALORA can be loaded.")
     if asked := [name for name in _UNKNOWN if config.get(name) not in _NOTHING]:

@@ -1,6 +1,7 @@
 """Adapters on disk: round trips for every method, and files that do not fit."""
 
 import json
+import os
 
 import jax
 import jax.numpy as jnp
@@ -174,3 +175,10 @@ def test_a_failed_save_keeps_the_old_adapter(saved):
     with pytest.raises(TypeError):
         save_adapters(saved, adapted((".*", SP), seed=5), metadata={"bad": object()})
     assert {path.name: path.read_bytes() for path in saved.iterdir()} == before
+
+
+@pytest.mark.parametrize("name", ["adapter.json", "adapter.safetensors"])
+def test_a_file_beyond_any_memory(saved, name):
+    os.truncate(saved / name, 2**43)
+    with pytest.raises(ValueError, match=f"{name} has 8796093022208 bytes, more than"):
+        load_adapters(saved, Net(nnx.Rngs(0)))

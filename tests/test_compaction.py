@@ -251,7 +251,7 @@ def test_scores_that_do_not_depend_on_the_input_distill_exactly(batches):
     ("act", "message"),
     [
         (functools.partial(lorasp_jax.prune, tolerance=1.0), r"tolerance must lie in \[0, 1\)"),
-        (functools.partial(lorasp_jax.distill, rank=0), "rank must be at least 1, got 0"),
+        (functools.partial(lorasp_jax.distill, rank=0), "at least 1, or None, got 0"),
     ],
 )
 def test_bad_arguments(act, message, batches):

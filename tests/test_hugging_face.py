@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -393,3 +394,19 @@ def test_what_cannot_be_written(rules, message, tmp_path):
     with pytest.raises(ValueError, match=message):
         hugging_face.save_peft(tmp_path / "new", model)
     assert not (tmp_path / "new").exists()
+
+
+def test_adapters_elsewhere_stay():
+    fresh = hugging_face.load_peft(FOLDER, Net())
+    (other,) = {"lin/0", "lin/1", "lin/2"} - adaptation.methods(fresh).keys()
+    model = adaptation.adapt(Net(), [(other, LoRA(rank=3))], rngs=nnx.Rngs(1))
+    loaded = hugging_face.load_peft(FOLDER, model)
+    expected = adaptation.methods(model) | adaptation.methods(fresh)
+    assert adaptation.methods(loaded) == expected
+
+
+@pytest.mark.parametrize("name", ["adapter_config.json", "adapter_model.safetensors"])
+def test_a_file_beyond_any_memory(copy, name):
+    os.truncate(copy / name, 2**43)
+    with pytest.raises(ValueError, match=f"{name} has 8796093022208 bytes, more than"):
+        hugging_face.load_peft(copy, Net())

@@ -131,3 +131,25 @@ def test_a_rank_beyond_the_kernel_that_is_split(initialization):
 def test_methods_are_found_by_name():
     with pytest.raises(ValueError, match=r"lora_sp has no field 'energy_targt' \(did you mean"):
         peft.create("lora_sp", energy_targt=0.9)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda m: lorasp_jax.combine([m]), "are a mapping by name"),
+        (lambda m: lorasp_jax.combine({"a": m}, rank=2.5), "rank must be a whole number up to"),
+        (lambda m: lorasp_jax.combine({"a": m}, rank=-1), "or None, got -1"),
+        (lambda m: lorasp_jax.choose(lorasp_jax.combine({"a": m}), 3), "a choice is a name"),
+        (
+            lambda m: lorasp_jax.choose(lorasp_jax.combine({"a": m}), {"a": float("nan")}),
+            "the weight of 'a' must be a finite number, got nan",
+        ),
+        (lambda m: lorasp_jax.extract(lorasp_jax.combine({"a": m}), 3), "there is no adapter 3"),
+        (lambda m: lorasp_jax.prune(m, [], "x"), "tolerance must lie in [0, 1), got 'x'"),
+        (lambda m: lorasp_jax.distill(m, [], 2.5), "must be a whole number, at least 1, or None"),
+    ],
+)
+def test_several_adapters_and_smaller_ones(call, message):
+    model = lorasp_jax.adapt(NET, [("inp", METHOD)], rngs=nnx.Rngs(0))
+    with pytest.raises(ValueError, match=re.escape(message)):
+        call(model)

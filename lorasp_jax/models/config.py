@@ -6,6 +6,9 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any, Literal, Self
 
+import jax.numpy as jnp
+
+from lorasp_jax import kinds
 from lorasp_jax.models.inputs import OURS, InputConfig
 from lorasp_jax.models.tokenizer import VOCABULARY_SIZE
 
@@ -173,9 +176,12 @@ class BackboneConfig:
         """The config of `dataclasses.asdict`, also after JSON.
 
         Raises:
-            TypeError, KeyError: missing or unknown fields.
+            TypeError, KeyError: missing or unknown fields, or types of arrays that there are not.
+            ValueError: values of other kinds than the fields'.
         """
-        inputs = fields.get("inputs", {})
+        inputs = fields.get("inputs", {}) if isinstance(fields, dict) else None
+        if not isinstance(inputs, dict):
+            raise TypeError("a config and its inputs are objects")
         parts = {
             "vision": VisionConfig(**fields["vision"]),
             "language": ExpertConfig(**fields["language"]),
@@ -183,4 +189,9 @@ class BackboneConfig:
             "cameras": tuple(fields["cameras"]),
             "inputs": InputConfig(**{**inputs, "delta": tuple(inputs.get("delta", ()))}),
         }
-        return cls(**{**fields, **parts})
+        config = cls(**{**fields, **parts})
+        kinds.check_fields(config)
+        kinds.check_fields(config.inputs, "inputs.")
+        for name in (config.dtype, config.param_dtype):
+            jnp.dtype(name)  # raises TypeError
+        return config

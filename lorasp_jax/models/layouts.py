@@ -8,6 +8,7 @@ refused before it is rearranged: as many values would fit into other heads, too.
 from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 Shape = tuple[int, ...]
@@ -99,6 +100,7 @@ def read(
 
     Raises:
         OtherModelError: a leaf is missing, some are left over, or one has another shape.
+        ValueError: a leaf is not of finite real numbers.
     """
     missing = [name for rule in rules for name in rule.theirs if name not in theirs]
     unexpected = theirs.keys() - {name for rule in rules for name in rule.theirs}
@@ -111,6 +113,8 @@ def read(
         if array.shape != shape:
             found = f"{whose} has {name} of shape {array.shape}"
             raise OtherModelError(f"{found}, the model needs {shape}.")
+        if not jnp.issubdtype(array.dtype, jnp.floating) or not np.isfinite(array).all():
+            raise ValueError(f"{whose} has {name} of numbers that are not real or not finite.")
         return array
 
     found: dict[str, Any] = {}

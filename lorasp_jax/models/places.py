@@ -18,6 +18,9 @@ HUB = "hf://"
 """How a repository on the hub begins, as in hf://owner/name."""
 REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 """A repository's id on the hub, owner/name."""
+BUCKET = re.compile(r"(gs|s3|memory)://[\w.-]+(/[\w.+=@-]+)*/?")
+"""A folder or file in a bucket: other URLs may be anything, a web page or a file of this machine's.
+In memory (fsspec's) are those of tests."""
 LEFT_OUT = ("train_state/*", "*.bin", "*.pt", "*.pth", "*.onnx", "*.gguf", "*.msgpack", "*.h5")
 """What nothing here reads: optimizer states, and the same weights for other libraries."""
 
@@ -38,12 +41,14 @@ def local(
         repository: what kind of repository on the hub.
 
     Raises:
-        ValueError: it is not there, or cannot be reached.
+        ValueError: it is not there, cannot be reached, or is another kind of URL.
     """
     name, path = os.fspath(where), Path(where)
     if name.startswith(HUB):
         return _from_hub(name.removeprefix(HUB), only, repository)
     if "://" in name:
+        if not BUCKET.fullmatch(name) or ".." in name.split("/"):
+            raise ValueError(f"{name} is no folder in a bucket: that is gs://bucket/folder.")
         return _from_bucket(name)
     for found in (path, ROOT / path) if _is_shipped(path) else (path,):
         if os.path.exists(found):  # Path.exists raises where a name is too long

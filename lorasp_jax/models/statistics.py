@@ -126,7 +126,8 @@ def checked(both: Mapping[str, Mapping[str, np.ndarray]], whose: str) -> Statist
     """Statistics of what was read, "state" and "action" each by name.
 
     Raises:
-        ValueError: nothing of one of them, different lengths, or numbers that are not finite.
+        ValueError: nothing of one of them, different lengths, numbers that are not finite, or
+            a standard deviation below 0.
     """
     arrays = [array for known in both.values() for array in known.values()]
     unknown = sorted({name for known in both.values() for name in known} - set(NAMES))
@@ -138,6 +139,8 @@ def checked(both: Mapping[str, Mapping[str, np.ndarray]], whose: str) -> Statist
         )
     if not all(np.isfinite(array).all() for array in arrays):
         raise ValueError(f"statistics in {whose} are not finite: they were never set.")
+    if any((known.get("std", np.zeros(1)) < 0).any() for known in both.values()):
+        raise ValueError(f"statistics in {whose} have a standard deviation below 0.")
     state, action = (
         {name: jnp.asarray(array, jnp.float32) for name, array in both[kind].items()}
         for kind in ("state", "action")

@@ -91,12 +91,15 @@ def load(where: str | os.PathLike[str]) -> Tokenizer:
     """
     from lorasp_jax.models import places
     from lorasp_jax.models.tokenizer_files import SentencePiece, TokenizersFile
+    from lorasp_jax.models.untrusted import TEXT_BYTES
 
     if not os.fspath(where):
         return Offline()
     path = places.local(where, only=["tokenizer.json", "*.model"])
     files = [path] if path.is_file() else [*path.glob("tokenizer.json"), *path.glob("*.model")]
     for file in files:
+        if file.is_file() and file.stat().st_size > TEXT_BYTES:
+            raise ValueError(f"{file} is no tokenizer: it has more than {TEXT_BYTES} bytes.")
         if file.is_file() and file.suffix in (".json", ".model"):
             return (TokenizersFile if file.suffix == ".json" else SentencePiece)(file)
     raise ValueError(f"{where} holds no tokenizer.json and no .model of SentencePiece.")

@@ -30,8 +30,28 @@ def read_text(path: Path) -> str:
         OSError: it must not be read.
         ValueError: it is a pipe or the like, too large, or no UTF-8.
     """
+    return read_bytes(path).decode()
+
+
+def read_bytes(path: Path) -> bytes:
+    """What is in a file of text.
+
+    Raises:
+        FileNotFoundError: there is none.
+        OSError: it must not be read.
+        ValueError: it is a pipe or the like, or too large.
+    """
     if path.exists() and not path.is_file():
         raise ValueError("it is no file")
     if path.stat().st_size > TEXT_BYTES:
         raise ValueError(f"it has more than {TEXT_BYTES} bytes")
-    return path.read_text(encoding="utf-8")
+    return path.read_bytes()
+
+
+def check_only_files(folder: Path) -> None:
+    """Raise ValueError for a pipe or the like anywhere in a folder: whoever reads it may wait for
+    ever.
+    """
+    for path in folder.rglob("*"):
+        if not (path.is_dir() or path.is_file()):
+            raise ValueError(f"{path} is no file")

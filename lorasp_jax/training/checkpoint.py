@@ -19,6 +19,7 @@ from rich.console import Console
 
 from envs.refusals import DISK_FULL
 from lorasp_jax.digest import digest
+from lorasp_jax.models.untrusted import check_only_files
 from lorasp_jax.training import processes
 from lorasp_jax.training.step import TrainState
 
@@ -109,6 +110,7 @@ class Checkpoints:
             meta=ocp.args.JsonRestore(),
         )
         try:
+            check_only_files(self._folder / str(step))
             found = self._manager.restore(step, args=arguments)
             base_hash, expected = (found["meta"][name] for name in ("base_hash", "digest"))
         except Exception as error:  # Orbax raises whatever its storage raises

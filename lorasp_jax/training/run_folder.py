@@ -21,6 +21,7 @@ from tensorboardX.proto.summary_pb2 import Summary
 
 from lorasp_jax.config import Config
 from lorasp_jax.digest import sealed, unsealed
+from lorasp_jax.models.untrusted import read_bytes
 from lorasp_jax.training import processes
 
 RECORD, CLOCK, DATASET = "config.json", "seconds.json", "dataset.json"
@@ -59,7 +60,7 @@ def read_json(path: Path) -> dict[str, Any]:
         ValueError: the file is damaged.
     """
     try:
-        return unsealed(json.loads(path.read_bytes())) if path.exists() else {}
+        return unsealed(json.loads(read_bytes(path))) if path.exists() else {}
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is damaged ({error}): put back a whole one") from error
 
@@ -145,7 +146,9 @@ def _locked(folder: Path) -> Iterator[None]:
     """
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        opened = (folder.parent / f".{folder.name}.lock").open("a+")
+        # Not through a link: the file that it leads to would lose what is in it.
+        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW
+        opened = os.fdopen(os.open(folder.parent / f".{folder.name}.lock", flags, 0o666), "a+")
     except OSError as error:
         raise ValueError(f"{error.filename} cannot be opened: {error.strerror}") from error
     with opened as file:
@@ -242,7 +245,10 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
         ValueError: a row is not as it was written.
     """
     path = folder / "metrics.jsonl"
-    lines = path.read_bytes().split(b"\n")[:-1] if path.exists() else []
+    try:
+        lines = read_bytes(path).split(b"\n")[:-1] if path.exists() else []
+    except ValueError as error:
+        raise ValueError(f"{path} cannot be read: {error}") from error
     rows = []
     for number, line in enumerate(lines, 1):
         try:

@@ -124,8 +124,20 @@ def test_bucket_that_cannot_be_read(bucket, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"cannot be fetched: OSError: connection lost\.$"):
         places.local("memory://models/pi0")
     assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".")]
-    with pytest.raises(ValueError, match="cannot be fetched"):
-        places.local("nothing://models/pi0")
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        *("nothing://models/pi0", "://a", "file:///etc/passwd", "http://localhost:9/x"),
+        *("github://a:b@/x", "gs://../../x", "gs://a/../../../../x", "gs://", "gs://a//b"),
+        *("zip://x::/tmp/x.zip", "simplecache::file:///etc/passwd", "local:///etc/passwd"),
+    ],
+)
+def test_only_buckets_are_asked_and_only_the_cache_is_written(where, monkeypatch):
+    monkeypatch.delattr("fsspec.core.url_to_fs")
+    with pytest.raises(ValueError, match="is no folder in a bucket: that is gs://bucket/folder"):
+        places.local(where)
 
 
 def test_a_store_whose_package_is_missing_names_our_extra(monkeypatch):

@@ -11,7 +11,7 @@ from lorasp_jax.models.statistics import NAMES, Statistics
 from tests.data.lerobots import golden
 
 RNG = np.random.default_rng(0)
-STATE, ACTION = RNG.normal(size=(2, len(NAMES), 7)).astype(np.float32)
+STATE, ACTION = RNG.uniform(size=(2, len(NAMES), 7)).astype(np.float32)
 
 
 def known(values, names=NAMES):
@@ -162,4 +162,8 @@ def test_what_cannot_be_read_is_one_sentence(tmp_path):
     unset["norm_stats"]["state"]["mean"][0] = float("inf")
     path.write_text(json.dumps(unset))
     with pytest.raises(ValueError, match="not finite: they were never set"):
+        statistics_files.read(path)
+    unset["norm_stats"]["state"] |= {"mean": [0.0] * 7, "std": [1.0] * 6 + [-1e-3]}
+    path.write_text(json.dumps(unset))
+    with pytest.raises(ValueError, match="have a standard deviation below 0"):
         statistics_files.read(path)

@@ -1,5 +1,6 @@
 """Folders of models name nothing elsewhere, hang nobody, and take no more memory than they hold."""
 
+import dataclasses
 import json
 import os
 
@@ -7,7 +8,8 @@ import numpy as np
 import orbax.checkpoint as ocp
 import pytest
 
-from lorasp_jax.models import checkpoint, loading, published, statistics_files, tokenizer
+from lorasp_jax.models import checkpoint, layouts, loading, published, statistics_files, tokenizer
+from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.tensor_files import INDEX, SINGLE, TensorFiles, weight_files
 from lorasp_jax.models.untrusted import TEXT_BYTES
 
@@ -73,3 +75,29 @@ def test_files_larger_than_any_text(tmp_path):
             file.truncate(TEXT_BYTES + 1)  # a hole: takes no place
         with pytest.raises(ValueError, match=f"{name} is damaged"):
             read(tmp_path)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 3, True])
+def test_weights_that_are_no_finite_real_numbers(value):
+    rule = layouts.copied("ours", "theirs")
+    theirs = {"theirs": np.array([1, value, 2])}
+    with pytest.raises(ValueError, match="x has theirs of numbers that are not real or not finite"):
+        layouts.read([rule], theirs, {"ours": (3,)}, "x", lambda name, array: array)
+
+
+def test_a_tokenizer_without_end(tmp_path):
+    for name in ("tokenizer.json", "x.model"):
+        (tmp_path / name).touch()
+        os.truncate(tmp_path / name, 2**40)
+        with pytest.raises(ValueError, match=f"{name} is no tokenizer: it has more than"):
+            tokenizer.load(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["dtype", "param_dtype", "inputs", "remat", "unroll"])
+@pytest.mark.parametrize("value", [5, "x", None, [1], {"state": [0]}])
+def test_a_config_of_other_kinds(name, value):
+    fields = dataclasses.asdict(Pi0Config.dummy())
+    if (name, value) == ("unroll", None):
+        pytest.skip("that is one")
+    with pytest.raises((ValueError, TypeError)):
+        Pi0Config.from_dict(fields | {name: value})

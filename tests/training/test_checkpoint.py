@@ -210,3 +210,13 @@ def test_digest_does_not_depend_on_where_the_arrays_lie():
     for mesh in (meshes.make_mesh(2), meshes.make_mesh(1, jax.devices()[:1])):
         for sharding in (meshes.batch_sharding(mesh), meshes.replicated(mesh)):
             assert digest({"a": jax.device_put(array, sharding)}) == expected
+
+
+@pytest.mark.timeout(60)
+def test_a_link_to_what_has_no_end_hangs_nobody(folder):
+    file = next(path for path in (folder / "checkpoints" / "2").rglob("d/*") if path.is_file())
+    file.unlink()
+    file.symlink_to("/dev/zero")
+    step, said = restore(folder)
+    assert step == 1
+    assert "the checkpoint at step 2 is damaged" in said

@@ -226,3 +226,26 @@ def test_a_run_that_has_something_is_kept(tmp_path, more):
         open_run(dataclasses.replace(CONFIG, seed=1), tmp_path, resume=False)
     assert (folder / more).read_text() == "more"
     assert json.loads((folder / "config.json").read_text())["seed"] == 0
+
+
+def test_a_lock_that_is_a_link_leaves_what_it_leads_to(tmp_path):
+    precious = tmp_path / "precious"
+    precious.write_text("precious")
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / f".{CONFIG.name}.lock").symlink_to(precious)
+    with (
+        pytest.raises(ValueError, match="lock cannot be opened"),
+        run_folder.open_run(CONFIG, tmp_path / "runs", resume=False),
+    ):
+        pass
+    assert precious.read_text() == "precious"
+
+
+@pytest.mark.timeout(20)
+def test_a_pipe_among_the_records_hangs_nobody(tmp_path):
+    for name in ("config.json", "metrics.jsonl"):
+        os.mkfifo(tmp_path / name)
+    with pytest.raises(ValueError, match=r"config\.json is damaged \(it is no file\)"):
+        run_folder.read_json(tmp_path / "config.json")
+    with pytest.raises(ValueError, match=r"metrics\.jsonl cannot be read: it is no file"):
+        read_metrics(tmp_path)
