@@ -211,18 +211,30 @@ class Env:
         return jax.jit(where)(state.done, self.reset(key, ranges), state)
 
     def proprio(self, state: State) -> jax.Array:
-        """Measured joint angles [rad] and gripper opening [m], f32 [W, J + 1]."""
+        """Measured joint angles [rad] and gripper opening [m], f32 [W, J + 1].
+
+        Raises:
+            TypeError, ValueError: as `step`, for the state.
+        """
+        self._check_worlds(state)
         joints = state.data.qpos[:, : self.num_joints]
         fingers = state.data.qpos[:, self.num_joints : self.num_joints + 2]
         return jnp.concatenate([joints, jnp.sum(fingers, axis=1, keepdims=True)], axis=1)
 
-    @functools.partial(jax.jit, static_argnums=0)
     def full_state(self, state: State) -> jax.Array:
         """All that a learner may know beside pictures, f32 [W, D]; `full_state_layout` says what.
 
         Joints, speeds and last targets of the robot, where its tool is, and relative to that where
         the task's objects are and how they move: see `envs.observations.parts`.
+
+        Raises:
+            TypeError, ValueError: as `step`, for the state.
         """
+        self._check_worlds(state)
+        return self._full_states(state)
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def _full_states(self, state: State) -> jax.Array:
         find = functools.partial(observations.parts, self.model, bodies=self._placed)
 
         def one(data: Data, command: jax.Array) -> jax.Array:

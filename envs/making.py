@@ -90,7 +90,7 @@ def make(
         discount=discount,
         distractors=distractors,
         model=model,
-        physics=physics.Physics(model, backend or physics.default_backend()),
+        physics=physics.Physics(model, physics.default_backend() if backend is None else backend),
         render_model=rays.model,
         renderer=_renderer(renderer, model, rays, num_envs),
     )
@@ -112,21 +112,22 @@ def _renderer(
 
 def _checked_dt(given: float, time_limit: float) -> float:
     control_dt = checks.number("control_dt", given)
+    if control_dt > time_limit:
+        limit = f"the time limit of the task, {time_limit} s"
+        raise ValueError(f"control_dt must be at most {limit}, got {control_dt}")
     moves = control_dt / TARGET_DT
     if round(moves) < 1 or abs(moves - round(moves)) > 1e-6:
         raise ValueError(
             f"control_dt must be a positive multiple of {TARGET_DT} s, got {control_dt}"
         )
-    if control_dt > time_limit:
-        limit = f"the time limit of the task, {time_limit} s"
-        raise ValueError(f"control_dt must be at most {limit}, got {control_dt}")
     return control_dt
 
 
 def _check_reward(reward: str, discount: float) -> None:
     if reward not in REWARDS:
         raise ValueError(f"unknown reward {reward!r}: choose from {', '.join(REWARDS)}")
-    if not isinstance(discount, numbers.Real) or not 0 < discount <= 1:
+    real = isinstance(discount, numbers.Real) and not isinstance(discount, bool)
+    if not real or not 0 < discount <= 1:
         raise ValueError(f"discount must be a number above 0 and at most 1, got {discount!r}")
 
 

@@ -76,7 +76,8 @@ def dense(
       y [...tokens, *O] in the type of x, and the adapter's aux.
 
     Raises:
-      ValueError: x does not end in the kernel's input size.
+      ValueError: x is of integers or does not end in the kernel's input size, or a mask of another
+        shape.
     """
     return dense_together(x, [(kernel, bias, params, method)], token_mask=token_mask)[0]
 
@@ -95,8 +96,9 @@ def dense_together(
       y and aux of each layer.
 
     Raises:
-      ValueError: x does not end in a kernel's input size.
+      ValueError: as `dense`.
     """
+    _check_input(x, token_mask)
     plain, adapted = {}, {}
     for i, (kernel, _, params, method) in enumerate(layers):
         if x.shape[-1] != kernel.shape[0]:
@@ -113,6 +115,16 @@ def dense_together(
         y = found[i][0].reshape(*x.shape[:-1], *kernel.shape[1:])
         results.append((y if bias is None else y + bias.astype(y.dtype), found[i][1]))
     return results
+
+
+def _check_input(x: Any, token_mask: Any) -> None:
+    """Raises a ValueError unless x is inexact [...tokens, I] and a mask bool [...tokens]."""
+    if not (jnp.issubdtype(getattr(x, "dtype", int), jnp.inexact) and x.ndim):
+        found = f"{x.dtype} {list(x.shape)}" if hasattr(x, "dtype") else type(x).__name__
+        raise ValueError(f"x must be floating-point numbers [...tokens, I], got {found}.")
+    if token_mask is not None and (token_mask.shape, token_mask.dtype) != (x.shape[:-1], bool):
+        found = f"{token_mask.dtype} {list(token_mask.shape)}"
+        raise ValueError(f"token_mask must be bool {list(x.shape[:-1])}, got {found}.")
 
 
 def with_value(variable: Any, value: Any) -> Any:

@@ -194,3 +194,21 @@ def test_what_one_more_layer_adds_to_a_program(method, most):
         return jax.jit(jax.grad(loss)).lower(adapters, jnp.ones((5, 8))).as_text().count(" = ")
 
     assert (lines(6) - lines(3)) / 3 <= most
+
+
+@pytest.mark.parametrize("method", [LoRA(rank=2), LoRASP(rank=2, hidden_width=2)])
+@pytest.mark.parametrize(
+    ("x", "mask", "message"),
+    [
+        (jnp.ones((2, 4), int), None, r"floating-point numbers .* got int32 \[2, 4\]"),
+        (jnp.ones(()), None, r"got float32 \[\]"),
+        ([[1.0] * 4], None, "got list"),
+        (jnp.ones((2, 4)), jnp.ones((3, 3), bool), r"bool \[2\], got bool \[3, 3\]"),
+        (jnp.ones((2, 4)), jnp.ones(2), r"bool \[2\], got float32 \[2\]"),
+    ],
+)
+def test_odd_inputs(method, x, mask, message):
+    kernel = jnp.ones((4, 3))
+    params, kernel = method.init(jax.random.key(0), kernel)
+    with pytest.raises(ValueError, match=message):
+        dense(x, kernel, None, params, method, token_mask=mask)

@@ -47,7 +47,7 @@ def read(
         ValueError: if there is none, MuJoCo does not take it, or it names files elsewhere.
     """
     path = Path(path).absolute()
-    if not path.is_file():
+    if not os.path.isfile(path):  # Path.is_file raises where a name is too long
         raise ValueError("there is no such file")
     try:
         sources.check(path, Path(folder or path.parent))

@@ -4,6 +4,8 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Literal
 
+from lorasp_jax import kinds
+
 
 @dataclasses.dataclass(frozen=True)
 class Keys:
@@ -38,7 +40,13 @@ class Keys:
     image_size: int = 0
 
     def __post_init__(self) -> None:
-        """Checks the numbers."""
+        """Checks the fields."""
+        kinds.check_fields(self)
+        if not isinstance(self.cameras, Mapping):
+            raise ValueError(f"cameras must be a mapping, name -> feature, got {self.cameras!r}")
+        for name, feature in self.cameras.items():
+            if not isinstance(name, str) or not isinstance(feature, str):
+                raise ValueError(f"cameras must be texts, got {name!r} -> {feature!r}")
         if self.every < 1 or self.image_size < 0:
             raise ValueError(
                 f"every must be at least 1 and image_size at least 0, "

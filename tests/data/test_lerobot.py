@@ -276,3 +276,25 @@ def test_wrong_keys_name_what_there_is(keys):
         LeRobot(golden("v3"), Keys(**keys))
     with pytest.raises(ValueError, match="every must be at least 1"):
         Keys(every=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("state", 5),
+        ("state_numbers", "01"),
+        ("action_numbers", (0, 1)),
+        ("cameras", ["observation.images.side"]),
+        ("cameras", {1: "observation.images.side"}),
+        ("cameras", {"side": None}),
+        ("angles", "Degrees"),
+        ("gripper", "mm"),
+        ("every", 1.5),
+        ("every", True),
+        ("image_size", 10**30),
+    ],
+)
+def test_kinds_of_keys(name, value):
+    """A unit that is not known would be taken for radians or metres."""
+    with pytest.raises(ValueError, match=f"^{name} must be"):
+        Keys(**{name: value})

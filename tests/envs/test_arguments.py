@@ -46,10 +46,17 @@ def worlds():
         ({"control_dt": 0.03}, "control_dt must be a positive multiple of 0.02 s, got 0.03"),
         ({"control_dt": 0.0}, "control_dt must be a positive multiple of 0.02 s, got 0.0"),
         ({"control_dt": 1e12}, "control_dt must be at most the time limit of the task, 8.0 s, got"),
+        (
+            {"control_dt": 1e308},
+            "control_dt must be at most the time limit of the task, 8.0 s, got",
+        ),
         ({"control_dt": np.inf}, "control_dt must be finite, got inf"),
         ({"control_dt": "3"}, "control_dt must be a number, got '3'"),
         ({"control_dt": True}, "control_dt must be a number, got True"),
         ({"actions": "voltage"}, "unknown actions 'voltage': choose from joint, delta_joint"),
+        ({"discount": True}, "discount must be a number above 0 and at most 1, got True"),
+        ({"robot": f"{300 * 'a'}.xml"}, "robot a+.xml: there is no such file"),
+        ({"backend": ""}, "unknown backend '': choose from jax, warp"),
         ({"backend": 7}, "unknown backend 7: choose from jax, warp"),
         ({"renderer": None}, "unknown renderer None: choose from rays, warp"),
     ],
@@ -107,6 +114,8 @@ def test_states(worlds):
     other = dataclasses.replace(env, num_envs=3)
     for call in (
         env.observe,
+        env.proprio,
+        env.full_state,
         lambda s: env.step(s, np.zeros((2, 7))),
         lambda s: env.reset_done(s, KEY),
     ):
