@@ -2,14 +2,19 @@
 
 import os
 
-from tests import xla
-
 os.environ["JAX_PLATFORMS"] = "cpu"
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {xla.flags(devices=8)}".strip()
 
 import jax
 
 from envs import compilation_cache
+from tests import xla
 
 compilation_cache.enable()
 jax.config.update("jax_default_matmul_precision", "highest")
+
+
+def pytest_configure(config):
+    """Fast tests run most programs once; long ones run what users run."""
+    os.environ["XLA_FLAGS"] = xla.flags(devices=8)
+    if config.option.markexpr == "not slow":
+        os.environ["XLA_FLAGS"] += f" {xla.UNOPTIMISED}"
