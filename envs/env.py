@@ -214,9 +214,9 @@ class Env:
         """Measured joint angles [rad] and gripper opening [m], f32 [W, J + 1].
 
         Raises:
-            TypeError, ValueError: as `step`, for the state.
+            TypeError: if the state is none.
         """
-        self._check_worlds(state)
+        checks.instance("state", state, State, "what reset gave")
         joints = state.data.qpos[:, : self.num_joints]
         fingers = state.data.qpos[:, self.num_joints : self.num_joints + 2]
         return jnp.concatenate([joints, jnp.sum(fingers, axis=1, keepdims=True)], axis=1)
@@ -228,9 +228,9 @@ class Env:
         the task's objects are and how they move: see `envs.observations.parts`.
 
         Raises:
-            TypeError, ValueError: as `step`, for the state.
+            TypeError: if the state is none.
         """
-        self._check_worlds(state)
+        checks.instance("state", state, State, "what reset gave")
         return self._full_states(state)
 
     @functools.partial(jax.jit, static_argnums=0)

@@ -21,7 +21,6 @@ from tensorboardX.proto.summary_pb2 import Summary
 
 from lorasp_jax.config import Config
 from lorasp_jax.digest import sealed, unsealed
-from lorasp_jax.models.untrusted import read_bytes
 from lorasp_jax.training import processes
 
 RECORD, CLOCK, DATASET = "config.json", "seconds.json", "dataset.json"
@@ -53,6 +52,13 @@ def write_text(path: Path, text: str) -> None:
     os.replace(temporary, path)
 
 
+def _read(path: Path) -> bytes:
+    """The bytes of a plain file."""
+    from lorasp_jax.models.untrusted import read_bytes  # its package imports Orbax, --help does not
+
+    return read_bytes(path)
+
+
 def read_json(path: Path) -> dict[str, Any]:
     """What `write_json` wrote; nothing without a file.
 
@@ -60,7 +66,7 @@ def read_json(path: Path) -> dict[str, Any]:
         ValueError: the file is damaged.
     """
     try:
-        return unsealed(json.loads(read_bytes(path))) if path.exists() else {}
+        return unsealed(json.loads(_read(path))) if path.exists() else {}
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is damaged ({error}): put back a whole one") from error
 
@@ -246,7 +252,7 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
     """
     path = folder / "metrics.jsonl"
     try:
-        lines = read_bytes(path).split(b"\n")[:-1] if path.exists() else []
+        lines = _read(path).split(b"\n")[:-1] if path.exists() else []
     except ValueError as error:
         raise ValueError(f"{path} cannot be read: {error}") from error
     rows = []
