@@ -19,12 +19,14 @@ def bars(console: Console, unit: str, *, per_step: int = 1, shown: bool = True) 
 
 
 class _Rate(ProgressColumn):
-    """Units per second."""
+    """Units per second; nothing before there are two points in time."""
 
     def __init__(self, unit: str, per_step: int) -> None:
         super().__init__()
         self._unit, self._per_step = unit, per_step
 
     def render(self, task: Task) -> Text:
-        rate = (task.finished_speed or task.speed or 0.0) * self._per_step
+        if not (speed := task.finished_speed or task.speed):
+            return Text("")
+        rate = speed * self._per_step
         return Text(f"{rate:,.3g} {self._unit}/s" if rate < 100 else f"{rate:,.0f} {self._unit}/s")

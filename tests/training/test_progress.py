@@ -15,7 +15,7 @@ from lorasp_jax.training.progress import bars
         (64, 2.0, None, "128 samples/s"),
         (512, 40.0, None, "20,480 samples/s"),
         (1, 0.25, None, "0.25 samples/s"),
-        (1, None, None, "0 samples/s"),  # nothing done yet
+        (1, None, None, ""),  # nothing done yet, or all at once
         (2, 3.0, 5.0, "10 samples/s"),  # over the whole time, once it is over
     ],
 )
