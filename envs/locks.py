@@ -21,13 +21,12 @@ def alone(path: Path, waiting: Callable[[], None] | None = None) -> Iterator[Non
             waited for.
 
     Raises:
-        ValueError: if another process is at it and is not waited for.
+        ValueError: if another process is at it and is not waited for, or as `open_lock`.
     """
     lock = path.with_name(f".{path.name}.lock")
-    lock.parent.mkdir(parents=True, exist_ok=True)
     how = fcntl.LOCK_EX | fcntl.LOCK_NB
     while True:
-        with lock.open("a") as held:
+        with open_lock(lock) as held:
             try:
                 fcntl.flock(held, how)
             except BlockingIOError as error:
@@ -43,6 +42,21 @@ def alone(path: Path, waiting: Callable[[], None] | None = None) -> Iterator[Non
             finally:
                 lock.unlink(missing_ok=True)
             return
+
+
+def open_lock(path: Path) -> TextIO:
+    """A lock file, made where there is none.
+
+    Raises:
+        ValueError: it cannot be opened.
+    """
+    # Not through a link: the file that it leads to is not ours to make, to write or to wait for.
+    flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return os.fdopen(os.open(path, flags, 0o666), "a+")
+    except OSError as error:
+        raise ValueError(f"{error.filename or path} cannot be opened: {error.strerror}") from error
 
 
 def _was_deleted(file: TextIO, path: Path) -> bool:

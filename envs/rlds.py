@@ -24,7 +24,7 @@ from array_record.python import array_record_module
 
 from envs import rlds_schema
 from envs.episodes import SHARED, Episodes, creating, replacing
-from envs.files import regular
+from envs.files import reason, regular
 from envs.locks import alone
 from envs.rlds_reading import (
     FORMAT,
@@ -32,10 +32,9 @@ from envs.rlds_reading import (
     SPLIT,
     THREADS,
     Reader,
-    damage_in_one_sentence,
+    damage,
     metadata,
     read,
-    reason,
 )
 
 __all__ = ["METADATA", "Parts", "Reader", "metadata", "read", "write"]
@@ -149,7 +148,7 @@ class Parts:
             data_dir=str(self.folder),
             module_name="",
         )
-        with damage_in_one_sentence(self.folder, ": delete it to start anew"):
+        with damage(self.folder, ": delete it to start anew"):
             features = rlds_schema.stored(self.folder)
         info = tfds.core.DatasetInfo(
             builder=identity,
@@ -213,7 +212,7 @@ def _write_records(file: Path, records: Iterable[bytes]) -> None:
 
 def _check_whole(file: Path, episodes: int) -> None:
     """Raises a ValueError if a part is damaged; every record has a checksum."""
-    with damage_in_one_sentence(file, f": delete {file.parent} to start anew"):
+    with damage(file, f": delete {file.parent} to start anew"):
         reader = array_record_module.ArrayRecordReader(str(regular(file, file.parent)))
         if reader.num_records() != episodes or len(reader.read_all()) != episodes:
             raise ValueError(f"it holds {reader.num_records()} episodes, not {episodes}")
@@ -225,4 +224,5 @@ def _failure_in_one_sentence(file: Path) -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        raise OSError(f"{file} could not be written ({reason(error)})") from error
+        why = reason(error).partition("; ")[0]  # the rest is where in the file
+        raise OSError(f"{file} could not be written ({why})") from error

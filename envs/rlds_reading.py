@@ -2,7 +2,7 @@
 
 import contextlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +12,7 @@ import tensorflow_datasets as tfds
 from array_record.python import array_record_module
 from google.protobuf.json_format import ParseError
 
-from envs import rlds_schema
+from envs import files, rlds_schema
 from envs.episodes import SHARED, Episodes, concatenate
 from envs.files import RefusedError, read_json, regular, whole
 
@@ -25,9 +25,6 @@ THREADS = ThreadPoolExecutor(8)
 _BEGUN: dict[str, Any] = {"options": dict, "parts": list, "steps": int, "attempted": int}
 _FILLED: dict[str, Any] = {"task": str, "robot": str, "actions": str, "instructions": list}
 _FILLED |= {"cameras": dict, "control_dt": int | float, "physics_dt": int | float}
-_FAILURES = (OSError, RuntimeError, ValueError, LookupError, TypeError, AttributeError, ParseError)
-_FAILURES += (ArithmeticError, SyntaxError)  # of numbers that are infinite; of PNG
-_FAILURES += (ImportError,)  # what tfds says of features that would need TensorFlow
 
 
 def read(path: str | os.PathLike) -> Episodes:
@@ -41,7 +38,7 @@ def read(path: str | os.PathLike) -> Episodes:
     """
     found = Reader(path)
     parts = list(THREADS.map(found.episode, range(len(found))))
-    with damage_in_one_sentence(found.path):
+    with damage(found.path):
         return replace(concatenate(parts), attempted=found.facts["attempted"])
 
 
@@ -93,7 +90,7 @@ class Reader:
         """
         self.path = Path(path)
         self.facts = metadata(self.path)
-        with damage_in_one_sentence(self.path):
+        with damage(self.path):
             self.cameras = {name: rlds_schema.picture_name(name) for name in self.facts["cameras"]}
             self.control_dt = float(self.facts["control_dt"])
             self.num_steps = whole(self.facts["steps"])
@@ -119,7 +116,7 @@ class Reader:
         Raises:
             ValueError: if it is damaged or lacks something.
         """
-        with damage_in_one_sentence(self.path):
+        with damage(self.path):
             names = self.cameras if cameras is None else cameras
             wanted = {name: self.cameras[name] for name in names}
             sizes = self.facts["cameras"]
@@ -145,17 +142,6 @@ def _builder(folder: Path, parts: Sequence[int]) -> Any:
     return builder
 
 
-@contextlib.contextmanager
-def damage_in_one_sentence(path: Path, remedy: str = "") -> Iterator[None]:
-    """What goes wrong inside becomes one ValueError about this path; a refusal is one already."""
-    try:
-        yield
-    except RefusedError:
-        raise
-    except _FAILURES as error:
-        raise ValueError(f"{path} is damaged ({reason(error)}){remedy}") from error
-
-
-def reason(error: Exception) -> str:
-    """What the libraries say can be long; its beginning says what is wrong."""
-    return str(error).split("; ")[0].split("\n")[0][:200]
+def damage(path: Path, remedy: str = "") -> contextlib.AbstractContextManager[None]:
+    """`files.damage`, of protobuf's errors too."""
+    return files.damage(path, ParseError, remedy=remedy)

@@ -16,13 +16,14 @@ from envs.episodes import Episodes
 from lorasp_jax import adaptation
 from lorasp_jax.config import Config, ModelConfig, OptimConfig
 from lorasp_jax.dense import Dense
+from lorasp_jax.evaluation import video
 from lorasp_jax.models import tokenizer
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.prompt_table import PromptTable
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.training.run import Callback, Run
-from lorasp_jax.training.run_folder import read_metrics
+from lorasp_jax.training.run_folder import MetricsLog, read_metrics, to_json, write_json
 from lorasp_jax.training.setup import processor
 
 TIMED = ("speed/", "memory/")
@@ -39,6 +40,23 @@ CONFIG = Config(
     log_every=2,
     checkpoint_every=2,
 )
+
+RESULTS = {
+    "scale": "cpu",
+    "seconds": {"collect": 1.0, "train": 2.0, "evaluate": 3.0, "total": 7.0},
+    "tasks": {
+        "press": {
+            "before": {"success": 0.03125, "episodes": 64, "ci95": [0.009, 0.107]},
+            "after": {"success": 0.75, "episodes": 64, "ci95": [0.632, 0.84]},
+        }
+    },
+    "active_rank": {"vision": 4.25, "language": 3.0, "action": 2.0, "mean": 3.1},
+    "layer_active_rank": {"vision": {"fc1": [4.0, 4.5]}, "action": {"q_proj": [2.0]}},
+    "active_rank_histogram": {},
+    "trainable_parameters": 10,
+    "total_parameters": 1000,
+}
+"""What results.json holds."""
 
 
 class Miniature(nnx.Module):
@@ -115,3 +133,17 @@ def repeatable(folder: Path) -> list[dict[str, float]]:
 def leaves(tree) -> dict[str, np.ndarray]:
     found = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in found}
+
+
+def finish(folder: Path) -> Path:
+    """A folder as a run of two logged steps leaves it, but for its weights."""
+    write_json(folder / "config.json", {**to_json(CONFIG), "name": "<b>run</b>"})
+    write_json(folder / "results.json", RESULTS)
+    log = MetricsLog(folder)
+    for step in (2, 4):
+        log.write(step, {"task": 1 / step, "spectral": 0.1, "active_rank/vision": 4.0})
+    log.close()
+    frames = np.random.default_rng(0).integers(0, 255, (4, 32, 64, 3), np.uint8)
+    video.write_picture(folder / "cameras_press.png", frames[0])
+    video.write_video(folder / "rollout_press.mp4", frames, fps=10)
+    return folder

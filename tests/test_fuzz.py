@@ -16,11 +16,14 @@ from envs import mjcf, rlds
 from lorasp_jax.data import cache, inspection
 from lorasp_jax.data.opening import open_source
 from lorasp_jax.models import statistics_files
+from lorasp_jax.report.callback import final_table
+from lorasp_jax.report.html import write_report
 from tests import fuzzing
 from tests.data.lerobots import golden
 from tests.envs.test_episodes import make
 from tests.envs.user_arm import write
 from tests.malformed import check_refusal
+from tests.runs import finish
 
 SEEDS, SLOW_SEEDS = 12, 200
 DEAR = {"mjcf": 4}  # how many times as much time a kind takes
@@ -38,6 +41,12 @@ def go_on(folder: Path) -> None:
     rlds.Parts(folder, {}).complete()
 
 
+def seen(folder: Path) -> None:
+    """As a finished run is."""
+    write_report(folder)
+    final_table(folder)
+
+
 FILES: list[fuzzing.Change] = [fuzzing.damaged, fuzzing.replaced]
 KINDS: dict[str, tuple[Callable[[Path], Any], list[fuzzing.Change]]] = {
     "rlds": (read, [*FILES, *[fuzzing.described] * 4]),
@@ -47,6 +56,7 @@ KINDS: dict[str, tuple[Callable[[Path], Any], list[fuzzing.Change]]] = {
     "lerobot v21": (read, [*FILES, *[fuzzing.described] * 2, *[fuzzing.tabled] * 2]),
     "lerobot v3": (read, [*FILES, *[fuzzing.described] * 2, *[fuzzing.tabled] * 2]),
     "statistics": (statistics_files.read, [*FILES, fuzzing.described]),
+    "run": (seen, [*FILES, *[fuzzing.described] * 6]),
     "mjcf": (lambda folder: mjcf.load(folder / "arm.xml"), [*FILES, *[fuzzing.drawn] * 4]),
 }
 
@@ -58,9 +68,10 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     rlds.write(make(), at / "rlds")
     cache.write([open_source(at / "rlds")], at / "cache", lambda done, total: None)
     make().save(at / "npz" / "episodes.npz")
-    (at / "mjcf").mkdir()
-    write(at / "mjcf")
-    found = {name: at / name for name in ("rlds", "cache", "npz", "mjcf")}
+    for name, fill in (("mjcf", write), ("run", finish)):
+        (at / name).mkdir()
+        fill(at / name)
+    found = {name: at / name for name in ("rlds", "cache", "npz", "mjcf", "run")}
     found |= {"rlds, gone on with": at / "rlds", "statistics": golden("v21") / "meta"}
     return found | {f"lerobot {version}": golden(version) for version in ("v21", "v3")}
 

@@ -11,6 +11,7 @@ import pytest
 
 import train
 from lorasp_jax.training.run_folder import write_json
+from tests.runs import RESULTS
 
 ROOT = Path(__file__).parent.parent
 MULTITASK = ["--config", str(ROOT / "configs" / "multitask.py"), "--scale", "smoke"]
@@ -108,7 +109,7 @@ def test_full_disk(capsys, monkeypatch):
 def test_damaged_files_of_a_finished_run(name, content, capsys):
     assert train.main([*MULTITASK, "--model.checkpoint", "nowhere"]) == 2
     folder = Path("runs/multitask")
-    write_json(folder / "results.json", {"seconds": {}, "tasks": {}, "layer_active_rank": {}})
+    write_json(folder / "results.json", RESULTS)
     (folder / name).write_text(content)
     capsys.readouterr()
     assert train.main([*MULTITASK, "--model.checkpoint", "nowhere", "--resume"]) == 2
@@ -137,8 +138,7 @@ def test_finished_run_is_not_run_again(capsys):
     assert train.main([*MULTITASK, "--model.checkpoint", "nowhere"]) == 2
     record = json.loads(Path("runs/multitask/config.json").read_text())
     assert record["peft"]["method"] == "LoRASP"
-    results = {"seconds": {}, "tasks": {}, "layer_active_rank": {}}
-    write_json(Path("runs/multitask/results.json"), results)
+    write_json(Path("runs/multitask/results.json"), RESULTS)
     assert train.main([*MULTITASK, "--model.checkpoint", "nowhere", "--resume"]) == 0
     assert "this run is finished: runs/multitask/report.html" in capsys.readouterr().out
     assert "The run goes on" not in Path("runs/multitask/report.html").read_text()

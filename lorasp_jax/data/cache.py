@@ -22,10 +22,10 @@ from typing import Any, Self
 import numpy as np
 
 from envs.episodes import SHARED, Episodes, check_camera, creating
-from envs.files import read_json, read_text
+from envs.files import damage, read_json, read_text
 from envs.locks import alone
 from lorasp_jax.data.batches import Steps
-from lorasp_jax.data.columns import Column, damage, mapped
+from lorasp_jax.data.columns import Column, mapped
 from lorasp_jax.data.pictures import Pictures, checksum
 from lorasp_jax.data.source import Progress, Source
 from lorasp_jax.digest import DIGEST, sealed, unsealed

@@ -1,20 +1,13 @@
 """Arrays in files: written row by row, and mapped into memory again."""
 
-import contextlib
 import os
-import tokenize
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from envs.files import RefusedError, regular
-
-_FAILURES = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError)
-_FAILURES += (SyntaxError, tokenize.TokenError)  # of NumPy, which parses a file's header
-_FAILURES += (ArithmeticError, RecursionError)  # of JSON and its numbers
+from envs.files import damage, regular
 
 
 class Column:
@@ -74,15 +67,3 @@ def mapped(
         if crc32 is not None and zlib.crc32(array.data) != crc32:
             raise ValueError("its checksum is another one")
         return array.view(np.ndarray)
-
-
-@contextlib.contextmanager
-def damage(path: Path) -> Iterator[None]:
-    """What goes wrong inside becomes one ValueError about this file; a refusal is one already."""
-    try:
-        yield
-    except RefusedError:
-        raise
-    except _FAILURES as error:
-        why = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
-        raise ValueError(f"{path} is damaged ({why.partition(chr(10))[0]})") from error

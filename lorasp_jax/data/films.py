@@ -2,7 +2,6 @@
 
 import io
 import math
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 from av.video.reformatter import VideoReformatter
 from PIL import Image
 
-from envs.files import check_memory
+from envs.files import check_memory, reason
 
 # What a file may be: FFmpeg itself also reads playlists, which name other files and addresses.
 _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
@@ -140,9 +139,3 @@ def reduced(picture: np.ndarray, image_size: int) -> np.ndarray:
         return picture
     size = (max(1, width * image_size // longest), max(1, height * image_size // longest))
     return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BILINEAR))
-
-
-def reason(error: BaseException) -> str:
-    """What a library says of an error, without its further lines and the path, which we name."""
-    text = str(getattr(error, "strerror", None) or error) or type(error).__name__
-    return text.partition("\n")[0].rstrip(".").replace(os.linesep, " ")[:200]

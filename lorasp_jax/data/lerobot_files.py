@@ -19,16 +19,8 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from envs.files import (
-    RefusedError,
-    check_memory,
-    inside,
-    read_json,
-    read_text,
-    regular,
-    whole,
-)
-from lorasp_jax.data.films import reason
+from envs import files
+from envs.files import check_memory, inside, read_json, read_text, regular, whole
 
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 _FIELD = re.compile(r"\{(\w+)(?::(\d{0,2}d?))?\}")
@@ -226,25 +218,6 @@ def _json_lines(path: Path, folder: Path) -> Iterator[dict[str, Any]]:
     return (json.loads(line) for line in read_text(path, folder).splitlines() if line.strip())
 
 
-@contextlib.contextmanager
-def damage(path: Path) -> Iterator[None]:
-    """What goes wrong inside becomes one ValueError about this file; a refusal is one already."""
-    try:
-        yield
-    except RefusedError:
-        raise
-    except KeyError as error:
-        raise ValueError(f"{path} lacks {error}") from error
-    except FileNotFoundError as error:
-        raise ValueError(f"{path} is missing") from error
-    except (
-        pa.ArrowException,
-        OSError,
-        ValueError,
-        TypeError,
-        AttributeError,
-        IndexError,
-        ArithmeticError,  # of numbers that are 0 or infinite
-        RecursionError,  # of JSON
-    ) as error:
-        raise ValueError(f"{path} is damaged ({reason(error)})") from error
+def damage(path: Path) -> contextlib.AbstractContextManager[None]:
+    """`files.damage`, of pyarrow's errors too."""
+    return files.damage(path, pa.ArrowException)

@@ -21,6 +21,7 @@ from lorasp_jax import adaptation
 from lorasp_jax.data.demonstrations import side_by_side
 from lorasp_jax.evaluation import video
 from lorasp_jax.evaluation.rollout import Result, evaluate, make_rollout
+from lorasp_jax.training import records
 from lorasp_jax.training.progress import bars
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import read_json, write_json
@@ -156,7 +157,7 @@ def success(result: Result) -> dict[str, Any]:
 
 def summarise(run: Run, after: dict[str, Result]) -> dict[str, Any]:
     """The content of results.json."""
-    before = read_json(run.folder / "before.json") if after else {}
+    before = read_json(run.folder / "before.json", records.BEFORE) if after else {}
     layers = _mean([result.active_rank for result in after.values()])
     modules = {
         tower: float(np.mean(np.concatenate(list(layers[tower].values()))))

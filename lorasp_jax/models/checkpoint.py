@@ -20,11 +20,11 @@ import numpy as np
 import safetensors.numpy
 from flax import nnx
 
+from envs.files import read_text
 from lorasp_jax.adapter_set import SetParam
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.models import backbone
 from lorasp_jax.models.tensor_files import INDEX, SINGLE, TensorFiles, weight_files
-from lorasp_jax.models.untrusted import read_text
 from lorasp_jax.quantization import is_quantized
 
 CONFIG = "config.json"

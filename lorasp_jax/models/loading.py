@@ -7,11 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from envs.files import read_text
 from lorasp_jax.models import backbone, checkpoint, lerobot_config, places, published
 from lorasp_jax.models.inputs import InputConfig
 from lorasp_jax.models.layouts import OtherModelError
 from lorasp_jax.models.tensor_files import weight_files
-from lorasp_jax.models.untrusted import read_text
 
 _log = logging.getLogger(__name__)
 

@@ -27,11 +27,11 @@ import orbax.checkpoint as ocp
 import safetensors.numpy
 from flax import nnx
 
+from envs.files import check_only_files
 from lorasp_jax.models import layouts
 from lorasp_jax.models.checkpoint import base_arrays, by_path, named_arrays, set_arrays
 from lorasp_jax.models.pi0 import openpi_lora
 from lorasp_jax.models.tensor_files import INDEX, SINGLE, TensorFiles, weight_files
-from lorasp_jax.models.untrusted import check_only_files
 
 _DENSITY, _SMALL = 20, 2**30  # bytes of arrays in a byte of files; bytes that do no harm
 _READ_AHEAD = 1  # GB that Orbax reads at once, beside the result

@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 import safetensors
 
+from envs.files import beside, read_text
 from lorasp_jax.models import places
 from lorasp_jax.models.statistics import NAMES, Statistics, checked
-from lorasp_jax.models.untrusted import beside, read_text
 
 OURS, OPENPI, DATASET = "statistics.json", "norm_stats.json", "stats.json"
 EPISODES = "episodes_stats.jsonl"

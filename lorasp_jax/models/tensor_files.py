@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import safetensors
 
-from lorasp_jax.models.untrusted import beside, read_text
+from envs.files import beside, read_text
 
 SINGLE, INDEX = "model.safetensors", "model.safetensors.index.json"
 

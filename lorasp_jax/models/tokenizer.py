@@ -89,9 +89,9 @@ def load(where: str | os.PathLike[str]) -> Tokenizer:
     Raises:
         ValueError: there is no such place, or no tokenizer in it.
     """
+    from envs.files import TEXT_BYTES
     from lorasp_jax.models import places
     from lorasp_jax.models.tokenizer_files import SentencePiece, TokenizersFile
-    from lorasp_jax.models.untrusted import TEXT_BYTES
 
     if not os.fspath(where):
         return Offline()

@@ -7,6 +7,7 @@ from pathlib import Path
 from rich.table import Table
 
 from lorasp_jax.report.html import speed, success_cell, write_report
+from lorasp_jax.training import records
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import STOPPED, read_json, read_metrics, write_json
 
@@ -58,7 +59,7 @@ class Report(Callback):
 
 def final_table(folder: Path) -> Table:
     """Success, loss, speed, active rank and time of the finished run in a folder."""
-    results = read_json(folder / "results.json")
+    results = read_json(folder / "results.json", records.RESULTS)
     rows = [row for row in read_metrics(folder) if "task" in row]  # not all steps were skipped
     table = Table("", "before", "after", title=folder.name)
     for task, value in results["tasks"].items():

@@ -33,8 +33,10 @@ def success(results: dict[str, Any]) -> str:
         figure = Figure(figsize=(6, 1.1 + 0.8 * len(tasks)), layout="constrained")
         axes = figure.subplots()
         for row, task in enumerate(tasks):
-            for name, value in tasks[task].items():
-                offset, color = _BARS[name]
+            for name, (offset, color) in _BARS.items():
+                if name not in tasks[task]:
+                    continue
+                value = tasks[task][name]
                 low, high = value["ci95"]
                 rate = value["success"]
                 axes.barh(row + offset, 100 * rate, height=0.32, color=COLORS[color])
@@ -108,7 +110,7 @@ def layer_ranks(layers: dict[str, dict[str, Sequence[float]]], rank: int) -> str
         panels = figure.subplots(1, len(layers), sharey=True, squeeze=False)[0]
         for axes, (tower, linears) in zip(panels, layers.items(), strict=True):
             for position, values in enumerate(linears.values()):
-                axes.scatter([position] * len(values), values, color=COLORS[tower], s=14)
+                axes.scatter([position] * len(values), values, color=_color(tower), s=14)
             axes.set_xticks(range(len(linears)), list(linears), rotation=70, ha="right")
             axes.set_ylim(0, 1.06 * rank)
             axes.set_title(tower, loc="left")
@@ -128,12 +130,17 @@ def rank_histogram(histogram: dict[str, Sequence[int]]) -> str:
         for axes, (tower, counts) in zip(panels, histogram.items(), strict=True):
             total = max(sum(counts), 1)
             shares = [100 * count / total for count in counts]
-            axes.bar(range(len(counts)), shares, width=1.0, color=COLORS[tower])
+            axes.bar(range(len(counts)), shares, width=1.0, color=_color(tower))
             axes.set_xlim(-0.5, len(counts) - 0.5)
             axes.set_xlabel("active rank of a token")
             axes.set_title(tower, loc="left")
         panels[0].set_ylabel("tokens [%]")
         return _svg(figure)
+
+
+def _color(tower: str) -> str:
+    """A tower's color; of one that only another version knows, grey."""
+    return COLORS.get(tower, COLORS["before"])
 
 
 def _line(axes: Any, rows: Rows, name: str, color: str, label: str) -> None:

@@ -8,7 +8,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from envs.files import inside, read_bytes
 from lorasp_jax.report import figures
+from lorasp_jax.training import records
 from lorasp_jax.training.run_folder import (
     CLOCK,
     RECORD,
@@ -50,10 +52,10 @@ def write_report(folder: Path) -> Path:
     Raises:
         ValueError: the folder holds no run, or damaged files.
     """
-    config = read_json(folder / RECORD)
+    config = read_json(folder / RECORD, records.CONFIG)
     if not config:
         raise ValueError(f"{folder} holds no run: there is no {RECORD}")
-    finished = read_json(folder / "results.json")
+    finished = read_json(folder / "results.json", records.RESULTS)
     results = finished or _unfinished(folder)
     rows = read_metrics(folder)
     parts = [
@@ -87,9 +89,9 @@ def write_report(folder: Path) -> Path:
 
 def _unfinished(folder: Path) -> dict[str, Any]:
     """What results.json will have, as far as it is known."""
-    before = read_json(folder / "before.json").items()
+    before = read_json(folder / "before.json", records.BEFORE).items()
     return {
-        "seconds": read_json(folder / CLOCK),
+        "seconds": read_json(folder / CLOCK, records.TIMES),
         "tasks": {task: {"before": value} for task, value in before},
         "layer_active_rank": {},
     }
@@ -97,7 +99,7 @@ def _unfinished(folder: Path) -> dict[str, Any]:
 
 def _progress(folder: Path, config: dict[str, Any], rows: figures.Rows) -> Iterable[str]:
     """How far a run is that is not finished; or why it stopped."""
-    stopped = read_json(folder / STOPPED)
+    stopped = read_json(folder / STOPPED, records.STOPPED)
     if stopped:
         yield f"<p><b>The run stopped:</b> {html.escape(stopped['reason'])}.</p>"
         return
@@ -208,7 +210,7 @@ def _active_rank(results: dict[str, Any], rows: figures.Rows, rank: Any) -> Iter
     modules = ((module, f"{mean:.1f}") for module, mean in results["active_rank"].items())
     yield _table(("module", "active rank in closed loop"), modules)
     yield _image(figures.layer_ranks(results["layer_active_rank"], rank))
-    if "active_rank_histogram" in results:
+    if results["active_rank_histogram"]:
         yield _image(figures.rank_histogram(results["active_rank_histogram"]))
 
 
@@ -230,7 +232,7 @@ def _image(svg: str) -> str:
 
 def _filmed(folder: Path, task: str) -> Path:
     """The video of a task."""
-    return folder / f"rollout_{task}.mp4"
+    return inside(folder, f"rollout_{task}.mp4")
 
 
 def _media(folder: Path, tasks: Collection[str]) -> Iterable[str]:
@@ -238,13 +240,13 @@ def _media(folder: Path, tasks: Collection[str]) -> Iterable[str]:
     if tasks:
         yield "<h2>What the policy sees and does</h2>"
     for task in tasks:
-        picture, video = folder / f"cameras_{task}.png", _filmed(folder, task)
-        if missing := [path.name for path in (picture, video) if not path.is_file()]:
+        picture, video = inside(folder, f"cameras_{task}.png"), _filmed(folder, task)
+        if missing := [path.name for path in (picture, video) if not path.exists()]:
             gone = html.escape(" and ".join(missing))
             yield f"<h3>{html.escape(task)}</h3><p>{gone} missing.</p>"
             continue
-        shown = base64.b64encode(picture.read_bytes()).decode()
-        played = base64.b64encode(video.read_bytes()).decode()
+        shown = base64.b64encode(read_bytes(picture, folder)).decode()
+        played = base64.b64encode(read_bytes(video, folder)).decode()
         yield (
             f"<h3>{html.escape(task)}</h3>"
             f'<figure><img class=camera width=400 alt="side and wrist camera" '

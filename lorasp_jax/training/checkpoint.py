@@ -17,9 +17,9 @@ import jax
 import orbax.checkpoint as ocp
 from rich.console import Console
 
+from envs.files import check_only_files
 from envs.refusals import DISK_FULL
 from lorasp_jax.digest import digest
-from lorasp_jax.models.untrusted import check_only_files
 from lorasp_jax.training import processes
 from lorasp_jax.training.step import TrainState
 

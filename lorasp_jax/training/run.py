@@ -12,7 +12,7 @@ from envs.episodes import Episodes
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Steps, flatten
 from lorasp_jax.models.policy import Policy
-from lorasp_jax.training import processes
+from lorasp_jax.training import processes, records
 from lorasp_jax.training.run_folder import CLOCK, read_json, write_json
 
 
@@ -49,7 +49,7 @@ class Run:
 
     def __post_init__(self) -> None:
         """Takes over the time that earlier processes spent."""
-        self.seconds = {"total": 0.0, **read_json(self.folder / CLOCK)}
+        self.seconds = {"total": 0.0, **read_json(self.folder / CLOCK, records.TIMES)}
         self._before = self.seconds["total"]
 
     @property

@@ -19,9 +19,11 @@ from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.proto.summary_pb2 import Summary
 
+from envs.files import check_only_files, damage, read_bytes
+from envs.locks import open_lock
 from lorasp_jax.config import Config
 from lorasp_jax.digest import sealed, unsealed
-from lorasp_jax.training import processes
+from lorasp_jax.training import processes, records
 
 RECORD, CLOCK, DATASET = "config.json", "seconds.json", "dataset.json"
 """All files that a run leaves which failed before it had anything."""
@@ -45,30 +47,30 @@ def write_json(path: Path, value: Mapping[str, Any]) -> None:
 def write_text(path: Path, text: str) -> None:
     """Write a whole file under a temporary name, then give it its own."""
     temporary = path.with_suffix(".tmp")
-    with temporary.open("w") as file:
+    temporary.unlink(missing_ok=True)  # a killed process left it, or it leads elsewhere
+    with temporary.open("x") as file:
         file.write(text)
         file.flush()
         os.fsync(file.fileno())  # or a power cut could leave the name without the text
     os.replace(temporary, path)
 
 
-def _read(path: Path) -> bytes:
-    """The bytes of a plain file."""
-    from lorasp_jax.models.untrusted import read_bytes  # its package imports Orbax, --help does not
-
-    return read_bytes(path)
-
-
-def read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path, kind: Mapping[Any, Any] = MappingProxyType({})) -> dict[str, Any]:
     """What `write_json` wrote; nothing without a file.
 
+    Args:
+        path: the file.
+        kind: what must be in it, see `records.check`.
+
     Raises:
-        ValueError: the file is damaged.
+        ValueError: the file is damaged, or another version wrote other values.
     """
-    try:
-        return unsealed(json.loads(_read(path))) if path.exists() else {}
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is damaged ({error}): put back a whole one") from error
+    if not path.exists():
+        return {}
+    with damage(path, remedy=": put back a whole one"):
+        found = unsealed(json.loads(read_bytes(path)))
+        records.check(found, kind)
+        return found
 
 
 @contextlib.contextmanager
@@ -81,7 +83,7 @@ def open_run(config: Config, root: Path, *, resume: bool | Literal["auto"]) -> I
     Raises:
         ValueError: the folder cannot be made or has a wildcard in its path; another process works
             on it; it holds a run and `resume` is off, holds none and `resume` is on, or holds a run
-            with another config.
+            with another config, a pipe, or a link to elsewhere.
     """
     folder = root / config.name
     if found := WILDCARDS & set(str(folder.absolute())):
@@ -91,6 +93,7 @@ def open_run(config: Config, root: Path, *, resume: bool | Literal["auto"]) -> I
         )
     with _locked(folder):
         if (folder / RECORD).exists() if resume == "auto" else resume:
+            check_only_files(folder, folder)
             changed = _differences(_recorded(folder), to_json(config))
             if changed:
                 raise ValueError(
@@ -132,7 +135,7 @@ def record_dataset(folder: Path, facts: Mapping[str, Any], *, streams: bool) -> 
         ValueError: the run began with another dataset.
     """
     path, now = folder / DATASET, {"facts": dict(facts), "streams": streams}
-    before = read_json(path) or now
+    before = read_json(path, records.DATASET) or now
     if before is now:
         write_json(path, now)
     if before["facts"] != now["facts"]:
@@ -150,14 +153,7 @@ def _locked(folder: Path) -> Iterator[None]:
     The operating system lets go of the lock when the process ends, in whatever way: the file that a
     killed run leaves stops nobody.
     """
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        # Not through a link: the file that it leads to would lose what is in it.
-        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW
-        opened = os.fdopen(os.open(folder.parent / f".{folder.name}.lock", flags, 0o666), "a+")
-    except OSError as error:
-        raise ValueError(f"{error.filename} cannot be opened: {error.strerror}") from error
-    with opened as file:
+    with open_lock(folder.parent / f".{folder.name}.lock") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
@@ -176,7 +172,7 @@ def _recorded(folder: Path) -> dict[str, Any]:
     """The config of the run in `folder`."""
     if not (folder / RECORD).exists():
         raise ValueError(f"{folder} holds no run to resume: start it without --resume")
-    return read_json(folder / RECORD)
+    return read_json(folder / RECORD, records.CONFIG)
 
 
 def _differences(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> list[str]:
@@ -251,14 +247,12 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
         ValueError: a row is not as it was written.
     """
     path = folder / "metrics.jsonl"
-    try:
-        lines = _read(path).split(b"\n")[:-1] if path.exists() else []
-    except ValueError as error:
-        raise ValueError(f"{path} cannot be read: {error}") from error
+    lines = read_bytes(path).split(b"\n")[:-1] if path.exists() else []
     rows = []
     for number, line in enumerate(lines, 1):
         try:
             rows.append(unsealed(json.loads(line)))
+            records.check(rows[-1], records.ROW)
         except (ValueError, RecursionError) as error:
             raise ValueError(
                 f"line {number} of {path} is damaged ({error}): put back a whole one, or remove it"

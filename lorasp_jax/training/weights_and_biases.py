@@ -5,6 +5,7 @@ from types import TracebackType
 from typing import Self
 
 from lorasp_jax.config import Config
+from lorasp_jax.training import records
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import read_json, to_json, write_json
 
@@ -30,7 +31,7 @@ class WeightsAndBiases(Callback):
         except ImportError as error:
             raise ValueError("--wandb needs a package: pip install wandb") from error
         self._wandb, record = wandb, folder / RECORD
-        known = read_json(record).get("id")
+        known = read_json(record, {"id": str}).get("id")
         try:
             self._run = wandb.init(
                 project=project,
@@ -62,7 +63,7 @@ class WeightsAndBiases(Callback):
         write_json(run.folder / RECORD, {"id": self._run.id})
         before = run.folder / "before.json"
         if before.exists():
-            self._success(0, read_json(before))
+            self._success(0, read_json(before, records.BEFORE))
 
     def on_log(self, run: Run, step: int, metrics: dict[str, float]) -> None:  # noqa: ARG002
         """Send the metrics."""
@@ -70,7 +71,7 @@ class WeightsAndBiases(Callback):
 
     def on_end(self, run: Run) -> None:
         """Send success after the last step and the videos."""
-        results = read_json(run.folder / "results.json")
+        results = read_json(run.folder / "results.json", records.RESULTS)
         after = {task: result["after"] for task, result in results["tasks"].items()}
         self._success(run.config.optim.steps, after)
         videos = {

@@ -109,3 +109,39 @@ def test_whole_numbers():
         with pytest.raises(ValueError, match="is no whole number"):
             files.whole(bad)
     assert json.loads("1e999") == float("inf")
+
+
+def test_only_files(folder, tmp_path):
+    files.check_only_files(folder, folder)
+    for name, target in (("file", "../../secret.json"), ("folder", "../..")):
+        (folder / "data" / name).symlink_to(target)
+        files.check_only_files(folder)
+        with pytest.raises(files.RefusedError, match=rf"{name} leads to .*, out of .*dataset"):
+            files.check_only_files(folder, folder)
+        (folder / "data" / name).unlink()
+    os.mkfifo(folder / "data" / "pipe")
+    with pytest.raises(files.RefusedError, match="pipe must be a file, but is a pipe"):
+        files.check_only_files(folder)
+
+
+@pytest.mark.parametrize(
+    ("error", "sentence"),
+    [
+        (ValueError("it is odd\nand more"), "x is damaged (it is odd)"),
+        (KeyError("a"), "x lacks 'a'"),
+        (FileNotFoundError(2, "", "x/y"), "x/y is missing"),
+        (RecursionError(), "x is damaged (RecursionError)"),
+        (ZeroDivisionError("by 0."), "x is damaged (by 0)"),
+        (UserWarning("of a library"), "x is damaged (of a library)"),
+        (files.RefusedError("x is a pipe"), "x is a pipe"),
+    ],
+)
+def test_damage_is_one_sentence(error, sentence):
+    remedy = "" if isinstance(error, files.RefusedError) else ": mend it"
+    with (
+        pytest.raises(ValueError, match=f"^{re.escape(sentence + remedy)}$"),
+        files.damage(files.Path("x"), UserWarning, remedy=": mend it"),
+    ):
+        raise error
+    with pytest.raises(AssertionError), files.damage(files.Path("x")):
+        raise AssertionError  # ours

@@ -86,3 +86,19 @@ def test_a_lock_that_was_deleted_meanwhile_is_none(path, monkeypatch, anew):
         assert len(calls) == 2
         with pytest.raises(ValueError, match="another process"), locks.alone(path):
             pass
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("kind", ["link", "folder", "pipe"])
+def test_a_lock_that_is_no_file_is_refused(path, kind):
+    """A link's file would be made or written; nobody reads a pipe."""
+    path.parent.mkdir()
+    lock = path.with_name(".press.lock")
+    {
+        "link": lambda: lock.symlink_to("precious"),
+        "folder": lock.mkdir,
+        "pipe": lambda: os.mkfifo(lock),
+    }[kind]()
+    with pytest.raises(ValueError, match=r"press\.lock cannot be opened"), locks.alone(path):
+        pass
+    assert [file.name for file in path.parent.iterdir()] == [lock.name]

@@ -165,7 +165,7 @@ def test_foreign_folders(tmp_path, path):
         rlds.read(path)
     rlds.write(make(), path)
     (path / "dataset_info.json").unlink()
-    with pytest.raises(ValueError, match="press is damaged"):
+    with pytest.raises(ValueError, match=r"dataset_info.json is missing"):
         rlds.read(path)
     for text in ("{", "[]", '{"format": "other"}'):
         (path / "metadata.json").write_text(text)
@@ -215,7 +215,7 @@ def test_a_damaged_part_is_refused(tmp_path, how):
     parts.append(make(2))
     (file,) = parts.folder.glob("*array_record*")
     damage(file, how) if how != "missing" else file.unlink()
-    with pytest.raises(ValueError, match=r"0 is damaged \(.*\): delete .*parts to start anew$"):
+    with pytest.raises(ValueError, match=r"0 is (damaged \(.*\)|missing): delete .*parts to"):
         rlds.Parts(parts.folder, {})
 
 

@@ -8,10 +8,10 @@ import numpy as np
 import orbax.checkpoint as ocp
 import pytest
 
+from envs.files import TEXT_BYTES
 from lorasp_jax.models import checkpoint, layouts, loading, published, statistics_files, tokenizer
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.tensor_files import INDEX, SINGLE, TensorFiles, weight_files
-from lorasp_jax.models.untrusted import TEXT_BYTES
 
 READERS = {
     "config.json": [loading.load_config, checkpoint.load_config],

@@ -3,44 +3,17 @@
 import json
 import re
 
-import numpy as np
 import pytest
 
 from lorasp_jax.digest import sealed
-from lorasp_jax.evaluation import video
 from lorasp_jax.report.html import speed, write_report
 from lorasp_jax.training.run_folder import STOPPED, MetricsLog, to_json, write_json
-from tests.runs import CONFIG
-
-RESULTS = {
-    "scale": "cpu",
-    "seconds": {"collect": 1.0, "train": 2.0, "evaluate": 3.0, "total": 7.0},
-    "tasks": {
-        "press": {
-            "before": {"success": 0.03125, "episodes": 64, "ci95": [0.009, 0.107]},
-            "after": {"success": 0.75, "episodes": 64, "ci95": [0.632, 0.84]},
-        }
-    },
-    "active_rank": {"vision": 4.25, "language": 3.0, "action": 2.0, "mean": 3.1},
-    "layer_active_rank": {"vision": {"fc1": [4.0, 4.5]}, "action": {"q_proj": [2.0]}},
-    "trainable_parameters": 10,
-    "total_parameters": 1000,
-}
+from tests.runs import CONFIG, RESULTS, finish
 
 
 @pytest.fixture
 def folder(tmp_path):
-    config = to_json(CONFIG)
-    write_json(tmp_path / "config.json", {**config, "name": "<b>run</b>"})
-    write_json(tmp_path / "results.json", RESULTS)
-    log = MetricsLog(tmp_path)
-    for step in (2, 4):
-        log.write(step, {"task": 1 / step, "spectral": 0.1, "active_rank/vision": 4.0})
-    log.close()
-    frames = np.random.default_rng(0).integers(0, 255, (4, 32, 64, 3), np.uint8)
-    video.write_picture(tmp_path / "cameras_press.png", frames[0])
-    video.write_video(tmp_path / "rollout_press.mp4", frames, fps=10)
-    return tmp_path
+    return finish(tmp_path)
 
 
 def test_report_shows_the_results_and_needs_no_other_file(folder):

@@ -241,11 +241,27 @@ def test_a_lock_that_is_a_link_leaves_what_it_leads_to(tmp_path):
     assert precious.read_text() == "precious"
 
 
+def test_a_run_that_leads_elsewhere_is_not_gone_on_with(tmp_path):
+    folder = open_run(CONFIG, tmp_path / "runs", resume=False)
+    (tmp_path / "precious.mp4").write_text("precious")
+    (folder / "unfinished_press.mp4").symlink_to("../../precious.mp4")
+    with pytest.raises(ValueError, match=r"unfinished_press.mp4 leads to .*precious.mp4, out of"):
+        open_run(CONFIG, tmp_path / "runs", resume=True)
+
+
+def test_a_link_under_a_temporary_name_is_not_followed(tmp_path):
+    (tmp_path / "precious").write_text("precious")
+    (tmp_path / "seconds.tmp").symlink_to("precious")
+    run_folder.write_json(tmp_path / "seconds.json", {"total": 1.0})
+    assert (tmp_path / "precious").read_text() == "precious"
+    assert run_folder.read_json(tmp_path / "seconds.json") == {"total": 1.0}
+
+
 @pytest.mark.timeout(20)
 def test_a_pipe_among_the_records_hangs_nobody(tmp_path):
     for name in ("config.json", "metrics.jsonl"):
         os.mkfifo(tmp_path / name)
-    with pytest.raises(ValueError, match=r"config\.json is damaged \(it is no file\)"):
+    with pytest.raises(ValueError, match=r"config\.json must be a file, but is a pipe"):
         run_folder.read_json(tmp_path / "config.json")
-    with pytest.raises(ValueError, match=r"metrics\.jsonl cannot be read: it is no file"):
+    with pytest.raises(ValueError, match=r"metrics\.jsonl must be a file, but is a pipe"):
         read_metrics(tmp_path)

@@ -9,7 +9,7 @@ import pytest
 import train
 from lorasp_jax.training.run_folder import write_json
 from lorasp_jax.training.weights_and_biases import WeightsAndBiases
-from tests.runs import CONFIG
+from tests.runs import CONFIG, RESULTS
 from tests.test_train import MULTITASK
 
 
@@ -48,7 +48,8 @@ def test_a_run_and_its_continuation(fake, tmp_path):
     folder = tmp_path / "test"
     folder.mkdir()
     run = SimpleNamespace(folder=folder, config=CONFIG)
-    write_json(folder / "before.json", {"press": {"success": 0.25}})
+    before = RESULTS["tasks"]["press"]["before"]
+    write_json(folder / "before.json", {"press": before | {"success": 0.25}})
     with contextlib.suppress(KeyboardInterrupt), WeightsAndBiases("arms", CONFIG, folder) as first:
         assert list(folder.iterdir()) == [folder / "before.json"]  # nothing to lose yet
         first.on_start(run)
@@ -56,8 +57,7 @@ def test_a_run_and_its_continuation(fake, tmp_path):
         raise KeyboardInterrupt
     with WeightsAndBiases("arms", CONFIG, folder) as callback:
         callback.on_log(run, 2, {"loss": 0.4})
-        results = {"tasks": {"press": {"before": {}, "after": {"success": 0.75}}}}
-        write_json(folder / "results.json", results)
+        write_json(folder / "results.json", RESULTS)
         callback.on_end(run)
     assert [(b["project"], b["id"], b["name"]) for b in fake.begun] == [
         ("arms", None, "test"),
