@@ -1,19 +1,26 @@
 """Adapt a policy to a robot: `python train.py --config configs/multitask.py`."""
 
 import contextlib
+import os
 import shlex
+import signal
 import sys
 import time
 from pathlib import Path
 
-from rich.console import Console
-
-from envs import compilation_cache
-from envs.refusals import refused
-
-RUNS = Path("runs")
 STOPPED = 130
 """Exit code after a signal, as shells have it."""
+
+if __name__ == "__main__":  # first: while the rest is imported there is nothing to save or to say
+    for _number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(_number, lambda *_: os._exit(STOPPED))
+
+from rich.console import Console  # noqa: E402
+
+from envs import compilation_cache  # noqa: E402
+from envs.refusals import refused  # noqa: E402
+
+RUNS = Path("runs")
 
 
 def main(arguments: list[str]) -> int:
@@ -26,34 +33,18 @@ def main(arguments: list[str]) -> int:
     from lorasp_jax.training import processes
     from lorasp_jax.training.interrupt import sigterm_as_interrupt
     from lorasp_jax.training.overrides import parse
-    from lorasp_jax.training.run_folder import open_run, to_json
+    from lorasp_jax.training.run_folder import to_json
 
     console, errors = Console(), processes.LastWords(stderr=True)
     try:
-        if "--distributed" in arguments:
-            processes.initialize(console, f"to go on: {resuming(arguments)}")
-            console.quiet = not processes.is_first()
-        command = parse(arguments)
-        options = {"resume": command.resume, "dry_run": command.dry_run}
-        processes.agree("settings", to_json(command.config) | options)
-        if command.dry_run:
-            from lorasp_jax.training.dry_run import dry_run
-
-            dry_run(command.config, RUNS / command.config.name, console)
-            return 0
-        folder = RUNS / command.config.name
-        with contextlib.ExitStack() as stack:
-            with processes.first_goes_ahead("opened"):
-                if processes.is_first():
-                    stack.enter_context(open_run(command.config, RUNS, resume=command.resume))
-            if command.resume and (folder / "results.json").exists():
-                from lorasp_jax.report.html import write_report
-
-                if processes.is_first():
-                    console.print(f"this run is finished: {write_report(folder)}", markup=False)
-                return 0
-            stack.enter_context(sigterm_as_interrupt())
-            run(command, folder, console, started)
+        with sigterm_as_interrupt():
+            if "--distributed" in arguments:
+                processes.initialize(console, f"to go on: {resuming(arguments)}")
+                console.quiet = not processes.is_first()
+            command = parse(arguments)
+            options = {"resume": command.resume, "dry_run": command.dry_run}
+            processes.agree("settings", to_json(command.config) | options)
+            _execute(command, console, started)
     except Exception as error:  # the input's fault is told in one sentence, ours is raised again
         return refused(error, errors, ": make room and add --resume")
     except KeyboardInterrupt:
@@ -63,10 +54,33 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
+def _execute(command, console: Console, started: float) -> None:
+    """A dry run, a run, or the report of one that is finished."""
+    from lorasp_jax.training import processes
+    from lorasp_jax.training.run_folder import open_run
+
+    folder = RUNS / command.config.name
+    if command.dry_run:
+        from lorasp_jax.training.dry_run import dry_run
+
+        dry_run(command.config, folder, console)
+        return
+    with contextlib.ExitStack() as stack:
+        with processes.first_goes_ahead("opened"):
+            if processes.is_first():
+                stack.enter_context(open_run(command.config, RUNS, resume=command.resume))
+        if not (command.resume and (folder / "results.json").exists()):
+            run(command, folder, console, started)
+        elif processes.is_first():
+            from lorasp_jax.report.html import write_report
+
+            console.print(f"this run is finished: {write_report(folder)}", markup=False)
+
+
 def resuming(arguments: list[str]) -> str:
-    """The command that goes on with this run."""
-    resumes = any(argument.startswith("--resume") for argument in arguments)
-    return shlex.join(["python", "train.py", *arguments, *([] if resumes else ["--resume"])])
+    """The command that goes on with this run, or begins it where it had not begun."""
+    more = [] if {"--resume", "--resume=auto", "--dry-run"} & {*arguments} else ["--resume", "auto"]
+    return shlex.join(["python", "train.py", *arguments, *more])
 
 
 def run(command, folder: Path, console: Console, started: float) -> None:

@@ -4,11 +4,15 @@ The data position and every random stream of a run are functions of its seed and
 these three restore a run to the bit. The base is recorded by its hash, the values by their digest.
 """
 
+import asyncio
 import contextlib
+import functools
 import itertools
 import logging
 import os
 import shutil
+import sys
+import traceback
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -32,7 +36,9 @@ class Checkpoints:
 
     def __init__(self, folder: Path, base_hash: str, console: Console) -> None:
         """Open `folder`/checkpoints for a run on the base identified by `base_hash`."""
-        logging.getLogger("absl").addFilter(_is_news)
+        for name in ("absl", "asyncio"):
+            logging.getLogger(name).addFilter(_is_news)
+        _leave_echoes_out()
         atomic = ocp.options.AtomicityOptions(mode=ocp.options.AtomicityMode.COMMIT_FILE)
         options = ocp.CheckpointManagerOptions(max_to_keep=2, atomicity_options=atomic)
         self._folder = (folder / "checkpoints").absolute()
@@ -178,9 +184,27 @@ class _DamagedError(Exception):
 
 def _is_news(record: logging.LogRecord) -> bool:
     """Whether a log record says more than an exception will: of a failed write Orbax logs one
-    traceback a thread, and raises it.
+    traceback a thread, asyncio one a task, and Orbax raises it.
     """
-    return not (record.exc_info and "orbax" in record.pathname)
+    frames = traceback.extract_tb(record.exc_info[2]) if record.exc_info else ()
+    return not any("orbax" in frame.filename for frame in frames)
+
+
+@functools.cache  # once a process
+def _leave_echoes_out() -> None:
+    """Of a failed write say nothing for each thread of Orbax' storage that is still writing.
+
+    It finds the event loop closed, as the first failure ended it, and has nobody to tell.
+    """
+    before = sys.unraisablehook
+
+    def hook(failed: Any) -> None:
+        place = failed.exc_traceback and failed.exc_traceback.tb_frame.f_code.co_filename
+        echo = asyncio.base_events.__file__, "Event loop is closed"
+        if (place, str(failed.exc_value)) != echo:
+            before(failed)
+
+    sys.unraisablehook = hook
 
 
 def _suffixes() -> Iterator[str]:

@@ -72,6 +72,7 @@ def parse(arguments: Sequence[str]) -> Command:
     if wants_help:
         _parser(type(config.peft).__module__.rpartition(".")[2]).print_help()
         print(f"\n{_on_scales(known.config, known.scale)}")
+        rest = ["--help"]  # it may stand where an option wants its value
     if known.method is not None:
         config = dataclasses.replace(config, peft=_switch(config.peft, known.method))
     if known.resume and known.dry_run:
@@ -159,7 +160,9 @@ def load(path: Path, scale: str) -> Config:
         if not hasattr(module, "get_config"):
             raise ValueError("it has no function get_config(scale)")
         config = module.get_config(scale)
-    except (Exception, SystemExit) as error:  # whatever a file's code raises
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # whatever a file's code raises
         reason = str(error).partition("\n")[0]
         raise ValueError(f"{path} gives no config ({type(error).__name__}: {reason})") from error
     if not isinstance(config, Config):

@@ -96,6 +96,23 @@ def test_help_lists_every_field_and_option(config, capsys):
     assert f"presets ({', '.join(PRESETS)}) and regular expressions" in words
 
 
+@pytest.mark.parametrize("arguments", [["--robot", "-h"], ["--peft.rank", "x", "--help"]])
+def test_help_in_place_of_a_value(arguments, capsys):
+    with pytest.raises(SystemExit) as caught:
+        parse([*MULTITASK, *arguments])
+    assert caught.value.code in (0, None)
+    printed = capsys.readouterr()
+    assert "--optim.learning-rate" in printed.out
+    assert not printed.err
+
+
+@pytest.mark.parametrize("raised", ["GeneratorExit", "SystemExit", "BaseException", "ValueError"])
+def test_a_config_that_ends_the_process(raised, tmp_path):
+    (tmp_path / "x.py").write_text(f"def get_config(scale):\n    raise {raised}('so')\n")
+    with pytest.raises(ValueError, match=rf"x.py gives no config \({raised}: so\)"):
+        parse(["--config", str(tmp_path / "x.py"), "--scale", "cpu"])
+
+
 def test_help_says_what_the_scales_change(capsys):
     with pytest.raises(SystemExit):
         parse([*MULTITASK, "--help"])
