@@ -10,7 +10,7 @@ Axis letters used in every docstring and einsum of this package:
 """
 
 from lorasp_jax import dense, hugging_face, named, peft
-from lorasp_jax.adaptation import adapt, merge, split
+from lorasp_jax.adaptation import adapt, merge, split, with_dropout
 from lorasp_jax.adapter_io import load_adapters, save_adapters
 from lorasp_jax.auxiliary import auxiliary_losses
 from lorasp_jax.compaction import distill, prune
@@ -55,4 +55,5 @@ __all__ = [
     "summary",
     "swap",
     "unmerge",
+    "with_dropout",
 ]

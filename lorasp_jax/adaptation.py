@@ -26,10 +26,10 @@ import jax.numpy as jnp
 from flax import linen, nnx
 
 from lorasp_jax import layers, paths
-from lorasp_jax.dense import AdaptedLayer, AdapterAux, AdapterParam
+from lorasp_jax.dense import DROPPING, AdaptedLayer, AdapterAux, AdapterParam, DropoutKey
 from lorasp_jax.kernels.quantized import QuantizedKernel
 from lorasp_jax.peft import FullFineTuning, Method
-from lorasp_jax.peft.method import Params
+from lorasp_jax.peft.method import Params, drop_rate
 
 Model = TypeVar("Model", bound=nnx.Module)
 
@@ -95,6 +95,31 @@ def split(model: nnx.Module) -> tuple[nnx.GraphDef, nnx.State, nnx.State]:
     """
     graphdef, adapters, frozen = nnx.split(_copy(model)[0], AdapterParam, ...)
     return graphdef, adapters, frozen
+
+
+def with_dropout(model: Model, key: jax.Array) -> Model:
+    """The model for one training step, in which adapters with a `dropout` see parts of their input.
+
+    Called inside the loss, with another key for each step:
+
+        model = with_dropout(nnx.merge(graphdef, adapters, frozen, copy=True), key)
+
+    All other models evaluate: those of `adapt` and `load_adapters`, and what `split`, `merge` and
+    other functions make of the result. The layers of a stack draw apart from each other; a layer
+    that is called twice drops the same places of both inputs, if they are of one shape.
+
+    Args:
+      model: left untouched; without such adapters the result computes the same.
+      key: typed random key.
+    """
+    holder = _copy(model)
+    for place in paths.once(paths.places(holder, AdaptedLayer)):
+        layer = place.child
+        if isinstance(layer.adapter, AdapterParam) and drop_rate(layer.method):
+            own = jax.random.fold_in(key, zlib.crc32(place.path.encode()))
+            leading = layer.stack_shape()
+            setattr(layer, DROPPING, DropoutKey(jax.random.split(own, leading) if leading else own))
+    return holder[0]
 
 
 def count(model: nnx.Module) -> Counts:
@@ -198,12 +223,12 @@ def checked_module(model: Any) -> Any:
 
 
 def _copy(model: nnx.Module) -> nnx.List:
-    """A holder of one copy of the model that shares its arrays, free of what layers kept.
+    """A holder of one copy of the model that shares its arrays, free of what calls need or leave.
 
     The holder gives a model that is itself one layer a parent to be replaced in.
     """
     model = nnx.clone(checked_module(model))
-    nnx.pop(model, AdapterAux)
+    nnx.pop(model, nnx.Any(AdapterAux, DropoutKey))
     return nnx.List([model])
 
 

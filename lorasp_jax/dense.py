@@ -18,7 +18,7 @@ second result asks for it, `layer(x, return_aux=True)`, and then nothing is stor
 
 import contextlib
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple
 
 import flax.errors
 import flax.linen as nn
@@ -29,9 +29,10 @@ from flax.typing import Dtype, Initializer
 
 from lorasp_jax.kernels.quantized import QuantizedKernel
 from lorasp_jax.peft import Aux, Method
-from lorasp_jax.peft.method import Params, apply_together
+from lorasp_jax.peft.method import Params, apply_together, drop_rate
 
 KEPT = "kept_aux"
+DROPPING = "held_dropout_key"
 KERNEL_INIT = jax.nn.initializers.lecun_normal()  # of nnx.Linear and nn.Dense too
 
 
@@ -49,8 +50,18 @@ def refuse_sharding(out_sharding: Any) -> None:
         raise ValueError("an adapted layer takes no out_sharding: constrain what it returns.")
 
 
-DenseLayer: TypeAlias = tuple[jax.Array, jax.Array | None, Params | None, Method | None]
-"""Kernel, bias, params and method of a layer, as `dense` takes them."""
+class DropoutKey(nnx.Variable):
+    """What `with_dropout` gives a layer for one training step."""
+
+
+class DenseLayer(NamedTuple):
+    """What `dense` takes beside the input."""
+
+    kernel: jax.Array
+    bias: jax.Array | None = None
+    params: Params | None = None
+    method: Method | None = None
+    dropout_key: jax.Array | None = None
 
 
 def dense(
@@ -59,6 +70,7 @@ def dense(
     bias: jax.Array | None = None,
     params: Params | None = None,
     method: Method | None = None,
+    dropout_key: jax.Array | None = None,
     *,
     token_mask: jax.Array | None = None,
 ) -> tuple[jax.Array, Aux]:
@@ -70,6 +82,7 @@ def dense(
       bias: broadcastable to [*O], or None.
       params: the adapter's parameters for the kernel as a matrix [I, O], or None.
       method: the adapter's method, given with `params`.
+      dropout_key: for the method's dropout in a training step; None: nothing is dropped.
       token_mask: bool [...tokens]; False (padding) stays out of losses and statistics.
 
     Returns:
@@ -79,7 +92,8 @@ def dense(
       ValueError: x is of integers or does not end in the kernel's input size, or a mask of another
         shape.
     """
-    return dense_together(x, [(kernel, bias, params, method)], token_mask=token_mask)[0]
+    layer = DenseLayer(kernel, bias, params, method, dropout_key)
+    return dense_together(x, [layer], token_mask=token_mask)[0]
 
 
 def dense_together(
@@ -89,7 +103,7 @@ def dense_together(
 
     Args:
       x: [...tokens, I].
-      layers: (kernel, bias, params, method) of each; see `dense`.
+      layers: (kernel, bias, params, method, dropout_key) of each; see `dense`.
       token_mask: bool [...tokens].
 
     Returns:
@@ -100,18 +114,20 @@ def dense_together(
     """
     _check_input(x, token_mask)
     plain, adapted = {}, {}
-    for i, (kernel, _, params, method) in enumerate(layers):
+    for i, (kernel, _, params, method, key) in enumerate(layers):
         if x.shape[-1] != kernel.shape[0]:
             raise ValueError(f"input of width {x.shape[-1]} meets a kernel {tuple(kernel.shape)}.")
         matrix = kernel.reshape(kernel.shape[0], -1)
         if method is None or params is None:
             plain[i] = x @ matrix.astype(x.dtype), Aux()
+        elif key is not None:
+            plain[i] = method.apply_dropped(params, x, matrix, key, token_mask=token_mask)
         else:
             adapted[i] = method, params, matrix
     fused = apply_together([*adapted.values()], x, token_mask=token_mask)
     found = plain | dict(zip(adapted, fused, strict=True))
     results = []
-    for i, (kernel, bias, _, _) in enumerate(layers):
+    for i, (kernel, bias, *_) in enumerate(layers):
         y = found[i][0].reshape(*x.shape[:-1], *kernel.shape[1:])
         results.append((y if bias is None else y + bias.astype(y.dtype), found[i][1]))
     return results
@@ -149,6 +165,10 @@ class AdaptedLayer(nnx.Module):
         """The kernel as the adapter sees it, [..., I, O]; leading axes are stacks of layers."""
         return getattr(self, self.kernel_name).get_value()
 
+    def stack_shape(self) -> tuple[int, ...]:
+        """Sizes of the stacks of layers that this one is; () for one layer."""
+        return tuple(self.kernel_matrices().shape[:-2])
+
     def set_kernel_matrices(self, matrices: jax.Array | QuantizedKernel) -> None:
         """Gives the layer another kernel in a variable of its own: the old one may be shared."""
         old = getattr(self, self.kernel_name)
@@ -172,6 +192,12 @@ class AdaptedLayer(nnx.Module):
         """The layer as it was before adaptation, or as near as it comes, with its kernel of now."""
         self.adapter, self.method = None, None
         return self
+
+    @property
+    def dropout_key(self) -> jax.Array | None:
+        """The key of `with_dropout`, or None: nothing is dropped."""
+        held = getattr(self, DROPPING, None)
+        return None if held is None else held.get_value()
 
     def keep_aux(self, aux: Aux) -> None:
         """Stores aux for `collect_aux`, where the layer may be changed."""
@@ -251,7 +277,7 @@ class Dense(AdaptedLayer):
         """What `dense` and `dense_together` take."""
         bias = None if self.bias is None else self.bias.get_value()
         params = None if self.adapter is None else self.adapter.get_value()
-        return self.kernel.get_value(), bias, params, self.method
+        return DenseLayer(self.kernel.get_value(), bias, params, self.method, self.dropout_key)
 
 
 class LinenDense(nn.Module):
@@ -259,7 +285,8 @@ class LinenDense(nn.Module):
 
     The kernel and bias are in the collection "params", the adapter's parameters in "adapters": what
     trains is a collection. Full fine-tuning trains "params" and adds nothing. With "intermediates"
-    mutable, aux is sown there for `collect_aux`.
+    mutable, aux is sown there for `collect_aux`. The method's dropout is on in calls that get rngs
+    for "dropout".
 
     Attributes:
       features: O.
@@ -291,7 +318,9 @@ class LinenDense(nn.Module):
         if self.method is not None and not self.method.trains_base:
             params = self.variable("adapters", "adapter", self._init_adapter, kernel).value
         x = x.astype(self.dtype or jnp.promote_types(x.dtype, kernel.dtype))
-        y, aux = dense(x, kernel, bias, params, self.method, token_mask=token_mask)
+        drops = params is not None and drop_rate(self.method) and self.has_rng("dropout")
+        key = self.make_rng("dropout") if drops else None
+        y, aux = dense(x, kernel, bias, params, self.method, key, token_mask=token_mask)
         if return_aux:
             return y, aux
         if params is not None:

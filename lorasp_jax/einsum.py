@@ -135,6 +135,7 @@ def einsum(
     bias: jax.Array | None = None,
     params: Params | None = None,
     method: Method | None = None,
+    dropout_key: jax.Array | None = None,
 ) -> tuple[jax.Array, Aux]:
     """The einsum of x and kernel through an adapter, or plainly without one, plus bias.
 
@@ -144,6 +145,7 @@ def einsum(
       bias: the kernel's axes that y has, in the order of y, or None.
       params: the adapter's parameters for `to_matrices(equation, kernel)`, or None.
       method: the adapter's method, given with `params`.
+      dropout_key: as for `dense`.
 
     Returns:
       y in the type of x, and the adapter's aux, all with leading batch axes but the losses, which
@@ -157,12 +159,14 @@ def einsum(
     order = [axes.x.index(c) for c in axes.batch + tokens + axes.inputs]
     rows = x.transpose(order).reshape(*(sizes[c] for c in axes.batch + tokens), -1)
 
-    def one(x: jax.Array, matrix: jax.Array, params: Params | None) -> tuple[jax.Array, Aux]:
-        return dense(x, matrix, None, params, method)
+    def one(x: jax.Array, matrix: jax.Array, params: Any, key: Any) -> tuple[jax.Array, Aux]:
+        return dense(x, matrix, None, params, method, key)
 
     for _ in axes.batch:
         one = jax.vmap(one)
-    y, aux = one(rows, to_matrices(equation, kernel), params)
+    if dropout_key is not None:
+        dropout_key = jax.random.split(dropout_key, [sizes[c] for c in axes.batch])
+    y, aux = one(rows, to_matrices(equation, kernel), params, dropout_key)
     found = axes.batch + tokens + axes.outputs
     y = y.reshape([sizes[c] for c in found]).transpose([found.index(c) for c in axes.y])
     if bias is not None:

@@ -25,6 +25,7 @@ from lorasp_jax import adaptation, layers, paths
 from lorasp_jax.adapter_io import write_whole
 from lorasp_jax.dense import AdaptedLayer, AdapterParam
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA
+from lorasp_jax.peft.method import drop_rate
 from lorasp_jax.peft_folders import CONFIG, PREFIX, TENSORS, Adapter, read
 from lorasp_jax.peft_whole import Names, exported_whole, whole_parameters
 
@@ -52,7 +53,8 @@ def load_peft(
     Biases and modules that the folder trained in full (`bias`, `modules_to_save`) train in full
     here, too. Adapters go to dense layers and einsums, `nnx.MultiHeadAttention`'s among them, whose
     kernels stand for torch's with all heads side by side. AdaLoRA comes as the LoRA that it has
-    become. Zeros make up for different ranks in a stack.
+    become. Zeros make up for different ranks in a stack. `lora_dropout` is the methods' `dropout`,
+    which is off but for `with_dropout`.
 
     Args:
       folder: with adapter_config.json and adapter_model.safetensors; or a repository on the hub,
@@ -104,6 +106,7 @@ def matched(
     folder = _at_hand(folder)
     config, modules, full = read(folder)
     kind = DoRA if config.get("use_dora") else LoRA
+    dropout = config.get("lora_dropout") or 0.0
     left, known, rules, values = dict(modules), [], [], {}
     for path, (*leading, d_in, d_out) in shapes.items():
         wanted = [names(path, index) for index in np.ndindex(*leading)]
@@ -117,7 +120,7 @@ def matched(
             _check_fits(folder, name, adapter, d_in, d_out)
         scale, values[path] = _stacked(found, leading)
         rank = values[path]["lora_a"].shape[-1]
-        rules.append((f"^{re.escape(path)}$", kind(rank=rank, alpha=scale * rank)))
+        rules.append((f"^{re.escape(path)}$", kind(rank, scale * rank, dropout=dropout)))
     _check_used(folder, modules, left, known)
     whole = whole_parameters(folder, full, shapes, sizes, names)
     # Of a layer with an adapter the bias may train in full: such rules go first.
@@ -149,10 +152,11 @@ def save_peft(
       base: what the folder says of its base model.
 
     Raises:
-      ValueError: adapters that PEFT has no counterpart for, or LoRA and DoRA together.
+      ValueError: adapters that PEFT has no counterpart for, LoRA and DoRA together, or several
+        rates of dropout.
     """
     modules: dict[str, tuple[float, Adapter]] = {}
-    kinds = set()
+    kinds, rates = set(), set()
     methods = adaptation.methods(model).items()
     known = {p for p, method in methods if not method.trains_base and _is_known(p, method)}
     for place in paths.places(nnx.List([model]), AdaptedLayer):
@@ -162,11 +166,17 @@ def save_peft(
                     f"{place.path} is neither dense nor an einsum: it cannot be in a PEFT folder."
                 )
             kinds.add(isinstance(place.child.method, DoRA))
+            rates.add(drop_rate(place.child.method))
             shape = place.child.kernel_matrices().shape[:-2]
             for index in np.ndindex(*shape):
                 modules[names(place.path, index)] = _exported(place.child, index)
     if len(kinds) != 1:
         raise ValueError("a PEFT folder holds either LoRA or DoRA, and at least one adapter.")
+    if len(rates) != 1:
+        raise ValueError(
+            f"a PEFT folder has one lora_dropout, the adapters have {sorted(rates)}: give their "
+            "layers one, as in layer.method = dataclasses.replace(layer.method, dropout=0.1)."
+        )
     tensors = {
         f"{PREFIX}{module}.{name}": value
         for module, (_, adapter) in modules.items()
@@ -177,7 +187,8 @@ def save_peft(
     folder = pathlib.Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / TENSORS, data)
-    text = json.dumps(_config(modules, dora=kinds.pop(), base=base) | said, indent=2)
+    said |= {"use_dora": kinds.pop(), "lora_dropout": rates.pop()}
+    text = json.dumps(_config(modules, base) | said, indent=2)
     write_whole(folder / CONFIG, text.encode())
 
 
@@ -247,10 +258,8 @@ def _exported(layer: AdaptedLayer, index: tuple[int, ...]) -> tuple[float, Adapt
     return layer.method.scale, tensors  # pyright: ignore[reportAttributeAccessIssue, reportOptionalMemberAccess]
 
 
-def _config(
-    modules: Mapping[str, tuple[float, Adapter]], *, dora: bool, base: str | None
-) -> dict[str, Any]:
-    """adapter_config.json: one rank and α for most, patterns for the others."""
+def _config(modules: Mapping[str, tuple[float, Adapter]], base: str | None) -> dict[str, Any]:
+    """Most of adapter_config.json: one rank and α for most, patterns for the others."""
     ranks = {name: len(found["lora_A.weight"]) for name, (_, found) in modules.items()}
     alphas = {name: scale * ranks[name] for name, (scale, _) in modules.items()}
     rank, alpha = (collections.Counter(x.values()).most_common(1)[0][0] for x in (ranks, alphas))
@@ -263,11 +272,8 @@ def _config(
         "rank_pattern": {f"^{re.escape(n)}": r for n, r in ranks.items() if r != rank},
         "alpha_pattern": {f"^{re.escape(n)}": a for n, a in alphas.items() if a != alpha},
         "target_modules": sorted(modules),
-        "use_dora": dora,
         "use_rslora": False,
-        "bias": "none",
         "fan_in_fan_out": False,
         "inference_mode": True,
-        "lora_dropout": 0.0,
         "task_type": None,
     }

@@ -17,6 +17,7 @@ from lorasp_jax import einsum
 from lorasp_jax.dense import AdaptedLayer, Dense, refuse_sharding, with_value
 from lorasp_jax.kernels.quantized import QuantizedKernel
 from lorasp_jax.peft import LoRA, Method
+from lorasp_jax.peft.method import drop_rate, dropped
 
 Einsums = Mapping[type, Callable[[Any], tuple[str, str | None]]]
 """By layer class, of NNX or Linen: a function of the layer that gives the name of its kernel and
@@ -62,7 +63,13 @@ class EinsumLayer(AdaptedLayer):
         params = None if self.adapter is None else self.adapter.get_value()
         dtype = getattr(self, "dtype", None) or jnp.promote_types(x.dtype, kernel.dtype)
         y, aux = einsum.einsum(
-            self.kernel_equation, x.astype(dtype), kernel, bias, params, self.method
+            self.kernel_equation,
+            x.astype(dtype),
+            kernel,
+            bias,
+            params,
+            self.method,
+            self.dropout_key,
         )
         if self.adapter is not None:
             self.keep_aux(aux)
@@ -71,6 +78,11 @@ class EinsumLayer(AdaptedLayer):
     def kernel_matrices(self) -> jax.Array:
         """The kernel as [..., *batch, I, O]."""
         return einsum.to_matrices(self.kernel_equation, super().kernel_matrices())
+
+    def stack_shape(self) -> tuple[int, ...]:
+        """As for every layer; axes of the einsum are none of them."""
+        shape = super().kernel_matrices().shape
+        return tuple(shape[: len(shape) - len(einsum.parse(self.kernel_equation).kernel)])
 
     def set_kernel_matrices(self, matrices: jax.Array | QuantizedKernel) -> None:
         """Gives the layer another kernel."""
@@ -123,6 +135,8 @@ class ConvLayer(LoRALayer):
     def __call__(self, inputs: jax.Array, *args: Any, **kwargs: Any) -> jax.Array:
         """The convolution, [..., *spatial, O]."""
         y = super().__call__(inputs, *args, **kwargs)
+        if self.dropout_key is not None:
+            inputs = dropped(inputs, drop_rate(self.method), self.dropout_key)
         return self.with_delta(y, lambda a: convolved(self, a, inputs))
 
     def kernel_matrices(self) -> jax.Array:

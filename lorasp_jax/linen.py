@@ -29,11 +29,13 @@ from lorasp_jax.layers import Einsums
 from lorasp_jax.linen_layers import kind, layer_map, with_lora
 from lorasp_jax.paths import Rules, check_method_rules, governing, no_match
 from lorasp_jax.peft import Method
+from lorasp_jax.peft.method import drop_rate
 
 ADAPTER = "lorasp_adapter"  # name of an adapter among its layer's parameters
 # Set on scopes of the model: its code may apply other modules, which have variables of their own,
 # as Hugging Face's tied heads do.
 OURS = "lorasp_jax"
+DROPS = "lorasp_jax_dropout"  # on scopes of a call that got rngs for "dropout"
 Next = Callable[..., Any]
 
 
@@ -121,10 +123,11 @@ class LinenAdapter:
           *args: as for the model.
           mutable: as for the model, but for "params"; with "intermediates" in it `collect_aux`
             finds what the layers reported.
-          **kwargs: as for the model.
+          **kwargs: as for the model; the methods' dropout is on if rngs has a "dropout".
 
         Raises:
-          ValueError: variables without an adapter that the rules ask for, or mutable "params".
+          ValueError: variables without an adapter that the rules ask for, mutable "params", or a
+            scan that hands no rngs for dropout on.
         """
         if flax.core.scope.in_filter(mutable, "params"):
             raise ValueError("'params' cannot be mutable: it holds the adapters during the call.")
@@ -277,10 +280,11 @@ class LinenAdapter:
             y = run(*args, **kwargs)
             return y + layers.attend_delta(method, params, *args, **kwargs).astype(y.dtype)
         view = layer_map(module, self.einsums, args, kwargs)
+        key = _dropout_key(module, method)
         if view.equation:
-            y, aux = view.einsum(method, params)
+            y, aux = view.einsum(method, params, key)
         else:
-            y, aux = with_lora(module, method, params, run(*args, **kwargs), *args, **kwargs)
+            y, aux = with_lora(module, method, params, key, run(*args, **kwargs), *args, **kwargs)
         module.sow("intermediates", KEPT, aux)
         return y
 
@@ -301,12 +305,26 @@ def _is_ours(module: nn.Module) -> bool:
     return module.scope is not None and module.scope.has_flag(OURS)
 
 
+def _dropout_key(module: nn.Module, method: Method) -> jax.Array | None:
+    """A key where the method has dropout and the call of the model got rngs for it, else None."""
+    assert module.scope is not None
+    if not drop_rate(method) or not module.scope.has_flag(DROPS):
+        return None
+    if not module.has_rng("dropout"):
+        raise ValueError(
+            f"{'/'.join(module.path)} gets no rngs for its adapter's dropout: the scan or vmap "
+            "around it needs 'dropout' in split_rngs."
+        )
+    return module.make_rng("dropout")
+
+
 def _apply(model: nn.Module, variables: Any, *args: Any, method: Any = None, **kwargs: Any) -> Any:
     """`model.apply`, in scopes that can be told from others."""
 
     def run(module: nn.Module, *args: Any, **kwargs: Any) -> Any:
         assert module.scope is not None
-        module.scope.flags = module.scope.flags.copy({OURS: True})
+        drops = {DROPS: True} if module.has_rng("dropout") else {}
+        module.scope.flags = module.scope.flags.copy({OURS: True} | drops)
         if callable(method):
             return method(module, *args, **kwargs)
         return getattr(module, method or "__call__")(*args, **kwargs)

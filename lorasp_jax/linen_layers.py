@@ -11,6 +11,7 @@ import numpy as np
 from lorasp_jax import layers
 from lorasp_jax.einsum import LINEAR, einsum, from_matrices, general_equation, to_matrices
 from lorasp_jax.peft import Aux, Method
+from lorasp_jax.peft.method import drop_rate, dropped
 
 
 def _general(layer: Any) -> tuple[str, str]:
@@ -79,12 +80,12 @@ class LayerMap(NamedTuple):
         """
         return method.init if self.equation else layers.lora_init(self.module, method)
 
-    def einsum(self, method: Method, params: Any) -> tuple[jax.Array, Aux]:
+    def einsum(self, method: Method, params: Any, key: Any) -> tuple[jax.Array, Aux]:
         """The einsum through an adapter, plus bias; and aux."""
         assert self.equation is not None
         kernel, bias = self.kernel(), nn.meta.unbox(self.module.get_variable("params", "bias"))
         dtype = getattr(self.module, "dtype", None) or jnp.promote_types(self.x.dtype, kernel.dtype)
-        return einsum(self.equation, self.x.astype(dtype), kernel, bias, params, method)
+        return einsum(self.equation, self.x.astype(dtype), kernel, bias, params, method, key)
 
 
 def layer_map(module: nn.Module, einsums: layers.Einsums, args: Any, kwargs: Any) -> LayerMap:
@@ -111,11 +112,13 @@ def layer_map(module: nn.Module, einsums: layers.Einsums, args: Any, kwargs: Any
 
 
 def with_lora(
-    module: nn.Module, method: Any, params: Any, y: jax.Array, inputs: jax.Array
+    module: nn.Module, method: Any, params: Any, key: Any, y: jax.Array, inputs: jax.Array
 ) -> tuple[jax.Array, Aux]:
     """y of an embedding or a convolution plus the delta, and aux."""
     a = params["lora_a"]
     conv = isinstance(module, nn.Conv)
+    if conv and key is not None:
+        inputs = dropped(inputs, drop_rate(method), key)
     hidden = layers.convolved(module, a, inputs) if conv else layers.lookup(a, inputs)
     z, aux = method.between(params, hidden.astype(y.dtype), None)
     return y + z @ method.up(params).astype(y.dtype), aux

@@ -59,7 +59,8 @@ def read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter], Whol
         raise ValueError(f"{folder} holds {str(kind)[:40]}; LORA and ADALORA can be loaded.")
     if asked := [name for name in _UNKNOWN if config.get(name) not in _NOTHING]:
         raise ValueError(
-            f"{folder} sets {asked[0]} to {reprlib.repr(config[asked[0]])}, which is not supported."
+            f"{folder} sets {asked[0]} to {reprlib.repr(config[asked[0]])}, which is not "
+            "supported: merge it into its base in PEFT (merge_and_unload), and load the result."
         )
     if (start := config.get("init_lora_weights")) not in _WHOLE_BASE:
         raise ValueError(
@@ -149,8 +150,8 @@ _KINDS: dict[str, tuple[Callable[[Any], bool], tuple[str, ...]]] = {
         ("alpha_pattern",),
     ),
     f"a whole number from 1 to {LARGEST_SIZE}": (_is_size, ("r", "init_r", "target_r")),
-    "a number from 0 to 1": (
-        lambda value: _is_number(value) and 0 <= value <= 1,
+    "a number from 0 on, less than 1": (
+        lambda value: _is_number(value) and 0 <= value < 1,
         ("lora_dropout",),
     ),
     "a text": (

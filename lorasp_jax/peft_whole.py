@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 from flax import nnx
 
-from lorasp_jax import paths
+from lorasp_jax import layers, paths
 from lorasp_jax.dense import AdapterParam, Dense
 from lorasp_jax.peft_folders import PREFIX, Adapter, Whole
 
 Names = Callable[[str, tuple[int, ...]], str]
 _TORCH_NAMES = {"kernel": "weight", "embedding": "weight", "scale": "weight", "bias": "bias"}
+_AXES = {"embedding": 2, "scale": 1, "bias": 1}  # outside of layers that multiply; more are stacks
 
 
 def whole_parameters(
@@ -37,14 +38,14 @@ def whole_parameters(
     for path, size in sizes.items() if full else ():
         module, _, name = path.rpartition("/")
         kind = _TORCH_NAMES.get(name, "")
-        leading = tuple(shapes[module][:-2]) if module in shapes else ()
+        leading = _stack(name, size, shapes.get(module))
         wanted = [(names(module, index), kind) for index in np.ndindex(*leading)]
         parts = [left.pop(key) for key in wanted if key in left]
         if not parts:
             continue
         if len(parts) < len(wanted):
             raise ValueError(f"{folder} holds {kind} of only some layers of the stack {module}.")
-        value = np.stack([part.T if name == "kernel" else part for part in parts])
+        value = np.stack([_from_torch(part) if name == "kernel" else part for part in parts])
         rows = value.shape[1:] if name == "kernel" else (value[0].size,)
         own = tuple(size[len(leading) :])
         if rows != (own if name == "kernel" else (math.prod(own),)):
@@ -68,12 +69,14 @@ def exported_whole(
     free = [place for place in places if isinstance(place.child, AdapterParam)]
     saved = {_module(place) for place in free if place.name != "bias"}
     biases = {_module(place) for place in free} - saved
+    multiplying = paths.multiplying(nnx.List([model]))
+    shapes = {place.path: layers.matrices_shape(place.child, {}) for place in multiplying}
     tensors: Adapter = {}
     for place in places:
         module = _module(place)
         if module in saved or place in free:
             middle = ".base_layer" if module in adapted else ""
-            for index, value in _parts(place):
+            for index, value in _parts(place, shapes.get(module)):
                 name = f"{names(module, index)}{middle}.{_TORCH_NAMES[place.name]}"
                 tensors[PREFIX + name] = value
     stems = {name.removeprefix(PREFIX).rpartition(".")[0] for name in tensors}
@@ -86,14 +89,35 @@ def _module(place: paths.Place) -> str:
     return place.path.rpartition("/")[0]
 
 
-def _parts(place: paths.Place) -> list[tuple[tuple[int, ...], np.ndarray]]:
+def _stack(name: str, size: Sequence[int], matrices: Sequence[int] | None) -> tuple[int, ...]:
+    """Axes of a stack of layers in a parameter of this size.
+
+    Args:
+      name: of the parameter.
+      size: its shape.
+      matrices: [..., I, O] of its layer's kernel, if that multiplies its input by matrices.
+    """
+    if matrices is not None:
+        return tuple(matrices[:-2])
+    return tuple(size[: -_AXES[name]]) if name in _AXES else ()
+
+
+def _from_torch(kernel: np.ndarray) -> np.ndarray:
+    """[I, O] of torch's [out, in], and a convolution's [*sizes, I, O] of [out, in, *sizes]."""
+    return kernel.transpose(*range(2, kernel.ndim), 1, 0)
+
+
+def _parts(
+    place: paths.Place, matrices: Sequence[int] | None
+) -> list[tuple[tuple[int, ...], np.ndarray]]:
     """Index in a stack and value in torch's layout, of each layer that shares a parameter."""
-    value = np.asarray(place.child.get_value(), np.float32)
+    value, name = np.asarray(place.child.get_value(), np.float32), place.name
     dense = isinstance(place.parent, nnx.Linear | Dense)
-    if place.name not in _TORCH_NAMES or (place.name == "kernel" and not dense):
+    if name not in _TORCH_NAMES or (name == "kernel" and not dense):
         raise ValueError(f"{place.path} trains in full, which a PEFT folder cannot hold.")
-    leading = place.parent.kernel.get_value().shape[:-2] if dense else ()
-    parts = [(index, value[index]) for index in np.ndindex(*leading)]
-    return [
-        (i, np.ascontiguousarray(part.T if place.name == "kernel" else part)) for i, part in parts
-    ]
+    found = []
+    for index in np.ndindex(*_stack(name, value.shape, matrices)):
+        part = value[index]
+        part = part.T if name == "kernel" else part if name == "embedding" else part.ravel()
+        found.append((index, np.ascontiguousarray(part)))
+    return found

@@ -225,7 +225,8 @@ def test_stacks(tmp_path):
     ("changes", "message"),
     [
         ({"peft_type": "LOHA"}, "holds LOHA; LORA and ADALORA can be loaded"),
-        ({"lora_bias": True}, "sets lora_bias to True, which is not supported"),
+        ({"lora_bias": True}, "sets lora_bias to True, which is not supported: merge it into"),
+        ({"lora_dropout": 1.0}, "lora_dropout must be a number from 0 on, less than 1, got 1.0"),
         ({"use_dora": True}, "adapter of lin.0 lacks lora_magnitude_vector"),
         ({"peft_type": "ADALORA"}, "adapter of lin.0 lacks lora_E"),
         ({"lora_alpha": None}, "lacks lora_alpha or init_r, which scale it"),

@@ -79,6 +79,9 @@ def test_models_of_another_library():
         ({"alpha": 1e35}, "alpha must not be 0 nor beyond 1e+30"),
         ({"alpha": 0}, "alpha must not be 0"),
         ({"alpha": -1.0, "initialization": "pissa"}, "alpha -1.0 is negative"),
+        ({"dropout": 1.0}, "dropout must be at least 0 and less than 1, got 1.0"),
+        ({"dropout": -0.1}, "dropout must be at least 0"),
+        ({"dropout": "0.1"}, "dropout must be a finite number, got '0.1'"),
         ({"initialization": ["eva"]}, "initialization must be one of 'kaiming'"),
     ],
 )
@@ -88,8 +91,8 @@ def test_fields_of_lora(fields, message):
 
 
 def test_more_values_than_fields():
-    with pytest.raises(ValueError, match="lora has 4 fields, not 5: rank, alpha"):
-        LoRA(1, 2.0, False, "kaiming", 3)  # pyright: ignore[reportCallIssue]
+    with pytest.raises(ValueError, match="lora has 5 fields, not 6: rank, alpha"):
+        LoRA(1, 2.0, False, "kaiming", 0.1, 3)  # pyright: ignore[reportCallIssue]
 
 
 BAD = ["x", None, True, -1, 10**30, 1e308, float("nan"), float("inf"), [], {}, (), object]

@@ -57,6 +57,9 @@ class AdaLoRA(Method):
     """β1 of the mean importance."""
     uncertainty_decay: float = 0.85
     """β2 of the mean deviation from it."""
+    dropout: float = 0.0
+    """Probability with which the adapter sees a number of its input as 0, in training alone:
+    `with_dropout` of NNX models, rngs={"dropout": key} of Linen's."""
 
     def __post_init__(self) -> None:
         """Checks the fields."""

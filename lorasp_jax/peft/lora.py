@@ -24,7 +24,7 @@ class LoRA(Method):
     Parameters: lora_a [I, R], lora_b [R, O], (I + O) R numbers.
 
     Raises:
-      ValueError: a rank below 1 or an unknown initialization.
+      ValueError: a rank below 1, an unknown initialization, or a dropout outside [0, 1).
     """
 
     rank: int = 128
@@ -40,6 +40,9 @@ class LoRA(Method):
     decomposition (`orthogonal_part`); what trains is then taken out of the kernel. "eva": A spans
     most of what the layer's inputs contain (`principal_inputs`), for which `adapt` needs
     statistics."""
+    dropout: float = 0.0
+    """Probability with which the adapter sees a number of its input as 0, in training alone:
+    `with_dropout` of NNX models, rngs={"dropout": key} of Linen's."""
 
     def __post_init__(self) -> None:
         """Checks the fields."""

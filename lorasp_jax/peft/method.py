@@ -50,6 +50,8 @@ class Method:
         alpha = getattr(self, "alpha", None)
         if alpha is not None and not 1 / LARGEST_ALPHA <= abs(alpha) <= LARGEST_ALPHA:
             raise ValueError(f"alpha must not be 0 nor beyond {LARGEST_ALPHA:g}, got {alpha}.")
+        if not 0 <= (rate := drop_rate(self)) < 1:
+            raise ValueError(f"dropout must be at least 0 and less than 1, got {rate}.")
 
     trains_base: ClassVar[bool] = False
     """True if the base weights themselves are what trains."""
@@ -202,6 +204,35 @@ class Method:
         """
         return _apply_fused([(self, params, kernel)], x, token_mask)[0]
 
+    def apply_dropped(
+        self,
+        params: Params,
+        x: jax.Array,
+        kernel: jax.Array,
+        key: jax.Array,
+        *,
+        token_mask: jax.Array | None = None,
+    ) -> tuple[jax.Array, Aux]:
+        """`apply` in training, where the adapter reads `dropped` x and the kernel all of x.
+
+        A method that is not additive also rescales what the kernel makes of the dropped x, and
+        leaves the rest of x W as it is (Hugging Face PEFT's DoRA).
+
+        Args:
+          params: from `init`.
+          x: [...tokens, I].
+          kernel: [I, O]; no gradient reaches it.
+          key: typed random key.
+          token_mask: as for `delta`.
+        """
+        seen = dropped(x, drop_rate(self), key)
+        kernel = jax.lax.stop_gradient(kernel.astype(x.dtype))
+        if self.additive:
+            delta, aux = self.delta(params, seen, token_mask=token_mask)
+            return x @ kernel + delta, aux
+        y, aux = self.apply(params, seen, kernel, token_mask=token_mask)
+        return (x - seen) @ kernel + y, aux
+
     def _rows_dtype(self, x: jax.Array) -> Any:
         return jnp.float32 if self.reads_in_fp32 else x.dtype
 
@@ -305,6 +336,17 @@ def check_matrix(kernel: Kernel) -> None:
     """Raises a ValueError unless it is one."""
     if len(kernel.shape) != 2:
         raise ValueError(f"an adapter needs a kernel [I, O], got shape {tuple(kernel.shape)}.")
+
+
+def drop_rate(method: Any) -> float:
+    """`dropout` of a method that has such a field, 0 of others."""
+    return getattr(method, "dropout", 0.0)
+
+
+def dropped(x: jax.Array, rate: float, key: jax.Array) -> jax.Array:
+    """x with each number at 0 with probability `rate`, and divided by 1 - rate otherwise."""
+    kept = jax.random.bernoulli(key, 1 - rate, x.shape)
+    return jnp.where(kept, x / (1 - rate), 0).astype(x.dtype)
 
 
 def kaiming_uniform(key: jax.Array, shape: tuple[int, int]) -> jax.Array:

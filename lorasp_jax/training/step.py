@@ -91,9 +91,11 @@ def loss_fn(
     """Eq. 14 of arXiv 2603.07404: flow-matching loss plus weighted auxiliary losses.
 
     The task loss is the mean over the elements that `batch.action_mask` marks as valid; `valid`
-    takes the place of their number, `noise` and `flow_time` of what is drawn.
+    takes the place of their number, `noise` and `flow_time` of what is drawn. `key` is the
+    adapters' dropout's too.
     """
-    model, mask = nnx.merge(graphdef, adapters, frozen), batch.action_mask
+    model = adaptation.with_dropout(nnx.merge(graphdef, adapters, frozen), key)
+    mask = batch.action_mask
     valid = jnp.sum(mask) if valid is None else valid
     per_element, aux = model.loss(
         key,
@@ -131,14 +133,14 @@ def gradients(
     valid = jnp.sum(batch.action_mask) / parts
 
     def add(total: Any, part: Any) -> tuple[Any, Metrics]:
-        rows, (noise, flow_time) = part
+        rows, (noise, flow_time), own_key = part
         given = {"valid": valid, "noise": noise, "flow_time": flow_time}
-        grads, metrics = gradient(adapters, frozen, graphdef, rows, key, weights, **given)
+        grads, metrics = gradient(adapters, frozen, graphdef, rows, own_key, weights, **given)
         return jax.tree.map(jnp.add, total, grads), metrics
 
     zeros = jax.tree.map(jnp.zeros_like, adapters)
     each = jax.tree.map(split, (batch, flow_matching.draw(key, batch.actions)))
-    total, metrics = jax.lax.scan(add, zeros, each)
+    total, metrics = jax.lax.scan(add, zeros, (*each, jax.random.split(key, parts)))
     mean = lambda tree: jax.tree.map(lambda x: x.mean(0), tree)  # noqa: E731
     return jax.tree.map(lambda x: x / parts, total), mean(metrics)
 

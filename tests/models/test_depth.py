@@ -7,9 +7,9 @@ import pytest
 from flax import nnx
 
 from lorasp_jax import adaptation
-from lorasp_jax.dense import Dense
+from lorasp_jax.dense import AdapterParam, Dense
 from lorasp_jax.models.depth import scan_depth, stack, stored
-from lorasp_jax.peft import LoRASP
+from lorasp_jax.peft import LoRA, LoRASP
 from tests.nets import METHODS, trained
 
 DEPTH, TOKENS, WIDTH, INNER = 3, 5, 8, 12
@@ -49,6 +49,19 @@ def loss_of(graphdef, frozen, **options):
 
 def close(found, expected):
     assert np.linalg.norm(found - expected) <= 1e-3 * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("remat", ["none", "products"])
+def test_dropout_is_the_same_in_straight_line_code_and_in_the_loop(remat):
+    """Each layer of the stack by a key of its own."""
+    model = trained((".*", LoRA(rank=4, dropout=0.5)), seed=1, net=Net())
+    dropping = adaptation.with_dropout(model, jax.random.key(5))
+    found = []
+    for net, unroll in ((model, False), (dropping, False), (dropping, True)):
+        graphdef, adapters, frozen = nnx.split(net, AdapterParam, ...)
+        found.append(jax.jit(loss_of(graphdef, frozen, remat=remat, unroll=unroll))(adapters))
+    np.testing.assert_allclose(found[1], found[2], rtol=1e-5)
+    assert abs(found[1] - found[0]) > 1e-2 * found[0]
 
 
 @pytest.mark.parametrize("remat", ["none", "products"])

@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from flax import nnx
 
 from lorasp_jax import adaptation
-from lorasp_jax.data.batches import flatten, sample_batch
-from lorasp_jax.peft import Aux
+from lorasp_jax.data.batches import Batch, flatten, sample_batch
+from lorasp_jax.peft import Aux, LoRA
 from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.step import active_ranks, gradients, init_state, train_step
@@ -71,6 +72,37 @@ def test_a_batch_in_parts_is_the_whole_batch(small):
             near = {"atol": 1e-4 * np.abs(value).max(), "rtol": 0, "err_msg": name}
             assert near["atol"] > 0, name
             np.testing.assert_allclose(leaves(parts)[name], value, **near)
+
+
+class Linear(nnx.Module):
+    """What a step needs of a backbone; nothing is random but dropout."""
+
+    def __init__(self):
+        self.out = nnx.Linear(8, 2, rngs=nnx.Rngs(0))
+
+    def loss(self, key, observation, actions, **_):
+        del key
+        return (self.out(observation) - actions) ** 2, {}
+
+
+def test_dropout_takes_the_steps_key_and_another_one_for_each_part():
+    method = LoRA(rank=2, dropout=0.5, initialization="pissa")
+    model = adaptation.adapt(Linear(), [("out", method)], rngs=nnx.Rngs(0))
+    graphdef, adapters, frozen = adaptation.split(model)
+    one = lambda *shape: jnp.ones((1, *shape))  # noqa: E731
+    batch = Batch(jnp.arange(8.0)[None], one(1, 2), one(1, 2))
+
+    def task(copies, key, parts=1):
+        rows = jax.tree.map(lambda x: jnp.repeat(x, copies, 0), batch)
+        return gradients(adapters, frozen, graphdef, rows, jax.random.key(key), {}, parts)[1][
+            "task"
+        ]
+
+    assert task(1, 0) == task(1, 0) != task(1, 1)
+    assert task(2, 0, parts=2) != task(1, 0)
+    assert gradients(adapters, frozen, graphdef, batch, jax.random.key(0), {})[1]["task"] != (
+        model.loss(None, batch.observation, batch.actions)[0].mean()
+    )
 
 
 def test_the_average_follows_and_is_what_is_used(small):

@@ -1,0 +1,217 @@
+"""Dropout of what adapters read: PEFT's formula, off in evaluation, in every kind of layer."""
+
+import dataclasses
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+import lorasp_jax
+from lorasp_jax.adapter_io import load_adapters, save_adapters
+from lorasp_jax.dense import LinenDense
+from lorasp_jax.peft import AdaLoRA, DoRA, LoRA
+from lorasp_jax.peft.dora import column_factor
+from lorasp_jax.peft.method import dropped
+from tests import nets
+from tests.test_scanned import EINSUMS, IDS, Llama
+
+RATE = 0.4
+KEY = jax.random.key(7)
+X = jax.random.normal(jax.random.key(0), (6, 5))
+WIDE = LoRA(rank=2, dropout=RATE)
+
+
+def away(params, seed=3):
+    """Parameters with nothing left at its start."""
+    noise = lambda p: p + 0.3 * jax.random.normal(jax.random.key(seed), p.shape)  # noqa: E731
+    return jax.tree.map(noise, params)
+
+
+def same(a, b):
+    return bool(jnp.array_equal(a, b))
+
+
+def test_a_share_is_zero_and_the_rest_makes_up_for_it():
+    seen = dropped(jnp.ones((200, 100), jnp.bfloat16), 0.25, KEY)
+    assert seen.dtype == jnp.bfloat16
+    np.testing.assert_allclose(jnp.unique(seen), [0, 4 / 3], rtol=4e-3)
+    np.testing.assert_allclose((seen == 0).mean(), 0.25, atol=0.01)
+
+
+@pytest.mark.parametrize("method", [WIDE, DoRA(rank=2, dropout=RATE), AdaLoRA(2, dropout=RATE)])
+def test_formula_of_peft(method):
+    """PEFT 0.21.2: lora_B(lora_A(dropout(x))); DoRA's magnitude rescales W dropout(x) (dora.py)."""
+    kernel = jax.random.normal(jax.random.key(1), (5, 4))
+    params = away(method.init(jax.random.key(2), kernel)[0])
+    seen = dropped(X, RATE, KEY)
+    a, b = params["lora_a"], params["lora_b"]
+    if isinstance(method, AdaLoRA):
+        a = a * params["lora_e"]
+    delta = method.scale * seen @ a @ b
+    if isinstance(method, DoRA):
+        factor = column_factor(params["magnitude"], kernel + method.scale * a @ b)
+        delta = (factor - 1) * (seen @ kernel) + factor * delta
+    y, aux = method.apply_dropped(params, X, kernel, KEY)
+    np.testing.assert_allclose(y, X @ kernel + delta, rtol=1e-4, atol=1e-5)
+    assert aux.active_rank.shape == X.shape[:-1]
+    slope = jax.grad(lambda kernel: method.apply_dropped(params, X, kernel, KEY)[0].sum())(kernel)
+    assert not slope.any()  # as without dropout: the base is frozen
+
+
+def trained(base, rules, **options):
+    model = lorasp_jax.adapt(base, rules, rngs=nnx.Rngs(1), **options)
+    graphdef, adapters, frozen = lorasp_jax.split(model)
+    return nnx.merge(graphdef, away(adapters), frozen, copy=True)
+
+
+@pytest.mark.parametrize("path", ["conv", "split", "experts", "join", "blocks", "out"])
+def test_every_kind_of_layer(path):
+    """In training another function at each key, with a gradient; in evaluation always one."""
+    model = trained(nets.Kinds(), [(path, WIDE)])
+    ids = jnp.array([[1, 2, 3], [4, 5, 6]])
+
+    @jax.jit
+    def run(key):
+        return lorasp_jax.with_dropout(model, key)(ids)
+
+    first, second = run(KEY), run(jax.random.key(8))
+    assert not np.allclose(first, second)
+    assert same(first, run(KEY))
+    without = lorasp_jax.adapt(nets.Kinds(), [(path, LoRA(rank=2))], rngs=nnx.Rngs(1))
+    graphdef, _, frozen = lorasp_jax.split(without)
+    assert same(model(ids), nnx.merge(graphdef, lorasp_jax.split(model)[1], frozen)(ids))
+
+
+def test_ids_of_an_embedding_are_never_dropped():
+    model = trained(nets.Kinds(), [("embed", WIDE)])
+    ids = jnp.array([[1, 2, 3]])
+    assert same(lorasp_jax.with_dropout(model, KEY)(ids), model(ids))
+
+
+def test_layers_experts_and_stacks_draw_apart():
+    model = lorasp_jax.with_dropout(trained(nets.Kinds(), [("out|join|blocks", WIDE)]), KEY)
+    keys = [model.out.dropout_key, model.join.dropout_key, *model.blocks.dropout_key]
+    assert len({tuple(jax.random.key_data(key).tolist()) for key in keys}) == 5
+    layer = trained(nets.Kinds(), [("experts", WIDE)]).experts
+    x = jnp.ones((50, 2, 3))
+    twins = jax.tree.map(lambda p: p.at[1].set(p[0]), layer.adapter.get_value())
+    layer.adapter.set_value(twins)
+    layer.kernel.set_value(layer.kernel.get_value().at[1].set(layer.kernel.get_value()[0]))
+    layer.bias.set_value(jnp.zeros_like(layer.bias.get_value()))
+    y = lorasp_jax.with_dropout(layer, KEY)(x)
+    assert same(layer(x)[:, 0], layer(x)[:, 1])
+    assert not np.allclose(y[:, 0], y[:, 1])
+
+
+def test_off_again_in_whatever_is_made_of_the_model(tmp_path):
+    base = nnx.Linear(5, 4, rngs=nnx.Rngs(0))
+    model = trained(base, [("", WIDE)])
+    dropping = lorasp_jax.with_dropout(model, KEY)
+    assert not np.allclose(dropping(X), model(X))
+    again = nnx.merge(*lorasp_jax.split(dropping))
+    assert lorasp_jax.split(dropping)[0] == lorasp_jax.split(model)[0]
+    assert same(again(X), model(X))
+    np.testing.assert_allclose(lorasp_jax.merge(dropping)(X), model(X), atol=1e-5)
+    save_adapters(tmp_path / "a", dropping)
+    loaded = load_adapters(tmp_path / "a", base)
+    assert loaded.method == WIDE
+    assert same(loaded(X), model(X))
+
+
+def test_without_dropout_the_program_is_the_same():
+    """Of a method that has none, in a model "for training" too; and of one that has, outside it."""
+
+    def program(model, rate):
+        model = lorasp_jax.adapt(model, [("", LoRA(rank=2, dropout=rate))], rngs=nnx.Rngs(1))
+        graphdef, adapters, frozen = lorasp_jax.split(model)
+
+        def loss(adapters, x, training):
+            model = nnx.merge(graphdef, adapters, frozen, copy=True)
+            return (lorasp_jax.with_dropout(model, KEY) if training else model)(x).sum()
+
+        def text(training):
+            return str(jax.make_jaxpr(jax.grad(lambda a, x: loss(a, x, training)))(adapters, X))
+
+        return text(False), text(True)
+
+    base = nnx.Linear(5, 4, rngs=nnx.Rngs(0))
+    (plain, for_training), (evaluating, dropping) = program(base, 0.0), program(base, RATE)
+    assert plain == for_training == evaluating
+    assert "low_rank_matmul" in plain
+    assert "random_bits" in dropping
+
+
+@pytest.mark.parametrize("scanned", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_models_with_remat_and_scan(scanned):
+    """The documented loss, with a key."""
+    rules = [("layers|head", WIDE)]
+    model = trained(Llama(remat=True, scanned=scanned), rules, einsums=EINSUMS)
+    graphdef, adapters, frozen = lorasp_jax.split(model)
+
+    @jax.jit
+    def loss(adapters, key):
+        model = nnx.merge(graphdef, adapters, frozen, copy=True)
+        return jnp.square(lorasp_jax.with_dropout(model, key)(IDS)).mean()
+
+    value, gradient = jax.value_and_grad(loss)(adapters, KEY)
+    other, _ = jax.value_and_grad(loss)(adapters, jax.random.key(9))
+    assert value != other
+    assert all(np.abs(g).max() > 0 for g in jax.tree.leaves(gradient))
+
+
+class Block(nn.Module):
+    @nn.compact
+    def __call__(self, x, _=None):
+        return x + jnp.tanh(nn.Dense(6, name="dense")(x)), None
+
+
+class Linen(nn.Module):
+    """A scanned stack, an einsum, a convolution and an embedding."""
+
+    streams: tuple = ("params", "dropout")
+
+    @nn.compact
+    def __call__(self, ids):
+        x = nn.Embed(7, 6, name="embed")(ids)
+        scan = nn.scan(Block, {"params": 0}, split_rngs=dict.fromkeys(self.streams, True), length=2)
+        x, _ = scan(name="blocks")(x, None)
+        x = nn.DenseGeneral((2, 3), name="split")(x).reshape(x.shape)
+        return nn.Conv(4, (2,), name="conv")(x)
+
+
+LINEN_IDS = jnp.array([[1, 2, 3], [4, 5, 6]])
+
+
+@pytest.mark.parametrize("path", ["blocks", "split", "conv"])
+def test_linen(path):
+    adapter = lorasp_jax.LinenAdapter(Linen(), [(path, WIDE)])
+    variables = adapter.init(jax.random.key(0), LINEN_IDS)
+    variables |= {"adapters": away(variables["adapters"])}
+    run = jax.jit(lambda key: adapter.apply(variables, LINEN_IDS, rngs={"dropout": key}))
+    assert not np.allclose(run(KEY), run(jax.random.key(8)))
+    assert same(run(KEY), run(KEY))
+    off = dataclasses.replace(adapter, rules=[(path, LoRA(rank=2))])
+    expected = off.apply(variables, LINEN_IDS)
+    assert same(adapter.apply(variables, LINEN_IDS), expected)
+    assert same(off.apply(variables, LINEN_IDS, rngs={"dropout": KEY}), expected)
+
+
+def test_linen_scan_that_hands_no_rngs_on():
+    adapter = lorasp_jax.LinenAdapter(Linen(streams=("params",)), [("blocks", WIDE)])
+    variables = adapter.init(jax.random.key(0), LINEN_IDS)
+    adapter.apply(variables, LINEN_IDS)
+    with pytest.raises(ValueError, match=r"blocks/dense gets no rngs .* 'dropout' in split_rngs"):
+        adapter.apply(variables, LINEN_IDS, rngs={"dropout": KEY})
+
+
+def test_linen_dense():
+    layer = LinenDense(4, method=WIDE)
+    variables = layer.init(jax.random.key(0), X)
+    variables |= {"adapters": away(variables["adapters"])}
+    first, second = (layer.apply(variables, X, rngs={"dropout": k}) for k in jax.random.split(KEY))
+    assert not np.allclose(first, second)
+    expected = LinenDense(4, method=LoRA(rank=2)).apply(variables, X)
+    assert same(layer.apply(variables, X), expected)
