@@ -165,7 +165,7 @@ def einsum(
     for _ in axes.batch:
         one = jax.vmap(one)
     if dropout_key is not None:
-        dropout_key = jax.random.split(dropout_key, [sizes[c] for c in axes.batch])
+        dropout_key = jax.random.split(dropout_key, tuple(sizes[c] for c in axes.batch))
     y, aux = one(rows, to_matrices(equation, kernel), params, dropout_key)
     found = axes.batch + tokens + axes.outputs
     y = y.reshape([sizes[c] for c in found]).transpose([found.index(c) for c in axes.y])
