@@ -235,12 +235,12 @@ class Env:
 
     @functools.partial(jax.jit, static_argnums=0)
     def _full_states(self, state: State) -> jax.Array:
-        find = functools.partial(observations.parts, self.model, bodies=self._placed)
+        return jax.vmap(self._full_state)(state)
 
-        def one(data: Data, command: jax.Array) -> jax.Array:
-            return jnp.concatenate([*find(data, command).values()])
-
-        return jax.vmap(one)(state.data, state.info["command"])
+    def _full_state(self, state: State) -> jax.Array:
+        """That of one world, f32 [D]."""
+        found = observations.parts(self.model, state.data, state.info["command"], self._placed)
+        return jnp.concatenate([*found.values()])
 
     @functools.cached_property
     def full_state_layout(self) -> dict[str, slice]:

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from envs import checks
+from envs import checks, fast_cpu
 from envs.env import Env
 from envs.randomization import Randomization, prepared
 from envs.state import State
@@ -22,6 +22,11 @@ try:
     from brax.envs import base
 except ImportError as error:
     raise ImportError('envs.interop.brax needs Brax: pip install -e ".[brax]"') from error
+
+# One world alone: what Brax batches anew would else be traced, and compiled, as a batch of batches.
+_reset = fast_cpu.jit(Env._reset, static_argnums=0)
+_step = fast_cpu.jit(Env._step, static_argnums=0)
+_full_state = fast_cpu.jit(Env._full_state, static_argnums=0)
 
 
 class BraxEnv(base.Env):
@@ -59,9 +64,15 @@ class BraxEnv(base.Env):
         self.ranges = ranges
 
     def reset(self, rng: jax.Array) -> base.State:
-        """One fresh world, all from the key `rng`."""
-        world = self.env.reset(rng, self.ranges)
-        return base.State(reward=world.reward[0], metrics=self._metrics(world), **self._seen(world))
+        """One fresh world, all from the key `rng`.
+
+        Raises:
+            TypeError: if it is no key.
+        """
+        ranges = prepared(self.ranges, self.env.control_dt)
+        with self.env._calls.first("reset", ranges is None):
+            world = _reset(self.env, ranges, checks.key(rng))
+        return base.State(reward=world.reward, metrics=world.metrics, **self._seen(world))
 
     def step(self, state: base.State, action: jax.Array) -> base.State:
         """The world one control step later.
@@ -69,16 +80,23 @@ class BraxEnv(base.Env):
         Args:
             state: one world.
             action: [A] in [-1, 1]; clipped.
+
+        Raises:
+            TypeError, ValueError: as `Env.step`.
         """
-        before: Any = state.pipeline_state
+        pipeline: Any = state.pipeline_state
+        checks.instance("state.pipeline_state", pipeline, State, "what reset gave")
+        before = jax.tree.map(lambda x: x[0], pipeline)
         low, high = jnp.asarray(self.env.action_low), jnp.asarray(self.env.action_high)
-        world = self.env.step(before, (low + (action + 1) / 2 * (high - low))[None])
+        action = checks.action(action, low.shape)
+        with self.env._calls.first("step", before.info["draw"] is None):
+            world = _step(self.env, before, low + (action + 1) / 2 * (high - low))
         # Brax would take the task's own time limit for a failure. A clock that stands still never
         # gets there.
         clock = jnp.zeros_like(world.info["steps"])
         world = dataclasses.replace(world, info=world.info | {"steps": clock})
-        reward = jnp.where(before.done, 0.0, world.reward)[0]
-        metrics = state.metrics | self._metrics(world)  # wrappers add their own
+        reward = jnp.where(before.done, 0.0, world.reward)
+        metrics = state.metrics | world.metrics  # wrappers add their own
         return state.replace(reward=reward, metrics=metrics, **self._seen(world))
 
     @property
@@ -97,12 +115,9 @@ class BraxEnv(base.Env):
         return "mjx"
 
     def _seen(self, world: State) -> dict[str, Any]:
-        """The fields of Brax's state that say how the world is now."""
+        """The fields of Brax's state that say how one world, without an axis W, is now."""
         return {
-            "pipeline_state": world,
-            "obs": self.env.full_state(world)[0],
-            "done": world.done[0].astype(jnp.float32),
+            "pipeline_state": jax.tree.map(lambda x: x[None], world),
+            "obs": _full_state(self.env, world),
+            "done": world.done.astype(jnp.float32),
         }
-
-    def _metrics(self, world: State) -> dict[str, jax.Array]:
-        return {name: value[0] for name, value in world.metrics.items()}

@@ -20,6 +20,7 @@ from envs import experts
 from envs.interop.brax import BraxEnv
 from envs.interop.gymnasium import OBSERVATIONS, SingleEnv, VectorEnv
 from envs.names import names
+from tests.jaxprs import primitives
 
 W = 4
 B = 2
@@ -193,6 +194,27 @@ def test_brax_observation(env, wrapped, first):
     worlds = jax.tree.map(lambda x: x[:, 0], first.pipeline_state)
     np.testing.assert_allclose(first.obs, env.full_state(worlds), atol=1e-6)
     assert np.any(first.obs[0] != first.obs[1])
+
+
+def test_brax_compiles_little_more_than_the_bare_environment(env):
+    """A batch of batches of one world would be a fifteenth more, and traced twice as long."""
+    keys = jax.random.split(jax.random.PRNGKey(0), W)
+    state = jax.eval_shape(env.reset, keys[0])
+    bare = primitives(env.reset, keys[0]) + primitives(env.full_state, state)
+    wrapped = primitives(jax.vmap(BraxEnv(env).reset), keys)
+    assert len(wrapped) < 1.03 * len(bare)
+
+
+@pytest.mark.slow
+def test_brax_misuse(env):
+    world = BraxEnv(env)
+    with pytest.raises(TypeError, match="key must be a key such as"):
+        world.reset(5)
+    state = world.reset(jax.random.key(0))
+    with pytest.raises(ValueError, match=r"action must have shape \(7,\), got \(6,\)"):
+        world.step(state, jnp.zeros(6))
+    with pytest.raises(TypeError, match="must be what reset gave"):
+        world.step(state.replace(pipeline_state=None), jnp.zeros(7))
 
 
 @pytest.mark.slow
