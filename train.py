@@ -17,7 +17,7 @@ if __name__ == "__main__":  # first: while the rest is imported there is nothing
 
 from rich.console import Console  # noqa: E402
 
-from envs import compilation_cache  # noqa: E402
+from envs import alarms, compilation_cache  # noqa: E402
 from envs.refusals import refused  # noqa: E402
 
 RUNS = Path("runs")
@@ -107,6 +107,7 @@ def run(command, folder: Path, console: Console, started: float) -> None:
 
 
 if __name__ == "__main__":
+    alarms.silence()
     code = main(sys.argv[1:])
     if code:
         from lorasp_jax.training import processes

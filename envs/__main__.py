@@ -10,14 +10,14 @@ from typing import Any
 
 from rich.console import Console
 
-from envs import actions, commands, compilation_cache, distractors
+from envs import actions, alarms, commands, compilation_cache, distractors
 from envs.names import names
-from envs.refusals import refused
+from envs.refusals import parsed, refused
 
 
 def main(arguments: Sequence[str]) -> int:
     """Runs one command; returns the exit code: 0 done, 2 bad input, 130 stopped."""
-    options = _parser().parse_args(arguments)
+    options = parsed(_parser(), arguments)
     console = Console(stderr=True)
     # JAX would reserve most of a GPU at its start, which takes a second (measured) for a command of
     # half a minute.
@@ -89,4 +89,5 @@ def finite(text: str) -> float:
 
 
 if __name__ == "__main__":
+    alarms.silence()
     sys.exit(main(sys.argv[1:]))

@@ -4,9 +4,12 @@ Bad input raises ValueError everywhere in the project. A file that cannot be ope
 and memory that does not suffice are the machine's. Who stops reading has nothing to be told.
 """
 
+import argparse
 import errno
 import os
 import select
+import sys
+from collections.abc import Sequence
 
 from rich.console import Console
 
@@ -19,6 +22,24 @@ LONGEST = 1000
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Numbers of the errors of a write for which there is no room."""
 _STDOUT = 1
+
+
+def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse.Namespace:
+    """The options of a command.
+
+    Raises:
+        SystemExit: after help or bad options, as argparse does; `UNREAD` if nobody reads the help.
+    """
+    try:
+        return parser.parse_args(arguments)
+    except SystemExit:
+        try:
+            sys.stdout.flush()  # else Python does at its end, and complains
+        except BrokenPipeError as error:
+            if _reader_left():
+                raise SystemExit(UNREAD) from error
+            raise
+        raise
 
 
 def refused(error: Exception, errors: Console, remedy: str = "") -> int:

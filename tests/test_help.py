@@ -82,12 +82,16 @@ def test_an_unknown_name_is_refused_before_slow_imports(option):
     assert_light(found)
 
 
-def test_a_reader_that_leaves_is_told_nothing():
+@pytest.mark.parametrize(
+    "arguments", [["train.py"], ["-m", "envs"], ["-m", "lorasp_jax.data"]], ids=str
+)
+def test_a_reader_that_leaves_is_told_nothing(arguments):
     reading, writing = os.pipe()
     os.close(reading)
     found = subprocess.run(
-        [sys.executable, "train.py", "--help"],
+        [sys.executable, *arguments, "--help"],
         cwd=ROOT,
+        env={name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"},
         stdout=writing,
         stderr=subprocess.PIPE,
         text=True,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TextColumn
 
-from envs.refusals import refused
+from envs.refusals import parsed, refused
 from lorasp_jax.data.keys import Keys
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 def main(arguments: Sequence[str]) -> int:
     """Runs one command; returns the exit code: 0 done, 2 bad input, 130 stopped."""
-    options = _parser().parse_args(arguments)  # before the slow imports, which help does not need
+    options = parsed(_parser(), arguments)  # before the slow imports, which help does not need
     import jax
 
     jax.config.update("jax_platforms", "cpu")  # nothing here is worth taking an accelerator
