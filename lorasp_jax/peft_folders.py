@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from lorasp_jax.adapter_io import read_tensors, read_whole
+from lorasp_jax.name_patterns import values_of
 from lorasp_jax.peft.method import LARGEST_ALPHA, LARGEST_SIZE
 
 CONFIG, TENSORS = "adapter_config.json", "adapter_model.safetensors"
@@ -76,9 +77,12 @@ def read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter], Whol
         else:
             raise ValueError(f"{folder} holds {name!r}, which belongs to no LoRA.")
     try:
-        imported = {name: _imported(config, name, found) for name, found in modules.items()}
+        alphas = values_of(config.get("alpha_pattern") or {}, modules, config.get("lora_alpha"))
+        imported = {
+            name: _imported(config, name, found, alphas[name]) for name, found in modules.items()
+        }
         return config, imported, whole
-    except (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, re.error) as error:
+    except (ValueError, TypeError, LookupError, ArithmeticError, RecursionError) as error:
         raise ValueError(f"{folder} is no PEFT adapter that can be read: {error}") from error
 
 
@@ -88,7 +92,7 @@ def _trains(config: Mapping[str, Any], module: str, kind: str) -> bool:
     return saved or (kind == "bias" and config.get("bias") in ("all", "lora_only"))
 
 
-def _imported(config: Mapping[str, Any], module: str, found: Adapter) -> Adapter:
+def _imported(config: Mapping[str, Any], module: str, found: Adapter, alpha: Any) -> Adapter:
     """lora_a, lora_b, perhaps magnitude, and scale, in our layout."""
     ada = config["peft_type"] == "ADALORA"
     needed = {"lora_A", "lora_B"} | ({"lora_E"} if ada else set())
@@ -98,7 +102,6 @@ def _imported(config: Mapping[str, Any], module: str, found: Adapter) -> Adapter
     if beyond := found.keys() - needed:
         raise ValueError(f"the adapter of {module} has {min(beyond)}, which its kind does not.")
     a, b = found["lora_A"].T, found["lora_B"].T
-    alpha = _pattern(config.get("alpha_pattern"), module, config.get("lora_alpha"))
     if not alpha or (ada and not config.get("init_r")):
         raise ValueError(f"the adapter of {module} lacks lora_alpha or init_r, which scale it.")
     if ada:
@@ -113,14 +116,6 @@ def _imported(config: Mapping[str, Any], module: str, found: Adapter) -> Adapter
     if "lora_magnitude_vector" in found:
         adapter["magnitude"] = found["lora_magnitude_vector"].reshape(-1)
     return adapter
-
-
-def _pattern(pattern: Mapping[str, Any] | None, module: str, default: Any) -> Any:
-    """The value of the first regular expression that the end of the module's name matches."""
-    for key, value in (pattern or {}).items():
-        if re.match(rf"(.*\.)?({key})$", module):
-            return value
-    return default
 
 
 def _is_number(value: Any) -> bool:

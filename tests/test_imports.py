@@ -32,6 +32,7 @@ ROOMS = [
     "lorasp_jax.tables",
     "lorasp_jax.adapter_io",
     "lorasp_jax.models.places",
+    "lorasp_jax.name_patterns",
     "lorasp_jax.peft_folders",
     "lorasp_jax.peft_whole",
     "lorasp_jax.hugging_face",
