@@ -168,10 +168,10 @@ def test_patterns_follow_the_end_of_a_name(copy):
 
 
 def test_a_pattern_that_takes_python_for_ever(copy):
-    """In a folder whose module is named to fit it; nothing is matched by Python's own."""
+    """In a folder whose module is named to fit it."""
     retensor(copy, lambda t: {n.replace("lin.0", "a" * 60): v for n, v in t.items()})
     edit(copy, alpha_pattern={"(a+)+b": 8})
-    with pytest.raises(ValueError, match=r"adapts 'aaa.* which the model lacks"):
+    with pytest.raises(ValueError, match=r"the pattern '\(a\+\)\+b' could take too long"):
         hugging_face.load_peft(copy, Net())
 
 
@@ -244,7 +244,7 @@ def test_stacks(tmp_path):
         ({"use_rslora": "x"}, "use_rslora must be true or false, got 'x'"),
         ({"use_dora": 1}, "use_dora must be true or false, got 1"),
         ({"alpha_pattern": {"lin.0": "8"}}, "alpha_pattern must be an object of such numbers"),
-        ({"alpha_pattern": {"l{2}": 8}}, r"the pattern 'l\{2}' is not of letters"),
+        ({"alpha_pattern": {"l(": 8}}, r"'l\(' is no regular expression"),
         ({"r": 8.5}, "r must be a whole number from 1"),
         ({"target_modules": 3}, "target_modules must be a text or a list of texts"),
         ({"bias": 0}, "bias must be 'none', 'all' or 'lora_only', got 0"),
