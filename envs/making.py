@@ -3,6 +3,7 @@
 import importlib
 import numbers
 import os
+from collections.abc import Iterator, Sequence
 from typing import Any, Literal, get_args
 
 import mujoco
@@ -19,8 +20,13 @@ from envs.robots import Robot
 AnyRobot = str | os.PathLike[str] | Robot
 RendererName = Literal["rays", "warp"]
 RENDERERS: tuple[str, ...] = get_args(RendererName)
-# What nobody means, and no device has memory for.
-_MOST = {"num_envs": 2**20, "image_size": 2**12, "antialias": 16}
+# Largest, which nobody means and no device has memory for, and least where that is not 1.
+_RANGES: dict[str, tuple[int, ...]] = {
+    "num_envs": (2**20,),
+    "image_size": (2**12,),
+    "antialias": (16,),
+    "distractors": (envs.distractors.MOST, 0),
+}
 
 
 def make(
@@ -64,19 +70,12 @@ def make(
     """
     fast_cpu.warn_if_late()
     found_task, found_robot = _find("task", task), _find_robot(robot)
-    num_envs, image_size, antialias = (
-        checks.count(name, value, _MOST[name])
-        for name, value in (
-            ("num_envs", num_envs),
-            ("image_size", image_size),
-            ("antialias", antialias),
-        )
+    num_envs, image_size, antialias, distractors = _counts(
+        num_envs=num_envs, image_size=image_size, antialias=antialias, distractors=distractors
     )
-    distractors = checks.count("distractors", distractors, envs.distractors.MOST, least=0)
     control_dt = _checked_dt(control_dt, found_task.time_limit)
-    if actions not in MODES:
-        raise ValueError(f"unknown actions {actions!r}: choose from {', '.join(MODES)}")
-    _check_reward(reward, discount)
+    _check_choices(actions=(actions, MODES), reward=(reward, REWARDS))
+    _check_discount(discount)
     things = found_task.scene + envs.distractors.mjcf(distractors)
     model = scene.build(things, found_robot)
     rays = render.RayRenderer(render.build(model, scene.CAMERAS), image_size, antialias)
@@ -100,10 +99,9 @@ def _renderer(
     name: str, model: mujoco.MjModel, rays: render.RayRenderer, num_envs: int
 ) -> render.Renderer:
     """A renderer by its name, with the pictures of the ray caster."""
+    _check_choices(renderer=(name, RENDERERS))
     if name == "rays":
         return rays
-    if name != "warp":
-        raise ValueError(f"unknown renderer {name!r}: choose from {', '.join(RENDERERS)}")
     physics.need_warp("renderer")
     from envs.warp_renderer import WarpRenderer
 
@@ -123,9 +121,19 @@ def _checked_dt(given: float, time_limit: float) -> float:
     return control_dt
 
 
-def _check_reward(reward: str, discount: float) -> None:
-    if reward not in REWARDS:
-        raise ValueError(f"unknown reward {reward!r}: choose from {', '.join(REWARDS)}")
+def _counts(**given: Any) -> Iterator[int]:
+    """Whole numbers by their names, each checked."""
+    return (checks.count(name, value, *_RANGES[name]) for name, value in given.items())
+
+
+def _check_choices(**given: tuple[Any, Sequence[str]]) -> None:
+    """Values by their names, each with what it may be."""
+    for name, (value, known) in given.items():
+        if value not in known:
+            raise ValueError(f"unknown {name} {value!r}: choose from {', '.join(known)}")
+
+
+def _check_discount(discount: float) -> None:
     real = isinstance(discount, numbers.Real) and not isinstance(discount, bool)
     if not real or not 0 < discount <= 1:
         raise ValueError(f"discount must be a number above 0 and at most 1, got {discount!r}")

@@ -13,6 +13,7 @@ from envs.mjcf import sources
 
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _KINDS = ("free", "ball", "slide", "hinge")
+_MOST_JOINTS = 16  # of an arm; whoever simulates one compiles each
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
@@ -84,6 +85,8 @@ def find_arm(model: mujoco.MjModel) -> Arm:
         base, root = root, int(model.body_parentid[root])
     if not joints or any(model.jnt_type[joints] != _HINGE):
         raise ValueError(f"hinges alone must lead from the base to the hand; {_joints(model)}")
+    if len(joints) > _MOST_JOINTS:
+        raise ValueError(f"the arm has {len(joints)} hinges; at most are {_MOST_JOINTS}")
     own = np.flatnonzero(model.body_rootid[model.jnt_bodyid] == base)
     if others := set(own.tolist()) - {*joints, *fingers}:
         raise ValueError(f"{_names(model, others)}: neither part of the arm nor one of its fingers")

@@ -17,7 +17,10 @@ from envs.files import check_memory, read_text, regular
 
 _FOLDERS = ("assetdir", "meshdir", "texturedir")  # attributes of compiler
 _DESCRIPTIONS = ("include", "model")  # elements that name another description
-_MOST_COPIES, _MOST_ENTRIES, _MOST_PLACES = 10_000, 10**6, 10**5
+_HOLDING = ("include", "attach")  # elements in whose place another description's are put
+_MOST_DEPTH, _MOST_TEXT = 20, 2**25
+_MOST_COPIES, _MOST_ELEMENTS = 1000, 10_000  # MuJoCo 3.17 takes seconds for these (measured)
+_MOST_ENTRIES, _MOST_PLACES = 10**6, 10**5
 _ENTRIES = {"dim", "num", "nsample"}  # attributes of sensors and actuators
 _MOST_RINGS = 300  # of a mesh that MuJoCo makes, whose vertices are as many squared
 _BYTES = ("memory", "nstack")  # attributes of size that `reading` leaves out
@@ -35,6 +38,7 @@ def check(path: Path, folder: Path) -> None:
     descriptions = _all_descriptions(path, folder)
     for root in descriptions.values():
         _check_sizes(root, 1)
+    _check_growth(descriptions, path.parent)
     for named in _named(descriptions, path.parent, ()):
         _check_picture(regular(named, folder))
 
@@ -42,18 +46,23 @@ def check(path: Path, folder: Path) -> None:
 def _all_descriptions(path: Path, folder: Path) -> dict[Path, ElementTree.Element]:
     """The XML of a file and of all that it includes."""
     regular(path)
-    main, known, new = path.parent, {}, [path]
-    while new:
+    main, known, new, size = path.parent, {}, [path], 0
+    for _ in range(_MOST_DEPTH):
         for each in new:
             text = read_text(each, folder if known else None)
+            if (size := size + len(text)) > _MOST_TEXT:
+                raise ValueError(f"its XML is longer than {_MOST_TEXT} characters")
             known[each] = ElementTree.fromstring(text)  # whose parser bounds what entities become
         new = [p for p in _named(known, main, _DESCRIPTIONS) if p not in known]
-    _check_circles(known, main)
-    return known
+        if not new:
+            return known
+    raise ValueError(f"{new[0]} is named more than {_MOST_DEPTH} descriptions deep")
 
 
-def _check_circles(descriptions: dict[Path, ElementTree.Element], main: Path) -> None:
-    """Raises a ValueError if a description holds itself: MuJoCo would end this process."""
+def _check_growth(descriptions: dict[Path, ElementTree.Element], main: Path) -> None:
+    """Raises a ValueError if a description holds itself, which would end this process, or makes
+    more elements than MuJoCo can take: its time grows with their square.
+    """
     held: dict[Path, set[Path]] = {}
     for path, root in descriptions.items():
         names = [_portable(e.get("file", "")) for e in root.iter() if e.tag in _DESCRIPTIONS]
@@ -61,10 +70,26 @@ def _check_circles(descriptions: dict[Path, ElementTree.Element], main: Path) ->
         held[path] = {
             Path(os.path.normpath(home / name)) for home in homes for name in names if name
         }
+    made: dict[Path, float] = {}
     try:
-        graphlib.TopologicalSorter(held).prepare()
+        order = [*graphlib.TopologicalSorter(held).static_order()]  # what is held comes first
     except graphlib.CycleError as error:
         raise ValueError(f"{error.args[1][0]} holds itself, by its includes and models") from None
+    for path in order:
+        if path in descriptions:
+            inner = max((made.get(each, 0.0) for each in held[path]), default=0.0)
+            made[path] = _elements(descriptions[path], 1, inner)
+            if made[path] > _MOST_ELEMENTS:
+                raise ValueError(
+                    f"{path} makes {made[path]:g} elements; at most are {_MOST_ELEMENTS}"
+                )
+
+
+def _elements(element: ElementTree.Element, copies: float, inner: float) -> float:
+    """How many an element makes, at most, where a description that it holds makes `inner`."""
+    more = inner if element.tag in _HOLDING else 0.0
+    below = copies * _copies(element)
+    return copies * (1 + more) + sum(_elements(child, below, inner) for child in element)
 
 
 def _named(
@@ -95,7 +120,7 @@ def _portable(name: str) -> str:
 
 def _check_sizes(element: ElementTree.Element, copies: float) -> None:
     """Raises a ValueError if an element makes something that is too large."""
-    copies *= math.prod(_numbers(element, "count"))
+    copies *= _copies(element)
     grid = math.prod([*_numbers(element, "nrow"), *_numbers(element, "ncol")])
     picture = math.prod([*_numbers(element, "width"), *_numbers(element, "height")])
     counted = element.attrib.keys() & _ENTRIES
@@ -115,6 +140,11 @@ def _check_sizes(element: ElementTree.Element, copies: float) -> None:
     check_memory(int(min(_PIXEL_BYTES * max(grid, picture), 1e30)), f"its {element.tag}")
     for child in element:
         _check_sizes(child, copies)
+
+
+def _copies(element: ElementTree.Element) -> float:
+    """How often an element makes what is in it."""
+    return math.prod(_numbers(element, "count"))
 
 
 def _numbers(element: ElementTree.Element, attribute: str) -> list[float]:

@@ -10,7 +10,7 @@ import dataclasses
 import importlib
 import importlib.util
 from types import ModuleType
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -107,6 +107,21 @@ class Robot:
         return np.append(self.speed, self.gripper_speed).astype(np.float32)
 
 
+class Geometry(NamedTuple):
+    """What kinematics need of a robot, whose numbers may be traced here."""
+
+    chain: jax.Array
+    tool: jax.Array
+    lower: jax.Array
+    upper: jax.Array
+    home: jax.Array
+
+    @property
+    def num_joints(self) -> int:
+        """J, without the gripper."""
+        return len(self.chain)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Primitives:
     """A body of primitive shapes laid over the joint chain.
@@ -178,7 +193,7 @@ def rotation(axis: str, angle: float) -> np.ndarray:
     return transform
 
 
-def forward_kinematics(chain: np.ndarray, q: jax.Array) -> tuple[jax.Array, jax.Array]:
+def forward_kinematics(chain: np.ndarray | jax.Array, q: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Poses of all links of a chain of hinges about z.
 
     Args:
@@ -202,7 +217,7 @@ def forward_kinematics(chain: np.ndarray, q: jax.Array) -> tuple[jax.Array, jax.
     return jnp.stack(positions, axis=-2), jnp.stack(rotations, axis=-3)
 
 
-def tool_pose(robot: Robot, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def tool_pose(robot: Robot | Geometry, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Pose of the tcp and its Jacobian.
 
     Args:
@@ -222,7 +237,7 @@ def tool_pose(robot: Robot, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Arr
 
 
 def inverse_kinematics(
-    robot: Robot, position: jax.Array, rotation: jax.Array, start: jax.Array
+    robot: Robot | Geometry, position: jax.Array, rotation: jax.Array, start: jax.Array
 ) -> jax.Array:
     """Joint angles [J] within the limits that bring the tcp to a pose, found from `start` [J]."""
     lower, upper, home = (

@@ -113,6 +113,7 @@ def test_pipes(name, robots):
             "replicate makes 1e+06 copies",
         ),
         ("", '<flexcomp name="f" count="999 999 9"/>', "flexcomp makes 8.98201e+06 copies"),
+        (f"<!--{' ' * 2**25}-->", "", "its XML is longer than 33554432 characters"),
         (
             '<asset><hfield name="h" nrow="9999999" ncol="9999999" size="1 1 1 1"/></asset>',
             "",
@@ -145,6 +146,34 @@ def test_sizes(asset, body, sentence, robots):
     (robots / "robot" / "circle.xml").write_text(circle)
     with pytest.raises(ValueError, match=re.escape(sentence)):
         reading.read(model(robots, asset, body=body))
+
+
+@pytest.mark.parametrize("kind", ["attach", "include"])
+def test_descriptions_in_descriptions(kind, robots):
+    """Ten in each of five: more than MuJoCo could ever make."""
+    for i in range(5):
+        model = f'<asset><model name="m" file="x{i + 1}.xml"/></asset>'
+        ten = "".join(f'<attach model="m" body="b" prefix="{j}"/>' for j in range(10))
+        if kind == "include":
+            model, ten = "", 10 * f'<include file="x{i + 1}.xml"/>'
+        text = f'<mujoco>{model}<worldbody><body name="b">{ten}</body></worldbody></mujoco>'
+        (robots / "robot" / f"x{i}.xml").write_text(text)
+    end = '<mujoco><worldbody><body name="b"><geom size="1"/></body></worldbody></mujoco>'
+    (robots / "robot" / "x5.xml").write_text(end)
+    with pytest.raises(ValueError, match=r"x1.xml makes \d+ elements; at most are 10000"):
+        reading.read(robots / "robot" / "x0.xml")
+    assert sources.check(robots / "robot" / "x3.xml", robots / "robot") is None
+
+
+def test_many_elements_and_deep_descriptions(robots):
+    path = model(robots, "", body="<geom/>" * 10_000)
+    with pytest.raises(ValueError, match=r"x.xml makes 10003 elements; at most are 10000"):
+        reading.read(path)
+    for i in range(25):
+        text = f'<mujoco><include file="{i + 1}.xml"/></mujoco>'
+        (robots / "robot" / f"{i}.xml").write_text(text)
+    with pytest.raises(ValueError, match=r"20.xml is named more than 20 descriptions deep"):
+        reading.read(robots / "robot" / "0.xml")
 
 
 def test_memory_of_the_simulation_is_not_kept(robots):

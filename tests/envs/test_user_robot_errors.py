@@ -14,6 +14,8 @@ _NO_BALL = (
     ('<sensor><jointpos joint="yaw"/></sensor>', ""),
     ('qpos="1 1 1 1 0 0 0 0', 'qpos="1 1 1 1 0 0 0 1 0 0 0'),
 )
+_HINGE = '<joint axis="0 0 1" range="0 1"/>'
+_KEY = '<key name="home" qpos="1 1 1 1 0 0 0 0 .5 1.5 0 1 0 -.02 .02"/>'
 _MISSING = (
     (
         "two slide joints are needed for the fingers; the joints are joint 0 (free), yaw (hinge)",
@@ -24,6 +26,16 @@ _MISSING = (
         [('<body name="b"', '</body><body name="b"'), ("      </body>\n    </frame>", "</frame>")],
     ),
     ("hinges alone must lead from the base to the hand; the joints are", _NO_BALL),
+    (
+        "the arm has 18 hinges; at most are 16",
+        [
+            *(
+                (f'<joint name="{joint}"', 4 * _HINGE + f'<joint name="{joint}"')
+                for joint in ("shoulder", "elbow", "roll")
+            ),
+            (_KEY, ""),
+        ],
+    ),
     (
         "knob: neither part of the arm nor one of its fingers",
         [
