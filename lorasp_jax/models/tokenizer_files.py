@@ -28,8 +28,9 @@ class SentencePiece:
     def __init__(self, file: Path) -> None:
         try:
             self._model = sentencepiece.SentencePieceProcessor(model_file=str(file))
-        except (OSError, RuntimeError) as error:
-            raise ValueError(f"{file} is no SentencePiece model.") from error
+            self._model.encode("", add_bos=True)  # as long as that works, every text does
+        except (OSError, RuntimeError, ValueError) as error:
+            raise ValueError(f"{file} is no SentencePiece model of PaliGemma's kind.") from error
 
     @property
     def vocabulary(self) -> int:
@@ -71,11 +72,10 @@ class TokenizersFile:
                 f"{file} has no token to pad with, which is {' or '.join(PAD_TOKENS)}."
             )
         self._pad = found[0]
-
-    @property
-    def vocabulary(self) -> int:
-        """Number of tokens."""
-        return self._model.get_vocab_size()
+        self.vocabulary = 1 + max(self._model.get_vocab().values())
+        """Number of tokens, those included that the file leaves out."""
+        if self.vocabulary > np.iinfo(np.int32).max:
+            raise ValueError(f"{file} has a token of number {self.vocabulary - 1}.")
 
     def encode(
         self, texts: Sequence[str], max_tokens: int, *, complete: bool = False

@@ -15,6 +15,7 @@ import sys
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import jax
@@ -36,8 +37,6 @@ class Checkpoints:
 
     def __init__(self, folder: Path, base_hash: str, console: Console) -> None:
         """Open `folder`/checkpoints for a run on the base identified by `base_hash`."""
-        for name in ("absl", "asyncio"):
-            logging.getLogger(name).addFilter(_is_news)
         _leave_echoes_out()
         atomic = ocp.options.AtomicityOptions(mode=ocp.options.AtomicityMode.COMMIT_FILE)
         options = ocp.CheckpointManagerOptions(max_to_keep=2, atomicity_options=atomic)
@@ -182,29 +181,39 @@ class _DamagedError(Exception):
     """A checkpoint is not what was saved; the message says how that shows."""
 
 
-def _is_news(record: logging.LogRecord) -> bool:
-    """Whether a log record says more than an exception will: of a failed write Orbax logs one
-    traceback a thread, asyncio one a task, and Orbax raises it.
+def _leave_echoes_out() -> None:
+    """Of reads and writes that fail say nothing but what Orbax raises of the first.
+
+    Of the others Orbax logs a traceback each, asyncio one for each task that nobody waits for, and
+    Python prints what their threads and forgotten coroutines raise.
     """
-    frames = traceback.extract_tb(record.exc_info[2]) if record.exc_info else ()
-    return not any("orbax" in frame.filename for frame in frames)
+    for name in ("absl", "asyncio"):
+        logging.getLogger(name).addFilter(_is_news)
+    _hook_echoes()
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    """Whether a log record says more than an exception will."""
+    return not (record.exc_info and _is_echo(record.exc_info[2]))
 
 
 @functools.cache  # once a process
-def _leave_echoes_out() -> None:
-    """Of a failed write say nothing for each thread of Orbax' storage that is still writing.
-
-    It finds the event loop closed, as the first failure ended it, and has nobody to tell.
-    """
+def _hook_echoes() -> None:
+    """Let echoes pass `sys.unraisablehook` unsaid."""
     before = sys.unraisablehook
 
     def hook(failed: Any) -> None:
-        place = failed.exc_traceback and failed.exc_traceback.tb_frame.f_code.co_filename
-        echo = asyncio.base_events.__file__, "Event loop is closed"
-        if (place, str(failed.exc_value)) != echo:
+        if not _is_echo(failed.exc_traceback):
             before(failed)
 
     sys.unraisablehook = hook
+
+
+def _is_echo(raised: TracebackType | None) -> bool:
+    """Whether an exception comes from Orbax, or from a thread that finds its event loop closed."""
+    frames = traceback.extract_tb(raised)
+    closed = bool(frames) and frames[0].filename == asyncio.base_events.__file__
+    return closed or any("orbax" in frame.filename for frame in frames)
 
 
 def _suffixes() -> Iterator[str]:

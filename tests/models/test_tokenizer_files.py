@@ -80,6 +80,15 @@ def test_what_is_no_tokenizer_is_one_sentence(tmp_path):
         (tmp_path / name).write_text("{}")
         with pytest.raises(ValueError, match=message):
             tokenizer.load(tmp_path / name)
+    model = bytearray((GOLDEN / FILES["paligemma"]).read_bytes())
+    model[43] ^= 1  # BOS is none any more
+    (tmp_path / "b.model").write_bytes(model)
+    large = json.loads((GOLDEN / FILES["smolvlm"]).read_text())
+    large["model"]["vocab"]["push"] = 2**31
+    (tmp_path / "b.json").write_text(json.dumps(large))
+    for name, message in (("b.model", "no SentencePiece model"), ("b.json", "number 2147483648")):
+        with pytest.raises(ValueError, match=message):
+            tokenizer.load(tmp_path / name)
     bare = json.loads((GOLDEN / FILES["smolvlm"]).read_text())
     bare["added_tokens"] = []
     bare["model"]["vocab"].pop("<|im_end|>")

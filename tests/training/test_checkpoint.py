@@ -17,7 +17,7 @@ from rich.console import Console
 
 from lorasp_jax.digest import digest
 from lorasp_jax.training import mesh as meshes
-from lorasp_jax.training.checkpoint import WRITTEN, Checkpoints, _leave_echoes_out
+from lorasp_jax.training.checkpoint import WRITTEN, Checkpoints, _hook_echoes
 from lorasp_jax.training.guard import Guard
 from lorasp_jax.training.step import TrainState
 from tests.runs import leaves
@@ -184,11 +184,12 @@ def test_of_a_failed_write_only_its_own_error_is_said(folder, monkeypatch, caplo
     """Threads that are still at it find the loop closed; tasks that failed were left alone."""
     said = []
     monkeypatch.setattr(sys, "unraisablehook", said.append)
-    _leave_echoes_out.__wrapped__()
+    _hook_echoes.__wrapped__()
     Checkpoints(folder, "base", Console(file=io.StringIO())).close()
     loop = asyncio.new_event_loop()
     loop.close()
-    for call in (lambda: loop.call_soon_threadsafe(print), lambda: int("x")):
+    read = compile("1 / 0", "orbax/checkpoint/path.py", "exec")
+    for call in (lambda: loop.call_soon_threadsafe(print), lambda: exec(read), lambda: int("x")):
         try:
             call()
         except Exception as error:
