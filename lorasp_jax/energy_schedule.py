@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from lorasp_jax.kernels.bisection import Ratio, bisected_boundary
-from lorasp_jax.kernels.energy_gate import SMALLEST_TARGET, kept_mask, positive
+from lorasp_jax.kernels.bisection import Ratio, bisected_mask
+from lorasp_jax.kernels.energy_gate import SMALLEST_TARGET, positive
 
 Curve = Literal["linear", "cosine"]
 PROGRESS = "progress"
@@ -44,8 +44,8 @@ def gate_at(scores: jax.Array, target: jax.Array) -> jax.Array:
     As exact as η itself, which is the fp32 number here and not a decimal.
     """
     constant = jnp.abs(jax.lax.stop_gradient(scores.astype(jnp.float32)))
-    last = bisected_boundary(constant, Ratio(jnp.maximum(target, SMALLEST_TARGET), 1))
-    return jnp.where(target >= 1, positive(constant), kept_mask(constant, last))
+    below_one = bisected_mask(constant, Ratio(jnp.maximum(target, SMALLEST_TARGET), 1))
+    return jnp.where(target >= 1, positive(constant), below_one)
 
 
 class ScheduleState(NamedTuple):

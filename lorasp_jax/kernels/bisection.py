@@ -1,7 +1,7 @@
 """The search for the last score that an energy gate keeps, without a sort.
 
 Numbers >= 0 in fp32 are ordered as their bit patterns, so a binary search on those bits finds the
-threshold by comparisons and row sums alone: one function for XLA and for the body of a kernel.
+threshold by comparisons and row sums alone: of all rows in XLA, of a few in a kernel's body.
 """
 
 import functools
@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 
 class Boundary(NamedTuple):
@@ -64,15 +65,47 @@ class _Bracket(NamedTuple):
     num_high: jax.Array
 
 
-def bisected_boundary(scores: jax.Array, ratio: Ratio, *, is_block: bool = False) -> Boundary:
-    """A binary search for the largest score that reaches the target together with all above it, and
-    one for the last tie of it that is needed.
+def bisected_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
+    """The mask, bool [..., R]: a search in all rows at once, for XLA.
 
-    Only elementwise work and row sums: the XLA implementation is also the Pallas kernel's body. A
-    few rows, a block, stop as soon as they know (11 steps of 31 for softplus scores, R = 128). For
-    many rows in XLA there is nothing to gain, and devices that share them would ask one another.
-    One row, [R], has scalars, whose comparison costs a kernel nothing.
+    Bit by bit it finds the largest score that reaches the target together with all above it. Each
+    step gives verdicts: what is above a threshold that falls short is kept, what is below one that
+    reaches is not. In the end only ties of the last score are open, and of these each is kept while
+    the energy before it falls short.
+
+    Verdicts are given inside the loop, as a score found there must not be compared with others
+    outside: XLA may compute them once more for that, and round them differently.
     """
+    energy = energies(scores)
+    target = ratio.numerator * energy.sum(-1, keepdims=True)
+
+    def step(i: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        found, verdict = carry
+        candidate = found | jax.lax.shift_left(jnp.int32(1), 30 - i)
+        chosen = scores >= _float(candidate)
+        reached = ratio.denominator * jnp.where(chosen, energy, 0).sum(-1, keepdims=True) >= target
+        news = jnp.where(reached, jnp.int8(-1), jnp.int8(1))
+        return jnp.where(reached, candidate, found), jnp.where(chosen == reached, verdict, news)
+
+    start = jnp.zeros_like(target, jnp.int32), jnp.zeros_like(scores, jnp.int8)
+    _, verdict = jax.lax.fori_loop(0, 31, step, start)
+    kept, tied = verdict > 0, verdict == 0
+    earlier = np.triu(np.ones((scores.shape[-1],) * 2, np.float32), 1)
+    ties_before = tied.astype(jnp.float32) @ earlier
+    before = jnp.where(kept, energy, 0).sum(-1, keepdims=True) + ties_before * energy
+    return (kept | (tied & (ratio.denominator * before < target))) & (target > 0)
+
+
+def block_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
+    """The boundary of a block of rows [..., R]: the body of a kernel, which computes scores once.
+
+    A binary search for the largest score that reaches the target together with all above it, and
+    one for the last tie of it that is needed: only elementwise work and row sums. A few rows stop
+    as soon as they know (11 steps of 31 for softplus scores, R = 128). One row has scalars, whose
+    comparison costs a kernel nothing.
+    """
+    if scores.size == scores.shape[-1]:
+        scores = scores.reshape(-1)
     energy = energies(scores)
     target = ratio.numerator * _by_row(jnp.sum, energy)
 
@@ -88,26 +121,17 @@ def bisected_boundary(scores: jax.Array, ratio: Ratio, *, is_block: bool = False
 
     lowest, highest = (_bits(_by_row(f, scores)) for f in (jnp.min, jnp.max))
     none = jnp.zeros_like(lowest)
-    bracket = _Bracket(lowest, highest + 1, none + scores.shape[-1], none)
-    if is_block:
-        bracket = jax.lax.while_loop(
-            lambda b: _any((b.high - b.low > 1) & (b.num_low - b.num_high > 1)), halve, bracket
-        )
-    else:
-        bracket = jax.lax.fori_loop(0, 31, lambda _, b: halve(b), bracket)
+    bracket = jax.lax.while_loop(
+        lambda b: _any((b.high - b.low > 1) & (b.num_low - b.num_high > 1)),
+        halve,
+        _Bracket(lowest, highest + 1, none + scores.shape[-1], none),
+    )
     # What is left in the bracket is one score, or ties.
     score = _by_row(jnp.max, jnp.where(scores <= _float(bracket.high - 1), scores, -1))
-    index = functools.partial(_last_tie, scores, energy, score, target, ratio)
-    if is_block:
-        several = _any(bracket.num_low - bracket.num_high > 1)
-        index = functools.partial(jax.lax.cond, several, index, lambda: none + scores.shape[-1])
-    return Boundary(jnp.where(target > 0, score, jnp.nan), index())
-
-
-def block_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
-    """`bisected_boundary` of a block of rows [..., R], which for one of them has scalars."""
-    rows = scores.reshape(-1) if scores.size == scores.shape[-1] else scores
-    return bisected_boundary(rows, ratio, is_block=True)
+    find = functools.partial(_last_tie, scores, energy, score, target, ratio)
+    several = _any(bracket.num_low - bracket.num_high > 1)
+    last = jnp.where(target > 0, score, jnp.nan)
+    return Boundary(last, jax.lax.cond(several, find, lambda: none + scores.shape[-1]))
 
 
 def _last_tie(

@@ -5,7 +5,7 @@ keeps the smallest k with E_k >= η, ties by lowest index. All implementations b
 row to its `Boundary`, the last kept (score, index) in that order; the mask follows elementwise.
 
 - "pairwise": for each direction the energy of those that rank before it, summed term by term.
-  R^2 work in one vectorised kernel, the fastest on CPU up to R = 32.
+  R^2 work, vectorised over rows and R, the fastest on CPU up to R = 32.
 - "sort": value sort, cumulative energy, threshold. The reference; its running sum may round across
   η on a rare row.
 - "bisection": no sort. Binary search on the bits of the threshold, since fp32 numbers >= 0 are
@@ -27,16 +27,17 @@ import decimal
 import fractions
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.experimental import pallas as pl
 
 from lorasp_jax.kernels.bisection import (
     Boundary,
     Ratio,
-    bisected_boundary,
+    bisected_mask,
     block_boundary,
     energies,
 )
@@ -106,19 +107,27 @@ def default_implementation(rank: int) -> Implementation:
 
 def _finder(implementation: str) -> Callable[[jax.Array, Ratio], jax.Array]:
     """The function from scores [..., R] and η to the mask."""
+    masks = {"pairwise": _pairwise_mask, "bisection": bisected_mask}
     boundaries = {
         "sort": _sorted_boundary,
-        "bisection": bisected_boundary,
         "block": block_boundary,
         "pallas": _pallas_boundary,
     }
-    if implementation == "pairwise":
-        return _pairwise_mask
+    if implementation in masks:
+        return masks[implementation]
     if implementation not in boundaries:
-        valid = ", ".join(("pairwise", *boundaries))
+        valid = ", ".join(get_args(Implementation))
         raise ValueError(f"unknown gate {implementation!r}; valid are {valid}.")
     boundary = boundaries[implementation]
-    return lambda scores, ratio: kept_mask(scores, boundary(scores, ratio))
+    # A kernel computes scores once. XLA may do so twice, and round them differently, the boundary
+    # and what is compared with it.
+    once = (lambda scores: scores) if implementation == "block" else jax.lax.optimization_barrier
+
+    def find(scores: jax.Array, ratio: Ratio) -> jax.Array:
+        scores = once(scores)
+        return kept_mask(scores, boundary(scores, ratio))
+
+    return find
 
 
 def positive(scores: jax.Array) -> jax.Array:
@@ -129,12 +138,14 @@ def positive(scores: jax.Array) -> jax.Array:
 def _pairwise_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
     """Keeps what falls short of the target with all that ranks before it; zeros are never kept."""
     energy = energies(scores)
-    position = jax.lax.broadcasted_iota(jnp.int32, scores.shape, scores.ndim - 1)
-    before = jnp.zeros_like(scores)
-    for j in range(scores.shape[-1]):  # unrolled: one kernel, vectorised over rows and R
-        other = scores[..., j : j + 1]
+    position = np.arange(scores.shape[-1])
+
+    def add(j: jax.Array, before: jax.Array) -> jax.Array:
+        other, its_energy = (jax.lax.dynamic_index_in_dim(a, j, -1) for a in (scores, energy))
         first = (other > scores) | ((other == scores) & (j < position))
-        before += jnp.where(first, energy[..., j : j + 1], 0)
+        return before + jnp.where(first, its_energy, 0)
+
+    before = jax.lax.fori_loop(0, scores.shape[-1], add, jnp.zeros_like(scores))
     target = ratio.numerator * energy.sum(-1, keepdims=True)
     return (ratio.denominator * before < target) & (scores > 0)
 

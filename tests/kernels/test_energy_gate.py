@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from lorasp_jax.kernels import energy_gate as gate
+from lorasp_jax.peft import LoRASP
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "energy_gate_exact.npz"
 KERNEL = gate._pallas_boundary
@@ -103,6 +104,16 @@ def test_where_fp32_ends(implementation, eta, expected):
     assert np.isfinite(gradient).all()
 
 
+def test_a_direction_stays_whose_score_is_computed_twice():
+    """Unoptimised, XLA rounds scores for the search in one way, for what follows in another."""
+    method = LoRASP(rank=8, hidden_width=4, energy_start=0.5, energy_target=0.5)
+    params = method.init_params(jax.random.key(0), 6, 5)
+    params["router"]["w2"] = jax.random.normal(jax.random.key(1), (4, 8))
+    x = jax.random.normal(jax.random.key(2), (3, 40, 6))
+    run = jax.jit(method.delta, compiler_options={"xla_backend_optimization_level": 0})
+    assert run(params, x)[1].kept_energy.min() > 0.4999
+
+
 def test_a_block_is_rows_behind_any_axes():
     scores = scores_like((1, 5, 7))
     run = jax.jit(lambda s, name: gate.energy_gate(s, 0.9, implementation=name), static_argnums=1)
@@ -114,10 +125,8 @@ def test_a_block_is_rows_behind_any_axes():
 def test_pallas_takes_any_shape(shape):
     scores, ratio = scores_like(shape), gate.exact_ratio(0.9)
     pallas = jax.jit(jax.vmap(lambda s: run_kernel(s, ratio)))(scores[None])
-    reference = jax.jit(lambda s: gate.bisected_boundary(s, ratio))(scores)
-    np.testing.assert_array_equal(pallas.score[0], reference.score)
     mask = gate.kept_mask(scores, jax.tree.map(lambda leaf: leaf[0], pallas))
-    np.testing.assert_array_equal(mask, gate.kept_mask(scores, reference))
+    np.testing.assert_array_equal(mask, jax.jit(lambda s: gate.bisected_mask(s, ratio))(scores))
 
 
 @pytest.mark.parametrize("implementation", ["pairwise", "sort", "bisection"])
