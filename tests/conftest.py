@@ -1,5 +1,6 @@
 """Every test runs on CPU with eight simulated devices and keeps what it compiles."""
 
+import gc
 import os
 
 os.environ["JAX_PLATFORMS"] = "cpu"
@@ -18,3 +19,9 @@ def pytest_configure(config):
     os.environ["XLA_FLAGS"] = xla.flags(devices=8)
     if config.option.markexpr == "not slow":
         os.environ["XLA_FLAGS"] += f" {xla.UNOPTIMISED}"
+
+
+def pytest_collection_finish():
+    """What was imported stays, and tracing makes many objects: collect garbage less often."""
+    gc.freeze()
+    gc.set_threshold(20_000, 20, 20)

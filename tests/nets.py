@@ -12,6 +12,7 @@ from flax import nnx
 from lorasp_jax import adaptation, peft
 from lorasp_jax.dense import Dense
 from lorasp_jax.peft import LoRA, LoRASP
+from tests.models.drawn import filled, moved
 
 GOLDEN = Path(__file__).parent / "golden"
 SP = LoRASP(rank=8, hidden_width=4)
@@ -66,8 +67,8 @@ class Kinds(nnx.Module):
         return self.out(scan(x, self.blocks)[0])
 
 
-NET = Net()
-X = jax.random.normal(jax.random.key(0), (4, 3, 5))
+NET = filled(Net)
+X = jnp.asarray(np.random.default_rng(0).normal(size=(4, 3, 5)), jnp.float32)
 
 
 @jax.jit
@@ -76,18 +77,10 @@ def call(model, x):
 
 
 def trained(*rules, seed, net=NET):
-    """An adapted model whose adapters have moved off their start.
-
-    NumPy draws: JAX would compile a program for every shape.
-    """
+    """An adapted model whose adapters have moved off their start."""
     model = adaptation.adapt(net, rules, rngs=nnx.Rngs(seed))
     graphdef, adapters, frozen = adaptation.split(model)
-    leaves, structure = jax.tree.flatten(adapters)
-    rng = np.random.default_rng(seed)
-    moved = [
-        jnp.asarray(x + 0.5 * rng.normal(size=x.shape), x.dtype) for x in map(np.asarray, leaves)
-    ]
-    return nnx.merge(graphdef, jax.tree.unflatten(structure, moved), frozen)
+    return nnx.merge(graphdef, moved(adapters, 0.5, seed), frozen)
 
 
 def assert_close(actual, expected):

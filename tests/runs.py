@@ -25,6 +25,7 @@ from lorasp_jax.peft import LoRASP
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import MetricsLog, read_metrics, to_json, write_json
 from lorasp_jax.training.setup import processor
+from tests.models.drawn import drawn
 
 TIMED = ("speed/", "memory/")
 
@@ -111,7 +112,7 @@ def random_episodes(task: str, seed: int) -> Episodes:
 def make_run(folder: Path, config: Config = CONFIG, model: Any = None) -> Run:
     """By default on the dummy backbone."""
     folder.mkdir(exist_ok=True)
-    model = model or Pi0Config.dummy().create(nnx.Rngs(0))
+    model = model or drawn(Pi0Config.dummy())
     model = adaptation.adapt(
         model, [(path, config.peft) for path in config.targets], rngs=nnx.Rngs(1)
     )

@@ -21,6 +21,7 @@ from lorasp_jax.models.statistics import Statistics
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.training.base import TRAINING
 from lorasp_jax.training.run_folder import MetricsLog, read_json, read_metrics, write_json
+from tests.models.drawn import drawn
 from tests.runs import leaves, random_episodes
 
 HEADERS = 200
@@ -61,7 +62,7 @@ def read_run(folder: Path) -> Any:
 
 
 def base(folder: Path) -> None:
-    models.save(folder, Pi0Config.dummy().create(nnx.Rngs(0)))
+    models.save(folder, drawn(Pi0Config.dummy()))
     state = np.random.default_rng(0).normal(size=(9, 7))
     known = Statistics.measure(state, state, np.ones(9, bool), slots=range(7), dim=8)
     (folder / "statistics.json").write_text(known.to_json() + "\n")

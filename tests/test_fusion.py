@@ -1,5 +1,7 @@
 """Fused LoRAs against the sum that they stand for; kernels back from merged ones."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,19 +15,22 @@ from lorasp_jax.fusion import truncated
 from lorasp_jax.peft import DoRA, FullFineTuning, LoRA, LoRAMoE
 from tests.nets import NET, SP, X, assert_close, call, golden_models, trained
 
-PAIR = lorasp_jax.combine(
-    {
+WEIGHTS = {"pour": 0.5, "press": -0.7}
+
+
+@functools.cache
+def pair():
+    models = {
         "pour": trained(("inp", LoRA(rank=2, alpha=3)), ("blocks", LoRA(rank=3)), seed=1),
         "press": trained(("", LoRA(rank=4, alpha=5, rank_stabilized=True)), seed=2),
         "sp": trained(("inp", SP), seed=3),
     }
-)
-WEIGHTS = {"pour": 0.5, "press": -0.7}
+    return lorasp_jax.combine(models)
 
 
 def test_together_is_exact():
-    fused, errors = lorasp_jax.fuse(PAIR, WEIGHTS)
-    assert_close(call(fused, X), call(lorasp_jax.choose(PAIR, WEIGHTS), X))
+    fused, errors = lorasp_jax.fuse(pair(), WEIGHTS)
+    assert_close(call(fused, X), call(lorasp_jax.choose(pair(), WEIGHTS), X))
     assert {path: method.rank for path, method in adaptation.methods(fused).items()} == {
         "inp": 6, "blocks": 7, "out": 4,
     }  # fmt: skip
@@ -43,8 +48,8 @@ def deltas(fused, path):
 @pytest.mark.parametrize("rank", [1, 2, 3])
 def test_smaller_is_the_best_of_its_rank(rank):
     """Against the singular value decomposition of the whole delta, layer by layer of the stack."""
-    fused, errors = lorasp_jax.fuse(PAIR, WEIGHTS, rank=rank)
-    exact = lorasp_jax.fuse(PAIR, WEIGHTS).model
+    fused, errors = lorasp_jax.fuse(pair(), WEIGHTS, rank=rank)
+    exact = lorasp_jax.fuse(pair(), WEIGHTS).model
     for path in ("inp", "blocks"):
         whole, ours = deltas(exact, path), deltas(fused, path)
         left, values, right = np.linalg.svd(whole, full_matrices=False)
@@ -80,13 +85,13 @@ def test_deltas_of_zero():
 
 def test_what_does_not_fuse():
     with pytest.raises(ValueError, match=r"cannot fuse sp at inp: LoRASP.* is no LoRA"):
-        lorasp_jax.fuse(PAIR, {"pour": 1.0, "sp": 0.5})
+        lorasp_jax.fuse(pair(), {"pour": 1.0, "sp": 0.5})
     with pytest.raises(ValueError, match="no adapter 'pure'; the model has pour"):
-        lorasp_jax.fuse(PAIR, {"pure": 1.0})
+        lorasp_jax.fuse(pair(), {"pure": 1.0})
     with pytest.raises(ValueError, match="needs weights and a rank of at least 1"):
-        lorasp_jax.fuse(PAIR, WEIGHTS, rank=0)
+        lorasp_jax.fuse(pair(), WEIGHTS, rank=0)
     with pytest.raises(ValueError, match="needs weights and a rank of at least 1"):
-        lorasp_jax.fuse(PAIR, {})
+        lorasp_jax.fuse(pair(), {})
 
 
 UNMERGEABLE = ("dora", "full", "lora_moe", "lora_sp")

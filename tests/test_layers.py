@@ -13,6 +13,7 @@ from lorasp_jax.dense import AdapterParam
 from lorasp_jax.hugging_face import save_peft
 from lorasp_jax.peft import DoRA, FullFineTuning, LoRA, LoRASP
 from tests.cases import mostly_slow
+from tests.models.drawn import filled, moved
 
 SP = LoRASP(rank=8, hidden_width=4)
 
@@ -50,10 +51,7 @@ def adapted(model, *rules, **settings):
 def perturbed(model):
     """The model with adapters that do something."""
     graphdef, adapters, frozen = adaptation.split(model)
-    leaves, tree = jax.tree.flatten(adapters)
-    keys = jax.random.split(jax.random.key(5), len(leaves))
-    moved = [v + 0.3 * jax.random.normal(k, v.shape) for k, v in zip(keys, leaves, strict=True)]
-    return nnx.merge(graphdef, jax.tree.unflatten(tree, moved), frozen)
+    return nnx.merge(graphdef, moved(adapters, 0.3), frozen)
 
 
 call = jax.jit(lambda model, *args: model(*args))
@@ -61,7 +59,7 @@ call = jax.jit(lambda model, *args: model(*args))
 
 @pytest.fixture(scope="module")
 def heads():
-    return Heads(nnx.Rngs(0))
+    return filled(lambda: Heads(nnx.Rngs(0)))
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +69,7 @@ def x():
 
 @pytest.fixture(scope="module")
 def vision():
-    return Vision(nnx.Rngs(0))
+    return filled(lambda: Vision(nnx.Rngs(0)))
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,7 @@
 """Quantised bases under adapters: what shrinks, what stays, what still works."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,8 +18,10 @@ from lorasp_jax.peft import FullFineTuning, LoRA
 from tests.cases import mostly_slow
 from tests.nets import METHODS, NET, SP, Net, X, assert_close, call, trained
 
-WIDE = nnx.Linear(256, 512, rngs=nnx.Rngs(0))
-ALL = {kind: lorasp_jax.quantize(NET, [("", kind)]).model for kind in KINDS}
+
+@functools.cache
+def quantized(kind):
+    return lorasp_jax.quantize(NET, [("", kind)]).model
 
 
 def widened(model):
@@ -37,18 +41,19 @@ def size(model):
 @pytest.mark.parametrize(("kind", "bits", "error"), [("int8", 8.125, 0.0051), ("nf4", 4.5, 0.092)])
 def test_memory_and_error(kind, bits, error):
     """In all, and of the output: as far off as is reported, for an input without a direction."""
-    smaller, errors = lorasp_jax.quantize(WIDE, [("", kind)])
+    wide = nnx.Linear(256, 512, rngs=nnx.Rngs(0))
+    smaller, errors = lorasp_jax.quantize(wide, [("", kind)])
     assert size(smaller) == 256 * 512 * bits / 8 + 512 * 4
     assert errors[""] == pytest.approx(error, rel=0.1)
     x = jax.random.normal(jax.random.key(1), (2048, 256))
-    y = x @ WIDE.kernel.get_value()
+    y = x @ wide.kernel.get_value()
     lost = jnp.linalg.norm(smaller(x) - y) / jnp.linalg.norm(y)
     assert float(lost) == pytest.approx(errors[""], rel=0.02)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_quantised_equals_widened(kind):
-    model = ALL[kind]
+    model = quantized(kind)
     assert isinstance(model.blocks.kernel.get_value(), QuantizedKernel)
     assert_close(call(model, X), call(widened(model), X))
     assert np.abs(call(model, X) - call(NET, X)).max() > 1e-4  # and something was quantised
@@ -63,11 +68,11 @@ def test_methods_over_a_quantised_base(name):
     method = METHODS[name]
     if method.trains_base:
         with pytest.raises(ValueError, match="inp/kernel is quantised and cannot train in full"):
-            adaptation.adapt(ALL["nf4"], [("inp", method)], rngs=nnx.Rngs(0))
+            adaptation.adapt(quantized("nf4"), [("inp", method)], rngs=nnx.Rngs(0))
         with pytest.raises(ValueError, match="cannot quantise inp: its kernel trains"):
             lorasp_jax.quantize(trained(("inp", method), seed=0), [("", "nf4")])
         return
-    model = trained(("inp|blocks", method), seed=1, net=ALL["nf4"])
+    model = trained(("inp|blocks", method), seed=1, net=quantized("nf4"))
     assert_close(call(model, X), call(widened(model), X))
     later, _ = lorasp_jax.quantize(trained(("inp|blocks", method), seed=1), [("", "nf4")])
     if method.additive:  # what DoRA starts from is of the kernel that it found
@@ -79,7 +84,7 @@ def test_methods_over_a_quantised_base(name):
 @pytest.mark.parametrize("kind", KINDS)
 def test_gradients_and_training(kind):
     """They reach x and the adapters as over widened kernels; the base does not move."""
-    model = trained(("blocks|inp", LoRA(rank=2)), seed=1, net=ALL[kind])
+    model = trained(("blocks|inp", LoRA(rank=2)), seed=1, net=quantized(kind))
 
     def loss(adapters, x, graphdef, frozen):
         return jnp.mean((nnx.merge(graphdef, adapters, frozen)(x) - 1) ** 2)
@@ -99,37 +104,40 @@ def test_gradients_and_training(kind):
 
 
 def test_adapters_are_saved_as_ever(tmp_path):
-    model = trained(("inp|blocks", SP), seed=1, net=ALL["int8"])
+    model = trained(("inp|blocks", SP), seed=1, net=quantized("int8"))
     save_adapters(tmp_path, model)
-    assert_close(call(load_adapters(tmp_path, ALL["int8"]), X), call(model, X))
+    assert_close(call(load_adapters(tmp_path, quantized("int8")), X), call(model, X))
     own, _ = lorasp_jax.quantize(load_adapters(tmp_path, NET), [("", "int8")])
     assert_close(call(own, X), call(model, X))
 
 
 def test_merge_widens_what_it_merges():
-    model = trained(("blocks", LoRA(rank=2)), seed=1, net=ALL["nf4"])
+    model = trained(("blocks", LoRA(rank=2)), seed=1, net=quantized("nf4"))
     merged = lorasp_jax.merge(model)
     assert merged.blocks.kernel.get_value().dtype == jnp.float32
     assert isinstance(merged.inp.kernel.get_value(), QuantizedKernel)
     assert_close(call(merged, X), call(model, X))
     back = lorasp_jax.unmerge(merged, model)
-    assert_close(back.blocks.kernel.get_value(), widened(ALL["nf4"]).blocks.kernel.get_value())
+    assert_close(
+        back.blocks.kernel.get_value(), widened(quantized("nf4")).blocks.kernel.get_value()
+    )
 
 
 @pytest.mark.slow
 def test_named_adapters_over_one_quantised_base():
     models = {
-        n: trained(("", LoRA(rank=i)), seed=i, net=ALL["nf4"]) for i, n in ((1, "a"), (2, "b"))
+        n: trained(("", LoRA(rank=i)), seed=i, net=quantized("nf4"))
+        for i, n in ((1, "a"), (2, "b"))
     }
     model = lorasp_jax.choose(lorasp_jax.combine(models), ["a", None, "b", "b"])
-    each = [call(m, X) for m in (models["a"], ALL["nf4"], models["b"], models["b"])]
+    each = [call(m, X) for m in (models["a"], quantized("nf4"), models["b"], models["b"])]
     assert_close(call(model, X), jnp.stack([y[i] for i, y in enumerate(each)]))
 
 
 def test_split_kernels_come_first():
     pissa = LoRA(rank=2, initialization="pissa")
     with pytest.raises(ValueError, match="adapt first, then quantise the rest"):
-        adaptation.adapt(ALL["int8"], [("inp", pissa)], rngs=nnx.Rngs(0))
+        adaptation.adapt(quantized("int8"), [("inp", pissa)], rngs=nnx.Rngs(0))
     model, errors = lorasp_jax.quantize(trained(("inp", pissa), seed=1), [("inp", "nf4")])
     assert_close(call(model, X), call(widened(model), X))
     assert 0 < errors["inp"] < 0.12
@@ -186,7 +194,7 @@ def test_shared_kernels_stay_shared():
 
 def test_tables_and_reports():
     """A summary counts weights, not bytes; adapters report as ever."""
-    model = trained(("", LoRA(rank=2)), seed=1, net=ALL["nf4"])
+    model = trained(("", LoRA(rank=2)), seed=1, net=quantized("nf4"))
     assert "inp" in lorasp_jax.summary(model)
     assert lorasp_jax.summary(model) == lorasp_jax.summary(widened(model))
     named = lorasp_jax.choose(lorasp_jax.combine({"a": model}), None)

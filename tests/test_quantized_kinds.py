@@ -12,9 +12,10 @@ from lorasp_jax.adapter_io import load_adapters, save_adapters
 from lorasp_jax.kernels.quantized import KINDS, QuantizedKernel
 from lorasp_jax.peft import LoRA, LoRASP
 from tests.cases import mostly_slow
+from tests.models.drawn import filled
 from tests.nets import Kinds, assert_close, call, trained
 
-NET = Kinds()
+NET = filled(Kinds)
 IDS = jax.random.randint(jax.random.key(0), (4, 5), 0, 7)
 LORA = (".*", LoRA(rank=2))
 MATRICES = {

@@ -88,6 +88,7 @@ def test_an_expert_that_never_succeeds_is_an_error(env, monkeypatch):
         return state.info["command"]  # stands still
 
     monkeypatch.setattr(viewer, "_TRIES", 1)
+    monkeypatch.setattr(viewer, "_plan", lambda env, state, key: None)
     monkeypatch.setattr(viewer, "_act", act)
     with pytest.raises(ValueError, match="the expert failed in all of 4 layouts"):
         viewer.episode(env, jax.random.key(0))

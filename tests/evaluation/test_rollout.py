@@ -22,8 +22,9 @@ def env():
     return envs.make("press", robot="piper", num_envs=2, image_size=32)
 
 
-def policy_with(folder, env, **fields):
-    config = dataclasses.replace(CONFIG, peft=LoRASP(rank=8, hidden_width=8, **fields))
+def policy_with(folder, env, targets=CONFIG.targets, **fields):
+    peft = LoRASP(rank=8, hidden_width=8, **fields)
+    config = dataclasses.replace(CONFIG, peft=peft, targets=targets)
     policy = make_run(folder, config).policy
     prompts = PromptTable.of(Offline(), env.instructions, policy.model.config, num_joints=6)
     return Policy(policy.model, dataclasses.replace(policy.processor, prompts=prompts))
@@ -39,7 +40,7 @@ def policy_with(folder, env, **fields):
     ],
 )
 def test_lowers_for(platform, kind, gate, env, tmp_path):
-    policy = _told(policy_with(tmp_path / "run", env, gate=gate), env)
+    policy = _told(policy_with(tmp_path / "run", env, ("q_proj",), gate=gate), env)
     device = jax.sharding.AbstractDevice(device_kind=kind, num_cores=None, platform=platform)
     mesh = jax.sharding.AbstractMesh((), (), abstract_device=device)
     shapes = jax.eval_shape(lambda: (policy, jax.random.key(0)))

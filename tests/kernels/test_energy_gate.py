@@ -76,6 +76,13 @@ def test_special_rows(implementation):
 
 
 INF, NAN = np.inf, np.nan
+EXTREME = [
+    [INF] * 4,
+    [INF, 1, INF, 0],
+    [0, 0, 3e38, -0.0],
+    [-0.0, 1, 1, 0],
+    [-3, 1, 2, -4],
+]
 
 
 @pytest.mark.usefixtures("interpret")
@@ -91,8 +98,7 @@ INF, NAN = np.inf, np.nan
 )
 def test_where_fp32_ends(implementation, eta, expected):
     """Infinite scores share the energy, NaN keeps nothing, -0 is 0, magnitudes count."""
-    rows = [[INF] * 4, [INF, 1, INF, 0], [0, 0, 3e38, -0.0], [-0.0, 1, 1, 0]]
-    rows = np.array([*rows, [-3, 1, 2, -4], [NAN, 1, INF, 2]], np.float32)
+    rows = np.array([*EXTREME, [NAN, 1, INF, 2]], np.float32)
     run = jax.jit(lambda s: gate.energy_gate(s, eta, implementation=implementation))
     mask, rank, kept = run(rows)
     np.testing.assert_array_equal(rank, expected)
@@ -100,7 +106,12 @@ def test_where_fp32_ends(implementation, eta, expected):
     assert (mask <= (rows != 0)).all()
     assert np.isfinite(kept[:-1]).all()
     assert np.isnan(kept[-1])
-    gradient = jax.jit(jax.grad(lambda s: gate.energy_gate(s, eta)[2].sum()))(rows[:-1])
+
+
+@pytest.mark.parametrize("eta", [1e-300, 0.5, 0.9, 1.0])
+def test_gradients_where_fp32_ends(eta):
+    rows = np.array(EXTREME, np.float32)
+    gradient = jax.jit(jax.grad(lambda s: gate.energy_gate(s, eta)[2].sum()))(rows)
     assert np.isfinite(gradient).all()
 
 

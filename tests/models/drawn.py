@@ -1,5 +1,9 @@
-"""Models with random parameters, norms and biases too, drawn faster than by their own `create`."""
+"""Models with random parameters, norms and biases too.
 
+NumPy draws them: JAX would compile a program for every shape.
+"""
+
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -10,16 +14,28 @@ from flax import nnx
 from lorasp_jax.models.observation import Observation
 
 
-def drawn(config: Any) -> Any:
-    """A model of these sizes."""
-    rng = np.random.default_rng(0)
+def drawn(config: Any, seed: int = 0) -> Any:
+    """A backbone of these sizes."""
+    return filled(lambda: config.create(nnx.Rngs(0)), seed)
+
+
+def filled(build: Callable[[], nnx.Module], seed: int = 0) -> Any:
+    """What `build` makes, with other numbers in it."""
+    rng = np.random.default_rng(seed)
 
     def draw(leaf: jax.ShapeDtypeStruct) -> jax.Array:
         fan_in = leaf.shape[-2] if len(leaf.shape) > 1 else 4
         return jnp.asarray(rng.normal(size=leaf.shape) / fan_in**0.5, leaf.dtype)
 
-    graphdef, parameters = nnx.split(nnx.eval_shape(lambda: config.create(nnx.Rngs(0))))
+    graphdef, parameters = nnx.split(nnx.eval_shape(build))
     return nnx.merge(graphdef, jax.tree.map(draw, parameters))
+
+
+def moved(tree: Any, size: float, seed: int = 0) -> Any:
+    """Arrays as after some training: at their start, half of the gradients vanish."""
+    rng = np.random.default_rng(seed)
+    step = lambda x: size * rng.normal(size=x.shape)  # noqa: E731
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x) + step(x), x.dtype), tree)
 
 
 def observation(config: Any, batch: int) -> Observation:

@@ -12,13 +12,14 @@ from lorasp_jax import models
 from lorasp_jax.models import checkpoint
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import LoRA
+from tests.models.drawn import drawn
 
 CONFIG = Pi0Config.dummy()
 
 
 @pytest.fixture(scope="module")
 def model():
-    return CONFIG.create(nnx.Rngs(0))
+    return drawn(CONFIG)
 
 
 @pytest.fixture

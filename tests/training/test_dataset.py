@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax import nnx
 from rich.console import Console
 
 from lorasp_jax import adaptation
@@ -26,6 +25,7 @@ from lorasp_jax.training.loop import train
 from lorasp_jax.training.run_folder import read_metrics, to_json, write_json
 from lorasp_jax.training.speed import Speed
 from lorasp_jax.training.stretches import Streamed, _batches
+from tests.models.drawn import drawn
 from tests.runs import CONFIG, Terminate, leaves, make_run, random_episodes, repeatable
 
 
@@ -104,7 +104,7 @@ def test_a_streamed_run_on_eight_devices(tmp_path, monkeypatch):
 
 
 def prepare(folder, monkeypatch, source, room=2**40):
-    model = Pi0Config.dummy().create(nnx.Rngs(0))
+    model = drawn(Pi0Config.dummy())
     monkeypatch.setattr(setup, "base_model", lambda *_, **__: (model, ""))
     monkeypatch.setattr(preflight, "available_bytes", lambda: room)
     evaluation = dataclasses.replace(CONFIG.evaluation, execute_steps=1)

@@ -20,6 +20,7 @@ from lorasp_jax.training import dry_run, preflight, setup
 from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.overrides import Command, load
 from lorasp_jax.training.run import Run
+from tests.models.drawn import drawn
 from tests.runs import CONFIG, random_episodes
 
 ROOT = Path(__file__).parents[2]
@@ -38,9 +39,7 @@ def config(monkeypatch):
     mesh = meshes.make_mesh(1, jax.devices()[:1])
     monkeypatch.setattr(meshes, "make_mesh", lambda fsdp: mesh)
     monkeypatch.setattr(setup.envs, "make", lambda *_, **__: world)
-    monkeypatch.setattr(
-        setup, "base_model", lambda *_, **__: (Pi0Config.dummy().create(nnx.Rngs(0)), "")
-    )
+    monkeypatch.setattr(setup, "base_model", lambda *_, **__: (drawn(Pi0Config.dummy()), ""))
     monkeypatch.setattr(setup, "demonstrations", lambda *_: pytest.fail("it collects"))
     evaluation = dataclasses.replace(CONFIG.evaluation, execute_steps=1)
     data = DataConfig(episodes=EPISODES)

@@ -22,6 +22,7 @@ from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.processing import Statistics
 from lorasp_jax.peft import FullFineTuning
 from lorasp_jax.training import base, export, setup
+from tests.models.drawn import drawn
 from tests.runs import CONFIG, leaves, make_run
 
 BASES = sorted(path.parent for path in Path("assets").glob("*/config.json"))
@@ -49,7 +50,7 @@ def test_adapters(tmp_path):
     metadata = json.loads((run.folder / "adapter.json").read_text())["metadata"]
     assert (metadata["robot"], metadata["control_dt"]) == ("piper", 0.1)
     assert Statistics.from_json(json.dumps(metadata["policy"]["statistics"]))
-    bare = Pi0Config.dummy().create(nnx.Rngs(0))
+    bare = drawn(Pi0Config.dummy())
     loaded = adapter_io.load_adapters(run.folder, bare, base=run.base_hash)
     expected = leaves(adaptation.split(run.policy.model)[1])
     for name, value in leaves(adaptation.split(loaded)[1]).items():
@@ -60,7 +61,7 @@ def test_adapters(tmp_path):
 
 @pytest.mark.parametrize("method", [CONFIG.peft, FullFineTuning()], ids=["adapters", "base"])
 def test_a_policy_comes_back(tmp_path, method):
-    models.save(tmp_path / "base", Pi0Config.dummy().create(nnx.Rngs(0)))
+    models.save(tmp_path / "base", drawn(Pi0Config.dummy()))
     chosen = dataclasses.replace(CONFIG.model, checkpoint=str(tmp_path / "base"))
     config = dataclasses.replace(CONFIG, model=chosen, peft=method)
     run = make_run(tmp_path / "run", config, models.load(tmp_path / "base"))
@@ -96,14 +97,14 @@ def test_a_policy_comes_back_in_another_folder(tmp_path, monkeypatch, kind):
         chosen = ModelConfig()
     else:
         monkeypatch.chdir(tmp_path)
-        models.save("base", Pi0Config.dummy().create(nnx.Rngs(0)))
+        models.save("base", drawn(Pi0Config.dummy()))
         chosen = dataclasses.replace(CONFIG.model, checkpoint="base")
     model = models.load(chosen.source)
     run = make_run(tmp_path / "run", dataclasses.replace(CONFIG, model=chosen), model)
     run.base_hash = models.weights_hash(model)
     export.write(run)
     elsewhere = tmp_path / "elsewhere"
-    models.save(elsewhere / chosen.source, Pi0Config.dummy().create(nnx.Rngs(1)))
+    models.save(elsewhere / chosen.source, drawn(Pi0Config.dummy(), seed=1))
     command = [sys.executable, "-c", ELSEWHERE, str(run.folder)]
     env = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
     found = subprocess.run(
@@ -114,7 +115,7 @@ def test_a_policy_comes_back_in_another_folder(tmp_path, monkeypatch, kind):
 
 def test_a_base_that_is_gone_is_named_with_the_way_out(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    models.save("base", Pi0Config.dummy().create(nnx.Rngs(0)))
+    models.save("base", drawn(Pi0Config.dummy()))
     chosen = dataclasses.replace(CONFIG.model, checkpoint="base")
     run = make_run(tmp_path / "run", dataclasses.replace(CONFIG, model=chosen), models.load("base"))
     run.base_hash = models.weights_hash("base")
@@ -126,14 +127,14 @@ def test_a_base_that_is_gone_is_named_with_the_way_out(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=message):
         export.load_policy("run")
     assert export.load_policy("run", base="moved").model
-    models.save("moved", Pi0Config.dummy().create(nnx.Rngs(1)))
+    models.save("moved", drawn(Pi0Config.dummy(), seed=1))
     with pytest.raises(ValueError, match="was trained on another base"):
         export.load_policy("run", base="moved")
     assert export.load_policy("run", base="moved", any_base=True).model
 
 
 def test_another_tokenizer_is_refused(tmp_path, monkeypatch):
-    models.save(tmp_path / "base", Pi0Config.dummy().create(nnx.Rngs(0)))
+    models.save(tmp_path / "base", drawn(Pi0Config.dummy()))
     chosen = dataclasses.replace(CONFIG.model, checkpoint=str(tmp_path / "base"))
     config = dataclasses.replace(CONFIG, model=chosen)
     run = make_run(tmp_path / "run", config, models.load(tmp_path / "base"))

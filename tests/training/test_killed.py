@@ -23,6 +23,7 @@ from tests.several import environments
 from tests.training.worker import work
 
 ROOT = Path(__file__).parents[2]
+STEPS = 8
 
 
 @pytest.fixture
@@ -34,6 +35,16 @@ def use(monkeypatch):
         monkeypatch.setattr(meshes, "make_mesh", lambda _: make(1, jax.devices()[:count]))
 
     return choose
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run on one device that nobody stopped."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            meshes, "make_mesh", lambda _, make=meshes.make_mesh: make(1, jax.devices()[:1])
+        )
+        return work(tmp_path_factory.mktemp("runs") / "whole", STEPS)
 
 
 @contextlib.contextmanager
@@ -75,10 +86,10 @@ def kill(folder, steps, chance):
 
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("times", [1, pytest.param(20, marks=pytest.mark.slow)])
-def test_a_killed_run_resumes_to_the_bit(times, tmp_path, use, capsys):
+def test_a_killed_run_resumes_to_the_bit(times, whole, tmp_path, use, capsys):
     use(1)
-    steps, chance = 12 * times, random.Random(times)
-    work(tmp_path / "whole", steps)
+    steps, chance = STEPS * times, random.Random(times)
+    expected = whole.folder if times == 1 else work(tmp_path / "whole", steps).folder
     killed = tmp_path / "killed"
     for _ in range(times):
         kill(killed, steps, chance)
@@ -87,8 +98,8 @@ def test_a_killed_run_resumes_to_the_bit(times, tmp_path, use, capsys):
     capsys.readouterr()
     work(killed, steps)
     assert f"started\nstep {newest + 1}\n" in capsys.readouterr().out
-    assert saved(killed, steps) == saved(tmp_path / "whole", steps)
-    assert repeatable(killed) == repeatable(tmp_path / "whole")
+    assert saved(killed, steps) == saved(expected, steps)
+    assert repeatable(killed) == repeatable(expected)
 
 
 def test_a_signal_to_another_process_stops_this_one_too(tmp_path, use, monkeypatch):
@@ -111,14 +122,12 @@ def assert_same(found, expected):
         )
 
 
-def test_a_run_goes_on_with_another_number_of_devices(tmp_path, use):
-    use(1)
-    whole = adapters(work(tmp_path / "whole", 6))
+def test_a_run_goes_on_with_another_number_of_devices(whole, tmp_path, use):
     moved = tmp_path / "moved"
     for count, until in ((4, 2), (1, 4), (8, None)):
         use(count)
-        run = work(moved, 6, until)
-    assert_same(adapters(run), whole)
+        run = work(moved, STEPS, until)
+    assert_same(adapters(run), adapters(whole))
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """What a step needs of memory: exact where it can be; one sentence where it cannot fit."""
 
 import dataclasses
+import functools
 
 import jax
 import pytest
@@ -14,8 +15,16 @@ CONFIG = Config(name="a", scale="cpu", peft=LoRA(rank=4), optim=OptimConfig(batc
 TINY = dataclasses.replace(Pi0Config.dummy(), vision=Pi0Config.nano().vision, image_size=64)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def once():
+    """The same question is traced once for all tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(preflight, "expected", functools.cache(preflight.expected))
+        yield
+
+
 @pytest.fixture(scope="module")
-def memory():
+def memory(once):
     return {
         remat: preflight.expected(CONFIG, dataclasses.replace(TINY, remat=remat))
         for remat in preflight.REMATS

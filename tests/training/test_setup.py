@@ -29,6 +29,7 @@ from lorasp_jax.training.loop import train
 from lorasp_jax.training.overrides import override
 from lorasp_jax.training.run import Run
 from tests.data.lerobots import golden
+from tests.models.drawn import drawn
 from tests.runs import CONFIG, leaves, random_episodes
 
 BASE_MODEL = setup.base_model
@@ -44,9 +45,7 @@ def config(monkeypatch):
     """No simulation, and the dummy backbone."""
     worlds = world(*random_episodes("", 0).instructions)
     monkeypatch.setattr(setup.envs, "make", lambda *_, **__: worlds)
-    monkeypatch.setattr(
-        setup, "base_model", lambda *_, **__: (Pi0Config.dummy().create(nnx.Rngs(0)), "")
-    )
+    monkeypatch.setattr(setup, "base_model", lambda *_, **__: (drawn(Pi0Config.dummy()), ""))
     monkeypatch.setattr(
         setup, "demonstrations", lambda c, *_: {t: random_episodes(t, 0) for t in c.tasks}
     )
@@ -101,7 +100,7 @@ def test_policies_of_lerobot_are_fed_as_they_say(config, tmp_path, monkeypatch):
     found, _ = BASE_MODEL(dataclasses.replace(config, model=model))
     assert found.config.inputs == inputs.OPENPI
     two_arms = dataclasses.replace(inputs.OURS, delta=(True,) * 14)
-    found = dataclasses.replace(Pi0Config.dummy(), inputs=two_arms).create(nnx.Rngs(0))
+    found = drawn(dataclasses.replace(Pi0Config.dummy(), inputs=two_arms))
     monkeypatch.setattr(setup, "base_model", lambda *_, **__: (found, ""))
     with pytest.raises(ValueError, match="said of 14 numbers, the robot has 7"):
         setup.prepare(config, tmp_path, Console(file=io.StringIO()), time.perf_counter())
@@ -152,7 +151,7 @@ def test_eva_of_the_command_line_sees_the_demonstrations(config, tmp_path):
     run = setup.prepare(config, tmp_path, Console(file=io.StringIO()), time.perf_counter())
     found = adaptation.methods(run.policy.model)
     assert {method.initialization for method in found.values()} == {"eva"}
-    base = Pi0Config.dummy().create(nnx.Rngs(0))
+    base = drawn(Pi0Config.dummy())
     moments = setup.input_moments(run, base, run.policy.processor)
     assert set(moments) == set(found)
     assert len(found) == 3

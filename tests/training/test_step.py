@@ -15,6 +15,7 @@ from lorasp_jax.peft import Aux, LoRA
 from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.step import active_ranks, gradients, init_state, train_step
+from tests.models.drawn import moved
 from tests.runs import CONFIG, Terminate, leaves, make_run
 
 
@@ -47,12 +48,10 @@ def small(tmp_path_factory):
     config = dataclasses.replace(CONFIG, targets=("fc1", "action_out_proj"))
     run = make_run(tmp_path_factory.mktemp("run") / "run", config)
     graphdef, adapters, frozen = adaptation.split(run.policy.model)
-    keys = iter(jax.random.split(jax.random.key(3), 1000))
-    adapters = jax.tree.map(lambda x: x + 0.1 * jax.random.normal(next(keys), x.shape), adapters)
     steps, chunk = flatten(list(run.episodes.values())), run.policy.model.config.chunk
     sizes = {"batch_size": 16, "chunk": chunk, "state_noise": 0.0}
     batch = sample_batch(jax.random.key(0), steps, run.policy.processor, **sizes)
-    return graphdef, adapters, frozen, batch
+    return graphdef, moved(adapters, 0.1), frozen, batch
 
 
 def test_a_batch_in_parts_is_the_whole_batch(small):
