@@ -71,5 +71,5 @@ def test_the_terminal_tells_what_compiles(capsys, monkeypatch):
     for _ in range(2):
         run(jax.numpy.ones(2), jax.random.key(0), 3)
     told = capsys.readouterr().err
-    assert told.count("compiling the training step ...") == 1
+    assert len(re.findall(r"compiling the training step .*\.\.\.", told)) == 1
     assert re.search(r"compiled the training step in \d+ s", told)
