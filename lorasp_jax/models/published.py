@@ -27,8 +27,7 @@ import orbax.checkpoint as ocp
 import safetensors.numpy
 from flax import nnx
 
-from envs.files import check_only_files
-from lorasp_jax.models import layouts
+from lorasp_jax.models import layouts, orbax_folders
 from lorasp_jax.models.checkpoint import base_arrays, by_path, named_arrays, set_arrays
 from lorasp_jax.models.pi0 import openpi_lora
 from lorasp_jax.models.tensor_files import INDEX, SINGLE, TensorFiles, weight_files
@@ -159,8 +158,9 @@ def _restored(place: Path) -> dict[str, np.ndarray]:
     """Leaves of an Orbax checkpoint by path below `params`, without a trailing "/value"."""
     handler = ocp.PyTreeCheckpointHandler(restore_concurrent_gb=_READ_AHEAD)
     checkpointer = ocp.Checkpointer(handler)
+    orbax_folders.leave_echoes_out()
     try:
-        check_only_files(place)
+        orbax_folders.check(place)
         found: Any = checkpointer.metadata(place.absolute())
         tree = found.item_metadata.tree
         _check_size(place, tree)

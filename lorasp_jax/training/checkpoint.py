@@ -4,27 +4,21 @@ The data position and every random stream of a run are functions of its seed and
 these three restore a run to the bit. The base is recorded by its hash, the values by their digest.
 """
 
-import asyncio
 import contextlib
-import functools
 import itertools
-import logging
 import os
 import shutil
-import sys
-import traceback
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import jax
 import orbax.checkpoint as ocp
 from rich.console import Console
 
-from envs.files import check_only_files
 from envs.refusals import DISK_FULL
 from lorasp_jax.digest import digest
+from lorasp_jax.models import orbax_folders
 from lorasp_jax.training import processes
 from lorasp_jax.training.step import TrainState
 
@@ -37,7 +31,7 @@ class Checkpoints:
 
     def __init__(self, folder: Path, base_hash: str, console: Console) -> None:
         """Open `folder`/checkpoints for a run on the base identified by `base_hash`."""
-        _leave_echoes_out()
+        orbax_folders.leave_echoes_out()
         atomic = ocp.options.AtomicityOptions(mode=ocp.options.AtomicityMode.COMMIT_FILE)
         options = ocp.CheckpointManagerOptions(max_to_keep=2, atomicity_options=atomic)
         self._folder = (folder / "checkpoints").absolute()
@@ -115,7 +109,7 @@ class Checkpoints:
             meta=ocp.args.JsonRestore(),
         )
         try:
-            check_only_files(self._folder / str(step))
+            orbax_folders.check(self._folder / str(step))
             found = self._manager.restore(step, args=arguments)
             base_hash, expected = (found["meta"][name] for name in ("base_hash", "digest"))
         except Exception as error:  # Orbax raises whatever its storage raises
@@ -152,7 +146,11 @@ class Checkpoints:
         """Remove checkpoints that were not written to their end; their steps."""
         unfinished = sorted(step for step, whole in self._steps().items() if not whole)
         for step in unfinished if processes.is_first() else ():
-            shutil.rmtree(self._folder / str(step))
+            path = self._folder / str(step)
+            while path.exists():
+                # After a failed write Orbax' threads still remove files of their own.
+                with contextlib.suppress(FileNotFoundError):
+                    shutil.rmtree(path)
         return unfinished
 
     @contextlib.contextmanager
@@ -179,41 +177,6 @@ class Checkpoints:
 
 class _DamagedError(Exception):
     """A checkpoint is not what was saved; the message says how that shows."""
-
-
-def _leave_echoes_out() -> None:
-    """Of reads and writes that fail say nothing but what Orbax raises of the first.
-
-    Of the others Orbax logs a traceback each, asyncio one for each task that nobody waits for, and
-    Python prints what their threads and forgotten coroutines raise.
-    """
-    for name in ("absl", "asyncio"):
-        logging.getLogger(name).addFilter(_is_news)
-    _hook_echoes()
-
-
-def _is_news(record: logging.LogRecord) -> bool:
-    """Whether a log record says more than an exception will."""
-    return not (record.exc_info and _is_echo(record.exc_info[2]))
-
-
-@functools.cache  # once a process
-def _hook_echoes() -> None:
-    """Let echoes pass `sys.unraisablehook` unsaid."""
-    before = sys.unraisablehook
-
-    def hook(failed: Any) -> None:
-        if not _is_echo(failed.exc_traceback):
-            before(failed)
-
-    sys.unraisablehook = hook
-
-
-def _is_echo(raised: TracebackType | None) -> bool:
-    """Whether an exception comes from Orbax, or from a thread that finds its event loop closed."""
-    frames = traceback.extract_tb(raised)
-    closed = bool(frames) and frames[0].filename == asyncio.base_events.__file__
-    return closed or any("orbax" in frame.filename for frame in frames)
 
 
 def _suffixes() -> Iterator[str]:
