@@ -15,17 +15,21 @@ from rich.console import Console
 from envs import mjcf, rlds
 from lorasp_jax.data import cache, inspection
 from lorasp_jax.data.opening import open_source
-from lorasp_jax.models import statistics_files
+from lorasp_jax.models import statistics_files, tokenizer
 from lorasp_jax.report.callback import final_table
 from lorasp_jax.report.html import write_report
 from tests import fuzzing
-from tests.data.lerobots import golden
+from tests.data.lerobots import GOLDEN, golden
 from tests.envs.test_episodes import make
 from tests.envs.user_arm import write
 from tests.malformed import check_refusal
 from tests.runs import finish
 
 SEEDS, SLOW_SEEDS = 12, 200
+TOKENIZERS = {
+    "tokenizer.json": "smolvlm_like_tokenizer.json",
+    "tokenizer.model": "paligemma_like.model",
+}
 DEAR = {"mjcf": 4}  # how many times as much time a kind takes
 
 
@@ -47,6 +51,11 @@ def seen(folder: Path) -> None:
     final_table(folder)
 
 
+def spell(folder: Path) -> None:
+    """As the prompts of a policy are."""
+    tokenizer.load(folder).encode(["push the button"], 16)
+
+
 FILES: list[fuzzing.Change] = [fuzzing.damaged, fuzzing.replaced]
 KINDS: dict[str, tuple[Callable[[Path], Any], list[fuzzing.Change]]] = {
     "rlds": (read, [*FILES, *[fuzzing.described] * 4]),
@@ -56,6 +65,8 @@ KINDS: dict[str, tuple[Callable[[Path], Any], list[fuzzing.Change]]] = {
     "lerobot v21": (read, [*FILES, *[fuzzing.described] * 2, *[fuzzing.tabled] * 2]),
     "lerobot v3": (read, [*FILES, *[fuzzing.described] * 2, *[fuzzing.tabled] * 2]),
     "statistics": (statistics_files.read, [*FILES, fuzzing.described]),
+    "tokenizer.json": (spell, [*FILES, *[fuzzing.described] * 2]),
+    "tokenizer.model": (spell, [fuzzing.replaced, *[fuzzing.damaged] * 4]),
     "run": (seen, [*FILES, *[fuzzing.described] * 6]),
     "mjcf": (lambda folder: mjcf.load(folder / "arm.xml"), [*FILES, *[fuzzing.drawn] * 4]),
 }
@@ -72,6 +83,9 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         (at / name).mkdir()
         fill(at / name)
     found = {name: at / name for name in ("rlds", "cache", "npz", "mjcf", "run")}
+    for name, file in TOKENIZERS.items():
+        (at / name).mkdir()
+        found[name] = shutil.copy(GOLDEN / "tokenizers" / file, at / name / name).parent
     found |= {"rlds, gone on with": at / "rlds", "statistics": golden("v21") / "meta"}
     return found | {f"lerobot {version}": golden(version) for version in ("v21", "v3")}
 
