@@ -3,14 +3,14 @@
     env = envs.make("press", robot="my_arm.xml")
     env = envs.make("press", robot=envs.mjcf.load("my_arm.xml", tcp="pinch", speed=1.5))
 
-The file describes an arm: hinges from its base to a hand with two sliding fingers, which are found
-by what they are, not by name, and a position actuator for each hinge and for the fingers. Joints,
-masses, gains, meshes, names (after "robot/") and the pose of the base are kept; a hinge's limits
-are both its range and its actuator's ctrlrange. What a scene has of its own is not kept: floor,
-lights, options, keyframes, sensors, tendons, equalities. A camera "wrist" is the wrist camera; an
-arm without one gets that of the robots of this package. Of the arm only the fingers touch things,
-each with a box around the ends of its colliding geoms and a small sphere at the tip, like the
-robots of this package: MJX is slow with meshes.
+The file describes an arm: up to 16 hinges from its base to a hand with two sliding fingers, which
+are found by what they are, not by name, and a position actuator for each hinge and for the fingers.
+Joints, masses, gains, meshes, names (after "robot/") and the pose of the base are kept; a hinge's
+limits are both its range and its actuator's ctrlrange. What a scene has of its own is not kept:
+floor, lights, options, keyframes, sensors, tendons, equalities. A camera "wrist" is the wrist
+camera; an arm without one gets that of the robots of this package. Of the arm only the fingers
+touch things, each with a box around the ends of its colliding geoms and a small sphere at the tip,
+like the robots of this package: MJX is slow with meshes.
 """
 
 import os
