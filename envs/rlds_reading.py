@@ -135,7 +135,8 @@ def _builder(folder: Path, parts: Sequence[int]) -> Any:
     if list(split.shard_lengths) != list(parts):
         raise ValueError(f"it describes {sum(split.shard_lengths)} episodes, not {sum(parts)}")
     for file, episodes in zip(split.filepaths, parts, strict=True):
-        reader = array_record_module.ArrayRecordReader(str(regular(Path(file), folder)))
+        path = regular(files.inside(folder, os.path.relpath(file, folder)), folder)
+        reader = array_record_module.ArrayRecordReader(str(path))
         if reader.num_records() != episodes:
             raise ValueError(f"{file} holds {reader.num_records()} episodes, not {episodes}")
         reader.close()

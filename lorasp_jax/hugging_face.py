@@ -27,7 +27,7 @@ from lorasp_jax.dense import AdaptedLayer, AdapterParam
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA
 from lorasp_jax.peft.method import drop_rate
 from lorasp_jax.peft_folders import CONFIG, PREFIX, TENSORS, Adapter, read
-from lorasp_jax.peft_whole import Names, exported_whole, whole_parameters
+from lorasp_jax.peft_whole import Names, check_biases, exported_whole, whole_parameters
 
 
 def dotted(path: str, index: tuple[int, ...]) -> str:
@@ -122,6 +122,7 @@ def matched(
         rank = values[path]["lora_a"].shape[-1]
         rules.append((f"^{re.escape(path)}$", kind(rank, scale * rank, dropout=dropout)))
     _check_used(folder, modules, left, known)
+    check_biases(folder, config.get("bias", "none"), full, sizes, values)
     whole = whole_parameters(folder, full, shapes, sizes, names)
     # Of a layer with an adapter the bias may train in full: such rules go first.
     free = [(f"^{re.escape(path)}$", FullFineTuning()) for path in whole]

@@ -57,6 +57,31 @@ def whole_parameters(
     return found
 
 
+def check_biases(
+    folder: pathlib.Path,
+    bias: str,
+    full: Whole,
+    sizes: Collection[str],
+    adapted: Collection[str],
+) -> None:
+    """Raise if a folder says that it trained biases that the model has, and holds none.
+
+    Args:
+      folder: of PEFT.
+      bias: "none", "all" or "lora_only".
+      full: what it holds in full.
+      sizes: paths of the model's parameters.
+      adapted: paths of layers that the folder adapts.
+
+    Raises:
+      ValueError: it does.
+    """
+    own = [path.rpartition("/")[0] for path in sizes if path.rpartition("/")[2] == "bias"]
+    there = own if bias == "all" else set(own) & set(adapted)
+    if bias != "none" and there and not any(kind == "bias" for _, kind in full):
+        raise ValueError(f"{folder} was trained with bias {bias!r}, but holds no bias.")
+
+
 def exported_whole(
     model: nnx.Module, adapted: Collection[str], names: Names
 ) -> tuple[Adapter, dict[str, Any]]:

@@ -136,10 +136,13 @@ def tabled(r: random.Random, files: list[Path]) -> None:
 
 def array(r: random.Random, found: np.ndarray) -> np.ndarray:
     """Another one."""
+    minus = np.array(-1).astype(found.dtype)  # of unsigned integers the largest
     with np.errstate(all="ignore"):
         changes = [
             lambda: found.astype(r.choice(["f2", "f8", ">f4", "i8", "?", "U5", "S3"])),
-            lambda: np.where(np.arange(found.size).reshape(found.shape), found, r.choice([-1, 99])),
+            lambda: np.where(
+                np.arange(found.size).reshape(found.shape), found, r.choice([minus, 99])
+            ),
             lambda: found.reshape(-1),
             lambda: found[:-1],
             lambda: found[:0],

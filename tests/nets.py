@@ -76,11 +76,11 @@ def call(model, x):
     return model(x)
 
 
-def trained(*rules, seed, net=NET):
-    """An adapted model whose adapters have moved off their start."""
+def trained(*rules, seed, net=NET, size=0.5):
+    """An adapted model whose adapters have moved off their start, this far."""
     model = adaptation.adapt(net, rules, rngs=nnx.Rngs(seed))
     graphdef, adapters, frozen = adaptation.split(model)
-    return nnx.merge(graphdef, moved(adapters, 0.5, seed), frozen)
+    return nnx.merge(graphdef, moved(adapters, size, seed), frozen)
 
 
 def assert_close(actual, expected):

@@ -182,7 +182,7 @@ def test_layers_of_two_methods_are_joined_alone(second):
 )
 def test_sampling_follows_the_velocity(backbone):
     config = backbone.Config.dummy()
-    model = trained((".*_proj", METHODS["lora"]), seed=1, net=drawn(config))
+    model = trained((".*_proj", METHODS["lora"]), seed=1, net=drawn(config), size=0.1)
     obs = observation(config, 2)
     noise = jax.random.normal(jax.random.key(0), (2, config.chunk, config.action_dim))
     velocity = jax.jit(lambda model, x, t: model.velocity(obs, x, jnp.full(2, t)))

@@ -119,7 +119,7 @@ def test_experts_get_smaller_like_dense_twins(tool):
 
 @pytest.mark.slow
 def test_distilled_kinds_merge_save_and_load(tmp_path):
-    model = trained(("split|experts|join|blocks", SP), seed=4, net=NET)
+    model = trained(("split|experts|join|blocks", SP), seed=4, net=NET, size=0.2)
     smaller, report = lorasp_jax.distill(model, IDS)
     assert sorted(report.layer_errors) == EINSUMS
     assert {path: ranks.shape for path, ranks in report.ranks.items()} == {
@@ -136,7 +136,7 @@ def test_distilled_kinds_merge_save_and_load(tmp_path):
 @pytest.mark.slow
 def test_pruned_kinds_answer_as_before():
     """η = 0.6 never needs them all, so something goes, and nothing that was used."""
-    model = trained(("split|experts|join|blocks", SP), seed=4, net=NET)
+    model = trained(("split|experts|join|blocks", SP), seed=4, net=NET, size=0.2)
     smaller, report = lorasp_jax.prune(model, IDS)
     assert report.output_error < 1e-5
     for path, ranks in report.ranks.items():

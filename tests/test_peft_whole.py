@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 
 import flax.linen as nn
 import huggingface_hub
@@ -49,6 +50,18 @@ def test_what_trains_in_full_is_written_again(name, tmp_path):
     ours, theirs = (json.loads((f / hugging_face.CONFIG).read_text()) for f in folders)
     for key in ("bias", "modules_to_save", "lora_dropout"):
         assert ours[key] == theirs[key]
+
+
+@pytest.mark.parametrize("bias", ["all", "lora_only"])
+def test_biases_that_are_not_there(bias, tmp_path):
+    folder = shutil.copytree(FOLDER, tmp_path / "copy")
+    edit(folder, bias=bias)
+    with pytest.raises(ValueError, match=f"was trained with bias '{bias}', but holds no bias"):
+        hugging_face.load_peft(folder, Net())
+    bare = Net()
+    for layer in bare.lin:
+        layer.bias, layer.use_bias = None, False
+    hugging_face.load_peft(folder, bare)  # has none that could have been trained
 
 
 class Stack(nnx.Module):

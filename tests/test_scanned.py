@@ -121,7 +121,7 @@ def test_the_documented_loop(remat, scanned, tmp_path):
     save_adapters(tmp_path, trained)
     loaded = load_adapters(tmp_path, base, einsums=EINSUMS)
     np.testing.assert_array_equal(loaded(IDS), trained(IDS))
-    with pytest.raises(ValueError, match=r"of other classes: .*layers(/0)?/q \(Einsum\)"):
+    with pytest.raises(ValueError, match=r"of other classes: .*layers(/0)?/[qo] \(Einsum\)"):
         load_adapters(tmp_path, base)
 
 
@@ -140,8 +140,8 @@ def test_remat_and_scan_change_no_number():
     of_stack, of_layers = (dict(nnx.to_flat_state(g)) for g in gradients)
     for path, found in of_stack.items():
         if path[0] == "layers":
-            each_layer = [of_layers[("layers", i, *path[1:])][...] for i in range(DEPTH)]
-            found = found[...]
+            each_layer = [of_layers[("layers", i, *path[1:])].get_value() for i in range(DEPTH)]
+            found = found.get_value()
             jax.tree.map(
                 lambda a, *b: np.testing.assert_allclose(a, jnp.stack(b), rtol=1e-3, atol=1e-6),
                 found,

@@ -126,7 +126,7 @@ def page():
     return job, {line.split()[0]: line.partition("#")[0].split() for line in lines}
 
 
-def wait_for(what, seconds=900):
+def wait_for(what, seconds=1500):
     """Poll until it gives something."""
     end = time.monotonic() + seconds
     while not (found := what()):
