@@ -5,6 +5,7 @@ these three restore a run to the bit. The base is recorded by its hash, the valu
 """
 
 import contextlib
+import errno
 import itertools
 import os
 import shutil
@@ -148,9 +149,12 @@ class Checkpoints:
         for step in unfinished if processes.is_first() else ():
             path = self._folder / str(step)
             while path.exists():
-                # After a failed write Orbax' threads still remove files of their own.
-                with contextlib.suppress(FileNotFoundError):
+                try:
                     shutil.rmtree(path)
+                except OSError as error:
+                    # After a failed write Orbax' threads still add and remove files of their own.
+                    if error.errno not in (errno.ENOTEMPTY, errno.ENOENT):
+                        raise
         return unfinished
 
     @contextlib.contextmanager

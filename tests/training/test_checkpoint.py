@@ -1,5 +1,6 @@
 """Checkpoints that were damaged, half written or had no room: used as saved, or refused aloud."""
 
+import errno
 import gc
 import io
 import resource
@@ -174,6 +175,21 @@ def test_a_full_disk_leaves_the_checkpoint_before(folder, caplog):
     assert not [record for record in caplog.records if record.exc_info]
     assert names(folder) == ["1", "2"]
     assert restore(folder) == (2, "")
+
+
+def test_threads_that_still_write_are_outlasted(folder, monkeypatch):
+    """Of a failed write: a file more in a folder that is being removed."""
+    (folder / "3" / "left").mkdir(parents=True)
+    remove, failures = shutil.rmtree, [errno.ENOTEMPTY, errno.ENOENT]
+
+    def rmtree(path):
+        if failures:
+            raise OSError(failures.pop(), "somebody else was there")
+        remove(path)
+
+    monkeypatch.setattr(shutil, "rmtree", rmtree)
+    assert restore(folder)[0] == 2
+    assert names(folder) == ["1", "2"]
 
 
 @pytest.mark.parametrize("kind", ["float32", "bfloat16", "bool", "int8"])
