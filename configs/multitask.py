@@ -15,20 +15,22 @@ from lorasp_jax.peft import LoRASP
 
 
 def get_config(scale: str) -> Config:
-    """The experiment at `scale`: smoke (minutes, learns nothing), cpu or accelerator."""
+    """The experiment at `scale`: smoke (two minutes for press), cpu or accelerator."""
     return {"smoke": _smoke, "cpu": _cpu, "accelerator": _accelerator}[scale]()
 
 
 def _smoke() -> Config:
+    # Nearly all of it is compilation, so few layers are adapted: those that press needs.
     return Config(
         name="multitask",
         scale="smoke",
         peft=LoRASP(rank=8),
-        data=DataConfig(episodes=4, num_envs=8),
-        optim=OptimConfig(steps=4, batch_size=8, warmup_steps=1),
-        evaluation=EvaluationConfig(episodes=8, num_envs=8),
-        log_every=2,
-        checkpoint_every=2,
+        targets=("^action/.*(q|v|o|down)_proj", "^(state|action_in|action_out)_proj"),
+        data=DataConfig(episodes=32, num_envs=32),
+        optim=OptimConfig(steps=300, batch_size=32, learning_rate=3e-3, warmup_steps=15),
+        evaluation=EvaluationConfig(episodes=16, num_envs=16),
+        log_every=10,
+        checkpoint_every=300,
     )
 
 

@@ -52,6 +52,11 @@ def warn_if_late() -> None:
         )
 
 
+def without_simulation() -> dict[str, str | bool] | None:
+    """Options for compiling what simulates nothing, which the flag would make slower on CPU."""
+    return {_NAME: True} if _NEEDED and jax.default_backend() == "cpu" else None
+
+
 def jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     """`jax.jit`, fast on CPU even where the flag came too late; options are those of `jax.jit`."""
     plain = jax.jit(function, **options)

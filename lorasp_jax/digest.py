@@ -13,14 +13,16 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 DIGEST = "digest"
 """Key of a JSON object's digest."""
+_PART = 2**18  # words at a time, which a cache holds
 
 
 def digest(arrays: Mapping[str, jax.Array], *notes: str) -> str:
     """SHA-256, in hexadecimal, of names, types, shapes and sums of the arrays, and of the notes."""
-    sums = jax.device_get({name: _mixed_sum(array) for name, array in arrays.items()})
+    sums = jax.device_get({name: _sum(array) for name, array in arrays.items()})
     facts = [
         [name, str(array.dtype), list(array.shape), int(sums[name])]
         for name, array in sorted(arrays.items())
@@ -32,7 +34,7 @@ def fingerprints(weights: Mapping[str, Any]) -> dict[str, str]:
     """Eight hexadecimal digits of each array's values, rounded to bf16: the types that weights are
     kept in agree.
     """
-    sums = jax.device_get({name: _rounded_sum(array) for name, array in weights.items()})
+    sums = jax.device_get({name: _sum(array, rounded=True) for name, array in weights.items()})
     return {name: f"{int(found):08x}" for name, found in sums.items()}
 
 
@@ -65,11 +67,39 @@ def _json_digest(facts: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
 
 
+def _sum(array: Any, *, rounded: bool = False) -> Any:
+    """`_mixed_sum`, where asked for of floating-point numbers in bf16."""
+    rounded = rounded and jnp.issubdtype(array.dtype, jnp.floating)
+    if not _is_at_hand(array):
+        return _rounded_sum(array) if rounded else _mixed_sum(array)
+    array = np.asarray(array)
+    return _host_sum(array.astype(jnp.bfloat16) if rounded else array)
+
+
+def _is_at_hand(array: Any) -> bool:
+    """Whether NumPy can read it where it is: then nothing need be compiled for its shape."""
+    if isinstance(array, np.ndarray):
+        return True
+    return array.is_fully_addressable and all(d.platform == "cpu" for d in array.devices())
+
+
+def _host_sum(array: np.ndarray) -> int:
+    """`_mixed_sum` by NumPy, part by part."""
+    words = np.ascontiguousarray(array).reshape(-1).view(f"uint{min(8 * array.itemsize, 32)}")
+    total = 0
+    for start in range(0, len(words), _PART):
+        part = words[start : start + _PART].astype(np.uint32)
+        part ^= np.arange(start, start + len(part)).astype(np.uint32) * np.uint32(0x9E3779B9)
+        part = (part ^ (part >> 16)) * np.uint32(0x85EBCA6B)
+        part = (part ^ (part >> 13)) * np.uint32(0xC2B2AE35)
+        total += int(np.sum(part ^ (part >> 16), dtype=np.uint64))
+    return total % 2**32
+
+
 @jax.jit
 def _rounded_sum(array: jax.Array) -> jax.Array:
-    """`_mixed_sum` of floating-point numbers in bf16."""
-    real = jnp.issubdtype(array.dtype, jnp.floating)
-    return _mixed_sum(array.astype(jnp.bfloat16) if real else array)
+    """`_mixed_sum` in bf16."""
+    return _mixed_sum(array.astype(jnp.bfloat16))
 
 
 @jax.jit

@@ -15,7 +15,7 @@ from tests.several import ROOT, start
 COMMAND = (
     *(ROOT / "train.py", "--config", ROOT / "configs/multitask.py", "--scale", "smoke"),
     *("--tasks", "press", "--data.episodes", 2, "--data.num-envs", 2),
-    *("--evaluation.episodes", 2, "--evaluation.num-envs", 2),
+    *("--evaluation.episodes", 2, "--evaluation.num-envs", 2, "--optim.batch-size", 8),
 )
 SPLIT = (
     *("--model.size", "small", "--model.unroll", "False", "--method", "full", "--fsdp", 2),

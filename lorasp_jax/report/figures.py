@@ -104,7 +104,8 @@ def active_rank(rows: Rows, rank: int) -> str:
 
 
 def layer_ranks(layers: dict[str, dict[str, Sequence[float]]], rank: int) -> str:
-    """Active rank of every adapted layer after training, one panel per tower."""
+    """Active rank of every adapted layer after training, one panel per tower that has any."""
+    layers = {tower: linears for tower, linears in layers.items() if linears}
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(9, 3.4), layout="constrained")
         panels = figure.subplots(1, len(layers), sharey=True, squeeze=False)[0]

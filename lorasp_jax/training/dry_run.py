@@ -13,6 +13,7 @@ from flax import nnx
 from rich.console import Console
 from rich.table import Table
 
+from envs import fast_cpu
 from envs.episodes import Episodes
 from lorasp_jax import adaptation
 from lorasp_jax.config import Config
@@ -49,7 +50,8 @@ def dry_run(config: Config, folder: Path, console: Console) -> None:
     data = _prepared(run, built)
     began = time.perf_counter()
     with console.status("compiling the training step ..."):
-        compiled = _lowered(run, data).compile()
+        options = fast_cpu.without_simulation()
+        compiled = _lowered(run, data).compile(compiler_options=options)
     console.print(f"the training step compiled in {time.perf_counter() - began:.1f} s")
     console.print(_memory(built, _bytes(data) / _split(data), compiled.memory_analysis()))
     operations = preflight.operations(config, built.base.config)

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from envs import compiling
+from envs import compiling, fast_cpu
 from lorasp_jax import flops
 from lorasp_jax.data.batches import Raw, Steps, flatten, of_size
 from lorasp_jax.data.demonstrations import fresh_demonstrations
@@ -35,7 +35,8 @@ class Stretches:
 
             def compiled() -> Any:
                 with compiling.said("the training step"):
-                    return self._jitted.lower(self._frozen, self._data, state, key, count).compile()
+                    lowered = self._jitted.lower(self._frozen, self._data, state, key, count)
+                    return lowered.compile(compiler_options=fast_cpu.without_simulation())
 
             pool = ThreadPoolExecutor(1)
             self._compiled[count] = pool.submit(compiled)

@@ -8,6 +8,7 @@ import jax
 import pytest
 
 import envs
+from envs import fast_cpu
 
 OLD = jax.__version_info__ < (0, 11)
 old = pytest.mark.skipif(not OLD, reason="newer versions need no flag")
@@ -73,3 +74,9 @@ def test_too_late_is_one_warning_and_our_own_programs_are_fast():
         "jax.block_until_ready(state)\n"
         "assert time.process_time() - start < 1.5"  # else 10 s
     )
+
+
+def test_what_simulates_nothing_is_compiled_as_jax_does():
+    options = fast_cpu.without_simulation()
+    assert options == ({"xla_cpu_use_fusion_emitters": True} if OLD else None)
+    assert jax.jit(lambda x: x + 1).lower(1).compile(compiler_options=options)(1) == 2

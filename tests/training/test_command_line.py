@@ -14,7 +14,10 @@ from lorasp_jax.training.overrides import parse
 from lorasp_jax.training.run_folder import read_metrics
 
 ROOT = Path(__file__).parents[2]
-COMMAND = ["--config", f"{ROOT}/configs/multitask.py", "--scale", "smoke", "--tasks", "press"]
+COMMAND = [
+    *("--config", f"{ROOT}/configs/multitask.py", "--scale", "smoke", "--tasks", "press"),
+    *("--targets", "paper", "--optim.batch-size", "8"),
+]
 
 
 @pytest.fixture(scope="module")

@@ -3,11 +3,13 @@
 import dataclasses
 import os
 import signal
+from unittest.mock import Mock
 
 import jax
 import numpy as np
 import pytest
 
+from envs import fast_cpu
 from lorasp_jax import adaptation
 from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.loop import RunError, train
@@ -95,6 +97,13 @@ def test_signal_handlers_are_put_back(tmp_path):
     assert second["size"] == last["size"] != first["size"] > 0
     assert signal.getsignal(signal.SIGTERM) == before
     assert jax.device_count() == 8
+
+
+def test_steps_are_compiled_without_what_simulation_needs():
+    jitted = Mock()
+    Stretches(jitted, None, None, Mock()).compile(Mock(), 3).result()
+    compiled = jitted.lower.return_value.compile
+    compiled.assert_called_once_with(compiler_options=fast_cpu.without_simulation())
 
 
 @pytest.mark.slow

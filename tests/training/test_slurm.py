@@ -28,7 +28,7 @@ STEPS = 40
 OPTIONS = (
     *("--config", "configs/multitask.py", "--scale", "smoke", "--tasks", "press"),
     *("--optim.steps", str(STEPS), "--log-every", "1", "--checkpoint-every", "1000"),
-    *("--data.episodes", "2", "--data.num-envs", "2"),
+    *("--data.episodes", "2", "--data.num-envs", "2", "--targets", "paper"),
     *("--evaluation.episodes", "2", "--evaluation.num-envs", "2"),
 )
 SIZES = ("--nodes=1", "--ntasks-per-node=2", "--gpus-per-node=2", "--cpus-per-task=1")
