@@ -23,11 +23,12 @@ from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
-from flax import linen, nnx
+from flax import nnx
 
-from lorasp_jax import layers, paths
+from lorasp_jax import given, layers, paths
 from lorasp_jax.dense import DROPPING, AdaptedLayer, AdapterAux, AdapterParam, DropoutKey
 from lorasp_jax.kernels.quantized import QuantizedKernel
+from lorasp_jax.kinds import short
 from lorasp_jax.peft import FullFineTuning, Method
 from lorasp_jax.peft.method import Params, drop_rate
 
@@ -76,7 +77,8 @@ def adapt(
     """
     paths.check_method_rules(rules)
     layers.check_einsums(einsums)
-    holder, key = _copy(model), _key(rngs)
+    _check_statistics(statistics)
+    holder, key = _copy(model), given.rngs(rngs).params()
     used = _attach_all(holder, rules, key, einsums, statistics) | free_all(holder, rules)
     for i, (pattern, _) in enumerate(rules):
         if i not in used:
@@ -112,7 +114,7 @@ def with_dropout(model: Model, key: jax.Array) -> Model:
       model: left untouched; without such adapters the result computes the same.
       key: typed random key.
     """
-    holder = _copy(model)
+    holder, key = _copy(model), given.key(key)
     for place in paths.once(paths.places(holder, AdaptedLayer)):
         layer = place.child
         if isinstance(layer.adapter, AdapterParam) and drop_rate(layer.method):
@@ -130,6 +132,7 @@ def count(model: nnx.Module) -> Counts:
 def methods(model: nnx.Module) -> dict[str, Method]:
     """Method by path: of each layer with an adapter, and full fine-tuning of each parameter."""
     found = {}
+    given.module(model)
     for path, parent, name, _ in paths.places(nnx.List([model]), AdapterParam):
         if isinstance(parent, AdaptedLayer) and name == "adapter":
             found[path.rpartition("/")[0]] = parent.method
@@ -145,9 +148,9 @@ def merge(model: Model) -> Model:
     not, but merging changes it. A quantised kernel under an adapter becomes an array again.
 
     Raises:
-      ValueError: a method whose delta depends on the input.
+      ValueError: a method whose delta depends on the input, or a model without values.
     """
-    holder = _copy(model)
+    holder = _copy(given.with_values(model))
     for place in paths.once(paths.places(holder, AdaptedLayer)):
         layer = place.child
         if layer.adapter is not None:
@@ -206,20 +209,18 @@ def attach(
     layer.adapter = AdapterParam(params)
 
 
-def _key(rngs: Any) -> jax.Array:
-    """A key for the adapters; raises a ValueError for what is not `nnx.Rngs` with such a stream."""
-    if not isinstance(rngs, nnx.Rngs) or not {"params", "default"} & set(rngs):
-        given = list(rngs) if isinstance(rngs, nnx.Rngs) else type(rngs).__name__
-        raise ValueError(f"rngs must be nnx.Rngs(a seed or key) with params, got {given}.")
-    return rngs.params()
-
-
-def checked_module(model: Any) -> Any:
-    """The model; raises a ValueError for what is no NNX module."""
-    if not isinstance(model, nnx.Module):
-        hint = "; see LinenAdapter for Linen's" if isinstance(model, linen.Module) else ""
-        raise ValueError(f"the model must be an NNX module, got {type(model).__name__}{hint}.")
-    return model
+def _check_statistics(statistics: Any) -> None:
+    """Raises a ValueError unless these are matrices of finite numbers by path."""
+    if not isinstance(statistics, Mapping):
+        wanted = "statistics are those of calibration.input_moments, by path"
+        raise ValueError(f"{wanted}, got {short(statistics)}.")
+    for path, value in statistics.items():
+        shape = getattr(value, "shape", (0, 1))
+        traced = isinstance(value, jax.core.Tracer)
+        if shape[-2:] != shape[-1:] * 2 or not (traced or jnp.isfinite(value).all()):
+            raise ValueError(
+                f"statistics of {path} must be finite numbers [I, I], got {short(value)}."
+            )
 
 
 def _copy(model: nnx.Module) -> nnx.List:
@@ -227,7 +228,7 @@ def _copy(model: nnx.Module) -> nnx.List:
 
     The holder gives a model that is itself one layer a parent to be replaced in.
     """
-    model = nnx.clone(checked_module(model))
+    model = nnx.clone(given.module(model))
     nnx.pop(model, nnx.Any(AdapterAux, DropoutKey))
     return nnx.List([model])
 
@@ -277,6 +278,8 @@ def free_all(holder: nnx.List, rules: paths.Rules) -> set[int]:
                 raise ValueError(f"{place.path} cannot train in full under the layer's adapter.")
             if jnp.issubdtype(place.child.get_value().dtype, jnp.floating):
                 freed.append(place)
+    if shapes := [p for p in freed if isinstance(p.child.get_value(), jax.ShapeDtypeStruct)]:
+        raise ValueError(f"{shapes[0].path} has no value: call this within nnx.eval_shape.")
     _retype(freed, AdapterParam)
     return used
 
@@ -303,6 +306,8 @@ def init_stack(
 
     Not jitted as a whole: its random draws compile once for each I instead of for each shape.
     """
+    if len(getattr(kernel, "shape", ())) < 2:
+        raise ValueError(f"an adapter needs a kernel [..., I, O], got {short(kernel)}.")
     *leading, d_in, d_out = kernel.shape
     if not leading:
         return init(key, kernel, statistics=statistics)

@@ -22,8 +22,9 @@ import numpy as np
 import safetensors.numpy
 from flax import nnx
 
-from lorasp_jax import adaptation, digest, kinds, layers, peft
+from lorasp_jax import adaptation, digest, given, kinds, layers, peft
 from lorasp_jax.dense import AdapterParam
+from lorasp_jax.kinds import short
 from lorasp_jax.peft import Method
 
 TENSORS, DESCRIPTION = "adapter.safetensors", "adapter.json"
@@ -50,10 +51,11 @@ def save_adapters(
       metadata: anything JSON can hold.
 
     Raises:
-      ValueError: the model has nothing that trains.
-      TypeError: metadata that JSON cannot hold.
+      ValueError: the model has nothing that trains, or metadata that JSON would not give back.
     """
-    adapters = nnx.state(model, AdapterParam)
+    folder, adapters = given.folder(folder), nnx.state(given.with_values(model), AdapterParam)
+    if not isinstance(base, str):
+        raise ValueError(f"base must be a text, the name of the base, got {short(base)}.")
     tensors = {name: np.asarray(leaf) for name, leaf in _named(adapters).items()}
     if not tensors:
         raise ValueError("the model has no adapters to save; of a combined one, extract one first.")
@@ -65,12 +67,9 @@ def save_adapters(
         "weights": digest.fingerprints(_frozen_weights(model)),
         "sha256": hashlib.sha256(data).hexdigest(),
         "methods": {path: _settings(m) for path, m in adaptation.methods(model).items()},
-        "metadata": dict(metadata or {}),
+        "metadata": _checked_metadata({} if metadata is None else metadata),
     }
-    text = json.dumps(
-        digest.sealed(description), indent=2
-    )  # before anything is written: it may raise
-    folder = pathlib.Path(folder)
+    text = json.dumps(digest.sealed(description), indent=2)
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / TENSORS, data)
     write_whole(folder / DESCRIPTION, text.encode())
@@ -100,10 +99,12 @@ def load_adapters(
     Raises:
       ValueError: missing, damaged or foreign files, another base, or adapters that do not fit.
     """
-    folder = pathlib.Path(folder)
+    folder = given.folder(folder)
     description, tensors = _read(folder)
     if base is not None and description["base"] != base:
-        raise ValueError(f"{folder} was trained on base {description['base']!r}, not on {base!r}.")
+        raise ValueError(
+            f"{folder} was trained on base {description['base']!r}, not on {short(base)}."
+        )
     wanted = description["methods"]
     present = {path: _settings(method) for path, method in adaptation.methods(model).items()}
     if not present:
@@ -196,11 +197,22 @@ def _settings(method: Method) -> Settings:
 
 def _method(settings: Settings) -> Method:
     if not isinstance(settings, dict) or not isinstance(settings.get("method"), str):
-        raise ValueError(f"an adapter has settings {settings!r}, which name no method.")
+        raise ValueError(f"an adapter has settings {short(settings)}, which name no method.")
     fields = {name: value for name, value in settings.items() if name != "method"}
     method = peft.create(settings["method"], **fields)
     kinds.check_fields(method)
     return method
+
+
+def _checked_metadata(metadata: Any) -> dict[str, Any]:
+    """It as a dictionary; raises a ValueError for what would be another one once it is read."""
+    try:
+        again = json.loads(json.dumps(metadata, allow_nan=False))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"metadata is for JSON, which cannot hold it: {error}.") from error
+    if not isinstance(metadata, Mapping) or again.keys() != metadata.keys():
+        raise ValueError(f"metadata is a dictionary whose keys are texts, got {short(metadata)}.")
+    return again
 
 
 def write_whole(path: pathlib.Path, data: bytes) -> None:
@@ -214,11 +226,11 @@ def read_whole(path: pathlib.Path) -> bytes:
     """The bytes of a file.
 
     Raises:
-      ValueError: it has more than this machine's memory.
+      ValueError: it has more than a quarter of this machine's memory, which holds its tensors too.
     """
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    if (size := path.stat().st_size) > memory:
-        raise ValueError(f"{path} has {size} bytes, more than this machine's memory")
+    if (size := path.stat().st_size) > memory / 4:
+        raise ValueError(f"{path} has {size} bytes, more than a quarter of this machine's memory")
     return path.read_bytes()
 
 
@@ -266,7 +278,7 @@ def read_description(folder: pathlib.Path) -> dict[str, Any]:
             found = digest.unsealed(found)
             wrong = [name for name, kind in FIELDS.items() if not isinstance(found[name], kind)]
             if wrong:
-                raise ValueError(f"its {wrong[0]} is {found[wrong[0]]!r}")
+                raise ValueError(f"its {wrong[0]} is {short(found[wrong[0]])}")
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{path} is damaged or no adapter description ({error}).") from error
     if not known:

@@ -7,6 +7,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from lorasp_jax.kinds import short
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +41,7 @@ class Aux:
 def masked_mean(values: jax.Array, mask: jax.Array | None) -> jax.Array:
     """Mean of values [...] over the positions where mask [...] is True; 0 if there are none."""
     if mask is None:
-        return values.mean()
+        return values.mean() if values.size else jnp.zeros((), values.dtype)
     return jnp.where(mask, values, 0).sum() / jnp.maximum(mask.sum(), 1)
 
 
@@ -49,8 +51,13 @@ def auxiliary_losses(aux: Any) -> dict[str, jax.Array]:
     Args:
       aux: any tree of `Aux`, such as what `collect_aux` gives. One that a scan over depth stacked
         holds a value of each layer, and counts as so many.
+
+    Raises:
+      ValueError: it holds something else.
     """
     layers = jax.tree.leaves(aux, is_leaf=lambda node: isinstance(node, Aux))
+    if others := [layer for layer in layers if not isinstance(layer, Aux)]:
+        raise ValueError(f"aux must be a tree of Aux, as of collect_aux, got {short(others[0])}.")
     names = sorted({name for layer in layers for name in layer.losses})
     return {
         name: jnp.concatenate(

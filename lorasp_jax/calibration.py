@@ -21,6 +21,7 @@ from flax import nnx
 
 from lorasp_jax import adaptation, layers, paths
 from lorasp_jax.dense import AdapterAux, AdapterParam
+from lorasp_jax.kinds import short
 from lorasp_jax.peft.method import Aux, Method, Params
 
 Forward = Callable[[Any, Any], Any]
@@ -126,6 +127,8 @@ def observe(
       ValueError: no batches, a layer that was not called or whose aux `forward` did not return, or
         one with its own matrix product, precision or the like.
     """
+    if not isinstance(batches, Iterable):
+        raise ValueError(f"batches are a list or the like of inputs, got {short(batches)}.")
     step = _stepping(_observed(model, reports, others), forward)
     total: dict[str, Sums] = {}
     for batch in batches:
@@ -219,7 +222,7 @@ def input_moments(
     reports = {path: second_moment for path in known if re.search(pattern, path)}
     if not reports:
         close = paths.near_misses(pattern, known) or "none"
-        raise ValueError(f"{pattern!r} matches no dense layer or einsum; those here: {close}.")
+        raise ValueError(f"{short(pattern)} matches no dense layer or einsum; those here: {close}.")
     found = observe(model, batches, reports, forward)
     return {path: sums["moment"] for path, sums in found.items()}
 

@@ -16,10 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax import adaptation, calibration, paths
+from lorasp_jax import adaptation, calibration, given, paths
 from lorasp_jax.bank import normalized_bank
 from lorasp_jax.calibration import Forward, Layer, Sums
 from lorasp_jax.dense import AdaptedLayer, AdapterParam
+from lorasp_jax.kinds import short
 from lorasp_jax.peft import LoRA, LoRASP, Method
 from lorasp_jax.peft.method import Params
 
@@ -65,7 +66,7 @@ def prune(
       ValueError: a tolerance outside [0, 1), or a model without LoRA-SP.
     """
     if not (isinstance(tolerance, numbers.Real) and 0 <= tolerance < 1):
-        raise ValueError(f"tolerance must lie in [0, 1), got {tolerance!r:.80}.")
+        raise ValueError(f"tolerance must lie in [0, 1), got {short(tolerance)}.")
     layers = _lora_sp_layers(model)
     sums = calibration.observe(model, batches, dict.fromkeys(layers, _usage), forward)
     changed: Changed = {}
@@ -103,7 +104,7 @@ def distill(
       ValueError: a rank below 1, or a model without LoRA-SP.
     """
     if rank is not None and not (type(rank) is int and rank >= 1):
-        raise ValueError(f"rank must be a whole number, at least 1, or None, got {rank!r:.80}.")
+        raise ValueError(f"rank must be a whole number, at least 1, or None, got {short(rank)}.")
     layers = _lora_sp_layers(model)
     sums = calibration.observe(model, batches, dict.fromkeys(layers, _regression), forward)
     changed: Changed = {}
@@ -120,7 +121,7 @@ def distill(
 
 def _lora_sp_layers(model: nnx.Module) -> dict[str, Any]:
     """The layers with a LoRA-SP adapter by path."""
-    places = paths.places(nnx.List([model]), AdaptedLayer)
+    places = paths.places(nnx.List([given.module(model)]), AdaptedLayer)
     found = {p.path: p.child for p in places if isinstance(p.child.method, LoRASP)}
     if not found:
         raise ValueError("the model has no LoRA-SP layers.")

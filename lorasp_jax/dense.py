@@ -17,6 +17,7 @@ second result asks for it, `layer(x, return_aux=True)`, and then nothing is stor
 """
 
 import contextlib
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -27,7 +28,9 @@ import jax.numpy as jnp
 from flax import nnx
 from flax.typing import Dtype, Initializer
 
+from lorasp_jax import given
 from lorasp_jax.kernels.quantized import QuantizedKernel
+from lorasp_jax.kinds import short
 from lorasp_jax.peft import Aux, Method
 from lorasp_jax.peft.method import Params, apply_together, drop_rate
 
@@ -112,19 +115,24 @@ def dense_together(
     Raises:
       ValueError: as `dense`.
     """
-    _check_input(x, token_mask)
+    given.tokens(x, token_mask)
+    layers = [DenseLayer(*layer) for layer in layers]
     plain, adapted = {}, {}
     for i, (kernel, _, params, method, key) in enumerate(layers):
-        if x.shape[-1] != kernel.shape[0]:
-            raise ValueError(f"input of width {x.shape[-1]} meets a kernel {tuple(kernel.shape)}.")
-        matrix = kernel.reshape(kernel.shape[0], -1)
+        given.layer(layers[i], x.shape[-1])
+        matrix = kernel.reshape(kernel.shape[0], math.prod(kernel.shape[1:]))
         if method is None or params is None:
             plain[i] = x @ matrix.astype(x.dtype), Aux()
         elif key is not None:
             plain[i] = method.apply_dropped(params, x, matrix, key, token_mask=token_mask)
         else:
             adapted[i] = method, params, matrix
-    fused = apply_together([*adapted.values()], x, token_mask=token_mask)
+    try:
+        fused = apply_together([*adapted.values()], x, token_mask=token_mask)
+    except (TypeError, LookupError, AttributeError, ValueError):
+        for method, params, matrix in adapted.values():
+            given.params(method, params, matrix)
+        raise
     found = plain | dict(zip(adapted, fused, strict=True))
     results = []
     for i, (kernel, bias, *_) in enumerate(layers):
@@ -133,14 +141,19 @@ def dense_together(
     return results
 
 
-def _check_input(x: Any, token_mask: Any) -> None:
-    """Raises a ValueError unless x is inexact [...tokens, I] and a mask bool [...tokens]."""
-    if not (jnp.issubdtype(getattr(x, "dtype", int), jnp.inexact) and x.ndim):
-        found = f"{x.dtype} {list(x.shape)}" if hasattr(x, "dtype") else type(x).__name__
-        raise ValueError(f"x must be floating-point numbers [...tokens, I], got {found}.")
-    if token_mask is not None and (token_mask.shape, token_mask.dtype) != (x.shape[:-1], bool):
-        found = f"{token_mask.dtype} {list(token_mask.shape)}"
-        raise ValueError(f"token_mask must be bool {list(x.shape[:-1])}, got {found}.")
+def computed_in(dtype: Dtype | None, x: Any, kernel: Any) -> jax.Array:
+    """x in the type of a layer's computation; None: the type that x and the kernel promote to.
+
+    Raises:
+      ValueError: x is no array, or no such type is there, as for kernels of 8 bits.
+    """
+    try:
+        return given.array(x).astype(dtype or jnp.promote_types(x.dtype, kernel.dtype))
+    except jax.dtypes.TypePromotionError as error:
+        raise ValueError(
+            f"a layer with a kernel of {kernel.dtype} needs a dtype to compute {x.dtype} in, such "
+            "as dtype=jnp.bfloat16."
+        ) from error
 
 
 def with_value(variable: Any, value: Any) -> Any:
@@ -163,7 +176,10 @@ class AdaptedLayer(nnx.Module):
 
     def kernel_matrices(self) -> jax.Array:
         """The kernel as the adapter sees it, [..., I, O]; leading axes are stacks of layers."""
-        return getattr(self, self.kernel_name).get_value()
+        kernel = getattr(self, self.kernel_name)
+        if not isinstance(kernel, nnx.Variable):
+            raise ValueError(f"its {self.kernel_name} is {short(kernel)}, no parameter.")
+        return kernel.get_value()
 
     def stack_shape(self) -> tuple[int, ...]:
         """Sizes of the stacks of layers that this one is; () for one layer."""
@@ -240,7 +256,15 @@ class Dense(AdaptedLayer):
           param_dtype: type of kernel and bias; adapters are always fp32.
           kernel_init: initializer of the kernel.
           rngs: source of the random keys.
+
+        Raises:
+          ValueError: what is no width, method or source of keys.
         """
+        d_in, d_out = given.size("d_in", d_in), given.size("d_out", d_out)
+        given.method(method)
+        given.rngs(rngs)
+        given.real("param_dtype", param_dtype)
+        given.real("dtype", dtype or param_dtype)
         base = AdapterParam if method is not None and method.trains_base else nnx.Param
         self.kernel = base(kernel_init(rngs.params(), (d_in, d_out), param_dtype))
         self.bias = base(jnp.zeros(d_out, param_dtype)) if use_bias else None
@@ -271,7 +295,7 @@ class Dense(AdaptedLayer):
 
     def as_input(self, x: jax.Array) -> jax.Array:
         """x in the type of the computation."""
-        return x.astype(self.dtype or jnp.promote_types(x.dtype, self.kernel.get_value().dtype))
+        return computed_in(self.dtype, x, self.kernel.get_value())
 
     def arrays(self) -> DenseLayer:
         """What `dense` and `dense_together` take."""
@@ -309,7 +333,8 @@ class LinenDense(nn.Module):
         self, x: jax.Array, *, token_mask: jax.Array | None = None, return_aux: bool = False
     ) -> Any:
         """y [...tokens, O], or (y, aux) if asked; see `dense`."""
-        shape = (x.shape[-1], self.features)
+        given.method(self.method)
+        shape = (given.array(x).shape[-1], given.size("features", self.features))
         kernel = self.param("kernel", self.kernel_init, shape, self.param_dtype)
         bias = None
         if self.use_bias:
@@ -317,7 +342,7 @@ class LinenDense(nn.Module):
         params = None
         if self.method is not None and not self.method.trains_base:
             params = self.variable("adapters", "adapter", self._init_adapter, kernel).value
-        x = x.astype(self.dtype or jnp.promote_types(x.dtype, kernel.dtype))
+        x = computed_in(self.dtype, x, kernel)
         drops = params is not None and drop_rate(self.method) and self.has_rng("dropout")
         key = self.make_rng("dropout") if drops else None
         y, aux = dense(x, kernel, bias, params, self.method, key, token_mask=token_mask)

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 
 from lorasp_jax.dense import dense
 from lorasp_jax.kernels.quantized import QuantizedKernel
+from lorasp_jax.kinds import short
 from lorasp_jax.peft import Aux, Method
 from lorasp_jax.peft.method import Params
 
@@ -81,8 +82,8 @@ def parse(equation: str) -> Axes:
     same_dots = ("..." in axes.x) == ("..." in axes.y)
     if not (unique and same_dots and kernel and x ^ y <= kernel <= x | y):
         raise ValueError(
-            f"the einsum {equation!r} cannot be adapted: it must be 'x,kernel->y', explicit, where "
-            "each axis is in two or all of the three."
+            f"the einsum {short(equation)} cannot be adapted: it must be 'x,kernel->y', explicit, "
+            "where each axis is in two or all of the three."
         )
     return axes
 
@@ -157,7 +158,8 @@ def einsum(
     axes, sizes = _sizes(equation, x, kernel)
     tokens = "".join(c for c in axes.x if c not in axes.kernel)
     order = [axes.x.index(c) for c in axes.batch + tokens + axes.inputs]
-    rows = x.transpose(order).reshape(*(sizes[c] for c in axes.batch + tokens), -1)
+    width = math.prod(sizes[c] for c in axes.inputs)  # no -1: there may be no rows
+    rows = x.transpose(order).reshape(*(sizes[c] for c in axes.batch + tokens), width)
 
     def one(x: jax.Array, matrix: jax.Array, params: Any, key: Any) -> tuple[jax.Array, Aux]:
         return dense(x, matrix, None, params, method, key)

@@ -12,9 +12,10 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax import adaptation, layers, named, paths
+from lorasp_jax import adaptation, given, layers, named, paths
 from lorasp_jax.adaptation import Model
 from lorasp_jax.dense import AdaptedLayer, AdapterParam
+from lorasp_jax.kinds import short
 from lorasp_jax.peft import FullFineTuning, LoRA
 from lorasp_jax.peft.method import Params
 
@@ -43,10 +44,11 @@ def fuse(model: nnx.Module, weights: Mapping[str, float], *, rank: int | None = 
     Raises:
       ValueError: as for `choose`; no weight, a rank below 1, or a method that is no LoRA.
     """
-    if not weights or (rank is not None and rank < 1):
-        raise ValueError(f"fuse needs weights and a rank of at least 1, got {weights}, {rank}.")
-    for name in weights:
-        named.index_of(named.names(model), name)
+    if rank is not None:
+        given.size("rank", rank)
+    if not isinstance(weights, Mapping) or not weights:
+        raise ValueError(f"fuse needs weights by name, at least one, got {short(weights)}.")
+    named.weights(model, weights)  # raises for an unknown name or a weight that is no number
     result, errors = named.bare(model), {}
     there = named.modules(result)
     for path, _, _, layer in named.sets(model):
@@ -80,7 +82,8 @@ def unmerge(merged: Model, adapted: nnx.Module) -> Model:
         adapter that did not just add a constant: DoRA rescaled the kernel, and what it was before
         is not in the result.
     """
-    if named.sets(adapted):
+    given.with_values(merged)
+    if named.sets(given.with_values(adapted)):
         raise ValueError("the model to unmerge by has named adapters: extract one of them.")
     adapters = named.own_adapters(adapted)
     own = {p.path: p.child.get_value() for p in paths.places(nnx.List([adapted]), AdapterParam)}

@@ -21,9 +21,10 @@ import numpy as np
 import safetensors.numpy
 from flax import nnx
 
-from lorasp_jax import adaptation, layers, paths
+from lorasp_jax import adaptation, given, layers, paths
 from lorasp_jax.adapter_io import write_whole
 from lorasp_jax.dense import AdaptedLayer, AdapterParam
+from lorasp_jax.kinds import short
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA
 from lorasp_jax.peft.method import drop_rate
 from lorasp_jax.peft_folders import CONFIG, PREFIX, TENSORS, Adapter, read
@@ -39,6 +40,24 @@ def dotted(path: str, index: tuple[int, ...]) -> str:
     if index:
         raise ValueError(f"{path} is a stack of layers: give names(path, index) for its modules.")
     return path.replace("/", ".")
+
+
+def distinct(names: Names) -> Names:
+    """The same function, which now raises a ValueError for what it gives that is no name, and for
+    one name of two layers."""
+    if not callable(names):
+        raise ValueError(f"names is a function of a path and an index, got {short(names)}.")
+    layer_of: dict[str, tuple[str, tuple[int, ...]]] = {}
+
+    def checked(path: str, index: tuple[int, ...]) -> str:
+        name = names(path, index)
+        if not isinstance(name, str) or not name:
+            raise ValueError(f"names must give a text for {path!r}, {index}, got {short(name)}.")
+        if (first := layer_of.setdefault(name, (path, index))) != (path, index):
+            raise ValueError(f"names gives {short(name)} for {first} and for {(path, index)}.")
+        return name
+
+    return checked
 
 
 def load_peft(
@@ -67,7 +86,8 @@ def load_peft(
       ValueError: missing or damaged files, an adapter of another kind, modules that the model does
         not have, or adapters that do not fit their layers.
     """
-    holder = nnx.List([adaptation.checked_module(model)])
+    layers.check_einsums(einsums)
+    holder = nnx.List([given.module(model)])
     shapes = {
         place.path: layers.matrices_shape(place.child, einsums)
         for place in paths.multiplying(holder, einsums)
@@ -103,7 +123,7 @@ def matched(
     Raises:
       ValueError: as for `load_peft`.
     """
-    folder = _at_hand(folder)
+    folder, names = _at_hand(folder), distinct(names)
     config, modules, full = read(folder)
     kind = DoRA if config.get("use_dora") else LoRA
     dropout = config.get("lora_dropout") or 0.0
@@ -131,8 +151,8 @@ def matched(
 
 def _at_hand(folder: str | os.PathLike) -> pathlib.Path:
     """The folder on this machine; only what begins with hf:// is asked of the hub."""
-    if "://" not in os.fspath(folder):
-        return pathlib.Path(folder)
+    if "://" not in (path := given.folder(folder)).as_posix() and "://" not in str(folder):
+        return path
     from lorasp_jax.models import places  # with all backbones, which nothing else here needs
 
     return places.local(folder, only=[CONFIG, TENSORS])
@@ -156,6 +176,10 @@ def save_peft(
       ValueError: adapters that PEFT has no counterpart for, LoRA and DoRA together, or several
         rates of dropout.
     """
+    folder, names = given.folder(folder), distinct(names)
+    given.with_values(model)
+    if not isinstance(base, str | None):
+        raise ValueError(f"base must be a text, the name of the base, got {short(base)}.")
     modules: dict[str, tuple[float, Adapter]] = {}
     kinds, rates = set(), set()
     methods = adaptation.methods(model).items()
@@ -185,7 +209,6 @@ def save_peft(
     }
     whole, said = exported_whole(model, known, names)
     data = safetensors.numpy.save(tensors | whole, {"format": "pt"})
-    folder = pathlib.Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / TENSORS, data)
     said |= {"use_dora": kinds.pop(), "lora_dropout": rates.pop()}
@@ -212,7 +235,9 @@ def _check_used(
         raise ValueError(f"{folder} adapts nothing.")
     if left:
         close = paths.near_misses(min(left), known)
-        raise ValueError(f"{folder} adapts {min(left)!r}, which the model lacks; it has {close}.")
+        raise ValueError(
+            f"{folder} adapts {short(min(left))}, which the model lacks; it has {close}."
+        )
 
 
 def _stacked(found: list[Adapter], leading: list[int]) -> tuple[float, Adapter]:

@@ -32,14 +32,17 @@ def check_fields(owner: Any, prefix: str = "") -> None:
             continue
         value = getattr(owner, name)
         if not _fits(value, kind):
-            raise ValueError(f"{prefix}{name} must be {_called(kind)}, got {_shown(value)}")
+            raise ValueError(f"{prefix}{name} must be {_called(kind)}, got {short(value)}")
         if type(value) is int and abs(value) > most.get(name, LARGEST):
             raise ValueError(f"{prefix}{name} must be at most {most[name]}, got {value}")
 
 
-def _shown(value: Any) -> str:
-    """It on one line, cut where it is long: it may be a model or a file."""
-    return " ".join(repr(value).split())[:LONGEST]
+def short(value: Any) -> str:
+    """What a message says of a value: it on one line, cut where it is long, as a model may be."""
+    if hasattr(value, "dtype") and isinstance(getattr(value, "shape", None), tuple):
+        return f"{value.dtype} {list(value.shape)}"
+    text = " ".join(repr(value).split())
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
 
 
 def _fits(value: Any, kind: Any) -> bool:

@@ -14,8 +14,9 @@ from flax import linen, nnx
 from flax.nnx.nn.dtypes import promote_dtype
 
 from lorasp_jax import einsum
-from lorasp_jax.dense import AdaptedLayer, Dense, refuse_sharding, with_value
+from lorasp_jax.dense import AdaptedLayer, Dense, computed_in, refuse_sharding, with_value
 from lorasp_jax.kernels.quantized import QuantizedKernel
+from lorasp_jax.kinds import short
 from lorasp_jax.peft import LoRA, Method
 from lorasp_jax.peft.method import drop_rate, dropped
 
@@ -61,10 +62,9 @@ class EinsumLayer(AdaptedLayer):
         kernel = getattr(self, self.kernel_name).get_value()
         bias = None if getattr(self, "bias", None) is None else self.bias.get_value()
         params = None if self.adapter is None else self.adapter.get_value()
-        dtype = getattr(self, "dtype", None) or jnp.promote_types(x.dtype, kernel.dtype)
         y, aux = einsum.einsum(
             self.kernel_equation,
-            x.astype(dtype),
+            computed_in(getattr(self, "dtype", None), x, kernel),
             kernel,
             bias,
             params,
@@ -275,7 +275,7 @@ def check_einsums(einsums: Any) -> None:
     if not all(isinstance(cls, type) and callable(describe) for cls, describe in pairs):
         raise ValueError(
             "einsums are {layer class: function of a layer that gives (its kernel's name, "
-            f"equation)}}, got {einsums!r}."
+            f"equation)}}, got {short(einsums)}."
         )
 
 
@@ -286,7 +286,7 @@ def described(describe: Callable[[Any], Any], layer: Any) -> tuple[str, str | No
     except (TypeError, ValueError, AttributeError) as error:
         raise ValueError(f"einsums cannot describe a {type(layer).__name__}: {error}") from error
     if not isinstance(name, str) or not isinstance(equation, str | None):
-        raise ValueError(f"einsums give (name, equation), got {(name, equation)!r}.")
+        raise ValueError(f"einsums give (name, equation), got {short((name, equation))}.")
     return name, equation
 
 

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from lorasp_jax import layers
+from lorasp_jax import given, layers
 from lorasp_jax.adaptation import init_stack, over_stack
 from lorasp_jax.dense import KEPT
 from lorasp_jax.einsum import to_matrices
@@ -100,7 +100,7 @@ class LinenAdapter:
           ValueError: a rule that governs nothing that it applies to (lists near misses), a layer
             that an adapter cannot take over, or adapters that are there already.
         """
-        if ADAPTER in {name for path in flatten_dict(variables) for name in path}:
+        if ADAPTER in {name for path in flatten_dict(given.variables(variables)) for name in path}:
             raise ValueError("these variables have adapters already: start from the model's own.")
         rngs = key if isinstance(key, Mapping) else {"params": key}
         record = _Record()
@@ -334,6 +334,6 @@ def _apply(model: nn.Module, variables: Any, *args: Any, method: Any = None, **k
 
 def _joined(variables: Mapping[str, Any]) -> dict[str, Any]:
     """The variables with everything that trains where the model looks for it."""
-    trained = flatten_dict(flax.core.unfreeze(variables.get("adapters", {})))
+    trained = flatten_dict(flax.core.unfreeze(given.variables(variables).get("adapters", {})))
     params = flatten_dict(flax.core.unfreeze(variables["params"])) | trained
     return {**variables, "params": unflatten_dict(params)}

@@ -5,10 +5,10 @@ from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from lorasp_jax import layers
+from lorasp_jax.dense import computed_in
 from lorasp_jax.einsum import LINEAR, einsum, from_matrices, general_equation, to_matrices
 from lorasp_jax.peft import Aux, Method
 from lorasp_jax.peft.method import drop_rate, dropped
@@ -84,8 +84,8 @@ class LayerMap(NamedTuple):
         """The einsum through an adapter, plus bias; and aux."""
         assert self.equation is not None
         kernel, bias = self.kernel(), nn.meta.unbox(self.module.get_variable("params", "bias"))
-        dtype = getattr(self.module, "dtype", None) or jnp.promote_types(self.x.dtype, kernel.dtype)
-        return einsum(self.equation, self.x.astype(dtype), kernel, bias, params, method, key)
+        x = computed_in(getattr(self.module, "dtype", None), self.x, kernel)
+        return einsum(self.equation, x, kernel, bias, params, method, key)
 
 
 def layer_map(module: nn.Module, einsums: layers.Einsums, args: Any, kwargs: Any) -> LayerMap:

@@ -23,10 +23,11 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax import adaptation, layers, paths
+from lorasp_jax import adaptation, given, layers, paths
 from lorasp_jax.adaptation import Model
 from lorasp_jax.adapter_set import AdapterChoice, AdapterSet, NamedAdapters, empty_bank, put, take
 from lorasp_jax.dense import AdaptedLayer, AdapterParam
+from lorasp_jax.kinds import short
 from lorasp_jax.paths import Place
 from lorasp_jax.peft import LoRA, Method
 from lorasp_jax.peft.method import LARGEST_SIZE, Params
@@ -51,10 +52,14 @@ def combine(models: Mapping[str, Model], *, rank: int | None = None) -> Model:
       ValueError: no models, another base, a base weight that trains, an adapter that holds a part
         of its kernel, or a LoRA that exceeds `rank`.
     """
-    if not isinstance(models, Mapping) or not models:
-        raise ValueError("models to combine are a mapping by name, and at least one.")
+    if not isinstance(models, Mapping) or not models or not all(map(_is_text, models)):
+        raise ValueError("models to combine are a mapping by name, a text, and at least one.")
+    for model in models.values():
+        given.with_values(model)
     if rank is not None and not (type(rank) is int and 0 <= rank <= LARGEST_SIZE):
-        raise ValueError(f"rank must be a whole number up to {LARGEST_SIZE} or None, got {rank!r}.")
+        raise ValueError(
+            f"rank must be a whole number up to {LARGEST_SIZE} or None, got {short(rank)}."
+        )
     known = tuple(models)
     bases = {name: bare(model) for name, model in models.items()}
     adapters = {name: adapters_by_path(name, model) for name, model in models.items()}
@@ -107,7 +112,7 @@ def weights(model: nnx.Module, choice: One | Sequence[One] | jax.Array | np.ndar
         found = np.array([_row(known, one) for one in choice])
     else:
         raise ValueError(
-            f"a choice is a name, weights by name, None, or a list of these, got {choice!r:.80}."
+            f"a choice is a name, weights by name, None, or a list of these, got {short(choice)}."
         )
     size = len(known)
     if found.ndim not in (1, 2) or found.shape[-1] != size or found.dtype.kind != "f":
@@ -267,6 +272,10 @@ def _with_set(
     return layer
 
 
+def _is_text(name: Any) -> bool:
+    return isinstance(name, str)
+
+
 def _is_banked(method: Method | None) -> TypeGuard[LoRA | None]:
     """Whether a place in the bank of LoRAs fits: for plain LoRA, and for no adapter."""
     return method is None or type(method) is LoRA
@@ -274,7 +283,7 @@ def _is_banked(method: Method | None) -> TypeGuard[LoRA | None]:
 
 def sets(model: nnx.Module) -> list[Place]:
     """The layers that hold named adapters."""
-    places = paths.places(nnx.List([model]), AdaptedLayer)
+    places = paths.places(nnx.List([given.module(model)]), AdaptedLayer)
     return [place for place in places if isinstance(place.child.adapter, NamedAdapters)]
 
 
@@ -297,7 +306,9 @@ def _row(known: tuple[str, ...], one: One) -> list[float]:
     chosen = {one: 1.0} if isinstance(one, str) else one or {}
     for name, weight in chosen.items():
         if not isinstance(weight, numbers.Real) or not math.isfinite(weight):
-            raise ValueError(f"the weight of {name!r} must be a finite number, got {weight!r:.80}.")
+            raise ValueError(
+                f"the weight of {short(name)} must be a finite number, got {short(weight)}."
+            )
         row[index_of(known, name)] = float(weight)
     return row
 
@@ -306,5 +317,5 @@ def index_of(known: tuple[str, ...], name: str) -> int:
     """The place of a name; raises a ValueError that lists near misses for an unknown one."""
     if name not in known:
         close = paths.near_misses(str(name), known)
-        raise ValueError(f"there is no adapter {name!r}; the model has {close}.")
+        raise ValueError(f"there is no adapter {short(name)}; the model has {close}.")
     return known.index(name)

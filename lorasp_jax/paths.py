@@ -10,6 +10,7 @@ from flax import nnx
 
 from lorasp_jax import layers
 from lorasp_jax.dense import AdaptedLayer
+from lorasp_jax.kinds import short
 from lorasp_jax.peft import Method
 
 Rules = Sequence[tuple[str, Method | None]]
@@ -68,23 +69,25 @@ def check_rules(rules: Any, valid: Callable[[Any], bool], what: str) -> None:
     if isinstance(rules, Mapping):
         raise ValueError(f"{pairs}, got a {type(rules).__name__}: give list(rules.items()).")
     if not isinstance(rules, Sequence) or isinstance(rules, str) or not rules:
-        shown = "none" if rules == [] or rules == () else repr(rules)
+        shown = "none" if isinstance(rules, list | tuple) else short(rules)
         raise ValueError(f"{pairs}, at least one, got {shown}.")
     if isinstance(rules[0], str):
-        raise ValueError(f"{pairs}, got {rules!r}: one rule alone is [(pattern, ...)].")
+        raise ValueError(f"{pairs}, got {short(rules)}: one rule alone is [(pattern, ...)].")
     for rule in rules:
         if not isinstance(rule, tuple | list) or len(rule) != 2 or not isinstance(rule[0], str):
-            raise ValueError(f"{pairs}, got {rule!r} among them.")
+            raise ValueError(f"{pairs}, got {short(rule)} among them.")
         pattern, value = rule
         if isinstance(value, type):
             name = value.__name__
-            raise ValueError(f"rule {pattern!r} has the class {name}: write {name}().")
+            raise ValueError(f"rule {short(pattern)} has the class {name}: write {name}().")
         if not valid(value):
-            raise ValueError(f"rule {pattern!r} has {value!r} where {what} belongs.")
+            raise ValueError(f"rule {short(pattern)} has {short(value)} where {what} belongs.")
         try:
             re.compile(pattern)
         except (re.error, OverflowError, RecursionError) as error:
-            raise ValueError(f"rule {pattern!r} is no regular expression: {error}.") from error
+            raise ValueError(
+                f"rule {short(pattern)} is no regular expression: {short(str(error))[1:-1]}."
+            ) from error
 
 
 def check_method_rules(rules: Any) -> None:
@@ -118,9 +121,8 @@ def no_match(pattern: str, known: Sequence[str], others: Mapping[str, str]) -> s
       known: paths of the layers that adapters apply to.
       others: class by path of other modules that hold matrices.
     """
-    text = (
-        f"rule {pattern!r} applies to nothing; layers here: {near_misses(pattern, known) or 'none'}"
-    )
+    close = near_misses(pattern, known) or "none"
+    text = f"rule {short(pattern)} applies to nothing; layers here: {close}"
     if not others:
         return f"{text}."
     close = difflib.get_close_matches(pattern, others, n=3, cutoff=0.3) or list(others)[:3]

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from lorasp_jax.adapter_io import read_tensors, read_whole
+from lorasp_jax.kinds import short
 from lorasp_jax.name_patterns import values_of
 from lorasp_jax.peft.method import LARGEST_ALPHA, LARGEST_SIZE
 
@@ -75,7 +76,7 @@ def read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter], Whol
         elif (match := _WHOLE.fullmatch(name)) and _trains(config, match[1], match[3]):
             whole[match[1], match[3]] = tensor.astype(np.float32)
         else:
-            raise ValueError(f"{folder} holds {name!r}, which belongs to no LoRA.")
+            raise ValueError(f"{folder} holds {short(name)}, which belongs to no LoRA.")
     try:
         alphas = values_of(config.get("alpha_pattern") or {}, modules, config.get("lora_alpha"))
         imported = {

@@ -15,6 +15,7 @@ from flax import nnx
 
 from lorasp_jax import layers, paths
 from lorasp_jax.dense import AdapterParam, Dense
+from lorasp_jax.kinds import short
 from lorasp_jax.peft_folders import PREFIX, Adapter, Whole
 
 Names = Callable[[str, tuple[int, ...]], str]
@@ -53,7 +54,7 @@ def whole_parameters(
         found[path] = value.reshape(tuple(size))
     if left:
         module, kind = min(left)
-        raise ValueError(f"{folder} holds the {kind} of {module!r}, which the model lacks.")
+        raise ValueError(f"{folder} holds the {kind} of {short(module)}, which the model lacks.")
     return found
 
 

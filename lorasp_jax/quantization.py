@@ -19,9 +19,10 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax import adaptation, layers, paths
+from lorasp_jax import adaptation, given, layers, paths
 from lorasp_jax.dense import AdaptedLayer, AdapterParam
 from lorasp_jax.kernels.quantized import KINDS, Kind, QuantizedKernel, quantized
+from lorasp_jax.kinds import short
 
 # By identity of a variable, equation and kind: what replaces it, the variable itself, which so
 # stays alive, and the error.
@@ -56,6 +57,7 @@ def quantize(model: nnx.Module, rules: Sequence[tuple[str, Kind | None]]) -> Qua
     """
     kinds = " or ".join(map(repr, (*KINDS, None)))
     paths.check_rules(rules, lambda kind: kind in (*KINDS, None), kinds)
+    given.with_values(model)
     holder, errors, used = nnx.List([nnx.merge(*adaptation.split(model))]), {}, set()
     shared: Shared = {}
     known = paths.multiplying(holder)
@@ -74,7 +76,7 @@ def quantize(model: nnx.Module, rules: Sequence[tuple[str, Kind | None]]) -> Qua
         if rule not in used:
             close = paths.near_misses(rule[0], [place.path for place in known]) or "none"
             raise ValueError(
-                f"rule {rule[0]!r} governs nothing; dense layers and einsums here: {close}."
+                f"rule {short(rule[0])} governs nothing; dense layers and einsums here: {close}."
             )
     return Quantized(holder[0], errors)
 

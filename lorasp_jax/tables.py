@@ -7,8 +7,10 @@ from typing import Any
 import flax.traverse_util
 from flax import nnx
 
+from lorasp_jax import given
 from lorasp_jax.adaptation import Counts, count
 from lorasp_jax.dense import KEPT, AdapterAux, AdapterParam
+from lorasp_jax.kinds import short
 from lorasp_jax.layers import kernel_of
 from lorasp_jax.paths import REACHED, layer_places, other_places, places
 from lorasp_jax.peft import Aux
@@ -29,10 +31,16 @@ def summary(model: nnx.Module, aux: Mapping[str, Aux] | None = None) -> str:
     Raises:
       ValueError: aux of a layer that the model lacks.
     """
-    rows = _rows(model)
+    rows = _rows(given.module(model))
+    if aux is not None and not (
+        isinstance(aux, Mapping) and all(isinstance(one, Aux) for one in aux.values())
+    ):
+        raise ValueError(f"aux is what collect_aux returned, got {short(aux)}.")
     if aux is not None:
         if unknown := aux.keys() - {row[0] for row in rows}:
-            raise ValueError(f"there is aux for {min(unknown)!r}, which is no layer of the model.")
+            raise ValueError(
+                f"there is aux for {short(min(unknown, key=str))}, which is no layer of the model."
+            )
         rows = [(*row, _active_rank(aux.get(row[0]))) for row in rows]
     trainable, total = count(model)
     head = ("path", "method", "shape", "rank", "parameters", "trainable", "active rank")
@@ -122,8 +130,15 @@ def collect_aux(model: nnx.Module | Mapping) -> dict[str, Aux]:
         found = {path[:-1]: variable.get_value() for path, variable in kept}
     else:
         sown: dict[tuple[str, ...], Any]
-        sown = flax.traverse_util.flatten_dict(model.get("intermediates", {}))  # type: ignore
-        found = {path[:-1]: values[-1] for path, values in sown.items() if path[-1] == KEPT}
+        kept = model.get("intermediates", {}) if isinstance(model, Mapping) else None
+        if not isinstance(kept, Mapping):
+            raise ValueError(
+                "the model must be an NNX module or the variables that a Linen model returned, got "
+                f"{short(model)}."
+            )
+        sown = flax.traverse_util.flatten_dict(kept)  # type: ignore
+        sown = {path: kept for path, kept in sown.items() if path[-1] == KEPT}
+        found = {path[:-1]: kept[-1] for path, kept in sown.items() if isinstance(kept, tuple)}
     if not found:
         raise ValueError(
             "no adapted layer kept anything: call the model first, inside the same traced function "

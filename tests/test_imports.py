@@ -17,6 +17,7 @@ ROOMS = [
     "lorasp_jax.release",
     "lorasp_jax.bank",
     "lorasp_jax.peft",
+    "lorasp_jax.given",
     "lorasp_jax.dense",
     "lorasp_jax.einsum",
     "lorasp_jax.layers",

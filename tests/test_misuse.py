@@ -4,12 +4,15 @@ import re
 
 import flax.linen as nn
 import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 from flax import nnx
 
 import lorasp_jax
 from lorasp_jax import peft
-from lorasp_jax.peft import AdaLoRA, LoRA, LoRAMoE, LoRASP
+from lorasp_jax.dense import Dense, LinenDense, dense
+from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA, LoRAMoE, LoRASP
 
 METHOD = LoRA(rank=2)
 NET = nnx.Dict(inp=nnx.Linear(5, 4, rngs=nnx.Rngs(0)), head=nnx.Linear(4, 2, rngs=nnx.Rngs(0)))
@@ -156,3 +159,225 @@ def test_several_adapters_and_smaller_ones(call, message):
     model = lorasp_jax.adapt(NET, [("inp", METHOD)], rngs=nnx.Rngs(0))
     with pytest.raises(ValueError, match=re.escape(message)):
         call(model)
+
+
+KEY, X, KERNEL = jax.random.key(0), jnp.ones((2, 5)), jnp.ones((5, 4))
+LONG = "q" * 5000
+RNGS = {"rngs": nnx.Rngs(0)}
+
+
+def adapted(method=METHOD, net=NET):
+    return lorasp_jax.adapt(net, [("inp", method)], rngs=nnx.Rngs(0))
+
+
+def refuses(call, message):
+    """In one sentence, of no more letters than somebody reads."""
+    with pytest.raises(ValueError, match=re.escape(message)) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 800
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: Dense(2.5, 3, **RNGS), "d_in must be a whole number from 1 to 1048576, got 2.5"),
+        (lambda: Dense(3, True, **RNGS), "d_out must be a whole number"),
+        (lambda: Dense(0, 3, **RNGS), "got 0"),
+        (lambda: Dense(5, 3, method="lora", **RNGS), "LoRA(rank=8), got 'lora'; `peft.create`"),
+        (lambda: Dense(5, 3, method=LoRA, **RNGS), "write LoRA()"),
+        (lambda: Dense(5, 3, rngs=KEY), "rngs must be nnx.Rngs(a seed or key)"),
+        (lambda: Dense(5, 3, param_dtype="x", **RNGS), "param_dtype must be a floating-point"),
+        (lambda: Dense(5, 3, dtype=int, **RNGS), "dtype must be a floating-point type"),
+        (lambda: Dense(5, 3, **RNGS)([1.0]), "x must be an array [...tokens, I], got [1.0]"),
+        (lambda: LinenDense(2.5).init(KEY, X), "features must be a whole number"),
+        (lambda: LinenDense(3, method="lora").init(KEY, X), "got 'lora'"),
+        (lambda: LinenDense(3).init(KEY, None), "x must be an array"),
+        (lambda: dense(X, None), "a kernel must be an array [I, *O], got None"),
+        (lambda: dense(X, jnp.ones(5)), "a kernel must be an array [I, *O], got float32 [5]"),
+        (lambda: dense(X, KERNEL, jnp.ones(3)), "a bias must be an array [4], got float32 [3]"),
+        (lambda: dense(X, KERNEL, 5), "a bias must be an array [4], got 5"),
+        (lambda: dense(X, KERNEL, None, {}), "an adapter's parameters come with their method"),
+        (lambda: dense(X, KERNEL, None, None, METHOD), "and it with them"),
+        (lambda: dense(X, KERNEL, None, {"a": 1}, METHOD), "needs ['lora_a'] [5, 2], got None"),
+        (
+            lambda: dense(X, KERNEL, None, METHOD.init(KEY, jnp.ones((3, 4)))[0], METHOD),
+            "lora of a kernel [5, 4] needs ['lora_a'] [5, 2], got (3, 2)",
+        ),
+        (lambda: dense(X, KERNEL, token_mask=[True, True]), "must be bool [2], got list [2]"),
+        *[
+            (lambda m=m, k=k: m.init(KEY, k), "an adapter needs a kernel [I, O] of real numbers")
+            for m in (METHOD, DoRA(2), LoRA(2, initialization="pissa"), AdaLoRA(2), LoRASP(4))
+            for k in (None, jnp.ones(3), jnp.ones((0, 3)), jnp.ones((3, 3), int))
+        ],
+    ],
+)
+def test_layers(call, message):
+    refuses(call, message)
+
+
+def test_kernels_that_cannot_be_adapted():
+    """Each by its path: without numbers, of one axis, of none at all."""
+    zeros = nnx.initializers.zeros
+    for d_in, d_out in ((0, 3), (3, 0)):
+        net = nnx.Dict(inp=nnx.Linear(d_in, d_out, kernel_init=zeros, rngs=nnx.Rngs(0)))
+        refuses(lambda net=net: adapted(net=net), "cannot adapt inp: an adapter needs a kernel")
+    for value in (jnp.ones(3), "abc"):
+        net = nnx.clone(NET)
+        net["inp"].kernel.set_value(value)
+        refuses(lambda net=net: adapted(net=net), "cannot adapt inp: an adapter needs a kernel")
+    net["inp"].kernel = None
+    refuses(lambda: adapted(net=net), "cannot adapt inp: its kernel is None, no parameter")
+
+
+def test_kernels_of_8_bits_need_a_type_to_compute_in():
+    kind = {"param_dtype": jnp.float8_e4m3fn, "rngs": nnx.Rngs(0)}
+    net = nnx.Dict(inp=nnx.Linear(5, 4, **kind))
+    refuses(lambda: adapted(net=net)["inp"](X), "float8_e4m3fn needs a dtype to compute float32")
+    net = nnx.Dict(inp=nnx.Linear(5, 4, dtype=jnp.float32, **kind))
+    np.testing.assert_allclose(adapted(net=net)["inp"](X), net["inp"](X), rtol=1e-6)
+
+
+@pytest.mark.parametrize("method", [METHOD, LoRAMoE(2, 2), LoRASP(4, hidden_width=4)])
+def test_no_tokens(method):
+    """Losses and ranks are 0; a Linen model's output has no rows."""
+    params, _ = method.init(KEY, KERNEL)
+    y, aux = method.apply(params, jnp.zeros((0, 5)), KERNEL)
+    assert y.shape == (0, 4)
+    assert not any(aux.losses[name] for name in aux.losses)
+    assert aux.mean_active_rank() == 0
+    adapter = lorasp_jax.LinenAdapter(nn.Dense(3), [("", method)])
+    assert adapter.apply(adapter.init(KEY, X), jnp.zeros((0, 5))).shape == (0, 3)
+
+
+LINEN = lorasp_jax.LinenAdapter(nn.Dense(3), [("", METHOD)])
+
+
+@pytest.mark.parametrize("variables", [{}, None, 5, {"params": 5}, {"adapters": {}}])
+def test_variables_of_linen(variables):
+    message = 'variables are a dictionary with "params"'
+    refuses(lambda: LINEN.apply(variables, X), message)
+    refuses(lambda: LINEN.merge(variables, X), message)
+    refuses(lambda: LINEN.attach(KEY, variables, X), message)
+
+
+def test_adapters_of_another_width_in_linen():
+    variables = LINEN.init(KEY, X)
+    narrow = jax.tree.map(lambda a: a[:1], variables["adapters"])
+    refuses(lambda: LINEN.apply(variables | {"adapters": narrow}, X), "needs ['lora_a'] [5, 2]")
+
+
+SHAPES = "holds shapes without values"
+
+
+@pytest.mark.parametrize("model", [5, None, nn.Dense(3), {}])
+def test_what_is_no_model(model, tmp_path):
+    message = "must be an NNX module" if model != {} else "must be an NNX module, got dict"
+    for call in (
+        lambda: lorasp_jax.summary(model),
+        lambda: lorasp_jax.merge(model),
+        lambda: lorasp_jax.split(model),
+        lambda: lorasp_jax.with_dropout(model, KEY),
+        lambda: lorasp_jax.quantize(model, [("inp", "nf4")]),
+        lambda: lorasp_jax.save_adapters(tmp_path, model),
+        lambda: lorasp_jax.save_peft(tmp_path, model),
+        lambda: lorasp_jax.load_peft(tmp_path, model),
+        lambda: lorasp_jax.unmerge(model, adapted()),
+        lambda: lorasp_jax.unmerge(NET, model),
+        lambda: lorasp_jax.combine({"a": model}),
+        lambda: lorasp_jax.choose(model, "a"),
+        lambda: lorasp_jax.fuse(model, {"a": 1.0}),
+        lambda: lorasp_jax.prune(model, [X]),
+    ):
+        refuses(call, message)
+
+
+def test_models_without_values(tmp_path):
+    """Shapes can be adapted and counted, but not computed with."""
+    model = nnx.eval_shape(adapted)
+    assert lorasp_jax.summary(model)
+    for call in (
+        lambda: lorasp_jax.merge(model),
+        lambda: lorasp_jax.quantize(model, [("head", "nf4")]),
+        lambda: lorasp_jax.combine({"a": model}),
+        lambda: lorasp_jax.unmerge(NET, model),
+        lambda: lorasp_jax.save_adapters(tmp_path, model),
+        lambda: lorasp_jax.save_peft(tmp_path, model),
+    ):
+        refuses(call, SHAPES)
+    bare = nnx.eval_shape(lambda: nnx.clone(NET))
+    refuses(lambda: adapted(FullFineTuning(), bare), "inp/bias has no value: call this within")
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda _: lorasp_jax.summary(adapted(), 5), "aux is what collect_aux returned, got 5"),
+        (lambda _: lorasp_jax.collect_aux(None), "variables that a Linen model returned, got None"),
+        (lambda _: lorasp_jax.collect_aux({"intermediates": 5}), "got {'intermediates': 5}"),
+        (lambda _: lorasp_jax.auxiliary_losses({"a": 5}), "aux must be a tree of Aux"),
+        (
+            lambda _: lorasp_jax.adapt(NET, [("inp", METHOD)], **RNGS, statistics=5),
+            "statistics are those of calibration.input_moments, by path, got 5",
+        ),
+        (
+            lambda _: lorasp_jax.adapt(
+                NET, [("inp", METHOD)], **RNGS, statistics={"inp": jnp.full((5, 5), jnp.nan)}
+            ),
+            "statistics of inp must be finite numbers [I, I], got float32 [5, 5]",
+        ),
+        (lambda _: lorasp_jax.with_dropout(NET, 5), "key must be one such as jax.random.key(0)"),
+        (lambda _: lorasp_jax.save_adapters(5, adapted()), "a folder is a text or a path, got 5"),
+        (lambda f: lorasp_jax.load_adapters(f / LONG, NET), "has 255 bytes at most, got '"),
+        (lambda f: lorasp_jax.load_peft(f / LONG, NET), "has 255 bytes at most"),
+        (lambda f: lorasp_jax.save_adapters(f, adapted(), base=5), "base must be a text"),
+        (
+            lambda f: lorasp_jax.save_adapters(f, adapted(), metadata={"a": float("nan")}),
+            "metadata is for JSON, which cannot hold it: Out of range",
+        ),
+        (
+            lambda f: lorasp_jax.save_adapters(f, adapted(), metadata={1: 2}),
+            "metadata is a dictionary whose keys are texts, got {1: 2}",
+        ),
+        (lambda f: lorasp_jax.save_peft(f, adapted(), names=5), "names is a function of a path"),
+        (
+            lambda f: lorasp_jax.save_peft(f, adapted(), names=lambda *_: None),
+            "names must give a text for 'inp', (), got None",
+        ),
+        (
+            lambda f: lorasp_jax.save_peft(
+                f, lorasp_jax.adapt(NET, [(".*", METHOD)], **RNGS), names=lambda *_: "one"
+            ),
+            "names gives 'one' for ('head', ()) and for ('inp', ())",
+        ),
+        (lambda f: lorasp_jax.save_peft(f, adapted(), base=5), "base must be a text"),
+        (lambda _: lorasp_jax.fuse(lorasp_jax.combine({"a": adapted()}), 5), "needs weights by"),
+        (
+            lambda _: lorasp_jax.fuse(lorasp_jax.combine({"a": adapted()}), {"a": 1.0}, rank="x"),
+            "rank must be a whole number from 1",
+        ),
+        (lambda _: lorasp_jax.combine({5: adapted()}), "are a mapping by name, a text"),
+    ],
+)
+def test_what_functions_take_beside_a_model(call, message, tmp_path):
+    refuses(lambda: call(tmp_path / "new"), message)
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: lorasp_jax.adapt(NET, [(LONG, METHOD)], **RNGS),
+        lambda: lorasp_jax.adapt(NET, [("(" + LONG, METHOD)], **RNGS),
+        lambda: lorasp_jax.adapt(NET, [("inp", LONG)], **RNGS),
+        lambda: lorasp_jax.adapt(NET, LONG, **RNGS),
+        lambda: lorasp_jax.quantize(NET, [(LONG, "nf4")]),
+        lambda: peft.create(LONG),
+        lambda: LoRA(**{LONG: 1}),
+        lambda: LoRA(initialization=LONG),
+        lambda: lorasp_jax.choose(lorasp_jax.combine({"a": adapted()}), LONG),
+        lambda: lorasp_jax.summary(adapted(), {LONG: 5}),
+    ],
+)
+def test_long_texts_are_cut(call):
+    refuses(call, "qqq")

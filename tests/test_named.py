@@ -171,7 +171,7 @@ def test_models_that_do_not_combine():
         lorasp_jax.combine({"a": together()})
     with pytest.raises(ValueError, match="rank 4 needs more than the room for rank 3"):
         lorasp_jax.combine(models(), rank=3)
-    with pytest.raises(ValueError, match="a mapping by name, and at least one"):
+    with pytest.raises(ValueError, match="a mapping by name, a text, and at least one"):
         lorasp_jax.combine({})
 
 

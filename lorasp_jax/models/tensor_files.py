@@ -1,6 +1,8 @@
 """Tensors in safetensors files, one or several with an index as Hugging Face cuts them."""
 
 import json
+import math
+import re
 from collections.abc import Callable, Iterator, MutableMapping
 from pathlib import Path
 from typing import Any
@@ -8,7 +10,7 @@ from typing import Any
 import numpy as np
 import safetensors
 
-from envs.files import beside, read_text
+from envs.files import beside, check_memory, read_text
 
 SINGLE, INDEX = "model.safetensors", "model.safetensors.index.json"
 
@@ -64,7 +66,11 @@ class TensorFiles(MutableMapping[str, np.ndarray]):
         self._found[new] = self._found.pop(old)
 
     def __getitem__(self, name: str) -> np.ndarray:
+        """The tensor; raises a ValueError for one beyond this machine's memory."""
         file, stored = self._found[name]
+        part = file.get_slice(stored)
+        bits = re.search(r"\d+", part.get_dtype())  # "BF16", "F8_E4M3", "BOOL"
+        check_memory(math.prod(part.get_shape()) * (int(bits[0]) if bits else 8) // 8, name)
         return file.get_tensor(stored)
 
     def __delitem__(self, name: str) -> None:

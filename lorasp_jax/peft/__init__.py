@@ -9,6 +9,7 @@ import pkgutil
 from typing import Any
 
 from lorasp_jax.auxiliary import Aux
+from lorasp_jax.kinds import short
 from lorasp_jax.peft.ada_lora import AdaLoRA
 from lorasp_jax.peft.dora import DoRA
 from lorasp_jax.peft.full import FullFineTuning
@@ -44,9 +45,9 @@ def find(name: str) -> type[Method]:
       ValueError: there is no such file; lists what exists.
     """
     if name not in names():
-        close = difflib.get_close_matches(name, names(), n=1)
+        close = difflib.get_close_matches(str(name), names(), n=1)
         hint = f" (did you mean {close[0]!r}?)" if close else ""
-        raise ValueError(f"unknown method {name!r}{hint}; valid are {', '.join(names())}.")
+        raise ValueError(f"unknown method {short(name)}{hint}; valid are {', '.join(names())}.")
     module = importlib.import_module(f"{__name__}.{name}")
     classes = [c for c in vars(module).values() if isinstance(c, type) and issubclass(c, Method)]
     (cls,) = [c for c in classes if c.__module__ == module.__name__]

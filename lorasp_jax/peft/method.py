@@ -329,13 +329,17 @@ def check_names(cls: type[Method], values: Sequence[Any], fields: Sequence[str] 
         if field not in valid:
             close = difflib.get_close_matches(field, valid, n=1, cutoff=0.4)
             hint = f" (did you mean {close[0]!r}?)" if close else ""
-            raise ValueError(f"{name} has no field {field!r}{hint}; valid are {', '.join(valid)}.")
+            raise ValueError(
+                f"{name} has no field {kinds.short(field)}{hint}; valid are {', '.join(valid)}."
+            )
 
 
 def check_matrix(kernel: Kernel) -> None:
-    """Raises a ValueError unless it is one."""
-    if len(kernel.shape) != 2:
-        raise ValueError(f"an adapter needs a kernel [I, O], got shape {tuple(kernel.shape)}.")
+    """Raises a ValueError unless it is one of real numbers, or such a shape."""
+    shape, dtype = getattr(kernel, "shape", ()), getattr(kernel, "dtype", int)
+    if len(shape) != 2 or 0 in shape or not jnp.issubdtype(dtype, jnp.floating):
+        found = f"{dtype} {list(shape)}" if hasattr(kernel, "dtype") else type(kernel).__name__
+        raise ValueError(f"an adapter needs a kernel [I, O] of real numbers, got {found}.")
 
 
 def drop_rate(method: Any) -> float:

@@ -101,3 +101,15 @@ def test_a_config_of_other_kinds(name, value):
         pytest.skip("that is one")
     with pytest.raises((ValueError, TypeError)):
         Pi0Config.from_dict(fields | {name: value})
+
+
+def test_a_tensor_that_is_a_hole_beyond_any_memory(tmp_path):
+    """A sparse file of a tebibyte, all of it one tensor."""
+    header = {"hole": {"dtype": "BF16", "shape": [2**39], "data_offsets": [0, 2**40]}}
+    text = json.dumps(header).encode()
+    path = tmp_path / "model.safetensors"
+    path.write_bytes(len(text).to_bytes(8, "little") + text)
+    os.truncate(path, 8 + len(text) + 2**40)
+    tensors = TensorFiles([path])
+    with pytest.raises(ValueError, match=r"hole would take 1.02e\+03 GiB of memory"):
+        tensors["hole"]
