@@ -51,7 +51,7 @@ def files():
         ([*MULTITASK, *NANO, "--targets", "expert-onyl"], "there is no preset 'expert-onyl'"),
         ([*MULTITASK, *NANO, "--control-dt", "0.2"], "with control_dt 0.1 s, this run has 0.2"),
         ([*MULTITASK, *NANO, "--evaluation.execute-steps", "11"], "must be 1 to the chunk, 10"),
-        ([*MULTITASK, *NANO, "--evaluation.episodes", "12"], "must be a multiple of num_envs"),
+        ([*MULTITASK, *NANO, "--evaluation.episodes", "24"], "must be a multiple of num_envs"),
         ([*MULTITASK, *NANO, "--optim.batch-size", "9"], "multiple of the 8 devices"),
         ([*MULTITASK, *NANO, "--fsdp", "3"], "fsdp = 3 does not divide the 8 devices"),
         (
