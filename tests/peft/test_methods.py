@@ -189,7 +189,9 @@ def test_padding_has_no_influence(method, kernel, x):
 
 def test_needs_a_matrix(method):
     if not method.trains_base:
-        with pytest.raises(ValueError, match=r"needs a kernel \[I, O\], got shape \(2, 3, 4\)"):
+        with pytest.raises(
+            ValueError, match=r"needs a kernel \[I, O\] of real numbers, got float32 \[2, 3, 4\]"
+        ):
             method.init(jax.random.key(0), jnp.zeros((2, 3, 4)))
 
 

@@ -144,7 +144,9 @@ def test_values_and_a_fitting_rank_are_needed(name, cls):
 
 @SPLIT
 def test_a_matrix_is_needed(name):
-    with pytest.raises(ValueError, match=r"needs a kernel \[I, O\], got shape \(2, 9, 14\)"):
+    with pytest.raises(
+        ValueError, match=r"needs a kernel \[I, O\] of real numbers, got float32 \[2, 9, 14\]"
+    ):
         lora(name).init(jax.random.key(0), jnp.zeros((2, 9, 14)))
 
 
