@@ -25,16 +25,18 @@ def silence() -> None:
     ever. Leaves alone what TF_CPP_MIN_LOG_LEVEL asks for, and plugins such as CUDA's, which log by
     themselves. To be called once.
     """
-    if int(os.environ.get("TF_CPP_MIN_LOG_LEVEL", _JAX_DEFAULT)) == _JAX_DEFAULT:
+    if os.environ.get("TF_CPP_MIN_LOG_LEVEL", str(_JAX_DEFAULT)) == str(_JAX_DEFAULT):
         monitoring.register_scalar_listener(_begins)
         monitoring.register_event_duration_secs_listener(_ends)
 
 
-def _begins(event: str, _: float, **__: Any) -> None:
+def _begins(event: str, value: float, **_: Any) -> None:
+    del value  # when
     _count(event, 1)
 
 
-def _ends(event: str, _: float, **__: Any) -> None:
+def _ends(event: str, duration_secs: float, **_: Any) -> None:
+    del duration_secs
     _count(event, -1)
 
 
