@@ -25,6 +25,7 @@ from tests.several import ROOT
 PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "scancel", "scontrol")
 MISSING = [name for name in PROGRAMS if not shutil.which(name)]
 STEPS = 40
+UNFINISHED = ("PENDING", "RUNNING", "COMPLETING")
 OPTIONS = (
     *("--config", "configs/multitask.py", "--scale", "smoke", "--tasks", "press"),
     *("--optim.steps", str(STEPS), "--log-every", "1", "--checkpoint-every", "1000"),
@@ -153,7 +154,7 @@ def test_a_run_under_slurm_stops_goes_on_and_equals_one_process(slurm, tmp_path)
     sbatch = [submit[0], *SIZES, f"--output={tmp_path}/log", *submit[1:]]
     job_id = slurm(*sbatch, *OPTIONS, "--name", "slurm").split()[-1]
     told = lambda name: [word.replace("JOBID", job_id) for word in commands[name]]  # noqa: E731
-    ended = lambda: number("JobState")() not in ("PENDING", "RUNNING")  # noqa: E731
+    ended = lambda: number("JobState")() not in UNFINISHED  # noqa: E731
     wait_for(lambda: read_metrics(folder) or ended())
     slurm(*told("scancel"))
     wait_for(lambda: number("JobState")() == "FAILED")
@@ -163,8 +164,10 @@ def test_a_run_under_slurm_stops_goes_on_and_equals_one_process(slurm, tmp_path)
     assert log.count("stopped; to go on: python train.py --distributed --resume auto") == 1
     assert 0 < len(read_metrics(folder)) < STEPS
     slurm(*told("scontrol"))
-    slurm("scontrol", "update", f"jobid={job_id}", "StartTime=now")
-    wait_for(lambda: number("JobState")() == "COMPLETED")
+    # slurmd does not launch again what it killed in the same second
+    slurm("scontrol", "update", f"jobid={job_id}", "StartTime=now+5")
+    wait_for(ended)
+    assert number("JobState")() == "COMPLETED", (tmp_path / "log").read_text()
     assert number("Restarts")() == "1"
     assert not re.search("Traceback|without a word", (tmp_path / "log").read_text())
     assert_same(folder, whole)
