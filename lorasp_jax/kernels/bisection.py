@@ -33,13 +33,14 @@ def energies(scores: jax.Array) -> jax.Array:
     The scaling is exact, E_k does not depend on it, and squares neither under- nor overflow. For a
     maximum with exponent field e it is 2^(126 - e), with field 253 - e (at least 1: normal).
 
-    Of a row with infinite scores it is the limit: these have energy 1, all others 0.
+    Of a row with infinite scores it is the limit: these have energy 1, finite ones 0. NaN stays
+    NaN, also where a backend's maximum passes over it (Triton's does).
     """
     largest = _by_row(jnp.max, jnp.abs(jax.lax.stop_gradient(scores)))
     exponent = jax.lax.shift_right_logical(_bits(largest), 23)
     scale = _float(jax.lax.shift_left(jnp.maximum(253 - exponent, 1), 23))
-    infinite = (jnp.abs(scores) == jnp.inf).astype(jnp.float32)
-    return jnp.square(jnp.where(largest == jnp.inf, infinite, scores * scale))
+    scale = jnp.where(largest == jnp.inf, 0, scale)
+    return jnp.square(jnp.where(jnp.abs(scores) == jnp.inf, 1, scores * scale))
 
 
 def _by_row(reduce: Callable, rows: jax.Array, **options: Any) -> jax.Array:

@@ -108,6 +108,19 @@ def test_where_fp32_ends(implementation, eta, expected):
     assert np.isnan(kept[-1])
 
 
+@pytest.mark.usefixtures("interpret")
+@pytest.mark.parametrize("implementation", ["pairwise", "bisection", "block", "pallas"])
+def test_nan_counts_where_a_maximum_passes_over_it(monkeypatch, implementation):
+    """As Triton's does; the rows of `test_where_fp32_ends` go wrong there only beside INF."""
+    largest = jnp.max
+    monkeypatch.setattr(jnp, "max", lambda a, **o: largest(jnp.where(a == a, a, -INF), **o))
+    rows = np.array([[NAN, 1, INF, 2], [1, NAN, 3, 0], [NAN] * 4, [INF, 1, 2, 0]], np.float32)
+    run = jax.jit(lambda s: gate.energy_gate(s, 0.9, implementation=implementation))
+    _, rank, kept = run(rows)
+    np.testing.assert_array_equal(rank, [0, 0, 0, 1])
+    np.testing.assert_array_equal(kept, [NAN, NAN, NAN, 1])
+
+
 @pytest.mark.parametrize("eta", [1e-300, 0.5, 0.9, 1.0])
 def test_gradients_where_fp32_ends(eta):
     rows = np.array(EXTREME, np.float32)
