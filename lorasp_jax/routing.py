@@ -124,7 +124,12 @@ def router_scores(
 
 def bounded(hidden: jax.Array) -> jax.Array:
     """x W1 in fp32, in ±LARGEST_HIDDEN: scores, losses and gradients stay finite where x does."""
-    return jnp.clip(hidden.astype(jnp.float32), -LARGEST_HIDDEN, LARGEST_HIDDEN)
+    return _clipped(hidden.astype(jnp.float32), LARGEST_HIDDEN)
+
+
+def _clipped(x: jax.Array, largest: float) -> jax.Array:
+    """x in ±`largest`, and NaN where x is, which minimum and maximum pass over in Triton."""
+    return jnp.where(x > largest, largest, jnp.where(x < -largest, -largest, x))
 
 
 def gelu(x: jax.Array) -> jax.Array:
@@ -193,7 +198,7 @@ def select(
     if here < scores.shape[-1]:
         scores, mask = scores[..., :here], mask[..., :here]
     largest = min(LARGEST_READ, float(jnp.finfo(dtype).max))
-    product = jnp.clip(projected.astype(jnp.float32) * scores, -largest, largest)
+    product = _clipped(projected.astype(jnp.float32) * scores, largest)
     return jnp.where(mask, product, 0 * jax.lax.stop_gradient(energy)).astype(dtype)
 
 
