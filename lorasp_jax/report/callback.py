@@ -58,8 +58,14 @@ class Report(Callback):
 
 
 def final_table(folder: Path) -> Table:
-    """Success, loss, speed, active rank and time of the finished run in a folder."""
+    """Success, loss, speed, active rank and time of the finished run in a folder.
+
+    Raises:
+        ValueError: the run is not finished, or its files are damaged.
+    """
     results = read_json(folder / "results.json", records.RESULTS)
+    if not results:
+        raise ValueError(f"{folder} holds no finished run: there is no results.json")
     rows = [row for row in read_metrics(folder) if "task" in row]  # not all steps were skipped
     table = Table("", "before", "after", title=folder.name)
     for task, value in results["tasks"].items():

@@ -68,7 +68,7 @@ def write_report(folder: Path) -> Path:
         *_skipped(rows),
         *_while_training(rows),
         *_speed(rows),
-        *_active_rank(results, rows, config["peft"].get("rank")),
+        *_active_rank(folder, results, rows),
         *_media(folder, [t for t in results["tasks"] if finished or _filmed(folder, t).exists()]),
         "<h2>Time</h2>",
         _table(("phase", "seconds"), ((k, f"{v:.1f}") for k, v in results["seconds"].items())),
@@ -199,10 +199,11 @@ def _waited(rows: figures.Rows) -> Iterable[dict[str, float]]:
         yield row | {"waited": row[wait] / row[rate] / every} if wait in row else row
 
 
-def _active_rank(results: dict[str, Any], rows: figures.Rows, rank: Any) -> Iterable[str]:
+def _active_rank(folder: Path, results: dict[str, Any], rows: figures.Rows) -> Iterable[str]:
     """Active rank in training and in closed loop; nothing for a method without one."""
     if not any(name.startswith("active_rank/") for row in rows for name in row):
         return
+    rank = read_json(folder / RECORD, records.WITH_RANK)["peft"]["rank"]
     yield "<h2>Active rank</h2>"
     yield _image(figures.active_rank(rows, rank))
     if not results["layer_active_rank"]:  # not evaluated

@@ -33,6 +33,7 @@ CONFIG = {
     "model": {"backbone": str, "size": str},
     "optim": {"steps": int},
 }
+WITH_RANK = {"peft": {"rank": int}}
 
 
 def check(value: Any, kind: Any, name: str = "") -> None:

@@ -70,3 +70,8 @@ def test_training_does_not_wait_and_hears_of_failures(run, monkeypatch):
     report._begin(run.folder)
     with pytest.raises(ValueError, match="holds no run"):
         report._begin(run.folder)
+
+
+def test_no_table_of_a_run_that_is_not_finished(run):
+    with pytest.raises(ValueError, match="holds no finished run"):
+        callback.final_table(run.folder)

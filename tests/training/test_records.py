@@ -6,7 +6,7 @@ import pytest
 
 from lorasp_jax.report.html import write_report
 from lorasp_jax.training import records
-from lorasp_jax.training.run_folder import write_json
+from lorasp_jax.training.run_folder import RECORD, read_json, write_json
 from tests.runs import RESULTS, finish
 
 
@@ -63,3 +63,14 @@ def test_results_of_another_version(name, value, sentence, tmp_path):
     with pytest.raises(ValueError, match=rf"results\.json is damaged \({re.escape(sentence)}"):
         write_report(tmp_path)
     assert not (tmp_path / "report.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("peft", "sentence"), [({}, "peft lacks 'rank'"), ({"rank": []}, "peft.rank must be a whole")]
+)
+def test_settings_of_another_version(peft, sentence, tmp_path):
+    finish(tmp_path)
+    config = read_json(tmp_path / RECORD)
+    write_json(tmp_path / RECORD, config | {"peft": {"method": "LoRASP"} | peft})
+    with pytest.raises(ValueError, match=rf"config\.json is damaged \({re.escape(sentence)}"):
+        write_report(tmp_path)
