@@ -119,7 +119,9 @@ def test_nnx_gemma_with_names_and_in_fewer_bits(gemma):
 @pytest.fixture(scope="module")
 def linen():
     """Gemma of Hugging Face's transformers, and its parameters."""
-    gemma = pytest.importorskip("transformers.models.gemma.modeling_flax_gemma")
+    gemma = pytest.importorskip(
+        "transformers.models.gemma.modeling_flax_gemma", exc_type=ImportError
+    )
     config = gemma.GemmaConfig(
         vocab_size=gemmas.VOCABULARY,
         hidden_size=gemmas.WIDTH,
