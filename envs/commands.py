@@ -17,6 +17,7 @@ import envs
 from envs import collection, places, recipes, rlds, videos
 from envs.bars import Report, bars
 from envs.episodes import Episodes, replacing
+from envs.files import check_local
 from envs.locks import alone
 from envs.names import names
 
@@ -238,5 +239,6 @@ def _views(episode: Episodes) -> np.ndarray:
 
 
 def _refuse_existing(options: argparse.Namespace, file: Path) -> None:
+    check_local(file)
     if file.exists() and not options.overwrite:
         raise ValueError(f"{file} exists already: choose another --out or add --overwrite")

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.actions import MODES
-from envs.files import check_memory, damage, regular
+from envs.files import check_local, check_memory, damage, regular
 
 Array = jax.Array | np.ndarray
 
@@ -94,7 +94,7 @@ class Episodes:
             ValueError: if the arrays do not fit one another.
         """
         self.validate()
-        path = Path(path)
+        check_local(path := Path(path))
         facts = {name: getattr(self, name) for name in _FACTS}
         header = json.dumps({"format": _FORMAT, **facts}).encode()
         arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}

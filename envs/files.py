@@ -46,6 +46,12 @@ def inside(folder: Path, name: object) -> Path:
     return folder / name
 
 
+def check_local(path: Path) -> None:
+    """Raise ValueError for a URL: what is written goes to this machine."""
+    if len(path.parts) > 1 and _URL.fullmatch(path.parts[0]):
+        raise ValueError(f"{path} is a URL: what is written goes to a folder of this machine")
+
+
 def regular(path: Path, folder: Path | None = None) -> Path:
     """The same path, if a file is there that has an end and can be read.
 

@@ -7,13 +7,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TextIO
 
+from envs.files import check_local
+
 
 @contextlib.contextmanager
 def alone(path: Path, waiting: Callable[[], None] | None = None) -> Iterator[None]:
     """Keeps other processes from making the same file or folder meanwhile.
 
     A lock file beside it is what they share. The operating system unlocks it when a process ends,
-    however it ends.
+    however it ends. Where something is raised inside, empty folders made for it go again.
 
     Args:
         path: the file or folder.
@@ -21,8 +23,24 @@ def alone(path: Path, waiting: Callable[[], None] | None = None) -> Iterator[Non
             waited for.
 
     Raises:
-        ValueError: if another process is at it and is not waited for, or as `open_lock`.
+        ValueError: if another process is at it and is not waited for, the path is a URL, or as
+            `open_lock`.
     """
+    check_local(path)
+    missing = [folder for folder in path.parents if not folder.exists()]
+    try:
+        with _locked(path, waiting):
+            yield
+    except BaseException:
+        for folder in missing:
+            with contextlib.suppress(OSError):  # it is not empty, or was not made
+                folder.rmdir()
+        raise
+
+
+@contextlib.contextmanager
+def _locked(path: Path, waiting: Callable[[], None] | None) -> Iterator[None]:
+    """`alone`, but for the folders."""
     lock = path.with_name(f".{path.name}.lock")
     how = fcntl.LOCK_EX | fcntl.LOCK_NB
     while True:

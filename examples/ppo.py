@@ -23,6 +23,7 @@ import tyro
 
 import envs
 from envs import compilation_cache
+from envs.files import check_local
 
 
 @dataclasses.dataclass(frozen=True)
@@ -255,6 +256,7 @@ def draw(config: Config, curve: np.ndarray) -> None:
 
 def main(config: Config) -> float:
     """Trains, draws, and evaluates on layouts that were never trained on: share of successes."""
+    check_local(config.out)
     learner, curve = train(config)
     draw(config, curve)
     key = jax.random.key(config.seed + 1_000_000)

@@ -155,6 +155,8 @@ def folder(value: Any) -> pathlib.Path:
     if not isinstance(text, str) or not text or "\0" in text:
         raise ValueError(f"a folder is a text or a path, got {short(value)}.")
     path = pathlib.Path(text)
+    if len(path.parts) > 1 and path.parts[0].endswith(":"):  # of a Path, which has one slash
+        raise ValueError(f"{text} is a URL; a folder of adapters lies on this machine.")
     if any(len(part.encode(errors="replace")) > LONGEST_NAME for part in path.parts):
         raise ValueError(f"a name in a path has {LONGEST_NAME} bytes at most, got {short(text)}.")
     if path.exists() and not path.is_dir():

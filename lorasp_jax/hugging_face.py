@@ -151,8 +151,8 @@ def matched(
 
 def _at_hand(folder: str | os.PathLike) -> pathlib.Path:
     """The folder on this machine; only what begins with hf:// is asked of the hub."""
-    if "://" not in (path := given.folder(folder)).as_posix() and "://" not in str(folder):
-        return path
+    if not isinstance(folder, str) or "://" not in folder:
+        return given.folder(folder)
     from lorasp_jax.models import places  # with all backbones, which nothing else here needs
 
     return places.local(folder, only=[CONFIG, TENSORS])

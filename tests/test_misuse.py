@@ -1,6 +1,7 @@
 """What a first-time user writes by mistake: one sentence that says what is valid."""
 
 import re
+from pathlib import Path
 
 import flax.linen as nn
 import jax
@@ -328,6 +329,9 @@ def test_models_without_values(tmp_path):
         ),
         (lambda _: lorasp_jax.with_dropout(NET, 5), "key must be one such as jax.random.key(0)"),
         (lambda _: lorasp_jax.save_adapters(5, adapted()), "a folder is a text or a path, got 5"),
+        (lambda _: lorasp_jax.save_adapters("gs://x/y", adapted()), "gs://x/y is a URL; a folder"),
+        (lambda _: lorasp_jax.save_peft(Path("gs://x/y"), adapted()), "gs:/x/y is a URL; a folder"),
+        (lambda _: lorasp_jax.load_adapters("gs://x/y", NET), "gs://x/y is a URL; a folder of"),
         (lambda f: lorasp_jax.load_adapters(f / LONG, NET), "has 255 bytes at most, got '"),
         (lambda f: lorasp_jax.load_peft(f / LONG, NET), "has 255 bytes at most"),
         (lambda f: lorasp_jax.save_adapters(f, adapted(), base=5), "base must be a text"),

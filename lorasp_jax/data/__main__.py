@@ -4,13 +4,14 @@ import argparse
 import functools
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TextColumn
 
+from envs.files import check_local
 from envs.refusals import parsed, refused
 from lorasp_jax.data.keys import Keys
 
@@ -41,6 +42,8 @@ def inspect(options: argparse.Namespace, console: Console) -> None:
     from lorasp_jax.data.opening import open_source
 
     source = open_source(options.path, _keys(options))
+    if options.out:
+        check_local(options.out)
     if options.out and options.out.exists() and not options.overwrite:
         raise ValueError(f"{options.out} exists already: add --overwrite or choose another --out")
     path = options.out or inspection.place(options.path)
@@ -134,14 +137,19 @@ def _camera(text: str) -> tuple[str, str]:
 
 @contextmanager
 def _bar(title: str) -> Iterator[tuple["Report", Callable[[str], None]]]:
-    """A progress bar: what moves it, and what prints a sentence above it."""
+    """A progress bar: what moves it, from when on it shows, and what prints a sentence above it."""
     columns = (*Progress.get_default_columns(), MofNCompleteColumn(), TextColumn("steps"))
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        bar = progress.add_task(title, total=None)
-        say = functools.partial(
-            progress.console.print, soft_wrap=True, highlight=False, markup=False
-        )
-        yield lambda done, total: progress.update(bar, completed=done, total=total), say
+    progress = Progress(*columns, console=Console(stderr=True))
+    bar = progress.add_task(title, total=None)
+    say = functools.partial(progress.console.print, soft_wrap=True, highlight=False, markup=False)
+    with ExitStack() as shown:
+
+        def report(done: int, total: int) -> None:
+            if not progress.live.is_started:
+                shown.enter_context(progress)
+            progress.update(bar, completed=done, total=total)
+
+        yield report, say
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ import numpy as np
 import safetensors.numpy
 from flax import nnx
 
-from envs.files import read_text
+from envs.files import check_local, read_text
 from lorasp_jax.adapter_set import SetParam
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.models import backbone
@@ -47,8 +47,10 @@ def save(folder: Folder, model: Any) -> None:
         model: a backbone, with `config`.
 
     Raises:
-        ValueError: the model has adapters or quantised kernels, or is not as its config says.
+        ValueError: the model has adapters or quantised kernels, or is not as its config says; or
+            the folder is a URL.
     """
+    check_local(folder := pathlib.Path(folder))
     arrays = {name: a.astype(jnp.bfloat16) for name, a in base_arrays(model).items()}
     description = {
         "backbone": type(model).__module__.split(".")[-2],
@@ -64,7 +66,7 @@ def save(folder: Folder, model: Any) -> None:
         total = {"total_size": sum(array.nbytes for array in arrays.values())}
         files[INDEX] = json.dumps({"metadata": total, "weight_map": where}, indent=1).encode()
     files[CONFIG] = (json.dumps(description, indent=1) + "\n").encode()
-    _write(pathlib.Path(folder), files)
+    _write(folder, files)
 
 
 def base_arrays(model: nnx.Module) -> dict[str, np.ndarray]:

@@ -27,6 +27,7 @@ import orbax.checkpoint as ocp
 import safetensors.numpy
 from flax import nnx
 
+from envs.files import check_local
 from lorasp_jax.models import layouts, orbax_folders
 from lorasp_jax.models.checkpoint import base_arrays, by_path, named_arrays, set_arrays
 from lorasp_jax.models.pi0 import openpi_lora
@@ -91,8 +92,9 @@ def save(folder: Path, model: Any, layout: str, dtypes: Mapping[str, Any] | None
 
     Raises:
         ValueError: unknown layout, adapters or quantised kernels, parameters of other shapes than
-            the model's config says, or something is there already.
+            the model's config says; or the folder is a URL, or holds such a checkpoint.
     """
+    check_local(folder)
     weights = _weights(model.config)
     if layout not in weights.LAYOUTS:
         raise ValueError(f"layout {layout!r} is not one of {', '.join(weights.LAYOUTS)}.")

@@ -131,6 +131,29 @@ def test_bad_input(arguments, sentence, capsys, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("command", ["inspect", "convert"])
+def test_output_goes_to_this_machine(command, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, _, err = run(capsys, command, golden("v3"), "--out", "gs://bucket/folder")
+    assert code == 2
+    assert "gs:/bucket/folder is a URL: what is written goes to a folder of this machine" in err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("to", ["cache", "rlds"])
+def test_a_refused_conversion_begins_nothing(to, capsys, tmp_path, monkeypatch):
+    """No folder above the output is left, and no bar is shown."""
+
+    def refuse(self, number, cameras=None):
+        raise ValueError("no")
+
+    monkeypatch.setattr(LeRobot, "episode", refuse)
+    out = tmp_path / "a" / "b" / "made"
+    code, text, err = run(capsys, "convert", golden("v3"), "--to", to, "--out", out)
+    assert (code, text, err) == (2, "", "error: no\n")
+    assert not list(tmp_path.iterdir())
+
+
 def test_an_interrupt_leaves_nothing(capsys, tmp_path, monkeypatch):
     def stop(self, number, cameras=None):
         raise KeyboardInterrupt

@@ -50,7 +50,8 @@ def run(capsys, monkeypatch):
     return run
 
 
-def test_bad_input_is_one_sentence(tmp_path, run):
+def test_bad_input_is_one_sentence(tmp_path, run, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     existing, photos = tmp_path / "episodes.npz", tmp_path / "photos"
     existing.write_text("precious")
     photos.mkdir()
@@ -69,6 +70,9 @@ def test_bad_input_is_one_sentence(tmp_path, run):
         (f"play --image-size 33 {press}", tmp_path / "a.mp4", "even --image-size"),
         ("play --task dance --robot piper --out", tmp_path / "a.mp4", "dance"),
         ("gallery --task press --robot r2d2 --out", tmp_path / "g", "r2d2"),
+        (f"collect {press}", "gs://bucket/press", "gs:/bucket/press is a URL"),
+        (f"play {press}", "gs://bucket/press.mp4", "press.mp4 is a URL"),
+        ("gallery --task press --robot piper --out", "gs://bucket", "press_piper.gif is a URL"),
     ):
         code, said = run(text, out)
         assert code == 2

@@ -62,6 +62,8 @@ def test_hash_knows_the_base_and_not_its_adapters(folder, model):
             models.save(folder, has_adapters)
     with pytest.raises(ValueError, match="save a base before quantising it"):
         models.save(folder, lorasp_jax.quantize(loaded, [("state_proj", "int8")]).model)
+    with pytest.raises(ValueError, match="gs:/bucket/base is a URL"):
+        models.save("gs://bucket/base", loaded)
 
 
 def test_shards_stay_under_their_limit(tmp_path, model, monkeypatch):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import flax.traverse_util
 import jax
@@ -180,6 +181,8 @@ def test_what_does_not_fit_is_named(model, tensors, tmp_path):
         published.save(tmp_path / "more", model, "lerobot")
     with pytest.raises(ValueError, match="layout 'torch' is not one of openpi, lerobot"):
         published.save(tmp_path / "new", model, "torch")
+    with pytest.raises(ValueError, match="gs:/bucket/base is a URL"):
+        published.save(Path("gs://bucket/base"), model, "openpi")
 
 
 @pytest.mark.parametrize("layout", ["lerobot", "openpi"])
