@@ -2,6 +2,8 @@
 
 import importlib.metadata
 import inspect
+import subprocess
+import sys
 
 import lorasp_jax
 from lorasp_jax import peft
@@ -23,3 +25,10 @@ def test_what_one_makes_one_can_save_and_load():
 
 def test_the_version_is_that_of_the_installed_package():
     assert lorasp_jax.__version__ == importlib.metadata.version("lorasp_jax")
+
+
+def test_a_folder_of_the_same_name_does_not_hide_the_package(tmp_path):
+    """As a checkout does for whoever starts Python beside it."""
+    (tmp_path / "lorasp_jax" / "data").mkdir(parents=True)
+    use = "import lorasp_jax.data.keys; lorasp_jax.adapt"
+    subprocess.run([sys.executable, "-c", use], cwd=tmp_path, check=True)
