@@ -22,7 +22,7 @@ import optax
 import tyro
 
 import envs
-from envs import compilation_cache
+from envs import compilation_cache, compiling
 from envs.files import check_local
 
 
@@ -194,7 +194,7 @@ def begin(env: envs.Env, config: Config, key: jax.Array) -> Learner:
     params = {
         "actor": network(actor_key, *hidden, actions),
         "critic": network(critic_key, *hidden, 1),
-        "log_std": jnp.full(actions, jnp.log(config.std)),
+        "log_std": jnp.full(actions, jnp.log(config.std), jnp.float32),
     }
     nothing = {
         "count": jnp.float32(0),
@@ -221,8 +221,11 @@ def train(config: Config) -> tuple[Learner, np.ndarray]:
     env = make(config, config.num_envs, reward="dense", discount=config.discount)
     key, start = jax.random.key(config.seed), time.perf_counter()
     learner, rows = begin(env, config, key), []
+    calls = compiling.Calls(config.task)
     for number in range(1, config.updates + 1):
-        learner, (ended, won) = update(env, config, learner, jax.random.fold_in(key, number))
+        key_now = jax.random.fold_in(key, number)
+        with calls.first("an update"):
+            learner, (ended, won) = update(env, config, learner, key_now)
         steps, seconds = number * config.steps * config.num_envs, time.perf_counter() - start
         rows.append((steps, seconds, int(ended), int(won)))
         print(
@@ -261,7 +264,8 @@ def main(config: Config) -> float:
     draw(config, curve)
     key = jax.random.key(config.seed + 1_000_000)
     env = make(config, config.episodes)
-    success = float(np.mean(evaluate(env, learner.params, learner.moments, key)))
+    with compiling.said(f"the evaluation of {config.task}"):
+        success = float(np.mean(evaluate(env, learner.params, learner.moments, key)))
     print(
         f"{success:.1%} of {config.episodes} fresh layouts, {time.process_time():.0f} CPU seconds"
     )

@@ -75,9 +75,15 @@ class Points:
 
 def test_it_learns_to_move_a_point(ppo, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(ppo, "make", lambda config, num_envs, **_: Points(num_envs))
+    monkeypatch.setattr(ppo.compiling, "PATIENCE", 0.0)
     config = ppo.Config(num_envs=32, updates=15, learning_rate=3e-3, episodes=64, out=tmp_path)
+    before = ppo.update._cache_size()
     assert ppo.main(config) >= 0.95
-    lines = capsys.readouterr().out.splitlines()
+    assert ppo.update._cache_size() - before == 1  # the second update compiles nothing
+    printed, told = capsys.readouterr()
+    assert "compiling an update of press" in told
+    assert "compiling the evaluation of press" in told
+    lines = printed.splitlines()
     assert lines[14].startswith("   15,360 steps")
     assert " of 64 fresh layouts" in lines[15]
     assert (tmp_path / "curve.png").stat().st_size > 1000
