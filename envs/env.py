@@ -61,6 +61,9 @@ class Env:
     physics_dt = scene.PHYSICS_DT
     cameras = scene.CAMERAS
 
+    def __repr__(self) -> str:
+        return f"<Env {self.task.name!r} for {self.robot.name!r}, num_envs={self.num_envs}>"
+
     @property
     def num_joints(self) -> int:
         """J, without the gripper."""

@@ -73,6 +73,14 @@ class Episodes:
     attempted: int
     actions: str = "joint"
 
+    def __repr__(self) -> str:
+        """Facts, and of arrays the types and shapes."""
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        arrays |= {_IMAGE + name: picture for name, picture in self.image.items()}
+        shown = [f"{name}={_short(array)}" for name, array in arrays.items()]
+        shown += [f"{name}={getattr(self, name)!r}" for name in _FACTS]
+        return f"Episodes({', '.join(shown)})"
+
     @property
     def num_episodes(self) -> int:
         """E."""
@@ -239,6 +247,11 @@ def concatenate(parts: Sequence[Episodes]) -> Episodes:
     attempted = sum(part.attempted for part in parts)
     same = [dataclasses.replace(part, attempted=attempted) for part in parts]
     return jax.tree.map(join, *same)
+
+
+def _short(array: Any) -> str:
+    """Type and shape, of a tracer too; what a tree map has put in its place, as it is."""
+    return f"{array.dtype}{list(array.shape)}" if hasattr(array, "dtype") else repr(array)
 
 
 def _padded(xp: Any, array: Array, steps: int) -> Array:

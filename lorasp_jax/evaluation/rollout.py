@@ -67,7 +67,7 @@ class Result:
     steps: float
     active_rank: dict[str, dict[str, list[float]]]
     active_rank_histogram: dict[str, np.ndarray]
-    poses: Poses
+    poses: Poses = dataclasses.field(repr=False)
 
 
 def make_rollout(

@@ -39,6 +39,10 @@ def test_time(env):
     assert env.expert_steps <= env.max_steps
 
 
+def test_printed_it_is_a_line(env):
+    assert repr(env) == f"<Env 'press' for 'piper', num_envs={env.num_envs}>"
+
+
 def test_reset_is_random_and_repeatable(env, start):
     assert_equal(start, env.reset(jax.random.key(0)))
     other = env.reset(jax.random.key(1))

@@ -59,6 +59,15 @@ def test_round_trip(tmp_path):
     assert episodes.num_steps == 1 + 2 + 3
 
 
+def test_printed_they_are_a_line():
+    text = repr(make(3, 4))
+    assert "image/side=uint8[3, 4, 6, 8, 3]" in text
+    assert "task='press', robot='piper'" in text
+    assert len(text) < 500
+    assert "state=float32[3, 4, 7]" in repr(jax.eval_shape(lambda: make(3, 4)))
+    assert "state=0" in repr(jax.tree.map(lambda _: 0, make(3, 4)))
+
+
 def test_every_truncation_is_one_sentence(tmp_path):
     path = tmp_path / "episodes.npz"
     make().save(path)

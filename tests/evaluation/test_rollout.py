@@ -124,4 +124,5 @@ def test_batches_add_up():
     assert result.active_rank == {"vision": {"fc1": [1.0, 3.0]}}
     assert result.active_rank_histogram["vision"].tolist() == [3, 2 * many + 5]
     np.testing.assert_allclose(result.poses[0], [1.0, 1.01, 1.02, 1.03])  # until it was done
+    assert "poses" not in repr(result)
     np.testing.assert_allclose(_result([second]).poses[0], np.arange(9) / 100)
