@@ -47,16 +47,17 @@ def bars(console: Console, stop: threading.Event) -> Iterator[Callable[[str, str
 
         def new_bar(task: str, robot: str) -> Report:
             bar = progress.add_task(f"{task}, {robot}: compiling ...", total=None, rate="")
-            begun: list[int] = []  # how many there were at the first report
+            reports: list[tuple[int, float]] = []  # what was done, and when
 
             def report(done: int, total: int) -> None:
                 if stop.is_set():
                     raise KeyboardInterrupt
                 progress.update(bar, completed=done, total=total)
-                begun.append(done)
-                if len(begun) > 1:
-                    text, seconds = f"{task}, {robot}: collecting", progress.tasks[bar].elapsed or 1
-                    progress.update(bar, description=text, rate=_rate(done - begun[0], seconds))
+                reports.append((done, progress.tasks[bar].elapsed or 0.0))
+                if len(reports) > 1:  # the second comes after all is compiled and says no speed
+                    before, since = reports[1]
+                    rate = _rate(done - before, reports[-1][1] - since)
+                    progress.update(bar, description=f"{task}, {robot}: collecting", rate=rate)
 
             return report
 

@@ -4,6 +4,9 @@ from rich.console import Console
 from rich.progress import Progress, ProgressColumn, Task
 from rich.text import Text
 
+_PERIOD = 600.0
+"""Seconds of which the rate is the mean; there is none where no two updates fall into them."""
+
 
 def bars(console: Console, unit: str, *, per_step: int = 1, shown: bool = True) -> Progress:
     """Bars that show, beside share and remaining time, a rate.
@@ -15,7 +18,7 @@ def bars(console: Console, unit: str, *, per_step: int = 1, shown: bool = True) 
         shown: False while other bars are; a terminal shows one group at a time.
     """
     columns = (*Progress.get_default_columns(), _Rate(unit, per_step))
-    return Progress(*columns, console=console, disable=not shown)
+    return Progress(*columns, console=console, disable=not shown, speed_estimate_period=_PERIOD)
 
 
 class _Rate(ProgressColumn):

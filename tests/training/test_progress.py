@@ -22,3 +22,12 @@ from lorasp_jax.training.progress import bars
 def test_rate_counts_units_not_steps(per_step, speed, finished, text):
     rate = bars(Console(file=io.StringIO()), "samples", per_step=per_step).columns[-1]
     assert rate.render(SimpleNamespace(speed=speed, finished_speed=finished)).plain == text
+
+
+def test_slow_steps_have_a_rate_too():
+    progress, now = bars(Console(file=io.StringIO()), "samples"), [0.0]
+    progress.get_time = lambda: now[0]
+    bar = progress.add_task("training", total=100)
+    for now[0], done in ((60.0, 50), (120.0, 52), (180.0, 54)):
+        progress.update(bar, completed=done)
+    assert progress.tasks[bar].time_remaining == pytest.approx(46 / (4 / 120), rel=0.5)
