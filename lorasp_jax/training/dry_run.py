@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import time
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from flax import nnx
 from rich.console import Console
 from rich.table import Table
 
-from envs import fast_cpu
+from envs import compiling, fast_cpu
 from envs.episodes import Episodes
 from lorasp_jax import adaptation
 from lorasp_jax.config import Config
@@ -48,11 +47,9 @@ def dry_run(config: Config, folder: Path, console: Console) -> None:
     console.print(_parameters(built.model))
     run = Run(config, folder, console, built.base_hash)
     data = _prepared(run, built)
-    began = time.perf_counter()
-    with console.status("compiling the training step ..."):
+    with compiling.said("the training step"):
         options = fast_cpu.without_simulation()
         compiled = _lowered(run, data).compile(compiler_options=options)
-    console.print(f"the training step compiled in {time.perf_counter() - began:.1f} s")
     console.print(_memory(built, _bytes(data) / _split(data), compiled.memory_analysis()))
     operations = preflight.operations(config, built.base.config)
     console.print(

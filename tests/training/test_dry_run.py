@@ -10,6 +10,7 @@ from flax import nnx
 from rich.console import Console
 
 import train
+from envs import compiling
 from lorasp_jax import adaptation
 from lorasp_jax.config import DataConfig
 from lorasp_jax.data.batches import Raw, flatten
@@ -52,6 +53,7 @@ def config(monkeypatch):
 def test_what_is_printed_is_what_the_program_takes(config, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(preflight, "MIB", 1)
+    monkeypatch.setattr(compiling, "PATIENCE", 0.0)
     built, build = [], setup.build
     monkeypatch.setattr(setup, "build", lambda *a, **k: built.append(build(*a, **k)) or built[0])
     monkeypatch.setattr(train, "Console", lambda **_: Console(width=150))
@@ -60,7 +62,8 @@ def test_what_is_printed_is_what_the_program_takes(config, tmp_path, monkeypatch
     )
     assert train.main([]) == 0
     assert not list(tmp_path.iterdir())
-    printed = capsys.readouterr().out
+    printed, told = capsys.readouterr()
+    assert told.startswith("compiling the training step")  # before it waits, in a pipe too
     rows = [line.replace(",", "").strip("│ ").split() for line in printed.splitlines()]
     table = {row[0]: [cell for cell in row[1:] if cell != "│"] for row in rows if row}
     one = sum(x[:1].nbytes for x in jax.tree.leaves(flatten([random_episodes("", 0)])))
