@@ -38,8 +38,8 @@ class ModelConfig:
     """nano for a CPU, small for one accelerator, base as published; of pi0 also nano_pi05 and
     base_pi05."""
     checkpoint: str = "assets/{backbone}_{size}"
-    """Where the base weights are: a folder, hf://owner/name, a bucket; empty for random ones. A
-    shipped base is found from any folder. {backbone} and {size} stand for those fields."""
+    """Where the base weights are: a folder, hf://owner/name, a bucket; empty for random ones.
+    Shipped bases are found from any folder. {backbone} and {size} stand for those fields."""
     tokenizer: str = ""
     """A SentencePiece .model or tokenizer.json, a file or hf://owner/name; empty: the offline one
     of nano and small."""

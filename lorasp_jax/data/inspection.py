@@ -85,7 +85,7 @@ def report(source: Source, console: Console) -> None:
         "tasks": ", ".join(found.tasks),
         "cameras": ", ".join(_sizes(source)),
         "episodes": f"{len(source)}, of {found.length.min()} to {found.length.max()} steps, "
-        f"{np.median(found.length):g} in the middle",
+        f"median {np.median(found.length):g}",
         "steps": f"{steps} at {hertz:g} Hz, {minutes:.1f} minutes",
     }
     for name, text in facts.items():

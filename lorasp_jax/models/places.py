@@ -88,7 +88,7 @@ def _nowhere(name: str, path: Path) -> str:
         )
     if REPOSITORY.fullmatch(name):
         return f"there is no folder {name}; a repository on the hub is written {HUB}{name}"
-    return f"{name} does not exist, and is no {HUB}owner/name on the hub nor gs://bucket/path."
+    return f"{name} does not exist, and is neither {HUB}owner/name on the hub nor gs://bucket/path"
 
 
 def is_elsewhere(where: str | os.PathLike[str]) -> bool:

@@ -67,7 +67,9 @@ def final_table(folder: Path) -> Table:
     if not results:
         raise ValueError(f"{folder} holds no finished run: there is no results.json")
     rows = [row for row in read_metrics(folder) if "task" in row]  # not all steps were skipped
-    table = Table("", "before", "after", title=folder.name)
+    table = Table("", title=folder.name)
+    for column in ("before", "after"):
+        table.add_column(column, no_wrap=True)
     for task, value in results["tasks"].items():
         table.add_row(task, success_cell(value["before"]), success_cell(value["after"]))
     if results["tasks"]:

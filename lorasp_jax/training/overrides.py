@@ -99,9 +99,8 @@ def _parser(method: str = "") -> argparse.ArgumentParser:
     auto = "auto (the default: cpu on a CPU, accelerator elsewhere)"
     parser.add_argument("--scale", default="auto", help=f"{auto}, {', '.join(SCALES)}")
     methods = ", ".join(peft.names())
-    parser.add_argument(
-        "--method", help=f"adapter method: {methods} (default: the experiment's, {method})"
-    )
+    default = ", ".join(filter(None, ["the experiment's", method]))
+    parser.add_argument("--method", help=f"adapter method: {methods} (default: {default})")
     parser.add_argument(
         "--resume",
         nargs="?",

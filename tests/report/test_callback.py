@@ -44,6 +44,12 @@ def test_it_grows(run):
     assert cells["time, total"][1] == "7 s"
 
 
+def test_the_table_keeps_numbers_on_one_line(folder):  # noqa: F811
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(callback.final_table(folder))
+    assert "75.0 % [63.2, 84.0] of 64" in console.export_text()
+
+
 def test_a_run_that_stops_has_a_last_report(run):
     report, path = callback.Report(), run.folder / "report.html"
     report.on_start(run)

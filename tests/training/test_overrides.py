@@ -96,6 +96,12 @@ def test_help_lists_every_field_and_option(config, capsys):
     assert f"presets ({', '.join(PRESETS)}) and regular expressions" in words
 
 
+def test_without_an_experiment_its_method_is_not_known(capsys):
+    with pytest.raises(ValueError, match="no experiment was named"):
+        parse([])
+    assert "(default: the experiment's)" in " ".join(capsys.readouterr().out.split())
+
+
 @pytest.mark.parametrize("arguments", [["--robot", "-h"], ["--peft.rank", "x", "--help"]])
 def test_help_in_place_of_a_value(arguments, capsys):
     with pytest.raises(SystemExit) as caught:
