@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax import given, layers, paths
+from lorasp_jax import given, kinds, layers, paths
 from lorasp_jax.dense import DROPPING, AdaptedLayer, AdapterAux, AdapterParam, DropoutKey
 from lorasp_jax.kernels.quantized import QuantizedKernel
 from lorasp_jax.kinds import short
@@ -114,7 +114,7 @@ def with_dropout(model: Model, key: jax.Array) -> Model:
       model: left untouched; without such adapters the result computes the same.
       key: typed random key.
     """
-    holder, key = _copy(model), given.key(key)
+    holder, key = _copy(model), kinds.key(key)
     for place in paths.once(paths.places(holder, AdaptedLayer)):
         layer = place.child
         if isinstance(layer.adapter, AdapterParam) and drop_rate(layer.method):
@@ -126,6 +126,7 @@ def with_dropout(model: Model, key: jax.Array) -> Model:
 
 def count(model: nnx.Module) -> Counts:
     """How many parameters train, and how many there are; shapes suffice (`nnx.eval_shape`)."""
+    given.module(model)
     return Counts(_size(nnx.state(model, AdapterParam)), _size(nnx.state(model, nnx.Param)))
 
 
@@ -168,7 +169,7 @@ def merge(model: Model) -> Model:
 def penalties(model: nnx.Module) -> dict[str, jax.Array]:
     """Each loss on parameters alone, averaged over the adapted matrices whose method has it."""
     found: dict[str, list[jax.Array]] = {}
-    for _, _, _, layer in paths.places(nnx.List([model]), AdaptedLayer):
+    for _, _, _, layer in paths.places(nnx.List([given.module(model)]), AdaptedLayer):
         if layer.adapter is not None:
             penalty = over_stack(layer.method.penalty, layer.kernel_matrices())
             for name, values in penalty(layer.adapter.get_value()).items():

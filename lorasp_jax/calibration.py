@@ -17,9 +17,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 
-from lorasp_jax import adaptation, layers, paths
+from lorasp_jax import adaptation, given, layers, paths
 from lorasp_jax.dense import AdapterAux, AdapterParam
 from lorasp_jax.kinds import short
 from lorasp_jax.peft.method import Aux, Method, Params
@@ -127,11 +128,16 @@ def observe(
       ValueError: no batches, a layer that was not called or whose aux `forward` did not return, or
         one with its own matrix product, precision or the like.
     """
-    if not isinstance(batches, Iterable):
+    if not isinstance(batches, Iterable) or isinstance(batches, str | Mapping):
         raise ValueError(f"batches are a list or the like of inputs, got {short(batches)}.")
+    if not callable(forward):
+        raise ValueError(f"forward is a function of model and batch, got {short(forward)}.")
     step = _stepping(_observed(model, reports, others), forward)
     total: dict[str, Sums] = {}
     for batch in batches:
+        for leaf in jax.tree.leaves(batch):
+            if not isinstance(leaf, jax.Array | np.ndarray | np.generic | float | int):
+                raise ValueError(f"a batch holds arrays and numbers, got {short(leaf)}.")
         _add(total, step(batch))
     if missing := sorted(reports.keys() - total.keys()):
         raise ValueError(
@@ -218,7 +224,8 @@ def input_moments(
     Raises:
       ValueError: as for `observe`, or no such layer matches.
     """
-    known = [place.path for place in paths.multiplying(nnx.List([model]))]
+    paths.check_rules([(pattern, None)], lambda _: True, "None")
+    known = [place.path for place in paths.multiplying(nnx.List([given.with_values(model)]))]
     reports = {path: second_moment for path in known if re.search(pattern, path)}
     if not reports:
         close = paths.near_misses(pattern, known) or "none"

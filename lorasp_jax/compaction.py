@@ -121,7 +121,7 @@ def distill(
 
 def _lora_sp_layers(model: nnx.Module) -> dict[str, Any]:
     """The layers with a LoRA-SP adapter by path."""
-    places = paths.places(nnx.List([given.module(model)]), AdaptedLayer)
+    places = paths.places(nnx.List([given.with_values(model)]), AdaptedLayer)
     found = {p.path: p.child for p in places if isinstance(p.child.method, LoRASP)}
     if not found:
         raise ValueError("the model has no LoRA-SP layers.")

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 from flax import nnx
 from flax.typing import Dtype, Initializer
 
-from lorasp_jax import given
+from lorasp_jax import given, kinds
 from lorasp_jax.kernels.quantized import QuantizedKernel
 from lorasp_jax.kinds import short
 from lorasp_jax.peft import Aux, Method
@@ -115,7 +115,7 @@ def dense_together(
     Raises:
       ValueError: as `dense`.
     """
-    given.tokens(x, token_mask)
+    kinds.tokens(x, token_mask)
     layers = [DenseLayer(*layer) for layer in layers]
     plain, adapted = {}, {}
     for i, (kernel, _, params, method, key) in enumerate(layers):
@@ -127,12 +127,7 @@ def dense_together(
             plain[i] = method.apply_dropped(params, x, matrix, key, token_mask=token_mask)
         else:
             adapted[i] = method, params, matrix
-    try:
-        fused = apply_together([*adapted.values()], x, token_mask=token_mask)
-    except (TypeError, LookupError, AttributeError, ValueError):
-        for method, params, matrix in adapted.values():
-            given.params(method, params, matrix)
-        raise
+    fused = apply_together([*adapted.values()], x, token_mask=token_mask)
     found = plain | dict(zip(adapted, fused, strict=True))
     results = []
     for i, (kernel, bias, *_) in enumerate(layers):
@@ -334,6 +329,8 @@ class LinenDense(nn.Module):
     ) -> Any:
         """y [...tokens, O], or (y, aux) if asked; see `dense`."""
         given.method(self.method)
+        given.real("param_dtype", self.param_dtype)
+        given.real("dtype", self.dtype or self.param_dtype)
         shape = (given.array(x).shape[-1], given.size("features", self.features))
         kernel = self.param("kernel", self.kernel_init, shape, self.param_dtype)
         bias = None

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from lorasp_jax import kinds
 from lorasp_jax.kernels.bisection import Ratio, bisected_mask
 from lorasp_jax.kernels.energy_gate import SMALLEST_TARGET, positive
 
@@ -63,6 +64,7 @@ def scheduling(
     It wraps the whole optimizer: nothing else decays or moves the value. Wrapping twice is the same
     as once.
     """
+    kinds.whole("total_steps", total_steps)
 
     def init(params: Any) -> ScheduleState:
         return ScheduleState(jnp.zeros((), jnp.int32), optimizer.init(params))

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import linen, nnx
 
+from lorasp_jax import kinds
 from lorasp_jax.kinds import short
 from lorasp_jax.peft import Method
 from lorasp_jax.peft.method import LARGEST_SIZE
@@ -19,11 +20,8 @@ LONGEST_NAME = 255
 
 
 def size(name: str, value: Any) -> int:
-    """A width; raises a ValueError for what is no whole number of at least 1."""
-    if type(value) is not int or not 1 <= value <= LARGEST_SIZE:
-        whole = f"a whole number from 1 to {LARGEST_SIZE}"
-        raise ValueError(f"{name} must be {whole}, got {short(value)}.")
-    return value
+    """A width; raises a ValueError for what is no whole number from 1 to `LARGEST_SIZE`."""
+    return kinds.whole(name, value, LARGEST_SIZE)
 
 
 def method(value: Any) -> Method | None:
@@ -45,15 +43,6 @@ def rngs(value: Any) -> nnx.Rngs:
     return value
 
 
-def key(value: Any) -> jax.Array:
-    """One key of `jax.random`; raises a ValueError for anything else."""
-    dtype, shape = getattr(value, "dtype", None), getattr(value, "shape", None)
-    typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key) and shape == ()
-    if not typed and (dtype != jnp.uint32 or shape not in ((2,), (4,))):  # raw, threefry's, rbg's
-        raise ValueError(f"key must be one such as jax.random.key(0), got {short(value)}.")
-    return value
-
-
 def array(x: Any) -> Any:
     """An array of numbers; raises a ValueError for what is none, or has no axes."""
     known = isinstance(x, jax.Array | np.ndarray) and x.ndim
@@ -70,18 +59,6 @@ def real(name: str, dtype: Any) -> None:
         fits = False
     if not fits:
         raise ValueError(f"{name} must be a floating-point type, got {short(dtype)}.")
-
-
-def tokens(x: Any, token_mask: Any) -> None:
-    """Raises a ValueError unless x is inexact [...tokens, I] and a mask bool [...tokens]."""
-    if not (jnp.issubdtype(getattr(x, "dtype", int), jnp.inexact) and x.ndim):
-        shown = f"{x.dtype} {list(x.shape)}" if hasattr(x, "dtype") else type(x).__name__
-        raise ValueError(f"x must be floating-point numbers [...tokens, I], got {shown}.")
-    if token_mask is not None:
-        found = getattr(token_mask, "dtype", type(token_mask).__name__), np.shape(token_mask)
-        if found != (bool, x.shape[:-1]):
-            wanted = f"token_mask must be bool {list(x.shape[:-1])}"
-            raise ValueError(f"{wanted}, got {found[0]} {list(found[1])}.")
 
 
 def layer(found: Any, width: int) -> None:
@@ -101,22 +78,7 @@ def layer(found: Any, width: int) -> None:
     if (found.params is None) != (own is None or own.trains_base):
         raise ValueError("an adapter's parameters come with their method, and it with them.")
     if found.dropout_key is not None:
-        key(found.dropout_key)
-
-
-def params(own: Method, found: Any, kernel: Any) -> None:
-    """Raises a ValueError for parameters that a method would not make for a kernel [I, O]."""
-    make = jax.eval_shape(lambda: own.init_params(jax.random.key(0), *kernel.shape))
-    wanted, held = (
-        {jax.tree_util.keystr(path): jnp.shape(leaf) for path, leaf in leaves}
-        for leaves in map(jax.tree_util.tree_leaves_with_path, (make, found))
-    )
-    for name, shape in wanted.items():
-        if held.get(name) != shape:
-            raise ValueError(
-                f"{own.name} of a kernel {list(kernel.shape)} needs {name} {list(shape)}, got "
-                f"{held.get(name)}."
-            )
+        kinds.key(found.dropout_key)
 
 
 def module(model: Any) -> Any:
@@ -138,7 +100,7 @@ def with_values(model: Any) -> Any:
 
 
 def variables(value: Any) -> Any:
-    """Variables of a Linen model; raises a ValueError for what holds no "params"."""
+    """Variables of a Linen model; raises a ValueError for what holds no "params", or no arrays."""
     for part in ("params", "adapters"):
         held = value.get(part, {}) if isinstance(value, Mapping) else None
         if not isinstance(held, Mapping) or (part == "params" and part not in value):
@@ -146,6 +108,11 @@ def variables(value: Any) -> Any:
             raise ValueError(
                 f'variables are a dictionary with "params", a dictionary too, got {short(found)}.'
             )
+        for path, leaf in jax.tree_util.tree_leaves_with_path(held, is_leaf=lambda x: x is None):
+            known = isinstance(leaf, jax.Array | np.ndarray | np.generic | float | int)
+            if not known or getattr(leaf, "dtype", None) == np.dtype(object):
+                place = jax.tree_util.keystr(path, simple=True, separator="/")
+                raise ValueError(f'"{part}" must hold arrays, got {short(leaf)} at {place}.')
     return value
 
 

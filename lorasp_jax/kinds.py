@@ -1,9 +1,13 @@
-"""Whether the values of a dataclass are of the kinds that its fields state."""
+"""Whether values are of the kinds that the fields of a dataclass, or arguments, must have."""
 
 import dataclasses
 import types
 import typing
 from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
 
 LARGEST_REAL = (2 - 2**-23) * 2.0**127
 """Largest number of fp32."""
@@ -37,12 +41,45 @@ def check_fields(owner: Any, prefix: str = "") -> None:
             raise ValueError(f"{prefix}{name} must be at most {most[name]}, got {value}")
 
 
+def whole(name: str, value: Any, most: int = LARGEST) -> int:
+    """The value; raises a ValueError for what is no whole number from 1 to `most`."""
+    if type(value) is not int or not 1 <= value <= most:
+        raise ValueError(f"{name} must be a whole number from 1 to {most}, got {short(value)}.")
+    return value
+
+
+def key(value: Any) -> jax.Array:
+    """One key of `jax.random`; raises a ValueError for anything else."""
+    dtype, shape = (value.dtype, value.shape) if _is_array(value) else (None, None)
+    typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key) and shape == ()
+    if not typed and (dtype != jnp.uint32 or shape not in ((2,), (4,))):  # raw, threefry's, rbg's
+        raise ValueError(f"key must be one such as jax.random.key(0), got {short(value)}.")
+    return value
+
+
+def tokens(x: Any, token_mask: Any) -> None:
+    """Raises a ValueError unless x is inexact [...tokens, I] and a mask bool [...tokens]."""
+    if not (_is_array(x) and x.shape and jnp.issubdtype(x.dtype, jnp.inexact)):
+        shown = f"{x.dtype} {list(x.shape)}" if _is_array(x) else type(x).__name__
+        raise ValueError(f"x must be floating-point numbers [...tokens, I], got {shown}.")
+    if token_mask is not None:
+        found = getattr(token_mask, "dtype", type(token_mask).__name__), np.shape(token_mask)
+        if found != (bool, x.shape[:-1]):
+            wanted = f"token_mask must be bool {list(x.shape[:-1])}"
+            raise ValueError(f"{wanted}, got {found[0]} {list(found[1])}.")
+
+
 def short(value: Any) -> str:
     """What a message says of a value: it on one line, cut where it is long, as a model may be."""
-    if hasattr(value, "dtype") and isinstance(getattr(value, "shape", None), tuple):
+    if _is_array(value):
         return f"{value.dtype} {list(value.shape)}"
     text = " ".join(repr(value).split())
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+
+
+def _is_array(value: Any) -> bool:
+    """Whether it has a type and a shape; `nnx.Rngs` has an attribute of every name."""
+    return hasattr(value, "dtype") and isinstance(getattr(value, "shape", None), tuple)
 
 
 def _fits(value: Any, kind: Any) -> bool:

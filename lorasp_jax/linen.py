@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from lorasp_jax import given, layers
+from lorasp_jax import given, kinds, layers
 from lorasp_jax.adaptation import init_stack, over_stack
 from lorasp_jax.dense import KEPT
 from lorasp_jax.einsum import to_matrices
@@ -83,7 +83,7 @@ class LinenAdapter:
         Raises:
           ValueError: as for `attach`.
         """
-        return self.attach(key, self.model.init(key, *args, **kwargs), *args, **kwargs)
+        return self.attach(key, self.model.init(_rngs(key), *args, **kwargs), *args, **kwargs)
 
     def attach(
         self, key: Any, variables: Mapping[str, Any], *args: Any, **kwargs: Any
@@ -102,7 +102,7 @@ class LinenAdapter:
         """
         if ADAPTER in {name for path in flatten_dict(given.variables(variables)) for name in path}:
             raise ValueError("these variables have adapters already: start from the model's own.")
-        rngs = key if isinstance(key, Mapping) else {"params": key}
+        rngs = _rngs(key)
         record = _Record()
         visit = functools.partial(self._attach, record)
         params = self._visited(visit, variables, *args, rngs=rngs, **kwargs)
@@ -188,7 +188,7 @@ class LinenAdapter:
             matrices = functools.partial(to_matrices, view.equation)
             found["/".join(module.path)] = jax.eval_shape(matrices, shaped).shape
 
-        self._visited(visit, variables, *args, **kwargs)
+        self._visited(visit, given.variables(variables), *args, **kwargs)
         return found
 
     def _kind(self, module: nn.Module) -> type[nn.Module] | None:
@@ -298,6 +298,14 @@ class _Record:
     seen: list[str] = dataclasses.field(default_factory=list)
     others: dict[str, str] = dataclasses.field(default_factory=dict)
     kernels: set[tuple[str, ...]] = dataclasses.field(default_factory=set)
+
+
+def _rngs(key: Any) -> dict[str, jax.Array]:
+    """A key for each stream of random numbers; raises a ValueError for anything else."""
+    rngs = dict(key) if isinstance(key, Mapping) else {"params": key}
+    if "params" not in rngs:
+        raise ValueError(f'rngs need a key for "params", got {sorted(map(str, rngs))}.')
+    return {name: kinds.key(value) for name, value in rngs.items()}
 
 
 def _is_ours(module: nn.Module) -> bool:

@@ -115,7 +115,12 @@ def weights(model: nnx.Module, choice: One | Sequence[One] | jax.Array | np.ndar
             f"a choice is a name, weights by name, None, or a list of these, got {short(choice)}."
         )
     size = len(known)
-    if found.ndim not in (1, 2) or found.shape[-1] != size or found.dtype.kind != "f":
+    if (
+        found.ndim not in (1, 2)
+        or found.shape[-1] != size
+        or not len(found)
+        or found.dtype.kind != "f"
+    ):
         raise ValueError(
             f"weights of {size} adapters are floats of shape [{size}] or [B, {size}], got "
             f"{found.dtype} {found.shape}."
@@ -173,6 +178,7 @@ def swap(model: Model, name: str, other: nnx.Module) -> Model:
     Raises:
       ValueError: as for `combine`, or an adapter that does not fit the place.
     """
+    given.with_values(other)
     index, adapters = index_of(names(model), name), adapters_by_path(name, other)
     _check_same(bare(model), "the combined model", bare(other), name)
     model = nnx.clone(model)

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from lorasp_jax import kinds
 from lorasp_jax.auxiliary import Aux
 from lorasp_jax.peft.method import Method, Params
 
@@ -143,6 +144,7 @@ class AdaLoRA(Method):
           ValueError: if no step would be left between warm-up and final phase, or the parameters
             hold no AdaLoRA.
         """
+        kinds.whole("total_steps", total_steps)
         begin, end = round(self.warmup * total_steps), total_steps - round(self.final * total_steps)
         if begin >= end:
             raise ValueError(

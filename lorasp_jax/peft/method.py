@@ -5,9 +5,10 @@ parameters, a pytree, and the other methods are pure functions of them. It knows
 shells for NNX and Linen are in `lorasp_jax.dense`.
 """
 
+import contextlib
 import dataclasses
 import difflib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar, TypeAlias
 
 import jax
@@ -102,11 +103,11 @@ class Method:
           The parameters, and the kernel as it came (initialisations that split it return the rest).
 
         Raises:
-          ValueError: the kernel is not a matrix.
+          ValueError: the kernel is not a matrix, or the key is none.
         """
         del statistics
         check_matrix(kernel)
-        return self.init_params(key, *kernel.shape), kernel
+        return self.init_params(kinds.key(key), *kernel.shape), kernel
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
         """Fresh parameters for a kernel [d_in, d_out], a pure function of key and shape."""
@@ -173,8 +174,9 @@ class Method:
           token_mask: bool [...tokens]; False (padding) stays out of losses and statistics.
 
         Raises:
-          ValueError: the method is not additive.
+          ValueError: the method is not additive, or x or the mask is no such array.
         """
+        kinds.tokens(x, token_mask)
         if not self.additive:
             raise ValueError(f"{type(self).__name__} is not additive and has no delta; use apply.")
         z, aux = self.read(params, x, token_mask)
@@ -201,8 +203,14 @@ class Method:
         """The adapted linear map without its bias, [...tokens, O]: x @ kernel + delta, fused.
 
         No gradient reaches `kernel`; arguments as for `delta`.
+
+        Raises:
+          ValueError: x, the mask or the kernel is no such array, or the parameters are another's.
         """
-        return _apply_fused([(self, params, kernel)], x, token_mask)[0]
+        kinds.tokens(x, token_mask)
+        layers = [(self, params, kernel)]
+        with _explained(layers, x):
+            return _apply_fused(layers, x, token_mask)[0]
 
     def apply_dropped(
         self,
@@ -270,15 +278,47 @@ def apply_together(
     """
     groups: dict[bool, list[int]] = {}
     found: dict[int, tuple[jax.Array, Aux]] = {}
-    for i, (method, params, kernel) in enumerate(layers):
-        if type(method).apply is Method.apply:
-            groups.setdefault(method.reads_in_fp32, []).append(i)
-        else:
-            found[i] = method.apply(params, x, kernel, token_mask=token_mask)
-    for members in groups.values():
-        fused = _apply_fused([layers[i] for i in members], x, token_mask)
-        found |= zip(members, fused, strict=True)
+    with _explained(layers, x):
+        for i, (method, params, kernel) in enumerate(layers):
+            if type(method).apply is Method.apply:
+                groups.setdefault(method.reads_in_fp32, []).append(i)
+            else:
+                found[i] = method.apply(params, x, kernel, token_mask=token_mask)
+        for members in groups.values():
+            fused = _apply_fused([layers[i] for i in members], x, token_mask)
+            found |= zip(members, fused, strict=True)
     return [found[i] for i in range(len(layers))]
+
+
+@contextlib.contextmanager
+def _explained(layers: Sequence[tuple[Method, Params, jax.Array]], x: jax.Array) -> Iterator[None]:
+    """Says what of the layers does not fit, in place of an error that it led to inside."""
+    try:
+        yield
+    except (TypeError, LookupError, AttributeError, ValueError):
+        for method, params, kernel in layers:
+            check_matrix(kernel)
+            width, shape = x.shape[-1], kernel.shape
+            if width != shape[0]:
+                raise ValueError(f"input of width {width} meets a kernel {list(shape)}.") from None
+            if type(method).init_params is not Method.init_params:
+                _check_params(method, params, kernel)
+        raise
+
+
+def _check_params(own: Method, found: Any, kernel: Any) -> None:
+    """Raises a ValueError for parameters that a method would not make for a kernel [I, O]."""
+    make = jax.eval_shape(lambda: own.init_params(jax.random.key(0), *kernel.shape))
+    wanted, held = (
+        {jax.tree_util.keystr(path): jnp.shape(leaf) for path, leaf in leaves}
+        for leaves in map(jax.tree_util.tree_leaves_with_path, (make, found))
+    )
+    for name, shape in wanted.items():
+        if held.get(name) != shape:
+            raise ValueError(
+                f"{own.name} of a kernel {list(kernel.shape)} needs {name} {list(shape)}, got "
+                f"{held.get(name)}."
+            )
 
 
 def _apply_fused(

@@ -1,0 +1,112 @@
+"""Arguments of the adapters' deeper entries: what cannot be meant is one sentence."""
+
+import re
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from flax import nnx
+
+import lorasp_jax
+from lorasp_jax import calibration
+from lorasp_jax.adaptation import count, penalties
+from lorasp_jax.dense import LinenDense
+from lorasp_jax.peft import AdaLoRA, LoRA, LoRAMoE, LoRASP
+
+X, KERNEL, KEY = jnp.ones((3, 5)), jnp.ones((5, 4)), jax.random.key(0)
+METHOD, MOE = LoRA(rank=2), LoRAMoE(rank=2, experts=2)
+PARAMS, MOE_PARAMS = (method.init(KEY, KERNEL)[0] for method in (METHOD, MOE))
+NET = nnx.Linear(5, 4, rngs=nnx.Rngs(0))
+SHAPES = nnx.eval_shape(lambda: nnx.Linear(5, 4, rngs=nnx.Rngs(0)))
+LINEN = lorasp_jax.LinenAdapter(nn.Dense(4), [(".*", METHOD)])
+VARIABLES = LINEN.init(KEY, X)
+SP = lorasp_jax.adapt(NET, [(".*", LoRASP(rank=4, hidden_width=2))], rngs=nnx.Rngs(0))
+
+
+def named():
+    models = [lorasp_jax.adapt(NET, [(".*", METHOD)], rngs=nnx.Rngs(seed)) for seed in (0, 1)]
+    return lorasp_jax.combine(dict(zip("ab", models, strict=True)))
+
+
+def with_kernel(value):
+    return VARIABLES | {"params": VARIABLES["params"] | {"kernel": value}}
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: METHOD.init(0, KERNEL), "key must be one such as jax.random.key(0), got 0"),
+        (lambda: METHOD.init(nnx.Rngs(0), KERNEL), "key must be one such as"),
+        (lambda: METHOD.apply(PARAMS, X[:, 1:], KERNEL), "width 4 meets a kernel [5, 4]"),
+        (lambda: METHOD.apply(KERNEL, X, PARAMS), "a kernel [I, O] of real numbers, got dict"),
+        (lambda: METHOD.apply({}, X, KERNEL), "lora of a kernel [5, 4] needs ['lora_a'] [5, 2]"),
+        (lambda: METHOD.delta(PARAMS, [1.0]), "floating-point numbers [...tokens, I], got list"),
+        # One number for three tokens would count three times.
+        (
+            lambda: MOE.delta(MOE_PARAMS, X, token_mask=jnp.ones(1, bool)),
+            "token_mask must be bool [3], got bool [1]",
+        ),
+        (
+            lambda: MOE.apply(MOE_PARAMS, X, KERNEL, token_mask=np.ones(3)),
+            "token_mask must be bool [3], got float64 [3]",
+        ),
+        (
+            lambda: AdaLoRA(rank=2).transform(optax.sgd(0.1), 1.5),
+            "total_steps must be a whole number from 1 to 2147483647, got 1.5",
+        ),
+        (
+            lambda: LoRASP(energy_start=0.99).transform(optax.sgd(0.1), 0),
+            "total_steps must be a whole number from 1",
+        ),
+    ],
+)
+def test_methods_alone(call, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        call()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: LINEN.init(0, X), "key must be one such as jax.random.key(0), got 0"),
+        (lambda: LINEN.init({"dropout": KEY}, X), "need a key for \"params\", got ['dropout']"),
+        (lambda: LINEN.attach(None, VARIABLES["params"], X), 'a dictionary with "params"'),
+        (lambda: LINEN.attach(None, {"params": {}}, X), "key must be one such as"),
+        (
+            lambda: LINEN.apply(with_kernel(None), X),
+            '"params" must hold arrays, got None at kernel',
+        ),
+        (lambda: LINEN.merge(with_kernel("x"), X), "must hold arrays, got 'x' at kernel"),
+        (lambda: LINEN.kernel_shapes({"params": {"a": [None]}}, X), "got None at a/0"),
+        (
+            lambda: LinenDense(4, param_dtype=int).init(KEY, X),
+            "param_dtype must be a floating-point type",
+        ),
+    ],
+)
+def test_linen(call, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        call()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: count(5), "the model must be an NNX module, got int"),
+        (lambda: penalties(None), "the model must be an NNX module, got NoneType"),
+        (lambda: lorasp_jax.prune(SP, {"x": X}), "batches are a list or the like of inputs"),
+        (lambda: lorasp_jax.prune(SP, ["x"]), "a batch holds arrays and numbers, got 'x'"),
+        (lambda: lorasp_jax.distill(SP, [X], forward=5), "a function of model and batch, got 5"),
+        (lambda: calibration.input_moments(NET, [X], b"a"), "rules are a list of (pattern"),
+        (lambda: calibration.input_moments(SHAPES, [X]), "the model holds shapes without values"),
+        (lambda: lorasp_jax.swap(named(), "a", SHAPES), "the model holds shapes without values"),
+        (lambda: lorasp_jax.choose(named(), np.ones((0, 2))), "weights of 2 adapters are floats"),
+        (lambda: lorasp_jax.choose(named(), ["a", "b"])(X), "for 2 examples, but a layer sees 3"),
+    ],
+)
+def test_models(call, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        call()
