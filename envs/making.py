@@ -74,10 +74,8 @@ def make(
         num_envs=num_envs, image_size=image_size, antialias=antialias, distractors=distractors
     )
     control_dt = _checked_dt(control_dt, found_task.time_limit)
-    _check_choices(actions=(actions, MODES), reward=(reward, REWARDS))
-    _check_discount(discount)
-    things = found_task.scene + envs.distractors.mjcf(distractors)
-    model = scene.build(things, found_robot)
+    _check_learning(actions, reward, discount)
+    model = scene.build(found_task.scene + envs.distractors.mjcf(distractors), found_robot)
     rays = render.RayRenderer(render.build(model, scene.CAMERAS), image_size, antialias)
     return Env(
         task=found_task,
@@ -133,7 +131,9 @@ def _check_choices(**given: tuple[Any, Sequence[str]]) -> None:
             raise ValueError(f"unknown {name} {value!r}: choose from {', '.join(known)}")
 
 
-def _check_discount(discount: float) -> None:
+def _check_learning(actions: Mode, reward: Reward, discount: float) -> None:
+    """What a learner sees of the worlds."""
+    _check_choices(actions=(actions, MODES), reward=(reward, REWARDS))
     real = isinstance(discount, numbers.Real) and not isinstance(discount, bool)
     if not real or not 0 < discount <= 1:
         raise ValueError(f"discount must be a number above 0 and at most 1, got {discount!r}")

@@ -226,11 +226,11 @@ def read_whole(path: pathlib.Path) -> bytes:
     """The bytes of a file.
 
     Raises:
-      ValueError: it has more than a quarter of this machine's memory, which holds its tensors too.
+      ValueError: it has more than this machine's memory.
     """
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    if (size := path.stat().st_size) > memory / 4:
-        raise ValueError(f"{path} has {size} bytes, more than a quarter of this machine's memory")
+    if (size := path.stat().st_size) > memory:
+        raise ValueError(f"{path} has {size} bytes, more than this machine's memory")
     return path.read_bytes()
 
 
