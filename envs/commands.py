@@ -22,7 +22,7 @@ from envs.locks import alone
 from envs.names import names
 
 WORLDS = 4
-"""Tries at once where one episode is wanted: the expert may fail in one."""
+"""Tries at once for a window, which draws but one: the expert may fail in one."""
 _EVERY = 2  # control steps to a picture of a GIF
 
 
@@ -226,7 +226,7 @@ def _episode(options: argparse.Namespace, console: Console, task: str, robot: st
             num_episodes=1,
             key=jax.random.key(options.seed),
             image_size=options.image_size,
-            num_envs=WORLDS,
+            num_envs=1,  # pictures are most of the work; where the expert fails, it tries again
             antialias=2,
             progress=new_bar(task, robot),
         )

@@ -84,6 +84,7 @@ def test_bad_input_is_one_sentence(tmp_path, run, monkeypatch):
 
 def test_play_and_gallery_write_files(tmp_path, run, monkeypatch):
     def collect(task, robot, *, num_episodes, progress, **options):
+        assert options["num_envs"] == 1  # no picture is drawn that nobody sees
         progress(0, num_episodes)
         progress(num_episodes, num_episodes)
         length = np.full(num_episodes, 4, np.int32)
