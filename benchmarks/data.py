@@ -130,6 +130,7 @@ def record(folder: Path, episodes: int, codec: str) -> None:
 
 def encode(path: Path, rng: np.random.Generator, codec: str) -> None:
     """A film with LeRobot's settings, yuv420p, g 2, crf 30: something moves in front of a scene."""
+    os.environ.setdefault("SVT_LOG", "1")  # errors alone: else the AV1 encoder introduces itself
     scene, thing = texture(rng, HEIGHT, WIDTH), texture(rng, HEIGHT // 2, WIDTH // 4)
     with av.open(str(path), "w") as container:
         stream: Any = container.add_stream(CODECS[codec], rate=FPS)

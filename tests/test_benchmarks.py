@@ -85,8 +85,9 @@ def test_what_data_measures(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("codec", "size"), [("AV1", 13), ("H.264", 5)])
-def test_what_data_imports(tmp_path, codec, size):
+def test_what_data_imports(tmp_path, codec, size, capfd):
     data.record(tmp_path / codec, 2, codec)
+    assert not capfd.readouterr().err
     row = data.importing(tmp_path, codec, 64)
     assert row["kept as"] == "64x48"
     assert row["pictures/s"] == 2 * row["steps/s"]
