@@ -38,6 +38,7 @@ th, td { padding: .25rem .9rem .25rem 0; text-align: left; }
 th { border-bottom: 1px solid var(--line); font-weight: 600; }
 td.number { text-align: right; font-variant-numeric: tabular-nums; }
 img, video { max-width: 100%; height: auto; }
+img[alt=figure] { display: block; margin: 1rem 0; }
 figure { display: inline-block; margin: 0 1rem 1rem 0; max-width: 100%; }
 video, .camera { image-rendering: pixelated; background: var(--box); }
 pre { background: var(--box); padding: 1rem; overflow-x: auto; font-size: 13px; }

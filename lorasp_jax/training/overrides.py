@@ -217,7 +217,7 @@ def _sentence(message: str) -> str:
     """The first paragraph under the heading of tyro's framed error message, as one line."""
     lines = [line.strip(" │╭╮╰╯─-") for line in message.splitlines()]
     body = itertools.takewhile(bool, itertools.dropwhile(lambda line: not line, lines[1:]))
-    return " ".join(body).removeprefix("Error parsing Config: ")
+    return " ".join(body).removeprefix("Error parsing ").removeprefix("Config: ")
 
 
 def _switch(current: peft.Method, name: str) -> peft.Method:

@@ -68,7 +68,7 @@ def test_method_by_name_keeps_the_rank():
         ([*MULTITASK, "--dry-run", "--resume"], "leave --resume or --dry-run out"),
         ([*MULTITASK, "--resume", "always"], "--resume: invalid choice: 'always'.*auto"),
         ([*MULTITASK, "--optim.steps", "many"], "--optim.steps.*'many'"),
-        ([*MULTITASK, "--peft.energy-target", "1.5"], "1.5"),
+        ([*MULTITASK, "--peft.energy-target", "1.5"], "^peft: .*1.5"),
         ([*MULTITASK, "--peft.energy-target", "0"], "0"),
     ],
 )
