@@ -239,10 +239,16 @@ def _names(config: Any, prefix: str = "") -> Iterator[str]:
 
 
 def _concrete(config: Config) -> type[Config]:
-    """`Config` with `peft` typed as the method that is chosen, so that its fields can be set."""
+    """`Config` with `peft` typed as the method that is chosen, so that its fields can be set.
+
+    The scale is none of its options: it has chosen their defaults.
+    """
     return dataclasses.make_dataclass(
         "Config",
-        [("peft", type(config.peft), dataclasses.field())],
+        [
+            ("peft", type(config.peft), dataclasses.field()),
+            ("scale", tyro.conf.Suppress[str], dataclasses.field()),
+        ],
         bases=(Config,),
         frozen=True,
         kw_only=True,

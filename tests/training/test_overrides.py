@@ -93,6 +93,8 @@ def test_help_lists_every_field_and_option(config, capsys):
     assert re.search(r"--optim.b2 FLOAT +Decay of the second moment. \(default: 0.95\)", printed)
     words = " ".join(printed.replace("│", " ").split())
     assert "lora_moe, lora_sp (default: the experiment's, lora_sp)" in words
+    assert printed.count("--scale SCALE") == 1
+    assert "--scale STR" not in printed
     assert f"presets ({', '.join(PRESETS)}) and regular expressions" in words
 
 
