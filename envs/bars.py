@@ -32,6 +32,7 @@ def _rate(episodes: int, seconds: float) -> str:
 def bars(console: Console, stop: threading.Event) -> Iterator[Callable[[str, str], Report]]:
     """Progress bars: a function that makes one for a task and a robot, and gives what moves it.
 
+    A bar is seen from its first report on, before which a task or robot may be refused.
     Where `stop` is set, a report raises a KeyboardInterrupt.
     """
     columns = (
@@ -46,13 +47,14 @@ def bars(console: Console, stop: threading.Event) -> Iterator[Callable[[str, str
     with Progress(*columns, console=console) as progress:
 
         def new_bar(task: str, robot: str) -> Report:
-            bar = progress.add_task(f"{task}, {robot}: compiling ...", total=None, rate="")
+            text = f"{task}, {robot}: compiling ..."
+            bar = progress.add_task(text, total=None, rate="", visible=False)
             reports: list[tuple[int, float]] = []  # what was done, and when
 
             def report(done: int, total: int) -> None:
                 if stop.is_set():
                     raise KeyboardInterrupt
-                progress.update(bar, completed=done, total=total)
+                progress.update(bar, completed=done, total=total, visible=True)
                 reports.append((done, progress.tasks[bar].elapsed or 0.0))
                 if len(reports) > 1:  # the second comes after all is compiled and says no speed
                     before, since = reports[1]

@@ -29,3 +29,13 @@ def test_compiling_is_not_in_the_rate(monkeypatch):
         for now[0], done, rate in ((1.0, 0, ""), (60.0, 32, ""), (64.0, 64, "8.0 episodes/s")):
             report(done, 64)
             assert shown[0].tasks[0].fields["rate"] == rate
+
+
+def test_what_is_refused_has_no_bar():
+    console = Console(file=io.StringIO())
+    with bars.bars(console, threading.Event()) as new_bar:
+        new_bar("dance", "piper")
+        new_bar("press", "piper")(0, 1)
+    shown = console.file.getvalue()
+    assert "press, piper: compiling ..." in shown
+    assert "dance" not in shown
