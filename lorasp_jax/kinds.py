@@ -1,6 +1,7 @@
 """Whether values are of the kinds that the fields of a dataclass, or arguments, must have."""
 
 import dataclasses
+import functools
 import types
 import typing
 from typing import Any
@@ -69,12 +70,36 @@ def tokens(x: Any, token_mask: Any) -> None:
             raise ValueError(f"{wanted}, got {found[0]} {list(found[1])}.")
 
 
+def check_params(method: Any, found: Any, shape: tuple[int, ...]) -> None:
+    """Raises a ValueError for parameters that a method would not make for a kernel [I, O].
+
+    Some would be taken without an error, and computed with the scale of another rank.
+    """
+    held = _shapes(found)
+    for name, wanted in _made_shapes(method, shape).items():
+        if held.get(name) != wanted:
+            raise ValueError(
+                f"{method.name} of a kernel {list(shape)} needs {name} {list(wanted)}, got "
+                f"{held.get(name)}."
+            )
+
+
 def short(value: Any) -> str:
     """What a message says of a value: it on one line, cut where it is long, as a model may be."""
     if _is_array(value):
         return f"{value.dtype} {list(value.shape)}"
     text = " ".join(repr(value).split())
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+
+
+@functools.lru_cache(maxsize=1024)  # layers of a model are alike, and traced again and again
+def _made_shapes(method: Any, shape: tuple[int, ...]) -> dict[str, tuple[int, ...]]:
+    return _shapes(jax.eval_shape(lambda: method.init_params(jax.random.key(0), *shape)))
+
+
+def _shapes(params: Any) -> dict[str, tuple[int, ...]]:
+    leaves = jax.tree_util.tree_leaves_with_path(params)
+    return {jax.tree_util.keystr(path): jnp.shape(leaf) for path, leaf in leaves}
 
 
 def _is_array(value: Any) -> bool:

@@ -43,6 +43,12 @@ def with_kernel(value):
         (lambda: METHOD.apply(PARAMS, X[:, 1:], KERNEL), "width 4 meets a kernel [5, 4]"),
         (lambda: METHOD.apply(KERNEL, X, PARAMS), "a kernel [I, O] of real numbers, got dict"),
         (lambda: METHOD.apply({}, X, KERNEL), "lora of a kernel [5, 4] needs ['lora_a'] [5, 2]"),
+        # α/R of another rank would be the scale.
+        (
+            lambda: LoRA(rank=3, alpha=2.0).apply(PARAMS, X, KERNEL),
+            "lora of a kernel [5, 4] needs ['lora_a'] [5, 3], got (5, 2)",
+        ),
+        (lambda: LoRA(rank=3).delta(PARAMS, X), "needs ['lora_a'] [5, 3], got (5, 2)"),
         (lambda: METHOD.delta(PARAMS, [1.0]), "floating-point numbers [...tokens, I], got list"),
         # One number for three tokens would count three times.
         (

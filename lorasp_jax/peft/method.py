@@ -174,13 +174,15 @@ class Method:
           token_mask: bool [...tokens]; False (padding) stays out of losses and statistics.
 
         Raises:
-          ValueError: the method is not additive, or x or the mask is no such array.
+          ValueError: the method is not additive, x or the mask is no such array, or the parameters
+            are another method's.
         """
         kinds.tokens(x, token_mask)
         if not self.additive:
             raise ValueError(f"{type(self).__name__} is not additive and has no delta; use apply.")
         z, aux = self.read(params, x, token_mask)
         up = self.up(params).astype(x.dtype)
+        self._check_params(params, (x.shape[-1], up.shape[-1]))
         return z @ up, dataclasses.replace(aux, token_mask=token_mask)
 
     def read(
@@ -209,7 +211,7 @@ class Method:
         """
         kinds.tokens(x, token_mask)
         layers = [(self, params, kernel)]
-        with _explained(layers, x):
+        with _checked(layers, x):
             return _apply_fused(layers, x, token_mask)[0]
 
     def apply_dropped(
@@ -243,6 +245,10 @@ class Method:
 
     def _rows_dtype(self, x: jax.Array) -> Any:
         return jnp.float32 if self.reads_in_fp32 else x.dtype
+
+    def _check_params(self, params: Params, shape: tuple[int, ...]) -> None:
+        if type(self).init_params is not Method.init_params:
+            kinds.check_params(self, params, shape)
 
     def penalty(self, params: Params) -> dict[str, jax.Array]:
         """Losses on the parameters alone, by name."""
@@ -278,7 +284,7 @@ def apply_together(
     """
     groups: dict[bool, list[int]] = {}
     found: dict[int, tuple[jax.Array, Aux]] = {}
-    with _explained(layers, x):
+    with _checked(layers, x):
         for i, (method, params, kernel) in enumerate(layers):
             if type(method).apply is Method.apply:
                 groups.setdefault(method.reads_in_fp32, []).append(i)
@@ -291,34 +297,19 @@ def apply_together(
 
 
 @contextlib.contextmanager
-def _explained(layers: Sequence[tuple[Method, Params, jax.Array]], x: jax.Array) -> Iterator[None]:
-    """Says what of the layers does not fit, in place of an error that it led to inside."""
+def _checked(layers: Sequence[tuple[Method, Params, jax.Array]], x: jax.Array) -> Iterator[None]:
+    """Says what of the layers does not fit: at once, or in place of an error that it led to."""
     try:
+        for method, params, kernel in layers:
+            method._check_params(params, kernel.shape)
         yield
     except (TypeError, LookupError, AttributeError, ValueError):
-        for method, params, kernel in layers:
+        for _, _, kernel in layers:
             check_matrix(kernel)
             width, shape = x.shape[-1], kernel.shape
             if width != shape[0]:
                 raise ValueError(f"input of width {width} meets a kernel {list(shape)}.") from None
-            if type(method).init_params is not Method.init_params:
-                _check_params(method, params, kernel)
         raise
-
-
-def _check_params(own: Method, found: Any, kernel: Any) -> None:
-    """Raises a ValueError for parameters that a method would not make for a kernel [I, O]."""
-    make = jax.eval_shape(lambda: own.init_params(jax.random.key(0), *kernel.shape))
-    wanted, held = (
-        {jax.tree_util.keystr(path): jnp.shape(leaf) for path, leaf in leaves}
-        for leaves in map(jax.tree_util.tree_leaves_with_path, (make, found))
-    )
-    for name, shape in wanted.items():
-        if held.get(name) != shape:
-            raise ValueError(
-                f"{own.name} of a kernel {list(kernel.shape)} needs {name} {list(shape)}, got "
-                f"{held.get(name)}."
-            )
 
 
 def _apply_fused(
