@@ -125,8 +125,9 @@ def observe(
       layer's kernel matrices: those of a scanned stack and the batch axes of an einsum.
 
     Raises:
-      ValueError: no batches, a layer that was not called or whose aux `forward` did not return, or
-        one with its own matrix product, precision or the like.
+      ValueError: no batches, no token in them, or numbers that are not finite; a layer that was not
+        called or whose aux `forward` did not return, or one with its own matrix product, precision
+        or the like.
     """
     if not isinstance(batches, Iterable) or isinstance(batches, str | Mapping):
         raise ValueError(f"batches are a list or the like of inputs, got {short(batches)}.")
@@ -144,6 +145,11 @@ def observe(
             f"nothing was seen of {paths.near_misses(missing[0], missing)}: the batches must "
             "reach every layer, and `forward` must return the aux of a model that returns it."
         )
+    for path, sums in total.items():
+        if not np.any(sums["tokens"]):
+            raise ValueError(f"the batches hold no token that counts for {path or 'the model'}.")
+        if not all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(sums)):
+            raise ValueError(f"numbers that are not finite reach {path or 'the model'}.")
     return total
 
 

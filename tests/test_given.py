@@ -105,6 +105,8 @@ def test_linen(call, message):
         (lambda: penalties(None), "the model must be an NNX module, got NoneType"),
         (lambda: lorasp_jax.prune(SP, {"x": X}), "batches are a list or the like of inputs"),
         (lambda: lorasp_jax.prune(SP, ["x"]), "a batch holds arrays and numbers, got 'x'"),
+        (lambda: lorasp_jax.prune(SP, [X[:0]]), "the batches hold no token that counts"),
+        (lambda: lorasp_jax.prune(SP, [X * jnp.nan]), "that are not finite reach the model"),
         (lambda: lorasp_jax.distill(SP, [X], forward=5), "a function of model and batch, got 5"),
         (lambda: calibration.input_moments(NET, [X], b"a"), "rules are a list of (pattern"),
         (lambda: calibration.input_moments(SHAPES, [X]), "the model holds shapes without values"),
