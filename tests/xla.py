@@ -1,6 +1,9 @@
 """What XLA is told in tests, before JAX starts."""
 
+import functools
 import os
+import threading
+from typing import Any
 
 UNOPTIMISED = "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
 """Compiles in half the time: 113 tests of values take 65 s of CPU instead of 117 (JAX 0.10.2).
@@ -13,3 +16,32 @@ def flags(devices: int) -> str:
     """What it is told here, with so many simulated devices."""
     count = f"--xla_force_host_platform_device_count={devices}"
     return f"{os.environ.get('XLA_FLAGS', '')} {count}".strip()  # of two counts the last holds
+
+
+def compile_steps_as_all_else() -> None:
+    """Let training steps have no options of their own: theirs take three times as long unoptimised.
+
+    To be called where JAX may be imported.
+    """
+    if UNOPTIMISED in os.environ.get("XLA_FLAGS", ""):
+        from envs import fast_cpu
+
+        fast_cpu.without_simulation = functools.wraps(fast_cpu.without_simulation)(lambda: None)
+
+
+def reuse_contexts() -> None:
+    """Let a thread lower its programs in one MLIR context, as JAX does from 0.12 on.
+
+    Older ones make a context for each, a third of the time that a small program takes.
+    """
+    from jax._src.interpreters import mlir
+
+    if not hasattr(mlir, "_thread_local_context"):
+        make, own = mlir.make_ir_context, threading.local()
+
+        def kept() -> Any:
+            if not hasattr(own, "context"):
+                own.context = make()
+            return own.context
+
+        mlir.make_ir_context = kept

@@ -99,11 +99,12 @@ def test_signal_handlers_are_put_back(tmp_path):
     assert jax.device_count() == 8
 
 
-def test_steps_are_compiled_without_what_simulation_needs():
-    jitted = Mock()
+def test_steps_are_compiled_without_what_simulation_needs(monkeypatch):
+    jitted, options = Mock(), Mock()
+    monkeypatch.setattr(fast_cpu, "without_simulation", options)
     Stretches(jitted, None, None, Mock()).compile(Mock(), 3).result()
     compiled = jitted.lower.return_value.compile
-    compiled.assert_called_once_with(compiler_options=fast_cpu.without_simulation())
+    compiled.assert_called_once_with(compiler_options=options.return_value)
 
 
 @pytest.mark.slow

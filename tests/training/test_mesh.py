@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from flax import nnx
 from jax.sharding import PartitionSpec
 
 from lorasp_jax import adaptation
 from lorasp_jax.data.batches import flatten, sample_batch
-from lorasp_jax.peft import FullFineTuning
+from lorasp_jax.peft import FullFineTuning, LoRA
 from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.run_folder import read_metrics
@@ -22,8 +23,14 @@ from tests.runs import CONFIG, Terminate, leaves, make_run
 
 
 def test_one_and_eight_devices_agree(tmp_path):
-    run = make_run(tmp_path / "run")
-    graphdef, adapters, frozen = adaptation.split(run.policy.model)
+    """LoRA-SP on layers alone and on a stack; beside it LoRA, which compiles sooner."""
+    routed = dataclasses.replace(
+        CONFIG, targets=("patch_embed", "language/blocks/q_proj", "action_out_proj")
+    )
+    run = make_run(tmp_path / "run", routed)
+    plain = [("(vision|action)/blocks/q_proj|down_proj", LoRA(rank=8))]
+    model = adaptation.adapt(run.policy.model, plain, rngs=nnx.Rngs(2))
+    graphdef, adapters, frozen = adaptation.split(model)
     batch = sample_batch(
         jax.random.key(0),
         flatten(list(run.episodes.values())),

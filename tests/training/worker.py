@@ -31,6 +31,7 @@ def main(args: argparse.Namespace) -> None:
     from envs import compilation_cache
 
     compilation_cache.enable()
+    xla.compile_steps_as_all_else()
     jax.config.update("jax_default_matmul_precision", "highest")
     from lorasp_jax.training import mesh as meshes
     from lorasp_jax.training import processes
