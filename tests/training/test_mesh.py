@@ -21,15 +21,20 @@ from lorasp_jax.training.step import init_state, loss_fn
 from tests.models.drawn import moved
 from tests.runs import CONFIG, Terminate, leaves, make_run
 
+FEW = ("patch_embed", "language/blocks/q_proj", "action_out_proj")
+REST = "(vision|action)/blocks/q_proj|down_proj"
 
-def test_one_and_eight_devices_agree(tmp_path):
-    """LoRA-SP on layers alone and on a stack; beside it LoRA, which compiles sooner."""
-    routed = dataclasses.replace(
-        CONFIG, targets=("patch_embed", "language/blocks/q_proj", "action_out_proj")
-    )
-    run = make_run(tmp_path / "run", routed)
-    plain = [("(vision|action)/blocks/q_proj|down_proj", LoRA(rank=8))]
-    model = adaptation.adapt(run.policy.model, plain, rngs=nnx.Rngs(2))
+
+@pytest.mark.parametrize(
+    ("targets", "plain"),
+    [(FEW, [(REST, LoRA(rank=8))]), pytest.param(CONFIG.targets, [], marks=pytest.mark.slow)],
+)
+def test_one_and_eight_devices_agree(tmp_path, targets, plain):
+    """LoRA-SP on layers alone and on stacks; LoRA, which compiles sooner, on the rest."""
+    run = make_run(tmp_path / "run", dataclasses.replace(CONFIG, targets=targets))
+    model = run.policy.model
+    if plain:
+        model = adaptation.adapt(model, plain, rngs=nnx.Rngs(2))
     graphdef, adapters, frozen = adaptation.split(model)
     batch = sample_batch(
         jax.random.key(0),
