@@ -19,7 +19,6 @@ def pytest_configure(config):
     os.environ["XLA_FLAGS"] = xla.flags(devices=8)
     if config.option.markexpr == "not slow":
         os.environ["XLA_FLAGS"] += f" {xla.UNOPTIMISED}"
-        xla.reuse_contexts()
     xla.compile_steps_as_all_else()
 
 

@@ -2,8 +2,6 @@
 
 import functools
 import os
-import threading
-from typing import Any
 
 UNOPTIMISED = "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
 """Compiles in half the time: 113 tests of values take 65 s of CPU instead of 117 (JAX 0.10.2).
@@ -27,21 +25,3 @@ def compile_steps_as_all_else() -> None:
         from envs import fast_cpu
 
         fast_cpu.without_simulation = functools.wraps(fast_cpu.without_simulation)(lambda: None)
-
-
-def reuse_contexts() -> None:
-    """Let a thread lower its programs in one MLIR context, as JAX does from 0.12 on.
-
-    Older ones make a context for each, a third of the time that a small program takes.
-    """
-    from jax._src.interpreters import mlir
-
-    if not hasattr(mlir, "_thread_local_context"):
-        make, own = mlir.make_ir_context, threading.local()
-
-        def kept() -> Any:
-            if not hasattr(own, "context"):
-                own.context = make()
-            return own.context
-
-        mlir.make_ir_context = kept
