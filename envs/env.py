@@ -55,7 +55,6 @@ class Env:
     discount: float
     model: mujoco.MjModel
     physics: Physics
-    render_model: RenderModel
     renderer: Renderer
 
     physics_dt = scene.PHYSICS_DT
@@ -63,6 +62,11 @@ class Env:
 
     def __repr__(self) -> str:
         return f"<Env {self.task.name!r} for {self.robot.name!r}, num_envs={self.num_envs}>"
+
+    @property
+    def render_model(self) -> RenderModel:
+        """What the renderer draws."""
+        return self.renderer.model
 
     @property
     def num_joints(self) -> int:

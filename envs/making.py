@@ -76,7 +76,6 @@ def make(
     control_dt = _checked_dt(control_dt, found_task.time_limit)
     _check_learning(actions, reward, discount)
     model = scene.build(found_task.scene + envs.distractors.mjcf(distractors), found_robot)
-    rays = render.RayRenderer(render.build(model, scene.CAMERAS), image_size, antialias)
     return Env(
         task=found_task,
         robot=found_robot,
@@ -88,16 +87,16 @@ def make(
         distractors=distractors,
         model=model,
         physics=physics.Physics(model, physics.default_backend() if backend is None else backend),
-        render_model=rays.model,
-        renderer=_renderer(renderer, model, rays, num_envs),
+        renderer=_renderer(renderer, model, image_size, antialias, num_envs),
     )
 
 
 def _renderer(
-    name: str, model: mujoco.MjModel, rays: render.RayRenderer, num_envs: int
+    name: str, model: mujoco.MjModel, image_size: int, antialias: int, num_envs: int
 ) -> render.Renderer:
     """A renderer by its name, with the pictures of the ray caster."""
     _check_choices(renderer=(name, RENDERERS))
+    rays = render.RayRenderer(render.build(model, scene.CAMERAS), image_size, antialias)
     if name == "rays":
         return rays
     physics.need_warp("renderer")

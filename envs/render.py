@@ -119,6 +119,9 @@ class Renderer(Protocol):
     """What draws the pictures of an environment; see `RayRenderer`."""
 
     @property
+    def model(self) -> RenderModel: ...  # noqa: D102
+
+    @property
     def image_size(self) -> int: ...  # noqa: D102
 
     @property

@@ -32,7 +32,7 @@ class WarpRenderer:
             rays: the ray caster for it, whose cameras, look and kind of picture are taken over.
             num_worlds: worlds that Warp draws at a time.
         """
-        self._mujoco, self._own = model, rays.model
+        self._mujoco, self.model = model, rays.model
         # Warp's own way to take several rays a pixel cannot vary the field of view.
         self.image_size, self.samples = rays.image_size, rays.samples
         self._num_worlds = num_worlds
@@ -54,7 +54,7 @@ class WarpRenderer:
                     use_precomputed_rays=False,  # fields of view differ from world to world
                     enable_specular=False,
                 )
-                for camera in self._own.cameras
+                for camera in self.model.cameras
             ]
         self._render = self._callable()
         self._batch = warp_call.flattening_vmap(self._all)
@@ -81,8 +81,8 @@ class WarpRenderer:
         def every(x: Any) -> jax.Array:
             return jnp.broadcast_to(jnp.asarray(x), (number, *np.shape(x)))
 
-        look = jax.tree.map(every, self._own.look) if look is None else look
-        size = every(self._own.size) if size is None else size
+        look = jax.tree.map(every, self.model.look) if look is None else look
+        size = every(self.model.size) if size is None else size
         # A call takes exactly `num_worlds`: the last chunk is filled up with the last world.
         rest = -number % chunk
 
@@ -98,14 +98,14 @@ class WarpRenderer:
         """Pictures of one chunk."""
         geom_xpos, geom_xmat, cam_xpos, cam_xmat = poses
         worlds, side = self._num_worlds, self.image_size
-        own, light = self._own.look, -look.light
+        own, light = self.model.look, -look.light
         direction = (
             jnp.zeros((worlds, self._mujoco.nlight, 3))
             .at[:, 0]
             .set(light / jnp.linalg.norm(light, axis=-1, keepdims=True))
         )
         # Each camera has its own lamp, lights being the same for all pixels of a call.
-        place = jnp.repeat(cam_xpos[:, self._own.cameras, None], self._mujoco.nlight, axis=2)
+        place = jnp.repeat(cam_xpos[:, self.model.cameras, None], self._mujoco.nlight, axis=2)
         per_world = (size, look.rgba, self._material_colours(look), look.fovy)
         lights = (direction, *jnp.moveaxis(place, 1, 0))
         packed = self._render(*per_world, geom_xpos, geom_xmat, cam_xpos, cam_xmat, *lights)

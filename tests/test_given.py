@@ -38,6 +38,7 @@ def with_kernel(value):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
+        # methods alone
         (lambda: METHOD.init(0, KERNEL), "key must be one such as jax.random.key(0), got 0"),
         (lambda: METHOD.init(nnx.Rngs(0), KERNEL), "key must be one such as"),
         (lambda: METHOD.apply(PARAMS, X[:, 1:], KERNEL), "width 4 meets a kernel [5, 4]"),
@@ -67,16 +68,7 @@ def with_kernel(value):
             lambda: LoRASP(energy_start=0.99).transform(optax.sgd(0.1), 0),
             "total_steps must be a whole number from 1",
         ),
-    ],
-)
-def test_methods_alone(call, message):
-    with pytest.raises(ValueError, match=re.escape(message)):
-        call()
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
+        # Linen
         (lambda: LINEN.init(0, X), "key must be one such as jax.random.key(0), got 0"),
         (lambda: LINEN.init({"dropout": KEY}, X), "need a key for \"params\", got ['dropout']"),
         (lambda: LINEN.attach(None, VARIABLES["params"], X), 'a dictionary with "params"'),
@@ -91,16 +83,7 @@ def test_methods_alone(call, message):
             lambda: LinenDense(4, param_dtype=int).init(KEY, X),
             "param_dtype must be a floating-point type",
         ),
-    ],
-)
-def test_linen(call, message):
-    with pytest.raises(ValueError, match=re.escape(message)):
-        call()
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
+        # models
         (lambda: count(5), "the model must be an NNX module, got int"),
         (lambda: penalties(None), "the model must be an NNX module, got NoneType"),
         (lambda: lorasp_jax.prune(SP, {"x": X}), "batches are a list or the like of inputs"),
@@ -115,6 +98,6 @@ def test_linen(call, message):
         (lambda: lorasp_jax.choose(named(), ["a", "b"])(X), "for 2 examples, but a layer sees 3"),
     ],
 )
-def test_models(call, message):
+def test_one_sentence(call, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         call()

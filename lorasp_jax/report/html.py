@@ -53,12 +53,12 @@ def write_report(folder: Path) -> Path:
     Raises:
         ValueError: the folder holds no run, or damaged files.
     """
-    config = read_json(folder / RECORD, records.CONFIG)
+    rows = read_metrics(folder)
+    config = read_json(folder / RECORD, records.WITH_RANK if _has_rank(rows) else records.CONFIG)
     if not config:
         raise ValueError(f"{folder} holds no run: there is no {RECORD}")
     finished = read_json(folder / "results.json", records.RESULTS)
     results = finished or _unfinished(folder)
-    rows = read_metrics(folder)
     parts = [
         f"<h1>{html.escape(config['name'])}</h1>",
         f"<p class=muted>{_subtitle(config, results)}</p>",
@@ -69,7 +69,7 @@ def write_report(folder: Path) -> Path:
         *_skipped(rows),
         *_while_training(rows),
         *_speed(rows),
-        *_active_rank(folder, results, rows),
+        *_active_rank(results, rows, config["peft"].get("rank")),
         *_media(folder, [t for t in results["tasks"] if finished or _filmed(folder, t).exists()]),
         "<h2>Time</h2>",
         _table(("phase", "seconds"), ((k, f"{v:.1f}") for k, v in results["seconds"].items())),
@@ -200,11 +200,14 @@ def _waited(rows: figures.Rows) -> Iterable[dict[str, float]]:
         yield row | {"waited": row[wait] / row[rate] / every} if wait in row else row
 
 
-def _active_rank(folder: Path, results: dict[str, Any], rows: figures.Rows) -> Iterable[str]:
+def _has_rank(rows: figures.Rows) -> bool:
+    return any(name.startswith("active_rank/") for row in rows for name in row)
+
+
+def _active_rank(results: dict[str, Any], rows: figures.Rows, rank: Any) -> Iterable[str]:
     """Active rank in training and in closed loop; nothing for a method without one."""
-    if not any(name.startswith("active_rank/") for row in rows for name in row):
+    if not _has_rank(rows):
         return
-    rank = read_json(folder / RECORD, records.WITH_RANK)["peft"]["rank"]
     yield "<h2>Active rank</h2>"
     yield _image(figures.active_rank(rows, rank))
     if not results["layer_active_rank"]:  # not evaluated

@@ -33,7 +33,7 @@ CONFIG = {
     "model": {"backbone": str, "size": str},
     "optim": {"steps": int},
 }
-WITH_RANK = {"peft": {"rank": int}}
+WITH_RANK = CONFIG | {"peft": {"method": str, "rank": int}}
 
 
 def check(value: Any, kind: Any, name: str = "") -> None:
