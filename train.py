@@ -17,8 +17,8 @@ if __name__ == "__main__":  # first: while the rest is imported there is nothing
 
 from rich.console import Console  # noqa: E402
 
-from envs import alarms, compilation_cache  # noqa: E402
-from envs.refusals import refused  # noqa: E402
+from envs.cli.refusals import refused  # noqa: E402
+from envs.compilation import alarms, cache  # noqa: E402
 
 RUNS = Path("runs")
 
@@ -29,7 +29,7 @@ def main(arguments: list[str]) -> int:
     0: done, 2: bad input or a run that cannot go on, 130: stopped by a signal.
     """
     started = time.perf_counter()
-    compilation_cache.enable()
+    cache.enable()
     from lorasp_jax.training import processes
     from lorasp_jax.training.interrupt import sigterm_as_interrupt
     from lorasp_jax.training.overrides import parse
@@ -61,7 +61,7 @@ def _execute(command, console: Console, started: float) -> None:
 
     folder = RUNS / command.config.name
     if command.dry_run:
-        from lorasp_jax.training.dry_run import dry_run
+        from lorasp_jax.training.cost.dry_run import dry_run
 
         dry_run(command.config, folder, console)
         return

@@ -5,7 +5,7 @@
 
 A training step is this project's own, with AdamW and the auxiliary losses, on a batch that lies on
 the device; its state is donated. GiB is what the compiled program needs with its arguments, MFU the
-matrix products of loss and gradients (`lorasp_jax.flops`, nothing that is computed twice) a second
+matrix products of loss and gradients (`lorasp_jax.training.cost.flops`, nothing that is computed twice) a second
 over the device's bf16 peak. Sampling is ten denoising steps in one program, from pictures to action
 chunk, by the model's `sampler`, which was made before. "largest" is the largest batch whose step is
 expected to need at most 24 GiB.
@@ -26,16 +26,17 @@ from jax.sharding import Mesh
 from rich.console import Console
 
 from benchmarks.measuring import best, machine, print_table
-from lorasp_jax import adaptation, flops, peft
+from lorasp_jax import peft
+from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config, OptimConfig
 from lorasp_jax.models import backbone
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.models.sampling import Sampler
 from lorasp_jax.training import mesh as meshes
-from lorasp_jax.training import preflight
+from lorasp_jax.training.cost import flops, preflight
+from lorasp_jax.training.cost.preflight import GIB, REMATS, abstract_batch, expected
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
-from lorasp_jax.training.preflight import GIB, REMATS, abstract_batch, expected
 from lorasp_jax.training.step import init_state, train_step
 
 CAMERAS = {"pi0": 3, "smolvla": 2}

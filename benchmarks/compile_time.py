@@ -25,7 +25,7 @@ from rich.console import Console
 import lorasp_jax
 from benchmarks.measuring import machine, print_table
 from lorasp_jax import peft
-from lorasp_jax.adaptation import adapt
+from lorasp_jax.adapters.adaptation import adapt
 
 LOSS_WEIGHT = 1e-2
 PARTS = ("trace s", "lower s", "compile s", "total s")

@@ -29,11 +29,11 @@ import pyarrow.parquet as pq
 from rich.console import Console
 
 from benchmarks.measuring import machine, print_table
-from envs.episodes import Episodes
+from envs.datasets.episodes import Episodes
 from lorasp_jax.data import cache
 from lorasp_jax.data.lerobot import Keys, LeRobot
 from lorasp_jax.data.stream import Stream
-from lorasp_jax.models.statistics import Statistics
+from lorasp_jax.policies.statistics import Statistics
 
 CAMERAS, CHUNK, FPS = ("side", "wrist"), 50, 30
 EPISODE = 250  # steps

@@ -17,8 +17,8 @@ import jax
 from rich.console import Console
 
 from benchmarks.measuring import best, machine, print_table
-from lorasp_jax import decoding
 from lorasp_jax.peft import LoRASP
+from lorasp_jax.peft.lora_sp import decoding
 
 QUEUED = 10
 SHARES = (2, 4, 8)

@@ -30,8 +30,10 @@ from rich.console import Console
 import envs
 from benchmarks import measuring
 from benchmarks.measuring import best, print_table, text
-from envs import physics, placing, render
 from envs.env import Env
+from envs.physics import physics
+from envs.rendering import renderer
+from envs.scene import placing
 from envs.state import State
 
 CONTROL_STEPS = 10  # to a timed call
@@ -101,7 +103,7 @@ def time_pictures(env: Env, state: State, size: int) -> float:
     data = state.data
     poses = (data.geom_xpos, data.geom_xmat, data.cam_xpos, data.cam_xmat)
     draw = jax.jit(
-        lambda poses: render.render_batch(
+        lambda poses: renderer.render_batch(
             env.render_model, *poses, height=size, width=size, samples=1
         )
     )

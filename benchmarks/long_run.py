@@ -21,8 +21,11 @@ from rich.console import Console
 
 import envs
 from benchmarks import measuring
-from envs import Randomization, compilation_cache, experts, physics
+from envs import Randomization
+from envs.compilation import cache
 from envs.env import Env
+from envs.experts import expert
+from envs.physics import physics
 from envs.state import State
 
 PARTS = 5
@@ -70,10 +73,10 @@ def run(env: Env, episodes: int) -> Iterator[Found]:
         # A world whose expert has run out of waypoints, but not of the task's time, restarts too.
         state = dataclasses.replace(state, done=jnp.ones(env.num_envs, bool))
         state = env.reset_done(state, key, ranges)
-        plan = experts.plan(env, state, key)
+        plan = expert.plan(env, state, key)
 
         def body(state: State, _: None) -> tuple[State, None]:
-            return env.step(state, experts.act(env, plan, state)), None
+            return env.step(state, expert.act(env, plan, state)), None
 
         state = jax.lax.scan(body, state, length=env.expert_steps)[0]
         pictures = {name: image.mean() for name, image in env.observe(state)["image"].items()}
@@ -111,7 +114,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.episodes < PARTS:
         parser.error(f"--episodes must be at least {PARTS}, to see whether memory grows")
-    compilation_cache.enable()
+    cache.enable()
     backend: Any = options.backend or physics.default_backend()
     console, good = Console(soft_wrap=True), True
     for task in options.tasks:

@@ -9,16 +9,16 @@ import importlib
 import importlib.util
 from typing import TYPE_CHECKING, Any
 
-import envs.fast_cpu  # first: it must come before anything starts JAX
-import envs.ids
+import envs.compilation.fast_cpu  # first: it must come before anything starts JAX
+import envs.interop.ids
 
 if TYPE_CHECKING:
     from envs import robots  # noqa: F401  envs.robots.piper is public
-    from envs.collection import collect, expert_success
+    from envs.datasets.episodes import Episodes
     from envs.env import Env
-    from envs.episodes import Episodes
+    from envs.experts.collection import collect, expert_success
     from envs.making import make
-    from envs.randomization import Randomization
+    from envs.scene.randomization import Randomization
     from envs.state import State, Trajectory
 
 __all__ = [

@@ -10,9 +10,12 @@ from typing import Any
 
 from rich.console import Console
 
-from envs import actions, alarms, commands, compilation_cache, distractors
+from envs import actions
+from envs.cli import commands
+from envs.cli.refusals import parsed, refused
+from envs.compilation import alarms, cache
 from envs.names import names
-from envs.refusals import parsed, refused
+from envs.scene import distractors
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -22,7 +25,7 @@ def main(arguments: Sequence[str]) -> int:
     # JAX would reserve most of a GPU at its start, which takes a second (measured) for a command of
     # half a minute.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-    compilation_cache.enable()
+    cache.enable()
     try:
         options.command(options, console)
     except Exception as error:

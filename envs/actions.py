@@ -15,8 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs import robots, scene
+from envs import robots
 from envs.robots import Robot, multiply
+from envs.scene import scene
 
 Mode = Literal["joint", "delta_joint", "end_effector"]
 MODES: tuple[str, ...] = get_args(Mode)

@@ -18,22 +18,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs import (
-    actions,
-    checks,
-    compiling,
-    distractors,
-    fast_cpu,
-    observations,
-    placing,
-    randomization,
-    rewards,
-    scene,
-)
-from envs.physics import Physics
-from envs.randomization import Draw, Randomization
-from envs.render import Look, Renderer, RenderModel
+from envs import actions, checks, observations, rewards
+from envs.compilation import fast_cpu, messages
+from envs.physics.physics import Physics
+from envs.rendering.renderer import Look, Renderer, RenderModel
 from envs.robots import Robot
+from envs.scene import distractors, placing, randomization, scene
+from envs.scene.randomization import Draw, Randomization
 from envs.state import Changes, Data, State, Trajectory, where
 from envs.tasks import Layout, Task, View
 
@@ -280,9 +271,9 @@ class Env:
             raise ValueError(f"state has {found} worlds, this environment {self.num_envs}")
 
     @functools.cached_property
-    def _calls(self) -> compiling.Calls:
+    def _calls(self) -> messages.Calls:
         worlds = "one world" if self.num_envs == 1 else f"{self.num_envs} worlds"
-        return compiling.Calls(f"{self.task.name}, {worlds}")
+        return messages.Calls(f"{self.task.name}, {worlds}")
 
     @functools.partial(fast_cpu.jit, static_argnums=0)
     def _steps(self, state: State, action: jax.Array) -> State:

@@ -8,14 +8,18 @@ from typing import Any, Literal, get_args
 
 import mujoco
 
-import envs.distractors
-from envs import checks, fast_cpu, mjcf, physics, render, scene
+import envs.scene.distractors
+from envs import checks, mjcf
 from envs.actions import MODES, TARGET_DT, Mode
+from envs.compilation import fast_cpu
 from envs.env import Env
 from envs.names import check, names
-from envs.physics import Backend
+from envs.physics import physics
+from envs.physics.physics import Backend
+from envs.rendering import renderer as render
 from envs.rewards import REWARDS, Reward
 from envs.robots import Robot
+from envs.scene import scene
 
 AnyRobot = str | os.PathLike[str] | Robot
 RendererName = Literal["rays", "warp"]
@@ -100,7 +104,7 @@ def _renderer(
     if name == "rays":
         return rays
     physics.need_warp("renderer")
-    from envs.warp_renderer import WarpRenderer
+    from envs.rendering.warp import WarpRenderer
 
     return WarpRenderer(model, rays, num_envs)
 

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.randomization import belonging
 from envs.robots import multiply
+from envs.scene.randomization import belonging
 from envs.tasks import View
 
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))

@@ -61,7 +61,7 @@ class State:
             earlier, those before; held int32 [W], consecutive control steps at the goal; broken
             bool [W], ended at its last good moment because physics was not finite after it; layout,
             body name -> [W, 4] at reset: x, y, z [m], turn about z [rad]; draw, what
-            `envs.randomization` drew for each world, or None.
+            `envs.scene.randomization` drew for each world, or None.
     """
 
     data: Data

@@ -22,8 +22,8 @@ import optax
 import tyro
 
 import envs
-from envs import compilation_cache, compiling
-from envs.files import check_local
+from envs.compilation import cache, messages
+from envs.datasets.files import check_local
 
 
 @dataclasses.dataclass(frozen=True)
@@ -221,7 +221,7 @@ def train(config: Config) -> tuple[Learner, np.ndarray]:
     env = make(config, config.num_envs, reward="dense", discount=config.discount)
     key, start = jax.random.key(config.seed), time.perf_counter()
     learner, rows = begin(env, config, key), []
-    calls = compiling.Calls(config.task)
+    calls = messages.Calls(config.task)
     for number in range(1, config.updates + 1):
         key_now = jax.random.fold_in(key, number)
         with calls.first("an update"):
@@ -264,7 +264,7 @@ def main(config: Config) -> float:
     draw(config, curve)
     key = jax.random.key(config.seed + 1_000_000)
     env = make(config, config.episodes)
-    with compiling.said(f"the evaluation of {config.task}, its episodes included"):
+    with messages.said(f"the evaluation of {config.task}, its episodes included"):
         success = float(np.mean(evaluate(env, learner.params, learner.moments, key)))
     print(
         f"{success:.1%} of {config.episodes} fresh layouts, {time.process_time():.0f} CPU seconds"
@@ -273,5 +273,5 @@ def main(config: Config) -> float:
 
 
 if __name__ == "__main__":
-    compilation_cache.enable()
+    cache.enable()
     main(tyro.cli(Config, description=__doc__))

@@ -9,18 +9,20 @@ Axis letters used in every docstring and einsum of this package:
     J joints         W parallel worlds
 """
 
-from lorasp_jax import dense, hugging_face, named, peft
-from lorasp_jax.adaptation import adapt, merge, split, with_dropout
-from lorasp_jax.adapter_io import load_adapters, save_adapters
-from lorasp_jax.auxiliary import auxiliary_losses
-from lorasp_jax.compaction import distill, prune
-from lorasp_jax.fusion import fuse, unmerge
-from lorasp_jax.hugging_face import load_peft, save_peft
-from lorasp_jax.linen import LinenAdapter
-from lorasp_jax.named import choose, combine, extract, swap
+from lorasp_jax import dense, peft
+from lorasp_jax.adapters.adaptation import adapt, merge, split, with_dropout
+from lorasp_jax.adapters.combine import named
+from lorasp_jax.adapters.combine.fusion import fuse, unmerge
+from lorasp_jax.adapters.combine.named import choose, combine, extract, swap
+from lorasp_jax.adapters.compress.compaction import distill, prune
+from lorasp_jax.adapters.compress.quantization import quantize
+from lorasp_jax.adapters.io import hugging_face
+from lorasp_jax.adapters.io.hugging_face import load_peft, save_peft
+from lorasp_jax.adapters.io.native import load_adapters, save_adapters
+from lorasp_jax.adapters.linen import LinenAdapter
+from lorasp_jax.adapters.summary import collect_aux, summary
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA, LoRAMoE, LoRASP
-from lorasp_jax.quantization import quantize
-from lorasp_jax.tables import collect_aux, summary
+from lorasp_jax.peft._aux import auxiliary_losses
 
 __version__ = "0.1.0"
 

@@ -4,8 +4,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-from lorasp_jax import kinds
-from lorasp_jax.peft import Method
+from lorasp_jax.peft import Method, _fields
 
 SCALES = ("smoke", "cpu", "accelerator")
 LONGEST_NAME = 200
@@ -65,7 +64,7 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         """Checks the fields."""
-        kinds.check_fields(self)
+        _fields.check_fields(self)
         _at_least(0, self, "max_tokens")
 
 
@@ -88,7 +87,7 @@ class DataConfig:
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
-        kinds.check_fields(self)
+        _fields.check_fields(self)
         _at_least(1, self, "episodes", "num_envs")
         _at_least(0, self, "action_noise", "fresh_every")
         if self.fresh_every and self.source:
@@ -131,7 +130,7 @@ class OptimConfig:
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
-        kinds.check_fields(self)
+        _fields.check_fields(self)
         _at_least(1, self, "steps", "batch_size", "accumulate", "max_skipped")
         _at_least(0, self, "learning_rate", "final_learning_rate", "warmup_steps")
         _at_least(0, self, "weight_decay", "state_noise")
@@ -162,7 +161,7 @@ class AuxiliaryConfig:
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
-        kinds.check_fields(self)
+        _fields.check_fields(self)
         _at_least(0, self, "spectral", "balance", "z", "orthogonality")
         if not 0 <= self.warmup <= 1:
             raise ValueError(f"warmup must lie in [0, 1], got {self.warmup}")
@@ -191,7 +190,7 @@ class EvaluationConfig:
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
-        kinds.check_fields(self)
+        _fields.check_fields(self)
         _at_least(1, self, "episodes", "num_envs", "execute_steps", "denoise_steps")
         if self.every < 0:
             raise ValueError(f"evaluation.every must be at least 0, got {self.every}")
@@ -249,8 +248,8 @@ class Config:
 
     def __post_init__(self) -> None:
         """Checks what no single field shows."""
-        kinds.check_fields(self)
-        kinds.check_fields(self.peft, "peft.")
+        _fields.check_fields(self)
+        _fields.check_fields(self.peft, "peft.")
         _check_name(self.name)
         _at_least(1, self, "fsdp", "log_every", "checkpoint_every", "image_size")
         if self.control_dt <= 0 or not 0 <= self.seed < 2**32:

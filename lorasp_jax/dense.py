@@ -28,11 +28,11 @@ import jax.numpy as jnp
 from flax import nnx
 from flax.typing import Dtype, Initializer
 
-from lorasp_jax import given, kinds
-from lorasp_jax.kernels.quantized import QuantizedKernel
-from lorasp_jax.kinds import short
-from lorasp_jax.peft import Aux, Method
-from lorasp_jax.peft.method import Params, apply_together, drop_rate
+from lorasp_jax import given
+from lorasp_jax.kernels.quantized_kernel import QuantizedKernel
+from lorasp_jax.peft import Aux, Method, _fields
+from lorasp_jax.peft._fields import short
+from lorasp_jax.peft._method import Params, apply_together, drop_rate
 
 KEPT = "kept_aux"
 DROPPING = "held_dropout_key"
@@ -115,7 +115,7 @@ def dense_together(
     Raises:
       ValueError: as `dense`.
     """
-    kinds.tokens(x, token_mask)
+    _fields.tokens(x, token_mask)
     layers = [DenseLayer(*layer) for layer in layers]
     plain, adapted = {}, {}
     for i, (kernel, _, params, method, key) in enumerate(layers):

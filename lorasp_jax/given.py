@@ -10,10 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import linen, nnx
 
-from lorasp_jax import kinds
-from lorasp_jax.kinds import short
-from lorasp_jax.peft import Method
-from lorasp_jax.peft.method import LARGEST_SIZE
+from lorasp_jax.peft import Method, _fields
+from lorasp_jax.peft._fields import short
+from lorasp_jax.peft._method import LARGEST_SIZE
 
 LONGEST_NAME = 255
 """Bytes of the name of a file or folder."""
@@ -21,7 +20,7 @@ LONGEST_NAME = 255
 
 def size(name: str, value: Any) -> int:
     """A width; raises a ValueError for what is no whole number from 1 to `LARGEST_SIZE`."""
-    return kinds.whole(name, value, LARGEST_SIZE)
+    return _fields.whole(name, value, LARGEST_SIZE)
 
 
 def method(value: Any) -> Method | None:
@@ -78,7 +77,7 @@ def layer(found: Any, width: int) -> None:
     if (found.params is None) != (own is None or own.trains_base):
         raise ValueError("an adapter's parameters come with their method, and it with them.")
     if found.dropout_key is not None:
-        kinds.key(found.dropout_key)
+        _fields.key(found.dropout_key)
 
 
 def module(model: Any) -> Any:

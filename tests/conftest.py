@@ -7,10 +7,10 @@ os.environ["JAX_PLATFORMS"] = "cpu"
 
 import jax
 
-from envs import compilation_cache
+from envs.compilation import cache
 from tests import xla
 
-compilation_cache.enable()
+cache.enable()
 jax.config.update("jax_default_matmul_precision", "highest")
 
 

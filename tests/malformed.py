@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import safetensors.numpy
 
-from envs.files import RefusedError
+from envs.datasets.files import RefusedError
 from lorasp_jax.digest import DIGEST, sealed
 
 ROOT = Path(__file__).parent.parent

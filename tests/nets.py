@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax import adaptation, peft
+from lorasp_jax import peft
+from lorasp_jax.adapters import adaptation
 from lorasp_jax.dense import Dense
 from lorasp_jax.peft import LoRA, LoRASP
 from tests.models.drawn import filled, moved

@@ -12,16 +12,16 @@ import numpy as np
 from flax import nnx
 from rich.console import Console
 
-from envs.episodes import Episodes
-from lorasp_jax import adaptation
+from envs.datasets.episodes import Episodes
+from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config, ModelConfig, OptimConfig
 from lorasp_jax.dense import Dense
 from lorasp_jax.evaluation import video
-from lorasp_jax.models import tokenizer
 from lorasp_jax.models.pi0 import Pi0Config
-from lorasp_jax.models.policy import Policy
-from lorasp_jax.models.prompt_table import PromptTable
 from lorasp_jax.peft import LoRASP
+from lorasp_jax.policies import tokenizer
+from lorasp_jax.policies.policy import Policy
+from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import MetricsLog, read_metrics, to_json, write_json
 from lorasp_jax.training.setup import processor

@@ -10,9 +10,9 @@ import pytest
 from flax import nnx
 
 import lorasp_jax
-from lorasp_jax import adaptation
-from lorasp_jax.adapter_io import load_adapters, save_adapters
-from lorasp_jax.named import bare
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters.combine.named import bare
+from lorasp_jax.adapters.io.native import load_adapters, save_adapters
 from lorasp_jax.peft import LoRA, LoRAMoE, LoRASP
 from tests import nets
 from tests.cases import mostly_slow

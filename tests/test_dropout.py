@@ -10,11 +10,11 @@ import pytest
 from flax import nnx
 
 import lorasp_jax
-from lorasp_jax.adapter_io import load_adapters, save_adapters
+from lorasp_jax.adapters.io.native import load_adapters, save_adapters
 from lorasp_jax.dense import LinenDense
 from lorasp_jax.peft import AdaLoRA, DoRA, LoRA
+from lorasp_jax.peft._method import dropped
 from lorasp_jax.peft.dora import column_factor
-from lorasp_jax.peft.method import dropped
 from tests import nets
 from tests.test_scanned import EINSUMS, IDS, Llama
 

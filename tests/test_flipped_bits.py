@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from envs.episodes import Episodes
-from lorasp_jax import adaptation, models
-from lorasp_jax.adapter_io import load_adapters, read_description, save_adapters
+from envs.datasets.episodes import Episodes
+from lorasp_jax import models
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters.io.native import load_adapters, read_description, save_adapters
 from lorasp_jax.data import cache
 from lorasp_jax.data.opening import open_source
-from lorasp_jax.models import statistics_files
 from lorasp_jax.models.pi0 import Pi0Config
-from lorasp_jax.models.statistics import Statistics
 from lorasp_jax.peft import LoRASP
+from lorasp_jax.policies import statistics_files
+from lorasp_jax.policies.statistics import Statistics
 from lorasp_jax.training.base import TRAINING
 from lorasp_jax.training.run_folder import MetricsLog, read_json, read_metrics, write_json
 from tests.models.drawn import drawn

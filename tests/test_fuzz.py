@@ -12,15 +12,16 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from envs import mjcf, rlds
+from envs import mjcf
+from envs.datasets import rlds
 from lorasp_jax.data import cache, inspection
 from lorasp_jax.data.opening import open_source
-from lorasp_jax.models import statistics_files, tokenizer
+from lorasp_jax.policies import statistics_files, tokenizer
 from lorasp_jax.report.callback import final_table
 from lorasp_jax.report.html import write_report
 from tests import fuzzing
 from tests.data.lerobots import GOLDEN, golden
-from tests.envs.test_episodes import make
+from tests.envs.datasets.test_episodes import make
 from tests.envs.user_arm import write
 from tests.malformed import check_refusal
 from tests.runs import finish

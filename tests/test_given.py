@@ -11,8 +11,8 @@ import pytest
 from flax import nnx
 
 import lorasp_jax
-from lorasp_jax import calibration
-from lorasp_jax.adaptation import count, penalties
+from lorasp_jax.adapters.adaptation import count, penalties
+from lorasp_jax.adapters.compress import calibration
 from lorasp_jax.dense import LinenDense
 from lorasp_jax.peft import AdaLoRA, LoRA, LoRAMoE, LoRASP
 

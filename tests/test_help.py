@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 SLOW = (
     "av",
-    "envs.physics",
+    "envs.physics.physics",
     "grain",
     "matplotlib",
     "mujoco",

@@ -12,7 +12,9 @@ import pytest
 from flax import nnx
 
 import lorasp_jax
-from lorasp_jax import adaptation, adapter_io, calibration
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters.compress import calibration
+from lorasp_jax.adapters.io import native
 from lorasp_jax.dense import AdapterParam, Dense
 from lorasp_jax.peft import DoRA, LoRA, LoRASP
 from tests.models.drawn import filled
@@ -128,8 +130,8 @@ def test_distilled_kinds_merge_save_and_load(tmp_path):
     assert set(map(type, adaptation.methods(smaller).values())) == {LoRA}
     assert_close(call(lorasp_jax.merge(smaller), IDS[0]), call(smaller, IDS[0]))
     assert 0 < report.output_error < 1
-    adapter_io.save_adapters(tmp_path, smaller)
-    loaded = adapter_io.load_adapters(tmp_path, NET)
+    native.save_adapters(tmp_path, smaller)
+    loaded = native.load_adapters(tmp_path, NET)
     np.testing.assert_array_equal(call(loaded, IDS[0]), call(smaller, IDS[0]))
 
 

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from envs import rlds
-from envs.episodes import Episodes
-from lorasp_jax import adaptation
-from lorasp_jax.adapter_io import load_adapters, save_adapters
+from envs.datasets import rlds
+from envs.datasets.episodes import Episodes
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters.io.hugging_face import load_peft
+from lorasp_jax.adapters.io.native import load_adapters, save_adapters
 from lorasp_jax.data import cache
 from lorasp_jax.data.opening import open_source
 from lorasp_jax.digest import sealed
-from lorasp_jax.hugging_face import load_peft
 from lorasp_jax.peft import LoRASP
 from tests import malformed
 from tests.data.lerobots import GOLDEN, digest, golden

@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 
-from lorasp_jax.routing import gelu, softplus
+from lorasp_jax.peft.lora_sp.router import gelu, softplus
 
 
 def test_softplus_and_its_gradient():

@@ -9,7 +9,7 @@ import pytest
 from flax import nnx
 
 import lorasp_jax
-from lorasp_jax.adapter_io import load_adapters, save_adapters
+from lorasp_jax.adapters.io.native import load_adapters, save_adapters
 from lorasp_jax.peft import LoRASP
 
 WIDTH, HEADS, DEPTH, WORDS = 4, 2, 3, 7

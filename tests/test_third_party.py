@@ -8,8 +8,9 @@ import pytest
 from flax import nnx
 
 import lorasp_jax
-from lorasp_jax import LinenAdapter, adaptation
-from lorasp_jax.adapter_io import load_adapters, save_adapters
+from lorasp_jax import LinenAdapter
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters.io.native import load_adapters, save_adapters
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.peft import LoRA, LoRASP
 from tests import gemmas

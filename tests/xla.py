@@ -22,6 +22,6 @@ def compile_steps_as_all_else() -> None:
     To be called where JAX may be imported.
     """
     if UNOPTIMISED in os.environ.get("XLA_FLAGS", ""):
-        from envs import fast_cpu
+        from envs.compilation import fast_cpu
 
         fast_cpu.without_simulation = functools.wraps(fast_cpu.without_simulation)(lambda: None)

@@ -13,9 +13,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from envs import checks, fast_cpu
+from envs import checks
+from envs.compilation import fast_cpu
 from envs.env import Env
-from envs.randomization import Randomization, prepared
+from envs.scene.randomization import Randomization, prepared
 from envs.state import State
 
 try:

@@ -4,7 +4,7 @@ env = VectorEnv(envs.make("press", num_envs=64, image_size=64))
 observation, info = env.reset(seed=0)
 observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
 
-`make_vec` and `make` are what `gymnasium.make_vec` and `gymnasium.make` call, see `envs.ids`.
+`make_vec` and `make` are what `gymnasium.make_vec` and `gymnasium.make` call, see `envs.interop.ids`.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ import numpy as np
 from envs import checks
 from envs.env import Env
 from envs.making import make as make_env
-from envs.randomization import Randomization, prepared
+from envs.scene.randomization import Randomization, prepared
 from envs.state import State
 
 try:

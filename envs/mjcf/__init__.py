@@ -19,9 +19,9 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from envs import scene
 from envs.mjcf import attaching, hands, posing, reading
 from envs.robots import Robot
+from envs.scene import scene
 
 # Own choices: the speed lies between those of Panda (2.175 to 2.61) and PiPER (3).
 _SPEED, _GRIPPER_SPEED = 2.5, 0.1

@@ -10,7 +10,7 @@ from envs import robots
 from envs.mjcf import fitting
 from envs.mjcf.hands import Hand, Pad
 from envs.mjcf.reading import Arm, Gripper
-from envs.render_model import STAND_IN_GROUP, is_visible
+from envs.rendering.model import STAND_IN_GROUP, is_visible
 from envs.robots import Robot
 
 _BASE = "base"

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TextColumn
 
-from envs.files import check_local
-from envs.refusals import parsed, refused
+from envs.cli.refusals import parsed, refused
+from envs.datasets.files import check_local
 from lorasp_jax.data.keys import Keys
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def inspect(options: argparse.Namespace, console: Console) -> None:
 
 def convert(options: argparse.Namespace, console: Console) -> None:
     """Writes datasets as a cache, which training reads, or one as an RLDS dataset."""
-    from lorasp_jax.data import cache, conversion
+    from lorasp_jax.data import cache, rlds_export
     from lorasp_jax.data.opening import open_source
 
     keys = _keys(options)
@@ -63,7 +63,7 @@ def convert(options: argparse.Namespace, console: Console) -> None:
         raise ValueError(f"an RLDS dataset is made of one dataset, not of {len(sources)}")
     with _bar(f"writing {options.out.name}") as (progress, say):
         if options.to == "rlds":
-            conversion.to_rlds(sources[0], options.out, progress)
+            rlds_export.to_rlds(sources[0], options.out, progress)
         else:
             wait = f"another process is writing {options.out}: waiting for it"
             cache.write(sources, options.out, progress, waiting=lambda: say(wait))

@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.episodes import Array, Episodes
-from lorasp_jax.models.policy import Observation
-from lorasp_jax.models.processing import Processor, RawObservation
+from envs.datasets.episodes import Array, Episodes
+from lorasp_jax.policies.policy import Observation
+from lorasp_jax.policies.processor import Processor, RawObservation
 
 
 @jax.tree_util.register_dataclass

@@ -21,15 +21,15 @@ from typing import Any, Self
 
 import numpy as np
 
-from envs.episodes import SHARED, Episodes, check_camera, creating
-from envs.files import damage, read_json, read_text
-from envs.locks import alone
+from envs.datasets.episodes import SHARED, Episodes, check_camera, creating
+from envs.datasets.files import damage, read_json, read_text
+from envs.datasets.locks import alone
 from lorasp_jax.data.batches import Steps
-from lorasp_jax.data.columns import Column, mapped
+from lorasp_jax.data.cache_writer import Column, mapped
 from lorasp_jax.data.pictures import Pictures, checksum
 from lorasp_jax.data.source import Progress, Source
 from lorasp_jax.digest import DIGEST, sealed, unsealed
-from lorasp_jax.models.statistics import Statistics
+from lorasp_jax.policies.statistics import Statistics
 
 FORMAT = "lorasp-cache-1"
 HEADER, STATISTICS = "cache.json", "statistics.json"

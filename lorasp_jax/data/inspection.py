@@ -13,11 +13,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from envs.episodes import Episodes, replacing
-from envs.videos import side_by_side
-from lorasp_jax.data.films import reduced
+from envs.datasets.episodes import Episodes, replacing
+from envs.rendering.video import side_by_side
 from lorasp_jax.data.lerobot import LeRobot
 from lorasp_jax.data.source import Source
+from lorasp_jax.data.video import reduced
 
 EPISODES, FRAMES, TILE, LINE = 6, 5, 128, 14
 """Of the contact sheet: rows, pictures a row, a picture's longer side, a text's height [pixels]."""

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Literal
 
-from lorasp_jax import kinds
+from lorasp_jax.peft import _fields
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Keys:
 
     def __post_init__(self) -> None:
         """Checks the fields."""
-        kinds.check_fields(self)
+        _fields.check_fields(self)
         if not isinstance(self.cameras, Mapping):
             raise ValueError(f"cameras must be a mapping, name -> feature, got {self.cameras!r}")
         for name, feature in self.cameras.items():

@@ -17,12 +17,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from envs.episodes import Episodes
-from envs.files import check_memory, regular, whole
-from lorasp_jax.data.films import Film, decoded
+from envs.datasets.episodes import Episodes
+from envs.datasets.files import check_memory, regular, whole
 from lorasp_jax.data.keys import Keys
 from lorasp_jax.data.lerobot_files import Recording, damage, read_index, read_table
-from lorasp_jax.models import places
+from lorasp_jax.data.video import Film, decoded
+from lorasp_jax.models.checkpoints import hub
 
 _COLUMNS = ("timestamp", "frame_index", "episode_index", "task_index")
 _WIDTH = 10_000  # numbers that a state or an action may have
@@ -58,7 +58,7 @@ class LeRobot:
         Raises:
             ValueError: it is not there, damaged, or lacks a feature that the keys name.
         """
-        self.path = places.local(where, repository="dataset")
+        self.path = hub.local(where, repository="dataset")
         self.index, self.keys = read_index(self.path), keys or Keys()
         self.kind = f"LeRobot {self.index.version}"
         self.name = name or Path(where).name

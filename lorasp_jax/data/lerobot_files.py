@@ -19,8 +19,8 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from envs import files
-from envs.files import check_memory, inside, read_json, read_text, regular, whole
+from envs.datasets import files
+from envs.datasets.files import check_memory, inside, read_json, read_text, regular, whole
 
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 _FIELD = re.compile(r"\{(\w+)(?::(\d{0,2}d?))?\}")

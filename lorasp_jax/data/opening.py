@@ -5,13 +5,13 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from envs import rlds
-from envs.episodes import Episodes
+from envs.datasets import rlds
+from envs.datasets.episodes import Episodes
 from lorasp_jax.data.cache import HEADER, Cache
 from lorasp_jax.data.lerobot import Keys, LeRobot
 from lorasp_jax.data.lerobot_files import is_lerobot
 from lorasp_jax.data.source import Source
-from lorasp_jax.models import places
+from lorasp_jax.models.checkpoints import hub
 
 
 def open_source(where: str | os.PathLike[str], keys: Keys | None = None) -> Source:
@@ -24,7 +24,7 @@ def open_source(where: str | os.PathLike[str], keys: Keys | None = None) -> Sour
     Raises:
         ValueError: it is not there, is of no known kind, or is damaged; or keys for another kind.
     """
-    path = places.local(where, repository="dataset")
+    path = hub.local(where, repository="dataset")
     if is_lerobot(path):
         return LeRobot(path, keys, name=Path(where).name)
     if keys and dataclasses.replace(keys, image_size=0) != Keys():

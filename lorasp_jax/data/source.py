@@ -3,7 +3,7 @@
 from collections.abc import Callable, Collection, Sequence
 from typing import Protocol
 
-from envs.episodes import Episodes
+from envs.datasets.episodes import Episodes
 
 Progress = Callable[[int, int], None]
 """Called with steps done and steps in all."""

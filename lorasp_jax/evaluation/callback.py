@@ -14,14 +14,15 @@ import numpy as np
 from rich.progress import Progress
 
 import envs
-from envs import compiling, physics
+from envs.compilation import messages
 from envs.env import Env
-from envs.render import RayRenderer
-from lorasp_jax import adaptation
-from lorasp_jax.data.demonstrations import side_by_side
+from envs.physics import physics
+from envs.rendering.renderer import RayRenderer
+from lorasp_jax.adapters import adaptation
 from lorasp_jax.evaluation import video
 from lorasp_jax.evaluation.rollout import Result, evaluate, make_rollout
 from lorasp_jax.training import records
+from lorasp_jax.training.demonstrations import side_by_side
 from lorasp_jax.training.progress import bars
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import read_json, write_json
@@ -111,7 +112,7 @@ class Evaluation(Callback):
         with contextlib.ExitStack() as compiles:
             if task not in self._tasks:
                 what = f"the evaluation of {task}, its first episodes included"
-                compiles.enter_context(compiling.said(what))
+                compiles.enter_context(messages.said(what))
 
             def report(done: int, _: int) -> None:
                 compiles.close()

@@ -9,14 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs import fast_cpu
+from envs.compilation import fast_cpu
 from envs.env import Env
-from envs.randomization import Randomization
+from envs.scene.randomization import Randomization
 from envs.state import State
-from lorasp_jax import adaptation
+from lorasp_jax.adapters import adaptation
 from lorasp_jax.evaluation import metrics
-from lorasp_jax.models.policy import Policy
 from lorasp_jax.models.sampling import Sampler
+from lorasp_jax.policies.policy import Policy
 
 FILMED_WORLDS = 8
 """Worlds whose poses are kept, to choose one of them for the video."""

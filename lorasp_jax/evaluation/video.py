@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from envs.videos import side_by_side, write_video
+from envs.rendering.video import side_by_side, write_video
 
 __all__ = ["FILM_SIZE", "side_by_side", "write_picture", "write_video"]
 

@@ -41,7 +41,7 @@ from lorasp_jax.kernels.bisection import (
     block_boundary,
     energies,
 )
-from lorasp_jax.kernels.by_rows import by_rows
+from lorasp_jax.kernels.row_sharding import by_rows
 
 Implementation = Literal["pairwise", "sort", "bisection", "block", "pallas"]
 

@@ -19,8 +19,8 @@ import jax
 import jax.numpy as jnp
 from jax.experimental import pallas as pl
 
-from lorasp_jax.kernels.by_rows import by_rows
-from lorasp_jax.kernels.in_a_row import InARow, places
+from lorasp_jax.kernels.packing import InARow, places
+from lorasp_jax.kernels.row_sharding import by_rows
 
 
 class Launch(NamedTuple):

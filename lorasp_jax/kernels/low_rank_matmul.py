@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from lorasp_jax.kernels.quantized import QuantizedKernel
+from lorasp_jax.kernels.quantized_kernel import QuantizedKernel
 
 Rows = Callable[[Any, jax.Array, jax.Array | None], tuple[jax.Array, Any]]
 """f of one layer: (params, rows [..., Q], token_mask) -> z [..., R] and a pytree."""

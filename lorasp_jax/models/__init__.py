@@ -1,8 +1,9 @@
 """Backbones, policies and what surrounds them; a backbone is a folder here, found by its name."""
 
-from lorasp_jax.models import pi0, published, smolvla
-from lorasp_jax.models.checkpoint import save, set_arrays, weights_hash
-from lorasp_jax.models.loading import load, load_config
+from lorasp_jax.models import pi0, smolvla
+from lorasp_jax.models.checkpoints import published
+from lorasp_jax.models.checkpoints.loading import load, load_config
+from lorasp_jax.models.checkpoints.native import save, set_arrays, weights_hash
 from lorasp_jax.models.observation import Observation
 
 __all__ = [

@@ -12,16 +12,16 @@ from flax import nnx
 from lorasp_jax.dense import Dense
 from lorasp_jax.models import flow_matching
 from lorasp_jax.models.config import BackboneConfig
-from lorasp_jax.models.layers import (
+from lorasp_jax.models.observation import Observation
+from lorasp_jax.models.sampling import ModelAux, Sampler, with_action
+from lorasp_jax.models.transformer.layers import (
     LayerAux,
     Linears,
     block_mask,
     positions,
     time_embedding,
 )
-from lorasp_jax.models.observation import Observation
-from lorasp_jax.models.sampling import ModelAux, Sampler, with_action
-from lorasp_jax.models.siglip import SigLIP
+from lorasp_jax.models.transformer.siglip import SigLIP
 
 _PACKAGE = __name__.rpartition(".")[0]
 

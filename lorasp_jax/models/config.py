@@ -8,9 +8,9 @@ from typing import Any, Literal, Self
 
 import jax.numpy as jnp
 
-from lorasp_jax import kinds
 from lorasp_jax.models.inputs import OURS, InputConfig
-from lorasp_jax.models.tokenizer import VOCABULARY_SIZE
+from lorasp_jax.peft import _fields
+from lorasp_jax.policies.tokenizer import VOCABULARY_SIZE
 
 Remat = Literal["none", "products", "full"]
 _LARGEST = 2**24
@@ -190,8 +190,8 @@ class BackboneConfig:
             "inputs": InputConfig(**{**inputs, "delta": tuple(inputs.get("delta", ()))}),
         }
         config = cls(**{**fields, **parts})
-        kinds.check_fields(config)
-        kinds.check_fields(config.inputs, "inputs.")
+        _fields.check_fields(config)
+        _fields.check_fields(config.inputs, "inputs.")
         for name in (config.dtype, config.param_dtype):
             jnp.dtype(name)  # raises TypeError
         return config

@@ -11,7 +11,7 @@ import difflib
 import re
 from collections.abc import Sequence
 
-from lorasp_jax.paths import Rules
+from lorasp_jax.adapters.paths import Rules
 from lorasp_jax.peft import Method
 
 _AROUND = r"^(state_proj|action_in_proj|action_out_proj|(action_)?time_mlp_(in|out))"

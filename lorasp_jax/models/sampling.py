@@ -10,12 +10,13 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax import adaptation, inference
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters.layers import inference
 from lorasp_jax.models import flow_matching
 from lorasp_jax.models.config import BackboneConfig
-from lorasp_jax.models.depth import unstacked
-from lorasp_jax.models.layers import LayerAux
 from lorasp_jax.models.observation import Observation
+from lorasp_jax.models.transformer.depth import unstacked
+from lorasp_jax.models.transformer.layers import LayerAux
 from lorasp_jax.peft import Method
 
 if TYPE_CHECKING:

@@ -8,15 +8,15 @@ import importlib
 import pkgutil
 from typing import Any
 
-from lorasp_jax.auxiliary import Aux
-from lorasp_jax.kinds import short
+from lorasp_jax.peft._aux import Aux
+from lorasp_jax.peft._fields import short
+from lorasp_jax.peft._method import Method
 from lorasp_jax.peft.ada_lora import AdaLoRA
 from lorasp_jax.peft.dora import DoRA
 from lorasp_jax.peft.full import FullFineTuning
 from lorasp_jax.peft.lora import LoRA
 from lorasp_jax.peft.lora_moe import LoRAMoE
-from lorasp_jax.peft.lora_sp import LoRASP
-from lorasp_jax.peft.method import Method
+from lorasp_jax.peft.lora_sp.method import LoRASP
 
 __all__ = [
     "AdaLoRA",

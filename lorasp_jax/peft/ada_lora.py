@@ -21,9 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from lorasp_jax import kinds
-from lorasp_jax.auxiliary import Aux
-from lorasp_jax.peft.method import Method, Params
+from lorasp_jax.peft import _fields
+from lorasp_jax.peft._aux import Aux
+from lorasp_jax.peft._method import Method, Params
 
 _INIT_STD = 0.02  # of A and B in PEFT
 _NAMES = {"lora_a", "lora_e", "lora_b"}
@@ -144,7 +144,7 @@ class AdaLoRA(Method):
           ValueError: if no step would be left between warm-up and final phase, or the parameters
             hold no AdaLoRA.
         """
-        kinds.whole("total_steps", total_steps)
+        _fields.whole("total_steps", total_steps)
         begin, end = round(self.warmup * total_steps), total_steps - round(self.final * total_steps)
         if begin >= end:
             raise ValueError(

@@ -15,9 +15,9 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from lorasp_jax.auxiliary import Aux
+from lorasp_jax.peft._aux import Aux
+from lorasp_jax.peft._method import Kernel, Params
 from lorasp_jax.peft.lora import LoRA
-from lorasp_jax.peft.method import Kernel, Params
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,8 +6,8 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from lorasp_jax.auxiliary import Aux
-from lorasp_jax.peft.method import Kernel, Method, Params
+from lorasp_jax.peft._aux import Aux
+from lorasp_jax.peft._method import Kernel, Method, Params
 
 
 @dataclasses.dataclass(frozen=True)

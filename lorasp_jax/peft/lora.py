@@ -11,8 +11,8 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
-from lorasp_jax.auxiliary import Aux
-from lorasp_jax.peft.method import Kernel, Method, Params, check_matrix, kaiming_uniform
+from lorasp_jax.peft._aux import Aux
+from lorasp_jax.peft._method import Kernel, Method, Params, check_matrix, kaiming_uniform
 
 _SPLITS = ("pissa", "olora")
 

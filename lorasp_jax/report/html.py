@@ -8,7 +8,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from envs.files import inside, read_bytes
+from envs.datasets.files import inside, read_bytes
 from lorasp_jax.report import figures
 from lorasp_jax.training import records
 from lorasp_jax.training.run_folder import (

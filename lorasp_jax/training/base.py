@@ -10,8 +10,9 @@ from flax import nnx
 import envs
 from lorasp_jax import models
 from lorasp_jax.config import Config
-from lorasp_jax.models import backbone, loading, places
+from lorasp_jax.models import backbone
 from lorasp_jax.models.backbone import Backbone
+from lorasp_jax.models.checkpoints import hub, loading
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.training.run_folder import read_json
 
@@ -40,10 +41,10 @@ def base_model(config: Config, *, shapes: bool = False) -> tuple[Backbone, str]:
     wanted = dataclasses.replace(wanted, **kinds)
     if not wanted.inputs.masks_missing:
         wanted = dataclasses.replace(wanted, cameras=wanted.cameras[: len(envs.Env.cameras)])
-    if shapes and (not chosen.source or places.is_elsewhere(chosen.source)):
+    if shapes and (not chosen.source or hub.is_elsewhere(chosen.source)):
         return nnx.eval_shape(lambda: wanted.create(nnx.Rngs(0))), ""
     if chosen.source:
-        folder = places.local(chosen.source)
+        folder = hub.local(chosen.source)
         inputs = loading.lerobot_inputs(folder) or wanted.inputs
         wanted = dataclasses.replace(wanted, inputs=inputs)
         model = models.load(folder, wanted)

@@ -17,9 +17,9 @@ import jax
 import orbax.checkpoint as ocp
 from rich.console import Console
 
-from envs.refusals import DISK_FULL
+from envs.cli.refusals import DISK_FULL
 from lorasp_jax.digest import digest
-from lorasp_jax.models import orbax_folders
+from lorasp_jax.models.checkpoints import orbax_folders
 from lorasp_jax.training import processes
 from lorasp_jax.training.step import TrainState
 

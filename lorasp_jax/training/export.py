@@ -10,13 +10,17 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from lorasp_jax import adaptation, adapter_io, models
+from lorasp_jax import models
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters.io import native
 from lorasp_jax.digest import digest
-from lorasp_jax.models import backbone, places, tokenizer
-from lorasp_jax.models.policy import Policy
-from lorasp_jax.models.processing import Processor
-from lorasp_jax.models.prompt_table import PromptTable
-from lorasp_jax.models.statistics import Statistics
+from lorasp_jax.models import backbone
+from lorasp_jax.models.checkpoints import hub
+from lorasp_jax.policies import tokenizer
+from lorasp_jax.policies.policy import Policy
+from lorasp_jax.policies.processor import Processor
+from lorasp_jax.policies.prompt_table import PromptTable
+from lorasp_jax.policies.statistics import Statistics
 from lorasp_jax.training.base import TRAINING
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import read_json, write_json
@@ -43,8 +47,8 @@ def write(run: Run) -> None:
         (folder / "statistics.json").write_text(statistics + "\n")
         write_json(folder / TRAINING, facts)
         return
-    metadata = {"base": places.lasting(config.model.source), **facts}
-    adapter_io.save_adapters(run.folder, run.policy.model, base=run.base_hash, metadata=metadata)
+    metadata = {"base": hub.lasting(config.model.source), **facts}
+    native.save_adapters(run.folder, run.policy.model, base=run.base_hash, metadata=metadata)
 
 
 def _facts(run: Run) -> dict[str, Any]:
@@ -59,7 +63,7 @@ def _facts(run: Run) -> dict[str, Any]:
         "policy": {
             "backbone": config.model.backbone,
             "config": dataclasses.asdict(run.policy.model.config),
-            "tokenizer": places.lasting(config.model.tokenizer),
+            "tokenizer": hub.lasting(config.model.tokenizer),
             "prompts": _prompts_digest(processor.prompts),
             "instructions": list(processor.prompts.instructions),
             "num_joints": len(processor.robot_slots) - 1,
@@ -89,13 +93,13 @@ def load_policy(
     """
     folder = Path(folder)
     trained = (folder / BASE).is_dir()
-    path = folder / BASE / TRAINING if trained else folder / adapter_io.DESCRIPTION
+    path = folder / BASE / TRAINING if trained else folder / native.DESCRIPTION
     if not path.is_file():
         raise ValueError(f"{folder} has no policy: no run finished there")
-    told = read_json(path) if trained else adapter_io.read_description(folder)["metadata"]
+    told = read_json(path) if trained else native.read_description(folder)["metadata"]
     try:
         config = backbone.find(told["policy"]["backbone"]).from_dict(told["policy"]["config"])
-        source = folder / BASE if trained else base or places.found_again(told["base"])
+        source = folder / BASE if trained else base or hub.found_again(told["base"])
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} does not say what its policy needs") from error
     if not source:
@@ -106,7 +110,7 @@ def load_policy(
         hint = "" if trained else f" (base= says where the base of {folder} is now)"
         raise ValueError(f"{error}{hint}") from error
     if not trained:
-        model = adapter_io.load_adapters(folder, model, any_base=any_base)
+        model = native.load_adapters(folder, model, any_base=any_base)
     try:
         return Policy(model, _processor(told["policy"], config, words))
     except (KeyError, TypeError) as error:
@@ -117,7 +121,7 @@ def _processor(told: Mapping[str, Any], config: Any, words: str) -> Processor:
     """The processor of an exported policy."""
     joints = told["num_joints"]
     try:
-        found = tokenizer.load(words or places.found_again(told["tokenizer"]))
+        found = tokenizer.load(words or hub.found_again(told["tokenizer"]))
     except ValueError as error:
         raise ValueError(f"{error} (words= says where the policy's tokenizer is now)") from error
     prompts = PromptTable.of(found, told["instructions"], config, num_joints=joints)

@@ -9,10 +9,10 @@ from typing import Any
 import jax
 from flax import nnx
 
-from lorasp_jax import adaptation
+from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config, OptimConfig
 from lorasp_jax.data.batches import Raw, Steps, encode, sample_batch
-from lorasp_jax.models.policy import Policy
+from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training import processes
 from lorasp_jax.training.checkpoint import Checkpoints

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from rich.console import Console
 
-from envs.episodes import Episodes
+from envs.datasets.episodes import Episodes
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Steps, flatten
-from lorasp_jax.models.policy import Policy
+from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training import processes, records
 from lorasp_jax.training.run_folder import CLOCK, read_json, write_json
 

@@ -19,8 +19,8 @@ from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.proto.summary_pb2 import Summary
 
-from envs.files import check_only_files, damage, read_bytes
-from envs.locks import open_lock
+from envs.datasets.files import check_only_files, damage, read_bytes
+from envs.datasets.locks import open_lock
 from lorasp_jax.config import Config
 from lorasp_jax.digest import sealed, unsealed
 from lorasp_jax.training import processes, records

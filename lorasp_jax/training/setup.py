@@ -14,25 +14,30 @@ from rich.console import Console
 from rich.progress import TaskID
 
 import envs
+from envs.datasets.episodes import Episodes
 from envs.env import Env
-from envs.episodes import Episodes
-from lorasp_jax import adaptation, calibration, peft, tables
+from lorasp_jax import peft
+from lorasp_jax.adapters import adaptation, summary
+from lorasp_jax.adapters.compress import calibration
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Batch, encode, flatten, sample_batch, windows
-from lorasp_jax.data.demonstrations import demonstrations
-from lorasp_jax.data.imported import cached, is_simulated, opened, outline
 from lorasp_jax.data.pictures import loaded
 from lorasp_jax.data.source import Source
 from lorasp_jax.data.stream import Stream
-from lorasp_jax.models import places, presets, tokenizer
+from lorasp_jax.models import presets
 from lorasp_jax.models.backbone import Backbone
+from lorasp_jax.models.checkpoints import hub
 from lorasp_jax.models.config import BackboneConfig
-from lorasp_jax.models.policy import Policy
-from lorasp_jax.models.processing import Processor, Statistics, check_delta, robot_slots, to_delta
-from lorasp_jax.models.prompt_table import PromptTable
+from lorasp_jax.policies import tokenizer
+from lorasp_jax.policies.policy import Policy
+from lorasp_jax.policies.processor import Processor, Statistics, check_delta, robot_slots, to_delta
+from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.training import mesh as meshes
-from lorasp_jax.training import preflight, processes
+from lorasp_jax.training import processes
 from lorasp_jax.training.base import base_model, changed
+from lorasp_jax.training.cost import preflight
+from lorasp_jax.training.dataset import cached, is_simulated, opened, outline
+from lorasp_jax.training.demonstrations import demonstrations
 from lorasp_jax.training.progress import bars
 from lorasp_jax.training.run import Run
 from lorasp_jax.training.run_folder import record_dataset
@@ -91,7 +96,7 @@ def build(config: Config, folder: Path, *, shapes: bool = False) -> Built:
     sizes = {"image_size": config.image_size, "control_dt": config.control_dt}
     tasks = () if config.data.source else config.tasks
     worlds = [envs.make(task, robot=config.robot, **sizes) for task in tasks]
-    stands_in = shapes and places.is_elsewhere(config.model.tokenizer)
+    stands_in = shapes and hub.is_elsewhere(config.model.tokenizer)
     words = tokenizer.load("" if stands_in else config.model.tokenizer)
     base, base_hash = base_model(config, shapes=shapes)
     base = changed(base, max_tokens=config.model.max_tokens or base.config.max_tokens)
@@ -144,7 +149,7 @@ def headline(config: Config, model: Backbone) -> str:
     """One line: scale, method, backbone and what trains."""
     return (
         f"scale {config.scale}: {type(config.peft).__name__} on {config.model.backbone} "
-        f"{config.model.size}, {tables.trained_share(model)}"
+        f"{config.model.size}, {summary.trained_share(model)}"
     )
 
 

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import optax
 from flax import nnx
 
-from lorasp_jax import adaptation
-from lorasp_jax.auxiliary import Aux, auxiliary_losses, masked_mean
+from lorasp_jax.adapters import adaptation
 from lorasp_jax.data.batches import Batch
 from lorasp_jax.models import flow_matching
+from lorasp_jax.peft._aux import Aux, auxiliary_losses, masked_mean
 from lorasp_jax.training import guard as guards
 from lorasp_jax.training.guard import Guard
 

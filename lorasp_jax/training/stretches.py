@@ -8,16 +8,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from envs import compiling, fast_cpu
-from lorasp_jax import flops
+from envs.compilation import fast_cpu, messages
 from lorasp_jax.data.batches import Raw, Steps, flatten, of_size
-from lorasp_jax.data.demonstrations import fresh_demonstrations
 from lorasp_jax.data.pictures import loaded
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.training import mesh as meshes
-from lorasp_jax.training import preflight, processes
+from lorasp_jax.training import processes
+from lorasp_jax.training.cost import flops, preflight
+from lorasp_jax.training.cost.speed import Speed
+from lorasp_jax.training.demonstrations import fresh_demonstrations
 from lorasp_jax.training.run import Run
-from lorasp_jax.training.speed import Speed
 from lorasp_jax.training.step import TrainState
 
 
@@ -34,7 +34,7 @@ class Stretches:
             key = jax.random.key(0)
 
             def compiled() -> Any:
-                with compiling.said("the training step"):
+                with messages.said("the training step"):
                     lowered = self._jitted.lower(self._frozen, self._data, state, key, count)
                     return lowered.compile(compiler_options=fast_cpu.without_simulation())
 

@@ -10,8 +10,8 @@ import jax
 import numpy as np
 import pytest
 
-from envs.episodes import Episodes
-from lorasp_jax.data import cache, conversion
+from envs.datasets.episodes import Episodes
+from lorasp_jax.data import cache, rlds_export
 from lorasp_jax.data.batches import flatten, gather
 from lorasp_jax.data.lerobot import Keys, LeRobot
 from lorasp_jax.data.opening import open_source
@@ -42,7 +42,7 @@ def simulated(tmp_path_factory):
 
 def test_two_tasks_are_no_rlds_folder(simulated, tmp_path):
     with pytest.raises(ValueError, match="one task, not pour, press"):
-        conversion.to_rlds(simulated[1], tmp_path / "rlds", pytest.fail)
+        rlds_export.to_rlds(simulated[1], tmp_path / "rlds", pytest.fail)
 
 
 @pytest.mark.parametrize("version", VERSIONS)

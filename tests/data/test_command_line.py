@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from envs import rlds
-from lorasp_jax.data import conversion
+from envs.datasets import rlds
+from lorasp_jax.data import rlds_export
 from lorasp_jax.data.__main__ import main
 from lorasp_jax.data.cache import Cache
 from lorasp_jax.data.lerobot import LeRobot
 from lorasp_jax.data.opening import open_source
 from tests.data.lerobots import copied, cut, digest, golden
-from tests.envs.test_episodes import assert_equal
+from tests.envs.datasets.test_episodes import assert_equal
 
 
 def run(capsys, *arguments):
@@ -79,9 +79,9 @@ def test_convert_to_all_kinds_and_back(capsys, tmp_path):
 
 
 def test_rlds_in_several_files(tmp_path, monkeypatch):
-    monkeypatch.setattr(conversion, "_TOGETHER", 3)
+    monkeypatch.setattr(rlds_export, "_TOGETHER", 3)
     reports = []
-    conversion.to_rlds(
+    rlds_export.to_rlds(
         LeRobot(golden("v21")), tmp_path / "rlds", lambda *done: reports.append(done)
     )
     assert [done for done, _ in reports] == [25, 58, 98, 126]

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from lorasp_jax.config import DataConfig
-from lorasp_jax.data import cache, imported
+from lorasp_jax.data import cache
 from lorasp_jax.data.cache import Cache
 from lorasp_jax.data.opening import open_source
 from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.training import dataset
 from tests.data.lerobots import golden
 from tests.runs import CONFIG, random_episodes
 
@@ -37,15 +38,15 @@ def simulated(tmp_path_factory):
 
 def test_a_dataset_becomes_a_cache_once(tmp_path):
     chosen = config(golden("v3"))
-    source = imported.opened(chosen, MODEL, tmp_path)
-    found = imported.cached(source, tmp_path, quietly)
+    source = dataset.opened(chosen, MODEL, tmp_path)
+    found = dataset.cached(source, tmp_path, quietly)
     size = MODEL.image_size  # what the model sees, the longer side
     assert found.cameras["side"] == [size * 96 // 128, size]
-    again = imported.opened(chosen, MODEL, tmp_path)
+    again = dataset.opened(chosen, MODEL, tmp_path)
     assert isinstance(again, Cache)
     assert again.path == found.path == tmp_path / "cache" / "steps"
-    assert imported.cached(again, tmp_path, quietly) is again
-    assert not imported.is_simulated(found)
+    assert dataset.cached(again, tmp_path, quietly) is again
+    assert not dataset.is_simulated(found)
 
 
 @pytest.mark.parametrize(
@@ -61,7 +62,7 @@ def test_a_dataset_becomes_a_cache_once(tmp_path):
 )
 def test_what_does_not_fit_is_said_at_once(changes, model, sentence, tmp_path):
     with pytest.raises(ValueError, match=sentence):
-        imported.opened(
+        dataset.opened(
             config(golden("v3"), **changes),
             dataclasses.replace(MODEL, **model),
             tmp_path,
@@ -83,12 +84,12 @@ def test_numbers_that_no_policy_learns(changes, sentence, tmp_path):
     path = tmp_path / "recorded.npz"
     dataclasses.replace(random_episodes("press", 0), **changes).save(path)
     with pytest.raises(ValueError, match=sentence):
-        imported.opened(config(path), MODEL, tmp_path / "run")
+        dataset.opened(config(path), MODEL, tmp_path / "run")
 
 
 def test_outline(simulated):
     """The numbers are those of the episodes; one picture stands for all."""
-    found = imported.outline(simulated)
+    found = dataset.outline(simulated)
     assert list(found) == ["press", "pour"]
     for number, (task, group) in enumerate(found.items()):
         wanted = random_episodes(task, number)
@@ -110,10 +111,10 @@ def test_outline(simulated):
 
 
 def test_what_can_be_simulated(simulated):
-    assert imported.is_simulated(simulated)
+    assert dataset.is_simulated(simulated)
     facts = dict(simulated.facts)
     # The last: recordings of a real robot.
     for changed in ({"robot": "so101"}, {"tasks": ["press", "fold"]}, {"physics_dt": 0.0}):
         simulated.facts = facts | changed
-        assert not imported.is_simulated(simulated)
+        assert not dataset.is_simulated(simulated)
     simulated.facts = facts

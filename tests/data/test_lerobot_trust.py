@@ -10,9 +10,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from lorasp_jax.data.films import Film, decoded
 from lorasp_jax.data.lerobot import LeRobot
 from lorasp_jax.data.lerobot_files import read_table
+from lorasp_jax.data.video import Film, decoded
 from tests.data.lerobots import VERSIONS, copied, digest, edit_info, edit_rows, golden
 
 

@@ -6,9 +6,9 @@ import pytest
 
 from lorasp_jax.data.batches import encode, flatten, gather, sample_batch
 from lorasp_jax.data.stream import Stream
-from lorasp_jax.models import tokenizer
 from lorasp_jax.models.pi0 import Pi0Config
-from lorasp_jax.models.prompt_table import PromptTable
+from lorasp_jax.policies import tokenizer
+from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.training.setup import processor
 from tests.runs import random_episodes
 

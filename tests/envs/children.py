@@ -13,7 +13,8 @@ import jax
 import numpy as np
 
 from envs import __main__ as command_line
-from envs import collection, rlds, rlds_schema
+from envs.datasets import rlds, rlds_schema
+from envs.experts import collection
 
 COLLECT = "collect --task press --robot piper --num-episodes 20 --num-envs 6 --image-size 16"
 # Where a process is killed: a function, and which call of it the process does not survive.

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs import actions, experts
+from envs import actions
+from envs.experts import expert
 from envs.tasks import View
 
 
@@ -57,11 +58,11 @@ def _placed(scene, layout) -> mujoco.MjData:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _plan(scene, layout, command, key):
-    plan = experts._plan(scene, {"layout": layout, "command": command, "draw": None}, key)
+    plan = expert._plan(scene, {"layout": layout, "command": command, "draw": None}, key)
     return plan.knots, plan.times
 
 
-_target = jax.jit(experts._interpolate)
+_target = jax.jit(expert._interpolate)
 
 
 @functools.partial(jax.jit, static_argnums=1)

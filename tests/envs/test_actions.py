@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import envs
-from envs import actions, collection, robots
+from envs import actions, robots
+from envs.experts import collection
 
 
 @pytest.fixture

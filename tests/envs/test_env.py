@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import envs
-from envs import experts
+from envs.experts import expert
 
 W = 4
 
@@ -114,8 +114,8 @@ def test_time_limit_latches_and_freezes(env, start):
 
 
 def test_success_latches(env, start):
-    plan = experts.plan(env, start, jax.random.key(1))
-    act = jax.jit(lambda state: experts.act(env, plan, state))
+    plan = expert.plan(env, start, jax.random.key(1))
+    act = jax.jit(lambda state: expert.act(env, plan, state))
     state, history = start, []
     for _ in range(env.expert_steps):
         state = env.step(state, act(state))
@@ -168,8 +168,8 @@ def test_each_picture_is_of_the_camera_it_is_named_after(env, start):
 def test_lowers_for_every_accelerator(env):
     def episode(key):
         state = env.reset(key)
-        plan = experts.plan(env, state, key)
-        state = env.step(state, experts.act(env, plan, state))
+        plan = expert.plan(env, state, key)
+        state = env.step(state, expert.act(env, plan, state))
         return env.observe(env.reset_done(state, key))
 
     traced = jax.jit(episode).trace(jax.random.key(0))

@@ -16,7 +16,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import envs
-from envs import experts
+from envs.experts import expert
 from envs.interop.brax import BraxEnv
 from envs.interop.gymnasium import OBSERVATIONS, SingleEnv, VectorEnv
 from envs.names import names
@@ -36,8 +36,8 @@ def pressed(env):
     """An expert through the Gymnasium interface: the first success, and the worlds before it."""
     vector = VectorEnv(env, observation="state")
     vector.reset(seed=0)
-    plan = experts.plan(env, vector.state, jax.random.key(1))
-    act = jax.jit(lambda state: experts.act(env, plan, state))
+    plan = expert.plan(env, vector.state, jax.random.key(1))
+    act = jax.jit(lambda state: expert.act(env, plan, state))
     for _ in range(env.expert_steps):
         before, action = vector.state, np.asarray(act(vector.state))
         outcome = vector.step(action)

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import envs
-from envs import experts, rewards
+from envs import rewards
+from envs.experts import expert
 from envs.rewards import potential
 from envs.state import State
 from envs.tasks import View
@@ -168,8 +169,8 @@ def test_an_environment_with_dense_rewards(task_name):
     env = envs.make(task_name, num_envs=4, image_size=16, reward="dense", discount=0.95)
     ranges = envs.Randomization.typical()
     state = env.reset(jax.random.key(0), ranges)
-    plan = experts.plan(env, state, jax.random.key(1))
-    act = jax.jit(lambda state: experts.act(env, plan, state))
+    plan = expert.plan(env, state, jax.random.key(1))
+    act = jax.jit(lambda state: expert.act(env, plan, state))
     start, returns = np.asarray(state.metrics["potential"]), np.zeros(4)
     for step in range(env.expert_steps):
         before, state = state, env.step(state, act(state))

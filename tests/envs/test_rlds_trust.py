@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
-from envs import rlds
-from tests.envs.test_episodes import make
+from envs.datasets import rlds
+from tests.envs.datasets.test_episodes import make
 
 EVIL = "evil_of_a_dataset.Evil"
 DICT = "tensorflow_datasets.core.features.features_dict.FeaturesDict"

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 import envs
-from envs import mjcf, render, robots, scene
+from envs import mjcf, robots
+from envs.rendering import renderer
+from envs.scene import scene
 from envs.tasks import press
 from tests.cases import mostly_slow
 from tests.envs.user_arm import HALF, JOINTS, write
@@ -188,7 +190,7 @@ def test_a_hinge_may_be_called_left_and_the_rest_nothing(tmp_path):
 def test_small_meshes_are_not_drawn(tmp_path):
     model = built(tmp_path, ('name="shell"', 'name="shell" scale=".05 .05 .05"'))
     assert np.sum(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH) == 1
-    drawn = render.build(model, ["side"]).geoms
+    drawn = renderer.build(model, ["side"]).geoms
     assert not np.any(model.geom_type[list(drawn)] == mujoco.mjtGeom.mjGEOM_MESH)
 
 
@@ -224,7 +226,7 @@ def test_colours_are_the_geoms_own(tmp_path):
 
 def test_ray_caster_draws_something_in_the_place_of_a_mesh(robot, model):
     mesh = next(i for i in range(model.ngeom) if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_MESH)
-    drawn = render.build(model, ["side", "wrist"])
+    drawn = renderer.build(model, ["side", "wrist"])
     assert mesh not in drawn.geoms
     (stand_in,) = np.flatnonzero(model.geom_group == 5)
     assert stand_in in drawn.geoms

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import envs
-from envs import experts, physics
-from envs.randomization import Randomization
+from envs.experts import expert
+from envs.physics import physics
+from envs.scene.randomization import Randomization
 
 pytest.importorskip("warp")
 WORLDS, SIZE = 3, 48
@@ -27,9 +28,9 @@ def pair():
 def run(env, ranges, steps):
     """The expert's way through some control steps."""
     state = env.reset(jax.random.key(2), ranges)
-    plan = experts.plan(env, state, jax.random.key(3))
+    plan = expert.plan(env, state, jax.random.key(3))
     for _ in range(steps):
-        state = env.step(state, experts.act(env, plan, state))
+        state = env.step(state, expert.act(env, plan, state))
     return state
 
 

@@ -10,10 +10,10 @@ import pytest
 import envs
 from lorasp_jax.evaluation import evaluate, make_rollout
 from lorasp_jax.evaluation.rollout import Rollout, _largest_bank, _result, _told
-from lorasp_jax.models.policy import Policy
-from lorasp_jax.models.prompt_table import PromptTable
-from lorasp_jax.models.tokenizer import Offline
 from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP
+from lorasp_jax.policies.policy import Policy
+from lorasp_jax.policies.prompt_table import PromptTable
+from lorasp_jax.policies.tokenizer import Offline
 from tests.runs import CONFIG, make_run
 
 

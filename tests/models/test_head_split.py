@@ -10,7 +10,7 @@ import safetensors.numpy
 from flax import nnx
 
 from lorasp_jax import models
-from lorasp_jax.models import published
+from lorasp_jax.models.checkpoints import published
 from lorasp_jax.models.pi0 import Pi0Config, openpi_lora
 from lorasp_jax.models.smolvla import SmolVLAConfig
 from tests.models.drawn import drawn

@@ -7,8 +7,8 @@ import orbax.checkpoint as ocp
 import pytest
 from flax import nnx
 
-from lorasp_jax.models import layouts, published
-from lorasp_jax.models.checkpoint import base_arrays
+from lorasp_jax.models.checkpoints import layouts, published
+from lorasp_jax.models.checkpoints.native import base_arrays
 from lorasp_jax.models.pi0 import Pi0Config, openpi_lora, weights
 from tests.models.drawn import drawn
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from lorasp_jax.models import paper
+from benchmarks import paper_tables
 from lorasp_jax.peft import LoRA, LoRAMoE, LoRASP
 
 TABLE_I = {
@@ -33,7 +33,7 @@ def test_every_printed_digit(name, printed):
         for i, backbone in enumerate(("π0", "SmolVLA"))
         for strategy, values in printed.items()
     }
-    assert paper.parameter_column(name) == wanted
+    assert paper_tables.parameter_column(name) == wanted
 
 
 @pytest.mark.parametrize(
@@ -45,14 +45,14 @@ def test_every_printed_digit(name, printed):
 )
 def test_linear_layers(backbone, layers, both, inputs, total):
     """How many there are, their sums of I + O and of I, and the models' own parameters."""
-    config = paper.BACKBONES[backbone]
-    shapes, found = paper.linear_layers(config)
+    config = paper_tables.BACKBONES[backbone]
+    shapes, found = paper_tables.linear_layers(config)
     stacks = [(math.prod(stack), d_in, d_out) for *stack, d_in, d_out in shapes.values()]
     assert found == total
     assert sum(n for n, _, _ in stacks) == layers
     assert sum(n * (d_in + d_out) for n, d_in, d_out in stacks) == both
     assert sum(n * d_in for n, d_in, _ in stacks) == inputs
-    assert paper.count(config, LoRA(rank=16)) == (16 * both, total + 16 * both)
+    assert paper_tables.count(config, LoRA(rank=16)) == (16 * both, total + 16 * both)
 
 
 MORE_DIGITS = [
@@ -69,8 +69,8 @@ MORE_DIGITS = [
 
 @pytest.mark.parametrize(("method", "pi0", "smolvla"), MORE_DIGITS)
 def test_to_more_digits(method, pi0, smolvla):
-    for config, percent in zip(paper.BACKBONES.values(), (pi0, smolvla), strict=True):
-        trainable, total = paper.count(config, method)
+    for config, percent in zip(paper_tables.BACKBONES.values(), (pi0, smolvla), strict=True):
+        trainable, total = paper_tables.count(config, method)
         assert 100 * trainable / total == pytest.approx(percent, abs=6e-4)
 
 
@@ -84,7 +84,7 @@ def test_to_more_digits(method, pi0, smolvla):
     ids=["4", "8", "release"],
 )
 def test_what_does_not_give_the_17_1_of_lora_sp(router, printed):
-    shapes, total = paper.linear_layers(paper.BACKBONES["SmolVLA"])
+    shapes, total = paper_tables.linear_layers(paper_tables.BACKBONES["SmolVLA"])
     adapters = sum(
         math.prod(stack) * (128 * (d_in + d_out) + router(d_in))
         for *stack, d_in, d_out in shapes.values()

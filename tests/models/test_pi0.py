@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from lorasp_jax.models.layers import block_mask
 from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.models.transformer.layers import block_mask
 from tests.models.drawn import drawn, observation
 
 CONFIG = Pi0Config.dummy()

@@ -10,7 +10,8 @@ import pytest
 from flax import nnx
 
 import lorasp_jax
-from lorasp_jax.models import checkpoint, layouts, presets, published
+from lorasp_jax.models import presets
+from lorasp_jax.models.checkpoints import layouts, native, published
 from lorasp_jax.models.pi0 import Pi0Config, weights
 from lorasp_jax.peft import LoRA
 from tests.models.drawn import drawn, observation
@@ -38,7 +39,7 @@ def actions():
 
 def sizes(config):
     model = nnx.eval_shape(lambda: config.create(nnx.Rngs(0)))
-    return {name: leaf.shape for name, leaf in checkpoint.named_arrays(model).items()}
+    return {name: leaf.shape for name, leaf in native.named_arrays(model).items()}
 
 
 def test_parameter_count():
@@ -90,7 +91,7 @@ def test_published_names_and_shapes():
 def test_there_and_back(layout, model, tmp_path):
     published.save(tmp_path / "new", model, layout)
     found, _ = published.load(tmp_path / "new", CONFIG)
-    found, wanted = checkpoint.named_arrays(found), checkpoint.named_arrays(model)
+    found, wanted = native.named_arrays(found), native.named_arrays(model)
     assert found.keys() == wanted.keys()
     for name, array in wanted.items():
         np.testing.assert_array_equal(found[name], array, err_msg=name)
@@ -99,7 +100,7 @@ def test_there_and_back(layout, model, tmp_path):
 
 
 def test_dense_of_a_norm_is_transposed_for_lerobot(model):
-    arrays = {name: np.asarray(leaf) for name, leaf in checkpoint.named_arrays(model).items()}
+    arrays = {name: np.asarray(leaf) for name, leaf in native.named_arrays(model).items()}
     theirs = layouts.write(weights.lerobot_layout(CONFIG), arrays)
     name = "paligemma_with_expert.gemma_expert.model.layers.1.input_layernorm.dense.weight"
     wanted = arrays["action/blocks/input_layernorm/dense/kernel"][1].T
@@ -112,7 +113,7 @@ def test_cached_path_is_one_pass_over_the_whole_sequence(model, obs, actions):
     found, (tokens, valid) = jax.jit(
         lambda obs, x_t: (model.velocity(obs, x_t, time), model.embed_prefix(obs)[:2])
     )(obs, actions)
-    p = {n: np.asarray(a, np.float64) for n, a in checkpoint.named_arrays(model).items()}
+    p = {n: np.asarray(a, np.float64) for n, a in native.named_arrays(model).items()}
     wanted = joint_pass(
         p, np.float64(tokens), np.asarray(valid), np.float64(actions), np.float64(time)
     )

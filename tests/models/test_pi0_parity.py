@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from lorasp_jax.models import published
-from lorasp_jax.models.layers import block_mask, positions
+from lorasp_jax.models.checkpoints import published
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.pi0 import ExpertConfig, Pi0Config, VisionConfig
+from lorasp_jax.models.transformer.layers import block_mask, positions
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "pi0_tiny"
 EXPERT = ExpertConfig(width=64, depth=4, mlp=128, heads=8, kv_heads=1, head_dim=16)

@@ -7,7 +7,7 @@ import pytest
 from flax import nnx
 
 import lorasp_jax
-from lorasp_jax import adaptation, paths, tables
+from lorasp_jax.adapters import adaptation, paths, summary
 from lorasp_jax.models import pi0, presets, smolvla
 from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP
 
@@ -79,7 +79,7 @@ def test_adaptive_norms_are_of_the_expert_and_not_openpis():
 def test_share_of_the_published_sizes(config, adapters, base, share):
     """Sum of I + O over all linear layers but the lm_heads, times the rank."""
     model = adapted(config, "paper", LoRA(rank=128))
-    line = tables.trained_share(model)
+    line = summary.trained_share(model)
     assert line.startswith(
         f"{share} of all parameters train, {adapters:,} of {adapters + base:,}; the others are"
     )
@@ -91,15 +91,15 @@ def test_what_is_frozen_is_said():
     model = adapted(config, "expert-only", FullFineTuning())
     assert adaptation.count(model).trainable == 99_880_992
     line = "22.19% of all parameters train, 99,880,992 of 450,046,176; the others are frozen, all "
-    assert tables.trained_share(model) == f"{line}of language, vision among them"
+    assert summary.trained_share(model) == f"{line}of language, vision among them"
     dummy = smolvla.Config.dummy()
-    line = tables.trained_share(adapted(dummy, "all-linear", LoRA(rank=2)))
+    line = summary.trained_share(adapted(dummy, "all-linear", LoRA(rank=2)))
     assert line.endswith("; the others are frozen")
-    line = tables.trained_share(adapted(dummy, ".*", FullFineTuning()))
+    line = summary.trained_share(adapted(dummy, ".*", FullFineTuning()))
     assert line.startswith("100.00%")
     assert line.endswith("; nothing is frozen")
     bare = nnx.eval_shape(lambda: dummy.create(nnx.Rngs(0)))
-    assert tables.trained_share(bare).startswith("0.00% of all parameters train, 0 of ")
+    assert summary.trained_share(bare).startswith("0.00% of all parameters train, 0 of ")
 
 
 @pytest.mark.parametrize(

@@ -9,10 +9,10 @@ import pytest
 from flax import nnx
 
 from lorasp_jax import models
-from lorasp_jax.models.layers import rope, rope_table
 from lorasp_jax.models.observation import Observation
-from lorasp_jax.models.siglip import patches
 from lorasp_jax.models.smolvla import SmolVLAConfig, weights
+from lorasp_jax.models.transformer.layers import rope, rope_table
+from lorasp_jax.models.transformer.siglip import patches
 from tests.models.drawn import drawn
 
 CONFIG = SmolVLAConfig.dummy()

@@ -16,11 +16,11 @@ import safetensors.numpy
 from flax import nnx
 
 import lorasp_jax
-from lorasp_jax.models import checkpoint, layouts, published
+from lorasp_jax.models.checkpoints import layouts, native, published
 from lorasp_jax.models.config import ExpertConfig, VisionConfig
-from lorasp_jax.models.layers import block_mask, positions
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.smolvla import SmolVLAConfig, weights
+from lorasp_jax.models.transformer.layers import block_mask, positions
 from lorasp_jax.peft import LoRA
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "smolvla_tiny"
@@ -128,7 +128,7 @@ def test_loss_and_gradients(model, obs, inputs, expected):
     (mean, loss), grads = jax.jit(jax.value_and_grad(mean_loss, has_aux=True))(parameters)
     close(loss, expected["loss"], 3e-4)
     close(mean, expected["mean_loss"], 3e-4)
-    grads = checkpoint.base_arrays(nnx.merge(graphdef, grads))
+    grads = native.base_arrays(nnx.merge(graphdef, grads))
     theirs = layouts.write(weights.lerobot_layout(CONFIG), grads)
     grads = {f"model.{name}": grad for name, grad in theirs.items()}
     recorded = [name.removeprefix("grad/") for name in expected if name.startswith("grad/")]

@@ -8,13 +8,14 @@ import numpy as np
 import orbax.checkpoint as ocp
 import pytest
 
-from envs.files import TEXT_BYTES
-from lorasp_jax.models import checkpoint, layouts, loading, published, statistics_files, tokenizer
+from envs.datasets.files import TEXT_BYTES
+from lorasp_jax.models.checkpoints import layouts, loading, native, published
+from lorasp_jax.models.checkpoints.tensor_files import INDEX, SINGLE, TensorFiles, weight_files
 from lorasp_jax.models.pi0 import Pi0Config
-from lorasp_jax.models.tensor_files import INDEX, SINGLE, TensorFiles, weight_files
+from lorasp_jax.policies import statistics_files, tokenizer
 
 READERS = {
-    "config.json": [loading.load_config, checkpoint.load_config],
+    "config.json": [loading.load_config, native.load_config],
     SINGLE: [lambda folder: TensorFiles(weight_files(folder)), statistics_files.read],
     INDEX: [weight_files],
     "tokenizer.json": [tokenizer.load],

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from lorasp_jax import adaptation, adapter_io
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters.io import native
 from lorasp_jax.dense import Dense, LinenDense
 from lorasp_jax.peft import DoRA, LoRA
 
@@ -112,8 +113,8 @@ def test_saved_adapters_fit_the_base_they_were_made_from(name, tmp_path):
     adapted = adaptation.adapt(model(), [("layer", lora(name))], rngs=nnx.Rngs(0))
     trained = adapted.layer.adapter.get_value()
     adapted.layer.adapter.set_value(jax.tree.map(lambda leaf: leaf + 0.1, trained))
-    adapter_io.save_adapters(tmp_path, adapted)
-    loaded = adapter_io.load_adapters(tmp_path, model())
+    native.save_adapters(tmp_path, adapted)
+    loaded = native.load_adapters(tmp_path, model())
     np.testing.assert_allclose(loaded.layer(X), adapted.layer(X), atol=1e-5)
 
 

@@ -13,14 +13,16 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from lorasp_jax import adaptation, adapter_io, models
+from lorasp_jax import models
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters.io import native
 from lorasp_jax.config import ModelConfig
 from lorasp_jax.digest import sealed
-from lorasp_jax.models import tokenizer
 from lorasp_jax.models.pi0 import Pi0Config
-from lorasp_jax.models.policy import Policy
-from lorasp_jax.models.processing import Statistics
 from lorasp_jax.peft import FullFineTuning
+from lorasp_jax.policies import tokenizer
+from lorasp_jax.policies.policy import Policy
+from lorasp_jax.policies.processor import Statistics
 from lorasp_jax.training import base, export, setup
 from tests.models.drawn import drawn
 from tests.runs import CONFIG, leaves, make_run
@@ -51,12 +53,12 @@ def test_adapters(tmp_path):
     assert (metadata["robot"], metadata["control_dt"]) == ("piper", 0.1)
     assert Statistics.from_json(json.dumps(metadata["policy"]["statistics"]))
     bare = drawn(Pi0Config.dummy())
-    loaded = adapter_io.load_adapters(run.folder, bare, base=run.base_hash)
+    loaded = native.load_adapters(run.folder, bare, base=run.base_hash)
     expected = leaves(adaptation.split(run.policy.model)[1])
     for name, value in leaves(adaptation.split(loaded)[1]).items():
         np.testing.assert_array_equal(value, expected[name], err_msg=name)
     with pytest.raises(ValueError, match="was trained on base"):
-        adapter_io.load_adapters(run.folder, bare, base="another")
+        native.load_adapters(run.folder, bare, base="another")
 
 
 @pytest.mark.parametrize("method", [CONFIG.peft, FullFineTuning()], ids=["adapters", "base"])
@@ -157,7 +159,7 @@ def test_a_policy_that_cannot_come_back(tmp_path, changes):
         "base": "somewhere",
         "policy": {"backbone": "pi0", "config": dataclasses.asdict(config)},
     }
-    facts = {"format": adapter_io.FORMAT, "version": adapter_io.VERSION, "metadata": told | changes}
+    facts = {"format": native.FORMAT, "version": native.VERSION, "metadata": told | changes}
     facts |= {"base": "", "weights": {}, "methods": {}, "sha256": ""}
     (tmp_path / "adapter.json").write_text(json.dumps(sealed(facts)))
     with pytest.raises(ValueError, match=r"does not say what its policy needs|was random"):

@@ -10,7 +10,7 @@ import numpy as np
 import optax
 import pytest
 
-from lorasp_jax import adaptation
+from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import OptimConfig
 from lorasp_jax.training import guard as guards
 from lorasp_jax.training import mesh as meshes

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 import pytest
 
-from lorasp_jax import adaptation
+from lorasp_jax.adapters import adaptation
 from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training import processes
 from lorasp_jax.training.checkpoint import WRITTEN

@@ -9,8 +9,8 @@ import jax
 import numpy as np
 import pytest
 
-from envs import fast_cpu
-from lorasp_jax import adaptation
+from envs.compilation import fast_cpu
+from lorasp_jax.adapters import adaptation
 from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.loop import RunError, train
 from lorasp_jax.training.run import Callback

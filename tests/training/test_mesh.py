@@ -11,7 +11,7 @@ import pytest
 from flax import nnx
 from jax.sharding import PartitionSpec
 
-from lorasp_jax import adaptation
+from lorasp_jax.adapters import adaptation
 from lorasp_jax.data.batches import flatten, sample_batch
 from lorasp_jax.peft import FullFineTuning, LoRA
 from lorasp_jax.training import mesh as meshes

@@ -7,7 +7,8 @@ import numpy as np
 import optax
 import pytest
 
-from lorasp_jax import adaptation, peft
+from lorasp_jax import peft
+from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import OptimConfig
 from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.loop import train

@@ -14,15 +14,16 @@ import pytest
 from flax import nnx
 from rich.console import Console
 
-from lorasp_jax import adaptation, models, paths
+from lorasp_jax import models
+from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.config import ModelConfig
 from lorasp_jax.data.opening import open_source
 from lorasp_jax.models import inputs
 from lorasp_jax.models.pi0 import Pi0Config
-from lorasp_jax.models.policy import Policy
-from lorasp_jax.models.prompt_table import PromptTable
-from lorasp_jax.models.tokenizer import Offline
 from lorasp_jax.peft import FullFineTuning, LoRA
+from lorasp_jax.policies.policy import Policy
+from lorasp_jax.policies.prompt_table import PromptTable
+from lorasp_jax.policies.tokenizer import Offline
 from lorasp_jax.training import base, export, setup
 from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.loop import train

@@ -9,7 +9,7 @@ import optax
 import pytest
 from flax import nnx
 
-from lorasp_jax import adaptation
+from lorasp_jax.adapters import adaptation
 from lorasp_jax.data.batches import Batch, flatten, sample_batch
 from lorasp_jax.peft import Aux, LoRA
 from lorasp_jax.training import mesh as meshes

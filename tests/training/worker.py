@@ -28,9 +28,9 @@ def main(args: argparse.Namespace) -> None:
     import jax
     from rich.console import Console
 
-    from envs import compilation_cache
+    from envs.compilation import cache
 
-    compilation_cache.enable()
+    cache.enable()
     xla.compile_steps_as_all_else()
     jax.config.update("jax_default_matmul_precision", "highest")
     from lorasp_jax.training import mesh as meshes

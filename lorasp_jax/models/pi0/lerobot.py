@@ -4,8 +4,8 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+from lorasp_jax.models.checkpoints.lerobot_config import require
 from lorasp_jax.models.inputs import LEROBOT_CENTRED, LEROBOT_PI05
-from lorasp_jax.models.lerobot_config import require
 from lorasp_jax.models.pi0.config import Pi0Config
 
 

@@ -19,8 +19,8 @@ import numpy as np
 from flax import nnx
 
 from lorasp_jax.dense import AdapterParam
+from lorasp_jax.models.checkpoints.layouts import OtherModelError
 from lorasp_jax.models.config import ExpertConfig
-from lorasp_jax.models.layouts import OtherModelError
 from lorasp_jax.peft import LoRA
 
 _LAYERS = "PaliGemma/llm/layers"

@@ -15,12 +15,18 @@ import numpy as np
 from flax import nnx
 
 from lorasp_jax.models.backbone import Backbone, action_tokens, suffix_view
-from lorasp_jax.models.experts import AdaptiveExpert, Expert, KeysValues, LanguageExpert
-from lorasp_jax.models.layers import LayerAux, Linears, block_mask, positions, time_embedding
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.pi0.config import Pi0Config
 from lorasp_jax.models.sampling import ModelAux
-from lorasp_jax.models.siglip import SigLIP
+from lorasp_jax.models.transformer.experts import AdaptiveExpert, Expert, KeysValues, LanguageExpert
+from lorasp_jax.models.transformer.layers import (
+    LayerAux,
+    Linears,
+    block_mask,
+    positions,
+    time_embedding,
+)
+from lorasp_jax.models.transformer.siglip import SigLIP
 
 
 class Prefix(NamedTuple):

@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax.models.attention import attention
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig
-from lorasp_jax.models.depth import scan_depth, stack
-from lorasp_jax.models.experts import GATED, ExpertBlock, KeysValues, LanguageExpert
-from lorasp_jax.models.layers import (
+from lorasp_jax.models.transformer.attention import attention
+from lorasp_jax.models.transformer.depth import scan_depth, stack
+from lorasp_jax.models.transformer.experts import GATED, ExpertBlock, KeysValues, LanguageExpert
+from lorasp_jax.models.transformer.layers import (
     LayerAux,
     Linears,
     RMSNorm,

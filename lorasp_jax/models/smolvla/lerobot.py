@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from lorasp_jax.models.lerobot_config import require
+from lorasp_jax.models.checkpoints.lerobot_config import require
 from lorasp_jax.models.smolvla.config import SmolVLAConfig
 
 # What this backbone does, and LeRobot's may do otherwise.

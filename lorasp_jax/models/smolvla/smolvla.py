@@ -14,13 +14,13 @@ import numpy as np
 from flax import nnx
 
 from lorasp_jax.models.backbone import Backbone, action_tokens, suffix_view
-from lorasp_jax.models.experts import KeysValues
-from lorasp_jax.models.layers import LayerAux, Linears, block_mask, positions
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.sampling import ModelAux
-from lorasp_jax.models.siglip import SigLIP
 from lorasp_jax.models.smolvla.config import SmolVLAConfig
 from lorasp_jax.models.smolvla.experts import ActionExpert, Language
+from lorasp_jax.models.transformer.experts import KeysValues
+from lorasp_jax.models.transformer.layers import LayerAux, Linears, block_mask, positions
+from lorasp_jax.models.transformer.siglip import SigLIP
 
 
 class Prefix(NamedTuple):

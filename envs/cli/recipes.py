@@ -1,0 +1,39 @@
+"""How a dataset is made: what must be the same for the same episodes to come out."""
+
+import argparse
+import dataclasses
+from typing import Any
+
+import jax
+import mujoco
+
+import envs
+from envs.experts import traced
+
+
+def recipe(options: argparse.Namespace, env: envs.Env) -> dict[str, Any]:
+    """All that the episodes depend on."""
+    return {
+        "task": env.task.name,
+        "robot": options.robot,
+        "model": traced.digest(env),  # a user may edit the robot's file
+        "num_episodes": options.num_episodes,
+        "num_envs": env.num_envs,
+        "image_size": env.image_size,
+        "antialias": env.antialias,
+        "control_dt": env.control_dt,
+        "actions": env.actions,
+        "distractors": env.distractors,
+        "action_noise": options.action_noise,
+        "randomize": dataclasses.asdict(drawn) if (drawn := ranges(options)) else None,
+        "seed": options.seed,
+        "physics": env.physics.backend,
+        "device": jax.default_backend(),
+        "jax": jax.__version__,
+        "mujoco": mujoco.__version__,
+    }
+
+
+def ranges(options: argparse.Namespace) -> envs.Randomization | None:
+    """What differs from world to world."""
+    return envs.Randomization.typical() if options.randomize else None

@@ -1,0 +1,1 @@
+"""How XLA compiles for simulation, and what it says meanwhile."""

@@ -1,0 +1,1 @@
+"""Experts that solve the tasks, and demonstrations collected from them."""

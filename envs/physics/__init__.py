@@ -1,0 +1,1 @@
+"""MuJoCo MJX: the only folder that names an implementation of it."""

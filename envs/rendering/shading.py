@@ -1,0 +1,105 @@
+"""The colour of pixels.
+
+Nothing here is sliced or gathered: a view is a tree of scalars, geoms are looked up by number
+through a function, and pixels are one axis of any length.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from envs.rendering import intersections
+from envs.rendering.intersections import PLANE, Geoms, Matrix, Vec, along, dot, ray
+
+
+class View(NamedTuple):
+    """One camera and its light; every leaf is a scalar. Shares and colours as in `Look`."""
+
+    position: Vec
+    rotation: Matrix
+    pixel: jax.Array  # half a pixel's edge, one metre away [m]
+    ambient: jax.Array
+    headlight: jax.Array
+    diffuse: jax.Array
+    horizon: Vec  # colour of the sky
+    zenith: Vec
+    square: jax.Array  # edge of the squares on planes [m]
+    contrast: jax.Array
+
+
+class Raster(NamedTuple):
+    """A picture's size: rows, columns, and rays a pixel along either."""
+
+    height: int
+    width: int
+    samples: int
+
+
+def pack(tree: Any) -> jax.Array:
+    """The leaves of a tree, all of one shape, along a new first axis."""
+    return jnp.stack([jnp.asarray(leaf, jnp.float32) for leaf in jax.tree.leaves(tree)])
+
+
+def colours(
+    geoms: Geoms, kinds: tuple[int, ...], view: View, raster: Raster, pixel: jax.Array
+) -> Vec:
+    """Colour of pixels, a triple of uint8 `[P]`: the mean of `samples` x `samples` rays.
+
+    Each ray's colour is clipped to what a screen shows before the mean is taken (there is no gamma
+    to undo), as in a larger picture scaled down: else an overexposed edge would stay jagged.
+
+    Args:
+        geoms: V geoms as `view` sees them.
+        kinds: V kinds, ascending.
+        view: the camera.
+        raster: the picture's size.
+        pixel: int32 `[P]` numbers of pixels, row by row.
+    """
+    x, y = slopes(view, raster, pixel)
+    n = raster.samples
+
+    # One ray a pixel at a time: memory does not grow with the number of rays.
+    def add(i: jax.Array, total: Vec) -> Vec:
+        shifts = (
+            ((j + 0.5) / n - 0.5) * 2 * view.pixel for j in (jax.lax.rem(i, n), jax.lax.div(i, n))
+        )
+        found = _colour(geoms, kinds, view, *(z + s for z, s in zip((x, y), shifts, strict=True)))
+        return tuple(t + jnp.clip(c, 0, 1) for t, c in zip(total, found, strict=True))
+
+    zero = jnp.zeros(pixel.shape, jnp.float32)
+    total = jax.lax.fori_loop(0, n * n, add, (zero, zero, zero))
+    return tuple((t * (255 / n**2) + 0.5).astype(jnp.uint8) for t in total)
+
+
+def slopes(view: View, raster: Raster, pixel: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Slope of each pixel's ray to the right and upwards, both `[P]`."""
+    row = jax.lax.div(pixel, jnp.int32(raster.width))
+    column = pixel - raster.width * row
+    x = (2 * column + 1 - raster.width).astype(jnp.float32)
+    y = (raster.height - 1 - 2 * row).astype(jnp.float32)
+    return view.pixel * x, view.pixel * y
+
+
+def _colour(geoms: Geoms, kinds: tuple[int, ...], view: View, x: jax.Array, y: jax.Array) -> Vec:
+    """Colour of what each ray hits, a triple of `[P]`."""
+    number, depth = intersections.nearest(geoms, kinds, x, y)
+    hit = depth < jnp.inf
+    depth = jnp.where(hit, depth, 0)
+    geom = geoms(number)
+    to_light, to_eye = intersections.surface(geom, x, y, depth)
+    lit = (to_light > 0) & intersections.unshadowed(geoms, kinds, x, y, number, depth)
+    direction = ray(view.rotation, x, y)
+    length = jnp.sqrt(dot(direction, direction))
+    point = along(view.position, depth, direction)
+    squares = jnp.floor(point[0] / view.square) + jnp.floor(point[1] / view.square)
+    odd = squares - 2 * jnp.floor(squares / 2) == 1
+    square = jnp.where((geom.kind == PLANE) & odd, 1 - view.contrast, 1)
+    light = view.ambient + jnp.where(lit, view.diffuse * to_light, 0)
+    # A quotient comes last: XLA would redo anything cheaper for each of the three channels.
+    shade = square * (light * length + view.headlight * to_eye) / length
+    up = jnp.clip(direction[2] / length, 0, 1)
+    sky = along(
+        view.horizon, up, tuple(z - h for z, h in zip(view.zenith, view.horizon, strict=True))
+    )
+    return tuple(jnp.where(hit, c * shade, s) for c, s in zip(geom.rgb, sky, strict=True))

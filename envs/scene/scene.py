@@ -1,0 +1,133 @@
+"""The MuJoCo scene of a task: table, cameras and light, the same for every robot and task."""
+
+import contextlib
+import warnings
+from collections.abc import Iterator
+
+import mujoco
+import numpy as np
+
+from envs import robots
+from envs.rendering.model import AMBIENT, CONTRAST, DIFFUSE, HEADLIGHT, SKY, SQUARE
+from envs.robots import Robot
+
+CAMERAS = ("side", "wrist")
+PHYSICS_DT = 0.005  # s
+
+# Solver settings of the fact sheet's grasping experiments: fewer than 2 iterations do not grasp,
+# elliptic cones cost six times as much. Only spheres, boxes and the table plane ever touch.
+_SCENE = """
+<mujoco>
+  <compiler angle="radian"/>
+  <option timestep="{timestep}" integrator="implicitfast" solver="Newton" iterations="4"
+    ls_iterations="8" cone="pyramidal"><flag eulerdamp="disable"/></option>
+  <default>
+    <geom contype="0" conaffinity="0" condim="3"/>
+    <default class="collider"><geom group="3" rgba="0 0 0 0"/></default>
+    <default class="tip">
+      <geom type="sphere" mass="0" group="3" rgba="0 0 0 0" contype="2" condim="1" priority="1"/>
+    </default>
+    <default class="pad">
+      <geom type="box" conaffinity="5" condim="4" friction="1.5 .02 .001" solref=".01 1"
+        solimp=".95 .99 .001"/>
+    </default>
+    <default class="finger">
+      <joint type="slide" axis="0 1 0" armature=".05" damping="5"/>
+    </default>
+  </default>
+  {look}
+  <worldbody>
+    <light directional="true" pos=".6 -.5 1.2" dir="-.5 .2 -1" ambient="0 0 0" specular="0 0 0"
+      diffuse="{diffuse} {diffuse} {diffuse}"/>
+    <light name="lamp" type="point" active="false" castshadow="false" ambient="0 0 0"
+      specular="0 0 0" diffuse="{headlight} {headlight} {headlight}"/>
+    <camera name="side" {side} fovy="32"/>
+    <geom name="table" type="plane" size="{size} {size} .1" conaffinity="11" material="table"
+      rgba="{table}"/>
+    {robot}{task}
+  </worldbody>
+  <actuator>{actuators}</actuator>
+  <equality>
+    <joint joint1="right" joint2="left" polycoef="0 1 0 0 0" solref=".01 1"/>
+  </equality>
+</mujoco>
+"""
+# The look of the ray caster for MuJoCo's other renderers. Their headlight shines along the camera's
+# axis; the lamp is for those that can put it where the camera is, as the ray caster does.
+_LOOK = """
+  <visual>
+    <headlight ambient="{ambient} {ambient} {ambient}" specular="0 0 0"
+      diffuse="{headlight} {headlight} {headlight}"/>
+  </visual>
+  <asset>
+    <texture name="sky" type="skybox" builtin="gradient" rgb1="{up}" rgb2="{horizon}" width="64"
+      height="384"/>
+    <texture name="squares" type="2d" builtin="checker" rgb1="{dark} {dark} {dark}" rgb2="1 1 1"
+      width="64" height="64"/>
+    <material name="table" texture="squares" texrepeat="{repeat} {repeat}" specular="0"
+      rgba="{table}"/>
+  </asset>
+"""
+_TABLE, _TABLE_SIZE = ".62 .66 .68 1", 2.0  # colour; half the edge [m]
+_SIDE_EYE, _SIDE_TARGET = (0.76, -0.49, 0.42), (0.34, 0.0, 0.065)  # m
+
+
+def build(objects: str, robot: Robot) -> mujoco.MjModel:
+    """The model of a robot, base at the origin, at a table z = 0 with a task's objects on it."""
+    with warnings_of_python():
+        spec = mujoco.MjSpec.from_string(mjcf(objects, robot))
+        robot.body.attach(robot, spec)
+        return spec.compile()
+
+
+@contextlib.contextmanager
+def warnings_of_python() -> Iterator[None]:
+    """MuJoCo's own go to a file in the working folder."""
+    before, said = mujoco.get_mju_user_warning(), []
+    mujoco.set_mju_user_warning(said.append)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+    for text in said:
+        warnings.warn(f"MuJoCo says: {' '.join(text.split())}", stacklevel=3)
+
+
+def mjcf(objects: str, robot: Robot) -> str:
+    """MJCF of the same, without what only `Robot.body` can attach."""
+    bodies, actuators = robot.body.mjcf(robot)
+    return _SCENE.format(
+        timestep=PHYSICS_DT,
+        side=robots.pose(_look_at(np.array(_SIDE_EYE), np.array(_SIDE_TARGET))),
+        robot=bodies,
+        task=objects,
+        actuators=actuators,
+        look=_look(),
+        headlight=HEADLIGHT,
+        diffuse=DIFFUSE,
+        table=_TABLE,
+        size=_TABLE_SIZE,
+    )
+
+
+def _look() -> str:
+    horizon, up = (" ".join(map(str, colour)) for colour in SKY)
+    return _LOOK.format(
+        ambient=AMBIENT,
+        headlight=HEADLIGHT,
+        horizon=horizon,
+        up=up,
+        dark=1 - CONTRAST,
+        repeat=_TABLE_SIZE / SQUARE,  # the texture is two squares wide
+        table=_TABLE,
+    )
+
+
+def _look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """[4, 4] pose of a camera, which looks along -z with y up."""
+    z = (eye - target) / np.linalg.norm(eye - target)
+    x = np.cross([0.0, 0.0, 1.0], z)
+    x /= np.linalg.norm(x)
+    camera = robots.translation(*eye)
+    camera[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+    return camera

@@ -1,0 +1,1 @@
+"""Adapting whole models."""

@@ -1,0 +1,336 @@
+"""Several named adapters in one model: switched, mixed or summed without compiling again.
+
+    model = combine({"pour": model_pour, "press": model_press})
+    model = choose(model, "pour")                                 # one for the whole batch
+    model = choose(model, {"pour": 0.5, "press": 0.5})            # a weighted sum
+    model = choose(model, ["pour", "press", None, "pour"])        # one for each example of a batch
+    model = choose(model, None)                                   # the base
+
+A choice is an array of the model and no part of its structure, so a jitted function that gets the
+model as an argument runs on after another choice (once more compiled for choices by example, whose
+array has the batch's axis too). One adapter alone is `extract(model, "pour")`, to be saved by
+`save_adapters`, and gets back, or another in its place, by `swap(model, "pour", other)`.
+`lorasp_jax.adapters.combine.adapter_set` has the maths.
+"""
+
+import math
+import numbers
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias, TypeGuard
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from lorasp_jax import given
+from lorasp_jax.adapters import adaptation, paths
+from lorasp_jax.adapters.adaptation import Model
+from lorasp_jax.adapters.combine.adapter_set import (
+    AdapterChoice,
+    AdapterSet,
+    NamedAdapters,
+    empty_bank,
+    put,
+    take,
+)
+from lorasp_jax.adapters.layers import nnx_layers
+from lorasp_jax.adapters.paths import Place
+from lorasp_jax.dense import AdaptedLayer, AdapterParam
+from lorasp_jax.peft import LoRA, Method
+from lorasp_jax.peft._fields import short
+from lorasp_jax.peft._method import LARGEST_SIZE, Params
+
+One: TypeAlias = str | Mapping[str, float] | None
+Adapters: TypeAlias = dict[str, AdaptedLayer]
+"""Layers with an adapter, by path of the layer or by name of the model."""
+
+
+def combine(models: Mapping[str, Model], *, rank: int | None = None) -> Model:
+    """One model with the adapters of several; the first is chosen at first.
+
+    The adapters may differ in method, rank and scale and in the layers that they adapt, which may
+    be of every kind that `adapt` knows. Nothing trains in the result.
+
+    Args:
+      models: adapted from one base, by name; left untouched. The result shares their base. A bare
+        base is an empty place for `swap`.
+      rank: room for each LoRA in each adapted layer, None: the largest that is there.
+
+    Raises:
+      ValueError: no models, another base, a base weight that trains, an adapter that holds a part
+        of its kernel, or a LoRA that exceeds `rank`.
+    """
+    if not isinstance(models, Mapping) or not models or not all(map(_is_text, models)):
+        raise ValueError("models to combine are a mapping by name, a text, and at least one.")
+    for model in models.values():
+        given.with_values(model)
+    if rank is not None and not (type(rank) is int and 0 <= rank <= LARGEST_SIZE):
+        raise ValueError(
+            f"rank must be a whole number up to {LARGEST_SIZE} or None, got {short(rank)}."
+        )
+    known = tuple(models)
+    bases = {name: bare(model) for name, model in models.items()}
+    adapters = {name: adapters_by_path(name, model) for name, model in models.items()}
+    for name in known[1:]:
+        _check_same(bases[known[0]], known[0], bases[name], name)
+    holder = nnx.List([bases[known[0]]])
+    for place in paths.places(holder, nnx.Module):
+        found = {n: adapters[n][place.path] for n in known if place.path in adapters[n]}
+        if found:
+            setattr(place.parent, place.name, _with_set(place.child, known, found, rank))
+    return choose(holder[0], known[0])
+
+
+def choose(model: Model, choice: One | Sequence[One] | jax.Array | np.ndarray) -> Model:
+    """The model with another choice among its adapters; also inside jit.
+
+    Args:
+      model: from `combine`; left untouched, the result shares its arrays.
+      choice: a name, weights by name, or None for the base; a sequence of those, one for each
+        example of the batch; or an array of `weights`, f32 [A] or [B, A]. The batch is the first
+        axis of a layer's input, of an einsum's the first that its kernel lacks. Where the model
+        folds other axes into it, as in [B * cameras, ...], an example's rows are in turn.
+
+    Raises:
+      ValueError: a model without named adapters, an unknown name (lists near misses), or an array
+        of another shape.
+    """
+    chosen = weights(model, choice)
+    model = nnx.clone(model)
+    for place in sets(model):
+        held = place.child.adapter
+        leading = held.params.get_value()["bank"]["scale"].shape[:-1]
+        held.choice = AdapterChoice(jnp.broadcast_to(chosen, (*leading, *chosen.shape)))
+    return model
+
+
+def weights(model: nnx.Module, choice: One | Sequence[One] | jax.Array | np.ndarray) -> jax.Array:
+    """The array of a choice, f32 [A] or [B, A], for a jitted function that calls `choose`.
+
+    Arguments and errors as for `choose`.
+    """
+    known = names(model)
+    if isinstance(choice, jax.Array | np.ndarray):
+        found = choice
+    elif choice is None or isinstance(choice, str | Mapping):
+        found = np.array(_row(known, choice))
+    elif isinstance(choice, Sequence) and all(
+        one is None or isinstance(one, str | Mapping) for one in choice
+    ):
+        found = np.array([_row(known, one) for one in choice])
+    else:
+        raise ValueError(
+            f"a choice is a name, weights by name, None, or a list of these, got {short(choice)}."
+        )
+    size = len(known)
+    if (
+        found.ndim not in (1, 2)
+        or found.shape[-1] != size
+        or not len(found)
+        or found.dtype.kind != "f"
+    ):
+        raise ValueError(
+            f"weights of {size} adapters are floats of shape [{size}] or [B, {size}], got "
+            f"{found.dtype} {found.shape}."
+        )
+    return jnp.asarray(found, jnp.float32)
+
+
+def names(model: nnx.Module) -> tuple[str, ...]:
+    """The names of a combined model's adapters, in the order of their weights.
+
+    Raises:
+      ValueError: the model has none.
+    """
+    for place in sets(model):
+        return place.child.method.names
+    raise ValueError("the model has no named adapters: combine models first.")
+
+
+def extract(model: Model, name: str | None) -> Model:
+    """A model with one of the adapters alone, as before `combine`: to train, save or merge it.
+
+    A LoRA comes back with its rank and scale, however they were stated.
+
+    Args:
+      model: from `combine`; left untouched.
+      name: of the adapter; None for the bare base.
+
+    Raises:
+      ValueError: a model without named adapters, or an unknown name (lists near misses).
+    """
+    known, result = names(model), bare(model)
+    if name is None:
+        return result
+    index_of(known, name)
+    there = modules(result)
+    for place in sets(model):
+        method, params = member(place.child, name)
+        if method is not None:
+            layer = nnx_layers.like(there[place.path], place.child)
+            layer.method, layer.adapter = method, AdapterParam(params)
+    return result
+
+
+def swap(model: Model, name: str, other: nnx.Module) -> Model:
+    """The model with another adapter in the place of the one called `name`, without recompiling.
+
+    LoRAs of any scale fit each other's places, up to the room that `combine` made; other methods
+    need the same settings. What is chosen stays chosen.
+
+    Args:
+      model: from `combine`; left untouched.
+      name: the place; it keeps its name.
+      other: adapted from the same base.
+
+    Raises:
+      ValueError: as for `combine`, or an adapter that does not fit the place.
+    """
+    given.with_values(other)
+    index, adapters = index_of(names(model), name), adapters_by_path(name, other)
+    _check_same(bare(model), "the combined model", bare(other), name)
+    model = nnx.clone(model)
+    places = sets(model)
+    if beyond := sorted(adapters.keys() - {place.path for place in places}):
+        raise ValueError(f"{name} adapts {beyond[0]}, where the combined model has no adapters.")
+    for path, _, _, layer in places:
+        method, params = adapters[path].carried() if path in adapters else (None, None)
+        value = dict(layer.adapter.params.get_value())
+        if layer.method.methods[index] != (None if _is_banked(method) else method):
+            raise ValueError(f"{name} at {path} needs {layer.method.methods[index] or 'a LoRA'}.")
+        if _is_banked(method):
+            place = layer.method.banked.index(name)
+            value["bank"] = put(value["bank"], place, method, params)
+        else:
+            value["others"] = value["others"] | {name: params}
+        layer.adapter.params.set_value(value)
+    return model
+
+
+def bare(model: Model) -> Model:
+    """A copy without adapters that shares the base; base weights that train are left as they are.
+
+    Raises:
+      ValueError: an adapter holds a part of its kernel.
+    """
+    holder = nnx.List([nnx.merge(*adaptation.split(model))])
+    for place in paths.once(paths.places(holder, AdaptedLayer)):
+        if place.child.adapter is not None:
+            if place.child.method.splits_kernel:
+                raise ValueError(
+                    f"the adapter of {place.path} holds a part of its kernel, so the base alone "
+                    "is not there: merge it."
+                )
+            place.child.without_adapter()
+    return holder[0]
+
+
+def adapters_by_path(name: str, model: nnx.Module) -> Adapters:
+    """Every adapted layer by path.
+
+    Raises:
+      ValueError: something else trains too, or the model was combined already.
+    """
+    if sets(model):
+        raise ValueError(f"{name} has named adapters already: extract one of them.")
+    found = own_adapters(model)
+    if beyond := sorted(adaptation.methods(model).keys() - found.keys()):
+        raise ValueError(f"{name} trains {beyond[0]}; only adapters of layers have names.")
+    return found
+
+
+def own_adapters(model: nnx.Module) -> Adapters:
+    """The layers with an adapter of their own, by path."""
+    places = paths.places(nnx.List([model]), AdaptedLayer)
+    return {p.path: p.child for p in places if isinstance(p.child.adapter, AdapterParam)}
+
+
+def _check_same(one: nnx.Module, name: str, two: nnx.Module, other: str) -> None:
+    """Raises a ValueError unless two bare models have the same parameters."""
+    first, second = _parameters(one), _parameters(two)
+    for path in first | second:
+        a, b = first.get(path), second.get(path)
+        if a is not b and (a is None or b is None or not _equal(a, b)):
+            raise ValueError(f"{name} and {other} have different bases, first at {path!r}.")
+
+
+def _parameters(model: nnx.Module) -> dict[str, Any]:
+    """Leaves by path."""
+    state = nnx.to_pure_dict(nnx.state(model, nnx.Param))
+    leaves = jax.tree_util.tree_leaves_with_path(state)
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
+
+
+def _equal(a: jax.Array, b: jax.Array) -> bool:
+    return (a.shape, a.dtype) == (b.shape, b.dtype) and bool(jnp.array_equal(a, b))
+
+
+def _with_set(
+    layer: nnx.Module, known: tuple[str, ...], found: Adapters, rank: int | None
+) -> AdaptedLayer:
+    """The layer with what was found for it as a set, of whose weights all are 0."""
+    layer = nnx_layers.like(layer, next(iter(found.values())))
+    own = {name: adapted.carried() for name, adapted in found.items()}
+    methods = [own[name][0] if name in own else None for name in known]
+    if rank is None:
+        rank = max([m.rank for m in methods if type(m) is LoRA], default=0)
+    banked = [name for name, method in zip(known, methods, strict=True) if _is_banked(method)]
+    shape = layer.kernel_matrices().shape
+    bank = empty_bank(len(banked), rank, shape)
+    for i, name in enumerate(banked):
+        method, params = own.get(name, (None, None))
+        bank = put(bank, i, method, params)  # pyright: ignore[reportArgumentType]
+    params = {"bank": bank, "others": {n: p for n, (m, p) in own.items() if not _is_banked(m)}}
+    layer.method = AdapterSet(known, tuple(None if _is_banked(m) else m for m in methods))
+    layer.adapter = NamedAdapters(params, jnp.zeros((*shape[:-2], len(known))))
+    return layer
+
+
+def _is_text(name: Any) -> bool:
+    return isinstance(name, str)
+
+
+def _is_banked(method: Method | None) -> TypeGuard[LoRA | None]:
+    """Whether a place in the bank of LoRAs fits: for plain LoRA, and for no adapter."""
+    return method is None or type(method) is LoRA
+
+
+def sets(model: nnx.Module) -> list[Place]:
+    """The layers that hold named adapters."""
+    places = paths.places(nnx.List([given.module(model)]), AdaptedLayer)
+    return [place for place in places if isinstance(place.child.adapter, NamedAdapters)]
+
+
+def modules(model: nnx.Module) -> dict[str, nnx.Module]:
+    """The model and all modules in it, by path."""
+    return {place.path: place.child for place in paths.places(nnx.List([model]), nnx.Module)}
+
+
+def member(layer: Any, name: str) -> tuple[Method | None, Params]:
+    """One adapter of a layer's set, or None twice where the layer does not have it."""
+    value = layer.adapter.params.get_value()
+    if name in layer.method.others:
+        return layer.method.others[name], value["others"][name]
+    return take(value["bank"], layer.method.banked.index(name))
+
+
+def _row(known: tuple[str, ...], one: One) -> list[float]:
+    """One choice as a weight for each adapter."""
+    row = [0.0] * len(known)
+    chosen = {one: 1.0} if isinstance(one, str) else one or {}
+    for name, weight in chosen.items():
+        if not isinstance(weight, numbers.Real) or not math.isfinite(weight):
+            raise ValueError(
+                f"the weight of {short(name)} must be a finite number, got {short(weight)}."
+            )
+        row[index_of(known, name)] = float(weight)
+    return row
+
+
+def index_of(known: tuple[str, ...], name: str) -> int:
+    """The place of a name; raises a ValueError that lists near misses for an unknown one."""
+    if name not in known:
+        close = paths.near_misses(str(name), known)
+        raise ValueError(f"there is no adapter {short(name)}; the model has {close}.")
+    return known.index(name)

@@ -1,0 +1,1 @@
+"""Adapters in files: this project's own and Hugging Face PEFT's."""

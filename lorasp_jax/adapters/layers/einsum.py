@@ -1,0 +1,196 @@
+"""Adapted einsums: kernels with any number of input, output and batch axes.
+
+An equation "x,kernel->y" has one "..." at most in x and y. It says what each kernel axis is:
+
+    batch    in x, kernel and y: one map for each index, for instance one per expert
+    input    in x and kernel: summed over
+    output   in kernel and y
+
+To an adapter the kernel is a stack of matrices [*batch, I, O], inputs and outputs flattened in the
+order of the kernel's axes; an adapter has the batch axes in front, as it has those of a scanned
+stack. "BTD,NDH->BTNH" thus has one adapter of D inputs and N·H outputs. A quantised kernel is kept
+as that stack of matrices, with the sizes of its axes beside it.
+"""
+
+import dataclasses
+import math
+import re
+import string
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from lorasp_jax.dense import dense
+from lorasp_jax.kernels.quantized_kernel import QuantizedKernel
+from lorasp_jax.peft import Aux, Method
+from lorasp_jax.peft._fields import short
+from lorasp_jax.peft._method import Params
+
+LINEAR = "...i,io->...o"
+_EQUATION = re.compile(r"{0},([a-zA-Z]+)->{0}".format(r"([a-zA-Z]*(?:\.\.\.)?[a-zA-Z]*)"))
+
+
+class Axes(NamedTuple):
+    """Letters of an equation; those of x and y may hold "..."."""
+
+    x: str
+    kernel: str
+    y: str
+
+    @property
+    def batch(self) -> str:
+        """Kernel axes that x and y have too, in the kernel's order."""
+        return "".join(c for c in self.kernel if c in self.x and c in self.y)
+
+    @property
+    def inputs(self) -> str:
+        """Kernel axes that are summed over, in the kernel's order."""
+        return "".join(c for c in self.kernel if c not in self.y)
+
+    @property
+    def outputs(self) -> str:
+        """Kernel axes that x lacks, in the kernel's order."""
+        return "".join(c for c in self.kernel if c not in self.x)
+
+    def expanded(self, ndim: int) -> "Axes":
+        """The same for an x of so many axes, letters in place of the dots.
+
+        Raises:
+          ValueError: an equation for another number of axes.
+        """
+        letters = (c for c in string.ascii_letters if c not in self.x + self.kernel + self.y)
+        count = ndim - len(self.x.replace("...", ""))
+        if count < 0 or (count and "..." not in self.x):
+            raise ValueError(f"{self.x},{self.kernel}->{self.y} meets an input of {ndim} axes.")
+        dots = "".join(next(letters) for _ in range(count))
+        return Axes(self.x.replace("...", dots), self.kernel, self.y.replace("...", dots))
+
+
+def parse(equation: str) -> Axes:
+    """The axes of an equation.
+
+    Raises:
+      ValueError: it is no linear map from x to y, one at each index of the batch axes.
+    """
+    found = _EQUATION.fullmatch(equation.replace(" ", ""))
+    axes = Axes(*found.groups()) if found else Axes("", "", "")
+    letters = [part.replace("...", "") for part in axes]
+    x, kernel, y = map(set, letters)
+    unique = all(len(set(part)) == len(part) for part in letters)
+    same_dots = ("..." in axes.x) == ("..." in axes.y)
+    if not (unique and same_dots and kernel and x ^ y <= kernel <= x | y):
+        raise ValueError(
+            f"the einsum {short(equation)} cannot be adapted: it must be 'x,kernel->y', explicit, "
+            "where each axis is in two or all of the three."
+        )
+    return axes
+
+
+def general_equation(axis: Sequence[int], batch: Sequence[int], outputs: int) -> str:
+    """The equation of a general dense layer, whose kernel is [*batch, *inputs, *outputs].
+
+    Args:
+      axis: axes of x that are summed over; negative ones count from the end.
+      batch: leading axes of x that the kernel has too, from 0.
+      outputs: number of output axes.
+    """
+    letters = iter(string.ascii_letters)
+    from_start, from_end = sorted(a for a in axis if a >= 0), sorted(a for a in axis if a < 0)
+    head = [next(letters) for _ in range(max([-1, *from_start, *batch]) + 1)]
+    tail = [next(letters) for _ in range(-min([0, *from_end]))]
+    shared = "".join(head[b] for b in sorted(batch))
+    summed = "".join([head[a] for a in from_start] + [tail[a] for a in from_end])
+    free = ["".join(c for c in part if c not in shared + summed) for part in (head, tail)]
+    new = "".join(next(letters) for _ in range(outputs))
+    x = f"{''.join(head)}...{''.join(tail)}"
+    return f"{x},{shared}{summed}{new}->{shared}{free[0]}...{free[1]}{new}"
+
+
+def to_matrices(equation: str, kernel: Any) -> Any:
+    """A kernel, which may have further leading axes of a stack, as [..., *batch, I, O]."""
+    if isinstance(kernel, QuantizedKernel):
+        return dataclasses.replace(kernel, axes=None, batch=0)
+    axes, order = _order(equation, kernel.ndim)
+    kernel = kernel.transpose(order)
+    outer = kernel.ndim - len(axes.inputs + axes.outputs)
+    outputs = kernel.shape[outer + len(axes.inputs) :]
+    return kernel.reshape(*kernel.shape[:outer], -1, math.prod(outputs))
+
+
+def from_matrices(equation: str, matrices: Any, shape: Sequence[int]) -> Any:
+    """The inverse of `to_matrices` for a kernel of this shape."""
+    axes, order = _order(equation, len(shape))
+    if isinstance(matrices, QuantizedKernel):
+        sizes = tuple(shape[len(shape) - len(axes.kernel) :])
+        return dataclasses.replace(matrices, axes=sizes, batch=len(axes.batch))
+    inverse = [order.index(i) for i in range(len(shape))]
+    return matrices.reshape([shape[i] for i in order]).transpose(inverse)
+
+
+def einsum(
+    equation: str,
+    x: jax.Array,
+    kernel: jax.Array | QuantizedKernel,
+    bias: jax.Array | None = None,
+    params: Params | None = None,
+    method: Method | None = None,
+    dropout_key: jax.Array | None = None,
+) -> tuple[jax.Array, Aux]:
+    """The einsum of x and kernel through an adapter, or plainly without one, plus bias.
+
+    Args:
+      equation: as above.
+      x, kernel: as the equation says.
+      bias: the kernel's axes that y has, in the order of y, or None.
+      params: the adapter's parameters for `to_matrices(equation, kernel)`, or None.
+      method: the adapter's method, given with `params`.
+      dropout_key: as for `dense`.
+
+    Returns:
+      y in the type of x, and the adapter's aux, all with leading batch axes but the losses, which
+      are averaged over them.
+
+    Raises:
+      ValueError: an equation that is no adaptable map, or shapes that do not fit it.
+    """
+    axes, sizes = _sizes(equation, x, kernel)
+    tokens = "".join(c for c in axes.x if c not in axes.kernel)
+    order = [axes.x.index(c) for c in axes.batch + tokens + axes.inputs]
+    width = math.prod(sizes[c] for c in axes.inputs)  # no -1: there may be no rows
+    rows = x.transpose(order).reshape(*(sizes[c] for c in axes.batch + tokens), width)
+
+    def one(x: jax.Array, matrix: jax.Array, params: Any, key: Any) -> tuple[jax.Array, Aux]:
+        return dense(x, matrix, None, params, method, key)
+
+    for _ in axes.batch:
+        one = jax.vmap(one)
+    if dropout_key is not None:
+        dropout_key = jax.random.split(dropout_key, tuple(sizes[c] for c in axes.batch))
+    y, aux = one(rows, to_matrices(equation, kernel), params, dropout_key)
+    found = axes.batch + tokens + axes.outputs
+    y = y.reshape([sizes[c] for c in found]).transpose([found.index(c) for c in axes.y])
+    if bias is not None:
+        shape = [sizes[c] if c in axes.kernel else 1 for c in axes.y]
+        y = y + bias.reshape(shape).astype(y.dtype)
+    losses = {name: jnp.mean(values) for name, values in aux.losses.items()}
+    return y, dataclasses.replace(aux, losses=losses)
+
+
+def _sizes(equation: str, x: jax.Array, kernel: Any) -> tuple[Axes, dict[str, int]]:
+    """Axes for such an x, and their sizes."""
+    axes, shape = parse(equation).expanded(x.ndim), kernel.shape
+    if len(shape) == len(axes.kernel):
+        sizes = dict(zip(axes.kernel + axes.x, shape + x.shape, strict=True))
+        if shape == tuple(sizes[c] for c in axes.kernel):
+            return axes, sizes
+    raise ValueError(f"{equation!r} meets shapes {x.shape} and {shape}.")
+
+
+def _order(equation: str, ndim: int) -> tuple[Axes, list[int]]:
+    """Axes, and where those of a kernel [..., *batch, *inputs, *outputs] come from."""
+    axes = parse(equation)
+    outer = ndim - len(axes.kernel)
+    wanted = axes.batch + axes.inputs + axes.outputs
+    return axes, [*range(outer), *(outer + axes.kernel.index(c) for c in wanted)]

@@ -1,0 +1,1 @@
+"""Weights in files: this project's own layout and the published ones."""

@@ -1,0 +1,89 @@
+"""Rules for what PyTorch's policies are made of, under the names that transformers gives.
+
+PyTorch keeps a linear map as [O, I] and every layer for itself; ours are [I, O], a stack of them.
+"""
+
+from collections.abc import Iterable, Sequence
+
+from lorasp_jax.models.checkpoints.layouts import Rule, copied, stacked, transposed
+from lorasp_jax.models.config import VisionConfig
+
+PROJECTIONS = (
+    "state_proj",
+    "action_in_proj",
+    "action_time_mlp_in",
+    "action_time_mlp_out",
+    "action_out_proj",
+)
+"""Linear maps around the towers of pi0 and SmolVLA, under one name everywhere."""
+
+
+def linear(ours: str, theirs: str) -> list[Rule]:
+    """A linear map with a bias."""
+    return [
+        transposed(f"{ours}/kernel", f"{theirs}.weight"),
+        copied(f"{ours}/bias", f"{theirs}.bias"),
+    ]
+
+
+def siglip(theirs: str, size: VisionConfig) -> list[Rule]:
+    """The tower "vision" without its head."""
+    patches, norm = f"{theirs}.embeddings.patch_embedding", f"{theirs}.post_layernorm"
+    rules = [
+        _patches("vision/patch_embed/kernel", f"{patches}.weight", size),
+        copied("vision/patch_embed/bias", f"{patches}.bias"),
+        copied("vision/position_embedding", f"{theirs}.embeddings.position_embedding.weight"),
+        copied("vision/norm/scale", f"{norm}.weight"),
+        copied("vision/norm/bias", f"{norm}.bias"),
+    ]
+    layers = [f"{theirs}.encoder.layers.{i}" for i in range(size.depth)]
+    attention = (f"self_attn.{name}_proj" for name in ("q", "k", "v", "out"))
+    for name in (*attention, "mlp.fc1", "mlp.fc2"):
+        rules += [_weights("vision/blocks", layers, name), _biases("vision/blocks", layers, name)]
+    for name in ("layer_norm1", "layer_norm2"):
+        rules += [_scales("vision/blocks", layers, name), _biases("vision/blocks", layers, name)]
+    return rules
+
+
+def decoder(ours: str, theirs: str, layers: Iterable[int], *, adaptive: bool = False) -> list[Rule]:
+    """Some layers of a Llama or Gemma as our stack `ours`, perhaps with pi0.5's adaptive norms."""
+    paths = [f"{theirs}.layers.{i}" for i in layers]
+    attention = (f"self_attn.{name}_proj" for name in "qkvo")
+    kernels = (*attention, "mlp.gate_proj", "mlp.up_proj", "mlp.down_proj")
+    rules = [_weights(ours, paths, name) for name in kernels]
+    for name in ("input_layernorm", "post_attention_layernorm"):
+        if adaptive:
+            inside = [f"{path}.{name}" for path in paths]
+            rules += [each(f"{ours}/{name}", inside, "dense") for each in (_weights, _biases)]
+        else:
+            rules.append(_scales(ours, paths, name))
+    return rules
+
+
+def _patches(ours: str, theirs: str, size: VisionConfig) -> Rule:
+    """`[O, rgb, y, x]`, ours `[y x rgb, O]`."""
+    patch = size.patch
+    return Rule(
+        (ours,),
+        (theirs,),
+        lambda _: [(size.width, 3, patch, patch)],
+        lambda arrays: [w.transpose(2, 3, 1, 0).reshape(-1, len(w)) for w in arrays],
+        lambda kernel: [kernel.reshape(patch, patch, 3, -1).transpose(3, 2, 0, 1)],
+    )
+
+
+def _weights(ours: str, layers: Sequence[str], name: str) -> Rule:
+    names = [f"{layer}.{name}.weight" for layer in layers]
+    return stacked(f"{ours}/{_last(name)}/kernel", names, transpose=True)
+
+
+def _biases(ours: str, layers: Sequence[str], name: str) -> Rule:
+    return stacked(f"{ours}/{_last(name)}/bias", [f"{layer}.{name}.bias" for layer in layers])
+
+
+def _scales(ours: str, layers: Sequence[str], name: str) -> Rule:
+    return stacked(f"{ours}/{_last(name)}/scale", [f"{layer}.{name}.weight" for layer in layers])
+
+
+def _last(name: str) -> str:
+    return name.rpartition(".")[2]

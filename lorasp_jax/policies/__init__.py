@@ -1,0 +1,1 @@
+"""A network becomes a robot's policy: inputs, normalization, actions."""

@@ -1,0 +1,172 @@
+"""A sum of adapters as one method: against each adapter's own `apply`, one by one."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lorasp_jax import peft
+from lorasp_jax.adapters.combine.adapter_set import AdapterSet, empty_bank, put, take
+from lorasp_jax.peft import DoRA, LoRA, LoRAMoE, LoRASP
+
+D_IN, D_OUT = 6, 5
+LORAS = {"a": LoRA(rank=2, alpha=3), "b": LoRA(rank=4, alpha=5, rank_stabilized=True)}
+OTHERS = {
+    "sp": LoRASP(rank=8, hidden_width=4),
+    "moe": LoRAMoE(experts=2, rank=2),
+    "dora": DoRA(rank=2),
+    "ada": peft.AdaLoRA(rank=3),
+}
+METHODS = LORAS | OTHERS
+SET = AdapterSet(tuple(METHODS), tuple(OTHERS.get(name) for name in METHODS))
+
+
+@pytest.fixture(scope="module")
+def kernel():
+    return jax.random.normal(jax.random.key(0), (D_IN, D_OUT))
+
+
+@pytest.fixture(scope="module")
+def x():
+    return jax.random.normal(jax.random.key(1), (4, 3, D_IN))
+
+
+@pytest.fixture(scope="module")
+def members(kernel):
+    """Parameters of each adapter, moved off their start."""
+    found = {}
+    for i, (name, method) in enumerate(METHODS.items()):
+        leaves, structure = jax.tree.flatten(method.init(jax.random.key(i), kernel)[0])
+        keys = jax.random.split(jax.random.key(100 + i), len(leaves))
+        noise = [0.5 * jax.random.normal(k, x.shape) for k, x in zip(keys, leaves, strict=True)]
+        moved = [a + b for a, b in zip(leaves, noise, strict=True)]
+        found[name] = jax.tree.unflatten(structure, moved)
+    return found
+
+
+@pytest.fixture(scope="module")
+def params(members):
+    bank = empty_bank(2, 4, (D_IN, D_OUT))
+    for place, (name, method) in enumerate(LORAS.items()):
+        bank = put(bank, place, method, members[name])
+    return {"bank": bank, "others": {name: members[name] for name in OTHERS}}
+
+
+@jax.jit
+def apply(params, choice, x, kernel):
+    return SET.apply(params | {"choice": choice}, x, kernel)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_one_alone(params, members, x, kernel, name):
+    choice = jnp.array([float(other == name) for other in METHODS])
+    y, aux = apply(params, choice, x, kernel)
+    expected, report = METHODS[name].apply(members[name], x, kernel)
+    np.testing.assert_allclose(y, expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(aux.active_rank, report.active_rank)
+
+
+def test_the_base(params, x, kernel):
+    y, aux = apply(params, jnp.zeros(len(METHODS)), x, kernel)
+    np.testing.assert_allclose(y, x @ kernel, rtol=1e-5, atol=1e-5)
+    assert not aux.active_rank.any()
+    assert not aux.losses
+
+
+def deltas(members, x, kernel):
+    return jnp.stack([m.apply(members[n], x, kernel)[0] - x @ kernel for n, m in METHODS.items()])
+
+
+def test_weighted_sum(params, members, x, kernel):
+    weights = jnp.array([0.5, -1.0, 0.25, 2.0, 0.3, 1.0])
+    y, _ = apply(params, weights, x, kernel)
+    expected = x @ kernel + jnp.tensordot(weights, deltas(members, x, kernel), 1)
+    np.testing.assert_allclose(y, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_each_example_its_own(params, members, x, kernel):
+    weights = jax.random.normal(jax.random.key(5), (4, len(METHODS)))
+    y, aux = apply(params, weights, x, kernel)
+    expected = x @ kernel + jnp.einsum("ba,abto->bto", weights, deltas(members, x, kernel))
+    np.testing.assert_allclose(y, expected, rtol=1e-4, atol=1e-4)
+    assert aux.active_rank.shape == (4, 3)
+
+
+def test_rows_of_an_example_are_in_turn(params, x, kernel):
+    """[B, T, I] folded into [B T, I], as a vision tower folds its cameras."""
+    weights = jax.random.normal(jax.random.key(5), (4, len(METHODS)))
+    y, _ = apply(params, weights, x, kernel)
+    folded, _ = apply(params, weights, x.reshape(12, D_IN), kernel)
+    np.testing.assert_allclose(folded.reshape(y.shape), y, rtol=1e-5, atol=1e-5)
+    with pytest.raises(ValueError, match="chosen for 4 examples, but a layer sees 3 rows"):
+        apply(params, weights, x[:3], kernel)
+
+
+def test_without_a_bank(members, x, kernel):
+    method = AdapterSet(("sp", "dora"), (OTHERS["sp"], OTHERS["dora"]))
+    others = {name: members[name] for name in ("sp", "dora")}
+    params = {"bank": empty_bank(0, 0, (D_IN, D_OUT)), "others": others}
+    y, _ = method.apply(params | {"choice": jnp.array([1.0, 0.0])}, x, kernel)
+    expected, _ = OTHERS["sp"].apply(members["sp"], x, kernel)
+    np.testing.assert_allclose(y, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_merge(params, members, x, kernel):
+    """The sum of the deltas as one kernel, where none depends on the input."""
+    mergeable = [name for name in METHODS if name not in ("sp", "moe")]
+    method = AdapterSet(tuple(mergeable), tuple(OTHERS.get(name) for name in mergeable))
+    own = {"bank": params["bank"], "others": {name: members[name] for name in ("dora", "ada")}}
+    own["choice"] = jnp.array([0.5, -1.0, 1.5, 0.7])
+    expected, _ = method.apply(own, x, kernel)
+    np.testing.assert_allclose(x @ method.merge(own, kernel), expected, rtol=1e-4, atol=1e-4)
+    assert method.merge(own, kernel.astype(jnp.bfloat16)).dtype == jnp.bfloat16
+    with pytest.raises(ValueError, match="choose for all first"):
+        method.merge(own | {"choice": jnp.ones((2, 4))}, kernel)
+    with pytest.raises(ValueError, match="LoRA-SP"):
+        SET.merge(params | {"choice": jnp.ones(len(METHODS))}, kernel)
+
+
+def test_low_precision(params, x, kernel):
+    low = jnp.bfloat16
+    choice = jnp.full(len(METHODS), 0.3)
+    y, _ = apply(params, choice, x.astype(low), kernel.astype(low))
+    expected, _ = apply(params, choice, x, kernel)
+    assert y.dtype == low
+    np.testing.assert_allclose(y.astype(jnp.float32), expected, atol=0.05 * jnp.abs(expected).max())
+
+
+@pytest.mark.slow
+def test_gradients(params, x, kernel):
+    """They reach x, the weights and the parameters of the adapters that count, not the kernel."""
+    choice = jnp.zeros(len(METHODS)).at[1].set(1.0)
+
+    def loss(params, choice, x, kernel):
+        return jnp.sum(SET.apply(params | {"choice": choice}, x, kernel)[0] ** 2)
+
+    floats = {"others": params["others"]} | {"bank": dict(params["bank"])}
+    rank = floats["bank"].pop("rank")
+
+    def of_floats(floats, *rest):
+        return loss({**floats, "bank": floats["bank"] | {"rank": rank}}, *rest)
+
+    own, weights, inputs, base = jax.grad(of_floats, (0, 1, 2, 3))(floats, choice, x, kernel)
+    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(own))
+    place = own["bank"]["lora_b"]
+    assert (place[1] != 0).all()
+    assert not place[0].any()
+    assert (weights != 0).all()
+    assert (inputs != 0).any()
+    assert not base.any()
+
+
+def test_bank_gives_back_what_it_took(members):
+    bank = empty_bank(2, 7, (D_IN, D_OUT))
+    bank = put(put(bank, 0, LORAS["b"], members["b"]), 0, LORAS["a"], members["a"])
+    method, params = take(bank, 0)
+    assert (method.rank, method.scale) == (2, 1.5)
+    np.testing.assert_array_equal(params["lora_a"], members["a"]["lora_a"])
+    np.testing.assert_array_equal(params["lora_b"], members["a"]["lora_b"])
+    assert take(bank, 1) == (None, None)
+    assert take(put(bank, 0, None, None), 0) == (None, None)
+    with pytest.raises(ValueError, match="rank 4 needs more than the room for rank 3"):
+        put(empty_bank(1, 3, (D_IN, D_OUT)), 0, LORAS["b"], members["b"])

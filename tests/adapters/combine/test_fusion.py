@@ -1,0 +1,162 @@
+"""Fused LoRAs against the sum that they stand for; kernels back from merged ones."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+import lorasp_jax
+from lorasp_jax import peft
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters.combine.fusion import truncated
+from lorasp_jax.adapters.io.native import load_adapters, save_adapters
+from lorasp_jax.peft import DoRA, FullFineTuning, LoRA, LoRAMoE
+from tests.nets import NET, SP, X, assert_close, call, golden_models, trained
+
+WEIGHTS = {"pour": 0.5, "press": -0.7}
+
+
+@functools.cache
+def pair():
+    models = {
+        "pour": trained(("inp", LoRA(rank=2, alpha=3)), ("blocks", LoRA(rank=3)), seed=1),
+        "press": trained(("", LoRA(rank=4, alpha=5, rank_stabilized=True)), seed=2),
+        "sp": trained(("inp", SP), seed=3),
+    }
+    return lorasp_jax.combine(models)
+
+
+def test_together_is_exact():
+    fused, errors = lorasp_jax.fuse(pair(), WEIGHTS)
+    assert_close(call(fused, X), call(lorasp_jax.choose(pair(), WEIGHTS), X))
+    assert {path: method.rank for path, method in adaptation.methods(fused).items()} == {
+        "inp": 6, "blocks": 7, "out": 4,
+    }  # fmt: skip
+    assert errors == {"inp": 0.0, "blocks": 0.0, "out": 0.0}
+    assert_close(call(lorasp_jax.merge(fused), X), call(fused, X))
+
+
+def deltas(fused, path):
+    """What was added to a layer's kernels, one by one."""
+    layer, base = getattr(lorasp_jax.merge(fused), path), getattr(NET, path)
+    delta = np.asarray(layer.kernel.get_value() - base.kernel.get_value())
+    return delta.reshape(-1, *delta.shape[-2:])
+
+
+@pytest.mark.parametrize("rank", [1, 2, 3])
+def test_smaller_is_the_best_of_its_rank(rank):
+    """Against the singular value decomposition of the whole delta, layer by layer of the stack."""
+    fused, errors = lorasp_jax.fuse(pair(), WEIGHTS, rank=rank)
+    exact = lorasp_jax.fuse(pair(), WEIGHTS).model
+    for path in ("inp", "blocks"):
+        whole, ours = deltas(exact, path), deltas(fused, path)
+        left, values, right = np.linalg.svd(whole, full_matrices=False)
+        best = left[..., :rank] * values[..., None, :rank] @ right[..., :rank, :]
+        np.testing.assert_allclose(ours, best, atol=1e-4 * np.abs(best).max())
+        lost = np.linalg.norm(whole - best) / np.linalg.norm(whole)
+        assert errors[path] == pytest.approx(lost, rel=1e-3, abs=1e-5)
+        assert getattr(fused, path).method == LoRA(rank=rank, alpha=rank)
+
+
+@pytest.mark.slow
+def test_hugging_face():
+    """PEFT 0.21.2's add_weighted_adapter, "cat" and "svd": deltas and outputs to 1e-5."""
+    golden, models = golden_models()
+    model = lorasp_jax.combine({name: models[name] for name in "ac"})
+    for case, rank in (("cat", None), ("svd", 5)):
+        fused, _ = lorasp_jax.fuse(model, {"a": 0.7, "c": 0.3}, rank=rank)
+        merged = lorasp_jax.merge(fused)
+        for i, layer in enumerate(merged.lin):
+            delta = layer.kernel.get_value() - golden[f"base/lin.{i}.weight"].T
+            expected = golden[f"delta/{case}/{i}"].T
+            np.testing.assert_allclose(delta, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
+        expected = golden[f"y/{case}"]
+        y = fused(golden["x"])
+        np.testing.assert_allclose(y, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
+
+
+def test_deltas_of_zero():
+    a, b, error = truncated(jnp.ones((3, 4, 2)), jnp.zeros((3, 2, 5)), 1)
+    assert error == 0.0
+    np.testing.assert_array_equal(a @ b, 0)
+
+
+def test_what_does_not_fuse():
+    with pytest.raises(ValueError, match=r"cannot fuse sp at inp: LoRASP.* is no LoRA"):
+        lorasp_jax.fuse(pair(), {"pour": 1.0, "sp": 0.5})
+    with pytest.raises(ValueError, match="no adapter 'pure'; the model has pour"):
+        lorasp_jax.fuse(pair(), {"pure": 1.0})
+    with pytest.raises(ValueError, match="rank must be a whole number from 1 to 1048576, got 0"):
+        lorasp_jax.fuse(pair(), WEIGHTS, rank=0)
+    with pytest.raises(ValueError, match="needs weights by name, at least one"):
+        lorasp_jax.fuse(pair(), {})
+
+
+UNMERGEABLE = ("dora", "full", "lora_moe", "lora_sp")
+SPLITS = [LoRA(rank=2, initialization=start) for start in ("pissa", "olora")]
+METHODS = [peft.create(n, rank=2) for n in peft.names() if n not in UNMERGEABLE]
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
+@pytest.mark.parametrize("method", [*METHODS, LoRA(rank=3, rank_stabilized=True), *SPLITS], ids=str)
+def test_unmerge(method, dtype):
+    """The kernels that the adapters are over, to the stated rounding, and the same adapters."""
+    graphdef, state = nnx.split(NET)
+    net = nnx.merge(graphdef, jax.tree.map(lambda leaf: leaf.astype(dtype), state))
+    model = trained(("inp|blocks", method), seed=4, net=net)
+    merged = lorasp_jax.merge(model)
+    back = lorasp_jax.unmerge(merged, model)
+    for layer in ("inp", "blocks", "out"):
+        kernels = [getattr(m, layer).kernel.get_value() for m in (back, model, merged)]
+        assert {kernel.dtype for kernel in kernels} == {jnp.dtype(dtype)}
+        ours, base, folded = (np.asarray(kernel, np.float64) for kernel in kernels)
+        bound = 0.51 * float(jnp.finfo(dtype).eps) * (np.abs(folded) + np.abs(base)) + 1e-7
+        assert (np.abs(ours - base) <= bound).all()
+    assert adaptation.methods(back) == adaptation.methods(model)
+    if dtype == jnp.float32:
+        assert_close(call(back, X), call(model, X))
+        assert_close(call(lorasp_jax.merge(back), X), call(merged, X))
+    assert not adaptation.methods(merged)
+
+
+def test_unmerge_by_a_file(tmp_path):
+    model = trained(("", LoRA(rank=2)), seed=4)
+    save_adapters(tmp_path, model)
+    merged = lorasp_jax.merge(model)
+    back = lorasp_jax.unmerge(merged, load_adapters(tmp_path, merged, any_base=True))
+    assert_close(call(back, X), call(model, X))
+    assert_close(back.blocks.kernel.get_value(), NET.blocks.kernel.get_value())
+
+
+def test_unmerge_what_also_trains_in_full():
+    """Biases come back as what they are: trained, and training."""
+    rules = [("bias|out", FullFineTuning()), ("blocks", LoRA(rank=2))]
+    model = trained(*rules, seed=4)
+    back = lorasp_jax.unmerge(lorasp_jax.merge(model), model)
+    assert adaptation.methods(back) == adaptation.methods(model)
+    assert_close(call(back, X), call(model, X))
+    assert_close(back.blocks.kernel.get_value(), NET.blocks.kernel.get_value())
+    with pytest.raises(ValueError, match="the merged model has no parameter "):
+        lorasp_jax.unmerge(nnx.Dict(blocks=lorasp_jax.merge(model).blocks), model)
+
+
+def test_what_does_not_unmerge():
+    model = trained(("blocks", LoRA(rank=2)), seed=4)
+    merged = lorasp_jax.merge(model)
+    for method, message in (
+        (DoRA(rank=2), r"cannot unmerge blocks: DoRA.* did not just add"),
+        (SP, "cannot unmerge blocks: LoRA-SP chooses its directions per input"),
+        (LoRAMoE(experts=2, rank=2), "cannot unmerge blocks: LoRA-MoE's delta depends"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            lorasp_jax.unmerge(merged, trained(("blocks", method), seed=4))
+    with pytest.raises(ValueError, match="blocks of the merged model has an adapter"):
+        lorasp_jax.unmerge(model, model)
+    with pytest.raises(ValueError, match="has no layer blocks"):
+        lorasp_jax.unmerge(merged.inp, model)
+    other = adaptation.adapt(merged.inp, [("", LoRA(rank=2))], rngs=nnx.Rngs(0))
+    with pytest.raises(ValueError, match="cannot unmerge : "):
+        lorasp_jax.unmerge(merged.out, other)

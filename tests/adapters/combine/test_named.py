@@ -1,0 +1,241 @@
+"""Named adapters in one model: against each adapted model alone, and against Hugging Face PEFT."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+import lorasp_jax
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters.combine import named
+from lorasp_jax.adapters.io.native import load_adapters, save_adapters
+from lorasp_jax.dense import AdapterParam
+from lorasp_jax.models.observation import Observation
+from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA, LoRAMoE
+from tests.cases import mostly_slow
+from tests.models.drawn import filled
+from tests.nets import METHODS, NET, SP, Net, X, assert_close, call, golden_models, trained
+
+NAMES = ("pour", "press", "open", "pick")
+WEIGHTS = {"pour": 0.5, "press": -0.7}
+
+
+@functools.cache
+def models():
+    return {
+        "pour": trained(("inp", LoRA(rank=2, alpha=3)), ("blocks", LoRA(rank=3)), seed=1),
+        "press": trained(("", LoRA(rank=4, alpha=5, rank_stabilized=True)), seed=2),
+        "open": trained(("inp", SP), ("blocks", DoRA(rank=2)), seed=3),
+        "pick": trained(("inp", AdaLoRA(rank=3)), ("blocks", LoRAMoE(experts=2, rank=2)), seed=4),
+    }
+
+
+@functools.cache
+def together():
+    return lorasp_jax.combine(models())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_one_alone(name):
+    assert_close(call(lorasp_jax.choose(together(), name), X), call(models()[name], X))
+
+
+def test_the_base_and_the_first():
+    assert_close(call(lorasp_jax.choose(together(), None), X), call(NET, X))
+    assert_close(call(together(), X), call(models()["pour"], X))
+    assert named.names(together()) == NAMES
+
+
+def test_each_example_its_own():
+    chosen = ["press", "open", None, "pour"]
+    y = call(lorasp_jax.choose(together(), chosen), X)
+    alone = [call(models()[n] if n else NET, X)[i] for i, n in enumerate(chosen)]
+    assert_close(y, jnp.stack(alone))
+
+
+def test_a_choice_compiles_nothing():
+    """Neither another name nor another sum, by a new model or by an array inside jit."""
+    traces = []
+
+    @jax.jit
+    def run(model, x):
+        traces.append("model")
+        return model(x)
+
+    @jax.jit
+    def run_weights(model, weights, x):
+        traces.append("array")
+        return lorasp_jax.choose(model, weights)(x)
+
+    for choice in ("pour", "open", None, WEIGHTS):
+        y = run(lorasp_jax.choose(together(), choice), X)
+        assert_close(run_weights(together(), named.weights(together(), choice), X), y)
+    assert traces == ["model", "array"]
+    for choices in (["pour", None, "open", WEIGHTS], ["press"] * 4):
+        y = run(lorasp_jax.choose(together(), choices), X)
+        assert_close(run_weights(together(), named.weights(together(), choices), X), y)
+    assert traces == ["model", "array"] * 2
+
+
+def test_another_adapter_in_the_same_place_compiles_nothing():
+    model = lorasp_jax.combine({"a": models()["pour"], "spare": NET}, rank=6)
+    other = trained(("inp|blocks", LoRA(rank=6, alpha=2.5)), seed=8)
+    traces = []
+
+    @jax.jit
+    def run(model, x):
+        traces.append(0)
+        return model(x)
+
+    model = lorasp_jax.choose(model, "spare")
+    assert_close(run(model, X), call(NET, X))
+    assert_close(run(lorasp_jax.swap(model, "spare", other), X), call(other, X))
+    assert_close(
+        run(lorasp_jax.swap(model, "spare", models()["pour"]), X), call(models()["pour"], X)
+    )
+    assert_close(run(model, X), call(NET, X))
+    assert len(traces) == 1
+
+
+def test_weighted_sum_is_one_merged_model():
+    """In each kernel, the sum of what each adapter merges into it."""
+    pair = lorasp_jax.combine({name: models()[name] for name in WEIGHTS})
+    model = lorasp_jax.choose(pair, WEIGHTS)
+    merged = lorasp_jax.merge(model)
+    for layer in ("inp", "blocks", "out"):
+        expected = base = getattr(NET, layer).kernel.get_value()
+        for name, weight in WEIGHTS.items():
+            own = getattr(lorasp_jax.merge(models()[name]), layer).kernel.get_value()
+            expected += weight * (own - base)
+        assert_close(getattr(merged, layer).kernel.get_value(), expected)
+    assert_close(call(merged, X), call(model, X))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_extracting_one(tmp_path, name):
+    """As it was before, ready to train, and through a file."""
+    alone = lorasp_jax.extract(together(), name)
+    assert_close(call(alone, X), call(models()[name], X))
+    assert adaptation.count(alone).trainable == adaptation.count(models()[name]).trainable
+    save_adapters(tmp_path, alone)
+    model = lorasp_jax.swap(together(), name, load_adapters(tmp_path, NET))
+    assert_close(call(lorasp_jax.choose(model, name), X), call(models()[name], X))
+
+
+def test_extracting_the_base():
+    base = lorasp_jax.extract(together(), None)
+    assert not adaptation.methods(base)
+    np.testing.assert_array_equal(call(base, X), call(NET, X))
+
+
+def test_nothing_trains_and_the_base_is_shared():
+    assert not jax.tree.leaves(nnx.state(together(), AdapterParam))
+    assert together().blocks.kernel.get_value() is NET.blocks.kernel.get_value()
+    assert models()["pour"].blocks.method == LoRA(rank=3)
+    chosen = named.AdapterChoice
+    assert not np.array_equal(
+        *(
+            jax.tree.leaves(nnx.state(lorasp_jax.choose(together(), n), chosen))
+            for n in ("pour", "open")
+        )
+    )
+
+
+def test_unknown_names():
+    with pytest.raises(ValueError, match=r"no adapter 'puor'; the model has pour"):
+        lorasp_jax.choose(together(), "puor")
+    with pytest.raises(ValueError, match="no adapter 'press2'"):
+        lorasp_jax.choose(together(), ["pour", {"press2": 0.5}])
+    with pytest.raises(ValueError, match="no adapter 'prss'"):
+        lorasp_jax.extract(together(), "prss")
+    with pytest.raises(ValueError, match="no named adapters: combine models first"):
+        lorasp_jax.choose(NET, "pour")
+    for bad in (jnp.ones(3), [], np.array([0, 1, 2, 3]), np.ones((2, 2, 4))):
+        with pytest.raises(ValueError, match=r"are floats of shape \[4\] or \[B, 4\], got "):
+            lorasp_jax.choose(together(), bad)
+
+
+def test_models_that_do_not_combine():
+    other = filled(Net)
+    other.inp.kernel.set_value(other.inp.kernel.get_value() + 1)
+    with pytest.raises(ValueError, match="pour and b have different bases, first at 'inp/kernel'"):
+        lorasp_jax.combine({"pour": models()["pour"], "b": other})
+    with pytest.raises(ValueError, match=r"full trains out/(kernel|bias)"):
+        lorasp_jax.combine({"full": trained(("out", FullFineTuning()), seed=0)})
+    with pytest.raises(ValueError, match="inp holds a part of its kernel"):
+        lorasp_jax.combine({"a": trained(("inp", LoRA(2, initialization="pissa")), seed=0)})
+    with pytest.raises(ValueError, match="has named adapters already"):
+        lorasp_jax.combine({"a": together()})
+    with pytest.raises(ValueError, match="rank 4 needs more than the room for rank 3"):
+        lorasp_jax.combine(models(), rank=3)
+    with pytest.raises(ValueError, match="a mapping by name, a text, and at least one"):
+        lorasp_jax.combine({})
+
+
+def test_adapters_that_do_not_fit_a_place():
+    with pytest.raises(ValueError, match=r"open at blocks needs DoRA\(rank=2"):
+        lorasp_jax.swap(together(), "open", trained(("inp", SP), seed=0))
+    with pytest.raises(ValueError, match="pour at blocks needs a LoRA"):
+        lorasp_jax.swap(together(), "pour", models()["open"])
+    few = lorasp_jax.combine({"open": models()["open"], "pour": models()["pour"]})
+    with pytest.raises(ValueError, match="pour adapts out, where the combined model has no"):
+        lorasp_jax.swap(few, "pour", models()["press"])
+
+
+@pytest.mark.parametrize(
+    ("case", "choice"),
+    [
+        ("a", "a"),
+        ("b", "b"),
+        ("base", None),
+        ("a+b", {"a": 1.0, "b": 1.0}),
+        ("mixed", ["a", "b", None, "a"]),
+        ("cat", {"a": 0.7, "c": 0.3}),
+    ],
+)
+def test_hugging_face(case, choice):
+    """PEFT 0.21.2: single, disabled, two at once, mixed batch, weighted sum; tolerance 1e-5."""
+    golden, models = golden_models()
+    model = lorasp_jax.choose(lorasp_jax.combine(models), choice)
+    expected = golden[f"y/{case}"]
+    atol = 1e-5 * np.abs(expected).max()
+    np.testing.assert_allclose(model(golden["x"]), expected, rtol=0, atol=atol)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", mostly_slow([n for n in METHODS if n != "full"], ["lora_sp"]))
+def test_half_of_an_adapter_is_half_of_what_it_changes(name):
+    model = trained(("inp", METHODS[name]), seed=6)
+    pair = lorasp_jax.combine({"lora": models()["pour"], "own": model})
+    half = lorasp_jax.choose(pair, {"own": 0.5}).inp(X)
+    assert_close(half, 0.5 * (NET.inp(X) + model.inp(X)))
+
+
+@pytest.mark.slow
+def test_mixed_batch_through_pi0():
+    """Scanned towers, the cameras folded into the batch, a cache shared by both experts."""
+    config = Pi0Config.dummy()
+    net, size = config.create(nnx.Rngs(0)), (2, config.image_size, config.image_size, 3)
+    obs = Observation(
+        images={
+            n: jax.random.uniform(jax.random.key(i), size) for i, n in enumerate(config.cameras)
+        },
+        image_masks={n: jnp.ones(2, bool) for n in config.cameras},
+        tokens=jnp.ones((2, config.max_tokens), jnp.int32),
+        token_mask=jnp.ones((2, config.max_tokens), bool),
+        state=jax.random.normal(jax.random.key(3), (2, config.action_dim)),
+    )
+    x_t = jax.random.normal(jax.random.key(4), (2, config.chunk, config.action_dim))
+    models = {"a": trained(("vision/.*fc1|v_proj", LoRA(rank=2)), seed=1, net=net)}
+    models["b"] = trained(("vision/.*fc|state_proj", LoRA(rank=3)), seed=2, net=net)
+    model = lorasp_jax.combine(models)
+    velocity = jax.jit(lambda model: model.velocity(obs, x_t, jnp.full(2, 0.4)))
+    mixed, a, b = (
+        velocity(lorasp_jax.choose(model, c)) for c in (["b", "a"], ["a", "a"], ["b", "b"])
+    )
+    np.testing.assert_allclose(mixed, jnp.stack([b[0], a[1]]), rtol=1e-3, atol=1e-3)
+    assert jnp.abs(a - b).max() > 0.1

@@ -1,0 +1,117 @@
+"""Sums over a calibration set, and what EVA starts from."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+import lorasp_jax
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters.compress import calibration
+from lorasp_jax.adapters.io import native
+from lorasp_jax.dense import Dense
+from lorasp_jax.peft import LoRA
+from tests.adapters.test_adaptation import Net
+
+
+@pytest.fixture(scope="module")
+def net():
+    return Net(nnx.Rngs(0))
+
+
+@pytest.fixture(scope="module")
+def batches():
+    return [jax.random.normal(jax.random.key(i), (6, 5)) for i in range(4)]
+
+
+@pytest.fixture(scope="module")
+def moments(net, batches):
+    return calibration.input_moments(net, batches)
+
+
+def inputs(net, x):
+    """What each layer of the net sees, by hand: the net's own formula, layer after layer."""
+    h = net.norm(net.inp(x))
+    seen = []
+    for kernel, bias in zip(net.blocks.kernel[...], net.blocks.bias[...], strict=True):
+        seen.append(h)
+        h = h + jnp.tanh(h @ kernel + bias)
+    return {"inp": x, "blocks": np.stack(seen), "heads/0": h, "heads/1": h}
+
+
+def test_moments_are_those_of_the_inputs_by_hand(net, batches, moments):
+    seen = [inputs(net, x) for x in batches]
+    assert set(moments) == {"inp", "blocks", "heads/0", "heads/1"}
+    for path, moment in moments.items():
+        rows = np.concatenate([np.asarray(s[path], np.float64) for s in seen], axis=-2)
+        np.testing.assert_allclose(moment, np.swapaxes(rows, -1, -2) @ rows, rtol=1e-4, atol=1e-4)
+
+
+def test_the_model_is_left_alone(net, batches, moments):
+    del moments
+    assert not adaptation.methods(net)
+    assert isinstance(net.inp, nnx.Linear)
+    some = calibration.input_moments(net, batches, "heads/1")
+    assert set(some) == {"heads/1"}
+
+
+def test_padding_stays_out():
+    layer = nnx.List([Dense(5, 3, rngs=nnx.Rngs(0))])
+    x = jax.random.normal(jax.random.key(0), (2, 7, 5))
+    mask = jnp.arange(7)[None] < jnp.array([[3], [6]])
+    forward = lambda model, x: model[0](x, token_mask=mask)  # noqa: E731
+    found = calibration.input_moments(
+        layer, [jnp.where(mask[..., None], x, jnp.nan)], forward=forward
+    )
+    rows = np.asarray(x)[np.asarray(mask)]
+    np.testing.assert_allclose(found["0"], rows.T @ rows, rtol=1e-5)
+
+
+def test_what_was_not_seen_is_an_error(net, batches):
+    with pytest.raises(ValueError, match=r"nothing was seen of blocks.*must return the aux"):
+        calibration.input_moments(net, batches, forward=lambda model, x: model(x)[0])
+    with pytest.raises(ValueError, match="nothing was seen of blocks"):
+        calibration.input_moments(net, [])
+
+
+@pytest.mark.parametrize("path", ["inp", "heads/1"])
+def test_eva_starts_with_the_right_singular_vectors(path, net, batches, moments):
+    """The span of A is that of an SVD of the stacked activations, vector by vector."""
+    method = LoRA(rank=3, initialization="eva")
+    model = lorasp_jax.adapt(net, [("inp|heads/1", method)], rngs=nnx.Rngs(1), statistics=moments)
+    layer = model.inp if path == "inp" else model.heads[1]
+    stacked = np.concatenate([np.asarray(inputs(net, x)[path]) for x in batches])
+    right = np.linalg.svd(stacked, full_matrices=False)[2][:3]
+    params = layer.adapter.get_value()
+    np.testing.assert_allclose(np.abs(right @ params["lora_a"]), np.eye(3), atol=1e-3)
+    np.testing.assert_array_equal(params["lora_b"], 0)
+
+
+def test_eva_in_a_stack_saves_as_a_lora(net, batches, moments, tmp_path):
+    rules = [("blocks", LoRA(rank=2, initialization="eva"))]
+    model = lorasp_jax.adapt(net, rules, rngs=nnx.Rngs(1), statistics=moments)
+    stacked = np.concatenate([np.asarray(inputs(net, x)["blocks"]) for x in batches], axis=1)
+    for layer, rows in enumerate(stacked):
+        right = np.linalg.svd(rows, full_matrices=False)[2][:2]
+        a = model.blocks.adapter.get_value()["lora_a"][layer]
+        np.testing.assert_allclose(np.abs(right @ a), np.eye(2), atol=1e-3)
+    native.save_adapters(tmp_path, model)
+    loaded = native.load_adapters(tmp_path, net)
+    again = native.load_adapters(tmp_path, model)
+    for found in (loaded, again):
+        np.testing.assert_array_equal(found(batches[0])[0], model(batches[0])[0])
+
+
+@pytest.mark.parametrize(
+    ("rank", "statistics", "message"),
+    [
+        (2, {}, "needs the inputs' statistics: pass those of calibration.input_moments"),
+        (2, {"inp": jnp.eye(4)}, r"needs statistics \[5, 5\] .* got \[4, 4\] and 2"),
+        (6, {"inp": jnp.eye(5)}, r"a rank up to 5, got \[5, 5\] and 6"),
+    ],
+)
+def test_eva_needs_statistics_of_its_layer(rank, statistics, message, net):
+    method = LoRA(rank=rank, initialization="eva")
+    with pytest.raises(ValueError, match=message):
+        lorasp_jax.adapt(net, [("inp", method)], rngs=nnx.Rngs(1), statistics=statistics)

@@ -1,0 +1,203 @@
+"""Quantised bases under adapters: what shrinks, what stays, what still works."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from flax import nnx
+
+import lorasp_jax
+from lorasp_jax.adapters import adaptation, paths
+from lorasp_jax.adapters.io.native import load_adapters, save_adapters
+from lorasp_jax.dense import AdapterParam, Dense
+from lorasp_jax.kernels.quantized_kernel import KINDS, QuantizedKernel
+from lorasp_jax.peft import FullFineTuning, LoRA
+from tests.cases import mostly_slow
+from tests.nets import METHODS, NET, SP, Net, X, assert_close, call, trained
+
+
+@functools.cache
+def quantized(kind):
+    return lorasp_jax.quantize(NET, [("", kind)]).model
+
+
+def widened(model):
+    """The model with every quantised kernel as an array again."""
+    holder = nnx.List([nnx.clone(model)])
+    for place in paths.places(holder, Dense):
+        kernel = place.child.kernel.get_value()
+        if isinstance(kernel, QuantizedKernel):
+            place.child.kernel = nnx.Param(kernel.astype(kernel.dtype))
+    return holder[0]
+
+
+def size(model):
+    return sum(leaf.nbytes for leaf in jax.tree.leaves(nnx.state(model, nnx.Param)))
+
+
+@pytest.mark.parametrize(("kind", "bits", "error"), [("int8", 8.125, 0.0051), ("nf4", 4.5, 0.092)])
+def test_memory_and_error(kind, bits, error):
+    """In all, and of the output: as far off as is reported, for an input without a direction."""
+    wide = nnx.Linear(256, 512, rngs=nnx.Rngs(0))
+    smaller, errors = lorasp_jax.quantize(wide, [("", kind)])
+    assert size(smaller) == 256 * 512 * bits / 8 + 512 * 4
+    assert errors[""] == pytest.approx(error, rel=0.1)
+    x = jax.random.normal(jax.random.key(1), (2048, 256))
+    y = x @ wide.kernel.get_value()
+    lost = jnp.linalg.norm(smaller(x) - y) / jnp.linalg.norm(y)
+    assert float(lost) == pytest.approx(errors[""], rel=0.02)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_quantised_equals_widened(kind):
+    model = quantized(kind)
+    assert isinstance(model.blocks.kernel.get_value(), QuantizedKernel)
+    assert_close(call(model, X), call(widened(model), X))
+    assert np.abs(call(model, X) - call(NET, X)).max() > 1e-4  # and something was quantised
+    assert isinstance(NET.inp, nnx.Linear)
+    graphdef, state = nnx.split(model)
+    assert_close(jax.jit(lambda s: nnx.merge(graphdef, s)(X))(state), call(model, X))
+
+
+@pytest.mark.parametrize("name", mostly_slow(METHODS, ["lora", "lora_sp"]))
+def test_methods_over_a_quantised_base(name):
+    """By discovery: attached after or before, the same as over the widened kernels."""
+    method = METHODS[name]
+    if method.trains_base:
+        with pytest.raises(ValueError, match="inp/kernel is quantised and cannot train in full"):
+            adaptation.adapt(quantized("nf4"), [("inp", method)], rngs=nnx.Rngs(0))
+        with pytest.raises(ValueError, match="cannot quantise inp: its kernel trains"):
+            lorasp_jax.quantize(trained(("inp", method), seed=0), [("", "nf4")])
+        return
+    model = trained(("inp|blocks", method), seed=1, net=quantized("nf4"))
+    assert_close(call(model, X), call(widened(model), X))
+    later, _ = lorasp_jax.quantize(trained(("inp|blocks", method), seed=1), [("", "nf4")])
+    if method.additive:  # what DoRA starts from is of the kernel that it found
+        assert_close(call(later, X), call(model, X))
+    count = adaptation.count(trained(("inp|blocks", method), seed=1))
+    assert adaptation.count(model) == count
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_gradients_and_training(kind):
+    """They reach x and the adapters as over widened kernels; the base does not move."""
+    model = trained(("blocks|inp", LoRA(rank=2)), seed=1, net=quantized(kind))
+
+    def loss(adapters, x, graphdef, frozen):
+        return jnp.mean((nnx.merge(graphdef, adapters, frozen)(x) - 1) ** 2)
+
+    found = []
+    for one in (model, widened(model)):
+        graphdef, adapters, frozen = adaptation.split(one)
+        gradient = jax.jit(jax.grad(loss, (0, 1)), static_argnums=2)
+        found.append(gradient(adapters, X, graphdef, frozen))
+    for a, b in zip(*map(jax.tree.leaves, found), strict=True):
+        assert (a != 0).any()
+        assert_close(a, b)
+    graphdef, adapters, frozen = adaptation.split(model)
+    updates = jax.tree.map(lambda g: -0.1 * g, found[0][0])
+    after = loss(optax.apply_updates(adapters, updates), X, graphdef, frozen)
+    assert after < loss(adapters, X, graphdef, frozen)
+
+
+def test_adapters_are_saved_as_ever(tmp_path):
+    model = trained(("inp|blocks", SP), seed=1, net=quantized("int8"))
+    save_adapters(tmp_path, model)
+    assert_close(call(load_adapters(tmp_path, quantized("int8")), X), call(model, X))
+    own, _ = lorasp_jax.quantize(load_adapters(tmp_path, NET), [("", "int8")])
+    assert_close(call(own, X), call(model, X))
+
+
+def test_merge_widens_what_it_merges():
+    model = trained(("blocks", LoRA(rank=2)), seed=1, net=quantized("nf4"))
+    merged = lorasp_jax.merge(model)
+    assert merged.blocks.kernel.get_value().dtype == jnp.float32
+    assert isinstance(merged.inp.kernel.get_value(), QuantizedKernel)
+    assert_close(call(merged, X), call(model, X))
+    back = lorasp_jax.unmerge(merged, model)
+    assert_close(
+        back.blocks.kernel.get_value(), widened(quantized("nf4")).blocks.kernel.get_value()
+    )
+
+
+@pytest.mark.slow
+def test_named_adapters_over_one_quantised_base():
+    models = {
+        n: trained(("", LoRA(rank=i)), seed=i, net=quantized("nf4"))
+        for i, n in ((1, "a"), (2, "b"))
+    }
+    model = lorasp_jax.choose(lorasp_jax.combine(models), ["a", None, "b", "b"])
+    each = [call(m, X) for m in (models["a"], quantized("nf4"), models["b"], models["b"])]
+    assert_close(call(model, X), jnp.stack([y[i] for i, y in enumerate(each)]))
+
+
+def test_split_kernels_come_first():
+    pissa = LoRA(rank=2, initialization="pissa")
+    with pytest.raises(ValueError, match="adapt first, then quantise the rest"):
+        adaptation.adapt(quantized("int8"), [("inp", pissa)], rngs=nnx.Rngs(0))
+    model, errors = lorasp_jax.quantize(trained(("inp", pissa), seed=1), [("inp", "nf4")])
+    assert_close(call(model, X), call(widened(model), X))
+    assert 0 < errors["inp"] < 0.12
+
+
+def test_low_precision():
+    state = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), nnx.state(NET))
+    net = nnx.merge(nnx.graphdef(NET), state)
+    model, _ = lorasp_jax.quantize(net, [("", "int8")])
+    assert model.inp.kernel.get_value().dtype == jnp.bfloat16
+    y = model(X.astype(jnp.bfloat16))
+    assert y.dtype == jnp.bfloat16
+    np.testing.assert_allclose(y.astype(jnp.float32), call(NET, X), atol=0.1)
+    merged = lorasp_jax.merge(adaptation.adapt(model, [("", LoRA(rank=2))], rngs=nnx.Rngs(0)))
+    assert merged.inp.kernel.get_value().dtype == jnp.bfloat16
+
+
+def test_rules():
+    model, errors = lorasp_jax.quantize(NET, [("inp", None), ("blocks", "int8"), ("", "nf4")])
+    assert isinstance(model.inp, nnx.Linear)
+    assert model.blocks.kernel.get_value().codes.dtype == jnp.int8
+    assert set(errors) == {"blocks", "out"}
+    assert errors["blocks"] < 0.01 < errors["out"]
+    assert not jax.tree.leaves(nnx.state(model, AdapterParam))
+    for rules, message in (
+        (
+            [("blcks", "nf4")],
+            r"rule 'blcks' governs nothing; dense layers and einsums here: blocks",
+        ),
+        ([("", "nf4"), ("out", "int8")], "rule 'out' governs nothing"),
+        ([("out", "fp4")], "rule 'out' has 'fp4' where 'int8' or 'nf4' or None belongs"),
+        ([("(", "nf4")], r"rule '\(' is no regular expression"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            lorasp_jax.quantize(NET, rules)
+    with pytest.raises(ValueError, match="quantised already"):
+        lorasp_jax.quantize(model, [("out", "nf4")])
+    broken = Net()
+    broken.out.kernel.set_value(broken.out.kernel.get_value().at[0].set(jnp.inf))
+    with pytest.raises(ValueError, match="cannot quantise out: a kernel with infinite"):
+        lorasp_jax.quantize(broken, [("", "nf4")])
+    with pytest.raises(ValueError, match="out/kernel is quantised"):
+        adaptation.adapt(model, [("out", FullFineTuning())], rngs=nnx.Rngs(0))
+
+
+def test_shared_kernels_stay_shared():
+    tied = nnx.List([nnx.Linear(4, 4, use_bias=False, rngs=nnx.Rngs(i)) for i in range(2)])
+    tied[1].kernel = tied[0].kernel
+    model, errors = lorasp_jax.quantize(tied, [("", "int8")])
+    assert model[0].kernel is model[1].kernel
+    assert errors["0"] == errors["1"] > 0
+    assert size(model) == 4 * 4 + 4 * 4
+
+
+def test_tables_and_reports():
+    """A summary counts weights, not bytes; adapters report as ever."""
+    model = trained(("", LoRA(rank=2)), seed=1, net=quantized("nf4"))
+    assert "inp" in lorasp_jax.summary(model)
+    assert lorasp_jax.summary(model) == lorasp_jax.summary(widened(model))
+    named = lorasp_jax.choose(lorasp_jax.combine({"a": model}), None)
+    named(X)
+    assert not lorasp_jax.collect_aux(named)["inp"].active_rank.any()
+    assert "adapter_set" in lorasp_jax.summary(named)

@@ -1,0 +1,423 @@
+"""Adapter folders of Hugging Face PEFT, both ways."""
+
+import itertools
+import json
+import os
+import shutil
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import safetensors.numpy
+from flax import linen as nn
+from flax import nnx
+from flax.traverse_util import flatten_dict, unflatten_dict
+
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters.io import hugging_face
+from lorasp_jax.adapters.io.hugging_face_linen import load_peft_linen
+from lorasp_jax.dense import Dense
+from lorasp_jax.peft import AdaLoRA, DoRA, LoRA, LoRASP
+
+GOLDEN = Path(__file__).parent / "golden"
+FOLDER = GOLDEN / "adapter_lora"
+SIZES = (24, 40, 24, 16)
+
+
+class Net(nnx.Module):
+    """The oracle's net; a random one without its arrays."""
+
+    def __init__(self, arrays=None):
+        self.lin = nnx.List(
+            [
+                nnx.Linear(i, o, rngs=nnx.Rngs(n))
+                for n, (i, o) in enumerate(itertools.pairwise(SIZES))
+            ]
+        )
+        for n, layer in enumerate(self.lin if arrays is not None else []):
+            layer.kernel.set_value(jnp.array(arrays[f"base/lin.{n}.weight"].T))
+            layer.bias.set_value(jnp.array(arrays[f"base/lin.{n}.bias"]))
+
+    def __call__(self, x):
+        for n, layer in enumerate(self.lin):
+            x = layer(x)
+            x = jnp.tanh(x) if n < 2 else x
+        return x
+
+
+class Stack(nnx.Module):
+    """Three layers in one kernel."""
+
+    def __init__(self):
+        self.layer = Dense(6, 5, rngs=nnx.Rngs(0))
+        self.layer.kernel = nnx.Param(jax.random.normal(jax.random.key(0), (3, 6, 5)))
+
+
+def module(path, index):
+    return f"blocks.{index[0]}.{path}"
+
+
+X = jax.random.normal(jax.random.key(9), (4, 24))
+
+
+def trained(model, seed=5):
+    """The model with nothing left at zero."""
+    graphdef, adapters, frozen = adaptation.split(model)
+    leaves, structure = jax.tree.flatten(adapters)
+    keys = jax.random.split(jax.random.key(seed), len(leaves))
+    noise = [
+        leaf + 0.3 * jax.random.normal(k, leaf.shape) for leaf, k in zip(leaves, keys, strict=True)
+    ]
+    return nnx.merge(graphdef, jax.tree.unflatten(structure, noise), frozen)
+
+
+def adapted(*rules, seed=5):
+    return trained(adaptation.adapt(Net(), rules, rngs=nnx.Rngs(1)), seed)
+
+
+@pytest.fixture
+def copy(tmp_path):
+    return Path(shutil.copytree(FOLDER, tmp_path / "copy"))
+
+
+def edit(folder, **changes):
+    """Changes the folder's configuration."""
+    config = json.loads((folder / hugging_face.CONFIG).read_text()) | changes
+    (folder / hugging_face.CONFIG).write_text(json.dumps(config))
+
+
+def retensor(folder, change):
+    """Changes the folder's tensors."""
+    tensors = safetensors.numpy.load_file(folder / hugging_face.TENSORS)
+    safetensors.numpy.save_file(change(tensors), folder / hugging_face.TENSORS)
+
+
+def test_a_folder_that_peft_wrote_gives_its_outputs():
+    arrays = dict(np.load(GOLDEN / "adapter_lora_io.npz"))
+    model = hugging_face.load_peft(FOLDER, Net(arrays))
+    np.testing.assert_allclose(model(arrays["x"]), arrays["y"], rtol=0, atol=1e-5)
+    expected = LoRA(rank=4, alpha=8)
+    assert adaptation.methods(model) == {"lin/0": expected, "lin/2": expected}
+
+
+@pytest.mark.parametrize("name", ["dora", "rs", "ada"])
+def test_folders_that_peft_trained_give_its_outputs(name):
+    """DoRA, rsLoRA and AdaLoRA, 20 steps of SGD in PEFT 0.21.2, ranks and α by pattern."""
+    arrays = dict(np.load(GOLDEN / "adapter_trained_io.npz"))
+    model = hugging_face.load_peft(GOLDEN / f"adapter_{name}", Net(arrays))
+    np.testing.assert_allclose(model(arrays["x"]), arrays[f"y/{name}"], rtol=0, atol=1e-5)
+
+
+def test_what_peft_wrote_is_written_again(tmp_path):
+    hugging_face.save_peft(tmp_path, hugging_face.load_peft(FOLDER, Net()))
+    ours, theirs = (
+        safetensors.numpy.load_file(folder / hugging_face.TENSORS) for folder in (tmp_path, FOLDER)
+    )
+    assert ours.keys() == theirs.keys()
+    for name, value in theirs.items():
+        np.testing.assert_array_equal(ours[name], value)
+    ours, theirs = (
+        json.loads((folder / hugging_face.CONFIG).read_text()) for folder in (tmp_path, FOLDER)
+    )
+    for name, value in ours.items():
+        assert theirs[name] == value, name
+
+
+@pytest.mark.parametrize(
+    "methods",
+    [
+        [LoRA(rank=3, alpha=4.0)],
+        [LoRA(rank=3, rank_stabilized=True), LoRA(rank=5, alpha=1.0), LoRA(rank=3)],
+        [DoRA(rank=3, alpha=4.0), DoRA(rank=2)],
+        [AdaLoRA(rank=4, target_rank=2, alpha=4.0), LoRA(rank=2)],
+    ],
+    ids=["lora", "patterns", "dora", "adalora"],
+)
+def test_round_trip(methods, tmp_path):
+    model = adapted(*((f"lin/{i}", method) for i, method in enumerate(methods)))
+    if isinstance(methods[0], AdaLoRA):
+        params = model.lin[0].adapter.get_value()
+        model.lin[0].adapter.set_value(params | {"lora_e": params["lora_e"].at[1:].set(0.0)})
+    hugging_face.save_peft(tmp_path, model)
+    again = hugging_face.load_peft(tmp_path, Net())
+    np.testing.assert_allclose(again(X), model(X), rtol=1e-5, atol=1e-5)
+    ranks = [again.lin[i].method.rank for i in range(len(methods))]
+    assert ranks == [1 if isinstance(m, AdaLoRA) else m.rank for m in methods]
+    assert np.abs(again(X) - Net()(X)).max() > 0.1
+
+
+def test_adalora_as_peft_saves_it(tmp_path):
+    rng = np.random.default_rng(0)
+    a, b, e = rng.normal(size=(2, 24)), rng.normal(size=(40, 2)), rng.normal(size=(2, 1))
+    parts = {"lora_A": a, "lora_B": b, "lora_E": e}
+    tensors = {f"base_model.model.lin.0.{k}": v.astype(np.float32) for k, v in parts.items()}
+    safetensors.numpy.save_file(tensors, tmp_path / hugging_face.TENSORS)
+    config = {"peft_type": "ADALORA", "init_r": 6, "target_r": 2, "lora_alpha": 16, "r": 8}
+    (tmp_path / hugging_face.CONFIG).write_text(json.dumps(config))
+    model = hugging_face.load_peft(tmp_path, Net())
+    kernel = adaptation.merge(model).lin[0].kernel.get_value()
+    expected = Net().lin[0].kernel.get_value() + (b @ (a * e)).T * 16 / (6 + 1e-5)
+    np.testing.assert_allclose(kernel, expected, atol=1e-4)
+
+
+def test_patterns_follow_the_end_of_a_name(copy):
+    edit(copy, alpha_pattern={r"lin\.2": 16}, rank_pattern={"2": 4})
+    model = hugging_face.load_peft(copy, Net())
+    assert [model.lin[i].method.scale for i in (0, 2)] == [2, 4]
+
+
+def test_a_pattern_that_takes_python_for_ever(copy):
+    """In a folder whose module is named to fit it."""
+    retensor(copy, lambda t: {n.replace("lin.0", "a" * 60): v for n, v in t.items()})
+    edit(copy, alpha_pattern={"(a+)+b": 8})
+    with pytest.raises(ValueError, match=r"the pattern '\(a\+\)\+b' could take too long"):
+        hugging_face.load_peft(copy, Net())
+
+
+def test_names_that_end_in_another_name(tmp_path):
+    class Twins(nnx.Module):
+        def __init__(self):
+            self.proj = nnx.Linear(4, 3, rngs=nnx.Rngs(0))
+            self.head = nnx.List([nnx.Linear(3, 3, rngs=nnx.Rngs(1))])
+            self.head[0].proj = nnx.Linear(4, 3, rngs=nnx.Rngs(2))
+
+    rules = [("^proj", LoRA(rank=2, alpha=4.0)), ("head/0/proj", LoRA(rank=3, alpha=30.0))]
+    model = trained(adaptation.adapt(Twins(), rules, rngs=nnx.Rngs(0)))
+    hugging_face.save_peft(tmp_path, model)
+    again = adaptation.merge(hugging_face.load_peft(tmp_path, Twins()))
+    for ours, theirs in zip(
+        jax.tree.leaves(nnx.state(again)),
+        jax.tree.leaves(nnx.state(adaptation.merge(model))),
+        strict=True,
+    ):
+        np.testing.assert_allclose(ours, theirs, atol=1e-4)
+
+
+def test_rank_stabilized(copy):
+    edit(copy, use_rslora=True)
+    assert hugging_face.load_peft(copy, Net()).lin[0].method.scale == 4
+
+
+def test_stacks(tmp_path):
+    method = LoRA(rank=2, alpha=3.0)
+    model = trained(adaptation.adapt(Stack(), [("layer", method)], rngs=nnx.Rngs(0)))
+    hugging_face.save_peft(tmp_path, model, names=module, base="a base")
+    assert json.loads((tmp_path / hugging_face.CONFIG).read_text())["target_modules"] == [
+        f"blocks.{i}.layer" for i in range(3)
+    ]
+
+    def shrink(tensors):  # the second layer's rank
+        for side, cut in (("A", np.s_[:1]), ("B", np.s_[:, :1])):
+            name = f"base_model.model.blocks.1.layer.lora_{side}.weight"
+            tensors[name] = np.ascontiguousarray(tensors[name][cut])
+        return tensors
+
+    retensor(tmp_path, shrink)
+    edit(tmp_path, alpha_pattern={"1.layer": 6.0})
+    again = hugging_face.load_peft(tmp_path, Stack(), names=module)
+    ours, theirs = (adaptation.merge(m).layer.kernel.get_value() for m in (again, model))
+    np.testing.assert_allclose(ours[::2], theirs[::2], atol=1e-5)
+    params = {k: v[1] for k, v in model.layer.adapter.get_value().items()}
+    one = 6.0 * params["lora_a"][:, :1] @ params["lora_b"][:1]
+    np.testing.assert_allclose(ours[1], Stack().layer.kernel.get_value()[1] + one, atol=1e-5)
+
+    with pytest.raises(ValueError, match=r"layer is a stack of layers: give names"):
+        hugging_face.load_peft(tmp_path, Stack())
+    retensor(tmp_path, lambda t: {k: v for k, v in t.items() if "blocks.2" not in k})
+    with pytest.raises(ValueError, match="only some of the layers of the stack layer"):
+        hugging_face.load_peft(tmp_path, Stack(), names=module)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"peft_type": "LOHA"}, "holds LOHA; LORA and ADALORA can be loaded"),
+        ({"lora_bias": True}, "sets lora_bias to True, which is not supported: merge it into"),
+        ({"lora_dropout": 1.0}, "lora_dropout must be a number from 0 on, less than 1, got 1.0"),
+        ({"use_dora": True}, "adapter of lin.0 lacks lora_magnitude_vector"),
+        ({"peft_type": "ADALORA"}, "adapter of lin.0 lacks lora_E"),
+        ({"lora_alpha": None}, "lacks lora_alpha or init_r, which scale it"),
+        ({"lora_alpha": 0}, "lora_alpha must be a number other than 0"),
+        ({"lora_alpha": 1e308}, "lora_alpha must be a number other than 0"),
+        ({"lora_alpha": True}, "lora_alpha must be a number"),
+        ({"use_rslora": "x"}, "use_rslora must be true or false, got 'x'"),
+        ({"use_dora": 1}, "use_dora must be true or false, got 1"),
+        ({"alpha_pattern": {"lin.0": "8"}}, "alpha_pattern must be an object of such numbers"),
+        ({"alpha_pattern": {"l(": 8}}, r"'l\(' is no regular expression"),
+        ({"r": 8.5}, "r must be a whole number from 1"),
+        ({"target_modules": 3}, "target_modules must be a text or a list of texts"),
+        ({"bias": 0}, "bias must be 'none', 'all' or 'lora_only', got 0"),
+        ({"init_lora_weights": "pissa"}, "trained on what 'pissa' left of its base"),
+    ],
+)
+def test_folders_that_ask_for_more(copy, changes, message):
+    edit(copy, **changes)
+    with pytest.raises(ValueError, match=message):
+        hugging_face.load_peft(copy, Net())
+
+
+class Attention(nnx.Module):
+    """Flax's own attention, whose kernels have axes of heads, and a layer of another class."""
+
+    def __init__(self):
+        self.attn = nnx.MultiHeadAttention(2, 6, decode=False, rngs=nnx.Rngs(0))
+        self.own = Own()
+
+    def __call__(self, x):
+        return self.own(self.attn(x))
+
+
+class Own(nnx.Module):
+    """An einsum of somebody's own."""
+
+    def __init__(self):
+        self.w = nnx.Param(jax.random.normal(jax.random.key(3), (6, 4)))
+
+    def __call__(self, x):
+        return jnp.einsum("...i,io->...o", x, self.w[...])
+
+
+def torch_names(path, index):
+    return "model." + {"attn/query": "q_proj", "attn/out": "out_proj", "own": "head"}.get(
+        path, path
+    )
+
+
+def attention_folder(folder):
+    """As PEFT writes it for torch's [out, in] weights; and the updates [in, out] by module."""
+    rng, tensors, updates = np.random.default_rng(0), {}, {}
+    for name, d_out in (("q_proj", 6), ("out_proj", 6), ("head", 4)):
+        a, b = (rng.normal(size=s).astype(np.float32) for s in ((2, 6), (d_out, 2)))
+        tensors |= {
+            f"base_model.model.model.{name}.lora_{k}.weight": v for k, v in (("A", a), ("B", b))
+        }
+        updates[name] = 2 * (b @ a).T
+    safetensors.numpy.save_file(tensors, folder / hugging_face.TENSORS)
+    config = {"peft_type": "LORA", "lora_alpha": 4, "r": 2}
+    (folder / hugging_face.CONFIG).write_text(json.dumps(config))
+    return updates
+
+
+def test_attention_with_axes_of_heads_and_own_classes(tmp_path):
+    """Kernels [D, N, H] and [N, H, D] are torch's with all heads side by side."""
+    updates, base = attention_folder(tmp_path), Attention()
+    einsums = {Own: lambda layer: ("w", "...i,io->...o")}
+    model = hugging_face.load_peft(tmp_path, base, names=torch_names, einsums=einsums)
+    merged = adaptation.merge(model)
+    changes = {
+        "q_proj": (merged.attn.query.kernel, base.attn.query.kernel),
+        "out_proj": (merged.attn.out.kernel, base.attn.out.kernel),
+        "head": (merged.own.w, base.own.w),
+    }
+    for name, (after, before) in changes.items():
+        change = (after[...] - before[...]).reshape(updates[name].shape)
+        np.testing.assert_allclose(change, updates[name], atol=1e-5)
+    hugging_face.save_peft(tmp_path / "again", model, names=torch_names)
+    ours, theirs = (
+        safetensors.numpy.load_file(folder / hugging_face.TENSORS)
+        for folder in (tmp_path / "again", tmp_path)
+    )
+    assert ours.keys() == theirs.keys()
+    for name, value in theirs.items():
+        np.testing.assert_array_equal(ours[name], value)
+    with pytest.raises(ValueError, match=r"'model.head', which the model lacks; it has model\."):
+        hugging_face.load_peft(tmp_path, base, names=torch_names)
+
+
+def test_linen_attention_takes_the_same_folder(tmp_path):
+    """Its layers are known from a call; outputs are those of merged parameters."""
+
+    class Linen(nn.Module):
+        @nn.compact
+        def __call__(self, x):
+            x = nn.MultiHeadDotProductAttention(2, name="attn")(x)
+            return nn.Dense(4, use_bias=False, name="own")(x)
+
+    updates, x = attention_folder(tmp_path), jax.random.normal(jax.random.key(0), (1, 5, 6))
+    variables = Linen().init(jax.random.key(1), x)
+    adapter, loaded = load_peft_linen(tmp_path, Linen(), variables, x, names=torch_names)
+    by_path = {("attn", "query"): "q_proj", ("attn", "out"): "out_proj", ("own",): "head"}
+    flat = flatten_dict(variables["params"])
+    for path, name in by_path.items():
+        kernel = flat[(*path, "kernel")]
+        flat[(*path, "kernel")] = kernel + updates[name].reshape(kernel.shape)
+    expected = Linen().apply({"params": unflatten_dict(flat)}, x)
+    np.testing.assert_allclose(adapter.apply(loaded, x), expected, rtol=1e-4, atol=1e-4)
+    with pytest.raises(ValueError, match="must be an NNX module, got Linen; see LinenAdapter"):
+        hugging_face.load_peft(tmp_path, Linen())
+
+
+def renamed(tensors):
+    return {name.replace("lin.2", "lin.7"): value for name, value in tensors.items()}
+
+
+def halved(tensors):
+    return {name: value for name, value in tensors.items() if "2.lora_B" not in name}
+
+
+def narrowed(tensors):
+    return {k: v[:, :-1].copy() if "lora_A" in k else v for k, v in tensors.items()}
+
+
+def extended(tensors):
+    return tensors | {"base_model.model.head.weight": np.zeros(3, np.float32)}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (renamed, r"adapts 'lin.7', which the model lacks; it has lin"),
+        (halved, "adapter of lin.2 lacks lora_B"),
+        (narrowed, r"adapts lin.0 by arrays \(23, 4\) and \(4, 40\), the model's kernel is 24x40"),
+        (extended, "head.weight', which belongs to no LoRA"),
+        (lambda tensors: {}, "adapts nothing"),
+    ],
+)
+def test_tensors_that_do_not_fit(copy, change, message):
+    retensor(copy, change)
+    with pytest.raises(ValueError, match=message):
+        hugging_face.load_peft(copy, Net())
+
+
+@pytest.mark.parametrize("name", [hugging_face.CONFIG, hugging_face.TENSORS])
+def test_damaged_and_missing_files(copy, name):
+    (copy / name).write_bytes(b"{")
+    with pytest.raises(ValueError, match=f"{name} is damaged or no"):
+        hugging_face.load_peft(copy, Net())
+    (copy / name).unlink()
+    with pytest.raises(ValueError, match=f"holds no {name}"):
+        hugging_face.load_peft(copy, Net())
+
+
+@pytest.mark.parametrize(
+    ("rules", "message"),
+    [
+        ([("lin/0", LoRASP(rank=4))], "lin/0 has lora_sp, which Hugging Face PEFT does not know"),
+        ([("lin/0", LoRA(rank=2, initialization="pissa"))], "holds a part of its kernel"),
+        ([("lin/0", LoRA(rank=2)), ("lin/1", DoRA(rank=2))], "either LoRA or DoRA"),
+        ([], "at least one adapter"),
+    ],
+)
+def test_what_cannot_be_written(rules, message, tmp_path):
+    model = adapted(*rules) if rules else Net()
+    with pytest.raises(ValueError, match=message):
+        hugging_face.save_peft(tmp_path / "new", model)
+    assert not (tmp_path / "new").exists()
+
+
+def test_adapters_elsewhere_stay():
+    fresh = hugging_face.load_peft(FOLDER, Net())
+    (other,) = {"lin/0", "lin/1", "lin/2"} - adaptation.methods(fresh).keys()
+    model = adaptation.adapt(Net(), [(other, LoRA(rank=3))], rngs=nnx.Rngs(1))
+    loaded = hugging_face.load_peft(FOLDER, model)
+    expected = adaptation.methods(model) | adaptation.methods(fresh)
+    assert adaptation.methods(loaded) == expected
+
+
+@pytest.mark.parametrize("name", ["adapter_config.json", "adapter_model.safetensors"])
+def test_a_file_beyond_any_memory(copy, name):
+    os.truncate(copy / name, 2**43)
+    with pytest.raises(ValueError, match=f"{name} has 8796093022208 bytes, more than"):
+        hugging_face.load_peft(copy, Net())

@@ -1,0 +1,74 @@
+"""Patterns over names of modules: what PEFT's own matching gives, in bounded time."""
+
+import re
+import time
+
+import pytest
+
+from lorasp_jax.adapters.io.name_patterns import values_of
+
+NAMES = [
+    *("q_proj", "model.layers.0.q_proj", "model.layers.10.self_attn.q_proj", "layers.0.mlp.up"),
+    *("head", "lm_head", "a", "aa", "aab", "a.b", "ab.a", "b.aab", "..", "model.layers.1"),
+]
+PATTERNS = [
+    *(
+        "q_proj",
+        "^q_proj",
+        r"layers\.0\.q_proj",
+        "layers.0.q_proj",
+        ".*",
+        r".*\.0\..*_proj",
+        "head",
+    ),
+    *(
+        r"layers\.(0|1[0-9]?)\..*",
+        r"layers\.\d+",
+        "[^.]+",
+        "(?:a|b)+",
+        "a?a?b",
+        "(a|ab)(b|)",
+        "a*?b",
+    ),
+    *("^model$", "$", "a|b", "(^a|b)b?", r"\w+", "", "a{2}", "(layers)*", r"[\w-]+\.a"),
+]
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_as_peft_matches(pattern):
+    found = values_of({pattern: True}, NAMES, default=False)
+    assert found == {n: bool(re.match(rf"(.*\.)?({pattern})$", n)) for n in NAMES}
+
+
+def test_the_first_that_matches():
+    found = values_of({"0.q": 1, "q": 2}, ["x.0.q", "x.1.q", "k"], default=3)
+    assert found == {"x.0.q": 1, "x.1.q": 2, "k": 3}
+
+
+@pytest.mark.parametrize(
+    "pattern", ["(a+)+b", "(a|a)*b", "(.*)*b", "a?" * 60 + "a" * 60, "(((a*)*)*)*b", ".*.*.*.*.*b"]
+)
+def test_patterns_that_take_python_for_ever(pattern):
+    names = [f"{'a' * 250}{i}" for i in range(20)]
+    with pytest.raises(ValueError, match=r"^the pattern '.* could take too long for 20 names\.$"):
+        values_of({pattern: True}, names, default=False)
+
+
+def test_what_is_let_through_takes_seconds():
+    """The slowest kind, close to the limit, by this process's clock."""
+    names = [f"{'a' * 170}{i}" for i in range(50)]
+    began = time.process_time()
+    assert not any(values_of({".*a.*b": True}, names, default=False).values())
+    assert time.process_time() - began < 10
+
+
+@pytest.mark.parametrize("pattern", ["a)", "(a", "[a", "*a", "a**", "[z-a]", "a\\"])
+def test_no_regular_expressions(pattern):
+    with pytest.raises(ValueError, match="is no regular expression: "):
+        values_of({pattern: 1}, ["a"], default=2)
+
+
+@pytest.mark.parametrize("pattern", [r"(?=a)", r"(a)\1", "a++"])
+def test_what_is_not_supported(pattern):
+    with pytest.raises(ValueError, match=r"a pattern with [A-Z_]+ is not supported"):
+        values_of({pattern: 1}, ["a"], default=2)

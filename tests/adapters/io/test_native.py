@@ -1,0 +1,185 @@
+"""Adapters on disk: round trips for every method, and files that do not fit."""
+
+import json
+import os
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from lorasp_jax import peft
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters.io.native import load_adapters, save_adapters
+from lorasp_jax.dense import Dense
+from lorasp_jax.digest import sealed
+from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP
+
+SP = LoRASP(rank=8, hidden_width=4, energy_target=0.8)
+
+
+class Net(nnx.Module):
+    def __init__(self, rngs):
+        self.first = nnx.Linear(3, 4, rngs=rngs)
+        self.blocks = nnx.vmap(lambda r: Dense(4, 4, rngs=r))(rngs.split(2))
+        self.norm = nnx.RMSNorm(4, rngs=rngs)
+
+
+def adapted(*rules, seed=1):
+    return adaptation.adapt(Net(nnx.Rngs(0)), rules, rngs=nnx.Rngs(seed))
+
+
+def assert_same(one, two):
+    (graph, *states), (other, *others) = adaptation.split(one), adaptation.split(two)
+    assert graph == other
+    for a, b in zip(jax.tree.leaves(states), jax.tree.leaves(others), strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.fixture
+def saved(tmp_path):
+    save_adapters(tmp_path / "run", adapted((".*", SP)), base="abc", metadata={"step": 3})
+    return tmp_path / "run"
+
+
+@pytest.mark.parametrize("name", peft.names())
+def test_round_trip(tmp_path, name):
+    """Onto the bare base, which the file adapts, and onto a model adapted alike."""
+    rule = (".*", peft.create(name))
+    model = adapted(rule)
+    save_adapters(tmp_path, model)
+    assert_same(load_adapters(tmp_path, Net(nnx.Rngs(0))), model)
+    assert_same(load_adapters(tmp_path, adapted(rule, seed=2)), model)
+
+
+def test_mixed_methods(tmp_path):
+    model = adapted(("bias|norm", FullFineTuning()), ("first", LoRA(rank=2)), (".*", SP))
+    save_adapters(tmp_path, model)
+    assert_same(load_adapters(tmp_path, Net(nnx.Rngs(0))), model)
+
+
+def test_what_the_file_says(saved):
+    description = json.loads((saved / "adapter.json").read_text())
+    assert (description["base"], description["metadata"]) == ("abc", {"step": 3})
+    assert description["methods"]["blocks"]["method"] == "lora_sp"
+    assert description["methods"]["blocks"]["energy_target"] == 0.8
+    assert "gate" not in description["methods"]["blocks"]
+    assert {path.name for path in saved.iterdir()} == {"adapter.json", "adapter.safetensors"}
+
+
+def test_another_base(saved):
+    load_adapters(saved, Net(nnx.Rngs(0)), base="abc")
+    with pytest.raises(ValueError, match="was trained on base 'abc', not on 'xyz'"):
+        load_adapters(saved, Net(nnx.Rngs(0)), base="xyz")
+
+
+def with_other(model, change):
+    """The model with another number in the kernel that is first by path."""
+    graphdef, adapters, frozen = adaptation.split(model)
+    first, *others = jax.tree.leaves(frozen)
+    frozen = jax.tree.unflatten(jax.tree.structure(frozen), [change(first), *others])
+    return nnx.merge(graphdef, adapters, frozen)
+
+
+@pytest.mark.parametrize("bare", [True, False])
+def test_other_weights_of_the_same_shapes(saved, bare):
+    model = Net(nnx.Rngs(0)) if bare else adapted((".*", SP))
+    other = with_other(model, lambda kernel: kernel.at[0, 0].add(0.5))
+    with pytest.raises(
+        ValueError, match=r"another base: .* 1 differ, first 'blocks.*any_base=True"
+    ):
+        load_adapters(saved, other)
+    kept = load_adapters(saved, other, any_base=True)
+    assert_same(kept, with_other(load_adapters(saved, model), lambda k: k.at[0, 0].add(0.5)))
+
+
+def test_the_same_weights_in_another_type(saved):
+    half = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), Net(nnx.Rngs(0)))
+    load_adapters(saved, half)
+    mesh = jax.make_mesh((2,), ("data",), devices=jax.devices()[:2])
+    spread = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec(None))
+    load_adapters(saved, jax.device_put(Net(nnx.Rngs(0)), spread))
+
+
+def test_models_that_do_not_fit(saved):
+    with pytest.raises(ValueError, match="other adapters than the model, first at 'blocks'"):
+        load_adapters(saved, adapted((".*", LoRA(rank=2))))
+    with pytest.raises(ValueError, match=r"does not fit the model: rule '\^blocks\$'"):
+        load_adapters(saved, nnx.Dict(first=nnx.Linear(3, 4, rngs=nnx.Rngs(0))))
+    other = Net(nnx.Rngs(0))
+    other.first = nnx.Linear(7, 4, rngs=nnx.Rngs(0))
+    with pytest.raises(ValueError, match=r"tensor 'first/adapter/bank/v' has shape \(3, 8\) in"):
+        load_adapters(saved, other)
+
+
+@pytest.mark.parametrize("field", ["rank", "hidden_width", "pruned"])
+@pytest.mark.parametrize("size", [10**12, 10**30])
+def test_sizes_beyond_any_memory(saved, field, size):
+    """Are compared with the tensors before anything is made."""
+    path = saved / "adapter.json"
+    description = json.loads(path.read_text())
+    del description["digest"]
+    for settings in description["methods"].values():
+        settings[field] = size
+    path.write_text(json.dumps(sealed(description)))
+    with pytest.raises(ValueError, match=r"does not fit|has shape") as caught:
+        load_adapters(saved, Net(nnx.Rngs(0)))
+    assert "\n" not in str(caught.value)
+
+
+def resealed(old, new):
+    """A change by somebody who knows of the digest."""
+
+    def damage(data):
+        facts = json.loads(data.replace(old, new))
+        del facts["digest"]
+        return json.dumps(sealed(facts)).encode()
+
+    return damage
+
+
+@pytest.mark.parametrize(
+    ("name", "damage", "message"),
+    [
+        ("adapter.safetensors", lambda data: data[:-10], "is damaged or belongs to another"),
+        ("adapter.safetensors", lambda _: b"", "is damaged or belongs to another"),
+        ("adapter.json", lambda data: data[:50], "is damaged or no adapter description"),
+        ("adapter.json", lambda _: b'{"r": 8}', "is damaged or no adapter description"),
+        ("adapter.json", lambda data: data.replace(b"0.8", b"0.9"), "digest is another one"),
+        ("adapter.json", lambda data: data.replace(b'"abc"', b'"abd"'), "digest is another one"),
+        ("adapter.json", lambda _: b"[1]", "is damaged or no adapter description"),
+        ("adapter.json", lambda d: d.replace(b'"version": 2', b'"version": 9'), "of version 2"),
+        ("adapter.json", resealed(b"lora_sp", b"lora_ps"), "did you mean 'lora_sp'"),
+        ("adapter.json", resealed(b'"rank": 8', b'"rank": "8"'), "does not fit"),
+    ],
+)
+def test_damaged_files(saved, name, damage, message):
+    (saved / name).write_bytes(damage((saved / name).read_bytes()))
+    with pytest.raises(ValueError, match=message):
+        load_adapters(saved, Net(nnx.Rngs(0)))
+
+
+def test_missing_files(tmp_path, saved):
+    with pytest.raises(ValueError, match=r"holds no adapter\.json; an adapter is a"):
+        load_adapters(tmp_path, Net(nnx.Rngs(0)))
+    (saved / "adapter.safetensors").unlink()
+    with pytest.raises(ValueError, match=r"holds no adapter\.safetensors"):
+        load_adapters(saved, Net(nnx.Rngs(0)))
+
+
+def test_a_failed_save_keeps_the_old_adapter(saved):
+    before = {path.name: path.read_bytes() for path in saved.iterdir()}
+    with pytest.raises(ValueError, match="no adapters to save"):
+        save_adapters(saved, Net(nnx.Rngs(0)))
+    with pytest.raises(ValueError, match="metadata is for JSON, which cannot hold it"):
+        save_adapters(saved, adapted((".*", SP), seed=5), metadata={"bad": object()})
+    assert {path.name: path.read_bytes() for path in saved.iterdir()} == before
+
+
+@pytest.mark.parametrize("name", ["adapter.json", "adapter.safetensors"])
+def test_a_file_beyond_any_memory(saved, name):
+    os.truncate(saved / name, 2**43)
+    with pytest.raises(ValueError, match=f"{name} has 8796093022208 bytes, more than"):
+        load_adapters(saved, Net(nnx.Rngs(0)))

@@ -1,0 +1,201 @@
+"""Joined layers compute what they did, with fewer products."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from lorasp_jax.adapters.compress.quantization import quantize
+from lorasp_jax.adapters.layers import inference
+from lorasp_jax.dense import Dense
+from lorasp_jax.models import pi0, smolvla
+from lorasp_jax.models.sampling import Sampler
+from lorasp_jax.models.transformer.layers import Linears
+from lorasp_jax.peft import LoRASP
+from lorasp_jax.peft.lora_sp import method as lora_sp
+from tests.cases import mostly_slow
+from tests.models.drawn import drawn, observation
+from tests.nets import METHODS, trained
+
+JOINED = [name for name in METHODS if name not in ("full", "dora", "lora_moe")]
+
+
+class Readers(nnx.Module):
+    """Three layers that read x, one with a bias, and one that reads their sum."""
+
+    together = (("first", "second"),)
+
+    def __init__(self, dtype="bfloat16"):
+        kinds = {"dtype": dtype, "rngs": nnx.Rngs(0)}
+        self.first = Dense(8, 8, **kinds, use_bias=False)
+        self.second = Dense(8, 12, **kinds)
+        self.third = Dense(8, 8, **kinds)
+
+    def __call__(self, x, token_mask=None):
+        linear = Linears(self, token_mask)
+        first, second = linear.together(("first", "second"), x)
+        return linear("third", first) + second[..., :8], linear.aux
+
+
+def adapted(method, dtype="bfloat16"):
+    net = Readers(dtype)
+    net.second.bias.set_value(jnp.arange(12.0))
+    return trained((".*", method), seed=1, net=net)
+
+
+def ready(model):
+    model = nnx.merge(*nnx.split(model))
+    inference.prepare(model)
+    return model
+
+
+@pytest.mark.parametrize("name", mostly_slow(JOINED, ["lora_sp"]))
+def test_computes_the_same(name):
+    model, x = adapted(METHODS[name], "float32"), jnp.sin(jnp.arange(96.0)).reshape(2, 6, 8)
+    mask = jnp.arange(12).reshape(2, 6) % 5 != 0
+    run = jax.jit(lambda model, x: model(x, mask))
+    expected, aux = run(model, x)
+    prepared = ready(model)
+    assert set(prepared.ready.get_value()) == {("first", "second"), ("third",)}
+    found, other = run(prepared, x)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
+    assert jax.tree.structure(other) == jax.tree.structure(aux)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), other, aux)
+
+
+@pytest.mark.parametrize("name", mostly_slow(JOINED, ["lora_sp"]))
+def test_a_stack_computes_the_same(name):
+    """On rows fewer and more than inputs, for which W and U are joined."""
+    model = adapted(METHODS[name], "float32")
+    stack = jax.tree.map(lambda leaf: jnp.stack([leaf, 0.5 * leaf]), model)
+    run = jax.jit(jax.vmap(lambda model, x: model(x), in_axes=(0, None)))
+    prepared = inference.prepared_stack(stack)
+    for rows in (4, 12):
+        x = jnp.sin(jnp.arange(8.0 * rows)).reshape(1, rows, 8)
+        (expected, aux), (found, other) = run(stack, x), run(prepared, x)
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
+        assert jax.tree.structure(other) == jax.tree.structure(aux)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), other, aux)
+
+
+def test_a_stacks_adapters_are_cast_before_the_loop():
+    stack = jax.tree.map(lambda leaf: leaf[None], adapted(METHODS["lora"]))
+    x = jnp.ones((2, 8), jnp.bfloat16)
+
+    def in_loop(primitive, stack):
+        run = lambda x, stack: jax.lax.scan(lambda x, model: (model(x)[0], None), x, stack)  # noqa: E731
+        (loop,) = (e for e in jax.make_jaxpr(run)(x, stack).eqns if e.primitive.name == "scan")
+        return str(loop.params["jaxpr"]).count(primitive)
+
+    prepared = inference.prepared_stack(stack)
+    casts = [in_loop("convert_element_type", one) for one in (stack, prepared)]
+    assert casts[0] - casts[1] >= 6  # P and U of three layers
+    assert in_loop("optimization_barrier", prepared) == 2  # one for each input
+
+
+def test_a_kernel_gets_the_routers_numbers_joined_once(monkeypatch):
+    kernel = functools.partial(lora_sp.fused_rows, interpret=True)
+    monkeypatch.setattr(lora_sp, "fused_rows", kernel)
+    model = adapted(LoRASP(rank=32, hidden_width=16, gate="pallas"), "float32")
+    x = jnp.sin(jnp.arange(96.0)).reshape(2, 6, 8)
+    prepared = ready(model)
+    params = prepared.ready.get_value()["first", "second"].params
+    assert [leaf.shape for leaf in jax.tree.leaves(params)] == [(2, 16 * 32 + 16 + 32)]
+    run = jax.jit(lambda model, x: model(x))
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-4)
+    jax.tree.map(close, run(prepared, x), run(model, x))
+
+
+def test_a_quantised_base_computes_the_same():
+    model = quantize(adapted(METHODS["lora"], "float32"), [(".*", "int8")]).model
+    prepared, x = ready(model), jnp.sin(jnp.arange(48.0)).reshape(6, 8)
+    assert set(prepared.ready.get_value()) == {("first", "second"), ("third",)}
+    np.testing.assert_allclose(prepared(x)[0], model(x)[0], rtol=1e-4, atol=1e-4)
+
+
+def test_a_quantised_base_stays_so_where_it_is_not_copied():
+    model = quantize(adapted(METHODS["lora"], "float32"), [(".*", "int8")]).model
+    expected, x = model(jnp.ones((6, 8)))[0], jnp.ones((6, 8))
+    inference.prepare(model, copy_kernels=False)
+    codes = [leaf for leaf in jax.tree.leaves(nnx.state(model)) if leaf.dtype == jnp.int8]
+    assert len(codes) == 3
+    np.testing.assert_allclose(model(x)[0], expected, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("rows", "d_in", "d_out", "parts"),
+    [
+        (51, 4096, 1184, 8),  # the action expert's last product
+        (51, 2048, 1184, 4),
+        (51, 1024, 8512, 1),  # not long
+        (816, 4096, 2208, 1),  # many tiles
+        (51, 2050, 64, 1),  # does not divide
+    ],
+)
+def test_a_long_sum_of_few_rows_is_split(rows, d_in, d_out, parts):
+    assert inference._parts(rows, d_in, d_out) == parts
+
+
+def test_a_sum_over_parts_is_the_product():
+    keys = jax.random.split(jax.random.key(0))
+    x, matrix = (
+        jax.random.normal(k, s) for k, s in zip(keys, ((2, 3, 4096), (4096, 8)), strict=True)
+    )
+    assert "reduce_sum" in str(jax.make_jaxpr(inference.product)(x, matrix))
+    np.testing.assert_allclose(inference.product(x, matrix), x @ matrix, rtol=1e-4, atol=1e-3)
+    half = inference.product(x.astype(jnp.bfloat16), matrix.astype(jnp.bfloat16))
+    assert half.dtype == jnp.bfloat16
+    np.testing.assert_allclose(half.astype(jnp.float32), x @ matrix, atol=1)
+
+
+def test_layers_of_one_input_are_two_products():
+    model, x = adapted(METHODS["lora"]), jnp.ones((2, 8), jnp.bfloat16)
+    products = lambda model: str(jax.make_jaxpr(lambda x: model(x)[0])(x)).count("dot_general")  # noqa: E731
+    assert products(model) > products(ready(model)) == 4
+
+
+@pytest.mark.parametrize(
+    ("name", "dtype"),  # another product, rows in fp32, no type of its own
+    [("dora", "bfloat16"), ("lora_moe", "bfloat16"), ("lora", None)],
+)
+def test_what_cannot_be_joined_stays(name, dtype):
+    assert not hasattr(ready(adapted(METHODS[name], dtype)), "ready")
+
+
+@pytest.mark.parametrize("second", ["ada_lora", "dora", None])
+def test_layers_of_two_methods_are_joined_alone(second):
+    """Or left as they are: the last two."""
+    rules = [("second", second and METHODS[second]), (".*", METHODS["lora"])]
+    model, x = trained(*rules, seed=1, net=Readers("float32")), jnp.ones((2, 8))
+    prepared = ready(model)
+    joined = {"first", "third"} | ({"second"} if second == "ada_lora" else set())
+    assert set(prepared.ready.get_value()) == {(name,) for name in joined}
+    (found, other), (expected, aux) = prepared(x), model(x)
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
+    assert jax.tree.structure(other) == jax.tree.structure(aux)
+
+
+@pytest.mark.parametrize(
+    "backbone", [pi0, pytest.param(smolvla, marks=pytest.mark.slow)], ids=["pi0", "smolvla"]
+)
+def test_sampling_follows_the_velocity(backbone):
+    config = backbone.Config.dummy()
+    model = trained((".*_proj", METHODS["lora"]), seed=1, net=drawn(config), size=0.1)
+    obs = observation(config, 2)
+    noise = jax.random.normal(jax.random.key(0), (2, config.chunk, config.action_dim))
+    velocity = jax.jit(lambda model, x, t: model.velocity(obs, x, jnp.full(2, t)))
+    expected = noise - velocity(model, noise, 1.0) / 2
+    expected -= velocity(model, expected, 0.5) / 2
+    traced = []
+
+    @jax.jit
+    def sample(sampler):
+        traced.append(type(sampler))
+        return sampler.sample_actions(jax.random.key(0), obs, num_steps=2, noise=noise)
+
+    for _ in range(2):
+        np.testing.assert_allclose(sample(model.sampler()), expected, rtol=1e-4, atol=1e-5)
+    assert traced == [Sampler]  # two samplers of one model share a program

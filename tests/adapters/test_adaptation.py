@@ -1,0 +1,239 @@
+"""Adapting whole models: rules, stacked layers, splitting, counting, merging."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from flax import nnx
+
+import lorasp_jax
+from lorasp_jax import peft
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.dense import AdapterParam, Dense
+from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP
+
+LAYERS, WIDTH = 3, 4
+SP = LoRASP(rank=8, hidden_width=4)
+
+
+class Net(nnx.Module):
+    """A stranger's nnx.Linear, a norm, a stack that is scanned over, and a list of layers."""
+
+    def __init__(self, rngs, param_dtype=jnp.float32):
+        kinds = {"param_dtype": param_dtype, "rngs": rngs}
+        self.inp = nnx.Linear(5, WIDTH, **kinds)
+        self.norm = nnx.RMSNorm(WIDTH, **kinds)
+        stacked = nnx.vmap(lambda r: Dense(WIDTH, WIDTH, param_dtype=param_dtype, rngs=r))
+        self.blocks = stacked(rngs.split(LAYERS))
+        self.heads = nnx.List([nnx.Linear(WIDTH, 2, use_bias=False, **kinds) for _ in range(2)])
+
+    def __call__(self, x):
+        graphdef, layers = nnx.split(self.blocks)
+
+        def block(x, layer):
+            y, aux = nnx.merge(graphdef, layer)(x, return_aux=True)
+            return x + jnp.tanh(y), aux
+
+        x, aux = jax.lax.scan(jax.checkpoint(block), self.norm(self.inp(x)), layers)
+        return sum(head(x) for head in self.heads), aux
+
+
+@pytest.fixture(scope="module")
+def net():
+    return Net(nnx.Rngs(0))
+
+
+@pytest.fixture(scope="module")
+def x():
+    return jax.random.normal(jax.random.key(0), (6, 5))
+
+
+def adapted(net, *rules):
+    return adaptation.adapt(net, rules, rngs=nnx.Rngs(1))
+
+
+@jax.jit
+def call(model, x):
+    return model(x)
+
+
+def trained(model, x, steps=2):
+    """A few Adam steps as the train loop takes them: split once, merge inside."""
+    graphdef, adapters, frozen = adaptation.split(model)
+    optimizer = optax.adam(1e-2)
+
+    @jax.jit
+    def step(adapters, opt_state):
+        def loss(adapters):
+            return jnp.mean((nnx.merge(graphdef, adapters, frozen)(x)[0] - 1) ** 2)
+
+        gradients = jax.grad(loss)(adapters)
+        updates, opt_state = optimizer.update(gradients, opt_state)
+        return optax.apply_updates(adapters, updates), opt_state
+
+    opt_state = optimizer.init(adapters)
+    for _ in range(steps):
+        adapters, opt_state = step(adapters, opt_state)
+    return nnx.merge(graphdef, adapters, frozen)
+
+
+def leaves(model, kind):
+    return jax.tree.leaves(nnx.state(model, kind))
+
+
+@pytest.mark.parametrize("name", peft.names())
+def test_only_adapters_train(net, x, name):
+    """Every method: same output at first, a base that stays bit-identical, a trained part."""
+    method = SP if name == "lora_sp" else peft.create(name)
+    model = adapted(net, (".*", method))
+    np.testing.assert_allclose(call(model, x)[0], call(net, x)[0], rtol=1e-4, atol=1e-5)
+    _, before, frozen = adaptation.split(model)
+    after = trained(model, x)
+    for old, new in zip(leaves(frozen, ...), leaves(adaptation.split(after)[2], ...), strict=True):
+        np.testing.assert_array_equal(old, new)
+    now = leaves(after, AdapterParam)
+    moved = [bool((a != b).any()) for a, b in zip(leaves(before, ...), now, strict=True)]
+    assert sum(moved) >= len(moved) / 2
+    counts = adaptation.count(model)
+    assert (counts.trainable == counts.total) == method.trains_base
+
+
+def test_adapts_linear_and_stacked_layers(net, x):
+    model = adapted(net, ("inp|heads", LoRA(rank=2)), ("blocks", SP))
+    assert all(isinstance(layer, Dense) for layer in (model.inp, model.heads[0], model.heads[1]))
+    assert model.heads[0].bias is None
+    shapes = jax.tree.map(jnp.shape, model.blocks.adapter.get_value()["bank"])
+    assert shapes == {"u": (LAYERS, 8, WIDTH), "v": (LAYERS, WIDTH, 8)}
+    v = model.blocks.adapter.get_value()["bank"]["v"]
+    assert not np.array_equal(v[0], v[1])
+    _, aux = call(model, x)
+    assert aux.active_rank.shape == (LAYERS, 6)
+    assert aux.losses["spectral"].shape == (LAYERS,)
+
+
+def test_the_input_stays_as_it_was(net):
+    before = nnx.graphdef(net), jax.tree.leaves(nnx.state(net))
+    model = adapted(net, (".*", LoRA(rank=2)))
+    assert nnx.graphdef(net) == before[0]
+    assert isinstance(net.inp, nnx.Linear)
+    shared = {leaf.unsafe_buffer_pointer() for leaf in before[1]}
+    frozen = jax.tree.leaves(adaptation.split(model)[2])
+    assert {leaf.unsafe_buffer_pointer() for leaf in frozen} == shared  # no second copy
+    free = leaves(adapted(net, (".*", FullFineTuning())), AdapterParam)
+    assert not shared & {leaf.unsafe_buffer_pointer() for leaf in free}  # may be donated
+
+
+def test_first_match_wins_and_none_leaves_alone(net):
+    model = adapted(net, ("heads/1", None), ("inp|heads", LoRA(rank=2)), ("", FullFineTuning()))
+    assert set(adaptation.methods(model)) == {
+        "inp", "heads/0", "norm/scale", "blocks/kernel", "blocks/bias",
+    }  # fmt: skip
+    assert isinstance(model.heads[1], nnx.Linear)
+
+
+def test_adapters_depend_on_their_path_alone(net):
+    one, two = adapted(net, ("heads/1", SP)), adapted(net, ("inp", None), (".*", SP))
+
+    def v(layer):
+        return layer.adapter.get_value()["bank"]["v"]
+
+    np.testing.assert_array_equal(v(one.heads[1]), v(two.heads[1]))
+    assert not np.array_equal(v(two.heads[0]), v(two.heads[1]))
+
+
+def test_full_fine_tuning_frees_everything_under_a_path(x):
+    net = Net(nnx.Rngs(0), param_dtype=jnp.bfloat16)
+    model = adapted(net, ("norm|blocks", FullFineTuning()))
+    assert set(adaptation.methods(model)) == {"norm/scale", "blocks/kernel", "blocks/bias"}
+    assert {leaf.dtype for leaf in leaves(model, AdapterParam)} == {jnp.dtype("float32")}
+    assert leaves(net, nnx.Param)[0].dtype == jnp.bfloat16
+    with_bias = adapted(net, ("bias$", FullFineTuning()), ("blocks", LoRA(rank=2)))
+    assert set(adaptation.methods(with_bias)) == {"inp/bias", "blocks/bias", "blocks"}
+
+
+def test_adapting_what_trained_in_full_freezes_it(net):
+    full = adapted(net, (".*", FullFineTuning()))
+    model = adapted(full, ("inp", LoRA(rank=2)), (".*", None))
+    assert isinstance(model.inp, nnx.Linear) or model.inp.method == LoRA(rank=2)
+    assert not isinstance(model.inp.kernel, AdapterParam)
+    with pytest.raises(ValueError, match="inp/kernel cannot train in full under"):
+        adapted(net, ("kernel$", FullFineTuning()), ("inp", LoRA(rank=2)))
+
+
+def test_an_adapter_is_never_replaced(net, x):
+    """It may have been trained; what stays beside a new one is untouched."""
+    model = trained(adapted(net, ("inp", LoRA(rank=2))), x)
+    with pytest.raises(ValueError, match="cannot adapt inp: its lora adapter would be lost"):
+        adapted(model, (".*", LoRA(rank=3)))
+    both = adapted(model, ("inp", None), (".*", LoRA(rank=3)))
+    np.testing.assert_allclose(call(both, x)[0], call(model, x)[0], rtol=1e-5, atol=1e-6)
+    merged = adapted(lorasp_jax.merge(model), (".*", LoRA(rank=3)))
+    np.testing.assert_allclose(call(merged, x)[0], call(model, x)[0], rtol=1e-4, atol=1e-5)
+
+
+def test_rules_that_apply_to_nothing(net):
+    with pytest.raises(ValueError, match=r"rule 'block/' applies to nothing.*blocks"):
+        adapted(net, ("block/", LoRA(rank=2)))
+    with pytest.raises(ValueError, match="rule 'norm'"):
+        adapted(net, ("norm", LoRA(rank=2)))  # a norm is no dense layer
+    with pytest.raises(ValueError, match="rule 'inp' applies to nothing"):
+        adapted(net, (".*", LoRA(rank=2)), ("inp", SP))  # shadowed
+    with pytest.raises(ValueError, match=r"rule '\(' is no regular expression"):
+        adapted(net, ("(", SP))
+    with pytest.raises(ValueError, match="rule 'haeds'"):
+        adapted(net, ("haeds", None), (".*", SP))
+
+
+def test_linear_with_its_own_product_is_refused():
+    net = nnx.Linear(3, 4, precision="highest", rngs=nnx.Rngs(0))
+    with pytest.raises(ValueError, match="own dot_general or precision cannot be adapted"):
+        adapted(net, ("", LoRA(rank=2)))
+
+
+def test_a_single_layer_is_a_model(x):
+    layer = nnx.Linear(5, 2, rngs=nnx.Rngs(0))
+    model = adapted(layer, ("", LoRA(rank=2)))
+    np.testing.assert_allclose(model(x), layer(x), rtol=1e-5, atol=1e-6)
+
+
+def test_shapes_suffice():
+    """A model too large to build is adapted and counted under eval_shape."""
+    model = nnx.eval_shape(lambda: adapted(Net(nnx.Rngs(0)), ("blocks", SP)))
+    per_layer = 8 * (WIDTH + WIDTH) + 4 * (WIDTH + 8) + 4 + 8
+    assert adaptation.count(model).trainable == LAYERS * per_layer
+    base = 5 * WIDTH + WIDTH + WIDTH + LAYERS * (WIDTH + 1) * WIDTH + 2 * WIDTH * 2
+    assert adaptation.count(model).total == base + LAYERS * per_layer
+
+
+def test_summary(net):
+    text = lorasp_jax.summary(adapted(net, ("blocks", SP), ("norm", FullFineTuning())))
+    rows = {line.split()[0]: line.split() for line in text.splitlines()}
+    assert rows["path"] == ["path", "method", "shape", "rank", "parameters", "trainable"]
+    assert rows["blocks"] == ["blocks", "lora_sp", "3x4x4", "8", "432", "372"]
+    assert rows["norm/scale"] == ["norm/scale", "full", "4", "-", "4", "4"]
+    assert rows["total"] == ["total", "476", "376"]
+    assert text.endswith(
+        "78.99% of all parameters train, 376 of 476; the others are frozen, all of heads, inp "
+        "among them"
+    )
+
+
+def test_merge_equals_forward(net, x):
+    model = adapted(net, ("inp|blocks", LoRA(rank=2)), ("heads", FullFineTuning()))
+    model = trained(model, x)
+    merged = lorasp_jax.merge(model)
+    assert not leaves(merged, AdapterParam)
+    assert model.blocks.adapter is not None
+    np.testing.assert_allclose(call(merged, x)[0], call(model, x)[0], rtol=1e-4, atol=1e-5)
+    with pytest.raises(ValueError, match=r"cannot merge blocks: LoRA-SP .* prune .* distill"):
+        lorasp_jax.merge(adapted(net, ("blocks", SP)))
+
+
+def test_tree_mode(net, x):
+    """The split, the step and the merge also run with NNX's coming defaults."""
+    model = adapted(net, (".*", SP))
+    graphdef, adapters, frozen = adaptation.split(model)
+    with nnx.set_graph_mode(False):
+        y, _ = jax.jit(lambda a: nnx.merge(graphdef, a, frozen)(x))(adapters)
+    np.testing.assert_allclose(y, call(model, x)[0], rtol=1e-5)

@@ -1,0 +1,304 @@
+"""The command line's manners: nothing is overwritten, half written or lost."""
+
+import itertools
+import os
+import signal
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+import envs
+from envs import __main__ as command_line
+from envs.datasets import locks, places, rlds
+from envs.datasets.episodes import Episodes
+from envs.experts import collection
+from tests.cases import mostly_slow
+from tests.envs import user_arm
+from tests.envs.children import COLLECT, MOMENTS, REPLACING, fake_record, run_child
+from tests.envs.datasets.test_episodes import assert_equal, make
+from tests.envs.datasets.test_rlds import trimmed
+
+
+def stopping(function, calls):
+    """The function, which Ctrl-C meets after so many calls."""
+    count = itertools.count()
+
+    def stopped(*arguments, **options):
+        if next(count) == calls:
+            raise KeyboardInterrupt
+        return function(*arguments, **options)
+
+    return stopped
+
+
+@pytest.fixture
+def fake(monkeypatch):
+    monkeypatch.setattr(collection, "_record", fake_record)
+
+
+@pytest.fixture
+def run(capsys, monkeypatch):
+    """Runs a command; returns its exit code and what it said."""
+    # These act on the process.
+    monkeypatch.setattr(command_line.compilation_cache, "enable", lambda: None)
+
+    def run(text, *more):
+        code = command_line.main([*text.split(), *map(str, more)])
+        return code, " ".join(capsys.readouterr().err.split())
+
+    return run
+
+
+def test_bad_input_is_one_sentence(tmp_path, run, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    existing, photos = tmp_path / "episodes.npz", tmp_path / "photos"
+    existing.write_text("precious")
+    photos.mkdir()
+    press = "--task press --robot piper --out"
+    for text, out, message in (
+        (f"collect {press}", existing, "exists already"),
+        (f"collect --overwrite {press}", photos, "photos is not a folder of envs-rlds-1 episodes"),
+        (f"collect --num-episodes 0 {press}", tmp_path / "new", "num_episodes"),
+        (f"collect --num-envs 0 {press}", tmp_path / "new", "num_envs must be at least 1"),
+        (f"collect --randomize --control-dt 0.02 {press}", tmp_path / "new", "latency must lie in"),
+        (f"collect --control-dt 0.03 {press}", tmp_path / "new", "multiple of 0.02 s"),
+        (f"collect --actions voltage {press}", tmp_path / "new", "joint, delta_joint, end_eff"),
+        (f"collect --distractors 5 {press}", tmp_path / "new", "distractors must be at most 4"),
+        ("collect --task press dance --robot piper --out", tmp_path / "new", "dance"),
+        ("collect --task all --robot piper --out", tmp_path / "e.npz", "e.npz can hold one task"),
+        (f"play --image-size 33 {press}", tmp_path / "a.mp4", "even --image-size"),
+        ("play --task dance --robot piper --out", tmp_path / "a.mp4", "dance"),
+        ("gallery --task press --robot r2d2 --out", tmp_path / "g", "r2d2"),
+        (f"collect {press}", "gs://bucket/press", "gs:/bucket/press is a URL"),
+        (f"play {press}", "gs://bucket/press.mp4", "press.mp4 is a URL"),
+        ("gallery --task press --robot piper --out", "gs://bucket", "press_piper.gif is a URL"),
+    ):
+        code, said = run(text, out)
+        assert code == 2
+        assert message in said
+        assert "Traceback" not in said
+    assert existing.read_text() == "precious"
+    assert sorted(os.listdir(tmp_path)) == ["episodes.npz", "photos"]
+
+
+def test_play_and_gallery_write_files(tmp_path, run, monkeypatch):
+    def collect(task, robot, *, num_episodes, progress, **options):
+        assert options["num_envs"] == 1  # no picture is drawn that nobody sees
+        progress(0, num_episodes)
+        progress(num_episodes, num_episodes)
+        length = np.full(num_episodes, 4, np.int32)
+        return make(num_episodes, length=length, task=task, robot=robot)
+
+    monkeypatch.setattr(envs, "collect", collect)
+    for command, out in (("play", "v.mp4"), ("gallery", "g")):
+        code, said = run(f"{command} --task press --robot piper --out", tmp_path / out)
+        assert code == 0, said
+    assert (tmp_path / "v.mp4").read_bytes()[4:8] == b"ftyp"
+    (file,) = (tmp_path / "g").iterdir()
+    assert file.name == "press_piper.gif"
+    with Image.open(file) as picture:
+        assert picture.size == (2 * 8, 6)  # both cameras
+        assert picture.n_frames == 2  # every second step of four
+        assert picture.info["duration"] == 200  # ms
+
+
+def test_collect_writes_what_the_library_gives(tmp_path, run, fake):
+    code, said = run(COLLECT, "--out", tmp_path / "press", "--actions", "delta_joint")
+    assert code == 0, said
+    assert "20/20" in said
+    expected = envs.collect(
+        "press", num_episodes=20, num_envs=6, actions="delta_joint", key=jax.random.key(0)
+    )
+    assert expected.attempted > 20
+    found = rlds.read(tmp_path / "press")
+    assert_equal(found, trimmed(expected))
+    assert f"20 episodes of {found.attempted} tried, {found.num_steps} steps" in said
+    assert os.listdir(tmp_path) == ["press"]
+    assert (
+        rlds.metadata(tmp_path / "press")["options"].items() >= {"seed": 0, "num_envs": 6}.items()
+    )
+
+
+def test_collect_writes_a_file_or_many_datasets(tmp_path, run, fake):
+    assert run(COLLECT, "--out", tmp_path / "press.npz")[0] == 0
+    code, said = run(COLLECT.replace("press", "pour press"), "--out", tmp_path / "many")
+    assert code == 0, said
+    assert sorted(os.listdir(tmp_path)) == ["many", "press.npz"]
+    assert sorted(os.listdir(tmp_path / "many")) == ["pour", "press"]
+    assert_equal(Episodes.load(tmp_path / "press.npz"), rlds.read(tmp_path / "many" / "press"))
+    assert rlds.read(tmp_path / "many" / "pour").task == "pour"
+
+
+@pytest.mark.parametrize("moment", mostly_slow(MOMENTS, [*MOMENTS][:1]))
+def test_killed_and_continued(tmp_path, run, fake, moment):
+    run(COLLECT, "--out", tmp_path / "whole")
+    out, unfinished = tmp_path / "killed", tmp_path / "killed.partial"
+    child = run_child(f"collect_and_die({moment!r}, {str(out)!r})")
+    assert child.returncode == -signal.SIGKILL, child.stderr
+    assert not out.exists()
+    before = {file: file.stat().st_mtime_ns for file in unfinished.glob("*array_record*")}
+    parts = rlds.metadata(unfinished)["parts"]
+
+    code, said = run(COLLECT, "--out", out, "--seed", 1)
+    assert code == 2
+    assert "killed.partial was begun with seed 0, not 1: finish it with that, or delete it" in said
+
+    code, said = run(COLLECT, "--out", out)
+    assert code == 0, said
+    assert_equal(rlds.read(out), rlds.read(tmp_path / "whole"))
+    assert rlds.metadata(out) == rlds.metadata(tmp_path / "whole")
+    assert sorted(os.listdir(out)) == sorted(os.listdir(tmp_path / "whole"))
+    assert not unfinished.exists()
+    for file in sorted(before)[: len(parts)]:  # what was finished was not made again
+        assert (out / file.name).stat().st_mtime_ns == before[file]
+
+
+@pytest.mark.slow
+def test_interrupted_simulation_goes_on_bit_for_bit(tmp_path, run, env, monkeypatch):
+    for module in (envs, collection):
+        monkeypatch.setattr(module, "make", lambda *arguments, **options: env)
+    text, out = "collect --task press --robot piper --num-episodes 10", tmp_path / "press"
+    with monkeypatch.context() as patch:
+        patch.setattr(collection, "_record", stopping(collection._record, 2))
+        code, said = run(text, "--out", out)
+    assert code == 130
+    assert f"stopped: 8 of 10 episodes are kept in {out}.partial, the same command" in said
+    assert run(text, "--out", out)[0] == 0
+    whole = envs.collect("press", num_episodes=10, key=jax.random.key(0))
+    assert_equal(rlds.read(out), trimmed(whole))
+
+
+def test_interrupted_before_anything(tmp_path, run, fake, monkeypatch):
+    monkeypatch.setattr(rlds, "Parts", stopping(rlds.Parts, 0))
+    code, said = run(COLLECT, "--out", tmp_path / "press")
+    assert code == 130
+    assert said.endswith("stopped: no unfinished file is left")
+    assert not list(tmp_path.iterdir())
+
+
+def test_several_tasks_go_on_where_they_were(tmp_path, run, fake, monkeypatch):
+    text, out = COLLECT.replace("press", "all"), tmp_path / "many"
+    with monkeypatch.context() as patch:
+        patch.setattr(places, "install", stopping(places.install, 2))
+        code, said = run(text, "--out", out)
+    assert code == 130
+    done, rest = ([f for f in out.iterdir() if (f.suffix == ".partial") == p] for p in (0, 1))
+    assert len(done) >= 2
+    assert all(f"of 20 episodes are kept in {folder}, the same" in said for folder in rest)
+    before = {folder: folder.stat() for folder in done}
+    code, said = run(text, "--out", out)
+    assert code == 0, said
+    for folder in done:
+        assert f"{folder} is there already" in said
+        assert folder.stat() == before[folder]
+    assert sorted(os.listdir(out)) == ["open_pot", "pick_place", "pour", "press"]
+    run(COLLECT, "--out", tmp_path / "press")
+    assert_equal(rlds.read(tmp_path / "press"), rlds.read(out / "press"))
+    code, said = run(text, "--out", out, "--seed", 1)
+    assert code == 2
+    assert "open_pot exists already: choose another --out or add --overwrite" in said
+
+
+def test_one_bad_task_stops_the_others(tmp_path, run, monkeypatch):
+    def record(env, key, action_noise, ranges):
+        episodes, success = fake_record(env, key, action_noise, ranges)
+        return episodes, success & (env.task.name != "pour")
+
+    monkeypatch.setattr(collection, "_record", record)
+    code, said = run(COLLECT.replace("press", "press pour"), "--out", tmp_path)
+    assert code == 2
+    assert "error: the expert solved only 0 of 18 layouts of 'pour'" in said
+
+
+def test_ctrl_c_keeps_the_part_under_way(tmp_path):
+    out = tmp_path / "press"
+    child = run_child(f"collect_and_interrupt({str(out)!r})")
+    assert child.returncode == 130, child.stderr
+    assert len(rlds.metadata(tmp_path / "press.partial")["parts"]) == 2
+    assert b"are kept in" in child.stderr
+    assert b"Traceback" not in child.stderr
+
+
+def test_overwriting_keeps_the_old_until_the_new_is_whole(tmp_path, run, fake, monkeypatch):
+    out = tmp_path / "press"
+    run(COLLECT, "--out", out)
+    before = rlds.read(out)
+    with monkeypatch.context() as patch:
+        patch.setattr(rlds.Parts, "complete", stopping(rlds.Parts.complete, 0))
+        code, said = run(COLLECT, "--out", out, "--seed", 1, "--overwrite")
+    assert (code, "20 of 20 episodes are kept" in said) == (130, True)
+    assert_equal(rlds.read(out), before)
+    assert run(COLLECT, "--out", out, "--seed", 1, "--overwrite")[0] == 0
+    assert os.listdir(tmp_path) == ["press"]
+    assert rlds.metadata(out)["options"]["seed"] == 1
+
+
+def test_a_damaged_part_is_refused(tmp_path, run, fake, monkeypatch):
+    out = tmp_path / "press"
+    with monkeypatch.context() as patch:
+        patch.setattr(rlds.Parts, "complete", stopping(rlds.Parts.complete, 0))
+        run(COLLECT, "--out", out)
+    file = sorted((tmp_path / "press.partial").glob("*array_record*"))[1]
+    file.write_bytes(file.read_bytes()[:-9])
+    code, said = run(COLLECT, "--out", out)
+    assert code == 2
+    assert f"{file} is damaged" in said
+    assert said.endswith(f"delete {file.parent} to start anew")
+
+
+@pytest.mark.slow
+def test_an_edited_robot_is_another(tmp_path, run, fake):
+    text = COLLECT.replace("piper", str(user_arm.write(tmp_path)))
+    assert run(text, "--out", tmp_path / "done")[0] == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rlds.Parts, "complete", stopping(rlds.Parts.complete, 0))
+        assert run(text, "--out", tmp_path / "begun")[0] == 130
+    code, said = run(text, "--out", tmp_path / "done")
+    assert (code, "is there already" in said) == (0, True)
+    user_arm.write(tmp_path, ('kp="150"', 'kp="140"'))
+    code, said = run(text, "--out", tmp_path / "done")
+    assert (code, "exists already" in said) == (2, True)
+    code, said = run(text, "--out", tmp_path / "begun")
+    assert (code, "was begun with model" in said) == (2, True)
+
+
+def test_a_second_process_is_refused(tmp_path, run, fake):
+    out = tmp_path / "press"
+    with locks.alone(out):
+        code, said = run(COLLECT, "--out", out)
+        assert code == 2
+        assert said.endswith(f"another process is writing {out}")
+        assert not out.with_name("press.partial").exists()
+    assert run(COLLECT, "--out", out)[0] == 0
+    assert os.listdir(tmp_path) == ["press"]
+
+
+@pytest.mark.parametrize("moment", mostly_slow(REPLACING, [*REPLACING][:1]))
+def test_killed_while_the_old_is_replaced(tmp_path, run, fake, moment):
+    out = tmp_path / REPLACING[moment][3]
+    if out.suffix != ".npz":
+        run(COLLECT, "--out", out)
+    text = "" if out.suffix == ".npz" else "--seed 1 --overwrite"
+    child = run_child(f"collect_and_die({moment!r}, {str(out)!r}, {text!r})")
+    assert child.returncode == -signal.SIGKILL, child.stderr
+    assert len(os.listdir(tmp_path)) > 1
+    code, said = run(f"{COLLECT} {text}", "--out", out)
+    assert code == 0, said
+    assert os.listdir(tmp_path) == [out.name]
+    found = Episodes.load(out) if out.suffix == ".npz" else rlds.read(out)
+    assert found.num_episodes == 20
+
+
+def test_a_file_of_others_survives_parts_that_are_whole(tmp_path, run, fake, monkeypatch):
+    out = tmp_path / "press.npz"
+    with monkeypatch.context() as patch:
+        patch.setattr(rlds.Parts, "complete", stopping(rlds.Parts.complete, 0))
+        run(COLLECT, "--out", out)
+    make().save(out)
+    code, said = run(COLLECT, "--out", out)
+    assert (code, "exists already" in said) == (2, True)
+    assert_equal(Episodes.load(out), make())
+    assert run(f"{COLLECT} --overwrite", "--out", out)[0] == 0
+    assert os.listdir(tmp_path) == ["press.npz"]

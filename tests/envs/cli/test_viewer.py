@@ -1,0 +1,94 @@
+"""Replaying an episode in a window; the window itself is a stand-in."""
+
+import argparse
+import contextlib
+
+import jax
+import numpy as np
+import pytest
+from rich.console import Console
+
+import envs
+from envs.cli import commands, viewer
+
+PLAY = argparse.Namespace(task="press", robot="piper", out=None, seed=0)
+
+
+class Window:
+    """Stands in for MuJoCo's window: closes after some pictures."""
+
+    def __init__(self, model, data, pictures):
+        self.model, self.data, self.left = model, data, pictures
+        self.seen = []
+        self.closed = False
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.closed = True
+
+    def lock(self):
+        return contextlib.nullcontext()
+
+    def sync(self):
+        self.left -= 1
+        self.seen.append(self.data.qpos.copy())
+
+    def is_running(self):
+        return self.left > 0
+
+
+@pytest.mark.slow
+def test_play_repeats_an_episode_until_the_window_closes(env, monkeypatch):
+    opened, slept = [], []
+
+    def launch(model, data, *, show_left_ui, show_right_ui):
+        assert not show_left_ui
+        assert not show_right_ui
+        opened.append(Window(model, data, pictures=60))
+        return opened[0]
+
+    monkeypatch.setattr(envs, "make", lambda *arguments, **options: env)
+    monkeypatch.setattr(viewer.glfw, "init", lambda: True)
+    monkeypatch.setattr(viewer.mujoco.viewer, "launch_passive", launch)
+    monkeypatch.setattr(viewer.time, "sleep", slept.append)
+    commands.play(PLAY, Console())
+    (window,) = opened
+    assert window.closed
+    seen = np.array(window.seen)
+    assert len(seen) == len(slept) == 60
+    assert 0 < np.median(slept) < env.control_dt  # in real time
+    # The button stands where this world has it, and goes down; then all begins anew.
+    assert not np.allclose(window.model.body("button").pos, env.model.body("button").pos)
+    length = int(np.flatnonzero((seen == seen[0]).all(axis=1))[1])
+    (button,) = env.model.joint("button").qposadr
+    assert seen[0, button] < 0.001
+    assert seen[:length, button].max() > 0.009
+    np.testing.assert_array_equal(seen[length:], seen[: 60 - length])
+
+
+def test_without_a_display_it_says_what_to_do(monkeypatch):
+    monkeypatch.setattr(viewer.glfw, "init", lambda: False)
+    with pytest.raises(ValueError, match=r"no display to open a window on: add --out FILE\.mp4"):
+        commands.play(PLAY, Console())
+
+
+def test_where_windows_need_another_interpreter(env, monkeypatch):
+    def launch(model, data, **panels):
+        raise RuntimeError("`launch_passive` requires mjpython on macOS")
+
+    monkeypatch.setattr(viewer.mujoco.viewer, "launch_passive", launch)
+    with pytest.raises(ValueError, match=r"requires mjpython on macOS\): add --out FILE\.mp4"):
+        viewer.show(env.model, np.zeros((1, env.model.nq)), 0.1)
+
+
+def test_an_expert_that_never_succeeds_is_an_error(env, monkeypatch):
+    def act(env, plan, state):
+        return state.info["command"]  # stands still
+
+    monkeypatch.setattr(viewer, "_TRIES", 1)
+    monkeypatch.setattr(viewer, "_plan", lambda env, state, key: None)
+    monkeypatch.setattr(viewer, "_act", act)
+    with pytest.raises(ValueError, match="the expert failed in all of 4 layouts"):
+        viewer.episode(env, jax.random.key(0))

@@ -1,0 +1,86 @@
+"""XLA's alarms are silent while something compiles, and its errors are not at other times."""
+
+import os
+import subprocess
+import sys
+import threading
+
+import jax
+import pytest
+from jax import monitoring
+
+from envs.compilation import alarms
+
+# A sum over windows, which XLA computes while it compiles: seconds on one core of any machine.
+SLOW = """
+import os
+os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
+import jax
+{}
+iota = lambda: jax.lax.iota("float32", 20_000)
+sums = lambda x: x + jax.lax.reduce_window(iota(), 0.0, jax.lax.add, (100,), (1,), "VALID")
+jax.jit(sums).lower(1.0).compile()
+"""
+
+
+@pytest.fixture
+def levels(monkeypatch):
+    """The levels that were set, one after the other."""
+    found = []
+    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "1")
+    monkeypatch.setattr(alarms.utils, "absl_set_min_log_level", found.append)
+    alarms.silence()
+    yield found
+    monitoring.unregister_scalar_listener(alarms._begins)
+    monitoring.unregister_event_duration_listener(alarms._ends)
+
+
+def compiled(value):
+    """A program of its own for each value."""
+    return jax.jit(lambda x: x + value).lower(1.0).compile()
+
+
+def test_fatal_alone_while_something_compiles(levels):
+    compiled(1)
+    assert levels == [3, 1]
+
+
+def test_silent_until_the_last_of_several_is_compiled(levels):
+    def compile_inside(event, *_, **__):
+        if event == alarms._COMPILATION and len(levels) == 1:
+            thread = threading.Thread(target=compiled, args=[2])
+            thread.start()
+            thread.join()
+
+    monitoring.register_scalar_listener(compile_inside)
+    compiled(3)
+    monitoring.unregister_scalar_listener(compile_inside)
+    assert levels == [3, 3, 3, 1]
+
+
+def test_a_failed_compilation_ends_too(levels):
+    with pytest.raises(jax.errors.JaxRuntimeError, match="xla_no_such_option"):
+        jax.jit(lambda x: x + 4).lower(1.0).compile(compiler_options={"xla_no_such_option": "1"})
+    assert levels == [3, 1]
+
+
+def test_a_level_that_the_user_chose_stays(monkeypatch):
+    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "0")
+    monkeypatch.setattr(monitoring, "register_scalar_listener", pytest.fail)
+    alarms.silence()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="only Linux pins to a core")
+@pytest.mark.parametrize("silent", [False, True])
+def test_no_alarm_reaches_the_terminal(silent):
+    program = SLOW.format("from envs import alarms; alarms.silence()" if silent else "")
+    options = {"JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "false"}
+    found = subprocess.run(
+        [sys.executable, "-c", program],
+        env=os.environ | options,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert ("Constant folding an instruction is taking" in found.stderr) == (not silent)

@@ -1,0 +1,77 @@
+"""The XLA flag that MJX needs on CPU with old JAX, each time in a fresh process."""
+
+import inspect
+import os
+import subprocess
+import sys
+
+import jax
+import pytest
+
+import envs
+from envs.compilation import fast_cpu
+from tests import xla
+
+OLD = jax.__version_info__ < (0, 11)
+old = pytest.mark.skipif(not OLD, reason="newer versions need no flag")
+
+
+def python(code, flags=""):
+    """Runs code in a new process, where warnings are errors."""
+    root = os.path.dirname(os.path.dirname(envs.__file__))
+    environment = os.environ | {"XLA_FLAGS": flags}
+    subprocess.run(
+        [sys.executable, "-W", "error::UserWarning", "-c", code],
+        cwd=root,
+        env=environment,
+        check=True,
+    )
+
+
+def test_an_import_is_enough_and_replaced_flags_get_it_again():
+    python(
+        "import os, jax, envs\n"
+        "is_set = lambda: '--xla_cpu_use_fusion_emitters=false' in os.environ['XLA_FLAGS']\n"
+        f"assert is_set() == {OLD}\n"
+        "os.environ['XLA_FLAGS'] = '--xla_force_host_platform_device_count=2'\n"
+        "envs.make('press')\n"
+        f"assert is_set() == {OLD}\n"
+        "assert jax.device_count() == 2",
+        "--xla_force_host_platform_device_count=3",
+    )
+
+
+@old
+def test_what_the_user_says_stays():
+    flags = "--xla_cpu_use_fusion_emitters=true"
+    python(f"import os, envs\nassert os.environ['XLA_FLAGS'] == {flags!r}", flags)
+
+
+@old
+def test_too_late_is_one_warning_and_our_own_programs_are_fast():
+    python(
+        "import time, warnings, jax\n"
+        "jax.devices()\n"
+        "import envs, envs.compilation.cache\n"
+        "envs.compilation.cache.enable()\n"
+        "with warnings.catch_warnings(record=True) as caught:\n"
+        "    warnings.simplefilter('always')\n"
+        "    env = [envs.make('press'), envs.make('press')][0]\n"
+        "(said,) = map(str, [w.message for w in caught if w.category is UserWarning])\n"
+        "assert '15 to 400 times slower' in said and 'import envs before' in said, said\n"
+        "state = env.reset(jax.random.key(0))\n"
+        "state = env.step(state, state.info['command'])\n"
+        "jax.eval_shape(jax.jit(env.step), state, state.info['command'])\n"
+        "start = time.process_time()\n"
+        "for _ in range(10):\n"
+        "    state = env.step(state, state.info['command'])\n"
+        "jax.block_until_ready(state)\n"
+        "assert time.process_time() - start < 1.5",  # else 10 s
+        xla.UNOPTIMISED,
+    )
+
+
+def test_what_simulates_nothing_is_compiled_as_jax_does():
+    options = inspect.unwrap(fast_cpu.without_simulation)()  # in fast tests it is replaced
+    assert options == ({"xla_cpu_use_fusion_emitters": True} if OLD else None)
+    assert jax.jit(lambda x: x + 1).lower(1).compile(compiler_options=options)(1) == 2

@@ -1,0 +1,256 @@
+"""Episodes on disk and in memory."""
+
+import dataclasses
+import io
+import json
+import os
+import zipfile
+
+import jax
+import numpy as np
+import pytest
+
+from envs.datasets.episodes import Episodes, concatenate
+
+
+def make(episodes=3, steps=4, **changes):
+    rng = np.random.default_rng(episodes)
+    size = (episodes, steps)
+    values = {
+        "image": {
+            name: rng.integers(0, 256, (*size, 6, 8, 3), dtype=np.uint8)
+            for name in ("side", "wrist")
+        },
+        "state": rng.normal(size=(*size, 7)).astype(np.float32),
+        "action": rng.normal(size=(*size, 7)).astype(np.float32),
+        "length": np.arange(1, episodes + 1, dtype=np.int32).clip(max=steps),
+        "instruction": np.arange(episodes, dtype=np.int32) % 2,
+        "instructions": ("press the button", "push the red button"),
+        "task": "press",
+        "robot": "piper",
+        "control_dt": 0.1,
+        "physics_dt": 0.005,
+        "attempted": episodes + 1,
+    }
+    return Episodes(**values | changes)
+
+
+def assert_equal(a, b):
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        assert x.dtype == y.dtype
+        np.testing.assert_array_equal(x, y)
+
+
+def rewritten(path, **changes):
+    """The .npz file with some arrays replaced, None removing one."""
+    with np.load(path) as archive:
+        arrays = {name: archive[name] for name in archive.files} | changes
+    np.savez(path, **{name: x for name, x in arrays.items() if x is not None})
+
+
+def test_round_trip(tmp_path):
+    episodes = make()
+    path = tmp_path / "new folder" / "press.npz"
+    jax.tree.map(jax.numpy.asarray, episodes).save(path)  # device arrays too
+    assert_equal(Episodes.load(path, control_dt=0.1), episodes)
+    assert [file.name for file in path.parent.iterdir()] == ["press.npz"]
+    assert episodes.num_episodes == 3
+    assert episodes.num_steps == 1 + 2 + 3
+
+
+def test_printed_they_are_a_line():
+    text = repr(make(3, 4))
+    assert "image/side=uint8[3, 4, 6, 8, 3]" in text
+    assert "task='press', robot='piper'" in text
+    assert len(text) < 500
+    assert "state=float32[3, 4, 7]" in repr(jax.eval_shape(lambda: make(3, 4)))
+    assert "state=0" in repr(jax.tree.map(lambda _: 0, make(3, 4)))
+
+
+def test_every_truncation_is_one_sentence(tmp_path):
+    path = tmp_path / "episodes.npz"
+    make().save(path)
+    whole = path.read_bytes()
+    for size in (0, 1, 100, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:size])
+        with pytest.raises(ValueError, match=r"episodes\.npz is damaged") as caught:
+            Episodes.load(path)
+        assert "\n" not in str(caught.value)
+
+
+def test_flipped_bytes_are_noticed(tmp_path):
+    path = tmp_path / "episodes.npz"
+    make().save(path)
+    whole = bytearray(path.read_bytes())
+    whole[len(whole) // 2] ^= 0xFF
+    path.write_bytes(whole)
+    with pytest.raises(ValueError, match="is damaged"):
+        Episodes.load(path)
+
+
+def test_foreign_files(tmp_path):
+    np.savez(tmp_path / "other.npz", x=np.zeros(3))
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    (tmp_path / "text.npz").write_text("hello")
+    for name, message in (("other", "holds no"), ("array", "damaged"), ("text", "damaged")):
+        suffix = "npy" if name == "array" else "npz"
+        with pytest.raises(ValueError, match=message):
+            Episodes.load(tmp_path / f"{name}.{suffix}")
+    with pytest.raises(FileNotFoundError):
+        Episodes.load(tmp_path / "missing.npz")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"action": None}, "lacks action"),
+        ({"header": None}, "holds no"),
+        ({"header": np.frombuffer(b"[]", np.uint8)}, "holds no"),
+        ({"header": np.frombuffer(b'{"format": "envs-episodes-1"}', np.uint8)}, "lacks attempted"),
+        (
+            {"action": np.zeros((3, 4, 6), np.float32)},
+            r"action must have shape \(3, 4, 7\), not \(3, 4, 6\)",
+        ),
+        ({"action": np.zeros((3, 4, 7))}, "action must be float32, not float64"),
+        ({"image/side": np.zeros((3, 4, 6, 8), np.uint8)}, "image 'side' must be uint8"),
+        ({"image/wrist": np.zeros((3, 4, 6, 8, 3), np.float32)}, "image 'wrist' must be uint8"),
+        ({"image/side": None, "image/wrist": None}, "no camera"),
+        ({"length": np.array([1, 5, 2], np.int32)}, "length must lie in 1 to 4"),
+        ({"instruction": np.array([0, 1, 2], np.int32)}, "instruction must lie in 0 to 1"),
+        ({"length": np.array([1, 2, 3], np.float32)}, "length must be integers"),
+    ],
+)
+def test_bad_contents(tmp_path, changes, message):
+    path = tmp_path / "episodes.npz"
+    make().save(path)
+    rewritten(path, **changes)
+    with pytest.raises(ValueError, match=message):
+        Episodes.load(path)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_numbers_that_are_none(value):
+    episodes = make()
+    action = np.array(episodes.action)
+    action[1, 2, 3] = value
+    with pytest.raises(ValueError, match="action is not finite in number 3 at step 2 of episode 1"):
+        dataclasses.replace(episodes, action=action).validate()
+
+
+def test_every_action_convention(tmp_path):
+    panda = {"robot": "panda", "state": np.zeros((3, 4, 8), np.float32)}
+    tool = make(**panda, actions="end_effector", action=np.ones((3, 4, 7), np.float32))
+    tool.save(tmp_path / "e.npz")
+    assert_equal(Episodes.load(tmp_path / "e.npz"), tool)
+    with pytest.raises(ValueError, match=r"action must have shape \(3, 4, 8\)"):
+        dataclasses.replace(tool, actions="joint").validate()
+    with pytest.raises(ValueError, match="actions must be one of joint, delta_joint, end_effector"):
+        make(actions="voltage").validate()
+
+
+def test_files_from_before_actions_were_told_apart(tmp_path):
+    make().save(tmp_path / "e.npz")
+    with np.load(tmp_path / "e.npz") as archive:
+        facts = json.loads(archive["header"].tobytes())
+    assert facts.pop("actions") == "joint"
+    rewritten(tmp_path / "e.npz", header=np.frombuffer(json.dumps(facts).encode(), np.uint8))
+    assert Episodes.load(tmp_path / "e.npz").actions == "joint"
+
+
+def test_other_control_period(tmp_path):
+    make(control_dt=0.05).save(tmp_path / "e.npz")
+    with pytest.raises(ValueError, match=r"control_dt 0\.05 s, but 0\.1 s is needed"):
+        Episodes.load(tmp_path / "e.npz", control_dt=0.1)
+
+
+def test_failed_save_keeps_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "episodes.npz"
+    make().save(path)
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match="length must lie"):
+        dataclasses.replace(make(), length=np.array([9, 9, 9])).save(path)
+
+    def full(file, **arrays):
+        file.write(b"half")
+        raise OSError("no space left")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(OSError, match="no space"):
+        make(2).save(path)
+    assert path.read_bytes() == before
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_select_keeps_order():
+    episodes = make()
+    chosen = episodes.select([2, 0])
+    np.testing.assert_array_equal(chosen.action, episodes.action[[2, 0]])
+    np.testing.assert_array_equal(chosen.image["wrist"], episodes.image["wrist"][[2, 0]])
+    assert chosen.task == "press"
+
+
+def test_concatenate_pads_to_the_longest():
+    short, long = make(2, 3), make(3, 5)
+    both = concatenate([short, long])
+    both.validate()
+    assert both.num_episodes == 5
+    assert both.num_steps == short.num_steps + long.num_steps
+    assert both.attempted == 7
+    np.testing.assert_array_equal(both.image["side"][:2, :3], short.image["side"])
+    assert not both.action[:2, 3:].any()
+    np.testing.assert_array_equal(both.state[2:], long.state)
+    assert isinstance(both.state, np.ndarray)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"robot": "panda"}, {"control_dt": 0.2}, {"task": "pour"}, {"actions": "delta_joint"}],
+)
+def test_concatenate_refuses_mixtures(changes):
+    with pytest.raises(ValueError, match=f"one {next(iter(changes))} can be joined"):
+        concatenate([make(), make(**changes)])
+    with pytest.raises(ValueError, match="empty"):
+        concatenate([])
+
+
+def _npy(shape: tuple, data: bytes) -> bytes:
+    file = io.BytesIO()
+    header = {"descr": "<f4", "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(file, header)
+    return file.getvalue() + data
+
+
+@pytest.mark.parametrize(
+    "member",
+    [
+        _npy((10**6, 10**6), b"0" * 40),
+        _npy((-2, -5), b"0" * 40),
+        _npy((), b""),
+        b"\x93NUMPY\x09\x00",
+        b"\x93NUMPY\x01\x00\x20\x00{'descr': '<f4', 'shape': (((((",
+        b"\x93NUMPY\x01\x00\x04\x00\x00'''",
+        b"",
+    ],
+)
+def test_an_array_that_is_not_what_its_header_says(member, tmp_path):
+    """Least of all is memory taken for it."""
+    path = tmp_path / "x.npz"
+    make().save(path)
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("image/other.npy", member)
+    with pytest.raises(ValueError, match=r"x.npz is damaged"):
+        Episodes.load(path)
+
+
+def test_more_than_the_memory(tmp_path, monkeypatch):
+    make().save(tmp_path / "x.npz")
+    monkeypatch.setattr(os, "sysconf", lambda name: 30)  # 900 bytes
+    with pytest.raises(ValueError, match=r"x.npz would take .* GiB of memory"):
+        Episodes.load(tmp_path / "x.npz")
+
+
+def test_a_pipe(tmp_path):
+    os.mkfifo(tmp_path / "x.npz")
+    with pytest.raises(ValueError, match=r"x.npz must be a file, but is a pipe"):
+        Episodes.load(tmp_path / "x.npz")

@@ -1,0 +1,104 @@
+"""Locks between processes, which end with them."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from envs.datasets import locks
+
+HOLD = """
+import os, pathlib, sys
+from envs import locks
+
+with locks.alone(pathlib.Path(sys.argv[1])):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "new folder" / "press"
+
+
+def test_one_process_at_a_time(path):
+    child = subprocess.Popen(
+        [sys.executable, "-c", HOLD, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    with child:
+        assert child.stdout
+        assert child.stdout.readline() == b"held\n"
+        with (
+            pytest.raises(ValueError, match=r"another process is writing .*press$"),
+            locks.alone(path),
+        ):
+            pass
+        kill = threading.Thread(target=child.send_signal, args=(signal.SIGKILL,))
+        with locks.alone(path, kill.start):  # waits for it
+            assert kill.ident
+            assert child.wait(60) == -signal.SIGKILL
+    with locks.alone(path):  # what a killed process leaves is in nobody's way
+        assert path.parent.exists()
+    assert not list(path.parent.iterdir())
+
+
+def test_never_two_at_a_time(path):
+    """Some wait at a lock file that is deleted meanwhile, others come anew."""
+    inside, turns, told = [], [], []
+
+    def work(number):
+        for turn in range(20):
+            with locks.alone(path, lambda: told.append((number, turn))):  # noqa: B023
+                inside.append(number)
+                time.sleep(0.0005)
+                assert inside == [number]
+                turns.append((number, turn))
+                inside.remove(number)
+
+    with ThreadPoolExecutor(8) as pool:
+        for one in [pool.submit(work, number) for number in range(8)]:
+            one.result()
+    assert len(turns) == 8 * 20
+    assert len(told) == len(set(told)) > 8  # each once, however often it must wait
+    assert not os.listdir(path.parent)
+
+
+@pytest.mark.parametrize("anew", [False, True])
+def test_a_lock_that_was_deleted_meanwhile_is_none(path, monkeypatch, anew):
+    lock, flock, calls = path.with_name(".press.lock"), locks.fcntl.flock, []
+
+    def late(file, how):
+        if not calls:
+            lock.unlink()
+            if anew:
+                lock.touch()
+        calls.append(how)
+        flock(file, how)
+
+    monkeypatch.setattr(locks.fcntl, "flock", late)
+    with locks.alone(path):
+        assert len(calls) == 2
+        with pytest.raises(ValueError, match="another process"), locks.alone(path):
+            pass
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("kind", ["link", "folder", "pipe"])
+def test_a_lock_that_is_no_file_is_refused(path, kind):
+    """A link's file would be made or written; nobody reads a pipe."""
+    path.parent.mkdir()
+    lock = path.with_name(".press.lock")
+    {
+        "link": lambda: lock.symlink_to("precious"),
+        "folder": lock.mkdir,
+        "pipe": lambda: os.mkfifo(lock),
+    }[kind]()
+    with pytest.raises(ValueError, match=r"press\.lock cannot be opened"), locks.alone(path):
+        pass
+    assert [file.name for file in path.parent.iterdir()] == [lock.name]

@@ -1,0 +1,253 @@
+"""Datasets on disk: what goes in comes out, for us and for plain tfds, whole or not at all."""
+
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+from envs.datasets import rlds, rlds_schema
+from envs.datasets.episodes import Episodes, concatenate
+from tests.envs.datasets.test_episodes import assert_equal, make
+
+READER = """
+import json, sys
+import numpy as np
+import tensorflow_datasets as tfds
+
+builder = tfds.builder_from_directory(sys.argv[1])
+source = builder.as_data_source("train")
+episode = source[1]
+steps = list(episode["steps"])
+keys = ("reward", "discount", "is_first", "is_last", "is_terminal")
+print(json.dumps({
+    "episodes": len(source),
+    "metadata": episode["episode_metadata"],
+    "text": steps[-1]["language_instruction"],
+    **{key: [float(step[key]) for step in steps] for key in keys},
+    "image": np.stack([step["observation"]["image"] for step in steps]).tolist(),
+    "wrist_image": np.stack([step["observation"]["wrist_image"] for step in steps]).tolist(),
+    "state": np.stack([step["observation"]["state"] for step in steps]).tolist(),
+    "action": np.stack([step["action"] for step in steps]).tolist(),
+    "shared": builder.info.metadata["instructions"],
+    "tensorflow": "tensorflow" in sys.modules,
+}, default=lambda x: x.decode() if isinstance(x, bytes) else x.item()))
+"""
+
+
+def trimmed(episodes: Episodes) -> Episodes:
+    """As they come back: padding is zeros, up to the longest episode."""
+    longest = int(np.max(episodes.length))
+
+    def blank(array):
+        array = np.array(array)
+        if array.ndim > 1:
+            array = array[:, :longest]
+            for row, length in zip(array, episodes.length, strict=True):
+                row[length:] = 0
+        return array
+
+    return jax.tree.map(blank, episodes)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "new folder" / "press"
+
+
+def test_round_trip(path):
+    episodes = make(5, 9)
+    rlds.write(jax.tree.map(jax.numpy.asarray, episodes), path)  # device arrays too
+    assert_equal(rlds.read(path), trimmed(episodes))
+    assert os.listdir(path.parent) == ["press"]
+
+
+def test_other_cameras_robots_and_actions(path):
+    episodes = make(
+        state=np.ones((3, 4, 8), np.float32),
+        actions="end_effector",
+        robot="panda",
+        control_dt=0.02,
+        image={"top": np.full((3, 4, 5, 7, 3), 9, np.uint8)},
+    )
+    rlds.write(episodes, path)
+    assert_equal(rlds.read(path), trimmed(episodes))
+    form = rlds_schema.features(episodes)["steps"]
+    assert "joint_7 [rad], gripper opening [m]" in form["observation"]["state"].doc.desc
+    assert "rotation vector" in form["action"].doc.desc
+    assert set(form["observation"]) == {"top_image", "state"}
+
+
+def test_plain_tfds_reads_it_without_tensorflow(path):
+    episodes = make(3, 5, length=np.array([2, 4, 5], np.int32))
+    rlds.write(episodes, path)
+    run = subprocess.run(
+        [sys.executable, "-c", READER, path], capture_output=True, text=True, check=True
+    )
+    seen = json.loads(run.stdout)
+    assert not seen["tensorflow"]
+    assert seen["episodes"] == 3
+    assert seen["metadata"]["episode_id"] == 1
+    assert seen["metadata"]["task"] == "press"
+    assert seen["metadata"]["control_dt"] == pytest.approx(0.1)
+    assert tuple(seen["shared"]) == episodes.instructions
+    assert seen["text"] == episodes.instructions[1]
+    assert seen["reward"] == seen["is_last"] == seen["is_terminal"] == [0, 0, 0, 1]
+    assert seen["is_first"] == [1, 0, 0, 0]
+    assert seen["discount"] == [1, 1, 1, 1]
+    for key, expected in (
+        ("image", episodes.image["side"]),
+        ("wrist_image", episodes.image["wrist"]),
+        ("state", episodes.state),
+        ("action", episodes.action),
+    ):
+        np.testing.assert_array_equal(np.array(seen[key], expected.dtype), expected[1, :4])
+
+
+def test_what_stands_there_is_not_touched(path):
+    rlds.write(make(), path)
+    with pytest.raises(ValueError, match="exists already"):
+        rlds.write(make(2), path)
+    assert rlds.read(path).num_episodes == 3
+
+
+@pytest.mark.parametrize("changes", [{"length": np.array([9, 9, 9])}, {"actions": "delta"}])
+def test_bad_episodes_leave_nothing(path, changes):
+    with pytest.raises(ValueError, match="must"):
+        rlds.write(make(**changes), path)
+    assert not path.parent.exists()
+
+
+def test_a_full_disk_leaves_nothing(path, monkeypatch):
+    def full(*arguments):
+        raise OSError("no space left")
+
+    monkeypatch.setattr(rlds_schema, "record", full)
+    with pytest.raises(OSError, match="no space"):
+        rlds.write(make(), path)
+    assert not path.parent.exists()
+
+
+def damage(file, how):
+    whole = bytearray(file.read_bytes())
+    middle = whole.index(b"PNG")
+    if how == "flipped":
+        whole[middle + 50] ^= 0xFF
+    file.write_bytes(whole[: {"flipped": None, "cut": middle, "empty": 0}[how]])
+
+
+@pytest.mark.parametrize("name", ["dataset_info.json", "features.json", "metadata.json"])
+def test_a_damaged_description_is_one_sentence(path, name):
+    rlds.write(make(), path)
+    (path / name).write_bytes((path / name).read_bytes()[:40])
+    with pytest.raises(ValueError, match=r"is damaged|is not a folder of") as caught:
+        rlds.read(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("how", ["flipped", "cut", "empty"])
+def test_damage_is_one_sentence(path, how):
+    rlds.write(make(), path)
+    (file,) = path.glob("*array_record*")
+    damage(file, how)
+    with pytest.raises(ValueError, match="press is damaged") as caught:
+        rlds.read(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_foreign_folders(tmp_path, path):
+    with pytest.raises(FileNotFoundError, match="there is no dataset"):
+        rlds.read(path)
+    rlds.write(make(), path)
+    (path / "dataset_info.json").unlink()
+    with pytest.raises(ValueError, match=r"dataset_info.json is missing"):
+        rlds.read(path)
+    for text in ("{", "[]", '{"format": "other"}'):
+        (path / "metadata.json").write_text(text)
+        with pytest.raises(ValueError, match="is not a folder of envs-rlds-1 episodes"):
+            rlds.read(path)
+    with pytest.raises(ValueError, match="is not a folder of envs-rlds-1 episodes"):
+        rlds.read(tmp_path)
+
+
+def test_parts_add_up(tmp_path):
+    folder, options = tmp_path / "parts", {"seed": 0}
+    first, second = make(2, 3), make(3, 5)
+    parts = rlds.Parts(folder, options)
+    parts.append(first)
+    shutil.copytree(folder, tmp_path / "copy")
+    parts.append(second)
+
+    # As if it had been killed while the second part was written, then continued.
+    again = rlds.Parts(tmp_path / "copy", options)
+    assert (again.num_episodes, again.attempted) == (2, 3)
+    (torn,) = {file.name for file in folder.iterdir()} - {p.name for p in again.folder.iterdir()}
+    (again.folder / torn).write_bytes(b"half")
+    again.append(second)
+    for each in (parts, again):
+        each.complete()
+        assert_equal(rlds.read(each.folder), trimmed(concatenate([first, second])))
+
+
+def test_parts_belong_together(tmp_path):
+    parts = rlds.Parts(tmp_path / "parts", {"seed": 0})
+    parts.append(make())
+    with pytest.raises(ValueError, match="was begun with seed 0, not 1: finish it with that, or"):
+        rlds.Parts(parts.folder, {"seed": 1})
+    small = {name: np.zeros((3, 4, 2, 2, 3), np.uint8) for name in ("side", "wrist")}
+    for changes, message in (
+        ({"robot": "panda"}, "was begun with robot 'piper', not 'panda'"),
+        ({"image": small}, r"was begun with cameras .*\[6, 8\]"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            parts.append(make(**changes))
+    assert rlds.Parts(parts.folder, {"seed": 0}).num_episodes == 3
+
+
+@pytest.mark.parametrize("how", ["flipped", "cut", "empty", "missing"])
+def test_a_damaged_part_is_refused(tmp_path, how):
+    parts = rlds.Parts(tmp_path / "parts", {})
+    parts.append(make(2))
+    (file,) = parts.folder.glob("*array_record*")
+    damage(file, how) if how != "missing" else file.unlink()
+    with pytest.raises(ValueError, match=r"0 is (damaged \(.*\)|missing): delete .*parts to"):
+        rlds.Parts(parts.folder, {})
+
+
+def test_parts_of_another_dataset_are_noticed(tmp_path):
+    one, two = (rlds.Parts(tmp_path / name, {}) for name in ("one", "two"))
+    one.append(make(2))
+    two.append(make(3))
+    (file,) = one.folder.glob("*array_record*")
+    os.replace(file, two.folder / file.name)
+    with pytest.raises(ValueError, match=r"is damaged \(it holds 2 episodes, not 3\)"):
+        rlds.Parts(two.folder, {})
+
+
+def test_a_robot_by_path(path, tmp_path):
+    episodes = make(robot="../my robots/arm-v1.2 [new].xml")
+    rlds.write(episodes, path)
+    assert_equal(rlds.read(path), trimmed(episodes))
+
+
+def test_no_room_for_a_part(tmp_path):
+    folder = tmp_path / "parts"
+    parts = rlds.Parts(folder, {})
+    parts.append(make(2))
+    facts = rlds.metadata(folder)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+    try:
+        with pytest.raises(OSError, match=r"could not be written \(write\(\) failed: [^;\n]*\)$"):
+            parts.append(make(60))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert rlds.metadata(folder) == facts
+    again = rlds.Parts(folder, {})
+    again.append(make(60))
+    assert again.num_episodes == 62

@@ -1,0 +1,110 @@
+"""Datasets in RLDS form that are not what they should be, and reading only what is wanted."""
+
+import contextlib
+import dataclasses
+import itertools
+import json
+
+import numpy as np
+import pytest
+from array_record.python import array_record_module
+
+from envs.datasets import rlds, rlds_schema
+from tests.envs.datasets.test_episodes import assert_equal, make
+
+
+@pytest.fixture
+def path(tmp_path):
+    rlds.write(make(), tmp_path / "press")
+    return tmp_path / "press"
+
+
+def rewrite(path, episodes):
+    """Puts records in a dataset that `rlds.write` would refuse to."""
+    to = rlds_schema.serializer(rlds_schema.features(make()))
+    (file,) = path.glob("*array_record*")
+    writer = array_record_module.ArrayRecordWriter(str(file), "group_size:1,uncompressed")
+    for number in range(episodes.num_episodes):
+        writer.write(rlds_schema.record(to, episodes, number, number))
+    writer.close()
+
+
+def content(path):
+    return {file.name: file.read_bytes() for file in path.iterdir()}
+
+
+def test_one_episode_at_a_time(path):
+    found, wanted = rlds.Reader(path), make()
+    assert (len(found), found.num_steps, found.control_dt, found.kind) == (3, 6, 0.1, "RLDS")
+    for number in (2, 0):
+        length = int(wanted.length[number])
+        one = wanted.select([number])
+        short = dataclasses.replace(
+            one,
+            image={name: picture[:, :length] for name, picture in one.image.items()},
+            state=one.state[:, :length],
+            action=one.action[:, :length],
+            attempted=1,
+        )
+        assert_equal(found.episode(number), short)
+        assert_equal(found.episode(number, ()), dataclasses.replace(short, image={}))
+        (camera,) = found.episode(number, ["wrist"]).image
+        assert camera == "wrist"
+
+
+def test_numbers_that_are_none(path):
+    episodes = make()
+    episodes.state[1, 0, 2] = np.nan
+    rewrite(path, episodes)
+    before = content(path)
+    with pytest.raises(ValueError, match=r"press is damaged .*state is not finite in number 2"):
+        rlds.read(path)
+    assert content(path) == before
+
+
+def test_an_empty_episode(path, monkeypatch):
+    one = make()
+    nothing = {name: picture[:, :0] for name, picture in one.image.items()}
+    monkeypatch.setattr(rlds_schema, "_encode", lambda images: [])
+    rewrite(path, dataclasses.replace(one, image=nothing, length=np.array([1, 0, 1], np.int32)))
+    with pytest.raises(ValueError, match="press is damaged"):
+        rlds.read(path)
+
+
+def changes(node):
+    """All the ways to break one thing in a JSON value, each done and undone."""
+    keys = list(node) if isinstance(node, dict) else range(len(node))
+    for key in keys:
+        kept = node[key]
+        for value in (None, -1, "x", [], {}):
+            node[key] = value
+            yield
+        node[key] = kept
+        if isinstance(kept, (dict, list)):
+            yield from changes(kept)
+        if isinstance(node, dict):
+            del node[key]
+            yield
+            node[key] = kept
+
+
+@pytest.mark.parametrize(
+    ("name", "every"), [("metadata.json", 2), ("features.json", 8), ("dataset_info.json", 1)]
+)
+def test_any_change_of_a_description_is_read_or_refused(name, every, path):
+    """Columns that are missing, shapes and kinds that are wrong: never another exception."""
+    good = json.loads((path / name).read_text())
+    refused = tried = 0
+    for _ in itertools.islice(changes(good), 0, None, every):
+        tried += 1
+        (path / name).write_text(json.dumps(good))
+        before = content(path)
+        try:
+            with contextlib.suppress(ValueError):
+                rlds.read(path)
+                refused -= 1
+        finally:
+            assert content(path) == before
+        refused += 1
+    assert tried > 30
+    assert refused > tried // 4

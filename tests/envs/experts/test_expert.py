@@ -1,0 +1,191 @@
+"""Experts solve every task with every robot, smoothly, and what they do is recorded as it was."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import envs
+from envs import robots
+from envs.experts import collection, expert
+from envs.physics import physics
+from envs.tasks import route
+
+LAYOUTS = 256 if jax.default_backend() == "cpu" else 1024
+"""Pouring in 1,024 takes a CPU more than ten minutes."""
+
+
+def valid(episodes) -> np.ndarray:
+    """bool [E, T], the steps that count."""
+    return np.arange(episodes.state.shape[1]) < episodes.length[:, None]
+
+
+def test_experts_succeed(episodes):
+    assert episodes.num_episodes / episodes.attempted >= 0.95
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("backend", sorted({"jax", physics.default_backend()}))
+def test_experts_succeed_on_many_layouts(task_name, robot_name, backend):
+    success = envs.expert_success(
+        task_name,
+        robot_name,
+        num_episodes=LAYOUTS,
+        num_envs=256,
+        key=jax.random.key(1),
+        backend=backend,
+    )
+    assert success.shape == (LAYOUTS,)
+    assert success.dtype == bool
+    assert success.mean() >= 0.97
+
+
+def test_episodes_are_consistent(episodes, scene):
+    episodes.validate()
+    steps = scene.expert_steps
+    assert episodes.state.shape == (episodes.num_episodes, steps, scene.num_joints + 1)
+    assert episodes.image.keys() == {"side", "wrist"}
+    assert episodes.image["side"].shape[1:] == (steps, 16, 16, 3)
+    assert np.all(episodes.length > 0.4 * steps)
+    assert len(np.unique(episodes.length)) > 5
+    assert len(np.unique(episodes.instruction)) == len(scene.instructions)
+    assert (episodes.task, episodes.robot) == (scene.task.name, scene.robot.name)
+
+
+def test_actions_keep_the_limits(episodes, scene):
+    assert np.all(episodes.action >= scene.action_low - 1e-6)
+    assert np.all(episodes.action <= scene.action_high + 1e-6)
+    speed = np.abs(np.diff(episodes.action, axis=1)) / scene.control_dt
+    assert np.all(speed <= scene.robot.action_speed + 1e-4)
+    measured = np.abs(np.diff(episodes.state[..., :-1], axis=1)) / scene.control_dt
+    assert np.all(measured <= scene.robot.speed)
+
+
+def test_actions_are_smooth(episodes, scene):
+    """Second differences: a jump of the command's speed would show as a large one."""
+    bend = np.abs(np.diff(episodes.action[..., :-1], 2, axis=1))
+    assert bend.max() < 0.1  # rad per step^2
+
+
+def test_state_follows_the_action(episodes):
+    """A servo is late by damping over stiffness, 0.15 s; the expert keeps below 1.5 rad/s."""
+    lag = np.abs(episodes.state[:, 1:, :-1] - episodes.action[:, :-1, :-1])
+    assert lag[valid(episodes)[:, 1:]].max() < 0.25  # rad
+
+
+def test_pictures_show_the_episode(episodes):
+    for picture in episodes.image.values():
+        start, middle = picture[:, 0].astype(int), picture[:, 25].astype(int)
+        assert np.all(np.abs(start - middle).max(axis=(1, 2, 3)) > 30)  # the hand moved
+        assert np.abs(start - start[:1]).max() > 30  # layouts differ
+
+
+def test_inverse_kinematics_reaches(scene):
+    robot = scene.robot
+    rng = np.random.default_rng(0)
+    goals = jnp.array(rng.uniform([0.30, -0.18, 0.01], [0.42, 0.18, 0.12], (64, 3)), jnp.float32)
+    way = route(*((goal, (0.0, 0.0, 0.0), 0.0, 1.0, 0.0) for goal in goals))
+    rotations = expert.leaning(robot, way)
+    start = jnp.asarray(robot.home, jnp.float32)
+
+    @jax.jit
+    @jax.vmap
+    def solve(goal, rotation):
+        q = robots.inverse_kinematics(robot, goal, rotation, start)
+        return q, *robots.tool_pose(robot, q)[:2]
+
+    q, position, facing = solve(goals, rotations)
+    assert np.all((q >= robot.lower) & (q <= robot.upper))
+    np.testing.assert_allclose(position, goals, atol=2e-3)
+    np.testing.assert_allclose(facing, rotations, atol=0.03)
+
+
+def test_path_rests_at_every_knot_and_holds_the_last():
+    knots, times = jnp.array([[0.0, 0.0], [1.0, -1.0], [1.0, 2.0]]), jnp.array([0.0, 1.0, 3.0])
+    path = jax.vmap(lambda seconds: expert._interpolate(knots, times, seconds))
+    np.testing.assert_allclose(
+        path(jnp.array([0.0, 1.0, 3.0, 99.0])), knots[jnp.array([0, 1, 2, 2])]
+    )
+    speed = np.diff(path(jnp.linspace(0.0, 3.0, 301)), axis=0) / 0.01
+    np.testing.assert_allclose(speed[[0, 99, 100, 299]], 0.0, atol=0.01)
+    # The fastest moment of a minimum-jerk move is 1.875 times its mean speed.
+    np.testing.assert_allclose(np.abs(speed).max(axis=0), [1.875, 1.875 * 3 / 2], rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_hurried_experts_slow_down_to_half_the_speed_limits(env):
+    def hurried(layout):
+        way = env.task.waypoints(layout)
+        return dataclasses.replace(way, seconds=jnp.full_like(way.seconds, 1e-3))
+
+    quick = dataclasses.replace(env, task=dataclasses.replace(env.task, waypoints=hurried))
+    plan = expert.plan(quick, env.reset(jax.random.key(0)), jax.random.key(1))
+    fastest = 1.875 * np.abs(np.diff(plan.knots, axis=1)) / np.diff(plan.times)[..., None]
+    share = fastest / env.robot.action_speed
+    assert np.all(share[..., :-1] <= 0.5 + 1e-4)
+    assert np.all(share[..., -1] <= 1 + 1e-4)
+    assert np.all(share[:, 0].max(axis=-1) > 0.49)  # no slower than it must
+
+
+def fake_record(success):
+    """Stands in for `_record`: one step an episode, numbered by world."""
+
+    def record(env, key, action_noise, ranges):
+        world = jnp.arange(env.num_envs)
+        numbers = jnp.broadcast_to(world[:, None, None].astype(jnp.float32), (env.num_envs, 1, 7))
+        chunk = {
+            "image": {"side": jnp.zeros((env.num_envs, 1, 2, 2, 3), jnp.uint8)},
+            "state": numbers,
+            "action": numbers,
+            "length": jnp.ones(env.num_envs, jnp.int32),
+            "instruction": jnp.zeros(env.num_envs, jnp.int32),
+        }
+        return chunk, jnp.array(success)
+
+    return record
+
+
+def test_collect_keeps_successes_in_order(monkeypatch):
+    monkeypatch.setattr(collection, "_record", fake_record([True, False, True, True]))
+    calls = []
+    found = envs.collect(
+        "press",
+        num_episodes=5,
+        num_envs=4,
+        key=jax.random.key(0),
+        progress=lambda *numbers: calls.append(numbers),
+    )
+    assert found.state[:, 0, 0].tolist() == [0, 2, 3, 0, 2]
+    assert found.attempted == 7
+    assert calls == [(0, 5), (3, 5), (5, 5)]
+
+
+def test_collect_gives_up_on_a_broken_expert(monkeypatch):
+    monkeypatch.setattr(collection, "_record", fake_record([True, False, False, False]))
+    with pytest.raises(ValueError, match="solved only 4 of 16 layouts of 'press' with 'piper'"):
+        envs.collect("press", num_episodes=50, num_envs=4, key=jax.random.key(0))
+
+
+def test_expert_success_counts_whole_and_part_batches(monkeypatch):
+    seen = []
+
+    def attempt(env, key, ranges):
+        seen.append(key)
+        return jnp.array([True, True, False])
+
+    monkeypatch.setattr(collection, "_attempt", attempt)
+    success = envs.expert_success("press", num_episodes=5, num_envs=3, key=jax.random.key(0))
+    assert success.tolist() == [True, True, False, True, True]
+    assert len(seen) == 2
+    assert not np.array_equal(jax.random.key_data(seen[0]), jax.random.key_data(seen[1]))
+
+
+@pytest.mark.parametrize("number", [0, -1])
+def test_number_of_episodes_must_be_positive(number):
+    with pytest.raises(ValueError, match="num_episodes must be at least 1"):
+        envs.collect("press", num_episodes=number, key=jax.random.key(0))
+    with pytest.raises(ValueError, match="num_episodes must be at least 1"):
+        envs.expert_success("press", num_episodes=number, key=jax.random.key(0))

@@ -1,0 +1,191 @@
+"""Programs that are traced once for all processes."""
+
+import dataclasses
+import threading
+import time
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import envs
+from envs import Randomization, robots
+from envs.experts import traced as programs
+
+
+@pytest.fixture
+def cache(tmp_path):
+    """An empty compilation cache."""
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path / "cache"))
+    yield tmp_path / "cache"
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+@pytest.fixture(scope="module")
+def env():
+    return envs.make("press", num_envs=3, image_size=8, backend="jax")
+
+
+class Drawn:
+    """A program as `programs.kept` takes it, that counts how often it is traced."""
+
+    def __init__(self):
+        self.traced, self.__name__, self.__qualname__ = 0, "drawn", "drawn"
+
+    def __call__(self, env, key, scale, ranges=None):
+        self.traced += 1
+        noise = scale * jax.random.normal(key, (env.num_envs, env.num_joints))
+        return {"noise": noise}, env.reset(key, ranges).info["success"]
+
+
+def new_process(env, *arguments):
+    """The results in a new process, and whether it traced."""
+    function = Drawn()
+    return programs.kept(function)(env, *arguments), bool(function.traced)
+
+
+KEY = jax.random.key(0)
+
+
+def test_another_process_does_not_trace(env, cache):
+    plain = jax.jit(Drawn(), static_argnums=0)(env, KEY, 0.5)
+    first, traced = new_process(env, KEY, 0.5)
+    second, again = new_process(env, KEY, 0.25)
+    assert (traced, again) == (True, False)
+    np.testing.assert_array_equal(first[0]["noise"], plain[0]["noise"])
+    np.testing.assert_array_equal(second[0]["noise"], plain[0]["noise"] / 2)
+    np.testing.assert_array_equal(first[1], plain[1])
+
+
+def test_a_process_asks_once(env, cache, monkeypatch):
+    function = Drawn()
+    call = programs.kept(function)
+    call(env, KEY, 0.5)
+    monkeypatch.setattr(programs, "_load", None)  # would fail
+    call(env, jax.random.key(1), 1.0)
+    assert function.traced == 1
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        pytest.param({"num_envs": 4}, marks=pytest.mark.slow),
+        {"image_size": 9},
+        {"antialias": 2},
+        {"control_dt": 0.2},
+        {"distractors": 1},
+        pytest.param({"actions": "delta_joint"}, marks=pytest.mark.slow),
+    ],
+    ids=str,
+)
+def test_another_environment_is_traced(env, cache, change):
+    new_process(env, KEY, 0.5)
+    options = {"num_envs": 3, "image_size": 8, "backend": "jax"} | change
+    results, traced = new_process(envs.make("press", **options), KEY, 0.5)
+    assert traced
+    assert len(results[1]) == options["num_envs"]
+
+
+@pytest.mark.slow
+def test_another_scene_is_traced(env, cache):
+    new_process(env, KEY, 0.5)
+    options = {"num_envs": 3, "image_size": 8, "backend": "jax"}
+    assert new_process(envs.make("pick_place", **options), KEY, 0.5)[1]
+    assert new_process(envs.make("press", "panda", **options), KEY, 0.5)[1]
+    piper = robots.piper.ROBOT
+    slower = types.SimpleNamespace(**vars(piper) | {"speed": piper.speed / 2})
+    changed = types.SimpleNamespace(model=env.model, robot=slower)
+    same = types.SimpleNamespace(model=env.model, robot=piper)
+    assert programs.digest(changed) != programs.digest(same) == programs.digest(env)
+
+
+def test_other_arguments_are_traced(env, cache):
+    new_process(env, KEY, 0.5)
+    assert new_process(env, KEY, 0.5, Randomization.typical())[1]
+    assert not new_process(env, KEY, 0.5, Randomization(mass=(1.0, 2.0)))[1]  # a value, no shape
+    assert new_process(env, KEY, jnp.ones(env.num_joints))[1]
+
+
+@pytest.mark.slow
+def test_another_setting_is_traced(env, cache, monkeypatch):
+    new_process(env, KEY, 0.5)
+    with jax.default_matmul_precision("float32"):  # of this thread alone
+        assert new_process(env, KEY, 0.5)[1]
+    assert not new_process(env, KEY, 0.5)[1]
+    before = jax.config.jax_default_matmul_precision
+    try:
+        jax.config.update("jax_default_matmul_precision", "tensorfloat32")
+        assert new_process(env, KEY, 0.5)[1]
+    finally:
+        jax.config.update("jax_default_matmul_precision", before)
+    monkeypatch.setattr(programs, "_sources", lambda: "edited")
+    assert new_process(env, KEY, 0.5)[1]
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda b: b[:-9], lambda b: b[:99] + b"?" + b[100:], lambda _: b""]
+)
+def test_a_damaged_program_is_traced_anew(env, cache, damage):
+    (good, _), _ = new_process(env, KEY, 0.5)
+    (file,) = (cache / "traced").iterdir()
+    whole = file.read_bytes()
+    file.write_bytes(damage(whole))
+    (results, _), traced = new_process(env, KEY, 0.5)
+    assert traced
+    np.testing.assert_array_equal(results["noise"], good["noise"])
+    assert not new_process(env, KEY, 0.5)[1]
+
+
+def test_without_a_cache_nothing_is_kept(env, cache):
+    jax.config.update("jax_compilation_cache_dir", None)
+    assert new_process(env, KEY, 0.5)[1]
+    assert new_process(env, KEY, 0.5)[1]
+    assert not cache.exists()
+
+
+def test_a_task_that_was_changed_is_not_kept(env, cache):
+    task = dataclasses.replace(env.task, time_limit=2 * env.task.time_limit)
+    changed = dataclasses.replace(env, task=task)
+    assert new_process(changed, KEY, 0.5)[1]
+    assert new_process(changed, KEY, 0.5)[1]
+    stranger = dataclasses.replace(env, task=dataclasses.replace(env.task, name="a_new_one"))
+    assert not programs._can_be_kept(stranger)
+
+
+def test_warp_is_not_kept(env, cache):
+    warp = envs.make("press", num_envs=3, image_size=8, backend="jax")
+    warp.physics.backend = "warp"
+    assert not programs._can_be_kept(warp)
+    assert programs._can_be_kept(env)
+
+
+def test_no_room_is_a_warning(env, cache):
+    cache.mkdir()
+    (cache / "traced").write_text("a file where the folder should be")
+    with pytest.warns(UserWarning, match="could not be kept"):
+        (results, _), _ = new_process(env, KEY, 0.5)
+    assert np.isfinite(results["noise"]).all()
+
+
+def test_programs_are_traced_in_turn(env, cache):
+    inside, most = [0], [0]
+
+    def program(number):
+        def slow(env, key):
+            inside[0] += 1
+            most[0] = max(most[0], inside[0])
+            time.sleep(0.2)
+            inside[0] -= 1
+            return {"key": jax.random.normal(key, (number,))}
+
+        return programs.kept(slow)
+
+    threads = [threading.Thread(target=program(n + 1), args=(env, KEY)) for n in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert most == [1]

@@ -1,0 +1,91 @@
+"""Physics: as MuJoCo's, and sums in a fixed order, so that accelerators give the same again."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from envs import actions
+from envs.experts import expert
+from envs.physics import physics
+from envs.scene import placing
+
+
+@pytest.mark.parametrize(
+    ("segments", "number"),
+    [([0], 1), ([1, 0, 2], 3), ([0, 0, 0], 1), ([2, 0, 2, 0], 4), ([1], 2)],
+    ids=str,
+)
+def test_sums_in_order(segments, number):
+    segments = np.array(segments)
+    for values in (
+        jax.random.normal(jax.random.key(0), (len(segments), 3)),
+        jnp.arange(len(segments)) + 1,
+    ):
+        found = physics._sum_in_order(values, segments, number)
+        expected = jax.ops.segment_sum(values, segments, number)
+        assert found.dtype == expected.dtype
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
+    order = np.array([1e8, 1.0, -1e8], np.float32)  # the sum tells the order
+    assert physics._sum_in_order(jnp.array(order), np.zeros(3, int), 1)[0] == 0.0
+
+
+def equations(jaxpr):
+    """All of a program, those of its loops and calls included."""
+    for equation in jaxpr.eqns:
+        yield equation
+        for inner in jax.tree.leaves(list(equation.params.values())):
+            inner = getattr(inner, "jaxpr", inner)
+            if hasattr(inner, "eqns"):
+                yield from equations(inner)
+
+
+def unordered(function, *arguments):
+    """Scatters that add floats, perhaps several to one place, which a GPU does in any order."""
+    return [
+        equation
+        for equation in equations(jax.make_jaxpr(function)(*arguments).jaxpr)
+        if equation.primitive.name in ("scatter-add", "scatter_add", "scatter-mul", "scatter_mul")
+        and jnp.issubdtype(equation.invars[0].aval.dtype, jnp.floating)
+        and not equation.params["unique_indices"]
+    ]
+
+
+def test_a_step_adds_in_a_fixed_order(env):
+    state = jax.eval_shape(env.reset, jax.random.key(0))
+    assert not unordered(env.step, state, state.info["command"])
+
+
+def test_unordered_sums_would_be_found(env):
+    def loop(x):
+        return jax.lax.scan(
+            lambda c, _: (jax.ops.segment_sum(c, jnp.zeros(3, int), 3), 0), x, length=2
+        )
+
+    assert len(unordered(jax.jit(loop), jnp.ones(3))) == 1
+
+
+def test_a_control_step_is_that_of_mujoco(env):
+    """All of `mj_step` that a scene has is there: forces, limits, contacts, the equality."""
+    start = env.reset(jax.random.key(3))
+    plan = expert.plan(env, start, jax.random.key(1))
+    act = jax.jit(lambda state: expert.act(env, plan, state))
+    state = after = start
+    rest = start.metrics["button_depth"][0]
+    while after.metrics["button_depth"][0] < rest + 0.002:  # until the button is touched
+        assert not after.done[0]
+        state, after = after, env.step(after, act(after))
+    model = placing.placed(env.model, start.info["layout"], 0)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = state.data.qpos[0], state.data.qvel[0]
+    data.qacc_warmstart[:] = state.data.qacc_warmstart[0]
+    commands = jnp.stack([s.info["command"][0] for s in (state, state, after)])
+    contacts = 0
+    for control in np.asarray(actions.interpolate(commands, env.control_dt, 0.0)):
+        data.ctrl[:] = control
+        mujoco.mj_step(model, data)
+        contacts += data.ncon
+    assert contacts
+    np.testing.assert_allclose(after.data.qpos[0], data.qpos, atol=2e-5)
+    np.testing.assert_allclose(after.data.qvel[0], data.qvel, atol=2e-3)

@@ -1,0 +1,275 @@
+"""The ray caster against MuJoCo's own rays, and what light and colours may change."""
+
+import copy
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import envs
+from envs.rendering import renderer
+from tests.envs.test_tasks import world
+
+SCENE = """
+<mujoco>
+  <worldbody>
+    <light dir="0 -.6 -1"/>
+    <geom name="table" type="plane" size="0 0 1" rgba=".6 .6 .6 1"/>
+    <geom name="shelf" type="plane" size=".1 .06 1" pos="-.2 .2 .2" euler="10 20 30"/>
+    <geom name="ball" type="sphere" size=".06" pos="0 0 .1" rgba="1 0 0 1"/>
+    <geom name="egg" type="ellipsoid" size=".03 .05 .08" pos=".2 .1 .1" euler="40 10 70"/>
+    <geom name="rod" type="capsule" size=".02 .1" pos="-.2 -.1 .1" euler="50 20 0"/>
+    <geom name="post" type="capsule" size=".03 .05" pos="-.1 .1 .08"/>
+    <geom name="can" type="cylinder" size=".05 .04" pos=".15 -.15 .1" euler="30 40 0"/>
+    <geom name="tin" type="cylinder" size=".04 .03" pos=".05 .2 .03"/>
+    <geom name="brick" type="box" size=".03 .05 .04" pos="0 -.2 .1" euler="20 30 40"/>
+    <geom name="block" type="box" size=".03 .04 .02" pos=".25 -.05 .02"/>
+    <geom name="ghost" type="sphere" size=".1" pos="0 0 .3" rgba="1 1 1 0"/>
+    <geom name="hidden" type="sphere" size=".1" pos="0 0 .3" group="3"/>
+    <camera name="unused" pos="0 0 3"/>
+    <camera name="front" pos="0 -.8 .35" xyaxes="1 0 0 0 .3 .95" fovy="55"/>
+    <camera name="top" pos=".1 .05 .9" xyaxes=".9 .1 0 -.1 .9 .1" fovy="60"/>
+  </worldbody>
+</mujoco>
+"""
+CAMERAS = ("front", "top")
+SIZE = {"height": 48, "width": 64}
+GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)  # those that are drawn
+
+
+def poses_of(data):
+    """Arguments of `render.render`: poses of all geoms and cameras."""
+    arrays = (data.geom_xpos, data.geom_xmat, data.cam_xpos, data.cam_xmat)
+    ends = ((-1, 3), (-1, 3, 3)) * 2
+    return [jnp.asarray(x.reshape(s), jnp.float32) for x, s in zip(arrays, ends, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def shapes():
+    model = mujoco.MjModel.from_xml_string(SCENE)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return model, data
+
+
+@pytest.fixture(scope="module")
+def built(shapes):
+    return renderer.build(shapes[0], CAMERAS)
+
+
+@pytest.fixture(scope="module")
+def poses(shapes):
+    return poses_of(shapes[1])
+
+
+@pytest.fixture(scope="module")
+def picture(built, poses):
+    return np.asarray(renderer.render(built, *poses, look=built.look, **SIZE))
+
+
+def camera_rays(model, data, name, height, width):
+    """Unit vectors [P, 3] in world axes, and how far each goes a metre along the camera's axis."""
+    camera = model.camera(name).id
+    x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, height / 2 - np.arange(height) - 0.5)
+    edge = 2 * np.tan(np.deg2rad(model.cam_fovy[camera]) / 2) / height
+    rays = np.stack([x * edge, y * edge, -np.ones_like(x)], -1).reshape(-1, 3)
+    length = np.linalg.norm(rays, axis=1)
+    return rays / length[:, None] @ data.cam_xmat[camera].reshape(3, 3).T, length
+
+
+def assert_agrees_with_mujoco(model, data, name, geom, depth):
+    """Compares what a camera sees with MuJoCo's own rays; returns the geoms that are seen.
+
+    Both draw a plane as large as its size, without end where that is 0, and only from above.
+    """
+    rays, length = camera_rays(model, data, name, *geom.shape)
+    eye, geom, depth = data.camera(name).xpos, np.asarray(geom).ravel(), np.asarray(depth).ravel()
+    expected, distance = np.full(len(rays), -1, np.int32), np.full(len(rays), -1.0)
+    mujoco.mj_multiRay(
+        model, data, eye, rays.ravel(), GROUPS, 1, -1, expected, distance, None, len(rays),
+        mujoco.mjMAXVAL,
+    )  # fmt: skip
+    same = geom == expected
+    assert same.mean() >= 0.99
+    hit = same & (geom >= 0)
+    np.testing.assert_allclose(depth[hit], (distance / length)[hit], rtol=0, atol=1e-3)
+    assert np.all(np.isinf(depth[same & (geom < 0)]))
+    # mj_multiRay rules geoms out by bounds first and loses a few rays at the edges of boxes; mj_ray
+    # tries every geom, and leaves only pixels where two surfaces meet.
+    single = np.array([-1], np.int32)
+    wrong = 0
+    for i in np.flatnonzero(~same):
+        mujoco.mj_ray(model, data, eye, rays[i], GROUPS, 1, -1, single)
+        wrong += single[0] != geom[i]
+    assert wrong <= 1e-4 * len(rays)
+    return set(expected.tolist())
+
+
+def test_rays_agree_with_mujoco(shapes, built, poses):
+    geom, depth = renderer.cast(built, *poses, height=128, width=128)
+    assert geom.shape == depth.shape == (2, 128, 128)
+    assert geom.dtype == jnp.int32
+    assert depth.dtype == jnp.float32
+    seen = set()
+    for i, name in enumerate(CAMERAS):
+        seen |= assert_agrees_with_mujoco(*shapes, name, geom[i], depth[i])
+    assert seen == set(range(10)) | {-1}  # every visible geom, and the sky: nothing passed unseen
+
+
+def test_rays_agree_with_mujoco_in_every_task(scene):
+    data = world(scene)
+    geom, depth = renderer.cast(scene.render_model, *poses_of(data), height=128, width=128)
+    for i, name in enumerate(scene.cameras):
+        seen = assert_agrees_with_mujoco(scene.model, data, name, geom[i], depth[i])
+        assert len(seen) > 5  # the table, the gripper or the arm, and something to handle
+
+
+def pixel(shapes, name, point):
+    """Row and column of a world point in a picture of SIZE."""
+    model, data = shapes
+    camera = model.camera(name).id
+    x, y, z = data.cam_xmat[camera].reshape(3, 3).T @ (np.array(point) - data.cam_xpos[camera])
+    edge = 2 * np.tan(np.deg2rad(model.cam_fovy[camera]) / 2) / SIZE["height"]
+    return int(SIZE["height"] / 2 + y / z / edge), int(SIZE["width"] / 2 - x / z / edge)
+
+
+def test_shadow_falls_where_the_light_says(shapes, built, poses):
+    flat = dataclasses.replace(built.look, checker=jnp.array([0.1, 0.0]))
+    # The ball's centre is 0.1 m above the table, so its shadow is centred 0.15 m to one side.
+    left, right = (pixel(shapes, "top", (x, 0.0, 0.0)) for x in (-0.15, 0.15))
+    for slope, dark, bright in ((1.5, left, right), (-1.5, right, left)):
+        light = np.array([slope, 0.0, 1.0], np.float32)
+        look = dataclasses.replace(flat, light=light)
+        top = renderer.render(built, *poses, look=look, **SIZE)[1].astype(int)
+        assert top[bright].sum() > top[dark].sum() + 100
+
+
+def test_headlight_and_ambient_cast_no_shadow(built, poses):
+    dim = dataclasses.replace(
+        built.look, diffuse=jnp.array(0.0), headlight=jnp.array(0.0), checker=jnp.array([0.1, 0.0])
+    )
+    geom, _ = renderer.cast(built, *poses, **SIZE)
+    pixels = np.asarray(renderer.render(built, *poses, look=dim, **SIZE))[np.asarray(geom) == 0]
+    np.testing.assert_array_equal(pixels, np.broadcast_to(pixels[0], pixels.shape))
+    assert pixels[0, 0] == round(0.6 * 0.35 * 255)
+
+
+def test_colour_changes_only_its_geom(built, poses, picture):
+    geom = np.asarray(renderer.cast(built, *poses, **SIZE)[0])
+    green = built.look.rgba.copy()
+    green[2] = (0, 1, 0, 1)
+    look = dataclasses.replace(built.look, rgba=green)
+    changed = np.any(np.asarray(renderer.render(built, *poses, look=look, **SIZE)) != picture, -1)
+    np.testing.assert_array_equal(changed, geom == 2)
+
+
+def test_field_of_view_changes_only_its_camera(built, poses, picture):
+    look = dataclasses.replace(built.look, fovy=built.look.fovy + np.array([0, 10, 0], np.float32))
+    pictures = np.asarray(renderer.render(built, *poses, look=look, **SIZE))
+    assert np.any(pictures[0] != picture[0])
+    np.testing.assert_array_equal(pictures[1], picture[1])
+
+
+def test_batch_equals_single_worlds(built, poses):
+    worlds = 5
+    batch = [jnp.tile(x, (worlds, *[1] * x.ndim)) for x in poses]
+    batch[0] = batch[0].at[:, 2, 0].add(0.01 * jnp.arange(worlds))
+    looks = jax.tree.map(lambda x: jnp.stack([x * 0.8, *[x] * (worlds - 1)]), built.look)
+    pictures = jax.jit(
+        lambda poses, looks: renderer.render_batch(built, *poses, look=looks, **SIZE)
+    )(batch, looks)
+    assert pictures.shape == (worlds, 2, 48, 64, 3)
+    assert pictures.dtype == jnp.uint8
+    for i in range(worlds):
+        look = jax.tree.map(lambda x, i=i: x[i], looks)
+        single = renderer.render(built, *(x[i] for x in batch), look=look, **SIZE)
+        difference = np.abs(pictures[i].astype(int) - single.astype(int))
+        assert np.mean(difference > 1) < 1e-3  # rounding may move an edge by a pixel
+
+
+@pytest.mark.slow
+def test_sizes_differ_from_world_to_world(shapes, built, poses):
+    size = np.stack([built.size, built.size * 1.5, built.size])
+    size[2, :, 1] *= 0.5  # half the length of capsules and cylinders, other boxes and ellipsoids
+    batch = [jnp.tile(x, (len(size), *[1] * x.ndim)) for x in poses]
+    pictures = renderer.render_batch(built, *batch, size=size, **SIZE)
+    for own, found in zip(size, pictures, strict=True):
+        model = copy.copy(shapes[0])
+        model.geom_size[:] = own
+        expected = renderer.render(renderer.build(model, CAMERAS), *poses, **SIZE)
+        difference = np.abs(found.astype(int) - expected.astype(int))
+        assert np.mean(difference > 1) < 1e-3  # rounding may move an edge by a pixel
+    assert np.mean(pictures[0] != pictures[1]) > 0.05
+    assert np.mean(pictures[0] != pictures[2]) > 0.02
+
+
+@pytest.mark.parametrize("diffuse", [0.5, 1.5])  # 1.5 overexposes a third of the picture
+def test_samples_equal_a_larger_picture_scaled_down(built, poses, diffuse):
+    look = dataclasses.replace(built.look, diffuse=np.float32(diffuse))
+    height, width = SIZE.values()
+    fine = renderer.render(built, *poses, look=look, height=2 * height, width=2 * width)
+    expected = np.asarray(fine, float).reshape(2, height, 2, width, 2, 3).mean(axis=(2, 4))
+    smooth = renderer.render(built, *poses, look=look, samples=2, **SIZE)
+    assert smooth.shape == expected.shape
+    assert smooth.dtype == jnp.uint8
+    # Both are rounded; where two geoms meet, rounding may turn a ray from one to the other.
+    assert np.mean(np.abs(smooth.astype(float) - expected) > 1) < 1e-3
+
+
+def test_memory_does_not_grow_with_the_samples(built, poses):
+    def memory(samples):
+        lowered = renderer.render.lower(built, *poses, height=64, width=64, samples=samples)
+        return lowered.compile().memory_analysis().temp_size_in_bytes
+
+    assert memory(8) < 1.5 * memory(1)
+
+
+@pytest.mark.slow
+def test_environments_pass_antialias_on():
+    plain, smooth = (envs.make("press", image_size=12, antialias=n) for n in (1, 3))
+    batch = [x[None] for x in poses_of(world(plain))]
+    for env in (plain, smooth):
+        expected = renderer.render_batch(
+            env.render_model, *batch, height=12, width=12, samples=env.antialias
+        )
+        np.testing.assert_array_equal(env.render(*batch)["wrist"], expected[:, 1])
+    assert np.any(smooth.render(*batch)["wrist"] != plain.render(*batch)["wrist"])
+    with pytest.raises(ValueError, match="antialias must be at least 1, got 0"):
+        envs.make("press", antialias=0)
+
+
+def test_own_look_is_the_default(built, poses, picture):
+    np.testing.assert_array_equal(renderer.render(built, *poses, **SIZE), picture)
+
+
+@pytest.mark.parametrize("platform", ["cpu", "cuda", "tpu"])
+def test_lowers_inside_scan_and_vmap(built, poses, platform):
+    def run(shifts):
+        def body(carry, shift):
+            geoms = poses[0] + shift
+            return carry, jax.vmap(
+                lambda x: renderer.render(built, x, *poses[1:], height=8, width=8)
+            )(geoms[None])
+
+        return jax.lax.scan(body, None, shifts)[1]
+
+    lowered = jax.jit(run).trace(jnp.zeros(3)).lower(lowering_platforms=(platform,))
+    assert "3x1x2x8x8x3xui8" in lowered.as_text()
+
+
+def test_bad_input_is_named(shapes, built, poses):
+    with pytest.raises(ValueError, match=r"no camera {'back'}.*front"):
+        renderer.build(shapes[0], ("front", "back"))
+    with pytest.raises(ValueError, match=r"geom_xpos must have shape \(12, 3\)"):
+        renderer.render(built, poses[0][:3], *poses[1:], **SIZE)
+    with pytest.raises(ValueError, match=r"size must have shape \(12, 3\)"):
+        renderer.render(built, *poses, size=built.size[:3], **SIZE)
+    field = """<mujoco><asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset><worldbody>
+      <geom name="hill" type="hfield" hfield="h"/></worldbody></mujoco>"""
+    with pytest.raises(ValueError, match="geom hill cannot be drawn"):
+        renderer.build(mujoco.MjModel.from_xml_string(field), ())
+    with pytest.raises(ValueError, match="no visible geom"):
+        renderer.build(mujoco.MjModel.from_xml_string("<mujoco/>"), ())

@@ -1,0 +1,128 @@
+"""int8 and nf4 kernels against their bounds, their definitions and qwix."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.scipy.special import ndtri
+
+from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul, one_by_one
+from lorasp_jax.kernels.quantized_kernel import KINDS, NF4, quantized
+
+GOLDEN = Path(__file__).parent.parent / "golden" / "quantized_kernels.npz"
+WORST = {"int8": 1 / 255, "nf4": (NF4[1] - NF4[0]) / 2}
+
+
+def normal(*shape, seed=0):
+    return jax.random.normal(jax.random.key(seed), shape)
+
+
+def whole(kernel, kind):
+    return np.asarray(quantized(kernel, kind).astype(jnp.float32))
+
+
+def test_table_is_that_of_a_normal_distribution():
+    """QLoRA's construction: quantiles of both halves, 8 below 0 and 9 above, largest 1."""
+    offset = (1 / 32 + 1 / 30) / 2
+    below = ndtri(jnp.linspace(offset, 0.5, 8))
+    above = -ndtri(jnp.linspace(offset, 0.5, 9))
+    table = np.unique(np.concatenate([below / -below[0], above / above[0]]).round(6))
+    np.testing.assert_allclose(table, NF4, atol=2e-4)
+    assert len(NF4) == 16
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_qwix(kind):
+    """The same codes and scales as qwix 0.1.8, by column and in blocks of 64 inputs."""
+    with np.load(GOLDEN) as golden:
+        np.testing.assert_allclose(whole(golden["kernel"], kind), golden[kind], rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("shape", [(256, 12), (100, 7), (5, 3), (2, 130, 6)])
+def test_no_weight_is_further_off_than_stated(kind, shape):
+    kernel = np.asarray(normal(*shape))
+    smaller = quantized(kernel, kind)
+    assert (smaller.shape, smaller.dtype) == (shape, jnp.float32)
+    block = 64 if kind == "nf4" else shape[-2]
+    for start in range(0, shape[-2], block):
+        rows = np.s_[..., start : start + block, :]
+        largest = np.abs(kernel[rows]).max(-2, keepdims=True)
+        assert (
+            np.abs(whole(kernel, kind)[rows] - kernel[rows]) <= 1.0001 * WORST[kind] * largest
+        ).all()
+
+
+@pytest.mark.parametrize(("kind", "error"), [("int8", 0.0069), ("nf4", 0.092)])
+def test_error_and_bytes(kind, error):
+    """Of normal weights in 4 blocks; 8 and 4.5 bits a weight, the columns' scales aside."""
+    kernel = np.asarray(normal(256, 512))
+    lost = np.linalg.norm(whole(kernel, kind) - kernel) / np.linalg.norm(kernel)
+    assert lost == pytest.approx(error, rel=0.02)
+    bits = {"int8": 8 + 32 / 256, "nf4": 4 + 32 / 64}[kind]
+    assert quantized(kernel, kind).nbytes * 8 == bits * kernel.size
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_needs_no_rounding_comes_back(kind):
+    table = np.arange(-127, 128) / 127.5 if kind == "int8" else np.array(NF4)
+    kernel = np.random.default_rng(0).choice(table, (64, 9)).astype(np.float32)
+    kernel[0] = 1.0
+    kernel[:, 3] = 0.0
+    np.testing.assert_allclose(whole(kernel, kind)[1:], kernel[1:], atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_stack_is_its_layers(kind):
+    kernel = normal(2, 3, 70, 5)
+    stack = quantized(kernel, kind)
+    each = [[whole(matrix, kind) for matrix in row] for row in kernel]
+    np.testing.assert_array_equal(stack.astype(jnp.float32), each)
+    flat = stack.reshape(-1, 70, 5)
+    assert flat.shape == (6, 70, 5)
+    np.testing.assert_array_equal(flat.astype(jnp.float32)[4], each[1][1])
+    with pytest.raises(ValueError, match=r"\(2, 3, 70, 5\) cannot become \(6, 350\)"):
+        stack.reshape(6, 350)
+    scanned = jax.lax.scan(lambda _, k: (None, k.astype(jnp.bfloat16)), None, flat)[1]
+    assert scanned.dtype == jnp.bfloat16
+    np.testing.assert_array_equal(scanned, flat.astype(jnp.bfloat16))
+
+
+def product(x, kernel, p, u):
+    """x W + (x P) U."""
+    between = one_by_one([lambda _, rows, __: (rows, ())])
+    return low_rank_matmul(between, x.dtype, [LowRankLayer((), kernel, p, u)], x, None)[0][0]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("shape", [(6, 10), (10, 6)])
+def test_product_and_gradients_are_those_of_the_wide_kernel(kind, shape):
+    smaller = quantized(normal(*shape), kind)
+    x, p, u = normal(4, shape[0], seed=1), normal(shape[0], 3, seed=2), normal(3, shape[1], seed=3)
+
+    def loss(x, p, u, kernel):
+        return jnp.sum(jnp.sin(product(x, kernel, p, u)))
+
+    ours = jax.jit(jax.value_and_grad(loss, (0, 1, 2)))(x, p, u, smaller)
+    theirs = jax.value_and_grad(loss, (0, 1, 2))(x, p, u, smaller.astype(jnp.float32))
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_waits_for_the_backward_pass_is_small(kind):
+    """The codes, not the wide kernel."""
+    smaller = quantized(normal(64, 64), kind)
+    x, p, u = normal(2, 64), normal(64, 1), normal(1, 64)
+    _, pull = jax.vjp(lambda x, p, u: product(x, smaller, p, u), x, p, u)
+    kept = sum(leaf.nbytes for leaf in jax.tree.leaves(pull))
+    assert kept <= smaller.nbytes + x.nbytes + p.nbytes + u.nbytes + 2 * 4  # z [2, 1]
+
+
+def test_what_cannot_be_quantised():
+    with pytest.raises(ValueError, match="can be int8 or nf4, got 'int4'"):
+        quantized(normal(4, 4), "int4")
+    with pytest.raises(ValueError, match="infinite or undefined"):
+        quantized(jnp.array([[1.0, jnp.nan]]), "int8")

@@ -1,0 +1,87 @@
+"""A kernel on rows that lie on several devices: each works on its own, and nothing is gathered."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.sharding import NamedSharding, PartitionSpec
+
+from lorasp_jax.kernels import fused_rows as kernels
+from lorasp_jax.kernels.row_sharding import by_rows
+from lorasp_jax.training import mesh as meshes
+from tests.kernels.test_fused_rows import WIDTHS, close, gated
+
+
+def doubled(shared, arrays):
+    """Rows times two and their sum, with a mark of how many rows there were at a time."""
+    (rows,) = arrays
+    return [shared[0] * rows, jnp.full((len(rows), 1), len(rows))], [rows.sum(0)]
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def call(factor, rows, function=doubled):
+    return by_rows(function, [factor], [rows])
+
+
+def placed(rows, fsdp=2, axes=("data", "fsdp")):
+    return jax.device_put(rows, NamedSharding(meshes.make_mesh(fsdp), PartitionSpec(axes)))
+
+
+@pytest.mark.parametrize(
+    ("num_rows", "axes", "at_a_time"),
+    # over all 8 devices, 4 pairs, 2 groups of 4, and each device has them all
+    [(16, ("data", "fsdp"), 2), (16, "data", 4), (16, "fsdp", 8), (16, None, 16)],
+)
+def test_each_device_has_its_own_rows(num_rows, axes, at_a_time):
+    rows = jnp.arange(num_rows * 3.0).reshape(num_rows, 3)
+    (twice, numbers), (total,) = call(jnp.float32(2), placed(rows, axes=axes))
+    np.testing.assert_array_equal(twice, 2 * rows)
+    np.testing.assert_array_equal(numbers, at_a_time)
+    np.testing.assert_array_equal(total, rows.sum(0))
+
+
+def test_rows_that_do_not_divide_are_gathered():
+    """12 rows on 8 devices: what a share is filled up with would be added up too."""
+
+    @jax.jit
+    def cut(rows):
+        return by_rows(doubled, [jnp.float32(2)], [rows[:12] + 1])
+
+    rows = jnp.arange(16 * 3.0).reshape(16, 3)
+    (twice, _), (total,) = cut(placed(rows))
+    np.testing.assert_array_equal(twice, 2 * rows[:12] + 2)
+    np.testing.assert_array_equal(total, (rows[:12] + 1).sum(0))
+
+
+def test_vmap():
+    rows = jnp.arange(2 * 4 * 3.0).reshape(2, 4, 3)
+    factors = jnp.float32([2, 3])
+    (times, _), (totals,) = jax.vmap(call, in_axes=(0, 0))(factors, rows)
+    np.testing.assert_array_equal(times, factors[:, None, None] * rows)
+    np.testing.assert_array_equal(totals, rows.sum(1))
+
+
+def test_the_fused_chain(monkeypatch):
+    """Tokens of a batch that is split, from the layer around the kernel: values and gradients."""
+    monkeypatch.setattr(kernels, "FEW_ROWS", 0)
+    keys = jax.random.split(jax.random.key(0), 3)
+    shared = {"w": jax.random.normal(keys[0], (16, 32)), "b": jax.random.normal(keys[1], (32,))}
+    x = jax.random.normal(keys[2], (8, 5, 48))
+
+    @jax.jit
+    def gradients(shared, x):
+        def loss(shared, x):
+            rows = jnp.sin(x).reshape(-1, 48)
+            counts = rows[:, :1] > 0
+            output, sums, _ = kernels.fused_rows(
+                gated, shared, rows, WIDTHS, counts, interpret=True
+            )
+            return jnp.sin(output).sum() + sums["squares"].sum()
+
+        return jax.value_and_grad(loss, argnums=(0, 1))(shared, x)
+
+    split = gradients.lower(shared, placed(x)).compile()
+    assert "all-gather" not in split.as_text()
+    jax.tree.map(close, split(shared, placed(x)), gradients(shared, x))

@@ -1,0 +1,149 @@
+"""Nothing here touches a network: the hub is replaced, the bucket lies in memory."""
+
+import re
+
+import fsspec
+import huggingface_hub
+import pytest
+from huggingface_hub.errors import LocalEntryNotFoundError
+
+from lorasp_jax.models.checkpoints import hub
+
+
+def test_what_is_here_stays_here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs" / "base").mkdir(parents=True)
+    assert hub.local("runs/base").samefile(tmp_path / "runs" / "base")
+    assert hub.local(tmp_path) == tmp_path
+
+
+def test_hub(tmp_path, monkeypatch):
+    asked = {}
+
+    def snapshot_download(name, **options):
+        asked.update(options, name=name)
+        return str(tmp_path)
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
+    assert hub.local("hf://lerobot/smolvla_base", only=["*.json"]) == tmp_path
+    assert (asked["name"], asked["allow_patterns"]) == ("lerobot/smolvla_base", ["*.json"])
+    assert "train_state/*" in asked["ignore_patterns"]
+    assert asked["repo_type"] == "model"
+    hub.local("hf://lerobot/pusht", repository="dataset")
+    assert asked["repo_type"] == "dataset"
+
+
+def test_offline_is_one_sentence(monkeypatch):
+    def snapshot_download(name, **_):
+        raise LocalEntryNotFoundError("Got: no connection\nand a page of explanations")
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
+    with pytest.raises(ValueError, match=r"did not give hf://a/b, .*no connection\)\.$") as caught:
+        hub.local("hf://a/b")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["/a/b", "a", "a/b/c", "n" * 300, "/" + "n" * 300, "a\0b"])
+def test_nowhere(name, no_hub):
+    with pytest.raises(ValueError, match=f"^{re.escape(name)} does not exist"):
+        hub.local(name)
+
+
+@pytest.mark.parametrize("name", ["runs/base", "lerobot/smolvla_base"])
+def test_a_folder_that_is_not_there_is_never_asked_of_the_hub(name, tmp_path, monkeypatch, no_hub):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=f"no folder {name}; .* is written hf://{name}$"):
+        hub.local(name)
+    with pytest.raises(ValueError, match=r"is no repository on the hub: that is hf://owner/name"):
+        hub.local("hf://too/many/parts")
+
+
+@pytest.fixture
+def no_hub(monkeypatch):
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda *_, **__: 1 / 0)
+
+
+def test_shipped_bases_are_found_from_any_folder(tmp_path, monkeypatch, no_hub):
+    monkeypatch.chdir(tmp_path)
+    assert (hub.local("assets/pi0_nano") / "config.json").is_file()
+    for name in ("assets/pi0_nan", "assets/../runs/pi0"):
+        with pytest.raises(ValueError, match=r"is not there: a checkout|does not exist"):
+            hub.local(name)
+    monkeypatch.setattr(hub, "ROOT", tmp_path / "site-packages")
+    with pytest.raises(
+        ValueError, match=r"site-packages/assets; an installed package has none: name"
+    ):
+        hub.local("assets/pi0_nano")
+
+
+def test_what_is_written_down_is_found_from_any_other_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine").mkdir()
+    for where in ("mine", str(tmp_path / "mine")):
+        assert hub.lasting(where) == str(tmp_path / "mine")
+    for where in ("assets/pi0_nano", str(hub.ROOT / "assets" / "pi0_nano")):
+        assert hub.lasting(where) == "assets/pi0_nano"
+    for where in ("", "gs://bucket/folder", "hf://owner/name"):
+        assert hub.found_again(hub.lasting(where)) == where
+    (tmp_path / "assets" / "pi0_nano").mkdir(parents=True)
+    assert hub.lasting("assets/pi0_nano") == str(tmp_path / "assets" / "pi0_nano")
+    assert hub.found_again("assets/pi0_nano") == str(hub.ROOT / "assets" / "pi0_nano")
+
+
+@pytest.fixture
+def bucket(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    store = fsspec.filesystem("memory")
+    for name in ("params/_METADATA", "params/d/0", "train_state/d/0"):
+        store.pipe(f"/models/pi0/{name}", name.encode())
+    yield store
+    store.rm("/models", recursive=True)
+
+
+def test_bucket_is_fetched_once(bucket, tmp_path):
+    found = hub.local("memory://models/pi0/")
+    assert found == tmp_path / "lorasp_jax" / "memory" / "models" / "pi0"
+    files = {path.relative_to(found).as_posix() for path in found.rglob("*") if path.is_file()}
+    assert files == {"params/_METADATA", "params/d/0"}
+    assert (found / "params" / "d" / "0").read_text() == "params/d/0"
+    bucket.pipe("/models/pi0/params/d/0", b"new")
+    assert (hub.local("memory://models/pi0") / "params" / "d" / "0").read_text() == "params/d/0"
+    one = hub.local("memory://models/pi0/params/_METADATA")
+    assert one.read_text() == "params/_METADATA"
+    assert not list(tmp_path.rglob(".*"))
+
+
+def test_bucket_that_cannot_be_read(bucket, tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match=r"models/no cannot be fetched: .*nothing of that name\.$"):
+        hub.local("memory://models/no")
+
+    def get_file(*_, **__):
+        raise OSError("connection lost")
+
+    monkeypatch.setattr(type(bucket), "get_file", get_file)
+    with pytest.raises(ValueError, match=r"cannot be fetched: OSError: connection lost\.$"):
+        hub.local("memory://models/pi0")
+    assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".")]
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        *("nothing://models/pi0", "://a", "file:///etc/passwd", "http://localhost:9/x"),
+        *("github://a:b@/x", "gs://../../x", "gs://a/../../../../x", "gs://", "gs://a//b"),
+        *("zip://x::/tmp/x.zip", "simplecache::file:///etc/passwd", "local:///etc/passwd"),
+    ],
+)
+def test_only_buckets_are_asked_and_only_the_cache_is_written(where, monkeypatch):
+    monkeypatch.delattr("fsspec.core.url_to_fs")
+    with pytest.raises(ValueError, match="is no folder in a bucket: that is gs://bucket/folder"):
+        hub.local(where)
+
+
+def test_a_store_whose_package_is_missing_names_our_extra(monkeypatch):
+    def url_to_fs(url):
+        raise ImportError("Please install gcsfs to access Google Storage")
+
+    monkeypatch.setattr("fsspec.core.url_to_fs", url_to_fs)
+    with pytest.raises(ValueError, match=r'needs a package: pip install "lorasp_jax\[buckets\]"'):
+        hub.local("gs://openpi-assets/no-such")

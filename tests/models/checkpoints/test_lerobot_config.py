@@ -1,0 +1,112 @@
+import dataclasses
+import json
+
+import pytest
+
+from lorasp_jax.models.checkpoints.lerobot_config import config_of
+from lorasp_jax.models.inputs import LEROBOT, LEROBOT_CENTRED, LEROBOT_PI05
+from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.models.smolvla import SmolVLAConfig
+
+SMOLVLA = {
+    "type": "smolvla",
+    "chunk_size": 50,
+    "max_state_dim": 32,
+    "max_action_dim": 32,
+    "resize_imgs_with_padding": [512, 512],
+    "tokenizer_max_length": 48,
+    "num_vlm_layers": 16,
+    "num_expert_layers": 0,
+    "expert_width_multiplier": 0.75,
+    "self_attn_every_n_layers": 2,
+    "attention_mode": "cross_attn",
+    "add_image_special_tokens": False,
+    "normalization_mapping": {"VISUAL": "IDENTITY", "STATE": "MEAN_STD", "ACTION": "MEAN_STD"},
+    "input_features": {
+        "observation.state": {"type": "STATE", "shape": [6]},
+        **{
+            f"observation.images.camera{i}": {"type": "VISUAL", "shape": [3, 256, 256]}
+            for i in (1, 2, 3)
+        },
+    },
+}
+
+
+def test_published_fields_are_the_published_sizes():
+    assert config_of(SMOLVLA) == SmolVLAConfig.base()
+    assert config_of({"type": "smolvla"}) == SmolVLAConfig.base()
+    expected = dataclasses.replace(Pi0Config.base(), inputs=LEROBOT_CENTRED)
+    assert config_of({"type": "pi0", "image_resolution": [224, 224]}) == expected
+    expected = dataclasses.replace(Pi0Config.base_pi05(), inputs=LEROBOT_PI05)
+    assert config_of({"type": "pi05", "tokenizer_max_length": 200}) == expected
+    assert (expected.inputs.state, expected.inputs.action) == ("quantiles", "quantiles")
+
+
+def test_what_differs_is_read():
+    features = {
+        "observation.images.top": {"type": "VISUAL"},
+        "observation.image": {"type": "VISUAL"},
+    }
+    found = config_of(
+        SMOLVLA
+        | {
+            "chunk_size": 10,
+            "max_state_dim": 24,
+            "max_action_dim": 24,
+            "tokenizer_max_length": 20,
+            "resize_imgs_with_padding": [256, 256],
+            "num_vlm_layers": 8,
+            "expert_width_multiplier": 0.5,
+            "input_features": features,
+            "empty_cameras": 1,
+            "normalization_mapping": {"STATE": "QUANTILE10", "ACTION": "MIN_MAX"},
+        }
+    )
+    assert (found.chunk, found.action_dim, found.max_tokens, found.image_size) == (10, 24, 20, 256)
+    assert (found.language.depth, found.action.depth) == (8, 8)
+    # Two thirds of 4 * 480, in whole 256s: 1280.
+    assert (found.language.width, found.action.width, found.action.mlp) == (960, 480, 1280)
+    assert found.cameras == ("top", "image", "empty_camera_0")
+    assert found.inputs == dataclasses.replace(LEROBOT, state="quantile10", action="min_max")
+    large = config_of({"type": "pi0", "action_expert_variant": "gemma_2b"})
+    assert large.action == large.language
+
+
+@pytest.mark.parametrize(
+    ("names", "kept", "relative"),
+    [
+        (["j1.pos", "Gripper.pos", "j2.pos"], {}, (True, False, True)),
+        (["j1.pos", "Gripper.pos", "j2.pos"], {"relative_exclude_joints": []}, (True,) * 3),
+        (["gripper"], {"relative_exclude_joints": ["j2", "GRIP"]}, (False, True, True)),
+        (None, {}, (True,) * 3),
+    ],
+)
+def test_relative_actions(names, kept, relative):
+    """Names that hold an excluded word are absolute; without names nothing is."""
+    fields = {"type": "pi0", "output_features": {"action": {"type": "ACTION", "shape": [3]}}}
+    fields |= {"use_relative_actions": True, "action_feature_names": names, **kept}
+    config = config_of(fields)
+    assert config.inputs.delta == relative
+    assert config_of(fields | {"use_relative_actions": False}).inputs.delta == ()
+    assert Pi0Config.from_dict(json.loads(json.dumps(dataclasses.asdict(config)))) == config
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"type": "act"}, "of type 'act' is not one of pi0, pi05, smolvla"),
+        ({"attention_mode": "self_attn"}, "attention_mode must be 'cross_attn' here"),
+        ({"max_state_dim": 7}, "state and action must have one length"),
+        ({"resize_imgs_with_padding": [512, 256]}, "pictures be square"),
+        ({"resize_imgs_with_padding": None}, "pictures be square"),
+        ({"normalization_mapping": {"STATE": "QUANTILE5"}}, "'QUANTILE5' is not one of MEAN_STD"),
+        ({"use_relative_actions": True}, "not as LeRobot writes it"),
+        ({"normalization_mapping": {"VISUAL": "MEAN_STD"}}, "pictures are not normalised here"),
+        ({"type": "pi05", "use_visual_memory": True}, "use_visual_memory must be False here"),
+        ({"num_expert_layers": 8}, "must be that of the language model, 16"),
+        ({"input_features": [1]}, "not as LeRobot writes it"),
+    ],
+)
+def test_what_no_config_says_raises(change, message):
+    with pytest.raises(ValueError, match=message):
+        config_of(SMOLVLA | change)

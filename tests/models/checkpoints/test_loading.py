@@ -1,0 +1,94 @@
+"""One function for every layout and place; the published sizes are replaced by the goldens'."""
+
+import json
+import logging
+import shutil
+
+import numpy as np
+import pytest
+import safetensors.numpy
+
+from lorasp_jax import models
+from lorasp_jax.models.checkpoints import hub, published
+from lorasp_jax.models.checkpoints.native import named_arrays
+from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.models.smolvla import SmolVLAConfig
+from tests.models import test_pi0_parity as pi0
+from tests.models import test_smolvla_parity as smolvla
+
+FIELDS = {
+    "type": "smolvla",
+    "chunk_size": smolvla.CONFIG.chunk,
+    "tokenizer_max_length": smolvla.CONFIG.max_tokens,
+    "resize_imgs_with_padding": [smolvla.CONFIG.image_size] * 2,
+    "input_features": {f"observation.images.{i}": {"type": "VISUAL"} for i in (0, 1)},
+}
+
+
+@pytest.fixture(autouse=True)
+def tiny(monkeypatch):
+    """The goldens' towers stand for the published ones, which no config.json describes."""
+    monkeypatch.setattr(Pi0Config, "base", lambda: pi0.CONFIG)
+    monkeypatch.setattr(SmolVLAConfig, "base", lambda: smolvla.CONFIG)
+
+
+@pytest.fixture
+def lerobot(tmp_path):
+    """A policy's folder as `lerobot/smolvla_base` was: statistics among the weights."""
+    folder = tmp_path / "policy"
+    folder.mkdir()
+    tensors = safetensors.numpy.load_file(smolvla.GOLDEN / "model.safetensors")
+    tensors = {name.replace("model.", "model._orig_mod.", 1): a for name, a in tensors.items()}
+    for name in ("so100_buffer_observation_state", "buffer_observation_images_camera1"):
+        tensors[f"normalize_inputs.{name}.mean"] = np.zeros(6, np.float32)
+    safetensors.numpy.save_file(tensors, folder / "model.safetensors")
+    (folder / "config.json").write_text(json.dumps(FIELDS))
+    return folder
+
+
+def assert_same(one, other):
+    one, other = named_arrays(one), named_arrays(other)
+    assert one.keys() == other.keys()
+    for name, array in one.items():
+        np.testing.assert_array_equal(array, other[name], err_msg=name)
+
+
+def test_lerobot(lerobot, caplog):
+    with caplog.at_level(logging.INFO):
+        model = models.load(lerobot)
+    assert "nothing reads normalize_inputs." in caplog.text
+    assert model.config == models.load_config(lerobot) == smolvla.CONFIG
+    assert_same(model, published.load(smolvla.GOLDEN, smolvla.CONFIG)[0])
+    (lerobot / "config.json").unlink()
+    assert_same(models.load(lerobot, smolvla.CONFIG), model)
+    with pytest.raises(ValueError, match=r"holds weights, but no config\.json"):
+        models.load(lerobot)
+
+
+def test_openpi(tmp_path):
+    folder = tmp_path / "29999"
+    shutil.copytree(pi0.GOLDEN / "orbax", folder)
+    model = models.load(folder)
+    assert model.config == models.load_config(folder) == pi0.CONFIG
+    assert_same(model, published.load(folder / "params", pi0.CONFIG)[0])
+
+
+def test_ours_and_the_hub(tmp_path, monkeypatch):
+    models.save(tmp_path, models.load(pi0.GOLDEN / "orbax"))
+    monkeypatch.setattr(hub, "_from_hub", lambda *_: tmp_path)
+    assert models.load_config("hf://me/pi0") == pi0.CONFIG
+    assert models.weights_hash(models.load("hf://me/pi0")) == models.weights_hash(tmp_path)
+
+
+def test_bad_folders_are_one_sentence(lerobot, tmp_path):
+    with pytest.raises(ValueError, match="holds no model"):
+        models.load(tmp_path)
+    with pytest.raises(ValueError, match="no_such does not exist"):
+        models.load(tmp_path / "no_such")
+    (lerobot / "config.json").write_text(json.dumps({**FIELDS, "type": "act"}))
+    with pytest.raises(ValueError, match=r"config\.json fits no backbone: a policy of type 'act'"):
+        models.load(lerobot)
+    for text in ("{", "[]"):
+        (lerobot / "config.json").write_text(text)
+        with pytest.raises(ValueError, match=r"config\.json is damaged"):
+            models.load(lerobot)

@@ -1,0 +1,128 @@
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+import lorasp_jax
+from lorasp_jax import models
+from lorasp_jax.models.checkpoints import native
+from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.peft import LoRA
+from tests.models.drawn import drawn
+
+CONFIG = Pi0Config.dummy()
+
+
+@pytest.fixture(scope="module")
+def model():
+    return drawn(CONFIG)
+
+
+@pytest.fixture
+def folder(tmp_path, model):
+    models.save(tmp_path / "base", model)
+    return tmp_path / "base"
+
+
+def parameters(model: nnx.Module) -> dict:
+    return nnx.to_pure_dict(nnx.state(model, nnx.Param))
+
+
+def test_round_trip_is_exact_in_bfloat16(folder, model):
+    loaded, kept = models.load(folder), dataclasses.replace(CONFIG, unroll=None)
+    assert loaded.config == kept
+    jax.tree.map(
+        lambda a, b: np.testing.assert_array_equal(a, b.astype(jnp.bfloat16).astype(jnp.float32)),
+        parameters(loaded),
+        parameters(model),
+    )
+    assert models.load_config(folder) == kept
+
+
+def test_types_are_as_asked(folder):
+    wanted = dataclasses.replace(CONFIG, dtype="bfloat16", param_dtype="bfloat16", remat="full")
+    loaded = models.load(folder, wanted)
+    assert loaded.config == wanted
+    assert {leaf.dtype for leaf in jax.tree.leaves(parameters(loaded))} == {jnp.dtype("bfloat16")}
+    assert models.weights_hash(loaded) == models.weights_hash(folder)
+
+
+def test_hash_knows_the_base_and_not_its_adapters(folder, model):
+    loaded = models.load(folder)
+    assert models.weights_hash(loaded) == models.weights_hash(folder)
+    adapted = lorasp_jax.adapt(loaded, [("^action", LoRA(rank=2))], rngs=nnx.Rngs(0))
+    assert models.weights_hash(adapted) == models.weights_hash(folder)
+    assert models.weights_hash(model) != models.weights_hash(folder)  # not yet rounded to bf16
+    for has_adapters in (adapted, lorasp_jax.combine({"own": adapted})):
+        with pytest.raises(ValueError, match="without adapters"):
+            models.save(folder, has_adapters)
+    with pytest.raises(ValueError, match="save a base before quantising it"):
+        models.save(folder, lorasp_jax.quantize(loaded, [("state_proj", "int8")]).model)
+    with pytest.raises(ValueError, match="gs:/bucket/base is a URL"):
+        models.save("gs://bucket/base", loaded)
+
+
+def test_shards_stay_under_their_limit(tmp_path, model, monkeypatch):
+    monkeypatch.setattr(native, "SHARD_BYTES", 80_000)
+    models.save(tmp_path, model)
+    shards = sorted(tmp_path.glob("model-*.safetensors"))
+    assert len(shards) > 2
+    assert all(shard.stat().st_size <= 80_000 for shard in shards)
+    monkeypatch.undo()
+    sharded = models.weights_hash(tmp_path)
+    assert models.weights_hash(models.load(tmp_path)) == sharded
+    shards[1].unlink()
+    with pytest.raises(ValueError, match=f"lacks {shards[1].name}"):
+        models.load(tmp_path)
+    models.save(tmp_path, model)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["config.json", "model.safetensors"]
+    assert models.weights_hash(tmp_path) == sharded
+
+
+def test_other_sizes_raise(folder):
+    other = dataclasses.replace(CONFIG, image_size=64)
+    with pytest.raises(ValueError, match=r"does not fit the model: image_size is 32, not 64\.$"):
+        models.load(folder, other)
+
+
+def edit(folder, **change):
+    path = folder / "config.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+
+
+def test_damaged_and_foreign_folders_raise(folder):
+    with pytest.raises(ValueError, match=r"holds no model: there is no config\.json"):
+        native.load(folder / "nothing")
+    sizes = json.loads((folder / "config.json").read_text())["config"]
+    edit(folder, config={**sizes, "vocabulary": 7})
+    with pytest.raises(ValueError, match="weights and sizes lack the hash"):
+        models.load(folder)
+    edit(folder, config=sizes, sha256="0" * 64)
+    with pytest.raises(ValueError, match="weights and sizes lack the hash"):
+        models.load(folder)
+    for change in ({"backbone": "no_such"}, {"config": {"vision": {}}}):
+        edit(folder, **{"config": sizes, "backbone": "pi0", **change})
+        with pytest.raises(ValueError, match="describes no backbone of this version"):
+            models.load(folder)
+    (folder / "config.json").write_text('{"architectures": []}')
+    with pytest.raises(ValueError, match="was not written by this project"):
+        native.load(folder)
+
+
+def test_a_file_cut_short_raises(folder):
+    path = folder / "model.safetensors"
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(ValueError, match=r"model\.safetensors is damaged or cut short"):
+        models.load(folder)
+
+
+def test_set_arrays_lists_what_does_not_fit(model):
+    with pytest.raises(ValueError, match="missing arrays: action/blocks/down_proj/kernel, "):
+        models.set_arrays(model, {})
+    arrays = native.named_arrays(model)
+    with pytest.raises(ValueError, match=r"unexpected arrays: lm_head\.$"):
+        models.set_arrays(model, {**arrays, "lm_head": np.zeros(1)})

@@ -1,0 +1,136 @@
+"""Straight-line code over a stack of layers against the loop: values, gradients, what is stored."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.dense import AdapterParam, Dense
+from lorasp_jax.models.transformer.depth import scan_depth, stack, stored
+from lorasp_jax.peft import LoRA, LoRASP
+from tests.nets import METHODS, trained
+
+DEPTH, TOKENS, WIDTH, INNER = 3, 5, 8, 12
+
+
+class Net(nnx.Module):
+    """Residual layers in a stack."""
+
+    def __init__(self):
+        self.blocks = stack(lambda rngs: Layer(rngs=rngs), DEPTH, nnx.Rngs(0))
+
+
+class Layer(nnx.Module):
+    def __init__(self, *, rngs):
+        self.up = Dense(WIDTH, INNER, rngs=rngs)
+        self.down = Dense(INNER, WIDTH, rngs=rngs)
+
+    def __call__(self, x):
+        return x + self.down(jnp.tanh(self.up(x)))
+
+
+@pytest.fixture(scope="module")
+def split():
+    return adaptation.split(trained((".*", METHODS["lora"]), seed=1, net=Net()))
+
+
+def loss_of(graphdef, frozen, **options):
+    x = jnp.sin(jnp.arange(TOKENS * WIDTH)).reshape(1, TOKENS, WIDTH)
+
+    def loss(adapters):
+        blocks = nnx.merge(graphdef, adapters, frozen).blocks
+        y, kept = scan_depth(blocks, lambda block, x, _: (block(x), x.sum()), x, **options)
+        return (y**2).sum() + (kept * jnp.arange(DEPTH)).sum()
+
+    return loss
+
+
+def close(found, expected):
+    assert np.linalg.norm(found - expected) <= 1e-3 * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("remat", ["none", "products"])
+def test_dropout_is_the_same_in_straight_line_code_and_in_the_loop(remat):
+    """Each layer of the stack by a key of its own."""
+    model = trained((".*", LoRA(rank=4, dropout=0.5)), seed=1, net=Net())
+    dropping = adaptation.with_dropout(model, jax.random.key(5))
+    found = []
+    for net, unroll in ((model, False), (dropping, False), (dropping, True)):
+        graphdef, adapters, frozen = nnx.split(net, AdapterParam, ...)
+        found.append(jax.jit(loss_of(graphdef, frozen, remat=remat, unroll=unroll))(adapters))
+    np.testing.assert_allclose(found[1], found[2], rtol=1e-5)
+    assert abs(found[1] - found[0]) > 1e-2 * found[0]
+
+
+@pytest.mark.parametrize("remat", ["none", "products"])
+def test_straight_line_code_has_the_loops_gradients(split, remat):
+    graphdef, adapters, frozen = split
+    expected, found = (
+        jax.jit(jax.value_and_grad(loss_of(graphdef, frozen, remat=remat, unroll=unroll)))(adapters)
+        for unroll in (False, True)
+    )
+    jax.tree.map(close, found, expected)
+
+
+def test_straight_line_code_stores_no_layers_weights_and_stacks_gradients(split):
+    graphdef, adapters, frozen = split
+
+    def residuals(adapters, frozen):
+        return jax.vjp(loss_of(graphdef, frozen, remat="products", unroll=True), adapters)[1]
+
+    jaxpr = jax.make_jaxpr(residuals)(adapters, frozen).jaxpr
+    shapes = {v.aval.shape for v in jaxpr.outvars if v not in jaxpr.invars}
+    assert (1, TOKENS, INNER) in shapes
+    weights = {leaf.shape[1:] for leaf in jax.tree.leaves((adapters, frozen))}
+    assert not shapes & weights
+    gradient = jax.make_jaxpr(jax.grad(loss_of(graphdef, frozen, unroll=True)))(adapters)
+    assert "dynamic_update_slice" not in str(gradient)
+
+
+def test_what_has_a_name_is_stored_in_place_of_its_products():
+    class Sum(nnx.Module):
+        def __init__(self, *, rngs):
+            self.first, self.second = Dense(WIDTH, INNER, rngs=rngs), Dense(WIDTH, INNER, rngs=rngs)
+
+        def __call__(self, x, keep):
+            return x + jnp.cos(keep(self.first(x) + self.second(x))).sum(-1, keepdims=True)
+
+    blocks = stack(lambda rngs: Sum(rngs=rngs), DEPTH, nnx.Rngs(0))
+
+    def inner(keep):
+        run = lambda x: scan_depth(blocks, lambda b, x, _: (b(x, keep), None), x, remat="products")  # noqa: E731
+        pull_back = jax.eval_shape(lambda x: jax.vjp(run, x)[1], jnp.ones((1, TOKENS, WIDTH)))
+        return sum(leaf.shape[-2:] == (TOKENS, INNER) for leaf in jax.tree.leaves(pull_back))
+
+    assert (inner(lambda x: x), inner(stored)) == (2, 1)
+
+
+@pytest.mark.parametrize("unroll", [False, True])
+def test_a_stack_in_which_nothing_trains(unroll):
+    blocks, x = Net().blocks, jnp.ones((1, TOKENS, WIDTH))
+    run = lambda x: scan_depth(blocks, lambda block, x, _: (block(x), None), x, unroll=unroll)[0]  # noqa: E731
+    expected = x
+    for i in range(DEPTH):
+        graphdef, state = nnx.split(blocks)
+        expected = nnx.merge(graphdef, jax.tree.map(lambda a, i=i: a[i], state))(expected)
+    np.testing.assert_allclose(run(x), expected, rtol=1e-5)
+
+
+def test_the_adapters_kernel_runs_once_each_way():
+    method = LoRASP(rank=16, hidden_width=16, gate="pallas")
+    blocks = stack(lambda rngs: Dense(WIDTH, WIDTH, method=method, rngs=rngs), DEPTH, nnx.Rngs(0))
+    graphdef, adapters, frozen = adaptation.split(blocks)
+
+    def loss(adapters):
+        layer = lambda block, x, _: block(x, return_aux=True)  # noqa: E731
+        blocks = nnx.merge(graphdef, adapters, frozen)
+        return scan_depth(blocks, layer, jnp.ones((1, 16, WIDTH)), remat="products")[0].sum()
+
+    def calls(jaxpr):
+        inner = (getattr(value, "jaxpr", value) for e in jaxpr.eqns for value in e.params.values())
+        own = sum(e.primitive.name == "custom_vmap_call" for e in jaxpr.eqns)
+        return own + sum(calls(j) for j in inner if hasattr(j, "eqns"))
+
+    assert calls(jax.make_jaxpr(jax.grad(loss))(adapters).jaxpr) == 2

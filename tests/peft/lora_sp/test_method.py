@@ -1,0 +1,269 @@
+"""LoRA-SP's equations, losses, parameter counts and its identity with LoRA."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lorasp_jax.kernels import fused_rows
+from lorasp_jax.peft import LoRA, LoRASP
+from lorasp_jax.peft._method import apply_together
+from lorasp_jax.peft.lora_sp import method as lora_sp
+from lorasp_jax.peft.lora_sp import router as routing
+from tests.jaxprs import primitives
+
+D_IN, D_OUT = 24, 40
+KERNEL = jax.ShapeDtypeStruct((D_IN, D_OUT), jnp.float32)
+
+
+@pytest.fixture(scope="module")
+def x():
+    return jax.random.normal(jax.random.key(0), (3, 7, D_IN))
+
+
+def initial(method, key=1):
+    return jax.jit(lambda key: method.init(key, KERNEL)[0])(jax.random.key(key))
+
+
+def scores_of(router, x):
+    return routing.router_scores(router, x @ router["w1"])
+
+
+def losses_of(scores, kept_energy=1.0, rows=None):
+    """The three losses of rows of scores that are all kept; logits are the scores."""
+    counts = jnp.ones((len(scores), 1), bool) if rows is None else rows
+    energy = jnp.broadcast_to(jnp.asarray(kept_energy).reshape(-1, 1), (len(scores), 1))
+    sums = routing.loss_sums(scores, scores, scores > 0, energy, counts)
+    return routing.spectral_loss(sums), routing.balance_loss(sums), routing.z_loss(sums)
+
+
+@pytest.mark.parametrize(
+    ("method", "router"),
+    [
+        (LoRASP(), 32 * (D_IN + 128) + 32 + 128),
+        (LoRASP(rank=64, hidden_width=8), 8 * (D_IN + 64) + 8 + 64),
+        (LoRASP.paper(), 4 * (D_IN + 128)),
+    ],
+)
+def test_parameter_count(method, router):
+    shapes = jax.eval_shape(lambda key: method.init(key, KERNEL)[0], jax.random.key(0))
+    count = sum(leaf.size for leaf in jax.tree.leaves(shapes))
+    assert count == method.rank * (D_IN + D_OUT) + router
+
+
+def test_scores_start_at_one(x):
+    scores, logits = scores_of(initial(LoRASP())["router"], x)
+    assert (scores.shape, logits.shape) == ((3, 7, 128), (3, 7, 128))
+    np.testing.assert_allclose(scores, 1, atol=0.15)
+    assert np.std(scores) > 1e-3  # never all equal, or the same last directions would go
+
+
+def test_paper_router_spreads_a_softmax(x):
+    """Four softmax values, each the score of a block of 32; non-negative whatever W2 becomes."""
+    router = initial(LoRASP.paper())["router"]
+    scores, logits = scores_of(router, x)
+    np.testing.assert_allclose(scores, np.repeat(jax.nn.softmax(logits), 32, -1), rtol=1e-6)
+    pushed, _ = scores_of(router | {"w2": router["w2"] - 0.3}, x)
+    assert pushed.min() == 0
+
+
+def test_unit_scores_and_full_target_equal_lora(x):
+    """s = 1 (router weights zero) and η = 1 leave plain LoRA of the same rank and alpha."""
+    method = LoRASP(rank=16, energy_target=1.0, alpha=8.0)
+    params = initial(method)
+    router = params["router"] | {"w2": jnp.zeros((32, 16))}
+    u = jax.random.normal(jax.random.key(2), (16, D_OUT))
+    params = {"bank": params["bank"] | {"u": u}, "router": router}
+    ours, aux = jax.jit(method.delta)(params, x)
+    lora = {"lora_a": params["bank"]["v"], "lora_b": u}
+    theirs, _ = jax.jit(LoRA(rank=16, alpha=8.0).delta)(lora, x)
+    np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-5)
+    np.testing.assert_array_equal(aux.active_rank, 16)
+
+
+def test_update_is_u_sigma_v(x):
+    """Eqs. (9) and (11) literally, token by token."""
+    method = LoRASP(rank=16, energy_target=0.7, alpha=4.0)
+    params = initial(method)
+    params["bank"]["u"] = jax.random.normal(jax.random.key(2), (16, D_OUT))
+    params["router"]["w2"] = jax.random.normal(jax.random.key(3), (32, 16))
+    delta, aux = jax.jit(method.delta)(params, x)
+    scores, _ = scores_of(params["router"], x)
+    mask = np.asarray(jax.jit(lambda s: lora_sp.energy_gate(s, 0.7)[0])(scores))
+    u, v = np.asarray(params["bank"]["u"]), np.asarray(params["bank"]["v"])
+    token = np.asarray(x)[1, 4]
+    expected = 4 / 16 * token @ v @ np.diag(np.where(mask, scores, 0)[1, 4]) @ u
+    np.testing.assert_allclose(delta[1, 4], expected, rtol=1e-4, atol=1e-5)
+    assert 0 < aux.active_rank.mean() < 16
+    assert (aux.kept_energy >= 0.7 - 1e-6).all()
+
+
+def test_pruned_directions_get_no_task_gradient(x):
+    method = LoRASP(rank=16, energy_target=0.5)
+    params = initial(method)
+    params["bank"]["u"] = jnp.ones((16, D_OUT))
+
+    def task(shift):
+        scores = scores_of(params["router"], x)[0] + shift
+        mask, _, energy = lora_sp.energy_gate(scores, 0.5)
+        z = routing.select(x @ params["bank"]["v"], scores, mask, energy[..., None])
+        return z.sum(), mask
+
+    gradient, mask = jax.jit(jax.grad(task, has_aux=True))(jnp.zeros((3, 7, 16)))
+    np.testing.assert_array_equal(gradient != 0, mask)
+
+
+def test_losses_of_uniform_and_concentrated_routing():
+    """Balance is 1 where all directions are used alike and R where one takes all; z is 0 at 0."""
+    even, one = jnp.ones((5, 8)), jnp.eye(8)[jnp.zeros(5, int)]
+    assert losses_of(even)[1] == pytest.approx(1)
+    assert losses_of(one)[1] == pytest.approx(8)
+    assert losses_of(jnp.eye(8)[:5])[1] == pytest.approx(8 / 5)  # balanced over tokens
+    assert losses_of(jnp.full((5, 8), 3.0))[2] == pytest.approx(9, rel=1e-5)
+    assert losses_of(jnp.full((5, 8), 1e-9))[2] == pytest.approx(0, abs=1e-6)
+    kept = jnp.array([0.9, 1.0, 0.95, 0.2, 0.1])
+    spectral, _, _ = losses_of(even, kept, rows=jnp.arange(5)[:, None] < 3)
+    assert spectral == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize(
+    ("masked", "few"),
+    [pytest.param(False, 0, marks=pytest.mark.slow), (True, 0), (True, fused_rows.FEW_ROWS)],
+)
+def test_one_kernel_equals_the_equations(x, monkeypatch, masked, few):
+    """The fused chain, run by Triton on a GPU and by its interpreter elsewhere."""
+    interpret = jax.default_backend() != "gpu"
+    kernel = functools.partial(lora_sp.fused_rows, interpret=interpret)
+    monkeypatch.setattr(lora_sp, "fused_rows", kernel)
+    monkeypatch.setattr(fused_rows, "FEW_ROWS", few)
+    plain = LoRASP(rank=32, hidden_width=16, energy_target=0.7, gate="bisection")
+    params = initial(plain)
+    params["bank"]["u"] = jax.random.normal(jax.random.key(2), (32, D_OUT))
+    params["router"]["w2"] = jax.random.normal(jax.random.key(3), (16, 32))
+    mask = jax.random.bernoulli(jax.random.key(4), 0.6, x.shape[:2]) if masked else None
+
+    def loss(params, x, method):
+        y, aux = method.delta(params, x, token_mask=mask)
+        return jnp.sin(y).sum() + sum(i * v for i, v in enumerate(aux.losses.values())), (y, aux)
+
+    run = jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True), static_argnums=2)
+    with jax.default_matmul_precision("highest"):
+        expected = run(params, x, plain)
+        found = run(params, x, dataclasses.replace(plain, gate="pallas"))
+    assert 1 < found[0][1][1].mean_active_rank() < 31
+    for f, e in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        error = np.asarray(f, float) - np.asarray(e, float)
+        assert np.linalg.norm(error) <= 1e-5 * np.linalg.norm(e)
+
+
+def test_layers_of_one_input_are_one_kernel(x, monkeypatch):
+    kernel = functools.partial(lora_sp.fused_rows, interpret=True)
+    monkeypatch.setattr(lora_sp, "fused_rows", kernel)
+    method = LoRASP(rank=32, hidden_width=16, energy_target=0.7, gate="pallas")
+    params = [initial(method, key) for key in (1, 2)]
+    for i, p in enumerate(params):
+        p["bank"]["u"] = jax.random.normal(jax.random.key(i), (32, D_OUT))
+        p["router"]["w2"] = jax.random.normal(jax.random.key(i + 3), (16, 32))
+    weights = jax.random.normal(jax.random.key(9), (2, D_IN, D_OUT))
+    mask = jax.random.bernoulli(jax.random.key(4), 0.6, x.shape[:2])
+
+    def together(params, x):
+        layers = [(method, p, w) for p, w in zip(params, weights, strict=True)]
+        return apply_together(layers, x, token_mask=mask)
+
+    def alone(params, x):
+        pairs = zip(params, weights, strict=True)
+        return [method.apply(p, x, w, token_mask=mask) for p, w in pairs]
+
+    def everything(layers):
+        def loss(params, x):
+            found = layers(params, x)
+            losses = sum(i * v for _, aux in found for i, v in enumerate(aux.losses.values()))
+            return sum(jnp.sin(y).sum() for y, _ in found) + losses, found
+
+        return jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
+
+    found, expected = (jax.jit(everything(f))(params, x) for f in (together, alone))
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3), found, expected
+    )
+    programs = [primitives(everything(f), params, x) for f in (together, alone)]
+    assert [names.count("pallas_call") for names in programs] == [2, 4]
+
+
+@pytest.mark.parametrize("method", [LoRASP(rank=48), LoRASP.paper(rank=64), LoRASP(hidden_width=8)])
+def test_what_triton_cannot_take_keeps_the_gate_alone(x, monkeypatch, method):
+    monkeypatch.setattr(lora_sp, "fused_rows", None)
+    gates = []
+    monkeypatch.setattr(
+        routing,
+        "energy_gate",
+        lambda s, eta, implementation: gates.append(implementation) or (s > 0,),
+    )
+    jax.eval_shape(dataclasses.replace(method, gate="pallas").delta, initial(method), x)
+    assert gates == ["pallas"]
+
+
+def test_rows_without_scores_stay_out(x):
+    """A ReLU router can go silent: nothing is kept, nothing is lost, no loss is counted."""
+    method = LoRASP.paper()
+    params = initial(method)
+    params["router"]["w2"] = -params["router"]["w2"]
+
+    def loss(params):
+        y, aux = method.delta(params, x)
+        return y.sum() + sum(aux.losses.values()), aux
+
+    gradients, aux = jax.jit(jax.grad(loss, has_aux=True))(params)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
+    np.testing.assert_array_equal(aux.active_rank, 0)
+    np.testing.assert_array_equal(aux.kept_energy, 1)
+    assert all(value == 0 for value in aux.losses.values())
+
+
+@pytest.mark.parametrize("place", [("router", "b2"), ("router", "w1"), ("bank", "v")])
+def test_broken_parameters_are_not_hidden(x, monkeypatch, place):
+    """Nor where a clip loses NaN, as one of minimum and maximum does in a GPU's kernel."""
+    monkeypatch.setattr(jnp, "clip", lambda a, low, high: jnp.fmin(jnp.fmax(a, low), high))
+    params = initial(LoRASP())
+    room, name = place
+    params[room][name] = params[room][name].at[0].set(jnp.nan)
+    y, aux = jax.jit(LoRASP().delta)(params, x)
+    assert jnp.isnan(y).all()
+    if room == "router":
+        assert all(jnp.isnan(value) for value in aux.losses.values())
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"energy_target": 0.0}, r"energy_target must lie in \(0, 1\], got 0.0"),
+        ({"energy_target": 1.5}, r"energy_target must lie in \(0, 1\], got 1.5"),
+        ({"rank": 0}, "at least 1"),
+        ({"router": "relu"}, "router must be one of 'gelu', 'softmax', 'linear', got 'relu'"),
+        ({"router": "softmax", "hidden_width": 5}, "divisible by its width, got 128 and 5"),
+    ],
+)
+def test_bad_fields(fields, message):
+    with pytest.raises(ValueError, match=message):
+        LoRASP(**fields)
+
+
+def test_scale_follows_alpha():
+    assert LoRASP().scale == LoRASP(rank=16).scale == 2
+    assert dataclasses.replace(LoRASP(), alpha=64.0).scale == 0.5
+
+
+def test_losses_of_stacked_layers_are_those_of_each():
+    def sums(key):
+        one = lambda key, size: jax.random.uniform(key, (size,), minval=1, maxval=3)  # noqa: E731
+        return routing.LossSums(*map(one, jax.random.split(key, 5), (1, 1, 1, 8, 8)))
+
+    each = [sums(key) for key in jax.random.split(jax.random.key(0), 3)]
+    stacked = routing.Losses(jax.tree.map(lambda *leaves: jnp.stack(leaves), *each))
+    assert [*stacked] == ["spectral", "balance", "z"]
+    for name, values in stacked.items():
+        np.testing.assert_allclose(values, [routing.Losses(one)[name] for one in each], rtol=1e-6)

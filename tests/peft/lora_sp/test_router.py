@@ -1,0 +1,133 @@
+"""Score functions, and masks that several tokens share."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lorasp_jax.peft import LoRASP
+from lorasp_jax.peft.lora_sp import router as routing
+
+pytestmark = pytest.mark.slow
+
+D_IN, D_OUT, RANK = 6, 5, 16
+MASK = jnp.arange(7)[None] < jnp.array([[3], [7], [0]])
+
+
+@pytest.fixture
+def x():
+    return jax.random.normal(jax.random.key(0), (3, 7, D_IN))
+
+
+def arrays(method, spread=1.0):
+    kernel = jax.ShapeDtypeStruct((D_IN, D_OUT), jnp.float32)
+    params, _ = method.init(jax.random.key(1), kernel)
+    params["bank"]["u"] = jax.random.normal(jax.random.key(2), (RANK, D_OUT))
+    w2 = params["router"]["w2"]
+    params["router"]["w2"] = w2 + spread * jax.random.normal(jax.random.key(3), w2.shape)
+    return params
+
+
+def scores_of(method, params, x):
+    router = params["router"]
+    return routing.router_scores(router, x @ router["w1"], method.score_function)
+
+
+@pytest.mark.parametrize("name", ["softplus", "relu", "softmax"])
+def test_score_functions(name, x):
+    """1 at the start for each; then the function of one and the same logits."""
+    method = LoRASP(rank=RANK, score_function=name)
+    scores, _ = scores_of(method, arrays(method, 0), x)
+    np.testing.assert_allclose(scores, 1, atol=0.1)
+    params = arrays(method)
+    scores, logits = map(np.asarray, scores_of(method, params, x))
+    expected = {
+        "softplus": np.log1p(np.exp(logits)),
+        "relu": np.maximum(logits, 0),
+        "softmax": RANK * np.exp(logits) / np.exp(logits).sum(-1, keepdims=True),
+    }[name]
+    np.testing.assert_allclose(scores, expected, rtol=1e-5, atol=1e-6)
+    delta, aux = jax.jit(method.delta)(params, x)
+    kept = scores * np.asarray(jnp.stack([_smallest(s, 0.9) for s in scores.reshape(-1, RANK)]))[
+        :
+    ].reshape(scores.shape)
+    expected = method.scale * (np.asarray(x @ params["bank"]["v"]) * kept) @ params["bank"]["u"]
+    np.testing.assert_allclose(delta, expected, rtol=1e-4, atol=1e-4)
+    assert 0 < aux.mean_active_rank() < RANK
+
+
+def _smallest(scores, target):
+    """Eq. (12) by hand: the mask of the fewest scores that hold `target` of the squares."""
+    order = np.argsort(-scores, kind="stable")
+    energy = np.cumsum(np.float64(scores[order]) ** 2)
+    k = int(np.searchsorted(energy, target * energy[-1])) + 1
+    return np.isin(np.arange(len(scores)), order[:k])
+
+
+@pytest.mark.parametrize("granularity", ["sample", "layer"])
+def test_shared_masks(granularity, x):
+    """One mask for the tokens of a sample, or of all: the fewest that hold η of their energy."""
+    method = LoRASP(rank=RANK, energy_target=0.7, granularity=granularity)
+    params = arrays(method)
+    delta, aux = jax.jit(method.delta)(params, x, token_mask=MASK)
+    scores = np.asarray(scores_of(method, params, x)[0])
+    energy = np.where(MASK[..., None], scores**2, 0)
+    groups = energy.sum(1) if granularity == "sample" else np.tile(energy.sum((0, 1)), (3, 1))
+    for sample in range(2):  # the third is all padding
+        mask = _smallest(np.sqrt(groups[sample]), 0.7)
+        np.testing.assert_array_equal(aux.active_rank[sample], mask.sum())
+        share = (scores[sample] ** 2 * mask).sum(-1) / (scores[sample] ** 2).sum(-1)
+        np.testing.assert_allclose(aux.kept_energy[sample], share, rtol=1e-5)
+        z = method.scale * np.asarray(x[sample] @ params["bank"]["v"]) * scores[sample] * mask
+        np.testing.assert_allclose(delta[sample], z @ params["bank"]["u"], rtol=1e-4, atol=1e-4)
+    assert 1 < aux.mean_active_rank() < RANK
+
+
+@pytest.mark.parametrize("granularity", ["token", "sample", "layer"])
+@pytest.mark.parametrize("name", ["softplus", "relu", "softmax"])
+def test_padding_stays_out(granularity, name, x):
+    """Losses, usage, outputs of valid tokens and gradients do not see what padding holds."""
+    method = LoRASP(rank=RANK, granularity=granularity, score_function=name)
+    params = arrays(method)
+
+    @jax.jit
+    def run(x):
+        def loss(params):
+            y, aux = method.delta(params, x, token_mask=MASK)
+            y = jnp.where(MASK[..., None], y, 0)
+            return y.sum() + sum(aux.losses.values()), (y, aux.losses, aux.usage)
+
+        return jax.value_and_grad(loss, has_aux=True)(params)
+
+    clean, padded = run(x), run(jnp.where(MASK[..., None], x, 1e3))
+    for a, b in zip(jax.tree.leaves(clean), jax.tree.leaves(padded), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
+
+
+def test_one_token_needs_no_pool(x):
+    params = arrays(LoRASP(rank=RANK))
+    one = [LoRASP(rank=RANK, granularity=g).delta(params, x[0, 0]) for g in ("token", "sample")]
+    for a, b in zip(jax.tree.leaves(one[0]), jax.tree.leaves(one[1]), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_usage_counts_valid_tokens(x):
+    method = LoRASP(rank=RANK, energy_target=0.7)
+    params = arrays(method)
+    _, aux = method.delta(params, x, token_mask=MASK)
+    scores = np.asarray(scores_of(method, params, x)[0])[np.asarray(MASK)]
+    expected = sum(_smallest(s, 0.7).astype(int) for s in scores)
+    np.testing.assert_array_equal(aux.usage, expected)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"score_function": "gelu"}, "score_function must be one of 'softplus', 'relu', 'softmax'"),
+        ({"granularity": "batch"}, "granularity must be one of 'token', 'sample', 'layer'"),
+        ({"router": "softmax", "score_function": "relu"}, "only a 'gelu' router"),
+    ],
+)
+def test_bad_fields(fields, message):
+    with pytest.raises(ValueError, match=message):
+        LoRASP(**fields)

@@ -1,0 +1,245 @@
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lorasp_jax.models.inputs import OPENPI
+from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.models.smolvla import SmolVLAConfig
+from lorasp_jax.policies import prompts
+from lorasp_jax.policies.policy import Policy
+from lorasp_jax.policies.processor import Processor, robot_slots, to_absolute, to_delta
+from lorasp_jax.policies.prompt_table import Ids, PromptTable
+from lorasp_jax.policies.statistics import Statistics
+from lorasp_jax.policies.tokenizer import Offline
+
+DIM = 8
+RNG = np.random.default_rng(0)
+ROBOTS = {"piper": ((0, 1, 2, 3, 4, 5, 7), 6), "panda": ((0, 1, 2, 3, 4, 5, 6, 7), 7)}
+
+
+def processor(num_joints: int) -> Processor:
+    slots = robot_slots(num_joints)
+    state = RNG.normal(2.0, 3.0, (4, 5, len(slots)))
+    action = RNG.normal(-1.0, 0.5, (4, 5, len(slots)))
+    valid = np.ones((4, 5), bool)
+    statistics = Statistics.measure(state, action, valid, slots=slots, dim=DIM)
+    tokens = jnp.array([[3, 4, 0], [5, 0, 0]])
+    return Processor(slots, statistics, PromptTable(Ids(tokens, tokens > 0)), image_size=16)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_slots(robot):
+    slots, joints = ROBOTS[robot]
+    assert robot_slots(joints) == slots
+    assert np.flatnonzero(processor(joints).slot_mask).tolist() == list(slots)
+    with pytest.raises(ValueError, match="1 to 7 joints here, got 8"):
+        robot_slots(8)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_decode_inverts_normalize(robot):
+    own = processor(ROBOTS[robot][1])
+    actions = RNG.normal(size=(3, 4, len(own.robot_slots))).astype(np.float32)
+    inside = own.normalize_actions(jnp.asarray(actions))
+    assert inside.shape == (3, 4, DIM)
+    assert not inside[..., ~own.slot_mask].any()
+    np.testing.assert_allclose(own.decode(inside), actions, atol=1e-5)
+
+
+def test_encode():
+    own = processor(6)
+    image = RNG.integers(0, 256, (2, 16, 16, 3), np.uint8)
+    state = RNG.normal(size=(2, 7)).astype(np.float32)
+    raw = {"image": {"side": jnp.asarray(image)}, "state": jnp.asarray(state)}
+    obs = jax.jit(lambda own, raw, ids: own.encode(raw, ids))(own, raw, jnp.array([1, 0]))
+    np.testing.assert_allclose(obs.images["side"], image / 127.5 - 1, atol=1e-6)
+    assert obs.tokens.tolist() == [[5, 0, 0], [3, 4, 0]]
+    assert obs.token_mask.sum(axis=1).tolist() == [1, 2]
+    assert obs.image_masks["side"].all()
+    assert not obs.state[:, 6].any()
+    gripper = (state[:, -1] - own.statistics.state["mean"][7]) / own.statistics.state["std"][7]
+    np.testing.assert_allclose(obs.state[:, 7], gripper, rtol=1e-5)
+
+
+def test_bad_observations_raise():
+    own = processor(6)
+    state = jnp.zeros((2, 7))
+    with pytest.raises(ValueError, match=r"'side' needs uint8 \[B, H, W, 3\], got float32"):
+        own.encode(
+            {"image": {"side": jnp.zeros((2, 16, 16, 3))}, "state": state}, jnp.zeros(2, int)
+        )
+    with pytest.raises(ValueError, match="6 numbers need as many different slots"):
+        own.encode({"image": {}, "state": state[:, :6]}, jnp.zeros(2, int))
+
+
+def test_cameras_of_any_size_keep_their_names():
+    own = processor(6)
+    shades = {"wrist": ((2, 32, 32, 3), 255), "side": ((2, 8, 16, 3), 0)}
+    raw = {
+        "image": {
+            name: jnp.full(shape, shade, jnp.uint8) for name, (shape, shade) in shades.items()
+        },
+        "state": jnp.zeros((2, 7)),
+    }
+    found = own.encode(raw, jnp.zeros(2, int)).images
+    assert {name: image.shape for name, image in found.items()} == dict.fromkeys(
+        shades, (2, 16, 16, 3)
+    )
+    np.testing.assert_allclose(found["wrist"], 1, atol=1e-6)
+    np.testing.assert_allclose(found["side"], -1, atol=1e-6)
+    grey = {**raw, "image": {"side": raw["image"]["side"][..., 0]}}
+    with pytest.raises(ValueError, match=r"got uint8 \(2, 8, 16\)"):
+        own.encode(grey, jnp.zeros(2, int))
+
+
+def test_unused_slots_reach_no_motor():
+    own = processor(6)
+    chunk = jnp.asarray(RNG.normal(size=(2, 4, DIM)), jnp.float32)
+    np.testing.assert_array_equal(own.decode(chunk), own.decode(chunk.at[..., 6].set(99.0)))
+    moved = own.decode(chunk.at[..., 7].add(1.0)) - own.decode(chunk)
+    assert not moved[..., :6].any()
+    np.testing.assert_allclose(moved[..., 6], own.statistics.action["std"][7], rtol=1e-4)
+
+
+def published(num_joints: int = 6, relative: tuple[bool, ...] = (), **choices) -> Processor:
+    """With openpi's inputs: one block of numbers, noise in all of the 32 slots."""
+    inputs = dataclasses.replace(OPENPI, delta=relative)
+    config = dataclasses.replace(Pi0Config.base(), image_size=28, inputs=inputs)
+    state, action = RNG.normal(2.0, 3.0, (2, 20, num_joints + 1))
+    valid = np.ones(20, bool)
+    statistics = Statistics.measure(
+        state, action, valid, slots=range(num_joints + 1), dim=num_joints + 1
+    )
+    ids = jnp.array([[3, 4, 0]])
+    prompts = PromptTable(Ids(ids, ids > 0))
+    return Processor.of(config, statistics, prompts, num_joints=num_joints, **choices)
+
+
+def test_published_weights_have_one_block_of_numbers():
+    own = published()
+    assert own.robot_slots == (0, 1, 2, 3, 4, 5, 6)
+    assert (own.slot_mask.sum(), own.flow_slots.sum()) == (7, 32)
+    assert processor(6).flow_slots.tolist() == processor(6).slot_mask.tolist()
+    state = RNG.normal(size=(2, 7)).astype(np.float32)
+    obs = own.encode({"image": {}, "state": jnp.asarray(state)}, jnp.zeros(2, int))
+    mean, std = own.statistics.state["mean"][:7], own.statistics.state["std"][:7]
+    np.testing.assert_allclose(obs.state[:, :7], (state - mean) / (std + 1e-6), rtol=1e-5)
+    assert not obs.state[:, 7:].any()
+    actions = RNG.normal(size=(2, 4, 7)).astype(np.float32)
+    np.testing.assert_allclose(own.decode(own.normalize_actions(actions)), actions, atol=1e-5)
+
+
+def test_missing_cameras_are_black_and_masked():
+    """The robot's two cameras fill two of pi0's three pictures."""
+    own = published(cameras={"base_0_rgb": "side", "left_wrist_0_rgb": "wrist"})
+    raw = {
+        "image": {
+            "wrist": jnp.full((2, 14, 28, 3), 255, jnp.uint8),
+            "side": jnp.full((2, 28, 28, 3), 0, jnp.uint8),
+        },
+        "state": jnp.zeros((2, 7)),
+    }
+    obs = jax.jit(lambda own, raw: own.encode(raw, jnp.zeros(2, int)))(own, raw)
+    assert list(obs.images) == list(Pi0Config.base().cameras)
+    assert {name: mask.tolist() for name, mask in obs.image_masks.items()} == {
+        "base_0_rgb": [True, True],
+        "left_wrist_0_rgb": [True, True],
+        "right_wrist_0_rgb": [False, False],
+    }
+    wrist = obs.images["left_wrist_0_rgb"]
+    np.testing.assert_allclose(wrist[:, 7:21], 1, atol=1e-6)
+    assert (wrist[:, :7] == -1).all()
+    assert obs.images["right_wrist_0_rgb"].shape == (2, 28, 28, 3)
+    assert (obs.images["right_wrist_0_rgb"] == -1).all()
+    with pytest.raises(ValueError, match="camera wrist is not among side"):
+        own.encode({**raw, "image": {"side": raw["image"]["side"]}}, jnp.zeros(2, int))
+    with pytest.raises(ValueError, match=r"backbone's cameras are base_0_rgb, .* got top"):
+        published(cameras={"top": "side"})
+
+
+def test_smolvla_has_its_bar_above():
+    config = dataclasses.replace(SmolVLAConfig.base(), image_size=64)
+    own = processor(6)
+    own = dataclasses.replace(own, image_size=64, inputs=config.inputs)
+    own = dataclasses.replace(own, robot_slots=robot_slots(6, config.inputs))
+    raw = {"image": {"side": jnp.full((1, 32, 64, 3), 255, jnp.uint8)}, "state": jnp.zeros((1, 7))}
+    found = own.encode(raw, jnp.zeros(1, int)).images["side"][0]
+    np.testing.assert_allclose(found[32:], 1, atol=1e-6)
+    assert (found[:32] == -1).all()
+
+
+def test_delta_actions():
+    """Joints count from the state, the gripper does not; numbers by hand."""
+    state = jnp.array([[1.0, 2.0, 3.0]])
+    actions = jnp.array([[[1.5, 2.0, 0.1], [0.0, 5.0, 0.2]]])
+    found = to_delta(actions, state, (True, True, False))
+    np.testing.assert_allclose(found, [[[0.5, 0.0, 0.1], [-1.0, 3.0, 0.2]]], atol=1e-6)
+    np.testing.assert_allclose(to_delta(actions, state, (True,))[0, 1], [-1.0, 5.0, 0.2])
+    np.testing.assert_allclose(to_absolute(found, state, (True, True, False)), actions, atol=1e-6)
+
+
+@pytest.mark.parametrize("said", ["by the caller", "by the backbone"])
+def test_policies_of_delta_actions_move_absolutely(said):
+    mask = (*[True] * 6, False)
+    own = published(delta=mask) if said == "by the caller" else published(relative=mask)
+    plain = published(relative=mask, delta=())
+    own = dataclasses.replace(own, statistics=plain.statistics)
+    state = jnp.asarray(RNG.normal(size=(2, 7)), jnp.float32)
+    actions = jnp.asarray(RNG.normal(size=(2, 4, 7)), jnp.float32)
+    relative = actions - state[:, None].at[..., 6].set(0)
+    inside = own.normalize_actions(actions, state)
+    np.testing.assert_allclose(inside, plain.normalize_actions(relative), atol=1e-5)
+    np.testing.assert_allclose(own.decode(inside, state), actions, atol=1e-5)
+    with pytest.raises(ValueError, match="give the raw state"):
+        own.decode(inside)
+    with pytest.raises(ValueError, match="said of 14 numbers, the robot has 7"):
+        published(relative=(True,) * 14)
+
+
+def test_prompts_tell_the_normalised_state():
+    """Of the robot's slots, with its noise; by the plain function."""
+    config, texts = Pi0Config.nano_pi05(), ["press the button", "push it"]
+    state, action = RNG.normal(2.0, 3.0, (2, 50, 7))
+    valid = np.ones(50, bool)
+    statistics = Statistics.measure(state, action, valid, slots=range(7), dim=7)
+    table = PromptTable.of(Offline(), texts, config, num_joints=6)
+    own = Processor.of(config, statistics, table, num_joints=6)
+    raw = {"image": {}, "state": jnp.asarray(state, jnp.float32)}
+    noise = jnp.asarray(RNG.normal(size=(50, DIM)), jnp.float32)
+    rows = RNG.integers(0, 2, 50)
+    obs = jax.jit(Processor.encode)(own, raw, jnp.asarray(rows), state_noise=noise)
+    low, high = np.quantile(state, [0.01, 0.99], axis=0)
+    numbers = 2 * (state - low) / (high - low) - 1 + noise[:, [0, 1, 2, 3, 4, 5, 7]]
+    np.testing.assert_allclose(obs.state[:, [0, 1, 2, 3, 4, 5, 7]], numbers, atol=1e-5)
+    numbers = np.asarray(obs.state[:, [0, 1, 2, 3, 4, 5, 7]])
+    wanted = [prompts.pi05(texts[row], mine) for row, mine in zip(rows, numbers, strict=True)]
+    ids, mask = Offline().encode(wanted, config.max_tokens, complete=True)
+    np.testing.assert_array_equal(obs.tokens, ids)
+    np.testing.assert_array_equal(obs.token_mask, mask)
+
+
+class Still:
+    """A backbone that answers its own state, which makes the whole path visible."""
+
+    def sample_actions(self, key, obs, *, num_steps, slots, return_aux):
+        chunk = jnp.broadcast_to(obs.state[:, None] * slots, (2, 4, DIM))
+        return chunk, {"steps": num_steps}
+
+
+def test_policy_goes_from_robot_to_robot():
+    own = processor(6)
+    raw = {
+        "image": {},
+        "state": jnp.asarray(own.statistics.state["mean"][jnp.array(own.robot_slots)]),
+    }
+    raw["state"] = jnp.broadcast_to(raw["state"], (2, 7))
+    policy = Policy(Still(), own)
+    actions, aux = policy.sample(
+        jax.random.key(0), raw, jnp.zeros(2, int), num_steps=4, return_aux=True
+    )
+    mean = own.statistics.action["mean"][jnp.array(own.robot_slots)]
+    np.testing.assert_allclose(actions, jnp.broadcast_to(mean, (2, 4, 7)), atol=1e-5)
+    assert aux == {"steps": 4}

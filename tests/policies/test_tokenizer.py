@@ -1,0 +1,77 @@
+import hashlib
+import pkgutil
+
+import numpy as np
+import pytest
+
+import envs
+from envs import tasks
+from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.policies import tokenizer
+
+
+def test_vocabulary_is_frozen():
+    """Shipped weights depend on every id. Only reserved entries may change, and then this hash."""
+    assert len(tokenizer.VOCABULARY) == tokenizer.VOCABULARY_SIZE
+    assert sorted(tokenizer.VOCABULARY.values()) == list(range(tokenizer.VOCABULARY_SIZE))
+    digest = hashlib.sha256("\n".join(tokenizer.VOCABULARY).encode()).hexdigest()
+    assert digest[:16] == "47bb2a5f5d2d5882"
+
+
+def test_known_words_are_one_token():
+    texts = [
+        "put the grape in the basket",
+        "Press the RED button",
+        "open the lid of the pot",
+        "pour the block out of the cup",
+    ]
+    ids, valid = tokenizer.encode(texts, 10)
+    assert ids.dtype == np.int32
+    assert valid.sum(axis=1).tolist() == [len(text.split()) for text in texts]
+    assert not ids[~valid].any()
+    words = [list(tokenizer.VOCABULARY)[i] for i in ids[1, :4]]
+    assert words == ["press", "the", "red", "button"]
+
+
+def test_any_printable_ascii_text_encodes():
+    text = "".join(map(chr, range(32, 127)))
+    ids, valid = tokenizer.encode([text, "zyzzyva-42!"], 100)
+    assert tokenizer.VOCABULARY["[UNK]"] not in ids[valid]
+
+
+@pytest.mark.parametrize("text", ["", "press the red button now or never", "drücke 按"])
+def test_what_cannot_be_encoded_raises(text):
+    with pytest.raises(ValueError, match=r"valid are 1 to 4|tokenizer lacks"):
+        tokenizer.encode([text], 4)
+
+
+def test_limit_is_the_last_length_that_fits():
+    assert tokenizer.encode(["press the red button"], 4)[1].all()
+    with pytest.raises(ValueError, match="has 4 tokens; valid are 1 to 3"):
+        tokenizer.encode(["press the red button"], 3)
+    assert [array.shape for array in tokenizer.encode([], 3)] == [(0, 3), (0, 3)]
+
+
+def test_spacing_case_and_full_stops():
+    texts = ["press the button", "  Press\tTHE\n button ", "press the button."]
+    ids, valid = tokenizer.encode(texts, 6)
+    np.testing.assert_array_equal(ids[0], ids[1])
+    np.testing.assert_array_equal(ids[0, :3], ids[2, :3])
+    assert valid.sum(axis=1).tolist() == [3, 3, 4]
+
+
+def test_unknown_words_are_spelled():
+    entries = list(tokenizer.VOCABULARY)
+    ids, valid = tokenizer.encode(["xylo", "yxlo"], 8)
+    assert [entries[i] for i in ids[0][valid[0]]] == ["x", "##y", "##l", "##o"]
+    assert [entries[i] for i in ids[1][valid[1]]] == ["y", "##x", "##l", "##o"]
+
+
+@pytest.mark.parametrize("size", ["nano", "small"])
+def test_instructions_of_every_task_are_known_words(size):
+    limit = getattr(Pi0Config, size)().max_tokens
+    for name in (module.name for module in pkgutil.iter_modules(tasks.__path__)):
+        texts = envs.make(name).instructions
+        ids, valid = tokenizer.encode(texts, limit)
+        assert valid.sum(axis=1).tolist() == [len(text.split()) for text in texts], name
+        assert len(np.unique(ids, axis=0)) == len(texts)

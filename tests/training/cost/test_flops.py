@@ -1,0 +1,55 @@
+"""Operations counted by hand, and against XLA's own count."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from lorasp_jax.models.pi0 import Pi0Config
+from lorasp_jax.training.cost import flops
+from tests.models.drawn import drawn, observation
+
+X, W = jnp.ones((6, 8)), jnp.ones((8, 5))
+PRODUCT = 2 * 6 * 8 * 5
+
+
+def layers(x, w):
+    def body(x, w):
+        return x @ w, None
+
+    return jax.lax.scan(body, x, w)[0]
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments", "expected"),
+    [
+        (jnp.matmul, (X, W), PRODUCT),
+        (jax.jit(lambda x, w: jnp.tanh(x @ w)), (X, W), PRODUCT),
+        (layers, (X, jnp.ones((4, 8, 8))), 4 * 2 * 6 * 8 * 8),
+        (jax.grad(lambda w: (X @ w).sum()), (W,), PRODUCT),  # the sum itself is not used
+        (jax.grad(lambda w: jnp.square(X @ w).sum()), (W,), 2 * PRODUCT),
+        (lambda x, w: jax.lax.cond(x.sum() > 0, lambda: x @ w, lambda: x[:, :5]), (X, W), PRODUCT),
+        (lambda x: jnp.einsum("bij,bkj->bik", x, x), (jnp.ones((3, 4, 5)),), 2 * 3 * 4 * 4 * 5),
+    ],
+)
+def test_counted_by_hand(function, arguments, expected):
+    assert flops.count(function, *arguments) == expected
+
+
+def test_shapes_are_enough():
+    assert flops.count(jnp.matmul, jax.ShapeDtypeStruct((6, 8), "bfloat16"), W) == PRODUCT
+
+
+def test_a_backbone_needs_what_xla_says():
+    config = Pi0Config.nano()
+    model, obs = drawn(config), observation(config, 2)
+    actions = jnp.zeros((2, config.chunk, config.action_dim))
+
+    def loss(model, obs):
+        return model.loss(jax.random.key(0), obs, actions)[0].mean()
+
+    xla = jax.jit(loss).lower(model, obs).cost_analysis()["flops"]
+    assert 0.75 * xla < flops.count(loss, model, obs) < xla  # XLA counts elementwise work too
+
+
+def test_utilisation_needs_a_known_device():
+    assert flops.utilisation(1e12, 1.0) is None  # a CPU

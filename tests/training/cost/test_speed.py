@@ -1,0 +1,74 @@
+"""Throughput, waiting, memory: what a stretch of steps reports beside its losses."""
+
+import re
+from types import SimpleNamespace
+
+import jax
+import pytest
+
+from envs.compilation import messages
+from lorasp_jax.training.cost import flops, speed
+from lorasp_jax.training.cost.speed import Speed
+from lorasp_jax.training.stretches import Stretches
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that is set by hand."""
+    now = SimpleNamespace(seconds=100.0)
+    monkeypatch.setattr(speed.time, "perf_counter", lambda: now.seconds)
+    return now
+
+
+def device(**memory):
+    return [SimpleNamespace(device_kind="NVIDIA H100 80GB HBM3", memory_stats=lambda: memory)]
+
+
+def test_a_stretch(clock, monkeypatch):
+    monkeypatch.setattr(jax, "devices", device)
+    monkeypatch.setattr(jax, "device_count", lambda: 2)
+    peak = flops.PEAK["NVIDIA H100"]
+    timer = Speed(batch_size=8, operations=0.5 * peak)
+    for stretch in range(2):
+        clock.seconds += 7 * stretch  # between two stretches
+        timer.begin()
+        clock.seconds += 5
+        timer.begin()  # the next step of the same stretch
+        clock.seconds += 5
+        found = timer.end(20)
+        assert found["speed/samples_per_second"] == 20 * 8 / 10
+        assert found["speed/flop_utilisation"] == pytest.approx(20 * 0.5 / 2 / 10)
+        assert "speed/data_wait" not in found
+
+
+def test_waiting_counts_where_the_device_had_nothing_to_do(clock):
+    timer = Speed(batch_size=8, operations=None)
+    for times in range(2):
+        timer.begin()
+        for ready in (False, True, False):
+            with timer.waiting(SimpleNamespace(is_ready=lambda ready=ready: ready)):
+                clock.seconds += 2
+        found = timer.end(3)
+        assert found["speed/data_wait"] == pytest.approx(2 / 6), times
+        assert "speed/flop_utilisation" not in found
+
+
+def test_memory_where_it_is_reported(monkeypatch):
+    assert speed.memory() == {}  # a CPU
+    memory = device(bytes_in_use=2**30, peak_bytes_in_use=3 * 2**29, num_allocs=4)
+    monkeypatch.setattr(jax, "local_devices", lambda: memory)
+    assert speed.memory() == {"memory/in_use_gib": 1.0, "memory/peak_gib": 1.5}
+    monkeypatch.setattr(jax, "local_devices", device)
+    assert speed.memory() == {}
+
+
+def test_the_terminal_tells_what_compiles(capsys, monkeypatch):
+    """In words, for how long, and that it is the first time only."""
+    monkeypatch.setattr(messages, "PATIENCE", 0.0)
+    many = jax.jit(lambda frozen, data, state, key, count: state + count, static_argnums=4)
+    run = Stretches(many, jax.numpy.ones(2), jax.numpy.ones(2), Speed(1, None))
+    for _ in range(2):
+        run(jax.numpy.ones(2), jax.random.key(0), 3)
+    told = capsys.readouterr().err
+    assert len(re.findall(r"compiling the training step .*\.\.\.", told)) == 1
+    assert re.search(r"compiled the training step in \d+ s", told)
