@@ -34,16 +34,16 @@ __all__ = [
 
 _HOMES = {
     "Env": "env",
-    "Episodes": "episodes",
-    "Randomization": "randomization",
+    "Episodes": "datasets.episodes",
+    "Randomization": "scene.randomization",
     "State": "state",
     "Trajectory": "state",
-    "collect": "collection",
-    "expert_success": "collection",
+    "collect": "experts.collection",
+    "expert_success": "experts.collection",
     "make": "making",
 }
 
-envs.ids.register()
+envs.interop.ids.register()
 
 
 def __getattr__(name: str) -> Any:

@@ -29,7 +29,7 @@ _RANGES: dict[str, tuple[int, ...]] = {
     "num_envs": (2**20,),
     "image_size": (2**12,),
     "antialias": (16,),
-    "distractors": (envs.distractors.MOST, 0),
+    "distractors": (envs.scene.distractors.MOST, 0),
 }
 
 
@@ -79,7 +79,7 @@ def make(
     )
     control_dt = _checked_dt(control_dt, found_task.time_limit)
     _check_learning(actions, reward, discount)
-    model = scene.build(found_task.scene + envs.distractors.mjcf(distractors), found_robot)
+    model = scene.build(found_task.scene + envs.scene.distractors.mjcf(distractors), found_robot)
     return Env(
         task=found_task,
         robot=found_robot,

@@ -276,7 +276,7 @@ def replacing(file: Path) -> Iterator[Path]:
 def creating(path: str | os.PathLike) -> Iterator[Path]:
     """A temporary folder that takes the path's place when all went well, else nothing is left.
 
-    One process at a time may create the path, see `envs.datasets.locks`. What one left that was killed is
+    One process at a time may create the path (`envs.datasets.locks`). Leftovers of a killed one are
     deleted.
 
     Raises:

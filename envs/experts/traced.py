@@ -133,7 +133,7 @@ def _name(env: Env, tree: Any, kinds: tuple[Any, ...], settings: tuple[Any, ...]
 @functools.cache
 def _sources() -> str:
     """SHA-256 of this package's source files, hexadecimal."""
-    found, package = hashlib.sha256(), Path(__file__).parent
+    found, package = hashlib.sha256(), Path(__file__).parents[1]
     for file in sorted(package.rglob("*.py")):
         found.update(f"{file.relative_to(package)}\n".encode() + file.read_bytes())
     return found.hexdigest()

@@ -4,7 +4,7 @@ env = VectorEnv(envs.make("press", num_envs=64, image_size=64))
 observation, info = env.reset(seed=0)
 observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
 
-`make_vec` and `make` are what `gymnasium.make_vec` and `gymnasium.make` call, see `envs.interop.ids`.
+`gymnasium.make_vec` and `gymnasium.make` call `make_vec` and `make` (`envs.interop.ids`).
 """
 
 import dataclasses

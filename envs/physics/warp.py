@@ -44,7 +44,7 @@ class WarpSteps:
         self._callables: dict[tuple[str, ...], Any] = {}
 
     def __call__(self, changes: Changes, start: Data, controls: jax.Array) -> Sequence[jax.Array]:
-        """The `MOVING` of one world after S physics steps, as in `envs.physics.physics.Physics.advance`."""
+        """The `MOVING` of one world after S physics steps, as `Physics.advance` gives them."""
         names = tuple(sorted(changes))
         differing = [jnp.asarray(changes[name], jnp.float32) for name in names]
         state = [getattr(start, name) for name in (*_FIXED, *MOVING)]

@@ -27,9 +27,12 @@ _PACKAGE = __name__.rpartition(".")[0]
 
 
 def names() -> list[str]:
-    """Names of the backbones: the folders beside this file."""
+    """Names of the backbones: the folders beside this file that define a `Config`."""
     here = importlib.import_module(_PACKAGE).__path__
-    return sorted(module.name for module in pkgutil.iter_modules(here) if module.ispkg)
+    folders = [module.name for module in pkgutil.iter_modules(here) if module.ispkg]
+    return sorted(
+        n for n in folders if hasattr(importlib.import_module(f"{_PACKAGE}.{n}"), "Config")
+    )
 
 
 def find(name: str) -> type[BackboneConfig]:

@@ -10,7 +10,9 @@ import jax.numpy as jnp
 
 from lorasp_jax.models.inputs import OURS, InputConfig
 from lorasp_jax.peft import _fields
-from lorasp_jax.policies.tokenizer import VOCABULARY_SIZE
+
+VOCABULARY_SIZE = 320
+"""Rows of the embedding table of our own bases, those of reserved words included."""
 
 Remat = Literal["none", "products", "full"]
 _LARGEST = 2**24

@@ -1,6 +1,7 @@
-"""Adapter methods, framework-free: one frozen dataclass in one file each.
+"""Adapter methods, framework-free: one frozen dataclass in one file or folder each.
 
-`create("lora_sp", rank=64)` finds a method by its file's name; a new file is a new method.
+`create("lora_sp", rank=64)` finds a method by its file's name; a new file is a new method. Names
+that begin with `_` hold what methods share.
 """
 
 import difflib
@@ -16,7 +17,7 @@ from lorasp_jax.peft.dora import DoRA
 from lorasp_jax.peft.full import FullFineTuning
 from lorasp_jax.peft.lora import LoRA
 from lorasp_jax.peft.lora_moe import LoRAMoE
-from lorasp_jax.peft.lora_sp.method import LoRASP
+from lorasp_jax.peft.lora_sp import LoRASP
 
 __all__ = [
     "AdaLoRA",
@@ -34,8 +35,8 @@ __all__ = [
 
 
 def names() -> list[str]:
-    """Names of the methods: the files of this package but `method`."""
-    return sorted(m.name for m in pkgutil.iter_modules(__path__) if m.name != "method")
+    """Names of the methods: the files and folders of this package, but for `_names`."""
+    return sorted(m.name for m in pkgutil.iter_modules(__path__) if not m.name.startswith("_"))
 
 
 def find(name: str) -> type[Method]:
@@ -50,7 +51,7 @@ def find(name: str) -> type[Method]:
         raise ValueError(f"unknown method {short(name)}{hint}; valid are {', '.join(names())}.")
     module = importlib.import_module(f"{__name__}.{name}")
     classes = [c for c in vars(module).values() if isinstance(c, type) and issubclass(c, Method)]
-    (cls,) = [c for c in classes if c.__module__ == module.__name__]
+    (cls,) = [c for c in classes if f"{c.__module__}.".startswith(f"{module.__name__}.")]
     return cls
 
 

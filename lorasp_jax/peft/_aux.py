@@ -21,7 +21,8 @@ class Aux:
       losses: fp32 scalars by name, already averaged over the valid tokens.
       token_mask: bool [...tokens], True where a token counts; None means all do.
       usage: f32 [R], for how many valid tokens each direction was in use; None without a gate.
-      statistics: sums over valid tokens by layer path, where `lorasp_jax.adapters.compress.calibration` observes.
+      statistics: sums over valid tokens by layer path, during calibration
+        (`lorasp_jax.adapters.compress.calibration`).
     """
 
     active_rank: jax.Array | None = None

@@ -76,8 +76,8 @@ class Method:
 
     @property
     def name(self) -> str:
-        """The method's file name, as `create` takes it."""
-        return type(self).__module__.rpartition(".")[2]
+        """As `create` takes it."""
+        return name_of(type(self))
 
     @property
     def needs_statistics(self) -> bool:
@@ -350,10 +350,16 @@ class _Between:
         return list(zip(jnp.split(z, n, axis=-1), of_each, strict=True))
 
 
+def name_of(cls: type[Method]) -> str:
+    """The name of the file that defines a method, or of the folder around its `method.py`."""
+    folder, _, file = cls.__module__.rpartition(".")
+    return folder.rpartition(".")[2] if file == "method" else file
+
+
 def check_names(cls: type[Method], values: Sequence[Any], fields: Sequence[str] | dict) -> None:
     """Raises a ValueError unless these are values and names for a method's fields."""
     valid = [field.name for field in dataclasses.fields(cls)]  # pyright: ignore[reportArgumentType]
-    name = cls.__module__.rpartition(".")[2]
+    name = name_of(cls)
     if len(values) > len(valid):
         raise ValueError(f"{name} has {len(valid)} fields, not {len(values)}: {', '.join(valid)}.")
     for field in fields:

@@ -15,8 +15,7 @@ import numpy as np
 import tokenizers
 from tokenizers import models, normalizers, pre_tokenizers
 
-VOCABULARY_SIZE = 320
-"""Rows of the embedding table, reserved ones included."""
+from lorasp_jax.models.config import VOCABULARY_SIZE
 
 _SPECIAL = ("[PAD]", "[UNK]")
 _CHARACTERS = tuple(chr(code) for code in range(33, 127) if not chr(code).isupper())

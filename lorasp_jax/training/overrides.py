@@ -70,7 +70,7 @@ def parse(arguments: Sequence[str]) -> Command:
         parser.print_help()
         raise ValueError("no experiment was named: add --config, such as configs/multitask.py")
     if wants_help:
-        _parser(type(config.peft).__module__.rpartition(".")[2]).print_help()
+        _parser(config.peft.name).print_help()
         print(f"\n{_on_scales(known.config, known.scale)}")
         rest = ["--help"]  # it may stand where an option wants its value
     if known.method is not None:

@@ -95,7 +95,7 @@ def mask(actions):
 @pytest.fixture(scope="module")
 def trained(adapted, obs, actions, mask):
     """Loss, aux and gradients."""
-    graphdef, adapters, frozen = lorasp_jax.adaptation.split(adapted)
+    graphdef, adapters, frozen = lorasp_jax.split(adapted)
 
     def loss(adapters):
         model = nnx.merge(graphdef, adapters, frozen)

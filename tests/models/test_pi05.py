@@ -208,7 +208,7 @@ def test_a_step_trains_adapters_on_every_dense_layer(model, obs, actions):
     """Those of the norms too; their reports say how many conditions they saw."""
     rules = presets.rules("expert-only", LoRA(rank=2))
     adapted = lorasp_jax.adapt(model, rules, rngs=nnx.Rngs(1))
-    graphdef, adapters, frozen = lorasp_jax.adaptation.split(adapted)
+    graphdef, adapters, frozen = lorasp_jax.split(adapted)
 
     @jax.jit
     def step(adapters):

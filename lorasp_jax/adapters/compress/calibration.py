@@ -41,7 +41,7 @@ def call(model: Any, batch: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Layer:
-    """One call of one matrix of a layer, as a report sees it; see `lorasp_jax.adapters.layers.einsum`.
+    """One call of one matrix of a layer, as a report of `layers.einsum` sees it.
 
     Attributes:
       method: the layer's own, or None.

@@ -13,7 +13,7 @@ from lorasp_jax.dense import AdapterParam
 from lorasp_jax.models.config import Remat
 
 _SLOW_TO_REPEAT = ("dot_product_attention_fwd_wrapper", "custom_vmap_call")
-"""Primitives of cuDNN's attention and of the adapters' kernel (`lorasp_jax.kernels.row_sharding`)."""
+"""Primitives of cuDNN's attention and of the adapters' kernel (`kernels.row_sharding`)."""
 _NAMED = "stored"
 
 

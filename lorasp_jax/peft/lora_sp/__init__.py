@@ -1,1 +1,5 @@
 """LoRA-SP (arXiv 2603.07404)."""
+
+from lorasp_jax.peft.lora_sp.method import LoRASP
+
+__all__ = ["LoRASP"]

@@ -10,7 +10,7 @@ scores reach the energy target η stay active. One function per equation of the 
     (14) router       L_router: balance and z                         `balance_loss`, `z_loss`
 
 Where the paper is silent (activation, initialisation, scale, form of the router losses) the choices
-are this project's; each is stated where it is made, the router's in `lorasp_jax.peft.lora_sp.router`.
+are this project's; each is stated where it is made, the router's in `router`.
 """
 
 import dataclasses
@@ -83,7 +83,7 @@ class LoRASP(Method):
     """Share of the steps in which it does."""
     normalized_bank: bool = False
     """Keep the bank's directions orthonormal, so that the scores' energy is that of ΔW and eq. (4),
-    ‖ΔW - ΔW_k‖ = √(1 - E_k) ‖ΔW‖, holds (`lorasp_jax.peft.lora_sp.bank`). Needs a side of at least R."""
+    ‖ΔW - ΔW_k‖ = √(1 - E_k) ‖ΔW‖, holds (see `bank`). Needs a side of at least R."""
     pruned: int = 0
     """Directions that pruning dropped. The router still scores them, behind the R others, as their
     energy counts in E_k."""
