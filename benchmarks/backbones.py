@@ -6,9 +6,9 @@
 A training step is this project's own, with AdamW and the auxiliary losses, on a batch that lies on
 the device; its state is donated. GiB is what the compiled program needs with its arguments, MFU the
 matrix products of loss and gradients a second (`lorasp_jax.training.cost.flops`, recomputation not
-counted) over the device's bf16 peak. Sampling is ten denoising steps in one program, from pictures to action
-chunk, by the model's `sampler`, which was made before. "largest" is the largest batch whose step is
-expected to need at most 24 GiB.
+counted) over the device's bf16 peak. Sampling is ten denoising steps in one program, from pictures
+to action chunk, by the model's `sampler`, which was made before. "largest" is the largest batch
+whose step is expected to need at most 24 GiB.
 """
 
 import argparse

@@ -5,9 +5,10 @@ from pathlib import Path
 
 
 def names(kind: str) -> list[str]:
-    """The names of all of a kind, task or robot."""
+    """The names of all of a kind, task or robot; those that begin with `_` are skipped."""
     folder = Path(__file__).parent / f"{kind}s"
-    return sorted(module.name for module in pkgutil.iter_modules([str(folder)]))
+    found = (module.name for module in pkgutil.iter_modules([str(folder)]))
+    return sorted(name for name in found if not name.startswith("_"))
 
 
 def check(kind: str, name: str) -> None:

@@ -14,8 +14,8 @@ import safetensors.numpy
 
 from envs.datasets.files import RefusedError
 from lorasp_jax.digest import DIGEST, sealed
+from tests import ROOT
 
-ROOT = Path(__file__).parent.parent
 Damage = Callable[[Path], None]
 Cases = Iterator[tuple[str, Damage]]
 ABSENT = object()

@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +12,9 @@ from lorasp_jax import peft
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.dense import Dense
 from lorasp_jax.peft import LoRA, LoRASP
+from tests import GOLDEN
 from tests.models.drawn import filled, moved
 
-GOLDEN = Path(__file__).parent / "golden"
 SP = LoRASP(rank=8, hidden_width=4)
 SIZES = {"rank": 8, "hidden_width": 4}
 

@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import importlib.util
 import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +12,9 @@ import pytest
 
 from envs import rewards
 from envs.state import State, where
+from tests import ROOT
 
-PATH = Path(__file__).parent.parent / "examples" / "ppo.py"
+PATH = ROOT / "examples" / "ppo.py"
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,9 @@ import pytest
 
 import train
 from lorasp_jax.training.run_folder import write_json
+from tests import ROOT
 from tests.runs import RESULTS
 
-ROOT = Path(__file__).parent.parent
 MULTITASK = ["--config", str(ROOT / "configs" / "multitask.py"), "--scale", "smoke"]
 NANO = ["--model.checkpoint", str(ROOT / "assets" / "pi0_nano")]
 

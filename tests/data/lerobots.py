@@ -10,7 +10,8 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-GOLDEN = Path(__file__).parent.parent / "golden"
+from tests import GOLDEN
+
 VERSIONS = ("v21", "v3")
 
 

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import threading
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -15,6 +14,7 @@ import numpy as np
 from envs import __main__ as command_line
 from envs.datasets import rlds, rlds_schema
 from envs.experts import collection
+from tests import ROOT
 
 COLLECT = "collect --task press --robot piper --num-episodes 20 --num-envs 6 --image-size 16"
 # Where a process is killed: a function, and which call of it the process does not survive.
@@ -65,7 +65,7 @@ def die_at(owner, name, call):
 def run_child(call):
     """What the tests call: a process that runs one of the functions below to its end."""
     code = f"from tests.envs import children; children.{call}"
-    root = Path(__file__).parents[2]
+    root = ROOT
     return subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, check=False)
 
 

@@ -1,17 +1,16 @@
 """Scenes and expert episodes that several tests look at; each is compiled once a session."""
 
 import functools
-import pkgutil
 
 import jax
 import numpy as np
 import pytest
 
 import envs
-from envs import robots, tasks
+from envs.names import names
 
-TASKS = sorted(module.name for module in pkgutil.iter_modules(tasks.__path__))
-ROBOTS = sorted(module.name for module in pkgutil.iter_modules(robots.__path__))
+TASKS = names("task")
+ROBOTS = names("robot")
 EPISODES = 32
 SHORT = ("press", "piper")  # whose episodes every run of the tests looks at
 

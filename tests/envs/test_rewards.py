@@ -1,7 +1,6 @@
 """Dense rewards: laws of the potential, which hold for every task, and how they become a reward."""
 
 import re
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -15,10 +14,11 @@ from envs.experts import expert
 from envs.rewards import potential
 from envs.state import State
 from envs.tasks import View
+from tests import ROOT
 from tests.envs import expert_in_c
 
 EPISODES = 4
-PAGE = Path(__file__).parents[2] / "docs" / "reinforcement_learning.md"
+PAGE = ROOT / "docs" / "reinforcement_learning.md"
 
 
 def stages(scene, data, size=1.0) -> np.ndarray:

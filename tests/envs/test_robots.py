@@ -1,7 +1,5 @@
 """Kinematics against the vendor's SDK and against MuJoCo, limits against what is published."""
 
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -10,8 +8,9 @@ import pytest
 
 from envs import robots
 from envs.robots import piper
+from tests import GOLDEN
 
-GOLDEN = np.load(Path(__file__).parent.parent / "golden" / "piper_fk.npz")
+GOLDEN = np.load(GOLDEN / "piper_fk.npz")
 
 
 def at_pose(scene, q) -> mujoco.MjData:

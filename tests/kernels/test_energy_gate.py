@@ -1,7 +1,6 @@
 """The energy gate against exact arithmetic, and its behaviour under JAX's transformations."""
 
 import functools
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +9,9 @@ import pytest
 
 from lorasp_jax.kernels import energy_gate as gate
 from lorasp_jax.peft import LoRASP
+from tests import GOLDEN
 
-GOLDEN = Path(__file__).parent.parent / "golden" / "energy_gate_exact.npz"
+GOLDEN = GOLDEN / "energy_gate_exact.npz"
 KERNEL = gate._pallas_boundary
 
 

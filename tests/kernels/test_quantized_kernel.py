@@ -1,7 +1,5 @@
 """int8 and nf4 kernels against their bounds, their definitions and qwix."""
 
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,8 +8,9 @@ from jax.scipy.special import ndtri
 
 from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul, one_by_one
 from lorasp_jax.kernels.quantized_kernel import KINDS, NF4, quantized
+from tests import GOLDEN
 
-GOLDEN = Path(__file__).parent.parent / "golden" / "quantized_kernels.npz"
+GOLDEN = GOLDEN / "quantized_kernels.npz"
 WORST = {"int8": 1 / 255, "nf4": (NF4[1] - NF4[0]) / 2}
 
 

@@ -1,7 +1,5 @@
 """pi0 against numbers recorded from openpi (tests/golden/pi0_tiny, fp32)."""
 
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,8 +10,9 @@ from lorasp_jax.models.checkpoints import published
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.pi0 import ExpertConfig, Pi0Config, VisionConfig
 from lorasp_jax.models.transformer.layers import block_mask, positions
+from tests import GOLDEN
 
-GOLDEN = Path(__file__).parent.parent / "golden" / "pi0_tiny"
+GOLDEN = GOLDEN / "pi0_tiny"
 EXPERT = ExpertConfig(width=64, depth=4, mlp=128, heads=8, kv_heads=1, head_dim=16)
 CONFIG = Pi0Config(
     vision=VisionConfig(width=32, depth=2, mlp=48, heads=2, patch=14),

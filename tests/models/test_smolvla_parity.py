@@ -5,7 +5,6 @@ here all of them go through the cache.
 """
 
 import dataclasses
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -22,8 +21,9 @@ from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.smolvla import SmolVLAConfig, weights
 from lorasp_jax.models.transformer.layers import block_mask, positions
 from lorasp_jax.peft import LoRA
+from tests import GOLDEN
 
-GOLDEN = Path(__file__).parent.parent / "golden" / "smolvla_tiny"
+GOLDEN = GOLDEN / "smolvla_tiny"
 CONFIG = SmolVLAConfig(
     vision=VisionConfig(width=32, depth=2, mlp=48, heads=4, patch=8, shuffle=4),
     language=ExpertConfig(width=64, depth=4, mlp=96, heads=4, kv_heads=2, head_dim=16),

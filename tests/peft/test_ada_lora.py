@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +10,8 @@ import optax
 import pytest
 
 from lorasp_jax.peft import AdaLoRA, LoRA, ada_lora
+from tests import GOLDEN
 
-GOLDEN = Path(__file__).parent.parent / "golden"
 LAYERS = ("lin.0", "lin.1", "lin.2")
 
 

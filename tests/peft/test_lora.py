@@ -1,15 +1,13 @@
 """LoRA against Hugging Face PEFT: forward, gradients and merged weights of a three-layer net."""
 
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from lorasp_jax.peft import LoRA
+from tests import GOLDEN
 
-GOLDEN = Path(__file__).parent.parent / "golden"
 SIDES = {"lora_a": "lora_A", "lora_b": "lora_B"}
 CASES = [
     ("lora_r8", [LoRA(rank=8, alpha=16)] * 3),

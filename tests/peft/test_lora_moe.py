@@ -1,7 +1,5 @@
 """LoRA-MoE: router losses against Hugging Face, routing against plain loops, identities."""
 
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,8 +7,9 @@ import pytest
 
 from lorasp_jax.peft import LoRA, LoRASP
 from lorasp_jax.peft.lora_moe import LoRAMoE, balance_loss, z_loss
+from tests import GOLDEN
 
-GOLDEN = Path(__file__).parent.parent / "golden" / "moe_switch_losses.npz"
+GOLDEN = GOLDEN / "moe_switch_losses.npz"
 D_IN, D_OUT, EXPERTS, RANK = 6, 5, 4, 2
 TOP1 = [
     LoRAMoE(EXPERTS, RANK, routing="top1"),

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +11,9 @@ import pytest
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.policies import prompts, tokenizer
 from lorasp_jax.policies.prompt_table import PromptTable
+from tests import GOLDEN
 
-GOLDEN = Path(__file__).parent.parent / "golden" / "tokenizers"
+GOLDEN = GOLDEN / "tokenizers"
 SMOLVLM = GOLDEN / "smolvlm_like_tokenizer.json"
 TEXTS = ["press the button", " pick_up\nthe cup "]
 PI05 = Pi0Config.nano_pi05()

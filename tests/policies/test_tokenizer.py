@@ -1,11 +1,10 @@
 import hashlib
-import pkgutil
 
 import numpy as np
 import pytest
 
 import envs
-from envs import tasks
+from envs.names import names
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.policies import tokenizer
 
@@ -70,7 +69,7 @@ def test_unknown_words_are_spelled():
 @pytest.mark.parametrize("size", ["nano", "small"])
 def test_instructions_of_every_task_are_known_words(size):
     limit = getattr(Pi0Config, size)().max_tokens
-    for name in (module.name for module in pkgutil.iter_modules(tasks.__path__)):
+    for name in names("task"):
         texts = envs.make(name).instructions
         ids, valid = tokenizer.encode(texts, limit)
         assert valid.sum(axis=1).tolist() == [len(text.split()) for text in texts], name

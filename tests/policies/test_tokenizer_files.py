@@ -3,7 +3,6 @@
 import json
 import shutil
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +10,9 @@ import sentencepiece
 
 from lorasp_jax.models.checkpoints import hub
 from lorasp_jax.policies import prompts, tokenizer
+from tests import GOLDEN
 
-GOLDEN = Path(__file__).parent.parent / "golden" / "tokenizers"
+GOLDEN = GOLDEN / "tokenizers"
 PROMPTS = json.loads((GOLDEN / "prompts.json").read_text())
 FILES = {"paligemma": "paligemma_like.model", "smolvlm": "smolvlm_like_tokenizer.json"}
 

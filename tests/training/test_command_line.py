@@ -12,8 +12,8 @@ from lorasp_jax.models import backbone
 from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.overrides import parse
 from lorasp_jax.training.run_folder import read_metrics
+from tests import ROOT
 
-ROOT = Path(__file__).parents[2]
 COMMAND = [
     *("--config", f"{ROOT}/configs/multitask.py", "--scale", "smoke", "--tasks", "press"),
     *("--targets", "paper", "--optim.batch-size", "8"),

@@ -24,6 +24,7 @@ from lorasp_jax.policies import tokenizer
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Statistics
 from lorasp_jax.training import base, export, setup
+from tests import ROOT
 from tests.models.drawn import drawn
 from tests.runs import CONFIG, leaves, make_run
 
@@ -108,7 +109,7 @@ def test_a_policy_comes_back_in_another_folder(tmp_path, monkeypatch, kind):
     elsewhere = tmp_path / "elsewhere"
     models.save(elsewhere / chosen.source, drawn(Pi0Config.dummy(), seed=1))
     command = [sys.executable, "-c", ELSEWHERE, str(run.folder)]
-    env = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    env = os.environ | {"PYTHONPATH": str(ROOT)}
     found = subprocess.run(
         command, check=False, cwd=elsewhere, env=env, capture_output=True, text=True
     )

@@ -5,13 +5,12 @@ import os
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 from lorasp_jax.training.interrupt import deferred, sigterm_as_interrupt
+from tests import ROOT
 
-ROOT = Path(__file__).parents[2]
 IMPORTING = """
 import os, runpy, sys
 

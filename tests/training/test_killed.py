@@ -7,7 +7,6 @@ import random
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -18,11 +17,11 @@ from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training import processes
 from lorasp_jax.training.checkpoint import WRITTEN
 from lorasp_jax.training.run_folder import read_metrics
+from tests import ROOT
 from tests.runs import leaves, repeatable
 from tests.several import environments
 from tests.training.worker import work
 
-ROOT = Path(__file__).parents[2]
 STEPS = 8
 
 

@@ -6,7 +6,6 @@ import os
 import resource
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,8 +18,8 @@ from lorasp_jax.peft import LoRASP
 from lorasp_jax.training import run_folder
 from lorasp_jax.training.run import Run
 from lorasp_jax.training.run_folder import MetricsLog, read_metrics, record_dataset
+from tests import ROOT
 
-ROOT = Path(__file__).parents[2]
 CONFIG = Config(name="a", scale="cpu", peft=LoRASP(rank=8))
 
 

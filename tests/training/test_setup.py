@@ -4,7 +4,6 @@ import dataclasses
 import io
 import json
 import time
-from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -29,6 +28,7 @@ from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.overrides import override
 from lorasp_jax.training.run import Run
+from tests import GOLDEN
 from tests.data.lerobots import golden
 from tests.models.drawn import drawn
 from tests.runs import CONFIG, leaves, random_episodes
@@ -71,7 +71,7 @@ def test_targets_of_the_command_line_can_be_presets(config, tmp_path):
 def test_a_tokenizer_of_another_model_is_found_before_anything_long(config, tmp_path, monkeypatch):
     """As are demonstrations that an older version of the tasks left."""
     console = Console(file=io.StringIO())
-    smolvlm = Path(__file__).parents[1] / "golden/tokenizers/smolvlm_like_tokenizer.json"
+    smolvlm = GOLDEN / "tokenizers/smolvlm_like_tokenizer.json"
     other = override(config, ["--model.tokenizer", str(smolvlm)])
     with pytest.raises(ValueError, match="demonstrations of other instructions"):
         setup._collect(Run(config, tmp_path, console, "", 0), ["press the red button"])

@@ -1,4 +1,4 @@
-"""Adapter folders of Hugging Face PEFT for Linen models; `lorasp_jax.adapters.io.hugging_face` has NNX."""
+"""Adapter folders of Hugging Face PEFT for Linen models; `hugging_face` has NNX."""
 
 import os
 from collections.abc import Mapping

@@ -1,10 +1,11 @@
 """The rule of LoRA-SP's public code, which differs from the paper's equations.
 
 For parity with results made by that code, github.com/dhkim-furiosa/LoRA-SP at dfbf57d, PyTorch;
-only facts about it are used here. Against the paper (`router`): scores may be negative and are ranked with their signs; the gate keeps the most directions whose energy stays *within* η,
-and always one, so E_k mostly falls short of η; the spectral loss is a ratio of sums over tokens;
-balance is Switch's on a softmax over all scores with the pruned ones at 0; the z-loss is
-ln(1 + lse), cut to lse in [-1, 10], which is -inf at the lower end.
+only facts about it are used here. Against the paper (`router`): scores may be negative and are
+ranked with their signs; the gate keeps the most directions whose energy stays *within* η, and
+always one, so E_k mostly falls short of η; the spectral loss is a ratio of sums over tokens;
+balance is Switch's on a softmax over all scores with the pruned ones at 0; the z-loss is ln(1 +
+lse), cut to lse in [-1, 10], which is -inf at the lower end.
 
 Unlike there, padding stays out and everything is in fp32.
 """

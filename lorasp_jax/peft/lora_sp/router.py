@@ -1,7 +1,7 @@
 """LoRA-SP's router: its scores, how scores of several tokens are pooled, and its losses.
 
-One function per equation of the paper (arXiv 2603.07404), all in fp32; `LoRASP` (`method`) puts them
-together. Padding stays out of everything that is summed over tokens.
+One function per equation of the paper (arXiv 2603.07404), all in fp32; `method` puts them together.
+Padding stays out of everything that is summed over tokens.
 """
 
 import dataclasses

@@ -20,8 +20,8 @@ from lorasp_jax.adapters.io import hugging_face
 from lorasp_jax.adapters.io.hugging_face_linen import load_peft_linen
 from lorasp_jax.dense import Dense
 from lorasp_jax.peft import AdaLoRA, DoRA, LoRA, LoRASP
+from tests import GOLDEN
 
-GOLDEN = Path(__file__).parent / "golden"
 FOLDER = GOLDEN / "adapter_lora"
 SIZES = (24, 40, 24, 16)
 

@@ -1,7 +1,6 @@
 """The public code's rule: its gate against recorded ranks, its losses against plain NumPy."""
 
 import fractions
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +9,11 @@ import pytest
 
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.peft.lora_sp import release
+from tests import GOLDEN
 from tests.cases import mostly_slow
 
 pytestmark = pytest.mark.slow
 
-GOLDEN = Path(__file__).parent / "golden"
 D_IN, D_OUT, RANK = 12, 10, 16
 METHODS = [LoRASP.release(rank=RANK), LoRASP.release(rank=RANK, projection=True)]
 

@@ -1,7 +1,6 @@
 """A dry run says what the run will need, and leaves nothing behind."""
 
 import dataclasses
-from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -22,10 +21,10 @@ from lorasp_jax.training import setup
 from lorasp_jax.training.cost import dry_run, preflight
 from lorasp_jax.training.overrides import Command, load
 from lorasp_jax.training.run import Run
+from tests import ROOT
 from tests.models.drawn import drawn
 from tests.runs import CONFIG, random_episodes
 
-ROOT = Path(__file__).parents[2]
 LIMIT, EPISODES = 50, 6
 
 

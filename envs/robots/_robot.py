@@ -1,0 +1,152 @@
+"""A robot arm as numbers, and as MJCF of primitive shapes.
+
+A robot's joint chain is stated once; its MuJoCo bodies and its analytic kinematics both come from
+that statement, so they cannot disagree. All hands share one tool frame, `tcp`: z points out of the
+hand, y is the axis along which the fingers open, and the finger tips end `TIP_LENGTH` further out.
+That lets the tasks and the expert talk about hands without knowing the robot.
+"""
+
+import dataclasses
+from typing import Protocol
+
+import mujoco
+import numpy as np
+
+TIP_LENGTH = 0.012  # m from the tcp to the end of the finger tips, the same on every hand
+TIP_RADIUS = 0.005  # m, sphere at each finger tip that touches tables, walls and buttons
+
+# The wrist camera sits on the outer side of the hand and looks along it, tilted 22 degrees towards
+# the tips (own choice: the tips stand in the lower half of the picture, the object above them).
+WRIST_POSITION, WRIST_FOVY = (-0.08, 0.0, -0.093), 75.0  # m, deg
+WRIST_AXES = (0.0, -1.0, 0.0, -0.9272, 0.0, 0.3746)  # its x and y, in the frame of the tcp
+
+
+class Body(Protocol):
+    """What is simulated of a robot: bodies, joints, geoms, actuators."""
+
+    def mjcf(self, robot: "Robot", /) -> tuple[str, str]:
+        """MJCF of the body tree, base at the world's origin, and of the position servos."""
+        ...
+
+    def attach(self, robot: "Robot", scene: mujoco.MjSpec) -> None:
+        """Adds what is not MJCF to the scene that `mjcf` became a part of."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Robot:
+    """One arm with a two-finger gripper; J joints. Positions in m, angles in rad.
+
+    Attributes:
+        name: file name of the robot.
+        chain: [J, 4, 4] fixed transform from link i-1 (base first) to joint i, which turns about z.
+        tool: [4, 4] pose of the tcp in the last link.
+        lower, upper: [J] joint limits [rad].
+        speed: [J] joint speed limits [rad/s].
+        home: [J] start pose [rad]: tcp at (.34, 0, .18) m, tool down with its lean.
+        lean: angle by which the hand leans outwards when it works from above [rad], chosen so that
+            the whole table in front of the robot is within the wrist's limits.
+        tilt_side: where the hand can tilt by a right angle from pointing down: 1 outwards, -1 back
+            towards the base.
+        stroke: largest gripper opening, both fingers together [m].
+        gripper_speed: largest change of the opening [m/s].
+        body: what is simulated.
+    """
+
+    name: str
+    chain: np.ndarray
+    tool: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    speed: np.ndarray
+    home: np.ndarray
+    lean: float
+    tilt_side: int
+    stroke: float
+    gripper_speed: float
+    body: Body
+
+    def __repr__(self) -> str:
+        return f"<Robot {self.name!r}: {self.num_joints} joints, opens {1000 * self.stroke:.0f} mm>"
+
+    @property
+    def num_joints(self) -> int:
+        """J, without the gripper."""
+        return len(self.chain)
+
+    @property
+    def action_low(self) -> np.ndarray:
+        """[J + 1] lowest joint targets [rad] and gripper opening [m], float32."""
+        return np.append(self.lower, 0.0).astype(np.float32)
+
+    @property
+    def action_high(self) -> np.ndarray:
+        """[J + 1] highest joint targets [rad] and gripper opening [m], float32."""
+        return np.append(self.upper, self.stroke).astype(np.float32)
+
+    @property
+    def action_speed(self) -> np.ndarray:
+        """[J + 1] fastest change of the commands [rad/s, m/s], float32."""
+        return np.append(self.speed, self.gripper_speed).astype(np.float32)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Primitives:
+    """A body of primitive shapes laid over the joint chain.
+
+    Attributes:
+        stiffness, damping: [J] gains of the position actuators [N m/rad, N m s/rad].
+        armature: reflected motor inertia of every joint [kg m^2].
+        base, links: MJCF geoms carried by the base and by each link, in the link's frame.
+        hand, finger: MJCF geoms of the hand and of the finger at y > 0, in the tcp frame, closed.
+        tip_offset: y of the middle of a closed finger [m].
+    """
+
+    stiffness: np.ndarray
+    damping: np.ndarray
+    armature: float
+    base: str
+    links: tuple[str, ...]
+    hand: str
+    finger: str
+    tip_offset: float
+
+    def mjcf(self, robot: Robot, /) -> tuple[str, str]:
+        """MJCF of the body tree, and of the servos: joints first, then the left finger."""
+        return self._bodies(robot), self._actuators()
+
+    def attach(self, robot: Robot, scene: mujoco.MjSpec) -> None:
+        """Does nothing: all of it is MJCF."""
+
+    def _bodies(self, robot: Robot) -> str:
+        xml, closing = f'<body name="base">{self.base}', "</body>"
+        for i, (fixed, geoms) in enumerate(zip(robot.chain, self.links, strict=True)):
+            xml += f'<body name="link{i + 1}" {pose(fixed)} gravcomp="1">'
+            xml += f'<joint name="joint{i + 1}" range="{robot.lower[i]} {robot.upper[i]}" '
+            xml += f'armature="{self.armature}"/>{geoms}'
+            closing += "</body>"
+        position, axes = (" ".join(map(str, x)) for x in (WRIST_POSITION, WRIST_AXES))
+        xml += f'<body name="hand" {pose(robot.tool)} gravcomp="1"><site name="tcp"/>'
+        xml += f'<camera name="wrist" pos="{position}" xyaxes="{axes}" fovy="{WRIST_FOVY}"/>'
+        xml += self.hand
+        tip = f'pos="0 {self.tip_offset} {TIP_LENGTH - TIP_RADIUS}" size="{TIP_RADIUS}"'
+        for side, turn in (("left", "1 0 0 0"), ("right", "0 0 0 1")):
+            xml += f'<body name="{side}" quat="{turn}" gravcomp="1"><joint name="{side}" '
+            xml += f'class="finger" range="0 {robot.stroke / 2}"/>{self.finger}'
+            xml += f'<geom class="tip" {tip}/></body>'
+        return xml + "</body>" + closing
+
+    def _actuators(self) -> str:
+        xml = ""
+        for i, (kp, kv) in enumerate(zip(self.stiffness, self.damping, strict=True)):
+            xml += f'<position name="joint{i + 1}" joint="joint{i + 1}" kp="{kp}" kv="{kv}"/>'
+        # Half the opening. kp, kv: own choice that holds a 12 g grape without slip and stays below
+        # 20 N at full stroke.
+        return xml + '<position name="gripper" joint="left" kp="400" kv="20"/>'
+
+
+def pose(transform: np.ndarray) -> str:
+    """MJCF attributes `pos` and `xyaxes` of a [4, 4] transform."""
+    numbers = np.round(transform, 12) + 0.0
+    position, x, y = (" ".join(map(str, numbers[:3, i])) for i in (3, 0, 1))
+    return f'pos="{position}" xyaxes="{x} {y}"'
