@@ -42,7 +42,7 @@ def fake(monkeypatch):
 def run(capsys, monkeypatch):
     """Runs a command; returns its exit code and what it said."""
     # These act on the process.
-    monkeypatch.setattr(command_line.compilation_cache, "enable", lambda: None)
+    monkeypatch.setattr(command_line.cache, "enable", lambda: None)
 
     def run(text, *more):
         code = command_line.main([*text.split(), *map(str, more)])
