@@ -30,7 +30,7 @@ def main(arguments: list[str]) -> int:
     """
     started = time.perf_counter()
     cache.enable()
-    from lorasp_jax.training import processes
+    from lorasp_jax.training.distributed import processes
     from lorasp_jax.training.interrupt import sigterm_as_interrupt
     from lorasp_jax.training.overrides import parse
     from lorasp_jax.training.run_folder import to_json
@@ -56,7 +56,7 @@ def main(arguments: list[str]) -> int:
 
 def _execute(command, console: Console, started: float) -> None:
     """A dry run, a run, or the report of one that is finished."""
-    from lorasp_jax.training import processes
+    from lorasp_jax.training.distributed import processes
     from lorasp_jax.training.run_folder import open_run
 
     folder = RUNS / command.config.name
@@ -87,7 +87,8 @@ def run(command, folder: Path, console: Console, started: float) -> None:
     """Train with evaluation before and after, export the adapters and write the report."""
     from lorasp_jax.evaluation.callback import Evaluation, NoEvaluation
     from lorasp_jax.report.callback import Report
-    from lorasp_jax.training import loop, processes, setup
+    from lorasp_jax.training import loop, setup
+    from lorasp_jax.training.distributed import processes
     from lorasp_jax.training.export import Export
     from lorasp_jax.training.weights_and_biases import WeightsAndBiases
 
@@ -110,6 +111,6 @@ if __name__ == "__main__":
     alarms.silence()
     code = main(sys.argv[1:])
     if code:
-        from lorasp_jax.training import processes
+        from lorasp_jax.training.distributed import processes
 
         processes.leave(code)  # not waiting for threads that still compile, which cannot be stopped

@@ -33,9 +33,9 @@ from lorasp_jax.models import backbone
 from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.models.sampling import Sampler
-from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.cost import flops, preflight
 from lorasp_jax.training.cost.preflight import GIB, REMATS, abstract_batch, expected
+from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
 from lorasp_jax.training.step import init_state, train_step
 

@@ -22,8 +22,8 @@ from rich.console import Console
 from benchmarks import backbones
 from benchmarks.measuring import best, machine, print_table
 from lorasp_jax import peft
-from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.cost.preflight import GIB
+from lorasp_jax.training.distributed import mesh as meshes
 
 BATCH = {"nano": 512, "small": 512, "base": 32}
 

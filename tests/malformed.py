@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import safetensors.numpy
 
 from envs.datasets.files import RefusedError
-from lorasp_jax.digest import DIGEST, sealed
+from lorasp_jax.storage.digest import DIGEST, sealed
 from tests import ROOT
 
 Damage = Callable[[Path], None]

@@ -12,7 +12,7 @@ from benchmarks import compile_time, data, long_run, measuring, scaling
 from lorasp_jax import peft
 from lorasp_jax.data.cache import Cache
 from lorasp_jax.models.pi0 import Pi0Config
-from lorasp_jax.training import mesh as meshes
+from lorasp_jax.training.distributed import mesh as meshes
 
 
 def part(broken=0, **memory):

@@ -9,12 +9,11 @@ from tests import ROOT
 
 ROOMS = [
     "envs",
-    "lorasp_jax.digest",
+    "lorasp_jax.storage",
     "lorasp_jax.kernels",
     "lorasp_jax.peft",
     "lorasp_jax.given",
     "lorasp_jax.dense",
-    "lorasp_jax.models.checkpoints.hub",
     "lorasp_jax.adapters",
     "lorasp_jax.config",
     "lorasp_jax.models",

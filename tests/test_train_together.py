@@ -8,7 +8,7 @@ from flax import nnx
 from safetensors.numpy import load_file
 
 from lorasp_jax.models.pi0 import Pi0Config
-from lorasp_jax.training import mesh as meshes
+from lorasp_jax.training.distributed import mesh as meshes
 from tests.runs import repeatable
 from tests.several import ROOT, start
 

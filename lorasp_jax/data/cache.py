@@ -28,8 +28,8 @@ from lorasp_jax.data.batches import Steps
 from lorasp_jax.data.cache_writer import Column, mapped
 from lorasp_jax.data.pictures import Pictures, checksum
 from lorasp_jax.data.source import Progress, Source
-from lorasp_jax.digest import DIGEST, sealed, unsealed
 from lorasp_jax.policies.statistics import Statistics
+from lorasp_jax.storage.digest import DIGEST, sealed, unsealed
 
 FORMAT = "lorasp-cache-1"
 HEADER, STATISTICS = "cache.json", "statistics.json"

@@ -22,7 +22,7 @@ from envs.datasets.files import check_memory, regular, whole
 from lorasp_jax.data.keys import Keys
 from lorasp_jax.data.lerobot_files import Recording, damage, read_index, read_table
 from lorasp_jax.data.video import Film, decoded
-from lorasp_jax.models.checkpoints import hub
+from lorasp_jax.storage import hub
 
 _COLUMNS = ("timestamp", "frame_index", "episode_index", "task_index")
 _WIDTH = 10_000  # numbers that a state or an action may have

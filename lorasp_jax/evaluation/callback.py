@@ -23,8 +23,7 @@ from lorasp_jax.evaluation import video
 from lorasp_jax.evaluation.rollout import Result, evaluate, make_rollout
 from lorasp_jax.training import records
 from lorasp_jax.training.demonstrations import side_by_side
-from lorasp_jax.training.progress import bars
-from lorasp_jax.training.run import Callback, Run
+from lorasp_jax.training.run import Callback, Run, bars
 from lorasp_jax.training.run_folder import read_json, write_json
 
 TOWERS = ("vision", "language", "action")

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from lorasp_jax.adapters import adaptation
-from lorasp_jax.adapters.layers import inference
+from lorasp_jax.adapters.layers import prepared
 from lorasp_jax.models import flow_matching
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.observation import Observation
@@ -103,7 +103,7 @@ def _reading(model: Backbone) -> Backbone:
     """A copy for a prefix without gradient, in which no loop copies each layer's weights."""
     model = nnx.merge(*nnx.split(model))
     for tower in (model.vision, model.language):
-        tower.blocks = unstacked(inference.prepared_stack(tower.blocks))
+        tower.blocks = unstacked(prepared.prepared_stack(tower.blocks))
     return model
 
 
@@ -113,7 +113,7 @@ def _acting(model: Backbone) -> Backbone:
     del model.vision, model.language
     model.action.blocks = unstacked(model.action.blocks)
     for module in (model, *(module for _, module in nnx.iter_modules(model.action))):
-        inference.prepare(module)
+        prepared.prepare(module)
     return model
 
 

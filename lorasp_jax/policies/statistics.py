@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lorasp_jax.digest import DIGEST, sealed, unsealed
 from lorasp_jax.policies.normalization import SMALLEST_SPREAD
+from lorasp_jax.storage.digest import DIGEST, sealed, unsealed
 
 NAMES = ("mean", "std", "min", "max", "q01", "q99", "q10", "q90")
 """Statistics that may be known."""

@@ -24,8 +24,8 @@ import numpy as np
 import safetensors
 
 from envs.datasets.files import beside, read_text
-from lorasp_jax.models.checkpoints import hub
 from lorasp_jax.policies.statistics import NAMES, Statistics, checked
+from lorasp_jax.storage import hub
 
 OURS, OPENPI, DATASET = "statistics.json", "norm_stats.json", "stats.json"
 EPISODES = "episodes_stats.jsonl"

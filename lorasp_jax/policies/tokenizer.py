@@ -89,8 +89,8 @@ def load(where: str | os.PathLike[str]) -> Tokenizer:
         ValueError: there is no such place, or no tokenizer in it.
     """
     from envs.datasets.files import TEXT_BYTES
-    from lorasp_jax.models.checkpoints import hub
     from lorasp_jax.policies.tokenizer_files import SentencePiece, TokenizersFile
+    from lorasp_jax.storage import hub
 
     if not os.fspath(where):
         return Offline()

@@ -12,8 +12,9 @@ from lorasp_jax import models
 from lorasp_jax.config import Config
 from lorasp_jax.models import backbone
 from lorasp_jax.models.backbone import Backbone
-from lorasp_jax.models.checkpoints import hub, loading
+from lorasp_jax.models.checkpoints import loading
 from lorasp_jax.models.config import BackboneConfig
+from lorasp_jax.storage import hub
 from lorasp_jax.training.run_folder import read_json
 
 SIZES = ("nano", "small", "base", "nano_pi05", "base_pi05")

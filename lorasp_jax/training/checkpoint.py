@@ -18,9 +18,9 @@ import orbax.checkpoint as ocp
 from rich.console import Console
 
 from envs.cli.refusals import DISK_FULL
-from lorasp_jax.digest import digest
 from lorasp_jax.models.checkpoints import orbax_folders
-from lorasp_jax.training import processes
+from lorasp_jax.storage.digest import digest
+from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.step import TrainState
 
 WRITTEN = "commit_success.txt"

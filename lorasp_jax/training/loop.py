@@ -13,14 +13,13 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config, OptimConfig
 from lorasp_jax.data.batches import Raw, Steps, encode, sample_batch
 from lorasp_jax.policies.policy import Policy
-from lorasp_jax.training import mesh as meshes
-from lorasp_jax.training import processes
 from lorasp_jax.training.checkpoint import Checkpoints
+from lorasp_jax.training.distributed import mesh as meshes
+from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.guard import summarise
 from lorasp_jax.training.interrupt import deferred
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
-from lorasp_jax.training.progress import bars
-from lorasp_jax.training.run import Callback, Run
+from lorasp_jax.training.run import Callback, Run, bars
 from lorasp_jax.training.run_folder import MetricsLog
 from lorasp_jax.training.step import TrainState, init_state, train_step
 from lorasp_jax.training.stretches import Stretches, stretches

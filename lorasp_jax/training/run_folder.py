@@ -22,8 +22,9 @@ from tensorboardX.proto.summary_pb2 import Summary
 from envs.datasets.files import check_only_files, damage, read_bytes
 from envs.datasets.locks import open_lock
 from lorasp_jax.config import Config
-from lorasp_jax.digest import sealed, unsealed
-from lorasp_jax.training import processes, records
+from lorasp_jax.storage.digest import sealed, unsealed
+from lorasp_jax.training import records
+from lorasp_jax.training.distributed import processes
 
 RECORD, CLOCK, DATASET = "config.json", "seconds.json", "dataset.json"
 """All files that a run leaves which failed before it had anything."""

@@ -26,20 +26,19 @@ from lorasp_jax.data.source import Source
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.models import presets
 from lorasp_jax.models.backbone import Backbone
-from lorasp_jax.models.checkpoints import hub
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.policies import tokenizer
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Processor, Statistics, check_delta, robot_slots, to_delta
 from lorasp_jax.policies.prompt_table import PromptTable
-from lorasp_jax.training import mesh as meshes
-from lorasp_jax.training import processes
+from lorasp_jax.storage import hub
 from lorasp_jax.training.base import base_model, changed
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.dataset import cached, is_simulated, opened, outline
 from lorasp_jax.training.demonstrations import demonstrations
-from lorasp_jax.training.progress import bars
-from lorasp_jax.training.run import Run
+from lorasp_jax.training.distributed import mesh as meshes
+from lorasp_jax.training.distributed import processes
+from lorasp_jax.training.run import Run, bars
 from lorasp_jax.training.run_folder import record_dataset
 
 STATISTICS_BATCHES = 8

@@ -12,11 +12,11 @@ from envs.compilation import fast_cpu, messages
 from lorasp_jax.data.batches import Raw, Steps, flatten, of_size
 from lorasp_jax.data.pictures import loaded
 from lorasp_jax.data.stream import Stream
-from lorasp_jax.training import mesh as meshes
-from lorasp_jax.training import processes
 from lorasp_jax.training.cost import flops, preflight
 from lorasp_jax.training.cost.speed import Speed
 from lorasp_jax.training.demonstrations import fresh_demonstrations
+from lorasp_jax.training.distributed import mesh as meshes
+from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.run import Run
 from lorasp_jax.training.step import TrainState
 

@@ -10,7 +10,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 from lorasp_jax.kernels import fused_rows as kernels
 from lorasp_jax.kernels.row_sharding import by_rows
-from lorasp_jax.training import mesh as meshes
+from lorasp_jax.training.distributed import mesh as meshes
 from tests.kernels.test_fused_rows import WIDTHS, close, gated
 
 

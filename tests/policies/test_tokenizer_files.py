@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import sentencepiece
 
-from lorasp_jax.models.checkpoints import hub
 from lorasp_jax.policies import prompts, tokenizer
+from lorasp_jax.storage import hub
 from tests import GOLDEN
 
 GOLDEN = GOLDEN / "tokenizers"

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from lorasp_jax.digest import digest
-from lorasp_jax.training import mesh as meshes
+from lorasp_jax.storage.digest import digest
 from lorasp_jax.training.checkpoint import WRITTEN, Checkpoints
+from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.guard import Guard
 from lorasp_jax.training.step import TrainState
 from tests.runs import leaves

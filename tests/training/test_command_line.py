@@ -9,7 +9,7 @@ import pytest
 import train
 from lorasp_jax import peft
 from lorasp_jax.models import backbone
-from lorasp_jax.training import mesh as meshes
+from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.overrides import parse
 from lorasp_jax.training.run_folder import read_metrics
 from tests import ROOT

@@ -15,14 +15,14 @@ from rich.console import Console
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import DataConfig
 from lorasp_jax.data.batches import flatten
-from lorasp_jax.digest import sealed
 from lorasp_jax.evaluation.callback import NoEvaluation
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.report.html import write_report
-from lorasp_jax.training import mesh as meshes
+from lorasp_jax.storage.digest import sealed
 from lorasp_jax.training import setup
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.cost.speed import Speed
+from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.run_folder import read_metrics, to_json, write_json
 from lorasp_jax.training.stretches import Streamed, _batches

@@ -17,12 +17,12 @@ from lorasp_jax import models
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io import native
 from lorasp_jax.config import ModelConfig
-from lorasp_jax.digest import sealed
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import FullFineTuning
 from lorasp_jax.policies import tokenizer
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Statistics
+from lorasp_jax.storage.digest import sealed
 from lorasp_jax.training import base, export, setup
 from tests import ROOT
 from tests.models.drawn import drawn

@@ -8,7 +8,7 @@ import pytest
 
 from lorasp_jax.data.batches import flatten, of_size, windows
 from lorasp_jax.training import demonstrations, stretches
-from lorasp_jax.training import mesh as meshes
+from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.loop import train
 from tests.runs import CONFIG, Miniature, Terminate, make_run, random_episodes, repeatable
 

@@ -13,8 +13,8 @@ import pytest
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import OptimConfig
 from lorasp_jax.training import guard as guards
-from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training import step as steps
+from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.loop import RunError, train
 from lorasp_jax.training.run import Callback
 from lorasp_jax.training.run_folder import read_metrics

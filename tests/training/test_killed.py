@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from lorasp_jax.adapters import adaptation
-from lorasp_jax.training import mesh as meshes
-from lorasp_jax.training import processes
 from lorasp_jax.training.checkpoint import WRITTEN
+from lorasp_jax.training.distributed import mesh as meshes
+from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.run_folder import read_metrics
 from tests import ROOT
 from tests.runs import leaves, repeatable

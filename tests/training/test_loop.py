@@ -11,7 +11,7 @@ import pytest
 
 from envs.compilation import fast_cpu
 from lorasp_jax.adapters import adaptation
-from lorasp_jax.training import mesh as meshes
+from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.loop import RunError, train
 from lorasp_jax.training.run import Callback
 from lorasp_jax.training.run_folder import read_metrics

@@ -10,7 +10,7 @@ import pytest
 from lorasp_jax import peft
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import OptimConfig
-from lorasp_jax.training import mesh as meshes
+from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.optim import make_optimizer
 from lorasp_jax.training.run_folder import read_metrics

@@ -12,7 +12,7 @@ from flax import nnx
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.data.batches import Batch, flatten, sample_batch
 from lorasp_jax.peft import Aux, LoRA
-from lorasp_jax.training import mesh as meshes
+from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.step import active_ranks, gradients, init_state, train_step
 from tests.models.drawn import moved

@@ -17,7 +17,7 @@ from rich.console import Console
 from lorasp_jax.config import EvaluationConfig
 from lorasp_jax.data.batches import flatten
 from lorasp_jax.peft import FullFineTuning
-from lorasp_jax.training import mesh, processes
+from lorasp_jax.training.distributed import mesh, processes
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.run import Callback, Run
 from tests.runs import CONFIG, Terminate, make_run

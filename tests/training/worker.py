@@ -33,8 +33,8 @@ def main(args: argparse.Namespace) -> None:
     cache.enable()
     xla.compile_steps_as_all_else()
     jax.config.update("jax_default_matmul_precision", "highest")
-    from lorasp_jax.training import mesh as meshes
-    from lorasp_jax.training import processes
+    from lorasp_jax.training.distributed import mesh as meshes
+    from lorasp_jax.training.distributed import processes
 
     if "JAX_PROCESS_ID" in os.environ:
         processes.initialize(Console(), "add --resume")

@@ -155,9 +155,7 @@ def _at_hand(folder: str | os.PathLike) -> pathlib.Path:
     """The folder on this machine; only what begins with hf:// is asked of the hub."""
     if not isinstance(folder, str) or "://" not in folder:
         return given.folder(folder)
-    from lorasp_jax.models.checkpoints import (
-        hub,  # with all backbones, which nothing else here needs
-    )
+    from lorasp_jax.storage import hub
 
     return hub.local(folder, only=[CONFIG, TENSORS])
 

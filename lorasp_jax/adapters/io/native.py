@@ -22,12 +22,13 @@ import numpy as np
 import safetensors.numpy
 from flax import nnx
 
-from lorasp_jax import digest, given, peft
+from lorasp_jax import given, peft
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.peft import Method, _fields
 from lorasp_jax.peft._fields import short
+from lorasp_jax.storage import digest
 
 TENSORS, DESCRIPTION = "adapter.safetensors", "adapter.json"
 FORMAT, VERSION = "lorasp_jax adapter", 2

@@ -9,10 +9,11 @@ from typing import Any
 
 from envs.datasets.files import read_text
 from lorasp_jax.models import backbone
-from lorasp_jax.models.checkpoints import hub, lerobot_config, native, published
+from lorasp_jax.models.checkpoints import lerobot_config, native, published
 from lorasp_jax.models.checkpoints.layouts import OtherModelError
 from lorasp_jax.models.checkpoints.tensor_files import weight_files
 from lorasp_jax.models.inputs import InputConfig
+from lorasp_jax.storage import hub
 
 _log = logging.getLogger(__name__)
 

@@ -1,7 +1,7 @@
 """pi0: SigLIP, two Gemma experts with shared attention, flow matching over actions."""
 
-from lorasp_jax.models.pi0.config import ExpertConfig, Pi0Config, VisionConfig
-from lorasp_jax.models.pi0.pi0 import Pi0
+from lorasp_jax.models.config import ExpertConfig, VisionConfig
+from lorasp_jax.models.pi0.pi0 import Pi0, Pi0Config
 
 Config = Pi0Config
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from lorasp_jax.models.checkpoints.lerobot_config import require
 from lorasp_jax.models.inputs import LEROBOT_CENTRED, LEROBOT_PI05
-from lorasp_jax.models.pi0.config import Pi0Config
+from lorasp_jax.models.pi0.pi0 import Pi0Config
 
 
 def pi0(fields: Mapping[str, Any]) -> Pi0Config:

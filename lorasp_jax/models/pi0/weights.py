@@ -10,7 +10,7 @@ import numpy as np
 from lorasp_jax.models.checkpoints.layouts import Rule, copied, reshaped
 from lorasp_jax.models.checkpoints.torch_layouts import PROJECTIONS, decoder, linear, siglip
 from lorasp_jax.models.config import ExpertConfig
-from lorasp_jax.models.pi0.config import Pi0Config
+from lorasp_jax.models.pi0.pi0 import Pi0Config
 
 _IMG, _LLM = "PaliGemma/img", "PaliGemma/llm"
 _PALIGEMMA = "paligemma_with_expert.paligemma"

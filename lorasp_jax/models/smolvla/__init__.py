@@ -1,7 +1,6 @@
 """SmolVLA: SigLIP, SmolLM2 and an action expert that reads its keys and values."""
 
-from lorasp_jax.models.smolvla.config import SmolVLAConfig
-from lorasp_jax.models.smolvla.smolvla import SmolVLA
+from lorasp_jax.models.smolvla.smolvla import SmolVLA, SmolVLAConfig
 
 Config = SmolVLAConfig
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from lorasp_jax.models.checkpoints.lerobot_config import require
-from lorasp_jax.models.smolvla.config import SmolVLAConfig
+from lorasp_jax.models.smolvla.smolvla import SmolVLAConfig
 
 # What this backbone does, and LeRobot's may do otherwise.
 _FIXED = {

@@ -4,7 +4,7 @@ import re
 
 from lorasp_jax.models.checkpoints.layouts import Rule, copied, transposed
 from lorasp_jax.models.checkpoints.torch_layouts import PROJECTIONS, decoder, linear, siglip
-from lorasp_jax.models.smolvla.config import SmolVLAConfig
+from lorasp_jax.models.smolvla.smolvla import SmolVLAConfig
 
 UNUSED: tuple[str, ...] = ()
 """The language model's head stays, as LeRobot trains and saves it."""

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax.adapters.layers import inference
+from lorasp_jax.adapters.layers import prepared
 from lorasp_jax.dense import Dense, dense_together
 from lorasp_jax.peft import Aux
 
@@ -113,7 +113,7 @@ class Linears:
 
     def together(self, names: tuple[str, ...], x: jax.Array) -> list[jax.Array]:
         """y of each layer for the same x `[B, T, I]`, which adapters of `Dense` read once."""
-        found = inference.call(self._module, names, x, self._token_mask)
+        found = prepared.call(self._module, names, x, self._token_mask)
         if others := [name for name in names if name not in found]:
             found |= zip(others, self._together(others, x), strict=True)
         self.aux |= {name: found[name][1] for name in names}

@@ -18,12 +18,12 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Raw, Steps, flatten, gather
 from lorasp_jax.dense import AdaptedLayer
-from lorasp_jax.models.checkpoints import hub
 from lorasp_jax.policies.policy import Policy
+from lorasp_jax.storage import hub
 from lorasp_jax.training import loop, setup
-from lorasp_jax.training import mesh as meshes
 from lorasp_jax.training.cost import preflight
 from lorasp_jax.training.cost.preflight import HEADROOM, unit_of
+from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.optim import make_optimizer
 from lorasp_jax.training.run import Run
 from lorasp_jax.training.step import init_state

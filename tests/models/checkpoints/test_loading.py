@@ -9,10 +9,11 @@ import pytest
 import safetensors.numpy
 
 from lorasp_jax import models
-from lorasp_jax.models.checkpoints import hub, published
+from lorasp_jax.models.checkpoints import published
 from lorasp_jax.models.checkpoints.native import named_arrays
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.smolvla import SmolVLAConfig
+from lorasp_jax.storage import hub
 from tests.models import test_pi0_parity as pi0
 from tests.models import test_smolvla_parity as smolvla
 

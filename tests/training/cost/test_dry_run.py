@@ -13,12 +13,12 @@ from envs.compilation import messages
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import DataConfig
 from lorasp_jax.data.batches import Raw, flatten
-from lorasp_jax.models.checkpoints import hub
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import LoRA
-from lorasp_jax.training import mesh as meshes
+from lorasp_jax.storage import hub
 from lorasp_jax.training import setup
 from lorasp_jax.training.cost import dry_run, preflight
+from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.overrides import Command, load
 from lorasp_jax.training.run import Run
 from tests import ROOT

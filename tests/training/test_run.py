@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from lorasp_jax.training.progress import bars
+from lorasp_jax.training.run import bars
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import shutil
 from pathlib import Path
 from typing import Literal
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 """The folder that the package lies in: of a checkout, its root."""
 SHIPPED = "assets"
 """Folder of a checkout with the bases that it ships, found from wherever a program is started."""

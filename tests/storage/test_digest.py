@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lorasp_jax import digest
+from lorasp_jax.storage import digest
 
 VALUES = np.random.default_rng(0).normal(size=(3, 5, 7)) * 100
 

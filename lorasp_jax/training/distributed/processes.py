@@ -24,8 +24,8 @@ from jax._src import clusters  # there is no public way to ask where the others 
 from jax.experimental import multihost_utils
 from rich.console import Console
 
-from lorasp_jax.training import peers
-from lorasp_jax.training.meeting import PATIENCE, Meeting
+from lorasp_jax.training.distributed import peers
+from lorasp_jax.training.distributed.meeting import PATIENCE, Meeting
 
 _LONGEST_WAIT = 24 * 3600 * 1000  # ms; the first process may collect and evaluate for hours
 _NAMES = ("JAX_NUM_PROCESSES", "JAX_PROCESS_ID")

@@ -10,8 +10,8 @@ from typing import ClassVar
 
 import pytest
 
-from lorasp_jax.training import meeting, peers
-from lorasp_jax.training.meeting import Meeting
+from lorasp_jax.training.distributed import meeting, peers
+from lorasp_jax.training.distributed.meeting import Meeting
 from tests.several import free_address
 
 ADVICE = "to go on: add --resume"

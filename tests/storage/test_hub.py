@@ -7,7 +7,7 @@ import huggingface_hub
 import pytest
 from huggingface_hub.errors import LocalEntryNotFoundError
 
-from lorasp_jax.models.checkpoints import hub
+from lorasp_jax.storage import hub
 
 
 def test_what_is_here_stays_here(tmp_path, monkeypatch):

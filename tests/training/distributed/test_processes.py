@@ -9,8 +9,8 @@ import pytest
 from jax.sharding import PartitionSpec as P
 from rich.console import Console
 
-from lorasp_jax.training import mesh as meshes
-from lorasp_jax.training import processes
+from lorasp_jax.training.distributed import mesh as meshes
+from lorasp_jax.training.distributed import processes
 from tests.runs import repeatable
 from tests.several import NAMES, start
 

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import IO, Any
 
-from lorasp_jax.training import meeting
+from lorasp_jax.training.distributed import meeting
 
 _TRY_EVERY, _ANSWER = 0.5, 5.0  # s
 _SILENCE = 3.0  # s without a connection after which that is said

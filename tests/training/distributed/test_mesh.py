@@ -14,7 +14,7 @@ from jax.sharding import PartitionSpec
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.data.batches import flatten, sample_batch
 from lorasp_jax.peft import FullFineTuning, LoRA
-from lorasp_jax.training import mesh as meshes
+from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.run_folder import read_metrics
 from lorasp_jax.training.step import init_state, loss_fn
