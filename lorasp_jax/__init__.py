@@ -10,10 +10,11 @@ Axis letters used in every docstring and einsum of this package:
 """
 
 from lorasp_jax import dense, peft
-from lorasp_jax.adapters.adaptation import adapt, merge, split, with_dropout
+from lorasp_jax.adapters.adaptation import adapt, count, merge, penalties, split, with_dropout
 from lorasp_jax.adapters.combine import named
 from lorasp_jax.adapters.combine.fusion import fuse, unmerge
 from lorasp_jax.adapters.combine.named import choose, combine, extract, swap
+from lorasp_jax.adapters.compress.calibration import input_moments
 from lorasp_jax.adapters.compress.compaction import distill, prune
 from lorasp_jax.adapters.compress.quantization import quantize
 from lorasp_jax.adapters.io import hugging_face
@@ -39,16 +40,19 @@ __all__ = [
     "choose",
     "collect_aux",
     "combine",
+    "count",
     "dense",
     "distill",
     "extract",
     "fuse",
     "hugging_face",
+    "input_moments",
     "load_adapters",
     "load_peft",
     "merge",
     "named",
     "peft",
+    "penalties",
     "prune",
     "quantize",
     "save_adapters",

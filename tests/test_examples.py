@@ -75,7 +75,7 @@ class Points:
 
 def test_it_learns_to_move_a_point(ppo, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(ppo, "make", lambda config, num_envs, **_: Points(num_envs))
-    monkeypatch.setattr(ppo.compiling, "PATIENCE", 0.0)
+    monkeypatch.setattr(ppo.messages, "PATIENCE", 0.0)
     config = ppo.Config(num_envs=32, updates=15, learning_rate=3e-3, episodes=64, out=tmp_path)
     before = ppo.update._cache_size()
     assert ppo.main(config) >= 0.95
