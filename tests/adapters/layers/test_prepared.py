@@ -9,7 +9,7 @@ import pytest
 from flax import nnx
 
 from lorasp_jax.adapters.compress.quantization import quantize
-from lorasp_jax.adapters.layers import inference
+from lorasp_jax.adapters.layers import prepared as inference
 from lorasp_jax.dense import Dense
 from lorasp_jax.models import pi0, smolvla
 from lorasp_jax.models.sampling import Sampler
