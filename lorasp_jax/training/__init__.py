@@ -1,6 +1,9 @@
 """Training: the step, the loop around it, checkpoints and what a run leaves."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lorasp_jax.training.export import load_policy
 
 __all__ = ["load_policy"]
 

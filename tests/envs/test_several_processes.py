@@ -7,7 +7,7 @@ import jax
 from rich.console import Console
 
 import envs
-from lorasp_jax.training import processes
+from lorasp_jax.training.distributed import processes
 
 processes.initialize(Console(), "add --resume")
 assert jax.process_count() == 2
