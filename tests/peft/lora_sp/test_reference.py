@@ -5,49 +5,96 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lorasp_jax.dense import dense
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.peft.lora_sp import reference
 
-TOKENS, D_IN, D_OUT = 48, 24, 20
+
+def normal(seed, *shape):
+    return jax.random.normal(jax.random.key(seed), shape)
 
 
-def drawn(method, spread):
+def drawn(method, d_in, d_out, spread=1.0):
     """Parameters with U and W2 far from their start, so that scores differ."""
-    params = method.init_params(jax.random.key(0), D_IN, D_OUT)
-    u, w2 = (
-        jax.random.normal(jax.random.key(i), (s, o))
-        for i, s, o in ((1, method.rank, D_OUT), (2, method.hidden_width, method.rank))
-    )
-    params["bank"]["u"], params["router"]["w2"] = u / 8, spread * w2
+    params = method.init_params(jax.random.key(0), d_in, d_out)
+    params["bank"]["u"] = normal(1, method.rank, d_out) / 8
+    params["router"]["w2"] = spread * normal(2, method.hidden_width, method.rank)
     return params
 
 
-@pytest.mark.parametrize("energy_target", [0.5, 0.9, 0.99])
-@pytest.mark.parametrize("spread", [0.1, 1.0])
-def test_the_fast_path_is_the_paper(energy_target, spread):
-    method = LoRASP(rank=32, hidden_width=16, energy_target=energy_target)
-    params = drawn(method, spread)
-    x = jax.random.normal(jax.random.key(3), (TOKENS, D_IN))
+def results(layer, *arguments):
+    """y, the losses, and the gradients of a scalar made of them."""
 
-    def total(function):
-        def loss(params, x):
-            delta, losses = function(params, x)
-            return jnp.sum(jnp.sin(delta)) + sum(losses.values()), (delta, losses)
+    def loss(*arguments):
+        y, losses = layer(*arguments)
+        return jnp.sum(jnp.sin(y.astype(jnp.float32))) + sum(losses.values()), (y, losses)
 
-        return jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True))(params, x)
+    count = range(len(arguments))
+    return jax.jit(jax.value_and_grad(loss, argnums=tuple(count), has_aux=True))(*arguments)
 
-    def fast(params, x):
-        delta, aux = method.delta(params, x)
-        return delta, dict(aux.losses)
 
-    found = total(fast)
-    expected = total(lambda params, x: reference.lora_sp(params, x, energy_target, method.scale))
+def fast(method):
+    def layer(params, x, kernel):
+        y, aux = method.apply(params, x, kernel)
+        return y, dict(aux.losses)
+
+    return layer
+
+
+def plain(method):
+    def layer(params, x, kernel):
+        return reference.lora_sp(params, x, kernel, method.energy_target, method.scale)
+
+    return layer
+
+
+def assert_close(found, expected, tolerance):
     assert jax.tree.structure(found) == jax.tree.structure(expected)
     for one, other in zip(*map(jax.tree.leaves, (found, expected)), strict=True):
-        np.testing.assert_allclose(one, other, rtol=2e-4, atol=2e-5 * float(jnp.abs(other).max()))
+        error = np.linalg.norm(np.asarray(one, np.float64) - np.asarray(other, np.float64))
+        assert error <= tolerance * max(np.linalg.norm(np.asarray(other, np.float64)), 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("tokens", "d_in", "d_out", "fields"),
+    [
+        (48, 24, 20, {"rank": 32, "hidden_width": 16, "energy_target": 0.5}),
+        (48, 20, 24, {"rank": 32, "hidden_width": 16, "energy_target": 0.99, "alpha": 5.0}),
+        (1, 6, 40, {"rank": 48, "hidden_width": 3}),  # a bank wider than the layer
+        (7, 8, 8, {"rank": 1, "hidden_width": 1}),
+    ],
+)
+def test_the_fast_path_is_the_paper(tokens, d_in, d_out, fields):
+    """Values, and gradients of all parameters, x and the kernel (none)."""
+    method = LoRASP(**fields)
+    arguments = (drawn(method, d_in, d_out), normal(3, tokens, d_in), normal(4, d_in, d_out))
+    found, expected = (results(layer(method), *arguments) for layer in (fast, plain))
+    assert_close(found, expected, 1e-4)
+
+
+def test_half_precision_is_the_paper_up_to_its_rounding():
+    method = LoRASP(rank=32, hidden_width=16)
+    half = [(a / 4).astype(jnp.bfloat16) for a in (normal(3, 96, 24), normal(4, 24, 20))]
+    params = drawn(method, 24, 20, spread=0.3)
+    found = results(fast(method), params, *half)
+    expected = results(plain(method), params, *(a.astype(jnp.float32) for a in half))
+    assert found[0][1][0].dtype == jnp.bfloat16
+    assert_close(found, expected, 0.05)
+
+
+def test_a_layer_is_the_paper():
+    """From the front door, with token axes and a bias."""
+    method = LoRASP(rank=16, hidden_width=8, energy_target=0.7)
+    params, x, kernel, bias = drawn(method, 6, 5), normal(3, 2, 9, 6), normal(4, 6, 5), normal(5, 5)
+    y, aux = dense(x, kernel, bias, params, method)
+    expected, losses = plain(method)(params, x.reshape(18, 6), kernel)
+    assert_close(y, (expected + bias).reshape(2, 9, 5), 1e-5)
+    assert_close(dict(aux.losses), losses, 1e-5)
 
 
 def test_the_gate_keeps_the_fewest():
     scores = jnp.array([[3.0, 1.0, 2.0, 0.0]])  # energy 9, 1, 4, 0 of 14
     for target, kept in ((0.6, [1, 0, 0, 0]), (0.9, [1, 0, 1, 0]), (0.93, [1, 1, 1, 0])):
-        np.testing.assert_array_equal(reference.energy_gate(scores, target)[0], kept)
+        mask, kept_energy = reference.energy_gate(scores, target)
+        np.testing.assert_array_equal(mask[0], kept)
+        assert kept_energy[0] == pytest.approx(sum(np.array(kept) * [9, 1, 4, 0]) / 14)
