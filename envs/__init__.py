@@ -14,6 +14,7 @@ import envs.interop.ids
 
 if TYPE_CHECKING:
     from envs import robots  # noqa: F401  envs.robots.piper is public
+    from envs.datasets import rlds
     from envs.datasets.episodes import Episodes
     from envs.env import Env
     from envs.experts.collection import collect, expert_success
@@ -30,6 +31,7 @@ __all__ = [
     "collect",
     "expert_success",
     "make",
+    "rlds",
 ]
 
 _HOMES = {
@@ -50,6 +52,8 @@ def __getattr__(name: str) -> Any:
     """Public names and modules, imported when asked for: MJX takes seconds, `--help` needs none."""
     if name in _HOMES:
         return getattr(importlib.import_module(f"envs.{_HOMES[name]}"), name)
+    if name == "rlds":
+        return importlib.import_module("envs.datasets.rlds")
     if importlib.util.find_spec(f"envs.{name}") is None:
         raise AttributeError(f"module 'envs' has no attribute {name!r}")
     return importlib.import_module(f"envs.{name}")

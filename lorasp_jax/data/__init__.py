@@ -1,7 +1,20 @@
 """From episodes to training batches."""
 
-from lorasp_jax.data import cache
-from lorasp_jax.data.opening import open_source
-from lorasp_jax.data.stream import Stream
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lorasp_jax.data import cache
+    from lorasp_jax.data.opening import open_source
+    from lorasp_jax.data.stream import Stream
 
 __all__ = ["Stream", "cache", "open_source"]
+
+_HOMES = {"Stream": "stream", "open_source": "opening"}
+
+
+def __getattr__(name: str) -> Any:
+    """Public names, imported when asked for: `--help` needs neither Grain nor PyArrow."""
+    if name in _HOMES:
+        return getattr(importlib.import_module(f"lorasp_jax.data.{_HOMES[name]}"), name)
+    raise AttributeError(f"module 'lorasp_jax.data' has no attribute {name!r}")

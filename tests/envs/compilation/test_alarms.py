@@ -74,7 +74,7 @@ def test_a_level_that_the_user_chose_stays(monkeypatch):
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="only Linux pins to a core")
 @pytest.mark.parametrize("silent", [False, True])
 def test_no_alarm_reaches_the_terminal(silent):
-    program = SLOW.format("from envs import alarms; alarms.silence()" if silent else "")
+    program = SLOW.format("from envs.compilation import alarms; alarms.silence()" if silent else "")
     options = {"JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "false"}
     found = subprocess.run(
         [sys.executable, "-c", program],

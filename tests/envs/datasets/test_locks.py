@@ -14,7 +14,7 @@ from envs.datasets import locks
 
 HOLD = """
 import os, pathlib, sys
-from envs import locks
+from envs.datasets import locks
 
 with locks.alone(pathlib.Path(sys.argv[1])):
     print("held", flush=True)
