@@ -18,9 +18,9 @@ from envs.names import names
 from envs.scene import distractors
 
 
-def main(arguments: Sequence[str]) -> int:
+def main(arguments: Sequence[str], program: str = "python -m envs") -> int:
     """Runs one command; returns the exit code: 0 done, 2 bad input, 130 stopped."""
-    options = parsed(_parser(), arguments)
+    options = parsed(parser(program), arguments)
     console = Console(stderr=True)
     # JAX would reserve most of a GPU at its start, which takes a second (measured) for a command of
     # half a minute.
@@ -36,8 +36,9 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m envs", description="Scripted expert episodes.")
+def parser(program: str) -> argparse.ArgumentParser:
+    """The commands and their options."""
+    parser = argparse.ArgumentParser(prog=program, description="Scripted expert episodes.")
     subparsers = parser.add_subparsers(required=True, metavar="command")
     tasks = ", ".join(names("task"))
     robots = f"{', '.join(names('robot'))}, or the path of an MJCF file"

@@ -22,6 +22,7 @@ ROOMS = [
     "lorasp_jax.training",
     "lorasp_jax.evaluation",
     "lorasp_jax.report",
+    "lorasp_jax.cli",
 ]
 SOURCES = [
     path

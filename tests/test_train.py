@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-import train
+from lorasp_jax.cli import train
 from lorasp_jax.training.run_folder import write_json
 from tests import ROOT
 from tests.runs import RESULTS

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from lorasp_jax.data.source import Progress as Report
 
 
-def main(arguments: Sequence[str]) -> int:
+def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.data") -> int:
     """Runs one command; returns the exit code: 0 done, 2 bad input, 130 stopped."""
-    options = parsed(_parser(), arguments)  # before the slow imports, which help does not need
+    options = parsed(parser(program), arguments)  # before slow imports, which help does not need
     import jax
 
     jax.config.update("jax_platforms", "cpu")  # nothing here is worth taking an accelerator
@@ -71,8 +71,9 @@ def convert(options: argparse.Namespace, console: Console) -> None:
     console.print(f"{options.out}: {episodes} episodes", soft_wrap=True, highlight=False)
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m lorasp_jax.data", description=__doc__)
+def parser(program: str) -> argparse.ArgumentParser:
+    """The commands and their options."""
+    parser = argparse.ArgumentParser(prog=program, description="Inspect or convert datasets.")
     subparsers = parser.add_subparsers(required=True, metavar="command")
     where = "a LeRobot dataset (folder or hf://owner/name), an RLDS one, a cache or an .npz file"
 

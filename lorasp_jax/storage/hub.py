@@ -10,10 +10,8 @@ import shutil
 from pathlib import Path
 from typing import Literal
 
-ROOT = Path(__file__).resolve().parents[2]
-"""The folder that the package lies in: of a checkout, its root."""
-SHIPPED = "assets"
-"""Folder of a checkout with the bases that it ships, found from wherever a program is started."""
+from lorasp_jax.storage import shipped
+
 HUB = "hf://"
 """How a repository on the hub begins, as in hf://owner/name."""
 REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
@@ -36,7 +34,7 @@ def local(
     Args:
         where: a path; or a repository on the hub, hf://owner/name, kept in its own cache; or a URL
             of a bucket, gs://bucket/folder, kept below the user's cache folder, lorasp_jax/. A
-            shipped base, assets/pi0_nano, is found beside the package, too.
+            shipped base, assets/pi0_nano, is found from any folder.
         only: patterns of the files that are wanted from a repository; None: all but `LEFT_OUT`.
         repository: what kind of repository on the hub.
 
@@ -50,7 +48,7 @@ def local(
         if not BUCKET.fullmatch(name) or ".." in name.split("/"):
             raise ValueError(f"{name} is no folder in a bucket: that is gs://bucket/folder.")
         return _from_bucket(name)
-    for found in (path, ROOT / path) if _is_shipped(path) else (path,):
+    for found in (path, shipped.ROOT / path) if _is_shipped(path) else (path,):
         if os.path.exists(found):  # Path.exists raises where a name is too long
             return found
     raise ValueError(_nowhere(name, path))
@@ -64,28 +62,24 @@ def lasting(where: str) -> str:
     if not os.path.exists(path) and _is_shipped(path):
         return where
     path = path.resolve()
-    inside = path.is_relative_to(ROOT) and _is_shipped(path.relative_to(ROOT))
-    return path.relative_to(ROOT).as_posix() if inside else str(path)
+    inside = path.is_relative_to(shipped.ROOT) and _is_shipped(path.relative_to(shipped.ROOT))
+    return path.relative_to(shipped.ROOT).as_posix() if inside else str(path)
 
 
 def found_again(where: str) -> str:
     """What `lasting` wrote down, for `local`: no other folder takes the place of a shipped base."""
-    return str(ROOT / where) if _is_shipped(Path(where)) else where
+    return str(shipped.ROOT / where) if _is_shipped(Path(where)) else where
 
 
 def _is_shipped(path: Path) -> bool:
-    """Whether a relative path is one of a shipped base."""
-    return path.parts[:1] == (SHIPPED,) and len(path.parts) > 1 and ".." not in path.parts
+    return shipped.is_one(path, shipped.BASES)
 
 
 def _nowhere(name: str, path: Path) -> str:
     """Why a path leads nowhere, and what else may have been meant."""
-    inside = path.relative_to(ROOT) if path.is_relative_to(ROOT) else path
+    inside = path.relative_to(shipped.ROOT) if path.is_relative_to(shipped.ROOT) else path
     if _is_shipped(inside):
-        return (
-            f"{name} is not there: a checkout of the project has such bases beside the package, in "
-            f"{ROOT / SHIPPED}; an installed package has none: name the folder of a base"
-        )
+        return shipped.no_base(name)
     if REPOSITORY.fullmatch(name):
         return f"there is no folder {name}; a repository on the hub is written {HUB}{name}"
     return f"{name} does not exist, and is neither {HUB}owner/name on the hub nor gs://bucket/path"

@@ -10,7 +10,7 @@ import itertools
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin
 
 import jax
 import tyro
@@ -19,11 +19,10 @@ from envs.names import check
 from lorasp_jax import peft
 from lorasp_jax.config import SCALES, Config
 from lorasp_jax.peft import LoRASP
+from lorasp_jax.storage import shipped
 from lorasp_jax.training.scales import differences
 
 HELP = {"-h", "--help"}
-SHIPPED = Path(__file__).parents[2] / "configs"
-"""The experiments of a checkout."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,15 +42,19 @@ class Command:
     wandb: str | None = None
 
 
-def parse(arguments: Sequence[str]) -> Command:
+def parse(arguments: Sequence[str], program: str = "python train.py") -> Command:
     """What `arguments` ask for.
+
+    Args:
+        arguments: the command line.
+        program: how it was started, for the help.
 
     Raises:
         ValueError: an unknown config, scale, method, field, task or robot, or a value that does
             not fit.
         SystemExit: help was asked for and printed.
     """
-    parser = _parser()
+    parser = _parser(program)
     try:
         known, rest = parser.parse_known_args(arguments)
     except argparse.ArgumentError as error:
@@ -62,7 +65,7 @@ def parse(arguments: Sequence[str]) -> Command:
     if wants_help and known.scale == "auto":
         known.scale = "cpu"  # to look at the devices, JAX would have to start
     if known.config is not None:
-        config = load(Path(known.config), choose_scale(known.scale))
+        config = load(known.config, choose_scale(known.scale))
     elif wants_help:
         config = Config(name="NAME", scale=known.scale, peft=LoRASP())
     else:
@@ -70,32 +73,45 @@ def parse(arguments: Sequence[str]) -> Command:
         parser.print_help()
         raise ValueError("no experiment was named: add --config, such as configs/multitask.py")
     if wants_help:
-        _parser(config.peft.name).print_help()
+        _parser(program, config.peft.name).print_help()
         print(f"\n{_on_scales(known.config, known.scale)}")
         rest = ["--help"]  # it may stand where an option wants its value
     if known.method is not None:
         config = dataclasses.replace(config, peft=_switch(config.peft, known.method))
     if known.resume and known.dry_run:
         raise ValueError("a run is either resumed or tried dry: leave --resume or --dry-run out")
-    config = override(config, rest)
+    config = override(config, rest, program)
     _check_simulated(config)
     return Command(config, known.resume, known.dry_run, known.wandb)
 
 
-def _parser(method: str = "") -> argparse.ArgumentParser:
+def parser(program: str) -> argparse.ArgumentParser:
+    """All options with the default method's, for completion."""
+    parser = argparse.ArgumentParser(
+        prog=program, parents=[_parser(program)], add_help=False, conflict_handler="resolve"
+    )
+    for name, kind in _fields(Config(name="NAME", scale="cpu", peft=LoRASP())):
+        choices = get_args(kind) if get_origin(kind) is Literal else None
+        parser.add_argument(f"--{name}", choices=choices)
+    parser.add_argument("--help", action="store_true")
+    return parser
+
+
+def _parser(program: str = "", method: str = "") -> argparse.ArgumentParser:
     """The options that are no fields of a config.
 
     Args:
+        program: how it was started.
         method: the experiment's, for its help.
     """
     parser = argparse.ArgumentParser(
-        prog="train.py",
+        prog=program,
         add_help=False,
         exit_on_error=False,
         allow_abbrev=False,
-        usage="python train.py --config FILE [options] [fields]",
+        usage=f"{program} --config FILE [options] [fields]",
     )
-    parser.add_argument("--config", help="experiment file, such as configs/multitask.py")
+    parser.add_argument("--config", type=Path, help="experiment file, such as configs/multitask.py")
     auto = "auto (the default: cpu on a CPU, accelerator elsewhere)"
     parser.add_argument("--scale", default="auto", help=f"{auto}, {', '.join(SCALES)}")
     methods = ", ".join(peft.names())
@@ -123,11 +139,11 @@ def _parser(method: str = "") -> argparse.ArgumentParser:
     return parser
 
 
-def _on_scales(path: str | None, scale: str) -> str:
+def _on_scales(path: Path | None, scale: str) -> str:
     """Which scale the fields in a help are of, and what another one would change."""
     if path is None:
         return "the fields below have their own defaults; with --config FILE, the experiment's"
-    changed = differences(lambda scale: load(Path(path), scale))
+    changed = differences(lambda scale: load(path, scale))
     return f"{changed}the defaults below are those of --scale {scale}"
 
 
@@ -143,11 +159,16 @@ def choose_scale(scale: str) -> str:
 def load(path: Path, scale: str) -> Config:
     """What the experiment file's `get_config(scale)` returns.
 
+    Shipped experiments, configs/multitask.py, are found from any folder.
+
     Raises:
         ValueError: there is no such file, its code fails, or it returns something else.
     """
+    ours = shipped.ROOT / path
+    if shipped.is_one(path, shipped.EXPERIMENTS) and not os.path.exists(path):
+        path = ours if os.path.isfile(ours) else path
     if not os.path.isfile(path):  # Path.is_file raises where a name is too long
-        folder = path.parent if os.path.isdir(path.parent) else SHIPPED
+        folder = path.parent if os.path.isdir(path.parent) else shipped.ROOT / shipped.EXPERIMENTS
         found = ", ".join(str(file) for file in sorted(folder.glob("*.py")))
         raise ValueError(f"there is no config {path}" + (f": found {found}" if found else ""))
     spec = importlib.util.spec_from_file_location(path.stem, path)
@@ -169,7 +190,7 @@ def load(path: Path, scale: str) -> Config:
     return config
 
 
-def override(config: Config, arguments: Sequence[str]) -> Config:
+def override(config: Config, arguments: Sequence[str], program: str = "") -> Config:
     """Apply dotted overrides such as `--peft.rank 64 --optim.steps 100`."""
     _check_names(arguments, config)
     wants_help = bool(HELP & set(arguments))
@@ -177,9 +198,7 @@ def override(config: Config, arguments: Sequence[str]) -> Config:
     quiet = contextlib.nullcontext() if wants_help else contextlib.redirect_stderr(printed)
     try:
         with quiet:
-            chosen = tyro.cli(
-                _concrete(config), default=config, args=list(arguments), prog="python train.py"
-            )
+            chosen = tyro.cli(_concrete(config), default=config, args=list(arguments), prog=program)
     except SystemExit as error:
         if wants_help:
             raise
@@ -190,7 +209,7 @@ def override(config: Config, arguments: Sequence[str]) -> Config:
 
 def _check_names(arguments: Sequence[str], config: Config) -> None:
     """Raise ValueError for an option that is neither a field nor one of ours."""
-    fields = ["--" + name for name in _names(config)]
+    fields = ["--" + name for name, _ in _fields(config)]
     for argument in arguments:
         name = argument.split("=")[0].replace("_", "-")
         if name.startswith("--") and name not in (*fields, "--help"):
@@ -228,14 +247,14 @@ def _switch(current: peft.Method, name: str) -> peft.Method:
     return method
 
 
-def _names(config: Any, prefix: str = "") -> Iterator[str]:
-    """Dotted names of all fields, as options spell them."""
+def _fields(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted names of all fields, as options spell them, and their types."""
     for field in dataclasses.fields(config):
         value, name = getattr(config, field.name), prefix + field.name.replace("_", "-")
         if dataclasses.is_dataclass(value):
-            yield from _names(value, f"{name}.")
+            yield from _fields(value, f"{name}.")
         else:
-            yield name
+            yield name, field.type
 
 
 def _concrete(config: Config) -> type[Config]:

@@ -7,7 +7,7 @@ import huggingface_hub
 import pytest
 from huggingface_hub.errors import LocalEntryNotFoundError
 
-from lorasp_jax.storage import hub
+from lorasp_jax.storage import hub, shipped
 
 
 def test_what_is_here_stays_here(tmp_path, monkeypatch):
@@ -67,13 +67,20 @@ def test_shipped_bases_are_found_from_any_folder(tmp_path, monkeypatch, no_hub):
     monkeypatch.chdir(tmp_path)
     assert (hub.local("assets/pi0_nano") / "config.json").is_file()
     for name in ("assets/pi0_nan", "assets/../runs/pi0"):
-        with pytest.raises(ValueError, match=r"is not there: a checkout|does not exist"):
+        with pytest.raises(
+            ValueError, match=r"is not there: the bases in .* are pi0_nano, |does not exist"
+        ):
             hub.local(name)
-    monkeypatch.setattr(hub, "ROOT", tmp_path / "site-packages")
-    with pytest.raises(
-        ValueError, match=r"site-packages/assets; an installed package has none: name"
-    ):
-        hub.local("assets/pi0_nano")
+
+
+def test_an_installed_package_names_the_bases_it_lacks(tmp_path, monkeypatch, no_hub):
+    (tmp_path / "assets" / "pi0_nano").mkdir(parents=True)
+    (tmp_path / "assets" / "pi0_nano" / "config.json").touch()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(shipped, "ROOT", tmp_path)
+    monkeypatch.setattr(shipped, "PACKAGE", tmp_path)
+    with pytest.raises(ValueError, match=r"the bases in .*/assets are pi0_nano; take pi0_small "):
+        hub.local("assets/pi0_small")
 
 
 def test_what_is_written_down_is_found_from_any_other_folder(tmp_path, monkeypatch):
@@ -81,13 +88,13 @@ def test_what_is_written_down_is_found_from_any_other_folder(tmp_path, monkeypat
     (tmp_path / "mine").mkdir()
     for where in ("mine", str(tmp_path / "mine")):
         assert hub.lasting(where) == str(tmp_path / "mine")
-    for where in ("assets/pi0_nano", str(hub.ROOT / "assets" / "pi0_nano")):
+    for where in ("assets/pi0_nano", str(shipped.ROOT / "assets" / "pi0_nano")):
         assert hub.lasting(where) == "assets/pi0_nano"
     for where in ("", "gs://bucket/folder", "hf://owner/name"):
         assert hub.found_again(hub.lasting(where)) == where
     (tmp_path / "assets" / "pi0_nano").mkdir(parents=True)
     assert hub.lasting("assets/pi0_nano") == str(tmp_path / "assets" / "pi0_nano")
-    assert hub.found_again("assets/pi0_nano") == str(hub.ROOT / "assets" / "pi0_nano")
+    assert hub.found_again("assets/pi0_nano") == str(shipped.ROOT / "assets" / "pi0_nano")
 
 
 @pytest.fixture

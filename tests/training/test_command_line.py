@@ -6,8 +6,8 @@ import jax
 import numpy as np
 import pytest
 
-import train
 from lorasp_jax import peft
+from lorasp_jax.cli import train
 from lorasp_jax.models import backbone
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.overrides import parse

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-import train
+from lorasp_jax.cli import train
 from lorasp_jax.training.run_folder import write_json
 from lorasp_jax.training.weights_and_biases import WeightsAndBiases
 from tests.runs import CONFIG, RESULTS

@@ -8,9 +8,9 @@ import pytest
 from flax import nnx
 from rich.console import Console
 
-import train
 from envs.compilation import messages
 from lorasp_jax.adapters import adaptation
+from lorasp_jax.cli import train
 from lorasp_jax.config import DataConfig
 from lorasp_jax.data.batches import Raw, flatten
 from lorasp_jax.models.pi0 import Pi0Config

@@ -1,0 +1,55 @@
+"""What completes the commands in a shell: `lorasp-jax completion bash`."""
+
+import argparse
+import importlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from envs.cli.refusals import parsed
+from lorasp_jax.cli import commands
+
+
+def main(arguments: Sequence[str], program: str) -> int:
+    """Print a completion script; returns the exit code."""
+    shell = parsed(parser(program), arguments).shell
+    import shtab
+
+    tree = _tree()
+    for action in _actions(tree):
+        if action.type is Path or action.dest in ("path", "paths"):
+            action.complete = shtab.FILE
+    print(shtab.complete(tree, shell))
+    return 0
+
+
+def parser(program: str) -> argparse.ArgumentParser:
+    """The options of the command."""
+    import shtab
+
+    parser = argparse.ArgumentParser(
+        prog=program,
+        description="Print a script that completes commands, options and fields with the Tab key.",
+        epilog=f'In bash: eval "$({program} bash)". In zsh: {program} zsh > DIRECTORY/_lorasp-jax, '
+        "where DIRECTORY is one of fpath.",
+    )
+    parser.add_argument("shell", choices=shtab.SUPPORTED_SHELLS)
+    return parser
+
+
+def _tree() -> argparse.ArgumentParser:
+    """All commands with their options."""
+    tree = argparse.ArgumentParser(prog="lorasp-jax")
+    found = tree.add_subparsers(metavar="command")
+    for name, (module, text) in commands.COMMANDS.items():
+        options = importlib.import_module(module).parser(f"lorasp-jax {name}")
+        found.add_parser(name, help=text, parents=[options], add_help=False)
+    return tree
+
+
+def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
+    """Every option and argument of a parser and of its commands."""
+    for action in parser._actions:
+        yield action
+        if isinstance(action, argparse._SubParsersAction):
+            for below in action.choices.values():
+                yield from _actions(below)

@@ -1,0 +1,115 @@
+"""The console command: the same programs as `python train.py` and the modules, by one name."""
+
+import importlib
+import subprocess
+import sys
+
+import pytest
+
+from lorasp_jax.cli import commands, completion, report
+from tests import ROOT
+from tests.runs import finish
+
+TAB = """
+source "$0"
+COMP_WORDS=("$@") COMP_CWORD=$(($# - 1))
+_shtab_lorasp_jax lorasp-jax "${@: -1}" "${@: -2:1}"
+printf "%s\\n" "${COMPREPLY[@]}"
+"""
+CONSOLE = "from lorasp_jax.cli.commands import main; main()"
+
+
+def console(*arguments, cwd=None):
+    command = [sys.executable, "-c", CONSOLE, *arguments]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
+
+
+def test_what_is_no_command_is_refused():
+    found = console("trian")
+    assert found.returncode == 2
+    assert "'trian' (choose from" in found.stderr
+    assert "Traceback" not in found.stderr
+
+
+@pytest.mark.parametrize("name", commands.COMMANDS)
+def test_every_command_has_help_under_its_own_name(name, capsys):
+    module = importlib.import_module(commands.COMMANDS[name][0])
+    assert module.parser(f"lorasp-jax {name}").prog == f"lorasp-jax {name}"
+    with pytest.raises(SystemExit, match="0"):
+        module.main(["--help"], f"lorasp-jax {name}")
+    printed = capsys.readouterr().out
+    assert f"usage: lorasp-jax {name}" in printed
+    assert "python " not in printed.partition("\n")[0]
+
+
+def test_train_is_the_same_program(tmp_path):
+    bad = ["--config", "configs/multitask.py", "--scale", "smoke", "--peft.rnk", "3"]
+    found = console("train", *bad, cwd=tmp_path)
+    script = [sys.executable, str(ROOT / "train.py"), *bad]
+    other = subprocess.run(script, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert found.returncode == other.returncode == 2
+    assert found.stderr == other.stderr
+    assert "did you mean --peft.rank?" in found.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_report_is_written_again(tmp_path, capsys):
+    folder = finish(tmp_path)
+    assert report.main([str(folder)]) == 0
+    assert capsys.readouterr().out == f"report: {folder / 'report.html'}\n"
+    first = (folder / "report.html").read_bytes()
+    (folder / "report.html").unlink()
+    assert report.main([str(folder)]) == 0
+    assert (folder / "report.html").read_bytes() == first
+
+
+def test_a_folder_without_a_run_has_no_report(tmp_path, capsys):
+    assert report.main([str(tmp_path / "nowhere")]) == 2
+    printed = capsys.readouterr().err
+    assert "nowhere holds no run" in printed
+    assert printed.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture(scope="module")
+def bash_script(tmp_path_factory):
+    path = tmp_path_factory.mktemp("completion") / "lorasp-jax.bash"
+    path.write_text(console("completion", "bash").stdout)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["tra"], {"train"}),
+        (["train", "--peft.gran"], {"--peft.granularity"}),
+        (["train", "--peft.granularity", "sa"], {"sample"}),
+        (["envs", "col"], {"collect"}),
+        (["envs", "collect", "--num-"], {"--num-envs", "--num-episodes"}),
+        (["data", "convert", "--to", ""], {"cache", "rlds"}),
+        (["report", "run"], {"runs"}),
+        (["train", "--config", "run"], {"runs"}),
+    ],
+)
+def test_the_tab_key(words, expected, bash_script, tmp_path):
+    (tmp_path / "runs").mkdir()
+    words = ["lorasp-jax", *words]
+    press = 'source "$0"; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1))\n'
+    press += (
+        '_shtab_lorasp_jax lorasp-jax "${@: -1}" "${@: -2:1}"\nprintf "%s\\n" "${COMPREPLY[@]}"'
+    )
+    found = subprocess.run(
+        ["bash", "-c", press, bash_script, *words],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert expected <= {line.rstrip("/ ") for line in found.stdout.splitlines()}
+    assert len(found.stdout.splitlines()) < 10
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_other_shells(shell, capsys):
+    assert completion.main([shell], "lorasp-jax completion") == 0
+    assert "peft.granularity" in capsys.readouterr().out
