@@ -58,7 +58,7 @@ def test_what_is_printed_is_what_the_program_takes(config, tmp_path, monkeypatch
     monkeypatch.setattr(setup, "build", lambda *a, **k: built.append(build(*a, **k)) or built[0])
     monkeypatch.setattr(train, "Console", lambda **_: Console(width=150))
     monkeypatch.setattr(
-        "lorasp_jax.training.overrides.parse", lambda _: Command(config, dry_run=True)
+        "lorasp_jax.training.overrides.parse", lambda *_: Command(config, dry_run=True)
     )
     assert train.main([]) == 0
     assert not list(tmp_path.iterdir())
