@@ -20,6 +20,7 @@ from lorasp_jax import peft
 from lorasp_jax.config import SCALES, Config
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.storage import shipped
+from lorasp_jax.training.help_text import REGISTRY
 from lorasp_jax.training.scales import differences
 
 HELP = {"-h", "--help"}
@@ -198,7 +199,13 @@ def override(config: Config, arguments: Sequence[str], program: str = "") -> Con
     quiet = contextlib.nullcontext() if wants_help else contextlib.redirect_stderr(printed)
     try:
         with quiet:
-            chosen = tyro.cli(_concrete(config), default=config, args=list(arguments), prog=program)
+            chosen = tyro.cli(
+                _concrete(config),
+                default=config,
+                args=list(arguments),
+                prog=program,
+                registry=REGISTRY,
+            )
     except SystemExit as error:
         if wants_help:
             raise

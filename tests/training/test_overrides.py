@@ -136,3 +136,12 @@ def test_a_file_without_get_config(tmp_path):
     file.write_text("")
     with pytest.raises(ValueError, match=r"gives no config .*no function get_config"):
         load(file, "cpu")
+
+
+def test_help_is_running_text(monkeypatch, capsys):
+    """tyro would break this docstring of three lines where its source does."""
+    monkeypatch.setenv("COLUMNS", "400")
+    with pytest.raises(SystemExit, match="0"):
+        parse(["--help"])
+    said = "nothing, all but matrix products, or all inside a layer; auto is the first of these"
+    assert said in capsys.readouterr().out

@@ -1,0 +1,43 @@
+"""What `--help` says of a field: its docstring as running text.
+
+tyro keeps the line breaks of docstrings whose further lines are indented, as those of fields are.
+"""
+
+import dataclasses
+import functools
+from typing import get_type_hints
+
+import docstring_parser
+import tyro
+from tyro.constructors import StructConstructorSpec, StructFieldSpec, StructTypeInfo
+
+REGISTRY = tyro.constructors.ConstructorRegistry()
+"""For `tyro.cli`, whose default must be an instance."""
+
+
+@REGISTRY.struct_rule
+def _fields(info: StructTypeInfo) -> StructConstructorSpec | None:
+    """What tyro takes a dataclass for."""
+    if not dataclasses.is_dataclass(info.type):
+        return None
+    types = get_type_hints(info.type, include_extras=True)
+    fields = (
+        StructFieldSpec(
+            field.name,
+            types[field.name],
+            getattr(info.default, field.name),
+            helptext=functools.partial(_text, info.type, field.name),
+        )
+        for field in dataclasses.fields(info.type)
+        if field.init
+    )
+    return StructConstructorSpec(instantiate=info.type, fields=tuple(fields))
+
+
+def _text(owner: type, name: str) -> str | None:
+    """The docstring of a field, on one line."""
+    for kind in owner.__mro__[:-1]:
+        for field in docstring_parser.parse_from_object(kind).params:
+            if field.arg_name == name and field.description:
+                return " ".join(field.description.split())
+    return None
