@@ -9,6 +9,7 @@ Nothing is rendered unless `observe` is called, and no world restarts unless `re
 """
 
 import dataclasses
+import enum
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -30,6 +31,14 @@ from envs.tasks import Layout, Task, View
 
 _HOME_NOISE = 0.03  # rad, half the range of the random start pose around home
 _START_OPENING = 0.04  # m, of the gripper
+
+
+@enum.unique
+class _LayoutStream(enum.IntEnum):
+    """What is drawn at random beside a layout, from a key of its own derived from the layout's."""
+
+    DISTRACTORS = 1
+    RANDOMIZATION = 2
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -287,11 +296,11 @@ class Env:
     def _reset(self, ranges: Randomization | None, key: jax.Array) -> State:
         layout_key, pose_key, instruction_key = jax.random.split(key, 3)
         layout = self.task.place(layout_key)
-        others = jax.random.fold_in(layout_key, 1)
-        layout |= distractors.place(others, layout, self.distractors)
+        others_key = jax.random.fold_in(layout_key, _LayoutStream.DISTRACTORS)
+        layout |= distractors.place(others_key, layout, self.distractors)
         draw = None
         if ranges:
-            draw_key = jax.random.fold_in(layout_key, 2)
+            draw_key = jax.random.fold_in(layout_key, _LayoutStream.RANDOMIZATION)
             draw, layout = randomization.draw(draw_key, ranges, self.model, layout)
         noise = jax.random.uniform(pose_key, (self.num_joints,), minval=-1.0, maxval=1.0)
         joints = jnp.asarray(self.robot.home, jnp.float32) + _HOME_NOISE * noise

@@ -16,10 +16,10 @@ from rich.console import Console
 import envs
 from envs.cli import recipes
 from envs.cli.bars import Report, bars
-from envs.datasets import places, rlds
-from envs.datasets.episodes import Episodes, replacing
+from envs.datasets import rlds, writing
+from envs.datasets.episodes import Episodes
 from envs.datasets.files import check_local
-from envs.datasets.locks import alone
+from envs.datasets.locks import locked
 from envs.experts import collection
 from envs.names import names
 from envs.rendering import video
@@ -39,8 +39,8 @@ def collect(options: argparse.Namespace, console: Console) -> None:
     scenes = [_scene(options, task) for task in tasks]  # bad input shows before any work
     with contextlib.ExitStack() as locks:
         for file in files:
-            locks.enter_context(alone(file))
-            places.recover(file)
+            locks.enter_context(locked(file))
+            writing.recover_folder(file)
         left = {f: e for f, e in zip(files, scenes, strict=True) if not _is_done(options, e, f)}
         try:
             found = _side_by_side(options, left, console)
@@ -65,7 +65,7 @@ def gallery(options: argparse.Namespace, console: Console) -> None:
             episode = _episode(options, console, task, robot)
             views = _views(episode)[::_EVERY]
             options.out.mkdir(parents=True, exist_ok=True)
-            with replacing(file) as unfinished:
+            with writing.replacing(file) as unfinished:
                 video.write_gif(unfinished, views, _EVERY * episode.control_dt)
             console.print(str(file))
 
@@ -87,7 +87,7 @@ def play(options: argparse.Namespace, console: Console) -> None:
     episode = _episode(options, console, options.task, options.robot)
     views = _views(episode)
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(options.out) as unfinished:
+    with writing.replacing(options.out) as unfinished:
         video.write_video(unfinished, views, fps=1 / episode.control_dt)
     text = episode.instructions[int(episode.instruction[0])]
     console.print(f"{options.out}: {len(views)} steps, {text!r}")
@@ -181,7 +181,7 @@ def _collect(options: argparse.Namespace, env: envs.Env, out: Path, report: Repo
         _save(options, parts.folder, out)
         size = out.stat().st_size
     else:
-        places.install(parts.folder, out)
+        writing.replace_folder(parts.folder, out, rlds.metadata)  # raises for all but datasets
     return (
         f"{parts.num_episodes} episodes of {parts.attempted} tried, {parts.facts['steps']} steps, "
         f"{size / 1e6:.0f} MB"

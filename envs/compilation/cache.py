@@ -1,10 +1,12 @@
 """Compiled programs kept between processes, safely for many at once."""
 
 import os
-import tempfile
+from pathlib import Path
 
 import jax
 from jax._src import compilation_cache, lru_cache  # JAX has no public way to replace its writer
+
+from envs.datasets.writing import write_bytes
 
 
 class WholeFiles(lru_cache.LRUCache):
@@ -23,14 +25,7 @@ class WholeFiles(lru_cache.LRUCache):
         if self.eviction_enabled or "://" in str(self.path):
             super().put(key, value)  # a lock guards it, or a bucket that writes whole objects
             return
-        handle, aside = tempfile.mkstemp(dir=self.path, prefix=".", suffix=".unfinished")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(value)
-            os.replace(aside, self.path / f"{key}-cache")
-        except BaseException:
-            os.unlink(aside)
-            raise
+        write_bytes(Path(self.path) / f"{key}-cache", value)
 
 
 def enable() -> None:

@@ -1,6 +1,5 @@
 """Recorded episodes: batched arrays in memory, one .npz file on disk."""
 
-import contextlib
 import dataclasses
 import functools
 import json
@@ -8,9 +7,8 @@ import math
 import numbers
 import os
 import re
-import shutil
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -20,6 +18,7 @@ import numpy as np
 
 from envs.actions import MODES
 from envs.datasets.files import check_local, check_memory, damage, regular
+from envs.datasets.writing import replacing
 
 Array = jax.Array | np.ndarray
 
@@ -259,41 +258,6 @@ def _padded(xp: Any, array: Array, steps: int) -> Array:
     if array.ndim == 1 or array.shape[1] == steps:
         return array
     return xp.pad(array, [(0, 0), (0, steps - array.shape[1])] + [(0, 0)] * (array.ndim - 2))
-
-
-@contextlib.contextmanager
-def replacing(file: Path) -> Iterator[Path]:
-    """A temporary path that takes the file's place when all went well."""
-    unfinished = file.with_name(f".{file.name}.{os.getpid()}.tmp")
-    try:
-        yield unfinished
-        os.replace(unfinished, file)
-    finally:
-        unfinished.unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def creating(path: str | os.PathLike) -> Iterator[Path]:
-    """A temporary folder that takes the path's place when all went well, else nothing is left.
-
-    One process at a time may create the path (`envs.datasets.locks`). Leftovers of a killed one are
-    deleted.
-
-    Raises:
-        ValueError: if the path exists already.
-    """
-    path = Path(path)
-    if path.exists():
-        raise ValueError(f"{path} exists already: choose another path")
-    folder = path.with_name(f".{path.name}.tmp")
-    if folder.exists():
-        shutil.rmtree(folder)
-    try:
-        folder.mkdir(parents=True)
-        yield folder
-        os.rename(folder, path)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:

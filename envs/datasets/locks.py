@@ -1,36 +1,49 @@
-"""A file or folder that one process at a time makes."""
+"""A file or folder that one process at a time may write."""
 
 import contextlib
-import fcntl
-import os
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TextIO
+
+import filelock
 
 from envs.datasets.files import check_local
 
+_RETRY = 0.2  # seconds; a lock file deleted by its last holder is made anew at the second attempt
+
 
 @contextlib.contextmanager
-def alone(path: Path, waiting: Callable[[], None] | None = None) -> Iterator[None]:
-    """Keeps other processes from making the same file or folder meanwhile.
+def locked(path: Path, waiting: Callable[[], None] | None = None) -> Iterator[None]:
+    """Keep other processes and threads from writing the same file or folder meanwhile.
 
-    A lock file beside it is what they share. The operating system unlocks it when a process ends,
-    however it ends. Where something is raised inside, empty folders made for it go again.
+    They share a lock file beside it, which is deleted at the end. If something is raised inside,
+    empty folders that were made for it are deleted, too.
 
     Args:
         path: the file or folder.
-        waiting: called once if another process is at it, whose end is then waited for; None: not
-            waited for.
+        waiting: called once if another process holds the lock, which is then waited for; None: that
+            is an error.
 
     Raises:
-        ValueError: if another process is at it and is not waited for, the path is a URL, or as
-            `open_lock`.
+        ValueError: another process holds the lock and `waiting` is None, the path is a URL, or as
+            `acquire`.
     """
     check_local(path)
     missing = [folder for folder in path.parents if not folder.exists()]
+    file = path.with_name(f".{path.name}.lock")
     try:
-        with _locked(path, waiting):
-            yield
+        try:
+            lock = acquire(file)
+        except filelock.Timeout as error:
+            if waiting is None:
+                raise ValueError(f"another process is writing {path}") from error
+            waiting()
+            lock = acquire(file, wait=True)
+        with lock:
+            try:
+                yield
+            finally:
+                file.unlink(missing_ok=True)
     except BaseException:
         for folder in missing:
             with contextlib.suppress(OSError):  # it is not empty, or was not made
@@ -38,48 +51,25 @@ def alone(path: Path, waiting: Callable[[], None] | None = None) -> Iterator[Non
         raise
 
 
-@contextlib.contextmanager
-def _locked(path: Path, waiting: Callable[[], None] | None) -> Iterator[None]:
-    """`alone`, but for the folders."""
-    lock = path.with_name(f".{path.name}.lock")
-    how = fcntl.LOCK_EX | fcntl.LOCK_NB
-    while True:
-        with open_lock(lock) as held:
-            try:
-                fcntl.flock(held, how)
-            except BlockingIOError as error:
-                if waiting is None:
-                    raise ValueError(f"another process is writing {path}") from error
-                waiting()
-                how = fcntl.LOCK_EX
-                continue
-            if _was_deleted(held, lock):  # by the process that had it, since it was opened
-                continue
-            try:
-                yield
-            finally:
-                lock.unlink(missing_ok=True)
-            return
+def acquire(file: Path, *, wait: bool = False) -> AbstractContextManager:
+    """Lock a file, made where there is none; the lock is released at the end of a `with` block.
 
+    The operating system releases it when the process ends, in whatever way.
 
-def open_lock(path: Path) -> TextIO:
-    """A lock file, made where there is none.
+    Args:
+        file: the lock file itself.
+        wait: until no other process holds the lock.
 
     Raises:
-        ValueError: it cannot be opened.
+        filelock.Timeout: another process holds the lock, and it is not waited for.
+        ValueError: the file cannot be opened or locked.
     """
-    # Not through a link: the file that it leads to is not ours to make, to write or to wait for.
-    flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        return os.fdopen(os.open(path, flags, 0o666), "a+")
+        if file.is_fifo():
+            raise OSError(None, "it is a pipe", str(file))
+        lock = filelock.FileLock(file, fallback_to_soft=False)
+        return lock.acquire(timeout=-1 if wait else _RETRY)
+    except filelock.Timeout:  # an OSError, too
+        raise
     except OSError as error:
-        raise ValueError(f"{error.filename or path} cannot be opened: {error.strerror}") from error
-
-
-def _was_deleted(file: TextIO, path: Path) -> bool:
-    """Whether an open file is no longer the one at its path."""
-    try:
-        return not os.path.samestat(os.fstat(file.fileno()), path.stat())
-    except FileNotFoundError:
-        return True
+        raise ValueError(f"{error.filename or file} cannot be opened: {error.strerror}") from error

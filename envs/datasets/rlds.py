@@ -23,9 +23,9 @@ import tensorflow_datasets as tfds
 from array_record.python import array_record_module
 
 from envs.datasets import rlds_schema
-from envs.datasets.episodes import SHARED, Episodes, creating, replacing
+from envs.datasets.episodes import SHARED, Episodes
 from envs.datasets.files import reason, regular
-from envs.datasets.locks import alone
+from envs.datasets.locks import locked
 from envs.datasets.rlds_reading import (
     FORMAT,
     METADATA,
@@ -36,6 +36,7 @@ from envs.datasets.rlds_reading import (
     metadata,
     read,
 )
+from envs.datasets.writing import creating, sync, write_text
 
 __all__ = ["METADATA", "Parts", "Reader", "metadata", "read", "write"]
 
@@ -60,7 +61,7 @@ def write(episodes: Episodes, path: str | os.PathLike) -> None:
             not fit one another.
         OSError: if there is no room for it.
     """
-    with alone(Path(path)), creating(path) as folder:
+    with locked(Path(path)), creating(path) as folder:
         parts = Parts(folder, {})
         parts.append(episodes)
         parts.complete()
@@ -167,8 +168,7 @@ class Parts:
         info.write_to_directory(self.folder)
 
     def _save(self) -> None:
-        with replacing(self.folder / METADATA) as unfinished:
-            unfinished.write_text(json.dumps(self.facts, indent=2))
+        write_text(self.folder / METADATA, json.dumps(self.facts, indent=2))
 
     @property
     def _name(self) -> str:
@@ -208,6 +208,7 @@ def _write_records(file: Path, records: Iterable[bytes]) -> None:
             writer.write(record)
     with _failure_in_one_sentence(file):
         writer.close()
+    sync(file)
 
 
 def _check_whole(file: Path, episodes: int) -> None:

@@ -24,7 +24,7 @@ from jax import export
 
 from envs import tasks
 from envs.compilation import fast_cpu
-from envs.datasets.episodes import replacing
+from envs.datasets.writing import write_bytes
 from envs.env import Env
 from envs.rendering.renderer import RayRenderer
 from envs.tasks import Task
@@ -152,8 +152,7 @@ def _load(file: Path) -> export.Exported | None:
 def _save(file: Path, program: bytearray) -> None:
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(file) as unfinished:
-            unfinished.write_bytes(_checksum(program) + program)
+        write_bytes(file, _checksum(program) + program)
     except OSError as error:  # as JAX's cache does
         warnings.warn(f"a traced program could not be kept: {error}", stacklevel=2)
 

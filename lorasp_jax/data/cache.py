@@ -21,9 +21,10 @@ from typing import Any, Self
 
 import numpy as np
 
-from envs.datasets.episodes import SHARED, Episodes, check_camera, creating
+from envs.datasets.episodes import SHARED, Episodes, check_camera
 from envs.datasets.files import damage, read_json, read_text
-from envs.datasets.locks import alone
+from envs.datasets.locks import locked
+from envs.datasets.writing import creating
 from lorasp_jax.data.batches import Steps
 from lorasp_jax.data.cache_writer import Column, mapped
 from lorasp_jax.data.pictures import Pictures, checksum
@@ -66,7 +67,7 @@ def write(
     """
     path, total = Path(path), sum(source.num_steps for source in sources)
     there = path.exists()
-    with alone(path, waiting):
+    with locked(path, waiting):
         if path.exists() and not there:
             _check(Cache(path), sources, total)
             return

@@ -1,6 +1,5 @@
 """Arrays in files: written row by row, and mapped into memory again."""
 
-import os
 import zlib
 from pathlib import Path
 from typing import Any
@@ -27,11 +26,9 @@ class Column:
         self._length += len(rows)
 
     def close(self) -> None:
-        """Ends it; it is on the disk then."""
+        """Ends it."""
         self._file.seek(0)
         self._write_header()
-        self._file.flush()
-        os.fsync(self._file.fileno())  # before the folder gets its name
         self._file.close()
 
     def _write_header(self) -> None:

@@ -13,7 +13,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from envs.datasets.episodes import Episodes, replacing
+from envs.datasets.episodes import Episodes
+from envs.datasets.writing import replacing
 from envs.rendering.video import side_by_side
 from lorasp_jax.data.lerobot import LeRobot
 from lorasp_jax.data.source import Source

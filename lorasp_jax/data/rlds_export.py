@@ -4,8 +4,9 @@ import os
 from pathlib import Path
 
 from envs.datasets import rlds
-from envs.datasets.episodes import concatenate, creating
-from envs.datasets.locks import alone
+from envs.datasets.episodes import concatenate
+from envs.datasets.locks import locked
+from envs.datasets.writing import creating
 from lorasp_jax.data.source import Progress, Source
 
 _TOGETHER = 16  # episodes in a file
@@ -27,7 +28,7 @@ def to_rlds(source: Source, path: str | os.PathLike[str], progress: Progress) ->
     tasks = sorted({source.episode(number, ()).task for number in (0, len(source) - 1)})
     if len(tasks) > 1:  # now, not when hours of the first one's pictures are written
         raise ValueError(f"an RLDS folder holds one task, not {', '.join(tasks)}")
-    with alone(Path(path)), creating(path) as folder:
+    with locked(Path(path)), creating(path) as folder:
         parts, done = rlds.Parts(folder, {}), 0
         for first in range(0, len(source), _TOGETHER):
             numbers = range(first, min(first + _TOGETHER, len(source)))

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import functools
-import os
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -15,6 +14,7 @@ from rich.progress import Progress
 
 import envs
 from envs.compilation import messages
+from envs.datasets.writing import replacing
 from envs.env import Env
 from envs.physics import physics
 from envs.rendering.renderer import RayRenderer
@@ -23,6 +23,7 @@ from lorasp_jax.evaluation import video
 from lorasp_jax.evaluation.rollout import Result, evaluate, make_rollout
 from lorasp_jax.training import records
 from lorasp_jax.training.demonstrations import side_by_side
+from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Callback, Run, bars
 from lorasp_jax.training.run_folder import read_json, write_json
 
@@ -77,9 +78,8 @@ class Evaluation(Callback):
         for task, result in results.items():
             first = {name: np.asarray(i[0, 0]) for name, i in run.episodes[task].image.items()}
             video.write_picture(run.folder / f"cameras_{task}.png", video.side_by_side(first))
-            unfinished = run.folder / f"unfinished_{task}.mp4"  # a report may read the one before
-            _film(self._tasks[task][0], result, unfinished)
-            os.replace(unfinished, run.folder / f"rollout_{task}.mp4")
+            with replacing(run.folder / f"rollout_{task}.mp4") as unfinished:
+                _film(self._tasks[task][0], result, unfinished)
 
     def _measure(self, run: Run, when: str, episodes: int = 0) -> dict[str, Result]:
         """Results by task, of the config's number of episodes or another; compilations run side by
@@ -107,7 +107,7 @@ class Evaluation(Callback):
         episodes = episodes or run.config.evaluation.episodes
         bar = progress.add_task(f"compiling evaluation of {task} ...", total=episodes)
         number = 2 * run.config.tasks.index(task) + (when == "after")
-        key = jax.random.fold_in(jax.random.key(run.config.seed), 10 + number)
+        key = RandomStream.EVALUATION.key(run.config.seed, number)
         with contextlib.ExitStack() as compiles:
             if task not in self._tasks:
                 what = f"the evaluation of {task}, its first episodes included"

@@ -9,6 +9,7 @@ from statistics import median
 from typing import Any
 
 from envs.datasets.files import inside, read_bytes
+from envs.datasets.writing import write_text
 from lorasp_jax.report import figures
 from lorasp_jax.training import records
 from lorasp_jax.training.run_folder import (
@@ -17,7 +18,6 @@ from lorasp_jax.training.run_folder import (
     STOPPED,
     read_json,
     read_metrics,
-    write_text,
 )
 
 _REFRESH = "<meta http-equiv=refresh content=30>"

@@ -6,9 +6,12 @@ repository of the same name.
 
 import os
 import re
-import shutil
+import sys
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
+
+from envs.datasets.locks import locked
+from envs.datasets.writing import creating, replacing
 
 from lorasp_jax.storage import shipped
 
@@ -113,26 +116,29 @@ def _from_bucket(url: str) -> Path:
 
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "lorasp_jax"
     target = cache / url.rstrip("/").replace("://", "/", 1)
-    if target.exists():
-        return target
-    unfinished = target.with_name(f".{target.name}.{os.getpid()}")
+    waiting = f"another process is fetching {url}: waiting for it"
     try:
-        store, root = fsspec.core.url_to_fs(url)
-        names = [n for n in store.find(root) if "/train_state/" not in n]
-        if not names:
-            raise FileNotFoundError("there is nothing of that name")
-        for name in names:
-            file = unfinished / name[len(root.rstrip("/")) :].lstrip("/")
-            file.parent.mkdir(parents=True, exist_ok=True)
-            store.get_file(name, str(file))
-        unfinished.rename(target)
+        with locked(target, lambda: print(waiting, file=sys.stderr)):
+            if not target.exists():
+                _fetch(*fsspec.core.url_to_fs(url), target)
     except ImportError as error:  # fsspec's own sentence names the store's package alone
         raise ValueError(f'{url} needs a package: pip install "lorasp_jax[buckets]"') from error
     except Exception as error:  # every store raises its own kinds
         raise ValueError(f"{url} cannot be fetched: {_first_line(error)}.") from error
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
     return target
+
+
+def _fetch(store: Any, root: str, target: Path) -> None:
+    """Copy a file or folder of a bucket."""
+    names = [name for name in store.find(root) if "/train_state/" not in name]
+    if not names:
+        raise FileNotFoundError("there is nothing of that name")
+    is_file = names == [root]
+    with (replacing if is_file else creating)(target) as unfinished:
+        for name in names:
+            file = unfinished if is_file else unfinished / name[len(root) :].lstrip("/")
+            file.parent.mkdir(parents=True, exist_ok=True)
+            store.get_file(name, str(file))
 
 
 def _first_line(error: Exception) -> str:

@@ -4,7 +4,6 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-import jax
 from flax import nnx
 
 import envs
@@ -15,6 +14,7 @@ from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.checkpoints import loading
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.storage import hub
+from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run_folder import read_json
 
 SIZES = ("nano", "small", "base", "nano_pi05", "base_pi05")
@@ -52,8 +52,7 @@ def base_model(config: Config, *, shapes: bool = False) -> tuple[Backbone, str]:
         if loading.is_own(folder):
             _check_time(folder, config.control_dt)
         return model, models.weights_hash(model)
-    key = jax.random.fold_in(jax.random.key(config.seed), 4)
-    model = wanted.create(nnx.Rngs(key))
+    model = wanted.create(nnx.Rngs(RandomStream.BASE.key(config.seed)))
     return model, models.weights_hash(model)
 
 

@@ -18,6 +18,7 @@ import orbax.checkpoint as ocp
 from rich.console import Console
 
 from envs.cli.refusals import DISK_FULL
+from envs.datasets.writing import rename
 from lorasp_jax.models.checkpoints import orbax_folders
 from lorasp_jax.storage.digest import digest
 from lorasp_jax.training.distributed import processes
@@ -130,7 +131,7 @@ class Checkpoints:
             names = (self._folder / f"{step}.damaged{suffix}" for suffix in _suffixes())
             aside = next(path for path in names if not path.exists())
             if processes.is_first():
-                (self._folder / str(step)).rename(aside)
+                rename(self._folder / str(step), aside)
             self._say(
                 f"the checkpoint at step {step} is damaged, {reason}: it is set aside as {aside}, "
                 f"and the run goes on from step {used}"

@@ -11,6 +11,7 @@ import jax
 import envs
 from envs.datasets.episodes import Episodes
 from lorasp_jax.config import Config
+from lorasp_jax.training.random_streams import RandomStream
 
 Progress = Callable[[str, int, int], None]
 """Called with task, episodes done and episodes wanted."""
@@ -34,7 +35,7 @@ def fresh_demonstrations(config: Config, generation: int) -> dict[str, Episodes]
 
 def _keys(config: Config) -> jax.Array:
     """One for each task."""
-    return jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 1), len(config.tasks))
+    return jax.random.split(RandomStream.DEMONSTRATIONS.key(config.seed), len(config.tasks))
 
 
 def side_by_side(function: Callable, *arguments: Iterable[Any]) -> list[Any]:

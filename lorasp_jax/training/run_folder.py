@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import fcntl
 import json
 import math
 import os
@@ -13,6 +12,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
 
+import filelock
 import numpy as np
 from tensorboardX import summary
 from tensorboardX.event_file_writer import EventsWriter
@@ -20,7 +20,8 @@ from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.proto.summary_pb2 import Summary
 
 from envs.datasets.files import check_only_files, damage, read_bytes
-from envs.datasets.locks import open_lock
+from envs.datasets.locks import acquire
+from envs.datasets.writing import UNFINISHED, write_text
 from lorasp_jax.config import Config
 from lorasp_jax.storage.digest import sealed, unsealed
 from lorasp_jax.training import records
@@ -43,17 +44,6 @@ def to_json(config: Config) -> dict[str, Any]:
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
     """Write a JSON object with its digest so that readers never see half of it."""
     write_text(path, json.dumps(sealed(value), indent=2) + "\n")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a whole file under a temporary name, then give it its own."""
-    temporary = path.with_suffix(".tmp")
-    temporary.unlink(missing_ok=True)  # a killed process left it, or it leads elsewhere
-    with temporary.open("x") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())  # or a power cut could leave the name without the text
-    os.replace(temporary, path)
 
 
 def read_json(path: Path, kind: Mapping[Any, Any] = MappingProxyType({})) -> dict[str, Any]:
@@ -110,15 +100,18 @@ def _begin(config: Config, folder: Path) -> None:
     """Record a new run in a folder that holds none."""
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file: remove it, or give this run another --name")
-    allowed = {folder / name for name in (RECORD, CLOCK, DATASET)}
+    names = (RECORD, CLOCK, DATASET)
+    allowed = {folder / name for name in names}
+    for name in names:
+        allowed |= {*folder.glob(f".{name}.*{UNFINISHED}")}  # of a process that was killed
     if any(path not in allowed for path in folder.rglob("*") if not path.is_dir()):
         raise ValueError(
             f"{folder} already holds a run: add --resume to continue it, "
             "or give this one another --name"
         )
     folder.mkdir(exist_ok=True)
-    for name in (CLOCK, DATASET):
-        (folder / name).unlink(missing_ok=True)
+    for path in allowed - {folder / RECORD}:
+        path.unlink(missing_ok=True)
     write_json(folder / RECORD, to_json(config))
 
 
@@ -149,23 +142,18 @@ def record_dataset(folder: Path, facts: Mapping[str, Any], *, streams: bool) -> 
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Keep other processes out of a folder, by a file beside it.
-
-    The operating system lets go of the lock when the process ends, in whatever way: the file that a
-    killed run leaves stops nobody.
-    """
-    with open_lock(folder.parent / f".{folder.name}.lock") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            file.seek(0)
-            raise ValueError(
-                f"{folder} is in use by {file.read().strip() or 'another process'}: wait for that "
-                "run or stop it, or give this one another --name"
-            ) from error
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {platform.node()}\n")
-        file.flush()
+    """Keep other processes out of a folder, by a lock file beside it that names its last user."""
+    file = folder.parent / f".{folder.name}.lock"
+    try:
+        lock = acquire(file)
+    except filelock.Timeout as error:
+        user = file.read_text().strip() or "another process"
+        raise ValueError(
+            f"{folder} is in use by {user}: wait for that run or stop it, or give this one another "
+            "--name"
+        ) from error
+    with lock:
+        file.write_text(f"process {os.getpid()} on {platform.node()}\n")
         yield
 
 

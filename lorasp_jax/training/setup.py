@@ -38,6 +38,7 @@ from lorasp_jax.training.dataset import cached, is_simulated, opened, outline
 from lorasp_jax.training.demonstrations import demonstrations
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.distributed import processes
+from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Run, bars
 from lorasp_jax.training.run_folder import record_dataset
 
@@ -208,7 +209,7 @@ def _adapted(
     statistics: Mapping[str, jax.Array] = MappingProxyType({}),
 ) -> Backbone:
     """The model with the method on the run's targets, from the run's key."""
-    rngs = nnx.Rngs(jax.random.fold_in(jax.random.key(config.seed), 3))
+    rngs = nnx.Rngs(RandomStream.ADAPTERS.key(config.seed))
     rules = presets.rules(config.targets, method)
     return adaptation.adapt(model, rules, rngs=rngs, statistics=statistics)
 
@@ -221,7 +222,7 @@ def input_moments(run: Run, model: Backbone, processor: Processor) -> dict[str, 
         key, batch = drawn
         return model.loss(key, batch.observation, batch.actions, action_mask=batch.action_mask)
 
-    keys = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 5), STATISTICS_BATCHES)
+    keys = jax.random.split(RandomStream.STATISTICS.key(config.seed), STATISTICS_BATCHES)
     pattern = "|".join(f"(?:{path})" for path in presets.patterns(config.targets))
     batches = ((key, draw(key)) for key in keys)
     return calibration.input_moments(model, batches, pattern, forward)

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from envs.datasets.locks import alone
+from envs.datasets.locks import locked
 from lorasp_jax.data import cache
 from lorasp_jax.data.__main__ import main
 from lorasp_jax.data.cache import Cache
@@ -42,7 +42,7 @@ def whole(tmp_path_factory):
 def test_one_writes_and_the_others_wait(whole, tmp_path):
     out = tmp_path / "cache"
     sentence = f"another process is writing {out}: waiting for it\n"
-    with alone(out):
+    with locked(out):
         children = [convert(out), convert(out)]
         assert [child.stderr.readline() for child in children] == [sentence, sentence]
     said = [child.communicate()[1] for child in children]
@@ -84,7 +84,7 @@ def test_what_another_one_wrote_must_be_the_same(tmp_path, keys, fits):
     out, asked = tmp_path / "cache", threading.Event()
     cache.write([LeRobot(golden("v3"))], tmp_path / "other", lambda *_: None)
     with ThreadPoolExecutor() as pool:
-        with alone(out):
+        with locked(out):
             mine = LeRobot(golden("v3"), Keys(**keys))
             waiting = pool.submit(cache.write, [mine], out, lambda *_: None, asked.set)
             assert asked.wait(60)
@@ -97,6 +97,6 @@ def test_what_another_one_wrote_must_be_the_same(tmp_path, keys, fits):
 
 def test_who_does_not_wait_is_refused(tmp_path):
     out = tmp_path / "cache"
-    with alone(out), pytest.raises(ValueError, match=r"another process is writing .*cache$"):
+    with locked(out), pytest.raises(ValueError, match=r"another process is writing .*cache$"):
         cache.write([LeRobot(golden("v3"))], out, lambda *_: None)
     assert not list(tmp_path.iterdir())

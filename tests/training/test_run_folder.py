@@ -248,12 +248,12 @@ def test_a_run_that_leads_elsewhere_is_not_gone_on_with(tmp_path):
         open_run(CONFIG, tmp_path / "runs", resume=True)
 
 
-def test_a_link_under_a_temporary_name_is_not_followed(tmp_path):
-    (tmp_path / "precious").write_text("precious")
-    (tmp_path / "seconds.tmp").symlink_to("precious")
-    run_folder.write_json(tmp_path / "seconds.json", {"total": 1.0})
-    assert (tmp_path / "precious").read_text() == "precious"
-    assert run_folder.read_json(tmp_path / "seconds.json") == {"total": 1.0}
+def test_killed_before_its_first_file_had_its_name(tmp_path):
+    folder = tmp_path / CONFIG.name
+    folder.mkdir()
+    (folder / ".config.json.0123abcd.tmp").write_text("{")
+    open_run(CONFIG, tmp_path, resume=False)
+    assert [path.name for path in folder.iterdir()] == ["config.json"]
 
 
 @pytest.mark.timeout(20)

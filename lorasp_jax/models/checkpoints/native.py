@@ -21,6 +21,7 @@ import safetensors.numpy
 from flax import nnx
 
 from envs.datasets.files import check_local, read_text
+from envs.datasets.writing import write_bytes
 from lorasp_jax.adapters.combine.adapter_set import SetParam
 from lorasp_jax.adapters.compress.quantization import is_quantized
 from lorasp_jax.dense import AdapterParam
@@ -96,9 +97,7 @@ def _write(folder: pathlib.Path, files: Mapping[str, bytes]) -> None:
     """Put files of a model, by name, in the place of those that are in the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     for file, data in files.items():
-        temporary = folder / f".{file}.{os.getpid()}"
-        temporary.write_bytes(data)
-        temporary.replace(folder / file)
+        write_bytes(folder / file, data)
     for stale in {*folder.glob("model*.safetensors"), folder / INDEX}:
         if stale.name not in files:
             stale.unlink(missing_ok=True)

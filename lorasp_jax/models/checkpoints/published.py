@@ -28,6 +28,7 @@ import safetensors.numpy
 from flax import nnx
 
 from envs.datasets.files import check_local
+from envs.datasets.writing import replacing
 from lorasp_jax.models.checkpoints import layouts, orbax_folders
 from lorasp_jax.models.checkpoints.native import base_arrays, by_path, named_arrays, set_arrays
 from lorasp_jax.models.checkpoints.tensor_files import INDEX, SINGLE, TensorFiles, weight_files
@@ -108,9 +109,9 @@ def save(folder: Path, model: Any, layout: str, dtypes: Mapping[str, Any] | None
     folder.mkdir(parents=True, exist_ok=True)
     if layout == "lerobot":
         theirs |= {name: theirs[twin] for name, twin in weights.TIED.items()}
-        unfinished = target.with_name(f".{target.name}.unfinished")
-        safetensors.numpy.save_file({_PREFIX + name: a for name, a in theirs.items()}, unfinished)
-        unfinished.rename(target)
+        tensors = {_PREFIX + name: array for name, array in theirs.items()}
+        with replacing(target) as unfinished:
+            safetensors.numpy.save_file(tensors, unfinished)
     else:
         tree = jax.tree.map(jnp.asarray, flax.traverse_util.unflatten_dict(theirs, sep="/"))
         ocp.PyTreeCheckpointer().save(target.absolute(), {"params": tree})

@@ -11,7 +11,7 @@ from PIL import Image
 
 import envs
 from envs import __main__ as command_line
-from envs.datasets import locks, places, rlds
+from envs.datasets import locks, rlds, writing
 from envs.datasets.episodes import Episodes
 from envs.experts import collection
 from tests.cases import mostly_slow
@@ -181,7 +181,7 @@ def test_interrupted_before_anything(tmp_path, run, fake, monkeypatch):
 def test_several_tasks_go_on_where_they_were(tmp_path, run, fake, monkeypatch):
     text, out = COLLECT.replace("press", "all"), tmp_path / "many"
     with monkeypatch.context() as patch:
-        patch.setattr(places, "install", stopping(places.install, 2))
+        patch.setattr(writing, "replace_folder", stopping(writing.replace_folder, 2))
         code, said = run(text, "--out", out)
     assert code == 130
     done, rest = ([f for f in out.iterdir() if (f.suffix == ".partial") == p] for p in (0, 1))
@@ -266,7 +266,7 @@ def test_an_edited_robot_is_another(tmp_path, run, fake):
 
 def test_a_second_process_is_refused(tmp_path, run, fake):
     out = tmp_path / "press"
-    with locks.alone(out):
+    with locks.locked(out):
         code, said = run(COLLECT, "--out", out)
         assert code == 2
         assert said.endswith(f"another process is writing {out}")
