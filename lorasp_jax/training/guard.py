@@ -79,7 +79,7 @@ def select(counts: jax.Array, after: Any, before: Any) -> Any:
 
 
 def summarise(rows: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """What a stretch of steps is logged as.
+    """What is logged of several steps.
 
     Args:
         rows: metrics by name, `[steps, ...]`, with `in_a_row` as `Guard` has it after each step.

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import FrameType
 
-_SAID = b"stopping after this stretch of steps; once more stops at once\n"
+_SAID = b"stopping at the next log line; once more stops at once\n"
 
 
 @dataclass

@@ -2,9 +2,10 @@
 
 import contextlib
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import Progress, ProgressColumn, Task
@@ -35,6 +36,7 @@ class Run:
         dataset: the steps of a dataset, in files; None: those of `episodes`.
         streams: whether the steps of a dataset are read from there step by step, because the device
             has no room for them.
+        devices: those that train; None: all.
         simulated: whether the tasks can be evaluated in simulation.
         policy: the policy as it is while a callback runs; in between, training owns its memory.
         started: `time.perf_counter()` when this process began.
@@ -49,6 +51,7 @@ class Run:
     episodes: dict[str, Episodes] = field(default_factory=dict)
     dataset: Steps | None = None
     streams: bool = False
+    devices: Sequence[Any] | None = None
     simulated: bool = True
     policy: Policy = field(init=False)
     seconds: dict[str, float] = field(init=False)
@@ -89,7 +92,7 @@ class Callback:
         """Before the first step, with the policy as it comes; not called again on resume."""
 
     def on_log(self, run: Run, step: int, metrics: dict[str, float]) -> dict[str, float] | None:
-        """After every logged stretch of steps, with the policy as it is then.
+        """At every log line, with the policy as it is then.
 
         Returns:
             Further scalars to log at this step.

@@ -47,7 +47,7 @@ def test_twenty_steps(name, method, demonstrations, tmp_path, monkeypatch):
 
 def one_device(make):
     """Compiles in a quarter of the time."""
-    return lambda fsdp: make(fsdp, jax.devices()[:1])
+    return lambda fsdp, _=None: make(fsdp, jax.devices()[:1])
 
 
 @pytest.mark.parametrize("name", backbone.names())

@@ -25,26 +25,20 @@ from lorasp_jax.training.cost.speed import Speed
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.run_folder import read_metrics, to_json, write_json
-from lorasp_jax.training.stretches import Streamed, _batches
+from lorasp_jax.training.stepper import StreamingStepper, _batches
 from tests.models.drawn import drawn
 from tests.runs import CONFIG, Terminate, leaves, make_run, random_episodes, repeatable
 
 
-def one_device(monkeypatch):
-    mesh = meshes.make_mesh(1, jax.devices()[:1])
-    monkeypatch.setattr(meshes, "make_mesh", lambda fsdp: mesh)
-
-
-def streamed(folder):
-    run = make_run(folder)
+def streamed(folder, devices=1):
+    run = make_run(folder, devices=devices)
     run.dataset = jax.tree.map(np.asarray, flatten(list(run.episodes.values())))
     run.streams = True
     return run
 
 
 @pytest.mark.slow
-def test_a_streamed_run_resumes_to_the_bit(tmp_path, monkeypatch):
-    one_device(monkeypatch)
+def test_a_streamed_run_resumes_to_the_bit(tmp_path):
     whole = streamed(tmp_path / "whole")
     _, before, _ = adaptation.split(whole.policy.model)
     train(whole)
@@ -63,8 +57,8 @@ def test_a_streamed_run_resumes_to_the_bit(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_every_step_of_a_stretch_has_the_next_batch(tmp_path):
-    """From the step on at which a run continues, however stretches are cut."""
+def test_every_step_has_the_next_batch(tmp_path):
+    """From the step on at which a run continues, in however many calls."""
     run = streamed(tmp_path / "run")
     mesh = meshes.make_mesh()
 
@@ -73,14 +67,14 @@ def test_every_step_of_a_stretch_has_the_next_batch(tmp_path):
         assert count == 1
         return state + 1, {"seen": jnp.atleast_1d(raw.state.sum() + frozen)}
 
-    def seen(start, *stretches):
-        many = Streamed(note, 1.0, _batches(run, mesh, start), Speed(8, None))
+    def seen(start, *counts):
+        stepper = StreamingStepper(note, 1.0, _batches(run, mesh, start), Speed(8, None))
         state, found = start, []
-        for count in stretches:
-            state, metrics = many(state, jax.random.key(0), count)
+        for count in counts:
+            state, metrics = stepper(state, jax.random.key(0), count)
             assert metrics["seen"].shape == (count,)
             found += [float(metrics["seen"].sum())]
-        assert state == start + sum(stretches)
+        assert state == start + sum(counts)
         return found
 
     batches = _batches(run, mesh, 0)
@@ -92,11 +86,10 @@ def test_every_step_of_a_stretch_has_the_next_batch(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_streamed_run_on_eight_devices(tmp_path, monkeypatch):
+def test_a_streamed_run_on_eight_devices(tmp_path):
     """The batch is split over them; the numbers are those of one."""
-    many = streamed(tmp_path / "many")
+    many = streamed(tmp_path / "many", devices=8)
     train(many)
-    one_device(monkeypatch)
     one = streamed(tmp_path / "one")
     train(one)
     rows = zip(read_metrics(one.folder), read_metrics(many.folder), strict=True)

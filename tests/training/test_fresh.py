@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from lorasp_jax.data.batches import flatten, of_size, windows
-from lorasp_jax.training import demonstrations, stretches
-from lorasp_jax.training.distributed import mesh as meshes
+from lorasp_jax.training import demonstrations
 from lorasp_jax.training.loop import train
 from tests.runs import CONFIG, Miniature, Terminate, make_run, random_episodes, repeatable
 
@@ -16,46 +15,45 @@ SAME = dataclasses.replace(CONFIG, targets=("inp", "out"))
 FRESH = dataclasses.replace(SAME, data=dataclasses.replace(SAME.data, fresh_every=2))
 
 
-@pytest.fixture
-def asked(monkeypatch):
-    """Which generations were; without simulation and on one device."""
-    found = []
+class Collect:
+    """Notes which generations were asked for, without simulation."""
 
-    def collect(config, generation):
-        found.append(generation)
+    def __init__(self):
+        self.asked = []
+
+    def __call__(self, config, generation):
+        self.asked.append(generation)
         return {task: random_episodes(task, 10 * generation) for task in config.tasks}
-
-    mesh = meshes.make_mesh(1, jax.devices()[:1])
-    monkeypatch.setattr(meshes, "make_mesh", lambda _: mesh)
-    monkeypatch.setattr(stretches, "fresh_demonstrations", collect)
-    return found
 
 
 def run(folder, config=FRESH):
     return make_run(folder, config, Miniature())
 
 
-def test_generations_train_one_after_the_other(asked, tmp_path):
+def test_generations_train_one_after_the_other(tmp_path):
     """The first as without, the next on others; a run that goes on repeats them to the bit."""
+    collect = Collect()
     same, whole = run(tmp_path / "same", SAME), run(tmp_path / "whole")
-    train(same)
-    assert asked == []
-    train(whole)
-    assert asked == [*range(1, CONFIG.optim.steps // 2)]
+    train(same, collect=collect)
+    assert collect.asked == []
+    train(whole, collect=collect)
+    assert collect.asked == [*range(1, CONFIG.optim.steps // 2)]
     first, *others = zip(repeatable(same.folder), repeatable(whole.folder), strict=True)
     assert first[0] == first[1]
     assert all(without != fresh for without, fresh in others)
     halved = run(tmp_path / "halved")
     with pytest.raises(KeyboardInterrupt):
-        train(halved, [Terminate()])
-    asked.clear()
+        train(halved, [Terminate()], collect=collect)
+    collect.asked.clear()
     halved = run(tmp_path / "halved")
-    train(halved, [Terminate()], resume=True)
-    assert asked == [*range(1, CONFIG.optim.steps // 2)]
+    train(halved, [Terminate()], resume=True, collect=collect)
+    assert collect.asked == [*range(1, CONFIG.optim.steps // 2)]
     assert repeatable(halved.folder) == repeatable(whole.folder)
-    asked.clear()
-    train(run(tmp_path / "whole"), resume=True)  # as one that was stopped in the last evaluation
-    assert asked == []
+    collect.asked.clear()
+    train(
+        run(tmp_path / "whole"), resume=True, collect=collect
+    )  # as one that was stopped in the last evaluation
+    assert collect.asked == []
 
 
 @pytest.mark.parametrize("size", [13, 21, 50])

@@ -14,7 +14,6 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import OptimConfig
 from lorasp_jax.training import guard as guards
 from lorasp_jax.training import step as steps
-from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.loop import RunError, train
 from lorasp_jax.training.run import Callback
 from lorasp_jax.training.run_folder import read_metrics
@@ -148,13 +147,6 @@ def test_numbers_that_make_no_sense(bad):
         OptimConfig(**bad)
 
 
-@pytest.fixture
-def one_device(monkeypatch):
-    """Compiles in a quarter of the time."""
-    mesh = meshes.make_mesh(1, jax.devices()[:1])
-    monkeypatch.setattr(meshes, "make_mesh", lambda fsdp: mesh)
-
-
 def spoiled(folder, episodes, at, **optim):
     """A run whose demonstrations of a task have NaN for the state somewhere."""
     optim = dataclasses.replace(CONFIG.optim, **optim)
@@ -164,7 +156,7 @@ def spoiled(folder, episodes, at, **optim):
     return run
 
 
-def test_a_run_of_skipped_steps_stops_and_says_so(tmp_path, one_device):
+def test_a_run_of_skipped_steps_stops_and_says_so(tmp_path):
     class Note(Callback):
         def on_stop(self, run, reason):
             self.reason = reason
@@ -187,7 +179,7 @@ def test_a_run_of_skipped_steps_stops_and_says_so(tmp_path, one_device):
         np.testing.assert_array_equal(value, before[name], err_msg=name)
 
 
-def test_some_skipped_steps_are_counted_and_the_others_train(tmp_path, one_device):
+def test_some_skipped_steps_are_counted_and_the_others_train(tmp_path):
     run = spoiled(tmp_path / "run", 0, 0)
     run.config = dataclasses.replace(run.config, seed=1)
     train(run)

@@ -8,13 +8,11 @@ import subprocess
 import sys
 import time
 
-import jax
 import numpy as np
 import pytest
 
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.training.checkpoint import WRITTEN
-from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.run_folder import read_metrics
 from tests import ROOT
@@ -25,25 +23,10 @@ from tests.training.worker import work
 STEPS = 8
 
 
-@pytest.fixture
-def use(monkeypatch):
-    """Chooses how many of the eight devices this process uses."""
-    make = meshes.make_mesh
-
-    def choose(count):
-        monkeypatch.setattr(meshes, "make_mesh", lambda _: make(1, jax.devices()[:count]))
-
-    return choose
-
-
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """A run on one device that nobody stopped."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            meshes, "make_mesh", lambda _, make=meshes.make_mesh: make(1, jax.devices()[:1])
-        )
-        return work(tmp_path_factory.mktemp("runs") / "whole", STEPS)
+    return work(tmp_path_factory.mktemp("runs") / "whole", STEPS, devices=1)
 
 
 @contextlib.contextmanager
@@ -85,27 +68,25 @@ def kill(folder, steps, chance):
 
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("times", [1, pytest.param(20, marks=pytest.mark.slow)])
-def test_a_killed_run_resumes_to_the_bit(times, whole, tmp_path, use, capsys):
-    use(1)
+def test_a_killed_run_resumes_to_the_bit(times, whole, tmp_path, capsys):
     steps, chance = STEPS * times, random.Random(times)
-    expected = whole.folder if times == 1 else work(tmp_path / "whole", steps).folder
+    expected = whole.folder if times == 1 else work(tmp_path / "whole", steps, devices=1).folder
     killed = tmp_path / "killed"
     for _ in range(times):
         kill(killed, steps, chance)
     newest = max(int(path.parent.name) for path in killed.glob(f"checkpoints/*/{WRITTEN}"))
     assert newest < steps  # else nothing is left to do
     capsys.readouterr()
-    work(killed, steps)
+    work(killed, steps, devices=1)
     assert f"started\nstep {newest + 1}\n" in capsys.readouterr().out
     assert saved(killed, steps) == saved(expected, steps)
     assert repeatable(killed) == repeatable(expected)
 
 
-def test_a_signal_to_another_process_stops_this_one_too(tmp_path, use, monkeypatch):
-    use(1)
+def test_a_signal_to_another_process_stops_this_one_too(tmp_path, monkeypatch):
     asked = iter([False, True])  # at steps 1 and 2
     monkeypatch.setattr(processes, "anywhere", lambda _: next(asked))
-    assert work(tmp_path / "run", 6) is None
+    assert work(tmp_path / "run", 6, devices=1) is None
     assert sorted(os.listdir(tmp_path / "run/checkpoints")) == ["1", "2"]
 
 
@@ -121,11 +102,10 @@ def assert_same(found, expected):
         )
 
 
-def test_a_run_goes_on_with_another_number_of_devices(whole, tmp_path, use):
+def test_a_run_goes_on_with_another_number_of_devices(whole, tmp_path):
     moved = tmp_path / "moved"
     for count, until in ((4, 2), (1, 4), (8, None)):
-        use(count)
-        run = work(moved, STEPS, until)
+        run = work(moved, STEPS, until, devices=count)
     assert_same(adapters(run), adapters(whole))
 
 

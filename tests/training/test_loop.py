@@ -11,19 +11,11 @@ import pytest
 
 from envs.compilation import fast_cpu
 from lorasp_jax.adapters import adaptation
-from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.loop import RunError, train
 from lorasp_jax.training.run import Callback
 from lorasp_jax.training.run_folder import read_metrics
-from lorasp_jax.training.stretches import Stretches
+from lorasp_jax.training.stepper import Stepper
 from tests.runs import CONFIG, Miniature, Terminate, leaves, make_run, repeatable
-
-
-@pytest.fixture(autouse=True)
-def one_device(monkeypatch):
-    """Compiles in a quarter of the time; tests of the mesh use all eight."""
-    mesh = meshes.make_mesh(1, jax.devices()[:1])
-    monkeypatch.setattr(meshes, "make_mesh", lambda fsdp: mesh)
 
 
 def quick_run(folder):
@@ -102,21 +94,21 @@ def test_signal_handlers_are_put_back(tmp_path):
 def test_steps_are_compiled_without_what_simulation_needs(monkeypatch):
     jitted, options = Mock(), Mock()
     monkeypatch.setattr(fast_cpu, "without_simulation", options)
-    Stretches(jitted, None, None, Mock()).compile(Mock(), 3).result()
+    Stepper(jitted, None, None, Mock()).compile(Mock(), 3).result()
     compiled = jitted.lower.return_value.compile
     compiled.assert_called_once_with(compiler_options=options.return_value)
 
 
 @pytest.mark.slow
-def test_each_length_of_stretch_compiles_once_and_beside_the_callbacks(tmp_path, monkeypatch):
+def test_each_number_of_steps_compiles_once_and_beside_the_callbacks(tmp_path, monkeypatch):
     compiled = []
-    begin = Stretches.compile
+    begin = Stepper.compile
 
     def compile_and_note(self, state, count):
         compiled.append((count, count in self._compiled))
         return begin(self, state, count)
 
-    monkeypatch.setattr(Stretches, "compile", compile_and_note)
+    monkeypatch.setattr(Stepper, "compile", compile_and_note)
 
     class Look(Callback):
         def on_start(self, run):

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import numpy as np
 import optax
 import pytest
@@ -10,7 +9,6 @@ import pytest
 from lorasp_jax import peft
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import OptimConfig
-from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.optim import make_optimizer
 from lorasp_jax.training.run_folder import read_metrics
@@ -25,13 +23,6 @@ def configure(name, **changes):
     method = peft.create(name, **{key: value for key, value in SMALL.items() if key in fields})
     optim = dataclasses.replace(CONFIG.optim, **changes)
     return dataclasses.replace(CONFIG, peft=method, optim=optim, targets=("q_proj",))
-
-
-@pytest.fixture(autouse=True)
-def one_device(monkeypatch):
-    """Compiles in a quarter of the time."""
-    mesh = meshes.make_mesh(1, jax.devices()[:1])
-    monkeypatch.setattr(meshes, "make_mesh", lambda fsdp: mesh)
 
 
 @pytest.mark.slow

@@ -24,7 +24,6 @@ from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.policies.tokenizer import Offline
 from lorasp_jax.training import base, export, setup
-from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.overrides import override
 from lorasp_jax.training.run import Run
@@ -120,12 +119,10 @@ def test_straight_line_code_is_chosen_on_the_command_line(monkeypatch):
 def test_a_pi05_of_the_command_line_trains_and_acts(config, tmp_path, monkeypatch):
     """And its base, trained in full, loads again; prompts with another state are others."""
     monkeypatch.setattr(setup, "base_model", BASE_MODEL)
-    monkeypatch.setattr(
-        meshes, "make_mesh", lambda _, own=meshes.make_mesh: own(1, jax.devices()[:1])
-    )
     config = dataclasses.replace(config, peft=FullFineTuning(), model=ModelConfig(checkpoint=""))
     config = override(config, ["--model.size", "nano_pi05", "--optim.steps", "2"])
     run = setup.prepare(config, tmp_path, Console(file=io.StringIO()), time.perf_counter())
+    run.devices = jax.devices()[:1]
     before = leaves(nnx.state(run.policy.model))
     train(run)
     after = leaves(nnx.state(run.policy.model))

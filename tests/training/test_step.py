@@ -12,7 +12,6 @@ from flax import nnx
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.data.batches import Batch, flatten, sample_batch
 from lorasp_jax.peft import Aux, LoRA
-from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.step import active_ranks, gradients, init_state, train_step
 from tests.models.drawn import moved
@@ -122,9 +121,7 @@ def test_the_average_follows_and_is_what_is_used(small):
 
 
 @pytest.mark.slow
-def test_a_run_in_parts_with_an_average_resumes_to_the_bit(tmp_path, monkeypatch):
-    mesh = meshes.make_mesh(1, jax.devices()[:1])
-    monkeypatch.setattr(meshes, "make_mesh", lambda fsdp: mesh)
+def test_a_run_in_parts_with_an_average_resumes_to_the_bit(tmp_path):
     optim = dataclasses.replace(CONFIG.optim, accumulate=2, ema=0.5)
     config = dataclasses.replace(CONFIG, optim=optim, targets=("action_out_proj",))
     whole, plain = make_run(tmp_path / "whole", config), make_run(tmp_path / "plain", config)

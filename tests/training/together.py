@@ -55,7 +55,7 @@ def main(folder: str, streams: str) -> None:
     first = processes.is_first()
 
     def run() -> Run:
-        made = make_run(Path(folder), config)
+        made = make_run(Path(folder), config, devices=None)
         if streams == "True":
             steps = flatten([*made.episodes.values()])
             made.dataset, made.streams = jax.tree.map(np.asarray, steps), True

@@ -33,18 +33,15 @@ def main(args: argparse.Namespace) -> None:
     cache.enable()
     xla.compile_steps_as_all_else()
     jax.config.update("jax_default_matmul_precision", "highest")
-    from lorasp_jax.training.distributed import mesh as meshes
     from lorasp_jax.training.distributed import processes
 
     if "JAX_PROCESS_ID" in os.environ:
         processes.initialize(Console(), "add --resume")
 
-    devices = jax.devices()[: args.mesh]
-    meshes.make_mesh = lambda _, make=meshes.make_mesh: make(1, devices)
-    work(args.folder, args.steps, args.until, args.fails)
+    work(args.folder, args.steps, args.until, args.fails, args.mesh)
 
 
-def prepare(folder: Path, steps: int):
+def prepare(folder: Path, steps: int, devices: int | None = None):
     """A run that logs and saves at every step."""
     from tests.runs import CONFIG, Miniature, make_run
 
@@ -55,10 +52,16 @@ def prepare(folder: Path, steps: int):
         log_every=1,
         checkpoint_every=1,
     )
-    return make_run(folder, config, Miniature())
+    return make_run(folder, config, Miniature(), devices)
 
 
-def work(folder: Path, steps: int, until: int | None = None, fails: int | None = None):
+def work(
+    folder: Path,
+    steps: int,
+    until: int | None = None,
+    fails: int | None = None,
+    devices: int | None = None,
+):
     """Begin the run or go on with it; it is returned if it is finished."""
     from lorasp_jax.training.interrupt import sigterm_as_interrupt
     from lorasp_jax.training.loop import train
@@ -73,7 +76,7 @@ def work(folder: Path, steps: int, until: int | None = None, fails: int | None =
                 signal.raise_signal(signal.SIGTERM)
 
     with sigterm_as_interrupt():
-        run = prepare(folder, steps)
+        run = prepare(folder, steps, devices)
         print("started", flush=True)
         try:
             train(run, [Tell()], resume=True)

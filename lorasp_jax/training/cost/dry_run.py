@@ -75,7 +75,7 @@ def _prepared(run: Run, built: setup.Built) -> Any:
     run.policy = Policy(
         built.model, setup.processor([first], model, built.prompts, relative=relative)
     )
-    mesh = meshes.make_mesh(config.fsdp)
+    mesh = meshes.make_mesh(config.fsdp, run.devices)
     one = jax.eval_shape(lambda: flatten([first]))
     steps = jax.tree.map(lambda x: jax.ShapeDtypeStruct((count, *x.shape[1:]), x.dtype), one)
     if source is None or _bytes(steps) <= built.room:
@@ -105,10 +105,10 @@ def _blank(config: Config, built: setup.Built) -> Episodes:
 
 
 def _lowered(run: Run, data: Steps | Raw) -> Any:
-    """The stretch of steps that `loop.train` compiles first, from shapes."""
+    """The steps that `loop.train` compiles first, from shapes."""
     config, model = run.config, run.policy.model
     optimizer = make_optimizer(config.optim, adaptation.methods(model).values())
-    mesh = meshes.make_mesh(config.fsdp)
+    mesh = meshes.make_mesh(config.fsdp, run.devices)
     graphdef, adapters, frozen = adaptation.split(model)
     state = jax.eval_shape(
         functools.partial(init_state, optimizer=optimizer, ema=config.optim.ema > 0), adapters
@@ -117,8 +117,8 @@ def _lowered(run: Run, data: Steps | Raw) -> Any:
     frozen = jax.tree.map(_placed, frozen, meshes.shardings(frozen, mesh))
     state = jax.tree.map(_placed, state, placed)
     count = 1 if isinstance(data, Raw) else min(config.log_every, config.optim.steps)
-    stretch = loop.jit_stretch(run, graphdef, optimizer, placed)
-    return stretch.lower(frozen, data, state, jax.random.key(0), count)
+    steps = loop.jit_steps(run, graphdef, optimizer, placed)
+    return steps.lower(frozen, data, state, jax.random.key(0), count)
 
 
 def _placed(tree: Any, sharding: jax.sharding.Sharding) -> Any:

@@ -1,6 +1,6 @@
-"""How fast a run trains, what it waits for and what memory it holds, by stretch of steps.
+"""How fast a run trains, what it waits for and what memory it holds, by log interval.
 
-Nothing here waits for the device: a stretch ends where its metrics were read anyway.
+Nothing here waits for the device: an interval ends where its metrics were read anyway.
 """
 
 import contextlib
@@ -15,7 +15,7 @@ from lorasp_jax.training.cost.preflight import GIB
 
 
 class Speed:
-    """The clock of a run; it stands still between two stretches, and while a program compiles."""
+    """The clock of a run; it stands still between two intervals, and while a program compiles."""
 
     def __init__(self, batch_size: int, operations: float | None) -> None:
         """Not yet begun.
@@ -29,7 +29,7 @@ class Speed:
         self._waited: float | None = None
 
     def begin(self) -> None:
-        """A stretch begins, unless it did."""
+        """Start the clock, unless it runs."""
         if self._began is None:
             self._began = time.perf_counter()
 
@@ -49,7 +49,7 @@ class Speed:
         self._waited = (self._waited or 0.0) + idle * (time.perf_counter() - began)
 
     def end(self, steps: int) -> dict[str, float]:
-        """What is known of the stretch of `steps` that ends; the next one can begin.
+        """Stop the clock after so many steps, and give what is known of them.
 
         Returns:
             `speed/samples_per_second`; `speed/flop_utilisation`, where operations are counted and

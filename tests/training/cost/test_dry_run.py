@@ -38,7 +38,7 @@ def config(monkeypatch):
         max_steps=LIMIT,
     )
     mesh = meshes.make_mesh(1, jax.devices()[:1])
-    monkeypatch.setattr(meshes, "make_mesh", lambda fsdp: mesh)
+    monkeypatch.setattr(meshes, "make_mesh", lambda *_: mesh)
     monkeypatch.setattr(setup.envs, "make", lambda *_, **__: world)
     monkeypatch.setattr(setup, "base_model", lambda *_, **__: (drawn(Pi0Config.dummy()), ""))
     monkeypatch.setattr(setup, "demonstrations", lambda *_: pytest.fail("it collects"))

@@ -1,4 +1,4 @@
-"""Throughput, waiting, memory: what a stretch of steps reports beside its losses."""
+"""Throughput, waiting, memory: what is logged beside the losses."""
 
 import re
 from types import SimpleNamespace
@@ -9,7 +9,7 @@ import pytest
 from envs.compilation import messages
 from lorasp_jax.training.cost import flops, speed
 from lorasp_jax.training.cost.speed import Speed
-from lorasp_jax.training.stretches import Stretches
+from lorasp_jax.training.stepper import Stepper
 
 
 @pytest.fixture
@@ -24,16 +24,16 @@ def device(**memory):
     return [SimpleNamespace(device_kind="NVIDIA H100 80GB HBM3", memory_stats=lambda: memory)]
 
 
-def test_a_stretch(clock, monkeypatch):
+def test_log_intervals(clock, monkeypatch):
     monkeypatch.setattr(jax, "devices", device)
     monkeypatch.setattr(jax, "device_count", lambda: 2)
     peak = flops.PEAK["NVIDIA H100"]
     timer = Speed(batch_size=8, operations=0.5 * peak)
-    for stretch in range(2):
-        clock.seconds += 7 * stretch  # between two stretches
+    for interval in range(2):
+        clock.seconds += 7 * interval  # between two intervals
         timer.begin()
         clock.seconds += 5
-        timer.begin()  # the next step of the same stretch
+        timer.begin()  # the next step of the same interval
         clock.seconds += 5
         found = timer.end(20)
         assert found["speed/samples_per_second"] == 20 * 8 / 10
@@ -65,8 +65,8 @@ def test_memory_where_it_is_reported(monkeypatch):
 def test_the_terminal_tells_what_compiles(capsys, monkeypatch):
     """In words, for how long, and that it is the first time only."""
     monkeypatch.setattr(messages, "PATIENCE", 0.0)
-    many = jax.jit(lambda frozen, data, state, key, count: state + count, static_argnums=4)
-    run = Stretches(many, jax.numpy.ones(2), jax.numpy.ones(2), Speed(1, None))
+    steps = jax.jit(lambda frozen, data, state, key, count: state + count, static_argnums=4)
+    run = Stepper(steps, jax.numpy.ones(2), jax.numpy.ones(2), Speed(1, None))
     for _ in range(2):
         run(jax.numpy.ones(2), jax.random.key(0), 3)
     told = capsys.readouterr().err

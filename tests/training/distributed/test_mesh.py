@@ -95,17 +95,15 @@ def test_full_fine_tuning_is_split_and_the_numbers_are_those_of_one_device(tmp_p
     config = dataclasses.replace(
         CONFIG, peft=FullFineTuning(), targets=("action",), fsdp=2, optim=optim
     )
-    many = make_run(tmp_path / "many", config)
+    many = make_run(tmp_path / "many", config, devices=8)
     with pytest.raises(KeyboardInterrupt):
         train(many, [Terminate()])
-    many = make_run(tmp_path / "many", dataclasses.replace(config, fsdp=4))
+    many = make_run(tmp_path / "many", dataclasses.replace(config, fsdp=4), devices=8)
     train(many, resume=True)
     trained = jax.tree.leaves(adaptation.split(many.policy.model)[1])
     shares = [x.addressable_shards[0].data.size / x.size for x in trained]
     assert shares.count(0.25) > 5
-    mesh = meshes.make_mesh(1, jax.devices()[:1])
-    monkeypatch.setattr(meshes, "make_mesh", lambda fsdp: mesh)
-    one = make_run(tmp_path / "one", config)
+    one = make_run(tmp_path / "one", dataclasses.replace(config, fsdp=1))
     train(one)
     rows = zip(read_metrics(one.folder), read_metrics(many.folder), strict=True)
     for expected, found in rows:

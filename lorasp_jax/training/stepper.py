@@ -1,0 +1,196 @@
+"""Run training steps, several in one call, on data from wherever the run has them."""
+
+import functools
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from envs.compilation import fast_cpu, messages
+from envs.datasets.episodes import Episodes
+from lorasp_jax.config import Config
+from lorasp_jax.data.batches import Raw, Steps, flatten, of_size
+from lorasp_jax.data.pictures import loaded
+from lorasp_jax.data.stream import Stream
+from lorasp_jax.training.cost import flops, preflight
+from lorasp_jax.training.cost.speed import Speed
+from lorasp_jax.training.distributed import mesh as meshes
+from lorasp_jax.training.distributed import processes
+from lorasp_jax.training.run import Run
+from lorasp_jax.training.step import TrainState
+
+Collect = Callable[[Config, int], dict[str, Episodes]]
+"""Gives demonstrations by task for a generation, 1 and on, as `fresh_demonstrations` does."""
+
+
+class Stepper:
+    """Runs steps, (state, key, count) -> state, metrics; each count is compiled once.
+
+    Attributes:
+        speed: the clock of the steps.
+    """
+
+    def __init__(self, jitted: Callable, frozen: Any, data: Steps | Raw, speed: Speed) -> None:
+        """Take what `loop.jit_steps` gives, the frozen parameters and the data on the device."""
+        self._jitted, self._frozen, self._data, self.speed = jitted, frozen, data, speed
+        self._compiled: dict[int, Future] = {}
+
+    def compile(self, state: TrainState, count: int) -> Future:
+        """Begin to compile `count` steps in a thread, unless that was begun before."""
+        if count not in self._compiled:
+            self._compiled[count] = _in_thread(self._compile, state, count)
+        return self._compiled[count]
+
+    def _compile(self, state: TrainState, count: int) -> Any:
+        key = jax.random.key(0)
+        with messages.said("the training step"):
+            lowered = self._jitted.lower(self._frozen, self._data, state, key, count)
+            return lowered.compile(compiler_options=fast_cpu.without_simulation())
+
+    def __call__(self, state: TrainState, key: jax.Array, count: int) -> tuple[TrainState, Any]:
+        """Run `count` steps; the metrics have a leading axis over them."""
+        compiled = self.compile(state, count).result()
+        self.speed.begin()
+        return compiled(self._frozen, self._data, state, key)
+
+
+class StreamingStepper(Stepper):
+    """Runs steps on batches read from files; the next batch is always on its way to the device."""
+
+    def __init__(self, jitted: Callable, frozen: Any, batches: Iterator[Raw], speed: Speed) -> None:
+        """Read the first batch."""
+        super().__init__(jitted, frozen, next(batches), speed)
+        self._batches = batches
+
+    def compile(self, state: TrainState, count: int) -> Future:  # noqa: ARG002
+        """Begin to compile a single step: each has a batch of its own."""
+        return super().compile(state, 1)
+
+    def __call__(self, state: TrainState, key: jax.Array, count: int) -> tuple[TrainState, Any]:
+        """Run `count` steps, reading the next batch during each."""
+        found = []
+        for _ in range(count):
+            state, metrics = super().__call__(state, key, 1)
+            with self.speed.waiting(metrics):
+                self._data = next(self._batches)
+            found.append(metrics)
+        return state, jax.tree.map(lambda *values: jnp.concatenate(values), *found)
+
+
+class RefreshingStepper(Stepper):
+    """Runs steps on demonstrations that are replaced every `data.fresh_every` steps.
+
+    Generation 0, 1, ... trains for that many steps each; the next one is collected on the device
+    meanwhile. A generation is a function of the run's seed and its number alone, so a run resumed
+    within one collects it again.
+    """
+
+    def __init__(
+        self,
+        jitted: Callable,
+        frozen: Any,
+        speed: Speed,
+        config: Config,
+        collect: Callable[[int], Steps],
+        start: int,
+    ) -> None:
+        """Collect the generation of the first step, and begin to collect the next.
+
+        Args:
+            jitted: as in `Stepper`.
+            frozen: as in `Stepper`.
+            speed: as in `Stepper`.
+            config: the run's.
+            collect: gives a generation on the device, all of equal shapes.
+            start: the first step's number.
+        """
+        self._every, self._last = config.data.fresh_every, config.optim.steps - 1
+        self._collect = collect
+        self._generation = self._generation_of(min(start, self._last))
+        first = self._generation if start <= self._last else 0  # at hand, if nothing trains
+        super().__init__(jitted, frozen, collect(first), speed)
+        self._collect_next()
+
+    def __call__(self, state: TrainState, key: jax.Array, count: int) -> tuple[TrainState, Any]:
+        """Run `count` steps, all on the generation of the first."""
+        if self._generation_of(int(state.step)) > self._generation:
+            self.speed.begin()
+            with self.speed.waiting(state):
+                self._data = self._next.result()
+            self._generation += 1
+            self._collect_next()
+        return super().__call__(state, key, count)
+
+    def _generation_of(self, step: int) -> int:
+        return step // self._every
+
+    def _collect_next(self) -> None:
+        """Begin to collect the next generation in a thread, if any step will train on it."""
+        if self._generation_of(self._last) > self._generation:
+            self._next = _in_thread(self._collect, self._generation + 1)
+
+
+def make_stepper(
+    run: Run,
+    jitted: Callable,
+    frozen: Any,
+    mesh: jax.sharding.Mesh,
+    start: int,
+    collect: Collect,
+) -> Stepper:
+    """The stepper for where the run has its data.
+
+    Args:
+        run: the run.
+        jitted: what `loop.jit_steps` gives.
+        frozen: frozen parameters, on the mesh.
+        mesh: the devices that train.
+        start: the first step's number.
+        collect: gives demonstrations where the config wants them replaced.
+    """
+    speed = _speed(run)
+    if run.streams:
+        return StreamingStepper(jitted, frozen, _batches(run, mesh, start), speed)
+
+    def generation(number: int) -> Steps:
+        steps = loaded(run.steps)
+        if number:
+            episodes = collect(run.config, number)
+            steps = of_size(flatten(list(episodes.values())), len(steps.end))
+        return processes.put(steps, meshes.replicated(mesh))
+
+    if run.config.data.fresh_every:
+        return RefreshingStepper(jitted, frozen, speed, run.config, generation, start)
+    return Stepper(jitted, frozen, generation(0), speed)
+
+
+def _in_thread(function: Callable, *arguments: Any) -> Future:
+    """The result to come of a call in a thread of its own."""
+    pool = ThreadPoolExecutor(1)
+    future = pool.submit(function, *arguments)
+    pool.shutdown(wait=False)
+    return future
+
+
+def _batches(run: Run, mesh: jax.sharding.Mesh, start: int) -> Iterator[Raw]:
+    """Batches of a dataset from a step on, split over the devices."""
+    stream = Stream(
+        run.steps,
+        batch_size=run.config.optim.batch_size,
+        chunk=run.policy.model.config.chunk,
+        seed=run.config.seed,
+        start=start,
+        process=(jax.process_index(), jax.process_count()),
+    )
+    put = functools.partial(jax.make_array_from_process_local_data, meshes.batch_sharding(mesh))
+    return (jax.tree.map(put, raw) for raw in stream)
+
+
+def _speed(run: Run) -> Speed:
+    """The run's clock; operations are counted where it is known how many there could be."""
+    size = run.config.optim.batch_size
+    if flops.peak() is None:
+        return Speed(size, None)
+    return Speed(size, preflight.operations(run.config, run.policy.model.config))
