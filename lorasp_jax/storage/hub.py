@@ -12,7 +12,6 @@ from typing import Any, Literal
 
 from envs.datasets.locks import locked
 from envs.datasets.writing import creating, replacing
-
 from lorasp_jax.storage import shipped
 
 HUB = "hf://"
