@@ -9,17 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from lorasp_jax.adapters.layers.prepared import Layer, join_one
 from lorasp_jax.dense import Dense
 from lorasp_jax.models import flow_matching
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.observation import Observation
-from lorasp_jax.models.sampling import ModelAux, Sampler, with_action
+from lorasp_jax.models.sampling import Sampler
 from lorasp_jax.models.transformer.layers import (
     LayerAux,
-    Linears,
+    ModelAux,
     block_mask,
     positions,
     time_embedding,
+    with_action,
 )
 from lorasp_jax.models.transformer.siglip import SigLIP
 
@@ -63,20 +65,42 @@ class Backbone(nnx.Module):
     def _make_projections(self, state_width: int, rngs: nnx.Rngs) -> None:
         """The linear maps around the towers: of state, noisy actions, their time and velocity."""
         width, dim = self.config.action.width, self.config.action_dim
-        sizes = {
-            "state_proj": (dim, state_width),
-            "action_in_proj": (dim, width),
-            "action_time_mlp_in": (2 * width, width),
-            "action_time_mlp_out": (width, width),
-            "action_out_proj": (width, dim),
-        }
-        self._make_linears(sizes, rngs)
+        kinds: Any = {"dtype": jnp.float32, "param_dtype": self.config.param_dtype, "rngs": rngs}
+        self.state_proj: Layer = Dense(dim, state_width, **kinds)
+        self.action_in_proj: Layer = Dense(dim, width, **kinds)
+        self.action_time_mlp_in: Layer = Dense(2 * width, width, **kinds)
+        self.action_time_mlp_out: Layer = Dense(width, width, **kinds)
+        self.action_out_proj: Layer = Dense(width, dim, **kinds)
 
-    def _make_linears(self, sizes: dict[str, tuple[int, int]], rngs: nnx.Rngs) -> None:
-        """Dense layers [I, O] by name, which compute in fp32."""
-        kinds = {"dtype": jnp.float32, "param_dtype": self.config.param_dtype}
-        for name, (d_in, d_out) in sizes.items():
-            setattr(self, name, Dense(d_in, d_out, **kinds, rngs=rngs))
+    def join_layers(self, *, copy_kernels: bool = True) -> None:
+        """See `prepared.JoinsLayers`: the linear maps around the towers, each by itself."""
+        self.state_proj = join_one(self.state_proj, copy_kernels=copy_kernels)
+        self.action_in_proj = join_one(self.action_in_proj, copy_kernels=copy_kernels)
+        self.action_time_mlp_in = join_one(self.action_time_mlp_in, copy_kernels=copy_kernels)
+        self.action_time_mlp_out = join_one(self.action_time_mlp_out, copy_kernels=copy_kernels)
+        self.action_out_proj = join_one(self.action_out_proj, copy_kernels=copy_kernels)
+
+    def action_tokens(
+        self, x_t: jax.Array, flow_time: jax.Array, action_valid: jax.Array | None
+    ) -> tuple[jax.Array, LayerAux]:
+        """Tokens of noisy actions that carry their time.
+
+        Args:
+            x_t: `[B, C, A]`.
+            flow_time: `[B]`.
+            action_valid: `[B, C]` bool, what the adapters count; None counts all.
+
+        Returns:
+            `[B, C, D]` f32, and the adapters' reports.
+        """
+        aux: LayerAux = {}
+        asked: Any = {"token_mask": action_valid, "return_aux": True}
+        h, aux["action_in_proj"] = self.action_in_proj(x_t.astype(jnp.float32), **asked)
+        time = time_embedding(flow_time, h.shape[-1])[:, None]
+        h = jnp.concatenate([h, jnp.broadcast_to(time, h.shape)], axis=-1)
+        h, aux["action_time_mlp_in"] = self.action_time_mlp_in(h, **asked)
+        h, aux["action_time_mlp_out"] = self.action_time_mlp_out(jax.nn.silu(h), **asked)
+        return h, aux
 
     def run_prefix(self, obs: Observation) -> tuple[Any, ModelAux]:
         """Everything that does not depend on the actions, once per observation."""
@@ -171,21 +195,6 @@ class Backbone(nnx.Module):
     def sampler(self) -> Sampler:
         """Itself for many calls of `sample_actions`."""
         return Sampler.of(self)
-
-
-def action_tokens(linear: Linears, x_t: jax.Array, flow_time: jax.Array) -> jax.Array:
-    """Tokens `[B, C, D]` f32 of noisy actions `[B, C, A]` at `[B]` times.
-
-    Args:
-        linear: of a module with `action_in_proj`, `action_time_mlp_in` and `action_time_mlp_out`.
-        x_t: `[B, C, A]`.
-        flow_time: `[B]`.
-    """
-    h = linear("action_in_proj", x_t.astype(jnp.float32))
-    time = time_embedding(flow_time, h.shape[-1])[:, None]
-    h = jnp.concatenate([h, jnp.broadcast_to(time, h.shape)], axis=-1)
-    h = jax.nn.silu(linear("action_time_mlp_in", h))
-    return linear("action_time_mlp_out", h)
 
 
 def suffix_view(

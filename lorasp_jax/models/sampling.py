@@ -1,10 +1,8 @@
 """Action chunks by integrating the flow, with what depends on weights alone computed once."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol, Self, cast
 
 import jax
 import jax.numpy as jnp
@@ -16,14 +14,27 @@ from lorasp_jax.models import flow_matching
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.transformer.depth import unstacked
-from lorasp_jax.models.transformer.layers import LayerAux
+from lorasp_jax.models.transformer.layers import LayerAux, ModelAux, with_action
 from lorasp_jax.peft import Method
 
-if TYPE_CHECKING:
-    from lorasp_jax.models.backbone import Backbone
 
-ModelAux = dict[str, LayerAux]
-"""Adapters' reports by tower ("vision", "language", "action") and layer name."""
+class FlowModel(prepared.JoinsLayers, Protocol):
+    """What a sampler reads of a backbone, see `backbone.Backbone`."""
+
+    config: BackboneConfig
+    vision: Any
+    language: Any
+    action: Any
+
+    def run_prefix(self, obs: Observation) -> tuple[Any, ModelAux]:
+        """What is computed once per observation."""
+        ...
+
+    def run_suffix(
+        self, prefix: Any, obs: Observation, x_t: jax.Array, flow_time: jax.Array
+    ) -> tuple[jax.Array, LayerAux]:
+        """What is computed in every step of the flow."""
+        ...
 
 
 @functools.partial(
@@ -48,11 +59,11 @@ class Sampler:
     """Of the backbone's adapters, each once."""
 
     @classmethod
-    def of(cls, model: Backbone) -> Sampler:
+    def of(cls, model: FlowModel) -> Self:
         """The sampler of a backbone, which stays as it is."""
         graphdefs, states = zip(*map(nnx.split, (_reading(model), _acting(model))), strict=True)
         weights, tree = jax.tree.flatten(states)
-        methods = dict.fromkeys(adaptation.methods(model).values())
+        methods = dict.fromkeys(adaptation.methods(cast(nnx.Module, model)).values())
         return cls(weights, (graphdefs, tree), model.config, tuple(methods))
 
     def sample_actions(
@@ -99,24 +110,20 @@ class Sampler:
         return actions, with_action({**aux, "action": once}, action_aux)
 
 
-def _reading(model: Backbone) -> Backbone:
+def _reading(model: FlowModel) -> FlowModel:
     """A copy for a prefix without gradient, in which no loop copies each layer's weights."""
     model = nnx.merge(*nnx.split(model))
     for tower in (model.vision, model.language):
-        tower.blocks = unstacked(prepared.prepared_stack(tower.blocks))
+        tower.blocks = unstacked(prepared.join_stack(tower.blocks))
     return model
 
 
-def _acting(model: Backbone) -> Backbone:
+def _acting(model: FlowModel) -> FlowModel:
     """A copy for the steps of a flow, in which nothing depends on weights alone any more."""
     model = nnx.merge(*nnx.split(model))
     del model.vision, model.language
     model.action.blocks = unstacked(model.action.blocks)
     for module in (model, *(module for _, module in nnx.iter_modules(model.action))):
-        prepared.prepare(module)
+        if isinstance(module, prepared.JoinsLayers):
+            module.join_layers()
     return model
-
-
-def with_action(aux: ModelAux, action: LayerAux) -> ModelAux:
-    """Reports with those of the action expert's steps next to what it did in the prefix."""
-    return {**aux, "action": {**aux.get("action", {}), **action}}

@@ -48,7 +48,7 @@ def read(where: str | os.PathLike[str], *, dataset: str = "") -> Statistics:
 
     Args:
         where: a file or folder as above, the first that is there; or a place that
-            `places.local` fetches.
+            `hub.local` fetches.
         dataset: which data, where a checkpoint knows several: a name below openpi's assets/, or the
             one in LeRobot's tensors.
 

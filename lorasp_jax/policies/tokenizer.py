@@ -82,7 +82,7 @@ def load(where: str | os.PathLike[str]) -> Tokenizer:
 
     Args:
         where: a SentencePiece `.model`, a `tokenizer.json`, or a folder with one of them, in a
-            place that `places.local` knows: on this machine, on the hub, in a bucket. Empty: the
+            place that `hub.local` knows: on this machine, on the hub, in a bucket. Empty: the
             offline tokenizer.
 
     Raises:

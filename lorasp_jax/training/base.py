@@ -45,12 +45,11 @@ def base_model(config: Config, *, shapes: bool = False) -> tuple[Backbone, str]:
     if shapes and (not chosen.source or hub.is_elsewhere(chosen.source)):
         return nnx.eval_shape(lambda: wanted.create(nnx.Rngs(0))), ""
     if chosen.source:
-        folder = hub.local(chosen.source)
-        inputs = loading.lerobot_inputs(folder) or wanted.inputs
-        wanted = dataclasses.replace(wanted, inputs=inputs)
-        model = models.load(folder, wanted)
-        if loading.is_own(folder):
-            _check_time(folder, config.control_dt)
+        found = loading.find(chosen.source)
+        wanted = dataclasses.replace(wanted, inputs=found.inputs or wanted.inputs)
+        model = found.load(wanted)
+        if found.layout == "ours":
+            _check_time(found.folder, config.control_dt)
         return model, models.weights_hash(model)
     model = wanted.create(nnx.Rngs(RandomStream.BASE.key(config.seed)))
     return model, models.weights_hash(model)

@@ -17,7 +17,16 @@ import functools
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import (
+    Any,
+    Literal,
+    NamedTuple,
+    Protocol,
+    TypeAlias,
+    TypeGuard,
+    TypeVar,
+    runtime_checkable,
+)
 
 import jax
 import jax.numpy as jnp
@@ -28,8 +37,7 @@ from lorasp_jax.kernels.low_rank_matmul import aligned, two_products
 from lorasp_jax.kernels.quantized_kernel import QuantizedKernel
 from lorasp_jax.peft import Aux, Method
 
-Names = tuple[str, ...]
-Block = TypeVar("Block", bound=nnx.Module)
+Block = TypeVar("Block", bound="JoinsLayers")
 
 TILE, PROGRAMS = 64, 256
 """Side of the tiles of a product's result, and how many of them at once keep a GPU busy."""
@@ -85,60 +93,78 @@ class Apart:
 
 
 class Ready(nnx.Variable):
-    """What `prepare` leaves in a module: `Joined` or `Apart` by the names of the layers."""
+    """`Joined` or `Apart`."""
 
 
-def prepare(module: nnx.Module, *, copy_kernels: bool = True) -> None:
-    """Joins adapted layers that are attributes of the module, which `call` then finds in `ready`.
+class Prepared(nnx.Module):
+    """Joined layers in the place of the first of them; the others' places hold an empty one."""
 
-    `module.together`, if there is one, names layers that read the same input. Layers of the kind
-    `Dense` with a type of their own are joined, if their method is x W + z U; the others stay.
-    `copy_kernels` is for modules that are called again and again.
+    def __init__(self, arrays: Joined | Apart | None = None) -> None:
+        self.ready = None if arrays is None else Ready(arrays)
+
+    def __call__(
+        self, x: jax.Array, *, token_mask: jax.Array | None, return_aux: Literal[True]
+    ) -> tuple[jax.Array, Aux]:
+        """y `[..., O]` and aux of the only layer."""
+        del return_aux
+        (result,) = self.results(x, token_mask)
+        return result
+
+    def results(self, x: jax.Array, token_mask: jax.Array | None) -> list[tuple[jax.Array, Aux]]:
+        """y and aux of each of the layers for x `[..., I]`; none if it is empty."""
+        if self.ready is None:
+            return []
+        joined = self.ready.get_value()
+        compute: Callable = _call_joined if isinstance(joined, Joined) else _call_apart
+        ys, aux = compute(joined, x.astype(joined.read.dtype), token_mask)
+        of_each = [jax.tree.map(lambda a, i=i: a[i], aux) for i in range(len(ys))]
+        reports = [dataclasses.replace(one, token_mask=token_mask) for one in of_each]
+        return list(zip(ys, reports, strict=True))
+
+
+Layer: TypeAlias = Dense | Prepared
+"""What stands where a `Dense` was."""
+
+
+@runtime_checkable
+class JoinsLayers(Protocol):
+    """A module that knows which of its layers read the same input."""
+
+    def join_layers(self, *, copy_kernels: bool = True) -> None:
+        """Puts joined layers in the place of its own, children's left out; see `join`."""
+        ...
+
+
+def join(layers: Sequence[Layer], *, copy_kernels: bool = True) -> list[Layer]:
+    """What takes the places of layers that read the same input.
+
+    Layers of the kind `Dense` with a type of their own are joined, if their method is x W + z U:
+    all of them, or each by itself where they differ in method or type. The others stay.
+
+    Args:
+        layers: in the order in which they are called together.
+        copy_kernels: for layers that are called again and again.
     """
-    layers = {name: layer for name, layer in vars(module).items() if _can_join(layer)}
-    groups = [names for names in getattr(module, "together", ()) if _one_kind(layers, names)]
-    grouped = {name for names in groups for name in names}
-    groups += [(name,) for name in layers if name not in grouped]
-    if groups:
-        join = _join if copy_kernels else _apart
-        joined = {names: join([layers[name] for name in names]) for names in groups}
-        module.ready = Ready(joined)  # pyright: ignore[reportAttributeAccessIssue]
-        for name in itertools.chain(*groups):
-            delattr(module, name)
+    can = [layer for layer in layers if _can_join(layer)]
+    arrays = _join if copy_kernels else _apart
+    if len(can) == len(layers) and len({(layer.method, layer.dtype) for layer in can}) == 1:
+        return [Prepared(arrays(can)), *(Prepared() for _ in can[1:])]
+    return [Prepared(arrays([layer])) if _can_join(layer) else layer for layer in layers]
 
 
-def prepared_stack(blocks: Block) -> Block:
+def join_one(layer: Layer, *, copy_kernels: bool = True) -> Layer:
+    """`join` for a layer whose input no other reads."""
+    return join([layer], copy_kernels=copy_kernels)[0]
+
+
+def join_stack(blocks: Block) -> Block:
     """Stacked blocks [L, ...] for one run through them, adapters' matrices cast all at once."""
 
-    def prepared(block: Block) -> Block:
-        prepare(block, copy_kernels=False)
+    def joined(block: Block) -> Block:
+        block.join_layers(copy_kernels=False)
         return block
 
-    return jax.vmap(prepared)(blocks)
-
-
-def call(
-    module: nnx.Module, names: Names, x: jax.Array, token_mask: jax.Array | None
-) -> dict[str, tuple[jax.Array, Aux]]:
-    """y and aux for the same x `[..., I]`, by name, of those of the layers that `ready` holds."""
-    ready = getattr(module, "ready", None)
-    groups: dict[Names, Joined | Apart] = {} if ready is None else ready.get_value()
-    found = {}
-    for group, joined in groups.items():
-        if set(group) <= set(names):
-            found |= zip(group, _call(joined, x, token_mask), strict=True)
-    return found
-
-
-def _call(
-    joined: Joined | Apart, x: jax.Array, token_mask: jax.Array | None
-) -> list[tuple[jax.Array, Aux]]:
-    """y and aux of each layer."""
-    compute: Callable = _call_joined if isinstance(joined, Joined) else _call_apart
-    ys, aux = compute(joined, x.astype(joined.read.dtype), token_mask)
-    of_each = [jax.tree.map(lambda a, i=i: a[i], aux) for i in range(len(ys))]
-    reports = [dataclasses.replace(one, token_mask=token_mask) for one in of_each]
-    return list(zip(ys, reports, strict=True))
+    return jax.vmap(joined)(blocks)
 
 
 def _call_joined(
@@ -206,19 +232,13 @@ def _parts(rows: int, d_in: int, d_out: int) -> int:
     return parts if d_in >= LONG_SUM else 1
 
 
-def _can_join(layer: Any) -> bool:
+def _can_join(layer: Layer) -> TypeGuard[Dense]:
     """Whether it is an adapted layer, not a stack, of a method that leaves `apply` as it is."""
     if type(layer) is not Dense or layer.adapter is None or layer.dtype is None:
         return False
     method, _ = layer.carried()
     plain = type(method).apply is Method.apply and not method.reads_in_fp32
     return plain and len(layer.kernel_matrices().shape) == 2  # a quantised one has no ndim
-
-
-def _one_kind(layers: dict[str, Dense], names: Names) -> bool:
-    """Whether all of these are there, with one method and type."""
-    found = [layers[name] for name in names if name in layers]
-    return len(found) == len(names) and len({(a.method, a.dtype) for a in found}) == 1
 
 
 def _matrices(

@@ -10,22 +10,23 @@ mixed into the actions' tokens but conditions the action expert's norms.
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax.models.backbone import Backbone, action_tokens, suffix_view
+from lorasp_jax.adapters.layers.prepared import Layer, join_one
+from lorasp_jax.dense import Dense
+from lorasp_jax.models.backbone import Backbone, suffix_view
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig, VisionConfig
 from lorasp_jax.models.inputs import OPENPI, OPENPI_PI05, OURS_PI05
 from lorasp_jax.models.observation import Observation
-from lorasp_jax.models.sampling import ModelAux
 from lorasp_jax.models.transformer.experts import AdaptiveExpert, Expert, KeysValues, LanguageExpert
 from lorasp_jax.models.transformer.layers import (
     LayerAux,
-    Linears,
+    ModelAux,
     block_mask,
     positions,
     time_embedding,
@@ -162,11 +163,10 @@ class Pi0(Backbone):
         Returns:
             `[B, 1 + C, D]` f32, and the adapters' reports.
         """
-        state = Linears(self, jnp.ones((x_t.shape[0], 1), bool))
-        actions = Linears(self, action_valid)
-        state_token = state("state_proj", obs.state[:, None].astype(jnp.float32))
-        h = action_tokens(actions, x_t, flow_time)
-        return jnp.concatenate([state_token, h], axis=1), {**state.aux, **actions.aux}
+        one, state = jnp.ones((x_t.shape[0], 1), bool), obs.state[:, None].astype(jnp.float32)
+        state_token, state_aux = self.state_proj(state, token_mask=one, return_aux=True)
+        h, aux = self.action_tokens(x_t, flow_time, action_valid)
+        return jnp.concatenate([state_token, h], axis=1), {"state_proj": state_aux, **aux}
 
     def run_prefix(self, obs: Observation) -> tuple[Prefix, ModelAux]:
         """Everything that does not depend on the actions, once per observation."""
@@ -197,9 +197,9 @@ class Pi0(Backbone):
         out, _, expert_aux = self.action(
             tokens, position, mask, prefix.cache, token_mask=counted, condition=condition
         )
-        linear = Linears(self, action_valid)
-        v_t = linear("action_out_proj", out[:, -chunk:].astype(jnp.float32))
-        return v_t, {**expert_aux, **aux, **time_aux, **linear.aux}
+        out = out[:, -chunk:].astype(jnp.float32)
+        v_t, out_aux = self.action_out_proj(out, token_mask=action_valid, return_aux=True)
+        return v_t, {**expert_aux, **aux, **time_aux, "action_out_proj": out_aux}
 
     def condition(self, flow_time: jax.Array) -> tuple[jax.Array | None, LayerAux]:
         """What the action expert's norms follow at `[B]` times, none here; adapters' reports."""
@@ -216,13 +216,18 @@ class Pi05(Pi0):
         """The linear maps around the towers: of noisy actions, their time and velocity."""
         del state_width
         width, dim = self.config.action.width, self.config.action_dim
-        sizes = {
-            "action_in_proj": (dim, width),
-            "time_mlp_in": (width, width),
-            "time_mlp_out": (width, width),
-            "action_out_proj": (width, dim),
-        }
-        self._make_linears(sizes, rngs)
+        kinds: Any = {"dtype": jnp.float32, "param_dtype": self.config.param_dtype, "rngs": rngs}
+        self.action_in_proj: Layer = Dense(dim, width, **kinds)
+        self.time_mlp_in: Layer = Dense(width, width, **kinds)
+        self.time_mlp_out: Layer = Dense(width, width, **kinds)
+        self.action_out_proj: Layer = Dense(width, dim, **kinds)
+
+    def join_layers(self, *, copy_kernels: bool = True) -> None:
+        """See `prepared.JoinsLayers`: the linear maps around the towers, each by itself."""
+        self.action_in_proj = join_one(self.action_in_proj, copy_kernels=copy_kernels)
+        self.time_mlp_in = join_one(self.time_mlp_in, copy_kernels=copy_kernels)
+        self.time_mlp_out = join_one(self.time_mlp_out, copy_kernels=copy_kernels)
+        self.action_out_proj = join_one(self.action_out_proj, copy_kernels=copy_kernels)
 
     def embed_suffix(
         self,
@@ -236,13 +241,15 @@ class Pi05(Pi0):
         The state is in the prompt and the time in the norms, so `obs` and `flow_time` are not read.
         """
         del obs, flow_time
-        linear = Linears(self, action_valid)
-        return linear("action_in_proj", x_t.astype(jnp.float32)), linear.aux
+        x_t = x_t.astype(jnp.float32)
+        h, aux = self.action_in_proj(x_t, token_mask=action_valid, return_aux=True)
+        return h, {"action_in_proj": aux}
 
     def condition(self, flow_time: jax.Array) -> tuple[jax.Array, LayerAux]:
         """What the action expert's norms follow at `[B]` times, `[B, 1, D]` f32, and reports."""
-        linear = Linears(self, jnp.ones((flow_time.shape[0], 1), bool))
+        aux: LayerAux = {}
+        asked: Any = {"token_mask": jnp.ones((flow_time.shape[0], 1), bool), "return_aux": True}
         h = time_embedding(flow_time, self.config.action.width)[:, None]
-        for name in ("time_mlp_in", "time_mlp_out"):
-            h = jax.nn.silu(linear(name, h))
-        return h, linear.aux
+        h, aux["time_mlp_in"] = self.time_mlp_in(h, **asked)
+        h, aux["time_mlp_out"] = self.time_mlp_out(jax.nn.silu(h), **asked)
+        return jax.nn.silu(h), aux

@@ -11,17 +11,18 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
+from lorasp_jax.adapters.layers.prepared import join_one
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig
 from lorasp_jax.models.transformer.attention import attention
 from lorasp_jax.models.transformer.depth import scan_depth, stack
-from lorasp_jax.models.transformer.experts import GATED, ExpertBlock, KeysValues, LanguageExpert
+from lorasp_jax.models.transformer.experts import ExpertBlock, KeysValues, LanguageExpert
 from lorasp_jax.models.transformer.layers import (
     LayerAux,
-    Linears,
     RMSNorm,
     positions,
     rope,
     rope_table,
+    under,
 )
 
 
@@ -35,22 +36,28 @@ class SelfBlock(ExpertBlock):
 class CrossBlock(SelfBlock):
     """A layer of the action expert that attends to the language model's keys and values alone."""
 
-    together = (GATED,)
-
     def __init__(self, size: ExpertConfig, config: BackboneConfig, *, rngs: nnx.Rngs) -> None:
         super().__init__(size, config, context=size.kv_heads * size.head_dim, rngs=rngs)
+
+    def join_layers(self, *, copy_kernels: bool = True) -> None:
+        """See `prepared.JoinsLayers`; queries, keys and values each read another input."""
+        self.q_proj = join_one(self.q_proj, copy_kernels=copy_kernels)
+        self.k_proj = join_one(self.k_proj, copy_kernels=copy_kernels)
+        self.v_proj = join_one(self.v_proj, copy_kernels=copy_kernels)
+        self.join_rest(copy_kernels=copy_kernels)
 
     def read(self, cache: KeysValues, valid: jax.Array) -> tuple[KeysValues, LayerAux]:
         """Own keys and values `[B, P, K, H]` from the language model's of the same shape.
 
         The language model has rotated its keys already; they are not rotated again.
         """
-        linear = Linears(self, valid)
+        aux: LayerAux = {}
         keys, values = cache
         flat = (*keys.shape[:2], -1)
-        k = linear("k_proj", keys.reshape(flat)).reshape(keys.shape)
-        v = linear("v_proj", values.reshape(flat)).reshape(values.shape)
-        return (k, v), linear.aux
+        k, aux["k_proj"] = self.k_proj(keys.reshape(flat), token_mask=valid, return_aux=True)
+        k = k.reshape(keys.shape)
+        v, aux["v_proj"] = self.v_proj(values.reshape(flat), token_mask=valid, return_aux=True)
+        return (k, v.reshape(values.shape)), aux
 
     def attend(
         self,
@@ -61,10 +68,12 @@ class CrossBlock(SelfBlock):
         token_mask: jax.Array,
     ) -> tuple[jax.Array, LayerAux]:
         """x `[B, T, D]` after this layer, given what `read` made; mask `[B, T, P]`."""
-        linear = Linears(self, token_mask)
-        q = linear("q_proj", self.input_layernorm(x)).reshape(*x.shape[:2], -1, self.head_dim)
+        h, *_ = self.input_layernorm.conditioned(x, None)
+        q, q_aux = self.q_proj(h, token_mask=token_mask, return_aux=True)
+        q = q.reshape(*x.shape[:2], -1, self.head_dim)
         q = rope(q, table, scale=self.head_dim**-0.5)
-        return self.finish(linear, x, attention(q, *own, mask)), linear.aux
+        x, aux = self.finish(x, attention(q, *own, mask), token_mask)
+        return x, {"q_proj": q_aux, **aux}
 
 
 class Language(LanguageExpert):
@@ -114,7 +123,7 @@ class ActionExpert(nnx.Module):
             remat=self.config.remat,
             unroll=self.config.straight_line,
         )
-        return even, cross, _named("cross_layer", aux)
+        return even, cross, under("cross_layer", aux)
 
     def __call__(
         self,
@@ -148,7 +157,7 @@ class ActionExpert(nnx.Module):
         ) -> tuple[jax.Array, LayerAux]:
             x, (_, own) = pair.self_layer(x, table, mask, read[0], token_mask)
             x, other = pair.cross_layer.attend(x, own_table, prefix_mask, read[1], token_mask)
-            return x, _named("self_layer", own) | _named("cross_layer", other)
+            return x, under("self_layer", own) | under("cross_layer", other)
 
         x, aux = scan_depth(
             self.blocks,
@@ -159,7 +168,3 @@ class ActionExpert(nnx.Module):
             unroll=self.config.straight_line,
         )
         return self.norm(x), aux
-
-
-def _named(layer: str, aux: LayerAux) -> LayerAux:
-    return {f"{layer}/{name}": report for name, report in aux.items()}

@@ -16,14 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax.models.backbone import Backbone, action_tokens, suffix_view
+from lorasp_jax.models.backbone import Backbone, suffix_view
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig, VisionConfig
 from lorasp_jax.models.inputs import LEROBOT
 from lorasp_jax.models.observation import Observation
-from lorasp_jax.models.sampling import ModelAux
 from lorasp_jax.models.smolvla.experts import ActionExpert, Language
 from lorasp_jax.models.transformer.experts import KeysValues
-from lorasp_jax.models.transformer.layers import LayerAux, Linears, block_mask, positions
+from lorasp_jax.models.transformer.layers import LayerAux, ModelAux, block_mask, positions
 from lorasp_jax.models.transformer.siglip import SigLIP
 
 
@@ -138,14 +137,14 @@ class SmolVLA(Backbone):
         """
         seen, image_valid, aux = self.look(obs)
         one = jnp.ones((obs.state.shape[0], 1), bool)
-        linear = Linears(self, one)
-        state = linear("state_proj", obs.state[:, None].astype(jnp.float32))
+        state = obs.state[:, None].astype(jnp.float32)
+        state, state_aux = self.state_proj(state, token_mask=one, return_aux=True)
         # Unlike pi0's, the pictures' tokens have the scale of the language's.
         seen = seen * math.sqrt(seen.shape[-1])
         text = self.language.embed(obs.tokens)
         tokens = jnp.concatenate([seen, text, state.astype(text.dtype)], axis=1)
         valid = jnp.concatenate([image_valid, obs.token_mask, one], axis=1)
-        return tokens, valid, {**aux, "action": linear.aux}
+        return tokens, valid, {**aux, "action": {"state_proj": state_aux}}
 
     def embed_suffix(
         self,
@@ -166,8 +165,7 @@ class SmolVLA(Backbone):
             `[B, C, D]` f32, and the adapters' reports.
         """
         del obs
-        linear = Linears(self, action_valid)
-        return action_tokens(linear, x_t, flow_time), linear.aux
+        return self.action_tokens(x_t, flow_time, action_valid)
 
     def run_prefix(self, obs: Observation) -> tuple[Prefix, ModelAux]:
         """Everything that does not depend on the actions, once per observation."""
@@ -197,9 +195,9 @@ class SmolVLA(Backbone):
         out, expert_aux = self.action(
             tokens, position, mask, prefix.cache, prefix.cross, token_mask=action_valid
         )
-        linear = Linears(self, action_valid)
-        v_t = linear("action_out_proj", out.astype(jnp.float32))
-        return v_t, {**expert_aux, **aux, **linear.aux}
+        out = out.astype(jnp.float32)
+        v_t, out_aux = self.action_out_proj(out, token_mask=action_valid, return_aux=True)
+        return v_t, {**expert_aux, **aux, "action_out_proj": out_aux}
 
 
 def _prefix_blocks(tokens: int) -> np.ndarray:

@@ -13,25 +13,24 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
+from lorasp_jax.adapters.layers.prepared import Layer, join, join_one
 from lorasp_jax.dense import Dense
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig
 from lorasp_jax.models.transformer.attention import attention
 from lorasp_jax.models.transformer.depth import scan_depth, stack, stored
 from lorasp_jax.models.transformer.layers import (
-    QKV,
     AdaptiveRMSNorm,
     LayerAux,
-    Linears,
+    Norm,
     RMSNorm,
     rope,
     rope_table,
+    together,
+    under,
 )
 
 KeysValues = tuple[jax.Array, jax.Array]
 """Keys after the rotation and values, each `[B, S, K, H]`, or `[L, B, S, K, H]` for all layers."""
-
-
-GATED = ("gate_proj", "up_proj")
 
 
 class ExpertBlock(nnx.Module):
@@ -40,7 +39,6 @@ class ExpertBlock(nnx.Module):
     There are no biases. Subclasses have other norms and activations.
     """
 
-    together = (QKV, GATED)
     make_norm = staticmethod(RMSNorm)
     activation = staticmethod(functools.partial(jax.nn.gelu, approximate=True))
 
@@ -61,15 +59,28 @@ class ExpertBlock(nnx.Module):
         }
         width, inner, context = size.width, size.heads * size.head_dim, context or size.width
         self.head_dim = size.head_dim
-        self.input_layernorm = self.make_norm(width, param_dtype=config.param_dtype)
-        self.q_proj = Dense(width, inner, **kinds)
-        self.k_proj = Dense(context, size.kv_heads * size.head_dim, **kinds)
-        self.v_proj = Dense(context, size.kv_heads * size.head_dim, **kinds)
-        self.o_proj = Dense(inner, width, **kinds)
-        self.post_attention_layernorm = self.make_norm(width, param_dtype=config.param_dtype)
-        self.gate_proj = Dense(width, size.mlp, **kinds)
-        self.up_proj = Dense(width, size.mlp, **kinds)
-        self.down_proj = Dense(size.mlp, width, **kinds)
+        self.input_layernorm: Norm = self.make_norm(width, param_dtype=config.param_dtype)
+        self.q_proj: Layer = Dense(width, inner, **kinds)
+        self.k_proj: Layer = Dense(context, size.kv_heads * size.head_dim, **kinds)
+        self.v_proj: Layer = Dense(context, size.kv_heads * size.head_dim, **kinds)
+        self.o_proj: Layer = Dense(inner, width, **kinds)
+        self.post_attention_layernorm: Norm = self.make_norm(width, param_dtype=config.param_dtype)
+        self.gate_proj: Layer = Dense(width, size.mlp, **kinds)
+        self.up_proj: Layer = Dense(width, size.mlp, **kinds)
+        self.down_proj: Layer = Dense(size.mlp, width, **kinds)
+
+    def join_layers(self, *, copy_kernels: bool = True) -> None:
+        """See `prepared.JoinsLayers`."""
+        qkv = self.q_proj, self.k_proj, self.v_proj
+        self.q_proj, self.k_proj, self.v_proj = join(qkv, copy_kernels=copy_kernels)
+        self.join_rest(copy_kernels=copy_kernels)
+
+    def join_rest(self, *, copy_kernels: bool) -> None:
+        """Joins what `finish` calls."""
+        self.o_proj = join_one(self.o_proj, copy_kernels=copy_kernels)
+        gated = self.gate_proj, self.up_proj
+        self.gate_proj, self.up_proj = join(gated, copy_kernels=copy_kernels)
+        self.down_proj = join_one(self.down_proj, copy_kernels=copy_kernels)
 
     def __call__(
         self,
@@ -93,35 +104,40 @@ class ExpertBlock(nnx.Module):
         Returns:
             x, then the own keys and values and the adapters' reports.
         """
-        linear = Linears(self, token_mask)
-        heads = (*x.shape[:2], -1, self.head_dim)
-        h, branch = linear.norm("input_layernorm", x, condition)
-        read = linear.together(QKV, h)
-        q, k, v = (y.reshape(heads) for y in read)
+        h, gate, norm_aux = self.input_layernorm.conditioned(x, condition)
+        qkv = {"q_proj": self.q_proj, "k_proj": self.k_proj, "v_proj": self.v_proj}
+        read, aux = together(h, token_mask, **qkv)
+        q, k, v = (y.reshape(*x.shape[:2], -1, self.head_dim) for y in read)
         q, k = rope(q, table, scale=self.head_dim**-0.5), rope(k, table)
         keys, values = k, v = stored(k), stored(v)
         if cache is not None:
             keys = jnp.concatenate([cache[0], k], axis=1)
             values = jnp.concatenate([cache[1], v], axis=1)
         attended = attention(q, keys, values, mask)
-        return self.finish(linear, x, attended, branch, condition), ((k, v), linear.aux)
+        x, rest = self.finish(x, attended, token_mask, gate, condition)
+        return x, ((k, v), aux | under("input_layernorm", norm_aux) | rest)
 
     def finish(
         self,
-        linear: Linears,
         x: jax.Array,
         attended: jax.Array,
-        branch: jax.Array | int = 1,
+        token_mask: jax.Array,
+        gate: jax.Array | int = 1,
         condition: jax.Array | None = None,
-    ) -> jax.Array:
+    ) -> tuple[jax.Array, LayerAux]:
         """x `[B, T, D]` after the attention's result `[B, T, N H]` and the gated MLP.
 
-        `branch` multiplies what the attention adds, see `Linears.norm`.
+        `gate` multiplies what the attention adds, see `AdaptiveRMSNorm`.
         """
-        x = x + branch * linear("o_proj", attended)
-        h, branch = linear.norm("post_attention_layernorm", x, condition)
-        gate, up = linear.together(GATED, h)
-        return x + branch * linear("down_proj", self.activation(gate) * up)
+        y, o_aux = self.o_proj(attended, token_mask=token_mask, return_aux=True)
+        x = x + gate * y
+        h, gate, norm_aux = self.post_attention_layernorm.conditioned(x, condition)
+        gated = {"gate_proj": self.gate_proj, "up_proj": self.up_proj}
+        (opened, up), aux = together(h, token_mask, **gated)
+        h = self.activation(opened) * up
+        y, aux["down_proj"] = self.down_proj(h, token_mask=token_mask, return_aux=True)
+        aux |= {"o_proj": o_aux, **under("post_attention_layernorm", norm_aux)}
+        return x + gate * y, aux
 
 
 class Expert(nnx.Module):
@@ -133,7 +149,7 @@ class Expert(nnx.Module):
         self.config = config
         self.head_dim = size.head_dim
         self.blocks = stack(lambda rngs: self.block(size, config, rngs=rngs), size.depth, rngs)
-        self.norm = self.block.make_norm(size.width, param_dtype=config.param_dtype)
+        self.norm: Norm = self.block.make_norm(size.width, param_dtype=config.param_dtype)
 
     def __call__(
         self,
@@ -168,9 +184,8 @@ class Expert(nnx.Module):
             remat=self.config.remat,
             unroll=self.config.straight_line,
         )
-        linear = Linears(self, None)
-        x, _ = linear.norm("norm", x, condition)
-        return x, own, aux | linear.aux
+        x, _, norm_aux = self.norm.conditioned(x, condition)
+        return x, own, aux | under("norm", norm_aux)
 
 
 class AdaptiveBlock(ExpertBlock):

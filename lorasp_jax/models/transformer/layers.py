@@ -1,21 +1,21 @@
-"""What the backbones share: norms, calls of dense layers, rotary positions and masks."""
+"""What the backbones share: norms, layers that read one input, rotary positions and masks."""
 
 import math
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax.adapters.layers import prepared
+from lorasp_jax.adapters.layers.prepared import Layer, Prepared, join_one
 from lorasp_jax.dense import Dense, dense_together
 from lorasp_jax.peft import Aux
 
 LayerAux = dict[str, Aux]
-
-QKV = ("q_proj", "k_proj", "v_proj")
-"""Layers of an attention that read one input."""
+"""Adapters' reports by layer name."""
+ModelAux = dict[str, LayerAux]
+"""Adapters' reports by tower ("vision", "language", "action") and layer name."""
 
 
 def normalized(x: jax.Array, eps: float) -> jax.Array:
@@ -47,6 +47,13 @@ class RMSNorm(nnx.Module):
         factor = self.offset + self.scale.get_value().astype(jnp.float32)
         return (normalized(x, self.eps) * factor).astype(x.dtype)
 
+    def conditioned(
+        self, x: jax.Array, condition: jax.Array | None
+    ) -> tuple[jax.Array, int, LayerAux]:
+        """What `AdaptiveRMSNorm.conditioned` returns, without a condition and with a gate of 1."""
+        del condition
+        return self(x), 1, {}
+
 
 class AdaptiveRMSNorm(nnx.Module):
     """RMSNorm with a factor, an offset and a gate from a condition, as pi0.5 has them ("adaRMS").
@@ -60,22 +67,34 @@ class AdaptiveRMSNorm(nnx.Module):
 
     def __init__(self, width: int, *, dtype: Any, param_dtype: Any, rngs: nnx.Rngs) -> None:
         kinds = {"dtype": dtype, "param_dtype": param_dtype, "rngs": rngs}
-        self.dense = Dense(width, 3 * width, kernel_init=nnx.initializers.zeros, **kinds)
+        self.dense: Layer = Dense(width, 3 * width, kernel_init=nnx.initializers.zeros, **kinds)
         self.eps = 1e-6
 
-    def __call__(self, x: jax.Array, modulation: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """y and the gate.
+    def join_layers(self, *, copy_kernels: bool = True) -> None:
+        """See `prepared.JoinsLayers`."""
+        self.dense = join_one(self.dense, copy_kernels=copy_kernels)
+
+    def conditioned(
+        self, x: jax.Array, condition: jax.Array | None
+    ) -> tuple[jax.Array, jax.Array, LayerAux]:
+        """y, the gate and the adapter's report.
 
         Args:
             x: `[B, T, D]`.
-            modulation: `[B, 1, 3 D]`, what `dense` made of the condition.
+            condition: `[B, 1, D]`.
 
         Returns:
-            `[B, T, D]` and `[B, 1, D]`, in the type of x.
+            `[B, T, D]` and `[B, 1, D]` in the type of x, and the report of `dense`.
         """
+        assert condition is not None  # whoever has such norms makes one
+        every = jnp.ones(condition.shape[:2], bool)
+        modulation, aux = self.dense(condition, token_mask=every, return_aux=True)
         scale, shift, gate = jnp.split(modulation.astype(jnp.float32), 3, axis=-1)
         y = normalized(x, self.eps) * (1 + scale) + shift
-        return y.astype(x.dtype), gate.astype(x.dtype)
+        return y.astype(x.dtype), gate.astype(x.dtype), {"dense": aux}
+
+
+Norm: TypeAlias = RMSNorm | AdaptiveRMSNorm
 
 
 class LayerNorm(nnx.Module):
@@ -95,50 +114,44 @@ class LayerNorm(nnx.Module):
         return (wide * scale.astype(jnp.float32) + bias.astype(jnp.float32)).astype(x.dtype)
 
 
-class Linears:
-    """Calls the dense layers of one module by name and keeps what their adapters report.
+def together(
+    x: jax.Array, token_mask: jax.Array | None, **layers: Layer
+) -> tuple[list[jax.Array], LayerAux]:
+    """Layers that read the same x `[B, T, I]`, which adapters of `Dense` then read once.
 
-    Attributes:
-        aux: report of each layer called so far, by name.
+    Args:
+        x: `[B, T, I]`.
+        token_mask: `[B, T]` bool, what the adapters count; None counts all.
+        layers: by name, in the order in which they were joined if they are joined.
+
+    Returns:
+        y `[B, T, O]` of each layer, and the adapters' reports by name.
     """
+    plain = [layer for layer in layers.values() if type(layer) is Dense]
+    inputs = [layer.as_input(x) for layer in plain]
+    fused = []
+    if len({x.dtype for x in inputs}) == 1:
+        fused = dense_together(inputs[0], [one.arrays() for one in plain], token_mask=token_mask)
+    of_plain, found = iter(fused), []
+    for layer in layers.values():
+        if isinstance(layer, Prepared):
+            found += layer.results(x, token_mask)
+        elif fused and type(layer) is Dense:
+            found.append(next(of_plain))
+        else:
+            found.append(layer(x, token_mask=token_mask, return_aux=True))
+    ys, reports = zip(*found, strict=True)
+    return list(ys), dict(zip(layers, reports, strict=True))
 
-    def __init__(self, module: nnx.Module, token_mask: jax.Array | None) -> None:
-        self.aux: LayerAux = {}
-        self._module = module
-        self._token_mask = token_mask
 
-    def __call__(self, name: str, x: jax.Array) -> jax.Array:
-        """y of the layer `name` for x `[B, T, I]`."""
-        return self.together((name,), x)[0]
+def under(name: str, aux: LayerAux) -> LayerAux:
+    """Reports of the layers of a module called `name`, by their path from its parent on."""
+    return {f"{name}/{layer}": report for layer, report in aux.items()}
 
-    def together(self, names: tuple[str, ...], x: jax.Array) -> list[jax.Array]:
-        """y of each layer for the same x `[B, T, I]`, which adapters of `Dense` read once."""
-        found = prepared.call(self._module, names, x, self._token_mask)
-        if others := [name for name in names if name not in found]:
-            found |= zip(others, self._together(others, x), strict=True)
-        self.aux |= {name: found[name][1] for name in names}
-        return [found[name][0] for name in names]
 
-    def _together(self, names: list[str], x: jax.Array) -> list[tuple[jax.Array, Aux]]:
-        layers = [getattr(self._module, name) for name in names]
-        inputs = [layer.as_input(x) for layer in layers if type(layer) is Dense]
-        mask = self._token_mask
-        if len(inputs) < len(layers) or len({x.dtype for x in inputs}) > 1:
-            return [layer(x, token_mask=mask, return_aux=True) for layer in layers]
-        return dense_together(inputs[0], [layer.arrays() for layer in layers], token_mask=mask)
-
-    def norm(self, name: str, x: jax.Array, condition: jax.Array | None) -> tuple[jax.Array, Any]:
-        """y of the norm `name` for x `[B, T, D]`, and what multiplies the branch that reads it.
-
-        An adaptive norm reads a condition `[B, 1, D]` and has a gate `[B, 1, D]`; others have 1.
-        """
-        norm = getattr(self._module, name)
-        if condition is None:
-            return norm(x), 1
-        linear = Linears(norm, jnp.ones(condition.shape[:2], bool))
-        modulation = linear("dense", condition)
-        self.aux |= {f"{name}/{layer}": aux for layer, aux in linear.aux.items()}
-        return norm(x, modulation)
+def with_action(aux: ModelAux, action: LayerAux) -> ModelAux:
+    """Reports with those of the action expert's steps next to what it did in the prefix."""
+    return {**aux, "action": {**aux.get("action", {}), **action}}
 
 
 def positions(valid: jax.Array) -> jax.Array:

@@ -4,41 +4,50 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
+from lorasp_jax.adapters.layers.prepared import Layer, join, join_one
 from lorasp_jax.dense import Dense
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.transformer.attention import attention
 from lorasp_jax.models.transformer.depth import scan_depth, stack
-from lorasp_jax.models.transformer.layers import QKV, LayerAux, LayerNorm, Linears
+from lorasp_jax.models.transformer.layers import LayerAux, LayerNorm, together
 
 
 class VisionBlock(nnx.Module):
     """Pre-norm transformer layer: x + attention(norm(x)), x + mlp(norm(x)), tanh-GELU, biases."""
-
-    together = (QKV,)
 
     def __init__(self, config: BackboneConfig, *, rngs: nnx.Rngs) -> None:
         width, mlp = config.vision.width, config.vision.mlp
         kinds = {"dtype": config.dtype, "param_dtype": config.param_dtype, "rngs": rngs}
         self.heads = config.vision.heads
         self.layer_norm1 = LayerNorm(width, param_dtype=config.param_dtype)
-        self.q_proj = Dense(width, width, **kinds)
-        self.k_proj = Dense(width, width, **kinds)
-        self.v_proj = Dense(width, width, **kinds)
-        self.out_proj = Dense(width, width, **kinds)
+        self.q_proj: Layer = Dense(width, width, **kinds)
+        self.k_proj: Layer = Dense(width, width, **kinds)
+        self.v_proj: Layer = Dense(width, width, **kinds)
+        self.out_proj: Layer = Dense(width, width, **kinds)
         self.layer_norm2 = LayerNorm(width, param_dtype=config.param_dtype)
-        self.fc1 = Dense(width, mlp, **kinds)
-        self.fc2 = Dense(mlp, width, **kinds)
+        self.fc1: Layer = Dense(width, mlp, **kinds)
+        self.fc2: Layer = Dense(mlp, width, **kinds)
+
+    def join_layers(self, *, copy_kernels: bool = True) -> None:
+        """See `prepared.JoinsLayers`."""
+        qkv = self.q_proj, self.k_proj, self.v_proj
+        self.q_proj, self.k_proj, self.v_proj = join(qkv, copy_kernels=copy_kernels)
+        self.out_proj = join_one(self.out_proj, copy_kernels=copy_kernels)
+        self.fc1 = join_one(self.fc1, copy_kernels=copy_kernels)
+        self.fc2 = join_one(self.fc2, copy_kernels=copy_kernels)
 
     def __call__(self, x: jax.Array, token_mask: jax.Array) -> tuple[jax.Array, LayerAux]:
         """x `[B, T, D]` -> x `[B, T, D]` and the adapters' reports."""
-        linear = Linears(self, token_mask)
-        heads = (*x.shape[:2], self.heads, -1)
-        h = self.layer_norm1(x)
-        read = linear.together(QKV, h)
-        q, k, v = (y.reshape(heads) for y in read)
-        x = x + linear("out_proj", attention(q * q.shape[-1] ** -0.5, k, v, None))
-        h = jax.nn.gelu(linear("fc1", self.layer_norm2(x)), approximate=True)
-        return x + linear("fc2", h), linear.aux
+        qkv = {"q_proj": self.q_proj, "k_proj": self.k_proj, "v_proj": self.v_proj}
+        read, aux = together(self.layer_norm1(x), token_mask, **qkv)
+        q, k, v = (y.reshape(*x.shape[:2], self.heads, -1) for y in read)
+        h = attention(q * q.shape[-1] ** -0.5, k, v, None)
+        y, aux["out_proj"] = self.out_proj(h, token_mask=token_mask, return_aux=True)
+        x = x + y
+        h, aux["fc1"] = self.fc1(self.layer_norm2(x), token_mask=token_mask, return_aux=True)
+        h = jax.nn.gelu(h, approximate=True)
+        y, aux["fc2"] = self.fc2(h, token_mask=token_mask, return_aux=True)
+        return x + y, aux
 
 
 class SigLIP(nnx.Module):
@@ -76,8 +85,9 @@ class SigLIP(nnx.Module):
             `[B, T, D]` tokens of the language width, and the adapters' reports.
         """
         mask = jnp.broadcast_to(present[:, None], (images.shape[0], self.config.patches))
-        linear = Linears(self, mask)
-        x = linear("patch_embed", patches(images, self.config.vision.patch))
+        own: LayerAux = {}
+        x = patches(images, self.config.vision.patch)
+        x, own["patch_embed"] = self.patch_embed(x, token_mask=mask, return_aux=True)
         x = x + self.position_embedding.get_value().astype(x.dtype)
         x, aux = scan_depth(
             self.blocks,
@@ -89,9 +99,9 @@ class SigLIP(nnx.Module):
         side = self.config.image_size // self.config.vision.patch
         norm = self.norm if self.config.remat == "none" else jax.checkpoint(self.norm)
         grid = norm(x).reshape(x.shape[0], side, side, -1)
-        head = Linears(self, mask[:, : self.config.image_tokens])
-        x = head("head", patches(grid, self.config.vision.shuffle))
-        return x, {**aux, **linear.aux, **head.aux}
+        x, mask = patches(grid, self.config.vision.shuffle), mask[:, : self.config.image_tokens]
+        x, own["head"] = self.head(x, token_mask=mask, return_aux=True)
+        return x, aux | own
 
 
 def patches(images: jax.Array, size: int) -> jax.Array:

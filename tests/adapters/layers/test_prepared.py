@@ -9,11 +9,11 @@ import pytest
 from flax import nnx
 
 from lorasp_jax.adapters.compress.quantization import quantize
-from lorasp_jax.adapters.layers import prepared as inference
+from lorasp_jax.adapters.layers import prepared
 from lorasp_jax.dense import Dense
 from lorasp_jax.models import pi0, smolvla
 from lorasp_jax.models.sampling import Sampler
-from lorasp_jax.models.transformer.layers import Linears
+from lorasp_jax.models.transformer.layers import together
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.peft.lora_sp import method as lora_sp
 from tests.cases import mostly_slow
@@ -26,18 +26,21 @@ JOINED = [name for name in METHODS if name not in ("full", "dora", "lora_moe")]
 class Readers(nnx.Module):
     """Three layers that read x, one with a bias, and one that reads their sum."""
 
-    together = (("first", "second"),)
-
     def __init__(self, dtype="bfloat16"):
         kinds = {"dtype": dtype, "rngs": nnx.Rngs(0)}
         self.first = Dense(8, 8, **kinds, use_bias=False)
         self.second = Dense(8, 12, **kinds)
         self.third = Dense(8, 8, **kinds)
 
+    def join_layers(self, *, copy_kernels=True):
+        pair = self.first, self.second
+        self.first, self.second = prepared.join(pair, copy_kernels=copy_kernels)
+        self.third = prepared.join_one(self.third, copy_kernels=copy_kernels)
+
     def __call__(self, x, token_mask=None):
-        linear = Linears(self, token_mask)
-        first, second = linear.together(("first", "second"), x)
-        return linear("third", first) + second[..., :8], linear.aux
+        (first, second), aux = together(x, token_mask, first=self.first, second=self.second)
+        y, aux["third"] = self.third(first, token_mask=token_mask, return_aux=True)
+        return y + second[..., :8], aux
 
 
 def adapted(method, dtype="bfloat16"):
@@ -48,8 +51,14 @@ def adapted(method, dtype="bfloat16"):
 
 def ready(model):
     model = nnx.merge(*nnx.split(model))
-    inference.prepare(model)
+    model.join_layers()
     return model
+
+
+def joined_sizes(model):
+    """How many layers are joined in the place of each; those that stay count as none."""
+    layers = [getattr(layer, "ready", None) for layer in (model.first, model.second, model.third)]
+    return [len(ready.get_value().chain.sizes) if ready else 0 for ready in layers]
 
 
 @pytest.mark.parametrize("name", mostly_slow(JOINED, ["lora_sp"]))
@@ -58,9 +67,9 @@ def test_computes_the_same(name):
     mask = jnp.arange(12).reshape(2, 6) % 5 != 0
     run = jax.jit(lambda model, x: model(x, mask))
     expected, aux = run(model, x)
-    prepared = ready(model)
-    assert set(prepared.ready.get_value()) == {("first", "second"), ("third",)}
-    found, other = run(prepared, x)
+    joined = ready(model)
+    assert joined_sizes(joined) == [2, 0, 1]
+    found, other = run(joined, x)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
     assert jax.tree.structure(other) == jax.tree.structure(aux)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), other, aux)
@@ -72,10 +81,10 @@ def test_a_stack_computes_the_same(name):
     model = adapted(METHODS[name], "float32")
     stack = jax.tree.map(lambda leaf: jnp.stack([leaf, 0.5 * leaf]), model)
     run = jax.jit(jax.vmap(lambda model, x: model(x), in_axes=(0, None)))
-    prepared = inference.prepared_stack(stack)
+    joined = prepared.join_stack(stack)
     for rows in (4, 12):
         x = jnp.sin(jnp.arange(8.0 * rows)).reshape(1, rows, 8)
-        (expected, aux), (found, other) = run(stack, x), run(prepared, x)
+        (expected, aux), (found, other) = run(stack, x), run(joined, x)
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
         assert jax.tree.structure(other) == jax.tree.structure(aux)
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), other, aux)
@@ -90,10 +99,10 @@ def test_a_stacks_adapters_are_cast_before_the_loop():
         (loop,) = (e for e in jax.make_jaxpr(run)(x, stack).eqns if e.primitive.name == "scan")
         return str(loop.params["jaxpr"]).count(primitive)
 
-    prepared = inference.prepared_stack(stack)
-    casts = [in_loop("convert_element_type", one) for one in (stack, prepared)]
+    joined = prepared.join_stack(stack)
+    casts = [in_loop("convert_element_type", one) for one in (stack, joined)]
     assert casts[0] - casts[1] >= 6  # P and U of three layers
-    assert in_loop("optimization_barrier", prepared) == 2  # one for each input
+    assert in_loop("optimization_barrier", joined) == 2  # one for each input
 
 
 def test_a_kernel_gets_the_routers_numbers_joined_once(monkeypatch):
@@ -101,25 +110,25 @@ def test_a_kernel_gets_the_routers_numbers_joined_once(monkeypatch):
     monkeypatch.setattr(lora_sp, "fused_rows", kernel)
     model = adapted(LoRASP(rank=32, hidden_width=16, gate="pallas"), "float32")
     x = jnp.sin(jnp.arange(96.0)).reshape(2, 6, 8)
-    prepared = ready(model)
-    params = prepared.ready.get_value()["first", "second"].params
+    joined = ready(model)
+    params = joined.first.ready.get_value().params
     assert [leaf.shape for leaf in jax.tree.leaves(params)] == [(2, 16 * 32 + 16 + 32)]
     run = jax.jit(lambda model, x: model(x))
     close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-4)
-    jax.tree.map(close, run(prepared, x), run(model, x))
+    jax.tree.map(close, run(joined, x), run(model, x))
 
 
 def test_a_quantised_base_computes_the_same():
     model = quantize(adapted(METHODS["lora"], "float32"), [(".*", "int8")]).model
-    prepared, x = ready(model), jnp.sin(jnp.arange(48.0)).reshape(6, 8)
-    assert set(prepared.ready.get_value()) == {("first", "second"), ("third",)}
-    np.testing.assert_allclose(prepared(x)[0], model(x)[0], rtol=1e-4, atol=1e-4)
+    joined, x = ready(model), jnp.sin(jnp.arange(48.0)).reshape(6, 8)
+    assert joined_sizes(joined) == [2, 0, 1]
+    np.testing.assert_allclose(joined(x)[0], model(x)[0], rtol=1e-4, atol=1e-4)
 
 
 def test_a_quantised_base_stays_so_where_it_is_not_copied():
     model = quantize(adapted(METHODS["lora"], "float32"), [(".*", "int8")]).model
     expected, x = model(jnp.ones((6, 8)))[0], jnp.ones((6, 8))
-    inference.prepare(model, copy_kernels=False)
+    model.join_layers(copy_kernels=False)
     codes = [leaf for leaf in jax.tree.leaves(nnx.state(model)) if leaf.dtype == jnp.int8]
     assert len(codes) == 3
     np.testing.assert_allclose(model(x)[0], expected, rtol=1e-4, atol=1e-4)
@@ -136,7 +145,7 @@ def test_a_quantised_base_stays_so_where_it_is_not_copied():
     ],
 )
 def test_a_long_sum_of_few_rows_is_split(rows, d_in, d_out, parts):
-    assert inference._parts(rows, d_in, d_out) == parts
+    assert prepared._parts(rows, d_in, d_out) == parts
 
 
 def test_a_sum_over_parts_is_the_product():
@@ -144,9 +153,9 @@ def test_a_sum_over_parts_is_the_product():
     x, matrix = (
         jax.random.normal(k, s) for k, s in zip(keys, ((2, 3, 4096), (4096, 8)), strict=True)
     )
-    assert "reduce_sum" in str(jax.make_jaxpr(inference.product)(x, matrix))
-    np.testing.assert_allclose(inference.product(x, matrix), x @ matrix, rtol=1e-4, atol=1e-3)
-    half = inference.product(x.astype(jnp.bfloat16), matrix.astype(jnp.bfloat16))
+    assert "reduce_sum" in str(jax.make_jaxpr(prepared.product)(x, matrix))
+    np.testing.assert_allclose(prepared.product(x, matrix), x @ matrix, rtol=1e-4, atol=1e-3)
+    half = prepared.product(x.astype(jnp.bfloat16), matrix.astype(jnp.bfloat16))
     assert half.dtype == jnp.bfloat16
     np.testing.assert_allclose(half.astype(jnp.float32), x @ matrix, atol=1)
 
@@ -162,7 +171,8 @@ def test_layers_of_one_input_are_two_products():
     [("dora", "bfloat16"), ("lora_moe", "bfloat16"), ("lora", None)],
 )
 def test_what_cannot_be_joined_stays(name, dtype):
-    assert not hasattr(ready(adapted(METHODS[name], dtype)), "ready")
+    model = ready(adapted(METHODS[name], dtype))
+    assert {type(layer) for layer in (model.first, model.second, model.third)} == {Dense}
 
 
 @pytest.mark.parametrize("second", ["ada_lora", "dora", None])
@@ -170,10 +180,9 @@ def test_layers_of_two_methods_are_joined_alone(second):
     """Or left as they are: the last two."""
     rules = [("second", second and METHODS[second]), (".*", METHODS["lora"])]
     model, x = trained(*rules, seed=1, net=Readers("float32")), jnp.ones((2, 8))
-    prepared = ready(model)
-    joined = {"first", "third"} | ({"second"} if second == "ada_lora" else set())
-    assert set(prepared.ready.get_value()) == {(name,) for name in joined}
-    (found, other), (expected, aux) = prepared(x), model(x)
+    joined = ready(model)
+    assert joined_sizes(joined) == [1, int(second == "ada_lora"), 1]
+    (found, other), (expected, aux) = joined(x), model(x)
     np.testing.assert_allclose(found, expected, rtol=1e-4)
     assert jax.tree.structure(other) == jax.tree.structure(aux)
 

@@ -9,7 +9,7 @@ import pytest
 import safetensors.numpy
 
 from lorasp_jax import models
-from lorasp_jax.models.checkpoints import published
+from lorasp_jax.models.checkpoints import loading, published
 from lorasp_jax.models.checkpoints.native import named_arrays
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.smolvla import SmolVLAConfig
@@ -66,11 +66,30 @@ def test_lerobot(lerobot, caplog):
         models.load(lerobot)
 
 
+def test_a_folder_is_resolved_once(lerobot, monkeypatch):
+    asked = []
+    monkeypatch.setattr(loading.hub, "local", lambda where: asked.append(where) or lerobot)
+    found = loading.find("hf://me/policy")
+    assert (found.layout, found.config) == ("lerobot", smolvla.CONFIG)
+    assert found.inputs == smolvla.CONFIG.inputs
+    assert found.load().config == smolvla.CONFIG
+    assert asked == ["hf://me/policy"]
+
+
+def test_what_no_file_says_is_none_or_an_error(lerobot):
+    (lerobot / "config.json").unlink()
+    found = loading.find(lerobot)
+    assert (found.layout, found.inputs) == ("lerobot", None)
+    with pytest.raises(ValueError, match="pass a config"):
+        _ = found.config
+
+
 def test_openpi(tmp_path):
     folder = tmp_path / "29999"
     shutil.copytree(pi0.GOLDEN / "orbax", folder)
     model = models.load(folder)
     assert model.config == models.load_config(folder) == pi0.CONFIG
+    assert loading.find(folder).layout == "openpi"
     assert_same(model, published.load(folder / "params", pi0.CONFIG)[0])
 
 
@@ -78,6 +97,7 @@ def test_ours_and_the_hub(tmp_path, monkeypatch):
     models.save(tmp_path, models.load(pi0.GOLDEN / "orbax"))
     monkeypatch.setattr(hub, "_from_hub", lambda *_: tmp_path)
     assert models.load_config("hf://me/pi0") == pi0.CONFIG
+    assert loading.find("hf://me/pi0").layout == "ours"
     assert models.weights_hash(models.load("hf://me/pi0")) == models.weights_hash(tmp_path)
 
 
