@@ -58,7 +58,7 @@ def ready(model):
 def joined_sizes(model):
     """How many layers are joined in the place of each; those that stay count as none."""
     layers = [getattr(layer, "ready", None) for layer in (model.first, model.second, model.third)]
-    return [len(ready.get_value().chain.sizes) if ready else 0 for ready in layers]
+    return [0 if ready is None else len(ready.get_value().chain.sizes) for ready in layers]
 
 
 @pytest.mark.parametrize("name", mostly_slow(JOINED, ["lora_sp"]))

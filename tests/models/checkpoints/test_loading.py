@@ -66,14 +66,12 @@ def test_lerobot(lerobot, caplog):
         models.load(lerobot)
 
 
-def test_a_folder_is_resolved_once(lerobot, monkeypatch):
-    asked = []
-    monkeypatch.setattr(loading.hub, "local", lambda where: asked.append(where) or lerobot)
-    found = loading.find("hf://me/policy")
+def test_what_was_found_is_not_read_again(lerobot):
+    found = loading.find(lerobot)
     assert (found.layout, found.config) == ("lerobot", smolvla.CONFIG)
+    (lerobot / "config.json").unlink()
     assert found.inputs == smolvla.CONFIG.inputs
     assert found.load().config == smolvla.CONFIG
-    assert asked == ["hf://me/policy"]
 
 
 def test_what_no_file_says_is_none_or_an_error(lerobot):
