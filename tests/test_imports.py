@@ -1,6 +1,7 @@
 """Data flows one way: a room imports only rooms above it."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from tests import ROOT
 
 ROOMS = [
     "envs",
+    "lorasp_jax._compat",
     "lorasp_jax.storage",
     "lorasp_jax.kernels",
     "lorasp_jax.peft",
@@ -24,6 +26,8 @@ ROOMS = [
     "lorasp_jax.report",
     "lorasp_jax.cli",
 ]
+PRIVATE = re.compile(r"(jax|flax|optax|orbax)(\..*)?\._|jaxlib\b|jax\.interpreters\b")
+"""Names that a package may change without notice."""
 SOURCES = [
     path
     for top in ("envs", "lorasp_jax")
@@ -58,6 +62,8 @@ def test_imports_point_up(path: Path):
         other = room(name)
         assert other is None or other <= own, f"{module} imports {name}"
         assert not name.startswith("configs"), f"{module} imports {name}"
+        if path.name != "_compat.py":
+            assert not PRIVATE.match(name), f"{module} imports {name}: only _compat.py may"
         if own == 0:
             assert not name.startswith("lorasp_jax"), f"{module} imports {name}"
 
@@ -65,3 +71,5 @@ def test_imports_point_up(path: Path):
 def test_a_wrong_import_would_be_seen():
     assert room("lorasp_jax.report.html") > room("lorasp_jax.training.step")
     assert room("jax.numpy") is None
+    assert PRIVATE.match("jax._src.core")
+    assert not PRIVATE.match("jax.numpy")

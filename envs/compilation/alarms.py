@@ -9,7 +9,8 @@ import threading
 from typing import Any
 
 from jax import monitoring
-from jaxlib import utils
+
+from envs import _compat
 
 _COMPILATION = "/jax/core/compile/backend_compile_duration"  # recorded at its start and at its end
 _FATAL, _JAX_DEFAULT = 3, 1  # levels of TF_CPP_MIN_LOG_LEVEL
@@ -46,4 +47,4 @@ def _count(event: str, change: int) -> None:
     if event == _COMPILATION:
         with _lock:
             _running += change
-            utils.absl_set_min_log_level(_FATAL if _running else _JAX_DEFAULT)
+            _compat.set_least_logged_level(_FATAL if _running else _JAX_DEFAULT)

@@ -4,12 +4,13 @@ import os
 from pathlib import Path
 
 import jax
-from jax._src import compilation_cache, lru_cache  # JAX has no public way to replace its writer
+
+from envs import _compat
 
 from envs.datasets.writing import write_bytes
 
 
-class WholeFiles(lru_cache.LRUCache):
+class WholeFiles(_compat.FileCache):
     """JAX' cache of files, in which a program appears whole or not at all.
 
     JAX writes an entry in place: another process reads half of it, and what a killed process left
@@ -37,4 +38,4 @@ def enable() -> None:
         folder = os.path.join(os.path.expanduser("~"), ".cache", "lorasp_jax", "xla")
         jax.config.update("jax_compilation_cache_dir", folder)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
-    compilation_cache.LRUCache = WholeFiles  # pyright: ignore[reportPrivateImportUsage]
+    _compat.use_file_cache(WholeFiles)

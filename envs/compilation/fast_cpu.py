@@ -13,7 +13,8 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-from jax._src import core, xla_bridge  # no public way to ask for a backend or for a trace
+
+from envs import _compat
 
 _NAME = "xla_cpu_use_fusion_emitters"
 FLAG = f"--{_NAME}=false"
@@ -25,7 +26,7 @@ def _set_flag() -> bool:
     flags = os.environ.get("XLA_FLAGS", "")
     if not _NEEDED or _NAME in flags:
         return False
-    if not xla_bridge.backends_are_initialized():
+    if not _compat.backends_are_initialized():
         os.environ["XLA_FLAGS"] = f"{flags} {FLAG}".strip()
         return False
     return True
@@ -66,7 +67,7 @@ def jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     own = jax.jit(function, **options, compiler_options={_NAME: False})
 
     def chosen() -> Callable[..., Any]:
-        return own if is_late() and core.trace_state_clean() else plain
+        return own if is_late() and _compat.is_untraced() else plain
 
     @functools.wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:

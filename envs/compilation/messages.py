@@ -9,7 +9,8 @@ from contextlib import AbstractContextManager
 from typing import Any
 
 import jax
-from jax._src import core  # there is no public way to ask whether something is traced
+
+from envs import _compat
 
 PATIENCE = 2.0
 """Seconds that nobody minds."""
@@ -56,13 +57,13 @@ class Calls:
 
     def first(self, *call: Any) -> AbstractContextManager[None]:
         """Around a call: what is called, and what else decides whether it is compiled anew."""
-        if call in self._called or not core.trace_state_clean():
+        if call in self._called or not _compat.is_untraced():
             return contextlib.nullcontext()
         self._called.add(call)
         return self.said(call[0])
 
     def said(self, what: str) -> AbstractContextManager[None]:
         """As `said`, unless this becomes a part of something that others compile."""
-        if not core.trace_state_clean():
+        if not _compat.is_untraced():
             return contextlib.nullcontext()
         return said(f"{what} of {self._name}")

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from lorasp_jax import given
+from lorasp_jax import _compat, given
 from lorasp_jax.adapters.adaptation import init_stack, over_stack
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.adapters.layers.einsum import to_matrices
@@ -130,7 +130,7 @@ class LinenAdapter:
           ValueError: variables without an adapter that the rules ask for, mutable "params", or a
             scan that hands no rngs for dropout on.
         """
-        if flax.core.scope.in_filter(mutable, "params"):
+        if _compat.is_mutable(mutable, "params"):
             raise ValueError("'params' cannot be mutable: it holds the adapters during the call.")
         with nn.intercept_methods(self._call):
             return _apply(self.model, _joined(variables), *args, mutable=mutable, **kwargs)

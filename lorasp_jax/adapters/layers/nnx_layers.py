@@ -11,8 +11,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import linen, nnx
-from flax.nnx.nn.dtypes import promote_dtype
 
+from lorasp_jax import _compat
 from lorasp_jax.adapters.layers import einsum
 from lorasp_jax.dense import AdaptedLayer, Dense, computed_in, refuse_sharding, with_value
 from lorasp_jax.kernels.quantized_kernel import QuantizedKernel
@@ -39,7 +39,7 @@ _PLAIN: dict[str, tuple[Any, ...]] = {
     "einsum_op": (jnp.einsum,),
     "precision": (None,),
     "preferred_element_type": (None,),
-    "promote_dtype": (promote_dtype, linen.dtypes.promote_dtype),
+    "promote_dtype": (_compat.nnx_promote_dtype, linen.dtypes.promote_dtype),
 }
 
 

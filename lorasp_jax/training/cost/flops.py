@@ -10,7 +10,8 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-from jax.interpreters import partial_eval
+
+from lorasp_jax import _compat
 
 PEAK = {"NVIDIA H200": 989e12, "NVIDIA H100": 989e12, "NVIDIA A100": 312e12, "TPU v5p": 459e12}
 """Dense bf16 operations a second by how a device's name begins (NVIDIA's and Google's data sheets,
@@ -29,7 +30,7 @@ def count(function: Callable, *arguments: Any) -> float:
       arguments: arrays, or `jax.ShapeDtypeStruct`s; only shapes are read.
     """
     jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
-    return _of_jaxpr(partial_eval.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))[0])
+    return _of_jaxpr(_compat.without_unused(jaxpr, [True] * len(jaxpr.outvars))[0])
 
 
 def utilisation(operations: float, seconds: float) -> float | None:

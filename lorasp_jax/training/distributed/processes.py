@@ -20,10 +20,10 @@ from typing import Any, NoReturn
 
 import jax
 import numpy as np
-from jax._src import clusters  # there is no public way to ask where the others are
 from jax.experimental import multihost_utils
 from rich.console import Console
 
+from lorasp_jax import _compat
 from lorasp_jax.training.distributed import peers
 from lorasp_jax.training.distributed.meeting import PATIENCE, Meeting
 
@@ -75,7 +75,7 @@ def _whereabouts() -> tuple[str, int, int]:
     """
     try:
         count, number = (int(os.environ[name]) if name in os.environ else None for name in _NAMES)
-        address, count, number, _ = clusters.ClusterEnv.auto_detect_unset_distributed_params(
+        address, count, number, _ = _compat.find_processes(
             os.environ.get("JAX_COORDINATOR_ADDRESS"), count, number, None, None, int(PATIENCE)
         )
         if address is None or count is None or number is None:
