@@ -35,7 +35,6 @@ from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import Params, apply_together, drop_rate
 
 KEPT = "kept_aux"
-DROPPING = "held_dropout_key"
 KERNEL_INIT = jax.nn.initializers.lecun_normal()  # of nnx.Linear and nn.Dense too
 
 
@@ -163,18 +162,30 @@ class AdaptedLayer(nnx.Module):
       kernel_name: name of the attribute that holds the layer's kernel.
       adapter: `AdapterParam` holding the method's parameters, or None.
       method: the adapter's method, static.
+      kept_aux: what the last call reported, and held_dropout_key: what `with_dropout` gives; where
+        there is none, the layer lacks the attribute, so that its structure stays what it was.
     """
 
     kernel_name: str = "kernel"
     adapter: AdapterParam | None
     method: Method | None
+    kept_aux: AdapterAux
+    held_dropout_key: DropoutKey
 
     def kernel_matrices(self) -> jax.Array:
         """The kernel as the adapter sees it, [..., I, O]; leading axes are stacks of layers."""
-        kernel = getattr(self, self.kernel_name)
+        kernel = self.kernel_variable()
         if not isinstance(kernel, nnx.Variable):
             raise ValueError(f"its {self.kernel_name} is {short(kernel)}, no parameter.")
         return kernel.get_value()
+
+    def kernel_variable(self) -> Any:
+        """What holds the kernel, under whichever name the layer's own class gives it."""
+        return getattr(self, self.kernel_name)
+
+    def set_kernel_variable(self, variable: Any) -> None:
+        """Gives the layer what holds another kernel, or one shared with other layers."""
+        setattr(self, self.kernel_name, variable)
 
     def stack_shape(self) -> tuple[int, ...]:
         """Sizes of the stacks of layers that this one is; () for one layer."""
@@ -182,8 +193,8 @@ class AdaptedLayer(nnx.Module):
 
     def set_kernel_matrices(self, matrices: jax.Array | QuantizedKernel) -> None:
         """Gives the layer another kernel in a variable of its own: the old one may be shared."""
-        old = getattr(self, self.kernel_name)
-        setattr(self, self.kernel_name, with_value(old, matrices.reshape(old.get_value().shape)))
+        old = self.kernel_variable()
+        self.set_kernel_variable(with_value(old, matrices.reshape(old.get_value().shape)))
 
     def adapter_init(self, method: Method) -> Callable[[jax.Array, jax.Array], tuple[Params, Any]]:
         """What makes a method's parameters, and the kernel it leaves, from a key and one [I, O].
@@ -200,21 +211,24 @@ class AdaptedLayer(nnx.Module):
         return self.method, self.adapter.get_value()
 
     def without_adapter(self) -> nnx.Module:
-        """The layer as it was before adaptation, or as near as it comes, with its kernel of now."""
+        """The layer as it was before adaptation, or as near as it comes, with its kernel of now.
+
+        One of another class is a new object that shares the variables.
+        """
         self.adapter, self.method = None, None
         return self
 
     @property
     def dropout_key(self) -> jax.Array | None:
         """The key of `with_dropout`, or None: nothing is dropped."""
-        held = getattr(self, DROPPING, None)
+        held = getattr(self, "held_dropout_key", None)
         return None if held is None else held.get_value()
 
     def keep_aux(self, aux: Aux) -> None:
         """Stores aux for `collect_aux`, where the layer may be changed."""
         # A module of an outer trace cannot be changed; collect_aux then raises.
         with contextlib.suppress(flax.errors.TraceContextError):
-            setattr(self, KEPT, AdapterAux(aux))
+            self.kept_aux = AdapterAux(aux)
 
 
 class Dense(AdaptedLayer):

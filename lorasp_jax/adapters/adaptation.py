@@ -19,7 +19,7 @@ import math
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ from flax import nnx
 from lorasp_jax import given
 from lorasp_jax.adapters import paths
 from lorasp_jax.adapters.layers import nnx_layers
-from lorasp_jax.dense import DROPPING, AdaptedLayer, AdapterAux, AdapterParam, DropoutKey
+from lorasp_jax.dense import AdaptedLayer, AdapterAux, AdapterParam, DropoutKey
 from lorasp_jax.kernels.quantized_kernel import QuantizedKernel
 from lorasp_jax.peft import FullFineTuning, Method, _fields
 from lorasp_jax.peft._fields import short
@@ -122,7 +122,7 @@ def with_dropout(model: Model, key: jax.Array) -> Model:
         if isinstance(layer.adapter, AdapterParam) and drop_rate(layer.method):
             own = jax.random.fold_in(key, zlib.crc32(place.path.encode()))
             leading = layer.stack_shape()
-            setattr(layer, DROPPING, DropoutKey(jax.random.split(own, leading) if leading else own))
+            layer.held_dropout_key = DropoutKey(jax.random.split(own, leading) if leading else own)
     return holder[0]
 
 
@@ -154,18 +154,22 @@ def merge(model: Model) -> Model:
       ValueError: a method whose delta depends on the input, or a model without values.
     """
     holder = _copy(given.with_values(model))
-    for place in paths.once(paths.places(holder, AdaptedLayer)):
-        layer = place.child
-        if layer.adapter is not None:
-            try:
-                kernel = layer.kernel_matrices()
-                kernel = over_stack(layer.method.merge, kernel)(layer.adapter.get_value(), kernel)
-            except ValueError as error:
-                raise ValueError(f"cannot merge {place.path}: {error}") from error
-            layer.set_kernel_matrices(kernel)
-        layer.without_adapter()
+    paths.replace(paths.places(holder, AdaptedLayer), _merged)
     _retype(paths.places(holder, AdapterParam), nnx.Param)
     return holder[0]
+
+
+def _merged(place: paths.Place) -> nnx.Module:
+    """The layer without its adapter, whose delta its kernel has."""
+    layer = place.child
+    if layer.adapter is not None:
+        try:
+            kernel = layer.kernel_matrices()
+            kernel = over_stack(layer.method.merge, kernel)(layer.adapter.get_value(), kernel)
+        except ValueError as error:
+            raise ValueError(f"cannot merge {place.path}: {error}") from error
+        layer.set_kernel_matrices(kernel)
+    return layer.without_adapter()
 
 
 def penalties(model: nnx.Module) -> dict[str, jax.Array]:
@@ -244,22 +248,28 @@ def _attach_all(
     statistics: Mapping[str, jax.Array],
 ) -> set[int]:
     """Attaches adapters in place; returns the rules that were used."""
-    used, attached = set(), set()
-    for path, parent, name, layer in paths.layer_places(holder, einsums):
-        i = paths.governing(rules, path)
+    used: dict[str, int] = {}
+    found = paths.layer_places(holder, einsums)
+    for place in found:
+        i = paths.governing(rules, place.path)
         method = None if i is None else rules[i][1]
-        if method is not None and not method.trains_base:
-            own_key = jax.random.fold_in(key, zlib.crc32(path.encode()))
-            try:
-                layer = nnx_layers.adapted(layer, einsums)
-                if layer not in attached:  # it may hang in several places
-                    attach(layer, method, own_key, statistics.get(path))
-                attached.add(layer)
-            except ValueError as error:
-                raise ValueError(f"cannot adapt {path or 'the model'}: {error}") from error
-            setattr(parent, name, layer)
-            used.add(i)
-    return used
+        if i is not None and method is not None and not method.trains_base:
+            used[place.path] = i
+
+    def attached(place: paths.Place) -> AdaptedLayer | None:
+        if place.path not in used:
+            return None
+        method = cast(Method, rules[used[place.path]][1])
+        own_key = jax.random.fold_in(key, zlib.crc32(place.path.encode()))
+        try:
+            layer = nnx_layers.adapted(place.child, einsums)
+            attach(layer, method, own_key, statistics.get(place.path))
+        except ValueError as error:
+            raise ValueError(f"cannot adapt {place.path or 'the model'}: {error}") from error
+        return layer
+
+    paths.replace(found, attached)
+    return set(used.values())
 
 
 def free_all(holder: nnx.List, rules: paths.Rules) -> set[int]:
@@ -289,14 +299,14 @@ def free_all(holder: nnx.List, rules: paths.Rules) -> set[int]:
 
 def _retype(places: Sequence[paths.Place], kind: type[nnx.Param]) -> None:
     """Replaces variables by ones of another type, shared ones by one; those that train are fp32."""
-    renewed = {}
-    for _, parent, name, variable in places:
-        if id(variable) not in renewed:
-            value = variable.get_value()
-            if kind is AdapterParam:  # a copy: the train step may donate what trains
-                value = jnp.array(value, jnp.float32, copy=True)
-            renewed[id(variable)] = kind(value, **variable.get_metadata())
-        setattr(parent, name, renewed[id(variable)])
+
+    def renewed(place: paths.Place) -> nnx.Param:
+        value = place.child.get_value()
+        if kind is AdapterParam:  # a copy: the train step may donate what trains
+            value = jnp.array(value, jnp.float32, copy=True)
+        return kind(value, **place.child.get_metadata())
+
+    paths.replace(places, renewed)
 
 
 def init_stack(

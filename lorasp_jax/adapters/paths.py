@@ -42,6 +42,34 @@ def once(found: list[Place]) -> list[Place]:
     return list({id(place.child): place for place in reversed(found)}.values())[::-1]
 
 
+def put(place: Place, child: Any) -> None:
+    """Hangs another child into a place: the parent is anyone's, so its attribute has any name."""
+    setattr(place.parent, place.name, child)
+
+
+def replace(found: Sequence[Place], make: Callable[[Place], Any]) -> None:
+    """Hangs something else into the places of children.
+
+    Args:
+      found: the places.
+      make: what to put into a place, or None to try the child's next one. It is asked once for a
+        child that hangs in several places, all of which get the same; but each place of an
+        `nnx.Linear` gets its own, so that it has an adapter of its own there.
+    """
+    made: dict[Any, Any] = {}
+    for place in found:
+        if _one(place) not in made and (new := make(place)) is not None:
+            made[_one(place)] = new
+    for place in found:
+        if _one(place) in made:
+            put(place, made[_one(place)])
+
+
+def _one(place: Place) -> Any:
+    """What is the same for places that get the same."""
+    return place.path if isinstance(place.child, nnx.Linear) else id(place.child)
+
+
 def layer_places(
     holder: nnx.List, einsums: nnx_layers.Einsums = MappingProxyType({})
 ) -> list[Place]:

@@ -52,8 +52,7 @@ def fuse(model: nnx.Module, weights: Mapping[str, float], *, rank: int | None = 
     if not isinstance(weights, Mapping) or not weights:
         raise ValueError(f"fuse needs weights by name, at least one, got {short(weights)}.")
     named.weights(model, weights)  # raises for an unknown name or a weight that is no number
-    result, errors = named.bare(model), {}
-    there = named.modules(result)
+    fused, errors = {}, {}
     for path, _, _, layer in named.sets(model):
         found = []
         for name, weight in weights.items():
@@ -63,9 +62,9 @@ def fuse(model: nnx.Module, weights: Mapping[str, float], *, rank: int | None = 
             if method is not None:
                 found.append((params["lora_a"], weight * method.scale * params["lora_b"]))
         if found:
-            one = nnx_layers.like(there[path], layer)
-            one.method, one.adapter, errors[path] = _one(found, rank)
-    return Fused(result, errors)
+            method, params, errors[path] = _one(found, rank)
+            fused[path] = layer, method, params
+    return Fused(named.with_adapters(named.bare(model), fused), errors)
 
 
 def unmerge(merged: Model, adapted: nnx.Module) -> Model:
@@ -94,19 +93,19 @@ def unmerge(merged: Model, adapted: nnx.Module) -> Model:
     if has := adaptation.methods(merged):
         raise ValueError(f"{min(has)} of the merged model has an adapter.")
     holder = nnx.List([nnx.merge(*adaptation.split(merged))])
-    for place in paths.places(holder, nnx.Module):
+
+    def taken_apart(place: paths.Place) -> AdaptedLayer | None:
         if place.path not in adapters:
-            continue
-        by = adapters.pop(place.path)
-        if getattr(place.child, "adapter", None) is not None:
-            continue  # it hangs in several places, and it was taken apart at another one
+            return None
         try:
-            layer = _unmerged(place.child, by)
+            return _unmerged(place.child, adapters[place.path])
         except (ValueError, TypeError) as error:
             raise ValueError(f"cannot unmerge {place.path}: {error}") from error
-        setattr(place.parent, place.name, layer)
-    if adapters:
-        raise ValueError(f"the merged model has no layer {min(adapters)}.")
+
+    found = paths.places(holder, nnx.Module)
+    paths.replace(found, taken_apart)
+    if beyond := adapters.keys() - {place.path for place in found}:
+        raise ValueError(f"the merged model has no layer {min(beyond)}.")
     full = [(f"^{re.escape(path)}$", FullFineTuning()) for path in freed]
     for i in set(range(len(full))) - adaptation.free_all(holder, full):
         raise ValueError(f"the merged model has no parameter {freed[i]}.")
@@ -130,9 +129,7 @@ def _unmerged(layer: nnx.Module, adapted: AdaptedLayer) -> AdaptedLayer:
     return layer
 
 
-def _one(
-    found: list[tuple[jax.Array, jax.Array]], rank: int | None
-) -> tuple[LoRA, AdapterParam, float]:
+def _one(found: list[tuple[jax.Array, jax.Array]], rank: int | None) -> tuple[LoRA, Params, float]:
     """One LoRA of scale 1 with Σ A_i B_i, and its relative error."""
     a = jnp.concatenate([a for a, _ in found], axis=-1)
     b = jnp.concatenate([b for _, b in found], axis=-2)
@@ -140,7 +137,7 @@ def _one(
     if rank is not None and rank < a.shape[-1]:
         a, b, error = truncated(a, b, rank)
     params: Params = {"lora_a": a, "lora_b": b}
-    return LoRA(rank=a.shape[-1], alpha=a.shape[-1]), AdapterParam(params), error
+    return LoRA(rank=a.shape[-1], alpha=a.shape[-1]), params, error
 
 
 def truncated(a: jax.Array, b: jax.Array, rank: int) -> tuple[jax.Array, jax.Array, float]:

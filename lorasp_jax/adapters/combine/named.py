@@ -75,10 +75,12 @@ def combine(models: Mapping[str, Model], *, rank: int | None = None) -> Model:
     for name in known[1:]:
         _check_same(bases[known[0]], known[0], bases[name], name)
     holder = nnx.List([bases[known[0]]])
-    for place in paths.places(holder, nnx.Module):
+
+    def with_set(place: Place) -> AdaptedLayer | None:
         found = {n: adapters[n][place.path] for n in known if place.path in adapters[n]}
-        if found:
-            setattr(place.parent, place.name, _with_set(place.child, known, found, rank))
+        return _with_set(place.child, known, found, rank) if found else None
+
+    paths.replace(paths.places(holder, nnx.Module), with_set)
     return choose(holder[0], known[0])
 
 
@@ -164,13 +166,33 @@ def extract(model: Model, name: str | None) -> Model:
     if name is None:
         return result
     index_of(known, name)
-    there = modules(result)
-    for place in sets(model):
-        method, params = member(place.child, name)
-        if method is not None:
-            layer = nnx_layers.like(there[place.path], place.child)
-            layer.method, layer.adapter = method, AdapterParam(params)
-    return result
+    return with_adapters(
+        result, {place.path: (place.child, *member(place.child, name)) for place in sets(model)}
+    )
+
+
+def with_adapters(
+    base: Model, adapters: Mapping[str, tuple[AdaptedLayer, Method | None, Params]]
+) -> Model:
+    """The base, whose layers get adapters of their own by path; it is changed in place.
+
+    Args:
+      base: from `bare`.
+      adapters: a layer of the kind that can carry it, the method, None for no adapter, and the
+        parameters.
+    """
+
+    def with_own(place: Place) -> AdaptedLayer | None:
+        kind, method, params = adapters.get(place.path, (None, None, {}))
+        if kind is None or method is None:
+            return None
+        layer = nnx_layers.like(place.child, kind)
+        layer.method, layer.adapter = method, AdapterParam(params)
+        return layer
+
+    holder = nnx.List([base])
+    paths.replace(paths.places(holder, nnx.Module), with_own)
+    return holder[0]
 
 
 def swap(model: Model, name: str, other: nnx.Module) -> Model:
@@ -215,14 +237,18 @@ def bare(model: Model) -> Model:
       ValueError: an adapter holds a part of its kernel.
     """
     holder = nnx.List([nnx.merge(*adaptation.split(model))])
-    for place in paths.once(paths.places(holder, AdaptedLayer)):
-        if place.child.adapter is not None:
-            if place.child.method.splits_kernel:
-                raise ValueError(
-                    f"the adapter of {place.path} holds a part of its kernel, so the base alone "
-                    "is not there: merge it."
-                )
-            place.child.without_adapter()
+
+    def without(place: Place) -> nnx.Module | None:
+        if place.child.adapter is None:
+            return None
+        if place.child.method.splits_kernel:
+            raise ValueError(
+                f"the adapter of {place.path} holds a part of its kernel, so the base alone is not "
+                "there: merge it."
+            )
+        return place.child.without_adapter()
+
+    paths.replace(paths.places(holder, AdaptedLayer), without)
     return holder[0]
 
 
@@ -300,11 +326,6 @@ def sets(model: nnx.Module) -> list[Place]:
     """The layers that hold named adapters."""
     places = paths.places(nnx.List([given.module(model)]), AdaptedLayer)
     return [place for place in places if isinstance(place.child.adapter, NamedAdapters)]
-
-
-def modules(model: nnx.Module) -> dict[str, nnx.Module]:
-    """The model and all modules in it, by path."""
-    return {place.path: place.child for place in paths.places(nnx.List([model]), nnx.Module)}
 
 
 def member(layer: Any, name: str) -> tuple[Method | None, Params]:

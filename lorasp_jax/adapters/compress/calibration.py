@@ -185,19 +185,20 @@ def _observed(
     """A copy of the model that reports."""
     holder = nnx.List([nnx.clone(model)])
     nnx.pop(holder, AdapterAux)
-    for path, parent, name, layer in paths.multiplying(holder):
+    for place in paths.multiplying(holder):
+        path = place.path
         if path not in reports:
             continue
         try:
-            layer = nnx_layers.adapted(layer, {})
+            layer = nnx_layers.adapted(place.child, {})
         except ValueError as error:
             raise ValueError(f"cannot observe {path}: {error}") from error
-        setattr(parent, name, layer)
+        paths.put(place, layer)
         if layer.adapter is None:
             adaptation.attach(layer, Observed(path, None, reports[path]), jax.random.key(0))
         else:
-            method = Observed(path, layer.method, reports[path])
-            params = layer.adapter.get_value()
+            own, params = layer.carried()
+            method = Observed(path, own, reports[path])
             if path in others:
                 another, its_params = others[path]
                 method = dataclasses.replace(method, another=another)

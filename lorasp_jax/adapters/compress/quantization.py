@@ -73,7 +73,7 @@ def quantize(model: nnx.Module, rules: Sequence[tuple[str, Kind | None]]) -> Qua
                 layer, errors[place.path] = _quantized(place.child, kind, shared)
             except ValueError as error:
                 raise ValueError(f"cannot quantise {place.path}: {error}") from error
-            setattr(place.parent, place.name, layer)
+            paths.put(place, layer)
     for rule in rules:
         if rule not in used:
             close = paths.near_misses(rule[0], [place.path for place in known]) or "none"
@@ -92,8 +92,7 @@ def is_quantized(model: nnx.Module) -> bool:
 def _quantized(layer: nnx.Module, kind: Kind, shared: Shared) -> tuple[AdaptedLayer, float]:
     """The layer with a quantised kernel, and its relative error; shared kernels stay shared."""
     layer = nnx_layers.adapted(layer, {})
-    name, kernel = layer.kernel_name, layer.kernel_matrices()
-    variable = getattr(layer, name)
+    variable, kernel = layer.kernel_variable(), layer.kernel_matrices()
     if isinstance(variable, AdapterParam):
         raise ValueError("its kernel trains, and what trains needs all of its bits.")
     if isinstance(kernel, QuantizedKernel):
@@ -102,9 +101,9 @@ def _quantized(layer: nnx.Module, kind: Kind, shared: Shared) -> tuple[AdaptedLa
     if key not in shared:
         smaller = quantized(kernel, kind)
         layer.set_kernel_matrices(smaller)
-        shared[key] = getattr(layer, name), variable, float(_error(kernel, smaller))
+        shared[key] = layer.kernel_variable(), variable, float(_error(kernel, smaller))
     new, _, error = shared[key]
-    setattr(layer, name, new)
+    layer.set_kernel_variable(new)
     return layer, error
 
 

@@ -1,7 +1,8 @@
 """Layers of other people's NNX models with an adapter inside: einsums, lookups, convolutions.
 
-A layer that is adapted keeps its attributes and its class as a base class, so that what the model
-reads of it is still there; `without_adapter` makes it what it was. `nnx.Linear` becomes a `Dense`.
+An adapted layer takes the layer's place with the same attributes and its class as a base class, so
+that what the model reads of it is still there; `without_adapter` gives one of the old class again.
+`nnx.Linear` becomes a `Dense`.
 """
 
 import functools
@@ -31,7 +32,6 @@ EINSUMS: Einsums = {
     ),
     nnx.Einsum: lambda layer: ("kernel", layer.einsum_str),
 }
-_SETTINGS = ("kernel_name", "kernel_equation")  # of an adapted layer, beside adapter and method
 # Settings that an adapted layer does not follow, and the values that ask for nothing.
 _PLAIN: dict[str, tuple[Any, ...]] = {
     "dot_general": (None, jax.lax.dot_general),
@@ -59,7 +59,7 @@ class EinsumLayer(AdaptedLayer):
           ValueError: an output sharding was asked for.
         """
         refuse_sharding(out_sharding)
-        kernel = getattr(self, self.kernel_name).get_value()
+        kernel = self.kernel_variable().get_value()
         bias = None if getattr(self, "bias", None) is None else self.bias.get_value()
         params = None if self.adapter is None else self.adapter.get_value()
         y, aux = einsum.einsum(
@@ -86,14 +86,17 @@ class EinsumLayer(AdaptedLayer):
 
     def set_kernel_matrices(self, matrices: jax.Array | QuantizedKernel) -> None:
         """Gives the layer another kernel."""
-        old = getattr(self, self.kernel_name)
+        old = self.kernel_variable()
         kernel = einsum.from_matrices(self.kernel_equation, matrices, old.get_value().shape)
-        setattr(self, self.kernel_name, with_value(old, kernel))
+        self.set_kernel_variable(with_value(old, kernel))
 
     def without_adapter(self) -> nnx.Module:
         """The layer in its own class again, unless that cannot read a quantised kernel."""
-        quantized = isinstance(super().kernel_matrices(), QuantizedKernel)
-        return super().without_adapter() if quantized else _undressed(self)
+        if isinstance(super().kernel_matrices(), QuantizedKernel):
+            return super().without_adapter()
+        layer = _plain(self)
+        del layer.kernel_equation
+        return layer
 
 
 class LoRALayer(AdaptedLayer):
@@ -112,7 +115,7 @@ class LoRALayer(AdaptedLayer):
 
     def without_adapter(self) -> nnx.Module:
         """The layer in its own class again."""
-        return _undressed(self)
+        return _plain(self)
 
 
 class EmbedLayer(LoRALayer):
@@ -203,7 +206,7 @@ def adapted(layer: nnx.Module, einsums: Einsums) -> AdaptedLayer:
     """The layer as one that can carry an adapter.
 
     Args:
-      layer: of a known kind; changed in place, unless it is an `nnx.Linear`.
+      layer: of a known kind; left as it is, but one with an adapter is returned itself.
       einsums: further layer classes that are einsums.
 
     Raises:
@@ -216,20 +219,20 @@ def adapted(layer: nnx.Module, einsums: Einsums) -> AdaptedLayer:
         return as_dense(layer)
     if known not in (nnx.Embed, nnx.Conv):
         check_plain(layer)
-    if known in (nnx.Embed, nnx.Conv):
-        mixin, name = (ConvLayer, "kernel") if known is nnx.Conv else (EmbedLayer, "embedding")
-        settings = {"kernel_name": name}
-    else:
-        mixin, (name, equation) = EinsumLayer, kernel_and_equation(layer, known, einsums)
-        settings = {"kernel_name": name, "kernel_equation": equation}
-    return _dressed(layer, mixin, settings)
+    if known is nnx.Embed:
+        return _carrying(layer, EmbedLayer, "embedding")
+    if known is nnx.Conv:
+        return _carrying(layer, ConvLayer, "kernel")
+    name, equation = kernel_and_equation(layer, known, einsums)
+    return _carrying(layer, EinsumLayer, name, equation)
 
 
 def like(layer: Any, other: AdaptedLayer) -> AdaptedLayer:
     """The layer as one that can carry the adapters of another, which has been adapted.
 
     Args:
-      layer: of the other's kind, adapted or not; changed in place, unless it is an `nnx.Linear`.
+      layer: of the other's kind, adapted or not; left as it is, but one that can carry adapters is
+        returned itself.
       other: left untouched.
 
     Raises:
@@ -242,8 +245,7 @@ def like(layer: Any, other: AdaptedLayer) -> AdaptedLayer:
         raise ValueError(f"a {type(layer).__name__} is there instead of a {plain.__name__}.")
     if mixin is Dense:
         return as_dense(layer)
-    settings = {name: value for name, value in vars(other).items() if name in _SETTINGS}
-    return _dressed(layer, mixin, settings)
+    return _carrying(layer, mixin, other.kernel_name, getattr(other, "kernel_equation", None))
 
 
 def kind(layer: Any, einsums: Einsums) -> type[nnx.Module] | None:
@@ -348,21 +350,42 @@ def _class(mixin: type[AdaptedLayer], base: type[nnx.Module]) -> type[AdaptedLay
     return type(f"Adapted{base.__name__}", (mixin, base), {"__doc__": mixin.__doc__})
 
 
-def _dressed(layer: Any, mixin: type[AdaptedLayer], settings: dict[str, str]) -> AdaptedLayer:
-    """The layer with the mixin in front of its class."""
-    names = ("adapter", "method", *settings)
+def _carrying(
+    layer: nnx.Module, mixin: type[AdaptedLayer], name: str, equation: str | None = None
+) -> AdaptedLayer:
+    """A layer that shares the variables of one and has the mixin in front of its class.
+
+    Args:
+      layer: left as it is.
+      mixin: what it does with an adapter.
+      name: of its kernel.
+      equation: of an einsum.
+
+    Raises:
+      ValueError: the layer has an attribute of a name that is needed.
+    """
+    names = ("adapter", "method", "kernel_name") + (("kernel_equation",) if equation else ())
     if taken := [name for name in names if hasattr(layer, name)]:
         raise ValueError(f"{type(layer).__name__} has an attribute {taken[0]} of its own.")
-    layer.__class__ = _class(mixin, type(layer))
-    layer.adapter, layer.method = nnx.data(None), None
-    for name, value in settings.items():
-        setattr(layer, name, value)
-    return layer
+    new = _in_class(layer, _class(mixin, type(layer)))
+    new.adapter, new.method, new.kernel_name = nnx.data(None), None, name
+    if equation:
+        new.kernel_equation = equation
+    return new
 
 
-def _undressed(layer: Any) -> nnx.Module:
-    """What `_dressed` was given."""
-    for name in {"adapter", "method", *_SETTINGS} & vars(layer).keys():
-        delattr(layer, name)
-    layer.__class__ = type(layer).__bases__[1]
-    return layer
+def _plain(layer: AdaptedLayer) -> Any:
+    """What `_carrying` was given, with the variables of now."""
+    plain = _in_class(layer, type(layer).__bases__[1])
+    del plain.adapter, plain.method, plain.kernel_name
+    return plain
+
+
+def _in_class(layer: nnx.Module, kind: type[nnx.Module]) -> Any:
+    """A layer of another class with the same attributes, of which one class adds none to the other.
+
+    Like copies of `copy.copy`, it does not run `__init__`, whose arguments nobody knows any more.
+    """
+    new = object.__new__(kind)
+    vars(new).update(vars(layer))
+    return new
