@@ -13,9 +13,7 @@ from envs.compilation import fast_cpu
 from envs.env import Env
 from envs.scene.randomization import Randomization
 from envs.state import State
-from lorasp_jax.adapters import adaptation
 from lorasp_jax.evaluation import metrics
-from lorasp_jax.models.sampling import Sampler
 from lorasp_jax.policies.policy import Policy
 
 FILMED_WORLDS = 8
@@ -89,6 +87,7 @@ def make_rollout(
         if not 1 <= execute_steps <= chunk:
             raise ValueError(f"execute_steps must be 1 to the chunk, {chunk}, got {execute_steps}")
         reset_key, sample_key = jax.random.split(key)
+        policy = policy.with_sampler()
         look = functools.partial(_look, env, policy, execute_steps, denoise_steps)
         state, (poses, ranks, histogram, running) = jax.lax.scan(
             look, env.reset(reset_key, ranges), jax.random.split(sample_key, looks)
@@ -166,11 +165,8 @@ def _look(
 
 
 def _largest_bank(policy: Policy) -> int:
-    """R of the widest adapter; 0 if no method has a rank."""
-    model = policy.model
-    is_ready = isinstance(model, Sampler)
-    methods = model.methods if is_ready else adaptation.methods(model).values()
-    return max((getattr(method, "rank", 0) for method in methods), default=0)
+    """R of the widest adapter of a policy `with_sampler`; 0 if no method has a rank."""
+    return max((getattr(method, "rank", 0) for method in policy.model.methods), default=0)
 
 
 def _result(runs: Sequence[Rollout]) -> Result:

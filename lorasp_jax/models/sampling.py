@@ -66,6 +66,10 @@ class Sampler:
         methods = dict.fromkeys(adaptation.methods(cast(nnx.Module, model)).values())
         return cls(weights, (graphdefs, tree), model.config, tuple(methods))
 
+    def sampler(self) -> Self:
+        """Itself, as it is ready for many calls."""
+        return self
+
     def sample_actions(
         self,
         key: jax.Array,

@@ -1,7 +1,8 @@
 """A policy: a backbone together with the processor of one robot and its tasks."""
 
+import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import jax
 
@@ -23,6 +24,14 @@ class Policy:
 
     model: Any
     processor: Processor
+
+    def with_sampler(self) -> Self:
+        """The same policy for many calls: what depends on weights alone is computed here, once.
+
+        In a loop of `jax.lax`, call this before it: that XLA moves such work out of a loop is seen
+        on a CPU, and promised nowhere.
+        """
+        return dataclasses.replace(self, model=self.model.sampler())
 
     def sample(
         self,

@@ -5,6 +5,7 @@ much damage, not all of it: numbers that do not compress are stored as they are,
 among them is restored as another number. Of JSON they stand beside the values, under "digest".
 """
 
+import functools
 import hashlib
 import json
 import math
@@ -17,7 +18,6 @@ import numpy as np
 
 DIGEST = "digest"
 """Key of a JSON object's digest."""
-_PART = 2**18  # words at a time, which a cache holds
 
 
 def digest(arrays: Mapping[str, jax.Array], *notes: str) -> str:
@@ -68,50 +68,41 @@ def _json_digest(facts: Mapping[str, Any]) -> str:
 
 
 def _sum(array: Any, *, rounded: bool = False) -> Any:
-    """`_mixed_sum`, where asked for of floating-point numbers in bf16."""
+    """`mixed_sum`, where asked for of floating-point numbers in bf16; by NumPy where that can read
+    the array, since then nothing need be compiled for its shape."""
     rounded = rounded and jnp.issubdtype(array.dtype, jnp.floating)
-    if not _is_at_hand(array):
-        return _rounded_sum(array) if rounded else _mixed_sum(array)
+    at_hand = isinstance(array, np.ndarray) or (
+        array.is_fully_addressable and all(d.platform == "cpu" for d in array.devices())
+    )
+    if not at_hand:
+        return mixed_sum(array, rounded=rounded)
     array = np.asarray(array)
-    return _host_sum(array.astype(jnp.bfloat16) if rounded else array)
+    return host_sum(array.astype(jnp.bfloat16) if rounded else array)
 
 
-def _is_at_hand(array: Any) -> bool:
-    """Whether NumPy can read it where it is: then nothing need be compiled for its shape."""
-    if isinstance(array, np.ndarray):
-        return True
-    return array.is_fully_addressable and all(d.platform == "cpu" for d in array.devices())
-
-
-def _host_sum(array: np.ndarray) -> int:
-    """`_mixed_sum` by NumPy, part by part."""
+def host_sum(array: np.ndarray, part: int = 2**18) -> int:
+    """`mixed_sum` by NumPy, so many words at a time: a cache holds them."""
     words = np.ascontiguousarray(array).reshape(-1).view(f"uint{min(8 * array.itemsize, 32)}")
     total = 0
-    for start in range(0, len(words), _PART):
-        part = words[start : start + _PART].astype(np.uint32)
-        part ^= np.arange(start, start + len(part)).astype(np.uint32) * np.uint32(0x9E3779B9)
-        part = (part ^ (part >> 16)) * np.uint32(0x85EBCA6B)
-        part = (part ^ (part >> 13)) * np.uint32(0xC2B2AE35)
-        total += int(np.sum(part ^ (part >> 16), dtype=np.uint64))
+    for start in range(0, len(words), part):
+        mixed = words[start : start + part].astype(np.uint32)
+        mixed ^= np.arange(start, start + len(mixed)).astype(np.uint32) * np.uint32(0x9E3779B9)
+        mixed = (mixed ^ (mixed >> 16)) * np.uint32(0x85EBCA6B)
+        mixed = (mixed ^ (mixed >> 13)) * np.uint32(0xC2B2AE35)
+        total += int(np.sum(mixed ^ (mixed >> 16), dtype=np.uint64))
     return total % 2**32
 
 
-@jax.jit
-def _rounded_sum(array: jax.Array) -> jax.Array:
-    """`_mixed_sum` in bf16."""
-    return _mixed_sum(array.astype(jnp.bfloat16))
-
-
-@jax.jit
-def _mixed_sum(array: jax.Array) -> jax.Array:
-    """`[]` uint32, the sum of all elements' bits, each mixed with its position.
+@functools.partial(jax.jit, static_argnames="rounded")
+def mixed_sum(array: jax.Array, *, rounded: bool = False) -> jax.Array:
+    """`[]` uint32, the sum of all elements' bits, in bf16 if rounded, each mixed with its position.
 
     Mixing is the finalizer of MurmurHash3 (github.com/aappleby/smhasher, MurmurHash3.cpp:68), a
     permutation of the 32-bit words: no change of a single word stays unseen, another one with a
     probability of 2^-32. Sums of integers do not depend on their order.
     """
-    if array.dtype == bool:
-        array = array.astype(jnp.uint8)
+    if rounded or array.dtype == bool:
+        array = array.astype(jnp.bfloat16 if rounded else jnp.uint8)
     kind = jnp.dtype(f"uint{min(8 * array.dtype.itemsize, 32)}")
     words = jax.lax.bitcast_convert_type(array, kind).astype(jnp.uint32)
     position = jnp.zeros(words.shape, jnp.uint32)

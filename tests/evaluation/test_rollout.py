@@ -89,17 +89,27 @@ def test_evaluate_reports_what_happened(env, tmp_path):
 @pytest.mark.slow
 def test_a_sampler_reports_what_its_backbone_does(env, tmp_path):
     policy = _told(policy_with(tmp_path / "run", env), env)
-    sampler = dataclasses.replace(policy, model=policy.model.sampler())
     rollout = make_rollout(env, execute_steps=4, denoise_steps=1)
-    one, other = (jax.eval_shape(rollout, each, jax.random.key(0)) for each in (policy, sampler))
-    assert one == other
-    assert one.active_rank_histogram["action"].shape[-1] == 9
+    trace = jax.make_jaxpr(rollout, return_shape=True)
+    (one, shapes), (other, others) = (
+        trace(each, jax.random.key(0)) for each in (policy, policy.with_sampler())
+    )
+    assert shapes == others
+    assert shapes.active_rank_histogram["action"].shape[-1] == 9
+    assert looks(one) == looks(other)  # the sampler is made before the loop
+    assert len(one.eqns) > len(other.eqns)
+
+
+def looks(jaxpr):
+    """The body of a rollout's loop."""
+    (body,) = (e.params["jaxpr"] for e in jaxpr.eqns if e.primitive.name == "scan")
+    return str(body)
 
 
 def test_methods_without_a_choice(tmp_path):
     lora = make_run(tmp_path / "lora", dataclasses.replace(CONFIG, peft=LoRA(rank=5))).policy
     full = make_run(tmp_path / "full", dataclasses.replace(CONFIG, peft=FullFineTuning())).policy
-    assert (_largest_bank(lora), _largest_bank(full)) == (5, 0)
+    assert [_largest_bank(policy.with_sampler()) for policy in (lora, full)] == [5, 0]
 
 
 def batch(success, steps, counts):

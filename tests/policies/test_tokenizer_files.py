@@ -4,12 +4,12 @@ import json
 import shutil
 import warnings
 
+import huggingface_hub
 import numpy as np
 import pytest
 import sentencepiece
 
 from lorasp_jax.policies import prompts, tokenizer
-from lorasp_jax.storage import hub
 from tests import GOLDEN
 
 GOLDEN = GOLDEN / "tokenizers"
@@ -69,9 +69,14 @@ def test_a_folder_and_the_offline_tokenizer(tmp_path, monkeypatch):
     ):
         np.testing.assert_array_equal(found, wanted)
     asked = []
-    monkeypatch.setattr(hub, "_from_hub", lambda *args: asked.append(args) or tmp_path)
+
+    def download(name, *, repo_type, allow_patterns, **_):
+        asked.append((name, repo_type, allow_patterns))
+        return tmp_path
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
     assert tokenizer.load("hf://owner/name").vocabulary
-    assert asked == [("owner/name", ["tokenizer.json", "*.model"], "model")]
+    assert asked == [("owner/name", "model", ["tokenizer.json", "*.model"])]
 
 
 def test_what_is_no_tokenizer_is_one_sentence(tmp_path):

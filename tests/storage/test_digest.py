@@ -4,29 +4,47 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import monitoring
 
 from lorasp_jax.storage import digest
 
 VALUES = np.random.default_rng(0).normal(size=(3, 5, 7)) * 100
 
 
+@pytest.fixture
+def compiled():
+    """What JAX has compiled so far, or taken from its cache."""
+    events = []
+
+    def listen(event, *_, **__):
+        if event == "/jax/core/compile/backend_compile_duration":
+            events.append(event)
+
+    monitoring.register_event_duration_secs_listener(listen)
+    yield events
+    monitoring.unregister_event_duration_listener(listen)
+
+
 @pytest.mark.parametrize(
     "dtype", ["float32", "bfloat16", "float8_e4m3fn", "int32", "uint8", "bool", "float16"]
 )
 @pytest.mark.parametrize("rounded", [False, True])
-def test_the_host_finds_what_a_device_finds(dtype, rounded, monkeypatch):
-    monkeypatch.setattr(digest, "_PART", 16)  # several parts, the last one shorter
+def test_the_host_finds_what_a_device_finds(dtype, rounded):
     array = jnp.asarray(VALUES).astype(dtype)
-    found = digest._sum(array, rounded=rounded)
-    assert isinstance(found, int)
-    monkeypatch.setattr(digest, "_is_at_hand", lambda _: False)
-    assert found == int(digest._sum(array, rounded=rounded))
+    rounded = rounded and jnp.issubdtype(dtype, jnp.floating)
+    held = np.asarray(array.astype(jnp.bfloat16) if rounded else array)
+    found = digest.host_sum(held, part=16)  # several parts, the last one shorter
+    assert found == digest.host_sum(held) == int(digest.mixed_sum(array, rounded=rounded))
 
 
-def test_nothing_is_compiled_on_a_cpu(monkeypatch):
-    monkeypatch.setattr(digest, "_mixed_sum", pytest.fail)
-    arrays = {"a": jnp.ones((2, 3)), "b": np.ones(2), "c": jnp.zeros(()), "d": jnp.ones((0, 4))}
-    assert digest.digest(arrays) != digest.digest(arrays | {"c": jnp.ones(())})
+def test_nothing_is_compiled_on_a_cpu(compiled):
+    arrays = {"a": jnp.ones((2, 37)), "b": np.ones(2), "c": jnp.zeros(()), "d": jnp.ones((0, 4))}
+    other = arrays | {"c": jnp.ones(())}
+    compiled.clear()
+    assert digest.digest(arrays) != digest.digest(other)
+    assert compiled == []
+    digest.mixed_sum(arrays["a"])
+    assert compiled
 
 
 @pytest.mark.parametrize("index", [0, 41, 104])

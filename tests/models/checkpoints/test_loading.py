@@ -4,6 +4,7 @@ import json
 import logging
 import shutil
 
+import huggingface_hub
 import numpy as np
 import pytest
 import safetensors.numpy
@@ -13,7 +14,6 @@ from lorasp_jax.models.checkpoints import loading, published
 from lorasp_jax.models.checkpoints.native import named_arrays
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.smolvla import SmolVLAConfig
-from lorasp_jax.storage import hub
 from tests.models import test_pi0_parity as pi0
 from tests.models import test_smolvla_parity as smolvla
 
@@ -93,7 +93,7 @@ def test_openpi(tmp_path):
 
 def test_ours_and_the_hub(tmp_path, monkeypatch):
     models.save(tmp_path, models.load(pi0.GOLDEN / "orbax"))
-    monkeypatch.setattr(hub, "_from_hub", lambda *_: tmp_path)
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda *_, **__: tmp_path)
     assert models.load_config("hf://me/pi0") == pi0.CONFIG
     assert loading.find("hf://me/pi0").layout == "ours"
     assert models.weights_hash(models.load("hf://me/pi0")) == models.weights_hash(tmp_path)
