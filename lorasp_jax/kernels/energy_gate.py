@@ -70,7 +70,11 @@ def exact_ratio(energy_target: float) -> Ratio:
 
 
 def energy_gate(
-    scores: jax.Array, energy_target: float, *, implementation: Implementation | None = None
+    scores: jax.Array,
+    energy_target: float,
+    *,
+    implementation: Implementation | None = None,
+    interpret: bool = False,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Keeps the smallest set of directions whose energy share reaches the target (eq. 12).
 
@@ -81,6 +85,7 @@ def energy_gate(
       scores: [..., R], non-negative; computed in fp32. Of a negative one the magnitude counts.
       energy_target: η in (0, 1], a Python number, read as an exact decimal.
       implementation: how to find the mask; None takes `default_implementation(R)`.
+      interpret: for "pallas" without a GPU: its kernel's body, as XLA operations.
 
     Returns:
       mask bool [..., R], active_rank f32 [...] = k, kept_energy f32 [...] = E_k.
@@ -89,7 +94,7 @@ def energy_gate(
       ValueError: η outside (0, 1] or an unknown implementation.
     """
     ratio = exact_ratio(energy_target)
-    find = _finder(implementation or default_implementation(scores.shape[-1]))
+    find = _finder(implementation or default_implementation(scores.shape[-1]), interpret)
     scores = scores.astype(jnp.float32)
     constant = jnp.abs(jax.lax.stop_gradient(scores))  # no -0, which the bits would put below all
     whole = ratio.numerator == ratio.denominator
@@ -105,13 +110,13 @@ def default_implementation(rank: int) -> Implementation:
     return "pallas" if backend == "gpu" else "bisection"
 
 
-def _finder(implementation: str) -> Callable[[jax.Array, Ratio], jax.Array]:
+def _finder(implementation: str, interpret: bool) -> Callable[[jax.Array, Ratio], jax.Array]:
     """The function from scores [..., R] and η to the mask."""
     masks = {"pairwise": _pairwise_mask, "bisection": bisected_mask}
     boundaries = {
         "sort": _sorted_boundary,
         "block": block_boundary,
-        "pallas": _pallas_boundary,
+        "pallas": functools.partial(_pallas_boundary, interpret=interpret),
     }
     if implementation in masks:
         return masks[implementation]
@@ -193,7 +198,7 @@ def _sorted_row_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
     return Boundary(score, index.astype(jnp.int32))
 
 
-def _pallas_boundary(scores: jax.Array, ratio: Ratio, *, interpret: bool = False) -> Boundary:
+def _pallas_boundary(scores: jax.Array, ratio: Ratio, *, interpret: bool) -> Boundary:
     """The bisection as a Triton kernel; R is padded with zeros, which are never kept."""
     *leading, rank = scores.shape
     width = max(pl.next_power_of_2(rank), 2)

@@ -12,7 +12,6 @@ from lorasp_jax.peft import LoRASP
 from tests import GOLDEN
 
 GOLDEN = GOLDEN / "energy_gate_exact.npz"
-KERNEL = gate._pallas_boundary
 
 
 @pytest.fixture(scope="module")
@@ -21,21 +20,16 @@ def golden():
         return dict(file)
 
 
-def run_kernel(scores, ratio):
-    """The Triton kernel on a GPU; elsewhere its body in the interpreter."""
-    return KERNEL(scores, ratio, interpret=jax.default_backend() != "gpu")
-
-
-@pytest.fixture
-def interpret(monkeypatch):
-    monkeypatch.setattr(gate, "_pallas_boundary", run_kernel)
+def energy_gate(scores, eta, implementation=None):
+    """With the Triton kernel on a GPU; elsewhere its body in the interpreter."""
+    interpret = jax.default_backend() != "gpu"
+    return gate.energy_gate(scores, eta, implementation=implementation, interpret=interpret)
 
 
 def scores_like(shape, seed=0):
     return jax.nn.softplus(2 * jax.random.normal(jax.random.key(seed), shape))
 
 
-@pytest.mark.usefixtures("interpret")
 @pytest.mark.parametrize(
     ("implementation", "may_miss"),
     [("pairwise", 0), ("bisection", 0), ("block", 0), ("pallas", 0), ("sort", 1)],
@@ -45,7 +39,7 @@ def test_equals_exact_arithmetic(golden, implementation, may_miss, eta):
     """`k` and `order` were found with big integers; the running sum of "sort" rounds on one row."""
     row = [round(100 * eta) for eta in (0.5, 0.7, 0.8, 0.9, 0.99, 1)].index(round(100 * eta))
     k, order = golden["k"][row], golden["order"]
-    run = jax.jit(lambda s: gate.energy_gate(s, eta, implementation=implementation))
+    run = jax.jit(lambda s: energy_gate(s, eta, implementation))
     mask, active_rank, kept_energy = map(np.asarray, run(golden["scores"]))
     expected = np.argsort(order, axis=1) < k[:, None]
     assert (mask != expected).any(1).sum() <= may_miss
@@ -62,11 +56,10 @@ def test_target_of_one_keeps_every_positive_score(golden):
     np.testing.assert_allclose(kept_energy, 1, rtol=1e-6)  # a GPU may add up in two orders
 
 
-@pytest.mark.usefixtures("interpret")
 @pytest.mark.parametrize("implementation", ["pairwise", "sort", "bisection", "pallas"])
 def test_special_rows(implementation):
     rows = np.array([[0] * 4, [3e38] * 4, [0, 0, 0, 2e-38], [1] * 4, [0, 1e-20, 1, 1e-20]])
-    run = jax.jit(lambda s: gate.energy_gate(s, 0.5, implementation=implementation))
+    run = jax.jit(lambda s: energy_gate(s, 0.5, implementation))
     mask, rank, kept = run(rows.astype(np.float32))
     expected = [[0, 0, 0, 0], [1, 1, 0, 0], [0, 0, 0, 1], [1, 1, 0, 0], [0, 0, 1, 0]]
     np.testing.assert_array_equal(mask, np.array(expected, bool))
@@ -85,7 +78,6 @@ EXTREME = [
 ]
 
 
-@pytest.mark.usefixtures("interpret")
 @pytest.mark.parametrize("implementation", ["pairwise", "sort", "bisection", "block", "pallas"])
 @pytest.mark.parametrize(
     ("eta", "expected"),
@@ -99,7 +91,7 @@ EXTREME = [
 def test_where_fp32_ends(implementation, eta, expected):
     """Infinite scores share the energy, NaN keeps nothing, -0 is 0, magnitudes count."""
     rows = np.array([*EXTREME, [NAN, 1, INF, 2]], np.float32)
-    run = jax.jit(lambda s: gate.energy_gate(s, eta, implementation=implementation))
+    run = jax.jit(lambda s: energy_gate(s, eta, implementation))
     mask, rank, kept = run(rows)
     np.testing.assert_array_equal(rank, expected)
     np.testing.assert_array_equal(mask.sum(1), expected)
@@ -108,14 +100,13 @@ def test_where_fp32_ends(implementation, eta, expected):
     assert np.isnan(kept[-1])
 
 
-@pytest.mark.usefixtures("interpret")
 @pytest.mark.parametrize("implementation", ["pairwise", "bisection", "block", "pallas"])
 def test_nan_counts_where_a_maximum_passes_over_it(monkeypatch, implementation):
     """As Triton's does; the rows of `test_where_fp32_ends` go wrong there only beside INF."""
     largest = jnp.max
     monkeypatch.setattr(jnp, "max", lambda a, **o: largest(jnp.where(a == a, a, -INF), **o))
     rows = np.array([[NAN, 1, INF, 2], [1, NAN, 3, 0], [NAN] * 4, [INF, 1, 2, 0]], np.float32)
-    run = jax.jit(lambda s: gate.energy_gate(s, 0.9, implementation=implementation))
+    run = jax.jit(lambda s: energy_gate(s, 0.9, implementation))
     _, rank, kept = run(rows)
     np.testing.assert_array_equal(rank, [0, 0, 0, 1])
     np.testing.assert_array_equal(kept, [NAN, NAN, NAN, 1])
@@ -147,10 +138,10 @@ def test_a_block_is_rows_behind_any_axes():
 
 @pytest.mark.parametrize("shape", [(3, 1), (2, 5, 100)])
 def test_pallas_takes_any_shape(shape):
-    scores, ratio = scores_like(shape), gate.exact_ratio(0.9)
-    pallas = jax.jit(jax.vmap(lambda s: run_kernel(s, ratio)))(scores[None])
-    mask = gate.kept_mask(scores, jax.tree.map(lambda leaf: leaf[0], pallas))
-    np.testing.assert_array_equal(mask, jax.jit(lambda s: gate.bisected_mask(s, ratio))(scores))
+    scores = scores_like(shape)
+    (pallas,) = jax.jit(jax.vmap(lambda s: energy_gate(s, 0.9, "pallas")[0]))(scores[None])
+    bisected = jax.jit(lambda s: energy_gate(s, 0.9, "bisection")[0])(scores)
+    np.testing.assert_array_equal(pallas, bisected)
 
 
 @pytest.mark.parametrize("implementation", ["pairwise", "sort", "bisection"])
