@@ -6,7 +6,6 @@ from pathlib import Path
 import jax
 
 from envs import _compat
-
 from envs.datasets.writing import write_bytes
 
 
