@@ -266,7 +266,10 @@ class Env:
         """Pictures of N recorded scenes: camera name -> uint8 [N, image_size, image_size, 3].
 
         Args:
-            geom_xpos, geom_xmat, cam_xpos, cam_xmat: `[N, ...]`, from the data of a state.
+            geom_xpos: `[N, ...]`, from the data of a state.
+            geom_xmat: likewise.
+            cam_xpos: likewise.
+            cam_xmat: likewise.
             draw: what the worlds drew, leading axis N, from the info of that state.
         """
         look, size = jax.vmap(self._looks)(draw) if draw else (None, None)

@@ -105,11 +105,13 @@ def collect(
     """Successful demonstrations by the scripted expert, on the device, padded to its longest time.
 
     Args:
-        task, robot: as for `envs.make`.
+        task: as for `envs.make`.
+        robot: as for `envs.make`.
         num_episodes: episodes E to return.
         key: all randomness; the same key gives the same episodes.
         num_envs: worlds W simulated at once; None picks by device.
-        action_noise, ranges: see `rollout`.
+        action_noise: see `rollout`.
+        ranges: see `rollout`.
         progress: called with (episodes so far, num_episodes), first with 0 before compilation.
         **options: others of `envs.make`; the backend is jax unless they say otherwise.
 
