@@ -25,7 +25,14 @@ API = {
     "envs": ["envs", "envs.mjcf", "envs.interop.gymnasium", "envs.interop.brax"],
 }
 """Public modules by page."""
-OUTSIDE = ("assets/**/*.gif", "assets/*.png", "notebooks/*.ipynb", "CONTRIBUTING.md", "LICENSE")
+OUTSIDE = (
+    "assets/**/*.gif",
+    "assets/*.png",
+    "notebooks/*.ipynb",
+    "CONTRIBUTING.md",
+    "LICENSE",
+    "CITATION.cff",
+)
 """What pages link to beside docs/; the site has copies."""
 REFERENCE, LISTING = "lorasp_jax/peft/lora_sp/reference.py", "methods/reference.md"
 """A source file that pages link to, and its page."""

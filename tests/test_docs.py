@@ -16,6 +16,7 @@ WITHOUT_EXAMPLES = {"runs", "benchmarks", "architecture"}
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 OPTION = re.compile(r"^\| `(\w+)` \| `([^`]+)` \| \S", re.MULTILINE)
 LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)|src(?:set)?=\"([^\":]+)\"")
+FILE = re.compile(r"`((?:lorasp_jax|envs|benchmarks|configs|examples|tests)/[\w/]+\.py)[`:]")
 FUNCTION = re.compile(r"`([\w/]+\.py)::(\w+)`")
 NODE = re.compile(r"^    (\w+)\[", re.MULTILINE)
 ARROWS = re.compile(r"^    (\w+(?: --> \w+)+)$", re.MULTILINE)
@@ -67,6 +68,11 @@ def test_links_lead_somewhere(page):
     for link, source in LINK.findall(BLOCK.sub("", page.read_text())):
         target = link or source
         assert (page.parent / target).exists(), f"{page} links to {target}"
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda page: page.stem)
+def test_files_are_where_a_page_says(page):
+    assert [file for file in FILE.findall(page.read_text()) if not (ROOT / file).is_file()] == []
 
 
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda page: page.stem)

@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Rectangle
+from matplotlib.ticker import MaxNLocator
 
 HERE = Path(__file__).parent
 SCHEMES = {
@@ -26,7 +27,7 @@ SCHEMES = {
 """Colors on GitHub's pages; the background is transparent."""
 TOKENS = "#12b886", "#f76707"
 """Colors of a token with few active directions and of one with many."""
-HEAT = LinearSegmentedColormap.from_list("rank", ["#0b3d3a", TOKENS[0], "#ffd43b", TOKENS[1]])
+HEAT = LinearSegmentedColormap.from_list("rank", [TOKENS[0], "#ffd43b", TOKENS[1]])
 """Active rank, in the tokens' colors at its ends."""
 GREY = np.array([0.299, 0.587, 0.114])
 """Luma of RGB (ITU-R BT.601)."""
@@ -70,7 +71,7 @@ def draw(facts: dict[str, np.ndarray], colors: dict[str, str], path: Path) -> No
             energies(axes, facts, colors, which)
         picture(figure, facts)
         titles = {
-            0.25: "x",
+            0.25: r"one adapted layer:  $\Delta W(x) = U\,\Sigma(x)\,V$",
             0.632: "two patches: energy $s_i^2$, sorted",
             0.857: "active rank, patch by patch",
         }
@@ -83,7 +84,7 @@ def flow(axes: Axes, facts: dict[str, np.ndarray], colors: dict[str, str]) -> No
     """x through W and through V, scores, gate and U."""
     axes.set(xlim=(0, 100), ylim=(0, 66))
     axes.axis("off")
-    mask, scores = facts["mask"][1], facts["scores"][1]
+    mask, scores = facts["mask"][0], facts["scores"][0]
     text = functools.partial(axes.text, ha="center", va="center")
     arrow = functools.partial(_arrow, axes, colors["soft"])
     # The frozen way.
@@ -125,7 +126,7 @@ def stripes(axes, corner, size, mask, colors, *, upright: bool) -> None:
         step = (width if upright else height) / count
         place = (x + i * step, y) if upright else (x, y + (count - 1 - i) * step)
         side = (0.72 * step, height) if upright else (width, 0.72 * step)
-        color = TOKENS[1] if kept else colors["pruned"]
+        color = TOKENS[0] if kept else colors["pruned"]
         axes.add_patch(Rectangle(place, *side, fc=color, lw=0))
 
 
@@ -134,7 +135,7 @@ def bars(axes, corner, size, values, mask, colors) -> None:
     (x, y), (width, height) = corner, size
     step, top = width / len(values), values.max()
     for i, (value, kept) in enumerate(zip(values, mask, strict=True)):
-        color = TOKENS[1] if kept else colors["pruned"]
+        color = TOKENS[0] if kept else colors["pruned"]
         place = x + i * step, y
         axes.add_patch(Rectangle(place, 0.72 * step, height * value / top, fc=color, lw=0))
 
@@ -154,13 +155,14 @@ def energies(axes: Axes, facts: dict[str, np.ndarray], colors: dict[str, str], w
     axes.annotate(
         f"$k$ = {kept}",
         (kept, running[kept - 1]),
-        xytext=(9, -17),
+        xytext=(-7, 6),
         textcoords="offset points",
+        ha="right",
         color=color,
         weight="bold",
         size=12,
     )
-    axes.set(xlim=(0.2, len(share) + 0.8), ylim=(0, 1.07), yticks=[0, target])
+    axes.set(xlim=(0.2, len(share) + 0.8), ylim=(0, 1.16), yticks=[0, target])
     axes.set_yticklabels(["0", f"η = {target:g}"])
     axes.set_xticks([1, len(share)])
     axes.tick_params(size=2)
@@ -171,7 +173,7 @@ def energies(axes: Axes, facts: dict[str, np.ndarray], colors: dict[str, str], w
 def picture(figure: Figure, facts: dict[str, np.ndarray]) -> None:
     """Active rank of every patch over what the camera sees."""
     rank, grey = facts["active_rank"], facts["image"] @ GREY
-    axes, side = figure.add_axes((0.755, 0.13, 0.2045, 0.6185)), len(rank)
+    axes, side = figure.add_axes((0.755, 0.19, 0.2045, 0.6185)), len(rank)
     axes.imshow(grey, cmap="gray", extent=(0, side, side, 0))
     shown = axes.imshow(rank, cmap=HEAT, alpha=0.55, extent=(0, side, side, 0))
     for token, color in zip(facts["token"], TOKENS, strict=True):
@@ -179,11 +181,12 @@ def picture(figure: Figure, facts: dict[str, np.ndarray]) -> None:
         for width, edge in ((5, "white"), (2.5, color)):
             axes.add_patch(Rectangle((column, row), 1, 1, fill=False, ec=edge, lw=width, zorder=3))
     axes.axis("off")
-    bar = figure.colorbar(shown, cax=figure.add_axes((0.966, 0.13, 0.008, 0.6185)))
+    bar = figure.colorbar(shown, cax=figure.add_axes((0.966, 0.19, 0.008, 0.6185)))
     assert bar.solids is not None
     bar.solids.set_alpha(1)
     bar.outline.set_visible(False)  # type: ignore
     bar.ax.tick_params(size=0)
+    bar.ax.yaxis.set_major_locator(MaxNLocator(integer=True, nbins=6))
 
 
 def _box(axes: Axes, corner: tuple, size: tuple, colors: dict[str, str]) -> None:

@@ -12,6 +12,7 @@ from films import prompted
 import envs
 from envs.compilation import cache
 from envs.rendering.renderer import RayRenderer
+from lorasp_jax.models.transformer.depth import unstacked
 from lorasp_jax.models.transformer.siglip import patches
 from lorasp_jax.peft.lora_sp import reference
 from lorasp_jax.policies import Policy
@@ -23,7 +24,7 @@ CAMERA = "side"
 
 
 def measure(run: Path, task: str, steps: int) -> dict[str, Any]:
-    """Scores and active ranks of the patch embedding, after some control steps of a task.
+    """Scores and active ranks of the first layer's keys, after some control steps of a task.
 
     The scores are those that the paper's equations give for the layer's input, and their active
     rank is compared with that of the model's own forward pass.
@@ -39,7 +40,9 @@ def measure(run: Path, task: str, steps: int) -> dict[str, Any]:
     cache.enable()
     policy = load_policy(run)
     told = read_json(run / "adapter.json")["metadata"]
-    config, layer = policy.model.config, policy.model.vision.patch_embed
+    config, tower = policy.model.config, policy.model.vision
+    block = unstacked(tower.blocks)[0]
+    layer = block.k_proj
     if layer.adapter is None or layer.method.name != "lora_sp":
         raise ValueError(f"{run} has no LoRA-SP in its vision tower")
     env = envs.make(task, robot=told["robot"], num_envs=WORLDS, image_size=config.image_size)
@@ -48,8 +51,9 @@ def measure(run: Path, task: str, steps: int) -> dict[str, Any]:
     seen = policy.processor.encode(env.observe(state), state.info["instruction"])
     _, _, aux = jax.jit(lambda model, seen: model.look(seen))(policy.model, seen)
     number = config.cameras.index(CAMERA)
-    ranks = aux["vision"]["patch_embed"].active_rank.reshape(WORLDS, len(config.cameras), -1)
-    x = patches(seen.images[CAMERA], config.vision.patch)
+    ranks = aux["vision"]["k_proj"].active_rank[0].reshape(WORLDS, len(config.cameras), -1)
+    x, _ = tower.patch_embed(patches(seen.images[CAMERA], config.vision.patch), return_aux=True)
+    x = block.layer_norm1(x + tower.position_embedding.get_value())
     scores, _ = reference.router_scores(layer.adapter.get_value()["router"], x)
     gated, _ = reference.energy_gate(scores, layer.method.energy_target)
     mask = np.asarray(gated)
