@@ -54,7 +54,7 @@ def seen(folder: Path) -> None:
 
 def spell(folder: Path) -> None:
     """As the prompts of a policy are."""
-    tokenizer.load(folder).encode(["push the button"], 16)
+    tokenizer.load_tokenizer(folder).encode(["push the button"], 16)
 
 
 FILES: list[fuzzing.Change] = [fuzzing.damaged, fuzzing.replaced]

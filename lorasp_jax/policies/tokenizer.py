@@ -1,4 +1,4 @@
-"""Text to token ids. `load` reads the published language models' tokenizers.
+"""Text to token ids. `load_tokenizer` reads the published language models' tokenizers.
 
 The one written here is a tiny offline tokenizer for the project's own base weights: WordPiece over
 manipulation words. Words outside the list fall into characters, so every printable ASCII text
@@ -77,7 +77,7 @@ class Tokenizer(Protocol):
         ...
 
 
-def load(where: str | os.PathLike[str]) -> Tokenizer:
+def load_tokenizer(where: str | os.PathLike[str]) -> Tokenizer:
     """A tokenizer from its file.
 
     Args:

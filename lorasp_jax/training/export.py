@@ -121,7 +121,7 @@ def _processor(told: Mapping[str, Any], config: Any, words: str) -> Processor:
     """The processor of an exported policy."""
     joints = told["num_joints"]
     try:
-        found = tokenizer.load(words or hub.found_again(told["tokenizer"]))
+        found = tokenizer.load_tokenizer(words or hub.found_again(told["tokenizer"]))
     except ValueError as error:
         raise ValueError(f"{error} (words= says where the policy's tokenizer is now)") from error
     prompts = PromptTable.of(found, told["instructions"], config, num_joints=joints)

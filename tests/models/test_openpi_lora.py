@@ -92,7 +92,7 @@ def test_a_checkpoint_with_lora_is_loaded(model, leaves, tmp_path):
     base = layouts.write(weights.openpi_layout(CONFIG), base_arrays(model))
     tree = flax.traverse_util.unflatten_dict({**base, **one}, sep="/")
     ocp.PyTreeCheckpointer().save(tmp_path / "params", {"params": tree})
-    found, unused = published.load(tmp_path, CONFIG)
+    found, unused = published.load_published(tmp_path, CONFIG)
     assert unused == []
     wanted = openpi_lora.adapted(model, one)
     assert wanted.action.blocks.q_proj.adapter is None

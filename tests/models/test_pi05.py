@@ -62,7 +62,7 @@ def test_published_names_and_shapes():
 
     def saved(rule):
         zeros = [np.broadcast_to(np.zeros((), np.int8), ours[name]) for name in rule.ours]
-        return zip(rule.theirs, (array.shape for array in rule.save(*zeros)), strict=True)
+        return zip(rule.theirs, (array.shape for array in rule.to_theirs(*zeros)), strict=True)
 
     new = re.compile("norm|time_mlp")  # the others are pi0's, and too large to be stacked here
     shapes = dict(
@@ -90,13 +90,13 @@ def test_published_names_and_shapes():
 @pytest.mark.parametrize("layout", ["openpi", "lerobot"])
 def test_there_and_back(layout, model, tmp_path):
     published.save(tmp_path / "new", model, layout)
-    found, _ = published.load(tmp_path / "new", CONFIG)
+    found, _ = published.load_published(tmp_path / "new", CONFIG)
     found, wanted = native.named_arrays(found), native.named_arrays(model)
     assert found.keys() == wanted.keys()
     for name, array in wanted.items():
         np.testing.assert_array_equal(found[name], array, err_msg=name)
     with pytest.raises(ValueError, match=r"lacks .*state_proj"):
-        published.load(tmp_path / "new", Pi0Config.dummy())
+        published.load_published(tmp_path / "new", Pi0Config.dummy())
 
 
 def test_dense_of_a_norm_is_transposed_for_lerobot(model):

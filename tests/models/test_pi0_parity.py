@@ -34,7 +34,7 @@ def arrays(name: str) -> dict[str, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def model():
-    return published.load(GOLDEN / "orbax", CONFIG)[0]
+    return published.load_published(GOLDEN / "orbax", CONFIG)[0]
 
 
 @pytest.fixture(scope="module")

@@ -50,7 +50,7 @@ def tensors():
 
 @pytest.fixture(scope="module")
 def model():
-    return published.load(GOLDEN, CONFIG)[0]
+    return published.load_published(GOLDEN, CONFIG)[0]
 
 
 @pytest.fixture(scope="module")
@@ -171,7 +171,7 @@ def test_stored_types_are_kept(tensors, tmp_path):
     }
     (tmp_path / "from").mkdir()
     safetensors.numpy.save_file(mixed, tmp_path / "from" / "model.safetensors")
-    loaded, unused = published.load(tmp_path / "from", CONFIG)
+    loaded, unused = published.load_published(tmp_path / "from", CONFIG)
     assert unused == []
     types = published.stored_dtypes(tmp_path / "from", CONFIG)
     published.save(tmp_path / "to", loaded, "lerobot", types)
@@ -185,13 +185,13 @@ def test_other_sizes_raise():
     with pytest.raises(
         ValueError, match=r"embed_tokens.weight of shape \(101, 64\), the model needs \(100, 64\)"
     ):
-        published.load(GOLDEN, dataclasses.replace(CONFIG, vocabulary=100))
+        published.load_published(GOLDEN, dataclasses.replace(CONFIG, vocabulary=100))
 
 
 def test_names_without_prefix(model, tensors, tmp_path):
     bare = {name.removeprefix("model."): tensor for name, tensor in tensors.items()}
     safetensors.numpy.save_file(bare, tmp_path / "model.safetensors")
-    found, _ = published.load(tmp_path, CONFIG)
+    found, _ = published.load_published(tmp_path, CONFIG)
     pairs = zip(jax.tree.leaves(nnx.state(found)), jax.tree.leaves(nnx.state(model)), strict=True)
     for ours, theirs in pairs:
         np.testing.assert_array_equal(ours, theirs)

@@ -18,8 +18,8 @@ READERS = {
     "config.json": [loading.load_config, native.load_config],
     SINGLE: [lambda folder: TensorFiles(weight_files(folder)), statistics_files.read],
     INDEX: [weight_files],
-    "tokenizer.json": [tokenizer.load],
-    "x.model": [tokenizer.load],
+    "tokenizer.json": [tokenizer.load_tokenizer],
+    "x.model": [tokenizer.load_tokenizer],
     "norm_stats.json": [statistics_files.read],
 }
 
@@ -91,7 +91,7 @@ def test_a_tokenizer_without_end(tmp_path):
         (tmp_path / name).touch()
         os.truncate(tmp_path / name, 2**40)
         with pytest.raises(ValueError, match=f"{name} is no tokenizer: it has more than"):
-            tokenizer.load(tmp_path / name)
+            tokenizer.load_tokenizer(tmp_path / name)
 
 
 @pytest.mark.parametrize("name", ["dtype", "param_dtype", "inputs", "remat", "unroll"])

@@ -30,7 +30,7 @@ def test_a_row_for_each_instruction():
 
 def test_some_of_its_instructions():
     """As an environment numbers its own."""
-    words, rows = tokenizer.load(SMOLVLM), jnp.arange(2)
+    words, rows = tokenizer.load_tokenizer(SMOLVLM), jnp.arange(2)
     config = dataclasses.replace(Pi0Config.nano(), max_tokens=20, vocabulary=words.vocabulary)
     table = PromptTable.of(words, ["open the lid", *TEXTS], config, num_joints=6)
     own = PromptTable.of(words, TEXTS[::-1], config, num_joints=6)
@@ -45,7 +45,7 @@ def test_some_of_its_instructions():
 @pytest.mark.parametrize("numbers", [1, 7])
 def test_prompts_with_a_state_are_the_tokenizers(words, numbers):
     """Also on the edges of bins, and beyond them."""
-    words = tokenizer.load(words and GOLDEN / words)
+    words = tokenizer.load_tokenizer(words and GOLDEN / words)
     config = dataclasses.replace(PI05, max_tokens=100, vocabulary=words.vocabulary)
     table = PromptTable.of(words, TEXTS, config, num_joints=numbers - 1)
     rng = np.random.default_rng(1)
@@ -60,7 +60,7 @@ def test_prompts_with_a_state_are_the_tokenizers(words, numbers):
 
 
 def test_what_is_too_long_is_cut_as_the_tokenizer_cuts_it():
-    words = tokenizer.load(SMOLVLM)
+    words = tokenizer.load_tokenizer(SMOLVLM)
     config = dataclasses.replace(PI05, max_tokens=35, vocabulary=words.vocabulary)
     with pytest.warns(UserWarning, match="is cut to 35"):
         table = PromptTable.of(words, TEXTS, config, num_joints=6)
@@ -83,11 +83,11 @@ def test_a_tokenizer_that_joins_numbers_is_refused(joined, tmp_path):
     (tmp_path / "tokenizer.json").write_text(json.dumps(fields))
     config = dataclasses.replace(PI05, max_tokens=100, vocabulary=401)
     with pytest.raises(ValueError, match="does not write a state's numbers one by one"):
-        PromptTable.of(tokenizer.load(tmp_path), TEXTS, config, num_joints=6)
+        PromptTable.of(tokenizer.load_tokenizer(tmp_path), TEXTS, config, num_joints=6)
 
 
 @pytest.mark.parametrize("config", [Pi0Config.nano(), dataclasses.replace(PI05, max_tokens=100)])
 def test_a_tokenizer_of_another_model(config):
-    words = tokenizer.load(SMOLVLM)
+    words = tokenizer.load_tokenizer(SMOLVLM)
     with pytest.raises(ValueError, match=r"token \d+ is beyond the backbone's vocabulary of 320"):
         PromptTable.of(words, ["press the red button"], config, num_joints=6)

@@ -22,7 +22,7 @@ FILES = {"paligemma": "paligemma_like.model", "smolvlm": "smolvlm_like_tokenizer
 def test_ids_are_theirs(name, length, suffix):
     """Too long prompts are cut, with a warning each; PaliGemma's stand-in has none above 48."""
     expected = np.load(GOLDEN / f"{name}_like_ids.npz")
-    found = tokenizer.load(GOLDEN / FILES[name])
+    found = tokenizer.load_tokenizer(GOLDEN / FILES[name])
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         ids, mask = found.encode(PROMPTS, length)
@@ -36,14 +36,14 @@ def test_ids_are_theirs(name, length, suffix):
 
 def test_padding_to_the_longest_only_cuts_what_is_masked():
     expected = np.load(GOLDEN / "smolvlm_like_ids.npz")
-    ids, mask = tokenizer.load(GOLDEN / FILES["smolvlm"]).encode(PROMPTS[:4], 48)
+    ids, mask = tokenizer.load_tokenizer(GOLDEN / FILES["smolvlm"]).encode(PROMPTS[:4], 48)
     length = expected["tokens_longest"].shape[1]
     np.testing.assert_array_equal(ids[:, :length], expected["tokens_longest"])
     assert not mask[:, length:].any()
 
 
 def test_a_prompt_begins_with_bos_and_ends_with_a_newline():
-    ids, mask = tokenizer.load(GOLDEN / FILES["paligemma"]).encode(["push"], 8)
+    ids, mask = tokenizer.load_tokenizer(GOLDEN / FILES["paligemma"]).encode(["push"], 8)
     assert ids[0][mask[0]][[0, -1]].tolist() == [2, 4]  # BOS, newline
 
 
@@ -53,19 +53,21 @@ def test_prompt_of_pi05():
     text = prompts.pi05(" pick_up\nthe cup ", state)
     assert text == "Task: pick up the cup, State: -1 0 0 128 192 255 255 255;\nAction: "
     model = sentencepiece.SentencePieceProcessor(model_file=str(GOLDEN / FILES["paligemma"]))
-    ids, mask = tokenizer.load(GOLDEN / FILES["paligemma"]).encode([text], 200, complete=True)
+    ids, mask = tokenizer.load_tokenizer(GOLDEN / FILES["paligemma"]).encode(
+        [text], 200, complete=True
+    )
     assert ids[0][mask[0]].tolist() == [2, *model.encode(text)]
 
 
 def test_a_folder_and_the_offline_tokenizer(tmp_path, monkeypatch):
     shutil.copy(GOLDEN / FILES["smolvlm"], tmp_path / "tokenizer.json")
-    ids, _ = tokenizer.load(tmp_path).encode(["push"], 4)
+    ids, _ = tokenizer.load_tokenizer(tmp_path).encode(["push"], 4)
     np.testing.assert_array_equal(
-        ids, tokenizer.load(GOLDEN / FILES["smolvlm"]).encode(["push"], 4)[0]
+        ids, tokenizer.load_tokenizer(GOLDEN / FILES["smolvlm"]).encode(["push"], 4)[0]
     )
     text = ["press the red button"]
     for found, wanted in zip(
-        tokenizer.load("").encode(text, 6), tokenizer.encode(text, 6), strict=True
+        tokenizer.load_tokenizer("").encode(text, 6), tokenizer.encode(text, 6), strict=True
     ):
         np.testing.assert_array_equal(found, wanted)
     asked = []
@@ -75,17 +77,17 @@ def test_a_folder_and_the_offline_tokenizer(tmp_path, monkeypatch):
         return tmp_path
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
-    assert tokenizer.load("hf://owner/name").vocabulary
+    assert tokenizer.load_tokenizer("hf://owner/name").vocabulary
     assert asked == [("owner/name", "model", ["tokenizer.json", "*.model"])]
 
 
 def test_what_is_no_tokenizer_is_one_sentence(tmp_path):
     with pytest.raises(ValueError, match=r"holds no tokenizer\.json and no \.model"):
-        tokenizer.load(tmp_path)
+        tokenizer.load_tokenizer(tmp_path)
     for name, message in (("a.model", "no SentencePiece model"), ("a.json", "library tokenizers")):
         (tmp_path / name).write_text("{}")
         with pytest.raises(ValueError, match=message):
-            tokenizer.load(tmp_path / name)
+            tokenizer.load_tokenizer(tmp_path / name)
     model = bytearray((GOLDEN / FILES["paligemma"]).read_bytes())
     model[43] ^= 1  # BOS is none any more
     (tmp_path / "b.model").write_bytes(model)
@@ -94,10 +96,10 @@ def test_what_is_no_tokenizer_is_one_sentence(tmp_path):
     (tmp_path / "b.json").write_text(json.dumps(large))
     for name, message in (("b.model", "no SentencePiece model"), ("b.json", "number 2147483648")):
         with pytest.raises(ValueError, match=message):
-            tokenizer.load(tmp_path / name)
+            tokenizer.load_tokenizer(tmp_path / name)
     bare = json.loads((GOLDEN / FILES["smolvlm"]).read_text())
     bare["added_tokens"] = []
     bare["model"]["vocab"].pop("<|im_end|>")
     (tmp_path / "tokenizer.json").write_text(json.dumps(bare))
     with pytest.raises(ValueError, match=r"no token to pad with"):
-        tokenizer.load(tmp_path / "tokenizer.json")
+        tokenizer.load_tokenizer(tmp_path / "tokenizer.json")

@@ -25,9 +25,9 @@ class Rule(NamedTuple):
     theirs: tuple[str, ...]
     shapes: Callable[..., Sequence[Shape]]
     """Shapes of ours -> shapes of theirs."""
-    load: Callable[[Iterator[np.ndarray]], Sequence[np.ndarray]]
+    to_ours: Callable[[Iterator[np.ndarray]], Sequence[np.ndarray]]
     """Their arrays, read as they are asked for -> ours."""
-    save: Callable[..., Sequence[np.ndarray]]
+    to_theirs: Callable[..., Sequence[np.ndarray]]
     """Our arrays -> theirs."""
 
 
@@ -62,7 +62,7 @@ def stacked(ours: str, theirs: Iterable[str], *, transpose: bool = False) -> Rul
     """One of our arrays [L, ...] that is theirs layer by layer, perhaps as in `transposed`."""
     names = tuple(theirs)
 
-    def load(layers: Iterator[np.ndarray]) -> list[np.ndarray]:
+    def stacked_up(layers: Iterator[np.ndarray]) -> list[np.ndarray]:
         first = turned(next(layers))
         found = np.empty((len(names), *first.shape), first.dtype)
         found[0] = first
@@ -76,7 +76,7 @@ def stacked(ours: str, theirs: Iterable[str], *, transpose: bool = False) -> Rul
     def shapes(shape: Shape) -> list[Shape]:
         return [shape[:0:-1] if transpose else shape[1:]] * len(names)
 
-    return Rule((ours,), names, shapes, load, lambda a: [turned(layer) for layer in a])
+    return Rule((ours,), names, shapes, stacked_up, lambda a: [turned(layer) for layer in a])
 
 
 def read(
@@ -120,7 +120,7 @@ def read(
     found: dict[str, Any] = {}
     for rule in rules:
         wanted = rule.shapes(*(shapes[name] for name in rule.ours))
-        ours = rule.load(taken(*each) for each in zip(rule.theirs, wanted, strict=True))
+        ours = rule.to_ours(taken(*each) for each in zip(rule.theirs, wanted, strict=True))
         found |= {name: place(name, a) for name, a in zip(rule.ours, ours, strict=True)}
         del ours  # or it would stay beside what the next rule reads
     return found
@@ -130,7 +130,7 @@ def write(rules: Sequence[Rule], ours: Mapping[str, np.ndarray]) -> dict[str, np
     """Our leaves under their names and in their shapes, contiguous."""
     found: dict[str, np.ndarray] = {}
     for rule in rules:
-        arrays = rule.save(*(np.asarray(ours[name]) for name in rule.ours))
+        arrays = rule.to_theirs(*(np.asarray(ours[name]) for name in rule.ours))
         found |= {
             name: np.ascontiguousarray(a) for name, a in zip(rule.theirs, arrays, strict=True)
         }

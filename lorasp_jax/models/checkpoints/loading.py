@@ -63,11 +63,11 @@ class Found:
     def load(self, config: BackboneConfig | None = None) -> Any:
         """The model; arguments and errors as for `load`."""
         if self.layout == "ours":
-            return native.load(self.folder, config)
+            return native.load_native(self.folder, config)
         if config is not None and self.layout == "lerobot" and "type" in self.fields:
             _require_same_heads(config, self.folder, self.fields)
         try:
-            model, unused = published.load(self.folder, config or self.config)
+            model, unused = published.load_published(self.folder, config or self.config)
         except OtherModelError as error:
             if config is not None:
                 raise

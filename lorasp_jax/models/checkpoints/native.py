@@ -103,7 +103,7 @@ def _write(folder: pathlib.Path, files: Mapping[str, bytes]) -> None:
             stale.unlink(missing_ok=True)
 
 
-def load(folder: Folder, config: Any = None) -> Any:
+def load_native(folder: Folder, config: Any = None) -> Any:
     """A model from a folder that `save` wrote.
 
     Args:

@@ -41,7 +41,7 @@ _STATISTIC = re.compile(r"(?:un)?normalize_(?:inputs|targets|outputs)\.")  # of 
 _COMPILED = "_orig_mod."  # what PyTorch puts before the names of a compiled module
 
 
-def load(folder: Path, config: Any) -> tuple[Any, list[str]]:
+def load_published(folder: Path, config: Any) -> tuple[Any, list[str]]:
     """A model from a folder in one of the published layouts, which is found out.
 
     Args:
@@ -121,7 +121,7 @@ def stored_dtypes(folder: Path, config: Any) -> dict[str, np.dtype]:
     """Type of each leaf in a published folder, for `save`.
 
     Raises:
-        ValueError: as `load`.
+        ValueError: as `load_published`.
     """
     _, theirs = _open(folder, _weights(config).canonical_name)
     return {name: theirs[name].dtype for name in theirs}

@@ -59,7 +59,7 @@ def test_lerobot(lerobot, caplog):
         model = models.load(lerobot)
     assert "nothing reads normalize_inputs." in caplog.text
     assert model.config == models.load_config(lerobot) == smolvla.CONFIG
-    assert_same(model, published.load(smolvla.GOLDEN, smolvla.CONFIG)[0])
+    assert_same(model, published.load_published(smolvla.GOLDEN, smolvla.CONFIG)[0])
     (lerobot / "config.json").unlink()
     assert_same(models.load(lerobot, smolvla.CONFIG), model)
     with pytest.raises(ValueError, match=r"holds weights, but no config\.json"):
@@ -88,7 +88,7 @@ def test_openpi(tmp_path):
     model = models.load(folder)
     assert model.config == models.load_config(folder) == pi0.CONFIG
     assert loading.find(folder).layout == "openpi"
-    assert_same(model, published.load(folder / "params", pi0.CONFIG)[0])
+    assert_same(model, published.load_published(folder / "params", pi0.CONFIG)[0])
 
 
 def test_ours_and_the_hub(tmp_path, monkeypatch):

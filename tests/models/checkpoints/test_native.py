@@ -96,7 +96,7 @@ def edit(folder, **change):
 
 def test_damaged_and_foreign_folders_raise(folder):
     with pytest.raises(ValueError, match=r"holds no model: there is no config\.json"):
-        native.load(folder / "nothing")
+        native.load_native(folder / "nothing")
     sizes = json.loads((folder / "config.json").read_text())["config"]
     edit(folder, config={**sizes, "vocabulary": 7})
     with pytest.raises(ValueError, match="weights and sizes lack the hash"):
@@ -110,7 +110,7 @@ def test_damaged_and_foreign_folders_raise(folder):
             models.load(folder)
     (folder / "config.json").write_text('{"architectures": []}')
     with pytest.raises(ValueError, match="was not written by this project"):
-        native.load(folder)
+        native.load_native(folder)
 
 
 def test_a_file_cut_short_raises(folder):

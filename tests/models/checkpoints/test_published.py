@@ -25,7 +25,7 @@ HEAD = "model.paligemma_with_expert.paligemma.lm_head.weight"
 
 @pytest.fixture(scope="module")
 def model():
-    return published.load(OPENPI, CONFIG)[0]
+    return published.load_published(OPENPI, CONFIG)[0]
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def test_openpi_there_and_back(model, leaves, tmp_path):
     assert back.keys() == leaves.keys()
     for name, array in leaves.items():
         np.testing.assert_array_equal(array, back[name], err_msg=name)
-    assert published.load(tmp_path / "new" / "params", CONFIG)[1] == []
+    assert published.load_published(tmp_path / "new" / "params", CONFIG)[1] == []
 
 
 def test_openpi_saved_from_a_state(model, leaves, tmp_path):
@@ -79,7 +79,7 @@ def test_openpi_saved_from_a_state(model, leaves, tmp_path):
         {(*k.split("/"), "value"): jnp.asarray(a) for k, a in leaves.items()}
     )
     ocp.PyTreeCheckpointer().save(tmp_path / "params", {"params": tree})
-    assert_same(published.load(tmp_path, CONFIG)[0], model)
+    assert_same(published.load_published(tmp_path, CONFIG)[0], model)
 
 
 def test_lerobot_has_the_documented_tensors(tensors, leaves):
@@ -116,7 +116,7 @@ def test_lerobot_of_the_published_size():
 
 
 def test_lerobot_there_and_back(model, tensors, tmp_path):
-    found, unused = published.load(write(tmp_path / "again", tensors), CONFIG)
+    found, unused = published.load_published(write(tmp_path / "again", tensors), CONFIG)
     assert_same(found, model)
     assert unused == [HEAD.removeprefix("model.")]
 
@@ -132,7 +132,7 @@ def test_lerobot_in_bf16_and_in_shards(model, tensors, tmp_path):
         safetensors.numpy.save_file({n: narrow[n] for n in part}, tmp_path / "shards" / file)
     index = {"weight_map": {name: file for file, part in parts.items() for name in part}}
     (tmp_path / "shards" / "model.safetensors.index.json").write_text(json.dumps(index))
-    wide, _ = published.load(tmp_path / "shards", CONFIG)
+    wide, _ = published.load_published(tmp_path / "shards", CONFIG)
     assert {a.dtype for a in named_arrays(wide).values()} == {np.dtype("float32")}
     dtypes = published.stored_dtypes(tmp_path / "shards", CONFIG)
     published.save(tmp_path / "new", wide, "lerobot", dtypes)
@@ -142,7 +142,7 @@ def test_lerobot_in_bf16_and_in_shards(model, tensors, tmp_path):
         assert back[name].dtype == array.dtype
         np.testing.assert_array_equal(back[name], array, err_msg=name)
     half = dataclasses.replace(CONFIG, param_dtype="bfloat16")
-    stored, _ = published.load(tmp_path / "shards", half)
+    stored, _ = published.load_published(tmp_path / "shards", half)
     assert {a.dtype for a in named_arrays(stored).values()} == {np.dtype("bfloat16")}
 
 
@@ -155,7 +155,7 @@ def test_lerobot_of_older_versions(model, tensors, tmp_path):
         )
         old[name.replace("paligemma.model.vision_tower", "paligemma.vision_tower")] = array
     del old["paligemma_with_expert.paligemma.language_model.model.embed_tokens.weight"]
-    found, unused = published.load(write(tmp_path / "old", old), CONFIG)
+    found, unused = published.load_published(write(tmp_path / "old", old), CONFIG)
     assert_same(found, model)
     assert unused == []
 
@@ -163,20 +163,20 @@ def test_lerobot_of_older_versions(model, tensors, tmp_path):
 def test_what_does_not_fit_is_named(model, tensors, tmp_path):
     lora = {**tensors, "model.extra.lora_A.weight": np.zeros((2, 2), np.float32)}
     with pytest.raises(ValueError, match=r"has, beyond this model, extra\.lora_A\.weight"):
-        published.load(write(tmp_path / "more", lora), CONFIG)
+        published.load_published(write(tmp_path / "more", lora), CONFIG)
     less = {name: a for name, a in tensors.items() if "layers.1.mlp.up_proj" not in name}
     with pytest.raises(ValueError, match=r"lacks .*layers\.1\.mlp\.up_proj\.weight"):
-        published.load(write(tmp_path / "less", less), CONFIG)
+        published.load_published(write(tmp_path / "less", less), CONFIG)
     other = dataclasses.replace(CONFIG, action_dim=7)
     with pytest.raises(
         ValueError, match=r"has state_proj/kernel of shape \(32, 64\), the model needs \(7, 64\)"
     ):
-        published.load(OPENPI, other)
+        published.load_published(OPENPI, other)
     twice = {**tensors, "state_proj.bias": np.zeros(64, np.float32)}
     with pytest.raises(ValueError, match="one tensor under two names"):
-        published.load(write(tmp_path / "twice", twice), CONFIG)
+        published.load_published(write(tmp_path / "twice", twice), CONFIG)
     with pytest.raises(ValueError, match="neither an Orbax checkpoint"):
-        published.load(tmp_path, CONFIG)
+        published.load_published(tmp_path, CONFIG)
     with pytest.raises(ValueError, match="exists already"):
         published.save(tmp_path / "more", model, "lerobot")
     with pytest.raises(ValueError, match="layout 'torch' is not one of openpi, lerobot"):
@@ -194,4 +194,4 @@ def test_damage_is_one_sentence(layout, model, tmp_path):
     else:
         (tmp_path / "new" / "params" / "_METADATA").write_bytes(b"nothing")
     with pytest.raises(ValueError, match="damaged"):
-        published.load(tmp_path / "new", CONFIG)
+        published.load_published(tmp_path / "new", CONFIG)
