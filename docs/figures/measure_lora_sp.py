@@ -21,6 +21,8 @@ from lorasp_jax.training.run_folder import read_json
 
 WORLDS, PIXELS = 4, 320
 CAMERA = "side"
+ROUNDED = 2
+"""Directions by which a model that computes in bfloat16 may differ from the equations in fp32."""
 
 
 def measure(run: Path, task: str, steps: int) -> dict[str, Any]:
@@ -57,7 +59,8 @@ def measure(run: Path, task: str, steps: int) -> dict[str, Any]:
     scores, _ = reference.router_scores(layer.adapter.get_value()["router"], x)
     gated, _ = reference.energy_gate(scores, layer.method.energy_target)
     mask = np.asarray(gated)
-    np.testing.assert_array_equal(mask.sum(-1), ranks[:, number])
+    rounded = 0 if config.dtype == "float32" else ROUNDED
+    np.testing.assert_allclose(mask.sum(-1), ranks[:, number], atol=rounded)
     world = int(np.argmax(mask.sum(-1).std(-1)))
     rank, side = mask[world].sum(-1), config.image_size // config.vision.patch
     token = np.array([rank.argmin(), rank.argmax()])
