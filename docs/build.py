@@ -22,7 +22,15 @@ API = {
     "data": ["lorasp_jax.data"],
     "training": ["lorasp_jax.training", "lorasp_jax.config"],
     "evaluation": ["lorasp_jax.evaluation"],
-    "envs": ["envs", "envs.mjcf", "envs.interop.gymnasium", "envs.interop.brax"],
+    "envs": [
+        "envs",
+        "envs.mjcf",
+        "envs.robots.piper",
+        "envs.datasets.rlds",
+        "envs.interop.gymnasium",
+        "envs.interop.brax",
+        "envs.compilation.cache",
+    ],
 }
 """Public modules by page."""
 OUTSIDE = (
