@@ -92,7 +92,7 @@ def films(run: Path, key: jax.Array) -> list[Column]:
     """
     trained, told = load_policy(run), read_json(run / "adapter.json")["metadata"]
     base = models.load(hub.found_again(told["base"]), trained.model.config)
-    policies = [Policy(model.sampler(), trained.processor) for model in (base, trained.model)]
+    policies = [policy.with_sampler() for policy in (Policy(base, trained.processor), trained)]
     return [column(policies, told, task, key) for task in told["tasks"]]
 
 
