@@ -1,7 +1,8 @@
-"""The search for the last score that an energy gate keeps, without a sort.
+"""Sort-free search for the energy gate's threshold.
 
-Numbers >= 0 in fp32 are ordered as their bit patterns, so a binary search on those bits finds the
-threshold by comparisons and row sums alone: of all rows in XLA, of a few in a kernel's body.
+Non-negative fp32 numbers sort like their bit patterns, so a binary search over those bits finds the
+threshold with nothing but comparisons and row sums: over all rows in XLA, or over a few rows in the
+body of a kernel.
 """
 
 import functools
@@ -14,27 +15,28 @@ import numpy as np
 
 
 class Boundary(NamedTuple):
-    """The last kept position of each row: keep s > score, and s == score up to `index`."""
+    """Last kept position of each row: s > score is kept, s == score up to and including `index`."""
 
-    score: jax.Array  # f32 [..., 1], of one row alone []; NaN where nothing is kept
-    index: jax.Array  # int32, the same
+    score: jax.Array  # f32 [..., 1], [] for a single row; NaN where nothing is kept
+    index: jax.Array  # int32, same shape
 
 
 class Ratio(NamedTuple):
-    """η as numerator / denominator, in [0, 1], exact in fp32 for decimals of up to 7 digits."""
+    """η in [0, 1] as numerator / denominator, exact in fp32 for decimals of up to 7 digits."""
 
-    numerator: float | jax.Array  # an array where η is one
+    numerator: float | jax.Array  # an array if η is traced
     denominator: float
 
 
 def energies(scores: jax.Array) -> jax.Array:
-    """s² of rows scaled by the power of two that brings their maximum into [1/2, 1).
+    """Square the scores, after scaling each row by a power of two to a maximum in [1/2, 1).
 
-    The scaling is exact, E_k does not depend on it, and squares neither under- nor overflow. For a
-    maximum with exponent field e it is 2^(126 - e), with field 253 - e (at least 1: normal).
+    The scaling is exact and cancels in E_k, and it keeps the squares from under- and overflowing.
+    For a maximum with exponent field e the factor is 2^(126 - e), whose own field is 253 - e (at
+    least 1, so that it stays normal).
 
-    Of a row with infinite scores it is the limit: these have energy 1, finite ones 0. NaN stays
-    NaN, also where a backend's maximum passes over it (Triton's does).
+    A row with infinite scores gives the limit: energy 1 for those, 0 for finite ones. NaN stays
+    NaN, even on backends whose maximum ignores it (Triton's does).
     """
     largest = _by_row(jnp.max, jnp.abs(jax.lax.stop_gradient(scores)))
     exponent = jax.lax.shift_right_logical(_bits(largest), 23)
@@ -44,7 +46,7 @@ def energies(scores: jax.Array) -> jax.Array:
 
 
 def _by_row(reduce: Callable, rows: jax.Array, **options: Any) -> jax.Array:
-    """A number of each row [..., R]: [..., 1], of one row alone []."""
+    """Reduce the last axis of [..., R] to [..., 1]; a single row gives a scalar."""
     return reduce(rows, axis=-1, keepdims=rows.ndim > 1, **options)
 
 
@@ -57,40 +59,45 @@ def _float(bits: jax.Array) -> jax.Array:
 
 
 class _Bracket(NamedTuple):
-    """Bits of scores, int32 [..., 1]: those from `low` on reach the target, from `high` on not."""
+    """Search interval on the bits of scores, int32 [..., 1].
+
+    The scores >= `low` reach the target together, the scores >= `high` do not.
+    """
 
     low: jax.Array
     high: jax.Array
     num_low: jax.Array
-    """How many scores there are from `low` on."""
+    """Number of scores >= `low`."""
     num_high: jax.Array
+    """Number of scores >= `high`."""
 
 
 def bisected_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
-    """The mask, bool [..., R]: a search in all rows at once, for XLA.
+    """Compute the mask, bool [..., R], by searching all rows at once in XLA.
 
-    Bit by bit it finds the largest score that reaches the target together with all above it. Each
-    step gives verdicts: what is above a threshold that falls short is kept, what is below one that
-    reaches is not. In the end only ties of the last score are open, and of these each is kept while
-    the energy before it falls short.
+    The search fixes, bit by bit, the largest threshold at which the scores >= threshold reach the
+    target. Each step also decides scores: if a threshold falls short, every score above it is kept;
+    if it reaches the target, every score below it is dropped. At the end only ties with the
+    threshold are undecided; each is kept as long as the energy before it falls short.
 
-    Verdicts are given inside the loop, as a score found there must not be compared with others
-    outside: XLA may compute them once more for that, and round them differently.
+    Scores are decided inside the loop because the threshold must not be compared with them outside:
+    XLA may recompute the scores there and round them differently.
     """
     energy = energies(scores)
     target = ratio.numerator * energy.sum(-1, keepdims=True)
 
     def step(i: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        found, verdict = carry
-        candidate = found | jax.lax.shift_left(jnp.int32(1), 30 - i)
-        chosen = scores >= _float(candidate)
-        reached = ratio.denominator * jnp.where(chosen, energy, 0).sum(-1, keepdims=True) >= target
-        news = jnp.where(reached, jnp.int8(-1), jnp.int8(1))
-        return jnp.where(reached, candidate, found), jnp.where(chosen == reached, verdict, news)
+        threshold, decision = carry
+        candidate = threshold | jax.lax.shift_left(jnp.int32(1), 30 - i)
+        above = scores >= _float(candidate)
+        reached = ratio.denominator * jnp.where(above, energy, 0).sum(-1, keepdims=True) >= target
+        update = jnp.where(reached, jnp.int8(-1), jnp.int8(1))
+        threshold = jnp.where(reached, candidate, threshold)
+        return threshold, jnp.where(above == reached, decision, update)
 
     start = jnp.zeros_like(target, jnp.int32), jnp.zeros_like(scores, jnp.int8)
-    _, verdict = jax.lax.fori_loop(0, 31, step, start)
-    kept, tied = verdict > 0, verdict == 0
+    _, decision = jax.lax.fori_loop(0, 31, step, start)
+    kept, tied = decision > 0, decision == 0
     earlier = np.triu(np.ones((scores.shape[-1],) * 2, np.float32), 1)
     ties_before = tied.astype(jnp.float32) @ earlier
     before = jnp.where(kept, energy, 0).sum(-1, keepdims=True) + ties_before * energy
@@ -98,12 +105,12 @@ def bisected_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
 
 
 def block_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
-    """The boundary of a block of rows [..., R]: the body of a kernel, which computes scores once.
+    """Find the boundary of a block of rows [..., R] inside a kernel, which computes scores once.
 
-    A binary search for the largest score that reaches the target together with all above it, and
-    one for the last tie of it that is needed: only elementwise work and row sums. A few rows stop
-    as soon as they know (11 steps of 31 for softplus scores, R = 128). One row has scalars, whose
-    comparison costs a kernel nothing.
+    One binary search finds the largest score s such that all scores >= s reach the target, a second
+    one the last tie of s that is needed. Both use elementwise operations and row sums only. The
+    loop stops once all rows of the block are decided (after 11 of 31 steps for softplus scores,
+    R = 128). A single row works on scalars, which cost a kernel nothing to compare.
     """
     if scores.size == scores.shape[-1]:
         scores = scores.reshape(-1)
@@ -112,12 +119,12 @@ def block_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
 
     def halve(bracket: _Bracket) -> _Bracket:
         middle = bracket.low + jax.lax.shift_right_logical(bracket.high - bracket.low, 1)
-        chosen = scores >= _float(middle)
-        number = _by_row(jnp.sum, chosen.astype(jnp.int32), dtype=jnp.int32)
-        reached = _by_row(jnp.sum, jnp.where(chosen, energy, 0))
+        above = scores >= _float(middle)
+        count = _by_row(jnp.sum, above.astype(jnp.int32), dtype=jnp.int32)
+        reached = _by_row(jnp.sum, jnp.where(above, energy, 0))
         is_low = ratio.denominator * reached >= target
-        upper = bracket._replace(low=middle, num_low=number)
-        lower = bracket._replace(high=middle, num_high=number)
+        upper = bracket._replace(low=middle, num_low=count)
+        lower = bracket._replace(high=middle, num_high=count)
         return jax.tree.map(functools.partial(jnp.where, is_low), upper, lower)
 
     lowest, highest = (_bits(_by_row(f, scores)) for f in (jnp.min, jnp.max))
@@ -127,36 +134,36 @@ def block_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
         halve,
         _Bracket(lowest, highest + 1, none + scores.shape[-1], none),
     )
-    # What is left in the bracket is one score, or ties.
+    # The bracket now holds one score, or several equal ones.
     score = _by_row(jnp.max, jnp.where(scores <= _float(bracket.high - 1), scores, -1))
-    find = functools.partial(_last_tie, scores, energy, score, target, ratio)
-    several = _any(bracket.num_low - bracket.num_high > 1)
+    last_tie = functools.partial(_last_tie, scores, energy, score, target, ratio)
+    has_ties = _any(bracket.num_low - bracket.num_high > 1)
     last = jnp.where(target > 0, score, jnp.nan)
-    return Boundary(last, jax.lax.cond(several, find, lambda: none + scores.shape[-1]))
+    return Boundary(last, jax.lax.cond(has_ties, last_tie, lambda: none + scores.shape[-1]))
 
 
 def _last_tie(
     scores: jax.Array, energy: jax.Array, score: jax.Array, target: jax.Array, ratio: Ratio
 ) -> jax.Array:
-    """Index of the last position of `score` that is needed, int32 [..., 1].
+    """Find the index of the last tie of `score` that is kept, int32 [..., 1].
 
-    Ties share one energy; one is kept while the energy before it falls short of the target.
+    All ties have the same energy; a tie is kept if the energy before it falls short of the target.
     """
     above = _by_row(jnp.sum, jnp.where(scores > score, energy, 0))
     tied = scores == score
-    each = _by_row(jnp.max, jnp.where(tied, energy, 0))
+    tie_energy = _by_row(jnp.max, jnp.where(tied, energy, 0))
     position = jax.lax.broadcasted_iota(jnp.int32, scores.shape, scores.ndim - 1)
     num_bits = (scores.shape[-1] - 1).bit_length()
 
-    def step(i: jax.Array, found: jax.Array) -> jax.Array:
-        candidate = found | jax.lax.shift_left(jnp.int32(1), num_bits - 1 - i)
+    def step(i: jax.Array, index: jax.Array) -> jax.Array:
+        candidate = index | jax.lax.shift_left(jnp.int32(1), num_bits - 1 - i)
         before = _by_row(jnp.sum, (tied & (position < candidate)).astype(jnp.float32))
-        falls_short = ratio.denominator * (above + before * each) < target
-        return jnp.where(falls_short, candidate, found)
+        falls_short = ratio.denominator * (above + before * tie_energy) < target
+        return jnp.where(falls_short, candidate, index)
 
     return jax.lax.fori_loop(0, num_bits, step, jnp.zeros_like(score, jnp.int32))
 
 
 def _any(condition: jax.Array) -> jax.Array:
-    """Whether it holds in any row; Triton reduces numbers."""
+    """Return whether the condition holds in any row; Triton cannot reduce booleans."""
     return condition.astype(jnp.int32).max() > 0

@@ -1,26 +1,28 @@
-"""The energy gate of LoRA-SP: the fewest directions whose squared scores reach an energy target.
+"""Energy gate of LoRA-SP: keep the fewest directions whose squared scores reach an energy target.
 
 For scores s >= 0 let E_k be the energy share of the k largest squares (paper eq. 12). The gate
-keeps the smallest k with E_k >= η, ties by lowest index. All implementations but the first reduce a
-row to its `Boundary`, the last kept (score, index) in that order; the mask follows elementwise.
+keeps the smallest k with E_k >= η; ties go to the lowest index. Implementations:
 
-- "pairwise": for each direction the energy of those that rank before it, summed term by term.
-  R^2 work, vectorised over rows and R, the fastest on CPU up to R = 32.
-- "sort": value sort, cumulative energy, threshold. The reference; its running sum may round across
-  η on a rare row.
-- "bisection": no sort. Binary search on the bits of the threshold, since fp32 numbers >= 0 are
-  ordered as their bit patterns.
-- "block": the same for a few rows, which stop as soon as they know: the body of a kernel.
-- "pallas": "block" in a Triton kernel of its own, a row to a warp, scores held in registers.
+- "pairwise": for each direction, sum the energy of all that rank before it. R² work, vectorised
+  over rows and R; the fastest on CPU up to R = 32.
+- "sort": sort the values, accumulate energy, threshold. The reference; on a rare row its running
+  sum rounds across η.
+- "bisection": no sort. Binary search for the threshold on its bits, since non-negative fp32
+  numbers sort like their bit patterns.
+- "block": bisection for the few rows of a kernel's block, stopping early. The body of a kernel.
+- "pallas": "block" as a Triton kernel, one row per warp, scores in registers.
 
-η is the decimal that was written: 0.9 means 9/10, and E_k >= 9/10 is tested as 10 Σ_k >= 9 Σ, so a
-row that reaches the target exactly is not lost to the rounding of 0.9.
+"sort", "block" and "pallas" reduce each row to its `Boundary`, the last kept (score, index); the
+mask follows elementwise.
 
-What all implementations give where fp32 ends:
+η is the decimal as written: 0.9 means 9/10, and E_k >= 9/10 is tested as 10 Σ_k >= 9 Σ, so a row
+that reaches the target exactly is not lost to the rounding of 0.9.
 
-- The first direction alone holds at least 1/R of the energy, so every η up to 1/R keeps one.
-- Infinite scores share the energy equally, and finite ones beside them have none.
-- A row with NaN keeps nothing and has kept_energy NaN.
+All implementations agree at the limits of fp32:
+
+- The largest score holds at least 1/R of the energy, so every η up to 1/R keeps one direction.
+- Infinite scores share the energy equally; finite scores in the same row have none.
+- A row with NaN keeps nothing and its kept_energy is NaN.
 """
 
 import decimal
@@ -46,14 +48,15 @@ from lorasp_jax.kernels.row_sharding import by_rows
 Implementation = Literal["pairwise", "sort", "bisection", "block", "pallas"]
 
 SMALLEST_TARGET = 2.0**-64
-"""Every smaller η is as this one, since no bank has 2^64 directions; in fp32 it could be zero."""
+"""Smaller η are raised to this: they would underflow in fp32, and keep one direction anyway, since
+no bank has 2^64 directions."""
 
 PAIRWISE_RANK = 32
-"""Largest R for which pairwise is the default on CPU: the crossing of both on two cores."""
+"""Largest R for which pairwise is the default on CPU: beyond it bisection is faster (two cores)."""
 
 
 def exact_ratio(energy_target: float) -> Ratio:
-    """Reads η as the decimal it was written as.
+    """Convert η to an exact ratio, reading it as the decimal it was written as.
 
     Raises:
       ValueError: η is not a number in (0, 1].
@@ -65,7 +68,7 @@ def exact_ratio(energy_target: float) -> Ratio:
     if not 0 < ratio <= 1:
         raise ValueError(f"energy_target must lie in (0, 1], got {energy_target!r}.")
     ratio = max(ratio, fractions.Fraction(SMALLEST_TARGET))
-    power = 2 ** ratio.denominator.bit_length()  # scales both without rounding
+    power = 2 ** ratio.denominator.bit_length()  # scale both without rounding
     return Ratio(ratio.numerator / power, ratio.denominator / power)
 
 
@@ -76,16 +79,16 @@ def energy_gate(
     implementation: Implementation | None = None,
     interpret: bool = False,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Keeps the smallest set of directions whose energy share reaches the target (eq. 12).
+    """Keep the smallest set of directions whose energy share reaches the target (eq. 12).
 
     No gradient flows through the mask; `kept_energy` is differentiable in the scores. A row of
-    zeros keeps nothing and has `kept_energy` 1. At η = 1 every positive score is kept.
+    zeros keeps nothing and has `kept_energy` 1. η = 1 keeps every positive score.
 
     Args:
-      scores: [..., R], non-negative; computed in fp32. Of a negative one the magnitude counts.
+      scores: [..., R], non-negative, computed in fp32. Negative scores count by magnitude.
       energy_target: η in (0, 1], a Python number, read as an exact decimal.
-      implementation: how to find the mask; None takes `default_implementation(R)`.
-      interpret: for "pallas" without a GPU: its kernel's body, as XLA operations.
+      implementation: how to compute the mask; None for `default_implementation(R)`.
+      interpret: run the kernel of "pallas" without a GPU, its body as XLA operations.
 
     Returns:
       mask bool [..., R], active_rank f32 [...] = k, kept_energy f32 [...] = E_k.
@@ -94,24 +97,25 @@ def energy_gate(
       ValueError: η outside (0, 1] or an unknown implementation.
     """
     ratio = exact_ratio(energy_target)
-    find = _finder(implementation or default_implementation(scores.shape[-1]), interpret)
+    name = implementation or default_implementation(scores.shape[-1])
+    compute_mask = _mask_function(name, interpret)
     scores = scores.astype(jnp.float32)
-    constant = jnp.abs(jax.lax.stop_gradient(scores))  # no -0, which the bits would put below all
-    whole = ratio.numerator == ratio.denominator
-    mask = positive(constant) if whole else find(constant, ratio)
+    constant = jnp.abs(jax.lax.stop_gradient(scores))  # also turns -0, whose sign bit is set, to 0
+    keep_all = ratio.numerator == ratio.denominator
+    mask = positive(constant) if keep_all else compute_mask(constant, ratio)
     return mask, mask.sum(-1).astype(jnp.float32), kept_energy(scores, mask)
 
 
 def default_implementation(rank: int) -> Implementation:
-    """Pallas on NVIDIA GPUs, pairwise for a small bank on CPU, bisection in XLA elsewhere."""
+    """Choose "pallas" on NVIDIA GPUs, "pairwise" for small banks on CPU, else "bisection"."""
     backend = jax.default_backend()
     if backend == "cpu" and rank <= PAIRWISE_RANK:
         return "pairwise"
     return "pallas" if backend == "gpu" else "bisection"
 
 
-def _finder(implementation: str, interpret: bool) -> Callable[[jax.Array, Ratio], jax.Array]:
-    """The function from scores [..., R] and η to the mask."""
+def _mask_function(implementation: str, interpret: bool) -> Callable[[jax.Array, Ratio], jax.Array]:
+    """Return the function from scores [..., R] and η to the mask."""
     masks = {"pairwise": _pairwise_mask, "bisection": bisected_mask}
     boundaries = {
         "sort": _sorted_boundary,
@@ -122,33 +126,33 @@ def _finder(implementation: str, interpret: bool) -> Callable[[jax.Array, Ratio]
         return masks[implementation]
     if implementation not in boundaries:
         valid = ", ".join(get_args(Implementation))
-        raise ValueError(f"unknown gate {implementation!r}; valid are {valid}.")
+        raise ValueError(f"Unknown energy gate {implementation!r}; valid are {valid}.")
     boundary = boundaries[implementation]
-    # A kernel computes scores once. XLA may do so twice, and round them differently, the boundary
-    # and what is compared with it.
-    once = (lambda scores: scores) if implementation == "block" else jax.lax.optimization_barrier
+    # A kernel computes the scores once. XLA may compute them twice, for the boundary and for the
+    # comparison with it, and round them differently; the barrier prevents that.
+    fixed = (lambda scores: scores) if implementation == "block" else jax.lax.optimization_barrier
 
-    def find(scores: jax.Array, ratio: Ratio) -> jax.Array:
-        scores = once(scores)
+    def compute_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
+        scores = fixed(scores)
         return kept_mask(scores, boundary(scores, ratio))
 
-    return find
+    return compute_mask
 
 
 def positive(scores: jax.Array) -> jax.Array:
-    """The mask at η = 1, bool [..., R]: every score that is not zero, none in a row with NaN."""
+    """Return the mask at η = 1, bool [..., R]: every positive score; none in a row with NaN."""
     return (scores > 0) & (scores.sum(-1, keepdims=True) > 0)
 
 
 def _pairwise_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
-    """Keeps what falls short of the target with all that ranks before it; zeros are never kept."""
+    """Keep each direction before which the energy falls short of the target; never keep zeros."""
     energy = energies(scores)
     position = np.arange(scores.shape[-1])
 
     def add(j: jax.Array, before: jax.Array) -> jax.Array:
-        other, its_energy = (jax.lax.dynamic_index_in_dim(a, j, -1) for a in (scores, energy))
-        first = (other > scores) | ((other == scores) & (j < position))
-        return before + jnp.where(first, its_energy, 0)
+        score_j, energy_j = (jax.lax.dynamic_index_in_dim(a, j, -1) for a in (scores, energy))
+        ranks_first = (score_j > scores) | ((score_j == scores) & (j < position))
+        return before + jnp.where(ranks_first, energy_j, 0)
 
     before = jax.lax.fori_loop(0, scores.shape[-1], add, jnp.zeros_like(scores))
     target = ratio.numerator * energy.sum(-1, keepdims=True)
@@ -156,15 +160,15 @@ def _pairwise_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
 
 
 def kept_mask(scores: jax.Array, last: Boundary) -> jax.Array:
-    """The mask, bool [..., R], of scores up to the last that is kept."""
+    """Return the mask, bool [..., R], of all scores up to the boundary."""
     position = jax.lax.broadcasted_iota(jnp.int32, scores.shape, scores.ndim - 1)
     return (scores > last.score) | ((scores == last.score) & (position <= last.index))
 
 
 def kept_energy(scores: jax.Array, mask: jax.Array) -> jax.Array:
-    """E_k of eq. (12) for f32 scores and a mask [..., R], f32 [...].
+    """Compute E_k of eq. (12), f32 [...], from f32 scores and a mask [..., R].
 
-    1 for a row of zeros, with a zero gradient there, and NaN for NaN.
+    A row of zeros gives 1 with zero gradient; a row with NaN gives NaN.
     """
     energy = energies(scores)
     total = energy.sum(-1)
@@ -173,7 +177,7 @@ def kept_energy(scores: jax.Array, mask: jax.Array) -> jax.Array:
 
 
 def energy_share(scores: jax.Array) -> jax.Array:
-    """Share of each direction in its row's energy, for f32 scores [..., R]; 0 in a row of zeros."""
+    """Compute each direction's share of its row's energy, f32 [..., R]; a row of zeros gives 0."""
     energy = energies(scores)
     total = energy.sum(-1, keepdims=True)
     return energy * (1 / jnp.where(total == 0, 1, total))
@@ -194,12 +198,12 @@ def _sorted_row_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
     score = jnp.where(kept.any(), jnp.where(kept, descending, jnp.inf).min(), jnp.nan)
     tied = scores == score
     num_ties = kept.sum() - (scores > score).sum()
-    index = (jnp.cumsum(tied) < num_ties).sum()  # tied scores up to here: num_ties of them
+    index = (jnp.cumsum(tied) < num_ties).sum()  # position of the last kept tie
     return Boundary(score, index.astype(jnp.int32))
 
 
 def _pallas_boundary(scores: jax.Array, ratio: Ratio, *, interpret: bool) -> Boundary:
-    """The bisection as a Triton kernel; R is padded with zeros, which are never kept."""
+    """Run the block search as a Triton kernel; R is padded with zeros, which are never kept."""
     *leading, rank = scores.shape
     width = max(pl.next_power_of_2(rank), 2)
     rows = jnp.pad(scores.reshape(-1, rank), ((0, 0), (0, width - rank)))
@@ -208,13 +212,13 @@ def _pallas_boundary(scores: jax.Array, ratio: Ratio, *, interpret: bool) -> Bou
 
 
 def _call_kernel(ratio: Ratio, interpret: bool, _: Any, arrays: Sequence[jax.Array]) -> tuple:
-    """The two columns of `Boundary`, and no sums, for rows of scores."""
+    """Compute the columns of `Boundary` for rows of scores; `by_rows` also expects sums: none."""
     from jax.experimental.pallas import triton  # absent from builds without NVIDIA support
 
     (rows,), column = arrays, pl.BlockSpec((1, 1), lambda i: (i, 0))
     columns = pl.pallas_call(
         functools.partial(_boundary_kernel, ratio=ratio),
-        grid=(len(rows),),  # one row and one warp to a program: the fastest measured
+        grid=(len(rows),),  # one row and one warp per program: the fastest measured on an H200
         in_specs=[pl.BlockSpec((1, rows.shape[1]), lambda i: (i, 0))],
         out_specs=[column, column],
         out_shape=[jax.ShapeDtypeStruct((len(rows), 1), t) for t in (jnp.float32, jnp.int32)],
@@ -226,6 +230,6 @@ def _call_kernel(ratio: Ratio, interpret: bool, _: Any, arrays: Sequence[jax.Arr
 
 
 def _boundary_kernel(scores: Any, score: Any, index: Any, *, ratio: Ratio) -> None:
-    """One program: references to scores [rows, width] in, to the two columns of `Boundary` out."""
-    for ref, found in zip((score, index), block_boundary(scores[...], ratio), strict=True):
-        ref[...] = jnp.broadcast_to(found, ref.shape)
+    """Read a block of scores [rows, width] and write the two columns of its `Boundary`."""
+    for ref, column in zip((score, index), block_boundary(scores[...], ratio), strict=True):
+        ref[...] = jnp.broadcast_to(column, ref.shape)

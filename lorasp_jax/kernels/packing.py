@@ -1,4 +1,4 @@
-"""Many small arrays as one."""
+"""Pack many small arrays into one."""
 
 import dataclasses
 import functools
@@ -15,17 +15,17 @@ import jax.numpy as jnp
     jax.tree_util.register_dataclass, data_fields=["values"], meta_fields=["structure", "shapes"]
 )
 @dataclasses.dataclass(frozen=True)
-class InARow:
-    """A tree of fp32 arrays as one array, which costs a kernel, and XLA before it, one step."""
+class PackedTree:
+    """A pytree of fp32 arrays in one flat array: one operand for a kernel, one copy for XLA."""
 
     values: jax.Array
-    """All numbers, [N], or [n, N] of n such trees."""
+    """All leaves end to end: [N], or [n, N] for n stacked trees."""
     structure: Any
     shapes: tuple[tuple[int, ...], ...]
 
     @classmethod
-    def of(cls, tree: Any, axes: int = 0) -> "InARow":
-        """The tree, whose leaves have so many leading axes, or what is in a row already."""
+    def of(cls, tree: Any, axes: int = 0) -> "PackedTree":
+        """Pack a tree whose leaves share `axes` leading axes; a packed tree is returned as is."""
         if isinstance(tree, cls):
             return tree
         leaves, structure = jax.tree.flatten(tree)
@@ -34,15 +34,15 @@ class InARow:
         return cls(jnp.concatenate(flat, axis=-1), structure, shapes)
 
     def tree(self, part: Callable[[int, int], jax.Array] | None = None) -> Any:
-        """The tree; `part`, (start, size) -> [..., size], says how a stretch of the row is read."""
+        """Unpack; `part`, (start, size) -> [..., size], overrides how a slice is read."""
         read = part or (lambda start, size: self.values[..., start : start + size])
-        parts = [read(*place) for place in places(tuple(map(math.prod, self.shapes)))]
+        parts = [read(*span) for span in spans(tuple(map(math.prod, self.shapes)))]
         leaves = [
             p.reshape(*p.shape[:-1], *shape) for p, shape in zip(parts, self.shapes, strict=True)
         ]
         return jax.tree.unflatten(self.structure, leaves)
 
 
-def places(widths: tuple[int, ...]) -> list[tuple[int, int]]:
-    """(start, width) of columns side by side."""
+def spans(widths: tuple[int, ...]) -> list[tuple[int, int]]:
+    """Return (start, width) of adjacent columns of these widths."""
     return list(zip(itertools.accumulate(widths[:-1], initial=0), widths, strict=True))

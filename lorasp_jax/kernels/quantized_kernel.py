@@ -1,10 +1,10 @@
-"""Frozen kernels in 8 or 4 bits, and what they cost: int8 by column, nf4 in blocks of 64 inputs.
+"""Frozen kernels in 8 or 4 bits: int8 with a scale per column, nf4 in blocks of 64 inputs.
 
-Symmetric, scaled by the largest magnitude of what shares a scale. nf4 is the 4-bit NormalFloat of
-QLoRA (Dettmers et al., arXiv 2305.14314, appendix E), without its second quantisation of the
-scales: 4.5 bits a weight. With m the largest magnitude under a scale, a weight is off by at most
-m/255 in int8 and 0.152 m in nf4, half the widest gap of its table. The product under an adapter
-widens a kernel where it multiplies by it, again in the backward pass, and keeps the codes alone.
+Quantisation is symmetric; each scale is the largest magnitude of its group. nf4 is the 4-bit
+NormalFloat of QLoRA (Dettmers et al., arXiv 2305.14314, appendix E) without double quantisation of
+the scales: 4.5 bits per weight. With m the largest magnitude of a group, the error of a weight is
+at most m/255 in int8 and 0.152 m, half the widest gap of the table, in nf4. Adapted layers
+dequantise the kernel right where they multiply, in both passes, and store the codes alone.
 """
 
 import dataclasses
@@ -19,8 +19,12 @@ import numpy as np
 Kind: TypeAlias = Literal["int8", "nf4"]
 KINDS: tuple[Kind, ...] = ("int8", "nf4")
 NF4_BLOCK = 64
-INT8_BOUND = 127.5  # half a step above 127, so that the outermost codes are used like the others
-# Quantiles of a normal distribution, 0 among them, scaled to [-1, 1]; arXiv 2305.14314, appendix E.
+"""Inputs per scale in nf4 (arXiv 2305.14314, section 3)."""
+INT8_BOUND = 127.5
+"""Divisor of int8 scales: half a step above 127, so that the outermost codes get a full bin (as in
+qwix 0.1.8, which the tests compare with)."""
+# Quantiles of a normal distribution with 0 among them, scaled to [-1, 1]; arXiv 2305.14314,
+# appendix E.
 NF4 = (
     -1.0, -0.6961928009986877, -0.5250730514526367, -0.39491748809814453, -0.28444138169288635,
     -0.18477343022823334, -0.09105003625154495, 0.0, 0.07958029955625534, 0.16093020141124725,
@@ -32,9 +36,9 @@ NF4 = (
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class QuantizedKernel:
-    """A kernel [..., I, O] in the place of an array: it has a shape and a type, and `astype`.
+    """A quantised kernel [..., I, O] with the `shape`, `dtype` and `astype` of an array.
 
-    A pytree whose arrays keep the leading axes, so scan, vmap and sharding take it as it is.
+    A pytree whose arrays keep the leading axes, so it passes through scan, vmap and sharding.
     """
 
     codes: jax.Array
@@ -43,18 +47,18 @@ class QuantizedKernel:
     scale: jax.Array
     """f32 [..., 1 or I/64, 1, O]."""
     d_in: int = dataclasses.field(metadata={"static": True})
-    """I; the last block may be longer than what is left of it."""
+    """I; the last block is padded if 64 does not divide it."""
     dtype: Any = dataclasses.field(metadata={"static": True})
-    """The type that it stands for."""
+    """Dtype of the original kernel."""
     axes: tuple[int, ...] | None = dataclasses.field(default=None, metadata={"static": True})
-    """Where it stands for an einsum's kernel, the sizes of that one's axes: its shape after the
-    axes of a stack. The codes stay matrices, and so does what `astype` gives."""
+    """Shape of the einsum kernel that this one replaces, without stack axes; None if it replaces a
+    matrix. Codes and `astype` stay matrices."""
     batch: int = dataclasses.field(default=0, metadata={"static": True})
-    """How many of the codes' leading axes are among them."""
+    """Number of leading axes of the codes that belong to `axes`."""
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """[..., I, O], or [..., *axes]."""
+        """Shape of the original kernel: [..., I, O], or [..., *axes]."""
         leading = self.codes.shape[:-3]
         if self.axes is None:
             return *leading, self.d_in, self.codes.shape[-1]
@@ -62,11 +66,11 @@ class QuantizedKernel:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of codes and scales."""
+        """Size of codes and scales in bytes."""
         return self.codes.nbytes + self.scale.nbytes
 
     def astype(self, dtype: Any) -> jax.Array:
-        """The kernel as an array [..., I, O]."""
+        """Dequantise to an array [..., I, O]."""
         if self.codes.dtype == jnp.int8:
             values = self.codes.astype(jnp.float32)
         else:
@@ -77,14 +81,17 @@ class QuantizedKernel:
         return whole[..., : self.d_in, :]
 
     def reshape(self, *shape: Any) -> "QuantizedKernel":
-        """With other leading axes; -1 is allowed as in `jnp.reshape`.
+        """Reshape the leading axes; -1 works as in `jnp.reshape`.
 
         Raises:
-          ValueError: another [I, O].
+          ValueError: the shape does not end in [I, O].
         """
         *leading, d_in, d_out = np.empty(self.shape, np.void).reshape(*shape).shape
         if (d_in, d_out) != self.shape[-2:]:
-            raise ValueError(f"a quantised kernel {self.shape} cannot become {shape}.")
+            raise ValueError(
+                f"Cannot reshape a quantised kernel {self.shape} to {shape}; "
+                "only its leading axes may change."
+            )
         arrays = {n: getattr(self, n) for n in ("codes", "scale")}
         return dataclasses.replace(
             self, **{n: a.reshape(*leading, *a.shape[-3:]) for n, a in arrays.items()}
@@ -92,22 +99,22 @@ class QuantizedKernel:
 
 
 def quantized(kernel: jax.Array, kind: Kind) -> QuantizedKernel:
-    """A kernel [..., I, O] in int8 or nf4, every code the nearest.
+    """Quantise a kernel [..., I, O] to int8 or nf4, rounding to the nearest code.
 
     Raises:
-      ValueError: an unknown kind, or a kernel with a value that is not finite.
+      ValueError: an unknown kind, or a kernel with non-finite values.
     """
     if kind not in KINDS:
-        raise ValueError(f"kernels can be {' or '.join(KINDS)}, got {kind!r}.")
+        raise ValueError(f"Unknown quantisation {kind!r}; valid are {', '.join(KINDS)}.")
     codes, scale = _codes(kernel, kind)
     if not bool(jnp.isfinite(scale).all()):
-        raise ValueError("a kernel with infinite or undefined values cannot be quantised.")
+        raise ValueError("Cannot quantise a kernel with NaN or infinite values.")
     return QuantizedKernel(codes, scale, kernel.shape[-2], jnp.dtype(kernel.dtype))
 
 
 @functools.partial(jax.jit, static_argnames="kind")
 def _codes(kernel: jax.Array, kind: Kind) -> tuple[jax.Array, jax.Array]:
-    """Codes and scales of a `QuantizedKernel`."""
+    """Compute the codes and scales of a `QuantizedKernel`."""
     *leading, d_in, d_out = kernel.shape
     values = kernel.astype(jnp.float32)
     if kind == "nf4":
@@ -127,7 +134,7 @@ def _int8(relative: jax.Array) -> jax.Array:
 
 
 def _nf4(relative: jax.Array) -> jax.Array:
-    """Codes of values [..., 64, O] in [-1, 1], two to a byte."""
+    """Encode values [..., 64, O] in [-1, 1], two codes per byte."""
     table = np.array(NF4, np.float32)
     codes = jnp.searchsorted((table[1:] + table[:-1]) / 2, relative).astype(jnp.uint8)
     low, high = jnp.split(codes, 2, axis=-2)

@@ -1,8 +1,8 @@
-"""Kernels that work row by row, on arrays whose rows lie on several devices.
+"""Run row-wise kernels on arrays whose rows are sharded over devices.
 
-XLA cannot look into a kernel: it would gather all rows on every device and run it there on all of
-them. With a rule (jax.experimental.custom_partitioning) each device runs the kernel on the rows it
-has, however the mesh is made and whatever its axes are called.
+A kernel is opaque to XLA, which would gather all rows on every device and run it on all of them.
+With a sharding rule (jax.experimental.custom_partitioning) each device runs the kernel on its own
+rows, for any mesh shape and axis names.
 """
 
 import itertools
@@ -20,18 +20,18 @@ Kernel = Callable[[Arrays, Arrays], tuple[Arrays, Arrays]]
 
 
 def by_rows(kernel: Kernel, shared: Arrays, arrays: Arrays) -> tuple[Arrays, Arrays]:
-    """What the kernel makes of the arrays, each device running it on its own rows.
+    """Run the kernel with each device working on its own rows.
 
     Under `jax.vmap` every device runs it on all rows. No gradient is defined.
 
     Args:
-      kernel: (shared, arrays) -> (outputs, sums). Row i of the outputs depends on row i of the
-        arrays alone, and the sums add up over rows.
-      shared: of any shape.
-      arrays: [T, .] each.
+      kernel: (shared, arrays) -> (outputs, sums). Row i of the outputs depends only on row i of the
+        arrays; the sums add up over rows.
+      shared: replicated arrays of any shape.
+      arrays: [T, ...] each, sharded over T.
 
     Returns:
-      outputs [T, .], and sums of any shape.
+      outputs [T, ...] each, sharded like the arrays, and sums of any shape.
     """
     count = len(shared)
 
@@ -40,43 +40,44 @@ def by_rows(kernel: Kernel, shared: Arrays, arrays: Arrays) -> tuple[Arrays, Arr
 
     @custom_vmap
     def call(*operands: jax.Array) -> tuple[Arrays, Arrays]:
-        found = jax.eval_shape(flat, *operands)
+        results = jax.eval_shape(flat, *operands)
         partitioned = custom_partitioning(flat)
         partitioned.def_partition(
-            lambda mesh, operands, found: _partition(flat, count, mesh, operands, found),
-            sharding_rule=_rule(count, operands, *found),
+            lambda mesh, operands, results: _partition(flat, count, mesh, operands, results),
+            sharding_rule=_rule(count, operands, *results),
         )
         return partitioned(*operands)
 
     @call.def_vmap
     def _(size: int, batched: Sequence[bool], *operands: jax.Array) -> Any:
         axes = [0 if is_batched else None for is_batched in batched]
-        found = jax.vmap(flat, in_axes=axes, axis_size=size)(*operands)
-        return found, jax.tree.map(lambda _: True, found)
+        results = jax.vmap(flat, in_axes=axes, axis_size=size)(*operands)
+        return results, jax.tree.map(lambda _: True, results)
 
     return call(*shared, *arrays)
 
 
-def _partition(flat: Callable, count: int, mesh: Any, operands: Any, found: Any) -> tuple:
-    """Where operands and results lie, and what a device does with its part of them."""
+def _partition(flat: Callable, count: int, mesh: Any, operands: Any, results: Any) -> tuple:
+    """Return the shardings of results and operands, and the function each device runs."""
     first = operands[count]
     axes = first.sharding.spec[0]
     names = axes if isinstance(axes, tuple) else () if axes is None else (axes,)
     if first.shape[0] % math.prod(mesh.shape[name] for name in names):
-        names = ()  # the devices' shares would be filled up with rows that are none
-    rows, whole = (NamedSharding(mesh, PartitionSpec(axes)) for axes in (names or None, None))
+        names = ()  # XLA would pad the shards with rows that the sums must not include
+    rows, replicated = (NamedSharding(mesh, PartitionSpec(axes)) for axes in (names or None, None))
 
     def own_rows(*operands: jax.Array) -> tuple[Arrays, Arrays]:
         outputs, sums = flat(*operands)
         return outputs, jax.lax.psum(sums, names) if names else sums
 
-    outputs, sums = found
-    placed = jax.tree.map(lambda _: rows, outputs), jax.tree.map(lambda _: whole, sums)
-    return mesh, own_rows, placed, tuple(whole if i < count else rows for i in range(len(operands)))
+    outputs, sums = results
+    out_shardings = jax.tree.map(lambda _: rows, outputs), jax.tree.map(lambda _: replicated, sums)
+    in_shardings = tuple(replicated if i < count else rows for i in range(len(operands)))
+    return mesh, own_rows, out_shardings, in_shardings
 
 
 def _rule(count: int, operands: Arrays, outputs: Arrays, sums: Arrays) -> str:
-    """ "c0, rows c1 -> rows c2, c3": rows go with rows, whatever lies along the other axes."""
+    """Return the sharding rule, such as "c0, rows c1 -> rows c2, c3": only rows are shared."""
     others = (f"c{i}" for i in itertools.count())
 
     def axes(array: jax.Array, *, has_rows: bool) -> str:

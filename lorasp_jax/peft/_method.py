@@ -338,7 +338,7 @@ class _Between:
         widths: Sequence[int],
         token_mask: jax.Array | None,
     ) -> list[tuple[jax.Array, Aux]]:
-        """z and aux of each; arguments as for `low_rank_matmul.Between`."""
+        """z and aux of each; arguments as for `low_rank_matmul.InnerFunction`."""
         first, n = self.methods[0], len(self.methods)
         if n == 1 or not first.gains_together or any(method != first for method in self.methods):
             each = one_by_one([method.between for method in self.methods])

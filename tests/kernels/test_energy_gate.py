@@ -21,7 +21,7 @@ def golden():
 
 
 def energy_gate(scores, eta, implementation=None):
-    """With the Triton kernel on a GPU; elsewhere its body in the interpreter."""
+    """Run the gate, the Triton kernel in the interpreter where there is no GPU."""
     interpret = jax.default_backend() != "gpu"
     return gate.energy_gate(scores, eta, implementation=implementation, interpret=interpret)
 
@@ -36,7 +36,7 @@ def scores_like(shape, seed=0):
 )
 @pytest.mark.parametrize("eta", [0.5, 0.7, 0.8, 0.9, 0.99])
 def test_equals_exact_arithmetic(golden, implementation, may_miss, eta):
-    """`k` and `order` were found with big integers; the running sum of "sort" rounds on one row."""
+    """`k` and `order` come from big-integer arithmetic; "sort" rounds across η on one row."""
     row = [round(100 * eta) for eta in (0.5, 0.7, 0.8, 0.9, 0.99, 1)].index(round(100 * eta))
     k, order = golden["k"][row], golden["order"]
     run = jax.jit(lambda s: energy_gate(s, eta, implementation))
@@ -53,7 +53,7 @@ def test_target_of_one_keeps_every_positive_score(golden):
     mask, active_rank, kept_energy = run(golden["scores"])
     np.testing.assert_array_equal(mask, golden["scores"] > 0)
     assert (active_rank <= golden["k"][-1]).all()
-    np.testing.assert_allclose(kept_energy, 1, rtol=1e-6)  # a GPU may add up in two orders
+    np.testing.assert_allclose(kept_energy, 1, rtol=1e-6)  # a GPU may sum in either order
 
 
 @pytest.mark.parametrize("implementation", ["pairwise", "sort", "bisection", "pallas"])
@@ -88,8 +88,8 @@ EXTREME = [
         (1.0, [4, 3, 1, 2, 4, 0]),
     ],
 )
-def test_where_fp32_ends(implementation, eta, expected):
-    """Infinite scores share the energy, NaN keeps nothing, -0 is 0, magnitudes count."""
+def test_limits_of_fp32(implementation, eta, expected):
+    """Infinite scores share the energy, NaN keeps nothing, -0 is 0, signs do not matter."""
     rows = np.array([*EXTREME, [NAN, 1, INF, 2]], np.float32)
     run = jax.jit(lambda s: energy_gate(s, eta, implementation))
     mask, rank, kept = run(rows)
@@ -101,8 +101,8 @@ def test_where_fp32_ends(implementation, eta, expected):
 
 
 @pytest.mark.parametrize("implementation", ["pairwise", "bisection", "block", "pallas"])
-def test_nan_counts_where_a_maximum_passes_over_it(monkeypatch, implementation):
-    """As Triton's does; the rows of `test_where_fp32_ends` go wrong there only beside INF."""
+def test_nan_with_a_maximum_that_ignores_it(monkeypatch, implementation):
+    """Triton's maximum ignores NaN, which the rows of `test_limits_of_fp32` show only with INF."""
     largest = jnp.max
     monkeypatch.setattr(jnp, "max", lambda a, **o: largest(jnp.where(a == a, a, -INF), **o))
     rows = np.array([[NAN, 1, INF, 2], [1, NAN, 3, 0], [NAN] * 4, [INF, 1, 2, 0]], np.float32)
@@ -113,14 +113,14 @@ def test_nan_counts_where_a_maximum_passes_over_it(monkeypatch, implementation):
 
 
 @pytest.mark.parametrize("eta", [1e-300, 0.5, 0.9, 1.0])
-def test_gradients_where_fp32_ends(eta):
+def test_gradients_at_the_limits_of_fp32(eta):
     rows = np.array(EXTREME, np.float32)
     gradient = jax.jit(jax.grad(lambda s: gate.energy_gate(s, eta)[2].sum()))(rows)
     assert np.isfinite(gradient).all()
 
 
-def test_a_direction_stays_whose_score_is_computed_twice():
-    """Unoptimised, XLA rounds scores for the search in one way, for what follows in another."""
+def test_mask_does_not_depend_on_recomputed_scores():
+    """Unoptimised, XLA computes scores twice, for search and comparison, with other rounding."""
     method = LoRASP(rank=8, hidden_width=4, energy_start=0.5, energy_target=0.5)
     params = method.init_params(jax.random.key(0), 6, 5)
     params["router"]["w2"] = jax.random.normal(jax.random.key(1), (4, 8))
@@ -129,7 +129,7 @@ def test_a_direction_stays_whose_score_is_computed_twice():
     assert run(params, x)[1].kept_energy.min() > 0.4999
 
 
-def test_a_block_is_rows_behind_any_axes():
+def test_block_takes_any_leading_axes():
     scores = scores_like((1, 5, 7))
     run = jax.jit(lambda s, name: gate.energy_gate(s, 0.9, implementation=name), static_argnums=1)
     for found, expected in zip(run(scores, "block"), run(scores, "pairwise"), strict=True):
@@ -159,7 +159,7 @@ def test_transformations_agree(implementation):
 
 
 def test_gradient_of_the_kept_energy():
-    """d(1 - E)/ds_i = -2 s_i (m_i - E) / sum s², with the mask constant; zero rows give zero."""
+    """d(1 - E)/ds_i = -2 s_i (m_i - E) / Σ s² for a constant mask; zero rows have zero gradient."""
     scores = scores_like((5, 16)).at[0].set(0)
 
     def loss(scores):

@@ -11,7 +11,7 @@ WIDTHS = (32, 16)
 
 
 def gated(shared, columns, counts, kept):
-    """A chain with all that a function may have: two columns, a product, a choice, sums."""
+    """Use everything a function may: two columns, a matrix product, a mask, sums."""
     left, right = columns
     mixed = left * jnp.tanh(right.astype(jnp.float32) @ shared["w"] + shared["b"])
     kept = mixed > 0 if kept is None else kept
@@ -30,7 +30,7 @@ def shared():
 
 
 def run(fused, shared, rows, counts):
-    """Value, everything returned, and gradients, with or without the kernel."""
+    """Return the loss, all outputs and the gradients, with or without the kernel."""
 
     def loss(shared, rows):
         if fused:
@@ -50,7 +50,7 @@ def close(found, expected):
 
 
 @pytest.mark.parametrize(
-    ("num_rows", "few"),  # one by one; less than a block, one, the last one not full
+    ("num_rows", "few"),  # one row per program; less than a block, one block, a partial last block
     [(5, kernels.FEW_ROWS), (1, 0), (16, 0), (83, 0)],
 )
 def test_equals_the_function(shared, num_rows, few, monkeypatch):
@@ -63,26 +63,26 @@ def test_equals_the_function(shared, num_rows, few, monkeypatch):
 
 
 def test_programs_share_the_rows(shared, monkeypatch):
-    """Several blocks to a program add up to the same."""
+    """Several blocks per program give the same sums."""
     monkeypatch.setattr(kernels, "FEW_ROWS", 0)
     rows = jax.random.normal(jax.random.key(1), (16 * 12, 48))
     counts = jnp.ones((len(rows), 1), bool)
     one_each = run(True, shared, rows, counts)
-    # 12 blocks: 3 each is the largest that divides. And 3 blocks, which divide into single ones.
+    # Forward: 12 blocks over at most 5 programs, 3 blocks each. Backward: 3 blocks, 1 each.
     monkeypatch.setattr(kernels, "FORWARD", kernels.Launch(16, 4, 5))
     monkeypatch.setattr(kernels, "BACKWARD", kernels.Launch(64, 4, 2))
     together = run(True, shared, rows, counts)
     jax.tree.map(close, together, one_each)
 
 
-def test_types_are_those_of_the_function(shared):
+def test_dtypes_are_those_of_the_function(shared):
     rows = jnp.ones((20, 48), jnp.bfloat16)
     (_, (output, _, _)), (_, d_rows) = run(True, shared, rows, jnp.ones((20, 1), bool))
     assert output.dtype == jnp.float32
     assert d_rows.dtype == jnp.bfloat16
 
 
-def test_stores_the_rows_and_the_bits_of_what_is_kept_alone(shared):
+def test_residuals_are_the_rows_and_the_packed_mask(shared):
     rows, counts = jnp.ones((32, 48)), jnp.ones((32, 1), bool)
     call = lambda rows: kernels.fused_rows(gated, shared, rows, WIDTHS, counts, interpret=True)[0]  # noqa: E731
     _, pull_back = jax.eval_shape(lambda rows: jax.vjp(call, rows), rows)
@@ -90,22 +90,22 @@ def test_stores_the_rows_and_the_bits_of_what_is_kept_alone(shared):
     assert stored <= {(32, 48), (32, 32 // 8), (32, 1), (1, 16 * 32 + 32)}
 
 
-def test_what_is_shared_may_be_in_a_row_already(shared):
+def test_shared_arrays_may_come_packed(shared):
     rows, counts = jnp.sin(jnp.arange(16.0 * 48)).reshape(16, 48), jnp.ones((16, 1), bool)
-    row = kernels.InARow.of(shared)
-    assert row.values.shape == (16 * 32 + 32,)
-    jax.tree.map(np.testing.assert_array_equal, row.tree(), shared)
+    packed = kernels.PackedTree.of(shared)
+    assert packed.values.shape == (16 * 32 + 32,)
+    jax.tree.map(np.testing.assert_array_equal, packed.tree(), shared)
     expected, (d_shared, d_rows) = run(True, shared, rows, counts)
-    found, (d_row, others) = run(True, row, rows, counts)
-    jax.tree.map(close, (found, d_row.tree(), others), (expected, d_shared, d_rows))
+    actual, (d_packed, others) = run(True, packed, rows, counts)
+    jax.tree.map(close, (actual, d_packed.tree(), others), (expected, d_shared, d_rows))
 
 
 @pytest.mark.parametrize("few", [0, pytest.param(kernels.FEW_ROWS, marks=pytest.mark.slow)])
 def test_functions_side_by_side(shared, few, monkeypatch):
-    """Two functions in one kernel, of columns behind others, against each alone."""
+    """Two functions in one kernel, their columns starting at an offset, equal two single calls."""
     monkeypatch.setattr(kernels, "FEW_ROWS", few)
     trees = [shared, jax.tree.map(jnp.negative, shared)]
-    pair = jax.tree.map(lambda *rows: jnp.stack(rows), *map(kernels.InARow.of, trees))
+    pair = jax.tree.map(lambda *rows: jnp.stack(rows), *map(kernels.PackedTree.of, trees))
     rows = jax.random.normal(jax.random.key(1), (20, 8 + 2 * 48 + 3))
     counts = jax.random.bernoulli(jax.random.key(2), 0.7, (20, 1))
 
@@ -135,9 +135,9 @@ def test_functions_side_by_side(shared, few, monkeypatch):
 
 def test_bits_are_the_bools():
     kept = jax.random.bernoulli(jax.random.key(0), 0.5, (16, 128))
-    packed = kernels._packed(kept)
+    packed = kernels._pack_bits(kept)
     assert packed.dtype == jnp.uint8
-    np.testing.assert_array_equal(kernels._unpacked(packed), kept)
+    np.testing.assert_array_equal(kernels._unpack_bits(packed), kept)
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""A kernel on rows that lie on several devices: each works on its own, and nothing is gathered."""
+"""A kernel on sharded rows: each device runs on its own rows, and nothing is gathered."""
 
 import functools
 
@@ -15,7 +15,7 @@ from tests.kernels.test_fused_rows import WIDTHS, close, gated
 
 
 def doubled(shared, arrays):
-    """Rows times two and their sum, with a mark of how many rows there were at a time."""
+    """Double the rows, sum them, and report how many rows one call saw."""
     (rows,) = arrays
     return [shared[0] * rows, jnp.full((len(rows), 1), len(rows))], [rows.sum(0)]
 
@@ -31,7 +31,7 @@ def placed(rows, fsdp=2, axes=("data", "fsdp")):
 
 @pytest.mark.parametrize(
     ("num_rows", "axes", "at_a_time"),
-    # over all 8 devices, 4 pairs, 2 groups of 4, and each device has them all
+    # sharded over all 8 devices, over 4 pairs, over 2 groups of 4, replicated
     [(16, ("data", "fsdp"), 2), (16, "data", 4), (16, "fsdp", 8), (16, None, 16)],
 )
 def test_each_device_has_its_own_rows(num_rows, axes, at_a_time):
@@ -43,7 +43,7 @@ def test_each_device_has_its_own_rows(num_rows, axes, at_a_time):
 
 
 def test_rows_that_do_not_divide_are_gathered():
-    """12 rows on 8 devices: what a share is filled up with would be added up too."""
+    """12 rows on 8 devices: the padding of the shards would end up in the sums."""
 
     @jax.jit
     def cut(rows):
@@ -63,8 +63,8 @@ def test_vmap():
     np.testing.assert_array_equal(totals, rows.sum(1))
 
 
-def test_the_fused_chain(monkeypatch):
-    """Tokens of a batch that is split, from the layer around the kernel: values and gradients."""
+def test_fused_rows(monkeypatch):
+    """Tokens of a sharded batch through the fused kernel: values and gradients."""
     monkeypatch.setattr(kernels, "FEW_ROWS", 0)
     keys = jax.random.split(jax.random.key(0), 3)
     shared = {"w": jax.random.normal(keys[0], (16, 32)), "b": jax.random.normal(keys[1], (32,))}

@@ -28,7 +28,7 @@ from lorasp_jax.kernels.energy_gate import (
     exact_ratio,
 )
 from lorasp_jax.kernels.fused_rows import fused_rows
-from lorasp_jax.kernels.packing import InARow
+from lorasp_jax.kernels.packing import PackedTree
 from lorasp_jax.peft._aux import Aux
 from lorasp_jax.peft._method import Method, Params, kaiming_uniform
 from lorasp_jax.peft.lora_sp import release, schedule
@@ -207,12 +207,12 @@ class LoRASP(Method):
     def for_rows(self, params: Params) -> Params:
         """The parameters without [V, W1] and U, and for the kernel the router's in a row."""
         params = {name: p for name, p in self._routing(params).items() if name != "bank"}
-        return params | ({"router": InARow.of(params["router"])} if self.gains_together else {})
+        return params | ({"router": PackedTree.of(params["router"])} if self.gains_together else {})
 
     def _routing(self, params: Params) -> Params:
         """The parameters with the router's but for W1, unless they are in a row."""
         router = params["router"]
-        if isinstance(router, InARow):
+        if isinstance(router, PackedTree):
             return params
         return {**params, "router": {name: p for name, p in router.items() if name != "w1"}}
 
