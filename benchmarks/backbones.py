@@ -1,14 +1,14 @@
-"""Whole backbones at their published sizes, with random weights: training steps and sampling.
+"""Speed of training and sampling of whole backbones at published sizes, with random weights.
 
     python -m benchmarks.backbones --json backbones.json
     python -m benchmarks.backbones --size nano --batch 4 --rank 8 --dtype float32    # on a CPU
 
-A training step is this project's own, with AdamW and the auxiliary losses, on a batch that lies on
-the device; its state is donated. GiB is what the compiled program needs with its arguments, MFU the
-matrix products of loss and gradients a second (`lorasp_jax.training.cost.flops`, recomputation not
-counted) over the device's bf16 peak. Sampling is ten denoising steps in one program, from pictures
-to action chunk, by the model's `sampler`, which was made before. "largest" is the largest batch
-whose step is expected to need at most 24 GiB.
+A training step is this project's own, with AdamW and the auxiliary losses, on a batch already on
+the device; its state is donated. GiB is the memory of the compiled program including its arguments.
+MFU is the rate of the matrix products of loss and gradients (`lorasp_jax.training.cost.flops`,
+without recomputation) relative to the device's bf16 peak. Sampling runs ten denoising steps in one
+program, from images to action chunk, with the model's prepared `sampler`. "largest" is the largest
+batch whose step is expected to fit in 24 GiB.
 """
 
 import argparse
@@ -44,7 +44,7 @@ STEPS = 10
 
 
 def sized(name: str, options: argparse.Namespace, remat: Remat = "none") -> BackboneConfig:
-    """The backbone at the size asked for, the base stored in the type of the products."""
+    """Return the backbone's config at the chosen size, its base stored in the compute dtype."""
     config = getattr(backbone.find(name), options.size)()
     return dataclasses.replace(
         config,
@@ -57,13 +57,13 @@ def sized(name: str, options: argparse.Namespace, remat: Remat = "none") -> Back
 
 
 def run_config(method: peft.Method, targets: tuple[str, ...], batch: int) -> Config:
-    """A run with this method."""
+    """Return the config of a run with this method."""
     optim = OptimConfig(batch_size=batch)
     return Config(name="benchmark", scale="", peft=method, targets=targets, optim=optim)
 
 
 def arrays(config: BackboneConfig, run: Config | None) -> tuple[Any, Any, Any]:
-    """Graph, adapters and frozen arrays, drawn on a device; no adapters without a run."""
+    """Initialise graph, adapters and frozen arrays on a device; no adapters without a run."""
 
     def model(key: jax.Array) -> Backbone:
         return preflight.adapted(run, config, key) if run else config.create(nnx.Rngs(key))
@@ -74,7 +74,7 @@ def arrays(config: BackboneConfig, run: Config | None) -> tuple[Any, Any, Any]:
 
 
 def noise(shapes: Any) -> Any:
-    """Arrays in which everything is valid."""
+    """Fill a batch with noise; all masks are true."""
 
     def fill(leaf: jax.ShapeDtypeStruct) -> jax.Array:
         if leaf.dtype == jnp.float32:
@@ -85,12 +85,12 @@ def noise(shapes: Any) -> Any:
 
 
 class Step:
-    """A compiled training step, and after `load` what it needs.
+    """A compiled training step; `load` gives it its arrays.
 
     Args:
-        config: of the backbone.
-        run: whose batch is that of all devices.
-        mesh: of the devices; by default the first alone.
+        config: the backbone's config.
+        run: the run's config; its batch size is that of all devices together.
+        mesh: mesh of devices; by default only the first device.
     """
 
     def __init__(self, config: BackboneConfig, run: Config, mesh: Mesh | None = None) -> None:
@@ -102,38 +102,38 @@ class Step:
         key = jax.eval_shape(jax.random.key, 1)
         shapes = jax.eval_shape(self._initial, adapters), frozen, self._batch, key
         state, base = (meshes.shardings(tree, mesh) for tree in shapes[:2])
-        whole = meshes.replicated(mesh)
-        self._placed = state, base, meshes.batch_sharding(mesh), whole
+        replicated = meshes.replicated(mesh)
+        self._shardings = state, base, meshes.batch_sharding(mesh), replicated
         step = functools.partial(
             train_step,
             graphdef=graphdef,
             optimizer=optimizer,
             weights=auxiliary_weights(run.auxiliary, run.optim.steps),
         )
-        out = state, whole
-        jitted = jax.jit(step, donate_argnums=0, in_shardings=self._placed, out_shardings=out)
+        out = state, replicated
+        jitted = jax.jit(step, donate_argnums=0, in_shardings=self._shardings, out_shardings=out)
         self.compiled = jitted.lower(*shapes).compile()
 
     def load(self, adapters: Any, frozen: Any) -> "Step":
-        """Itself, with copies of these arrays where they belong."""
-        found = self._initial(adapters), frozen, noise(self._batch), jax.random.key(1)
-        self.state, *self.others = jax.device_put(found, self._placed)
+        """Copy these arrays to their devices; return self."""
+        arrays = self._initial(adapters), frozen, noise(self._batch), jax.random.key(1)
+        self.state, *self.others = jax.device_put(arrays, self._shardings)
         return self
 
     def __call__(self) -> Any:
-        """The next step's metrics."""
+        """Run the next step; return its metrics."""
         self.state, metrics = self.compiled(self.state, *self.others)
         return metrics
 
     @property
     def bytes(self) -> float:
-        """What the program needs on each device, with its arguments."""
+        """Memory of the program on each device, including its arguments."""
         needed: Any = self.compiled.memory_analysis()
         return needed.argument_size_in_bytes + needed.temp_size_in_bytes
 
 
 def training(name: str, label: str, run: Config, options: argparse.Namespace, remat: Remat) -> Any:
-    """The row of one way to train."""
+    """Measure one training row."""
     config = sized(name, options, remat)
     step, size = Step(config, run).load(*arrays(config, run)[1:]), run.optim.batch_size
     seconds = best(step, calls=options.calls)
@@ -154,7 +154,7 @@ def training(name: str, label: str, run: Config, options: argparse.Namespace, re
 
 
 def largest(name: str, run: Config, options: argparse.Namespace) -> int:
-    """The largest batch expected to need at most `options.gib`, from two sizes."""
+    """Extrapolate the largest batch expected to fit in `options.gib` from two batch sizes."""
     config = sized(name, options, "full")
 
     def bytes_of(batch: int) -> float:
@@ -167,7 +167,7 @@ def largest(name: str, run: Config, options: argparse.Namespace) -> int:
 
 
 def sampling(name: str, label: str, run: Config | None, options: argparse.Namespace) -> Iterator:
-    """Rows of drawing action chunks."""
+    """Yield the rows of sampling action chunks."""
     config = sized(name, options)
     sampler = nnx.merge(*arrays(config, run)).sampler()
     observation = noise(abstract_batch(config, 1).observation)
@@ -177,13 +177,13 @@ def sampling(name: str, label: str, run: Config | None, options: argparse.Namesp
         return sampler.sample_actions(jax.random.key(0), observation, num_steps=STEPS)
 
     for batch in options.sampled:
-        seen = jax.tree.map(functools.partial(jnp.repeat, repeats=batch, axis=0), observation)
-        seconds = best(functools.partial(sample, sampler, seen), calls=1, repeats=10)
+        repeated = jax.tree.map(functools.partial(jnp.repeat, repeats=batch, axis=0), observation)
+        seconds = best(functools.partial(sample, sampler, repeated), calls=1, repeats=10)
         yield {"backbone": name, "adapters": label, "batch": batch, "ms": 1e3 * seconds}
 
 
 def rows(name: str, table: str, options: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Those of one backbone in one table."""
+    """Yield the rows of one backbone in one table."""
     method = peft.LoRASP(rank=options.rank)
     everywhere = run_config(method, ("all-linear",), options.batch)
     if table == "training":
@@ -199,10 +199,10 @@ def rows(name: str, table: str, options: argparse.Namespace) -> Iterator[dict[st
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What says how a step is made and measured."""
+    """Add the options that define a step and its measurement."""
     parser.add_argument("--rank", type=int, default=128)
     parser.add_argument("--remat", choices=REMATS, default="products")
-    parser.add_argument("--unroll", choices=["yes", "no"], help="default: what the size has")
+    parser.add_argument("--unroll", choices=["yes", "no"], help="default: as the size's preset")
     parser.add_argument("--dtype", default="bfloat16")
     parser.add_argument("--calls", type=int, default=5, help="steps queued together")
     parser.add_argument("--json", type=Path, help="file for the figures")
@@ -219,15 +219,15 @@ def main() -> None:
     parser.add_argument("--only", choices=["training", "largest", "sampling"])
     add_options(parser)
     options = parser.parse_args()
-    console, found = Console(soft_wrap=True), {"machine": machine("jax")}
-    console.print(f"{found['machine']}; {options.size}, rank {options.rank}, {options.dtype}")
+    console, results = Console(soft_wrap=True), {"machine": machine("jax")}
+    console.print(f"{results['machine']}; {options.size}, rank {options.rank}, {options.dtype}")
     tables: dict[str, list] = {"training": [], "largest": [], "sampling": []}
     for name in options.backbones:
         for table in [options.only] if options.only else tables:
             for row in rows(name, table, options):
                 tables[table].append(row)
                 if options.json:
-                    options.json.write_text(json.dumps(found | tables, indent=1))
+                    options.json.write_text(json.dumps(results | tables, indent=1))
             print_table(console, [row for row in tables[table] if row["backbone"] == name])
 
 

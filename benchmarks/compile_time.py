@@ -1,12 +1,11 @@
-"""How long an adapted model takes to compile: a stack of dense layers, bare and adapted, next to
-qwix's LoRA where that is installed (`pip install qwix`).
+"""Compile time of a stack of dense layers, bare and adapted, compared with qwix's LoRA.
 
     JAX_PLATFORMS=cpu python -m benchmarks.compile_time
 
-What is compiled is a training step's gradient with respect to the adapters, the losses that the
-adapters report taken along. Seconds are those of the process on all its cores, which other programs
-on the machine hardly change, the least of several repeats; the ratios are to qwix's LoRA in the
-same run, or without it to the bare model.
+The program is the gradient of a training loss with respect to the adapters, auxiliary losses
+included. Times are CPU seconds of this process on all cores, which other programs hardly affect;
+the best of several repeats counts. Ratios are relative to qwix's LoRA in the same run
+(`pip install qwix`), or to the bare model if qwix is not installed.
 """
 
 import argparse
@@ -32,22 +31,22 @@ PARTS = ("trace s", "lower s", "compile s", "total s")
 
 
 class Stack(nnx.Module):
-    """Dense layers one after the other, written out."""
+    """A sequence of dense layers, not scanned."""
 
     def __init__(self, depth: int, width: int, dtype: Any) -> None:
-        """Draws the weights."""
+        """Initialise the weights."""
         options = {"dtype": dtype, "param_dtype": dtype, "rngs": nnx.Rngs(0)}
         self.layers = nnx.List([nnx.Linear(width, width, **options) for _ in range(depth)])
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        """The last layer's output [T, D]."""
+        """Apply all layers; x and the result are [T, D]."""
         for layer in self.layers:
             x = nnx.relu(layer(x))
         return x
 
 
 def models(base: Stack, x: jax.Array, rank: int) -> Iterator[tuple[str, Any, Any]]:
-    """Name, model and the type of variable that trains; what the ratios are to comes first."""
+    """Yield name, model and the variable type that trains; the reference comes first."""
     if importlib.util.find_spec("qwix"):
         import qwix  # pyright: ignore[reportMissingImports]
 
@@ -65,7 +64,7 @@ def models(base: Stack, x: jax.Array, rank: int) -> Iterator[tuple[str, Any, Any
 
 
 def gradient(model: nnx.Module, kind: Any) -> tuple[Callable[..., Any], tuple[Any, Any]]:
-    """The function to be compiled and its first two arguments."""
+    """Return the function to compile, and its first two arguments."""
     graphdef, trained, frozen = nnx.split(nnx.clone(model), kind, ...)
 
     def loss(trained: Any, frozen: Any, x: jax.Array) -> jax.Array:
@@ -80,7 +79,7 @@ def gradient(model: nnx.Module, kind: Any) -> tuple[Callable[..., Any], tuple[An
 
 
 def seconds(function: Callable[..., Any], *arguments: Any) -> tuple[float, ...]:
-    """Of the processor, for each of `PARTS`."""
+    """Measure the CPU seconds of each of `PARTS`."""
     jax.clear_caches()
     times = [time.process_time()]
     traced = jax.jit(function).trace(*arguments)
@@ -93,23 +92,23 @@ def seconds(function: Callable[..., Any], *arguments: Any) -> tuple[float, ...]:
 
 
 def measure(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """One row a model; the models take turns, so that all see the same machine."""
+    """Yield one row per model; models take turns, so that load on the machine affects all alike."""
     x = jnp.ones((options.tokens, options.width), options.dtype)
     base = Stack(options.depth, options.width, options.dtype)
-    found: dict[str, list[tuple[float, ...]]] = {}
+    times: dict[str, list[tuple[float, ...]]] = {}
     functions = {name: gradient(m, kind) for name, m, kind in models(base, x, options.rank)}
     for _ in range(options.repeats):
         for name, (function, arguments) in functions.items():
-            found.setdefault(name, []).append(seconds(function, *arguments, x))
-    least = {name: min(rows, key=lambda row: row[-1]) for name, rows in found.items()}
-    first = next(iter(least.values()))[-1]
-    for name, row in least.items():
-        yield {"model": name, **dict(zip(PARTS, row, strict=True)), "ratio": row[-1] / first}
+            times.setdefault(name, []).append(seconds(function, *arguments, x))
+    fastest = {name: min(rows, key=lambda row: row[-1]) for name, rows in times.items()}
+    reference = next(iter(fastest.values()))[-1]
+    for name, row in fastest.items():
+        yield {"model": name, **dict(zip(PARTS, row, strict=True)), "ratio": row[-1] / reference}
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__.partition(":")[0] if __doc__ else None)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--depth", type=int, default=12)
     parser.add_argument("--width", type=int, default=512)
     parser.add_argument("--tokens", type=int, default=1024)

@@ -1,12 +1,12 @@
-"""Datasets: windows a second from the cache, the first batch, and how fast LeRobot's are imported.
+"""Speed of the data pipeline: windows/s from the cache, time to first batch, import from LeRobot.
 
     python -m benchmarks.data --json data.json
-    python -m benchmarks.data --steps 50000 --batches 500     # more than lies in the page cache
+    python -m benchmarks.data --steps 50000 --batches 500     # more than fits in the page cache
 
-Windows have two cameras and 50 actions, in shuffled order. Imported are synthetic recordings of two
-cameras as LeRobot writes them (AV1 or H.264, a key frame every 2), once kept at their size and once
-reduced to 224 pixels, as published models see them; beside it, what the decoder alone does, a film
-a core. Everything runs on the host; the accelerator is idle.
+Windows have two cameras and 50 actions, in shuffled order. The import reads synthetic recordings of
+two cameras as LeRobot writes them (AV1 or H.264, a key frame every 2 frames), once at full size and
+once resized to 224 pixels as for published models. For comparison, the decoder alone runs with one
+video per core. Everything runs on the host; the accelerator is idle.
 """
 
 import argparse
@@ -39,11 +39,11 @@ CAMERAS, CHUNK, FPS = ("side", "wrist"), 50, 30
 EPISODE = 250  # steps
 HEIGHT, WIDTH = 480, 640
 CODECS = {"AV1": "libsvtav1", "H.264": "libx264"}
-"""And their encoders."""
+"""Codec -> PyAV's encoder."""
 
 
 class Drawn:
-    """Episodes of noise, made as they are read."""
+    """Episodes of noise, drawn when they are read."""
 
     kind, cameras, control_dt = "drawn", CAMERAS, 1 / FPS
 
@@ -55,7 +55,7 @@ class Drawn:
         return self.num_steps // EPISODE
 
     def episode(self, number: int, cameras: Any = None) -> Episodes:  # noqa: ARG002
-        """Noise."""
+        """Draw an episode."""
         draw = self._rng.standard_normal
         state, action = (draw((1, EPISODE, 7), np.float32) for _ in range(2))
         return Episodes(
@@ -74,14 +74,14 @@ class Drawn:
 
 
 def seconds(call: Callable[[], Any]) -> float:
-    """Of one call, which is not repeated: the second one would find its files in memory."""
+    """Time one call, without repeats: a second one would find its files in memory."""
     start = time.perf_counter()
     call()
     return time.perf_counter() - start
 
 
 def reading(folder: Path, steps: int, size: tuple[int, int], batch: int, batches: int) -> Any:
-    """Windows a second, and the first batch from opening the folder on."""
+    """Measure windows/s, and the time from opening the folder to the first batch."""
     path = folder / f"{size[0]}x{size[1]}"
     if not path.exists():
         cache.write([Drawn(steps, *size)], path, lambda *_: None)
@@ -92,11 +92,11 @@ def reading(folder: Path, steps: int, size: tuple[int, int], batch: int, batches
     taken = seconds(lambda: collections.deque(itertools.islice(stream, batches), maxlen=1))
     pixels = f"{size[1]}x{size[0]}"
     rate = batch * batches / taken
-    return {"pictures": pixels, "batch": batch, "windows/s": rate, "first batch s": first}
+    return {"images": pixels, "batch": batch, "windows/s": rate, "first batch s": first}
 
 
 def record(folder: Path, episodes: int, codec: str) -> None:
-    """A LeRobot 2.1 dataset; its episodes differ in their numbers alone."""
+    """Write a LeRobot 2.1 dataset; its episodes share one video per camera."""
     rng, lines = np.random.default_rng(0), []
     for number in range(episodes):
         state, action = (rng.standard_normal((EPISODE, 7), np.float32) for _ in range(2))
@@ -109,14 +109,14 @@ def record(folder: Path, episodes: int, codec: str) -> None:
         pq.write_table(pa.table(rows), table)
         lines.append(json.dumps({"episode_index": number, "length": EPISODE}))
     for camera in CAMERAS:
-        films = folder / "videos/chunk-000" / camera
-        films.mkdir(parents=True)
-        first, *others = (films / f"episode_{number:06d}.mp4" for number in range(episodes))
+        videos = folder / "videos/chunk-000" / camera
+        videos.mkdir(parents=True)
+        first, *others = (videos / f"episode_{number:06d}.mp4" for number in range(episodes))
         encode(first, rng, codec)
-        for film in others:
-            shutil.copyfile(first, film)
-    vector, film = {"dtype": "float32", "shape": [7]}, {"dtype": "video", "shape": []}
-    features = {"observation.state": vector, "action": vector, **dict.fromkeys(CAMERAS, film)}
+        for other in others:
+            shutil.copyfile(first, other)
+    vector, video = {"dtype": "float32", "shape": [7]}, {"dtype": "video", "shape": []}
+    features = {"observation.state": vector, "action": vector, **dict.fromkeys(CAMERAS, video)}
     path = "chunk-{episode_chunk:03d}/"
     info = {"codebase_version": "v2.1", "fps": FPS, "robot_type": "piper", "features": features}
     info |= {"chunks_size": 1000, "data_path": f"data/{path}episode_{{episode_index:06d}}.parquet"}
@@ -129,25 +129,25 @@ def record(folder: Path, episodes: int, codec: str) -> None:
 
 
 def encode(path: Path, rng: np.random.Generator, codec: str) -> None:
-    """A film with LeRobot's settings, yuv420p, g 2, crf 30: something moves in front of a scene."""
-    os.environ.setdefault("SVT_LOG", "1")  # errors alone: else the AV1 encoder introduces itself
-    scene, thing = texture(rng, HEIGHT, WIDTH), texture(rng, HEIGHT // 2, WIDTH // 4)
+    """Encode an object moving over a background, with LeRobot's settings: yuv420p, g 2, crf 30."""
+    os.environ.setdefault("SVT_LOG", "1")  # errors only: the AV1 encoder prints a banner
+    scene, patch = texture(rng, HEIGHT, WIDTH), texture(rng, HEIGHT // 2, WIDTH // 4)
     with av.open(str(path), "w") as container:
         stream: Any = container.add_stream(CODECS[codec], rate=FPS)
         stream.height, stream.width, stream.pix_fmt = HEIGHT, WIDTH, "yuv420p"
         stream.options = {"g": "2", "crf": "30"} | ({"preset": "12"} if codec == "AV1" else {})
         for number in range(EPISODE):
-            picture = scene.copy()
+            image = scene.copy()
             y, x = int(120 + 100 * np.cos(number / 20)), int(240 + 200 * np.sin(number / 15))
-            picture[y : y + thing.shape[0], x : x + thing.shape[1]] = thing
-            picture += 2 * rng.standard_normal((HEIGHT, WIDTH, 1), np.float32)  # of the sensor
-            pixels = picture.clip(0, 255).astype(np.uint8)
+            image[y : y + patch.shape[0], x : x + patch.shape[1]] = patch
+            image += 2 * rng.standard_normal((HEIGHT, WIDTH, 1), np.float32)  # sensor noise
+            pixels = image.clip(0, 255).astype(np.uint8)
             container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
         container.mux(stream.encode())
 
 
 def texture(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
-    """f32 `[H, W, 3]` with detail of all sizes; AV1 takes 13 kB for it at 640 x 480."""
+    """Draw an image, f32 `[H, W, 3]`, with detail at all scales; AV1 needs 13 kB at 640 x 480."""
     frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width))
     frequency[0, 0] = np.inf
     noise = np.fft.fft2(rng.standard_normal((4, height, width))) / frequency**1.6
@@ -156,36 +156,36 @@ def texture(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
 
 
 def importing(folder: Path, codec: str, image_size: int) -> dict[str, Any]:
-    """Steps and pictures a second from a LeRobot dataset to a cache, with statistics."""
+    """Measure the import of a LeRobot dataset to a cache, with statistics: steps/s and images/s."""
     source = LeRobot(folder / codec, Keys(image_size=image_size))
-    made = folder / f"imported_{codec}_{image_size}"
-    rate = source.num_steps / seconds(lambda: cache.write([source], made, lambda *_: None))
-    side, _ = cache.Cache(made).cameras.values()
-    size, pictures = f"{side[1]}x{side[0]}", len(CAMERAS) * rate
-    return {"codec": codec, "kept as": size, "steps/s": rate, "pictures/s": pictures}
+    target = folder / f"imported_{codec}_{image_size}"
+    rate = source.num_steps / seconds(lambda: cache.write([source], target, lambda *_: None))
+    side, _ = cache.Cache(target).cameras.values()
+    size, images = f"{side[1]}x{side[0]}", len(CAMERAS) * rate
+    return {"codec": codec, "stored as": size, "steps/s": rate, "images/s": images}
 
 
 def decoding(folder: Path, codec: str) -> dict[str, Any]:
-    """Pictures a second from the decoder, which nobody looks at: a bound of the import."""
-    films = sorted((folder / codec).rglob("*.mp4"))
+    """Measure images/s of the decoder alone, an upper bound for the import."""
+    videos = sorted((folder / codec).rglob("*.mp4"))
 
-    def run(film: Path) -> int:
-        with av.open(str(film)) as container:
+    def run(video: Path) -> int:
+        with av.open(str(video)) as container:
             return sum(1 for _ in container.decode(video=0))
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         start = time.perf_counter()
-        pictures = sum(pool.map(run, films))
-        rate = pictures / (time.perf_counter() - start)
-    size = sum(film.stat().st_size for film in films) / pictures / 1000
-    return {"codec": codec, "kB/picture": size, "decoded/s": rate}
+        images = sum(pool.map(run, videos))
+        rate = images / (time.perf_counter() - start)
+    size = sum(video.stat().st_size for video in videos) / images / 1000
+    return {"codec": codec, "kB/image": size, "decoded/s": rate}
 
 
 def statistics(steps: int) -> dict[str, Any]:
-    """Time of the normalisation statistics of so many steps."""
+    """Time the computation of normalisation statistics over this many steps."""
     rows = np.random.default_rng(0).standard_normal((steps, 7), np.float32)
-    every = np.ones(steps, bool)
-    call = lambda: Statistics.measure(rows, rows, every, slots=range(7), dim=7)  # noqa: E731
+    valid = np.ones(steps, bool)
+    call = lambda: Statistics.measure(rows, rows, valid, slots=range(7), dim=7)  # noqa: E731
     return {"steps": float(steps), "statistics s": seconds(call)}
 
 
@@ -193,9 +193,9 @@ def main() -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--steps", type=int, default=5000, help="in the cache (%(default)s)")
-    parser.add_argument("--batches", type=int, default=200, help="that are timed (%(default)s)")
-    parser.add_argument("--episodes", type=int, default=4, help="imported (%(default)s)")
-    parser.add_argument("--json", type=Path, help="also write the numbers here")
+    parser.add_argument("--batches", type=int, default=200, help="to time (%(default)s)")
+    parser.add_argument("--episodes", type=int, default=4, help="to import (%(default)s)")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -208,15 +208,15 @@ def main() -> None:
             record(folder / codec, options.episodes, codec)
         imported = [importing(folder, codec, size) for codec in CODECS for size in (0, 224)]
         decoded = [decoding(folder, codec) for codec in CODECS]
-    found = {"cache": read, f"LeRobot {WIDTH}x{HEIGHT}": imported, "decoder": decoded}
-    found["columns"] = [statistics(1_000_000)]
-    where = machine("numpy", "grain", "av")
+    tables = {"cache": read, f"LeRobot {WIDTH}x{HEIGHT}": imported, "decoder": decoded}
+    tables["statistics"] = [statistics(1_000_000)]
+    name = machine("numpy", "grain", "av")
     console = Console()
-    console.print(where)
-    for title, rows in found.items():
+    console.print(name)
+    for title, rows in tables.items():
         print_table(console, rows, title)
     if options.json:
-        options.json.write_text(json.dumps({"machine": where, **found}, indent=1))
+        options.json.write_text(json.dumps({"machine": name, **tables}, indent=1))
 
 
 if __name__ == "__main__":

@@ -1,11 +1,12 @@
-"""One token through LoRA-SP layers: the dense bank against gathered active directions.
+"""Latency of LoRA-SP layers for one token: the whole bank, or only gathered active directions.
 
     python -m benchmarks.decoding --json decoding.json
     python -m benchmarks.decoding --dtype float32 --shapes 1024x1024 --ranks 128 512   # on a CPU
 
-Several layers with arrays of their own run in one program, so that neither a launch nor a cache
-decides. Capacities are shares of R; the router's start keeps about 0.9 R, so the gather drops what
-exceeds its room: the time does not depend on it. "gain" is dense / gathered time.
+Several layers with separate arrays run in one program, so that neither launch overhead nor cache
+hits dominate. Capacities are fractions of R. The initial router keeps about 0.9 R, so the gather
+drops directions beyond its capacity, which does not change the time. "gain" is dense / gathered
+time.
 """
 
 import argparse
@@ -25,7 +26,7 @@ SHARES = (2, 4, 8)
 
 
 def measure(shape: tuple[int, int], rank: int, dtype: str, num_layers: int) -> dict[str, Any]:
-    """Microseconds a layer, dense and by capacity."""
+    """Measure microseconds per layer, dense and for each capacity."""
     method = LoRASP(rank=rank)
 
     def draw(key: jax.Array) -> Any:
@@ -39,8 +40,8 @@ def measure(shape: tuple[int, int], rank: int, dtype: str, num_layers: int) -> d
     dense_params, prepared = map(list, zip(*pairs, strict=True))
     x = jax.random.normal(jax.random.key(1), (shape[0],)).astype(dtype)
     dense = jax.jit(lambda layers, x: [method.delta(p, x)[0] for p in layers])
-    before = best(lambda: dense(dense_params, x), calls=QUEUED) / num_layers
-    row: dict[str, Any] = {"layer": "x".join(map(str, shape)), "R": rank, "dense us": before * 1e6}
+    base = best(lambda: dense(dense_params, x), calls=QUEUED) / num_layers
+    row: dict[str, Any] = {"layer": "x".join(map(str, shape)), "R": rank, "dense us": base * 1e6}
     for share in SHARES:
         capacity = max(rank // share, 1)
         gathered = jax.jit(
@@ -49,7 +50,7 @@ def measure(shape: tuple[int, int], rank: int, dtype: str, num_layers: int) -> d
             ]
         )
         seconds = best(lambda run=gathered: run(prepared, x), calls=QUEUED) / num_layers
-        row |= {f"R/{share} us": seconds * 1e6, f"R/{share} gain": before / seconds}
+        row |= {f"R/{share} us": seconds * 1e6, f"R/{share} gain": base / seconds}
     return row
 
 
@@ -60,7 +61,7 @@ def main() -> None:
     parser.add_argument("--ranks", nargs="+", type=int, default=[128, 512, 2048])
     parser.add_argument("--dtype", default="bfloat16", choices=["bfloat16", "float32"])
     parser.add_argument("--layers", type=int, default=8)
-    parser.add_argument("--json", type=Path, help="also write the numbers here")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args()
     shapes = [tuple(map(int, shape.split("x"))) for shape in options.shapes]
     rows = [
@@ -68,11 +69,11 @@ def main() -> None:
         for d_in, d_out in shapes
         for rank in options.ranks
     ]
-    where = machine("jax", "jaxlib")
+    name = machine("jax", "jaxlib")
     console = Console()
-    print_table(console, rows, f"one token, {options.dtype}, {where}")
+    print_table(console, rows, f"one token, {options.dtype}, {name}")
     if options.json:
-        options.json.write_text(json.dumps({"machine": where, "rows": rows}, indent=1))
+        options.json.write_text(json.dumps({"machine": name, "rows": rows}, indent=1))
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""How fast the environments are, next to MuJoCo's C engine and MuJoCo Playground on this machine.
+"""Speed of the environments, compared with MuJoCo's C engine and MuJoCo Playground on this machine.
 
     python -m benchmarks.envs --batches 256 1024 4096 --json envs.json
 
-For each task, backend and batch: seconds to compile (`--jobs` programs at once), physics steps/s,
-control steps/s without and with ("seeing") the pictures of both cameras, images/s of the ray caster
-alone (hard shadows, two cameras), memory, and the ratio to MuJoCo's C engine with a thread a core
-on the same scene. Actions are noise around the start pose. Inputs are built under jit, everything
-is warmed up twice, the best of three calls counts.
+For each task, backend and batch size: compile time (`--jobs` programs at once), physics steps/s,
+control steps/s without and with rendering both cameras ("control+images/s"), images/s of the ray
+caster alone (hard shadows, two cameras), memory, and the speed relative to MuJoCo's C engine on the
+same scene with one thread per core ("over C"). Actions are noise around the start pose. Inputs are
+built under jit; everything is warmed up twice; the best of three calls counts.
 """
 
 import argparse
@@ -36,15 +36,15 @@ from envs.rendering import renderer
 from envs.scene import placing
 from envs.state import State
 
-CONTROL_STEPS = 10  # to a timed call
-C_STEPS = 500  # physics steps to a timed call of the C engine
-PICTURE_SIZES = (64, 128)  # [px] of the renderer's columns
-PLAYGROUND, PLAYGROUND_CONTACTS = "PandaPickCube", 24  # a world's contacts, its own default
+CONTROL_STEPS = 10  # per timed call
+C_STEPS = 500  # physics steps per timed call of the C engine
+IMAGE_SIZES = (64, 128)  # [px] of the renderer's columns
+PLAYGROUND, PLAYGROUND_CONTACTS = "PandaPickCube", 24  # contacts per world: Playground's default
 
 
 @dataclasses.dataclass
 class Case:
-    """One row of the table to be: an environment, and the program that steps it."""
+    """One row of the table: an environment, and the compiled program that steps it."""
 
     env: Env
     state: State
@@ -53,7 +53,7 @@ class Case:
 
     @classmethod
     def prepare(cls, options: argparse.Namespace, task: str, backend: Any, batch: int) -> Self:
-        """Everything compiled."""
+        """Make the environment and compile its program."""
         env = envs.make(
             task, options.robot, num_envs=batch, image_size=options.image_size, backend=backend
         )
@@ -71,35 +71,35 @@ class Case:
         return cls(env, state, steps, time.perf_counter() - start)
 
     def measure(self, reference: float) -> dict[str, Any]:
-        """The row, given the C engine's physics steps/s."""
+        """Measure the row; `reference` is the C engine's physics steps/s."""
         env = self.env
         start = time.perf_counter()
         jax.block_until_ready(self.steps(self.state, jax.random.key(1)))
         first = time.perf_counter() - start  # Warp compiles its kernels here
-        blind = best(lambda: self.steps(self.state, jax.random.key(1))) / CONTROL_STEPS
-        looking = best(lambda: env.observe(self.state))
-        physics_steps = env.num_envs * round(env.control_dt / env.physics_dt) / blind
+        stepping = best(lambda: self.steps(self.state, jax.random.key(1))) / CONTROL_STEPS
+        rendering = best(lambda: env.observe(self.state))
+        physics_steps = env.num_envs * round(env.control_dt / env.physics_dt) / stepping
         return {
             "task": env.task.name,
             "backend": env.physics.backend,
             "batch": env.num_envs,
-            "compile s": self.compile_seconds + first - CONTROL_STEPS * blind,
+            "compile s": self.compile_seconds + first - CONTROL_STEPS * stepping,
             "physics/s": physics_steps,
-            "control/s": env.num_envs / blind,
-            "seeing/s": env.num_envs / (blind + looking),
-            **{f"images/s, {n} px": time_pictures(env, self.state, n) for n in PICTURE_SIZES},
+            "control/s": env.num_envs / stepping,
+            "control+images/s": env.num_envs / (stepping + rendering),
+            **{f"images/s, {n} px": time_images(env, self.state, n) for n in IMAGE_SIZES},
             "MiB": self.memory(),
             "over C": physics_steps / reference,
         }
 
     def memory(self) -> float:
-        """What the program needs beside its arguments, and what Warp has taken, in MiB."""
+        """Return the program's temporary memory plus Warp's allocations, in MiB."""
         needed: int = self.steps.memory_analysis().temp_size_in_bytes
         return needed / 2**20 + measuring.warp_mib(self.env.physics.backend)
 
 
-def time_pictures(env: Env, state: State, size: int) -> float:
-    """Images/s of the renderer alone, all worlds and both cameras, `size` x `size` px."""
+def time_images(env: Env, state: State, size: int) -> float:
+    """Measure images/s of the renderer alone: all worlds, both cameras, `size` x `size` px."""
     data = state.data
     poses = (data.geom_xpos, data.geom_xmat, data.cam_xpos, data.cam_xmat)
     draw = jax.jit(
@@ -111,7 +111,7 @@ def time_pictures(env: Env, state: State, size: int) -> float:
 
 
 def mujoco_c(env: Env, state: State) -> float:
-    """Physics steps/s of MuJoCo's C engine from the same start, one thread a core."""
+    """Measure physics steps/s of MuJoCo's C engine from the same start, one thread per core."""
     cores = os.cpu_count() or 1
     model = placing.placed(env.model, state.info["layout"], 0)
     data = [mujoco.MjData(model) for _ in range(cores)]
@@ -127,15 +127,15 @@ def mujoco_c(env: Env, state: State) -> float:
 
 
 def playground(backend: Any, batch: Any) -> tuple[Callable[[], Any], int]:
-    """MuJoCo Playground's environment, with room for each world's contacts.
+    """Compile MuJoCo Playground's environment, with enough memory for each world's contacts.
 
     Returns:
-        A compiled call, and the physics steps that it makes in all worlds.
+        A compiled call, and the number of physics steps it makes in all worlds.
     """
     from mujoco_playground import registry  # pyright: ignore[reportMissingImports]
 
-    room = PLAYGROUND_CONTACTS * batch
-    overrides = {"impl": backend, "naconmax": room, "naccdmax": room}
+    contacts = PLAYGROUND_CONTACTS * batch
+    overrides = {"impl": backend, "naconmax": contacts, "naccdmax": contacts}
     env = registry.load(PLAYGROUND, config_overrides=overrides)
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), batch))
 
@@ -152,7 +152,7 @@ def playground(backend: Any, batch: Any) -> tuple[Callable[[], Any], int]:
 
 
 def measure_playground(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """The rows of MuJoCo Playground, one a backend and batch size."""
+    """Yield the rows of MuJoCo Playground, one per backend and batch size."""
     wanted = list(itertools.product(options.backends, options.batches))
     with ThreadPoolExecutor(options.jobs) as pool:
         prepared = list(pool.map(lambda names: playground(*names), wanted))
@@ -161,7 +161,7 @@ def measure_playground(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def measure(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """The rows, one a task, backend and batch size."""
+    """Yield the rows, one per task, backend and batch size."""
     wanted = itertools.product(options.tasks, options.backends, options.batches)
     references: dict[str, float] = {}
     with ThreadPoolExecutor(options.jobs) as pool:
@@ -177,7 +177,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--tasks", nargs="+", default=["open_pot", "pour", "press", "pick_place"])
     parser.add_argument("--robot", default="piper")
-    parser.add_argument("--backends", nargs="+", help="default: jax, and warp where it is picked")
+    parser.add_argument("--backends", nargs="+", help="default: jax, and warp if it is the default")
     parser.add_argument("--batches", nargs="+", type=int, default=[16])
     parser.add_argument("--image-size", type=int, default=64)
     parser.add_argument("--jobs", type=int, default=1, help="programs to compile at once")
@@ -186,7 +186,7 @@ def main() -> None:
     options.backends = options.backends or sorted({"jax", physics.default_backend()})
     console = Console()
     machine = measuring.machine("jax", "mujoco", "mujoco-mjx")
-    machine += f", pictures {options.image_size} px"
+    machine += f", images {options.image_size} px"
     console.print(machine)
     rows = []
     for row in measure(options):
@@ -196,14 +196,14 @@ def main() -> None:
     print_table(console, [{k: v for k, v in row.items() if k not in images} for row in rows])
     names = ["task", "backend", "batch", *images]
     print_table(console, [{name: row[name] for name in names} for row in rows])
-    found: dict[str, Any] = {"machine": machine, "rows": rows}
+    results: dict[str, Any] = {"machine": machine, "rows": rows}
     if importlib.util.find_spec("mujoco_playground"):
-        found[PLAYGROUND] = list(measure_playground(options))
-        print_table(console, found[PLAYGROUND], f"MuJoCo Playground's {PLAYGROUND}")
+        results[PLAYGROUND] = list(measure_playground(options))
+        print_table(console, results[PLAYGROUND], f"MuJoCo Playground's {PLAYGROUND}")
     else:
-        console.print(f"mujoco_playground is not installed: no figures of its {PLAYGROUND}")
+        console.print(f"mujoco_playground is not installed: no figures for its {PLAYGROUND}")
     if options.json:
-        options.json.write_text(json.dumps(found, indent=1))
+        options.json.write_text(json.dumps(results, indent=1))
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""Whether worlds can go on for ever: randomised expert episodes one after the other.
+"""Endurance test: many randomised expert episodes in a row, checking physics and memory.
 
     python -m benchmarks.long_run --tasks pour --backend warp --episodes 200 --num-envs 256
 
-For each task, after each fifth of the episodes: the share that the experts solved, worlds that
-broke (were ended because a position or velocity was not finite), and the memory of host and device.
-The exit code is 1 where a world broke or memory grew by more than 2 % after the first fifth.
+For each task, after each fifth of the episodes: the share of episodes solved, the number of broken
+worlds (ended because a position or velocity was not finite), and the memory of host and device. The
+exit code is 1 if a world broke, or if memory grew by more than 2 % after the first fifth.
 """
 
 import argparse
@@ -29,19 +29,19 @@ from envs.physics import physics
 from envs.state import State
 
 PARTS = 5
-MOST_GROWTH = 1.02
+MAX_GROWTH = 1.02  # of memory after the first part; own choice, above the noise of allocators
 
 
 @dataclasses.dataclass
-class Found:
-    """What `run` has seen so far.
+class Report:
+    """Results of `run` so far.
 
     Attributes:
-        episodes: of every world.
-        success: share that the experts solved.
-        broken: those that were ended because a value was not finite.
-        memory: [MiB] by its owner.
-        seconds: since the first.
+        episodes: episodes per world.
+        success: share of episodes that the expert solved.
+        broken: number of worlds that broke.
+        memory: memory by owner [MiB].
+        seconds: time since the first episode.
     """
 
     episodes: int
@@ -51,26 +51,26 @@ class Found:
     seconds: float
 
     def __str__(self) -> str:
-        held = ", ".join(f"{name} {mib:.1f}" for name, mib in self.memory.items())
+        memory = ", ".join(f"{name} {mib:.1f}" for name, mib in self.memory.items())
         return (
             f"{self.episodes} episodes in {self.seconds:.0f} s, success {self.success:.4f}, "
-            f"broken {self.broken}, MiB: {held}"
+            f"broken {self.broken}, MiB: {memory}"
         )
 
 
-def passed(parts: list[Found]) -> bool:
-    """Whether nothing broke, and no memory grew after the first part."""
+def passed(parts: list[Report]) -> bool:
+    """Return whether no world broke and no memory grew after the first part."""
     first, last = parts[0].memory, parts[-1].memory
-    return not parts[-1].broken and all(last[k] <= MOST_GROWTH * first[k] for k in first)
+    return not parts[-1].broken and all(last[k] <= MAX_GROWTH * first[k] for k in first)
 
 
-def run(env: Env, episodes: int) -> Iterator[Found]:
-    """Consecutive episodes of the expert in all worlds, each with a picture at its end."""
+def run(env: Env, episodes: int) -> Iterator[Report]:
+    """Run consecutive expert episodes in all worlds, rendering at the end of each."""
     ranges = Randomization.typical()
 
     @jax.jit
     def episode(state: State, key: jax.Array) -> tuple[State, dict[str, jax.Array]]:
-        # A world whose expert has run out of waypoints, but not of the task's time, restarts too.
+        # Restart all worlds, including those whose expert finished before the time limit.
         state = dataclasses.replace(state, done=jnp.ones(env.num_envs, bool))
         state = env.reset_done(state, key, ranges)
         plan = expert.plan(env, state, key)
@@ -79,41 +79,41 @@ def run(env: Env, episodes: int) -> Iterator[Found]:
             return env.step(state, expert.act(env, plan, state)), None
 
         state = jax.lax.scan(body, state, length=env.expert_steps)[0]
-        pictures = {name: image.mean() for name, image in env.observe(state)["image"].items()}
-        return state, pictures | {k: state.info[k].sum() for k in ("success", "broken")}
+        images = {name: image.mean() for name, image in env.observe(state)["image"].items()}
+        return state, images | {k: state.info[k].sum() for k in ("success", "broken")}
 
     state, begun = env.reset(jax.random.key(0), ranges), time.perf_counter()
     success = broken = 0
     for number in range(1, episodes + 1):
-        state, seen = episode(state, jax.random.key(number))
-        success, broken = success + int(seen["success"]), broken + int(seen["broken"])
+        state, sums = episode(state, jax.random.key(number))
+        success, broken = success + int(sums["success"]), broken + int(sums["broken"])
         if number * PARTS // episodes > (number - 1) * PARTS // episodes:
             share, seconds = success / (env.num_envs * number), time.perf_counter() - begun
-            yield Found(number, share, broken, memory(env), seconds)
+            yield Report(number, share, broken, memory(env), seconds)
 
 
 def memory(env: Env) -> dict[str, float]:
-    """What the process holds now, in MiB."""
+    """Return the memory in use by owner [MiB]."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
-    held: dict[str, float] = {"host": pages * 4096 / 2**20}
-    if of_device := jax.devices()[0].memory_stats():  # None on CPU
-        held["JAX"] = of_device["bytes_in_use"] / 2**20
+    used: dict[str, float] = {"host": pages * 4096 / 2**20}
+    if stats := jax.devices()[0].memory_stats():  # None on CPU
+        used["JAX"] = stats["bytes_in_use"] / 2**20
     if mib := measuring.warp_mib(env.physics.backend):
-        held["Warp"] = mib
-    return held
+        used["Warp"] = mib
+    return used
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run, print; the exit code."""
+    """Run and print; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--tasks", nargs="+", default=["open_pot", "pour", "press", "pick_place"])
     parser.add_argument("--robot", default="piper")
-    parser.add_argument("--backend", help="default: warp where it is picked, else jax")
+    parser.add_argument("--backend", help="default: warp or jax, by device")
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--num-envs", type=int, default=256)
     options = parser.parse_args(arguments)
     if options.episodes < PARTS:
-        parser.error(f"--episodes must be at least {PARTS}, to see whether memory grows")
+        parser.error(f"--episodes must be at least {PARTS} to measure the growth of memory")
     cache.enable()
     backend: Any = options.backend or physics.default_backend()
     console, good = Console(soft_wrap=True), True

@@ -1,4 +1,4 @@
-"""What all benchmarks share: the clock, the machine's name, tables that fit a terminal."""
+"""Shared by all benchmarks: timing, machine description, compact tables."""
 
 import importlib.metadata
 import os
@@ -14,7 +14,10 @@ from rich.table import Table
 
 
 def best(call: Callable[[], Any], *, calls: int = 1, repeats: int = 3) -> float:
-    """Seconds of one of `calls` that are queued together, the fastest of `repeats`, after two."""
+    """Time `calls` queued together; return seconds per call, the best of `repeats`.
+
+    Two repeats to warm up are not counted.
+    """
     seconds = []
     for _ in range(2 + repeats):
         start = time.perf_counter()
@@ -24,14 +27,14 @@ def best(call: Callable[[], Any], *, calls: int = 1, repeats: int = 3) -> float:
 
 
 def machine(*packages: str) -> str:
-    """Device, cores and versions, in words."""
+    """Describe device, cores and package versions."""
     versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)
     device = jax.devices()[0].device_kind
     return f"{device}, {os.cpu_count()} cores, Python {platform.python_version()}, {versions}"
 
 
 def warp_mib(backend: str) -> float:
-    """What Warp has taken of the device for its physics, in MiB; 0 where another engine runs."""
+    """Return the device memory that Warp has allocated, in MiB; 0 for other engines."""
     if backend != "warp" or jax.default_backend() != "gpu":
         return 0.0
     import warp
@@ -40,7 +43,7 @@ def warp_mib(backend: str) -> float:
 
 
 def print_table(console: Console, rows: list[dict[str, Any]], title: str = "") -> None:
-    """One line a row, close together."""
+    """Print one line per row, with narrow columns."""
     table = Table(title=title, box=None, padding=(0, 1, 0, 0))
     for name in rows[0]:
         table.add_column(escape(name), no_wrap=True, justify="right")
@@ -50,7 +53,7 @@ def print_table(console: Console, rows: list[dict[str, Any]], title: str = "") -
 
 
 def text(value: Any) -> str:
-    """Three digits of a number."""
+    """Format a value; floats get three significant digits."""
     if not isinstance(value, float):
         return str(value)
     for size, letter in ((1e6, " M"), (1e3, " k")):

@@ -1,18 +1,20 @@
-"""The parameter columns of Tables I and II of the paper (arXiv 2603.07404), counted as it did.
+"""Reproduce the parameter columns of Tables I and II of the paper (arXiv 2603.07404).
 
-Found from its percentages, to the last printed digit; the paper itself does not say it:
+The paper does not say how it counts. These rules reproduce its percentages to the last digit:
 
-- adapters sit on every linear layer of the PyTorch models (422 in pi0, 303 in SmolVLA), lm_heads
-  included, which no computation reads; the patch embedding is a convolution there;
-- the total has pi0's expert lm_head too, which no published file of openpi's holds: 3,501,372,176
-  and 450,046,176; "Trainable/Total" is adapters / (total + adapters);
-- LoRA-MoE is 4 experts of rank 32; AdaLoRA has rank 128 at the start, a diagonal more than LoRA;
-- LoRA-SP is `LoRASP.paper()`, a router 4 wide, and leaves out the five linear maps around the
-  towers. Of constant widths 4 alone fits both backbones, and with those five 17.1 would be 17.2.
-  Its released code, a router as wide as the bank, gives 12.0 and 23.0 instead of 9.2 and 17.1.
+- Adapters are on every linear layer of the PyTorch models (422 in pi0, 303 in SmolVLA), including
+  the unused lm_heads; there the patch embedding is a convolution.
+- The total includes pi0's expert lm_head, which is in no checkpoint published by openpi:
+  3,501,372,176 and 450,046,176. "Trainable/Total" is adapters / (total + adapters).
+- LoRA-MoE has 4 experts of rank 32. AdaLoRA starts at rank 128, with a diagonal more than LoRA.
+- LoRA-SP is `LoRASP.paper()`, with a router of width 4, and leaves out the five linear maps around
+  the towers. 4 is the only constant width that fits both backbones; with those five maps 17.1 would
+  be 17.2. The released code, with a router as wide as the bank, gives 12.0 and 23.0 instead of 9.2
+  and 17.1.
 
-Every number of the two columns is given. Active ranks and success were measured, not counted, and
-pi0's LoRA-SP row of success differs between the two tables (80 and 60 % for opening the pot).
+All numbers of both columns are covered. Active ranks and success rates are measurements, so they
+are not. The success row of LoRA-SP on pi0 differs between the tables (80 and 60 % for opening the
+pot).
 """
 
 import math
@@ -30,7 +32,7 @@ from lorasp_jax.models.smolvla import SmolVLAConfig
 from lorasp_jax.peft import AdaLoRA, FullFineTuning, LoRA, LoRAMoE, LoRASP, Method
 
 Shapes = dict[str, tuple[int, ...]]
-"""[I, O], or [L, I, O] of a stack, by path."""
+"""Path -> [I, O], or [L, I, O] for a stack."""
 
 STRATEGIES: dict[str, dict[str, Method]] = {
     "I": {
@@ -47,13 +49,13 @@ STRATEGIES: dict[str, dict[str, Method]] = {
         "LoRA-SP": LoRASP.paper(),
     },
 }
-"""The rows of each table, for either backbone."""
+"""Table -> rows, the same for both backbones."""
 
 BACKBONES: dict[str, BackboneConfig] = {"π0": Pi0Config.base(), "SmolVLA": SmolVLAConfig.base()}
 
 
 def count(config: BackboneConfig, method: Method) -> Counts:
-    """What trains and all parameters, as the paper counts; from shapes, nothing is allocated.
+    """Count trainable and total parameters as the paper does, from shapes, without allocating.
 
     Args:
         config: a backbone's sizes.
@@ -71,17 +73,17 @@ def count(config: BackboneConfig, method: Method) -> Counts:
 
 
 def parameter_column(table: str) -> dict[tuple[str, str], str]:
-    """The column "Trainable/Total (%)" of table "I" or "II" as printed, by (backbone, strategy)."""
-    found = {}
+    """Return "Trainable/Total (%)" of table "I" or "II" as printed, by (backbone, strategy)."""
+    column = {}
     for backbone, config in BACKBONES.items():
         for strategy, method in STRATEGIES[table].items():
             trainable, total = count(config, method)
-            found[backbone, strategy] = f"{100 * trainable / total:.1f}"
-    return found
+            column[backbone, strategy] = f"{100 * trainable / total:.1f}"
+    return column
 
 
 def linear_layers(config: BackboneConfig) -> tuple[Shapes, int]:
-    """What the paper adapts, by path, and the model's number of parameters without adapters."""
+    """Return the layers that the paper adapts, and the parameter count without adapters."""
     model = nnx.eval_shape(lambda: config.create(nnx.Rngs(0)))
     total = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(nnx.state(model, nnx.Param)))
     shapes = {
@@ -97,7 +99,7 @@ def linear_layers(config: BackboneConfig) -> tuple[Shapes, int]:
 
 
 def _size(method: Method, d_in: int, d_out: int) -> int:
-    """Parameters of one adapter."""
+    """Count the parameters of one adapter."""
     kernel = jax.ShapeDtypeStruct((d_in, d_out), jnp.float32)
     params = jax.eval_shape(lambda key: method.init(key, kernel)[0], jax.random.key(0))
     return sum(leaf.size for leaf in jax.tree.leaves(params))

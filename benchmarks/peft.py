@@ -1,15 +1,15 @@
-"""What adapters cost: one dense layer, bare and under every method, forward and with gradients.
+"""Cost of adapters: one dense layer, bare and with every method, forward and with gradients.
 
     python -m benchmarks.peft --json peft.json
     python -m benchmarks.peft --tokens 1024 --shapes 256x2048 2048x256 --dtype float32   # on a CPU
 
-For each shape [I, O]: the frozen layer alone ("bare"), LoRA written the usual way (`usual_lora`,
+For each shape [I, O]: the frozen layer alone ("bare"), LoRA as usually written (`usual_lora`,
 automatic differentiation of x W + scale (x A) B), and this project's methods at rank R, with their
-losses. Gradients are those of training: with respect to the input and the adapter. The ratios are
-to the usual LoRA in the same run. Memory is what the compiled program needs beside its arguments.
-Then layers of one input, "I:O,O,O", called one by one and together; at last the energy gate next to
-a copy of its scores. Inputs are made under jit, everything is warmed up twice, calls are queued ten
-together.
+losses. Gradients are those of training, with respect to the input and the adapter. Ratios are
+relative to the usual LoRA in the same run. Memory is that of the compiled program without its
+arguments. Then layers that share an input, "I:O,O,O", called one by one and together; finally the
+energy gate, compared with a copy of its scores. Inputs are made under jit, everything is warmed up
+twice, and ten calls are queued together.
 """
 
 import argparse
@@ -29,23 +29,23 @@ from lorasp_jax.kernels.energy_gate import energy_gate
 from lorasp_jax.peft._method import apply_together
 
 SHAPES = ((2048, 16384), (16384, 2048), (2048, 2048), (1152, 4304))
-# Query, key and value of pi0's language expert and vision tower; gate and up of a smaller MLP.
+# Query, key and value of pi0's language model and vision tower; gate and up of a smaller MLP.
 TOGETHER = ((2048, (2048, 256, 256)), (1152, (1152, 1152, 1152)), (1024, (4096, 4096)))
 QUEUED = 10
-COPIES = 20  # of the gate in one program: one alone takes no longer than its launch
+COPIES = 20  # of the gate per program: a single one is dominated by its launch
 LOSS_WEIGHT = 1e-2
 
 Layer = Callable[[Any, jax.Array, Any], tuple[Any, Any]]
 
 
 def bare(params: Any, x: jax.Array, kernel: jax.Array) -> tuple[jax.Array, Any]:
-    """The frozen layer."""
+    """Apply only the frozen layer."""
     del params
     return x @ kernel, {}
 
 
 def usual_lora(params: Any, x: jax.Array, kernel: jax.Array) -> tuple[jax.Array, Any]:
-    """LoRA as it is usually written."""
+    """Apply LoRA as it is usually written."""
     a, b = (params[name].astype(x.dtype) for name in ("lora_a", "lora_b"))
     return x @ kernel + 2.0 * ((x @ a) @ b), {}
 
@@ -65,7 +65,7 @@ def layers(rank: int) -> Iterator[tuple[str, Layer, Any]]:
 
 
 def make(name: str, rank: int) -> peft.Method:
-    """A method with `rank` directions in all."""
+    """Create a method with `rank` directions in total."""
     fields: dict[str, dict[str, Any]] = {
         "full": {},
         "lora_moe": {"rank": rank // 4},
@@ -74,7 +74,7 @@ def make(name: str, rank: int) -> peft.Method:
 
 
 def inputs(method: peft.Method, shape: tuple[int, int], tokens: int, dtype: str) -> Any:
-    """Parameters, x [tokens, I], kernel [I, O] and the gradient of y, made on the device."""
+    """Draw parameters, x [tokens, I], kernel [I, O] and the gradient of y, on the device."""
 
     @jax.jit
     def draw(key: jax.Array) -> Any:
@@ -88,7 +88,7 @@ def inputs(method: peft.Method, shape: tuple[int, int], tokens: int, dtype: str)
 
 
 def with_gradients(layer: Layer, params: Any, x: jax.Array, kernel: Any, g: Any) -> Any:
-    """y and the gradients of x and the adapter, the auxiliary losses taken along."""
+    """Compute y and the gradients of x and the adapter, auxiliary losses included."""
 
     def run(params: Any, x: jax.Array) -> tuple[jax.Array, jax.Array]:
         y, losses = layer(params, x, kernel)
@@ -101,7 +101,7 @@ def with_gradients(layer: Layer, params: Any, x: jax.Array, kernel: Any, g: Any)
 def measure_together(
     options: argparse.Namespace, d_in: int, d_outs: tuple[int, ...]
 ) -> Iterator[dict[str, Any]]:
-    """Layers of one input, one by one and together."""
+    """Measure layers that share an input, one by one and together."""
     for name in ("lora", "lora_sp"):
         method = make(name, options.rank)
         drawn = [inputs(method, (d_in, d_out), options.tokens, options.dtype) for d_out in d_outs]
@@ -129,14 +129,14 @@ def measure_together(
 
 
 def _summed(layers: Callable[..., Any], *arguments: Any) -> tuple[list[jax.Array], Any]:
-    """The outputs of several layers, and their losses under the names of one."""
-    found = layers(*arguments)
-    losses = (dict(aux.losses) for _, aux in found)
-    return [y for y, _ in found], jax.tree.map(lambda *x: sum(x), *losses)
+    """Return the outputs of several layers, and the sums of their losses by name."""
+    outputs = layers(*arguments)
+    losses = (dict(aux.losses) for _, aux in outputs)
+    return [y for y, _ in outputs], jax.tree.map(lambda *x: sum(x), *losses)
 
 
 def measure(options: argparse.Namespace, shape: tuple[int, int]) -> Iterator[dict[str, Any]]:
-    """The rows of one shape."""
+    """Yield the rows of one shape."""
     base: dict[str, float] = {}
     for name, layer, method in layers(options.rank):
         params, x, kernel, g = inputs(method, shape, options.tokens, options.dtype)
@@ -163,7 +163,7 @@ def measure(options: argparse.Namespace, shape: tuple[int, int]) -> Iterator[dic
 
 
 def measure_gate(options: argparse.Namespace) -> dict[str, Any]:
-    """The gate's time next to that of a copy of its scores, fp32 [tokens, R]."""
+    """Measure the gate, and a copy of its scores for comparison, fp32 [tokens, R]."""
     keys = jax.random.split(jax.random.key(0), COPIES)
     draw = jax.jit(jax.vmap(lambda key: jax.random.normal(key, (options.tokens, options.rank))))
     scores = [*jax.nn.softplus(draw(keys))]
@@ -199,22 +199,22 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args()
     console = Console(soft_wrap=True)
-    found: dict[str, Any] = {"machine": machine("jax"), "rows": []}
+    results: dict[str, Any] = {"machine": machine("jax"), "rows": []}
     console.print(
-        f"{found['machine']}; {options.tokens} tokens, rank {options.rank}, {options.dtype}"
+        f"{results['machine']}; {options.tokens} tokens, rank {options.rank}, {options.dtype}"
     )
     for shape in options.shapes:
         rows = list(measure(options, shape))
         print_table(console, rows)
-        found["rows"] += rows
-    found["together"] = [
+        results["rows"] += rows
+    results["together"] = [
         row for case in options.together for row in measure_together(options, *case)
     ]
-    print_table(console, found["together"])
-    found["gate"] = measure_gate(options)
-    print_table(console, [found["gate"]])
+    print_table(console, results["together"])
+    results["gate"] = measure_gate(options)
+    print_table(console, [results["gate"]])
     if options.json:
-        options.json.write_text(json.dumps(found, indent=1))
+        options.json.write_text(json.dumps(results, indent=1))
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""Training on 1, 2 and 4 devices of one host: LoRA-SP on every linear layer, random weights.
+"""Scaling of training to several devices of one host: LoRA-SP on all linear layers, random weights.
 
     python -m benchmarks.scaling --devices 1 2 4 --json scaling.json
     python -m benchmarks.scaling --devices 1 2 --sizes nano --batch 4 --rank 8 --dtype float32
 
-Every device has the same share of the batch, whatever their number ("batch"). "data": each device
-holds everything; "fsdp": all of them together hold base, adapters and the optimizer's state, and
-gather each layer's weights when they come to it. "of linear" is the rate over that of as many
-devices alone, and GiB what the program needs on each device.
+The batch per device ("batch") is constant. "data" replicates all weights on each device; "fsdp"
+shards base, adapters and optimizer state over the devices and gathers each layer's weights when
+needed. "of linear" is the rate relative to that of one device times their number; GiB is the memory
+of the program on each device.
 """
 
 import argparse
@@ -29,32 +29,32 @@ BATCH = {"nano": 512, "small": 512, "base": 32}
 
 
 def layouts(devices: list[int]) -> list[tuple[str, int]]:
-    """Which are measured, one device first."""
+    """Return (layout, number of devices) to measure, one device first."""
     several = sorted(set(devices) - {1})
     return [("data", 1), *((name, n) for n in several for name in ("data", "fsdp"))]
 
 
 def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """One for each layout; all of them are compiled at once."""
+    """Yield one row per layout; all programs are compiled in parallel."""
     each = options.batch or BATCH[options.size]
     config = backbones.sized(options.backbone, options, options.remat)
-    alone = backbones.run_config(peft.LoRASP(rank=options.rank), ("all-linear",), each)
+    single = backbones.run_config(peft.LoRASP(rank=options.rank), ("all-linear",), each)
 
     def compiled(layout: tuple[str, int]) -> backbones.Step:
         name, number = layout
         fsdp = number if name == "fsdp" else 1
         mesh = meshes.make_mesh(fsdp, jax.devices()[:number])
-        optim = dataclasses.replace(alone.optim, batch_size=number * each)
-        return backbones.Step(config, dataclasses.replace(alone, optim=optim, fsdp=fsdp), mesh)
+        optim = dataclasses.replace(single.optim, batch_size=number * each)
+        return backbones.Step(config, dataclasses.replace(single, optim=optim, fsdp=fsdp), mesh)
 
-    wanted, one = layouts(options.devices), None
+    wanted, single_rate = layouts(options.devices), None
     with ThreadPoolExecutor(options.threads) as pool:
-        drawn = pool.submit(backbones.arrays, config, alone)
+        drawn = pool.submit(backbones.arrays, config, single)
         steps = dict(zip(wanted, pool.map(compiled, wanted), strict=True))
     for name, number in wanted:
         step = steps.pop((name, number)).load(*drawn.result()[1:])
         rate = number * each / best(step, calls=options.calls)
-        one = one or rate
+        single_rate = single_rate or rate
         yield {
             "backbone": options.backbone,
             "size": options.size,
@@ -62,7 +62,7 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
             "layout": name,
             "batch": each,
             "samples/s": rate,
-            "of linear": rate / number / one,
+            "of linear": rate / number / single_rate,
             "GiB": step.bytes / GIB,
         }
 
@@ -73,18 +73,18 @@ def main() -> None:
     parser.add_argument("--backbone", default="pi0")
     parser.add_argument("--sizes", nargs="+", default=["small", "base"])
     parser.add_argument("--devices", type=int, nargs="+", default=[1, 2, 4])
-    parser.add_argument("--batch", type=int, help="windows a device; default: by size")
-    parser.add_argument("--threads", type=int, default=8, help="that compile")
+    parser.add_argument("--batch", type=int, help="windows per device; default: by size")
+    parser.add_argument("--threads", type=int, default=8, help="for compilation")
     backbones.add_options(parser)
     options = parser.parse_args()
-    console, found = Console(soft_wrap=True), dict[str, Any](machine=machine("jax"))
-    console.print(f"{found['machine']}, rank {options.rank}, {options.dtype}")
+    console, results = Console(soft_wrap=True), dict[str, Any](machine=machine("jax"))
+    console.print(f"{results['machine']}, rank {options.rank}, {options.dtype}")
     for size in options.sizes:
         options.size = size
-        found[size] = [*rows(options)]
-        print_table(console, found[size])
+        results[size] = [*rows(options)]
+        print_table(console, results[size])
         if options.json:
-            options.json.write_text(json.dumps(found, indent=1))
+            options.json.write_text(json.dumps(results, indent=1))
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""What an action means: one file for every convention, all of them turned into joint targets.
+"""Action modes, each converted to joint targets.
 
     joint         [J + 1] joint targets [rad], gripper opening [m]
     delta_joint   [J + 1] change of the joint targets [rad], gripper opening [m]
-    end_effector  [7] change of the tcp's position [m] and its rotation vector [rad], both along the
-                  axes of the base, gripper opening [m]
+    end_effector  [7] translation [m] and rotation vector [rad] of the tcp, both in the base frame,
+                  gripper opening [m]
 
-Changes are relative to the targets that were sent last, not to what was measured, so that servos
-that lag behind do not make an arm creep.
+Changes are relative to the last targets, not to measured positions, so that lag of the servos does
+not make an arm creep.
 """
 
 from typing import Literal, get_args
@@ -23,13 +23,13 @@ Mode = Literal["joint", "delta_joint", "end_effector"]
 MODES: tuple[str, ...] = get_args(Mode)
 
 TARGET_DT = 0.02
-"""Joint targets are interpolated to this rate between two actions [s]."""
+"""Period at which joint targets are interpolated between two actions [s]; own choice (50 Hz)."""
 
-_TOOL_SPEED = np.array([0.5] * 3 + [2.0] * 3, np.float32)  # own choice [m/s, rad/s]
+_TOOL_SPEED = np.array([0.5] * 3 + [2.0] * 3, np.float32)  # limits, own choice [m/s, rad/s]
 
 
 def bounds(mode: Mode, robot: Robot, control_dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest action, float32, of a robot that acts every `control_dt` seconds."""
+    """Return the lowest and the highest action, float32 [A], for one action per `control_dt` s."""
     if mode == "joint":
         return robot.action_low, robot.action_high
     speed = _TOOL_SPEED if mode == "end_effector" else robot.action_speed[:-1]
@@ -38,9 +38,9 @@ def bounds(mode: Mode, robot: Robot, control_dt: float) -> tuple[np.ndarray, np.
 
 
 def to_targets(mode: Mode, robot: Robot, command: jax.Array, action: jax.Array) -> jax.Array:
-    """Joint targets and opening [J + 1] of one world's action, given the last targets [J + 1].
+    """Convert one world's action [A] to targets [J + 1], given its last targets [J + 1].
 
-    An end-effector action out of reach gives the nearest pose that inverse kinematics finds.
+    An end-effector pose out of reach gives the closest one that inverse kinematics finds.
     """
     if mode == "joint":
         return action
@@ -53,9 +53,9 @@ def to_targets(mode: Mode, robot: Robot, command: jax.Array, action: jax.Array) 
 
 
 def from_targets(mode: Mode, robot: Robot, command: jax.Array, targets: jax.Array) -> jax.Array:
-    """The action that sends these targets [J + 1] after the last ones, `to_targets` turned round.
+    """Invert `to_targets`: return the action [A] that leads from the last targets to these.
 
-    Joints of an arm with more than six are not determined by an end-effector action.
+    An end-effector action does not determine the joints of an arm with more than six.
     """
     if mode == "joint":
         return targets
@@ -69,25 +69,25 @@ def from_targets(mode: Mode, robot: Robot, command: jax.Array, targets: jax.Arra
 
 
 def interpolate(commands: jax.Array, control_dt: float, latency: float | jax.Array) -> jax.Array:
-    """Actuator targets [S, J + 1] of the S physics steps between two actions.
+    """Interpolate actuator targets [S, J + 1] for the S physics steps of one control step.
 
     Args:
-        commands: [3, J + 1] targets of the last action but one, the last one and the new one.
-        control_dt: seconds from one to the next, a multiple of `TARGET_DT`.
-        latency: seconds, at most `control_dt`, by which they come late.
+        commands: [3, J + 1] targets of the last but one, the last and the new action.
+        control_dt: control period [s], a multiple of `TARGET_DT`.
+        latency: delay of the targets [s], at most `control_dt`.
     """
     moves, repeats = round(control_dt / TARGET_DT), round(TARGET_DT / scene.PHYSICS_DT)
     fraction = jnp.arange(1, moves + 1, dtype=jnp.float32)[:, None] / moves
-    # What is sent in this control step, after what was sent in the one before.
+    # The targets of the previous control step, followed by those of this one.
     path = commands[:-1, None] + fraction * jnp.diff(commands, axis=0)[:, None]
     path = path.at[..., -1].multiply(0.5)  # each finger makes half of the opening
-    sent = jnp.repeat(path.reshape(2 * moves, -1), repeats, axis=0)
-    late = jnp.round(latency / scene.PHYSICS_DT).astype(jnp.int32)
-    return jax.lax.dynamic_slice_in_dim(sent, moves * repeats - late, moves * repeats)
+    targets = jnp.repeat(path.reshape(2 * moves, -1), repeats, axis=0)
+    delay = jnp.round(latency / scene.PHYSICS_DT).astype(jnp.int32)
+    return jax.lax.dynamic_slice_in_dim(targets, moves * repeats - delay, moves * repeats)
 
 
 def _rotation_vector(rotation: jax.Array) -> jax.Array:
-    """Rotation vector [3] of a rotation [3, 3] by less than half a turn."""
+    """Convert a rotation matrix [3, 3] by less than 180 degrees to a rotation vector [3]."""
     axis = robots.sine_axis(rotation)
     sine = jnp.linalg.norm(axis)
     angle = jnp.arctan2(sine, (jnp.trace(rotation) - 1) / 2)

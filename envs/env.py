@@ -1,11 +1,11 @@
-"""Batched manipulation environments: pure functions over W worlds.
+"""Batched manipulation environments as pure functions over W worlds.
 
     env = envs.make("press", robot="piper", num_envs=64, image_size=64)
     state = env.reset(jax.random.key(0))
     state = env.step(state, action)
-    pictures = env.observe(state)["image"]
+    images = env.observe(state)["image"]
 
-Nothing is rendered unless `observe` is called, and no world restarts unless `reset_done` is.
+Only `observe` renders, and only `reset_done` restarts worlds.
 """
 
 import dataclasses
@@ -22,20 +22,20 @@ import numpy as np
 from envs import actions, checks, observations, rewards
 from envs.compilation import fast_cpu, messages
 from envs.physics.physics import Physics
-from envs.rendering.renderer import Look, Renderer, RenderModel
+from envs.rendering.renderer import Appearance, Renderer, RenderModel
 from envs.robots import Robot
 from envs.scene import distractors, placing, randomization, scene
 from envs.scene.randomization import Draw, Randomization
 from envs.state import Changes, Data, State, Trajectory, where
 from envs.tasks import Layout, Task, View
 
-_HOME_NOISE = 0.03  # rad, half the range of the random start pose around home
-_START_OPENING = 0.04  # m, of the gripper
+_HOME_NOISE = 0.03  # rad, half the range of random start poses around home; own choice
+_START_OPENING = 0.04  # m, gripper opening at reset; own choice
 
 
 @enum.unique
 class _LayoutStream(enum.IntEnum):
-    """What is drawn at random beside a layout, from a key of its own derived from the layout's."""
+    """Streams of randomness derived from the key of a layout."""
 
     DISTRACTORS = 1
     RANDOMIZATION = 2
@@ -43,7 +43,7 @@ class _LayoutStream(enum.IntEnum):
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Env:
-    """A task for a robot in `num_envs` worlds W, made by `envs.make`; methods are pure."""
+    """One task and one robot in W = `num_envs` worlds, made by `envs.make`. Methods are pure."""
 
     task: Task
     robot: Robot
@@ -65,7 +65,7 @@ class Env:
 
     @property
     def render_model(self) -> RenderModel:
-        """What the renderer draws."""
+        """The renderer's model: visible geoms, cameras, appearance."""
         return self.renderer.model
 
     @property
@@ -75,12 +75,12 @@ class Env:
 
     @property
     def image_size(self) -> int:
-        """Height and width of the pictures in pixels."""
+        """Height and width of the images in pixels."""
         return self.renderer.image_size
 
     @property
     def antialias(self) -> int:
-        """n for n x n rays a pixel."""
+        """n, for n x n rays per pixel."""
         return self.renderer.samples
 
     @property
@@ -105,19 +105,19 @@ class Env:
 
     @property
     def expert_steps(self) -> int:
-        """Control steps that the expert is given."""
+        """Control steps after which the expert stops."""
         return round(self.task.expert_time / self.control_dt)
 
     def reset(self, key: jax.Array, ranges: Randomization | None = None) -> State:
-        """Fresh worlds: random layout, phrasing and start pose near home, all from `key`.
+        """Start W worlds with a random layout, instruction and start pose near home.
 
         Args:
-            key: all randomness.
-            ranges: what else differs from world to world; None for nothing.
+            key: source of all randomness.
+            ranges: domain randomisation; None for none.
 
         Raises:
-            TypeError: if the key is none.
-            ValueError: if the ranges make no sense.
+            TypeError: `key` is not a key.
+            ValueError: a range is invalid.
         """
         ranges = randomization.prepared(ranges, self.control_dt)
         with self._calls.first("reset", ranges is None):
@@ -128,36 +128,36 @@ class Env:
 
         Args:
             state: W worlds.
-            action: [W, A], by default A = J + 1 joint targets [rad] and gripper opening [m]; other
-                conventions in `envs.actions`. Clipped to `action_low`, `action_high` and to what
-                the robot's speed limits allow.
+            action: [W, A], by default A = J + 1 joint targets [rad] and gripper opening [m]; see
+                `envs.actions` for other modes. Clipped to `action_low`, `action_high` and the
+                robot's speed limits.
 
         Returns:
-            The worlds `control_dt` later. Worlds that were done have not moved.
+            The worlds `control_dt` later. Worlds that were done stay as they were.
 
         Raises:
-            TypeError: if the action is no array of numbers, or the state none.
-            ValueError: if the action has another shape, or the state other worlds.
+            TypeError: the action is not a numeric array, or the state not a `State`.
+            ValueError: the action's shape or the state's number of worlds is wrong.
         """
         self._check_worlds(state)
         action = checks.action(action, (self.num_envs, len(self.action_low)))
-        # A weakly typed action, such as jnp.full(shape, 0.0), would compile all anew.
+        # A weakly typed action, such as jnp.full(shape, 0.0), would recompile the step.
         action = jax.lax.convert_element_type(action, jnp.float32)
         with self._calls.first("step", state.info["draw"] is None):
             return self._steps(state, action)
 
     def observe(self, state: State) -> dict[str, Any]:
-        """What a policy may see.
+        """Render and measure what a policy observes.
 
         Returns:
             `image`: camera name -> uint8 [W, image_size, image_size, 3]; `state`: f32 [W, J + 1]
             measured joint angles [rad] and gripper opening [m].
 
         Raises:
-            TypeError, ValueError: as `step`, for the state.
+            TypeError, ValueError: an invalid state, as in `step`.
         """
         self._check_worlds(state)
-        with self._calls.first("pictures", state.info["draw"] is None):
+        with self._calls.first("images", state.info["draw"] is None):
             return self._observes(state)
 
     @functools.partial(fast_cpu.jit, static_argnums=0)
@@ -175,69 +175,72 @@ class Env:
         key: jax.Array,
         ranges: Randomization | None = None,
     ) -> tuple[State, Trajectory]:
-        """Fresh worlds with a policy in the loop until the time limit; may be called under jit.
+        """Run a policy in fresh worlds until the time limit; can be called under jit.
 
         Args:
-            policy: (observation, key) -> action [W, A]. The observation is that of `observe`, with
-                `instruction` int32 [W]; pictures that the policy does not read are not rendered.
-            key: all randomness.
-            ranges: as for `reset`.
+            policy: (observation, key) -> action [W, A]. The observation is that of `observe` plus
+                `instruction`, int32 [W]. Images that the policy does not read are not rendered.
+            key: source of all randomness.
+            ranges: as in `reset`.
+
+        Returns:
+            The final state, and the trajectory of all steps.
 
         Raises:
-            TypeError, ValueError: as `reset` and `step`, or if the policy cannot be called.
+            TypeError, ValueError: as in `reset` and `step`, or the policy is not callable.
         """
         if not callable(policy):
-            what = checks.short(policy)
-            raise TypeError(f"policy must be a function (observation, key) -> action, got {what}")
+            got = checks.short(policy)
+            raise TypeError(f"policy must be a function (observation, key) -> action, got {got}")
         checks.key(key)
         reset_key, policy_key = jax.random.split(key)
 
         def body(state: State, key: jax.Array) -> tuple[State, Trajectory]:
-            seen = self.observe(state) | {"instruction": state.info["instruction"]}
-            action = policy(seen, key)
+            observation = self.observe(state) | {"instruction": state.info["instruction"]}
+            action = policy(observation, key)
             after = self.step(state, action)
-            return after, Trajectory(seen["state"], action, after.reward, after.done)
+            return after, Trajectory(observation["state"], action, after.reward, after.done)
 
         keys = jax.random.split(policy_key, self.max_steps)
         start = self.reset(reset_key, ranges)
-        with self._calls.said("rollout"):  # always: JAX knows no policy again
+        with self._calls.said("rollout"):  # every time: JAX retraces for each policy
             return jax.lax.scan(body, start, keys)
 
     def reset_done(
         self, state: State, key: jax.Array, ranges: Randomization | None = None
     ) -> State:
-        """The same worlds, those that are done started afresh, with the ranges of their `reset`.
+        """Restart the worlds that are done; pass the same ranges as to `reset`.
 
         Raises:
-            TypeError: as `reset` and `step`.
-            ValueError: if only one of the two had ranges, or they make no sense.
+            TypeError: as in `reset` and `step`.
+            ValueError: only one of `reset` and `reset_done` has ranges, or a range is invalid.
         """
         self._check_worlds(state)
         if (ranges is None) != (state.info["draw"] is None):
-            raise ValueError("reset_done needs ranges if, and only if, reset was given some")
+            raise ValueError("pass ranges to reset_done if, and only if, reset had ranges")
         return jax.jit(where)(state.done, self.reset(key, ranges), state)
 
     def proprio(self, state: State) -> jax.Array:
-        """Measured joint angles [rad] and gripper opening [m], f32 [W, J + 1].
+        """Measure joint angles [rad] and gripper opening [m], f32 [W, J + 1].
 
         Raises:
-            TypeError: if the state is none.
+            TypeError: `state` is not a `State`.
         """
-        checks.instance("state", state, State, "what reset gave")
+        checks.instance("state", state, State, "a state from reset or step")
         joints = state.data.qpos[:, : self.num_joints]
         fingers = state.data.qpos[:, self.num_joints : self.num_joints + 2]
         return jnp.concatenate([joints, jnp.sum(fingers, axis=1, keepdims=True)], axis=1)
 
     def full_state(self, state: State) -> jax.Array:
-        """All that a learner may know beside pictures, f32 [W, D]; `full_state_layout` says what.
+        """Return the privileged state as one vector, f32 [W, D], laid out as `full_state_layout`.
 
-        Joints, speeds and last targets of the robot, where its tool is, and relative to that where
-        the task's objects are and how they move: see `envs.observations.parts`.
+        It holds the robot's joints, speeds, last targets and tool pose, and the poses and speeds of
+        the task's objects relative to the tool: see `envs.observations.parts`.
 
         Raises:
-            TypeError: if the state is none.
+            TypeError: `state` is not a `State`.
         """
-        checks.instance("state", state, State, "what reset gave")
+        checks.instance("state", state, State, "a state from reset or step")
         return self._full_states(state)
 
     @functools.partial(jax.jit, static_argnums=0)
@@ -245,13 +248,13 @@ class Env:
         return jax.vmap(self._full_state)(state)
 
     def _full_state(self, state: State) -> jax.Array:
-        """That of one world, f32 [D]."""
-        found = observations.parts(self.model, state.data, state.info["command"], self._placed)
-        return jnp.concatenate([*found.values()])
+        """Return the privileged state of one world, f32 [D]."""
+        parts = observations.parts(self.model, state.data, state.info["command"], self._placed)
+        return jnp.concatenate([*parts.values()])
 
     @functools.cached_property
     def full_state_layout(self) -> dict[str, slice]:
-        """Name -> where it lies in the last axis of `full_state`."""
+        """Name of each part -> its slice of the last axis of `full_state`."""
         return observations.layout(self.model, self.num_joints, self._placed)
 
     def render(
@@ -263,24 +266,24 @@ class Env:
         *,
         draw: Draw | None = None,
     ) -> dict[str, jax.Array]:
-        """Pictures of N recorded scenes: camera name -> uint8 [N, image_size, image_size, 3].
+        """Render N recorded scenes: camera name -> uint8 [N, image_size, image_size, 3].
 
         Args:
-            geom_xpos: `[N, ...]`, from the data of a state.
+            geom_xpos: `[N, ...]`, from `State.data`.
             geom_xmat: likewise.
             cam_xpos: likewise.
             cam_xmat: likewise.
-            draw: what the worlds drew, leading axis N, from the info of that state.
+            draw: randomised values of these worlds, leading axis N, from `State.info`.
         """
-        look, size = jax.vmap(self._looks)(draw) if draw else (None, None)
-        pictures = self.renderer((geom_xpos, geom_xmat, cam_xpos, cam_xmat), look, size)
-        return {name: pictures[:, i] for i, name in enumerate(self.cameras)}
+        appearance, size = jax.vmap(self._appearance)(draw) if draw else (None, None)
+        images = self.renderer((geom_xpos, geom_xmat, cam_xpos, cam_xmat), appearance, size)
+        return {name: images[:, i] for i, name in enumerate(self.cameras)}
 
     def _check_worlds(self, state: Any) -> None:
-        checks.instance("state", state, State, "what reset gave")
+        checks.instance("state", state, State, "a state from reset or step")
         if state.done.shape != (self.num_envs,):
-            found = state.done.shape[0] if state.done.shape else "no axis of"
-            raise ValueError(f"state has {found} worlds, this environment {self.num_envs}")
+            number = state.done.shape[0] if state.done.shape else "no axis of"
+            raise ValueError(f"state has {number} worlds, this environment {self.num_envs}")
 
     @functools.cached_property
     def _calls(self) -> messages.Calls:
@@ -299,8 +302,8 @@ class Env:
     def _reset(self, ranges: Randomization | None, key: jax.Array) -> State:
         layout_key, pose_key, instruction_key = jax.random.split(key, 3)
         layout = self.task.place(layout_key)
-        others_key = jax.random.fold_in(layout_key, _LayoutStream.DISTRACTORS)
-        layout |= distractors.place(others_key, layout, self.distractors)
+        distractor_key = jax.random.fold_in(layout_key, _LayoutStream.DISTRACTORS)
+        layout |= distractors.place(distractor_key, layout, self.distractors)
         draw = None
         if ranges:
             draw_key = jax.random.fold_in(layout_key, _LayoutStream.RANDOMIZATION)
@@ -311,12 +314,12 @@ class Env:
         command = jnp.clip(jnp.append(joints, _START_OPENING), low, high)
         data = self._start(draw, layout, command)
         _, metrics = self._check(draw, data)
-        number = jax.random.randint(instruction_key, (), 0, len(self.instructions), jnp.int32)
+        instruction = jax.random.randint(instruction_key, (), 0, len(self.instructions), jnp.int32)
         zero, false = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
         info = {
             "success": false,
             "steps": zero,
-            "instruction": number,
+            "instruction": instruction,
             "command": command,
             "earlier": command,
             "held": zero,
@@ -325,13 +328,13 @@ class Env:
             "draw": draw,
         }
         state = State(data, jnp.zeros((), jnp.float32), false, metrics, info)
-        return state if self.reward == "sparse" else rewards.started(state, self._stages(state))
+        return state if self.reward == "sparse" else rewards.at_reset(state, self._stages(state))
 
     def _step(self, state: State, action: jax.Array) -> State:
         after = self._move(state, action)
         if self.reward == "sparse":
             return after
-        return rewards.earned(state, after, self._stages(after), self.discount)
+        return rewards.after_step(state, after, self._stages(after), self.discount)
 
     def _move(self, state: State, action: jax.Array) -> State:
         info = state.info
@@ -345,7 +348,7 @@ class Env:
         latency = draw.latency if draw else 0.0
         controls = actions.interpolate(commands, self.control_dt, latency)
         changes = self._changes(draw, info["layout"])
-        data = self._filmed(draw, self.physics.advance(changes, state.data, controls))
+        data = self._with_cameras(draw, self.physics.advance(changes, state.data, controls))
         reached, metrics = self._check(draw, data)
         held = jnp.where(reached, info["held"] + 1, 0)
         steps = info["steps"] + 1
@@ -365,33 +368,33 @@ class Env:
         return where(state.done, state, where(finite, after, broken))
 
     def _start(self, draw: Draw | None, layout: Layout, command: jax.Array) -> Data:
-        """A world at rest, its robot where the command wants it."""
+        """Start one world at rest, its robot at the command [J + 1]."""
         joints = jnp.concatenate([command[:-1], jnp.full(2, command[-1] / 2)])
         qpos = placing.positions(self.model, layout, joints)
-        return self._filmed(draw, self.physics.start(self._changes(draw, layout), qpos))
+        return self._with_cameras(draw, self.physics.start(self._changes(draw, layout), qpos))
 
     def _changes(self, draw: Draw | None, layout: Layout) -> Changes:
-        """How one world's model differs: what it drew, and where its fixed bodies stand."""
+        """Return the fields of one world's model: randomised values, poses of fixed bodies."""
         changes = randomization.changes(draw, self.model, self._objects) if draw else {}
         return changes | placing.fixed_bodies(self.model, layout, changes)
 
     @functools.cached_property
     def _objects(self) -> np.ndarray:
-        """Which bodies the task and its distractors are made of, bool [bodies]."""
+        """Mask of the bodies of the task's objects and distractors, bool [bodies]."""
         names = [*self._placed, *distractors.names(self.distractors)]
-        return randomization.belonging(self.model, names)
+        return randomization.in_subtrees(self.model, names)
 
     @functools.cached_property
     def _placed(self) -> list[str]:
         """Names of the bodies that the task places."""
         return sorted(jax.eval_shape(self.task.place, jax.random.key(0)))
 
-    def _looks(self, draw: Draw) -> tuple[Look, jax.Array]:
-        """Look of one world, and the sizes of its geoms."""
-        look = randomization.look(draw, self.render_model.look)
-        return look, randomization.geom_sizes(draw, self.model, self._objects)
+    def _appearance(self, draw: Draw) -> tuple[Appearance, jax.Array]:
+        """Return appearance and geom sizes [G, 3] of one world."""
+        appearance = randomization.appearance(draw, self.render_model.appearance)
+        return appearance, randomization.geom_sizes(draw, self.model, self._objects)
 
-    def _filmed(self, draw: Draw | None, data: Data) -> Data:
+    def _with_cameras(self, draw: Draw | None, data: Data) -> Data:
         return randomization.move_cameras(draw, data) if draw else data
 
     def _check(self, draw: Draw | None, data: Data) -> tuple[jax.Array, dict[str, jax.Array]]:

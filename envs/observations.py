@@ -1,6 +1,6 @@
-"""What a learner may know of a world beside its pictures: one flat vector with a stated layout.
+"""Privileged state of a world as one flat vector with a documented layout.
 
-Positions and directions are along the axes of the robot's base, which are those of the world.
+Positions and directions are in the robot's base frame, which is the world frame.
 """
 
 from collections.abc import Iterable
@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from envs.robots import multiply
-from envs.scene.randomization import belonging
+from envs.scene.randomization import in_subtrees
 from envs.tasks import View
 
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
@@ -21,13 +21,14 @@ _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 def parts(
     model: mujoco.MjModel, data: Any, command: jax.Array, bodies: Iterable[str]
 ) -> dict[str, jax.Array]:
-    """What one world is like, f32 vectors by name.
+    """Compute the parts of the privileged state of one world, f32 vectors by name.
 
-    `joints` [J + 1] in rad and the opening in m, `joint_speeds` [J + 1] per second, `command`
-    [J + 1] the last targets, `tool` [9] the position of the tcp and its x and y axes. Of each body:
-    `<body>` [9] its position relative to the tcp and its x and y axes; if it moves freely,
-    `<body>_speed` [6] in m/s and rad/s. Of each hinge or slide of such a body, `<body>/<joint>` [2]
-    its position and speed.
+    - `joints` [J + 1]: joint angles [rad] and gripper opening [m]; `joint_speeds` [J + 1]: their
+      derivatives per second; `command` [J + 1]: the last targets.
+    - `tool` [9]: position [m], x axis and y axis of the tcp.
+    - `<body>` [9]: position relative to the tcp [m], x axis and y axis; of free bodies also
+      `<body>_speed` [6]: linear [m/s] and angular [rad/s] velocity.
+    - `<body>/<joint>` [2]: position and speed of each hinge or slide of a body.
 
     Args:
         model: the scene.
@@ -37,7 +38,7 @@ def parts(
     """
     view, count = View(model, data), len(command) - 1
     tool = data.site_xmat[model.site("tcp").id].reshape(3, 3)
-    found = {
+    result = {
         "joints": _with_opening(data.qpos, count),
         "joint_speeds": _with_opening(data.qvel, count),
         "command": command,
@@ -46,25 +47,25 @@ def parts(
     for name in sorted(bodies):
         body = model.body(name)
         axes = data.xmat[body.id].reshape(3, 3)
-        found[name] = jnp.concatenate([view.position(name) - view.tcp, axes[:, 0], axes[:, 1]])
+        result[name] = jnp.concatenate([view.position(name) - view.tcp, axes[:, 0], axes[:, 1]])
         if body.jntnum[0]:
             first = body.dofadr[0]
-            turning = multiply(axes, data.qvel[first + 3 : first + 6])  # MuJoCo: along body's axes
-            found[f"{name}_speed"] = jnp.concatenate([data.qvel[first : first + 3], turning])
+            angular = multiply(axes, data.qvel[first + 3 : first + 6])  # qvel is in the body frame
+            result[f"{name}_speed"] = jnp.concatenate([data.qvel[first : first + 3], angular])
         for joint in _joints(model, name):
-            at = data.qpos[joint.qposadr[0]], data.qvel[joint.dofadr[0]]
-            found[f"{name}/{joint.name}"] = jnp.stack(at)
-    return found
+            values = data.qpos[joint.qposadr[0]], data.qvel[joint.dofadr[0]]
+            result[f"{name}/{joint.name}"] = jnp.stack(values)
+    return result
 
 
 def layout(model: mujoco.MjModel, joints: int, bodies: Iterable[str]) -> dict[str, slice]:
-    """Name of each part -> where it lies in all of them, one after the other."""
+    """Return the slice of each part in the concatenation of all `parts`."""
     names: list[str] = []
 
     def values() -> list[jax.Array]:
-        found = parts(model, mujoco.MjData(model), jnp.zeros(joints + 1), bodies)
-        names.extend(found)  # a tree of JAX would not keep their order
-        return [*found.values()]
+        by_name = parts(model, mujoco.MjData(model), jnp.zeros(joints + 1), bodies)
+        names.extend(by_name)  # JAX would sort the keys of a dict
+        return [*by_name.values()]
 
     sizes = [part.size for part in jax.eval_shape(values)]
     ends = np.cumsum(sizes).tolist()
@@ -72,12 +73,12 @@ def layout(model: mujoco.MjModel, joints: int, bodies: Iterable[str]) -> dict[st
 
 
 def _with_opening(values: jax.Array, count: int) -> jax.Array:
-    """What the robot's joints have, and the sum of what its two fingers have."""
+    """Return the values of the `count` joints, and the sum over both fingers."""
     return jnp.append(values[:count], values[count] + values[count + 1])
 
 
 def _joints(model: mujoco.MjModel, name: str) -> list[Any]:
-    """The hinges and slides of a body and of those that hang on it."""
-    hanging = belonging(model, [name])
-    every = [model.joint(i) for i in range(model.njnt)]
-    return [joint for joint in every if joint.type[0] in _SCALAR and hanging[joint.bodyid[0]]]
+    """Return the hinges and slides in the subtree of a body."""
+    in_subtree = in_subtrees(model, [name])
+    joints = [model.joint(i) for i in range(model.njnt)]
+    return [joint for joint in joints if joint.type[0] in _SCALAR and in_subtree[joint.bodyid[0]]]

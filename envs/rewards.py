@@ -1,14 +1,15 @@
-"""The dense reward: that of success, and a potential's discounted difference between two steps.
+"""Dense reward: success plus potential-based shaping.
 
     reward = success + discount * potential(after) - potential(before)
 
-What is added up to the end of an episode depends on its start alone, so that what is optimal stays
-optimal (Ng, Harada and Russell 1999, https://dl.acm.org/doi/10.5555/645528.657613). That asks for
+The discounted sum of the shaping terms depends only on the start of an episode, so optimal policies
+stay optimal (Ng, Harada and Russell 1999, https://dl.acm.org/doi/10.5555/645528.657613), provided
+that
 
-- the learner's own discount, which `envs.make` is given;
-- a potential of 0 in terminal states, here a success. Time limits and broken physics end no task:
-  the learner bootstraps from the state that they leave, whose potential therefore counts;
-- nothing across episodes: a done world earns 0 until it restarts, and a restart earns 0.
+- the discount is the learner's own, passed to `envs.make`;
+- the potential of terminal states is 0. Only success is terminal; after a time limit or broken
+  physics the learner bootstraps from the last state, whose potential therefore counts;
+- nothing crosses episodes: a done world gets 0 until it restarts, and a restart gets 0.
 """
 
 import dataclasses
@@ -24,11 +25,11 @@ REWARDS: tuple[str, ...] = get_args(Reward)
 
 
 def potential(stages: dict[str, jax.Array]) -> jax.Array:
-    """How far a task has come, 0 to 1: the stages passed and a share of the next one.
+    """Compute the progress of a task in [0, 1]: stages passed plus the share of the next one.
 
     Args:
-        stages: share of each that is done, f32 [...] in 0 to 1, first to last. A stage whose share
-            is 1 is passed, and with it all before it.
+        stages: completed share of each stage, f32 [...] in [0, 1], first to last. A stage with
+            share 1 is passed, and so are all before it.
     """
     shares = jnp.stack([*stages.values()])
     before = jnp.arange(len(shares)).reshape(-1, *[1] * (shares.ndim - 1))
@@ -37,23 +38,23 @@ def potential(stages: dict[str, jax.Array]) -> jax.Array:
     return (passed + share) / len(shares)
 
 
-def started(state: State, stages: dict[str, jax.Array]) -> State:
-    """One world at reset, with the metrics that `earned` gives."""
+def at_reset(state: State, stages: dict[str, jax.Array]) -> State:
+    """Add the metrics of `after_step` to one world at reset; its reward is 0."""
     zero = jnp.zeros((), jnp.float32)
     return _with_terms(state, stages, zero, zero)
 
 
-def earned(before: State, after: State, stages: dict[str, jax.Array], discount: float) -> State:
-    """One world after a step, with its dense reward and, in its metrics, what that is made of.
+def after_step(before: State, after: State, stages: dict[str, jax.Array], discount: float) -> State:
+    """Give one world its dense reward after a step, with the reward's terms in its metrics.
 
     Args:
         before, after: the world before and after the step.
-        stages: of the world after it.
-        discount: of the learner.
+        stages: stages of the world after the step.
+        discount: the learner's discount.
     """
     success = after.info["success"]
-    left = jnp.where(success, 0.0, discount * potential(stages))
-    shaping = jnp.where(before.done, 0.0, left - before.metrics["potential"])
+    discounted = jnp.where(success, 0.0, discount * potential(stages))
+    shaping = jnp.where(before.done, 0.0, discounted - before.metrics["potential"])
     return _with_terms(after, stages, (success & ~before.done).astype(jnp.float32), shaping)
 
 

@@ -1,4 +1,4 @@
-"""What a batch of worlds is between two steps, and what is kept of an episode."""
+"""State of a batch of worlds, and trajectories."""
 
 import dataclasses
 from typing import Any, Self
@@ -12,13 +12,14 @@ import jax.numpy as jnp
 class Data:
     """One world, or W worlds with a leading axis; names and units are MuJoCo's.
 
-    Of all that MuJoCo has, only what a step reads and the poses that others look at.
+    Holds only what the next step reads, and poses for rendering and tasks.
 
     Attributes:
         qpos, qvel: positions and velocities of all joints.
-        qacc_warmstart: where the constraint solver starts.
-        xpos, xquat, xmat: `[bodies, 3]` in m, `[bodies, 4]`, `[bodies, 3, 3]`, in the world frame.
-        geom_xpos, geom_xmat, site_xpos, site_xmat, cam_xpos, cam_xmat: the same of geoms, sites and
+        qacc_warmstart: initial guess of the constraint solver.
+        xpos, xquat, xmat: poses of bodies in the world frame, `[bodies, 3]` in m, `[bodies, 4]`,
+            `[bodies, 3, 3]`.
+        geom_xpos, geom_xmat, site_xpos, site_xmat, cam_xpos, cam_xmat: poses of geoms, sites and
             cameras.
     """
 
@@ -36,14 +37,14 @@ class Data:
     cam_xmat: jax.Array
 
     def replace(self, **changes: Any) -> Self:
-        """The same with other values of some fields."""
+        """Return a copy with some fields replaced."""
         return dataclasses.replace(self, **changes)
 
 
 MOVING = ("qpos", "qvel", "qacc_warmstart")
-"""The fields of `Data` that steps change; all others follow from them."""
+"""The fields of `Data` that physics steps update; all others are computed from them."""
 Changes = dict[str, jax.Array]
-"""Fields of the MuJoCo model that differ in one world, by MuJoCo's names."""
+"""Fields of the MuJoCo model that differ between worlds, by MuJoCo's names."""
 
 
 @jax.tree_util.register_dataclass
@@ -52,16 +53,16 @@ class State:
     """W worlds; every leaf has leading axis W.
 
     Attributes:
-        data: positions, velocities and poses, up to date.
-        reward: f32 [W], 1 where the task is done successfully.
-        done: bool [W], latched; a done world stands still until `reset_done`.
-        metrics: f32 [W] each, what the task measures.
+        data: positions, velocities and poses.
+        reward: f32 [W], of the last step; if sparse, 1 on success.
+        done: bool [W], latched; a done world stays frozen until `reset_done`.
+        metrics: f32 [W] each, the task's measurements.
         info: success bool [W]; steps int32 [W]; instruction int32 [W], index into
             `env.instructions`; command f32 [W, J + 1], the last targets sent to the robot [rad, m];
-            earlier, those before; held int32 [W], consecutive control steps at the goal; broken
-            bool [W], ended at its last good moment because physics was not finite after it; layout,
-            body name -> [W, 4] at reset: x, y, z [m], turn about z [rad]; draw, what
-            `envs.scene.randomization` drew for each world, or None.
+            earlier, the targets before those; held int32 [W], consecutive control steps at the
+            goal; broken bool [W], frozen at the last finite state because physics diverged; layout,
+            body name -> [W, 4] at reset: x, y, z [m], yaw [rad]; draw, randomised values from
+            `envs.scene.randomization`, or None.
     """
 
     data: Data
@@ -74,13 +75,13 @@ class State:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Trajectory:
-    """What W worlds went through in T control steps.
+    """T control steps of W worlds.
 
     Attributes:
         state: f32 [T, W, J + 1] joints [rad] and gripper opening [m] before each action.
         action: f32 [T, W, A].
-        reward: f32 [T, W] after it.
-        done: bool [T, W] after it.
+        reward: f32 [T, W] after the action.
+        done: bool [T, W] after the action.
     """
 
     state: jax.Array
@@ -90,7 +91,7 @@ class Trajectory:
 
 
 def where(condition: jax.Array, yes: Any, no: Any) -> Any:
-    """`jnp.where` over two trees; the condition's axes are the leading ones of every leaf."""
+    """Apply `jnp.where` to two trees; the condition has the leading axes of every leaf."""
 
     def choose(a: jax.Array, b: jax.Array) -> jax.Array:
         shape = condition.shape + (1,) * (a.ndim - condition.ndim)

@@ -1,11 +1,11 @@
-"""Learn a task from its full state by PPO, physics and learning in one jit.
+"""Train PPO on a task's privileged state, with physics and learning in one jitted step.
 
     python examples/ppo.py                                  # press, on a CPU, in minutes
     python examples/ppo.py --num-envs 2048 --learning-rate 3e-4     # every field is an option
 
-Proximal policy optimisation is Schulman et al. 2017 (arXiv 1707.06347), with generalised advantages
-(arXiv 1506.02438). Two things matter with this package's dense reward: the environment is told the
-learner's discount, and an episode that time ends is bootstrapped, because only success ends a task.
+PPO is Schulman et al. 2017 (arXiv 1707.06347), with generalised advantage estimation (arXiv
+1506.02438). For this package's dense reward, pass the learner's discount to the environment, and
+bootstrap from the last state of an episode that ran out of time: only success is terminal.
 """
 
 import dataclasses
@@ -28,28 +28,28 @@ from envs.datasets.files import check_local
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """What is learned, and how."""
+    """Task and hyperparameters; defaults are own choices that solve press in minutes on a CPU."""
 
     task: str = "press"
     robot: str = "piper"
     num_envs: int = 64  # worlds W
-    steps: int = 32  # T of every world between two updates
+    steps: int = 32  # T, steps per world between updates
     updates: int = 40
-    epochs: int = 8  # over these T x W steps, each in `minibatches` parts
+    epochs: int = 8  # passes over these T x W steps, each in `minibatches` parts
     minibatches: int = 4
     learning_rate: float = 1e-3
     discount: float = 0.97
-    trace: float = 0.9  # lambda of the advantages
-    clip: float = 0.2  # furthest that a probability may move from 1 times what it was
-    width: int = 64  # of two hidden layers
-    std: float = 0.5  # of the first actions, which span -1 to 1
-    episodes: int = 256  # of the evaluation
+    trace: float = 0.9  # lambda of generalised advantage estimation
+    clip: float = 0.2  # largest change of the probability ratio from 1
+    width: int = 64  # of both hidden layers
+    std: float = 0.5  # initial standard deviation of actions in [-1, 1]
+    episodes: int = 256  # for evaluation
     seed: int = 0
     out: Path = Path("runs/ppo")
 
 
 class Learner(NamedTuple):
-    """All that changes: networks, optimizer, mean and variance of observations, and the worlds."""
+    """Training state: networks, optimizer, running moments of the observations, worlds."""
 
     params: Any
     opt_state: Any
@@ -58,7 +58,7 @@ class Learner(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """Steps of worlds, [T, W, ...] while they are made and [T W, ...] to learn from."""
+    """Recorded steps, [T, W, ...] in a rollout and [T W, ...] for learning."""
 
     x: jax.Array
     action: jax.Array
@@ -70,7 +70,7 @@ class Batch(NamedTuple):
 
 
 def network(key: jax.Array, *sizes: int) -> list[tuple[jax.Array, jax.Array]]:
-    """Weights and biases of layers, the last of which starts near zero."""
+    """Initialise the weights and biases of an MLP, its last layer near zero."""
     keys, scales = jax.random.split(key, len(sizes) - 1), [1.4] * (len(sizes) - 2) + [0.01]
     return [
         (jax.nn.initializers.orthogonal(scale)(k, (i, o)), jnp.zeros(o))
@@ -79,55 +79,54 @@ def network(key: jax.Array, *sizes: int) -> list[tuple[jax.Array, jax.Array]]:
 
 
 def apply(layers: list[tuple[jax.Array, jax.Array]], x: jax.Array) -> jax.Array:
-    """Outputs [..., O] of inputs [..., I]."""
+    """Map inputs [..., I] to outputs [..., O]."""
     for weight, bias in layers[:-1]:
         x = jnp.tanh(x @ weight + bias)
     return x @ layers[-1][0] + layers[-1][1]
 
 
-def see(env: envs.Env, moments: dict[str, jax.Array], state: envs.State) -> jax.Array:
-    """The full state [W, D], each number by its mean and deviation so far."""
+def observe(env: envs.Env, moments: dict[str, jax.Array], state: envs.State) -> jax.Array:
+    """Return the full state [W, D], normalised by its running mean and variance."""
     return jnp.clip(
         (env.full_state(state) - moments["mean"]) / jnp.sqrt(moments["variance"] + 1e-6), -5.0, 5.0
     )
 
 
 def act(env: envs.Env, state: envs.State, action: jax.Array) -> envs.State:
-    """A step by actions [W, A], whose -1 to 1 is what the environment allows."""
+    """Take a step with actions [W, A] in [-1, 1], rescaled to the environment's limits."""
     low, high = jnp.asarray(env.action_low), jnp.asarray(env.action_high)
     return env.step(state, low + (jnp.clip(action, -1.0, 1.0) + 1) / 2 * (high - low))
 
 
 def log_prob(params: Any, x: jax.Array, action: jax.Array) -> jax.Array:
-    """Of actions [..., A] around the actor's, but for a constant."""
+    """Compute the log-probability [...] of actions [..., A], up to a constant."""
     z = (action - apply(params["actor"], x)) / jnp.exp(params["log_std"])
     return -jnp.sum(z**2 / 2 + params["log_std"], axis=-1)
 
 
-def play(env: envs.Env, config: Config, learner: Learner, key: jax.Array) -> Any:
-    """T steps in every world, which starts afresh when it is done: the worlds, [T, W] steps."""
+def rollout(env: envs.Env, config: Config, learner: Learner, key: jax.Array) -> Any:
+    """Take T steps in every world, restarting those that are done; return worlds and steps."""
     params, moments = learner.params, learner.moments
 
     def value(x: jax.Array) -> jax.Array:
         return apply(params["critic"], x)[:, 0]
 
     def body(state: envs.State, key: jax.Array) -> tuple[envs.State, Batch]:
-        x = see(env, moments, state)
+        x = observe(env, moments, state)
         noise = jax.random.normal(key, (env.num_envs, len(env.action_low)))
         action = apply(params["actor"], x) + jnp.exp(params["log_std"]) * noise
         after = act(env, state, action)
         success = after.info["success"]
-        ahead = jnp.where(success, 0.0, value(see(env, moments, after)))
-        error = after.reward + config.discount * ahead - value(x)
-        chance = log_prob(params, x, action)
-        made = Batch(x, action, chance, value(x), error, after.done, success)
-        return env.reset_done(after, jax.random.fold_in(key, 1)), made
+        next_value = jnp.where(success, 0.0, value(observe(env, moments, after)))
+        error = after.reward + config.discount * next_value - value(x)
+        step = Batch(x, action, log_prob(params, x, action), value(x), error, after.done, success)
+        return env.reset_done(after, jax.random.fold_in(key, 1)), step
 
     return jax.lax.scan(body, learner.state, jax.random.split(key, config.steps))
 
 
 def advantages(config: Config, batch: Batch) -> jax.Array:
-    """[T, W]: errors of the critic added up backwards, episode by episode."""
+    """Compute generalised advantages [T, W]: discounted sums of TD errors within each episode."""
 
     def body(later: jax.Array, step: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         error, done = step
@@ -139,24 +138,24 @@ def advantages(config: Config, batch: Batch) -> jax.Array:
 
 
 def loss(params: Any, config: Config, batch: Batch, advantage: jax.Array) -> jax.Array:
-    """The clipped objective, and the critic's squared error."""
+    """Compute PPO's clipped objective plus the critic's squared error."""
     ratio = jnp.exp(log_prob(params, batch.x, batch.action) - batch.log_prob)
     scaled = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-6)
     clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
-    wrong = apply(params["critic"], batch.x)[:, 0] - batch.value - advantage
-    return jnp.mean(wrong**2) - jnp.mean(jnp.minimum(ratio * scaled, clipped * scaled))
+    error = apply(params["critic"], batch.x)[:, 0] - batch.value - advantage
+    return jnp.mean(error**2) - jnp.mean(jnp.minimum(ratio * scaled, clipped * scaled))
 
 
 def optimizer(config: Config) -> optax.GradientTransformation:
-    """Adam on gradients of bounded size."""
+    """Make Adam with gradients clipped by their global norm."""
     return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(config.learning_rate))
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def update(env: envs.Env, config: Config, learner: Learner, key: jax.Array) -> Any:
-    """Plays and learns: the learner, and how many episodes ended and succeeded."""
-    play_key, order_key = jax.random.split(key)
-    state, steps = play(env, config, learner, play_key)
+    """Collect and learn from steps; return the learner and counts of ended and won episodes."""
+    rollout_key, order_key = jax.random.split(key)
+    state, steps = rollout(env, config, learner, rollout_key)
     data = steps, advantages(config, steps)
     data = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), data)
 
@@ -171,56 +170,55 @@ def update(env: envs.Env, config: Config, learner: Learner, key: jax.Array) -> A
     rows = jax.vmap(lambda k: jax.random.permutation(k, config.steps * config.num_envs))(keys)
     rows = rows.reshape(config.epochs * config.minibatches, -1)
     (params, opt_state), _ = jax.lax.scan(body, learner[:2], rows)
-    moments = updated(learner.moments, env.full_state(state))
+    moments = update_moments(learner.moments, env.full_state(state))
     return Learner(params, opt_state, moments, state), (steps.done.sum(), steps.success.sum())
 
 
-def updated(moments: dict[str, jax.Array], seen: jax.Array) -> dict[str, jax.Array]:
-    """Count, mean and variance of all observations, W more of which [W, D] were made."""
-    count = moments["count"] + len(seen)
-    share, shift = len(seen) / count, jnp.mean(seen, axis=0) - moments["mean"]
-    variance = (1 - share) * (moments["variance"] + share * shift**2) + share * jnp.var(
-        seen, axis=0
-    )
+def update_moments(moments: dict[str, jax.Array], new: jax.Array) -> dict[str, jax.Array]:
+    """Update count, mean and variance of all observations with W new ones [W, D]."""
+    count = moments["count"] + len(new)
+    share, shift = len(new) / count, jnp.mean(new, axis=0) - moments["mean"]
+    variance = (1 - share) * (moments["variance"] + share * shift**2) + share * jnp.var(new, axis=0)
     return {"count": count, "mean": moments["mean"] + share * shift, "variance": variance}
 
 
-def begin(env: envs.Env, config: Config, key: jax.Array) -> Learner:
-    """A learner that knows nothing, in fresh worlds."""
+def init(env: envs.Env, config: Config, key: jax.Array) -> Learner:
+    """Initialise a learner, in fresh worlds."""
     reset_key, actor_key, critic_key = jax.random.split(key, 3)
     state = env.reset(reset_key)
-    seen, actions = env.full_state(state), len(env.action_low)
-    hidden = seen.shape[1], config.width, config.width
+    observation, actions = env.full_state(state), len(env.action_low)
+    hidden = observation.shape[1], config.width, config.width
     params = {
         "actor": network(actor_key, *hidden, actions),
         "critic": network(critic_key, *hidden, 1),
         "log_std": jnp.full(actions, jnp.log(config.std), jnp.float32),
     }
-    nothing = {
+    empty = {
         "count": jnp.float32(0),
         "mean": jnp.zeros(hidden[0]),
         "variance": jnp.ones(hidden[0]),
     }
-    return Learner(params, optimizer(config).init(params), updated(nothing, seen), state)
+    moments = update_moments(empty, observation)
+    return Learner(params, optimizer(config).init(params), moments, state)
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def evaluate(
     env: envs.Env, params: Any, moments: dict[str, jax.Array], key: jax.Array
 ) -> jax.Array:
-    """Whether the actor, without noise, solves each of W fresh layouts, bool [W]."""
+    """Return whether the actor, without noise, solves each of W fresh layouts, bool [W]."""
 
     def body(state: envs.State, _: None) -> tuple[envs.State, None]:
-        return act(env, state, apply(params["actor"], see(env, moments, state))), None
+        return act(env, state, apply(params["actor"], observe(env, moments, state))), None
 
     return jax.lax.scan(body, env.reset(key), None, env.max_steps)[0].info["success"]
 
 
 def train(config: Config) -> tuple[Learner, np.ndarray]:
-    """The learner after all updates, and a row for each: steps, seconds, episodes, successes."""
+    """Train; return the learner, and a row of steps, seconds, episodes, successes per update."""
     env = make(config, config.num_envs, reward="dense", discount=config.discount)
     key, start = jax.random.key(config.seed), time.perf_counter()
-    learner, rows = begin(env, config, key), []
+    learner, rows = init(env, config, key), []
     calls = messages.Calls(config.task)
     for number in range(1, config.updates + 1):
         key_now = jax.random.fold_in(key, number)
@@ -235,16 +233,16 @@ def train(config: Config) -> tuple[Learner, np.ndarray]:
 
 
 def make(config: Config, num_envs: int, **options: Any) -> envs.Env:
-    """Worlds whose actions move the tool."""
+    """Make an environment with end-effector actions."""
     return envs.make(
         config.task, config.robot, num_envs=num_envs, actions="end_effector", **options
     )
 
 
 def draw(config: Config, curve: np.ndarray) -> None:
-    """Writes the learning curve: successes among the episodes of three updates.
+    """Plot the learning curve: success rate over windows of three updates.
 
-    Fewer would show successes of a time in which no failure can have ended.
+    Over shorter windows it would be biased: a success ends early, a failure only at the time limit.
     """
     steps, _, ended, won = curve.T
     ended, won = (np.convolve(x, np.ones(3))[2 : len(x)] for x in (ended, won))
@@ -258,7 +256,7 @@ def draw(config: Config, curve: np.ndarray) -> None:
 
 
 def main(config: Config) -> float:
-    """Trains, draws, and evaluates on layouts that were never trained on: share of successes."""
+    """Train, plot, and evaluate on new layouts; return the success rate."""
     check_local(config.out)
     learner, curve = train(config)
     draw(config, curve)

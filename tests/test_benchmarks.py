@@ -16,7 +16,7 @@ from lorasp_jax.training.distributed import mesh as meshes
 
 
 def part(broken=0, **memory):
-    return long_run.Found(1, 1.0, broken, memory, 1.0)
+    return long_run.Report(1, 1.0, broken, memory, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_tables_fit_a_terminal():
 
 def test_what_data_measures(tmp_path):
     row = data.reading(tmp_path, 500, (4, 6), batch=8, batches=3)
-    assert (row["pictures"], row["batch"]) == ("6x4", 8)
+    assert (row["images"], row["batch"]) == ("6x4", 8)
     assert row["windows/s"] > 0
     found = Cache(tmp_path / "4x6")
     assert (len(found), found.num_steps, found.cameras["wrist"]) == (2, 500, [4, 6])
@@ -89,8 +89,8 @@ def test_what_data_imports(tmp_path, codec, size, capfd):
     data.record(tmp_path / codec, 2, codec)
     assert not capfd.readouterr().err
     row = data.importing(tmp_path, codec, 64)
-    assert row["kept as"] == "64x48"
-    assert row["pictures/s"] == 2 * row["steps/s"]
+    assert row["stored as"] == "64x48"
+    assert row["images/s"] == 2 * row["steps/s"]
     assert data.decoding(tmp_path, codec)["kB/picture"] == pytest.approx(size, rel=0.3)
 
 

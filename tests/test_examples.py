@@ -38,7 +38,7 @@ def test_moments_are_those_of_all_that_was_seen(ppo):
     seen = np.random.default_rng(0).normal(3, 2, (40, 5)).astype(np.float32)
     moments = {"count": jnp.float32(0), "mean": jnp.zeros(5), "variance": jnp.ones(5)}
     for part in np.split(seen, [7, 20]):
-        moments = ppo.updated(moments, part)
+        moments = ppo.update_moments(moments, part)
     np.testing.assert_allclose(moments["mean"], seen.mean(axis=0), rtol=1e-5)
     np.testing.assert_allclose(moments["variance"], seen.var(axis=0), rtol=1e-4)
 
@@ -54,7 +54,7 @@ class Points:
         zero = jnp.zeros(self.num_envs)
         at = jax.random.uniform(key, zero.shape, minval=-2.0, maxval=2.0)
         state = State(at, zero, zero > 0, {}, {"success": zero > 0, "steps": zero})
-        return jax.vmap(rewards.started)(state, {"reach": jnp.exp(-jnp.abs(at))})
+        return jax.vmap(rewards.at_reset)(state, {"reach": jnp.exp(-jnp.abs(at))})
 
     def full_state(self, state):
         return jnp.stack([state.data, jnp.ones(self.num_envs)], axis=1)
@@ -66,7 +66,7 @@ class Points:
         info, done = {"success": success, "steps": steps}, success | (steps >= self.max_steps)
         after = State(at, state.reward, done, {}, info)
         shares = {"reach": jnp.exp(-jnp.abs(at))}
-        one = functools.partial(rewards.earned, discount=0.97)
+        one = functools.partial(rewards.after_step, discount=0.97)
         return jax.vmap(one)(state, after, shares)
 
     def reset_done(self, state, key):

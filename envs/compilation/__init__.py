@@ -1,1 +1,1 @@
-"""How XLA compiles for simulation, and what it says meanwhile."""
+"""XLA settings for simulation, compilation cache and messages."""

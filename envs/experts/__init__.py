@@ -1,1 +1,1 @@
-"""Experts that solve the tasks, and demonstrations collected from them."""
+"""Scripted experts that solve the tasks, and the collection of their demonstrations."""

@@ -1,7 +1,7 @@
-"""Expert episodes in bulk: the whole of an episode, pictures included, in one jitted call.
+"""Collect expert demonstrations in batches, each batch in one jitted call, images included.
 
-An episode is one scan over control steps in W worlds that records robot states, actions and the
-poses of all geoms and cameras; pictures are rendered from those poses in bounded memory.
+A call scans over the control steps of an episode in W worlds and records robot states, actions and
+the poses of all geoms and cameras; images are rendered from those poses in bounded memory.
 """
 
 import dataclasses
@@ -19,27 +19,27 @@ from envs.experts import expert, traced
 from envs.making import AnyRobot, make
 from envs.scene.randomization import Draw, Randomization, prepared
 
-# Worlds a call, where nobody says otherwise: enough to fill the device, few enough for its memory.
+# Default number of worlds per call; own choice: fills the device and fits its memory.
 _NUM_ENVS = {"cpu": 32, "gpu": 256, "tpu": 256}
-# Below this share of successes, once so many attempts were made, something is broken, and going on
-# would only waste time.
-_LEAST_SUCCESS, _PATIENCE = 0.5, 16
-_MOST_EPISODES = 10**9
+# Give up if fewer than this share of attempts succeed, after this many attempts. Own choice: the
+# experts solve nearly all layouts, so less means that something is broken.
+_MIN_SUCCESS, _MIN_ATTEMPTS = 0.5, 16
+_MAX_EPISODES = 10**9  # own choice, a bound against typos
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Rollout:
-    """One expert episode in each of W worlds, T control steps.
+    """One expert episode of T control steps in each of W worlds.
 
     Attributes:
         state: f32 [T, W, J + 1] measured joints [rad] and gripper opening [m] before each action.
-        action: f32 [T, W, J + 1] what the expert asked for, without noise.
-        poses: geom_xpos, geom_xmat, cam_xpos, cam_xmat, each [T, W, ...], as the pictures see them.
+        action: f32 [T, W, J + 1] the expert's actions, without noise.
+        poses: geom_xpos, geom_xmat, cam_xpos, cam_xmat, each [T, W, ...], before each action.
         length: int32 [W] control steps until the world was done.
         success: bool [W].
-        instruction: int32 [W].
-        draw: what the worlds drew, or None.
+        instruction: int32 [W] index into the task's instructions.
+        draw: randomised values of the worlds, or None.
     """
 
     state: jax.Array
@@ -57,14 +57,14 @@ def rollout(
     action_noise: float | jax.Array = 0.0,
     ranges: Randomization | None = None,
 ) -> Rollout:
-    """The expert's attempt at fresh random layouts; to be called under jit.
+    """Run the expert on fresh random layouts; call it under jit.
 
     Args:
         env: W worlds.
-        key: all randomness.
-        action_noise: standard deviation [rad] of gaussian noise on the executed joint targets. The
-            recorded actions are free of it, so they show how to recover.
-        ranges: what differs from world to world, see `envs.scene.randomization`.
+        key: source of all randomness.
+        action_noise: standard deviation [rad] of Gaussian noise on the executed joint targets.
+            Recorded actions are without noise, so they demonstrate recovery.
+        ranges: domain randomisation, see `envs.scene.randomization`.
     """
     reset_key, plan_key, noise_key = jax.random.split(key, 3)
     first = env.reset(reset_key, ranges)
@@ -102,26 +102,28 @@ def collect(
     progress: Callable[[int, int], None] | None = None,
     **options: Any,
 ) -> Episodes:
-    """Successful demonstrations by the scripted expert, on the device, padded to its longest time.
+    """Collect successful demonstrations by the scripted expert, on the device.
+
+    Episodes are padded to the expert's time limit.
 
     Args:
-        task: as for `envs.make`.
-        robot: as for `envs.make`.
-        num_episodes: episodes E to return.
-        key: all randomness; the same key gives the same episodes.
-        num_envs: worlds W simulated at once; None picks by device.
+        task: as in `envs.make`.
+        robot: as in `envs.make`.
+        num_episodes: number of episodes E to return.
+        key: source of all randomness; the same key gives the same episodes.
+        num_envs: number of worlds W simulated at once; None chooses by device.
         action_noise: see `rollout`.
         ranges: see `rollout`.
         progress: called with (episodes so far, num_episodes), first with 0 before compilation.
-        **options: others of `envs.make`; the backend is jax unless they say otherwise.
+        **options: further options of `envs.make`; the backend defaults to jax.
 
     Raises:
-        TypeError: for what is no number or no key.
-        ValueError: for bad names or numbers, or if the expert fails far too often.
+        TypeError: an argument is not a number, or not a key.
+        ValueError: an unknown name, a number out of range, or an expert that fails too often.
     """
     env = make_repeatable(task, robot, num_envs=worlds(num_episodes, num_envs), **options)
     parts = gather(env, num_episodes, key, action_noise, ranges)
-    return concatenate(list(_reported(parts, num_episodes, progress)))
+    return concatenate(list(_with_progress(parts, num_episodes, progress)))
 
 
 def expert_success(
@@ -134,9 +136,9 @@ def expert_success(
     ranges: Randomization | None = None,
     **options: Any,
 ) -> jax.Array:
-    """Whether the expert solves each of `num_episodes` random layouts, bool [num_episodes].
+    """Return whether the expert solves each of `num_episodes` random layouts, bool [num_episodes].
 
-    Arguments are those of `collect`.
+    Arguments are as in `collect`.
     """
     env = make_repeatable(task, robot, num_envs=worlds(num_episodes, num_envs), **options)
     ranges = prepared(ranges, env.control_dt)
@@ -147,7 +149,7 @@ def expert_success(
 
 
 def make_repeatable(task: str, robot: AnyRobot, **options: Any) -> Env:
-    """`envs.make` with physics that gives the same again: Warp sums forces in any order."""
+    """Call `envs.make`, by default with reproducible physics: Warp's order of sums varies."""
     options.setdefault("backend", "jax")
     return make(task, robot, **options)
 
@@ -162,16 +164,16 @@ def gather(
     kept: int = 0,
     attempted: int = 0,
 ) -> Iterator[Episodes]:
-    """Yields successes of one call after the other, until there are `num_episodes`.
+    """Yield the successful episodes of one call after the other, `num_episodes` in total.
 
     Args:
-        env: W worlds, the attempts of one call.
-        num_episodes, key, action_noise, ranges: as for `collect`.
-        kept, attempted: num_episodes and attempted of all that was yielded before, to go on as if
-            it had never stopped.
+        env: W worlds, one attempt each per call.
+        num_episodes, key, action_noise, ranges: as in `collect`.
+        kept, attempted: episodes yielded and attempts made before an interruption, to resume with
+            the same episodes as without it.
 
     Raises:
-        ValueError: if the expert fails far too often.
+        ValueError: the expert fails too often.
     """
     ranges = prepared(ranges, env.control_dt)
     checks.key(key)
@@ -183,21 +185,21 @@ def gather(
     while kept < num_episodes:
         _check_success(env, kept, attempted)
         key, chunk_key = jax.random.split(key)
-        # Waiting here, a thread leaves Python to those that write what others recorded.
+        # Wait here, outside Python's lock, so that other threads can write their episodes.
         chunk, success = jax.block_until_ready(_record(env, chunk_key, action_noise, ranges))
         wins = np.flatnonzero(success)[: num_episodes - kept]
         kept += len(wins)
-        # Attempts after the last one that was needed do not count.
+        # Do not count attempts after the last one needed.
         tries = env.num_envs if kept < num_episodes else int(wins[-1]) + 1
         attempted, tried = attempted + tries, tried + tries
         if len(wins):
             won = jax.tree.map(lambda x, wins=wins: x[wins], chunk)
-            yield Episodes(**won, **_facts(env), attempted=tried)
+            yield Episodes(**won, **_metadata(env), attempted=tried)
             tried = 0
 
 
-def _facts(env: Env) -> dict[str, Any]:
-    """What `Episodes` say of where they come from."""
+def _metadata(env: Env) -> dict[str, Any]:
+    """Return the fields of `Episodes` that describe their environment."""
     return {
         "instructions": env.instructions,
         "task": env.task.name,
@@ -208,10 +210,10 @@ def _facts(env: Env) -> dict[str, Any]:
     }
 
 
-def _reported(
+def _with_progress(
     parts: Iterable[Episodes], total: int, progress: Callable[[int, int], None] | None
 ) -> Iterator[Episodes]:
-    """The same parts, with progress before the first and after each."""
+    """Pass the parts through, reporting progress before the first and after each."""
     report = progress or _silent
     report(0, total)
     done = 0
@@ -222,30 +224,30 @@ def _reported(
 
 
 def _silent(done: int, total: int) -> None:
-    """The progress callback of nobody."""
+    """Report no progress."""
 
 
 def _check_success(env: Env, kept: int, attempted: int) -> None:
-    if attempted >= _PATIENCE and kept < _LEAST_SUCCESS * attempted:
+    if attempted >= _MIN_ATTEMPTS and kept < _MIN_SUCCESS * attempted:
         raise ValueError(
             f"the expert solved only {kept} of {attempted} layouts of {env.task.name!r} with "
-            f"{env.robot.name!r}, at least {_LEAST_SUCCESS:.0%} are expected: check the scene "
-            "or lower action_noise"
+            f"{env.robot.name!r}, but should solve {_MIN_SUCCESS:.0%}: check the scene or lower "
+            "action_noise"
         )
 
 
-@traced.kept
+@traced.cached
 def _record(
     env: Env, key: jax.Array, action_noise: jax.Array, ranges: Randomization | None
 ) -> tuple[dict[str, Any], jax.Array]:
     tries = rollout(env, key, action_noise, ranges)
     steps, worlds = tries.action.shape[:2]
-    # World-major order, so that an episode's pictures end up next to each other.
+    # World-major order, so that the images of an episode are contiguous.
     flat = [jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]) for x in tries.poses]
     drawn = jax.tree.map(lambda x: jnp.repeat(x, steps, axis=0), tries.draw)
-    pictures = env.render(*flat, draw=drawn)
+    images = env.render(*flat, draw=drawn)
     episodes = {
-        "image": {k: x.reshape(worlds, steps, *x.shape[1:]) for k, x in pictures.items()},
+        "image": {k: x.reshape(worlds, steps, *x.shape[1:]) for k, x in images.items()},
         "state": jnp.swapaxes(tries.state, 0, 1),
         "action": jnp.swapaxes(tries.action, 0, 1),
         "length": tries.length,
@@ -254,14 +256,14 @@ def _record(
     return episodes, tries.success
 
 
-@traced.kept
+@traced.cached
 def _attempt(env: Env, key: jax.Array, ranges: Randomization | None) -> jax.Array:
     return rollout(env, key, ranges=ranges).success
 
 
 def worlds(num_episodes: int, num_envs: int | None) -> int:
-    """Worlds at once for so many episodes, where `num_envs` does not say it."""
-    num_episodes = checks.count("num_episodes", num_episodes, _MOST_EPISODES)
+    """Return the number of worlds to simulate at once: `num_envs`, or a default for the device."""
+    num_episodes = checks.count("num_episodes", num_episodes, _MAX_EPISODES)
     if num_envs is not None:
         return num_envs
     return min(num_episodes, _NUM_ENVS.get(jax.default_backend(), 256))

@@ -1,10 +1,10 @@
-"""An environment as a Brax environment, for training from states with Brax's wrappers.
+"""Wrap an environment for Brax, to train from states with Brax's wrappers.
 
 env = brax.envs.training.wrap(BraxEnv(envs.make("press")), episode_length=80)
 state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), 4096))
 
-Brax's wrappers take keys of `jax.random.PRNGKey` only, not of `jax.random.key`. The agents in Brax
-0.14.2 call `jax.device_put_replicated`, which JAX 0.10 has removed (google/brax issue 671).
+Brax's wrappers accept only keys from `jax.random.PRNGKey`, not from `jax.random.key`. The agents of
+Brax 0.14.2 call `jax.device_put_replicated`, which JAX 0.10 removed (google/brax issue 671).
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ try:
 except ImportError as error:
     raise ImportError('envs.interop.brax needs Brax: pip install -e ".[brax]"') from error
 
-# One world alone: what Brax batches anew would else be traced, and compiled, as a batch of batches.
+# Of a single world: Brax adds its own batch axis, and a batch of batches would compile slower.
 _reset = fast_cpu.jit(Env._reset, static_argnums=0)
 _step = fast_cpu.jit(Env._step, static_argnums=0)
 _full_state = fast_cpu.jit(Env._full_state, static_argnums=0)
@@ -33,72 +33,72 @@ _full_state = fast_cpu.jit(Env._full_state, static_argnums=0)
 class BraxEnv(base.Env):
     """One world of a task behind Brax's interface; Brax's wrappers batch, time and restart it.
 
-    Observations are those of `Env.full_state`, float32 [D]. There are no pictures in them:
-    `state.pipeline_state` is the `envs.State` of one world, from which `env.observe` makes them.
+    Observations are those of `Env.full_state`, float32 [D], without images:
+    `state.pipeline_state` is the `envs.State` of one world, which `env.observe` can render.
 
-    Actions, [A] in [-1, 1], span `action_low` to `action_high` of the environment inside. The
-    sparse reward is 1 once, when the task is done, so the return of an episode is its success; the
-    dense one wants `action_repeat=1`, for a wrapper that repeats actions adds rewards without
-    discount. `done` means success or broken physics. Time is left to Brax: an episode lasts as long
-    as the wrapper says (`env.max_steps` is the task's own limit), and its end is a truncation.
-    Brax's AutoResetWrapper restarts a world as it first was, the layout included.
+    Actions, [A] in [-1, 1], are rescaled to `action_low` and `action_high` of the environment. The
+    sparse reward is 1 once, on success, so the return of an episode is its success. The dense
+    reward needs `action_repeat=1`, since Brax adds up the rewards of repeated actions without
+    discount. `done` means success or broken physics. Brax's wrapper sets the length of an episode
+    (`env.max_steps` is the task's own limit) and marks its end as a truncation. Brax's
+    AutoResetWrapper restarts a world in its first state, layout included.
 
     Attributes:
-        env: the environment inside, of one world.
-        ranges: how worlds differ.
+        env: the wrapped environment, with one world.
+        ranges: domain randomisation.
     """
 
     def __init__(self, env: Env, *, ranges: Randomization | None = None):
         """Wrap an environment.
 
         Args:
-            env: what `envs.make` gave; its number of worlds does not matter.
-            ranges: as for `Env.reset`, for every episode.
+            env: from `envs.make`; its number of worlds does not matter.
+            ranges: for every episode, as in `Env.reset`.
 
         Raises:
-            TypeError: if it is no environment.
-            ValueError: if the ranges make no sense.
+            TypeError: `env` is not an environment.
+            ValueError: a range is invalid.
         """
-        checks.instance("env", env, Env, "what envs.make gave")
+        checks.instance("env", env, Env, "an environment from envs.make")
         self.env = dataclasses.replace(env, num_envs=1)
         prepared(ranges, env.control_dt)
         self.ranges = ranges
 
     def reset(self, rng: jax.Array) -> base.State:
-        """One fresh world, all from the key `rng`.
+        """Start one world; the key `rng` is the source of all randomness.
 
         Raises:
-            TypeError: if it is no key.
+            TypeError: `rng` is not a key.
         """
         ranges = prepared(self.ranges, self.env.control_dt)
         with self.env._calls.first("reset", ranges is None):
             world = _reset(self.env, ranges, checks.key(rng))
-        return base.State(reward=world.reward, metrics=world.metrics, **self._seen(world))
+        return base.State(reward=world.reward, metrics=world.metrics, **self._fields(world))
 
     def step(self, state: base.State, action: jax.Array) -> base.State:
-        """The world one control step later.
+        """Simulate one control step.
 
         Args:
             state: one world.
-            action: [A] in [-1, 1]; clipped.
+            action: [A] in [-1, 1], clipped.
 
         Raises:
-            TypeError, ValueError: as `Env.step`.
+            TypeError, ValueError: as in `Env.step`.
         """
         pipeline: Any = state.pipeline_state
-        checks.instance("state.pipeline_state", pipeline, State, "what reset gave")
+        checks.instance("state.pipeline_state", pipeline, State, "a state from reset or step")
         before = jax.tree.map(lambda x: x[0], pipeline)
         low, high = jnp.asarray(self.env.action_low), jnp.asarray(self.env.action_high)
         action = checks.action(action, low.shape)
         with self.env._calls.first("step", before.info["draw"] is None):
             world = _step(self.env, before, low + (action + 1) / 2 * (high - low))
-        # Brax would take the task's own time limit for a failure. A clock that stands still never
-        # gets there.
+        # Brax would treat the task's own time limit as a failure. Stop the clock so that the world
+        # never reaches it.
         clock = jnp.zeros_like(world.info["steps"])
         world = dataclasses.replace(world, info=world.info | {"steps": clock})
         reward = jnp.where(before.done, 0.0, world.reward)
         metrics = state.metrics | world.metrics  # wrappers add their own
-        return state.replace(reward=reward, metrics=metrics, **self._seen(world))
+        return state.replace(reward=reward, metrics=metrics, **self._fields(world))
 
     @property
     def observation_size(self) -> int:
@@ -115,8 +115,8 @@ class BraxEnv(base.Env):
         """The physics engine."""
         return "mjx"
 
-    def _seen(self, world: State) -> dict[str, Any]:
-        """The fields of Brax's state that say how one world, without an axis W, is now."""
+    def _fields(self, world: State) -> dict[str, Any]:
+        """Return the fields of Brax's state that follow from one world without an axis W."""
         return {
             "pipeline_state": jax.tree.map(lambda x: x[None], world),
             "obs": _full_state(self.env, world),

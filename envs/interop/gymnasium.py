@@ -1,4 +1,4 @@
-"""An environment as a Gymnasium vector environment: NumPy outside, jitted JAX inside.
+"""Wrap an environment as a Gymnasium vector environment: NumPy outside, jitted JAX inside.
 
 env = VectorEnv(envs.make("press", num_envs=64, image_size=64))
 observation, info = env.reset(seed=0)
@@ -33,26 +33,25 @@ except ImportError as error:
 
 Observation = Literal["pictures", "state", "full_state"]
 OBSERVATIONS: tuple[str, ...] = get_args(Observation)
-"""state: a dict of `state`, float32 [J + 1], measured joint angles [rad] and gripper opening [m];
-pictures: with `image`, too, camera name -> uint8 [image_size, image_size, 3]; full_state: the flat
-vector of `Env.full_state`, objects and speeds included, float32 [D]."""
+"""state: dict with `state`, float32 [J + 1], measured joint angles [rad] and gripper opening [m].
+pictures: the same plus `image`, camera name -> uint8 [image_size, image_size, 3].
+full_state: the privileged state of `Env.full_state`, float32 [D]."""
 
 
 class VectorEnv(gymnasium.vector.VectorEnv):
     """W worlds of a task behind Gymnasium's interface.
 
-    Observations are what `OBSERVATIONS` says, with leading axis W. Actions are those of `Env.step`,
+    Observations are one of `OBSERVATIONS`, with leading axis W. Actions are those of `Env.step`,
     float32 [W, A]. Info: `success`, bool [W], and `instruction`, text [W].
 
-    Worlds restart by themselves in Gymnasium's next-step mode: the step after a world ended ignores
-    its action and gives the first observation of its next episode, with reward 0 and neither
-    terminated nor truncated. A seed and the actions determine everything that follows, restarts
-    included.
+    Worlds restart automatically in Gymnasium's next-step mode: the step after a world ended ignores
+    its action and returns the first observation of its next episode, with reward 0 and neither
+    terminated nor truncated. The seed and the actions determine everything, including restarts.
 
     Attributes:
-        env: the environment inside.
-        ranges: how its worlds differ.
-        state: its W worlds, for what the interface hides (metrics, layouts); None before `reset`.
+        env: the wrapped environment.
+        ranges: domain randomisation.
+        state: the W worlds, for what the interface hides (metrics, layouts); None before `reset`.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.NEXT_STEP}
@@ -67,15 +66,15 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         """Wrap an environment.
 
         Args:
-            env: what `envs.make` gave.
-            observation: pictures, which cost more than the physics, state or full_state.
-            ranges: as for `Env.reset`, for every episode.
+            env: from `envs.make`.
+            observation: one of `OBSERVATIONS`; pictures cost more than the physics.
+            ranges: for every episode, as in `Env.reset`.
 
         Raises:
-            TypeError: if it is no environment.
-            ValueError: for an unknown observation, or if the ranges make no sense.
+            TypeError: `env` is not an environment.
+            ValueError: the observation is unknown, or a range is invalid.
         """
-        checks.instance("env", env, Env, "what envs.make gave")
+        checks.instance("env", env, Env, "an environment from envs.make")
         self.env = env
         self.observation = observation
         prepared(ranges, env.control_dt)
@@ -90,14 +89,14 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start all worlds afresh: observation and info.
+        """Restart all worlds; return observation and info.
 
         Args:
-            seed: of all randomness from now on; None goes on from the seed before.
-            options: there are none.
+            seed: seed of all randomness; None continues with the previous one.
+            options: not supported.
 
         Raises:
-            ValueError: if options are given.
+            ValueError: options were passed.
         """
         if options:
             raise ValueError(f"reset takes no options, got {', '.join(options)}")
@@ -108,18 +107,18 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     def step(
         self, actions: np.ndarray
     ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Simulate one control step of every world, or restart it if it had ended.
+        """Simulate one control step of every world, or restart worlds that have ended.
 
         Args:
-            actions: [W, A], units and limits as for `Env.step`.
+            actions: [W, A], units and limits as in `Env.step`.
 
         Returns:
-            Observation; reward, float32 [W], as `envs.make` was asked for it; terminated, bool [W],
-            the task is done; truncated, bool [W], time is up or the physics broke; info.
+            Observation; reward, float32 [W], sparse or dense as chosen in `envs.make`; terminated,
+            bool [W], on success; truncated, bool [W], on a time limit or broken physics; info.
 
         Raises:
             gymnasium.error.ResetNeeded: before the first `reset`.
-            TypeError, ValueError: if the actions are no numbers, or have another shape.
+            TypeError, ValueError: the actions are not numbers, or their shape is wrong.
         """
         if self.state is None:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
@@ -130,12 +129,12 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return observation, reward, done & success, done & ~success, self._info(state)
 
     def _advance(self, state: State, actions: jax.Array) -> State:
-        """The worlds one step later; those that had ended, which stand still, are fresh instead."""
+        """Step all worlds, and restart those that ended before this step."""
         after = self.env.step(state, actions)
         ended = state.done
         if not np.any(ended):
             return after
-        # Worlds that ended in this very step must still be seen: only the earlier ones restart.
+        # The caller must still see worlds that end in this very step: restart only earlier ones.
         ended_only = dataclasses.replace(after, done=ended)
         fresh = self.env.reset_done(ended_only, self._key(), self.ranges)
         return dataclasses.replace(fresh, done=after.done & ~ended)
@@ -144,7 +143,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return jax.random.key(int(self.np_random.integers(2**31)))
 
     def _observation(self, state: State) -> Any:
-        return _look(self.env, state, self.observation)
+        return _observe(self.env, state, self.observation)
 
     def _info(self, state: State) -> dict[str, Any]:
         instructions = np.array(self.env.instructions)
@@ -152,17 +151,17 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             "success": np.array(state.info["success"]),
             "instruction": instructions[np.asarray(state.info["instruction"])],
         }
-        # Gymnasium's mark of the worlds that an entry is about: all of them.
+        # Gymnasium's mask of the worlds that an entry applies to: all of them.
         return info | {f"_{name}": np.ones(self.num_envs, bool) for name in info}
 
 
 class SingleEnv(gymnasium.Env):
     """One world of a task as a Gymnasium environment; `VectorEnv` is far faster.
 
-    As `VectorEnv`, without its axis of worlds and without restarts.
+    Works like `VectorEnv`, without the axis of worlds and without automatic restarts.
 
     Attributes:
-        vector: the environment inside, of one world.
+        vector: the wrapped environment, with one world.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
@@ -171,16 +170,16 @@ class SingleEnv(gymnasium.Env):
         """Wrap an environment.
 
         Args:
-            env: what `envs.make` gave; its number of worlds does not matter.
-            render_mode: rgb_array for `render`.
+            env: from `envs.make`; its number of worlds does not matter.
+            render_mode: rgb_array, to use `render`.
             **options: of `VectorEnv`.
 
         Raises:
-            ValueError: for an unknown observation or render mode.
+            ValueError: the observation or the render mode is unknown.
         """
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"unknown render_mode {render_mode!r}: choose from rgb_array")
-        checks.instance("env", env, Env, "what envs.make gave")
+        checks.instance("env", env, Env, "an environment from envs.make")
         self.render_mode = render_mode
         self.metadata = self.metadata | {"render_fps": round(1 / env.control_dt)}
         self.vector = VectorEnv(dataclasses.replace(env, num_envs=1), **options)
@@ -190,30 +189,32 @@ class SingleEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """As `VectorEnv.reset`."""
+        """Restart the world; see `VectorEnv.reset`."""
         super().reset(seed=seed)
-        found = self.vector.reset(seed=int(self.np_random.integers(2**31)), options=options)
-        return _first(found[0]), self._info(found[1])
+        vector_seed = int(self.np_random.integers(2**31))
+        observation, info = self.vector.reset(seed=vector_seed, options=options)
+        return _first(observation), self._info(info)
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """As `VectorEnv.step`.
+        """Simulate one control step; see `VectorEnv.step`.
 
         Args:
             action: [A].
 
         Raises:
-            gymnasium.error.ResetNeeded: before the first `reset` and after an end.
-            ValueError: if the action has another shape.
+            gymnasium.error.ResetNeeded: before the first `reset`, and after the end of an episode.
+            ValueError: the action's shape is wrong.
         """
         state = self.vector.state
         if state is not None and bool(state.done[0]):
             raise gymnasium.error.ResetNeeded("the episode has ended: call reset")
-        seen, reward, terminated, truncated, info = self.vector.step(np.asarray(action)[None])
+        batched = self.vector.step(np.asarray(action)[None])
+        observation, reward, terminated, truncated, info = batched
         ends = bool(terminated[0]), bool(truncated[0])
-        return _first(seen), float(reward[0]), *ends, self._info(info)
+        return _first(observation), float(reward[0]), *ends, self._info(info)
 
     def render(self) -> np.ndarray:
-        """The side camera's picture, uint8 [image_size, image_size, 3].
+        """Render the side camera, uint8 [image_size, image_size, 3].
 
         Raises:
             gymnasium.error.ResetNeeded: before the first `reset`.
@@ -235,7 +236,7 @@ def make_vec(
     ranges: Randomization | None = None,
     **options: Any,
 ) -> VectorEnv:
-    """A `VectorEnv` of what `envs.make` makes with these options."""
+    """Make a `VectorEnv`; further options are those of `envs.make`."""
     env = make_env(task, robot, num_envs=num_envs, **options)
     return VectorEnv(env, observation=observation, ranges=ranges)
 
@@ -249,13 +250,13 @@ def make(
     render_mode: str | None = None,
     **options: Any,
 ) -> SingleEnv:
-    """A `SingleEnv` of what `envs.make` makes with these options."""
+    """Make a `SingleEnv`; further options are those of `envs.make`."""
     env = make_env(task, robot, **options)
     return SingleEnv(env, observation=observation, ranges=ranges, render_mode=render_mode)
 
 
 def _space(env: Env, observation: str) -> spaces.Space:
-    """The space of one world's observations; no bounds, for joints give way at their limits."""
+    """Return the space of one world's observations, unbounded: joints can exceed their limits."""
     if observation not in OBSERVATIONS:
         raise ValueError(
             f"unknown observation {observation!r}: choose from {', '.join(OBSERVATIONS)}"
@@ -263,20 +264,22 @@ def _space(env: Env, observation: str) -> spaces.Space:
     if observation == "full_state":
         length = max(part.stop for part in env.full_state_layout.values())
         return spaces.Box(-np.inf, np.inf, (length,))
-    seen: dict[str, spaces.Space] = {"state": spaces.Box(-np.inf, np.inf, (env.num_joints + 1,))}
+    parts: dict[str, spaces.Space] = {"state": spaces.Box(-np.inf, np.inf, (env.num_joints + 1,))}
     if observation == "pictures":
-        picture = spaces.Box(0, 255, (env.image_size, env.image_size, 3), np.uint8)
-        seen["image"] = spaces.Dict(dict.fromkeys(env.cameras, picture))
-    return spaces.Dict(seen)
+        image = spaces.Box(0, 255, (env.image_size, env.image_size, 3), np.uint8)
+        parts["image"] = spaces.Dict(dict.fromkeys(env.cameras, image))
+    return spaces.Dict(parts)
 
 
-def _look(env: Env, state: State, observation: str) -> Any:
+def _observe(env: Env, state: State, observation: str) -> Any:
     if observation == "full_state":
-        seen = env.full_state(state)
+        values = env.full_state(state)
+    elif observation == "pictures":
+        values = env.observe(state)
     else:
-        seen = env.observe(state) if observation == "pictures" else {"state": env.proprio(state)}
-    return jax.tree.map(np.array, seen)  # copies, because JAX's own memory is read-only
+        values = {"state": env.proprio(state)}
+    return jax.tree.map(np.array, values)  # copy: JAX's buffers are read-only
 
 
-def _first(seen: Any) -> Any:
-    return jax.tree.map(lambda x: x[0], seen)
+def _first(observation: Any) -> Any:
+    return jax.tree.map(lambda x: x[0], observation)

@@ -1,4 +1,4 @@
-"""Gymnasium's ids of every task and robot: `lorasp_jax/<task>-<robot>-v0`.
+"""Gymnasium ids of all tasks and robots: `lorasp_jax/<task>-<robot>-v0`.
 
 import gymnasium, envs
 worlds = gymnasium.make_vec("lorasp_jax/press-piper-v0", num_envs=4, reward="dense")
@@ -10,7 +10,7 @@ from envs.names import names
 
 
 def register() -> None:
-    """Registers them where Gymnasium is installed; what they stand for is imported when made."""
+    """Register the ids if Gymnasium is installed; environments are imported when made."""
     try:
         import gymnasium
     except ImportError:

@@ -1,4 +1,4 @@
-"""A user's robot in a scene: joints, actuators and contacts as tasks and environment want them."""
+"""Attach a user's robot to a scene, with the joints, actuators and contacts that tasks expect."""
 
 import dataclasses
 from typing import Any
@@ -14,24 +14,24 @@ from envs.rendering.model import STAND_IN_GROUP, is_visible
 from envs.robots import Robot
 
 _BASE = "base"
-_PREFIX = "robot/"  # of all names in the user's file, which may be those of the scene or a task
+_PREFIX = "robot/"  # for all names in the user's file, to avoid clashes with the scene and tasks
 _LEFT_OUT = ("keys", "sensors", "actuators", "tendons", "equalities", "pairs", "excludes", "lights")
-_UNSET = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's colour of a geom; one that has it takes its material's
-_SMALL = 0.01  # m, half the extent of a mesh below which it is not drawn
+_UNSET = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default colour; such a geom takes its material's
+_SMALL = 0.01  # m, half-extent below which a mesh is not drawn; own choice
 _HIDDEN_GROUP = 3
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class UserBody:
-    """The body of a robot from a user's file, see `robots.Body`.
+    """Body of a robot from a user's file, see `robots.Body`.
 
     Attributes:
-        spec: the user's description; the joints of its fingers measure half the opening.
+        spec: the user's model; the joints of its fingers measure half the opening.
         root: name of the base's body.
         fingers: names of the left and the right finger's joint.
-        pads: what the left and the right finger touch things with.
-        gripper: what pulls the fingers together.
-        mount: [4, 4] pose of the body that carries the fingers in the last link.
+        pads: collision shapes of the left and the right finger.
+        gripper: the servo that closes the fingers.
+        mount: [4, 4] pose, in the last link, of the body that carries the fingers.
     """
 
     spec: mujoco.MjSpec
@@ -42,11 +42,11 @@ class UserBody:
     mount: np.ndarray
 
     def mjcf(self, _: Robot, /) -> tuple[str, str]:
-        """A place for the bodies; no actuators."""
+        """Return an empty base body as a mount for the robot, and no actuators."""
         return f'<body name="{_BASE}"/>', ""
 
     def attach(self, robot: Robot, scene: mujoco.MjSpec) -> None:
-        """Puts the bodies into their place in a scene, and adds the actuators."""
+        """Attach the robot to the base body of the scene, and add the actuators."""
         own = self.spec.copy()
         for name in dir(own.option):
             if not name.startswith("_"):
@@ -74,15 +74,15 @@ class UserBody:
 def prepare(
     spec: mujoco.MjSpec, model: mujoco.MjModel, arm: Arm, gripper: Gripper, hand: Hand
 ) -> UserBody:
-    """The body of a user's robot.
+    """Prepare the body of a user's robot.
 
     Args:
-        spec: what `model` was compiled from; changed in place.
+        spec: source of `model`; modified in place.
         model: the user's model.
-        arm, gripper, hand: what was found in it.
+        arm, gripper, hand: its parts.
 
     Raises:
-        ValueError: if the file sets the total mass, which a scene would lose.
+        ValueError: the file sets the total mass, which would be lost in a scene.
     """
     if spec.compiler.settotalmass > 0:
         raise ValueError("settotalmass is not supported: give bodies and geoms their own masses")
@@ -101,10 +101,10 @@ def prepare(
     fingers = [joints[joint] for joint in arm.fingers]
     for joint, sign, shift in zip(fingers, hand.signs, hand.shifts, strict=True):
         _redefine(joint, sign, shift)
-    for number, geom in geoms.items():
-        if model.body_rootid[model.geom_bodyid[number]] == arm.root:
-            _clothe(model, number, geom)
-    # Frames around it do not come along: what the compiler made of them does.
+    for geom_id, geom in geoms.items():
+        if model.body_rootid[model.geom_bodyid[geom_id]] == arm.root:
+            _make_visual(model, geom_id, geom)
+    # Frames around the root are not attached, so use the pose that the compiler computed from them.
     root.pos, root.quat = model.body_pos[arm.root], model.body_quat[arm.root]
     root.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
     names = [joint.name for joint in fingers]
@@ -114,7 +114,7 @@ def prepare(
 def _add_servo(
     spec: mujoco.MjSpec, model: mujoco.MjModel, joint: str, servo: int, gear: float
 ) -> None:
-    """An actuator like the user's, on the joint itself."""
+    """Add a copy of the user's actuator that acts on the joint itself."""
     new = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     new.gear[0] = gear
     for name in (
@@ -125,7 +125,7 @@ def _add_servo(
 
 
 def _redefine(joint: Any, sign: float, shift: float) -> None:
-    """Makes the joint of a finger measure half the opening."""
+    """Redefine the joint of a finger to measure half the opening."""
     low, high = sorted(sign * joint.range + shift)
     joint.axis = sign * joint.axis
     joint.ref = sign * joint.ref + shift
@@ -134,35 +134,35 @@ def _redefine(joint: Any, sign: float, shift: float) -> None:
     joint.actfrcrange = sorted(sign * joint.actfrcrange)
 
 
-def _clothe(model: mujoco.MjModel, number: int, geom: Any) -> None:
-    """Makes a geom touch nothing, and adds shapes in its place if it is a mesh to be seen.
+def _make_visual(model: mujoco.MjModel, geom_id: int, geom: Any) -> None:
+    """Disable a geom's collisions; if it is a visible mesh, add primitives to draw in its place.
 
-    Its colour is its own, not its material's, which MuJoCo Warp would draw instead and which does
-    not change with `Look`; only a material with a texture stays.
+    Colours are moved from materials to geoms, since MuJoCo Warp prefers a material's colour, which
+    `Appearance` does not change; only materials with a texture stay.
     """
     geom.contype = geom.conaffinity = 0
     geom.group = min(geom.group, STAND_IN_GROUP - 1)
-    rgba, material = model.geom_rgba[number], model.geom_matid[number]
+    rgba, material = model.geom_rgba[geom_id], model.geom_matid[geom_id]
     if material >= 0 and np.allclose(rgba, _UNSET):
         rgba = geom.rgba = model.mat_rgba[material]
     if material >= 0 and np.all(model.mat_texid[material] < 0):
         geom.material = ""
-    is_mesh = model.geom_type[number] == mujoco.mjtGeom.mjGEOM_MESH
-    if not is_mesh or not is_visible(model)[number]:
+    is_mesh = model.geom_type[geom_id] == mujoco.mjtGeom.mjGEOM_MESH
+    if not is_mesh or not is_visible(model)[geom_id]:
         return
-    if model.geom_aabb[number, 3:].max() < _SMALL:
+    if model.geom_aabb[geom_id, 3:].max() < _SMALL:
         geom.group = _HIDDEN_GROUP
         return
     rotation = np.empty(9)
-    mujoco.mju_quat2Mat(rotation, model.geom_quat[number])
+    mujoco.mju_quat2Mat(rotation, model.geom_quat[geom_id])
     rotation = rotation.reshape(3, 3)
-    for shape in fitting.fit(model, number):
-        place = {
-            "pos": model.geom_pos[number] + rotation @ shape.position,
+    for shape in fitting.fit(model, geom_id):
+        pose = {
+            "pos": model.geom_pos[geom_id] + rotation @ shape.position,
             "quat": _quat(rotation @ shape.rotation),
         }
-        look = {"type": shape.kind, "size": shape.size, "rgba": rgba, "group": STAND_IN_GROUP}
-        geom.parent.add_geom(**place, **look, material="", contype=0, conaffinity=0, mass=0)
+        visual = {"type": shape.kind, "size": shape.size, "rgba": rgba, "group": STAND_IN_GROUP}
+        geom.parent.add_geom(**pose, **visual, material="", contype=0, conaffinity=0, mass=0)
 
 
 def _add_pad(scene: mujoco.MjSpec, finger: Any, pad: Pad) -> None:

@@ -1,7 +1,7 @@
-"""Primitive shapes in place of meshes, for a renderer that draws no triangles.
+"""Approximate meshes by primitive shapes, for a renderer that does not draw triangles.
 
-A mesh is cut into a few parts, wherever that takes much air out of the boxes around them, and each
-part is replaced by the box, cylinder or capsule to which its surface is closest.
+A mesh is split into a few parts wherever that shrinks the total volume of their bounding boxes
+enough, and each part is replaced by the box, cylinder or capsule closest to its surface.
 """
 
 import dataclasses
@@ -9,14 +9,15 @@ import dataclasses
 import mujoco
 import numpy as np
 
+# Own choices.
 _POINTS = 500  # samples of a surface
-_CUTS = np.arange(1, 6) / 6  # where a part may be cut, as fractions of its extent
-_WORTH = 0.85  # a cut is made if it leaves less than this share of the volume
-_LONG = 0.06  # m, extent above which a part may be cut; 64 pixels of the side camera see 6 mm each
-_DEPTH = 3  # cuts one after the other
+_CUTS = np.arange(1, 6) / 6  # candidate cuts, as fractions of a part's extent
+_WORTH = 0.85  # cut only if the volume shrinks to less than this share
+_LONG = 0.06  # m, extent above which a part may be cut; a pixel of a 64 px side camera is 6 mm wide
+_DEPTH = 3  # largest number of successive cuts
 _FEWEST = 10  # points in a part
-_OUTLIERS = 0.01  # share of the points on each side that a shape need not hold
-_THIN = 0.0005  # m, least half-extent
+_OUTLIERS = 0.01  # share of the points on each side that a shape may leave out
+_THIN = 0.0005  # m, smallest half-extent
 _BOX, _CYLINDER, _CAPSULE = (
     mujoco.mjtGeom.mjGEOM_BOX,
     mujoco.mjtGeom.mjGEOM_CYLINDER,
@@ -26,13 +27,13 @@ _BOX, _CYLINDER, _CAPSULE = (
 
 @dataclasses.dataclass(frozen=True)
 class Shape:
-    """A primitive in the frame of the mesh geom that it stands for.
+    """A primitive in the frame of the mesh geom that it replaces.
 
     Attributes:
         kind: MuJoCo's geom type: box, cylinder or capsule.
-        size: [3] as MuJoCo has it for that type [m].
+        size: [3] in MuJoCo's convention for that type [m].
         position, rotation: [3] in m and [3, 3].
-        distance: mean distance of the points to its surface [m].
+        distance: mean distance of the mesh's points to its surface [m].
     """
 
     kind: mujoco.mjtGeom
@@ -43,17 +44,18 @@ class Shape:
 
 
 def fit(model: mujoco.MjModel, geom: int) -> list[Shape]:
-    """Shapes like a mesh geom, in its frame; their axes are those of its inertia or of its file."""
+    """Approximate a mesh geom by shapes in its frame, aligned with its inertia or file axes."""
     mesh = model.geom_dataid[geom]
     file_axes = np.empty(9)
     mujoco.mju_quat2Mat(file_axes, model.mesh_quat[mesh])
     frames = [np.eye(3), file_axes.reshape(3, 3).T]
-    turns = [frame[:, order] for frame in frames for order in ((0, 1, 2), (1, 2, 0), (2, 0, 1))]
-    return _fit(_surface(model, mesh), turns, _DEPTH)
+    orders = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
+    rotations = [frame[:, order] for frame in frames for order in orders]
+    return _fit(_sample_surface(model, mesh), rotations, _DEPTH)
 
 
-def _surface(model: mujoco.MjModel, mesh: int) -> np.ndarray:
-    """Points [N, 3] all over the triangles of a mesh."""
+def _sample_surface(model: mujoco.MjModel, mesh: int) -> np.ndarray:
+    """Sample points [N, 3] uniformly on the triangles of a mesh."""
     first, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
     vertices = model.mesh_vert[model.mesh_vertadr[mesh] :]
     a, b, c = vertices[model.mesh_face[first : first + count].T].astype(float)
@@ -65,8 +67,8 @@ def _surface(model: mujoco.MjModel, mesh: int) -> np.ndarray:
     return a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen]
 
 
-def _fit(points: np.ndarray, turns: list[np.ndarray], depth: int) -> list[Shape]:
-    whole, volume = _closest(points, turns)
+def _fit(points: np.ndarray, rotations: list[np.ndarray], depth: int) -> list[Shape]:
+    whole, volume = _closest(points, rotations)
     best, parts = _WORTH * volume, None
     for axis in whole.rotation.T:
         along = points @ axis
@@ -78,19 +80,19 @@ def _fit(points: np.ndarray, turns: list[np.ndarray], depth: int) -> list[Shape]
             halves = points[below], points[~below]
             if min(map(len, halves)) < _FEWEST:
                 continue
-            volume = sum(_closest(half, turns)[1] for half in halves)
+            volume = sum(_closest(half, rotations)[1] for half in halves)
             if volume < best:
                 best, parts = volume, halves
     if parts is None:
         return [whole]
-    return [shape for half in parts for shape in _fit(half, turns, depth - 1)]
+    return [shape for half in parts for shape in _fit(half, rotations, depth - 1)]
 
 
-def _closest(points: np.ndarray, turns: list[np.ndarray]) -> tuple[Shape, float]:
-    """The best shape along the last column of any of `turns`, and the least volume of a box."""
-    found = []
-    for turn in turns:
-        local = points @ turn
+def _closest(points: np.ndarray, rotations: list[np.ndarray]) -> tuple[Shape, float]:
+    """Return the closest shape with one of these rotations, and the volume of the smallest box."""
+    shapes = []
+    for rotation in rotations:
+        local = points @ rotation
         low, high = np.quantile(local, (_OUTLIERS, 1 - _OUTLIERS), axis=0)
         middle = (low + high) / 2
         local, half = local - middle, np.maximum((high - low) / 2, _THIN)
@@ -105,11 +107,11 @@ def _closest(points: np.ndarray, turns: list[np.ndarray]) -> tuple[Shape, float]
             (_CAPSULE, (radius, straight, 0), round_ends),
         ):
             mean = float(np.abs(distance).mean())
-            found.append(Shape(kind, np.array(size), turn @ middle, turn, mean))
-    best = min(found, key=lambda shape: shape.distance)
-    return best, min(8 * float(np.prod(shape.size)) for shape in found if shape.kind == _BOX)
+            shapes.append(Shape(kind, np.array(size), rotation @ middle, rotation, mean))
+    best = min(shapes, key=lambda shape: shape.distance)
+    return best, min(8 * float(np.prod(shape.size)) for shape in shapes if shape.kind == _BOX)
 
 
 def _signed(past: np.ndarray) -> np.ndarray:
-    """Signed distance [N] to a convex shape, from how far points are past its sides [N, S]."""
+    """Compute the signed distance [N] to a convex shape from those to its S sides [N, S]."""
     return np.linalg.norm(np.maximum(past, 0), axis=1) + np.minimum(past.max(axis=1), 0)

@@ -1,4 +1,4 @@
-"""Where the hand of a user's robot is, which way it looks, and how its fingers move and touch."""
+"""Locate the hand of a user's robot: its frame, how its fingers move, where they collide."""
 
 import itertools
 from typing import NamedTuple
@@ -9,28 +9,29 @@ import numpy as np
 from envs.mjcf.reading import Arm
 from envs.robots import TIP_LENGTH, TIP_RADIUS
 
-_PARALLEL = 0.99  # least cosine of directions that should be the same
+_PARALLEL = 0.99  # smallest cosine between parallel directions (8 deg); own choice
 _CORNERS = np.array(list(itertools.product((-1, 1), repeat=3)))
 
 
 class Pad(NamedTuple):
-    """What a finger touches things with, in the frame of its body [m]."""
+    """Collision shapes of a finger in the frame of its body: a box, and a sphere at the tip [m]."""
 
-    position: np.ndarray  # of a box
+    position: np.ndarray  # of the box
     rotation: np.ndarray
-    size: np.ndarray  # its half-extents
-    tip: np.ndarray  # of the sphere
+    size: np.ndarray  # half-extents of the box
+    tip: np.ndarray  # centre of the sphere
 
 
 class Hand(NamedTuple):
-    """A hand at the end of its arm.
+    """The hand of an arm.
 
-    A finger's pad is sign * q + shift away from the tcp: half the opening.
+    For a finger joint at q, sign * q + shift is the distance of its pad from the tcp, which is half
+    the opening.
     """
 
     chain: np.ndarray  # [J, 4, 4] as in `Robot`
     tool: np.ndarray  # [4, 4]
-    mount: np.ndarray  # [4, 4] pose of the body that carries the fingers in the last link
+    mount: np.ndarray  # [4, 4] pose, in the last link, of the body that carries the fingers
     signs: np.ndarray  # [2]
     shifts: np.ndarray  # [2] m
     stroke: float  # m
@@ -38,7 +39,7 @@ class Hand(NamedTuple):
 
 
 def find(model: mujoco.MjModel, arm: Arm, tcp: str | None) -> Hand:
-    """The hand of an arm.
+    """Locate the hand of an arm.
 
     Args:
         model: the user's model.
@@ -46,8 +47,8 @@ def find(model: mujoco.MjModel, arm: Arm, tcp: str | None) -> Hand:
         tcp: as in `envs.mjcf.load`.
 
     Raises:
-        ValueError: if the fingers do not slide along one line or have nothing to touch with, or the
-            site does not exist or does not suit them.
+        ValueError: the fingers do not slide along one line or have no colliding geom, or the site
+            does not exist or does not match the fingers.
     """
     data = mujoco.MjData(model)
     data.qpos[model.jnt_qposadr[arm.joints]] = 0
@@ -76,10 +77,11 @@ def find(model: mujoco.MjModel, arm: Arm, tcp: str | None) -> Hand:
 
 
 def _open(model: mujoco.MjModel, data: mujoco.MjData, arm: Arm) -> tuple[np.ndarray, np.ndarray]:
-    """Opens the fingers in `data`.
+    """Open the fingers in `data`.
 
     Returns:
-        Which way [2] each joint opens them, and the direction [3] from the second to the first.
+        Sign [2] of each joint's motion that opens the hand, and the direction [3] from the second
+        finger to the first.
     """
     mujoco.mj_kinematics(model, data)
     line = data.xaxis[arm.fingers[0]]
@@ -101,22 +103,22 @@ def _open(model: mujoco.MjModel, data: mujoco.MjData, arm: Arm) -> tuple[np.ndar
 
 
 def _corners(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> np.ndarray:
-    """Corners [N, 8, 3] of the boxes around the N colliding geoms of a finger."""
-    finger, found = model.jnt_bodyid[joint], []
+    """Return the corners [N, 8, 3] of the bounding boxes of the N colliding geoms of a finger."""
+    finger, corners = model.jnt_bodyid[joint], []
     for geom in np.flatnonzero(model.geom_contype | model.geom_conaffinity):
         body = model.geom_bodyid[geom]
-        while body > finger:  # a parent comes before its children
+        while body > finger:  # parents have smaller ids than their children
             body = model.body_parentid[body]
         if body == finger:
             centre, half = model.geom_aabb[geom].reshape(2, 3)
             rotation = data.geom_xmat[geom].reshape(3, 3)
-            found.append(data.geom_xpos[geom] + (centre + half * _CORNERS) @ rotation.T)
-    if not found:
+            corners.append(data.geom_xpos[geom] + (centre + half * _CORNERS) @ rotation.T)
+    if not corners:
         raise ValueError(
             f"finger {model.joint(joint).name} needs a geom that collides; its body "
             f"{model.body(finger).name} has none with contype or conaffinity"
         )
-    return np.stack(found)
+    return np.stack(corners)
 
 
 def _site(model: mujoco.MjModel, tcp: str | None) -> str | None:
@@ -124,14 +126,14 @@ def _site(model: mujoco.MjModel, tcp: str | None) -> str | None:
     if tcp is None:
         return "tcp" if "tcp" in names else None
     if tcp not in names:
-        raise ValueError(f"there is no site {tcp}; the sites are {', '.join(names) or 'none'}")
+        raise ValueError(f"unknown site {tcp}; the sites are {', '.join(names) or 'none'}")
     return tcp
 
 
 def _axes(
     model: mujoco.MjModel, data: mujoco.MjData, arm: Arm, across: np.ndarray, site: str | None
 ) -> np.ndarray:
-    """Axes [3, 3] of the hand in the world; y is `across`."""
+    """Compute the axes [3, 3] of the hand in the world, as columns; y is `across`."""
     last = arm.joints[-1]
     fingers = np.mean([_corners(model, data, f).mean(axis=(0, 1)) for f in arm.fingers], axis=0)
     reach = fingers - data.xanchor[last]
@@ -148,8 +150,8 @@ def _axes(
         z = data.xaxis[last] * (1 if data.xaxis[last] @ reach > 0 else -1)
         if abs(z @ across) > 1 - _PARALLEL:
             raise ValueError(
-                "a site tcp is needed, z out of the hand and y along which the fingers open: the "
-                "last joint does not turn about the hand's axis"
+                "the last joint's axis is not the hand's, so the file needs a site tcp with z "
+                "pointing out of the hand and y along which the fingers open"
             )
     z = z - (z @ across) * across
     z /= np.linalg.norm(z)
@@ -157,7 +159,7 @@ def _axes(
 
 
 def _end(corners: np.ndarray) -> np.ndarray:
-    """Lowest and highest coordinates [2, 3] of the boxes [N, 8, 3] near the end of a finger."""
+    """Return the bounds [2, 3] of the boxes [N, 8, 3] near the end of a finger."""
     reach = corners[:, :, 2].max(axis=1)
     near = corners[reach > reach.max() - 2 * TIP_LENGTH].reshape(-1, 3)
     return np.stack([near.min(axis=0), near.max(axis=0)])
@@ -166,7 +168,7 @@ def _end(corners: np.ndarray) -> np.ndarray:
 def _centre(
     data: mujoco.MjData, axes: np.ndarray, left: np.ndarray, right: np.ndarray, site: str | None
 ) -> np.ndarray:
-    """The tcp [3] along the hand's axes."""
+    """Compute the coordinates of the tcp [3] along the hand's axes."""
     x = np.mean([left[:, 0], right[:, 0]])
     if site:
         x = data.site(site).xpos @ axes[:, 0]
@@ -177,7 +179,7 @@ def _centre(
 
 
 def _frame(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> np.ndarray:
-    """Pose [4, 4] of a hinge in the world, turning about its z."""
+    """Return the pose [4, 4] of a hinge in the world, with z along its axis."""
     z = data.xaxis[joint]
     body = data.xmat[model.jnt_bodyid[joint]].reshape(3, 3)
     x = body[:, np.argmin(np.abs(z @ body))]
@@ -193,12 +195,12 @@ def _pose(position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 
 
 def _pad(data: mujoco.MjData, body: int, pose: np.ndarray, box: np.ndarray) -> Pad:
-    """The pad of a finger's body, from its box [2, 3] along the axes of the tcp's pose [4, 4]."""
+    """Make a finger's pad from its bounds [2, 3], given along the axes of the tcp's pose [4, 4]."""
     axes, origin = pose[:3, :3], pose[:3, 3]
     low, high = box - origin @ axes
     side = np.sign(low[1] + high[1])
     inner, outer = sorted((low[1], high[1]), key=abs)
-    thick = max(abs(outer - inner), 2 * TIP_RADIUS)  # what is thin lets things through
+    thick = max(abs(outer - inner), 2 * TIP_RADIUS)  # objects would tunnel through a thin pad
     centre, half = (low + high) / 2, (high - low) / 2
     centre[1], half[1] = inner + side * thick / 2, thick / 2
     tip = np.array([0.0, inner + side * TIP_RADIUS, TIP_LENGTH - TIP_RADIUS])
@@ -208,5 +210,5 @@ def _pad(data: mujoco.MjData, body: int, pose: np.ndarray, box: np.ndarray) -> P
 
 
 def _degrees(cosine: float) -> float:
-    """The angle between two lines, rounded [deg]."""
+    """Return the angle between two lines, rounded [deg]."""
     return round(np.rad2deg(np.arccos(min(abs(cosine), 1.0))))

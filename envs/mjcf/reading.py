@@ -1,4 +1,4 @@
-"""Finding an arm, its hand and its actuators in a MuJoCo model, and saying what is missing."""
+"""Find the arm, its limits and its actuators in a user's MuJoCo model, or say what is missing."""
 
 import os
 from collections.abc import Iterable
@@ -13,52 +13,52 @@ from envs.scene import scene
 
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _KINDS = ("free", "ball", "slide", "hinge")
-_MOST_JOINTS = 16  # of an arm; whoever simulates one compiles each
+_MAX_JOINTS = 16  # own choice: compile time grows with every joint
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
 class Arm(NamedTuple):
-    """Numbers in the user's model."""
+    """Ids in the user's model."""
 
-    root: int  # the base's body
+    root: int  # body of the base
     joints: list[int]  # hinges from the base to the hand
-    fingers: list[int]  # the two fingers' slides
+    fingers: list[int]  # slides of the two fingers
     servos: list[int]  # actuators of the hinges
-    gears: list[float]  # how fast their lengths grow with the hinges
+    gears: list[float]  # derivative of each actuator's length with respect to its hinge
 
 
 class Gripper(NamedTuple):
-    """What pulls both fingers together, as a position servo of half the opening."""
+    """The fingers' actuators as one position servo of half the opening."""
 
     stiffness: float  # N/m
     damping: float  # N s/m
-    force: float  # N, infinite where there is no limit
+    force: float  # limit in N, infinite if there is none
 
 
 def read(
     path: str | os.PathLike[str], folder: str | os.PathLike[str] | None = None
 ) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
-    """An MJCF file, also compiled.
+    """Read and compile an MJCF file.
 
     Args:
         path: the file.
-        folder: where all files must lie that it names; None: where the file is.
+        folder: folder that must contain all referenced files; by default that of the file.
 
     Raises:
-        ValueError: if there is none, MuJoCo does not take it, or it names files elsewhere.
+        ValueError: the file does not exist, MuJoCo rejects it, or it refers to files elsewhere.
     """
     path = Path(path).absolute()
-    if not os.path.isfile(path):  # Path.is_file raises where a name is too long
-        raise ValueError("there is no such file")
+    if not os.path.isfile(path):  # Path.is_file raises if a name is too long
+        raise ValueError("no such file")
     try:
         sources.check(path, Path(folder or path.parent))
-    except (SyntaxError, RecursionError, OSError) as error:  # the first: of XML
+    except (SyntaxError, RecursionError, OSError) as error:  # XML errors are SyntaxErrors
         raise ValueError(f"MuJoCo cannot read it: {error}") from error
     try:
-        with scene.warnings_of_python():
+        with scene.as_python_warnings():
             spec = mujoco.MjSpec.from_file(str(path))
-            spec.memory = -1  # as MuJoCo likes: nothing of the file itself is ever simulated
-            # Bodies and geoms keep their numbers.
+            spec.memory = -1  # automatic: this model itself is never simulated
+            # Keep the ids of bodies and geoms.
             spec.compiler.fusestatic = spec.compiler.discardvisual = False
             return spec, spec.compile()
     except ValueError as error:
@@ -66,14 +66,14 @@ def read(
 
 
 def find_arm(model: mujoco.MjModel) -> Arm:
-    """The joints and their servos, each where the tasks need it.
+    """Find the arm's joints and their servos.
 
     Raises:
-        ValueError: if one is missing or too many.
+        ValueError: the model has too few, too many or unsuitable joints or actuators.
     """
     fingers = np.flatnonzero(model.jnt_type == _SLIDE).tolist()
     if len(fingers) != 2:
-        raise ValueError(f"two slide joints are needed for the fingers; {_joints(model)}")
+        raise ValueError(f"the fingers need two slide joints; {_joints(model)}")
     hand, other = model.body_parentid[model.jnt_bodyid[fingers]]
     if hand != other:
         names = f"{model.body(hand).name} and {model.body(other).name}"
@@ -84,50 +84,50 @@ def find_arm(model: mujoco.MjModel) -> Arm:
         joints = [*range(first, first + model.body_jntnum[root]), *joints]
         base, root = root, int(model.body_parentid[root])
     if not joints or any(model.jnt_type[joints] != _HINGE):
-        raise ValueError(f"hinges alone must lead from the base to the hand; {_joints(model)}")
-    if len(joints) > _MOST_JOINTS:
-        raise ValueError(f"the arm has {len(joints)} hinges; at most are {_MOST_JOINTS}")
+        raise ValueError(f"all joints from the base to the hand must be hinges; {_joints(model)}")
+    if len(joints) > _MAX_JOINTS:
+        raise ValueError(f"the arm has {len(joints)} hinges; at most {_MAX_JOINTS} are supported")
     own = np.flatnonzero(model.body_rootid[model.jnt_bodyid] == base)
     if others := set(own.tolist()) - {*joints, *fingers}:
         raise ValueError(f"{_names(model, others)}: neither part of the arm nor one of its fingers")
-    if free := [joint for joint in (*joints, *fingers) if not model.jnt_limited[joint]]:
-        raise ValueError(f"every joint needs a range; {_names(model, free)} have none")
+    if unlimited := [joint for joint in (*joints, *fingers) if not model.jnt_limited[joint]]:
+        raise ValueError(f"every joint needs a range; {_names(model, unlimited)} have none")
     servos, gears = zip(*(_servo(model, joint) for joint in joints), strict=True)
     return Arm(base, joints, fingers, list(servos), list(gears))
 
 
 def find_limits(model: mujoco.MjModel, arm: Arm) -> tuple[np.ndarray, np.ndarray]:
-    """Least and largest angles [J] that the hinges have and their servos can be told [rad].
+    """Return the lowest and highest angles [J] allowed by both hinges and servos [rad].
 
     Raises:
-        ValueError: if there are none.
+        ValueError: the two ranges of a joint do not overlap.
     """
     lower, upper = model.jnt_range[arm.joints].T
-    told = np.where(
+    control = np.where(
         model.actuator_ctrllimited[arm.servos, None],
         model.actuator_ctrlrange[arm.servos],
         (-np.inf, np.inf),
     )
-    lower, upper = np.maximum(lower, told[:, 0]), np.minimum(upper, told[:, 1])
-    if none := [joint for joint, room in zip(arm.joints, upper - lower, strict=True) if room <= 0]:
+    lower, upper = np.maximum(lower, control[:, 0]), np.minimum(upper, control[:, 1])
+    if empty := [joint for joint, span in zip(arm.joints, upper - lower, strict=True) if span <= 0]:
         raise ValueError(
-            f"{_names(model, none)}: range and the actuator's ctrlrange do not overlap"
+            f"{_names(model, empty)}: range and the actuator's ctrlrange do not overlap"
         )
     return lower, upper
 
 
 def find_gripper(model: mujoco.MjModel, arm: Arm, signs: np.ndarray) -> Gripper:
-    """The fingers' actuators taken together; they may act on one finger, on both or on a tendon.
+    """Combine the fingers' actuators, which may act on one finger, on both, or on a tendon.
 
     Args:
         model: the user's model.
         arm: from `find_arm`.
-        signs: [2] 1 for a finger joint that opens the hand as it grows, else -1.
+        signs: [2], 1 for a finger joint whose positive direction opens the hand, else -1.
 
     Raises:
-        ValueError: if there is none, or it is not a position actuator.
+        ValueError: there is none, or one is not a position actuator.
     """
-    rates = np.zeros(model.nu)  # of each actuator's length, as half the opening grows
+    rates = np.zeros(model.nu)  # derivative of each actuator's length by half the opening
     for joint, sign in zip(arm.fingers, signs, strict=True):
         rates += sign * _rates(model, joint)
     acting = np.flatnonzero(rates).tolist()
@@ -142,22 +142,22 @@ def find_gripper(model: mujoco.MjModel, arm: Arm, signs: np.ndarray) -> Gripper:
 
 
 def _servo(model: mujoco.MjModel, joint: int) -> tuple[int, float]:
-    """The actuator that moves this joint alone, and its rate."""
+    """Find the actuator that moves only this joint, and its rate as in `_rates`."""
     rates = _rates(model, joint)
     others = np.any([_rates(model, j) for j in range(model.njnt) if j != joint], axis=0)
     for i in np.flatnonzero(rates * ~others).tolist():
         gain = model.actuator_gainprm[i, 0]
-        # Without force where length, rate times angle, makes up for the control: there they agree.
+        # No force if control = angle: gain * control and bias * rate * angle cancel.
         if _is_servo(model, i) and np.isclose(gain, -model.actuator_biasprm[i, 1] * rates[i]):
             return i, float(rates[i])
     raise ValueError(
         f"joint {_names(model, [joint])} needs a position actuator of its own, whose control "
-        f"is its angle; {_actuators(model)}"
+        f"is the joint angle; {_actuators(model)}"
     )
 
 
 def _rates(model: mujoco.MjModel, joint: int) -> np.ndarray:
-    """How fast the length [nu] of every actuator grows with a joint."""
+    """Compute the derivative of every actuator's length with respect to a joint, [nu]."""
     rates = np.zeros(model.nu)
     for i in range(model.nu):
         target, gear = model.actuator_trnid[i, 0], model.actuator_gear[i, 0]

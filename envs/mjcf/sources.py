@@ -1,7 +1,7 @@
-"""What an MJCF file names and how much it asks for, checked before MuJoCo opens and makes it.
+"""Check the files and sizes that an MJCF file asks for before MuJoCo loads it.
 
-MuJoCo looks for a file in several places: beside the main file, beside the one that includes the
-element, and below meshdir, texturedir and assetdir from there. Whatever lies in any of them counts.
+MuJoCo searches for a file in several places: beside the main file, beside the including file, and
+in meshdir, texturedir and assetdir relative to these. Files in any of them are checked.
 """
 
 import graphlib
@@ -16,147 +16,157 @@ from xml.etree import ElementTree
 from envs.datasets.files import check_memory, read_text, regular
 
 _FOLDERS = ("assetdir", "meshdir", "texturedir")  # attributes of compiler
-_DESCRIPTIONS = ("include", "model")  # elements that name another description
-_HOLDING = ("include", "attach")  # elements in whose place another description's are put
-_MOST_DEPTH, _MOST_TEXT = 20, 2**25
-_MOST_COPIES, _MOST_ELEMENTS = 1000, 10_000  # MuJoCo 3.17 takes seconds for these (measured)
-_MOST_ENTRIES, _MOST_PLACES = 10**6, 10**5
+_DESCRIPTIONS = ("include", "model")  # elements that refer to another MJCF file
+_HOLDING = ("include", "attach")  # elements that are replaced by those of another MJCF file
+# Limits are own choices, far above any robot; MuJoCo 3.17 takes seconds at _MAX_COPIES and
+# _MAX_ELEMENTS (measured).
+_MAX_DEPTH, _MAX_TEXT = 20, 2**25
+_MAX_COPIES, _MAX_ELEMENTS = 1000, 10_000
+_MAX_ENTRIES, _MAX_PATHS = 10**6, 10**5
 _ENTRIES = {"dim", "num", "nsample"}  # attributes of sensors and actuators
-_MOST_RINGS = 300  # of a mesh that MuJoCo makes, whose vertices are as many squared
-_BYTES = ("memory", "nstack")  # attributes of size that `reading` leaves out
+_MAX_RINGS = 300  # of a built-in mesh, which has as many vertices squared
+_BYTES = ("memory", "nstack")  # attributes of <size> that `reading` ignores
 _PIXEL_BYTES = 4
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def check(path: Path, folder: Path) -> None:
-    """Raises a ValueError unless all that a file names is in a folder and of a possible size.
+    """Check that all files an MJCF file refers to are inside a folder, and its sizes reasonable.
 
     Args:
         path: the MJCF file.
-        folder: where all files must lie that it names, links followed.
+        folder: folder that must contain all referenced files, after following links.
+
+    Raises:
+        ValueError: a file is outside, or something is too large.
     """
     descriptions = _all_descriptions(path, folder)
     for root in descriptions.values():
         _check_sizes(root, 1)
     _check_growth(descriptions, path.parent)
-    for named in _named(descriptions, path.parent, ()):
-        _check_picture(regular(named, folder))
+    for file in _referenced(descriptions, path.parent, ()):
+        _check_image(regular(file, folder))
 
 
 def _all_descriptions(path: Path, folder: Path) -> dict[Path, ElementTree.Element]:
-    """The XML of a file and of all that it includes."""
+    """Parse a file and all MJCF files that it includes, directly or not."""
     regular(path)
     main, known, new, size = path.parent, {}, [path], 0
-    for _ in range(_MOST_DEPTH):
-        for each in new:
-            text = read_text(each, folder if known else None)
-            if (size := size + len(text)) > _MOST_TEXT:
-                raise ValueError(f"its XML is longer than {_MOST_TEXT} characters")
-            known[each] = ElementTree.fromstring(text)  # whose parser bounds what entities become
-        new = [p for p in _named(known, main, _DESCRIPTIONS) if p not in known]
+    for _ in range(_MAX_DEPTH):
+        for file in new:
+            text = read_text(file, folder if known else None)
+            if (size := size + len(text)) > _MAX_TEXT:
+                raise ValueError(f"its XML is longer than {_MAX_TEXT} characters")
+            known[file] = ElementTree.fromstring(text)  # the parser limits entity expansion
+        new = [p for p in _referenced(known, main, _DESCRIPTIONS) if p not in known]
         if not new:
             return known
-    raise ValueError(f"{new[0]} is named more than {_MOST_DEPTH} descriptions deep")
+    raise ValueError(f"{new[0]} is included more than {_MAX_DEPTH} files deep")
 
 
 def _check_growth(descriptions: dict[Path, ElementTree.Element], main: Path) -> None:
-    """Raises a ValueError if a description holds itself, which would end this process, or makes
-    more elements than MuJoCo can take: its time grows with their square.
+    """Raise a ValueError if a file includes itself, or expands to too many elements.
+
+    The first would crash this process; MuJoCo's time grows with the square of the second.
     """
-    held: dict[Path, set[Path]] = {}
+    included: dict[Path, set[Path]] = {}
     for path, root in descriptions.items():
         names = [_portable(e.get("file", "")) for e in root.iter() if e.tag in _DESCRIPTIONS]
-        homes = (main, path.parent)
-        held[path] = {
-            Path(os.path.normpath(home / name)) for home in homes for name in names if name
+        folders = (main, path.parent)
+        included[path] = {
+            Path(os.path.normpath(folder / name)) for folder in folders for name in names if name
         }
-    made: dict[Path, float] = {}
+    sizes: dict[Path, float] = {}
     try:
-        order = [*graphlib.TopologicalSorter(held).static_order()]  # what is held comes first
+        order = [*graphlib.TopologicalSorter(included).static_order()]  # included files first
     except graphlib.CycleError as error:
-        raise ValueError(f"{error.args[1][0]} holds itself, by its includes and models") from None
+        cycle = error.args[1][0]
+        raise ValueError(f"{cycle} includes itself, through its includes and models") from None
     for path in order:
         if path in descriptions:
-            inner = max((made.get(each, 0.0) for each in held[path]), default=0.0)
-            made[path] = _elements(descriptions[path], 1, inner)
-            if made[path] > _MOST_ELEMENTS:
+            inner = max((sizes.get(file, 0.0) for file in included[path]), default=0.0)
+            sizes[path] = _elements(descriptions[path], 1, inner)
+            if sizes[path] > _MAX_ELEMENTS:
                 raise ValueError(
-                    f"{path} makes {made[path]:g} elements; at most are {_MOST_ELEMENTS}"
+                    f"{path} expands to {sizes[path]:g} elements; "
+                    f"at most {_MAX_ELEMENTS} are allowed"
                 )
 
 
 def _elements(element: ElementTree.Element, copies: float, inner: float) -> float:
-    """How many an element makes, at most, where a description that it holds makes `inner`."""
+    """Bound the elements that one expands to, if each included file has at most `inner`."""
     more = inner if element.tag in _HOLDING else 0.0
     below = copies * _copies(element)
     return copies * (1 + more) + sum(_elements(child, below, inner) for child in element)
 
 
-def _named(
+def _referenced(
     descriptions: dict[Path, ElementTree.Element], main: Path, kinds: tuple[str, ...]
 ) -> Iterator[Path]:
-    """Everything on the disk that elements of some kinds, or of all, may stand for."""
+    """Yield all existing files that elements of these kinds (empty: all) may refer to."""
     elements = [element for root in descriptions.values() for element in root.iter()]
     below = {_portable(e.get(name, "")) for e in elements for name in _FOLDERS}
-    homes = {main, *(path.parent for path in descriptions)}
+    folders = {main, *(path.parent for path in descriptions)}
     names = {
         _portable(value)
         for element in elements
         for attribute, value in element.attrib.items()
         if attribute.startswith("file") and (not kinds or element.tag in kinds)
     }
-    names |= {os.path.basename(name) for name in names}  # of strippath
-    parts = homes, below, {os.path.relpath(home, main) for home in homes}, names
-    if math.prod(map(len, parts)) > _MOST_PLACES:
-        raise ValueError("it names more files in more folders than any robot has")
-    found = {os.path.normpath(os.path.join(*place)) for place in itertools.product(*parts)}
-    yield from (Path(p) for p in sorted(found) if os.path.lexists(p) and not os.path.isdir(p))
+    names |= {os.path.basename(name) for name in names}  # for strippath
+    parts = folders, below, {os.path.relpath(folder, main) for folder in folders}, names
+    if math.prod(map(len, parts)) > _MAX_PATHS:
+        raise ValueError(f"its file names and folders combine to more than {_MAX_PATHS} paths")
+    paths = {os.path.normpath(os.path.join(*path)) for path in itertools.product(*parts)}
+    yield from (Path(p) for p in sorted(paths) if os.path.lexists(p) and not os.path.isdir(p))
 
 
 def _portable(name: str) -> str:
-    """MuJoCo takes both kinds of slashes."""
+    """Replace backslashes, which MuJoCo accepts too."""
     return name.replace("\\", "/")
 
 
 def _check_sizes(element: ElementTree.Element, copies: float) -> None:
-    """Raises a ValueError if an element makes something that is too large."""
+    """Raise a ValueError if an element asks for something too large."""
     copies *= _copies(element)
     grid = math.prod([*_numbers(element, "nrow"), *_numbers(element, "ncol")])
-    picture = math.prod([*_numbers(element, "width"), *_numbers(element, "height")])
+    image = math.prod([*_numbers(element, "width"), *_numbers(element, "height")])
     counted = element.attrib.keys() & _ENTRIES
     if element.tag == "size":
         counted = element.attrib.keys() - set(_BYTES)
     if element.tag == "numeric":
         counted = {"size"}
     entries = max(itertools.chain(*(_numbers(element, name) for name in counted)), default=0)
-    if entries > _MOST_ENTRIES:
+    if entries > _MAX_ENTRIES:
         raise ValueError(
-            f"its {element.tag} has {entries:g} of something; at most are {_MOST_ENTRIES}"
+            f"its {element.tag} asks for {entries:g} entries; at most {_MAX_ENTRIES} are allowed"
         )
-    if max(_numbers(element, "params"), default=0) > _MOST_RINGS:
-        raise ValueError(f"its {element.tag} is finer than {_MOST_RINGS} rings of vertices")
-    if copies > _MOST_COPIES:
-        raise ValueError(f"{element.tag} makes {copies:g} copies; at most are {_MOST_COPIES}")
-    check_memory(int(min(_PIXEL_BYTES * max(grid, picture), 1e30)), f"its {element.tag}")
+    if max(_numbers(element, "params"), default=0) > _MAX_RINGS:
+        raise ValueError(f"its {element.tag} has more than {_MAX_RINGS} rings of vertices")
+    if copies > _MAX_COPIES:
+        raise ValueError(
+            f"{element.tag} makes {copies:g} copies; at most {_MAX_COPIES} are allowed"
+        )
+    check_memory(int(min(_PIXEL_BYTES * max(grid, image), 1e30)), f"its {element.tag}")
     for child in element:
         _check_sizes(child, copies)
 
 
 def _copies(element: ElementTree.Element) -> float:
-    """How often an element makes what is in it."""
+    """Return how many copies an element makes of its children."""
     return math.prod(_numbers(element, "count"))
 
 
 def _numbers(element: ElementTree.Element, attribute: str) -> list[float]:
-    """The numbers in an attribute; MuJoCo says what is wrong with what is none."""
+    """Parse the numbers in an attribute; if malformed, leave the error to MuJoCo."""
     try:
         return [max(1.0, float(text)) for text in element.get(attribute, "").split()]
     except ValueError:
         return []
 
 
-def _check_picture(path: Path) -> None:
-    """Raises a ValueError if a PNG file says that it is larger than any memory."""
+def _check_image(path: Path) -> None:
+    """Raise a ValueError if the header of a PNG file claims a size that does not fit memory."""
     with path.open("rb") as file:
         head = file.read(24)
     if head.startswith(_PNG) and len(head) == 24:

@@ -1,1 +1,1 @@
-"""MuJoCo MJX: the only folder that names an implementation of it."""
+"""Simulate with MuJoCo MJX; the only folder that knows its implementations, JAX and Warp."""

@@ -1,8 +1,8 @@
-"""MuJoCo Warp inside jit, for NVIDIA GPUs.
+"""Call MuJoCo Warp inside jit, on NVIDIA GPUs.
 
-MJX can call MuJoCo Warp as well, one physics step a call, which passes some 350 arrays through
-Python every time: 2 ms, measured, for 0.6 ms of work in 4,096 worlds. Here all physics steps
-between two actions are one call with a dozen arrays, and one CUDA graph.
+MJX can call MuJoCo Warp too, but once per physics step, passing some 350 arrays through Python each
+time: 2 ms, measured, for 0.6 ms of work in 4,096 worlds. Here all physics steps between two actions
+are one call with a dozen arrays, and one CUDA graph.
 """
 
 import copy
@@ -18,44 +18,45 @@ from mujoco.mjx.third_party import mujoco_warp
 from envs.physics import warp_call
 from envs.state import MOVING, Changes, Data
 
-# Warp computes where the geoms of fixed bodies are but once, for the model that all worlds share.
+# Warp computes the geom poses of fixed bodies once, for the model that all worlds share, so each
+# world passes its own.
 _FIXED = ("geom_xpos", "geom_xmat")
 
 
 class WarpSteps:
-    """A MuJoCo model that simulates batches of worlds.
+    """Simulates batches of worlds of one MuJoCo model.
 
-    Device memory for each number of worlds is taken when its first call is traced, and kept until
-    the process ends. Not for threads: what one traces while another's graph is captured would
-    become part of that graph.
+    Device memory for each number of worlds is allocated when its first call is traced, and never
+    freed. Not thread-safe: what one thread traces while another captures a graph would become part
+    of that graph.
     """
 
     def __init__(self, model: mujoco.MjModel, *, contacts: int, rows: int, growth: float) -> None:
         """Prepare a model.
 
         Args:
-            model: what all worlds share.
-            contacts, rows: at most so many contacts and rows of constraints in each world.
-            growth: of geoms, at most, where a world has its own sizes.
+            model: shared by all worlds.
+            contacts, rows: largest number of contacts and constraint rows per world.
+            growth: largest factor on geom sizes in one world.
         """
-        self._mujoco = _with_room(model, growth)
+        self._mujoco = _with_larger_bounds(model, growth)
         self._sizes = {"nconmax": int(contacts), "njmax": int(rows)}
-        self._made: dict[tuple[str, int], tuple[Any, Any]] = {}
+        self._cache: dict[tuple[str, int], tuple[Any, Any]] = {}
         self._callables: dict[tuple[str, ...], Any] = {}
 
     def __call__(self, changes: Changes, start: Data, controls: jax.Array) -> Sequence[jax.Array]:
-        """The `MOVING` of one world after S physics steps, as `Physics.advance` gives them."""
+        """Return the `MOVING` fields of one world after S physics steps."""
         names = tuple(sorted(changes))
-        differing = [jnp.asarray(changes[name], jnp.float32) for name in names]
+        changed = [jnp.asarray(changes[name], jnp.float32) for name in names]
         state = [getattr(start, name) for name in (*_FIXED, *MOVING)]
-        results = self._batch(names)(*(x[None] for x in (controls, *differing, *state)))
+        results = self._batch(names)(*(x[None] for x in (controls, *changed, *state)))
         return [x[0] for x in results]
 
     def _batch(self, names: tuple[str, ...]) -> Any:
-        """The same for W worlds, all arrays with a leading axis."""
+        """Do the same for W worlds; all arrays have a leading axis W."""
 
         def run(controls: jax.Array, *arrays: jax.Array) -> list[jax.Array]:
-            # Memory must be there before a graph is captured; steps follow one another in memory.
+            # Allocate before the graph is captured. Steps come first, to be contiguous in memory.
             with wp.ScopedDevice(warp_call.device()):
                 self._worlds(len(controls))
             return self._callable(names)(jnp.swapaxes(controls, 0, 1), *arrays)
@@ -63,21 +64,21 @@ class WarpSteps:
         return warp_call.flattening_vmap(run)
 
     def _callable(self, names: tuple[str, ...]) -> Any:
-        """JAX's way into Warp: controls [S, W, nu], changed fields, `_FIXED`, `MOVING`."""
+        """Make the JAX callable of controls [S, W, nu], changed fields, `_FIXED`, `MOVING`."""
         if names not in self._callables:
 
             def simulate(*arrays: Any) -> None:
-                given = dict(zip(like, arrays, strict=True))
-                model, data = self._worlds(given["controls"].shape[1])
+                by_name = dict(zip(like, arrays, strict=True))
+                model, data = self._worlds(by_name["controls"].shape[1])
                 model = copy.copy(model)
                 for name in names:
-                    setattr(model, name, given[name])
+                    setattr(model, name, by_name[name])
                 for name in _FIXED:
-                    wp.copy(getattr(data, name), given[name])
+                    wp.copy(getattr(data, name), by_name[name])
                 for name in MOVING:
-                    setattr(data, name, given[name])
-                for step in range(given["controls"].shape[0]):
-                    wp.copy(data.ctrl, given["controls"][step])
+                    setattr(data, name, by_name[name])
+                for step in range(by_name["controls"].shape[0]):
+                    wp.copy(data.ctrl, by_name["controls"][step])
                     mujoco_warp.step(model, data)
 
             with wp.ScopedDevice(warp_call.device()):
@@ -90,28 +91,28 @@ class WarpSteps:
             )
         return self._callables[names]
 
-    def _worlds(self, number: int) -> tuple[Any, Any]:
-        """Model and data of so many worlds on Warp's current device."""
-        key = (str(wp.get_device()), number)
-        if key not in self._made:
-            data = mujoco_warp.make_data(self._mujoco, nworld=number, **self._sizes)
-            self._made[key] = self._model(key[0]), data
-        return self._made[key]
+    def _worlds(self, num_worlds: int) -> tuple[Any, Any]:
+        """Return the model, and data for this many worlds, on Warp's current device."""
+        key = (str(wp.get_device()), num_worlds)
+        if key not in self._cache:
+            data = mujoco_warp.make_data(self._mujoco, nworld=num_worlds, **self._sizes)
+            self._cache[key] = self._model(key[0]), data
+        return self._cache[key]
 
     def _model(self, device: str) -> Any:
-        """The model on Warp's current device, which is called so."""
-        for (other, _), (model, _) in self._made.items():
+        """Return the model on `device`, Warp's current one."""
+        for (other, _), (model, _) in self._cache.items():
             if other == device:
                 return model
         model = mujoco_warp.put_model(self._mujoco)
-        # A fixed, small number of iterations is what the scene asks for.
-        few = mujoco_warp.OverflowType.ITERATIONS | mujoco_warp.OverflowType.LS_ITERATIONS
-        model.opt.warn_overflow &= ~few
+        # Our scenes run the solver for a small, fixed number of iterations; do not warn about that.
+        iterations = mujoco_warp.OverflowType.ITERATIONS | mujoco_warp.OverflowType.LS_ITERATIONS
+        model.opt.warn_overflow &= ~iterations
         return model
 
 
-def _with_room(model: mujoco.MjModel, growth: float) -> mujoco.MjModel:
-    """The model with bounding volumes that also hold geoms that have grown."""
+def _with_larger_bounds(model: mujoco.MjModel, growth: float) -> mujoco.MjModel:
+    """Copy the model with bounding volumes scaled to hold geoms that have grown."""
     model = copy.copy(model)
     bounded = model.geom_rbound > 0  # planes have none
     model.geom_rbound[bounded] *= growth

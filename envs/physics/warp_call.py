@@ -1,4 +1,4 @@
-"""Functions that work on Warp's arrays, called from JAX."""
+"""Call functions of Warp arrays from JAX."""
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
@@ -10,23 +10,23 @@ import warp as wp
 
 
 def device() -> Any:
-    """Warp's name for the device that JAX computes on."""
+    """Return the Warp device that JAX computes on."""
     return wp.device_from_jax(jax.local_devices()[0])
 
 
 def from_jax(function: Callable[..., None], like: Mapping[str, Any], **options: Any) -> Any:
-    """A function of Warp arrays for use under jit.
+    """Make a function of Warp arrays callable under jit.
 
-    On a GPU it is captured as a CUDA graph at its first call, so all memory that outlives a call
-    must be there before; Warp copies the arguments to and from where the graph expects them.
+    On a GPU its first call is captured as a CUDA graph, so memory that outlives a call must be
+    allocated before; Warp copies arguments and results to and from the graph's buffers.
 
     Args:
-        function: takes arrays one after the other, the outputs last.
+        function: takes arrays as positional arguments, the outputs last.
         like: a Warp array of the type of each, by name.
-        options: of `warp.jax_callable`.
+        options: passed to `warp.jax_callable`.
     """
     kinds = {name: wp.array(dtype=x.dtype, ndim=x.ndim) for name, x in like.items()}
-    # Warp reads from the signature which arrays there are.
+    # Warp reads names and types of the arrays from the signature.
     function.__annotations__ = kinds
     function.__signature__ = inspect.Signature(
         [
@@ -40,7 +40,7 @@ def from_jax(function: Callable[..., None], like: Mapping[str, Any], **options: 
 
 
 def flattening_vmap(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of trees of arrays with a leading axis of worlds; to vmap it makes that longer."""
+    """Make `vmap` fold its axis into the leading axis of worlds of all arrays."""
 
     @jax.custom_batching.custom_vmap
     def run(*arguments: Any) -> Any:
@@ -48,8 +48,8 @@ def flattening_vmap(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @run.def_vmap
     def _(size: int, batched: Sequence[Any], *arguments: Any) -> Any:
-        def flat(x: jax.Array, given: bool) -> jax.Array:
-            x = x if given else jnp.broadcast_to(x, (size, *x.shape))
+        def flat(x: jax.Array, is_batched: bool) -> jax.Array:
+            x = x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
             return x.reshape(-1, *x.shape[2:])
 
         results = run(*jax.tree.map(flat, list(arguments), list(batched)))

@@ -1,1 +1,1 @@
-"""Pictures of the worlds, by ray casting."""
+"""Render images of the worlds by ray casting."""

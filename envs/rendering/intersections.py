@@ -1,13 +1,13 @@
-"""Rays of one camera against primitive geoms: the nearest geom, shadows, surface normals.
+"""Intersect the rays of one camera with primitive geoms: nearest hit, shadows, surface normals.
 
 Every geom is scaled to a unit shape in its own frame before it is intersected: a sphere or
 ellipsoid to the unit sphere, a cylinder to radius 1 and half-length 1, a box to the cube
 [-1, 1]^3, a plane to z = 0 with half-extents 1, a capsule to radius 1 (its half-length `half`
-stays a parameter). Scaling leaves the ray parameter t as it is.
+stays a parameter). Scaling does not change the ray parameter t.
 
-Vectors are triples of arrays, one per component, so that XLA fuses everything into one loop over
-pixels. Components broadcast: a camera ray has one origin and many directions, a shadow ray many
-origins and one direction.
+Vectors are triples of component arrays, so that XLA fuses everything into one loop over pixels.
+Components broadcast: camera rays have one origin and many directions, shadow rays many origins and
+one direction.
 """
 
 import functools
@@ -26,36 +26,36 @@ _TINY = 1e-12  # stands in for a zero direction component or squared length in a
 
 
 class Geom(NamedTuple):
-    """A geom as one camera sees it, in its unit frame.
+    """A geom and a camera, in the geom's unit frame.
 
-    Components are scalars; or arrays `[P]`, where each pixel has a geom of its own.
+    Components are scalars, or arrays `[P]` with the geom of each pixel.
     """
 
-    axes: Matrix  # rows of the matrix with the camera's axes as columns
+    axes: Matrix  # rows of the matrix whose columns are the camera's axes
     eye: Vec  # the camera's position
     light: Vec  # direction towards the light
-    shrink: Vec  # 1 / the half-extents that were scaled to 1 [1/m]
+    shrink: Vec  # 1 / half-extents before scaling [1/m]
     rgb: Vec
     half: jax.Array  # a capsule's half-length over its radius, else 0
     kind: jax.Array  # f32, PLANE .. BOX
 
 
 Geoms = Callable[[jax.Array], Geom]
-"""int32 number, or numbers `[P]` -> that geom, or the geom of each pixel; sorted by kind."""
+"""Look up a geom by its index, int32 scalar or `[P]`; geoms are sorted by kind."""
 
 
 def dot(a: Vec, b: Vec) -> jax.Array:
-    """Scalar product of two component triples."""
+    """Compute the dot product of two vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def ray(axes: Matrix, x: jax.Array, y: jax.Array) -> Vec:
-    """Components of axes @ (x, y, -1); `axes` are rows."""
+    """Compute axes @ (x, y, -1), `axes` given as rows."""
     return tuple(row[0] * x + row[1] * y - row[2] for row in axes)
 
 
 def along(origin: Vec, t: jax.Array, direction: Vec) -> Vec:
-    """The point origin + t * direction."""
+    """Compute the point origin + t * direction."""
     return tuple(o + t * d for o, d in zip(origin, direction, strict=True))
 
 
@@ -78,7 +78,7 @@ def _sphere(o: Vec, d: Vec, half: jax.Array) -> jax.Array:
 
 
 def _round_side(o: Vec, d: Vec) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Coefficients a t^2 + 2 b t + c = 0 of the infinite unit cylinder, and b^2 - a c."""
+    """Return a, b, c of a t² + 2 b t + c = 0 for the infinite unit cylinder, and b² - a c."""
     a = d[0] * d[0] + d[1] * d[1]
     b = o[0] * d[0] + o[1] * d[1]
     c = o[0] * o[0] + o[1] * o[1] - 1
@@ -86,7 +86,7 @@ def _round_side(o: Vec, d: Vec) -> tuple[jax.Array, jax.Array, jax.Array, jax.Ar
 
 
 def _capsule(o: Vec, d: Vec, half: jax.Array) -> jax.Array:
-    """The infinite cylinder; where it is entered beyond an end, the sphere at that end instead."""
+    """Intersect the infinite cylinder, or the end's sphere where the ray enters beyond that end."""
     a, b, c, root = _round_side(o, d)
     t = (-b - jnp.sqrt(jnp.maximum(root, 0))) / jnp.maximum(a, _TINY)
     z = o[2] + t * d[2]
@@ -124,13 +124,13 @@ def _box(o: Vec, d: Vec, half: jax.Array) -> jax.Array:
 
 Enter = Callable[[Vec, Vec, jax.Array], jax.Array]
 ENTER: tuple[Enter, ...] = (_plane, _sphere, _capsule, _cylinder, _box)
-"""By kind: (origin, direction, half) -> the t > 0 where the ray enters from outside, or +inf."""
+"""By kind: (origin, direction, half) -> t > 0 where the ray enters from outside, or +inf."""
 
 
 def nearest(
     geoms: Geoms, kinds: tuple[int, ...], x: jax.Array, y: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """First geom along the rays eye + depth * (x, y, -1) in the camera's frame.
+    """Find the first geom along the rays eye + depth * (x, y, -1) in the camera's frame.
 
     Args:
         geoms: V geoms.
@@ -139,8 +139,8 @@ def nearest(
         y: `[P]` slope upwards.
 
     Returns:
-        Its number `[P]` (int32, 0 where nothing is hit) and depth `[P]` (+inf where nothing is
-        hit), which is rounded down to leave the number's bits free.
+        Its index `[P]` (int32, 0 for no hit) and depth `[P]` (+inf for no hit), rounded down so
+        that its lowest bits can hold the index.
     """
     low = (1 << len(kinds).bit_length()) - 1
 
@@ -162,11 +162,10 @@ def unshadowed(
     number: jax.Array,
     depth: jax.Array,
 ) -> jax.Array:
-    """Whether no other geom lies between a surface point and the light, bool `[P]`.
+    """Return whether no other geom blocks the way from a surface point to the light, bool `[P]`.
 
-    Arguments are those and the results of `nearest`, depth finite. A convex geom shades itself
-    where its normal points away from the light, which is the caller's to see; planes cast no
-    shadows.
+    Takes the arguments and results of `nearest`, with finite depth. Planes cast no shadows. The
+    caller handles self-shadowing: a convex geom is dark where its normal faces away from the light.
     """
 
     def blocked(enter: Enter, other: jax.Array, lit: jax.Array) -> jax.Array:
@@ -185,23 +184,23 @@ def _over_kinds(
     *,
     first: int,
 ) -> jax.Array:
-    """One loop over the geoms of each kind from `first` on."""
+    """Run one loop per kind >= `first` over the geoms of that kind."""
     for kind in sorted(set(kinds)):
         if kind >= first:
             begin = kinds.index(kind)
-            turn = functools.partial(body, ENTER[kind])
-            carry = jax.lax.fori_loop(begin, begin + kinds.count(kind), turn, carry)
+            step = functools.partial(body, ENTER[kind])
+            carry = jax.lax.fori_loop(begin, begin + kinds.count(kind), step, carry)
     return carry
 
 
 def surface(
     geom: Geom, x: jax.Array, y: jax.Array, depth: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """What shading needs of the surface points at finite `depth` `[P]` on each pixel's geom.
+    """Compute the shading terms of surface points at finite `depth` `[P]` on each pixel's geom.
 
     Returns:
-        Cosine `[P]` between normal and direction to the light; cosine `[P]`, at least 0, between
-        normal and the ray reversed, times the ray's length.
+        Cosine `[P]` between the normal and the direction to the light; cosine `[P]`, at least 0,
+        between the normal and the reversed ray, times the ray's length.
     """
     slope = ray(geom.axes, x, y)
     outward = _gradient(along(geom.eye, depth, slope), geom.kind, geom.half)
@@ -212,7 +211,7 @@ def surface(
 
 
 def _gradient(point: Vec, kind: jax.Array, half: jax.Array) -> Vec:
-    """The outward normal at a surface point, in the unit frame and of any length."""
+    """Compute an outward normal of any length at a surface point, in the unit frame."""
     x, y, z = point
     ax, ay, az = jnp.abs(x), jnp.abs(y), jnp.abs(z)
     flat_end = z * z > x * x + y * y  # a cylinder has |z| < 1 = |(x, y)| on its side

@@ -1,4 +1,4 @@
-"""What a ray caster needs of a MuJoCo model: its visible geoms by kind, its cameras, its look."""
+"""Extract from a MuJoCo model what the ray caster needs: visible geoms, cameras, appearance."""
 
 import functools
 from collections.abc import Sequence
@@ -11,15 +11,15 @@ import numpy as np
 
 from envs.rendering.intersections import BOX, CAPSULE, CYLINDER, PLANE, SPHERE
 
-# How pictures look where a model does not say it; chosen by eye. Shares of light, colours of the
-# sky at the horizon and straight up, edge [m] and contrast of the squares on planes.
+# Defaults where a model does not specify them; own choices by eye. Shares of light, sky colour at
+# the horizon and at the zenith, edge [m] and contrast of the checker on planes.
 AMBIENT, HEADLIGHT, DIFFUSE = 0.35, 0.25, 0.5
 SKY = ((0.80, 0.84, 0.88), (0.45, 0.58, 0.75))
 SQUARE, CONTRAST = 0.1, 0.12
 
-STAND_IN_GROUP = 5  # its geoms are drawn in place of meshes
-_INFINITE = 1e4  # [m] half-extent drawn where a plane's size is 0, which means infinite
-# MuJoCo geom type -> kind, and which numbers of its size are the half-extents along x, y, z.
+STAND_IN_GROUP = 5  # geom group of primitives that are drawn in place of meshes
+_INFINITE = 1e4  # [m] half-extent of a plane of size 0, MuJoCo's "infinite"; beyond any camera
+# MuJoCo geom type -> kind, and the entries of its size that are half-extents along x, y, z.
 _SHAPES = {
     int(mujoco.mjtGeom.mjGEOM_PLANE): (PLANE, (0, 1, 2)),
     int(mujoco.mjtGeom.mjGEOM_SPHERE): (SPHERE, (0, 0, 0)),
@@ -32,19 +32,18 @@ _SHAPES = {
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Look:
-    """What a picture looks like apart from geometry. Every field is traced.
+class Appearance:
+    """Everything that an image depends on except geometry. Every field is traced.
 
     Attributes:
-        rgba: `[G, 4]` colour of each geom of the MuJoCo model, 0 to 1; alpha is not used, `build`
+        rgba: `[G, 4]` colour of each geom of the MuJoCo model, 0 to 1; alpha is ignored, `build`
             decides what is visible.
-        light: `[3]` direction towards the light in world axes, of any length (the light is
-            directional, like the sun).
-        ambient: `[]` share of a geom's colour that is there without light.
+        light: `[3]` direction towards the (directional) light in world axes, of any length.
+        ambient: `[]` share of a geom's colour that needs no light.
         headlight: `[]` share lit from the camera, without shadows.
         diffuse: `[]` share lit by `light`, with shadows.
-        sky: `[2, 3]` colour at the horizon and colour straight up.
-        checker: `[2]` edge [m] and contrast (0 to 1) of the squares on planes.
+        sky: `[2, 3]` colour at the horizon and at the zenith.
+        checker: `[2]` edge [m] and contrast (0 to 1) of the checker on planes.
         fovy: `[N]` vertical field of view of each camera of the MuJoCo model [deg].
     """
 
@@ -60,7 +59,7 @@ class Look:
 
 @functools.partial(
     jax.tree_util.register_dataclass,
-    data_fields=["look", "size"],
+    data_fields=["appearance", "size"],
     meta_fields=["geoms", "kinds", "sides", "cameras"],
 )
 @dataclass(frozen=True)
@@ -68,15 +67,15 @@ class RenderModel:
     """The visible geoms of a MuJoCo model, sorted by kind, and the cameras to render.
 
     Attributes:
-        look: the model's own colours, light and fields of view.
+        appearance: the model's own colours, light and fields of view.
         size: `[G, 3]` size of each geom of the MuJoCo model [m].
-        geoms: V numbers of the visible geoms in the MuJoCo model.
+        geoms: V ids of the visible geoms in the MuJoCo model.
         kinds: V kinds of `intersections`, ascending.
-        sides: V triples: which numbers of a geom's size are its half-extents along x, y, z.
-        cameras: K numbers of the cameras in the MuJoCo model.
+        sides: V triples: the entries of a geom's size that are half-extents along x, y, z.
+        cameras: K ids of the cameras in the MuJoCo model.
     """
 
-    look: Look
+    appearance: Appearance
     size: np.ndarray
     geoms: tuple[int, ...]
     kinds: tuple[int, ...]
@@ -85,12 +84,13 @@ class RenderModel:
 
 
 def build(mj_model: mujoco.MjModel, camera_names: Sequence[str]) -> RenderModel:
-    """Sorts the visible geoms (alpha above 0, group below 3) of a model for rendering.
+    """Collect the visible geoms (alpha > 0, group < 3) of a model, sorted by kind.
 
-    Meshes are left out if the model has primitives in their place, in `STAND_IN_GROUP`.
+    Meshes are left out if the model has primitives in `STAND_IN_GROUP` to draw in their place.
 
     Raises:
-        ValueError: if a camera does not exist, a visible geom is not a primitive, or none is left.
+        ValueError: if a camera does not exist, a visible geom is not a primitive, or no geom is
+            visible.
     """
     cameras = {mj_model.camera(i).name: i for i in range(mj_model.ncam)}
     if unknown := set(camera_names) - set(cameras):
@@ -100,17 +100,17 @@ def build(mj_model: mujoco.MjModel, camera_names: Sequence[str]) -> RenderModel:
         drawn = drawn & (mj_model.geom_type != mujoco.mjtGeom.mjGEOM_MESH) | stand_ins
     visible = np.flatnonzero(drawn).tolist()
     if not visible:
-        raise ValueError("the model has no visible geom (alpha above 0, group below 3)")
+        raise ValueError("the model has no visible geom (alpha > 0 and group < 3)")
     types = mj_model.geom_type.tolist()
     for i in visible:
         if types[i] not in _SHAPES:
             raise ValueError(
-                f"geom {mj_model.geom(i).name or i} cannot be drawn: only planes, spheres, "
-                "ellipsoids, capsules, cylinders and boxes can (group 3 hides a geom)"
+                f"cannot draw geom {mj_model.geom(i).name or i}: only planes, spheres, ellipsoids, "
+                "capsules, cylinders and boxes are supported; group 3 hides a geom"
             )
     geoms = sorted(visible, key=lambda i: _SHAPES[types[i]][0])
     return RenderModel(
-        look=_own_look(mj_model),
+        appearance=_default_appearance(mj_model),
         size=mj_model.geom_size.astype(np.float32),
         geoms=tuple(geoms),
         kinds=tuple(_SHAPES[types[i]][0] for i in geoms),
@@ -120,16 +120,16 @@ def build(mj_model: mujoco.MjModel, camera_names: Sequence[str]) -> RenderModel:
 
 
 def is_visible(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Which geoms `[G]` of a model are to be seen: alpha above 0, group below 3."""
+    """Return which geoms of a model are visible (alpha > 0, group < 3), bool `[G]`."""
     return (mj_model.geom_rgba[:, 3] > 0) & (mj_model.geom_group < 3)
 
 
 def unit_shapes(model: RenderModel, size: jax.Array | np.ndarray) -> tuple[jax.Array, jax.Array]:
-    """How visible geoms of sizes `[G, 3]` come from their unit shapes.
+    """Compute the scale from unit shapes to visible geoms of sizes `[G, 3]`.
 
     Returns:
-        Half-extents `[V, 3]` that were scaled to 1 [m]; and a capsule's half-length over its
-        radius `[V]`, else 0.
+        Half-extents `[V, 3]` [m], which become 1 in the unit frame; half-length over radius of
+        capsules `[V]`, 0 for other kinds.
     """
     size = jnp.asarray(size)[np.array(model.geoms)]
     scale = jnp.take_along_axis(size, np.array(model.sides), axis=1)
@@ -137,9 +137,9 @@ def unit_shapes(model: RenderModel, size: jax.Array | np.ndarray) -> tuple[jax.A
     return scale, jnp.where(np.array(model.kinds) == CAPSULE, size[:, 1] / scale[:, 0], 0)
 
 
-def _own_look(mj_model: mujoco.MjModel) -> Look:
-    """Colours, fields of view and first light of the model; the rest as above."""
-    values = Look(
+def _default_appearance(mj_model: mujoco.MjModel) -> Appearance:
+    """Take colours, fields of view and the first light from the model, the rest from defaults."""
+    values = Appearance(
         rgba=mj_model.geom_rgba,
         light=-mj_model.light_dir[0] if mj_model.nlight else np.array([0.3, -0.4, 0.87]),
         ambient=np.array(AMBIENT),

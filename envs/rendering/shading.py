@@ -1,7 +1,7 @@
-"""The colour of pixels.
+"""Compute pixel colours.
 
-Nothing here is sliced or gathered: a view is a tree of scalars, geoms are looked up by number
-through a function, and pixels are one axis of any length.
+Nothing here slices or gathers: a view is a tree of scalars, geoms are looked up by index through a
+function, and pixels are one axis of any length.
 """
 
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from envs.rendering.intersections import PLANE, Geoms, Matrix, Vec, along, dot, 
 
 
 class View(NamedTuple):
-    """One camera and its light; every leaf is a scalar. Shares and colours as in `Look`."""
+    """One camera and its light; every leaf is a scalar. Shares and colours as in `Appearance`."""
 
     position: Vec
     rotation: Matrix
@@ -24,12 +24,12 @@ class View(NamedTuple):
     diffuse: jax.Array
     horizon: Vec  # colour of the sky
     zenith: Vec
-    square: jax.Array  # edge of the squares on planes [m]
+    square: jax.Array  # edge of the checker on planes [m]
     contrast: jax.Array
 
 
 class Raster(NamedTuple):
-    """A picture's size: rows, columns, and rays a pixel along either."""
+    """Size of an image [px], and rays per pixel along each axis."""
 
     height: int
     width: int
@@ -37,35 +37,35 @@ class Raster(NamedTuple):
 
 
 def pack(tree: Any) -> jax.Array:
-    """The leaves of a tree, all of one shape, along a new first axis."""
+    """Stack the leaves of a tree, all of one shape, along a new first axis."""
     return jnp.stack([jnp.asarray(leaf, jnp.float32) for leaf in jax.tree.leaves(tree)])
 
 
 def colours(
     geoms: Geoms, kinds: tuple[int, ...], view: View, raster: Raster, pixel: jax.Array
 ) -> Vec:
-    """Colour of pixels, a triple of uint8 `[P]`: the mean of `samples` x `samples` rays.
+    """Compute pixel colours, a triple of uint8 `[P]`: the mean of `samples` x `samples` rays.
 
-    Each ray's colour is clipped to what a screen shows before the mean is taken (there is no gamma
-    to undo), as in a larger picture scaled down: else an overexposed edge would stay jagged.
+    Each ray's colour is clipped to [0, 1] before averaging (there is no gamma to undo), as if a
+    larger image were scaled down; otherwise overexposed edges would stay jagged.
 
     Args:
-        geoms: V geoms as `view` sees them.
+        geoms: V geoms in the frame of `view`.
         kinds: V kinds, ascending.
         view: the camera.
-        raster: the picture's size.
-        pixel: int32 `[P]` numbers of pixels, row by row.
+        raster: size of the image.
+        pixel: int32 `[P]` pixel indices in row-major order.
     """
     x, y = slopes(view, raster, pixel)
     n = raster.samples
 
-    # One ray a pixel at a time: memory does not grow with the number of rays.
+    # One ray per pixel at a time, so that memory does not grow with the number of rays.
     def add(i: jax.Array, total: Vec) -> Vec:
         shifts = (
             ((j + 0.5) / n - 0.5) * 2 * view.pixel for j in (jax.lax.rem(i, n), jax.lax.div(i, n))
         )
-        found = _colour(geoms, kinds, view, *(z + s for z, s in zip((x, y), shifts, strict=True)))
-        return tuple(t + jnp.clip(c, 0, 1) for t, c in zip(total, found, strict=True))
+        colour = _colour(geoms, kinds, view, *(z + s for z, s in zip((x, y), shifts, strict=True)))
+        return tuple(t + jnp.clip(c, 0, 1) for t, c in zip(total, colour, strict=True))
 
     zero = jnp.zeros(pixel.shape, jnp.float32)
     total = jax.lax.fori_loop(0, n * n, add, (zero, zero, zero))
@@ -73,7 +73,7 @@ def colours(
 
 
 def slopes(view: View, raster: Raster, pixel: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Slope of each pixel's ray to the right and upwards, both `[P]`."""
+    """Compute the slopes of each pixel's ray to the right and upwards, both `[P]`."""
     row = jax.lax.div(pixel, jnp.int32(raster.width))
     column = pixel - raster.width * row
     x = (2 * column + 1 - raster.width).astype(jnp.float32)
@@ -82,7 +82,7 @@ def slopes(view: View, raster: Raster, pixel: jax.Array) -> tuple[jax.Array, jax
 
 
 def _colour(geoms: Geoms, kinds: tuple[int, ...], view: View, x: jax.Array, y: jax.Array) -> Vec:
-    """Colour of what each ray hits, a triple of `[P]`."""
+    """Compute the colour that each ray sees, a triple of `[P]`."""
     number, depth = intersections.nearest(geoms, kinds, x, y)
     hit = depth < jnp.inf
     depth = jnp.where(hit, depth, 0)
@@ -96,7 +96,7 @@ def _colour(geoms: Geoms, kinds: tuple[int, ...], view: View, x: jax.Array, y: j
     odd = squares - 2 * jnp.floor(squares / 2) == 1
     square = jnp.where((geom.kind == PLANE) & odd, 1 - view.contrast, 1)
     light = view.ambient + jnp.where(lit, view.diffuse * to_light, 0)
-    # A quotient comes last: XLA would redo anything cheaper for each of the three channels.
+    # The division comes last: XLA would recompute anything cheaper for each of the three channels.
     shade = square * (light * length + view.headlight * to_eye) / length
     up = jnp.clip(direction[2] / length, 0, 1)
     sky = along(

@@ -1,4 +1,4 @@
-"""Moving pictures as files, and those of several cameras as one."""
+"""Write videos and GIFs, and join the images of several cameras."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,38 +8,38 @@ import av
 import numpy as np
 from PIL import Image
 
-_COLOURS = 256  # of a GIF
+_COLOURS = 256  # the largest palette of a GIF
 
 
 def write_video(path: Path, frames: np.ndarray, fps: float) -> None:
-    """Writes `[T, H, W, 3]` uint8 frames as H.264 in MP4 (yuv420p, which browsers play).
+    """Write `[T, H, W, 3]` uint8 frames as H.264 in MP4 (yuv420p, which browsers play).
 
     Raises:
-        ValueError: if H or W is odd, which yuv420p cannot hold.
+        ValueError: if H or W is odd, which yuv420p does not allow.
     """
     height, width = frames.shape[1:3]
     if height % 2 or width % 2:
-        raise ValueError(f"a video needs even height and width, not {height} x {width}")
-    options = {"movflags": "+faststart"}  # plays while it loads
+        raise ValueError(f"a video needs even height and width, got {height} x {width}")
+    options = {"movflags": "+faststart"}  # browsers can play it while it loads
     with av.open(str(path), "w", format="mp4", options=options) as container:
         stream: Any = container.add_stream("libx264", rate=round(fps))
         stream.height, stream.width = height, width
         stream.pix_fmt = "yuv420p"
-        stream.options = {"crf": "23"}
+        stream.options = {"crf": "23"}  # x264's default quality
         for frame in frames:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
         container.mux(stream.encode())
 
 
 def side_by_side(images: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Camera pictures `[..., H, W, 3]` in one row."""
+    """Join camera images `[..., H, W, 3]` along their width."""
     return np.concatenate(list(images.values()), axis=-2)
 
 
 def write_gif(path: Path, frames: np.ndarray, seconds: float) -> None:
-    """Writes `[T, H, W, 3]` uint8 frames as an endless GIF, each shown for so many seconds."""
-    # One palette for all of it: colours do not flicker, and the file is half the size.
-    method = Image.Quantize.MAXCOVERAGE  # small things keep their colour
+    """Write `[T, H, W, 3]` uint8 frames as a looping GIF, `seconds` per frame."""
+    # One palette for all frames: colours do not flicker, and the file is half the size.
+    method = Image.Quantize.MAXCOVERAGE  # small objects keep their colour
     palette = Image.fromarray(np.concatenate(frames)).quantize(_COLOURS, method)
     none = Image.Dither.NONE
     first, *rest = (Image.fromarray(f).quantize(palette=palette, dither=none) for f in frames)

@@ -1,6 +1,6 @@
-"""Robot arms: one file each, found by its name.
+"""Robot arms: one file per robot, found by its name.
 
-Names that begin with `_` hold what all robots share.
+Modules that begin with `_` hold what all robots share.
 """
 
 import importlib
@@ -53,7 +53,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> ModuleType:
-    """A robot's module, so that `import envs` makes `envs.robots.piper` public."""
+    """Import a robot's module on access, so that `import envs` makes `envs.robots.piper` work."""
     if importlib.util.find_spec(f"envs.robots.{name}") is None:
         raise AttributeError(f"module 'envs.robots' has no attribute {name!r}")
     return importlib.import_module(f"envs.robots.{name}")

@@ -1,9 +1,9 @@
 """A robot arm as numbers, and as MJCF of primitive shapes.
 
-A robot's joint chain is stated once; its MuJoCo bodies and its analytic kinematics both come from
-that statement, so they cannot disagree. All hands share one tool frame, `tcp`: z points out of the
-hand, y is the axis along which the fingers open, and the finger tips end `TIP_LENGTH` further out.
-That lets the tasks and the expert talk about hands without knowing the robot.
+A robot's joint chain is defined once; its MuJoCo bodies and its analytic kinematics both derive
+from it and cannot disagree. All hands share one tool frame, `tcp`: z points out of the hand, y is
+the axis along which the fingers open, and the finger tips end `TIP_LENGTH` further along z. Tasks
+and experts therefore need not know the robot.
 """
 
 import dataclasses
@@ -12,24 +12,24 @@ from typing import Protocol
 import mujoco
 import numpy as np
 
-TIP_LENGTH = 0.012  # m from the tcp to the end of the finger tips, the same on every hand
-TIP_RADIUS = 0.005  # m, sphere at each finger tip that touches tables, walls and buttons
+TIP_LENGTH = 0.012  # m from the tcp to the end of the finger tips on every hand; own choice
+TIP_RADIUS = 0.005  # m, sphere at each finger tip to touch tables, walls, buttons; own choice
 
 # The wrist camera sits on the outer side of the hand and looks along it, tilted 22 degrees towards
-# the tips (own choice: the tips stand in the lower half of the picture, the object above them).
+# the tips. Own choice: the tips are in the lower half of the image, the object above them.
 WRIST_POSITION, WRIST_FOVY = (-0.08, 0.0, -0.093), 75.0  # m, deg
-WRIST_AXES = (0.0, -1.0, 0.0, -0.9272, 0.0, 0.3746)  # its x and y, in the frame of the tcp
+WRIST_AXES = (0.0, -1.0, 0.0, -0.9272, 0.0, 0.3746)  # x and y axes of the camera in the tcp frame
 
 
 class Body(Protocol):
-    """What is simulated of a robot: bodies, joints, geoms, actuators."""
+    """The simulated part of a robot: bodies, joints, geoms, actuators."""
 
     def mjcf(self, robot: "Robot", /) -> tuple[str, str]:
-        """MJCF of the body tree, base at the world's origin, and of the position servos."""
+        """Return MJCF of the body tree, base at the world's origin, and of the position servos."""
         ...
 
     def attach(self, robot: "Robot", scene: mujoco.MjSpec) -> None:
-        """Adds what is not MJCF to the scene that `mjcf` became a part of."""
+        """Add to the scene what `mjcf` cannot express."""
         ...
 
 
@@ -39,18 +39,18 @@ class Robot:
 
     Attributes:
         name: file name of the robot.
-        chain: [J, 4, 4] fixed transform from link i-1 (base first) to joint i, which turns about z.
+        chain: [J, 4, 4] fixed transform from link i-1 (base first) to joint i, a hinge about z.
         tool: [4, 4] pose of the tcp in the last link.
         lower, upper: [J] joint limits [rad].
         speed: [J] joint speed limits [rad/s].
-        home: [J] start pose [rad]: tcp at (.34, 0, .18) m, tool down with its lean.
-        lean: angle by which the hand leans outwards when it works from above [rad], chosen so that
-            the whole table in front of the robot is within the wrist's limits.
-        tilt_side: where the hand can tilt by a right angle from pointing down: 1 outwards, -1 back
-            towards the base.
+        home: [J] start pose [rad]: tcp at (.34, 0, .18) m, tool pointing down plus `lean`.
+        lean: angle by which the hand leans outwards when it works from above [rad], chosen to keep
+            the wrist within its limits over the whole table in front of the robot.
+        tilt_side: side to which the hand can tilt by 90 degrees from pointing down: 1 outwards, -1
+            back towards the base.
         stroke: largest gripper opening, both fingers together [m].
-        gripper_speed: largest change of the opening [m/s].
-        body: what is simulated.
+        gripper_speed: largest speed of the opening [m/s].
+        body: the simulated part.
     """
 
     name: str
@@ -76,29 +76,29 @@ class Robot:
 
     @property
     def action_low(self) -> np.ndarray:
-        """[J + 1] lowest joint targets [rad] and gripper opening [m], float32."""
+        """Lowest joint targets [rad] and gripper opening [m], float32 [J + 1]."""
         return np.append(self.lower, 0.0).astype(np.float32)
 
     @property
     def action_high(self) -> np.ndarray:
-        """[J + 1] highest joint targets [rad] and gripper opening [m], float32."""
+        """Highest joint targets [rad] and gripper opening [m], float32 [J + 1]."""
         return np.append(self.upper, self.stroke).astype(np.float32)
 
     @property
     def action_speed(self) -> np.ndarray:
-        """[J + 1] fastest change of the commands [rad/s, m/s], float32."""
+        """Speed limits of the commands [rad/s, m/s], float32 [J + 1]."""
         return np.append(self.speed, self.gripper_speed).astype(np.float32)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Primitives:
-    """A body of primitive shapes laid over the joint chain.
+    """A robot body built from primitive shapes on the joint chain.
 
     Attributes:
         stiffness, damping: [J] gains of the position actuators [N m/rad, N m s/rad].
         armature: reflected motor inertia of every joint [kg m^2].
-        base, links: MJCF geoms carried by the base and by each link, in the link's frame.
-        hand, finger: MJCF geoms of the hand and of the finger at y > 0, in the tcp frame, closed.
+        base, links: MJCF geoms of the base and of each link, in the link's frame.
+        hand, finger: MJCF geoms of the hand and of the closed finger at y > 0, in the tcp frame.
         tip_offset: y of the middle of a closed finger [m].
     """
 
@@ -112,11 +112,11 @@ class Primitives:
     tip_offset: float
 
     def mjcf(self, robot: Robot, /) -> tuple[str, str]:
-        """MJCF of the body tree, and of the servos: joints first, then the left finger."""
+        """Return MJCF of the body tree, and of the servos: joints first, then the left finger."""
         return self._bodies(robot), self._actuators()
 
     def attach(self, robot: Robot, scene: mujoco.MjSpec) -> None:
-        """Does nothing: all of it is MJCF."""
+        """Do nothing: `mjcf` is complete."""
 
     def _bodies(self, robot: Robot) -> str:
         xml, closing = f'<body name="base">{self.base}', "</body>"
@@ -140,13 +140,13 @@ class Primitives:
         xml = ""
         for i, (kp, kv) in enumerate(zip(self.stiffness, self.damping, strict=True)):
             xml += f'<position name="joint{i + 1}" joint="joint{i + 1}" kp="{kp}" kv="{kv}"/>'
-        # Half the opening. kp, kv: own choice that holds a 12 g grape without slip and stays below
-        # 20 N at full stroke.
+        # The target is half the opening. kp, kv: own choice; they hold a 12 g grape without slip
+        # and stay below 20 N at full stroke.
         return xml + '<position name="gripper" joint="left" kp="400" kv="20"/>'
 
 
 def pose(transform: np.ndarray) -> str:
-    """MJCF attributes `pos` and `xyaxes` of a [4, 4] transform."""
+    """Format a [4, 4] transform as the MJCF attributes `pos` and `xyaxes`."""
     numbers = np.round(transform, 12) + 0.0
     position, x, y = (" ".join(map(str, numbers[:3, i])) for i in (3, 0, 1))
     return f'pos="{position}" xyaxes="{x} {y}"'

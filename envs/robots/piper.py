@@ -1,9 +1,9 @@
-"""AgileX PiPER: six joints and a parallel gripper of 70 mm.
+"""AgileX PiPER: six joints and a parallel gripper with 70 mm stroke.
 
-Kinematics, limits and speeds are those of the vendor's `piper_sdk` 0.6.2. Masses and servo gains
-are those of MuJoCo Menagerie's `agilex_piper` (commit cd165455), the shells being weighed without
-their motors: joints are gravity-compensated and no dynamic fidelity is claimed. Shapes are
-primitives laid over the kinematic skeleton.
+Kinematics, limits and speeds are from the vendor's `piper_sdk` 0.6.2. Masses and servo gains are
+from MuJoCo Menagerie's `agilex_piper` (commit cd165455), whose link masses leave out the motors, so
+joints are gravity-compensated and no dynamic fidelity is claimed. Shapes are primitives along the
+links.
 """
 
 import jax
@@ -11,9 +11,9 @@ import numpy as np
 
 from envs import robots
 
-# Modified (Craig) Denavit-Hartenberg table of C_PiperForwardKinematics, rows of
+# Modified (Craig) Denavit-Hartenberg table of piper_sdk's C_PiperForwardKinematics, rows of
 # (a [m], alpha [rad], d [m], theta0 [rad]); T_i = Rx(alpha) Tx(a) Rz(q + theta0) Tz(d).
-# Joints 2 and 3 have their zero at dh_is_offset=0, the convention of the URDF and of Menagerie.
+# Zeros of joints 2 and 3 as with dh_is_offset=0, the convention of the URDF and of Menagerie.
 _DH = np.array(
     [
         [0.0, 0.0, 0.123, 0.0],
@@ -24,7 +24,7 @@ _DH = np.array(
         [0.0, np.pi / 2, 0.091, 0.0],
     ]
 )
-# dh_is_offset=1, the SDK's default, moves the zeros of joints 2 and 3 by 2 degrees.
+# dh_is_offset=1, the SDK's default, shifts the zeros of joints 2 and 3 by 2 degrees.
 _SDK_OFFSET = np.deg2rad([0.0, 2.0, -2.0, 0.0, 0.0, 0.0])
 
 
@@ -43,18 +43,18 @@ _CHAIN, _SDK_CHAIN = _chain(np.zeros(6)), _chain(_SDK_OFFSET)
 
 
 def forward_kinematics(q: jax.Array, *, sdk_offset: bool = False) -> tuple[jax.Array, jax.Array]:
-    """Poses of links 1-6 in the base frame, as `piper_sdk` computes them.
+    """Compute the poses of links 1-6 in the base frame, as `piper_sdk` does.
 
     Args:
         q: [..., 6] joint angles [rad].
-        sdk_offset: take the vendor SDK's default zeros (dh_is_offset=1) of joints 2 and 3, which
-            lie 2 degrees from those of the URDF; ask which ones an arm's firmware uses.
+        sdk_offset: use the vendor SDK's default zeros (dh_is_offset=1) of joints 2 and 3, which
+            differ by 2 degrees from the URDF's; check which ones your arm's firmware uses.
 
     Returns:
         Positions [..., 6, 3] in m and rotations [..., 6, 3, 3].
 
     Raises:
-        ValueError: if the last axis of q is not 6.
+        ValueError: the last axis of q is not 6.
     """
     q = jax.numpy.asarray(q)
     if q.shape[-1:] != (6,):
@@ -63,19 +63,19 @@ def forward_kinematics(q: jax.Array, *, sdk_offset: bool = False) -> tuple[jax.A
 
 
 def from_sdk_zeros(q: jax.Array) -> jax.Array:
-    """This model's joint angles [..., 6] in rad for those that an arm with the SDK's zeros reports.
+    """Convert joint angles [..., 6] in rad from an arm with the SDK's zeros to this model's.
 
-    The vendor SDK's default zeros (dh_is_offset=1) of joints 2 and 3 lie 2 degrees from ours.
+    The vendor SDK's default zeros (dh_is_offset=1) of joints 2 and 3 differ from ours by 2 degrees.
     """
     return q + jax.numpy.asarray(_SDK_OFFSET, q.dtype)
 
 
 def to_sdk_zeros(q: jax.Array) -> jax.Array:
-    """What to send to an arm with the SDK's zeros for this model's joint angles [..., 6] in rad."""
+    """Convert this model's joint angles [..., 6] in rad to those of an arm with the SDK's zeros."""
     return q - jax.numpy.asarray(_SDK_OFFSET, q.dtype)
 
 
-# Shapes and colours are own choices; masses [kg] are Menagerie's, link 6 with its gripper .45.
+# Shapes and colours are own choices; masses [kg] are Menagerie's; link 6 with gripper weighs .45.
 _DARK, _GREY = 'rgba=".13 .14 .16 1"', 'rgba=".30 .32 .35 1"'
 _LINKS = (
     f'<geom type="capsule" size=".042" fromto="0 0 -.035 0 0 .01" mass=".098" {_GREY}/>',
@@ -89,17 +89,17 @@ _LINKS = (
 ROBOT = robots.Robot(
     name="piper",
     chain=_CHAIN,
-    # Finger tips .135 m from link 6 (Menagerie: bodies of link 7 and 8 at z = .13503).
+    # Finger tips are .135 m from link 6 (Menagerie: bodies of links 7 and 8 at z = .13503).
     tool=robots.translation(0, 0, 0.135 - robots.TIP_LENGTH),
     # piper_sdk, JointCtrl limits [rad].
     lower=np.array([-2.6179, 0.0, -2.967, -1.745, -1.22, -2.09439]),
     upper=np.array([2.6179, 3.14, 0.0, 1.745, 1.22, 2.09439]),
     speed=np.full(6, 3.0),  # piper_sdk, [rad/s]
     home=np.array([0.0, 1.528, -1.248, 0.0, 1.029, 0.0]),
-    lean=np.deg2rad(20.0),
-    tilt_side=1,  # joint 5 ends soon after the tool points down
+    lean=np.deg2rad(20.0),  # own choice
+    tilt_side=1,  # inwards, joint 5 reaches its limit soon after the tool points down
     stroke=0.07,  # piper_sdk, GripperCtrl [m]
-    gripper_speed=0.1,  # own choice [m/s]
+    gripper_speed=0.1,  # own choice, same as the Panda's [m/s]
     body=robots.Primitives(
         stiffness=np.array([80.0, 80.0, 80.0, 40.0, 10.0, 10.0]),
         damping=np.array([5.0, 5.0, 5.0, 5.0, 1.5, 1.5]),

@@ -1,1 +1,1 @@
-"""What stands on the table, and where."""
+"""The scene: table, cameras, objects and their randomisation."""

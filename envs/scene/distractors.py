@@ -1,11 +1,11 @@
-"""Things on the table that have nothing to do with the task."""
+"""Distractors: objects on the table that the task does not use."""
 
 import jax
 import jax.numpy as jnp
 
 from envs.tasks import Layout
 
-_SIZE = 0.016  # m, half the width of each, and its height above the table
+_SIZE = 0.016  # m, half the width of each, and the height of its centre; own choice
 _SHAPES = (  # own choices, in colours that no task uses
     f'type="box" size="{_SIZE} {_SIZE} {_SIZE}" rgba=".15 .55 .30 1"',
     f'type="sphere" size="{_SIZE}" rgba=".95 .75 .15 1"',
@@ -14,18 +14,18 @@ _SHAPES = (  # own choices, in colours that no task uses
 )
 MOST = len(_SHAPES)
 
-_LOW, _HIGH = (0.27, -0.21), (0.45, 0.21)  # m, where the side camera sees the table
-_CLEARANCE = 0.10  # m to the middle of everything else, wherever there is room for it
-_TRIES = 64
+_LOW, _HIGH = (0.27, -0.21), (0.45, 0.21)  # m, part of the table that the side camera sees
+_CLEARANCE = 0.10  # m between centres, where there is room; own choice
+_TRIES = 64  # random positions per distractor; own choice
 
 
 def names(count: int) -> list[str]:
-    """Names of the bodies of `count` of them."""
+    """Return the body names of `count` distractors."""
     return [f"distractor{i}" for i in range(count)]
 
 
 def mjcf(count: int) -> str:
-    """MJCF of bodies distractor0, distractor1 ...: fixed, solid for tips and loose objects."""
+    """Return MJCF of `count` fixed bodies, which collide with finger tips and loose objects."""
     return "".join(
         f'<body name="{name}"><geom {shape} conaffinity="3"/></body>'
         for name, shape in zip(names(count), _SHAPES[:count], strict=True)
@@ -33,20 +33,20 @@ def mjcf(count: int) -> str:
 
 
 def place(key: jax.Array, layout: Layout, count: int) -> Layout:
-    """Random places for `count` of them, clear of the layout and of one another.
+    """Sample poses of `count` distractors, clear of the layout and of one another.
 
-    Each takes the first of some random places that has the clearance, or else the clearest.
+    Each takes the first of `_TRIES` random positions with enough clearance, else the clearest one.
     """
-    taken = jnp.stack([where[:2] for where in layout.values()])
-    found: Layout = {}
-    for name, one in zip(names(count), jax.random.split(key, count), strict=True):
-        place_key, turn_key = jax.random.split(one)
-        spots = jax.random.uniform(
-            place_key, (_TRIES, 2), minval=jnp.array(_LOW), maxval=jnp.array(_HIGH)
+    occupied = jnp.stack([pose[:2] for pose in layout.values()])
+    placed: Layout = {}
+    for name, own_key in zip(names(count), jax.random.split(key, count), strict=True):
+        position_key, yaw_key = jax.random.split(own_key)
+        candidates = jax.random.uniform(
+            position_key, (_TRIES, 2), minval=jnp.array(_LOW), maxval=jnp.array(_HIGH)
         )
-        gap = jnp.linalg.norm(spots[:, None] - taken, axis=-1).min(axis=1)
-        chosen = spots[jnp.argmax(jnp.minimum(gap, _CLEARANCE))]  # argmax: the first of equals
-        turn = jax.random.uniform(turn_key, (), maxval=jnp.pi)
-        found[name] = jnp.stack([*chosen, jnp.float32(_SIZE), turn])
-        taken = jnp.concatenate([taken, chosen[None]])
-    return found
+        gap = jnp.linalg.norm(candidates[:, None] - occupied, axis=-1).min(axis=1)
+        best = candidates[jnp.argmax(jnp.minimum(gap, _CLEARANCE))]  # argmax: the first of equals
+        yaw = jax.random.uniform(yaw_key, (), maxval=jnp.pi)
+        placed[name] = jnp.stack([*best, jnp.float32(_SIZE), yaw])
+        occupied = jnp.concatenate([occupied, best[None]])
+    return placed

@@ -1,4 +1,4 @@
-"""How a layout gets into a MuJoCo model: loose bodies by qpos, fixed ones by the model itself."""
+"""Apply a layout to a MuJoCo model: free bodies through qpos, fixed ones through the model."""
 
 import copy
 
@@ -12,41 +12,41 @@ from envs.tasks import Layout
 
 
 def positions(model: mujoco.MjModel, layout: Layout, joints: jax.Array) -> jax.Array:
-    """qpos of one world: the robot's own joints first, loose bodies as the layout says."""
+    """Return the qpos of one world: the robot's joints first, free bodies as in the layout."""
     qpos = jnp.asarray(model.qpos0, jnp.float32).at[: len(joints)].set(joints)
-    for name, place in layout.items():
+    for name, pose in layout.items():
         body = model.body(name)
         if body.jntnum[0]:
             start = model.jnt_qposadr[body.jntadr[0]]
-            qpos = qpos.at[start : start + 7].set(_pose(place))
+            qpos = qpos.at[start : start + 7].set(_to_qpos(pose))
     return qpos
 
 
 def fixed_bodies(model: mujoco.MjModel, layout: Layout, changes: Changes) -> Changes:
-    """Poses of all bodies in their parents, the fixed ones of the layout where it says.
+    """Return the poses of all bodies in their parents, with fixed bodies placed by the layout.
 
-    Mocap bodies would be the usual way, but MJX leaves their children behind.
+    Mocap bodies would be the usual way, but MJX does not move their children.
     """
     position = changes.get("body_pos", jnp.asarray(model.body_pos, jnp.float32))
     rotation = jnp.asarray(model.body_quat, jnp.float32)
-    for name, place in layout.items():
-        body, pose = model.body(name), _pose(place)
+    for name, pose in layout.items():
+        body, qpos = model.body(name), _to_qpos(pose)
         if not body.jntnum[0]:
-            position = position.at[body.id].set(pose[:3])
-            rotation = rotation.at[body.id].set(pose[3:])
+            position = position.at[body.id].set(qpos[:3])
+            rotation = rotation.at[body.id].set(qpos[3:])
     return {"body_pos": position, "body_quat": rotation}
 
 
 def placed(model: mujoco.MjModel, layout: Layout, world: int) -> mujoco.MjModel:
-    """A copy of the model with its fixed bodies where one world of a batch has them."""
+    """Copy the model with its fixed bodies placed as in one world of a batch."""
     model = copy.copy(model)
-    own = {name: places[world] for name, places in layout.items()}
+    own = {name: poses[world] for name, poses in layout.items()}
     for name, value in fixed_bodies(model, own, {}).items():
         getattr(model, name)[:] = np.asarray(value)
     return model
 
 
-def _pose(place: jax.Array) -> jax.Array:
-    """Position in m and unit quaternion [7] of a place of a layout."""
-    half = place[3] / 2
-    return jnp.stack([*place[:3], jnp.cos(half), 0.0 * half, 0.0 * half, jnp.sin(half)])
+def _to_qpos(pose: jax.Array) -> jax.Array:
+    """Convert a pose [4] of a layout to position [m] and unit quaternion, [7]."""
+    half = pose[3] / 2
+    return jnp.stack([*pose[:3], jnp.cos(half), 0.0 * half, 0.0 * half, jnp.sin(half)])

@@ -1,10 +1,10 @@
-"""Domain randomisation: worlds that differ in everything but the task.
+"""Domain randomisation: worlds that differ in physics, cameras, light and colours.
 
     ranges = envs.Randomization(mass=(0.5, 2.0), latency=(0.0, 0.04))
     state = env.reset(key, ranges)
 
-Every world draws its own values at reset and keeps them until the next one. Ranges and draws are
-traced: other numbers compile nothing anew.
+Every world draws its values at reset and keeps them until its next reset. Ranges and draws are
+traced, so other numbers do not recompile.
 """
 
 import dataclasses
@@ -18,55 +18,55 @@ import numpy as np
 
 from envs import checks
 from envs.physics.physics import MOST_GROWTH
-from envs.rendering.renderer import Look
+from envs.rendering.renderer import Appearance
 from envs.robots import multiply, turn
 from envs.state import Changes, Data
 from envs.tasks import Layout
 
 Range = tuple[float, float]
 _POSITIVE = ("size", "mass", "friction", "gains", "brightness")
-_MOST_DEGREES = 20.0  # of change to a field of view; the narrowest camera has 32
-_STILL, _SAME = (0.0, 0.0), (1.0, 1.0)
+_MAX_FOV_CHANGE = 20.0  # deg; own choice, the narrowest camera has 32
+_ZERO, _ONE = (0.0, 0.0), (1.0, 1.0)
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Randomization:
-    """Ranges (low, high) to draw from uniformly; the defaults leave everything as it is.
+    """Ranges (low, high) to draw from uniformly; the defaults change nothing.
 
     Attributes:
-        position: shift of all objects together along x and along y [m].
-        turn: of each object about its own vertical axis, all by the same angle [rad].
-        size: factor on all objects, about where they stand on the table.
+        position: common shift of all objects along x and along y [m].
+        turn: rotation of each object about its own vertical axis, the same angle for all [rad].
+        size: common factor on the size of all objects, which stay on the table.
         mass: factor on each object's mass and inertia.
-        friction: factor on the friction of everything.
+        friction: common factor on all friction.
         gains: factor on each servo's stiffness and damping.
-        camera_position: shift of each camera along each of its own axes [m].
-        camera_turn: rotation vector of each camera, each of its components [rad].
+        camera_position: shift of each camera along each of its axes [m].
+        camera_turn: each component of each camera's rotation vector [rad].
         field_of_view: change of each camera's vertical field of view [deg].
-        light_turn: rotation vector of the light's direction, each component [rad].
+        light_turn: each component of the rotation vector of the light's direction [rad].
         brightness: factor on all light.
-        colour: change of red, green and blue of each geom, each 0 to 1.
-        latency: time from an action to its first effect [s], at most one control step.
+        colour: change of red, green and blue of each geom, on a scale of 0 to 1.
+        latency: delay from an action to its first effect [s], at most one control step.
     """
 
-    position: Range = _STILL
-    turn: Range = _STILL
-    size: Range = _SAME
-    mass: Range = _SAME
-    friction: Range = _SAME
-    gains: Range = _SAME
-    camera_position: Range = _STILL
-    camera_turn: Range = _STILL
-    field_of_view: Range = _STILL
-    light_turn: Range = _STILL
-    brightness: Range = _SAME
-    colour: Range = _STILL
-    latency: Range = _STILL
+    position: Range = _ZERO
+    turn: Range = _ZERO
+    size: Range = _ONE
+    mass: Range = _ONE
+    friction: Range = _ONE
+    gains: Range = _ONE
+    camera_position: Range = _ZERO
+    camera_turn: Range = _ZERO
+    field_of_view: Range = _ZERO
+    light_turn: Range = _ZERO
+    brightness: Range = _ONE
+    colour: Range = _ZERO
+    latency: Range = _ZERO
 
     @classmethod
     def typical(cls) -> Self:
-        """Ranges that are usual for such arms and cameras; own choices, which experts cope with."""
+        """Return moderate ranges for small arms and cameras; own choices that experts solve."""
         return cls(
             position=(-0.01, 0.01),
             turn=(-0.1, 0.1),
@@ -84,17 +84,17 @@ class Randomization:
         )
 
     def check(self, control_dt: float) -> None:
-        """Raises a ValueError for ranges that make no sense; `control_dt` in s."""
-        for name, given in vars(self).items():
-            if not _is_range(given):
-                raise ValueError(f"{name} must be two finite numbers (low, high), got {given}")
-            if name in _POSITIVE and given[0] <= 0:
-                raise ValueError(f"{name} is a factor and must be above 0, got {given}")
+        """Raise a ValueError if a range is invalid; `control_dt` in s bounds the latency."""
+        for name, value in vars(self).items():
+            if not _is_range(value):
+                raise ValueError(f"{name} must be two finite numbers (low, high), got {value}")
+            if name in _POSITIVE and value[0] <= 0:
+                raise ValueError(f"{name} is a factor and must be above 0, got {value}")
         if self.size[0] < 1 / MOST_GROWTH or self.size[1] > MOST_GROWTH:
             limits = f"{1 / MOST_GROWTH} to {MOST_GROWTH}"
             raise ValueError(f"size must lie in {limits}, got {self.size}")
-        if max(map(abs, self.field_of_view)) > _MOST_DEGREES:
-            limit = f"-{_MOST_DEGREES} to {_MOST_DEGREES} degrees"
+        if max(map(abs, self.field_of_view)) > _MAX_FOV_CHANGE:
+            limit = f"-{_MAX_FOV_CHANGE} to {_MAX_FOV_CHANGE} degrees"
             raise ValueError(f"field_of_view must lie in {limit}, got {self.field_of_view}")
         if self.latency[0] < 0 or self.latency[1] > control_dt:
             raise ValueError(f"latency must lie in 0 to {control_dt} s, got {self.latency}")
@@ -103,7 +103,7 @@ class Randomization:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Draw:
-    """What one world drew, fields as in `Randomization`; N cameras, G geoms of the model.
+    """Values drawn for one world, fields as in `Randomization`; N cameras, G geoms of the model.
 
     Attributes:
         size, friction, brightness, latency: [].
@@ -129,7 +129,7 @@ class Draw:
 
 
 def prepared(ranges: Randomization | None, control_dt: float) -> Randomization | None:
-    """The ranges as strongly typed arrays, checked; those already traced are taken as they are."""
+    """Check the ranges, unless they are traced, and convert them to strongly typed arrays."""
     leaves = jax.tree.leaves(ranges)
     if ranges is not None:
         checks.instance("ranges", ranges, Randomization, "an envs.Randomization or None")
@@ -138,31 +138,31 @@ def prepared(ranges: Randomization | None, control_dt: float) -> Randomization |
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), ranges)
 
 
-def _is_range(given: Any) -> bool:
-    """Whether it is two finite numbers in single precision, the lower first."""
-    if isinstance(given, tuple | list):
-        given = [np.asarray(x) for x in given]
-        if not all(x.shape == () and checks.is_numeric(x) for x in given):
+def _is_range(value: Any) -> bool:
+    """Return whether `value` is two numbers, finite in single precision, the lower first."""
+    if isinstance(value, tuple | list):
+        value = [np.asarray(x) for x in value]
+        if not all(x.shape == () and checks.is_numeric(x) for x in value):
             return False
-        given = np.array(given)
-    if not checks.is_numeric(given) or given.shape != (2,):
+        value = np.array(value)
+    if not checks.is_numeric(value) or value.shape != (2,):
         return False
     with np.errstate(over="ignore"):
-        low, high = np.asarray(given, np.float32)
-    return bool(np.isfinite([low, high]).all() and given[0] <= given[1])
+        low, high = np.asarray(value, np.float32)
+    return bool(np.isfinite([low, high]).all() and value[0] <= value[1])
 
 
 def draw(
     key: jax.Array, ranges: Randomization, model: mujoco.MjModel, layout: Layout
 ) -> tuple[Draw, Layout]:
-    """One world's values, and its layout with the objects moved, turned and grown."""
+    """Draw one world's values, and move, rotate and scale the objects of its layout."""
     keys = iter(jax.random.split(key, len(dataclasses.fields(ranges))))
 
     def uniform(name: str, *shape: int) -> jax.Array:
         low, high = getattr(ranges, name)
         return jax.random.uniform(next(keys), shape, minval=low, maxval=high)
 
-    found = Draw(
+    drawn = Draw(
         size=uniform("size"),
         mass=uniform("mass", model.nbody),
         friction=uniform("friction"),
@@ -176,62 +176,62 @@ def draw(
         latency=uniform("latency"),
     )
     move = jnp.stack([*uniform("position", 2), jnp.float32(0.0), uniform("turn")])
-    grow = jnp.ones(4).at[2].set(found.size)  # a height is the sum of what lies below
-    return found, {name: place * grow + move for name, place in layout.items()}
+    scale = jnp.ones(4).at[2].set(drawn.size)  # heights add up the sizes of all objects below
+    return drawn, {name: pose * scale + move for name, pose in layout.items()}
 
 
-def belonging(model: mujoco.MjModel, names: Iterable[str]) -> np.ndarray:
-    """Whether each body of a model is one of these or hangs on one, bool [bodies]."""
-    belongs = np.isin(np.arange(model.nbody), [model.body(name).id for name in names])
+def in_subtrees(model: mujoco.MjModel, names: Iterable[str]) -> np.ndarray:
+    """Return whether each body is one of these or a descendant of one, bool [bodies]."""
+    included = np.isin(np.arange(model.nbody), [model.body(name).id for name in names])
     for body in range(1, model.nbody):  # parents come first
-        belongs[body] |= belongs[model.body_parentid[body]]
-    return belongs
+        included[body] |= included[model.body_parentid[body]]
+    return included
 
 
-def geom_sizes(found: Draw, model: mujoco.MjModel, ours: np.ndarray) -> jax.Array:
-    """Sizes [G, 3] of all geoms in one world, `ours` being its objects' bodies."""
-    return model.geom_size * jnp.where(ours[model.geom_bodyid], found.size, 1.0)[:, None]
+def geom_sizes(drawn: Draw, model: mujoco.MjModel, objects: np.ndarray) -> jax.Array:
+    """Compute the sizes [G, 3] of all geoms of one world; `objects` masks the objects' bodies."""
+    return model.geom_size * jnp.where(objects[model.geom_bodyid], drawn.size, 1.0)[:, None]
 
 
-def changes(found: Draw, model: mujoco.MjModel, ours: np.ndarray) -> Changes:
-    """How a world's model differs from the one that all share, `ours` being its objects' bodies."""
-    mass = jnp.where(ours, found.mass, 1.0)
-    size = jnp.where(ours, found.size, 1.0)[:, None]
-    # Where a body's frame lies in its parent's: grown only if the parent has grown as well.
-    inner = jnp.where(ours[model.body_parentid], found.size, 1.0)[:, None]
-    # What the solver takes for 1 / mass and 1 / inertia of a free body.
-    lighter = 1 / jnp.stack([mass, mass * size[:, 0] ** 2], axis=1)
+def changes(drawn: Draw, model: mujoco.MjModel, objects: np.ndarray) -> Changes:
+    """Compute the model fields that differ in one world; `objects` masks the objects' bodies."""
+    mass = jnp.where(objects, drawn.mass, 1.0)
+    size = jnp.where(objects, drawn.size, 1.0)[:, None]
+    # A body's position in its parent scales only if the parent does.
+    parent_size = jnp.where(objects[model.body_parentid], drawn.size, 1.0)[:, None]
+    # The solver's estimates of 1 / mass and 1 / inertia of a free body.
+    inverse = 1 / jnp.stack([mass, mass * size[:, 0] ** 2], axis=1)
     return {
-        "geom_size": geom_sizes(found, model, ours),
+        "geom_size": geom_sizes(drawn, model, objects),
         "geom_pos": model.geom_pos * size[model.geom_bodyid],
-        "body_pos": model.body_pos * inner,
+        "body_pos": model.body_pos * parent_size,
         "body_ipos": model.body_ipos * size,
         "body_mass": model.body_mass * mass,
         "body_inertia": model.body_inertia * mass[:, None] * size**2,
-        "body_invweight0": model.body_invweight0 * lighter,
-        "geom_friction": model.geom_friction * found.friction,
-        "actuator_gainprm": model.actuator_gainprm * found.gains[:, None],
-        "actuator_biasprm": model.actuator_biasprm * found.gains[:, None],
+        "body_invweight0": model.body_invweight0 * inverse,
+        "geom_friction": model.geom_friction * drawn.friction,
+        "actuator_gainprm": model.actuator_gainprm * drawn.gains[:, None],
+        "actuator_biasprm": model.actuator_biasprm * drawn.gains[:, None],
     }
 
 
-def move_cameras(found: Draw, data: Data) -> Data:
-    """A world whose cameras are where it drew them."""
-    shift = multiply(data.cam_xmat, found.camera_position[..., None])[..., 0]
-    turned = multiply(data.cam_xmat, jax.vmap(turn)(found.camera_turn))
-    return data.replace(cam_xpos=data.cam_xpos + shift, cam_xmat=turned)
+def move_cameras(drawn: Draw, data: Data) -> Data:
+    """Move the cameras of one world as drawn."""
+    shift = multiply(data.cam_xmat, drawn.camera_position[..., None])[..., 0]
+    rotated = multiply(data.cam_xmat, jax.vmap(turn)(drawn.camera_turn))
+    return data.replace(cam_xpos=data.cam_xpos + shift, cam_xmat=rotated)
 
 
-def look(found: Draw, own: Look) -> Look:
-    """How a world looks, given how the model does."""
-    rgb = jnp.clip(own.rgba[:, :3] + found.colour, 0.0, 1.0)
+def appearance(drawn: Draw, base: Appearance) -> Appearance:
+    """Change the model's appearance to that drawn for one world."""
+    rgb = jnp.clip(base.rgba[:, :3] + drawn.colour, 0.0, 1.0)
     return dataclasses.replace(
-        own,
-        rgba=jnp.concatenate([rgb, own.rgba[:, 3:]], axis=1),
-        light=multiply(turn(found.light_turn), jnp.asarray(own.light)),
-        ambient=own.ambient * found.brightness,
-        headlight=own.headlight * found.brightness,
-        diffuse=own.diffuse * found.brightness,
-        sky=own.sky * found.brightness,
-        fovy=own.fovy + found.field_of_view,
+        base,
+        rgba=jnp.concatenate([rgb, base.rgba[:, 3:]], axis=1),
+        light=multiply(turn(drawn.light_turn), jnp.asarray(base.light)),
+        ambient=base.ambient * drawn.brightness,
+        headlight=base.headlight * drawn.brightness,
+        diffuse=base.diffuse * drawn.brightness,
+        sky=base.sky * drawn.brightness,
+        fovy=base.fovy + drawn.field_of_view,
     )

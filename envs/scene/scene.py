@@ -1,4 +1,4 @@
-"""The MuJoCo scene of a task: table, cameras and light, the same for every robot and task."""
+"""MuJoCo scene of a task: table, cameras and light, shared by all robots and tasks."""
 
 import contextlib
 import warnings
@@ -12,10 +12,10 @@ from envs.rendering.model import AMBIENT, CONTRAST, DIFFUSE, HEADLIGHT, SKY, SQU
 from envs.robots import Robot
 
 CAMERAS = ("side", "wrist")
-PHYSICS_DT = 0.005  # s
+PHYSICS_DT = 0.005  # s; own choice: the largest that is stable with solref .01 (at least 2 steps)
 
-# Solver settings of the fact sheet's grasping experiments: fewer than 2 iterations do not grasp,
-# elliptic cones cost six times as much. Only spheres, boxes and the table plane ever touch.
+# Solver settings are own choices from grasping experiments: with fewer than 2 iterations nothing is
+# grasped, and elliptic cones cost six times as much. Only spheres, boxes and the table plane touch.
 _SCENE = """
 <mujoco>
   <compiler angle="radian"/>
@@ -35,7 +35,7 @@ _SCENE = """
       <joint type="slide" axis="0 1 0" armature=".05" damping="5"/>
     </default>
   </default>
-  {look}
+  {visuals}
   <worldbody>
     <light directional="true" pos=".6 -.5 1.2" dir="-.5 .2 -1" ambient="0 0 0" specular="0 0 0"
       diffuse="{diffuse} {diffuse} {diffuse}"/>
@@ -52,9 +52,9 @@ _SCENE = """
   </equality>
 </mujoco>
 """
-# The look of the ray caster for MuJoCo's other renderers. Their headlight shines along the camera's
-# axis; the lamp is for those that can put it where the camera is, as the ray caster does.
-_LOOK = """
+# Make MuJoCo's other renderers resemble the ray caster. Their headlight shines along the camera's
+# axis; the lamp replaces it where a renderer can place one at the camera, as the ray caster does.
+_VISUALS = """
   <visual>
     <headlight ambient="{ambient} {ambient} {ambient}" specular="0 0 0"
       diffuse="{headlight} {headlight} {headlight}"/>
@@ -69,32 +69,32 @@ _LOOK = """
   </asset>
 """
 _TABLE, _TABLE_SIZE = ".62 .66 .68 1", 2.0  # colour; half the edge [m]
-_SIDE_EYE, _SIDE_TARGET = (0.76, -0.49, 0.42), (0.34, 0.0, 0.065)  # m
+_SIDE_EYE, _SIDE_TARGET = (0.76, -0.49, 0.42), (0.34, 0.0, 0.065)  # m; own choices
 
 
 def build(objects: str, robot: Robot) -> mujoco.MjModel:
-    """The model of a robot, base at the origin, at a table z = 0 with a task's objects on it."""
-    with warnings_of_python():
+    """Compile the model of a robot, base at the origin, at a table z = 0 with a task's objects."""
+    with as_python_warnings():
         spec = mujoco.MjSpec.from_string(mjcf(objects, robot))
         robot.body.attach(robot, spec)
         return spec.compile()
 
 
 @contextlib.contextmanager
-def warnings_of_python() -> Iterator[None]:
-    """MuJoCo's own go to a file in the working folder."""
-    before, said = mujoco.get_mju_user_warning(), []
-    mujoco.set_mju_user_warning(said.append)
+def as_python_warnings() -> Iterator[None]:
+    """Turn MuJoCo's warnings, which go to a file in the working folder, into Python warnings."""
+    before, messages = mujoco.get_mju_user_warning(), []
+    mujoco.set_mju_user_warning(messages.append)
     try:
         yield
     finally:
         mujoco.set_mju_user_warning(before)
-    for text in said:
+    for text in messages:
         warnings.warn(f"MuJoCo says: {' '.join(text.split())}", stacklevel=3)
 
 
 def mjcf(objects: str, robot: Robot) -> str:
-    """MJCF of the same, without what only `Robot.body` can attach."""
+    """Return the scene's MJCF, without what only `Robot.body.attach` can add."""
     bodies, actuators = robot.body.mjcf(robot)
     return _SCENE.format(
         timestep=PHYSICS_DT,
@@ -102,7 +102,7 @@ def mjcf(objects: str, robot: Robot) -> str:
         robot=bodies,
         task=objects,
         actuators=actuators,
-        look=_look(),
+        visuals=_visuals(),
         headlight=HEADLIGHT,
         diffuse=DIFFUSE,
         table=_TABLE,
@@ -110,9 +110,9 @@ def mjcf(objects: str, robot: Robot) -> str:
     )
 
 
-def _look() -> str:
+def _visuals() -> str:
     horizon, up = (" ".join(map(str, colour)) for colour in SKY)
-    return _LOOK.format(
+    return _VISUALS.format(
         ambient=AMBIENT,
         headlight=HEADLIGHT,
         horizon=horizon,
@@ -124,7 +124,7 @@ def _look() -> str:
 
 
 def _look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """[4, 4] pose of a camera, which looks along -z with y up."""
+    """Return the [4, 4] pose of a camera at `eye` that looks at `target` along -z, y up."""
     z = (eye - target) / np.linalg.norm(eye - target)
     x = np.cross([0.0, 0.0, 1.0], z)
     x /= np.linalg.norm(x)

@@ -1,6 +1,6 @@
-"""Manipulation tasks: one file each, found by its name.
+"""Manipulation tasks: one file per task, found by its name.
 
-Names that begin with `_` hold what all tasks share.
+Modules that begin with `_` hold what all tasks share.
 """
 
 from envs.tasks._task import (

@@ -1,12 +1,12 @@
-"""What a manipulation task states, and what all tasks share.
+"""Definition of a manipulation task, and helpers for all tasks.
 
-A task says what lies on the table and where (`place`), what counts as success (`check`), how people
-ask for it (`instructions`), how a hand does it (`waypoints`) and how far it has come on that way
-(`stages`). It knows nothing of robots.
+A task defines the objects on the table (`scene`, `place`), success (`check`), the requests
+(`instructions`), a solution as poses of the hand (`waypoints`) and the progress along it
+(`stages`). It does not depend on the robot.
 
-Contact masks of the scenes, one bit of contype for each part played: 1 objects that are carried,
-2 finger tips, 4 what only finger pads hold, 8 feet that stand on something. Whatever they may touch
-has the bit in its conaffinity, and no other pair is ever computed.
+Contact masks: each role has a bit of contype, 1 for carried objects, 2 for finger tips, 4 for
+surfaces that only finger pads hold, 8 for feet. A geom that may touch a role has its bit in
+conaffinity; no other pairs are ever computed.
 """
 
 import dataclasses
@@ -19,113 +19,121 @@ import mujoco
 
 from envs.robots import TIP_LENGTH, multiply
 
-_ALMOST = 0.99  # share of a stage that is not passed yet
+_ALMOST = 0.99  # largest share of a stage that is not passed yet; own choice
 
 Layout = dict[str, jax.Array]
-"""Body name -> where it is at reset: [4], x, y, z in m and the turn about z in rad."""
+"""Body name -> pose at reset: [4], x, y, z in m and yaw in rad."""
 
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """What a task sees of one simulated world, whose objects are `size` times their own size."""
+    """Measurements of one simulated world, whose objects are scaled by `size`."""
 
     model: mujoco.MjModel
     data: Any
     size: float | jax.Array = 1.0
 
     def position(self, body: str) -> jax.Array:
-        """Position [3] of a body in m."""
+        """Return the position [3] of a body [m]."""
         return self.data.xpos[self.model.body(body).id]
 
     def above(self, body: str, height: float) -> jax.Array:
-        """Point [3] in m, `height` [m] over a body's position where objects have their own size."""
+        """Return the point [3] at `height` * size above a body's position [m]."""
         return self.position(body) + self.size * jnp.array([0.0, 0.0, height])
 
     def upright(self, body: str) -> jax.Array:
-        """Cosine of the angle between a body's z axis and the vertical."""
+        """Return the cosine of the angle between a body's z axis and the vertical."""
         return self.data.xmat[self.model.body(body).id].reshape(3, 3)[2, 2]
 
     def on(self, body: str, height: float) -> jax.Array:
-        """Point [3] in m of a body, `height` [m] up its own z axis."""
+        """Return the point [3] at `height` * size along a body's own z axis [m]."""
         axis = self.data.xmat[self.model.body(body).id].reshape(3, 3)[:, 2]
         return self.position(body) + self.size * height * axis
 
     def speed(self, body: str) -> jax.Array:
-        """Linear speed of a free body in m/s."""
+        """Return the linear speed of a free body [m/s]."""
         start = self.model.jnt_dofadr[self.model.body(body).jntadr[0]]
         return jnp.linalg.norm(self.data.qvel[start : start + 3])
 
     def joint(self, name: str) -> jax.Array:
-        """Position of a hinge [rad] or slide [m]."""
+        """Return the position of a hinge [rad] or slide [m]."""
         return self.data.qpos[self.model.joint(name).qposadr[0]]
 
     def inside(self, body: str, box: str, half_width: float, height: float) -> jax.Array:
-        """Whether a body's position lies in a square box that stands where another body is."""
+        """Return whether a body's position is inside a square box, itself a body.
+
+        Args:
+            body, box: names of the bodies.
+            half_width, height: half the inner width of the box, and its height, at size 1 [m].
+        """
         axes = self.data.xmat[self.model.body(box).id].reshape(3, 3)
         offset = multiply(self.position(body) - self.position(box), axes) / self.size
         return jnp.all(jnp.abs(offset[:2]) < half_width) & (offset[2] < height)
 
     def apart(self, body: str, other: str) -> jax.Array:
-        """Distance of two bodies along the table in m."""
+        """Return the horizontal distance of two bodies [m]."""
         return jnp.linalg.norm((self.position(body) - self.position(other))[:2])
 
     def released(self, grip: jax.Array, width: float, away: float = 0.06) -> jax.Array:
-        """Whether the hand has let go of what is `width` [m] wide where it is held, at grip [3].
+        """Return whether the hand has released an object: opened wider than it, or moved away.
 
-        A gripper that holds it is as wide as it and around it: within `away` [m].
+        Args:
+            grip: [3] point at which the object is held [m].
+            width: width of the object there, at size 1 [m].
+            away: distance from the grip at which the hand no longer holds the object [m].
         """
         wider = self.opening > width * self.size + 0.005
         return wider | (jnp.linalg.norm(grip - self.tcp) > away)
 
     def reaching(self, grip: jax.Array) -> jax.Array:
-        """Share of a stage that ends with the tool centre at grip [3], within 15 mm."""
+        """Progress of a stage that ends with the tcp within 15 mm of grip [3]."""
         return near(jnp.linalg.norm(grip - self.tcp), within=0.015)
 
     def grasping(self, grip: jax.Array, width: float) -> jax.Array:
-        """Share of a stage that ends with the fingers closed around what is `width` [m] wide."""
+        """Progress of a stage that ends with the fingers closed around `width` [m] at grip [3]."""
         gap = self.opening - width * self.size
         return gate(self.reaching(grip) >= 1, near(gap, within=0.005, scale=0.02))
 
     def releasing(self, grip: jax.Array, width: float, away: float = 0.06) -> jax.Array:
-        """Share of a stage that ends with `released`, whose arguments these are."""
+        """Progress of a stage that ends with `released`; same arguments."""
         gap = width * self.size + 0.005 - self.opening
         share = jnp.minimum(near(gap, scale=0.02), _ALMOST)
         return jnp.where(self.released(grip, width, away), 1.0, share)
 
     @property
     def tcp(self) -> jax.Array:
-        """Position [3] of the tool centre between the fingers in m."""
+        """Position [3] of the tool centre point between the fingers [m]."""
         return self.data.site_xpos[self.model.site("tcp").id]
 
     @property
     def tip(self) -> jax.Array:
-        """Position [3] of the point between the ends of the finger tips in m."""
+        """Position [3] of the point between the ends of the finger tips [m]."""
         rotation = self.data.site_xmat[self.model.site("tcp").id].reshape(3, 3)
         return self.tcp + TIP_LENGTH * rotation[:, 2]
 
     @property
     def opening(self) -> jax.Array:
-        """Distance between the fingers in m."""
+        """Distance between the fingers [m]."""
         return self.joint("left") + self.joint("right")
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Waypoints:
-    """Poses the hand goes through one after the other; P of them.
+    """A sequence of P poses of the hand.
 
-    A robot turns the rotation about the fingers' axis: by its own lean (`Robot.lean`) times `lean`,
-    and by `tilt` to the side that its wrist prefers (`Robot.tilt_side`).
+    Each robot rotates them about the axis along which its fingers open: by `lean` times its own
+    lean (`Robot.lean`), and by `tilt` to the side that its wrist allows (`Robot.tilt_side`).
 
     Attributes:
-        position: [P, 3] in m of a point on the hand's axis, `reach` behind the tcp.
-        reach: [P] in m; 0 means the tcp itself. A hand turns about that point.
+        position: [P, 3] of a point on the hand's axis, `reach` behind the tcp [m].
+        reach: [P], 0 for the tcp itself; the hand rotates about that point [m].
         rotation: [P, 3, 3] of the tcp before leaning and tilting.
         lean: [P] share of the robot's own lean.
         tilt: [P] in rad.
-        opening: [P] of the gripper in m.
-        seconds: [P] nominal time to get there from the one before.
-        spread: [P] standard deviation of the noise on the position in m, 0 where it matters.
+        opening: [P] of the gripper [m].
+        seconds: [P] nominal time from the previous pose [s].
+        spread: [P] standard deviation of the noise on the position, 0 where precision matters [m].
     """
 
     position: jax.Array
@@ -140,21 +148,20 @@ class Waypoints:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Task:
-    """A task, all functions being for one world and pure.
+    """A task; all functions are pure and take one world.
 
     Attributes:
         name: file name of the task.
-        scene: MJCF of the bodies on the table; `place` moves those that are fixed or free.
+        scene: MJCF of the bodies on the table; `place` positions fixed and free bodies.
         instructions: phrasings of the request, at most 8 words each.
-        time_limit: seconds after which an episode ends.
-        expert_time: seconds the expert is given.
+        time_limit: time after which an episode ends [s].
+        expert_time: time after which the expert stops [s].
         hold_steps: consecutive control steps for which `check` must hold.
         place: key -> random layout.
-        check: view -> (bool scalar, metrics): the goal is met now.
-        waypoints: layout -> the way a hand does it.
-        stages: view -> name of each stage of that way, first to last, and the share of it that is
-            done, f32 0 to 1; 1 passes it and all before it. Dense rewards are made of them, see
-            `envs.rewards`.
+        check: view -> (bool scalar, metrics); whether the goal is reached now.
+        waypoints: layout -> a solution as poses of the hand.
+        stages: view -> completed share of each stage of that solution, f32 in [0, 1], by name,
+            first to last; 1 passes the stage and all before it. See `envs.rewards`.
     """
 
     name: str
@@ -170,25 +177,25 @@ class Task:
 
 
 def near(distance: jax.Array, within: float = 0.0, scale: float = 0.1) -> jax.Array:
-    """Share of a stage that ends where a distance [m] is `within`; a third is left at `scale`."""
+    """Progress of a stage that ends with a distance <= `within` [m]; decays as exp(-x / scale)."""
     return jnp.exp(-jnp.maximum(distance - within, 0.0) / scale)
 
 
 def gate(condition: jax.Array, share: jax.Array) -> jax.Array:
-    """Share of a stage that begins where a condition holds."""
+    """Progress of a stage that cannot begin before a condition holds."""
     return jnp.where(condition, share, 0.0)
 
 
 def azimuth(position: jax.Array) -> jax.Array:
-    """Direction [...] in rad in which the base, at the origin, sees positions [..., 3]."""
+    """Return the direction [...] of positions [..., 3] from the base at the origin [rad]."""
     return jnp.arctan2(position[..., 1], position[..., 0])
 
 
 def tool_down(position: jax.Array) -> jax.Array:
-    """Rotations [..., 3, 3] of a tcp that points down, fingers opening across the line to the base.
+    """Return tcp rotations [..., 3, 3] pointing down, fingers opening across the line to the base.
 
     Args:
-        position: [..., 3] where the tcp is; the arm's base stands at the origin.
+        position: [..., 3] of the tcp; the arm's base is at the origin.
     """
     yaw = azimuth(position)
     c, s, zero = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw)
@@ -203,12 +210,12 @@ def route(
     reach: float = 0.0,
     tilt: Sequence[float] = (),
 ) -> Waypoints:
-    """Waypoints with the tool pointing down, from rows (anchor, offset, opening, s, spread).
+    """Make waypoints with the tool pointing down, from rows (anchor, offset, opening, s, spread).
 
     Args:
-        rows: one a waypoint; an anchor is a place of the layout, or a position [3].
+        rows: one per waypoint; the anchor is a pose of the layout or a position [3].
         lean, reach: as in `Waypoints`, the same for all.
-        tilt: as in `Waypoints`, one a row [rad]; none tilts.
+        tilt: as in `Waypoints`, one per row [rad]; empty for none.
     """
     anchors, offsets, opening, seconds, spread = zip(*rows, strict=True)
     position = jnp.stack(anchors)[:, :3] + jnp.array(offsets)
@@ -219,27 +226,27 @@ def route(
 
 
 def scatter(key: jax.Array, centre: tuple, spread: tuple) -> jax.Array:
-    """Random place [4] on the table, uniform within `spread` [m] of `centre` [m], not turned."""
+    """Sample a pose [4] on the table, uniform within `spread` [m] of `centre` [m], with yaw 0."""
     shift = jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0) * jnp.array(spread)
     return jnp.concatenate([jnp.array(centre) + shift, jnp.zeros(2)])
 
 
 def raised(place: jax.Array, height: float) -> jax.Array:
-    """A place [4] moved up by a height in m."""
+    """Move a pose [4] up by a height [m]."""
     return place.at[2].add(height)
 
 
 def open_box(inside: float, wall: float, height: float, *, floor: str, walls: str) -> str:
-    """MJCF of a square box without a lid that stands at z = 0.
+    """Return MJCF of a square box without a lid, standing at z = 0.
 
     Args:
         inside, wall, height: half the inner width, half the walls' thickness, their height [m].
         floor, walls: MJCF attributes of the floor (4 mm) and of every wall.
     """
-    look, side, middle, long = walls, inside + wall, height / 2, inside + 2 * wall
+    side, middle, long = inside + wall, height / 2, inside + 2 * wall
     return f"""
   <geom type="box" {floor} size="{inside} {inside} .002" pos="0 0 .002"/>
-  <geom type="box" {look} size="{wall} {long} {middle}" pos="{side} 0 {middle}"/>
-  <geom type="box" {look} size="{wall} {long} {middle}" pos="{-side} 0 {middle}"/>
-  <geom type="box" {look} size="{inside} {wall} {middle}" pos="0 {side} {middle}"/>
-  <geom type="box" {look} size="{inside} {wall} {middle}" pos="0 {-side} {middle}"/>"""
+  <geom type="box" {walls} size="{wall} {long} {middle}" pos="{side} 0 {middle}"/>
+  <geom type="box" {walls} size="{wall} {long} {middle}" pos="{-side} 0 {middle}"/>
+  <geom type="box" {walls} size="{inside} {wall} {middle}" pos="0 {side} {middle}"/>
+  <geom type="box" {walls} size="{inside} {wall} {middle}" pos="0 {-side} {middle}"/>"""

@@ -1,6 +1,6 @@
 """Open the pot: grasp the lid by its knob, lift it off, put it down beside the pot.
 
-Numbers without a source are own choices that work with both arms.
+All numbers are own choices with which both arms solve the task.
 """
 
 import jax
@@ -20,22 +20,22 @@ from envs.tasks import (
 )
 
 _INSIDE, _WALL, _HEIGHT = 0.043, 0.005, 0.055  # m, of the pot: half the inner width, half a wall
-_FOOT = 0.005  # m, radius of the lid's feet, which stand in the middle of the walls
-_KNOB, _KNOB_HEIGHT = 0.010, 0.030  # m, its radius, and its centre above the feet
+_FOOT = 0.005  # m, radius of the lid's feet, which stand on the middle of the walls
+_KNOB, _KNOB_HEIGHT = 0.010, 0.030  # m, radius of the knob, and its centre above the feet
 _LID = 0.055  # m, radius
 _POT, _POT_RANGE = (0.36, 0.10), (0.04, 0.04)  # m, of the random position
-_BESIDE = 0.175  # m from pot to lid, to the right as the robot sees it
+_BESIDE = 0.175  # m from pot to lid, to the robot's right
 
 _STEEL, _RED = 'rgba=".55 .57 .60 1"', 'rgba=".62 .20 .16 1"'
 _RIM = _INSIDE + _WALL
-_BARELY_BESIDE = _LID + _RIM + _WALL  # m from pot to lid
-_CLEAR = 0.020  # m, of the lid above the pot when it is lifted off
+_BARELY_BESIDE = _LID + _RIM + _WALL  # m from pot to lid when they just do not overlap
+_CLEAR = 0.020  # m, height of the lid above the pot that counts as lifted off
 _FEET = "".join(
     f'<geom type="sphere" size="{_FOOT}" pos="{x} {y} {_FOOT}" contype="8" condim="4" mass=".005" '
     f'friction="1 .02 .001" solref=".01 1" {_STEEL}/>'
     for x, y in ((_RIM, 0), (-_RIM, 0), (0, _RIM), (0, -_RIM))
 )
-# A lid on four spheres rests a hundred times more quietly than one on a flat face.
+# Resting on four spheres, the lid has a hundredth of the residual velocity of one on a flat face.
 _SCENE = f"""
 <body name="pot">
   {open_box(_INSIDE, _WALL, _HEIGHT, floor=_RED, walls=f'conaffinity="10" {_RED}')}
@@ -68,16 +68,16 @@ def _check(view: View) -> tuple[jax.Array, dict[str, jax.Array]]:
 
 def _stages(view: View) -> dict[str, jax.Array]:
     knob, lid = view.on("lid", _KNOB_HEIGHT), view.position("lid")
-    held = view.grasping(knob, 2 * _KNOB)
-    risen = (lid[2] - _HEIGHT * view.size) / _CLEAR
+    grasped = view.grasping(knob, 2 * _KNOB)
+    lifted = (lid[2] - _HEIGHT * view.size) / _CLEAR
     level = view.upright("lid") > 0.97
     missing = (_BARELY_BESIDE + 0.005) * view.size - view.apart("lid", "pot")
     beside = gate(level, near(missing))
     down = gate(beside >= 1, near(lid[2], within=0.008))
     return {
         "reach": view.reaching(knob),
-        "grasp": held,
-        "lift": gate(held >= 1, jnp.clip(risen, 0.0, 1.0)),
+        "grasp": grasped,
+        "lift": gate(grasped >= 1, jnp.clip(lifted, 0.0, 1.0)),
         "carry": beside,
         "lower": down,
         "release": gate(down >= 1, view.releasing(knob, 2 * _KNOB)),

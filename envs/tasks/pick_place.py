@@ -1,6 +1,6 @@
-"""Pick the grape and place it in the basket: at rest inside, and let go.
+"""Pick the grape and place it in the basket: at rest inside, and released.
 
-Numbers without a source are own choices that work with both arms.
+All numbers are own choices with which both arms solve the task.
 """
 
 import jax
@@ -23,15 +23,15 @@ _RADIUS = 0.015  # m, a large table grape (12 g)
 _INSIDE = 0.046  # m, half the inner width of the basket
 _WALL = 0.003  # m, half the thickness of its walls
 _HEIGHT = 0.045  # m, of its walls
-_CLEAR = 0.080  # m, of the grape above the table: over the basket's walls
+_CLEAR = 0.080  # m, height of the grape above the table that clears the basket's walls
 _GRAPE, _GRAPE_RANGE = (0.36, -0.08), (0.06, 0.10)  # m, of the random position
 _BASKET, _BASKET_RANGE = (0.36, 0.155), (0.035, 0.035)  # m
 
-_LOOK = 'conaffinity="3" rgba=".85 .65 .30 1"'
-# The free joint's damping stops a rolling grape within half a second: 1.4 m r^2 / damping.
+_BASKET_GEOM = 'conaffinity="3" rgba=".85 .65 .30 1"'
+# The free joint's damping stops a rolling grape within half a second: 1.4 m r² / damping.
 _SCENE = f"""
 <body name="basket">
-  {open_box(_INSIDE, _WALL, _HEIGHT, floor=_LOOK, walls=_LOOK)}
+  {open_box(_INSIDE, _WALL, _HEIGHT, floor=_BASKET_GEOM, walls=_BASKET_GEOM)}
 </body>
 <body name="grape">
   <joint name="grape" type="free" damping="1e-5"/>
@@ -59,13 +59,13 @@ def _check(view: View) -> tuple[jax.Array, dict[str, jax.Array]]:
 def _stages(view: View) -> dict[str, jax.Array]:
     grape = view.position("grape")
     height = grape[2] - _RADIUS * view.size
-    held = view.grasping(grape, 2 * _RADIUS)
+    grasped = view.grasping(grape, 2 * _RADIUS)
     over = near(view.apart("grape", "basket"), within=0.03)
     low = gate(over >= 1, near(height, within=_HEIGHT, scale=0.05))
     return {
         "reach": view.reaching(grape),
-        "grasp": held,
-        "lift": gate(held >= 1, jnp.clip(height / _CLEAR, 0.0, 1.0)),
+        "grasp": grasped,
+        "lift": gate(grasped >= 1, jnp.clip(height / _CLEAR, 0.0, 1.0)),
         "carry": over,
         "lower": low,
         "release": gate(low >= 1, view.releasing(grape, 2 * _RADIUS)),

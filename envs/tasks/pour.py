@@ -1,6 +1,6 @@
 """Pour the block out of the cup into the basket, and set the cup upright again.
 
-Numbers without a source are own choices that work with both arms.
+All numbers are own choices with which both arms solve the task.
 """
 
 import math
@@ -22,21 +22,21 @@ from envs.tasks import (
     scatter,
 )
 
-_BLOCK = 0.010  # m, radius of the sphere that stands for the block where it touches things
+_BLOCK = 0.010  # m, radius of the sphere that the block collides with
 _BOTTOM = 0.014  # m, half the inner width of the cup at its bottom
-_FLARE = math.radians(20.0)  # of the two walls over which the block can leave
+_FLARE = math.radians(20.0)  # slant of the two walls over which the block can leave
 _HEIGHT, _THICK, _FOOT = 0.050, 0.002, 0.004  # m: of the cup, half a wall, a foot's radius
 _SIDE = 0.022  # m from the cup's middle to its upright walls
-_WIDTH = 2 * (_SIDE + 0.003)  # m, of the cup where it is held
-_CLEAR = 0.060  # m, of the cup above the table when it is lifted
-_GRIP = 0.033  # m, height at which the cup is held
-# The hand turns about a point above the cup's mouth: from there the block falls straight down.
+_WIDTH = 2 * (_SIDE + 0.003)  # m, of the cup where it is grasped
+_CLEAR = 0.060  # m, height of the cup above the table that counts as lifted
+_GRIP = 0.033  # m, height at which the cup is grasped
+# The hand rotates about a point above the cup's mouth, from where the block falls straight down.
 _REACH = _HEIGHT - _GRIP + 0.03  # m from the grip
 _CUP, _CUP_RANGE = (0.33, -0.09), (0.03, 0.05)  # m, of the random position
 _INSIDE, _WALL, _BASKET_HEIGHT = 0.050, 0.003, 0.045  # m, of the basket, as in pick_place
 _BASKET, _BASKET_RANGE = (0.37, 0.12), (0.03, 0.03)  # m
 
-_BLUE, _LOOK = 'rgba=".16 .38 .72 1"', 'conaffinity="1" rgba=".85 .65 .30 1"'
+_BLUE, _BASKET_GEOM = 'rgba=".16 .38 .72 1"', 'conaffinity="1" rgba=".85 .65 .30 1"'
 _RISE = (_HEIGHT - 2 * _FOOT) / 2  # m, half the height of the walls
 _CENTRE = 2 * _FOOT + _RISE
 _OUT = _BOTTOM + _THICK + math.tan(_FLARE) * _RISE
@@ -67,7 +67,7 @@ def _cup() -> str:
 
 _SCENE = f"""
 <body name="basket">
-  {open_box(_INSIDE, _WALL, _BASKET_HEIGHT, floor=_LOOK, walls=_LOOK)}
+  {open_box(_INSIDE, _WALL, _BASKET_HEIGHT, floor=_BASKET_GEOM, walls=_BASKET_GEOM)}
 </body>
 <body name="cup"><joint name="cup" type="free" damping="1e-4"/>{_cup()}</body>
 <body name="block">
@@ -102,7 +102,7 @@ def _check(view: View) -> tuple[jax.Array, dict[str, jax.Array]]:
 
 def _stages(view: View) -> dict[str, jax.Array]:
     grip, cup = view.on("cup", _GRIP), view.position("cup")
-    held = view.grasping(grip, _WIDTH)
+    grasped = view.grasping(grip, _WIDTH)
     mouth = view.on("cup", _GRIP + _REACH)
     loaded = jnp.linalg.norm(view.position("block") - view.on("cup", _CENTRE)) < _HEIGHT
     carried = gate(
@@ -111,12 +111,12 @@ def _stages(view: View) -> dict[str, jax.Array]:
     over = jnp.maximum(carried, near(view.apart("block", "basket"), within=0.04))
     inside = view.inside("block", "basket", _INSIDE, _BASKET_HEIGHT)
     tilted = jnp.clip((1 - view.upright("cup")) / 2, 0.0, 0.9)
-    level = jnp.clip(view.upright("cup") / 0.9, 0.0, 1.0)  # it may lean while it is held
+    level = jnp.clip(view.upright("cup") / 0.9, 0.0, 1.0)  # it may lean while grasped
     standing = gate(inside, level * near(cup[2], within=0.009))
     return {
         "reach": view.reaching(grip),
-        "grasp": held,
-        "lift": gate(held >= 1, jnp.clip(cup[2] / _CLEAR, 0.0, 1.0)),
+        "grasp": grasped,
+        "lift": gate(grasped >= 1, jnp.clip(cup[2] / _CLEAR, 0.0, 1.0)),
         "carry": over,
         "pour": jnp.where(inside, 1.0, gate(over >= 1, tilted)),
         "put_back": standing,
@@ -127,7 +127,7 @@ def _stages(view: View) -> dict[str, jax.Array]:
 def _waypoints(layout: Layout) -> Waypoints:
     cup, basket = (raised(layout[name], _GRIP + _REACH) for name in ("cup", "basket"))
     wide, closed = 0.066, 0.030  # m
-    # An arm that cannot point straight down high above the table may lean a little while it moves.
+    # Some arms cannot point straight down high above the table: let them lean while they carry.
     carry, level = math.radians(25.0), math.radians(94.0)
     return route(
         (cup, (0.0, 0.0, 0.070), wide, 1.5, 0.003),

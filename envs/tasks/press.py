@@ -1,6 +1,6 @@
-"""Press the red button: down past 75 % of its stroke, by the fingers.
+"""Press the red button down past 75 % of its stroke, with the fingers.
 
-Numbers without a source are own choices that work with both arms.
+All numbers are own choices with which both arms solve the task.
 """
 
 import jax
@@ -12,10 +12,10 @@ from envs.tasks import Layout, Task, View, Waypoints, gate, near, raised, route,
 _STROKE = 0.012  # m
 _TOP = 0.040  # m, height of the cap at rest
 _RADIUS = 0.024  # m, of the cap
-_DEEP = 0.75 * _STROKE  # how far it must go
+_DEEP = 0.75 * _STROKE  # m, depth that counts as pressed
 _CENTRE, _RANGE = (0.36, 0.0), (0.04, 0.04)  # m, of the random position
 
-# A spring of 150 N/m: 1.8 N at full stroke, far more than the cap's weight (compensated anyway).
+# A spring of 150 N/m gives 1.8 N at full stroke, far more than the cap's (compensated) weight.
 _SCENE = f"""
 <body name="button">
   <geom type="cylinder" size=".040 .012" pos="0 0 .012" rgba=".20 .22 .26 1"/>
@@ -49,7 +49,7 @@ def _stages(view: View) -> dict[str, jax.Array]:
 
 
 def _offset(view: View) -> jax.Array:
-    """From the top of the cap, wherever it is, to the tips of the fingers, [3] in m."""
+    """Return the vector [3] from the top of the cap, pressed or not, to the finger tips [m]."""
     down = view.joint("button") * jnp.array([0.0, 0.0, 1.0])
     return view.tip - view.above("button", _TOP) + down
 

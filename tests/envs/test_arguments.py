@@ -119,7 +119,7 @@ def test_states(worlds):
         lambda s: env.step(s, np.zeros((2, 7))),
         lambda s: env.reset_done(s, KEY),
     ):
-        with pytest.raises(TypeError, match=r"^state must be what reset gave, got None"):
+        with pytest.raises(TypeError, match=r"^state must be a state from reset or step, got None"):
             call(None)
     with pytest.raises(ValueError, match=r"^state has 2 worlds, this environment 3"):
         other.observe(state)
@@ -170,5 +170,5 @@ def test_collect(arguments, message):
 
 @pytest.mark.parametrize("wrap", [VectorEnv, BraxEnv])
 def test_wrappers(wrap):
-    with pytest.raises(TypeError, match=r"^env must be what envs.make gave, got 'press'"):
+    with pytest.raises(TypeError, match=r"^env must be an environment from envs.make, got 'press'"):
         wrap("press")

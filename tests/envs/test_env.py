@@ -147,10 +147,10 @@ def test_broken_worlds_are_done(env, start):
 def test_observation(env, start):
     found = env.observe(start)
     assert found["image"].keys() == set(env.cameras)
-    for picture in found["image"].values():
-        assert picture.shape == (W, 16, 16, 3)
-        assert picture.dtype == jnp.uint8
-        assert picture.std() > 5
+    for image in found["image"].values():
+        assert image.shape == (W, 16, 16, 3)
+        assert image.dtype == jnp.uint8
+        assert image.std() > 5
     assert found["state"].dtype == jnp.float32
     np.testing.assert_allclose(found["state"], start.info["command"], atol=1e-6)
 

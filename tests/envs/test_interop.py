@@ -213,7 +213,7 @@ def test_brax_misuse(env):
     state = world.reset(jax.random.key(0))
     with pytest.raises(ValueError, match=r"action must have shape \(7,\), got \(6,\)"):
         world.step(state, jnp.zeros(6))
-    with pytest.raises(TypeError, match="must be what reset gave"):
+    with pytest.raises(TypeError, match="must be a state from reset or step"):
         world.step(state.replace(pipeline_state=None), jnp.zeros(7))
 
 

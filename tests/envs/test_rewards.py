@@ -88,8 +88,8 @@ def world(shares, *, success=False, done=False, before=None, discount=0.9) -> St
     state = State(None, jnp.float32(0), jnp.array(done or success), {"depth": 1.0}, info)
     named = {f"s{i}": jnp.float32(share) for i, share in enumerate(shares)}
     if before is None:
-        return rewards.started(state, named)
-    return rewards.earned(before, state, named, discount)
+        return rewards.at_reset(state, named)
+    return rewards.after_step(before, state, named, discount)
 
 
 PATH = [[0.2, 0.0], [0.7, 0.0], [1.0, 0.4], [0.5, 0.3], [1.0, 0.9]]

@@ -230,7 +230,7 @@ def test_ray_caster_draws_something_in_the_place_of_a_mesh(robot, model):
     assert mesh not in drawn.geoms
     (stand_in,) = np.flatnonzero(model.geom_group == 5)
     assert stand_in in drawn.geoms
-    np.testing.assert_allclose(drawn.look.rgba[stand_in], [0.1, 0.2, 0.9, 1])
+    np.testing.assert_allclose(drawn.appearance.rgba[stand_in], [0.1, 0.2, 0.9, 1])
     data = at(model, np.array([0.0, 0.9, 1.2, 0, 0.6, 0]))
     points = np.random.default_rng(0).uniform(-1.3, 1.3, (4000, 3)) * HALF
     inside = np.abs(points) < HALF

@@ -18,16 +18,16 @@ _HINGE = '<joint axis="0 0 1" range="0 1"/>'
 _KEY = '<key name="home" qpos="1 1 1 1 0 0 0 0 .5 1.5 0 1 0 -.02 .02"/>'
 _MISSING = (
     (
-        "two slide joints are needed for the fingers; the joints are joint 0 (free), yaw (hinge)",
+        "the fingers need two slide joints; the joints are joint 0 (free), yaw (hinge)",
         [('<joint name="b" type="slide" axis="0 -1 0"', '<joint name="b" axis="0 -1 0"')],
     ),
     (
         "both fingers must be on the same body; they are on flange and wrist",
         [('<body name="b"', '</body><body name="b"'), ("      </body>\n    </frame>", "</frame>")],
     ),
-    ("hinges alone must lead from the base to the hand; the joints are", _NO_BALL),
+    ("all joints from the base to the hand must be hinges; the joints are", _NO_BALL),
     (
-        "the arm has 18 hinges; at most are 16",
+        "the arm has 18 hinges; at most 16 are supported",
         [
             *(
                 (f'<joint name="{joint}"', 4 * _HINGE + f'<joint name="{joint}"')
@@ -50,7 +50,7 @@ _MISSING = (
         [(' range="-30 130"', ""), (' range=".005 .045"', "")],
     ),
     (
-        "joint elbow needs a position actuator of its own, whose control is its angle; the",
+        "joint elbow needs a position actuator of its own, whose control is the joint angle; the",
         [('<position name="elbow"', '<motor name="elbow"')],
     ),
     (
@@ -80,7 +80,7 @@ _MISSING = (
         [("-.045 -.005", "-.009 -.005"), (".005 .045", ".005 .009")],
     ),
     (
-        "a site tcp is needed, z out of the hand and y along which the fingers open",
+        "the file needs a site tcp with z pointing out of the hand and y along which",
         [('name="turn" axis="0 0 -1"', 'name="turn" axis="0 1 0"')],
     ),
     (
@@ -126,7 +126,7 @@ def test_what_is_missing_is_named(tmp_path, message, edits):
 
 
 @pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
-def test_a_total_mass_is_refused(tmp_path):
+def test_settotalmass_raises(tmp_path):
     file = write(tmp_path, ('angle="degree"', 'angle="degree" settotalmass="9"'))
     with pytest.raises(ValueError, match="settotalmass is not supported"):
         mjcf.load(file)
@@ -135,7 +135,7 @@ def test_a_total_mass_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"tcp": "hook"}, "there is no site hook; the sites are grip, askew, inwards, aside"),
+        ({"tcp": "hook"}, "unknown site hook; the sites are grip, askew, inwards, aside"),
         ({"tcp": "askew"}, "the y axis of site askew is 60 deg off the line along which"),
         ({"tcp": "inwards"}, "the z axis of site inwards must point out of the hand"),
         ({"tcp": "aside"}, "the z axis of site aside does not run between the fingers"),
@@ -143,18 +143,18 @@ def test_a_total_mass_is_refused(tmp_path):
         ({"gripper_speed": 0.0}, "gripper_speed must be positive"),
     ],
 )
-def test_wrong_options_are_named(tmp_path, options, message):
+def test_bad_options(tmp_path, options, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         mjcf.load(write(tmp_path), **options)
 
 
-def test_missing_file_is_named():
-    with pytest.raises(ValueError, match=r"robot nowhere\.xml: there is no such file"):
+def test_missing_file():
+    with pytest.raises(ValueError, match=r"robot nowhere\.xml: no such file"):
         envs.make("press", "nowhere.xml")
 
 
 @pytest.mark.slow
-def test_a_reach_that_is_short_is_said(tmp_path):
+def test_short_reach_warns(tmp_path):
     file = write(tmp_path, ('range="-150 150"', 'range="-15 15"'))
     with pytest.warns(UserWarning, match="misses parts of the table by up to"):
         mjcf.load(file)

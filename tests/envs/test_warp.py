@@ -42,7 +42,7 @@ def test_the_backend_is_picked_by_the_device(pair, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(jax, "devices", lambda: [gpu])
     assert physics.default_backend() == "jax"  # eight devices here
-    with pytest.raises(ValueError, match="backend 'warp' works on one GPU, but JAX sees 8"):
+    with pytest.raises(ValueError, match="backend 'warp' needs a single GPU, but JAX sees 8"):
         make("press", backend="warp")
     monkeypatch.setattr(jax, "device_count", lambda: 1)
     assert physics.default_backend() == "warp"

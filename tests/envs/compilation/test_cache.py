@@ -1,4 +1,4 @@
-"""Processes that share a compilation cache read whole programs only."""
+"""Processes that share a compilation cache only read whole programs."""
 
 import threading
 
@@ -32,20 +32,20 @@ def test_a_reader_never_sees_half_an_entry(cache):
     assert cache.get("key") == values[-1]
 
 
-def test_an_entry_that_a_killed_process_left_is_written_again(cache, tmp_path):
+def test_a_half_written_entry_is_replaced(cache, tmp_path):
     (tmp_path / "key-cache").write_bytes(b"hal")
     cache.put("key", b"whole")
     assert cache.get("key") == b"whole"
 
 
-def test_a_write_that_fails_leaves_nothing(cache, tmp_path):
+def test_a_failed_write_leaves_nothing(cache, tmp_path):
     with pytest.raises(TypeError):
         cache.put("key", "no bytes")  # pyright: ignore[reportArgumentType]
     assert not list(tmp_path.iterdir())
 
 
-def test_jax_keeps_programs_in_it(tmp_path):
-    """`tests/conftest.py` has enabled it, as the commands do."""
+def test_jax_uses_it(tmp_path):
+    """`tests/conftest.py` enables it, as the commands do."""
     kept, folder = compilation_cache.get_file_cache(str(tmp_path))
     assert isinstance(kept, WholeFiles)
     assert folder == str(tmp_path)

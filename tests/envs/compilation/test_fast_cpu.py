@@ -1,4 +1,4 @@
-"""The XLA flag that MJX needs on CPU with old JAX, each time in a fresh process."""
+"""The XLA flag that MJX needs on CPU with old JAX; each test in a fresh process."""
 
 import inspect
 import os
@@ -17,7 +17,7 @@ old = pytest.mark.skipif(not OLD, reason="newer versions need no flag")
 
 
 def python(code, flags=""):
-    """Runs code in a new process, where warnings are errors."""
+    """Run code in a new process, with warnings as errors."""
     root = os.path.dirname(os.path.dirname(envs.__file__))
     environment = os.environ | {"XLA_FLAGS": flags}
     subprocess.run(
@@ -28,7 +28,7 @@ def python(code, flags=""):
     )
 
 
-def test_an_import_is_enough_and_replaced_flags_get_it_again():
+def test_import_sets_the_flag_again_if_flags_are_replaced():
     python(
         "import os, jax, envs\n"
         "is_set = lambda: '--xla_cpu_use_fusion_emitters=false' in os.environ['XLA_FLAGS']\n"
@@ -42,13 +42,13 @@ def test_an_import_is_enough_and_replaced_flags_get_it_again():
 
 
 @old
-def test_what_the_user_says_stays():
+def test_the_users_flag_stays():
     flags = "--xla_cpu_use_fusion_emitters=true"
     python(f"import os, envs\nassert os.environ['XLA_FLAGS'] == {flags!r}", flags)
 
 
 @old
-def test_too_late_is_one_warning_and_our_own_programs_are_fast():
+def test_too_late_warns_once_and_our_programs_are_fast():
     python(
         "import time, warnings, jax\n"
         "jax.devices()\n"
@@ -71,7 +71,7 @@ def test_too_late_is_one_warning_and_our_own_programs_are_fast():
     )
 
 
-def test_what_simulates_nothing_is_compiled_as_jax_does():
+def test_programs_without_simulation_use_jaxs_defaults():
     options = inspect.unwrap(fast_cpu.without_simulation)()  # in fast tests it is replaced
     assert options == ({"xla_cpu_use_fusion_emitters": True} if OLD else None)
     assert jax.jit(lambda x: x + 1).lower(1).compile(compiler_options=options)(1) == 2

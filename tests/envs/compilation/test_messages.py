@@ -1,4 +1,4 @@
-"""A line where something compiles for long, none where it does not."""
+"""Long compilations print a line, short ones do not."""
 
 import time
 
@@ -11,7 +11,7 @@ from envs.compilation import messages
 
 @pytest.fixture
 def impatient(monkeypatch):
-    """Where nothing is kept for the next start."""
+    """Announce after 50 ms, and disable the compilation cache."""
     monkeypatch.setattr(messages, "PATIENCE", 0.05)
     before = jax.config.jax_enable_compilation_cache
     jax.config.update("jax_enable_compilation_cache", False)
@@ -19,14 +19,14 @@ def impatient(monkeypatch):
     jax.config.update("jax_enable_compilation_cache", before)
 
 
-def test_long_work_is_said_while_it_goes_on(impatient, capsys):
+def test_long_compilation_is_announced(impatient, capsys):
     with messages.said("the world"):
         time.sleep(0.3)
         assert capsys.readouterr() == ("", "compiling the world ...\n")
     assert capsys.readouterr().err.startswith("compiled the world in 0 s")
 
 
-def test_where_programs_are_kept_it_is_long_the_first_time_only(impatient, capsys):
+def test_with_a_cache_the_message_says_the_first_time_only(impatient, capsys):
     jax.config.update("jax_enable_compilation_cache", True)
     with messages.said("the world"):
         time.sleep(0.3)
@@ -34,13 +34,13 @@ def test_where_programs_are_kept_it_is_long_the_first_time_only(impatient, capsy
     assert capsys.readouterr().err == told
 
 
-def test_short_work_is_not_said(capsys):
+def test_short_compilation_is_silent(capsys):
     with messages.said("the world"):
         pass
     assert capsys.readouterr() == ("", "")
 
 
-def test_an_error_is_not_called_done(impatient, capsys):
+def test_an_error_is_not_reported_as_done(impatient, capsys):
     def fail():
         with messages.said("the world"):
             time.sleep(0.3)
@@ -51,14 +51,14 @@ def test_an_error_is_not_called_done(impatient, capsys):
     assert capsys.readouterr().err == "compiling the world ...\n"
 
 
-def test_the_first_process_alone_says_it(impatient, capsys, monkeypatch):
+def test_only_the_first_process_prints(impatient, capsys, monkeypatch):
     monkeypatch.setattr(jax, "process_index", lambda: 1)
     with messages.said("the world"):
         time.sleep(0.2)
     assert capsys.readouterr() == ("", "")
 
 
-def test_an_environment_says_it_once(impatient, capsys):
+def test_an_environment_announces_once(impatient, capsys):
     env = envs.make("press", num_envs=2, image_size=8)
     jax.eval_shape(env.reset, jax.random.key(0))  # nothing is compiled
     assert capsys.readouterr().err == ""

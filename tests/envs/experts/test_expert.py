@@ -1,4 +1,4 @@
-"""Experts solve every task with every robot, smoothly, and what they do is recorded as it was."""
+"""Experts solve every task with every robot, smoothly, and recordings are faithful."""
 
 import dataclasses
 
@@ -14,11 +14,11 @@ from envs.physics import physics
 from envs.tasks import route
 
 LAYOUTS = 256 if jax.default_backend() == "cpu" else 1024
-"""Pouring in 1,024 takes a CPU more than ten minutes."""
+"""Random layouts; pouring in 1,024 takes more than ten minutes on CPU."""
 
 
 def valid(episodes) -> np.ndarray:
-    """bool [E, T], the steps that count."""
+    """Mask of the steps within each episode, bool [E, T]."""
     return np.arange(episodes.state.shape[1]) < episodes.length[:, None]
 
 
@@ -55,7 +55,7 @@ def test_episodes_are_consistent(episodes, scene):
     assert (episodes.task, episodes.robot) == (scene.task.name, scene.robot.name)
 
 
-def test_actions_keep_the_limits(episodes, scene):
+def test_actions_respect_the_limits(episodes, scene):
     assert np.all(episodes.action >= scene.action_low - 1e-6)
     assert np.all(episodes.action <= scene.action_high + 1e-6)
     speed = np.abs(np.diff(episodes.action, axis=1)) / scene.control_dt
@@ -65,18 +65,18 @@ def test_actions_keep_the_limits(episodes, scene):
 
 
 def test_actions_are_smooth(episodes, scene):
-    """Second differences: a jump of the command's speed would show as a large one."""
+    """A jump in the speed of the command would show as a large second difference."""
     bend = np.abs(np.diff(episodes.action[..., :-1], 2, axis=1))
     assert bend.max() < 0.1  # rad per step^2
 
 
 def test_state_follows_the_action(episodes):
-    """A servo is late by damping over stiffness, 0.15 s; the expert keeps below 1.5 rad/s."""
+    """A servo lags by damping / stiffness, 0.15 s; the expert stays below 1.5 rad/s."""
     lag = np.abs(episodes.state[:, 1:, :-1] - episodes.action[:, :-1, :-1])
     assert lag[valid(episodes)[:, 1:]].max() < 0.25  # rad
 
 
-def test_pictures_show_the_episode(episodes):
+def test_images_show_the_episode(episodes):
     for picture in episodes.image.values():
         start, middle = picture[:, 0].astype(int), picture[:, 25].astype(int)
         assert np.all(np.abs(start - middle).max(axis=(1, 2, 3)) > 30)  # the hand moved
@@ -131,7 +131,7 @@ def test_hurried_experts_slow_down_to_half_the_speed_limits(env):
 
 
 def fake_record(success):
-    """Stands in for `_record`: one step an episode, numbered by world."""
+    """Replace `_record`: episodes of one step, numbered by world."""
 
     def record(env, key, action_noise, ranges):
         world = jnp.arange(env.num_envs)

@@ -1,4 +1,4 @@
-"""Programs that are traced once for all processes."""
+"""Traced programs are cached between processes."""
 
 import dataclasses
 import threading
@@ -30,7 +30,7 @@ def env():
 
 
 class Drawn:
-    """A program as `programs.kept` takes it, that counts how often it is traced."""
+    """A program for `programs.cached` that counts its traces."""
 
     def __init__(self):
         self.traced, self.__name__, self.__qualname__ = 0, "drawn", "drawn"
@@ -42,9 +42,9 @@ class Drawn:
 
 
 def new_process(env, *arguments):
-    """The results in a new process, and whether it traced."""
+    """Return the results in a new process, and whether it traced."""
     function = Drawn()
-    return programs.kept(function)(env, *arguments), bool(function.traced)
+    return programs.cached(function)(env, *arguments), bool(function.traced)
 
 
 KEY = jax.random.key(0)
@@ -62,7 +62,7 @@ def test_another_process_does_not_trace(env, cache):
 
 def test_a_process_asks_once(env, cache, monkeypatch):
     function = Drawn()
-    call = programs.kept(function)
+    call = programs.cached(function)
     call(env, KEY, 0.5)
     monkeypatch.setattr(programs, "_load", None)  # would fail
     call(env, jax.random.key(1), 1.0)
@@ -128,7 +128,7 @@ def test_another_setting_is_traced(env, cache, monkeypatch):
 @pytest.mark.parametrize(
     "damage", [lambda b: b[:-9], lambda b: b[:99] + b"?" + b[100:], lambda _: b""]
 )
-def test_a_damaged_program_is_traced_anew(env, cache, damage):
+def test_a_damaged_program_is_retraced(env, cache, damage):
     (good, _), _ = new_process(env, KEY, 0.5)
     (file,) = (cache / "traced").iterdir()
     whole = file.read_bytes()
@@ -139,33 +139,33 @@ def test_a_damaged_program_is_traced_anew(env, cache, damage):
     assert not new_process(env, KEY, 0.5)[1]
 
 
-def test_without_a_cache_nothing_is_kept(env, cache):
+def test_nothing_is_cached_without_a_cache_folder(env, cache):
     jax.config.update("jax_compilation_cache_dir", None)
     assert new_process(env, KEY, 0.5)[1]
     assert new_process(env, KEY, 0.5)[1]
     assert not cache.exists()
 
 
-def test_a_task_that_was_changed_is_not_kept(env, cache):
+def test_a_modified_task_is_not_cached(env, cache):
     task = dataclasses.replace(env.task, time_limit=2 * env.task.time_limit)
     changed = dataclasses.replace(env, task=task)
     assert new_process(changed, KEY, 0.5)[1]
     assert new_process(changed, KEY, 0.5)[1]
     stranger = dataclasses.replace(env, task=dataclasses.replace(env.task, name="a_new_one"))
-    assert not programs._can_be_kept(stranger)
+    assert not programs._is_cacheable(stranger)
 
 
-def test_warp_is_not_kept(env, cache):
+def test_warp_is_not_cached(env, cache):
     warp = envs.make("press", num_envs=3, image_size=8, backend="jax")
     warp.physics.backend = "warp"
-    assert not programs._can_be_kept(warp)
-    assert programs._can_be_kept(env)
+    assert not programs._is_cacheable(warp)
+    assert programs._is_cacheable(env)
 
 
-def test_no_room_is_a_warning(env, cache):
+def test_a_failing_write_warns(env, cache):
     cache.mkdir()
     (cache / "traced").write_text("a file where the folder should be")
-    with pytest.warns(UserWarning, match="could not be kept"):
+    with pytest.warns(UserWarning, match="cannot cache a traced program"):
         (results, _), _ = new_process(env, KEY, 0.5)
     assert np.isfinite(results["noise"]).all()
 
@@ -181,7 +181,7 @@ def test_programs_are_traced_in_turn(env, cache):
             inside[0] -= 1
             return {"key": jax.random.normal(key, (number,))}
 
-        return programs.kept(slow)
+        return programs.cached(slow)
 
     threads = [threading.Thread(target=program(n + 1), args=(env, KEY)) for n in range(3)]
     for thread in threads:

@@ -1,4 +1,4 @@
-"""The ray caster against MuJoCo's own rays, and what light and colours may change."""
+"""Compare the ray caster with MuJoCo's rays; light and colours change nothing else."""
 
 import copy
 import dataclasses
@@ -37,7 +37,7 @@ SCENE = """
 """
 CAMERAS = ("front", "top")
 SIZE = {"height": 48, "width": 64}
-GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)  # those that are drawn
+GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)  # drawn
 
 
 def poses_of(data):
@@ -66,12 +66,12 @@ def poses(shapes):
 
 
 @pytest.fixture(scope="module")
-def picture(built, poses):
-    return np.asarray(renderer.render(built, *poses, look=built.look, **SIZE))
+def image(built, poses):
+    return np.asarray(renderer.render(built, *poses, appearance=built.appearance, **SIZE))
 
 
 def camera_rays(model, data, name, height, width):
-    """Unit vectors [P, 3] in world axes, and how far each goes a metre along the camera's axis."""
+    """Unit vectors [P, 3] in world axes, and the ray length per metre along the camera's axis."""
     camera = model.camera(name).id
     x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, height / 2 - np.arange(height) - 0.5)
     edge = 2 * np.tan(np.deg2rad(model.cam_fovy[camera]) / 2) / height
@@ -81,7 +81,7 @@ def camera_rays(model, data, name, height, width):
 
 
 def assert_agrees_with_mujoco(model, data, name, geom, depth):
-    """Compares what a camera sees with MuJoCo's own rays; returns the geoms that are seen.
+    """Compare what a camera sees with MuJoCo's own rays; returns the geoms that it sees.
 
     Both draw a plane as large as its size, without end where that is 0, and only from above.
     """
@@ -116,7 +116,7 @@ def test_rays_agree_with_mujoco(shapes, built, poses):
     seen = set()
     for i, name in enumerate(CAMERAS):
         seen |= assert_agrees_with_mujoco(*shapes, name, geom[i], depth[i])
-    assert seen == set(range(10)) | {-1}  # every visible geom, and the sky: nothing passed unseen
+    assert seen == set(range(10)) | {-1}  # every visible geom, and the sky: all are covered
 
 
 def test_rays_agree_with_mujoco_in_every_task(scene):
@@ -128,7 +128,7 @@ def test_rays_agree_with_mujoco_in_every_task(scene):
 
 
 def pixel(shapes, name, point):
-    """Row and column of a world point in a picture of SIZE."""
+    """Row and column of a world point in an image of SIZE."""
     model, data = shapes
     camera = model.camera(name).id
     x, y, z = data.cam_xmat[camera].reshape(3, 3).T @ (np.array(point) - data.cam_xpos[camera])
@@ -136,57 +136,66 @@ def pixel(shapes, name, point):
     return int(SIZE["height"] / 2 + y / z / edge), int(SIZE["width"] / 2 - x / z / edge)
 
 
-def test_shadow_falls_where_the_light_says(shapes, built, poses):
-    flat = dataclasses.replace(built.look, checker=jnp.array([0.1, 0.0]))
+def test_shadow_falls_opposite_the_light(shapes, built, poses):
+    flat = dataclasses.replace(built.appearance, checker=jnp.array([0.1, 0.0]))
     # The ball's centre is 0.1 m above the table, so its shadow is centred 0.15 m to one side.
     left, right = (pixel(shapes, "top", (x, 0.0, 0.0)) for x in (-0.15, 0.15))
     for slope, dark, bright in ((1.5, left, right), (-1.5, right, left)):
         light = np.array([slope, 0.0, 1.0], np.float32)
-        look = dataclasses.replace(flat, light=light)
-        top = renderer.render(built, *poses, look=look, **SIZE)[1].astype(int)
+        appearance = dataclasses.replace(flat, light=light)
+        top = renderer.render(built, *poses, appearance=appearance, **SIZE)[1].astype(int)
         assert top[bright].sum() > top[dark].sum() + 100
 
 
 def test_headlight_and_ambient_cast_no_shadow(built, poses):
     dim = dataclasses.replace(
-        built.look, diffuse=jnp.array(0.0), headlight=jnp.array(0.0), checker=jnp.array([0.1, 0.0])
+        built.appearance,
+        diffuse=jnp.array(0.0),
+        headlight=jnp.array(0.0),
+        checker=jnp.array([0.1, 0.0]),
     )
     geom, _ = renderer.cast(built, *poses, **SIZE)
-    pixels = np.asarray(renderer.render(built, *poses, look=dim, **SIZE))[np.asarray(geom) == 0]
+    pixels = np.asarray(renderer.render(built, *poses, appearance=dim, **SIZE))[
+        np.asarray(geom) == 0
+    ]
     np.testing.assert_array_equal(pixels, np.broadcast_to(pixels[0], pixels.shape))
     assert pixels[0, 0] == round(0.6 * 0.35 * 255)
 
 
-def test_colour_changes_only_its_geom(built, poses, picture):
+def test_colour_changes_only_its_geom(built, poses, image):
     geom = np.asarray(renderer.cast(built, *poses, **SIZE)[0])
-    green = built.look.rgba.copy()
+    green = built.appearance.rgba.copy()
     green[2] = (0, 1, 0, 1)
-    look = dataclasses.replace(built.look, rgba=green)
-    changed = np.any(np.asarray(renderer.render(built, *poses, look=look, **SIZE)) != picture, -1)
+    appearance = dataclasses.replace(built.appearance, rgba=green)
+    changed = np.any(
+        np.asarray(renderer.render(built, *poses, appearance=appearance, **SIZE)) != image, -1
+    )
     np.testing.assert_array_equal(changed, geom == 2)
 
 
-def test_field_of_view_changes_only_its_camera(built, poses, picture):
-    look = dataclasses.replace(built.look, fovy=built.look.fovy + np.array([0, 10, 0], np.float32))
-    pictures = np.asarray(renderer.render(built, *poses, look=look, **SIZE))
-    assert np.any(pictures[0] != picture[0])
-    np.testing.assert_array_equal(pictures[1], picture[1])
+def test_field_of_view_changes_only_its_camera(built, poses, image):
+    appearance = dataclasses.replace(
+        built.appearance, fovy=built.appearance.fovy + np.array([0, 10, 0], np.float32)
+    )
+    images = np.asarray(renderer.render(built, *poses, appearance=appearance, **SIZE))
+    assert np.any(images[0] != image[0])
+    np.testing.assert_array_equal(images[1], image[1])
 
 
 def test_batch_equals_single_worlds(built, poses):
     worlds = 5
     batch = [jnp.tile(x, (worlds, *[1] * x.ndim)) for x in poses]
     batch[0] = batch[0].at[:, 2, 0].add(0.01 * jnp.arange(worlds))
-    looks = jax.tree.map(lambda x: jnp.stack([x * 0.8, *[x] * (worlds - 1)]), built.look)
-    pictures = jax.jit(
-        lambda poses, looks: renderer.render_batch(built, *poses, look=looks, **SIZE)
+    looks = jax.tree.map(lambda x: jnp.stack([x * 0.8, *[x] * (worlds - 1)]), built.appearance)
+    images = jax.jit(
+        lambda poses, looks: renderer.render_batch(built, *poses, appearance=looks, **SIZE)
     )(batch, looks)
-    assert pictures.shape == (worlds, 2, 48, 64, 3)
-    assert pictures.dtype == jnp.uint8
+    assert images.shape == (worlds, 2, 48, 64, 3)
+    assert images.dtype == jnp.uint8
     for i in range(worlds):
-        look = jax.tree.map(lambda x, i=i: x[i], looks)
-        single = renderer.render(built, *(x[i] for x in batch), look=look, **SIZE)
-        difference = np.abs(pictures[i].astype(int) - single.astype(int))
+        appearance = jax.tree.map(lambda x, i=i: x[i], looks)
+        single = renderer.render(built, *(x[i] for x in batch), appearance=appearance, **SIZE)
+        difference = np.abs(images[i].astype(int) - single.astype(int))
         assert np.mean(difference > 1) < 1e-3  # rounding may move an edge by a pixel
 
 
@@ -195,24 +204,24 @@ def test_sizes_differ_from_world_to_world(shapes, built, poses):
     size = np.stack([built.size, built.size * 1.5, built.size])
     size[2, :, 1] *= 0.5  # half the length of capsules and cylinders, other boxes and ellipsoids
     batch = [jnp.tile(x, (len(size), *[1] * x.ndim)) for x in poses]
-    pictures = renderer.render_batch(built, *batch, size=size, **SIZE)
-    for own, found in zip(size, pictures, strict=True):
+    images = renderer.render_batch(built, *batch, size=size, **SIZE)
+    for own, found in zip(size, images, strict=True):
         model = copy.copy(shapes[0])
         model.geom_size[:] = own
         expected = renderer.render(renderer.build(model, CAMERAS), *poses, **SIZE)
         difference = np.abs(found.astype(int) - expected.astype(int))
         assert np.mean(difference > 1) < 1e-3  # rounding may move an edge by a pixel
-    assert np.mean(pictures[0] != pictures[1]) > 0.05
-    assert np.mean(pictures[0] != pictures[2]) > 0.02
+    assert np.mean(images[0] != images[1]) > 0.05
+    assert np.mean(images[0] != images[2]) > 0.02
 
 
-@pytest.mark.parametrize("diffuse", [0.5, 1.5])  # 1.5 overexposes a third of the picture
-def test_samples_equal_a_larger_picture_scaled_down(built, poses, diffuse):
-    look = dataclasses.replace(built.look, diffuse=np.float32(diffuse))
+@pytest.mark.parametrize("diffuse", [0.5, 1.5])  # 1.5 overexposes a third of the image
+def test_samples_equal_a_larger_image_scaled_down(built, poses, diffuse):
+    appearance = dataclasses.replace(built.appearance, diffuse=np.float32(diffuse))
     height, width = SIZE.values()
-    fine = renderer.render(built, *poses, look=look, height=2 * height, width=2 * width)
+    fine = renderer.render(built, *poses, appearance=appearance, height=2 * height, width=2 * width)
     expected = np.asarray(fine, float).reshape(2, height, 2, width, 2, 3).mean(axis=(2, 4))
-    smooth = renderer.render(built, *poses, look=look, samples=2, **SIZE)
+    smooth = renderer.render(built, *poses, appearance=appearance, samples=2, **SIZE)
     assert smooth.shape == expected.shape
     assert smooth.dtype == jnp.uint8
     # Both are rounded; where two geoms meet, rounding may turn a ray from one to the other.
@@ -241,8 +250,8 @@ def test_environments_pass_antialias_on():
         envs.make("press", antialias=0)
 
 
-def test_own_look_is_the_default(built, poses, picture):
-    np.testing.assert_array_equal(renderer.render(built, *poses, **SIZE), picture)
+def test_the_models_appearance_is_the_default(built, poses, image):
+    np.testing.assert_array_equal(renderer.render(built, *poses, **SIZE), image)
 
 
 @pytest.mark.parametrize("platform", ["cpu", "cuda", "tpu"])
@@ -260,7 +269,7 @@ def test_lowers_inside_scan_and_vmap(built, poses, platform):
     assert "3x1x2x8x8x3xui8" in lowered.as_text()
 
 
-def test_bad_input_is_named(shapes, built, poses):
+def test_bad_input(shapes, built, poses):
     with pytest.raises(ValueError, match=r"no camera {'back'}.*front"):
         renderer.build(shapes[0], ("front", "back"))
     with pytest.raises(ValueError, match=r"geom_xpos must have shape \(12, 3\)"):
@@ -269,7 +278,7 @@ def test_bad_input_is_named(shapes, built, poses):
         renderer.render(built, *poses, size=built.size[:3], **SIZE)
     field = """<mujoco><asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset><worldbody>
       <geom name="hill" type="hfield" hfield="h"/></worldbody></mujoco>"""
-    with pytest.raises(ValueError, match="geom hill cannot be drawn"):
+    with pytest.raises(ValueError, match="cannot draw geom hill"):
         renderer.build(mujoco.MjModel.from_xml_string(field), ())
     with pytest.raises(ValueError, match="no visible geom"):
         renderer.build(mujoco.MjModel.from_xml_string("<mujoco/>"), ())

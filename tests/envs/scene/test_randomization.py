@@ -17,7 +17,7 @@ from envs.scene.randomization import Randomization
 
 WORLDS, STEPS = 2, 50  # the expert lifts the grape at about step 35
 FIELDS = [field.name for field in dataclasses.fields(Randomization)]
-# What each range may change: where things lie, how they move, how pictures look.
+# What each range may change: where things lie, how they move, how images look.
 PLACES, MOTION, LOOKS = {"position", "turn"}, {"mass", "friction", "gains", "latency"}, {
     "camera_position", "camera_turn", "field_of_view", "light_turn", "brightness", "colour",
 }  # fmt: skip
@@ -35,7 +35,7 @@ def env():
 
 @pytest.fixture(scope="module")
 def episode(env):
-    """ranges -> start, its pictures, the state after some of the expert's steps."""
+    """ranges -> start, its images, the state after some of the expert's steps."""
 
     @jax.jit
     def run(key, ranges):
@@ -69,8 +69,8 @@ def test_defaults_change_nothing(env, neutral):
     plain = env.reset(jax.random.key(5))
     np.testing.assert_allclose(start.data.qpos, plain.data.qpos, atol=1e-7)
     np.testing.assert_allclose(start.data.cam_xmat, plain.data.cam_xmat, atol=1e-6)
-    for name, picture in env.observe(plain)["image"].items():
-        assert np.mean(picture != seen["image"][name]) < 0.002  # rounding at edges
+    for name, image in env.observe(plain)["image"].items():
+        assert np.mean(image != seen["image"][name]) < 0.002  # rounding at edges
 
 
 @pytest.mark.slow
@@ -140,8 +140,8 @@ def test_recorded_pictures_show_each_world_as_it_is(env):
     ranges, key = Randomization.typical(), jax.random.key(3)
     recorded, _ = collection._record(env, key, 0.0, ranges)
     start = env.reset(jax.random.split(key, 3)[0], ranges)
-    for name, picture in env.observe(start)["image"].items():
-        np.testing.assert_allclose(recorded["image"][name][:, 0], picture, atol=1)
+    for name, image in env.observe(start)["image"].items():
+        np.testing.assert_allclose(recorded["image"][name][:, 0], image, atol=1)
 
 
 @pytest.mark.slow
