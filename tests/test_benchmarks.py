@@ -1,4 +1,4 @@
-"""The benchmarks' own arithmetic; what they measure is measured by running them."""
+"""Arithmetic of the benchmarks; the measurements themselves are not tested."""
 
 import argparse
 import functools

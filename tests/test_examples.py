@@ -34,7 +34,7 @@ def test_advantages_stop_at_the_end_of_an_episode(ppo):
     assert ppo.advantages(config, batch)[:, 0].tolist() == [1 + 0.25 * 2, 2, 4]
 
 
-def test_moments_are_those_of_all_that_was_seen(ppo):
+def test_moments_are_those_of_all_observations(ppo):
     seen = np.random.default_rng(0).normal(3, 2, (40, 5)).astype(np.float32)
     moments = {"count": jnp.float32(0), "mean": jnp.zeros(5), "variance": jnp.ones(5)}
     for part in np.split(seen, [7, 20]):
@@ -45,7 +45,7 @@ def test_moments_are_those_of_all_that_was_seen(ppo):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Points:
-    """In place of an environment, which takes a minute to compile: points on a line go to 0."""
+    """Replaces an environment, which takes a minute to compile: points on a line, target 0."""
 
     num_envs: int
     action_low, action_high, max_steps = np.array([-0.2]), np.array([0.2]), 20

@@ -1,4 +1,4 @@
-"""Conventions of actions: they mean the same motion, and the expert works through all of them."""
+"""Action modes describe the same motion, and the expert works in all of them."""
 
 import dataclasses
 
@@ -18,14 +18,14 @@ def robot(robot_name):
 
 
 def command(robot, key):
-    """Targets near home and others a little further on."""
+    """Return targets near home, and others a little further."""
     draw = jax.random.normal(jax.random.key(key), (2, robot.num_joints))
     joints = jnp.asarray(robot.home, jnp.float32) + jnp.array([0.05, 0.1])[:, None] * draw
     return jnp.concatenate([joints, jnp.array([[0.02], [0.04]])], axis=1)
 
 
 @pytest.mark.parametrize("mode", actions.MODES)
-def test_bounds_follow_the_convention(robot, mode):
+def test_bounds_of_each_mode(robot, mode):
     low, high = actions.bounds(mode, robot, 0.1)
     assert len(low) == len(high) == (7 if mode == "end_effector" else robot.num_joints + 1)
     assert (low < high).all()
@@ -55,7 +55,7 @@ def test_end_effector_reaches_the_same_pose(robot):
     assert found[-1] == then[-1]
 
 
-def test_end_effector_moves_along_the_axes_of_the_base(robot):
+def test_end_effector_moves_in_the_base_frame(robot):
     now, _ = command(robot, 2)
     action = jnp.array([0.02, 0.0, -0.01, 0.0, 0.0, 0.2, 0.03])
     found = actions.to_targets("end_effector", robot, now, action)
@@ -65,14 +65,14 @@ def test_end_effector_moves_along_the_axes_of_the_base(robot):
     np.testing.assert_allclose(turn[:2, :2], [[0.980, -0.199], [0.199, 0.980]], atol=0.01)
 
 
-def test_unknown_convention_is_named():
+def test_unknown_mode():
     with pytest.raises(ValueError, match="unknown actions 'cartesian': choose from joint, delta"):
         envs.make("press", actions="cartesian")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["delta_joint", "end_effector"])
-def test_expert_works_in_every_convention(env, mode):
+def test_expert_works_in_every_mode(env, mode):
     other = dataclasses.replace(env, actions=mode)
     tries = jax.jit(collection.rollout, static_argnums=0)(other, jax.random.key(0))
     assert tries.action.shape[-1] == 7
@@ -82,7 +82,7 @@ def test_expert_works_in_every_convention(env, mode):
 
 
 @pytest.mark.slow
-def test_rollout_puts_a_policy_in_the_loop(env):
+def test_rollout(env):
     def policy(seen, key):
         del key
         assert seen["image"]["side"].shape == (4, 16, 16, 3)

@@ -1,4 +1,4 @@
-"""What cannot be meant is one sentence, before anything is compiled."""
+"""Invalid arguments raise one sentence before anything is compiled."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ NUMBER = ("num_envs", "image_size", "antialias", "distractors")
 
 @pytest.fixture(scope="module")
 def worlds():
-    """An environment that is never compiled, and what its states look like."""
+    """An environment that is never compiled, and the shapes of its state."""
     env = envs.make("press", num_envs=2, image_size=8)
     shapes = jax.eval_shape(env.reset, KEY)
     return env, jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
@@ -67,7 +67,7 @@ def test_make(arguments, message):
         envs.make(**{"task": "press", **arguments})
 
 
-def test_numbers_of_numpy_are_numbers():
+def test_numpy_numbers_are_accepted():
     env = envs.make("press", num_envs=np.int64(2), control_dt=np.float32(0.5))
     assert (env.num_envs, env.max_steps) == (2, 16)
 
@@ -88,7 +88,7 @@ def test_keys(worlds, key):
 
 
 @pytest.mark.parametrize("raw", [jax.random.PRNGKey(0), np.zeros(2, np.uint32)])
-def test_raw_keys_are_keys(worlds, raw):
+def test_raw_keys_are_accepted(worlds, raw):
     assert jax.eval_shape(worlds[0].reset, raw).done.shape == (2,)
 
 
@@ -146,7 +146,7 @@ def test_ranges(worlds, bad):
             wrap(worlds[0], ranges=envs.Randomization(position=bad))
 
 
-def test_ranges_of_another_kind(worlds):
+def test_ranges_of_a_wrong_type(worlds):
     with pytest.raises(TypeError, match=r"^ranges must be an envs.Randomization or None, got"):
         worlds[0].reset(KEY, {"mass": (1, 2)})
 

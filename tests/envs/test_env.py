@@ -39,7 +39,7 @@ def test_time(env):
     assert env.expert_steps <= env.max_steps
 
 
-def test_printed_it_is_a_line(env):
+def test_repr_is_one_line(env):
     assert repr(env) == f"<Env 'press' for 'piper', num_envs={env.num_envs}>"
 
 
@@ -60,7 +60,7 @@ def test_start_is_near_home(env, start):
 
 
 def test_state_has_one_axis_and_strong_types(start, moved):
-    """A step's output must look like its input, or a second call compiles all anew."""
+    """The output of a step must have the type of its input, or a second call recompiles."""
 
     def signature(state):
         leaves = jax.tree_util.tree_leaves_with_path(state)
@@ -81,7 +81,7 @@ def test_step_is_repeatable_and_moves_the_robot(env, start, moved):
     assert not np.any(moved.done)
 
 
-def test_worlds_do_not_touch_each_other(env, start, moved):
+def test_worlds_are_independent(env, start, moved):
     action = (start.info["command"] + 0.05).at[2:].add(-0.1)
     assert_equal(take(env.step(start, action), [0, 1]), take(moved, [0, 1]))
 
@@ -155,7 +155,7 @@ def test_observation(env, start):
     np.testing.assert_allclose(found["state"], start.info["command"], atol=1e-6)
 
 
-def test_each_picture_is_of_the_camera_it_is_named_after(env, start):
+def test_images_belong_to_the_named_cameras(env, start):
     before = env.observe(start)["image"]
     assert tuple(before) == env.cameras == ("side", "wrist")
     for name in env.cameras:

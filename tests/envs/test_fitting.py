@@ -1,4 +1,4 @@
-"""Primitives in place of meshes."""
+"""Meshes approximated by primitives."""
 
 import itertools
 
@@ -18,7 +18,7 @@ _CUBE_FACES = np.array(
 
 
 def fitted(vertices: np.ndarray, faces: str = "") -> list[fitting.Shape]:
-    """The shapes for a mesh; without faces it is the convex hull of its vertices."""
+    """Fit shapes to a mesh; without faces it is the convex hull of its vertices."""
     numbers = " ".join(map(str, vertices.ravel()))
     model = mujoco.MjModel.from_xml_string(
         f'<mujoco><asset><mesh name="mesh" vertex="{numbers}" {faces}/></asset>'
@@ -36,7 +36,7 @@ def test_round_meshes_become_cylinders():
     np.testing.assert_allclose(shape.size[:2], [0.04, 0.1], rtol=0.04)
 
 
-def test_bent_meshes_are_cut():
+def test_bent_meshes_are_split():
     long, tall = np.array([0.1, 0.01, 0.01]), np.array([0.01, 0.01, 0.1])
     beams = long * _CUBE, tall * _CUBE + np.array([0.09, 0, 0.11])
     faces = " ".join(map(str, np.concatenate([_CUBE_FACES, _CUBE_FACES + 8]).ravel()))

@@ -1,4 +1,4 @@
-"""The environments behind Gymnasium's and Brax's interfaces, and inside their own wrappers."""
+"""Environments behind Gymnasium's and Brax's interfaces, and in their wrappers."""
 
 import dataclasses
 import importlib
@@ -33,7 +33,7 @@ def vector(env):
 
 @pytest.fixture(scope="module")
 def pressed(env):
-    """An expert through the Gymnasium interface: the first success, and the worlds before it."""
+    """Run an expert through Gymnasium; return the first success, and the worlds before it."""
     vector = VectorEnv(env, observation="state")
     vector.reset(seed=0)
     plan = expert.plan(env, vector.state, jax.random.key(1))
@@ -48,7 +48,7 @@ def pressed(env):
 
 @pytest.fixture(scope="module")
 def wrapped(env):
-    """Brax's usual wrappers around two worlds, with episodes of three steps, jitted."""
+    """Wrap two worlds in Brax's usual wrappers, with episodes of three steps, jitted."""
     training = brax.envs.training
     found = training.EvalWrapper(training.wrap(BraxEnv(env), episode_length=3, action_repeat=1))
     return found, jax.jit(found.reset), jax.jit(found.step)
@@ -60,7 +60,7 @@ def first(wrapped):
 
 
 def at_step(vector, *steps):
-    """The vector environment with its worlds' clocks set."""
+    """Set the clocks of the vector environment's worlds."""
     info = vector.state.info | {"steps": jnp.array(steps, jnp.int32)}
     vector.state = dataclasses.replace(vector.state, info=info)
 
@@ -70,12 +70,12 @@ def commands(vector):
 
 
 def scaled(env, targets):
-    """Targets as the actions in [-1, 1] that Brax's agents give."""
+    """Convert targets to actions in [-1, 1], as Brax's agents produce."""
     return 2 * (targets - env.action_low) / (env.action_high - env.action_low) - 1
 
 
 @pytest.mark.parametrize("name", ["gymnasium", "brax"])
-def test_a_missing_package_is_one_sentence(name, monkeypatch):
+def test_a_missing_package_raises_one_sentence(name, monkeypatch):
     for module in [m for m in sys.modules if m.split(".")[0] == name]:
         monkeypatch.setitem(sys.modules, module, None)
     monkeypatch.delitem(sys.modules, f"envs.interop.{name}")
@@ -85,7 +85,7 @@ def test_a_missing_package_is_one_sentence(name, monkeypatch):
 
 
 @pytest.mark.parametrize("observation", OBSERVATIONS)
-def test_spaces_hold_what_is_seen(env, observation):
+def test_spaces_contain_observations(env, observation):
     vector = VectorEnv(env, observation=observation)
     assert (vector.num_envs, vector.action_space.shape) == (W, (W, 7))
     assert vector.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
@@ -105,7 +105,7 @@ def test_spaces_hold_what_is_seen(env, observation):
     assert np.all([info["_success"], info["_instruction"]])
 
 
-def test_steps_are_those_of_the_environment(env, vector):
+def test_steps_match_the_environment(env, vector):
     vector.reset(seed=0)
     before, action = vector.state, commands(vector) + 0.05
     seen, reward, terminated, truncated, _ = vector.step(action)
@@ -115,7 +115,7 @@ def test_steps_are_those_of_the_environment(env, vector):
         assert values.tolist() == [0] * W
 
 
-def test_restarts_come_with_the_next_step(vector):
+def test_worlds_restart_at_the_next_step(vector):
     start, _ = vector.reset(seed=0)
     at_step(vector, 79, 78, 0, 5)
     action = commands(vector) + 0.05
@@ -131,7 +131,7 @@ def test_restarts_come_with_the_next_step(vector):
     assert vector.state.info["steps"].tolist() == [1, 0, 3, 8]
 
 
-def test_a_seed_says_it_all(vector):
+def test_the_seed_determines_everything(vector):
     def episode(seed):
         vector.reset(seed=seed)
         at_step(vector, 79, 0, 0, 0)
@@ -197,7 +197,7 @@ def test_brax_observation(env, wrapped, first):
 
 
 def test_brax_compiles_little_more_than_the_bare_environment(env):
-    """A batch of batches of one world would be a fifteenth more, and traced twice as long."""
+    """A batch of batches would be a fifteenth larger, and take twice as long to trace."""
     keys = jax.random.split(jax.random.PRNGKey(0), W)
     state = jax.eval_shape(env.reset, keys[0])
     bare = primitives(env.reset, keys[0]) + primitives(env.full_state, state)

@@ -1,4 +1,4 @@
-"""The flat vector that learners see, against MuJoCo's own engine."""
+"""The privileged state against MuJoCo's own engine."""
 
 import itertools
 
@@ -21,12 +21,12 @@ def seen(scene, data) -> dict[str, np.ndarray]:
 
 
 def axes(part) -> np.ndarray:
-    """Rotation [3, 3] of a pose [9]."""
+    """Return the rotation [3, 3] of a pose [9]."""
     x, y = part[3:6], part[6:9]
     return np.stack([x, y, np.cross(x, y)], axis=1)
 
 
-def test_layout_is_that_of_the_parts(scene):
+def test_layout_matches_the_parts(scene):
     found = seen(scene, expert_in_c.world(scene))
     layout = scene.full_state_layout
     assert list(layout) == list(found)
@@ -38,8 +38,8 @@ def test_layout_is_that_of_the_parts(scene):
         assert (f"{name}_speed" in layout) == bool(scene.model.body(name).jntnum[0])
 
 
-def test_joints_of_objects_are_seen(scene):
-    """Every degree of freedom is the robot's, or one of the layout."""
+def test_joints_of_objects_are_included(scene):
+    """Every degree of freedom belongs to the robot or to a body of the layout."""
     speeds = [
         part for name, part in seen(scene, expert_in_c.world(scene)).items() if "speed" in name
     ]
@@ -75,7 +75,7 @@ def test_poses_and_speeds(scene):
         np.testing.assert_allclose(turned, spin, atol=1e-3)
 
 
-def test_full_state_is_what_the_layout_says(env):
+def test_full_state_follows_the_layout(env):
     state = env.reset(jax.random.key(0))
     found, layout = np.asarray(env.full_state(state)), env.full_state_layout
     assert found.shape == (4, max(part.stop for part in layout.values()))

@@ -1,4 +1,4 @@
-"""Dense rewards: laws of the potential, which hold for every task, and how they become a reward."""
+"""Dense rewards: properties of every task's potential, and the reward made from it."""
 
 import re
 
@@ -27,7 +27,7 @@ def stages(scene, data, size=1.0) -> np.ndarray:
 
 
 def potentials(scene, key) -> np.ndarray:
-    """[T + 1] along an expert's episode."""
+    """Return the potential [T + 1] along an expert's episode."""
     every = [stages(scene, data) for data in expert_in_c.episode(scene, key)]
     return np.asarray(potential(dict(enumerate(np.stack(every).T))))
 
@@ -49,7 +49,7 @@ def test_potential(shares, expected):
     np.testing.assert_allclose(found, [expected], rtol=1e-6)
 
 
-def test_every_stage_has_its_name_and_its_line_on_the_page(scene):
+def test_every_stage_is_on_the_docs_page(scene):
     names = [*scene.task.stages(View(scene.model, expert_in_c.world(scene)))]
     assert len(names) >= 2
     assert all(name.isidentifier() for name in names)
@@ -59,7 +59,7 @@ def test_every_stage_has_its_name_and_its_line_on_the_page(scene):
 
 @pytest.mark.parametrize("robot_name", ["piper", pytest.param("panda", marks=pytest.mark.slow)])
 def test_potential_rises_along_expert_episodes(scene):
-    """From near 0 to 1; a slip of the hand may cost one stage, and not in most episodes."""
+    """It rises from near 0 to 1; a slip may cost one stage, in a minority of episodes."""
     count = len(stages(scene, expert_in_c.world(scene)))
     falls = []
     for key in range(EPISODES):
@@ -72,7 +72,7 @@ def test_potential_rises_along_expert_episodes(scene):
     assert np.median(falls) < 0.03
 
 
-def test_stages_are_bounded_wherever_things_are(scene):
+def test_stages_are_bounded_for_random_poses(scene):
     rng = np.random.default_rng(0)
     data = expert_in_c.world(scene)
     for _ in range(50):
@@ -83,7 +83,7 @@ def test_stages_are_bounded_wherever_things_are(scene):
 
 
 def world(shares, *, success=False, done=False, before=None, discount=0.9) -> State:
-    """One world at these stages, that of `before` a step later."""
+    """Return one world at these stages, one step after `before`."""
     info = {"success": jnp.array(success)}
     state = State(None, jnp.float32(0), jnp.array(done or success), {"depth": 1.0}, info)
     named = {f"s{i}": jnp.float32(share) for i, share in enumerate(shares)}
@@ -96,7 +96,7 @@ PATH = [[0.2, 0.0], [0.7, 0.0], [1.0, 0.4], [0.5, 0.3], [1.0, 0.9]]
 
 
 def episode(*, discount, **last):
-    """The states of a walk through PATH, the last one with these facts."""
+    """Return the states of a walk through PATH, the last one with this info."""
     states = [world(PATH[0])]
     for shares in PATH[1:-1]:
         states.append(world(shares, before=states[-1], discount=discount))
@@ -109,7 +109,7 @@ def discounted(states, discount) -> float:
 
 @pytest.mark.parametrize("discount", [0.9, 1.0])
 def test_rewards_telescope(discount):
-    """A learner's return differs from the sparse one by what no action changes."""
+    """The return differs from the sparse one by a constant that no action changes."""
     start = 0.1  # potential
     length = len(PATH) - 1
     won = episode(discount=discount, success=True)
@@ -120,7 +120,7 @@ def test_rewards_telescope(discount):
     assert discounted(late, discount) == pytest.approx(discount**length * 0.95 - start)
 
 
-def test_closed_loops_earn_nothing():
+def test_closed_loops_get_no_reward():
     states = [world(PATH[0])]
     for shares in [*PATH[1:], PATH[0]]:
         states.append(world(shares, before=states[-1], discount=1.0))
@@ -139,7 +139,7 @@ def test_metrics_are_the_terms():
 
 
 @pytest.mark.parametrize("success", [True, False])
-def test_done_worlds_earn_nothing(success):
+def test_done_worlds_get_no_reward(success):
     end = world([1.0, 1.0], success=success, done=True)
     again = world([1.0, 1.0], success=success, done=True, before=end)
     assert float(again.reward) == 0
@@ -165,7 +165,7 @@ def test_bad_arguments(options, message):
 
 @pytest.mark.slow
 def test_an_environment_with_dense_rewards(task_name):
-    """What the expert earns in randomised worlds is finite, and telescopes."""
+    """The expert's rewards in randomised worlds are finite, and telescope."""
     env = envs.make(task_name, num_envs=4, image_size=16, reward="dense", discount=0.95)
     ranges = envs.Randomization.typical()
     state = env.reset(jax.random.key(0), ranges)
@@ -188,7 +188,7 @@ def test_an_environment_with_dense_rewards(task_name):
 
 
 @pytest.mark.slow
-def test_broken_worlds_stand_still():
+def test_broken_worlds_stay_frozen():
     env = envs.make("press", num_envs=2, reward="dense", discount=0.9)
     start = env.reset(jax.random.key(0))
     after = env.step(start, start.info["command"].at[1].set(jnp.nan))

@@ -1,4 +1,4 @@
-"""Kinematics against the vendor's SDK and against MuJoCo, limits against what is published."""
+"""Kinematics against the vendor's SDK and MuJoCo, limits against published numbers."""
 
 import jax
 import jax.numpy as jnp
@@ -42,14 +42,14 @@ def test_piper_kinematics_take_any_leading_axes():
     np.testing.assert_allclose(position.reshape(6, 6, 3), piper.forward_kinematics(q)[0], atol=1e-6)
 
 
-def test_piper_kinematics_want_six_angles():
+def test_piper_kinematics_need_six_angles():
     with pytest.raises(ValueError, match=r"\[\.\.\., 6\]"):
         piper.forward_kinematics(jnp.zeros(7))
 
 
 @pytest.mark.parametrize("task_name", ["press"])
 @pytest.mark.parametrize("robot_name", ["piper"])
-def test_piper_bodies_stand_where_the_sdk_says(scene):
+def test_piper_bodies_match_the_sdk(scene):
     for q, positions in zip(GOLDEN["q"], GOLDEN["position0"], strict=True):
         data = at_pose(scene, q)
         found = [data.body(f"link{i}").xpos for i in range(1, 7)]
@@ -57,7 +57,7 @@ def test_piper_bodies_stand_where_the_sdk_says(scene):
 
 
 @pytest.mark.parametrize("task_name", ["press"])
-def test_tool_pose_is_mujocos(scene, robot_name):
+def test_tool_pose_matches_mujoco(scene, robot_name):
     robot = scene.robot
     tool_pose = jax.jit(lambda q: robots.tool_pose(robot, q))
     site = scene.model.site("tcp").id
@@ -106,7 +106,7 @@ def pads(model) -> list[int]:
     return [int(model.body(side).geomadr[0]) for side in ("left", "right")]
 
 
-def test_sdk_zeros_are_the_kinematics_other_convention():
+def test_sdk_zeros_match_the_sdk_offset():
     q = jnp.array([[0.1, 1.2, -1.0, 0.2, 0.5, -0.3]])
     ours = piper.forward_kinematics(piper.from_sdk_zeros(q))
     theirs = piper.forward_kinematics(q, sdk_offset=True)

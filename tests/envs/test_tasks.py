@@ -1,4 +1,4 @@
-"""What a task promises, and that success means what it says, looked at in MuJoCo's own engine."""
+"""Contracts of tasks, and their success checks in MuJoCo's own engine."""
 
 import functools
 
@@ -20,7 +20,7 @@ def succeeds(scene, data) -> bool:
 
 
 def reach(scene, data, position, opening: float) -> None:
-    """Puts the tool, pointing down, at a position."""
+    """Move the tool, pointing down, to a position."""
     goal = jnp.asarray(position, jnp.float32)
     start = jnp.asarray(scene.robot.home, jnp.float32)
     solve = jax.jit(functools.partial(robots.inverse_kinematics, scene.robot))
@@ -69,7 +69,7 @@ def test_layouts_fill_their_range(scene, task_name):
         assert np.ptp(np.asarray(layouts[body])[:, 2]) == 0
 
 
-def test_every_layout_is_in_the_side_cameras_picture(scene):
+def test_every_layout_is_visible_to_the_side_camera(scene):
     camera = world(scene).camera("side")
     edge = np.tan(np.deg2rad(scene.model.camera("side").fovy[0]) / 2)
     layouts = jax.vmap(scene.task.place)(jax.random.split(jax.random.key(2), 256))
@@ -90,7 +90,7 @@ def test_nothing_moves_or_succeeds_by_itself(scene):
 
 
 def test_few_contacts_are_computed(scene):
-    """Every admitted pair costs at every step: only what must touch may."""
+    """Every admitted pair costs time at every step, so only necessary ones are admitted."""
     geoms = scene.model.ngeom
     con = scene.model.geom_contype, scene.model.geom_conaffinity
     pairs = sum(
@@ -108,7 +108,7 @@ def test_few_contacts_are_computed(scene):
 @pytest.mark.parametrize("task_name", ["press"])
 class TestPress:
     def press(self, scene, depth: float, height: float = 0.0, aside: float = 0.0) -> bool:
-        """The button (.040 m high) `depth` down, the tips `height` above it and `aside`."""
+        """Press the button (.040 m high) by `depth`, with the tips `height` above and `aside`."""
         data = world(scene)
         button = data.body("button").xpos
         reach(scene, data, button + np.array([aside, 0, 0.0515 - depth + height]), 0.0)
@@ -129,7 +129,7 @@ class TestPress:
 @pytest.mark.parametrize("task_name", ["pick_place"])
 class TestPickPlace:
     def drop(self, scene, offset=(0, 0, 0.019), speed: float = 0.0) -> mujoco.MjData:
-        """The grape at an offset [m] from the basket, the robot at home."""
+        """Place the grape at an offset [m] from the basket, the robot at home."""
         data = world(scene)
         data.joint("grape").qpos[:3] = data.body("basket").xpos + offset
         data.joint("grape").qvel[0] = speed
@@ -153,7 +153,7 @@ class TestPickPlace:
 
     @pytest.mark.parametrize(("opening", "done"), [(0.029, False), (0.05, True)])
     def test_released(self, scene, opening, done):
-        """In the basket but between the fingers counts only once they have let go."""
+        """A grape in the basket but between the fingers counts only once released."""
         data = self.drop(scene)
         reach(scene, data, data.joint("grape").qpos[:3], opening)
         assert succeeds(scene, data) is done
@@ -167,7 +167,7 @@ class TestPickPlace:
 @pytest.mark.parametrize("task_name", ["open_pot"])
 class TestOpenPot:
     def put(self, scene, offset, *, speed: float = 0.0, turn=(1, 0, 0, 0)) -> mujoco.MjData:
-        """The lid at an offset [m] from the pot, the robot at home."""
+        """Place the lid at an offset [m] from the pot, the robot at home."""
         data = world(scene)
         data.joint("lid").qpos[:3] = data.body("pot").xpos + offset
         data.joint("lid").qpos[3:] = turn
@@ -198,7 +198,7 @@ class TestOpenPot:
 @pytest.mark.parametrize("task_name", ["pour"])
 class TestPour:
     def poured(self, scene, block=(0, 0, 0.014), cup=(0, 0, 0), turn=(1, 0, 0, 0)):
-        """The block at an offset [m] from the basket, the cup from where it stood, turned."""
+        """Place the block at an offset [m] from the basket; move and rotate the cup."""
         data = world(scene)
         data.joint("block").qpos[:3] = data.body("basket").xpos + block
         data.joint("cup").qpos[:3] += cup

@@ -1,4 +1,4 @@
-"""Robots from a user's own MJCF: what is found in it, and what becomes of it in a scene."""
+"""Robots from a user's own MJCF, and their scenes."""
 
 import dataclasses
 from pathlib import Path
@@ -40,7 +40,7 @@ def at(model: mujoco.MjModel, q: np.ndarray, opening: float = 0.0) -> mujoco.MjD
     return data
 
 
-def test_kinematics_are_those_of_the_file(file, robot, model):
+def test_kinematics_match_the_file(file, robot, model):
     own = mujoco.MjModel.from_xml_path(str(file))
     data = mujoco.MjData(own)
     tool_pose = jax.jit(lambda q: robots.tool_pose(robot, q))
@@ -59,7 +59,7 @@ def test_kinematics_are_those_of_the_file(file, robot, model):
         np.testing.assert_allclose(data.body("wrist").xpos, ours.body("robot/wrist").xpos)
 
 
-def test_numbers_come_from_the_file(robot):
+def test_limits_match_the_file(robot):
     np.testing.assert_allclose(robot.lower, np.deg2rad([-150, -100, 0, -170, -30, -170]))
     np.testing.assert_allclose(robot.upper, np.deg2rad([150, 100, 160, 170, 130, 170]))
     np.testing.assert_allclose(robot.speed, [1, 1, 1, 2, 2, 2])
@@ -67,11 +67,11 @@ def test_numbers_come_from_the_file(robot):
     assert robot.action_low.shape == (7,)
 
 
-def test_a_robot_is_one_line(robot):
+def test_repr_is_one_line(robot):
     assert repr(robot) == f"<Robot {robot.name!r}: 6 joints, opens {1000 * robot.stroke:.0f} mm>"
 
 
-def test_start_pose_is_that_of_all_robots(robot, model):
+def test_start_pose_is_the_common_one(robot, model):
     data = at(model, robot.home)
     np.testing.assert_allclose(data.site("tcp").xpos, [0.34, 0, 0.18], atol=1e-3)
     x, y, z = data.site("tcp").xmat.reshape(3, 3).T
@@ -82,7 +82,7 @@ def test_start_pose_is_that_of_all_robots(robot, model):
 
 
 @pytest.mark.parametrize("name", mostly_slow(["piper", "panda"], ["piper"]))
-def test_lean_and_tilt_of_known_robots_are_found(name):
+def test_lean_and_tilt_of_our_robots_are_recovered(name):
     known = getattr(robots, name).ROBOT
     turned = known.tool @ robots.rotation("z", np.pi)
     found = mjcf.posing.posed(dataclasses.replace(known, tool=turned, lean=0.5, tilt_side=0))
@@ -91,7 +91,7 @@ def test_lean_and_tilt_of_known_robots_are_found(name):
     np.testing.assert_allclose(found.tool, known.tool, atol=1e-6)
 
 
-def test_scene_has_the_arm_alone(model):
+def test_scene_keeps_only_the_arm(model):
     names = [model.body(i).name for i in range(model.nbody)]
     assert names[1:3] == ["base", "robot/column"]
     assert "button" in names
@@ -106,7 +106,7 @@ def test_scene_has_the_arm_alone(model):
     )
 
 
-def test_only_fingers_touch(model):
+def test_only_fingers_collide(model):
     touching = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
     robot = [i for i in touching if model.body(model.geom_bodyid[i]).name in ("robot/a", "robot/b")]
     masks = [(model.geom_contype[i], model.geom_conaffinity[i]) for i in robot]
@@ -116,7 +116,7 @@ def test_only_fingers_touch(model):
 
 
 @pytest.mark.parametrize("opening", [0.0, 0.03, 0.08])
-def test_opening_is_the_room_between_the_pads(robot, model, opening):
+def test_opening_is_the_gap_between_the_pads(robot, model, opening):
     data = at(model, robot.home, opening)
     tcp, axes = data.site("tcp").xpos, data.site("tcp").xmat.reshape(3, 3)
     kinds = model.geom_conaffinity == 5, model.geom_contype == 2
@@ -129,7 +129,7 @@ def test_opening_is_the_room_between_the_pads(robot, model, opening):
     np.testing.assert_allclose(tips[:, 2], robots.TIP_LENGTH - robots.TIP_RADIUS, atol=1e-6)
 
 
-def test_actuators_hold_what_they_are_told(robot, model):
+def test_actuators_reach_their_targets(robot, model):
     data = at(model, robot.home)
     data.ctrl[:] = np.append(robot.home, robot.stroke / 2)
     for _ in range(300):
@@ -164,7 +164,7 @@ def built(folder: Path, *edits: tuple[str, str]) -> mujoco.MjModel:
     return scene.build(press.TASK.scene, mjcf.load(write(folder, *edits)))
 
 
-def test_names_may_be_those_of_the_scene(tmp_path):
+def test_names_may_clash_with_the_scene(tmp_path):
     edits = [(f'"{old}"', f'"{new}"') for old, new in zip("ab", ("right", "left"), strict=True)]
     edits += [('"upper"', '"base"'), ('"lower"', '"button"'), ('"yaw"', '"gripper"')]
     edits += [('"column"', '"hand"'), ('"blue"', '"table"'), ('"shell"', '"squares"')]
@@ -178,7 +178,7 @@ def test_names_may_be_those_of_the_scene(tmp_path):
     assert model.body(target).name == "robot/hand"
 
 
-def test_a_hinge_may_be_called_left_and_the_rest_nothing(tmp_path):
+def test_a_hinge_named_left_and_unnamed_parts(tmp_path):
     edits = [('<body name="column"', "<body"), ('"shoulder"', '"left"')]
     edits += [('joint name="b"', 'joint name="number 8"'), ('joint="b"', 'joint="number 8"')]
     model = built(tmp_path, *edits, ('joint2="b"', 'joint2="number 8"'))
@@ -195,13 +195,13 @@ def test_small_meshes_are_not_drawn(tmp_path):
 
 
 @pytest.mark.slow
-def test_limits_are_also_those_of_the_actuators(tmp_path):
+def test_limits_include_those_of_the_actuators(tmp_path):
     edit = ('<position name="yaw" joint="yaw"', '<position name="yaw" joint="yaw" ctrlrange="-1 9"')
     robot = mjcf.load(write(tmp_path, edit))
     assert (robot.lower[0], robot.upper[0]) == pytest.approx((-1, np.deg2rad(150)))
 
 
-def test_a_tendon_may_turn_a_hinge(tmp_path):
+def test_a_tendon_may_drive_a_hinge(tmp_path):
     edits = (
         ("</tendon>", '<fixed name="belt"><joint joint="yaw" coef="2"/></fixed></tendon>'),
         (
@@ -215,7 +215,7 @@ def test_a_tendon_may_turn_a_hinge(tmp_path):
     np.testing.assert_allclose(model.actuator("robot/yaw").biasprm[:3], [0, -50, -4])
 
 
-def test_colours_are_the_geoms_own(tmp_path):
+def test_colours_move_to_the_geoms(tmp_path):
     geoms = '<default class="robot"><geom contype="1"'
     model = built(tmp_path, (geoms, f'{geoms} material="blue"'))
     arm = model.body_rootid[model.geom_bodyid] == model.body("base").id
@@ -224,7 +224,7 @@ def test_colours_are_the_geoms_own(tmp_path):
     assert np.sum(np.all(np.isclose(model.geom_rgba[drawn], [0.1, 0.2, 0.9, 1]), axis=1)) == 8
 
 
-def test_ray_caster_draws_something_in_the_place_of_a_mesh(robot, model):
+def test_ray_caster_draws_primitives_in_place_of_a_mesh(robot, model):
     mesh = next(i for i in range(model.ngeom) if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_MESH)
     drawn = renderer.build(model, ["side", "wrist"])
     assert mesh not in drawn.geoms
@@ -241,14 +241,14 @@ def test_ray_caster_draws_something_in_the_place_of_a_mesh(robot, model):
 
 
 def _mesh_axes(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
-    """Axes in the world of the coordinates in which the mesh was written down."""
+    """Return the axes, in the world, of the coordinates in the mesh file."""
     turn = np.empty(9)
     mujoco.mju_quat2Mat(turn, model.mesh_quat[model.geom_dataid[geom]])
     return data.geom_xmat[geom].reshape(3, 3) @ turn.reshape(3, 3).T
 
 
 @pytest.mark.slow
-def test_steps_and_pictures(robot):
+def test_steps_and_images(robot):
     env = envs.make("press", robot, num_envs=2, image_size=48)
     start = env.reset(jax.random.key(0))
     state = env.step(start, start.info["command"].at[:, 0].add(0.05))

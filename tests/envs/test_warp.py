@@ -1,4 +1,4 @@
-"""MuJoCo Warp's physics and renderer against MJX-JAX and the ray caster; on CPU, slow but real."""
+"""MuJoCo Warp's physics and renderer against MJX-JAX and the ray caster; slow on CPU."""
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ def pair():
 
 
 def run(env, ranges, steps):
-    """The expert's way through some control steps."""
+    """Run the expert for some control steps."""
     state = env.reset(jax.random.key(2), ranges)
     plan = expert.plan(env, state, jax.random.key(3))
     for _ in range(steps):
@@ -34,7 +34,7 @@ def run(env, ranges, steps):
     return state
 
 
-def test_the_backend_is_picked_by_the_device(pair, monkeypatch):
+def test_default_backend_depends_on_the_device(pair, monkeypatch):
     assert physics.default_backend() == "jax"  # no NVIDIA GPU here
     assert make("press").physics.backend == "jax"
     assert pair[1].physics.backend == "warp"
@@ -50,7 +50,7 @@ def test_the_backend_is_picked_by_the_device(pair, monkeypatch):
     assert physics.default_backend() == "jax"
 
 
-def test_warp_that_is_missing_is_named(monkeypatch):
+def test_missing_warp(monkeypatch):
     monkeypatch.setattr(physics.importlib.util, "find_spec", lambda name: None)
     for option in ("backend", "renderer"):
         with pytest.raises(ValueError, match=rf"{option} 'warp' needs warp-lang: pip install"):
@@ -58,7 +58,7 @@ def test_warp_that_is_missing_is_named(monkeypatch):
 
 
 @pytest.mark.slow  # compiles both engines: a minute and a half
-def test_both_engines_move_alike(pair):
+def test_both_engines_agree(pair):
     """40 control steps: the lid rests on the pot, most worlds have lifted it at the end."""
     ours, theirs = (run(env, RANGES, 40) for env in pair)
     lid = pair[0].model.body("lid").id
@@ -69,8 +69,8 @@ def test_both_engines_move_alike(pair):
 
 
 @pytest.mark.slow
-def test_worlds_of_worlds_are_worlds(pair):
-    """A further vmap, such as Brax's, gives what a batch gives."""
+def test_nested_vmap(pair):
+    """An outer vmap, such as Brax's, gives the same as one batch."""
     env = pair[1]
     state = env.reset(jax.random.key(0), RANGES)
     action = state.info["command"] + 0.02
@@ -85,8 +85,8 @@ def test_worlds_of_worlds_are_worlds(pair):
     ("ranges", "antialias"),
     [(None, 2), (Randomization.typical(), 1)],
 )
-def test_pictures_match_the_ray_caster(ranges, antialias):
-    """On average within a level of 255; single pixels at edges differ."""
+def test_images_match_the_ray_caster(ranges, antialias):
+    """The mean difference is below one level of 255; single pixels at edges differ."""
     ours, theirs = (
         make("pour", backend="jax", renderer=r, antialias=antialias) for r in ("rays", "warp")
     )

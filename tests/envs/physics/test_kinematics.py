@@ -1,4 +1,4 @@
-"""Poses of all frames, as MuJoCo itself has them."""
+"""Poses of all frames agree with MuJoCo's."""
 
 import jax
 import jax.numpy as jnp
@@ -61,5 +61,5 @@ def test_every_scene(scene):
     assert_as_mujoco(scene.model)
 
 
-def test_a_model_with_every_kind_of_joint():
+def test_every_kind_of_joint():
     assert_as_mujoco(mujoco.MjModel.from_xml_string(ODD))

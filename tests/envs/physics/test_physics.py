@@ -1,4 +1,4 @@
-"""Physics: as MuJoCo's, and sums in a fixed order, so that accelerators give the same again."""
+"""Physics agrees with MuJoCo's and sums in a fixed order, so that results are reproducible."""
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +32,7 @@ def test_sums_in_order(segments, number):
 
 
 def equations(jaxpr):
-    """All of a program, those of its loops and calls included."""
+    """Yield all equations of a program, including those in loops and calls."""
     for equation in jaxpr.eqns:
         yield equation
         for inner in jax.tree.leaves(list(equation.params.values())):
@@ -42,7 +42,7 @@ def equations(jaxpr):
 
 
 def unordered(function, *arguments):
-    """Scatters that add floats, perhaps several to one place, which a GPU does in any order."""
+    """Find scatters that add floats, possibly to the same index, in any order on a GPU."""
     return [
         equation
         for equation in equations(jax.make_jaxpr(function)(*arguments).jaxpr)
@@ -52,12 +52,12 @@ def unordered(function, *arguments):
     ]
 
 
-def test_a_step_adds_in_a_fixed_order(env):
+def test_a_step_sums_in_a_fixed_order(env):
     state = jax.eval_shape(env.reset, jax.random.key(0))
     assert not unordered(env.step, state, state.info["command"])
 
 
-def test_unordered_sums_would_be_found(env):
+def test_unordered_sums_are_detected(env):
     def loop(x):
         return jax.lax.scan(
             lambda c, _: (jax.ops.segment_sum(c, jnp.zeros(3, int), 3), 0), x, length=2
@@ -66,8 +66,8 @@ def test_unordered_sums_would_be_found(env):
     assert len(unordered(jax.jit(loop), jnp.ones(3))) == 1
 
 
-def test_a_control_step_is_that_of_mujoco(env):
-    """All of `mj_step` that a scene has is there: forces, limits, contacts, the equality."""
+def test_a_control_step_matches_mujoco(env):
+    """Everything in `mj_step` that our scenes use: forces, limits, contacts, the equality."""
     start = env.reset(jax.random.key(3))
     plan = expert.plan(env, start, jax.random.key(1))
     act = jax.jit(lambda state: expert.act(env, plan, state))

@@ -1,4 +1,4 @@
-"""Distractors keep out of the way, are solid and seen, and change nothing else."""
+"""Distractors stay clear of the task, are solid and visible, and change nothing else."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ import envs
 from envs.scene import distractors
 
 
-def test_places_are_clear_and_random(scene):
+def test_positions_are_clear_and_random(scene):
     def draw(key):
         layout = scene.task.place(key)
         return layout, distractors.place(key, layout, 4)
@@ -25,7 +25,7 @@ def test_places_are_clear_and_random(scene):
         assert everything[:, i].std(axis=0).min() > 0.03
 
 
-def test_only_what_is_wanted_is_there(robot_name):
+def test_only_the_chosen_number_is_there(robot_name):
     plain, full = envs.make("press", robot_name), envs.make("press", robot_name, distractors=3)
     names = {full.model.body(i).name for i in range(full.model.nbody)}
     assert names - {plain.model.body(i).name for i in range(plain.model.nbody)} == {
@@ -52,7 +52,7 @@ def test_a_grape_does_not_fall_through(monkeypatch):
     assert data.body("grape").xpos[2] == pytest.approx(0.032 + 0.015, abs=2e-3)
 
 
-def test_no_distractors_leave_the_layout_alone(env):
+def test_zero_distractors_do_not_change_the_layout(env):
     first = env.reset(jax.random.key(0)).info["layout"]
     assert set(first) == {"button"}
     assert jnp.isfinite(first["button"]).all()

@@ -17,7 +17,7 @@ from envs.scene.randomization import Randomization
 
 WORLDS, STEPS = 2, 50  # the expert lifts the grape at about step 35
 FIELDS = [field.name for field in dataclasses.fields(Randomization)]
-# What each range may change: where things lie, how they move, how images look.
+# Outcomes that each range may change: layout, motion, images.
 PLACES, MOTION, LOOKS = {"position", "turn"}, {"mass", "friction", "gains", "latency"}, {
     "camera_position", "camera_turn", "field_of_view", "light_turn", "brightness", "colour",
 }  # fmt: skip
@@ -35,7 +35,7 @@ def env():
 
 @pytest.fixture(scope="module")
 def episode(env):
-    """ranges -> start, its images, the state after some of the expert's steps."""
+    """Return a function: ranges -> start, its images, the state after some expert steps."""
 
     @jax.jit
     def run(key, ranges):
@@ -75,7 +75,7 @@ def test_defaults_change_nothing(env, neutral):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FIELDS)
-def test_a_range_changes_its_own_outcome_and_no_other(episode, neutral, name):
+def test_a_range_changes_only_its_own_outcome(episode, neutral, name):
     (start, seen, end), (start0, seen0, end0) = episode(**exactly(name)), neutral
     assert not equal(end.data.qpos, end0.data.qpos) or name in LOOKS
     assert equal(start.info["command"], start0.info["command"])
@@ -95,7 +95,7 @@ def test_a_range_changes_its_own_outcome_and_no_other(episode, neutral, name):
 
 
 @pytest.mark.slow
-def test_objects_are_moved_turned_and_grown(episode, neutral):
+def test_objects_are_moved_rotated_and_scaled(episode, neutral):
     layout0 = neutral[0].info["layout"]
     for name, change in (
         ("position", lambda p: p + np.array([0.01, 0.01, 0, 0])),
@@ -108,7 +108,7 @@ def test_objects_are_moved_turned_and_grown(episode, neutral):
 
 
 @pytest.mark.slow
-def test_cameras_move_along_and_about_their_own_axes(env, episode, neutral):
+def test_cameras_move_along_and_about_their_axes(env, episode, neutral):
     data0 = neutral[0].data
     data = episode(**exactly("camera_position"))[0].data
     shift = np.einsum("wnij,j->wni", data0.cam_xmat, np.full(3, 0.02))
@@ -120,12 +120,12 @@ def test_cameras_move_along_and_about_their_own_axes(env, episode, neutral):
 
 
 @pytest.mark.slow
-def test_brightness_scales_the_pictures(episode, neutral):
+def test_brightness_scales_the_images(episode, neutral):
     bright, dark = (e[1]["image"]["side"].mean() for e in (neutral, episode(brightness=(0.5, 0.5))))
     assert dark / bright == pytest.approx(0.5, abs=0.03)
 
 
-def test_latency_delays_what_is_sent():
+def test_latency_delays_targets():
     commands = jnp.array([[0.0, 0.02], [0.1, 0.04], [0.3, 0.0]])
     now, late = (np.asarray(actions.interpolate(commands, 0.1, x)) for x in (0.0, 0.04))
     np.testing.assert_array_equal(late[8:], now[:-8])  # 8 physics steps of 5 ms
@@ -136,7 +136,7 @@ def test_latency_delays_what_is_sent():
 
 
 @pytest.mark.slow  # a scene of its own to compile
-def test_recorded_pictures_show_each_world_as_it_is(env):
+def test_recorded_images_match_each_world(env):
     ranges, key = Randomization.typical(), jax.random.key(3)
     recorded, _ = collection._record(env, key, 0.0, ranges)
     start = env.reset(jax.random.split(key, 3)[0], ranges)
@@ -145,7 +145,7 @@ def test_recorded_pictures_show_each_world_as_it_is(env):
 
 
 @pytest.mark.slow
-def test_worlds_draw_for_themselves(episode):
+def test_worlds_draw_independently(episode):
     draw = episode(mass=(0.5, 2.0), brightness=(0.5, 1.5))[0].info["draw"]
     assert draw.brightness[0] != draw.brightness[1]
     assert np.all((draw.mass >= 0.5) & (draw.mass <= 2.0))
@@ -153,7 +153,7 @@ def test_worlds_draw_for_themselves(episode):
 
 
 @pytest.mark.slow
-def test_other_ranges_compile_nothing(env):
+def test_other_ranges_do_not_recompile(env):
     events = []
     listen = lambda event, *_, **__: events.append(event)  # noqa: E731
     env.reset(jax.random.key(0), Randomization())
@@ -164,8 +164,8 @@ def test_other_ranges_compile_nothing(env):
 
 
 @pytest.mark.slow
-def test_the_model_is_what_mujoco_would_compile(env):
-    """Grown and heavier bodies against a model to which MuJoCo itself applied the same."""
+def test_the_model_matches_one_compiled_by_mujoco(env):
+    """Scaled and heavier bodies against a model that MuJoCo compiled with the same changes."""
     draw = jax.tree.map(
         lambda x: x[0], env.reset(jax.random.key(0), Randomization(mass=(2, 2), size=(1.1, 1.1)))
     ).info["draw"]
@@ -199,7 +199,7 @@ def mujoco_xml(env):
         ({"latency": (0.0, 0.2)}, "latency must lie in 0 to 0.1 s"),
     ],
 )
-def test_senseless_ranges_are_refused(env, ranges, message):
+def test_invalid_ranges_raise(env, ranges, message):
     with pytest.raises(ValueError, match=message):
         env.reset(jax.random.key(0), Randomization(**ranges))
     with pytest.raises(ValueError, match=message):
@@ -209,7 +209,7 @@ def test_senseless_ranges_are_refused(env, ranges, message):
 
 
 @pytest.mark.slow
-def test_reset_done_wants_the_ranges_of_reset(env):
+def test_reset_done_needs_the_ranges_of_reset(env):
     key, ranges = jax.random.key(0), Randomization()
     for first, second in ((None, ranges), (ranges, None)):
         with pytest.raises(ValueError, match="reset_done needs ranges if, and only if"):
