@@ -2,19 +2,20 @@
 
 The paper does not say how it counts. These rules reproduce its percentages to the last digit:
 
-- Adapters are on every linear layer of the PyTorch models (422 in pi0, 303 in SmolVLA), including
-  the unused lm_heads; there the patch embedding is a convolution.
-- The total includes pi0's expert lm_head, which is in no checkpoint published by openpi:
-  3,501,372,176 and 450,046,176. "Trainable/Total" is adapters / (total + adapters).
-- LoRA-MoE has 4 experts of rank 32. AdaLoRA starts at rank 128, with a diagonal more than LoRA.
+- Every linear layer of the PyTorch models has an adapter (422 in pi0, 303 in SmolVLA), including
+  the unused lm_heads. The patch embedding is a convolution there and has none.
+- The totals are 3,501,372,176 for pi0, including its expert's lm_head, which is in no checkpoint
+  published by openpi, and 450,046,176 for SmolVLA. "Trainable/Total" is
+  adapters / (total + adapters).
+- LoRA-MoE has 4 experts of rank 32. AdaLoRA starts at rank 128, with one diagonal more than LoRA.
 - LoRA-SP is `LoRASP.paper()`, with a router of width 4, and leaves out the five linear maps around
   the towers. 4 is the only constant width that fits both backbones; with those five maps 17.1 would
   be 17.2. The released code, with a router as wide as the bank, gives 12.0 and 23.0 instead of 9.2
   and 17.1.
 
-All numbers of both columns are covered. Active ranks and success rates are measurements, so they
-are not. The success row of LoRA-SP on pi0 differs between the tables (80 and 60 % for opening the
-pot).
+Both columns are complete. The tables also report active ranks and success rates, which are measured
+and cannot be counted; the success of LoRA-SP on pi0 differs between the tables (80 and 60 % for
+opening the pot).
 """
 
 import math

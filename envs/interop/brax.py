@@ -24,7 +24,7 @@ try:
 except ImportError as error:
     raise ImportError('envs.interop.brax needs Brax: pip install -e ".[brax]"') from error
 
-# Of a single world: Brax adds its own batch axis, and a batch of batches would compile slower.
+# Compile a single world: Brax adds its own batch axis, and nested batches would compile slower.
 _reset = fast_cpu.jit(Env._reset, static_argnums=0)
 _step = fast_cpu.jit(Env._step, static_argnums=0)
 _full_state = fast_cpu.jit(Env._full_state, static_argnums=0)

@@ -51,7 +51,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     Attributes:
         env: the wrapped environment.
         ranges: domain randomisation.
-        state: the W worlds, for what the interface hides (metrics, layouts); None before `reset`.
+        state: the W worlds, for access to metrics and layouts; None before `reset`.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.NEXT_STEP}

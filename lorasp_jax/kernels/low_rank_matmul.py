@@ -57,11 +57,11 @@ def one_by_one(functions: Sequence[LayerFunction]) -> InnerFunction:
 
     def inner(
         params: Sequence[Any],
-        read: jax.Array,
+        projected: jax.Array,
         widths: Sequence[int],
         token_mask: jax.Array | None,
     ) -> list[tuple[jax.Array, Any]]:
-        rows = _split(widths, read)
+        rows = _split(widths, projected)
         return [f(p, r, token_mask) for f, p, r in zip(functions, params, rows, strict=True)]
 
     return inner
