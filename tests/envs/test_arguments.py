@@ -55,7 +55,7 @@ def worlds():
         ({"control_dt": True}, "control_dt must be a number, got True"),
         ({"actions": "voltage"}, "unknown actions 'voltage': choose from joint, delta_joint"),
         ({"discount": True}, "discount must be a number above 0 and at most 1, got True"),
-        ({"robot": f"{300 * 'a'}.xml"}, "robot a+.xml: there is no such file"),
+        ({"robot": f"{300 * 'a'}.xml"}, "robot a+.xml: no such file"),
         ({"backend": ""}, "unknown backend '': choose from jax, warp"),
         ({"backend": 7}, "unknown backend 7: choose from jax, warp"),
         ({"renderer": None}, "unknown renderer None: choose from rays, warp"),
