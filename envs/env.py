@@ -175,16 +175,13 @@ class Env:
         key: jax.Array,
         ranges: Randomization | None = None,
     ) -> tuple[State, Trajectory]:
-        """Run a policy in fresh worlds until the time limit; can be called under jit.
+        """Run a policy in fresh worlds until the time limit; return the last state and all steps.
 
         Args:
             policy: (observation, key) -> action [W, A]. The observation is that of `observe` plus
                 `instruction`, int32 [W]. Images that the policy does not read are not rendered.
             key: source of all randomness.
             ranges: as in `reset`.
-
-        Returns:
-            The final state, and the trajectory of all steps.
 
         Raises:
             TypeError, ValueError: as in `reset` and `step`, or the policy is not callable.
@@ -234,8 +231,7 @@ class Env:
     def full_state(self, state: State) -> jax.Array:
         """Return the privileged state as one vector, f32 [W, D], laid out as `full_state_layout`.
 
-        It holds the robot's joints, speeds, last targets and tool pose, and the poses and speeds of
-        the task's objects relative to the tool: see `envs.observations.parts`.
+        It describes the robot and the task's objects: see `envs.observations.parts`.
 
         Raises:
             TypeError: `state` is not a `State`.
