@@ -200,7 +200,7 @@ class Env:
 
         keys = jax.random.split(policy_key, self.max_steps)
         start = self.reset(reset_key, ranges)
-        with self._calls.said("rollout"):  # every time: JAX retraces for each policy
+        with self._calls.announced("rollout"):  # every time: JAX retraces for each policy
             return jax.lax.scan(body, start, keys)
 
     def reset_done(

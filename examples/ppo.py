@@ -262,7 +262,7 @@ def main(config: Config) -> float:
     draw(config, curve)
     key = jax.random.key(config.seed + 1_000_000)
     env = make(config, config.episodes)
-    with messages.said(f"the evaluation of {config.task}, its episodes included"):
+    with messages.announced(f"the evaluation of {config.task}, its episodes included"):
         success = float(np.mean(evaluate(env, learner.params, learner.moments, key)))
     print(
         f"{success:.1%} of {config.episodes} fresh layouts, {time.process_time():.0f} CPU seconds"

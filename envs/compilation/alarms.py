@@ -1,7 +1,7 @@
-"""XLA's alarms about slow compilations, kept from the terminal of a program that says so itself.
+"""Silence XLA's alarms about slow compilation in programs that report it themselves.
 
 "Very slow compile? If you want to file a bug ..." and "Constant folding an instruction is taking
-> 1s" are logged as errors (xla/service/slow_operation_alarm.cc), and nothing turns off them alone.
+> 1s" are logged as errors (xla/service/slow_operation_alarm.cc), and cannot be turned off alone.
 """
 
 import os
@@ -13,48 +13,47 @@ from jax import monitoring
 
 from envs import _compat
 
-COMPILATION = "/jax/core/compile/backend_compile_duration"  # recorded at its start and at its end
+COMPILATION = "/jax/core/compile/backend_compile_duration"  # recorded at start and end
 _FATAL, _JAX_DEFAULT = 3, 1  # levels of TF_CPP_MIN_LOG_LEVEL
 
 
 def silence(
     set_level: Callable[[int], None] = _compat.set_least_logged_level,
 ) -> "Compilations | None":
-    """From now on JAX's own C++ logs nothing below fatal while this process compiles anything.
+    """Log nothing below fatal from JAX's C++ code while this process compiles. Call it once.
 
-    What makes a compilation fail is raised besides, and at all other times errors are logged as
-    ever. Leaves alone what TF_CPP_MIN_LOG_LEVEL asks for, and plugins such as CUDA's, which log by
-    themselves. To be called once.
+    Failing compilations still raise, and errors outside compilation are still logged. A level set
+    in TF_CPP_MIN_LOG_LEVEL is respected; plugins such as CUDA's log by themselves.
 
     Args:
-        set_level: sets the least level that is logged.
+        set_level: sets the lowest level that is logged.
 
     Returns:
-        What listens to JAX, or None where the user chose a level.
+        The listener registered with JAX, or None if the user chose a level.
     """
     if os.environ.get("TF_CPP_MIN_LOG_LEVEL", str(_JAX_DEFAULT)) != str(_JAX_DEFAULT):
         return None
     running = Compilations(set_level)
-    monitoring.register_scalar_listener(running.begins)
-    monitoring.register_event_duration_secs_listener(running.ends)
+    monitoring.register_scalar_listener(running.on_start)
+    monitoring.register_event_duration_secs_listener(running.on_end)
     return running
 
 
 class Compilations:
-    """Counts the compilations that run, side by side in threads, and sets the level by that."""
+    """Counts the compilations running in all threads, and sets the log level accordingly."""
 
     def __init__(self, set_level: Callable[[int], None]) -> None:
         self._set_level = set_level
         self._lock = threading.Lock()
         self._running = 0
 
-    def begins(self, event: str, value: float, **_: Any) -> None:
-        """Listens to the scalars that JAX records."""
-        del value  # when
+    def on_start(self, event: str, value: float, **_: Any) -> None:
+        """Handle a scalar that JAX records."""
+        del value  # the time
         self._count(event, 1)
 
-    def ends(self, event: str, duration_secs: float, **_: Any) -> None:
-        """Listens to the durations that JAX records."""
+    def on_end(self, event: str, duration_secs: float, **_: Any) -> None:
+        """Handle a duration that JAX records."""
         del duration_secs
         self._count(event, -1)
 

@@ -1,9 +1,9 @@
-"""Fast MJX on CPU: what JAX < 0.11 needs for it.
+"""Make MJX fast on CPU with JAX < 0.11.
 
 XLA's fusion emitters, which JAX 0.10 uses on CPU, make MJX 15 to 400 times slower (measured on two
-cores). An XLA flag turns them off, but XLA reads its flags only once, when JAX starts a backend:
-`import envs` sets it where that has not happened yet. Where it has, programs of this package's own
-still get it, as an option of their `jax.jit`; that cannot be given to what others compile.
+cores). An XLA flag turns them off, but XLA reads its flags once, when JAX starts a backend;
+`import envs` sets the flag if that has not happened yet. If it has, this package passes the option
+to its own `jax.jit` calls, but cannot do so for programs that others compile.
 """
 
 import functools
@@ -18,11 +18,11 @@ from envs import _compat
 
 _NAME = "xla_cpu_use_fusion_emitters"
 FLAG = f"--{_NAME}=false"
-_NEEDED = jax.__version_info__ < (0, 11)  # newer versions need no flag, and abort on this one
+_NEEDED = jax.__version_info__ < (0, 11)  # newer versions do not need the flag, and abort on it
 
 
 def _set_flag() -> bool:
-    """Sets the flag; returns whether it came too late."""
+    """Set the flag and return whether it was too late."""
     flags = os.environ.get("XLA_FLAGS", "")
     if not _NEEDED or _NAME in flags:
         return False
@@ -32,18 +32,18 @@ def _set_flag() -> bool:
     return True
 
 
-_LATE = _set_flag()  # when this package is imported
+_LATE = _set_flag()  # on import of this package
 
 
-@functools.cache  # what was so when JAX started stays so
+@functools.cache  # it cannot change once JAX has started
 def is_late() -> bool:
-    """Whether this process runs on a CPU, and what is compiled there lacks the flag."""
+    """Return whether this process compiles for CPU without the flag that it needs."""
     return (_LATE or _set_flag()) and jax.default_backend() == "cpu"
 
 
-@functools.cache  # once a process
+@functools.cache  # once per process
 def warn_if_late() -> None:
-    """Warns where simulation in programs of others will be slow, and says what helps."""
+    """Warn if simulation inside a user's own jit will be slow, and say how to fix it."""
     if is_late():
         warnings.warn(
             "JAX was started before `import envs`, so with JAX below 0.11 simulation inside your "
@@ -54,20 +54,20 @@ def warn_if_late() -> None:
 
 
 def without_simulation() -> dict[str, str | bool] | None:
-    """Options for compiling what simulates nothing, which the flag would make slower on CPU."""
+    """Return compiler options for programs without simulation, which the flag slows down on CPU."""
     return {_NAME: True} if _NEEDED and jax.default_backend() == "cpu" else None
 
 
 def jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
-    """`jax.jit`, fast on CPU even where the flag came too late; options are those of `jax.jit`."""
+    """Do `jax.jit` with these options, fast on CPU even if the flag was set too late."""
     plain = jax.jit(function, **options)
     if not _NEEDED:
         return plain
-    # JAX takes such options only where nothing is traced around the call.
-    own = jax.jit(function, **options, compiler_options={_NAME: False})
+    # JAX accepts compiler options only in an outermost jit.
+    fast = jax.jit(function, **options, compiler_options={_NAME: False})
 
     def chosen() -> Callable[..., Any]:
-        return own if is_late() and _compat.is_untraced() else plain
+        return fast if is_late() and _compat.is_untraced() else plain
 
     @functools.wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:

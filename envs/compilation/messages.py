@@ -1,4 +1,4 @@
-"""Says what is being compiled, where a user would otherwise wait in silence."""
+"""Tell the user what is being compiled if it takes long."""
 
 import contextlib
 import sys
@@ -13,57 +13,57 @@ import jax
 from envs import _compat
 
 PATIENCE = 2.0
-"""Seconds that nobody minds."""
+"""Seconds of compilation before a message appears; own choice."""
 
 
 @contextlib.contextmanager
-def said(what: str) -> Iterator[None]:
-    """Around work that compiles: one line on stderr if it takes long, and one when it is done.
+def announced(what: str) -> Iterator[None]:
+    """Print a line to stderr if the enclosed compilation takes long, and another when it is done.
 
-    Only the first of several processes says anything.
+    Of several processes only the first prints.
 
     Args:
-        what: what is compiled, in words.
+        what: description of what is compiled.
     """
     config = jax.config
-    kept = config.jax_enable_compilation_cache and config.jax_compilation_cache_dir is not None
-    begun = time.monotonic()
-    once = " (long the first time only)" if kept else ""
-    line = threading.Timer(PATIENCE, _say, [f"compiling {what}{once} ..."])
-    line.daemon = True
-    line.start()
+    cached = config.jax_enable_compilation_cache and config.jax_compilation_cache_dir is not None
+    start = time.monotonic()
+    once = " (long the first time only)" if cached else ""
+    timer = threading.Timer(PATIENCE, _print, [f"compiling {what}{once} ..."])
+    timer.daemon = True
+    timer.start()
     try:
         yield
     finally:
-        line.cancel()
-    seconds = time.monotonic() - begun
+        timer.cancel()
+    seconds = time.monotonic() - start
     if seconds > PATIENCE:
-        hint = "" if kept else "; envs.compilation.cache.enable() keeps it for the next start"
-        _say(f"compiled {what} in {seconds:.0f} s{hint}")
+        hint = "" if cached else "; envs.compilation.cache.enable() keeps it for the next start"
+        _print(f"compiled {what} in {seconds:.0f} s{hint}")
 
 
-def _say(line: str) -> None:
+def _print(line: str) -> None:
     if jax.process_index() == 0:
         print(line, file=sys.stderr, flush=True)
 
 
 class Calls:
-    """The calls of one object, of which the first of each kind compiles."""
+    """Tracks the calls of one object: the first of each kind compiles."""
 
     def __init__(self, name: str) -> None:
-        """Name what is called, for the user."""
+        """Set the object's name in messages."""
         self._name = name
         self._called: set[tuple[Any, ...]] = set()
 
     def first(self, *call: Any) -> AbstractContextManager[None]:
-        """Around a call: what is called, and what else decides whether it is compiled anew."""
+        """Wrap a call, given its name and everything that decides whether it recompiles."""
         if call in self._called or not _compat.is_untraced():
             return contextlib.nullcontext()
         self._called.add(call)
-        return self.said(call[0])
+        return self.announced(call[0])
 
-    def said(self, what: str) -> AbstractContextManager[None]:
-        """As `said`, unless this becomes a part of something that others compile."""
+    def announced(self, what: str) -> AbstractContextManager[None]:
+        """Announce a compilation, unless it is part of an outer trace."""
         if not _compat.is_untraced():
             return contextlib.nullcontext()
-        return said(f"{what} of {self._name}")
+        return announced(f"{what} of {self._name}")

@@ -111,7 +111,7 @@ class Evaluation(Callback):
         with contextlib.ExitStack() as compiles:
             if task not in self._tasks:
                 what = f"the evaluation of {task}, its first episodes included"
-                compiles.enter_context(messages.said(what))
+                compiles.enter_context(messages.announced(what))
 
             def report(done: int, _: int) -> None:
                 compiles.close()

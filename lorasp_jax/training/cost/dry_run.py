@@ -48,7 +48,7 @@ def dry_run(config: Config, folder: Path, console: Console) -> None:
     console.print(_parameters(built.model))
     run = Run(config, folder, console, built.base_hash)
     data = _prepared(run, built)
-    with messages.said("the training step"):
+    with messages.announced("the training step"):
         options = fast_cpu.without_simulation()
         compiled = _lowered(run, data).compile(compiler_options=options)
     console.print(_memory(built, _bytes(data) / _split(data), compiled.memory_analysis()))

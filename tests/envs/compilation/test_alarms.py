@@ -1,4 +1,4 @@
-"""XLA's alarms are silent while something compiles, and its errors are not at other times."""
+"""XLA's alarms are silent during compilation, and its errors are logged at other times."""
 
 import os
 import subprocess
@@ -25,27 +25,27 @@ jax.jit(sums).lower(1.0).compile()
 
 @pytest.fixture
 def levels(monkeypatch):
-    """The levels that were set, one after the other."""
+    """Log levels in the order they were set."""
     found = []
     monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "1")
     running = alarms.silence(found.append)
     assert running is not None
     yield found
-    monitoring.unregister_scalar_listener(running.begins)
-    monitoring.unregister_event_duration_listener(running.ends)
+    monitoring.unregister_scalar_listener(running.on_start)
+    monitoring.unregister_event_duration_listener(running.on_end)
 
 
 def compiled(value):
-    """A program of its own for each value."""
+    """Compile a different program for each value."""
     return jax.jit(lambda x: x + value).lower(1.0).compile()
 
 
-def test_fatal_alone_while_something_compiles(levels):
+def test_only_fatal_errors_while_compiling(levels):
     compiled(1)
     assert levels == [3, 1]
 
 
-def test_silent_until_the_last_of_several_is_compiled(levels):
+def test_silent_until_the_last_compilation_ends(levels):
     def compile_inside(event, *_, **__):
         if event == alarms.COMPILATION and len(levels) == 1:
             thread = threading.Thread(target=compiled, args=[2])
@@ -58,13 +58,13 @@ def test_silent_until_the_last_of_several_is_compiled(levels):
     assert levels == [3, 3, 3, 1]
 
 
-def test_a_failed_compilation_ends_too(levels):
+def test_a_failed_compilation_counts_as_ended(levels):
     with pytest.raises(jax.errors.JaxRuntimeError, match="xla_no_such_option"):
         jax.jit(lambda x: x + 4).lower(1.0).compile(compiler_options={"xla_no_such_option": "1"})
     assert levels == [3, 1]
 
 
-def test_a_level_that_the_user_chose_stays(monkeypatch):
+def test_a_level_set_by_the_user_stays(monkeypatch):
     monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "0")
     assert alarms.silence([].append) is None
 
