@@ -116,8 +116,7 @@ class Env:
             ranges: domain randomisation; None for none.
 
         Raises:
-            TypeError: `key` is not a key.
-            ValueError: a range is invalid.
+            TypeError, ValueError: the key or a range is invalid.
         """
         ranges = randomization.prepared(ranges, self.control_dt)
         with self._calls.first("reset", ranges is None):
@@ -229,9 +228,7 @@ class Env:
         return jnp.concatenate([joints, jnp.sum(fingers, axis=1, keepdims=True)], axis=1)
 
     def full_state(self, state: State) -> jax.Array:
-        """Return the privileged state as one vector, f32 [W, D], laid out as `full_state_layout`.
-
-        It describes the robot and the task's objects: see `envs.observations.parts`.
+        """Return the privileged state of robot and objects, f32 [W, D]; see `full_state_layout`.
 
         Raises:
             TypeError: `state` is not a `State`.

@@ -21,7 +21,7 @@ _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 def parts(
     model: mujoco.MjModel, data: Any, command: jax.Array, bodies: Iterable[str]
 ) -> dict[str, jax.Array]:
-    """Compute the parts of the privileged state of one world, f32 vectors by name.
+    """Compute the parts of the privileged state (`Env.full_state`) of one world, f32, by name.
 
     - `joints` [J + 1]: joint angles [rad] and gripper opening [m]; `joint_speeds` [J + 1]: their
       derivatives per second; `command` [J + 1]: the last targets.
