@@ -9,7 +9,7 @@ import importlib
 import importlib.util
 from typing import TYPE_CHECKING, Any
 
-import envs.compilation.fast_cpu  # first: it must come before anything starts JAX
+import envs.compilation.fast_cpu  # first, before anything starts JAX
 import envs.interop.ids
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ envs.interop.ids.register()
 
 
 def __getattr__(name: str) -> Any:
-    """Public names and modules, imported when asked for: MJX takes seconds, `--help` needs none."""
+    """Import public names and modules on access: MJX takes seconds, too long for `--help`."""
     if name in _HOMES:
         return getattr(importlib.import_module(f"envs.{_HOMES[name]}"), name)
     if name == "rlds":

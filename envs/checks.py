@@ -1,4 +1,4 @@
-"""What callers hand over: one sentence for what cannot be meant, before anything is computed."""
+"""Check arguments: one sentence for invalid ones, before anything is computed."""
 
 import math
 import numbers
@@ -10,11 +10,11 @@ import numpy as np
 
 
 def count(name: str, value: Any, most: int, least: int = 1) -> int:
-    """A whole number.
+    """Check that a value is an integer between `least` and `most`, and return it as an int.
 
     Raises:
-        TypeError: if it is none.
-        ValueError: if it is out of range.
+        TypeError: it is not an integer.
+        ValueError: it is out of range.
     """
     if isinstance(value, bool | np.bool_) or not isinstance(value, numbers.Integral):
         raise TypeError(f"{name} must be a whole number, got {value!r}")
@@ -27,11 +27,11 @@ def count(name: str, value: Any, most: int, least: int = 1) -> int:
 
 
 def number(name: str, value: Any) -> float:
-    """A finite real number, also as an array without axes.
+    """Check that a value is a finite real number or such a scalar array; return it as a float.
 
     Raises:
-        TypeError: if it is none.
-        ValueError: if it is not finite.
+        TypeError: it is not a real number.
+        ValueError: it is not finite.
     """
     real = isinstance(value, numbers.Real) and not isinstance(value, bool)
     if not real and not (is_numeric(value) and value.shape == ()):
@@ -42,10 +42,10 @@ def number(name: str, value: Any) -> float:
 
 
 def key(value: Any) -> Any:
-    """One key of `jax.random`, as it is; also one of `jax.random.PRNGKey`.
+    """Check that a value is one key, of `jax.random.key` or `jax.random.PRNGKey`, and return it.
 
     Raises:
-        TypeError: if it is something else, or several keys.
+        TypeError: it is not a key, or an array of several.
     """
     dtype, shape = getattr(value, "dtype", None), getattr(value, "shape", None)
     if dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key):
@@ -57,11 +57,11 @@ def key(value: Any) -> Any:
 
 
 def action(value: Any, shape: tuple[int, ...]) -> Any:
-    """Numbers of the right shape, as they are.
+    """Check that a value is a numeric array of this shape, and return it.
 
     Raises:
-        TypeError: if it is no array of numbers.
-        ValueError: if it has another shape.
+        TypeError: it is not a numeric array.
+        ValueError: its shape is different.
     """
     if not is_numeric(value):
         raise TypeError(f"action must be an array of numbers, {list(shape)}, got {short(value)}")
@@ -71,13 +71,13 @@ def action(value: Any, shape: tuple[int, ...]) -> Any:
 
 
 def instance(name: str, value: Any, kind: type, where: str) -> None:
-    """Raises a TypeError for what is not of a kind; `where` says how one gets it."""
+    """Raise a TypeError if a value is not an instance of `kind`; `where` says how to get one."""
     if not isinstance(value, kind):
         raise TypeError(f"{name} must be {where}, got {short(value)}")
 
 
 def is_numeric(value: Any) -> bool:
-    """Whether it is an array of real numbers; lists are none."""
+    """Return whether a value is an array of real numbers; lists are not."""
     dtype = getattr(value, "dtype", None)
     return dtype is not None and (
         jnp.issubdtype(dtype, jnp.integer) or jnp.issubdtype(dtype, jnp.floating)
@@ -85,7 +85,7 @@ def is_numeric(value: Any) -> bool:
 
 
 def short(value: Any) -> str:
-    """What a message says of a value, in a few words."""
+    """Describe a value briefly, for error messages."""
     if hasattr(value, "dtype"):
         return f"an array of {value.dtype}, shape {getattr(value, 'shape', ())}"
     text = repr(value)

@@ -1,4 +1,4 @@
-"""Making an environment from the names of a task and a robot, which are those of their files."""
+"""Make environments from the names of a task and a robot."""
 
 import importlib
 import numbers
@@ -24,7 +24,7 @@ from envs.scene import scene
 AnyRobot = str | os.PathLike[str] | Robot
 RendererName = Literal["rays", "warp"]
 RENDERERS: tuple[str, ...] = get_args(RendererName)
-# Largest, which nobody means and no device has memory for, and least where that is not 1.
+# Upper bounds, beyond any device's memory, against typos; and lower bounds that are not 1.
 _RANGES: dict[str, tuple[int, ...]] = {
     "num_envs": (2**20,),
     "image_size": (2**12,),
@@ -48,41 +48,41 @@ def make(
     backend: Backend | None = None,
     renderer: RendererName = "rays",
 ) -> Env:
-    """An environment.
+    """Make an environment.
 
     Args:
         task: name of a file in `envs/tasks`.
-        robot: name of a file in `envs/robots`, path of a user's MJCF file, or what `envs.mjcf.load`
-            made of one.
-        num_envs: parallel worlds W.
-        image_size: height and width of the pictures in pixels.
-        antialias: n for smooth edges by n x n rays a pixel, which take n squared times as long.
-        control_dt: seconds between two actions, a multiple of 0.02.
-        actions: what an action means: joint, delta_joint or end_effector, see `envs.actions`.
-        reward: sparse, 1 for success, or dense, which also says how far the task has come: see
-            `envs.rewards`.
-        discount: of the learner, for the dense reward, 0 to 1.
-        distractors: other things on the table, up to 4.
-        backend: of the physics, jax or warp; None takes the fastest there is.
-        renderer: rays, the ray caster that runs anywhere, or warp, MuJoCo Warp's, which also draws
-            meshes and textures.
+        robot: name of a file in `envs/robots`, path of an MJCF file, or a robot from
+            `envs.mjcf.load`.
+        num_envs: number of parallel worlds W.
+        image_size: height and width of images [px].
+        antialias: n, for smooth edges with n x n rays per pixel at n² times the cost.
+        control_dt: time between actions [s], a multiple of 0.02.
+        actions: action mode: joint, delta_joint or end_effector, see `envs.actions`.
+        reward: sparse, 1 on success, or dense, with shaping by progress, see `envs.rewards`.
+        discount: the learner's discount in (0, 1], for the dense reward.
+        distractors: number of unrelated objects on the table, up to 4.
+        backend: physics engine, jax or warp; None for the fastest available.
+        renderer: rays, the ray caster that runs everywhere, or warp, MuJoCo Warp's renderer, which
+            also draws meshes and textures.
 
     Raises:
-        TypeError: for what is no number, or no robot.
-        ValueError: for an unknown name (the known ones are listed), a robot that lacks something,
-            or a number out of range.
+        TypeError: an argument that should be a number or a robot is not.
+        ValueError: an unknown name (the message lists the known ones), an unsuitable robot, or a
+            number out of range.
     """
     fast_cpu.warn_if_late()
-    found_task, found_robot = _find("task", task), _find_robot(robot)
+    task_definition, robot_model = _find("task", task), _find_robot(robot)
     num_envs, image_size, antialias, distractors = _counts(
         num_envs=num_envs, image_size=image_size, antialias=antialias, distractors=distractors
     )
-    control_dt = _checked_dt(control_dt, found_task.time_limit)
+    control_dt = _checked_dt(control_dt, task_definition.time_limit)
     _check_learning(actions, reward, discount)
-    model = scene.build(found_task.scene + envs.scene.distractors.mjcf(distractors), found_robot)
+    objects = task_definition.scene + envs.scene.distractors.mjcf(distractors)
+    model = scene.build(objects, robot_model)
     return Env(
-        task=found_task,
-        robot=found_robot,
+        task=task_definition,
+        robot=robot_model,
         num_envs=num_envs,
         control_dt=control_dt,
         actions=actions,
@@ -98,7 +98,7 @@ def make(
 def _renderer(
     name: str, model: mujoco.MjModel, image_size: int, antialias: int, num_envs: int
 ) -> render.Renderer:
-    """A renderer by its name, with the pictures of the ray caster."""
+    """Make the renderer of this name; Warp's takes cameras and appearance from the ray caster."""
     _check_choices(renderer=(name, RENDERERS))
     rays = render.RayRenderer(render.build(model, scene.CAMERAS), image_size, antialias)
     if name == "rays":
@@ -109,8 +109,8 @@ def _renderer(
     return WarpRenderer(model, rays, num_envs)
 
 
-def _checked_dt(given: float, time_limit: float) -> float:
-    control_dt = checks.number("control_dt", given)
+def _checked_dt(value: float, time_limit: float) -> float:
+    control_dt = checks.number("control_dt", value)
     if control_dt > time_limit:
         limit = f"the time limit of the task, {time_limit} s"
         raise ValueError(f"control_dt must be at most {limit}, got {control_dt}")
@@ -122,20 +122,20 @@ def _checked_dt(given: float, time_limit: float) -> float:
     return control_dt
 
 
-def _counts(**given: Any) -> Iterator[int]:
-    """Whole numbers by their names, each checked."""
-    return (checks.count(name, value, *_RANGES[name]) for name, value in given.items())
+def _counts(**values: Any) -> Iterator[int]:
+    """Check integers against `_RANGES`."""
+    return (checks.count(name, value, *_RANGES[name]) for name, value in values.items())
 
 
-def _check_choices(**given: tuple[Any, Sequence[str]]) -> None:
-    """Values by their names, each with what it may be."""
-    for name, (value, known) in given.items():
+def _check_choices(**values: tuple[Any, Sequence[str]]) -> None:
+    """Check names against their valid choices: argument = (value, choices)."""
+    for name, (value, known) in values.items():
         if value not in known:
             raise ValueError(f"unknown {name} {value!r}: choose from {', '.join(known)}")
 
 
 def _check_learning(actions: Mode, reward: Reward, discount: float) -> None:
-    """What a learner sees of the worlds."""
+    """Check action mode, reward and discount."""
     _check_choices(actions=(actions, MODES), reward=(reward, REWARDS))
     real = isinstance(discount, numbers.Real) and not isinstance(discount, bool)
     if not real or not 0 < discount <= 1:

@@ -1,17 +1,17 @@
-"""The names of tasks and robots: those of their files, which nobody has to import for that."""
+"""Names of tasks and robots, read from their file names without importing them."""
 
 import pkgutil
 from pathlib import Path
 
 
 def names(kind: str) -> list[str]:
-    """The names of all of a kind, task or robot; those that begin with `_` are skipped."""
+    """List all names of a kind, "task" or "robot"; modules that begin with `_` are skipped."""
     folder = Path(__file__).parent / f"{kind}s"
-    found = (module.name for module in pkgutil.iter_modules([str(folder)]))
-    return sorted(name for name in found if not name.startswith("_"))
+    modules = (module.name for module in pkgutil.iter_modules([str(folder)]))
+    return sorted(name for name in modules if not name.startswith("_"))
 
 
 def check(kind: str, name: str) -> None:
-    """Raise ValueError, listing the known names, unless there is a task or robot of this name."""
+    """Raise a ValueError that lists the known names if there is no task or robot of this name."""
     if name not in names(kind):
         raise ValueError(f"unknown {kind} {name!r}: choose from {', '.join(names(kind))}")
