@@ -53,10 +53,10 @@ class WarpSteps:
         return [x[0] for x in results]
 
     def _batch(self, names: tuple[str, ...]) -> Any:
-        """Do the same for W worlds; all arrays have a leading axis W."""
+        """Make the function for W worlds; all arrays have a leading axis W."""
 
         def run(controls: jax.Array, *arrays: jax.Array) -> list[jax.Array]:
-            # Allocate before the graph is captured. Steps come first, to be contiguous in memory.
+            # Allocate before the graph is captured, and make the controls of a step contiguous.
             with wp.ScopedDevice(warp_call.device()):
                 self._worlds(len(controls))
             return self._callable(names)(jnp.swapaxes(controls, 0, 1), *arrays)
