@@ -94,13 +94,13 @@ class Backbone(nnx.Module):
             `[B, C, D]` f32, and the adapters' reports.
         """
         aux: LayerAux = {}
-        asked: Any = {"token_mask": action_valid, "return_aux": True}
-        h, aux["action_in_proj"] = self.action_in_proj(x_t.astype(jnp.float32), **asked)
+        x_t, counted = x_t.astype(jnp.float32), action_valid
+        h, aux["action_in_proj"] = self.action_in_proj(x_t, token_mask=counted, return_aux=True)
         time = time_embedding(flow_time, h.shape[-1])[:, None]
         h = jnp.concatenate([h, jnp.broadcast_to(time, h.shape)], axis=-1)
-        h, aux["action_time_mlp_in"] = self.action_time_mlp_in(h, **asked)
-        h, aux["action_time_mlp_out"] = self.action_time_mlp_out(jax.nn.silu(h), **asked)
-        return h, aux
+        h, mixed = self.action_time_mlp_in(h, token_mask=counted, return_aux=True)
+        h, out = self.action_time_mlp_out(jax.nn.silu(h), token_mask=counted, return_aux=True)
+        return h, aux | {"action_time_mlp_in": mixed, "action_time_mlp_out": out}
 
     def run_prefix(self, obs: Observation) -> tuple[Any, ModelAux]:
         """Everything that does not depend on the actions, once per observation."""

@@ -248,8 +248,9 @@ class Pi05(Pi0):
     def condition(self, flow_time: jax.Array) -> tuple[jax.Array, LayerAux]:
         """What the action expert's norms follow at `[B]` times, `[B, 1, D]` f32, and reports."""
         aux: LayerAux = {}
-        asked: Any = {"token_mask": jnp.ones((flow_time.shape[0], 1), bool), "return_aux": True}
+        one = jnp.ones((flow_time.shape[0], 1), bool)
         h = time_embedding(flow_time, self.config.action.width)[:, None]
-        h, aux["time_mlp_in"] = self.time_mlp_in(h, **asked)
-        h, aux["time_mlp_out"] = self.time_mlp_out(jax.nn.silu(h), **asked)
+        h, aux["time_mlp_in"] = self.time_mlp_in(h, token_mask=one, return_aux=True)
+        h = jax.nn.silu(h)
+        h, aux["time_mlp_out"] = self.time_mlp_out(h, token_mask=one, return_aux=True)
         return jax.nn.silu(h), aux
