@@ -12,7 +12,7 @@ import dataclasses
 import enum
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -57,8 +57,8 @@ class Env:
     physics: Physics
     renderer: Renderer
 
-    physics_dt = scene.PHYSICS_DT
-    cameras = scene.CAMERAS
+    physics_dt: ClassVar[float] = scene.PHYSICS_DT
+    cameras: ClassVar[tuple[str, ...]] = scene.CAMERAS
 
     def __repr__(self) -> str:
         return f"<Env {self.task.name!r} for {self.robot.name!r}, num_envs={self.num_envs}>"

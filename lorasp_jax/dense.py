@@ -38,11 +38,11 @@ KEPT = "kept_aux"
 KERNEL_INIT = jax.nn.initializers.lecun_normal()  # of nnx.Linear and nn.Dense too
 
 
-class AdapterParam(nnx.LoRAParam):
+class AdapterParam(nnx.LoRAParam[Any]):
     """What trains, and the only thing that does: an adapter's parameters, or a base weight."""
 
 
-class AdapterAux(nnx.Intermediate):
+class AdapterAux(nnx.Intermediate[Any]):
     """What a drop-in layer kept in its last call."""
 
 
@@ -52,7 +52,7 @@ def refuse_sharding(out_sharding: Any) -> None:
         raise ValueError("an adapted layer takes no out_sharding: constrain what it returns.")
 
 
-class DropoutKey(nnx.Variable):
+class DropoutKey(nnx.Variable[Any]):
     """What `with_dropout` gives a layer for one training step."""
 
 
@@ -275,8 +275,9 @@ class Dense(AdaptedLayer):
         given.real("param_dtype", param_dtype)
         given.real("dtype", dtype or param_dtype)
         base = AdapterParam if method is not None and method.trains_base else nnx.Param
-        self.kernel = base(kernel_init(rngs.params(), (d_in, d_out), param_dtype))
-        self.bias = base(jnp.zeros(d_out, param_dtype)) if use_bias else None
+        self.kernel: nnx.Param[Any] = base(kernel_init(rngs.params(), (d_in, d_out), param_dtype))
+        bias = base(jnp.zeros(d_out, param_dtype)) if use_bias else None
+        self.bias: nnx.Param[Any] | None = bias
         self.adapter = nnx.data(None)  # may hold a variable later
         self.method = method
         self.dtype = dtype

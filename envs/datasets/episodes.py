@@ -94,7 +94,7 @@ class Episodes:
         """The episodes with these numbers, in this order."""
         return jax.tree.map(lambda x: x[np.asarray(indices)], self)
 
-    def save(self, path: str | os.PathLike) -> None:
+    def save(self, path: str | os.PathLike[str]) -> None:
         """Writes one uncompressed .npz file; an existing file is replaced only when all is written.
 
         Raises:
@@ -111,7 +111,7 @@ class Episodes:
             np.savez(file, header=np.frombuffer(header, np.uint8), **arrays)
 
     @classmethod
-    def load(cls, path: str | os.PathLike, *, control_dt: float | None = None) -> Self:
+    def load(cls, path: str | os.PathLike[str], *, control_dt: float | None = None) -> Self:
         """Reads what `save` wrote, into host memory.
 
         Args:

@@ -4,6 +4,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 
 import filelock
 
@@ -51,7 +52,7 @@ def locked(path: Path, waiting: Callable[[], None] | None = None) -> Iterator[No
         raise
 
 
-def acquire(file: Path, *, wait: bool = False) -> AbstractContextManager:
+def acquire(file: Path, *, wait: bool = False) -> AbstractContextManager[Any]:
     """Lock a file, made where there is none; the lock is released at the end of a `with` block.
 
     The operating system releases it when the process ends, in whatever way.

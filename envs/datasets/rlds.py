@@ -49,7 +49,7 @@ _DESCRIPTIONS = {
 _RECORDS = "group_size:1,uncompressed"
 
 
-def write(episodes: Episodes, path: str | os.PathLike) -> None:
+def write(episodes: Episodes, path: str | os.PathLike[str]) -> None:
     """Writes a dataset folder, which is there only when all of it is.
 
     Args:

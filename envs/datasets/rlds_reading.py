@@ -27,7 +27,7 @@ _FILLED: dict[str, Any] = {"task": str, "robot": str, "actions": str, "instructi
 _FILLED |= {"cameras": dict, "control_dt": int | float, "physics_dt": int | float}
 
 
-def read(path: str | os.PathLike) -> Episodes:
+def read(path: str | os.PathLike[str]) -> Episodes:
     """All episodes of a dataset that `write` or `python -m envs collect` made, in host memory.
 
     They are padded with zeros to the longest.
@@ -81,19 +81,20 @@ class Reader:
 
     kind = "RLDS"
 
-    def __init__(self, path: str | os.PathLike) -> None:
+    def __init__(self, path: str | os.PathLike[str]) -> None:
         """Opens a dataset.
 
         Raises:
             FileNotFoundError: if there is no such folder.
             ValueError: if it is damaged or not such a dataset.
         """
-        self.path = Path(path)
-        self.facts = metadata(self.path)
+        self.path: Path = Path(path)
+        self.facts: dict[str, Any] = metadata(self.path)
         with damage(self.path):
-            self.cameras = {name: rlds_schema.picture_name(name) for name in self.facts["cameras"]}
-            self.control_dt = float(self.facts["control_dt"])
-            self.num_steps = whole(self.facts["steps"])
+            cameras = self.facts["cameras"]
+            self.cameras: dict[str, str] = {n: rlds_schema.picture_name(n) for n in cameras}
+            self.control_dt: float = float(self.facts["control_dt"])
+            self.num_steps: int = whole(self.facts["steps"])
             self._shared: dict[str, Any] = {name: self.facts[name] for name in SHARED}
             self._shared |= {"instructions": tuple(self.facts["instructions"]), "attempted": 1}
             builder = _builder(self.path, self.facts["parts"])

@@ -46,7 +46,7 @@ def write_text(file: Path, text: str) -> None:
 
 
 @contextlib.contextmanager
-def creating(path: str | os.PathLike) -> Iterator[Path]:
+def creating(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A new folder to fill, which is renamed to `path` when the block ends without an exception.
 
     One process at a time may create a path (`envs.datasets.locks.locked`): what a killed one left

@@ -60,7 +60,7 @@ class BraxEnv(base.Env):
             ValueError: a range is invalid.
         """
         checks.instance("env", env, Env, "an environment from envs.make")
-        self.env = dataclasses.replace(env, num_envs=1)
+        self.env: Env = dataclasses.replace(env, num_envs=1)
         prepared(ranges, env.control_dt)
         self.ranges = ranges
 

@@ -80,11 +80,13 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         prepared(ranges, env.control_dt)
         self.ranges = ranges
         self.state: State | None = None
-        self.num_envs = env.num_envs
-        self.single_action_space = spaces.Box(env.action_low, env.action_high)
-        self.single_observation_space = _space(env, observation)
-        self.action_space = batch_space(self.single_action_space, env.num_envs)
-        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
+        self.num_envs: int = env.num_envs
+        self.single_action_space: spaces.Space[Any] = spaces.Box(env.action_low, env.action_high)
+        self.single_observation_space: spaces.Space[Any] = _space(env, observation)
+        self.action_space: spaces.Space[Any] = batch_space(self.single_action_space, env.num_envs)
+        self.observation_space: spaces.Space[Any] = batch_space(
+            self.single_observation_space, env.num_envs
+        )
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -182,9 +184,9 @@ class SingleEnv(gymnasium.Env):
         checks.instance("env", env, Env, "an environment from envs.make")
         self.render_mode = render_mode
         self.metadata = self.metadata | {"render_fps": round(1 / env.control_dt)}
-        self.vector = VectorEnv(dataclasses.replace(env, num_envs=1), **options)
-        self.action_space = self.vector.single_action_space
-        self.observation_space = self.vector.single_observation_space
+        self.vector: VectorEnv = VectorEnv(dataclasses.replace(env, num_envs=1), **options)
+        self.action_space: spaces.Space[Any] = self.vector.single_action_space
+        self.observation_space: spaces.Space[Any] = self.vector.single_observation_space
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -255,7 +257,7 @@ def make(
     return SingleEnv(env, observation=observation, ranges=ranges, render_mode=render_mode)
 
 
-def _space(env: Env, observation: str) -> spaces.Space:
+def _space(env: Env, observation: str) -> spaces.Space[Any]:
     """Return the space of one world's observations, unbounded: joints can exceed their limits."""
     if observation not in OBSERVATIONS:
         raise ValueError(

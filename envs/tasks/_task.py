@@ -225,7 +225,7 @@ def route(
     return Waypoints(position, reach * same, tool_down(position), lean * same, angles, *columns)
 
 
-def scatter(key: jax.Array, centre: tuple, spread: tuple) -> jax.Array:
+def scatter(key: jax.Array, centre: tuple[float, ...], spread: tuple[float, ...]) -> jax.Array:
     """Sample a pose [4] on the table, uniform within `spread` [m] of `centre` [m], with yaw 0."""
     shift = jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0) * jnp.array(spread)
     return jnp.concatenate([jnp.array(centre) + shift, jnp.zeros(2)])

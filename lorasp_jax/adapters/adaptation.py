@@ -88,7 +88,7 @@ def adapt(
     return holder[0]
 
 
-def split(model: nnx.Module) -> tuple[nnx.GraphDef, nnx.State, nnx.State]:
+def split(model: nnx.Module) -> tuple[nnx.GraphDef[Any], nnx.State[Any, Any], nnx.State[Any, Any]]:
     """(graphdef, adapters, frozen): the structure, what trains, and everything else.
 
     A step takes its gradient with respect to `adapters` alone. In a model trained as a whole,
@@ -230,7 +230,7 @@ def _check_statistics(statistics: Any) -> None:
             )
 
 
-def _copy(model: nnx.Module) -> nnx.List:
+def _copy(model: nnx.Module) -> nnx.List[Any]:
     """A holder of one copy of the model that shares its arrays, free of what calls need or leave.
 
     The holder gives a model that is itself one layer a parent to be replaced in.
@@ -241,7 +241,7 @@ def _copy(model: nnx.Module) -> nnx.List:
 
 
 def _attach_all(
-    holder: nnx.List,
+    holder: nnx.List[Any],
     rules: paths.Rules,
     key: jax.Array,
     einsums: nnx_layers.Einsums,
@@ -272,7 +272,7 @@ def _attach_all(
     return set(used.values())
 
 
-def free_all(holder: nnx.List, rules: paths.Rules) -> set[int]:
+def free_all(holder: nnx.List[Any], rules: paths.Rules) -> set[int]:
     """Makes base parameters trainable in place; returns the rules that were used."""
     used, freed = set(), []
     for place in paths.places(holder, nnx.Param):
@@ -339,7 +339,7 @@ def over_stack(function: Callable[..., Any], kernel: jax.Array) -> Callable[...,
     return function
 
 
-def _no_match(pattern: str, holder: nnx.List, einsums: nnx_layers.Einsums) -> str:
+def _no_match(pattern: str, holder: nnx.List[Any], einsums: nnx_layers.Einsums) -> str:
     known = [place.path for place in paths.layer_places(holder, einsums)]
     others = paths.other_places(holder, einsums)
     classes = {p.path.rpartition("/")[0]: type(p.parent).__name__ for p in others}

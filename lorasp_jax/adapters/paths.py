@@ -25,7 +25,7 @@ class Place(NamedTuple):
     child: Any
 
 
-def places(holder: nnx.List, kind: type | tuple[type, ...]) -> list[Place]:
+def places(holder: nnx.List[Any], kind: type | tuple[type, ...]) -> list[Place]:
     """All children of a type, with paths that start below the holder."""
 
     def walk() -> Iterator[Place]:
@@ -71,7 +71,7 @@ def _one(place: Place) -> Any:
 
 
 def layer_places(
-    holder: nnx.List, einsums: nnx_layers.Einsums = MappingProxyType({})
+    holder: nnx.List[Any], einsums: nnx_layers.Einsums = MappingProxyType({})
 ) -> list[Place]:
     """All layers that have an adapter or could."""
     return [
@@ -82,7 +82,7 @@ def layer_places(
 
 
 def multiplying(
-    holder: nnx.List, einsums: nnx_layers.Einsums = MappingProxyType({})
+    holder: nnx.List[Any], einsums: nnx_layers.Einsums = MappingProxyType({})
 ) -> list[Place]:
     """The layers that multiply their input by matrices: dense ones and einsums, adapted or not."""
     found = layer_places(holder, einsums)
@@ -134,7 +134,7 @@ def governing(rules: Rules, *paths: str) -> int | None:
 
 
 def other_places(
-    holder: nnx.List, einsums: nnx_layers.Einsums = MappingProxyType({})
+    holder: nnx.List[Any], einsums: nnx_layers.Einsums = MappingProxyType({})
 ) -> list[Place]:
     """Parameters of two axes or more of modules that no adapter applies to; norms' are no matrices,
     though a stack gives them an axis."""

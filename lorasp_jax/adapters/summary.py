@@ -112,7 +112,7 @@ def _align(row: Row, widths: list[int]) -> list[str]:
     return [cell.ljust(w) for cell, w in left] + [cell.rjust(w) for cell, w in right]
 
 
-def collect_aux(model: nnx.Module | Mapping) -> dict[str, Aux]:
+def collect_aux(model: nnx.Module | Mapping[str, Any]) -> dict[str, Aux]:
     """What the drop-in layers of a model kept in the last call, by layer path; taken out of it.
 
     Args:

@@ -109,7 +109,7 @@ class Writer:
 
     def __init__(self, folder: Path) -> None:
         """Begins in a folder that is there."""
-        self.num_steps = 0
+        self.num_steps: int = 0
         self._folder, self._facts = folder, {}
         self._tasks: list[str] = []
         self._instructions: list[str] = []
@@ -210,7 +210,7 @@ class Cache:
         Raises:
             ValueError: it is not there, damaged, or of another format.
         """
-        self.path = Path(path)
+        self.path: Path = Path(path)
         header = self.path / HEADER
         if not header.is_file():
             raise ValueError(f"{path} is not a cache: there is no {HEADER} in it")
@@ -228,7 +228,7 @@ class Cache:
             self.cameras: dict[str, list[int]] = self.facts["cameras"]
             self.control_dt: float = self.facts["control_dt"]
             self.num_steps: int = self.facts["steps"]
-            self.instructions = tuple(self.facts["instructions"])
+            self.instructions: tuple[str, ...] = tuple(self.facts["instructions"])
             width = self.facts["numbers"]
             if not (0 < self.control_dt < math.inf and width > 0):
                 raise ValueError(f"control_dt is {self.control_dt} and numbers {width}")
@@ -258,7 +258,7 @@ class Cache:
             for name in ("state", "action"):
                 if not np.isfinite(self._columns[name]).all():
                     raise ValueError(f"{name} holds numbers that are not finite")
-        self.statistics = self._statistics()
+        self.statistics: Statistics | None = self._statistics()
 
     def __len__(self) -> int:
         """Number of episodes."""

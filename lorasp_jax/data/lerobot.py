@@ -20,7 +20,7 @@ import pyarrow.compute as pc
 from envs.datasets.episodes import Episodes
 from envs.datasets.files import check_memory, regular, whole
 from lorasp_jax.data.keys import Keys
-from lorasp_jax.data.lerobot_files import Recording, damage, read_index, read_table
+from lorasp_jax.data.lerobot_files import Index, Recording, damage, read_index, read_table
 from lorasp_jax.data.video import Film, decoded
 from lorasp_jax.storage import hub
 
@@ -58,14 +58,15 @@ class LeRobot:
         Raises:
             ValueError: it is not there, damaged, or lacks a feature that the keys name.
         """
-        self.path = hub.local(where, repository="dataset")
-        self.index, self.keys = read_index(self.path), keys or Keys()
-        self.kind = f"LeRobot {self.index.version}"
-        self.name = name or Path(where).name
-        self.cameras = self._cameras()
-        self.control_dt = self.keys.every / self.index.fps
+        self.path: Path = hub.local(where, repository="dataset")
+        self.index: Index = read_index(self.path)
+        self.keys: Keys = keys or Keys()
+        self.kind: str = f"LeRobot {self.index.version}"
+        self.name: str = name or Path(where).name
+        self.cameras: dict[str, str] = self._cameras()
+        self.control_dt: float = self.keys.every / self.index.fps
         self._columns = {"state": self._chosen("state"), "action": self._chosen("action")}
-        self.names = {
+        self.names: dict[str, list[str]] = {
             kind: [self._names(kind)[column] for column in columns]
             for kind, columns in self._columns.items()
         }

@@ -29,8 +29,11 @@ class Pictures:
             raise ValueError(f"{path} has {len(array)} pictures and {len(checksums)} checksums")
         self._path, self._array, self._checksums = path, array, checksums
         self._seen = np.zeros(len(array), bool)
-        self.shape, self.dtype = array.shape, array.dtype
-        self.ndim, self.size, self.nbytes = array.ndim, array.size, array.nbytes
+        self.shape: tuple[int, ...] = array.shape
+        self.dtype: np.dtype[Any] = array.dtype
+        self.ndim: int = array.ndim
+        self.size: int = array.size
+        self.nbytes: int = array.nbytes
 
     def __len__(self) -> int:
         """N."""

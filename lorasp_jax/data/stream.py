@@ -52,7 +52,7 @@ class Stream:
                 f"batch_size must be a multiple of the {count} processes, chunk at least 1 and "
                 f"start at least 0; got {batch_size}, {chunk} and {start}"
             )
-        self.position = start
+        self.position: int = start
 
         share = batch_size // count
         rows = slice(index * share, (index + 1) * share)

@@ -9,7 +9,7 @@ import contextlib
 import dataclasses
 import difflib
 from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, ClassVar, Protocol, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,16 @@ from lorasp_jax.peft import _fields
 from lorasp_jax.peft._aux import Aux
 
 Params: TypeAlias = Any
-Kernel: TypeAlias = jax.Array | jax.ShapeDtypeStruct
+
+
+class Shaped(Protocol):
+    """What a jax.ShapeDtypeStruct has, whose own types JAX leaves open."""
+
+    shape: Any
+    dtype: Any
+
+
+Kernel: TypeAlias = jax.Array | Shaped
 
 LARGEST_SIZE = 2**20
 """Of a rank, a width and the like: what is larger is a mistake, and would ask for all memory."""

@@ -90,6 +90,6 @@ def column_factor(magnitude: jax.Array, adapted: jax.Array) -> jax.Array:
     return (magnitude + empty) / (norm + empty)
 
 
-def norms(kernel: jax.Array) -> jax.Array:
+def norms(kernel: Any) -> jax.Array:
     """L2 norms over the input dimension of a kernel [I, O], f32 [O]."""
     return jnp.linalg.norm(kernel.astype(jnp.float32), axis=0)

@@ -72,7 +72,7 @@ class TokenizersFile:
                 f"{file} has no token to pad with, which is {' or '.join(PAD_TOKENS)}."
             )
         self._pad = found[0]
-        self.vocabulary = 1 + max(self._model.get_vocab().values())
+        self.vocabulary: int = 1 + max(self._model.get_vocab().values())
         """Number of tokens, those included that the file leaves out."""
         if self.vocabulary > np.iinfo(np.int32).max:
             raise ValueError(f"{file} has a token of number {self.vocabulary - 1}.")

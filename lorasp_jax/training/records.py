@@ -4,16 +4,18 @@ A digest says that a file is as it was written, not that this version wrote it.
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeAlias
 
 LARGEST = 1e38
 """No number of a run is larger: they are sums and means of fp32."""
 _NAMES: dict[Any, str] = {str: "a text", int: "a whole number", float: "a number", bool: "a flag"}
 
-TIMES = {str: float}
-RATE = {"success": float, "episodes": int, "ci95": (float, float)}
-BEFORE = {str: RATE}
-RESULTS = {
+Kind: TypeAlias = dict[Any, Any]
+"""What a JSON object must hold, see `check`."""
+TIMES: Kind = {str: float}
+RATE: Kind = {"success": float, "episodes": int, "ci95": (float, float)}
+BEFORE: Kind = {str: RATE}
+RESULTS: Kind = {
     "seconds": TIMES,
     "tasks": {str: {"before": RATE, "after": RATE}},
     "active_rank": {str: float},
@@ -22,10 +24,10 @@ RESULTS = {
     "trainable_parameters": int,
     "total_parameters": int,
 }
-ROW = {"step": float, str: float}
-DATASET = {"facts": {}, "streams": bool}
-STOPPED = {"reason": str}
-CONFIG = {
+ROW: Kind = {"step": float, str: float}
+DATASET: Kind = {"facts": {}, "streams": bool}
+STOPPED: Kind = {"reason": str}
+CONFIG: Kind = {
     "name": str,
     "scale": str,
     "robot": str,
@@ -33,7 +35,7 @@ CONFIG = {
     "model": {"backbone": str, "size": str},
     "optim": {"steps": int},
 }
-WITH_RANK = CONFIG | {"peft": {"method": str, "rank": int}}
+WITH_RANK: Kind = CONFIG | {"peft": {"method": str, "rank": int}}
 
 
 def check(value: Any, kind: Any, name: str = "") -> None:

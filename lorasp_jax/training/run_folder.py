@@ -185,7 +185,8 @@ class MetricsLog:
 
     def __init__(self, folder: Path, start_step: int = 0) -> None:
         """Open the log of the run in `folder`, which continues at `start_step`."""
-        self.path, self._writes = folder / "metrics.jsonl", processes.is_first()
+        self.path: Path = folder / "metrics.jsonl"
+        self._writes = processes.is_first()
         if not self._writes:
             return
         kept = [row for row in read_metrics(folder) if row["step"] <= start_step]

@@ -34,10 +34,11 @@ class Stepper:
 
     def __init__(self, jitted: Callable, frozen: Any, data: Steps | Raw, speed: Speed) -> None:
         """Take what `loop.jit_steps` gives, the frozen parameters and the data on the device."""
-        self._jitted, self._frozen, self._data, self.speed = jitted, frozen, data, speed
-        self._compiled: dict[int, Future] = {}
+        self._jitted, self._frozen, self._data = jitted, frozen, data
+        self.speed: Speed = speed
+        self._compiled: dict[int, Future[Any]] = {}
 
-    def compile(self, state: TrainState, count: int) -> Future:
+    def compile(self, state: TrainState, count: int) -> Future[Any]:
         """Begin to compile `count` steps in a thread, unless that was begun before."""
         if count not in self._compiled:
             self._compiled[count] = _in_thread(self._compile, state, count)
@@ -64,7 +65,7 @@ class StreamingStepper(Stepper):
         super().__init__(jitted, frozen, next(batches), speed)
         self._batches = batches
 
-    def compile(self, state: TrainState, count: int) -> Future:  # noqa: ARG002
+    def compile(self, state: TrainState, count: int) -> Future[Any]:  # noqa: ARG002
         """Begin to compile a single step: each has a batch of its own."""
         return super().compile(state, 1)
 
@@ -166,7 +167,7 @@ def make_stepper(
     return Stepper(jitted, frozen, generation(0), speed)
 
 
-def _in_thread(function: Callable, *arguments: Any) -> Future:
+def _in_thread(function: Callable, *arguments: Any) -> Future[Any]:
     """The result to come of a call in a thread of its own."""
     pool = ThreadPoolExecutor(1)
     future = pool.submit(function, *arguments)

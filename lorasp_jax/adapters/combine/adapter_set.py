@@ -10,7 +10,7 @@ side; other methods are computed one after the other, also where their weight is
 
 import dataclasses
 import itertools
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -20,11 +20,11 @@ from lorasp_jax.peft import Aux, LoRA, Method
 from lorasp_jax.peft._method import Params
 
 
-class AdapterChoice(nnx.Variable):
+class AdapterChoice(nnx.Variable[Any]):
     """The weights of a layer's adapters, f32 [..., A] or, for each example, [..., B, A]."""
 
 
-class SetParam(nnx.Param):
+class SetParam(nnx.Param[Any]):
     """The parameters of a layer's adapters. They are frozen: adapters train before or after."""
 
 
@@ -38,7 +38,8 @@ class NamedAdapters(nnx.Module):
 
     def __init__(self, params: Params, choice: jax.Array) -> None:
         """Wraps the arrays."""
-        self.choice, self.params = AdapterChoice(choice), SetParam(params)
+        self.choice: AdapterChoice = AdapterChoice(choice)
+        self.params: SetParam = SetParam(params)
 
     def get_value(self) -> Params:
         """The parameters of the `AdapterSet`."""

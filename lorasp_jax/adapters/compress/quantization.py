@@ -13,7 +13,7 @@ Adapters that take a part of a kernel (PiSSA, OLoRA) come first, and what they l
 
 import re
 from collections.abc import Sequence
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ from lorasp_jax.peft._fields import short
 
 # By identity of a variable, equation and kind: what replaces it, the variable itself, which so
 # stays alive, and the error.
-Shared: TypeAlias = dict[tuple[int, str, Kind], tuple[nnx.Param, nnx.Param, float]]
+Shared: TypeAlias = dict[tuple[int, str, Kind], tuple[nnx.Param[Any], nnx.Param[Any], float]]
 
 
 class Quantized(NamedTuple):

@@ -63,7 +63,7 @@ def distinct(names: Names) -> Names:
 
 
 def load_peft(
-    folder: str | os.PathLike,
+    folder: str | os.PathLike[str],
     model: adaptation.Model,
     *,
     names: Names = dotted,
@@ -108,7 +108,7 @@ def load_peft(
 
 
 def matched(
-    folder: str | os.PathLike,
+    folder: str | os.PathLike[str],
     shapes: Mapping[str, Sequence[int]],
     sizes: Mapping[str, Sequence[int]],
     names: Names,
@@ -151,7 +151,7 @@ def matched(
     return [*free, *rules], values, whole
 
 
-def _at_hand(folder: str | os.PathLike) -> pathlib.Path:
+def _at_hand(folder: str | os.PathLike[str]) -> pathlib.Path:
     """The folder on this machine; only what begins with hf:// is asked of the hub."""
     if not isinstance(folder, str) or "://" not in folder:
         return given.folder(folder)
@@ -161,7 +161,11 @@ def _at_hand(folder: str | os.PathLike) -> pathlib.Path:
 
 
 def save_peft(
-    folder: str | os.PathLike, model: nnx.Module, *, names: Names = dotted, base: str | None = None
+    folder: str | os.PathLike[str],
+    model: nnx.Module,
+    *,
+    names: Names = dotted,
+    base: str | None = None,
 ) -> None:
     """Writes the adapters of a model as a folder of Hugging Face PEFT.
 

@@ -16,7 +16,7 @@ from lorasp_jax.adapters.linen import ADAPTER, LinenAdapter
 
 
 def load_peft_linen(
-    folder: str | os.PathLike,
+    folder: str | os.PathLike[str],
     model: nn.Module,
     variables: Mapping[str, Any],
     *args: Any,

@@ -32,12 +32,18 @@ from lorasp_jax.storage import digest
 
 TENSORS, DESCRIPTION = "adapter.safetensors", "adapter.json"
 FORMAT, VERSION = "lorasp_jax adapter", 2
-FIELDS = {"base": str, "weights": dict, "sha256": str, "methods": dict, "metadata": dict}
+FIELDS: dict[str, type] = {
+    "base": str,
+    "weights": dict,
+    "sha256": str,
+    "methods": dict,
+    "metadata": dict,
+}
 Settings = dict[str, Any]
 
 
 def save_adapters(
-    folder: str | os.PathLike,
+    folder: str | os.PathLike[str],
     model: nnx.Module,
     *,
     base: str = "",
@@ -79,7 +85,7 @@ def save_adapters(
 
 
 def load_adapters(
-    folder: str | os.PathLike,
+    folder: str | os.PathLike[str],
     model: adaptation.Model,
     *,
     base: str | None = None,

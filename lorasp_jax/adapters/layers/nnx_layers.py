@@ -313,7 +313,7 @@ def matrices_shape(layer: Any, einsums: Einsums) -> tuple[int, ...]:
     return jax.eval_shape(lambda kernel: einsum.to_matrices(equation, kernel), shaped).shape
 
 
-def kernel_of(layer: Any) -> nnx.Param:
+def kernel_of(layer: Any) -> nnx.Param[Any]:
     """The kernel of a layer of a known kind, adapted or not."""
     name = "embedding" if isinstance(layer, nnx.Embed) else "kernel"
     return getattr(layer, getattr(layer, "kernel_name", name))

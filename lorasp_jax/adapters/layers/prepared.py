@@ -92,7 +92,7 @@ class Apart:
     """[O] of each layer."""
 
 
-class Ready(nnx.Variable):
+class Ready(nnx.Variable[Any]):
     """`Joined` or `Apart`."""
 
 

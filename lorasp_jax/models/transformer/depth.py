@@ -143,7 +143,7 @@ def _parts_of(trained: Any, frozen: Any) -> list[_Part]:
     return [_Part(trained, frozen, np.int32(i), own) for i, own in enumerate(gradients)]
 
 
-def unstacked(blocks: nnx.Module) -> nnx.List:
+def unstacked(blocks: nnx.Module) -> nnx.List[Any]:
     """Stacked blocks one by one: a loop around them then slices no weights."""
     graphdef, state = nnx.split(blocks)
     return nnx.List([nnx.merge(graphdef, layer) for layer in _layers_of(state)])

@@ -40,9 +40,11 @@ class Peers:
         Raises:
             ValueError: the address cannot be reached.
         """
-        self.number, self._address, self._say, self._advice = number, address, say, advice
+        self.number: int = number
+        self._address, self._say, self._advice = address, say, advice
         self._answers: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-        self.last_words, self._code = "", None
+        self.last_words: str = ""
+        self._code = None
         self._socket, self._lines = _connected(address, number, say)
         self._send({"process": number, "of": count, "host": platform.node()})
         self._listening = threading.Thread(target=self._listen, daemon=True)
