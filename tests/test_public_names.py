@@ -37,7 +37,7 @@ PUBLIC = {
 SHOWN = {
     "lorasp_jax.dense": "AdapterParam Dense LinenDense dense",
     "lorasp_jax.models.pi0": "Pi0Config",
-    "lorasp_jax.models.published": "load",
+    "lorasp_jax.models.published": "load_published",
     "lorasp_jax.models.smolvla": "SmolVLAConfig",
     "lorasp_jax.config": "Config DataConfig EvaluationConfig ModelConfig OptimConfig",
     "envs": "compilation interop mjcf robots",
