@@ -22,7 +22,15 @@ from lorasp_jax.adapters.io.hugging_face import load_peft, save_peft
 from lorasp_jax.adapters.io.native import load_adapters, save_adapters
 from lorasp_jax.adapters.linen import LinenAdapter
 from lorasp_jax.adapters.summary import collect_aux, summary
-from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA, LoRAMoE, LoRASP
+from lorasp_jax.peft import (
+    AdaLoRA,
+    DoRA,
+    FullFineTuning,
+    LoRA,
+    LoRAMoE,
+    LoRASP,
+    LoRASPRelease,
+)
 from lorasp_jax.peft._aux import auxiliary_losses
 
 __version__ = "0.1.0"
@@ -35,6 +43,7 @@ __all__ = [
     "LoRA",
     "LoRAMoE",
     "LoRASP",
+    "LoRASPRelease",
     "adapt",
     "auxiliary_losses",
     "choose",

@@ -14,7 +14,6 @@ ROOMS = [
     "lorasp_jax.storage",
     "lorasp_jax.kernels",
     "lorasp_jax.peft",
-    "lorasp_jax.given",
     "lorasp_jax.dense",
     "lorasp_jax.adapters",
     "lorasp_jax.config",

@@ -200,10 +200,10 @@ def refuses(call, message):
         (lambda: dense(X, KERNEL, 5), "a bias must be an array [4], got 5"),
         (lambda: dense(X, KERNEL, None, {}), "an adapter's parameters come with their method"),
         (lambda: dense(X, KERNEL, None, None, METHOD), "and it with them"),
-        (lambda: dense(X, KERNEL, None, {"a": 1}, METHOD), "needs ['lora_a'] [5, 2], got None"),
+        (lambda: dense(X, KERNEL, None, {"a": 1}, METHOD), "needs lora_a [5, 2], got None"),
         (
             lambda: dense(X, KERNEL, None, METHOD.init(KEY, jnp.ones((3, 4)))[0], METHOD),
-            "lora of a kernel [5, 4] needs ['lora_a'] [5, 2], got (3, 2)",
+            "lora of a kernel [5, 4] needs lora_a [5, 2], got (3, 2)",
         ),
         (lambda: dense(X, KERNEL, token_mask=[True, True]), "must be bool [2], got list [2]"),
         *[
@@ -265,7 +265,7 @@ def test_variables_of_linen(variables):
 def test_adapters_of_another_width_in_linen():
     variables = LINEN.init(KEY, X)
     narrow = jax.tree.map(lambda a: a[:1], variables["adapters"])
-    refuses(lambda: LINEN.apply(variables | {"adapters": narrow}, X), "needs ['lora_a'] [5, 2]")
+    refuses(lambda: LINEN.apply(variables | {"adapters": narrow}, X), "needs lora_a [5, 2]")
 
 
 SHAPES = "holds shapes without values"

@@ -14,13 +14,14 @@ from lorasp_jax import peft
 
 PUBLIC = {
     "lorasp_jax": """
-        AdaLoRA DoRA FullFineTuning LinenAdapter LoRA LoRAMoE LoRASP adapt auxiliary_losses choose
-        collect_aux combine count dense distill extract fuse hugging_face input_moments
-        load_adapters load_peft merge named peft penalties prune quantize save_adapters save_peft
-        split summary swap unmerge with_dropout
+        AdaLoRA DoRA FullFineTuning LinenAdapter LoRA LoRAMoE LoRASP LoRASPRelease adapt
+        auxiliary_losses choose collect_aux combine count dense distill extract fuse
+        hugging_face input_moments load_adapters load_peft merge named peft penalties prune
+        quantize save_adapters save_peft split summary swap unmerge with_dropout
     """,
     "lorasp_jax.peft": """
-        AdaLoRA Aux DoRA FullFineTuning LoRA LoRAMoE LoRASP Method create find names
+        AdaLoRA Aux DoRA EnergySchedule FullFineTuning LoRA LoRAMoE LoRASP LoRASPRelease Method
+        create find from_settings names to_settings
     """,
     "lorasp_jax.models": """
         Observation load load_config pi0 published save set_arrays smolvla weights_hash

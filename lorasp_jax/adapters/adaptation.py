@@ -25,12 +25,11 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax import given
 from lorasp_jax.adapters import paths
 from lorasp_jax.adapters.layers import nnx_layers
-from lorasp_jax.dense import AdaptedLayer, AdapterAux, AdapterParam, DropoutKey
+from lorasp_jax.dense import AdaptedLayer, AdapterAux, AdapterParam, DropoutKey, given
 from lorasp_jax.kernels.quantized_kernel import QuantizedKernel
-from lorasp_jax.peft import FullFineTuning, Method, _fields
+from lorasp_jax.peft import FullFineTuning, Method, _arguments
 from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import Params, drop_rate
 
@@ -116,7 +115,7 @@ def with_dropout(model: Model, key: jax.Array) -> Model:
       model: left untouched; without such adapters the result computes the same.
       key: typed random key.
     """
-    holder, key = _copy(model), _fields.key(key)
+    holder, key = _copy(model), _arguments.key(key)
     for place in paths.once(paths.places(holder, AdaptedLayer)):
         layer = place.child
         if isinstance(layer.adapter, AdapterParam) and drop_rate(layer.method):

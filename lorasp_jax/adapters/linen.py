@@ -21,15 +21,15 @@ import jax
 import jax.numpy as jnp
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from lorasp_jax import _compat, given
+from lorasp_jax import _compat
 from lorasp_jax.adapters.adaptation import init_stack, over_stack
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.adapters.layers.einsum import to_matrices
 from lorasp_jax.adapters.layers.linen_layers import kind, layer_map, with_lora
 from lorasp_jax.adapters.layers.nnx_layers import Einsums
 from lorasp_jax.adapters.paths import Rules, check_method_rules, governing, no_match
-from lorasp_jax.dense import KEPT
-from lorasp_jax.peft import Method, _fields
+from lorasp_jax.dense import KEPT, given
+from lorasp_jax.peft import Method, _arguments
 from lorasp_jax.peft._method import drop_rate
 
 ADAPTER = "lorasp_adapter"  # name of an adapter among its layer's parameters
@@ -306,7 +306,7 @@ def _rngs(key: Any) -> dict[str, jax.Array]:
     rngs = dict(key) if isinstance(key, Mapping) else {"params": key}
     if "params" not in rngs:
         raise ValueError(f'rngs need a key for "params", got {sorted(map(str, rngs))}.')
-    return {name: _fields.key(value) for name, value in rngs.items()}
+    return {name: _arguments.key(value) for name, value in rngs.items()}
 
 
 def _is_ours(module: nn.Module) -> bool:

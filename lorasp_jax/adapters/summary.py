@@ -7,11 +7,10 @@ from typing import Any
 import flax.traverse_util
 from flax import nnx
 
-from lorasp_jax import given
 from lorasp_jax.adapters.adaptation import Counts, count
 from lorasp_jax.adapters.layers.nnx_layers import kernel_of
 from lorasp_jax.adapters.paths import REACHED, layer_places, other_places, places
-from lorasp_jax.dense import KEPT, AdapterAux, AdapterParam
+from lorasp_jax.dense import KEPT, AdapterAux, AdapterParam, given
 from lorasp_jax.peft import Aux
 from lorasp_jax.peft._fields import short
 

@@ -43,6 +43,7 @@ from lorasp_jax.kernels.bisection import (
     block_boundary,
     energies,
 )
+from lorasp_jax.kernels.platform import platform
 from lorasp_jax.kernels.row_sharding import by_rows
 
 Implementation = Literal["pairwise", "sort", "bisection", "block", "pallas"]
@@ -108,7 +109,7 @@ def energy_gate(
 
 def default_implementation(rank: int) -> Implementation:
     """Choose "pallas" on NVIDIA GPUs, "pairwise" for small banks on CPU, else "bisection"."""
-    backend = jax.default_backend()
+    backend = platform()
     if backend == "cpu" and rank <= PAIRWISE_RANK:
         return "pairwise"
     return "pallas" if backend == "gpu" else "bisection"

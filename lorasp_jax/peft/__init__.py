@@ -10,27 +10,33 @@ import pkgutil
 from typing import Any
 
 from lorasp_jax.peft._aux import Aux
-from lorasp_jax.peft._fields import short
+from lorasp_jax.peft._fields import check_names, short
 from lorasp_jax.peft._method import Method
+from lorasp_jax.peft._settings import to_settings, upgraded
 from lorasp_jax.peft.ada_lora import AdaLoRA
 from lorasp_jax.peft.dora import DoRA
 from lorasp_jax.peft.full import FullFineTuning
 from lorasp_jax.peft.lora import LoRA
 from lorasp_jax.peft.lora_moe import LoRAMoE
-from lorasp_jax.peft.lora_sp import LoRASP
+from lorasp_jax.peft.lora_sp import EnergySchedule, LoRASP
+from lorasp_jax.peft.lora_sp_release import LoRASPRelease
 
 __all__ = [
     "AdaLoRA",
     "Aux",
     "DoRA",
+    "EnergySchedule",
     "FullFineTuning",
     "LoRA",
     "LoRAMoE",
     "LoRASP",
+    "LoRASPRelease",
     "Method",
     "create",
     "find",
+    "from_settings",
     "names",
+    "to_settings",
 ]
 
 
@@ -62,3 +68,18 @@ def create(name: str, **fields: Any) -> Method:
       ValueError: unknown method, unknown field or a bad value.
     """
     return find(name)(**fields)
+
+
+def from_settings(settings: Any) -> Method:
+    """The method that `to_settings` wrote, in this version or an earlier one.
+
+    Raises:
+      ValueError: no settings of a method, or as for `create`.
+    """
+    if not isinstance(settings, dict) or not isinstance(settings.get("method"), str):
+        raise ValueError(f"an adapter has settings {short(settings)}, which name no method.")
+    fields = upgraded(settings)
+    if isinstance(schedule := fields.get("schedule"), dict):
+        check_names(EnergySchedule, "schedule", (), schedule)
+        fields["schedule"] = EnergySchedule(**schedule)
+    return create(fields.pop("method"), **fields)

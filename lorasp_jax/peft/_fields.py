@@ -1,14 +1,11 @@
-"""Whether values are of the kinds that the fields of a dataclass, or arguments, must have."""
+"""Whether values are of the kinds that the fields of a dataclass must have."""
 
 import dataclasses
-import functools
+import difflib
 import types
 import typing
+from collections.abc import Iterable, Sequence
 from typing import Any
-
-import jax
-import jax.numpy as jnp
-import numpy as np
 
 LARGEST_REAL = (2 - 2**-23) * 2.0**127
 """Largest number of fp32."""
@@ -42,6 +39,20 @@ def check_fields(owner: Any, prefix: str = "") -> None:
             raise ValueError(f"{prefix}{name} must be at most {most[name]}, got {value}")
 
 
+def check_names(cls: type, name: str, values: Sequence[Any], fields: Iterable[str]) -> None:
+    """Raises a ValueError unless these are values and names for the fields of a class."""
+    valid = [field.name for field in dataclasses.fields(cls)]
+    if len(values) > len(valid):
+        raise ValueError(f"{name} has {len(valid)} fields, not {len(values)}: {', '.join(valid)}.")
+    for field in fields:
+        if field not in valid:
+            close = difflib.get_close_matches(field, valid, n=1, cutoff=0.4)
+            hint = f" (did you mean {close[0]!r}?)" if close else ""
+            raise ValueError(
+                f"{name} has no field {short(field)}{hint}; valid are {', '.join(valid)}."
+            )
+
+
 def whole(name: str, value: Any, most: int = LARGEST) -> int:
     """The value; raises a ValueError for what is no whole number from 1 to `most`."""
     if type(value) is not int or not 1 <= value <= most:
@@ -49,60 +60,15 @@ def whole(name: str, value: Any, most: int = LARGEST) -> int:
     return value
 
 
-def key(value: Any) -> jax.Array:
-    """One key of `jax.random`; raises a ValueError for anything else."""
-    dtype, shape = (value.dtype, value.shape) if _is_array(value) else (None, None)
-    typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key) and shape == ()
-    if not typed and (dtype != jnp.uint32 or shape not in ((2,), (4,))):  # raw, threefry's, rbg's
-        raise ValueError(f"key must be one such as jax.random.key(0), got {short(value)}.")
-    return value
-
-
-def tokens(x: Any, token_mask: Any) -> None:
-    """Raises a ValueError unless x is inexact [...tokens, I] and a mask bool [...tokens]."""
-    if not (_is_array(x) and x.shape and jnp.issubdtype(x.dtype, jnp.inexact)):
-        shown = f"{x.dtype} {list(x.shape)}" if _is_array(x) else type(x).__name__
-        raise ValueError(f"x must be floating-point numbers [...tokens, I], got {shown}.")
-    if token_mask is not None:
-        found = getattr(token_mask, "dtype", type(token_mask).__name__), np.shape(token_mask)
-        if found != (bool, x.shape[:-1]):
-            wanted = f"token_mask must be bool {list(x.shape[:-1])}"
-            raise ValueError(f"{wanted}, got {found[0]} {list(found[1])}.")
-
-
-def check_params(method: Any, found: Any, shape: tuple[int, ...]) -> None:
-    """Raises a ValueError for parameters that a method would not make for a kernel [I, O].
-
-    Some would be taken without an error, and computed with the scale of another rank.
-    """
-    held = _shapes(found)
-    for name, wanted in _made_shapes(method, shape).items():
-        if held.get(name) != wanted:
-            raise ValueError(
-                f"{method.name} of a kernel {list(shape)} needs {name} {list(wanted)}, got "
-                f"{held.get(name)}."
-            )
-
-
 def short(value: Any) -> str:
     """What a message says of a value: it on one line, cut where it is long, as a model may be."""
-    if _is_array(value):
+    if is_array(value):
         return f"{value.dtype} {list(value.shape)}"
     text = " ".join(repr(value).split())
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
 
 
-@functools.lru_cache(maxsize=1024)  # layers of a model are alike, and traced again and again
-def _made_shapes(method: Any, shape: tuple[int, ...]) -> dict[str, tuple[int, ...]]:
-    return _shapes(jax.eval_shape(lambda: method.init_params(jax.random.key(0), *shape)))
-
-
-def _shapes(params: Any) -> dict[str, tuple[int, ...]]:
-    leaves = jax.tree_util.tree_leaves_with_path(params)
-    return {jax.tree_util.keystr(path): jnp.shape(leaf) for path, leaf in leaves}
-
-
-def _is_array(value: Any) -> bool:
+def is_array(value: Any) -> bool:
     """Whether it has a type and a shape; `nnx.Rngs` has an attribute of every name."""
     return hasattr(value, "dtype") and isinstance(getattr(value, "shape", None), tuple)
 

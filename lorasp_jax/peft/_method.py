@@ -5,19 +5,17 @@ parameters, a pytree, and the other methods are pure functions of them. It knows
 shells for NNX and Linen are in `lorasp_jax.dense`.
 """
 
-import contextlib
 import dataclasses
-import difflib
-from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar, Protocol, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import optax
 
-from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul, one_by_one
-from lorasp_jax.peft import _fields
+from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul
+from lorasp_jax.peft import _arguments, _fields
 from lorasp_jax.peft._aux import Aux
+from lorasp_jax.peft._fused import Fused
 
 Params: TypeAlias = Any
 
@@ -38,16 +36,16 @@ LARGEST_ALPHA = 1e30
 
 
 class Method:
-    """Base of all methods. An additive one writes `init_params`, `down`, `between` and `up`:
+    """Base of all methods. An additive one writes `init_params` and four parts of its update:
 
-        delta = z U    with z, aux = between(params, x P)
+        delta = z U,    z, aux = between(middle(params), x P),    P = down(params), U = up(params)
 
     x is [...tokens, I], a kernel [I, O]; the result has the type of x. Parameters are fp32.
     """
 
     def __new__(cls, *values: Any, **fields: Any) -> "Method":
         """Raises a ValueError for a field that there is not, before Python's own TypeError."""
-        check_names(cls, values, fields)
+        _fields.check_names(cls, name_of(cls), values, fields)
         return super().__new__(cls)
 
     def __post_init__(self) -> None:
@@ -79,9 +77,9 @@ class Method:
         return False
 
     @property
-    def gains_together(self) -> bool:
-        """True if `between_all` costs less than `between` of each layer."""
-        return False
+    def plain(self) -> bool:
+        """True if `apply` is x W + z U and nothing else."""
+        return type(self).apply is Method.apply
 
     @property
     def name(self) -> str:
@@ -115,8 +113,8 @@ class Method:
           ValueError: the kernel is not a matrix, or the key is none.
         """
         del statistics
-        check_matrix(kernel)
-        return self.init_params(_fields.key(key), *kernel.shape), kernel
+        _arguments.matrix(kernel)
+        return self.init_params(_arguments.key(key), *kernel.shape), kernel
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
         """Fresh parameters for a kernel [d_in, d_out], a pure function of key and shape."""
@@ -126,13 +124,17 @@ class Method:
         """P [I, Q], the matrix that reads x."""
         raise NotImplementedError
 
+    def middle(self, params: Params) -> Params:
+        """What `between` reads of the parameters; all, unless a method says less."""
+        return params
+
     def between(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
         """What happens between the two matrices, row by row.
 
         Args:
-          params: from `init`.
+          params: from `middle`.
           rows: x P, [...tokens, Q] in the type of x, or in fp32 where `reads_in_fp32`.
           token_mask: as for `delta`.
 
@@ -141,32 +143,9 @@ class Method:
         """
         raise NotImplementedError
 
-    def for_rows(self, params: Params) -> Params:
-        """What `between` takes in place of `params`, for many calls: work on these done once."""
-        return params
-
-    def between_all(
-        self, params: Params, read: jax.Array, columns: range, token_mask: jax.Array | None
-    ) -> tuple[jax.Array, Aux]:
-        """`between` of n layers whose rows lie side by side.
-
-        Args:
-          params: of `for_rows`, [n, ...].
-          read: [...tokens, C], which holds the rows.
-          columns: the first column of each layer's Q.
-          token_mask: as for `delta`.
-
-        Returns:
-          z of all layers side by side [...tokens, n R], and aux [n, ...] without its token_mask.
-        """
-        tokens, (n, width) = read.shape[:-1], (len(columns), columns.step)
-        rows = read[..., columns.start : columns.stop].reshape(*tokens, n, width)
-
-        def one(params: Params, rows: jax.Array) -> tuple[jax.Array, Aux]:
-            return self.between(params, rows, token_mask)
-
-        z, aux = jax.vmap(one, in_axes=(0, -2), out_axes=(-2, 0))(params, rows)
-        return z.reshape(*tokens, -1), aux
+    def fused(self, params: Params) -> Fused | None:
+        """`between` for parameters of these shapes as a GPU kernel, if the method has one here."""
+        del params
 
     def up(self, params: Params) -> jax.Array:
         """U [R, O], the matrix that writes y."""
@@ -186,7 +165,7 @@ class Method:
           ValueError: the method is not additive, x or the mask is no such array, or the parameters
             are another method's.
         """
-        _fields.tokens(x, token_mask)
+        _arguments.tokens(x, token_mask)
         if not self.additive:
             raise ValueError(f"{type(self).__name__} is not additive and has no delta; use apply.")
         z, aux = self.read(params, x, token_mask)
@@ -199,8 +178,9 @@ class Method:
     ) -> tuple[jax.Array, Aux]:
         """z [...tokens, R] in the type of x and aux, from x itself."""
         down = self.down(params).astype(x.dtype)
-        rows = jnp.matmul(x, down, preferred_element_type=self._rows_dtype(x))
-        z, aux = self.between(params, rows, token_mask)
+        rows = jnp.matmul(x, down, preferred_element_type=self.rows_dtype(x))
+        run = self.fused(params) or self
+        z, aux = run.between(self.middle(params), rows, token_mask)
         return z.astype(x.dtype), aux
 
     def apply(
@@ -218,10 +198,11 @@ class Method:
         Raises:
           ValueError: x, the mask or the kernel is no such array, or the parameters are another's.
         """
-        _fields.tokens(x, token_mask)
-        layers = [(self, params, kernel)]
-        with _checked(layers, x):
-            return _apply_fused(layers, x, token_mask)[0]
+        _arguments.tokens(x, token_mask)
+        self.check(params, x, kernel)
+        run, layer = self.fused(params) or self, self.low_rank_layer(params, kernel)
+        ((y, aux),) = low_rank_matmul((run,), self.rows_dtype(x), [layer], x, token_mask)
+        return y, dataclasses.replace(aux, token_mask=token_mask)
 
     def apply_dropped(
         self,
@@ -252,12 +233,34 @@ class Method:
         y, aux = self.apply(params, seen, kernel, token_mask=token_mask)
         return (x - seen) @ kernel + y, aux
 
-    def _rows_dtype(self, x: jax.Array) -> Any:
+    def low_rank_layer(self, params: Params, kernel: jax.Array) -> LowRankLayer:
+        """The arrays of one layer for `low_rank_matmul`."""
+        return LowRankLayer(self.middle(params), kernel, self.down(params), self.up(params))
+
+    def rows_dtype(self, x: jax.Array) -> Any:
+        """The type of x P."""
         return jnp.float32 if self.reads_in_fp32 else x.dtype
+
+    def check(self, params: Params, x: jax.Array, kernel: jax.Array) -> None:
+        """Raises a ValueError unless x, kernel and parameters fit each other."""
+        _arguments.matrix(kernel)
+        if x.shape[-1] != kernel.shape[0]:
+            raise ValueError(f"input of width {x.shape[-1]} meets a kernel {list(kernel.shape)}.")
+        self._check_params(params, kernel.shape)
 
     def _check_params(self, params: Params, shape: tuple[int, ...]) -> None:
         if type(self).init_params is not Method.init_params:
-            _fields.check_params(self, params, shape)
+            _arguments.check_params(self, params, shape)
+
+    def shapes(self, made: _arguments.Shapes, found: _arguments.Shapes) -> _arguments.Shapes:
+        """The shapes that parameters must have.
+
+        Args:
+          made: those that `init_params` makes, by path.
+          found: those of the parameters, which may have been pruned.
+        """
+        del found
+        return made
 
     def penalty(self, params: Params) -> dict[str, jax.Array]:
         """Losses on the parameters alone, by name."""
@@ -280,112 +283,10 @@ class Method:
         raise NotImplementedError
 
 
-def apply_together(
-    layers: Sequence[tuple[Method, Params, jax.Array]],
-    x: jax.Array,
-    *,
-    token_mask: jax.Array | None = None,
-) -> list[tuple[jax.Array, Aux]]:
-    """`apply` of several layers (method, params, kernel) to one input, which is read once.
-
-    Once for all layers whose methods leave `apply` as it is and agree in `reads_in_fp32`; no
-    gradient reaches their kernels.
-    """
-    groups: dict[bool, list[int]] = {}
-    found: dict[int, tuple[jax.Array, Aux]] = {}
-    with _checked(layers, x):
-        for i, (method, params, kernel) in enumerate(layers):
-            if type(method).apply is Method.apply:
-                groups.setdefault(method.reads_in_fp32, []).append(i)
-            else:
-                found[i] = method.apply(params, x, kernel, token_mask=token_mask)
-        for members in groups.values():
-            fused = _apply_fused([layers[i] for i in members], x, token_mask)
-            found |= zip(members, fused, strict=True)
-    return [found[i] for i in range(len(layers))]
-
-
-@contextlib.contextmanager
-def _checked(layers: Sequence[tuple[Method, Params, jax.Array]], x: jax.Array) -> Iterator[None]:
-    """Says what of the layers does not fit: at once, or in place of an error that it led to."""
-    try:
-        for method, params, kernel in layers:
-            method._check_params(params, kernel.shape)
-        yield
-    except (TypeError, LookupError, AttributeError, ValueError):
-        for _, _, kernel in layers:
-            check_matrix(kernel)
-            width, shape = x.shape[-1], kernel.shape
-            if width != shape[0]:
-                raise ValueError(f"input of width {width} meets a kernel {list(shape)}.") from None
-        raise
-
-
-def _apply_fused(
-    layers: Sequence[tuple[Method, Params, jax.Array]], x: jax.Array, token_mask: jax.Array | None
-) -> list[tuple[jax.Array, Aux]]:
-    rows_dtype = layers[0][0]._rows_dtype(x)
-    arrays = [
-        LowRankLayer(params, kernel, method.down(params), method.up(params))
-        for method, params, kernel in layers
-    ]
-    between = _Between(tuple(method for method, _, _ in layers))
-    found: Any = low_rank_matmul(between, rows_dtype, arrays, x, token_mask)
-    return [(y, dataclasses.replace(aux, token_mask=token_mask)) for y, aux in found]
-
-
-@dataclasses.dataclass(frozen=True)
-class _Between:
-    """`between` of all layers, in one call where they have one method that gains by it."""
-
-    methods: tuple[Method, ...]
-
-    def __call__(
-        self,
-        params: Sequence[Params],
-        read: jax.Array,
-        widths: Sequence[int],
-        token_mask: jax.Array | None,
-    ) -> list[tuple[jax.Array, Aux]]:
-        """z and aux of each; arguments as for `low_rank_matmul.InnerFunction`."""
-        first, n = self.methods[0], len(self.methods)
-        if n == 1 or not first.gains_together or any(method != first for method in self.methods):
-            each = one_by_one([method.between for method in self.methods])
-            return each(params, read, widths, token_mask)
-        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(first.for_rows, params))
-        columns = range(0, sum(widths), widths[0])
-        z, aux = first.between_all(stacked, read, columns, token_mask)
-        of_each = [jax.tree.map(lambda a, i=i: a[i], aux) for i in range(n)]
-        return list(zip(jnp.split(z, n, axis=-1), of_each, strict=True))
-
-
 def name_of(cls: type[Method]) -> str:
     """The name of the file that defines a method, or of the folder around its `method.py`."""
     folder, _, file = cls.__module__.rpartition(".")
     return folder.rpartition(".")[2] if file == "method" else file
-
-
-def check_names(cls: type[Method], values: Sequence[Any], fields: Sequence[str] | dict) -> None:
-    """Raises a ValueError unless these are values and names for a method's fields."""
-    valid = [field.name for field in dataclasses.fields(cls)]  # pyright: ignore[reportArgumentType]
-    name = name_of(cls)
-    if len(values) > len(valid):
-        raise ValueError(f"{name} has {len(valid)} fields, not {len(values)}: {', '.join(valid)}.")
-    for field in fields:
-        if field not in valid:
-            close = difflib.get_close_matches(field, valid, n=1, cutoff=0.4)
-            hint = f" (did you mean {close[0]!r}?)" if close else ""
-            raise ValueError(
-                f"{name} has no field {_fields.short(field)}{hint}; valid are {', '.join(valid)}."
-            )
-
-
-def check_matrix(kernel: Kernel) -> None:
-    """Raises a ValueError unless it is one of real numbers, or such a shape."""
-    shape, dtype = getattr(kernel, "shape", ()), getattr(kernel, "dtype", int)
-    if len(shape) != 2 or 0 in shape or not jnp.issubdtype(dtype, jnp.floating):
-        found = f"{dtype} {list(shape)}" if hasattr(kernel, "dtype") else type(kernel).__name__
-        raise ValueError(f"an adapter needs a kernel [I, O] of real numbers, got {found}.")
 
 
 def drop_rate(method: Any) -> float:

@@ -58,7 +58,7 @@ class DoRA(LoRA):
         *,
         token_mask: jax.Array | None = None,
     ) -> tuple[jax.Array, Aux]:
-        """(x W + scale x A B) · m / ‖V‖, [...tokens, O]; no gradient reaches the kernel.
+        """Eq. (5): (x W + scale x A B) · m / ‖V‖, [...tokens, O]; no gradient reaches the kernel.
 
         The factor is applied in fp32: in bf16 it would be off by up to 0.4 % for a whole column.
         """

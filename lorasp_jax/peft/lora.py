@@ -11,8 +11,9 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
+from lorasp_jax.peft import _arguments
 from lorasp_jax.peft._aux import Aux
-from lorasp_jax.peft._method import Kernel, Method, Params, check_matrix, kaiming_uniform
+from lorasp_jax.peft._method import Kernel, Method, Params, kaiming_uniform
 
 _SPLITS = ("pissa", "olora")
 
@@ -80,12 +81,12 @@ class LoRA(Method):
             values or has a side below the rank; or statistics are missing or of another layer.
         """
         if self.needs_statistics:
-            check_matrix(kernel)
+            _arguments.matrix(kernel)
             a = principal_inputs(statistics, kernel.shape[0], self.rank)
             return {"lora_a": a, "lora_b": jnp.zeros((self.rank, kernel.shape[1]))}, kernel
         if not self.splits_kernel:
             return super().init(key, kernel, statistics=statistics)
-        check_matrix(kernel)
+        _arguments.matrix(kernel)
         if isinstance(kernel, jax.ShapeDtypeStruct) or self.rank > min(kernel.shape):
             has = "a shape" if isinstance(kernel, jax.ShapeDtypeStruct) else "a kernel"
             raise ValueError(
@@ -123,7 +124,7 @@ class LoRA(Method):
     def between(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
-        """z = scale x A; every token uses the whole rank."""
+        """Eq. (3) of Hu et al.: z = scale x A; every token uses the whole rank."""
         del params, token_mask
         return self.scale * rows, Aux(jnp.full(rows.shape[:-1], self.rank, jnp.float32))
 

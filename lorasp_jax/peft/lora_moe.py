@@ -79,7 +79,7 @@ class LoRAMoE(Method):
     def between(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
-        """z = scale w(x) x A, each weight over its expert's R columns; the router's losses."""
+        """Eq. (2) of LoRA-SP's paper: z = scale w(x) x A, a weight for each expert's R columns."""
         del params
         projected, logits = jnp.split(rows, [self.experts * self.rank], axis=-1)
         logits = bounded(logits)

@@ -12,13 +12,13 @@ import tyro
 from tyro.constructors import StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
 REGISTRY = tyro.constructors.ConstructorRegistry()
-"""For `tyro.cli`, whose default must be an instance."""
+"""For `tyro.cli`, whose default must be an instance. A field that holds None stays tyro's."""
 
 
 @REGISTRY.struct_rule
 def _fields(info: StructTypeInfo) -> StructConstructorSpec | None:
     """What tyro takes a dataclass for."""
-    if not dataclasses.is_dataclass(info.type):
+    if not dataclasses.is_dataclass(info.type) or not isinstance(info.default, info.type):
         return None
     types = get_type_hints(info.type, include_extras=True)
     fields = (

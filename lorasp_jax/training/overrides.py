@@ -8,6 +8,7 @@ import importlib.util
 import io
 import itertools
 import os
+import typing
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
@@ -193,8 +194,9 @@ def load(path: Path, scale: str) -> Config:
 
 def override(config: Config, arguments: Sequence[str], program: str = "") -> Config:
     """Apply dotted overrides such as `--peft.rank 64 --optim.steps 100`."""
-    _check_names(arguments, config)
     wants_help = bool(HELP & set(arguments))
+    config, arguments = _with_parts(config, arguments, every=wants_help)
+    _check_names(arguments, config)
     printed = io.StringIO()
     quiet = contextlib.nullcontext() if wants_help else contextlib.redirect_stderr(printed)
     try:
@@ -205,6 +207,7 @@ def override(config: Config, arguments: Sequence[str], program: str = "") -> Con
                 args=list(arguments),
                 prog=program,
                 registry=REGISTRY,
+                config=(tyro.conf.AvoidSubcommands,),
             )
     except SystemExit as error:
         if wants_help:
@@ -212,6 +215,30 @@ def override(config: Config, arguments: Sequence[str], program: str = "") -> Con
         raise ValueError(_sentence(printed.getvalue())) from error
     names = (field.name for field in dataclasses.fields(Config))
     return Config(**{name: getattr(chosen, name) for name in names})
+
+
+def _with_parts(
+    config: Config, arguments: Sequence[str], *, every: bool
+) -> tuple[Config, list[str]]:
+    """The config with the optional parts of its method that are named, and the other arguments.
+
+    `--peft.schedule.start 0.5` adds a schedule, `--peft.schedule None` takes it away. `every`: as
+    if all parts were named, to list their options.
+    """
+    method: Any = config.peft
+    rest = [part for a in arguments for part in (a.split("=") if a.endswith("=None") else [a])]
+    parts: dict[str, Any] = {}
+    for name, kind in typing.get_type_hints(type(method)).items():
+        part: Any
+        for part in filter(dataclasses.is_dataclass, typing.get_args(kind)):
+            option, held = f"--peft.{name}", getattr(method, name)
+            if [option, "None"] in map(list, itertools.pairwise(rest)):
+                at = rest.index(option)
+                del rest[at : at + 2]
+                parts[name] = None
+            elif held is None and (every or any(a.startswith(f"{option}.") for a in rest)):
+                parts[name] = part()
+    return dataclasses.replace(config, peft=dataclasses.replace(method, **parts)), rest
 
 
 def _check_names(arguments: Sequence[str], config: Config) -> None:

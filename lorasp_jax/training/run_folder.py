@@ -23,6 +23,7 @@ from envs.datasets.files import check_only_files, damage, read_bytes
 from envs.datasets.locks import acquire
 from envs.datasets.writing import UNFINISHED, write_text
 from lorasp_jax.config import Config
+from lorasp_jax.peft._settings import upgraded
 from lorasp_jax.storage.digest import sealed, unsealed
 from lorasp_jax.training import records
 from lorasp_jax.training.distributed import processes
@@ -161,7 +162,8 @@ def _recorded(folder: Path) -> dict[str, Any]:
     """The config of the run in `folder`."""
     if not (folder / RECORD).exists():
         raise ValueError(f"{folder} holds no run to resume: start it without --resume")
-    return read_json(folder / RECORD, records.CONFIG)
+    found = read_json(folder / RECORD, records.CONFIG)
+    return {**found, "peft": upgraded(found["peft"])}
 
 
 def _differences(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> list[str]:

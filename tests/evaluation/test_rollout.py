@@ -40,7 +40,7 @@ def policy_with(folder, env, targets=CONFIG.targets, **fields):
     ],
 )
 def test_lowers_for(platform, kind, gate, env, tmp_path):
-    policy = _told(policy_with(tmp_path / "run", env, ("q_proj",), gate=gate), env)
+    policy = _told(policy_with(tmp_path / "run", env, ("q_proj",)), env)
     device = jax.sharding.AbstractDevice(device_kind=kind, num_cores=None, platform=platform)
     mesh = jax.sharding.AbstractMesh((), (), abstract_device=device)
     shapes = jax.eval_shape(lambda: (policy, jax.random.key(0)))

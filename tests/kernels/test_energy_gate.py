@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lorasp_jax.kernels import energy_gate as gate
-from lorasp_jax.peft import LoRASP
+from lorasp_jax.peft import EnergySchedule, LoRASP
 from tests import GOLDEN
 
 GOLDEN = GOLDEN / "energy_gate_exact.npz"
@@ -119,9 +119,9 @@ def test_gradients_at_the_limits_of_fp32(eta):
     assert np.isfinite(gradient).all()
 
 
-def test_mask_does_not_depend_on_recomputed_scores():
-    """Unoptimised, XLA computes scores twice, for search and comparison, with other rounding."""
-    method = LoRASP(rank=8, hidden_width=4, energy_start=0.5, energy_target=0.5)
+def test_a_direction_stays_whose_score_is_computed_twice():
+    """Unoptimised, XLA rounds scores for the search in one way, for what follows in another."""
+    method = LoRASP(rank=8, hidden_width=4, energy_target=0.5, schedule=EnergySchedule(0.5))
     params = method.init_params(jax.random.key(0), 6, 5)
     params["router"]["w2"] = jax.random.normal(jax.random.key(1), (4, 8))
     x = jax.random.normal(jax.random.key(2), (3, 40, 6))

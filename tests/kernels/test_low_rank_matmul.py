@@ -1,34 +1,43 @@
 """The frozen-base product equals its formula and never computes a gradient for W."""
 
+import dataclasses
 import math
 import re
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul, one_by_one
+from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul
 
-# Every code path for 10 tokens: output wider than the input, far wider, square, input wider; then
-# with more inputs than tokens.
+# Every way to multiply 10 tokens: wide outputs, far wider ones, square and wide inputs; then the
+# same with more inputs than tokens.
 SHAPES = [(9, 10), (6, 20), (10, 10), (10, 7), (12, 30), (12, 12), (12, 7)]
 READ, RANK = 4, 3
 
 
 @pytest.fixture(autouse=True)
 def full_precision(monkeypatch):
-    """Avoid TF32 on GPU, and take the GPU's code path, which joins matrices, on CPU too."""
+    """A GPU would multiply in TF32, and a CPU joins no matrices."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     with jax.default_matmul_precision("highest"):
         yield
 
 
-def inner(params, rows, token_mask):
-    """A nonlinear f with R < Q, a loss and a statistic."""
+def between(params, rows, token_mask):
+    """Not linear, narrower behind than in front, with a loss and a statistic."""
     rows = rows if token_mask is None else jnp.where(token_mask[..., None], rows, 0)
     z = jnp.tanh(rows[..., :RANK] * params["scale"]) * rows[..., RANK:]
     return z, {"loss": jnp.square(rows).mean(), "statistic": rows.max(-1)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """As the product asks for it."""
+
+    between: Callable = between
 
 
 def inputs(d_in, d_out, dtype=jnp.float32):
@@ -43,11 +52,11 @@ MASK = jnp.arange(10).reshape(2, 5) != 3
 
 def ours(params, x, kernel, down, up, mask=MASK):
     layers = [LowRankLayer(params, kernel, down, up)]
-    return low_rank_matmul(one_by_one([inner]), x.dtype, layers, x, mask)[0]
+    return low_rank_matmul((Method(),), x.dtype, layers, x, mask)[0]
 
 
 def reference(params, x, kernel, down, up, mask=MASK):
-    z, aux = inner(params, x @ down, mask)
+    z, aux = between(params, x @ down, mask)
     return x @ kernel + z @ up, aux
 
 
@@ -74,13 +83,13 @@ def test_equals_the_formula(shape):
 
 @pytest.mark.parametrize("d_outs", [(4, 3), (12, 9), (30, 20, 3)])
 def test_several_layers_of_one_input(d_outs):
-    """Every path to the gradient of x: one product for all, separate ones, through [W; U]."""
+    """Each way to the input's gradient: all in one product, apart, through [W; U]."""
     params, x, *_ = inputs(9, 1)
     layers = [LowRankLayer(params, *inputs(9, d_out)[2:]) for d_out in d_outs]
 
     def together(params, x, layers):
         layers = [layer._replace(params=p) for p, layer in zip(params, layers, strict=True)]
-        return low_rank_matmul(one_by_one([inner] * len(layers)), x.dtype, layers, x, MASK)
+        return low_rank_matmul((Method(),) * len(layers), x.dtype, layers, x, MASK)
 
     def apart(params, x, layers):
         return [reference(p, x, *layer[1:]) for p, layer in zip(params, layers, strict=True)]
@@ -106,16 +115,16 @@ def test_several_layers_of_one_input(d_outs):
 def test_several_layers_read_once():
     params, x, *_ = inputs(9, 1)
     layers = [LowRankLayer(params, *inputs(9, d_out)[2:]) for d_out in (4, 3, 2)]
-    program = jax.make_jaxpr(
-        lambda x: low_rank_matmul(one_by_one([inner] * 3), x.dtype, layers, x, MASK)
-    )(x)
+    program = jax.make_jaxpr(lambda x: low_rank_matmul((Method(),) * 3, x.dtype, layers, x, MASK))(
+        x
+    )
     products = [line for line in str(program).splitlines() if "dot_general" in line]
     assert len(products) == 1 + 3 * 2  # x P; x W and z U of each
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_no_gradient_of_the_kernel(shape):
-    """No product in the gradient's jaxpr has the kernel's shape, so there is no buffer for it."""
+    """Not even a buffer: no product in the gradient's program has the kernel's shape."""
     arguments = inputs(*shape)
 
     def gradient(product):
@@ -132,8 +141,8 @@ def test_no_gradient_of_the_kernel(shape):
     np.testing.assert_array_equal(gradient(ours)(*arguments)[0][0], 0)
 
 
-def test_dtypes():
-    """y in the dtype of x, gradients of fp32 matrices in fp32, rows in `rows_dtype`."""
+def test_types():
+    """y as x; gradients of the fp32 matrices in fp32, rows as asked for."""
     arguments = inputs(6, 10, jnp.bfloat16)
     y, aux = jax.eval_shape(ours, *arguments)
     assert (y.dtype, aux["statistic"].dtype) == (jnp.bfloat16, jnp.bfloat16)
@@ -142,7 +151,7 @@ def test_dtypes():
     assert (of_x.dtype, of_down.dtype, of_up.dtype) == (jnp.bfloat16, jnp.float32, jnp.float32)
     params, x, *matrices = arguments
     layers = [LowRankLayer(params, *matrices)]
-    exact = jax.jit(lambda x: low_rank_matmul(one_by_one([inner]), jnp.float32, layers, x, MASK)[0])
+    exact = jax.jit(lambda x: low_rank_matmul((Method(),), jnp.float32, layers, x, MASK)[0])
     expected = x.astype(jnp.float32) @ matrices[1].astype(jnp.bfloat16).astype(jnp.float32)
     statistic = exact(x)[1]["statistic"]
     assert statistic.dtype == jnp.float32
@@ -156,7 +165,7 @@ def test_vmap():
 
 
 @pytest.mark.parametrize("shape", [(9, 20), (10, 10), (10, 7), (12, 30), (12, 12), (12, 7)])
-def test_kernels_are_joined_for_many_tokens_only(shape):
+def test_kernels_are_copied_for_many_tokens_only(shape):
     params, x, *rest = inputs(*shape)
 
     def gradients(*arrays):
@@ -169,8 +178,9 @@ def test_kernels_are_joined_for_many_tokens_only(shape):
     assert bool(copies) == (shape[0] <= 10)
 
 
-def test_no_joined_kernels_on_cpu(monkeypatch):
+def test_a_cpu_copies_no_kernel(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    jax.clear_caches()  # what was traced for a GPU
     program = str(jax.make_jaxpr(lambda *a: jax.vjp(ours, *a)[0])(*inputs(9, 20)))
     assert "dot_general" in program
     assert not re.search(r"f32\[\d+,20\] = concatenate", program)
@@ -181,14 +191,14 @@ def test_equal_layers_are_traced_once():
 
     def counting(params, rows, token_mask):
         calls.append(rows.shape)
-        return inner(params, rows, token_mask)
+        return between(params, rows, token_mask)
 
-    function, arguments = one_by_one([counting]), inputs(9, 9)
-    params, x, *rest = arguments
+    methods = (Method(counting),)
+    params, x, *rest = inputs(9, 9)
 
     def loss(params, x, several):
         for _ in range(several):
-            ((x, aux),) = low_rank_matmul(function, x.dtype, [LowRankLayer(params, *rest)], x, MASK)
+            ((x, aux),) = low_rank_matmul(methods, x.dtype, [LowRankLayer(params, *rest)], x, MASK)
         return x.sum() + aux["loss"]
 
     traced = []

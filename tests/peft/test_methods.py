@@ -11,7 +11,11 @@ import pytest
 from lorasp_jax import peft
 
 D_IN, D_OUT, RANK = 6, 10, 12  # a rank above both sides
-INPUT_DEPENDENT = (peft.LoRASP, peft.LoRAMoE)  # cannot be merged; every other method must be
+INPUT_DEPENDENT = (
+    peft.LoRASP,
+    peft.LoRASPRelease,
+    peft.LoRAMoE,
+)  # cannot be merged; every other method must be
 SMALL = {
     "rank": RANK,
     "target_rank": 6,

@@ -5,7 +5,16 @@ import jax.numpy as jnp
 import pytest
 
 from lorasp_jax import peft
-from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA, LoRAMoE, LoRASP
+from lorasp_jax.peft import (
+    AdaLoRA,
+    DoRA,
+    EnergySchedule,
+    FullFineTuning,
+    LoRA,
+    LoRAMoE,
+    LoRASP,
+    LoRASPRelease,
+)
 
 I, O = 24, 40
 """d_in, d_out."""
@@ -26,16 +35,14 @@ TABLE = [
     # A bank of R, h hidden units: R (I + O) + h (I + R), and h + R biases.
     (LoRASP(), 128 * (I + O) + 32 * (I + 128) + 32 + 128),
     *(
-        (LoRASP(rank=8, hidden_width=4, score_function=name), 8 * (I + O) + 4 * (I + 8) + 4 + 8)
-        for name in ("softplus", "relu", "softmax")
+        (LoRASP(rank=8, hidden_width=4, router=name), 8 * (I + O) + 4 * (I + 8) + 4 + 8)
+        for name in ("gelu", "gelu_relu", "gelu_softmax")
     ),
-    (LoRASP(rank=8, hidden_width=4, energy_start=0.5), 8 * (I + O) + 4 * (I + 8) + 4 + 8 + 1),
+    (LoRASP(rank=8, hidden_width=4, schedule=EnergySchedule()), 8 * (I + O) + 4 * (I + 8) + 13),
     (LoRASP(rank=8, hidden_width=4, normalized_bank=True), 8 * (I + O) + 4 * (I + 8) + 4 + 8 + 1),
-    # Three directions fewer in the bank; the router still scores eight.
-    (LoRASP(rank=5, hidden_width=4, pruned=3), 5 * (I + O) + 4 * (I + 8) + 4 + 8),
     (LoRASP.paper(), 128 * (I + O) + 4 * (I + 128)),
-    (LoRASP.release(), 128 * (I + O) + 128 * I),
-    (LoRASP.release(projection=True), 128 * (I + O) + 4 * (I + 128)),
+    (LoRASPRelease(), 128 * (I + O) + 128 * I),
+    (LoRASPRelease(hidden_width=4), 128 * (I + O) + 4 * (I + 128)),
     (FullFineTuning(), I * O),
 ]
 
@@ -58,4 +65,4 @@ def test_every_method_and_preset_is_in_the_table():
         for attribute, value in vars(peft.find(name)).items()
         if isinstance(value, classmethod) and not attribute.startswith("_")
     }
-    assert presets == {LoRASP.paper(), LoRASP.release()} <= {method for method, _ in TABLE}
+    assert presets == {LoRASP.paper()} <= {method for method, _ in TABLE}

@@ -7,7 +7,7 @@ import pytest
 
 from lorasp_jax.config import Config
 from lorasp_jax.models.presets import PRESETS
-from lorasp_jax.peft import LoRA, LoRASP
+from lorasp_jax.peft import EnergySchedule, LoRA, LoRASP, LoRASPRelease
 from lorasp_jax.training.overrides import load, override, parse
 
 CONFIG = Config(name="a", scale="cpu", peft=LoRASP(rank=8))
@@ -27,18 +27,26 @@ def test_scale_is_chosen_by_backend_and_can_be_forced():
 
 
 def test_every_variant_of_lora_sp_is_an_option():
-    changes = {
-        "score_function": "relu",
-        "granularity": "sample",
-        "energy_start": 0.5,
-        "energy_curve": "cosine",
-        "energy_share": 0.25,
-    }
-    options = [f"--peft.{name.replace('_', '-')}={value}" for name, value in changes.items()]
-    chosen = override(CONFIG, [*options, "--peft.normalized-bank"]).peft
-    assert chosen == LoRASP(rank=8, normalized_bank=True, **changes)
-    released = override(CONFIG, ["--peft.rule", "release", "--peft.router", "linear"]).peft
-    assert dataclasses.replace(released, hidden_width=8) == LoRASP.release(rank=8)
+    options = ["--peft.router=gelu_relu", "--peft.granularity=sample", "--peft.normalized-bank"]
+    moving = ["--peft.schedule.start=0.5", "--peft.schedule.curve", "cosine"]
+    chosen = override(CONFIG, [*options, *moving, "--peft.schedule.share=0.25"]).peft
+    schedule = EnergySchedule(0.5, "cosine", 0.25)
+    fields = {"router": "gelu_relu", "granularity": "sample", "normalized_bank": True}
+    assert chosen == LoRASP(rank=8, schedule=schedule, **fields)
+
+
+@pytest.mark.parametrize("off", [["--peft.schedule", "None"], ["--peft.schedule=None"]])
+def test_a_schedule_is_changed_and_taken_away(off):
+    moving = dataclasses.replace(CONFIG, peft=LoRASP(rank=8, schedule=EnergySchedule(0.5)))
+    assert override(moving, ["--peft.rank", "4"]).peft.schedule == EnergySchedule(0.5)
+    changed = override(moving, ["--peft.schedule.share", "0.1"]).peft.schedule
+    assert changed == EnergySchedule(0.5, share=0.1)
+    assert override(moving, off).peft == LoRASP(rank=8) == override(CONFIG, off).peft
+
+
+def test_the_releases_rule_is_a_method():
+    config = parse([*MULTITASK, "--method", "lora_sp_release", "--peft.hidden-width", "4"]).config
+    assert config.peft == LoRASPRelease(rank=config.peft.rank, hidden_width=4)
 
 
 def test_method_by_name_keeps_the_rank():
@@ -70,6 +78,8 @@ def test_method_by_name_keeps_the_rank():
         ([*MULTITASK, "--optim.steps", "many"], "--optim.steps.*'many'"),
         ([*MULTITASK, "--peft.energy-target", "1.5"], "^peft: .*1.5"),
         ([*MULTITASK, "--peft.energy-target", "0"], "0"),
+        ([*MULTITASK, "--peft.schedule.start", "2"], r"schedule.start must lie in \(0, 1\], got 2"),
+        ([*MULTITASK, "--peft.schedule.strat", "1"], "did you mean --peft.schedule.start?"),
     ],
 )
 def test_mistakes_are_one_sentence(arguments, message, capsys):
@@ -86,13 +96,18 @@ def test_help_lists_every_field_and_option(config, capsys):
         parse([*config, "--help"])
     assert caught.value.code == 0
     printed = capsys.readouterr().out
-    for name in ("--peft.energy-target", "--optim.learning-rate", "--evaluation.episodes"):
+    for name in (
+        "--peft.energy-target",
+        "--peft.schedule.curve",
+        "--optim.learning-rate",
+        "--evaluation.episodes",
+    ):
         assert name in printed
     for name in ("--config", "--method", "--resume", "--dry-run"):
         assert name in printed
     assert re.search(r"--optim.b2 FLOAT +Decay of the second moment. \(default: 0.95\)", printed)
     words = " ".join(printed.replace("│", " ").split())
-    assert "lora_moe, lora_sp (default: the experiment's, lora_sp)" in words
+    assert "lora_sp, lora_sp_release (default: the experiment's, lora_sp)" in words
     assert printed.count("--scale SCALE") == 1
     assert "--scale STR" not in printed
     assert f"presets ({', '.join(PRESETS)}) and regular expressions" in words

@@ -95,7 +95,9 @@ class AdapterSet(Method):
         z = [first * columns.astype(rows.dtype)]
         rank = jnp.sum((own != 0) * bank["rank"], axis=-1).astype(jnp.float32)
         for (name, method), part in zip(self._adding(), parts, strict=True):
-            more, aux = method.between(params["others"][name], part, token_mask)
+            own_params = params["others"][name]
+            run = method.fused(own_params) or method
+            more, aux = run.between(method.middle(own_params), part, token_mask)
             z.append(weights[name][..., None] * more)
             rank += _counted(weights[name], aux)
         return jnp.concatenate(z, axis=-1), Aux(jnp.broadcast_to(rank, rows.shape[:-1]))

@@ -12,12 +12,11 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax import given
 from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.adapters.adaptation import Model
 from lorasp_jax.adapters.combine import named
 from lorasp_jax.adapters.layers import nnx_layers
-from lorasp_jax.dense import AdaptedLayer, AdapterParam
+from lorasp_jax.dense import AdaptedLayer, AdapterParam, given
 from lorasp_jax.peft import FullFineTuning, LoRA
 from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import Params

@@ -23,7 +23,6 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax import given
 from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.adapters.adaptation import Model
 from lorasp_jax.adapters.combine.adapter_set import (
@@ -36,7 +35,7 @@ from lorasp_jax.adapters.combine.adapter_set import (
 )
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.adapters.paths import Place
-from lorasp_jax.dense import AdaptedLayer, AdapterParam
+from lorasp_jax.dense import AdaptedLayer, AdapterParam, given
 from lorasp_jax.peft import LoRA, Method
 from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import LARGEST_SIZE, Params

@@ -20,10 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax import given
 from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.adapters.layers import nnx_layers
-from lorasp_jax.dense import AdapterAux, AdapterParam
+from lorasp_jax.dense import AdapterAux, AdapterParam, given
 from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import Aux, Method, Params
 

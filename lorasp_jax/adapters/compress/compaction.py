@@ -16,15 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax import given
 from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.adapters.compress import calibration
 from lorasp_jax.adapters.compress.calibration import Forward, Layer, Sums
-from lorasp_jax.dense import AdaptedLayer, AdapterParam
-from lorasp_jax.peft import LoRA, LoRASP, Method
+from lorasp_jax.dense import AdaptedLayer, AdapterParam, given
+from lorasp_jax.peft import LoRA, Method
 from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import Params
-from lorasp_jax.peft.lora_sp.bank import normalized_bank
+from lorasp_jax.peft.lora_sp.bank import BankMethod, normalized_bank
 
 Changed = dict[str, tuple[Method, Params]]
 
@@ -124,7 +123,7 @@ def distill(
 def _lora_sp_layers(model: nnx.Module) -> dict[str, Any]:
     """The layers with a LoRA-SP adapter by path."""
     places = paths.places(nnx.List([given.with_values(model)]), AdaptedLayer)
-    found = {p.path: p.child for p in places if isinstance(p.child.method, LoRASP)}
+    found = {p.path: p.child for p in places if isinstance(p.child.method, BankMethod)}
     if not found:
         raise ValueError("the model has no LoRA-SP layers.")
     return found
@@ -138,28 +137,25 @@ def _usage(layer: Layer) -> Sums:
 def _pruned(layer: Any, used: np.ndarray, rank: int) -> tuple[Method, Params]:
     """The method and parameters with the `rank` most used directions, in their old order."""
     method = layer.method
-    own = np.arange(method.scored) < method.rank  # dropped ones stay dropped
+    own = np.arange(used.shape[-1]) < method.rank  # dropped ones stay dropped
     best = np.argsort(np.where(own, -used, 1), axis=-1, kind="stable")
     order = np.concatenate([np.sort(best[..., :rank]), np.sort(best[..., rank:])], axis=-1)
     params = layer.adapter.get_value()
     reorder = functools.partial(_reordered, method=method, rank=rank)
     each = adaptation.over_stack(reorder, layer.kernel_matrices())
     params = each(params, jnp.asarray(order))
-    smaller = dataclasses.replace(
-        method, rank=rank, pruned=method.scored - rank, alpha=method.scale * rank
-    )
+    smaller = dataclasses.replace(method, rank=rank, alpha=method.scale * rank)
     return smaller, params
 
 
-def _reordered(params: Params, order: jax.Array, *, method: LoRASP, rank: int) -> Params:
+def _reordered(params: Params, order: jax.Array, *, method: BankMethod, rank: int) -> Params:
     """One layer's parameters: the bank's first `rank` directions in a new order, all scores."""
     bank, router = dict(params["bank"]), dict(params["router"])
     if method.normalized_bank:  # what is orthonormal as a whole is so in part
         unit = jnp.asarray(bank["u"].shape[1] ** -0.5)
         bank |= normalized_bank(bank | {"gain": unit})
     bank["u"], bank["v"] = bank["u"][order[:rank]], bank["v"][:, order[:rank]]
-    scored = ("w1",) if method.router == "linear" else ("w2", "b2")
-    router |= {name: router[name][..., order] for name in scored if name in router}
+    router |= {name: router[name][..., order] for name in method.scored_by if name in router}
     return {**params, "bank": bank, "router": router}
 
 

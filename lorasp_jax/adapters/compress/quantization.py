@@ -19,10 +19,9 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax import given
 from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.adapters.layers import nnx_layers
-from lorasp_jax.dense import AdaptedLayer, AdapterParam
+from lorasp_jax.dense import AdaptedLayer, AdapterParam, given
 from lorasp_jax.kernels.quantized_kernel import KINDS, Kind, QuantizedKernel, quantized
 from lorasp_jax.peft._fields import short
 

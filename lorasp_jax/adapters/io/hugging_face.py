@@ -21,13 +21,12 @@ import numpy as np
 import safetensors.numpy
 from flax import nnx
 
-from lorasp_jax import given
 from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.adapters.io.native import write_whole
 from lorasp_jax.adapters.io.peft_folders import CONFIG, PREFIX, TENSORS, Adapter, read
 from lorasp_jax.adapters.io.peft_whole import Names, check_biases, exported_whole, whole_parameters
 from lorasp_jax.adapters.layers import nnx_layers
-from lorasp_jax.dense import AdaptedLayer, AdapterParam
+from lorasp_jax.dense import AdaptedLayer, AdapterParam, given
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA
 from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import drop_rate

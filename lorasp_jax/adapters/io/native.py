@@ -6,7 +6,6 @@ tensors, and its own digest. Tensor names are "/"-joined paths; a stacked layer'
 leading layer axes.
 """
 
-import dataclasses
 import hashlib
 import json
 import os
@@ -22,11 +21,11 @@ import numpy as np
 import safetensors.numpy
 from flax import nnx
 
-from lorasp_jax import given, peft
+from lorasp_jax import peft
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.layers import nnx_layers
-from lorasp_jax.dense import AdapterParam
-from lorasp_jax.peft import Method, _fields
+from lorasp_jax.dense import AdapterParam, given
+from lorasp_jax.peft import Method, to_settings
 from lorasp_jax.peft._fields import short
 from lorasp_jax.storage import digest
 
@@ -39,7 +38,6 @@ FIELDS: dict[str, type] = {
     "methods": dict,
     "metadata": dict,
 }
-Settings = dict[str, Any]
 
 
 def save_adapters(
@@ -75,7 +73,7 @@ def save_adapters(
         "base": base,
         "weights": digest.fingerprints(_frozen_weights(model)),
         "sha256": hashlib.sha256(data).hexdigest(),
-        "methods": {path: _settings(m) for path, m in adaptation.methods(model).items()},
+        "methods": {path: to_settings(m) for path, m in adaptation.methods(model).items()},
         "metadata": _checked_metadata({} if metadata is None else metadata),
     }
     text = json.dumps(digest.sealed(description), indent=2)
@@ -114,8 +112,8 @@ def load_adapters(
         raise ValueError(
             f"{folder} was trained on base {description['base']!r}, not on {short(base)}."
         )
-    wanted = description["methods"]
-    present = {path: _settings(method) for path, method in adaptation.methods(model).items()}
+    wanted = _methods(description["methods"], folder)
+    present = {path: method.as_saved for path, method in adaptation.methods(model).items()}
     if not present:
         model = _adapted(model, wanted, tensors, folder, einsums)
     elif present != wanted:
@@ -124,14 +122,14 @@ def load_adapters(
     if not any_base:
         _check_weights(model, description["weights"], folder)
     graphdef, adapters, frozen = adaptation.split(model)
-    expected = _fitting(adapters, tensors, folder)
+    expected = _fitting(adapters, tensors, adaptation.methods(model), folder)
     values = [jnp.asarray(tensors[name], leaf.dtype) for name, leaf in expected.items()]
     return nnx.merge(graphdef, jax.tree.unflatten(jax.tree.structure(adapters), values), frozen)
 
 
 def _adapted(
     model: adaptation.Model,
-    wanted: Mapping[str, Settings],
+    methods: Mapping[str, Method],
     tensors: Mapping[str, np.ndarray],
     folder: pathlib.Path,
     einsums: nnx_layers.Einsums,
@@ -141,7 +139,6 @@ def _adapted(
     They are made as shapes first: what is asked for may be larger than any memory.
     """
     try:
-        methods = {path: _method(settings) for path, settings in wanted.items()}
         # A parameter trained in full may sit in a layer with an adapter: such rules go first.
         paths = sorted(methods, key=lambda path: not methods[path].trains_base)
         rules = [(f"^{re.escape(path)}$", methods[path]) for path in paths]
@@ -149,7 +146,7 @@ def _adapted(
         adapters = adaptation.split(nnx.eval_shape(adapt))[1]
     except (ValueError, TypeError, OverflowError) as error:
         raise ValueError(f"{folder} does not fit the model: {error}") from error
-    _fitting(adapters, tensors, folder)
+    _fitting(adapters, tensors, methods, folder)
     return adapt()
 
 
@@ -178,15 +175,24 @@ def _check_weights(model: nnx.Module, saved: Mapping[str, str], folder: pathlib.
 
 
 def _fitting(
-    adapters: nnx.State, tensors: Mapping[str, np.ndarray], folder: pathlib.Path
+    adapters: nnx.State,
+    tensors: Mapping[str, np.ndarray],
+    methods: Mapping[str, Method],
+    folder: pathlib.Path,
 ) -> dict[str, Any]:
-    """The leaves of a state by name, of which each has a tensor of its shape."""
+    """The leaves of a state by name, of which each has a tensor that fits its method."""
     expected = _named(adapters)
     if differing := sorted(expected.keys() ^ tensors.keys()):
         raise ValueError(f"{folder} and the model differ in tensors, first {differing[0]!r}.")
-    for name, leaf in expected.items():
-        if tensors[name].shape != leaf.shape:
-            shapes = f"{tensors[name].shape} in {folder}, {leaf.shape} in the model"
+    made, held = ({name: a.shape for name, a in of.items()} for of in (expected, tensors))
+    for path, method in methods.items():
+        begin = f"{path}/adapter/".lstrip("/")
+        own = [name for name in made if name.startswith(begin)]
+        of_made, of_held = ({n.removeprefix(begin): s[n] for n in own} for s in (made, held))
+        made |= {begin + name: shape for name, shape in method.shapes(of_made, of_held).items()}
+    for name, shape in made.items():
+        if held[name] != shape:
+            shapes = f"{held[name]} in {folder}, {shape} in the model"
             raise ValueError(f"tensor {name!r} has shape {shapes}.")
     return expected
 
@@ -197,20 +203,12 @@ def _named(adapters: nnx.State) -> dict[str, jax.Array]:
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
 
 
-def _settings(method: Method) -> Settings:
-    """A method as JSON: its name and the fields that belong to a saved adapter."""
-    method = method.as_saved
-    saved = [f.name for f in dataclasses.fields(method) if f.metadata.get("saved", True)]  # pyright: ignore[reportArgumentType]
-    return {"method": method.name, **{name: getattr(method, name) for name in saved}}
-
-
-def _method(settings: Settings) -> Method:
-    if not isinstance(settings, dict) or not isinstance(settings.get("method"), str):
-        raise ValueError(f"an adapter has settings {short(settings)}, which name no method.")
-    fields = {name: value for name, value in settings.items() if name != "method"}
-    method = peft.create(settings["method"], **fields)
-    _fields.check_fields(method)
-    return method
+def _methods(found: Mapping[str, Any], folder: pathlib.Path) -> dict[str, Method]:
+    """The methods of a description, by path."""
+    try:
+        return {path: peft.from_settings(settings) for path, settings in found.items()}
+    except (ValueError, TypeError, OverflowError) as error:
+        raise ValueError(f"{folder} does not fit the model: {error}") from error
 
 
 def _checked_metadata(metadata: Any) -> dict[str, Any]:

@@ -35,7 +35,8 @@ from flax import nnx
 from lorasp_jax.dense import Dense
 from lorasp_jax.kernels.low_rank_matmul import aligned, two_products
 from lorasp_jax.kernels.quantized_kernel import QuantizedKernel
-from lorasp_jax.peft import Aux, Method
+from lorasp_jax.peft import Aux
+from lorasp_jax.peft._fused import Fused, Mapped
 
 Block = TypeVar("Block", bound="JoinsLayers")
 
@@ -48,7 +49,7 @@ LONG_SUM, SHORTEST_SUM = 2048, 512
 class Chain(NamedTuple):
     """f of n layers."""
 
-    method: Method
+    method: Fused
     width: int
     """Q, the columns of P of one layer."""
     sizes: tuple[int, ...]
@@ -188,7 +189,7 @@ def _call_apart(
     z, aux = _between(apart, read, 0, token_mask)
     ys, zs = [], jnp.split(z, len(apart.write), axis=-1)
     for own, kernel, up, bias in zip(zs, apart.kernels, apart.write, apart.biases, strict=True):
-        y = two_products(x, own, kernel.astype(x.dtype), up)
+        y = two_products(x, own, kernel, up)
         ys.append(y if bias is None else y + bias)
     return ys, aux
 
@@ -237,7 +238,7 @@ def _can_join(layer: Layer) -> TypeGuard[Dense]:
     if type(layer) is not Dense or layer.adapter is None or layer.dtype is None:
         return False
     method, _ = layer.carried()
-    plain = type(method).apply is Method.apply and not method.reads_in_fp32
+    plain = method.plain and not method.reads_in_fp32
     return plain and len(layer.kernel_matrices().shape) == 2  # a quantised one has no ndim
 
 
@@ -258,14 +259,17 @@ def _matrices(
 
 def _chain(layers: Sequence[Dense], downs: Sequence[jax.Array]) -> tuple[Chain, Any]:
     """f, and what it needs, [n, ...]; None where shapes differ."""
-    method, _ = layers[0].carried()
+    carried = [layer.carried() for layer in layers]
+    kernels = {method.fused(params) or Mapped(method) for method, params in carried}
+    between = kernels.pop() if len(kernels) == 1 else Mapped(carried[0][0])
 
     def stacked(*leaves: jax.Array) -> jax.Array | None:
         return jnp.stack(leaves) if len({leaf.shape for leaf in leaves}) == 1 else None
 
-    params = jax.tree.map(stacked, *(method.for_rows(layer.carried()[1]) for layer in layers))
+    packed = (between.pack(method.middle(params)) for method, params in carried)
+    params = jax.tree.map(stacked, *packed)
     sizes = tuple(layer.kernel_matrices().shape[1] for layer in layers)
-    return Chain(method, downs[0].shape[1], sizes), params
+    return Chain(between, downs[0].shape[1], sizes), params
 
 
 def _apart(layers: Sequence[Dense]) -> Apart:

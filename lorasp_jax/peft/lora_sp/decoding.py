@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from lorasp_jax.kernels.energy_gate import energy_gate
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.peft._method import Params
-from lorasp_jax.peft.lora_sp.bank import normalized_bank
-from lorasp_jax.peft.lora_sp.router import router_scores, select
+from lorasp_jax.peft.lora_sp.bank import normalized_bank, select
+from lorasp_jax.peft.lora_sp.router import router_scores
 
 
 class DecodingParams(NamedTuple):
@@ -35,12 +35,11 @@ def prepare(method: LoRASP, params: Params, dtype: jax.typing.DTypeLike) -> Deco
     """The parameters of one layer for `decode`, bank and W1 in the type of the computation.
 
     Raises:
-      ValueError: a method whose masks depend on more than the token, or of the release's rule.
+      ValueError: a method whose masks depend on more than the token.
     """
-    if (method.rule, method.granularity, method.energy_start) != ("paper", "token", None):
+    if (method.granularity, method.schedule) != ("token", None):
         raise ValueError(
-            "decoding by token needs rule 'paper', granularity 'token' and a constant "
-            f"energy_target, got {method}."
+            f"decoding by token needs granularity 'token' and no schedule, got {method}."
         )
     bank = normalized_bank(params["bank"]) if method.normalized_bank else params["bank"]
     router = dict(params["router"])
@@ -71,8 +70,8 @@ def decode(
             f"decode takes one token [I] and a capacity of 1 to {method.rank}, got "
             f"{list(x.shape)} and {capacity}."
         )
-    scores, _ = router_scores(params.router, x @ params.w1, method.score_function)
-    mask, _, energy = energy_gate(scores, method.energy_target, implementation=method.gate)
+    scores, _ = router_scores(params.router, x @ params.w1, method.router)
+    mask, _, energy = energy_gate(scores, method.energy_target)
     mask, scores = mask[: method.rank], scores[: method.rank]
     largest, index = jax.lax.top_k(jnp.where(mask, scores, 0), capacity)
     z = select(params.v[index] @ x, method.scale * largest, largest > 0, energy)

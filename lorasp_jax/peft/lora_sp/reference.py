@@ -55,7 +55,7 @@ def losses(scores: Any, logits: Any, mask: Any, kept_energy: Any) -> dict[str, j
 def lora_sp(
     params: Any, x: jax.Array, kernel: jax.Array, energy_target: float = 0.9, scale: float = 2.0
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """The adapted layer: y [T, O] for x [T, I] and W [I, O], and the losses of eq. (14)."""
+    """Eqs. (9)-(14): y [T, O] for x [T, I] and W [I, O], and the losses of eq. (14)."""
     scores, logits = router_scores(params["router"], x)
     mask, kept_energy = energy_gate(scores, energy_target)
     y = x @ jax.lax.stop_gradient(kernel) + scale * update(params["bank"], x, mask * scores)

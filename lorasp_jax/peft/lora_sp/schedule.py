@@ -5,6 +5,7 @@ it reaches a layer inside any model, scanned, rematerialised or sharded, is save
 it, and changes nothing that is compiled. The optimizer moves it (`scheduling`), never the gradient.
 """
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
@@ -17,26 +18,42 @@ from lorasp_jax.kernels.bisection import Ratio, bisected_mask
 from lorasp_jax.kernels.energy_gate import SMALLEST_TARGET, positive
 from lorasp_jax.peft import _fields
 
-Curve = Literal["linear", "cosine"]
 PROGRESS = "progress"
 
 
-def scheduled_target(
-    progress: jax.Array, start: float, end: float, share: float, curve: Curve
-) -> jax.Array:
-    """η, f32 [], that goes from `start` to `end` over the first `share` of the training.
+@dataclasses.dataclass(frozen=True)
+class EnergySchedule:
+    """How η goes from a start to its target.
 
-    Args:
-      progress: f32 [], share of the training that is done.
-      start: η at the first step.
-      end: η once `share` of the training is done.
-      share: in (0, 1].
-      curve: "linear", or "cosine", half a period of it, flat at both ends.
+    Raises:
+      ValueError: a start or a share outside (0, 1], or an unknown curve.
     """
-    done = jnp.clip(jax.lax.stop_gradient(progress) / share, 0, 1)
-    if curve == "cosine":
-        done = (1 - jnp.cos(math.pi * done)) / 2
-    return start + (end - start) * done
+
+    start: float = 1.0
+    """η at the first step; at 1 nothing is pruned."""
+    curve: Literal["linear", "cosine"] = "linear"
+    """"cosine": half a period of it, flat at both ends."""
+    share: float = 0.5
+    """Share of the steps in which it gets there."""
+
+    def __post_init__(self) -> None:
+        """Checks the fields."""
+        _fields.check_fields(self, "schedule.")
+        for name in ("start", "share"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ValueError(f"schedule.{name} must lie in (0, 1], got {getattr(self, name)}.")
+
+    def target(self, progress: jax.Array, end: float) -> jax.Array:
+        """η, f32 [].
+
+        Args:
+          progress: f32 [], share of the training that is done.
+          end: η once `share` of the training is done.
+        """
+        done = jnp.clip(jax.lax.stop_gradient(progress) / self.share, 0, 1)
+        if self.curve == "cosine":
+            done = (1 - jnp.cos(math.pi * done)) / 2
+        return self.start + (end - self.start) * done
 
 
 def gate_at(scores: jax.Array, target: jax.Array) -> jax.Array:

@@ -65,7 +65,6 @@ def test_what_the_file_says(saved):
     assert (description["base"], description["metadata"]) == ("abc", {"step": 3})
     assert description["methods"]["blocks"]["method"] == "lora_sp"
     assert description["methods"]["blocks"]["energy_target"] == 0.8
-    assert "gate" not in description["methods"]["blocks"]
     assert {path.name for path in saved.iterdir()} == {"adapter.json", "adapter.safetensors"}
 
 
@@ -114,7 +113,7 @@ def test_models_that_do_not_fit(saved):
         load_adapters(saved, other)
 
 
-@pytest.mark.parametrize("field", ["rank", "hidden_width", "pruned"])
+@pytest.mark.parametrize("field", ["rank", "hidden_width"])
 @pytest.mark.parametrize("size", [10**12, 10**30])
 def test_sizes_beyond_any_memory(saved, field, size):
     """Are compared with the tensors before anything is made."""

@@ -14,11 +14,10 @@ from lorasp_jax.dense import Dense
 from lorasp_jax.models import pi0, smolvla
 from lorasp_jax.models.sampling import Sampler
 from lorasp_jax.models.transformer.layers import together
-from lorasp_jax.peft import LoRASP
-from lorasp_jax.peft.lora_sp import method as lora_sp
 from tests.cases import mostly_slow
 from tests.models.drawn import drawn, observation
 from tests.nets import METHODS, trained
+from tests.peft.lora_sp.test_method import OnGPU
 
 JOINED = [name for name in METHODS if name not in ("full", "dora", "lora_moe")]
 
@@ -105,10 +104,8 @@ def test_a_stacks_adapters_are_cast_before_the_loop():
     assert in_loop("optimization_barrier", joined) == 2  # one for each input
 
 
-def test_a_kernel_gets_the_routers_numbers_joined_once(monkeypatch):
-    kernel = functools.partial(lora_sp.fused_rows, interpret=True)
-    monkeypatch.setattr(lora_sp, "fused_rows", kernel)
-    model = adapted(LoRASP(rank=32, hidden_width=16, gate="pallas"), "float32")
+def test_a_kernel_gets_the_routers_numbers_joined_once():
+    model = adapted(OnGPU(rank=32, hidden_width=16), "float32")
     x = jnp.sin(jnp.arange(96.0)).reshape(2, 6, 8)
     joined = ready(model)
     params = joined.first.ready.get_value().params

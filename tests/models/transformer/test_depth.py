@@ -9,8 +9,9 @@ from flax import nnx
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.dense import AdapterParam, Dense
 from lorasp_jax.models.transformer.depth import scan_depth, stack, stored
-from lorasp_jax.peft import LoRA, LoRASP
+from lorasp_jax.peft import LoRA
 from tests.nets import METHODS, trained
+from tests.peft.lora_sp.test_method import OnGPU
 
 DEPTH, TOKENS, WIDTH, INNER = 3, 5, 8, 12
 
@@ -119,7 +120,7 @@ def test_a_stack_in_which_nothing_trains(unroll):
 
 
 def test_the_adapters_kernel_runs_once_each_way():
-    method = LoRASP(rank=16, hidden_width=16, gate="pallas")
+    method = OnGPU(rank=16, hidden_width=16)
     blocks = stack(lambda rngs: Dense(WIDTH, WIDTH, method=method, rngs=rngs), DEPTH, nnx.Rngs(0))
     graphdef, adapters, frozen = adaptation.split(blocks)
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from lorasp_jax.peft import LoRASP
-from lorasp_jax.peft.lora_sp import router as routing
 from lorasp_jax.peft.lora_sp.bank import normalized_bank
+from lorasp_jax.peft.lora_sp.router import router_scores
 
 pytestmark = pytest.mark.slow
 
@@ -29,7 +29,7 @@ def arrays(d_in, d_out):
 
 def errors(method, params, x):
     """‖ΔW(x) - ΔW_k(x)‖ / ‖ΔW(x)‖ of one token, and √(1 - E_k) as the layer reports it."""
-    scores, _ = routing.router_scores(params["router"], x @ params["router"]["w1"])
+    scores, _ = router_scores(params["router"], x @ params["router"]["w1"], "gelu")
     bank = normalized_bank(params["bank"]) if method.normalized_bank else params["bank"]
     delta, aux = method.delta(params, x)
     kept = jnp.isin(jnp.arange(8), jnp.argsort(-scores)[: int(aux.active_rank)])

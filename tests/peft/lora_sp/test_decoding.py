@@ -17,9 +17,9 @@ D_IN, D_OUT = 24, 40
 METHOD = LoRASP(rank=16, hidden_width=4, energy_target=0.7)
 VARIANTS = [
     METHOD,
-    dataclasses.replace(METHOD, score_function="relu"),
+    dataclasses.replace(METHOD, router="gelu_relu"),
     dataclasses.replace(METHOD, normalized_bank=True),
-    dataclasses.replace(METHOD, rank=12, pruned=4, alpha=24.0),
+    dataclasses.replace(METHOD, rank=12, alpha=24.0),
     LoRASP.paper(rank=16, energy_target=0.7),
 ]
 IDS = ["default", "relu", "normalized", "pruned", "paper"]
@@ -31,6 +31,9 @@ def arrays(method, dtype):
     keys = jax.random.split(jax.random.key(2), len(leaves))
     moved = [p + jax.random.normal(k, p.shape) for k, p in zip(keys, leaves, strict=True)]
     params = jax.tree.unflatten(structure, moved)
+    if method.rank == 12:  # of 16 that the router scores
+        whole, _ = arrays(METHOD, dtype)
+        params |= {"router": whole["router"]}
     return params, decoding.prepare(method, params, dtype)
 
 
@@ -83,5 +86,5 @@ def test_bad_capacity(capacity):
 def test_needs_masks_by_token():
     method = dataclasses.replace(METHOD, granularity="sample")
     params, _ = method.init(jax.random.key(1), jnp.zeros((D_IN, D_OUT)))
-    with pytest.raises(ValueError, match="decoding by token needs rule 'paper'"):
+    with pytest.raises(ValueError, match="needs granularity 'token' and no schedule"):
         decoding.prepare(method, params, jnp.float32)

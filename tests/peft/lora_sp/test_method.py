@@ -1,7 +1,7 @@
 """LoRA-SP's equations, losses, parameter counts and its identity with LoRA."""
 
 import dataclasses
-import functools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from lorasp_jax.kernels import fused_rows
-from lorasp_jax.peft import LoRA, LoRASP
-from lorasp_jax.peft._method import apply_together
-from lorasp_jax.peft.lora_sp import method as lora_sp
-from lorasp_jax.peft.lora_sp import router as routing
+from lorasp_jax.kernels.energy_gate import energy_gate
+from lorasp_jax.peft import EnergySchedule, LoRA, LoRASP
+from lorasp_jax.peft._together import apply_together
+from lorasp_jax.peft.lora_sp import bank, losses
+from lorasp_jax.peft.lora_sp.fused import FusedRoute
+from lorasp_jax.peft.lora_sp.router import router_scores
 from tests.jaxprs import primitives
 
 D_IN, D_OUT = 24, 40
@@ -28,16 +30,16 @@ def initial(method, key=1):
     return jax.jit(lambda key: method.init(key, KERNEL)[0])(jax.random.key(key))
 
 
-def scores_of(router, x):
-    return routing.router_scores(router, x @ router["w1"])
+def scores_of(router, x, kind="gelu"):
+    return router_scores(router, x @ router["w1"], kind)
 
 
 def losses_of(scores, kept_energy=1.0, rows=None):
     """The three losses of rows of scores that are all kept; logits are the scores."""
     counts = jnp.ones((len(scores), 1), bool) if rows is None else rows
     energy = jnp.broadcast_to(jnp.asarray(kept_energy).reshape(-1, 1), (len(scores), 1))
-    sums = routing.loss_sums(scores, scores, scores > 0, energy, counts)
-    return routing.spectral_loss(sums), routing.balance_loss(sums), routing.z_loss(sums)
+    sums = losses.loss_sums(scores, scores, scores > 0, energy, counts)
+    return losses.spectral_loss(sums), losses.balance_loss(sums), losses.z_loss(sums)
 
 
 @pytest.mark.parametrize(
@@ -64,9 +66,9 @@ def test_scores_start_at_one(x):
 def test_paper_router_spreads_a_softmax(x):
     """Four softmax values, each the score of a block of 32; non-negative whatever W2 becomes."""
     router = initial(LoRASP.paper())["router"]
-    scores, logits = scores_of(router, x)
+    scores, logits = scores_of(router, x, "softmax")
     np.testing.assert_allclose(scores, np.repeat(jax.nn.softmax(logits), 32, -1), rtol=1e-6)
-    pushed, _ = scores_of(router | {"w2": router["w2"] - 0.3}, x)
+    pushed, _ = scores_of(router | {"w2": router["w2"] - 0.3}, x, "softmax")
     assert pushed.min() == 0
 
 
@@ -92,7 +94,7 @@ def test_update_is_u_sigma_v(x):
     params["router"]["w2"] = jax.random.normal(jax.random.key(3), (32, 16))
     delta, aux = jax.jit(method.delta)(params, x)
     scores, _ = scores_of(params["router"], x)
-    mask = np.asarray(jax.jit(lambda s: lora_sp.energy_gate(s, 0.7)[0])(scores))
+    mask = np.asarray(jax.jit(lambda s: energy_gate(s, 0.7)[0])(scores))
     u, v = np.asarray(params["bank"]["u"]), np.asarray(params["bank"]["v"])
     token = np.asarray(x)[1, 4]
     expected = 4 / 16 * token @ v @ np.diag(np.where(mask, scores, 0)[1, 4]) @ u
@@ -108,8 +110,8 @@ def test_pruned_directions_get_no_task_gradient(x):
 
     def task(shift):
         scores = scores_of(params["router"], x)[0] + shift
-        mask, _, energy = lora_sp.energy_gate(scores, 0.5)
-        z = routing.select(x @ params["bank"]["v"], scores, mask, energy[..., None])
+        mask, _, energy = energy_gate(scores, 0.5)
+        z = bank.select(x @ params["bank"]["v"], scores, mask, energy[..., None])
         return z.sum(), mask
 
     gradient, mask = jax.jit(jax.grad(task, has_aux=True))(jnp.zeros((3, 7, 16)))
@@ -129,18 +131,25 @@ def test_losses_of_uniform_and_concentrated_routing():
     assert spectral == pytest.approx(0.05)
 
 
+class OnGPU(LoRASP):
+    """One whose kernel is there on every machine: Triton's on a GPU, its interpreter elsewhere."""
+
+    def fused(self, params):
+        del params
+        interpret = jax.default_backend() != "gpu"
+        return FusedRoute(
+            self.rank, self.hidden_width, self.energy_target, self.scale, interpret=interpret
+        )
+
+
 @pytest.mark.parametrize(
     ("masked", "few"),
     [pytest.param(False, 0, marks=pytest.mark.slow), (True, 0), (True, fused_rows.FEW_ROWS)],
 )
 def test_one_kernel_equals_the_equations(x, monkeypatch, masked, few):
-    """The fused chain, run by Triton on a GPU and by its interpreter elsewhere."""
-    interpret = jax.default_backend() != "gpu"
-    kernel = functools.partial(lora_sp.fused_rows, interpret=interpret)
-    monkeypatch.setattr(lora_sp, "fused_rows", kernel)
     monkeypatch.setattr(fused_rows, "FEW_ROWS", few)
-    plain = LoRASP(rank=32, hidden_width=16, energy_target=0.7, gate="bisection")
-    params = initial(plain)
+    fields = {"rank": 32, "hidden_width": 16, "energy_target": 0.7}
+    params = initial(LoRASP(**fields))
     params["bank"]["u"] = jax.random.normal(jax.random.key(2), (32, D_OUT))
     params["router"]["w2"] = jax.random.normal(jax.random.key(3), (16, 32))
     mask = jax.random.bernoulli(jax.random.key(4), 0.6, x.shape[:2]) if masked else None
@@ -151,18 +160,15 @@ def test_one_kernel_equals_the_equations(x, monkeypatch, masked, few):
 
     run = jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True), static_argnums=2)
     with jax.default_matmul_precision("highest"):
-        expected = run(params, x, plain)
-        found = run(params, x, dataclasses.replace(plain, gate="pallas"))
+        expected, found = (run(params, x, kind(**fields)) for kind in (LoRASP, OnGPU))
     assert 1 < found[0][1][1].mean_active_rank() < 31
     for f, e in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         error = np.asarray(f, float) - np.asarray(e, float)
         assert np.linalg.norm(error) <= 1e-5 * np.linalg.norm(e)
 
 
-def test_layers_of_one_input_are_one_kernel(x, monkeypatch):
-    kernel = functools.partial(lora_sp.fused_rows, interpret=True)
-    monkeypatch.setattr(lora_sp, "fused_rows", kernel)
-    method = LoRASP(rank=32, hidden_width=16, energy_target=0.7, gate="pallas")
+def test_layers_of_one_input_are_one_kernel(x):
+    method = OnGPU(rank=32, hidden_width=16, energy_target=0.7)
     params = [initial(method, key) for key in (1, 2)]
     for i, p in enumerate(params):
         p["bank"]["u"] = jax.random.normal(jax.random.key(i), (32, D_OUT))
@@ -194,17 +200,46 @@ def test_layers_of_one_input_are_one_kernel(x, monkeypatch):
     assert [names.count("pallas_call") for names in programs] == [2, 4]
 
 
-@pytest.mark.parametrize("method", [LoRASP(rank=48), LoRASP.paper(rank=64), LoRASP(hidden_width=8)])
-def test_what_triton_cannot_take_keeps_the_gate_alone(x, monkeypatch, method):
-    monkeypatch.setattr(lora_sp, "fused_rows", None)
-    gates = []
-    monkeypatch.setattr(
-        routing,
-        "energy_gate",
-        lambda s, eta, implementation: gates.append(implementation) or (s > 0,),
-    )
-    jax.eval_shape(dataclasses.replace(method, gate="pallas").delta, initial(method), x)
-    assert gates == ["pallas"]
+@pytest.mark.parametrize(
+    ("method", "kernels"),
+    [
+        (LoRASP(rank=64), ["fused_rows"]),
+        (LoRASP(rank=48), ["energy_gate"]),  # sides that Triton does not take
+        (LoRASP(hidden_width=8), ["energy_gate"]),
+        (LoRASP.paper(rank=64), ["energy_gate"]),
+        (LoRASP(rank=64, router="gelu_relu"), ["energy_gate"]),
+        (LoRASP(rank=64, schedule=EnergySchedule()), []),
+    ],
+)
+def test_kernels_of_an_nvidia_gpu(x, method, kernels):
+    params, kernel = jax.eval_shape(lambda: initial(method)), jnp.ones((D_IN, D_OUT))
+    run = jax.jit(lambda params, x: method.apply(params, x, kernel)[0])
+    device = jax.sharding.AbstractDevice(device_kind="NVIDIA H200", num_cores=None, platform="cuda")
+    mesh = jax.sharding.AbstractMesh((), (), abstract_device=device)
+    with jax.sharding.use_abstract_mesh(mesh):
+        text = str(run.trace(params, x).jaxpr)
+    assert sorted(set(re.findall(r"name=(fused_rows|energy_gate)", text))) == kernels
+    assert "fused_rows" not in str(run.trace(params, x).jaxpr)  # this machine
+
+
+def test_pruned_directions_are_scored_and_never_kept(x):
+    """What a router scores behind the bank's R has no part in z, but in E_k."""
+    method, whole = LoRASP(rank=8, energy_target=1.0), LoRASP(rank=12, energy_target=1.0)
+    params = initial(whole)
+    bank = {"u": params["bank"]["u"][:8], "v": params["bank"]["v"][:, :8]}
+    found = method.apply(params | {"bank": bank}, x, jnp.ones((D_IN, D_OUT)))[1]
+    np.testing.assert_array_equal(found.active_rank, 8)
+    assert found.usage.shape == (12,)
+    np.testing.assert_allclose(found.kept_energy, 8 / 12, atol=0.05)
+    router = params["router"] | {"b2": params["router"]["b2"][:10]}
+    with pytest.raises(ValueError, match=r"needs router/b2 \[12\], got \(10,\)"):
+        method.apply({"bank": bank, "router": router}, x, jnp.ones((D_IN, D_OUT)))
+
+
+def test_a_softmax_router_spreads_its_values_over_any_rank():
+    w2 = LoRASP(rank=7, router="softmax", hidden_width=3).init_params(jax.random.key(0), 4, 4)
+    np.testing.assert_array_equal(w2["router"]["w2"].sum(0), 1)
+    np.testing.assert_array_equal(w2["router"]["w2"].sum(1), [3, 2, 2])
 
 
 def test_rows_without_scores_stay_out(x):
@@ -243,8 +278,10 @@ def test_broken_parameters_are_not_hidden(x, monkeypatch, place):
         ({"energy_target": 0.0}, r"energy_target must lie in \(0, 1\], got 0.0"),
         ({"energy_target": 1.5}, r"energy_target must lie in \(0, 1\], got 1.5"),
         ({"rank": 0}, "at least 1"),
-        ({"router": "relu"}, "router must be one of 'gelu', 'softmax', 'linear', got 'relu'"),
-        ({"router": "softmax", "hidden_width": 5}, "divisible by its width, got 128 and 5"),
+        ({"hidden_width": 0}, "hidden_width must be at least 1, got 0"),
+        ({"router": "relu"}, "router must be one of 'gelu', .*, 'softmax', got 'relu'"),
+        ({"granularity": "batch"}, "granularity must be one of 'token', 'sample', 'layer'"),
+        ({"schedule": 0.5}, "schedule must be EnergySchedule or None, got 0.5"),
     ],
 )
 def test_bad_fields(fields, message):
@@ -260,10 +297,10 @@ def test_scale_follows_alpha():
 def test_losses_of_stacked_layers_are_those_of_each():
     def sums(key):
         one = lambda key, size: jax.random.uniform(key, (size,), minval=1, maxval=3)  # noqa: E731
-        return routing.LossSums(*map(one, jax.random.split(key, 5), (1, 1, 1, 8, 8)))
+        return losses.LossSums(*map(one, jax.random.split(key, 5), (1, 1, 1, 8, 8)))
 
     each = [sums(key) for key in jax.random.split(jax.random.key(0), 3)]
-    stacked = routing.Losses(jax.tree.map(lambda *leaves: jnp.stack(leaves), *each))
+    stacked = losses.Losses(jax.tree.map(lambda *leaves: jnp.stack(leaves), *each))
     assert [*stacked] == ["spectral", "balance", "z"]
     for name, values in stacked.items():
-        np.testing.assert_allclose(values, [routing.Losses(one)[name] for one in each], rtol=1e-6)
+        np.testing.assert_allclose(values, [losses.Losses(one)[name] for one in each], rtol=1e-6)

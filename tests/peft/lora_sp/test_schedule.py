@@ -11,21 +11,21 @@ import pytest
 
 from lorasp_jax.config import OptimConfig
 from lorasp_jax.kernels.energy_gate import energy_gate
-from lorasp_jax.peft import AdaLoRA, LoRASP
+from lorasp_jax.peft import AdaLoRA, EnergySchedule, LoRASP
 from lorasp_jax.peft.lora_sp import schedule
 from lorasp_jax.training.optim import make_optimizer
 
 pytestmark = pytest.mark.slow
 
 KERNEL = jax.ShapeDtypeStruct((6, 5), jnp.float32)
-METHOD = LoRASP(rank=8, hidden_width=4, energy_start=0.5, energy_share=0.5)
+METHOD = LoRASP(rank=8, hidden_width=4, schedule=EnergySchedule(0.5))
 
 
 def test_values():
     progress = jnp.array([0.0, 0.1, 0.25, 0.5, 0.9])
-    linear = schedule.scheduled_target(progress, 0.5, 0.9, 0.5, "linear")
+    linear = EnergySchedule(0.5).target(progress, 0.9)
     np.testing.assert_allclose(linear, [0.5, 0.58, 0.7, 0.9, 0.9], rtol=1e-6)
-    cosine = schedule.scheduled_target(progress, 1.0, 0.8, 0.5, "cosine")
+    cosine = EnergySchedule(1.0, "cosine").target(progress, 0.8)
     expected = 0.8 + 0.2 * (1 + math.cos(math.pi / 5)) / 2
     np.testing.assert_allclose(cosine, [1.0, expected, 0.9, 0.8, 0.8], rtol=1e-6)
 
@@ -56,7 +56,7 @@ def test_a_layer_follows_its_progress_without_compiling_again(granularity):
 
 def test_the_optimizer_moves_it_past_decay_and_in_stacks():
     """Layers alone and stacked, two schedules and a budget of another method in one tree."""
-    other = dataclasses.replace(METHOD, energy_start=0.95, energy_curve="cosine")
+    other = dataclasses.replace(METHOD, schedule=EnergySchedule(0.95, "cosine"))
     key = jax.random.key(0)
     stacked = jax.vmap(lambda key: other.init_params(key, 6, 5))(jax.random.split(key, 3))
     ada = AdaLoRA(rank=4, target_rank=2, interval=1)
@@ -99,11 +99,11 @@ def test_progress_has_no_gradient_and_only_a_moving_target_has_it():
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"energy_start": 0.0}, r"energy_target must lie in \(0, 1\], got 0.0"),
-        ({"energy_start": 0.5, "energy_share": 0.0}, r"energy_share must lie in \(0, 1\]"),
-        ({"energy_curve": "square"}, "energy_curve must be one of 'linear', 'cosine'"),
+        ({"start": 0.0}, r"schedule.start must lie in \(0, 1\], got 0.0"),
+        ({"share": 0.0}, r"schedule.share must lie in \(0, 1\], got 0.0"),
+        ({"curve": "square"}, "schedule.curve must be one of 'linear', 'cosine', got 'square'"),
     ],
 )
 def test_bad_fields(fields, message):
     with pytest.raises(ValueError, match=message):
-        LoRASP(**fields)
+        EnergySchedule(**fields)

@@ -7,15 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lorasp_jax.peft import LoRASP
-from lorasp_jax.peft.lora_sp import release
+from lorasp_jax.peft import LoRASPRelease
+from lorasp_jax.peft import lora_sp_release as release
 from tests import GOLDEN
 from tests.cases import mostly_slow
 
 pytestmark = pytest.mark.slow
 
 D_IN, D_OUT, RANK = 12, 10, 16
-METHODS = [LoRASP.release(rank=RANK), LoRASP.release(rank=RANK, projection=True)]
+METHODS = [LoRASPRelease(rank=RANK), LoRASPRelease(rank=RANK, hidden_width=4)]
 
 
 @pytest.fixture
@@ -153,12 +153,12 @@ def test_the_z_loss_is_minus_infinity_at_its_end():
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"router": "linear"}, "signed scores, which need rule 'release'"),
-        ({"rule": "release"}, "needs a 'linear' or 'softmax' router"),
-        ({"rule": "release", "router": "linear", "granularity": "layer"}, "masks by token"),
-        ({"rule": "release", "router": "linear", "energy_start": 0.5}, "a constant energy_target"),
+        ({"rank": 0}, "rank must be at least 1, got 0"),
+        ({"hidden_width": 0}, "hidden_width must be at least 1, got 0"),
+        ({"energy_target": 1.5}, r"energy_target must lie in \(0, 1\], got 1.5"),
+        ({"granularity": "layer"}, "lora_sp_release has no field 'granularity'"),
     ],
 )
-def test_settings_that_exclude_each_other(fields, message):
+def test_bad_fields(fields, message):
     with pytest.raises(ValueError, match=message):
-        LoRASP(**fields)
+        LoRASPRelease(**fields)

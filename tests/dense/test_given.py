@@ -14,7 +14,7 @@ import lorasp_jax
 from lorasp_jax.adapters.adaptation import count, penalties
 from lorasp_jax.adapters.compress import calibration
 from lorasp_jax.dense import LinenDense
-from lorasp_jax.peft import AdaLoRA, LoRA, LoRAMoE, LoRASP
+from lorasp_jax.peft import AdaLoRA, EnergySchedule, LoRA, LoRAMoE, LoRASP
 
 X, KERNEL, KEY = jnp.ones((3, 5)), jnp.ones((5, 4)), jax.random.key(0)
 METHOD, MOE = LoRA(rank=2), LoRAMoE(rank=2, experts=2)
@@ -43,13 +43,13 @@ def with_kernel(value):
         (lambda: METHOD.init(nnx.Rngs(0), KERNEL), "key must be one such as"),
         (lambda: METHOD.apply(PARAMS, X[:, 1:], KERNEL), "width 4 meets a kernel [5, 4]"),
         (lambda: METHOD.apply(KERNEL, X, PARAMS), "a kernel [I, O] of real numbers, got dict"),
-        (lambda: METHOD.apply({}, X, KERNEL), "lora of a kernel [5, 4] needs ['lora_a'] [5, 2]"),
+        (lambda: METHOD.apply({}, X, KERNEL), "lora of a kernel [5, 4] needs lora_a [5, 2]"),
         # α/R of another rank would be the scale.
         (
             lambda: LoRA(rank=3, alpha=2.0).apply(PARAMS, X, KERNEL),
-            "lora of a kernel [5, 4] needs ['lora_a'] [5, 3], got (5, 2)",
+            "lora of a kernel [5, 4] needs lora_a [5, 3], got (5, 2)",
         ),
-        (lambda: LoRA(rank=3).delta(PARAMS, X), "needs ['lora_a'] [5, 3], got (5, 2)"),
+        (lambda: LoRA(rank=3).delta(PARAMS, X), "needs lora_a [5, 3], got (5, 2)"),
         (lambda: METHOD.delta(PARAMS, [1.0]), "floating-point numbers [...tokens, I], got list"),
         # One number for three tokens would count three times.
         (
@@ -65,7 +65,7 @@ def with_kernel(value):
             "total_steps must be a whole number from 1 to 2147483647, got 1.5",
         ),
         (
-            lambda: LoRASP(energy_start=0.99).transform(optax.sgd(0.1), 0),
+            lambda: LoRASP(schedule=EnergySchedule()).transform(optax.sgd(0.1), 0),
             "total_steps must be a whole number from 1",
         ),
         # Linen

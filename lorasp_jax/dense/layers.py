@@ -1,38 +1,21 @@
-"""The integration point: one functional adapted dense layer and its two shells.
-
-`dense` works on arrays. `Dense` (Flax NNX) and `LinenDense` (Flax Linen) are drop-ins for
-`nnx.Linear` and `nn.Dense`. All reach the same `Method.apply`, the only place that adds a delta.
-
-Called as a drop-in, where `layer(x)` gives `y` alone, a layer keeps what it would report for
-`collect_aux`. With NNX that works wherever the module may be changed: eagerly, or inside a jitted
-function that gets the model as an argument or merges it itself,
-
-    def loss(adapters):
-        model = nnx.merge(graphdef, adapters, frozen, copy=True)
-        y = model(x)
-        aux = lorasp_jax.collect_aux(model)
-
-A model that `jax.jit` closes over can be called too, but keeps nothing. Code that can handle a
-second result asks for it, `layer(x, return_aux=True)`, and then nothing is stored.
-"""
+"""What layers with an adapter have in common, and the drop-in for Flax NNX's `nnx.Linear`."""
 
 import contextlib
-import math
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import flax.errors
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from flax import nnx
 from flax.typing import Dtype, Initializer
 
-from lorasp_jax import given
+from lorasp_jax.dense import given
+from lorasp_jax.dense.functional import DenseLayer, computed_in, dense
 from lorasp_jax.kernels.quantized_kernel import QuantizedKernel
-from lorasp_jax.peft import Aux, Method, _fields
+from lorasp_jax.peft import Aux, Method
 from lorasp_jax.peft._fields import short
-from lorasp_jax.peft._method import Params, apply_together, drop_rate
+from lorasp_jax.peft._method import Params
 
 KEPT = "kept_aux"
 KERNEL_INIT = jax.nn.initializers.lecun_normal()  # of nnx.Linear and nn.Dense too
@@ -54,100 +37,6 @@ def refuse_sharding(out_sharding: Any) -> None:
 
 class DropoutKey(nnx.Variable[Any]):
     """What `with_dropout` gives a layer for one training step."""
-
-
-class DenseLayer(NamedTuple):
-    """What `dense` takes beside the input."""
-
-    kernel: jax.Array
-    bias: jax.Array | None = None
-    params: Params | None = None
-    method: Method | None = None
-    dropout_key: jax.Array | None = None
-
-
-def dense(
-    x: jax.Array,
-    kernel: jax.Array,
-    bias: jax.Array | None = None,
-    params: Params | None = None,
-    method: Method | None = None,
-    dropout_key: jax.Array | None = None,
-    *,
-    token_mask: jax.Array | None = None,
-) -> tuple[jax.Array, Aux]:
-    """x @ kernel + bias through an adapter, or plainly without one.
-
-    Args:
-      x: [...tokens, I].
-      kernel: [I, *O]. More than one output axis is one linear map onto all of them.
-      bias: broadcastable to [*O], or None.
-      params: the adapter's parameters for the kernel as a matrix [I, O], or None.
-      method: the adapter's method, given with `params`.
-      dropout_key: for the method's dropout in a training step; None: nothing is dropped.
-      token_mask: bool [...tokens]; False (padding) stays out of losses and statistics.
-
-    Returns:
-      y [...tokens, *O] in the type of x, and the adapter's aux.
-
-    Raises:
-      ValueError: x is of integers or does not end in the kernel's input size, or a mask of another
-        shape.
-    """
-    layer = DenseLayer(kernel, bias, params, method, dropout_key)
-    return dense_together(x, [layer], token_mask=token_mask)[0]
-
-
-def dense_together(
-    x: jax.Array, layers: Sequence[DenseLayer], *, token_mask: jax.Array | None = None
-) -> list[tuple[jax.Array, Aux]]:
-    """`dense` of several layers that share their input, which their adapters then read once.
-
-    Args:
-      x: [...tokens, I].
-      layers: (kernel, bias, params, method, dropout_key) of each; see `dense`.
-      token_mask: bool [...tokens].
-
-    Returns:
-      y and aux of each layer.
-
-    Raises:
-      ValueError: as `dense`.
-    """
-    _fields.tokens(x, token_mask)
-    layers = [DenseLayer(*layer) for layer in layers]
-    plain, adapted = {}, {}
-    for i, (kernel, _, params, method, key) in enumerate(layers):
-        given.layer(layers[i], x.shape[-1])
-        matrix = kernel.reshape(kernel.shape[0], math.prod(kernel.shape[1:]))
-        if method is None or params is None:
-            plain[i] = x @ matrix.astype(x.dtype), Aux()
-        elif key is not None:
-            plain[i] = method.apply_dropped(params, x, matrix, key, token_mask=token_mask)
-        else:
-            adapted[i] = method, params, matrix
-    fused = apply_together([*adapted.values()], x, token_mask=token_mask)
-    found = plain | dict(zip(adapted, fused, strict=True))
-    results = []
-    for i, (kernel, bias, *_) in enumerate(layers):
-        y = found[i][0].reshape(*x.shape[:-1], *kernel.shape[1:])
-        results.append((y if bias is None else y + bias.astype(y.dtype), found[i][1]))
-    return results
-
-
-def computed_in(dtype: Dtype | None, x: Any, kernel: Any) -> jax.Array:
-    """x in the type of a layer's computation; None: the type that x and the kernel promote to.
-
-    Raises:
-      ValueError: x is no array, or no such type is there, as for kernels of 8 bits.
-    """
-    try:
-        return given.array(x).astype(dtype or jnp.promote_types(x.dtype, kernel.dtype))
-    except jax.dtypes.TypePromotionError as error:
-        raise ValueError(
-            f"a layer with a kernel of {kernel.dtype} needs a dtype to compute {x.dtype} in, such "
-            "as dtype=jnp.bfloat16."
-        ) from error
 
 
 def with_value(variable: Any, value: Any) -> Any:
@@ -312,63 +201,3 @@ class Dense(AdaptedLayer):
         bias = None if self.bias is None else self.bias.get_value()
         params = None if self.adapter is None else self.adapter.get_value()
         return DenseLayer(self.kernel.get_value(), bias, params, self.method, self.dropout_key)
-
-
-class LinenDense(nn.Module):
-    """A dense layer with an optional adapter, a drop-in for `nn.Dense`.
-
-    The kernel and bias are in the collection "params", the adapter's parameters in "adapters": what
-    trains is a collection. Full fine-tuning trains "params" and adds nothing. With "intermediates"
-    mutable, aux is sown there for `collect_aux`. The method's dropout is on in calls that get rngs
-    for "dropout".
-
-    Attributes:
-      features: O.
-      use_bias: whether to add a bias.
-      method: adapter method, or None.
-      dtype: type of the computation; None promotes input and kernel.
-      param_dtype: type of kernel and bias; adapters are always fp32.
-      kernel_init: initializer of the kernel.
-    """
-
-    features: int
-    use_bias: bool = True
-    method: Method | None = None
-    dtype: Dtype | None = None
-    param_dtype: Dtype = jnp.float32
-    kernel_init: Initializer = KERNEL_INIT
-
-    @nn.compact
-    def __call__(
-        self, x: jax.Array, *, token_mask: jax.Array | None = None, return_aux: bool = False
-    ) -> Any:
-        """y [...tokens, O], or (y, aux) if asked; see `dense`."""
-        given.method(self.method)
-        given.real("param_dtype", self.param_dtype)
-        given.real("dtype", self.dtype or self.param_dtype)
-        shape = (given.array(x).shape[-1], given.size("features", self.features))
-        kernel = self.param("kernel", self.kernel_init, shape, self.param_dtype)
-        bias = None
-        if self.use_bias:
-            bias = self.param("bias", nn.initializers.zeros, (self.features,), self.param_dtype)
-        params = None
-        if self.method is not None and not self.method.trains_base:
-            params = self.variable("adapters", "adapter", self._init_adapter, kernel).value
-        x = computed_in(self.dtype, x, kernel)
-        drops = params is not None and drop_rate(self.method) and self.has_rng("dropout")
-        key = self.make_rng("dropout") if drops else None
-        y, aux = dense(x, kernel, bias, params, self.method, key, token_mask=token_mask)
-        if return_aux:
-            return y, aux
-        if params is not None:
-            self.sow("intermediates", KEPT, aux)
-        return y
-
-    def _init_adapter(self, kernel: jax.Array) -> Params:
-        assert self.method is not None
-        if self.method.splits_kernel:
-            raise ValueError(
-                "Linen cannot change a kernel that is there already, which this method's "
-                "initialization asks for: use `adapt` on an NNX model or another initialization."
-            )
-        return self.method.init(self.make_rng("params"), kernel)[0]

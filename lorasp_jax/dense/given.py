@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import linen, nnx
 
-from lorasp_jax.peft import Method, _fields
+from lorasp_jax.peft import Method, _arguments, _fields
 from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import LARGEST_SIZE
 
@@ -77,7 +77,7 @@ def layer(found: Any, width: int) -> None:
     if (found.params is None) != (own is None or own.trains_base):
         raise ValueError("an adapter's parameters come with their method, and it with them.")
     if found.dropout_key is not None:
-        _fields.key(found.dropout_key)
+        _arguments.key(found.dropout_key)
 
 
 def module(model: Any) -> Any:

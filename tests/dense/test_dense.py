@@ -1,5 +1,7 @@
 """The two shells: drop-ins for nnx.Linear and nn.Dense, and what they report."""
 
+import sys
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -10,6 +12,7 @@ from flax import nnx
 import lorasp_jax
 from lorasp_jax.dense import AdapterParam, Dense, LinenDense, dense, dense_together
 from lorasp_jax.peft import DoRA, FullFineTuning, LoRA, LoRASP
+from lorasp_jax.peft.lora_sp.router import router_scores
 
 METHOD = LoRASP(rank=8, hidden_width=4)
 
@@ -212,3 +215,23 @@ def test_odd_inputs(method, x, mask, message):
     params, kernel = method.init(jax.random.key(0), kernel)
     with pytest.raises(ValueError, match=message):
         dense(x, kernel, None, params, method, token_mask=mask)
+
+
+def test_five_jumps_lead_from_a_layer_to_the_first_equation():
+    """A reader who follows the calls meets eq. (10) after four other functions."""
+    layer = Dense(3, 5, method=LoRASP(rank=7, hidden_width=3), rngs=nnx.Rngs(0))
+    passed = []
+
+    def profile(frame, event, _):
+        if event == "call" and frame.f_code is router_scores.__code__ and not passed:
+            while frame := frame.f_back:
+                own = frame.f_globals.get("__name__", "").startswith("lorasp_jax.")
+                if own and not frame.f_code.co_name.startswith("<"):
+                    passed.append(frame.f_code.co_name)
+
+    sys.setprofile(profile)
+    try:
+        layer(jnp.ones((2, 3)))
+    finally:
+        sys.setprofile(None)
+    assert passed == ["between", "low_rank_matmul", "apply", "dense", "__call__"]

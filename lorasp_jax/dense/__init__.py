@@ -1,0 +1,46 @@
+"""The integration point: one functional adapted dense layer and its two shells.
+
+`dense` works on arrays. `Dense` (Flax NNX) and `LinenDense` (Flax Linen) are drop-ins for
+`nnx.Linear` and `nn.Dense`. All reach the same `Method.apply`, the only place that adds a delta.
+
+Called as a drop-in, where `layer(x)` gives `y` alone, a layer keeps what it would report for
+`collect_aux`. With NNX that works wherever the module may be changed: eagerly, or inside a jitted
+function that gets the model as an argument or merges it itself,
+
+    def loss(adapters):
+        model = nnx.merge(graphdef, adapters, frozen, copy=True)
+        y = model(x)
+        aux = lorasp_jax.collect_aux(model)
+
+A model that `jax.jit` closes over can be called too, but keeps nothing. Code that can handle a
+second result asks for it, `layer(x, return_aux=True)`, and then nothing is stored.
+"""
+
+from lorasp_jax.dense.functional import DenseLayer, computed_in, dense, dense_together
+from lorasp_jax.dense.layers import (
+    KEPT,
+    AdaptedLayer,
+    AdapterAux,
+    AdapterParam,
+    Dense,
+    DropoutKey,
+    refuse_sharding,
+    with_value,
+)
+from lorasp_jax.dense.linen import LinenDense
+
+__all__ = [
+    "KEPT",
+    "AdaptedLayer",
+    "AdapterAux",
+    "AdapterParam",
+    "Dense",
+    "DenseLayer",
+    "DropoutKey",
+    "LinenDense",
+    "computed_in",
+    "dense",
+    "dense_together",
+    "refuse_sharding",
+    "with_value",
+]

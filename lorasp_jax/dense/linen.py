@@ -1,0 +1,74 @@
+"""The drop-in for Flax Linen's `nn.Dense`."""
+
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax.typing import Dtype, Initializer
+
+from lorasp_jax.dense import given
+from lorasp_jax.dense.functional import computed_in, dense
+from lorasp_jax.dense.layers import KEPT, KERNEL_INIT
+from lorasp_jax.peft import Method
+from lorasp_jax.peft._method import Params, drop_rate
+
+
+class LinenDense(nn.Module):
+    """A dense layer with an optional adapter, a drop-in for `nn.Dense`.
+
+    The kernel and bias are in the collection "params", the adapter's parameters in "adapters": what
+    trains is a collection. Full fine-tuning trains "params" and adds nothing. With "intermediates"
+    mutable, aux is sown there for `collect_aux`. The method's dropout is on in calls that get rngs
+    for "dropout".
+
+    Attributes:
+      features: O.
+      use_bias: whether to add a bias.
+      method: adapter method, or None.
+      dtype: type of the computation; None promotes input and kernel.
+      param_dtype: type of kernel and bias; adapters are always fp32.
+      kernel_init: initializer of the kernel.
+    """
+
+    features: int
+    use_bias: bool = True
+    method: Method | None = None
+    dtype: Dtype | None = None
+    param_dtype: Dtype = jnp.float32
+    kernel_init: Initializer = KERNEL_INIT
+
+    @nn.compact
+    def __call__(
+        self, x: jax.Array, *, token_mask: jax.Array | None = None, return_aux: bool = False
+    ) -> Any:
+        """y [...tokens, O], or (y, aux) if asked; see `dense`."""
+        given.method(self.method)
+        given.real("param_dtype", self.param_dtype)
+        given.real("dtype", self.dtype or self.param_dtype)
+        shape = (given.array(x).shape[-1], given.size("features", self.features))
+        kernel = self.param("kernel", self.kernel_init, shape, self.param_dtype)
+        bias = None
+        if self.use_bias:
+            bias = self.param("bias", nn.initializers.zeros, (self.features,), self.param_dtype)
+        params = None
+        if self.method is not None and not self.method.trains_base:
+            params = self.variable("adapters", "adapter", self._init_adapter, kernel).value
+        x = computed_in(self.dtype, x, kernel)
+        drops = params is not None and drop_rate(self.method) and self.has_rng("dropout")
+        key = self.make_rng("dropout") if drops else None
+        y, aux = dense(x, kernel, bias, params, self.method, key, token_mask=token_mask)
+        if return_aux:
+            return y, aux
+        if params is not None:
+            self.sow("intermediates", KEPT, aux)
+        return y
+
+    def _init_adapter(self, kernel: jax.Array) -> Params:
+        assert self.method is not None
+        if self.method.splits_kernel:
+            raise ValueError(
+                "Linen cannot change a kernel that is there already, which this method's "
+                "initialization asks for: use `adapt` on an NNX model or another initialization."
+            )
+        return self.method.init(self.make_rng("params"), kernel)[0]

@@ -1,0 +1,93 @@
+"""LoRA-SP between its two matrix products as one GPU kernel, for the default router and gate.
+
+Layers that read one input share a kernel, which finds their columns side by side.
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from lorasp_jax.kernels.energy_gate import energy_gate, kept_energy
+from lorasp_jax.kernels.fused_rows import fused_rows
+from lorasp_jax.kernels.packing import PackedTree
+from lorasp_jax.peft._aux import Aux
+from lorasp_jax.peft._fused import Fused
+from lorasp_jax.peft.lora_sp.bank import select
+from lorasp_jax.peft.lora_sp.losses import Losses, LossSums, loss_sums
+from lorasp_jax.peft.lora_sp.router import router_scores
+
+
+@dataclasses.dataclass(frozen=True)
+class FusedRoute(Fused):
+    """`LoRASP.between` with a router "gelu", masks by token and a constant η."""
+
+    rank: int
+    hidden_width: int
+    energy_target: float
+    scale: float
+    interpret: bool = False
+    """Run the kernels' bodies without a GPU, slowly."""
+
+    @property
+    def fits(self) -> bool:
+        """Whether Triton takes the sides: blocks with powers of two, products of 16 or more."""
+        sides = self.rank, self.hidden_width
+        return all(side >= 16 and side.bit_count() == 1 for side in sides)
+
+    def pack(self, params: Any) -> Any:
+        """The router's numbers in a row."""
+        return PackedTree.of(params["router"])
+
+    def between_all(
+        self, params: Any, read: jax.Array, columns: range, token_mask: jax.Array | None
+    ) -> tuple[jax.Array, Aux]:
+        """As `Fused.between_all`."""
+        tokens, n = read.shape[:-1], len(columns)
+        valid = jnp.ones(tokens, bool) if token_mask is None else token_mask
+        z, sums, statistics = fused_rows(
+            functools.partial(route, energy_target=self.energy_target, scale=self.scale),
+            params,
+            read.reshape(-1, read.shape[-1]),
+            (self.rank, self.hidden_width),
+            valid.reshape(-1, 1),
+            start=columns.start,
+            interpret=self.interpret,
+        )
+        active_rank, energy = (column.T.reshape(n, *tokens) for column in statistics)
+        aux = Aux(active_rank, energy, Losses(sums), usage=sums.kept)
+        return z.reshape(*tokens, z.shape[-1]), aux
+
+
+def route(
+    router: dict[str, jax.Array],
+    columns: list[jax.Array],
+    valid: jax.Array,
+    kept: jax.Array | None,
+    *,
+    energy_target: float,
+    scale: float,
+) -> tuple[jax.Array, LossSums, jax.Array, list[jax.Array]]:
+    """A block of n rows, within the kernel.
+
+    Args:
+      router: b1 [H], w2 [H, R], b2 [R].
+      columns: V x [n, R] and W1 x [n, H] in one type.
+      valid: bool [n, 1], False for padding.
+      kept: bool [n, R], the gate's mask where it is known already; it has no gradient.
+      energy_target: η.
+      scale: α/R.
+
+    Returns:
+      z [n, R], the losses' sums over rows, the mask, and f32 [n, 1] each active rank and kept
+      energy.
+    """
+    projected, hidden = columns
+    scores, logits = router_scores(router, hidden, "gelu")
+    mask = energy_gate(scores, energy_target, implementation="block")[0] if kept is None else kept
+    energy = kept_energy(scores, mask)[:, None]
+    z = select(projected, scale * scores, mask, energy)
+    active_rank = mask.astype(jnp.float32).sum(-1, keepdims=True)
+    return z, loss_sums(scores, logits, mask, energy, valid), mask, [active_rank, energy]
