@@ -95,7 +95,7 @@ def test_what_does_not_fuse():
         lorasp_jax.fuse(pair(), {})
 
 
-UNMERGEABLE = ("dora", "full", "lora_moe", "lora_sp")
+UNMERGEABLE = ("dora", "full", "lora_moe", "lora_sp", "lora_sp_release")
 SPLITS = [LoRA(rank=2, initialization=start) for start in ("pissa", "olora")]
 METHODS = [peft.create(n, rank=2) for n in peft.names() if n not in UNMERGEABLE]
 
