@@ -12,22 +12,22 @@ import pytest
 
 from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul
 
-# Every way to multiply 10 tokens: wide outputs, far wider ones, square and wide inputs; then the
-# same with more inputs than tokens.
+# Every code path for 10 tokens: output wider than the input, far wider, square, input wider; then
+# with more inputs than tokens.
 SHAPES = [(9, 10), (6, 20), (10, 10), (10, 7), (12, 30), (12, 12), (12, 7)]
 READ, RANK = 4, 3
 
 
 @pytest.fixture(autouse=True)
 def full_precision(monkeypatch):
-    """A GPU would multiply in TF32, and a CPU joins no matrices."""
+    """Avoid TF32 on GPU, and take the GPU's code path, which joins matrices, on CPU too."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     with jax.default_matmul_precision("highest"):
         yield
 
 
-def between(params, rows, token_mask):
-    """Not linear, narrower behind than in front, with a loss and a statistic."""
+def inner(params, rows, token_mask):
+    """A nonlinear f with R < Q, a loss and a statistic."""
     rows = rows if token_mask is None else jnp.where(token_mask[..., None], rows, 0)
     z = jnp.tanh(rows[..., :RANK] * params["scale"]) * rows[..., RANK:]
     return z, {"loss": jnp.square(rows).mean(), "statistic": rows.max(-1)}
@@ -37,7 +37,7 @@ def between(params, rows, token_mask):
 class Method:
     """As the product asks for it."""
 
-    between: Callable = between
+    between: Callable = inner
 
 
 def inputs(d_in, d_out, dtype=jnp.float32):
@@ -56,7 +56,7 @@ def ours(params, x, kernel, down, up, mask=MASK):
 
 
 def reference(params, x, kernel, down, up, mask=MASK):
-    z, aux = between(params, x @ down, mask)
+    z, aux = inner(params, x @ down, mask)
     return x @ kernel + z @ up, aux
 
 
@@ -83,7 +83,7 @@ def test_equals_the_formula(shape):
 
 @pytest.mark.parametrize("d_outs", [(4, 3), (12, 9), (30, 20, 3)])
 def test_several_layers_of_one_input(d_outs):
-    """Each way to the input's gradient: all in one product, apart, through [W; U]."""
+    """Every path to the gradient of x: one product for all, separate ones, through [W; U]."""
     params, x, *_ = inputs(9, 1)
     layers = [LowRankLayer(params, *inputs(9, d_out)[2:]) for d_out in d_outs]
 
@@ -124,7 +124,7 @@ def test_several_layers_read_once():
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_no_gradient_of_the_kernel(shape):
-    """Not even a buffer: no product in the gradient's program has the kernel's shape."""
+    """No product in the gradient's jaxpr has the kernel's shape, so there is no buffer for it."""
     arguments = inputs(*shape)
 
     def gradient(product):
@@ -141,8 +141,8 @@ def test_no_gradient_of_the_kernel(shape):
     np.testing.assert_array_equal(gradient(ours)(*arguments)[0][0], 0)
 
 
-def test_types():
-    """y as x; gradients of the fp32 matrices in fp32, rows as asked for."""
+def test_dtypes():
+    """y in the dtype of x, gradients of fp32 matrices in fp32, rows in `rows_dtype`."""
     arguments = inputs(6, 10, jnp.bfloat16)
     y, aux = jax.eval_shape(ours, *arguments)
     assert (y.dtype, aux["statistic"].dtype) == (jnp.bfloat16, jnp.bfloat16)
@@ -165,7 +165,7 @@ def test_vmap():
 
 
 @pytest.mark.parametrize("shape", [(9, 20), (10, 10), (10, 7), (12, 30), (12, 12), (12, 7)])
-def test_kernels_are_copied_for_many_tokens_only(shape):
+def test_kernels_are_joined_for_many_tokens_only(shape):
     params, x, *rest = inputs(*shape)
 
     def gradients(*arrays):
@@ -178,7 +178,7 @@ def test_kernels_are_copied_for_many_tokens_only(shape):
     assert bool(copies) == (shape[0] <= 10)
 
 
-def test_a_cpu_copies_no_kernel(monkeypatch):
+def test_no_joined_kernels_on_cpu(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     jax.clear_caches()  # what was traced for a GPU
     program = str(jax.make_jaxpr(lambda *a: jax.vjp(ours, *a)[0])(*inputs(9, 20)))
@@ -191,7 +191,7 @@ def test_equal_layers_are_traced_once():
 
     def counting(params, rows, token_mask):
         calls.append(rows.shape)
-        return between(params, rows, token_mask)
+        return inner(params, rows, token_mask)
 
     methods = (Method(counting),)
     params, x, *rest = inputs(9, 9)

@@ -22,8 +22,8 @@ def whole(kernel, kind):
     return np.asarray(quantized(kernel, kind).astype(jnp.float32))
 
 
-def test_table_is_that_of_a_normal_distribution():
-    """QLoRA's construction: quantiles of both halves, 8 below 0 and 9 above, largest 1."""
+def test_nf4_table():
+    """QLoRA's construction: normal quantiles of both halves, 8 below 0 and 9 above, maximum 1."""
     offset = (1 / 32 + 1 / 30) / 2
     below = ndtri(jnp.linspace(offset, 0.5, 8))
     above = -ndtri(jnp.linspace(offset, 0.5, 9))
@@ -34,14 +34,14 @@ def test_table_is_that_of_a_normal_distribution():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_qwix(kind):
-    """The same codes and scales as qwix 0.1.8, by column and in blocks of 64 inputs."""
+    """Codes and scales equal those of qwix 0.1.8, per column and in blocks of 64 inputs."""
     with np.load(GOLDEN) as golden:
         np.testing.assert_allclose(whole(golden["kernel"], kind), golden[kind], rtol=1e-6)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("shape", [(256, 12), (100, 7), (5, 3), (2, 130, 6)])
-def test_no_weight_is_further_off_than_stated(kind, shape):
+def test_error_bound(kind, shape):
     kernel = np.asarray(normal(*shape))
     smaller = quantized(kernel, kind)
     assert (smaller.shape, smaller.dtype) == (shape, jnp.float32)
@@ -56,7 +56,7 @@ def test_no_weight_is_further_off_than_stated(kind, shape):
 
 @pytest.mark.parametrize(("kind", "error"), [("int8", 0.0069), ("nf4", 0.092)])
 def test_error_and_bytes(kind, error):
-    """Of normal weights in 4 blocks; 8 and 4.5 bits a weight, the columns' scales aside."""
+    """Relative error on normal weights in 4 blocks; 8 and 4.5 bits per weight plus int8 scales."""
     kernel = np.asarray(normal(256, 512))
     lost = np.linalg.norm(whole(kernel, kind) - kernel) / np.linalg.norm(kernel)
     assert lost == pytest.approx(error, rel=0.02)
@@ -65,7 +65,7 @@ def test_error_and_bytes(kind, error):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_needs_no_rounding_comes_back(kind):
+def test_representable_values_are_exact(kind):
     table = np.arange(-127, 128) / 127.5 if kind == "int8" else np.array(NF4)
     kernel = np.random.default_rng(0).choice(table, (64, 9)).astype(np.float32)
     kernel[0] = 1.0
@@ -74,7 +74,7 @@ def test_what_needs_no_rounding_comes_back(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_stack_is_its_layers(kind):
+def test_stack_equals_its_layers(kind):
     kernel = normal(2, 3, 70, 5)
     stack = quantized(kernel, kind)
     each = [[whole(matrix, kind) for matrix in row] for row in kernel]
@@ -82,7 +82,7 @@ def test_a_stack_is_its_layers(kind):
     flat = stack.reshape(-1, 70, 5)
     assert flat.shape == (6, 70, 5)
     np.testing.assert_array_equal(flat.astype(jnp.float32)[4], each[1][1])
-    with pytest.raises(ValueError, match=r"\(2, 3, 70, 5\) cannot become \(6, 350\)"):
+    with pytest.raises(ValueError, match=r"kernel \(2, 3, 70, 5\) to \(6, 350\)"):
         stack.reshape(6, 350)
     scanned = jax.lax.scan(lambda _, k: (None, k.astype(jnp.bfloat16)), None, flat)[1]
     assert scanned.dtype == jnp.bfloat16
@@ -103,7 +103,7 @@ def product(x, kernel, p, u):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("shape", [(6, 10), (10, 6)])
-def test_product_and_gradients_are_those_of_the_wide_kernel(kind, shape):
+def test_product_and_gradients_equal_those_of_the_dequantised_kernel(kind, shape):
     smaller = quantized(normal(*shape), kind)
     x, p, u = normal(4, shape[0], seed=1), normal(shape[0], 3, seed=2), normal(3, shape[1], seed=3)
 
@@ -117,8 +117,7 @@ def test_product_and_gradients_are_those_of_the_wide_kernel(kind, shape):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_waits_for_the_backward_pass_is_small(kind):
-    """The codes, not the wide kernel."""
+def test_residuals_hold_codes_not_the_dequantised_kernel(kind):
     smaller = quantized(normal(64, 64), kind)
     x, p, u = normal(2, 64), normal(64, 1), normal(1, 64)
     _, pull = jax.vjp(lambda x, p, u: product(x, smaller, p, u), x, p, u)
@@ -126,8 +125,8 @@ def test_what_waits_for_the_backward_pass_is_small(kind):
     assert kept <= smaller.nbytes + x.nbytes + p.nbytes + u.nbytes + 2 * 4  # z [2, 1]
 
 
-def test_what_cannot_be_quantised():
-    with pytest.raises(ValueError, match="can be int8 or nf4, got 'int4'"):
+def test_bad_input():
+    with pytest.raises(ValueError, match="Unknown quantisation 'int4'; valid are int8, nf4"):
         quantized(normal(4, 4), "int4")
-    with pytest.raises(ValueError, match="infinite or undefined"):
+    with pytest.raises(ValueError, match="NaN or infinite values"):
         quantized(jnp.array([[1.0, jnp.nan]]), "int8")
