@@ -34,7 +34,7 @@ from envs.env import Env
 from envs.physics import physics
 from envs.rendering import renderer
 from envs.scene import placing
-from envs.state import State
+from envs.state import Poses, State
 
 CONTROL_STEPS = 10  # per timed call
 C_STEPS = 500  # physics steps per timed call of the C engine
@@ -100,11 +100,10 @@ class Case:
 
 def time_images(env: Env, state: State, size: int) -> float:
     """Measure images/s of the renderer alone: all worlds, both cameras, `size` x `size` px."""
-    data = state.data
-    poses = (data.geom_xpos, data.geom_xmat, data.cam_xpos, data.cam_xmat)
+    poses = Poses.of(state.data)
     draw = jax.jit(
         lambda poses: renderer.render_batch(
-            env.render_model, *poses, height=size, width=size, samples=1
+            env.render_model, poses, height=size, width=size, samples=1
         )
     )
     return env.num_envs * len(env.cameras) / best(lambda: draw(poses))

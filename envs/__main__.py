@@ -14,13 +14,23 @@ from envs import actions
 from envs.cli import commands
 from envs.cli.refusals import parsed, refused
 from envs.compilation import alarms, cache
+from envs.experts.collection import Record
 from envs.names import names
 from envs.scene import distractors
 
 
-def main(arguments: Sequence[str], program: str = "python -m envs") -> int:
-    """Runs one command; returns the exit code: 0 done, 2 bad input, 130 stopped."""
+def main(
+    arguments: Sequence[str], program: str = "python -m envs", record: Record | None = None
+) -> int:
+    """Runs one command; returns the exit code: 0 done, 2 bad input, 130 stopped.
+
+    Args:
+        arguments: of the command line.
+        program: its name in help and errors.
+        record: as for `envs.collect`.
+    """
     options = parsed(parser(program), arguments)
+    options.record = record
     console = Console(stderr=True)
     # JAX would reserve most of a GPU at its start, which takes a second (measured) for a command of
     # half a minute.

@@ -26,7 +26,7 @@ from envs.rendering.renderer import Appearance, Renderer, RenderModel
 from envs.robots import Robot
 from envs.scene import distractors, placing, randomization, scene
 from envs.scene.randomization import Draw, Randomization
-from envs.state import Changes, Data, State, Trajectory, where
+from envs.state import Changes, Data, Poses, State, Trajectory, where
 from envs.tasks import Layout, Task, View
 
 _HOME_NOISE = 0.03  # rad, half the range of random start poses around home; own choice
@@ -161,10 +161,8 @@ class Env:
 
     @functools.partial(fast_cpu.jit, static_argnums=0)
     def _observes(self, state: State) -> dict[str, Any]:
-        data = state.data
-        poses = (data.geom_xpos, data.geom_xmat, data.cam_xpos, data.cam_xmat)
         return {
-            "image": self.render(*poses, draw=state.info["draw"]),
+            "image": self.render(Poses.of(state.data), draw=state.info["draw"]),
             "state": self.proprio(state),
         }
 
@@ -250,26 +248,15 @@ class Env:
         """Name of each part -> its slice of the last axis of `full_state`."""
         return observations.layout(self.model, self.num_joints, self._placed)
 
-    def render(
-        self,
-        geom_xpos: jax.Array,
-        geom_xmat: jax.Array,
-        cam_xpos: jax.Array,
-        cam_xmat: jax.Array,
-        *,
-        draw: Draw | None = None,
-    ) -> dict[str, jax.Array]:
+    def render(self, poses: Poses, *, draw: Draw | None = None) -> dict[str, jax.Array]:
         """Render N recorded scenes: camera name -> uint8 [N, image_size, image_size, 3].
 
         Args:
-            geom_xpos: `[N, ...]`, from `State.data`.
-            geom_xmat: likewise.
-            cam_xpos: likewise.
-            cam_xmat: likewise.
+            poses: of all geoms and cameras, leading axis N.
             draw: randomised values of these worlds, leading axis N, from `State.info`.
         """
         appearance, size = jax.vmap(self._appearance)(draw) if draw else (None, None)
-        images = self.renderer((geom_xpos, geom_xmat, cam_xpos, cam_xmat), appearance, size)
+        images = self.renderer(poses, appearance, size)
         return {name: images[:, i] for i, name in enumerate(self.cameras)}
 
     def _check_worlds(self, state: Any) -> None:

@@ -1,7 +1,7 @@
 """State of a batch of worlds, and trajectories."""
 
 import dataclasses
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +39,27 @@ class Data:
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields replaced."""
         return dataclasses.replace(self, **changes)
+
+
+class Poses(NamedTuple):
+    """Where all geoms and cameras of a scene are, in the world frame; leading axes may precede.
+
+    Attributes:
+        geom_xpos: `[G, 3]` positions of the geoms [m].
+        geom_xmat: `[G, 3, 3]` rotations of the geoms.
+        cam_xpos: `[N, 3]` positions of the cameras [m].
+        cam_xmat: `[N, 3, 3]` rotations of the cameras, which look along their -z, y up.
+    """
+
+    geom_xpos: jax.Array
+    geom_xmat: jax.Array
+    cam_xpos: jax.Array
+    cam_xmat: jax.Array
+
+    @classmethod
+    def of(cls, data: Data) -> Self:
+        """The poses in the data of a state."""
+        return cls(data.geom_xpos, data.geom_xmat, data.cam_xpos, data.cam_xmat)
 
 
 MOVING = ("qpos", "qvel", "qacc_warmstart")

@@ -1,66 +1,74 @@
-"""Progress bars of the command line, one for each task and robot."""
+"""Progress bars of all commands."""
 
-import contextlib
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
-    SpinnerColumn,
+    ProgressColumn,
+    Task,
+    TaskID,
     TextColumn,
-    TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.text import Text
 
 Report = Callable[[int, int], None]
-"""Called with the episodes that are done and those that are wanted."""
+"""Called with what is done and what is wanted."""
+_PERIOD = 600.0
+"""Seconds of which the rate is the mean; there is none where no two updates fall into them."""
 
 
-def _rate(episodes: int, seconds: float) -> str:
-    """Episodes a second, or seconds an episode where those are more."""
-    if not episodes:
-        return ""
-    if episodes < seconds:
-        return f"{seconds / episodes:.1f} s an episode"
-    return f"{episodes / seconds:.1f} episodes/s"
+def bars(console: Console, unit: str, *, per_step: int = 1, shown: bool = True) -> Progress:
+    """Bars with counts, a rate and the remaining time.
 
-
-@contextlib.contextmanager
-def bars(console: Console, stop: threading.Event) -> Iterator[Callable[[str, str], Report]]:
-    """Progress bars: a function that makes one for a task and a robot, and gives what moves it.
-
-    A bar is seen from its first report on, before which a task or robot may be refused.
-    Where `stop` is set, a report raises a KeyboardInterrupt.
+    Args:
+        console: where they are drawn.
+        unit: what is counted, such as "episodes".
+        per_step: units to a step of the bar.
+        shown: False while other bars are; a terminal shows one group at a time.
     """
     columns = (
-        SpinnerColumn(),
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TimeElapsedColumn(),
         TimeRemainingColumn(),
+        _Rate(unit, per_step),
     )
-    with Progress(*columns, console=console) as progress:
+    return Progress(*columns, console=console, disable=not shown, speed_estimate_period=_PERIOD)
 
-        def new_bar(task: str, robot: str) -> Report:
-            text = f"{task}, {robot}: compiling ..."
-            bar = progress.add_task(text, total=None, rate="", visible=False)
-            reports: list[tuple[int, float]] = []  # what was done, and when
 
-            def report(done: int, total: int) -> None:
-                if stop.is_set():
-                    raise KeyboardInterrupt
-                progress.update(bar, completed=done, total=total, visible=True)
-                reports.append((done, progress.tasks[bar].elapsed or 0.0))
-                if len(reports) > 1:  # the second comes after all is compiled and says no speed
-                    before, since = reports[1]
-                    rate = _rate(done - before, reports[-1][1] - since)
-                    progress.update(bar, description=f"{task}, {robot}: collecting", rate=rate)
+def collecting(progress: Progress, title: str, stop: threading.Event) -> Report:
+    """A report that moves a bar, which appears with the first report, before all is compiled.
 
-            return report
+    Where `stop` is set, a report raises a KeyboardInterrupt.
+    """
+    bar: TaskID | None = None
 
-        yield new_bar
+    def report(done: int, total: int) -> None:
+        nonlocal bar
+        if stop.is_set():
+            raise KeyboardInterrupt
+        if bar is None:
+            bar = progress.add_task(f"{title}: compiling ...", total=total, completed=done)
+        else:
+            progress.update(bar, completed=done, description=f"{title}: collecting")
+
+    return report
+
+
+class _Rate(ProgressColumn):
+    """Units per second; nothing before there are two points in time."""
+
+    def __init__(self, unit: str, per_step: int) -> None:
+        super().__init__()
+        self._unit, self._per_step = unit, per_step
+
+    def render(self, task: Task) -> Text:
+        if not (speed := task.finished_speed or task.speed):
+            return Text("")
+        rate = speed * self._per_step
+        return Text(f"{rate:,.3g} {self._unit}/s" if rate < 100 else f"{rate:,.0f} {self._unit}/s")

@@ -15,7 +15,7 @@ from rich.console import Console
 
 import envs
 from envs.cli import recipes
-from envs.cli.bars import Report, bars
+from envs.cli.bars import Report, bars, collecting
 from envs.datasets import rlds, writing
 from envs.datasets.episodes import Episodes
 from envs.datasets.files import check_local
@@ -144,12 +144,12 @@ def _side_by_side(
     """
     stop = threading.Event()
     running: dict[Path, Future[str]] = {}
-    with bars(console, stop) as new_bar, ThreadPoolExecutor() as pool:
+    with bars(console, "episodes") as progress, ThreadPoolExecutor() as pool:
         try:
             # The longest first: it runs while the others are still traced.
             for file, env in sorted(scenes.items(), key=lambda item: -item[1].expert_steps):
-                bar = new_bar(env.task.name, env.robot.name)
-                running[file] = pool.submit(_collect, options, env, file, bar)
+                report = collecting(progress, f"{env.task.name}, {env.robot.name}", stop)
+                running[file] = pool.submit(_collect, options, env, file, report)
             wait(running.values(), return_when=FIRST_EXCEPTION)
         finally:
             stop.set()
@@ -172,6 +172,7 @@ def _collect(options: argparse.Namespace, env: envs.Env, out: Path, report: Repo
         recipes.ranges(options),
         kept=parts.num_episodes,
         attempted=parts.attempted,
+        record=options.record,
     ):
         parts.append(part)
         report(parts.num_episodes, options.num_episodes)
@@ -222,7 +223,7 @@ def _kept(out: Path, num_episodes: int) -> str:
 
 def _episode(options: argparse.Namespace, console: Console, task: str, robot: str) -> Episodes:
     """One episode of the expert."""
-    with bars(console, threading.Event()) as new_bar:
+    with bars(console, "episodes") as progress:
         return envs.collect(
             task,
             robot,
@@ -231,7 +232,7 @@ def _episode(options: argparse.Namespace, console: Console, task: str, robot: st
             image_size=options.image_size,
             num_envs=1,  # pictures are most of the work; where the expert fails, it tries again
             antialias=2,
-            progress=new_bar(task, robot),
+            progress=collecting(progress, f"{task}, {robot}", threading.Event()),
         )
 
 

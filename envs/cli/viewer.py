@@ -3,6 +3,8 @@
 import itertools
 import time
 import warnings
+from collections.abc import Callable
+from typing import Any
 
 import glfw
 import jax
@@ -14,8 +16,7 @@ from envs.compilation import fast_cpu
 from envs.env import Env
 from envs.experts import expert
 from envs.scene import placing
-
-_TRIES = 8  # calls, of all worlds each
+from envs.state import State
 
 
 def check_display() -> None:
@@ -26,27 +27,42 @@ def check_display() -> None:
             raise ValueError("there is no display to open a window on: add --out FILE.mp4")
 
 
-def episode(env: Env, key: jax.Array) -> tuple[mujoco.MjModel, np.ndarray]:
+def episode(
+    env: Env,
+    key: jax.Array,
+    *,
+    tries: int = 8,
+    plan: Callable[[Env, State, jax.Array], Any] | None = None,
+    act: Callable[[Env, Any, State], jax.Array] | None = None,
+) -> tuple[mujoco.MjModel, np.ndarray]:
     """A successful episode of the expert: the scene of its world and all positions `[T, nq]` in it.
+
+    Args:
+        env: W worlds.
+        key: all randomness.
+        tries: layouts of all worlds to try.
+        plan: as `expert.plan`, which is compiled by default.
+        act: as `expert.act`, which is compiled by default.
 
     Raises:
         ValueError: if the expert never succeeds.
     """
-    for _ in range(_TRIES):
+    plan, act = plan or _plan, act or _act
+    for _ in range(tries):
         key, try_key = jax.random.split(key)
         reset_key, plan_key, _ = jax.random.split(try_key, 3)  # as envs.experts.collection does it
         state = env.reset(reset_key)
-        plan = _plan(env, state, plan_key)
+        planned = plan(env, state, plan_key)
         states = [state]
         for _ in range(env.expert_steps):
-            states.append(env.step(states[-1], _act(env, plan, states[-1])))
+            states.append(env.step(states[-1], act(env, planned, states[-1])))
         wins = np.flatnonzero(states[-1].info["success"])
         if len(wins):
             world = wins[0]
             steps = int(states[-1].info["steps"][world])
             positions = [np.asarray(state.data.qpos[world]) for state in states[: steps + 1]]
             return placing.placed(env.model, states[0].info["layout"], world), np.stack(positions)
-    raise ValueError(f"the expert failed in all of {_TRIES * env.num_envs} layouts")
+    raise ValueError(f"the expert failed in all of {tries * env.num_envs} layouts")
 
 
 def show(model: mujoco.MjModel, positions: np.ndarray, seconds: float) -> None:

@@ -230,7 +230,7 @@ def _encode(images: Any) -> list[bytes]:
     """
     count, height, width, _ = images.shape
     rows = np.zeros((count, height, 1 + 3 * width), np.uint8)  # each begins with 0: no filter
-    rows[..., 1:] = images.reshape(count, height, -1)
+    rows[..., 1:] = images.reshape(count, height, 3 * width)
     kind = struct.pack(">2I5B", width, height, 8, 2, 0, 0, 0)  # 8 bits a channel, RGB
     start, end = b"\x89PNG\r\n\x1a\n" + _chunk(b"IHDR", kind), _chunk(b"IEND", b"")
     return [

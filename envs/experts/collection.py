@@ -18,6 +18,7 @@ from envs.env import Env
 from envs.experts import expert, traced
 from envs.making import AnyRobot, make
 from envs.scene.randomization import Draw, Randomization, prepared
+from envs.state import Poses
 
 # Default number of worlds per call; own choice: fills the device and fits its memory.
 _NUM_ENVS = {"cpu": 32, "gpu": 256, "tpu": 256}
@@ -25,6 +26,11 @@ _NUM_ENVS = {"cpu": 32, "gpu": 256, "tpu": 256}
 # experts solve nearly all layouts, so less means that something is broken.
 _MIN_SUCCESS, _MIN_ATTEMPTS = 0.5, 16
 _MAX_EPISODES = 10**9  # own choice, a bound against typos
+
+Record = Callable[
+    [Env, jax.Array, float | jax.Array, Randomization | None], tuple[dict[str, Any], jax.Array]
+]
+"""Attempts an episode in every world: the arrays of `Episodes`, and which succeeded."""
 
 
 @jax.tree_util.register_dataclass
@@ -35,7 +41,7 @@ class Rollout:
     Attributes:
         state: f32 [T, W, J + 1] measured joints [rad] and gripper opening [m] before each action.
         action: f32 [T, W, J + 1] the expert's actions, without noise.
-        poses: geom_xpos, geom_xmat, cam_xpos, cam_xmat, each [T, W, ...], before each action.
+        poses: of geoms and cameras, leading axes [T, W], before each action.
         length: int32 [W] control steps until the world was done.
         success: bool [W].
         instruction: int32 [W] index into the task's instructions.
@@ -44,7 +50,7 @@ class Rollout:
 
     state: jax.Array
     action: jax.Array
-    poses: tuple[jax.Array, ...]
+    poses: Poses
     length: jax.Array
     success: jax.Array
     instruction: jax.Array
@@ -73,9 +79,8 @@ def rollout(
     def body(state: Any, key: jax.Array) -> tuple[Any, tuple]:
         action = expert.act(env, plan, state)
         noise = action_noise * jax.random.normal(key, action.shape).at[:, -1].set(0.0)
-        data = state.data
-        poses = (data.geom_xpos, data.geom_xmat, data.cam_xpos, data.cam_xmat)
-        return env.step(state, action + noise), (env.proprio(state), action, poses, ~state.done)
+        seen = (env.proprio(state), action, Poses.of(state.data), ~state.done)
+        return env.step(state, action + noise), seen
 
     keys = jax.random.split(noise_key, env.expert_steps)
     last, (state, action, poses, alive) = jax.lax.scan(body, first, keys)
@@ -100,6 +105,7 @@ def collect(
     action_noise: float = 0.0,
     ranges: Randomization | None = None,
     progress: Callable[[int, int], None] | None = None,
+    record: Record | None = None,
     **options: Any,
 ) -> Episodes:
     """Collect successful demonstrations by the scripted expert, on the device.
@@ -115,6 +121,7 @@ def collect(
         action_noise: see `rollout`.
         ranges: see `rollout`.
         progress: called with (episodes so far, num_episodes), first with 0 before compilation.
+        record: attempts an episode in every world; default: the expert in simulation.
         **options: further options of `envs.make`; the backend defaults to jax.
 
     Raises:
@@ -122,7 +129,7 @@ def collect(
         ValueError: an unknown name, a number out of range, or an expert that fails too often.
     """
     env = make_repeatable(task, robot, num_envs=worlds(num_episodes, num_envs), **options)
-    parts = gather(env, num_episodes, key, action_noise, ranges)
+    parts = gather(env, num_episodes, key, action_noise, ranges, record=record)
     return concatenate(list(_with_progress(parts, num_episodes, progress)))
 
 
@@ -134,17 +141,20 @@ def expert_success(
     key: jax.Array,
     num_envs: int | None = None,
     ranges: Randomization | None = None,
+    attempt: Callable[[Env, jax.Array, Randomization | None], jax.Array] | None = None,
     **options: Any,
 ) -> jax.Array:
     """Return whether the expert solves each of `num_episodes` random layouts, bool [num_episodes].
 
-    Arguments are as in `collect`.
+    Arguments are as in `collect`; `attempt` returns the success of every world, by default of the
+    expert in simulation.
     """
     env = make_repeatable(task, robot, num_envs=worlds(num_episodes, num_envs), **options)
     ranges = prepared(ranges, env.control_dt)
     checks.key(key)
     calls = -(-num_episodes // env.num_envs)
-    results = [_attempt(env, chunk_key, ranges) for chunk_key in jax.random.split(key, calls)]
+    attempt = attempt or attempt_expert
+    results = [attempt(env, chunk_key, ranges) for chunk_key in jax.random.split(key, calls)]
     return jnp.concatenate(results)[:num_episodes]
 
 
@@ -163,6 +173,7 @@ def gather(
     *,
     kept: int = 0,
     attempted: int = 0,
+    record: Record | None = None,
 ) -> Iterator[Episodes]:
     """Yield the successful episodes of one call after the other, `num_episodes` in total.
 
@@ -171,10 +182,12 @@ def gather(
         num_episodes, key, action_noise, ranges: as in `collect`.
         kept, attempted: episodes yielded and attempts made before an interruption, to resume with
             the same episodes as without it.
+        record: as in `collect`.
 
     Raises:
         ValueError: the expert fails too often.
     """
+    record = record or record_expert
     ranges = prepared(ranges, env.control_dt)
     checks.key(key)
     if checks.number("action_noise", action_noise) < 0:
@@ -186,7 +199,7 @@ def gather(
         _check_success(env, kept, attempted)
         key, chunk_key = jax.random.split(key)
         # Wait here, outside Python's lock, so that other threads can write their episodes.
-        chunk, success = jax.block_until_ready(_record(env, chunk_key, action_noise, ranges))
+        chunk, success = jax.block_until_ready(record(env, chunk_key, action_noise, ranges))
         wins = np.flatnonzero(success)[: num_episodes - kept]
         kept += len(wins)
         # Do not count attempts after the last one needed.
@@ -237,15 +250,16 @@ def _check_success(env: Env, kept: int, attempted: int) -> None:
 
 
 @traced.cached
-def _record(
-    env: Env, key: jax.Array, action_noise: jax.Array, ranges: Randomization | None
+def record_expert(
+    env: Env, key: jax.Array, action_noise: float | jax.Array, ranges: Randomization | None
 ) -> tuple[dict[str, Any], jax.Array]:
+    """The expert's attempts at random layouts, with pictures: a `Record`."""
     tries = rollout(env, key, action_noise, ranges)
     steps, worlds = tries.action.shape[:2]
     # World-major order, so that the images of an episode are contiguous.
     flat = [jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]) for x in tries.poses]
     drawn = jax.tree.map(lambda x: jnp.repeat(x, steps, axis=0), tries.draw)
-    images = env.render(*flat, draw=drawn)
+    images = env.render(Poses(*flat), draw=drawn)
     episodes = {
         "image": {k: x.reshape(worlds, steps, *x.shape[1:]) for k, x in images.items()},
         "state": jnp.swapaxes(tries.state, 0, 1),
@@ -257,7 +271,8 @@ def _record(
 
 
 @traced.cached
-def _attempt(env: Env, key: jax.Array, ranges: Randomization | None) -> jax.Array:
+def attempt_expert(env: Env, key: jax.Array, ranges: Randomization | None) -> jax.Array:
+    """Return whether the expert succeeds in each world, bool [W]."""
     return rollout(env, key, ranges=ranges).success
 
 

@@ -36,7 +36,9 @@ _VERSIONED = ("jax", "jaxlib", "mujoco", "mujoco-mjx")
 _CHECKSUM = hashlib.sha256().digest_size  # bytes at the start of a file
 
 
-def cached(function: Callable[..., Any]) -> Callable[..., Any]:
+def cached(
+    function: Callable[..., Any], sources: Callable[[], str] | None = None
+) -> Callable[..., Any]:
     """Wrap as `jax.jit(function, static_argnums=0)`, tracing once for all processes on a machine.
 
     Programs are cached only if JAX's compilation cache is enabled, for tasks of this package, and
@@ -45,6 +47,7 @@ def cached(function: Callable[..., Any]) -> Callable[..., Any]:
     Args:
         function: a function of this package, of an `Env` and trees of arrays; returns arrays in
             dicts, lists and tuples.
+        sources: a digest of the source files of the program; default: of this package's.
     """
     jitted = fast_cpu.jit(function, static_argnums=0)
 
@@ -56,7 +59,7 @@ def cached(function: Callable[..., Any]) -> Callable[..., Any]:
             return function(env, *jax.tree.unflatten(tree, leaves))
 
         name = f"{function.__module__}.{function.__qualname__}"
-        file = _folder() / f"{name}-{_key(env, tree, kinds, settings)}"
+        file = _folder() / f"{name}-{_key(env, tree, kinds, settings, (sources or _sources)())}"
         if (exported := _load(file)) is None:
             exported = export.export(jax.jit(run))(*kinds)
             _save(file, exported.serialize())
@@ -116,7 +119,9 @@ def _folder() -> Path:
     return Path(jax.config.jax_compilation_cache_dir) / "traced"
 
 
-def _key(env: Env, tree: Any, kinds: tuple[Any, ...], settings: tuple[Any, ...]) -> str:
+def _key(
+    env: Env, tree: Any, kinds: tuple[Any, ...], settings: tuple[Any, ...], sources: str
+) -> str:
     """Hash everything that the program depends on."""
     parts = [
         digest(env),
@@ -125,7 +130,7 @@ def _key(env: Env, tree: Any, kinds: tuple[Any, ...], settings: tuple[Any, ...])
         (env.control_dt, env.actions, env.distractors, env.reward, env.discount),
         (tree, kinds, settings, jax.default_backend()),
         [importlib.metadata.version(name) for name in _VERSIONED],
-        _sources(),
+        sources,
     ]
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 

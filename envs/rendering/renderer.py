@@ -16,7 +16,6 @@ worlds. Cameras follow MuJoCo (looking along -z, y up). Geoms that contain the c
 
 import dataclasses
 import functools
-from collections.abc import Sequence
 from typing import Protocol
 
 import jax
@@ -27,6 +26,7 @@ from envs.rendering import intersections, shading
 from envs.rendering.intersections import Geom, Geoms, Matrix, Vec, dot
 from envs.rendering.model import Appearance, RenderModel, build, unit_shapes
 from envs.rendering.shading import Raster, View
+from envs.state import Poses
 
 __all__ = [
     "Appearance",
@@ -47,10 +47,7 @@ _PIXELS_ON_CPU, _PIXELS_ON_ACCELERATOR = 2**14, 2**23
 @functools.partial(jax.jit, static_argnames=("height", "width", "samples"))
 def render(
     model: RenderModel,
-    geom_xpos: jax.Array,
-    geom_xmat: jax.Array,
-    cam_xpos: jax.Array,
-    cam_xmat: jax.Array,
+    poses: Poses,
     *,
     height: int,
     width: int,
@@ -62,9 +59,7 @@ def render(
 
     Args:
         model: from `build`.
-        geom_xpos, geom_xmat: `[G, 3]` positions [m] and `[G, 3, 3]` rotations of all geoms of the
-            MuJoCo model.
-        cam_xpos, cam_xmat: `[N, 3]` positions [m] and `[N, 3, 3]` rotations of all its cameras.
+        poses: of all geoms and cameras of the MuJoCo model.
         height, width: image size [px].
         samples: average n x n evenly spread rays per pixel, at n² times the cost.
         appearance: replaces the model's own.
@@ -73,9 +68,7 @@ def render(
     appearance = model.appearance if appearance is None else appearance
     size = model.size if size is None else size
     raster = Raster(height, width, samples)
-    geoms, views = in_camera_frames(
-        model, appearance, size, (geom_xpos, geom_xmat, cam_xpos, cam_xmat), height
-    )
+    geoms, views = in_camera_frames(model, appearance, size, poses, height)
 
     def image(geoms: Geom, view: View) -> jax.Array:
         pixel = jnp.arange(height * width, dtype=jnp.int32)
@@ -87,10 +80,7 @@ def render(
 
 def render_batch(
     model: RenderModel,
-    geom_xpos: jax.Array,
-    geom_xmat: jax.Array,
-    cam_xpos: jax.Array,
-    cam_xmat: jax.Array,
+    poses: Poses,
     *,
     height: int,
     width: int,
@@ -104,11 +94,11 @@ def render_batch(
         uint8 `[W, K, height, width, 3]`.
     """
     pixels = _PIXELS_ON_CPU if jax.default_backend() == "cpu" else _PIXELS_ON_ACCELERATOR
-    chunk = max(1, min(len(geom_xpos), pixels // (len(model.cameras) * height * width)))
-    worlds = ((geom_xpos, geom_xmat, cam_xpos, cam_xmat), {"appearance": appearance, "size": size})
+    chunk = max(1, min(len(poses.geom_xpos), pixels // (len(model.cameras) * height * width)))
+    worlds = (poses, {"appearance": appearance, "size": size})
     return jax.lax.map(
         lambda world: render(
-            model, *world[0], height=height, width=width, samples=samples, **world[1]
+            model, world[0], height=height, width=width, samples=samples, **world[1]
         ),
         worlds,
         batch_size=chunk,
@@ -128,7 +118,7 @@ class Renderer(Protocol):
     def samples(self) -> int: ...  # noqa: D102
 
     def __call__(  # noqa: D102
-        self, poses: Sequence[jax.Array], appearance: Appearance | None, size: jax.Array | None
+        self, poses: Poses, appearance: Appearance | None, size: jax.Array | None
     ) -> jax.Array: ...
 
 
@@ -147,13 +137,13 @@ class RayRenderer:
     samples: int
 
     def __call__(
-        self, poses: Sequence[jax.Array], appearance: Appearance | None, size: jax.Array | None
+        self, poses: Poses, appearance: Appearance | None, size: jax.Array | None
     ) -> jax.Array:
         """Render images, uint8 `[N, K, height, width, 3]`; arguments as for `render_batch`."""
         side, samples = self.image_size, self.samples
         return render_batch(
             self.model,
-            *poses,
+            poses,
             height=side,
             width=side,
             samples=samples,
@@ -165,10 +155,7 @@ class RayRenderer:
 @functools.partial(jax.jit, static_argnames=("height", "width"))
 def cast(
     model: RenderModel,
-    geom_xpos: jax.Array,
-    geom_xmat: jax.Array,
-    cam_xpos: jax.Array,
-    cam_xmat: jax.Array,
+    poses: Poses,
     *,
     height: int,
     width: int,
@@ -192,7 +179,6 @@ def cast(
         geom = jnp.where(jnp.isfinite(depth), jnp.array(model.geoms, jnp.int32)[number], -1)
         return geom.reshape(height, width), depth.reshape(height, width)
 
-    poses = (geom_xpos, geom_xmat, cam_xpos, cam_xmat)
     return jax.vmap(seen)(*in_camera_frames(model, model.appearance, size, poses, height))
 
 
@@ -208,7 +194,7 @@ def in_camera_frames(
     model: RenderModel,
     appearance: Appearance,
     size: jax.Array | np.ndarray,
-    poses: tuple[jax.Array, ...],
+    poses: Poses,
     height: int,
 ) -> tuple[Geom, View]:
     """Transform visible geoms to each camera's frame, leaves `[K, V]`; make views, leaves `[K]`."""

@@ -4,7 +4,6 @@ Its images resemble those of the ray caster: same light, same checker, same sky.
 """
 
 import copy
-from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -16,6 +15,7 @@ from mujoco.mjx.third_party import mujoco_warp
 
 from envs.physics import warp_call
 from envs.rendering.renderer import Appearance, RayRenderer
+from envs.state import Poses
 
 _PER_WORLD = ("geom_size", "geom_rgba", "mat_rgba", "cam_fovy")  # fields of Warp's model
 _POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "light_xdir")  # fields of its data
@@ -61,24 +61,24 @@ class WarpRenderer:
         self._batch = warp_call.flattening_vmap(self._all)
 
     def __call__(
-        self, poses: Sequence[jax.Array], appearance: Appearance | None, size: jax.Array | None
+        self, poses: Poses, appearance: Appearance | None, size: jax.Array | None
     ) -> jax.Array:
         """Render images, uint8 `[N, K, height, width, 3]`, like `renderer.render_batch`.
 
         Args:
-            poses: geom_xpos, geom_xmat, cam_xpos, cam_xmat with leading axis N.
+            poses: of all geoms and cameras, leading axis N.
             appearance: of each world, leading axis N; None for the model's own. Its ambient,
                 headlight and diffuse must be the model's times one factor; sky and checker are
                 always the model's.
             size: `[N, G, 3]` sizes of geoms; None for the model's own.
         """
-        return self._batch(tuple(poses), appearance, size)
+        return self._batch(poses, appearance, size)
 
     def _all(
-        self, poses: Sequence[jax.Array], appearance: Appearance | None, size: jax.Array | None
+        self, poses: Poses, appearance: Appearance | None, size: jax.Array | None
     ) -> jax.Array:
         """Render all worlds, chunk by chunk."""
-        number, chunk = len(poses[0]), self._num_worlds
+        number, chunk = len(poses.geom_xpos), self._num_worlds
 
         def every(x: Any) -> jax.Array:
             return jnp.broadcast_to(jnp.asarray(x), (number, *np.shape(x)))
@@ -97,9 +97,7 @@ class WarpRenderer:
         images = jax.lax.map(lambda world: self._render_chunk(*world), worlds)
         return images.reshape(-1, *images.shape[2:])[:number]
 
-    def _render_chunk(
-        self, poses: Sequence[jax.Array], appearance: Appearance, size: jax.Array
-    ) -> jax.Array:
+    def _render_chunk(self, poses: Poses, appearance: Appearance, size: jax.Array) -> jax.Array:
         """Render one chunk of worlds."""
         geom_xpos, geom_xmat, cam_xpos, cam_xmat = poses
         worlds, side = self._num_worlds, self.image_size

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.progress import MofNCompleteColumn, Progress, TextColumn
 
+from envs.cli.bars import bars
 from envs.cli.refusals import parsed, refused
 from envs.datasets.files import check_local
 from lorasp_jax.data.keys import Keys
@@ -139,8 +139,7 @@ def _camera(text: str) -> tuple[str, str]:
 @contextmanager
 def _bar(title: str) -> Iterator[tuple["Report", Callable[[str], None]]]:
     """A progress bar: what moves it, from when on it shows, and what prints a sentence above it."""
-    columns = (*Progress.get_default_columns(), MofNCompleteColumn(), TextColumn("steps"))
-    progress = Progress(*columns, console=Console(stderr=True))
+    progress = bars(Console(stderr=True), "steps")
     bar = progress.add_task(title, total=None)
     say = functools.partial(progress.console.print, soft_wrap=True, highlight=False, markup=False)
     with ExitStack() as shown:

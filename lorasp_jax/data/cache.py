@@ -31,6 +31,7 @@ from lorasp_jax.data.pictures import Pictures, checksum
 from lorasp_jax.data.source import Progress, Source
 from lorasp_jax.policies.statistics import Statistics
 from lorasp_jax.storage.digest import DIGEST, sealed, unsealed
+from lorasp_jax.storage.json_values import check
 
 FORMAT = "lorasp-cache-1"
 HEADER, STATISTICS = "cache.json", "statistics.json"
@@ -40,9 +41,17 @@ _IMAGE, _CHECKSUM = "image_", "crc32_"
 _KIND = {"state": np.float32, "action": np.float32, "image": np.uint8, "crc32": np.uint32}
 FACTS = tuple(name for name in SHARED if name not in ("task", "instructions"))
 """What the episodes of a cache have in common."""
-_KINDS = {"robot": str, "actions": str, "control_dt": float, "physics_dt": float, "steps": int}
-_KINDS |= {"numbers": int, "cameras": dict, "crc32": dict, "tasks": list, "instructions": list}
-_KNOWN = {*_KINDS, "format", DIGEST}
+_KINDS: dict[str, Any] = {
+    "format": str,
+    **dict.fromkeys(("robot", "actions"), str),
+    **dict.fromkeys(("control_dt", "physics_dt"), float),
+    **dict.fromkeys(("steps", "numbers"), int),
+    "tasks": [str],
+    "instructions": [str],
+    "cameras": {str: (int, int)},
+    "crc32": {str: int},
+}
+_KNOWN = {*_KINDS, DIGEST}
 
 
 def write(
@@ -222,9 +231,7 @@ class Cache:
                 raise ValueError(f"it has a field {unknown[0]!r}")
             if self.facts["format"] != FORMAT:
                 raise ValueError(f"it is of format {self.facts['format']!r}, not {FORMAT!r}")
-            for name, kind in _KINDS.items():
-                if not isinstance(self.facts[name], kind):
-                    raise ValueError(f"{name} is {self.facts[name]!r}")
+            check(self.facts, _KINDS)
             self.cameras: dict[str, list[int]] = self.facts["cameras"]
             self.control_dt: float = self.facts["control_dt"]
             self.num_steps: int = self.facts["steps"]
@@ -232,8 +239,6 @@ class Cache:
             width = self.facts["numbers"]
             if not (0 < self.control_dt < math.inf and width > 0):
                 raise ValueError(f"control_dt is {self.control_dt} and numbers {width}")
-            if not all(isinstance(x, str) for x in (*self.facts["tasks"], *self.instructions)):
-                raise ValueError("tasks and instructions are no texts")
             sizes = {name: tuple(size) for name, size in self.cameras.items()}
             for name in sizes:
                 check_camera(name)

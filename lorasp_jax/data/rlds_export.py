@@ -9,16 +9,21 @@ from envs.datasets.locks import locked
 from envs.datasets.writing import creating
 from lorasp_jax.data.source import Progress, Source
 
-_TOGETHER = 16  # episodes in a file
 
-
-def to_rlds(source: Source, path: str | os.PathLike[str], progress: Progress) -> None:
+def to_rlds(
+    source: Source,
+    path: str | os.PathLike[str],
+    progress: Progress,
+    *,
+    episodes_per_file: int = 16,
+) -> None:
     """Writes an RLDS folder, which is there only when all of it is; see `envs.datasets.rlds`.
 
     Args:
         source: a dataset of one task; it is not changed.
         path: the folder to make.
-        progress: told of the steps.
+        progress: called with the steps that are done and all that are to be.
+        episodes_per_file: so many are in memory at a time.
 
     Raises:
         ValueError: the path exists already, another process is writing it, there are several tasks,
@@ -30,8 +35,8 @@ def to_rlds(source: Source, path: str | os.PathLike[str], progress: Progress) ->
         raise ValueError(f"an RLDS folder holds one task, not {', '.join(tasks)}")
     with locked(Path(path)), creating(path) as folder:
         parts, done = rlds.Parts(folder, {}), 0
-        for first in range(0, len(source), _TOGETHER):
-            numbers = range(first, min(first + _TOGETHER, len(source)))
+        for first in range(0, len(source), episodes_per_file):
+            numbers = range(first, min(first + episodes_per_file, len(source)))
             part = []
             for number in numbers:
                 part.append(source.episode(number))

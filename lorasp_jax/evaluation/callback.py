@@ -1,7 +1,6 @@
 """Success in simulation before, while and after training, with a video of each task."""
 
 import contextlib
-import dataclasses
 import functools
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -12,19 +11,20 @@ import jax
 import numpy as np
 from rich.progress import Progress
 
-import envs
+from envs.cli.bars import bars
 from envs.compilation import messages
 from envs.datasets.writing import replacing
 from envs.env import Env
 from envs.physics import physics
-from envs.rendering.renderer import RayRenderer
+from envs.state import Poses
 from lorasp_jax.adapters import adaptation
+from lorasp_jax.config import Config
 from lorasp_jax.evaluation import video
-from lorasp_jax.evaluation.rollout import Result, evaluate, make_rollout
+from lorasp_jax.evaluation.rollout import Result, compiled_rollout, evaluate
 from lorasp_jax.training import records
 from lorasp_jax.training.demonstrations import side_by_side
 from lorasp_jax.training.random_streams import RandomStream
-from lorasp_jax.training.run import Callback, Run, bars
+from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import read_json, write_json
 
 TOWERS = ("vision", "language", "action")
@@ -38,8 +38,20 @@ class Evaluation(Callback):
     Training goes on while videos are made.
     """
 
-    def __init__(self) -> None:
-        """Nothing is compiled yet."""
+    def __init__(
+        self,
+        compiled: Callable[[Config, str], tuple[Env, Callable]] = compiled_rollout,
+        evaluate: Callable[..., Result] = evaluate,
+        film: Callable[[Env, Poses, Path], None] = video.write_film,
+    ) -> None:
+        """Compile nothing yet.
+
+        Args:
+            compiled: gives a task's environment and jitted rollout.
+            evaluate: measures a policy.
+            film: writes a video of an episode's poses to a file.
+        """
+        self._compile, self._evaluate, self._film = compiled, evaluate, film
         self._tasks: dict[str, tuple[Env, Callable]] = {}
         self._films = ThreadPoolExecutor(1)
         self._filming: Future | None = None
@@ -79,7 +91,7 @@ class Evaluation(Callback):
             first = {name: np.asarray(i[0, 0]) for name, i in run.episodes[task].image.items()}
             video.write_picture(run.folder / f"cameras_{task}.png", video.side_by_side(first))
             with replacing(run.folder / f"rollout_{task}.mp4") as unfinished:
-                _film(self._tasks[task][0], result, unfinished)
+                self._film(self._tasks[task][0], result.poses, unfinished)
 
     def _measure(self, run: Run, when: str, episodes: int = 0) -> dict[str, Result]:
         """Results by task, of the config's number of episodes or another; compilations run side by
@@ -117,27 +129,10 @@ class Evaluation(Callback):
                 compiles.close()
                 progress.update(bar, completed=done, description=f"evaluating {task} {when}")
 
-            env, rollout = self._compiled(run, task)
-            return evaluate(run.policy, env, key, episodes, rollout=rollout, progress=report)
-
-    def _compiled(self, run: Run, task: str) -> tuple[Env, Callable]:
-        """The environment and jitted rollout of a task, made once."""
-        if task not in self._tasks:
-            config = run.config
-            env = envs.make(
-                task,
-                robot=config.robot,
-                num_envs=config.evaluation.worlds,
-                image_size=config.image_size,
-                control_dt=config.control_dt,
-            )
-            rollout = make_rollout(
-                env,
-                execute_steps=config.evaluation.execute_steps,
-                denoise_steps=config.evaluation.denoise_steps,
-            )
-            self._tasks[task] = env, jax.jit(rollout)
-        return self._tasks[task]
+            if task not in self._tasks:
+                self._tasks[task] = self._compile(run.config, task)
+            env, rollout = self._tasks[task]
+            return self._evaluate(run.policy, env, key, episodes, rollout=rollout, progress=report)
 
 
 class NoEvaluation(Callback):
@@ -195,11 +190,3 @@ def _mean(trees: list[Any]) -> Any:
 def _joined(function: Callable, trees: list[Any], **options: Any) -> Any:
     """`jax.tree.map` over any number of trees; of none, an empty one."""
     return jax.tree.map(function, *trees, **options) if trees else {}
-
-
-def _film(env: Env, result: Result, path: Path) -> None:
-    """Render a recorded episode at film size and write it at the control rate."""
-    camera = dataclasses.replace(env, renderer=RayRenderer(env.render_model, video.FILM_SIZE, 1))
-    images = jax.jit(camera.render)(*result.poses)
-    frames = video.side_by_side({name: np.asarray(image) for name, image in images.items()})
-    video.write_video(path, frames, fps=1 / env.control_dt)

@@ -9,18 +9,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import envs
 from envs.compilation import fast_cpu
 from envs.env import Env
 from envs.scene.randomization import Randomization
-from envs.state import State
+from envs.state import Poses, State
+from lorasp_jax.config import Config
 from lorasp_jax.evaluation import metrics
 from lorasp_jax.policies.policy import Policy
 
 FILMED_WORLDS = 8
 """Worlds whose poses are kept, to choose one of them for the video."""
-
-Poses = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
-"""Geom positions and rotations, camera positions and rotations: the arguments of `Env.render`."""
 
 
 @jax.tree_util.register_dataclass
@@ -105,6 +104,23 @@ def make_rollout(
     return rollout
 
 
+def compiled_rollout(config: Config, task: str) -> tuple[Env, Callable]:
+    """The environment of a task, and its rollout, compiled when it is first called."""
+    env = envs.make(
+        task,
+        robot=config.robot,
+        num_envs=config.evaluation.worlds,
+        image_size=config.image_size,
+        control_dt=config.control_dt,
+    )
+    rollout = make_rollout(
+        env,
+        execute_steps=config.evaluation.execute_steps,
+        denoise_steps=config.evaluation.denoise_steps,
+    )
+    return env, jax.jit(rollout)
+
+
 def evaluate(
     policy: Policy,
     env: Env,
@@ -156,9 +172,7 @@ def _look(
 
     def act(state: State, action: jax.Array) -> tuple[State, Poses]:
         state = env.step(state, action)
-        data = state.data
-        poses = (data.geom_xpos, data.geom_xmat, data.cam_xpos, data.cam_xmat)
-        return state, jax.tree.map(lambda x: x[:FILMED_WORLDS], poses)
+        return state, jax.tree.map(lambda x: x[:FILMED_WORLDS], Poses.of(state.data))
 
     state, poses = jax.lax.scan(act, state, jnp.moveaxis(actions[:, :execute_steps], 1, 0))
     return state, (poses, ranks, histogram, running.sum())

@@ -1,4 +1,4 @@
-"""Figures of one run, as SVG, from `metrics.jsonl` and `results.json`."""
+"""Figures of one run, from `metrics.jsonl` and `results.json`."""
 
 import io
 from collections.abc import Sequence
@@ -26,117 +26,125 @@ _BARS = {"before": (-0.18, "before"), "after": (0.18, "vision")}
 Rows = Sequence[dict[str, float]]
 
 
-def success(results: dict[str, Any]) -> str:
+@mpl.rc_context(_STYLE)
+def svg(figure: Figure) -> str:
+    """A figure as SVG text."""
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None})
+    return buffer.getvalue()
+
+
+@mpl.rc_context(_STYLE)
+def success(results: dict[str, Any]) -> Figure:
     """Bars of success before and, at the end of a run, after with their 95 % intervals."""
     tasks = results["tasks"]
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(6, 1.1 + 0.8 * len(tasks)), layout="constrained")
-        axes = figure.subplots()
-        for row, task in enumerate(tasks):
-            for name, (offset, color) in _BARS.items():
-                if name not in tasks[task]:
-                    continue
-                value = tasks[task][name]
-                low, high = value["ci95"]
-                rate = value["success"]
-                axes.barh(row + offset, 100 * rate, height=0.32, color=COLORS[color])
-                axes.plot([100 * low, 100 * high], [row + offset] * 2, color="black", lw=1.5)
-                label = f"{name} {100 * rate:.0f} %"
-                axes.annotate(
-                    label, (100 * high, row + offset), xytext=(6, -3), textcoords="offset points"
-                )
-        axes.set_yticks(range(len(tasks)), list(tasks))
-        axes.invert_yaxis()
-        axes.set_xlim(0, 118)
-        axes.set_xticks(range(0, 101, 20))
-        axes.set_xlabel("success [%], line: 95 % Wilson interval")
-        axes.grid(axis="y", visible=False)
-        return _svg(figure)
+    figure = Figure(figsize=(6, 1.1 + 0.8 * len(tasks)), layout="constrained")
+    axes = figure.subplots()
+    for row, task in enumerate(tasks):
+        for name, (offset, color) in _BARS.items():
+            if name not in tasks[task]:
+                continue
+            value = tasks[task][name]
+            low, high = value["ci95"]
+            rate = value["success"]
+            axes.barh(row + offset, 100 * rate, height=0.32, color=COLORS[color])
+            axes.plot([100 * low, 100 * high], [row + offset] * 2, color="black", lw=1.5)
+            label = f"{name} {100 * rate:.0f} %"
+            axes.annotate(
+                label, (100 * high, row + offset), xytext=(6, -3), textcoords="offset points"
+            )
+    axes.set_yticks(range(len(tasks)), list(tasks))
+    axes.invert_yaxis()
+    axes.set_xlim(0, 118)
+    axes.set_xticks(range(0, 101, 20))
+    axes.set_xlabel("success [%], line: 95 % Wilson interval")
+    axes.grid(axis="y", visible=False)
+    return figure
 
 
-def losses(rows: Rows) -> str:
+@mpl.rc_context(_STYLE)
+def losses(rows: Rows) -> Figure:
     """Task loss and auxiliary losses over the steps."""
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(9, 3), layout="constrained")
-        left, right = figure.subplots(1, 2)
-        _line(left, rows, "task", "#4269d0", "flow matching")
-        left.set_yscale("log")
-        left.set_title("flow-matching loss", loc="left")
-        for name, color in (("spectral", "#ff725c"), ("balance", "#6cc5b0"), ("z", "#a463f2")):
-            _line(right, rows, name, color, name)
-        right.set_title("auxiliary losses, unweighted", loc="left")
-        for axes in (left, right):
-            axes.set_xlabel("step")
-        if right.lines:
-            right.set_yscale("log")
-            right.legend(frameon=False)
-        return _svg(figure)
+    figure = Figure(figsize=(9, 3), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    _line(left, rows, "task", "#4269d0", "flow matching")
+    left.set_yscale("log")
+    left.set_title("flow-matching loss", loc="left")
+    for name, color in (("spectral", "#ff725c"), ("balance", "#6cc5b0"), ("z", "#a463f2")):
+        _line(right, rows, name, color, name)
+    right.set_title("auxiliary losses, unweighted", loc="left")
+    for axes in (left, right):
+        axes.set_xlabel("step")
+    if right.lines:
+        right.set_yscale("log")
+        right.legend(frameon=False)
+    return figure
 
 
-def success_over_steps(rows: Rows) -> str:
+@mpl.rc_context(_STYLE)
+def success_over_steps(rows: Rows) -> Figure:
     """Success of each task while training."""
     names = sorted({name for row in rows for name in row if name.startswith("success/")})
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(9, 3), layout="constrained")
-        axes = figure.subplots()
-        for number, name in enumerate(names):
-            _line(axes, rows, name, f"C{number}", name.removeprefix("success/"))
-        axes.set_ylim(0, 1.03)
-        axes.set_xlabel("step")
-        axes.set_title("success while training, in fewer episodes than at the end", loc="left")
-        axes.legend(frameon=False, loc="lower right")
-        return _svg(figure)
+    figure = Figure(figsize=(9, 3), layout="constrained")
+    axes = figure.subplots()
+    for number, name in enumerate(names):
+        _line(axes, rows, name, f"C{number}", name.removeprefix("success/"))
+    axes.set_ylim(0, 1.03)
+    axes.set_xlabel("step")
+    axes.set_title("success while training, in fewer episodes than at the end", loc="left")
+    axes.legend(frameon=False, loc="lower right")
+    return figure
 
 
-def active_rank(rows: Rows, rank: int) -> str:
+@mpl.rc_context(_STYLE)
+def active_rank(rows: Rows, rank: int) -> Figure:
     """Active rank of each tower over training."""
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(9, 3), layout="constrained")
-        axes = figure.subplots()
-        for tower in ("vision", "language", "action"):
-            _line(axes, rows, f"active_rank/{tower}", COLORS[tower], tower)
-        axes.axhline(rank, color="black", lw=1, ls=":")
-        axes.set_ylim(0, 1.06 * rank)
-        axes.set_xlabel("step")
-        axes.set_title(f"mean active rank by tower, bank size {rank} dotted", loc="left")
-        axes.legend(frameon=False, loc="lower left")
-        return _svg(figure)
+    figure = Figure(figsize=(9, 3), layout="constrained")
+    axes = figure.subplots()
+    for tower in ("vision", "language", "action"):
+        _line(axes, rows, f"active_rank/{tower}", COLORS[tower], tower)
+    axes.axhline(rank, color="black", lw=1, ls=":")
+    axes.set_ylim(0, 1.06 * rank)
+    axes.set_xlabel("step")
+    axes.set_title(f"mean active rank by tower, bank size {rank} dotted", loc="left")
+    axes.legend(frameon=False, loc="lower left")
+    return figure
 
 
-def layer_ranks(layers: dict[str, dict[str, Sequence[float]]], rank: int) -> str:
+@mpl.rc_context(_STYLE)
+def layer_ranks(layers: dict[str, dict[str, Sequence[float]]], rank: int) -> Figure:
     """Active rank of every adapted layer after training, one panel per tower that has any."""
     layers = {tower: linears for tower, linears in layers.items() if linears}
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(9, 3.4), layout="constrained")
-        panels = figure.subplots(1, len(layers), sharey=True, squeeze=False)[0]
-        for axes, (tower, linears) in zip(panels, layers.items(), strict=True):
-            for position, values in enumerate(linears.values()):
-                axes.scatter([position] * len(values), values, color=_color(tower), s=14)
-            axes.set_xticks(range(len(linears)), list(linears), rotation=70, ha="right")
-            axes.set_ylim(0, 1.06 * rank)
-            axes.set_title(tower, loc="left")
-        panels[0].set_ylabel("active rank, one dot a layer")
-        return _svg(figure)
+    figure = Figure(figsize=(9, 3.4), layout="constrained")
+    panels = figure.subplots(1, len(layers), sharey=True, squeeze=False)[0]
+    for axes, (tower, linears) in zip(panels, layers.items(), strict=True):
+        for position, values in enumerate(linears.values()):
+            axes.scatter([position] * len(values), values, color=_color(tower), s=14)
+        axes.set_xticks(range(len(linears)), list(linears), rotation=70, ha="right")
+        axes.set_ylim(0, 1.06 * rank)
+        axes.set_title(tower, loc="left")
+    panels[0].set_ylabel("active rank, one dot a layer")
+    return figure
 
 
-def rank_histogram(histogram: dict[str, Sequence[int]]) -> str:
+@mpl.rc_context(_STYLE)
+def rank_histogram(histogram: dict[str, Sequence[int]]) -> Figure:
     """Share of tokens at each active rank, one panel per tower.
 
     Args:
         histogram: tower -> how many tokens had active rank 0, 1, ...
     """
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(9, 2.8), layout="constrained")
-        panels = figure.subplots(1, len(histogram), sharey=True, squeeze=False)[0]
-        for axes, (tower, counts) in zip(panels, histogram.items(), strict=True):
-            total = max(sum(counts), 1)
-            shares = [100 * count / total for count in counts]
-            axes.bar(range(len(counts)), shares, width=1.0, color=_color(tower))
-            axes.set_xlim(-0.5, len(counts) - 0.5)
-            axes.set_xlabel("active rank of a token")
-            axes.set_title(tower, loc="left")
-        panels[0].set_ylabel("tokens [%]")
-        return _svg(figure)
+    figure = Figure(figsize=(9, 2.8), layout="constrained")
+    panels = figure.subplots(1, len(histogram), sharey=True, squeeze=False)[0]
+    for axes, (tower, counts) in zip(panels, histogram.items(), strict=True):
+        total = max(sum(counts), 1)
+        shares = [100 * count / total for count in counts]
+        axes.bar(range(len(counts)), shares, width=1.0, color=_color(tower))
+        axes.set_xlim(-0.5, len(counts) - 0.5)
+        axes.set_xlabel("active rank of a token")
+        axes.set_title(tower, loc="left")
+    panels[0].set_ylabel("tokens [%]")
+    return figure
 
 
 def _color(tower: str) -> str:
@@ -149,10 +157,3 @@ def _line(axes: Any, rows: Rows, name: str, color: str, label: str) -> None:
     points = [(row["step"], row[name]) for row in rows if name in row]
     if points:
         axes.plot(*zip(*points, strict=True), color=color, label=label, lw=1.5)
-
-
-def _svg(figure: Figure) -> str:
-    """The figure as SVG text."""
-    buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None})
-    return buffer.getvalue()

@@ -8,6 +8,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from matplotlib.figure import Figure
+
 from envs.datasets.files import inside, read_bytes
 from envs.datasets.writing import write_text
 from lorasp_jax.report import figures
@@ -229,9 +231,9 @@ def _table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     return f"<table><tr>{head}</tr>{body}</table>"
 
 
-def _image(svg: str) -> str:
-    """An SVG as an image of its own, so that identifiers of several do not clash."""
-    data = base64.b64encode(svg.encode()).decode()
+def _image(figure: Figure) -> str:
+    """A figure as an image of its own, so that identifiers of several do not clash."""
+    data = base64.b64encode(figures.svg(figure).encode()).decode()
     return f'<img alt="figure" src="data:image/svg+xml;base64,{data}">'
 
 

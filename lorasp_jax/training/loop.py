@@ -9,6 +9,7 @@ from typing import Any
 import jax
 from flax import nnx
 
+from envs.cli.bars import bars
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config, OptimConfig
 from lorasp_jax.data.batches import Raw, Steps, encode, sample_batch
@@ -21,7 +22,7 @@ from lorasp_jax.training.guard import summarise
 from lorasp_jax.training.interrupt import deferred
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
 from lorasp_jax.training.random_streams import RandomStream
-from lorasp_jax.training.run import Callback, Run, bars
+from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import MetricsLog
 from lorasp_jax.training.step import TrainState, init_state, train_step
 from lorasp_jax.training.stepper import Collect, Stepper, make_stepper

@@ -1,4 +1,4 @@
-"""A run as its parts see it, the hooks into it, and its progress bars."""
+"""A run as its parts see it, and the hooks into it."""
 
 import contextlib
 import time
@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import Progress, ProgressColumn, Task
-from rich.text import Text
 
 from envs.datasets.episodes import Episodes
 from lorasp_jax.config import Config
@@ -18,9 +16,6 @@ from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training import records
 from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.run_folder import CLOCK, read_json, write_json
-
-_PERIOD = 600.0
-"""Seconds of which the rate is the mean; there is none where no two updates fall into them."""
 
 
 @dataclass
@@ -103,30 +98,3 @@ class Callback:
 
     def on_stop(self, run: Run, reason: str) -> None:
         """When training cannot go on, in place of `on_end`; there is no policy then."""
-
-
-def bars(console: Console, unit: str, *, per_step: int = 1, shown: bool = True) -> Progress:
-    """Bars that show, beside share and remaining time, a rate.
-
-    Args:
-        console: where they are drawn.
-        unit: what is counted, such as "episodes".
-        per_step: units to a step of the bar.
-        shown: False while other bars are; a terminal shows one group at a time.
-    """
-    columns = (*Progress.get_default_columns(), _Rate(unit, per_step))
-    return Progress(*columns, console=console, disable=not shown, speed_estimate_period=_PERIOD)
-
-
-class _Rate(ProgressColumn):
-    """Units per second; nothing before there are two points in time."""
-
-    def __init__(self, unit: str, per_step: int) -> None:
-        super().__init__()
-        self._unit, self._per_step = unit, per_step
-
-    def render(self, task: Task) -> Text:
-        if not (speed := task.finished_speed or task.speed):
-            return Text("")
-        rate = speed * self._per_step
-        return Text(f"{rate:,.3g} {self._unit}/s" if rate < 100 else f"{rate:,.0f} {self._unit}/s")

@@ -25,6 +25,7 @@ from envs.datasets.writing import UNFINISHED, write_text
 from lorasp_jax.config import Config
 from lorasp_jax.peft._settings import upgraded
 from lorasp_jax.storage.digest import sealed, unsealed
+from lorasp_jax.storage.json_values import check
 from lorasp_jax.training import records
 from lorasp_jax.training.distributed import processes
 
@@ -52,7 +53,7 @@ def read_json(path: Path, kind: Mapping[Any, Any] = MappingProxyType({})) -> dic
 
     Args:
         path: the file.
-        kind: what must be in it, see `records.check`.
+        kind: what must be in it, see `json_values.check`.
 
     Raises:
         ValueError: the file is damaged, or another version wrote other values.
@@ -61,7 +62,7 @@ def read_json(path: Path, kind: Mapping[Any, Any] = MappingProxyType({})) -> dic
         return {}
     with damage(path, remedy=": put back a whole one"):
         found = unsealed(json.loads(read_bytes(path)))
-        records.check(found, kind)
+        check(found, kind)
         return found
 
 
@@ -244,7 +245,7 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
     for number, line in enumerate(lines, 1):
         try:
             rows.append(unsealed(json.loads(line)))
-            records.check(rows[-1], records.ROW)
+            check(rows[-1], records.ROW)
         except (ValueError, RecursionError) as error:
             raise ValueError(
                 f"line {number} of {path} is damaged ({error}): put back a whole one, or remove it"

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import TaskID
 
 import envs
+from envs.cli.bars import bars
 from envs.datasets.episodes import Episodes
 from envs.env import Env
 from lorasp_jax import peft
@@ -39,7 +40,7 @@ from lorasp_jax.training.demonstrations import demonstrations
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.random_streams import RandomStream
-from lorasp_jax.training.run import Run, bars
+from lorasp_jax.training.run import Run
 from lorasp_jax.training.run_folder import record_dataset
 
 STATISTICS_BATCHES = 8

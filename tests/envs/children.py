@@ -13,7 +13,6 @@ import numpy as np
 
 from envs import __main__ as command_line
 from envs.datasets import rlds, rlds_schema
-from envs.experts import collection
 from tests import ROOT
 
 COLLECT = "collect --task press --robot piper --num-episodes 20 --num-envs 6 --image-size 16"
@@ -21,7 +20,7 @@ COLLECT = "collect --task press --robot piper --num-episodes 20 --num-envs 6 --i
 MOMENTS = {
     "in the middle of a part": (rlds_schema, "record", 9),
     "before the second part counts": (os, "replace", 3),
-    "before a further part": (collection, "_record", 4),
+    "before a further part": (sys.modules[__name__], "fake_record", 4),
     "when all parts are there": (rlds.Parts, "complete", 1),
     "before the dataset is in place": (os, "rename", 1),
 }
@@ -35,7 +34,7 @@ REPLACING = {
 
 
 def fake_record(env, key, action_noise, ranges):
-    """Stands in for `_record`: noise instead of pictures, some attempts fail."""
+    """Stands in for the simulation: noise instead of pictures, some attempts fail."""
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     size, width = (env.num_envs, 5), env.num_joints + 1
     episodes = {
@@ -71,9 +70,8 @@ def run_child(call):
 
 def collect_and_die(moment, out, options=""):
     """What a child process runs."""
-    collection._record = fake_record
     die_at(*(MOMENTS | REPLACING)[moment][:3])
-    command_line.main([*COLLECT.split(), "--out", out, *options.split()])
+    command_line.main([*COLLECT.split(), "--out", out, *options.split()], record=fake_record)
 
 
 def collect_and_interrupt(out):
@@ -91,6 +89,4 @@ def collect_and_interrupt(out):
         return fake_record(*arguments)
 
     signal.signal(signal.SIGINT, notice)
-
-    collection._record = record
-    sys.exit(command_line.main([*COLLECT.split(), "--out", out]))
+    sys.exit(command_line.main([*COLLECT.split(), "--out", out], record=record))

@@ -9,6 +9,7 @@ import envs
 from envs.experts import expert
 from envs.physics import physics
 from envs.scene.randomization import Randomization
+from envs.state import Poses
 
 pytest.importorskip("warp")
 WORLDS, SIZE = 3, 48
@@ -97,9 +98,9 @@ def test_images_match_the_ray_caster(ranges, antialias):
         assert difference.mean(axis=(1, 2, 3)).max() < 1.5
         assert np.mean(difference.max(axis=-1) > 16) < 0.03
     # Chunks of the context's size, the last one filled up.
-    poses = (state.data.geom_xpos, state.data.geom_xmat, state.data.cam_xpos, state.data.cam_xmat)
+    poses = Poses.of(state.data)
     many = jax.tree.map(lambda x: jnp.concatenate([x, x[:1]]), (poses, state.info["draw"]))
-    pictures = theirs.render(*many[0], draw=many[1])
+    pictures = theirs.render(many[0], draw=many[1])
     seen = theirs.observe(state)["image"]
     for name, picture in pictures.items():
         np.testing.assert_array_equal(picture, jnp.concatenate([seen[name], seen[name][:1]]))

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from lorasp_jax.config import EvaluationConfig
-from lorasp_jax.evaluation import Result, callback
+from lorasp_jax.evaluation import Result
 from lorasp_jax.evaluation.callback import Evaluation
 from lorasp_jax.training.run import Run
 from tests.runs import CONFIG, random_episodes
@@ -26,23 +26,19 @@ def run(tmp_path):
     return run
 
 
-def test_every_hundred_steps_at_the_next_log_line(run, monkeypatch):
+def test_every_hundred_steps_at_the_next_log_line(run):
     asked, filmed, go = [], [], threading.Event()
 
     def evaluate(policy, env, key, episodes, **_):
         asked.append((env, episodes))
         return Result(0.5, episodes, (0.4, 0.6), 30.0, {}, {}, poses=())
 
-    def film(env, result, path):
+    def film(env, poses, path):
         assert go.wait(60)
         filmed.append(env)
         path.touch()
 
-    monkeypatch.setattr(callback, "evaluate", evaluate)
-    monkeypatch.setattr(callback, "_film", film)
-    monkeypatch.setattr(callback.video, "write_picture", lambda *_: None)
-    evaluation = Evaluation()
-    evaluation._tasks = {task: (task, None) for task in run.config.tasks}
+    evaluation = Evaluation(lambda _, task: (task, None), evaluate, film)
     steps = [*range(40, 300, 40), 300]
     with run.timed("train"):
         found = {step: evaluation.on_log(run, step, {}) for step in steps[:3]}
@@ -65,8 +61,8 @@ def test_every_hundred_steps_at_the_next_log_line(run, monkeypatch):
     assert parts <= run.seconds["total"]  # an evaluation is not counted as training, too
 
 
-def test_without_it_nothing_is_measured(run, monkeypatch):
-    monkeypatch.setattr(callback, "evaluate", lambda *_, **__: pytest.fail("it measures"))
+def test_without_it_nothing_is_measured(run):
+    evaluation = Evaluation(evaluate=lambda *_, **__: pytest.fail("it measures"))
     settings = dataclasses.replace(run.config.evaluation, every=0)
     run.config = dataclasses.replace(run.config, evaluation=settings)
-    assert Evaluation().on_log(run, 40, {}) == {}
+    assert evaluation.on_log(run, 40, {}) == {}

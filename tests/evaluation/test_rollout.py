@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import envs
+from envs.state import Poses
 from lorasp_jax.evaluation import evaluate, make_rollout
 from lorasp_jax.evaluation.rollout import Rollout, _largest_bank, _result, _told
 from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP
@@ -120,7 +121,7 @@ def batch(success, steps, counts):
         steps=jnp.array(steps),
         active_rank={"vision": {"fc1": jnp.array([1.0, 3.0])}},
         active_rank_histogram={"vision": jnp.array(counts, jnp.int32)},
-        poses=(pose,) * 4,
+        poses=Poses(*(pose,) * 4),
     )
 
 

@@ -21,13 +21,7 @@ ROWS = [
 ]
 
 
-@pytest.fixture
-def drawn(monkeypatch):
-    """Figures as matplotlib's objects, before they become SVG."""
-    monkeypatch.setattr(figures, "_svg", lambda figure: figure)
-
-
-def test_success(drawn):
+def test_success():
     (axes,) = figures.success({"tasks": TASKS}).axes
     np.testing.assert_allclose([bar.get_width() for bar in axes.patches], [0, 75, 10, 50])
     ends = [line.get_xdata() for line in axes.lines]
@@ -36,7 +30,7 @@ def test_success(drawn):
     assert "after 75 %" in {text.get_text() for text in axes.texts}
 
 
-def test_success_over_steps(drawn):
+def test_success_over_steps():
     rows = [{"step": 2.0, "success/press": 0.25}, {"step": 4.0, "task": 1.0}]
     rows += [{"step": 6.0, "success/press": 0.5, "success/pour": 1.0}]
     (axes,) = figures.success_over_steps(rows).axes
@@ -44,7 +38,7 @@ def test_success_over_steps(drawn):
     assert found == {"press": [[2, 0.25], [6, 0.5]], "pour": [[6, 1]]}
 
 
-def test_losses_are_drawn_where_they_were_recorded(drawn):
+def test_losses_are_drawn_where_they_were_recorded():
     task, auxiliary = figures.losses(ROWS).axes
     np.testing.assert_array_equal(task.lines[0].get_xydata(), [[2, 1], [4, 0.5]])
     assert [line.get_label() for line in auxiliary.lines] == ["spectral"]
@@ -52,12 +46,12 @@ def test_losses_are_drawn_where_they_were_recorded(drawn):
     assert not figures.losses([{"step": 2.0, "task": 1.0}]).axes[1].lines
 
 
-def test_active_rank_and_its_bank(drawn):
+def test_active_rank_and_its_bank():
     (axes,) = figures.active_rank(ROWS, 8).axes
     assert [line.get_ydata()[0] for line in axes.lines] == [6, 8]
 
 
-def test_every_layer_is_a_dot(drawn):
+def test_every_layer_is_a_dot():
     layers = {"vision": {"fc1": [1.0, 2.0], "fc2": [3.0]}, "language": {}, "action": {"fc1": [4.0]}}
     panels = figures.layer_ranks(layers, 8).axes
     assert [axes.get_title(loc="left") for axes in panels] == ["vision", "action"]
@@ -65,7 +59,7 @@ def test_every_layer_is_a_dot(drawn):
     assert dots == [[0, 1], [0, 2], [1, 3]]
 
 
-def test_histogram_shows_shares_of_tokens(drawn):
+def test_histogram_shows_shares_of_tokens():
     panels = figures.rank_histogram({"vision": [0, 3, 1], "action": [0, 0, 0]}).axes
     for axes, shares in zip(panels, ([0, 75, 25], [0, 0, 0]), strict=True):
         assert [bar.get_height() for bar in axes.patches] == shares
@@ -73,4 +67,5 @@ def test_histogram_shows_shares_of_tokens(drawn):
 
 
 def test_same_numbers_give_the_same_file():
-    assert figures.success({"tasks": TASKS}) == figures.success({"tasks": TASKS})
+    once, again = (figures.svg(figures.success({"tasks": TASKS})) for _ in range(2))
+    assert once == again

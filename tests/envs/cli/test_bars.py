@@ -2,40 +2,57 @@
 
 import io
 import threading
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
-from envs.cli import bars
+from envs.cli.bars import bars, collecting
 
 
 @pytest.mark.parametrize(
-    ("episodes", "seconds", "text"),
-    [(0, 9.0, ""), (1, 40.0, "40.0 s an episode"), (64, 20.0, "3.2 episodes/s")],
+    ("per_step", "speed", "finished", "text"),
+    [
+        (64, 2.0, None, "128 samples/s"),
+        (512, 40.0, None, "20,480 samples/s"),
+        (1, 0.025, None, "0.025 samples/s"),
+        (1, None, None, ""),  # nothing done yet, or all at once
+        (2, 3.0, 5.0, "10 samples/s"),  # over the whole time, once it is over
+    ],
 )
-def test_a_rate_is_never_zero(episodes, seconds, text):
-    assert bars._rate(episodes, seconds) == text
+def test_rate_counts_units_not_steps(per_step, speed, finished, text):
+    rate = bars(Console(file=io.StringIO()), "samples", per_step=per_step).columns[-1]
+    assert rate.render(SimpleNamespace(speed=speed, finished_speed=finished)).plain == text
 
 
-def test_compiling_is_not_in_the_rate(monkeypatch):
-    """It ends with the first episodes."""
-    progress, now, shown = bars.Progress, [0.0], []
-    monkeypatch.setattr(
-        bars, "Progress", lambda *a, **k: shown.append(progress(*a, **k)) or shown[0]
-    )
-    with bars.bars(Console(file=io.StringIO()), threading.Event()) as new_bar:
-        shown[0].get_time = lambda: now[0]
-        report = new_bar("press", "piper")
-        for now[0], done, rate in ((1.0, 0, ""), (60.0, 32, ""), (64.0, 64, "8.0 episodes/s")):
-            report(done, 64)
-            assert shown[0].tasks[0].fields["rate"] == rate
+def test_slow_steps_have_a_rate_too():
+    progress, now = bars(Console(file=io.StringIO()), "samples"), [0.0]
+    progress.get_time = lambda: now[0]
+    bar = progress.add_task("training", total=100)
+    for now[0], done in ((60.0, 50), (120.0, 52), (180.0, 54)):
+        progress.update(bar, completed=done)
+    assert progress.tasks[bar].time_remaining == pytest.approx(46 / (4 / 120), rel=0.5)
 
 
-def test_what_is_refused_has_no_bar():
-    console = Console(file=io.StringIO())
-    with bars.bars(console, threading.Event()) as new_bar:
-        new_bar("dance", "piper")
-        new_bar("press", "piper")(0, 1)
-    shown = console.file.getvalue()
-    assert "press, piper: compiling ..." in shown
-    assert "dance" not in shown
+@pytest.mark.parametrize("kept", [0, 8])
+def test_compiling_is_not_in_the_rate(kept):
+    """It ends with the first episodes, also of a collection that continues."""
+    progress, now = bars(Console(file=io.StringIO()), "episodes"), [0.0]
+    progress.get_time = lambda: now[0]
+    report = collecting(progress, "press, piper", threading.Event())
+    for now[0], done, speed in ((1.0, kept, None), (60.0, 32, None), (64.0, 64, 8.0)):
+        report(done, 96)
+        (task,) = progress.tasks
+        assert task.speed == speed
+        assert task.description.endswith("compiling ..." if now[0] == 1 else "collecting")
+
+
+def test_what_is_refused_has_no_bar_and_what_is_stopped_ends():
+    progress, stop = bars(Console(file=io.StringIO()), "episodes"), threading.Event()
+    collecting(progress, "dance, piper", stop)
+    report = collecting(progress, "press, piper", stop)
+    report(0, 1)
+    assert [task.description for task in progress.tasks] == ["press, piper: compiling ..."]
+    stop.set()
+    with pytest.raises(KeyboardInterrupt):
+        report(1, 1)

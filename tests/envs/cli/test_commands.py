@@ -34,18 +34,13 @@ def stopping(function, calls):
 
 
 @pytest.fixture
-def fake(monkeypatch):
-    monkeypatch.setattr(collection, "_record", fake_record)
-
-
-@pytest.fixture
 def run(capsys, monkeypatch):
-    """Runs a command; returns its exit code and what it said."""
+    """Runs a command, by default without simulation; returns its exit code and what it said."""
     # These act on the process.
     monkeypatch.setattr(command_line.cache, "enable", lambda: None)
 
-    def run(text, *more):
-        code = command_line.main([*text.split(), *map(str, more)])
+    def run(text, *more, record=fake_record):
+        code = command_line.main([*text.split(), *map(str, more)], record=record)
         return code, " ".join(capsys.readouterr().err.split())
 
     return run
@@ -104,12 +99,17 @@ def test_play_and_gallery_write_files(tmp_path, run, monkeypatch):
         assert picture.info["duration"] == 200  # ms
 
 
-def test_collect_writes_what_the_library_gives(tmp_path, run, fake):
+def test_collect_writes_what_the_library_gives(tmp_path, run):
     code, said = run(COLLECT, "--out", tmp_path / "press", "--actions", "delta_joint")
     assert code == 0, said
     assert "20/20" in said
     expected = envs.collect(
-        "press", num_episodes=20, num_envs=6, actions="delta_joint", key=jax.random.key(0)
+        "press",
+        num_episodes=20,
+        num_envs=6,
+        actions="delta_joint",
+        key=jax.random.key(0),
+        record=fake_record,
     )
     assert expected.attempted > 20
     found = rlds.read(tmp_path / "press")
@@ -121,7 +121,7 @@ def test_collect_writes_what_the_library_gives(tmp_path, run, fake):
     )
 
 
-def test_collect_writes_a_file_or_many_datasets(tmp_path, run, fake):
+def test_collect_writes_a_file_or_many_datasets(tmp_path, run):
     assert run(COLLECT, "--out", tmp_path / "press.npz")[0] == 0
     code, said = run(COLLECT.replace("press", "pour press"), "--out", tmp_path / "many")
     assert code == 0, said
@@ -132,7 +132,7 @@ def test_collect_writes_a_file_or_many_datasets(tmp_path, run, fake):
 
 
 @pytest.mark.parametrize("moment", mostly_slow(MOMENTS, [*MOMENTS][:1]))
-def test_killed_and_continued(tmp_path, run, fake, moment):
+def test_killed_and_continued(tmp_path, run, moment):
     run(COLLECT, "--out", tmp_path / "whole")
     out, unfinished = tmp_path / "killed", tmp_path / "killed.partial"
     child = run_child(f"collect_and_die({moment!r}, {str(out)!r})")
@@ -160,17 +160,16 @@ def test_interrupted_simulation_goes_on_bit_for_bit(tmp_path, run, env, monkeypa
     for module in (envs, collection):
         monkeypatch.setattr(module, "make", lambda *arguments, **options: env)
     text, out = "collect --task press --robot piper --num-episodes 10", tmp_path / "press"
-    with monkeypatch.context() as patch:
-        patch.setattr(collection, "_record", stopping(collection._record, 2))
-        code, said = run(text, "--out", out)
+    expert = collection.record_expert
+    code, said = run(text, "--out", out, record=stopping(expert, 2))
     assert code == 130
     assert f"stopped: 8 of 10 episodes are kept in {out}.partial, the same command" in said
-    assert run(text, "--out", out)[0] == 0
+    assert run(text, "--out", out, record=expert)[0] == 0
     whole = envs.collect("press", num_episodes=10, key=jax.random.key(0))
     assert_equal(rlds.read(out), trimmed(whole))
 
 
-def test_interrupted_before_anything(tmp_path, run, fake, monkeypatch):
+def test_interrupted_before_anything(tmp_path, run, monkeypatch):
     monkeypatch.setattr(rlds, "Parts", stopping(rlds.Parts, 0))
     code, said = run(COLLECT, "--out", tmp_path / "press")
     assert code == 130
@@ -178,7 +177,7 @@ def test_interrupted_before_anything(tmp_path, run, fake, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_several_tasks_go_on_where_they_were(tmp_path, run, fake, monkeypatch):
+def test_several_tasks_go_on_where_they_were(tmp_path, run, monkeypatch):
     text, out = COLLECT.replace("press", "all"), tmp_path / "many"
     with monkeypatch.context() as patch:
         patch.setattr(writing, "replace_folder", stopping(writing.replace_folder, 2))
@@ -201,13 +200,13 @@ def test_several_tasks_go_on_where_they_were(tmp_path, run, fake, monkeypatch):
     assert "open_pot exists already: choose another --out or add --overwrite" in said
 
 
-def test_one_bad_task_stops_the_others(tmp_path, run, monkeypatch):
+def test_one_bad_task_stops_the_others(tmp_path, run):
     def record(env, key, action_noise, ranges):
         episodes, success = fake_record(env, key, action_noise, ranges)
         return episodes, success & (env.task.name != "pour")
 
-    monkeypatch.setattr(collection, "_record", record)
-    code, said = run(COLLECT.replace("press", "press pour"), "--out", tmp_path)
+    text = COLLECT.replace("press", "press pour")
+    code, said = run(text, "--out", tmp_path, record=record)
     assert code == 2
     assert "error: the expert solved only 0 of 18 layouts of 'pour'" in said
 
@@ -221,7 +220,7 @@ def test_ctrl_c_keeps_the_part_under_way(tmp_path):
     assert b"Traceback" not in child.stderr
 
 
-def test_overwriting_keeps_the_old_until_the_new_is_whole(tmp_path, run, fake, monkeypatch):
+def test_overwriting_keeps_the_old_until_the_new_is_whole(tmp_path, run, monkeypatch):
     out = tmp_path / "press"
     run(COLLECT, "--out", out)
     before = rlds.read(out)
@@ -235,7 +234,7 @@ def test_overwriting_keeps_the_old_until_the_new_is_whole(tmp_path, run, fake, m
     assert rlds.metadata(out)["options"]["seed"] == 1
 
 
-def test_a_damaged_part_is_refused(tmp_path, run, fake, monkeypatch):
+def test_a_damaged_part_is_refused(tmp_path, run, monkeypatch):
     out = tmp_path / "press"
     with monkeypatch.context() as patch:
         patch.setattr(rlds.Parts, "complete", stopping(rlds.Parts.complete, 0))
@@ -249,7 +248,7 @@ def test_a_damaged_part_is_refused(tmp_path, run, fake, monkeypatch):
 
 
 @pytest.mark.slow
-def test_an_edited_robot_is_another(tmp_path, run, fake):
+def test_an_edited_robot_is_another(tmp_path, run):
     text = COLLECT.replace("piper", str(user_arm.write(tmp_path)))
     assert run(text, "--out", tmp_path / "done")[0] == 0
     with pytest.MonkeyPatch.context() as patch:
@@ -264,7 +263,7 @@ def test_an_edited_robot_is_another(tmp_path, run, fake):
     assert (code, "was begun with model" in said) == (2, True)
 
 
-def test_a_second_process_is_refused(tmp_path, run, fake):
+def test_a_second_process_is_refused(tmp_path, run):
     out = tmp_path / "press"
     with locks.locked(out):
         code, said = run(COLLECT, "--out", out)
@@ -276,7 +275,7 @@ def test_a_second_process_is_refused(tmp_path, run, fake):
 
 
 @pytest.mark.parametrize("moment", mostly_slow(REPLACING, [*REPLACING][:1]))
-def test_killed_while_the_old_is_replaced(tmp_path, run, fake, moment):
+def test_killed_while_the_old_is_replaced(tmp_path, run, moment):
     out = tmp_path / REPLACING[moment][3]
     if out.suffix != ".npz":
         run(COLLECT, "--out", out)
@@ -291,7 +290,7 @@ def test_killed_while_the_old_is_replaced(tmp_path, run, fake, moment):
     assert found.num_episodes == 20
 
 
-def test_a_file_of_others_survives_parts_that_are_whole(tmp_path, run, fake, monkeypatch):
+def test_a_file_of_others_survives_parts_that_are_whole(tmp_path, run, monkeypatch):
     out = tmp_path / "press.npz"
     with monkeypatch.context() as patch:
         patch.setattr(rlds.Parts, "complete", stopping(rlds.Parts.complete, 0))

@@ -83,12 +83,9 @@ def test_where_windows_need_another_interpreter(env, monkeypatch):
         viewer.show(env.model, np.zeros((1, env.model.nq)), 0.1)
 
 
-def test_an_expert_that_never_succeeds_is_an_error(env, monkeypatch):
+def test_an_expert_that_never_succeeds_is_an_error(env):
     def act(env, plan, state):
         return state.info["command"]  # stands still
 
-    monkeypatch.setattr(viewer, "_TRIES", 1)
-    monkeypatch.setattr(viewer, "_plan", lambda env, state, key: None)
-    monkeypatch.setattr(viewer, "_act", act)
     with pytest.raises(ValueError, match="the expert failed in all of 4 layouts"):
-        viewer.episode(env, jax.random.key(0))
+        viewer.episode(env, jax.random.key(0), tries=1, plan=lambda *_: None, act=act)

@@ -11,6 +11,7 @@ import pytest
 
 import envs
 from envs.rendering import renderer
+from envs.state import Poses
 from tests.envs.test_tasks import world
 
 SCENE = """
@@ -42,9 +43,11 @@ GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)  # drawn
 
 def poses_of(data):
     """Arguments of `render.render`: poses of all geoms and cameras."""
-    arrays = (data.geom_xpos, data.geom_xmat, data.cam_xpos, data.cam_xmat)
+    arrays = Poses.of(data)
     ends = ((-1, 3), (-1, 3, 3)) * 2
-    return [jnp.asarray(x.reshape(s), jnp.float32) for x, s in zip(arrays, ends, strict=True)]
+    return Poses(
+        *(jnp.asarray(x.reshape(s), jnp.float32) for x, s in zip(arrays, ends, strict=True))
+    )
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +70,7 @@ def poses(shapes):
 
 @pytest.fixture(scope="module")
 def image(built, poses):
-    return np.asarray(renderer.render(built, *poses, appearance=built.appearance, **SIZE))
+    return np.asarray(renderer.render(built, poses, appearance=built.appearance, **SIZE))
 
 
 def camera_rays(model, data, name, height, width):
@@ -109,7 +112,7 @@ def assert_agrees_with_mujoco(model, data, name, geom, depth):
 
 
 def test_rays_agree_with_mujoco(shapes, built, poses):
-    geom, depth = renderer.cast(built, *poses, height=128, width=128)
+    geom, depth = renderer.cast(built, poses, height=128, width=128)
     assert geom.shape == depth.shape == (2, 128, 128)
     assert geom.dtype == jnp.int32
     assert depth.dtype == jnp.float32
@@ -121,7 +124,7 @@ def test_rays_agree_with_mujoco(shapes, built, poses):
 
 def test_rays_agree_with_mujoco_in_every_task(scene):
     data = world(scene)
-    geom, depth = renderer.cast(scene.render_model, *poses_of(data), height=128, width=128)
+    geom, depth = renderer.cast(scene.render_model, poses_of(data), height=128, width=128)
     for i, name in enumerate(scene.cameras):
         seen = assert_agrees_with_mujoco(scene.model, data, name, geom[i], depth[i])
         assert len(seen) > 5  # the table, the gripper or the arm, and something to handle
@@ -143,7 +146,7 @@ def test_shadow_falls_opposite_the_light(shapes, built, poses):
     for slope, dark, bright in ((1.5, left, right), (-1.5, right, left)):
         light = np.array([slope, 0.0, 1.0], np.float32)
         appearance = dataclasses.replace(flat, light=light)
-        top = renderer.render(built, *poses, appearance=appearance, **SIZE)[1].astype(int)
+        top = renderer.render(built, poses, appearance=appearance, **SIZE)[1].astype(int)
         assert top[bright].sum() > top[dark].sum() + 100
 
 
@@ -154,8 +157,8 @@ def test_headlight_and_ambient_cast_no_shadow(built, poses):
         headlight=jnp.array(0.0),
         checker=jnp.array([0.1, 0.0]),
     )
-    geom, _ = renderer.cast(built, *poses, **SIZE)
-    pixels = np.asarray(renderer.render(built, *poses, appearance=dim, **SIZE))[
+    geom, _ = renderer.cast(built, poses, **SIZE)
+    pixels = np.asarray(renderer.render(built, poses, appearance=dim, **SIZE))[
         np.asarray(geom) == 0
     ]
     np.testing.assert_array_equal(pixels, np.broadcast_to(pixels[0], pixels.shape))
@@ -163,12 +166,12 @@ def test_headlight_and_ambient_cast_no_shadow(built, poses):
 
 
 def test_colour_changes_only_its_geom(built, poses, image):
-    geom = np.asarray(renderer.cast(built, *poses, **SIZE)[0])
+    geom = np.asarray(renderer.cast(built, poses, **SIZE)[0])
     green = built.appearance.rgba.copy()
     green[2] = (0, 1, 0, 1)
     appearance = dataclasses.replace(built.appearance, rgba=green)
     changed = np.any(
-        np.asarray(renderer.render(built, *poses, appearance=appearance, **SIZE)) != image, -1
+        np.asarray(renderer.render(built, poses, appearance=appearance, **SIZE)) != image, -1
     )
     np.testing.assert_array_equal(changed, geom == 2)
 
@@ -177,24 +180,27 @@ def test_field_of_view_changes_only_its_camera(built, poses, image):
     appearance = dataclasses.replace(
         built.appearance, fovy=built.appearance.fovy + np.array([0, 10, 0], np.float32)
     )
-    images = np.asarray(renderer.render(built, *poses, appearance=appearance, **SIZE))
+    images = np.asarray(renderer.render(built, poses, appearance=appearance, **SIZE))
     assert np.any(images[0] != image[0])
     np.testing.assert_array_equal(images[1], image[1])
 
 
 def test_batch_equals_single_worlds(built, poses):
     worlds = 5
-    batch = [jnp.tile(x, (worlds, *[1] * x.ndim)) for x in poses]
-    batch[0] = batch[0].at[:, 2, 0].add(0.01 * jnp.arange(worlds))
+    batch = Poses(*(jnp.tile(x, (worlds, *[1] * x.ndim)) for x in poses))
+    moved = batch.geom_xpos.at[:, 2, 0].add(0.01 * jnp.arange(worlds))
+    batch = batch._replace(geom_xpos=moved)
     looks = jax.tree.map(lambda x: jnp.stack([x * 0.8, *[x] * (worlds - 1)]), built.appearance)
     images = jax.jit(
-        lambda poses, looks: renderer.render_batch(built, *poses, appearance=looks, **SIZE)
+        lambda poses, looks: renderer.render_batch(built, poses, appearance=looks, **SIZE)
     )(batch, looks)
     assert images.shape == (worlds, 2, 48, 64, 3)
     assert images.dtype == jnp.uint8
     for i in range(worlds):
         appearance = jax.tree.map(lambda x, i=i: x[i], looks)
-        single = renderer.render(built, *(x[i] for x in batch), appearance=appearance, **SIZE)
+        single = renderer.render(
+            built, Poses(*(x[i] for x in batch)), appearance=appearance, **SIZE
+        )
         difference = np.abs(images[i].astype(int) - single.astype(int))
         assert np.mean(difference > 1) < 1e-3  # rounding may move an edge by a pixel
 
@@ -203,12 +209,12 @@ def test_batch_equals_single_worlds(built, poses):
 def test_sizes_differ_from_world_to_world(shapes, built, poses):
     size = np.stack([built.size, built.size * 1.5, built.size])
     size[2, :, 1] *= 0.5  # half the length of capsules and cylinders, other boxes and ellipsoids
-    batch = [jnp.tile(x, (len(size), *[1] * x.ndim)) for x in poses]
-    images = renderer.render_batch(built, *batch, size=size, **SIZE)
+    batch = Poses(*(jnp.tile(x, (len(size), *[1] * x.ndim)) for x in poses))
+    images = renderer.render_batch(built, batch, size=size, **SIZE)
     for own, found in zip(size, images, strict=True):
         model = copy.copy(shapes[0])
         model.geom_size[:] = own
-        expected = renderer.render(renderer.build(model, CAMERAS), *poses, **SIZE)
+        expected = renderer.render(renderer.build(model, CAMERAS), poses, **SIZE)
         difference = np.abs(found.astype(int) - expected.astype(int))
         assert np.mean(difference > 1) < 1e-3  # rounding may move an edge by a pixel
     assert np.mean(images[0] != images[1]) > 0.05
@@ -219,9 +225,9 @@ def test_sizes_differ_from_world_to_world(shapes, built, poses):
 def test_samples_equal_a_larger_image_scaled_down(built, poses, diffuse):
     appearance = dataclasses.replace(built.appearance, diffuse=np.float32(diffuse))
     height, width = SIZE.values()
-    fine = renderer.render(built, *poses, appearance=appearance, height=2 * height, width=2 * width)
+    fine = renderer.render(built, poses, appearance=appearance, height=2 * height, width=2 * width)
     expected = np.asarray(fine, float).reshape(2, height, 2, width, 2, 3).mean(axis=(2, 4))
-    smooth = renderer.render(built, *poses, appearance=appearance, samples=2, **SIZE)
+    smooth = renderer.render(built, poses, appearance=appearance, samples=2, **SIZE)
     assert smooth.shape == expected.shape
     assert smooth.dtype == jnp.uint8
     # Both are rounded; where two geoms meet, rounding may turn a ray from one to the other.
@@ -230,7 +236,7 @@ def test_samples_equal_a_larger_image_scaled_down(built, poses, diffuse):
 
 def test_memory_does_not_grow_with_the_samples(built, poses):
     def memory(samples):
-        lowered = renderer.render.lower(built, *poses, height=64, width=64, samples=samples)
+        lowered = renderer.render.lower(built, poses, height=64, width=64, samples=samples)
         return lowered.compile().memory_analysis().temp_size_in_bytes
 
     assert memory(8) < 1.5 * memory(1)
@@ -239,19 +245,19 @@ def test_memory_does_not_grow_with_the_samples(built, poses):
 @pytest.mark.slow
 def test_environments_pass_antialias_on():
     plain, smooth = (envs.make("press", image_size=12, antialias=n) for n in (1, 3))
-    batch = [x[None] for x in poses_of(world(plain))]
+    batch = Poses(*(x[None] for x in poses_of(world(plain))))
     for env in (plain, smooth):
         expected = renderer.render_batch(
-            env.render_model, *batch, height=12, width=12, samples=env.antialias
+            env.render_model, batch, height=12, width=12, samples=env.antialias
         )
-        np.testing.assert_array_equal(env.render(*batch)["wrist"], expected[:, 1])
-    assert np.any(smooth.render(*batch)["wrist"] != plain.render(*batch)["wrist"])
+        np.testing.assert_array_equal(env.render(batch)["wrist"], expected[:, 1])
+    assert np.any(smooth.render(batch)["wrist"] != plain.render(batch)["wrist"])
     with pytest.raises(ValueError, match="antialias must be at least 1, got 0"):
         envs.make("press", antialias=0)
 
 
 def test_the_models_appearance_is_the_default(built, poses, image):
-    np.testing.assert_array_equal(renderer.render(built, *poses, **SIZE), image)
+    np.testing.assert_array_equal(renderer.render(built, poses, **SIZE), image)
 
 
 @pytest.mark.parametrize("platform", ["cpu", "cuda", "tpu"])
@@ -260,7 +266,7 @@ def test_lowers_inside_scan_and_vmap(built, poses, platform):
         def body(carry, shift):
             geoms = poses[0] + shift
             return carry, jax.vmap(
-                lambda x: renderer.render(built, x, *poses[1:], height=8, width=8)
+                lambda x: renderer.render(built, poses._replace(geom_xpos=x), height=8, width=8)
             )(geoms[None])
 
         return jax.lax.scan(body, None, shifts)[1]
@@ -273,9 +279,9 @@ def test_bad_input(shapes, built, poses):
     with pytest.raises(ValueError, match=r"no camera {'back'}.*front"):
         renderer.build(shapes[0], ("front", "back"))
     with pytest.raises(ValueError, match=r"geom_xpos must have shape \(12, 3\)"):
-        renderer.render(built, poses[0][:3], *poses[1:], **SIZE)
+        renderer.render(built, poses._replace(geom_xpos=poses.geom_xpos[:3]), **SIZE)
     with pytest.raises(ValueError, match=r"size must have shape \(12, 3\)"):
-        renderer.render(built, *poses, size=built.size[:3], **SIZE)
+        renderer.render(built, poses, size=built.size[:3], **SIZE)
     field = """<mujoco><asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset><worldbody>
       <geom name="hill" type="hfield" hfield="h"/></worldbody></mujoco>"""
     with pytest.raises(ValueError, match="cannot draw geom hill"):
