@@ -138,7 +138,7 @@ def test_latency_delays_targets():
 @pytest.mark.slow  # a scene of its own to compile
 def test_recorded_images_match_each_world(env):
     ranges, key = Randomization.typical(), jax.random.key(3)
-    recorded, _ = collection._record(env, key, 0.0, ranges)
+    recorded, _ = collection.record_expert(env, key, 0.0, ranges)
     start = env.reset(jax.random.split(key, 3)[0], ranges)
     for name, image in env.observe(start)["image"].items():
         np.testing.assert_allclose(recorded["image"][name][:, 0], image, atol=1)
