@@ -13,7 +13,7 @@ import lorasp_jax
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.combine.named import bare
 from lorasp_jax.adapters.io.native import load_adapters, save_adapters
-from lorasp_jax.peft import LoRA, LoRAMoE, LoRASP
+from lorasp_jax.peft import LoRA, LoRAMoE, LoRASP, LoRASPRelease
 from tests import nets
 from tests.cases import mostly_slow
 from tests.nets import NET, X, assert_close, call, trained
@@ -61,8 +61,8 @@ def test_off_is_the_base(method, model):
 
 
 def test_merging_is_the_forward_pass_and_unmerging_restores(method, model):
-    if isinstance(method, LoRASP | LoRAMoE):
-        way_out = {LoRASP: "prune it .* or distill", LoRAMoE: "keep its adapter"}[type(method)]
+    if isinstance(method, LoRASP | LoRASPRelease | LoRAMoE):
+        way_out = "keep its adapter" if isinstance(method, LoRAMoE) else "prune it .* or distill"
         with pytest.raises(ValueError, match=rf"cannot merge (inp|blocks): .*{way_out}"):
             lorasp_jax.merge(model)
         return

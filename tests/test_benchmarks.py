@@ -91,7 +91,7 @@ def test_what_data_imports(tmp_path, codec, size, capfd):
     row = data.importing(tmp_path, codec, 64)
     assert row["stored as"] == "64x48"
     assert row["images/s"] == 2 * row["steps/s"]
-    assert data.decoding(tmp_path, codec)["kB/picture"] == pytest.approx(size, rel=0.3)
+    assert data.decoding(tmp_path, codec)["kB/image"] == pytest.approx(size, rel=0.3)
 
 
 @pytest.mark.slow

@@ -127,8 +127,8 @@ def film(render: Callable, rollout: Rollout, world: int) -> Film:
     steps = max(int(rollout.steps[world]), 1)
     poses = jax.tree.map(lambda x: x[:steps:EVERY, world : world + 1], rollout.poses)
     pictures = []
-    for i in range(len(poses[0])):
-        large = np.asarray(render(*(pose[i] for pose in poses))["side"][0])
+    for i in range(len(poses.geom_xpos)):
+        large = np.asarray(render(jax.tree.map(lambda x, i=i: x[i], poses))["side"][0])
         pictures.append(np.asarray(Image.fromarray(large).resize((TILE, TILE))))
     return Film(np.stack(pictures), bool(rollout.success[world]))
 

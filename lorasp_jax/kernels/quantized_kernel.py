@@ -108,7 +108,7 @@ def quantized(kernel: jax.Array, kind: Kind) -> QuantizedKernel:
         raise ValueError(f"Unknown quantisation {kind!r}; valid are {', '.join(KINDS)}.")
     codes, scale = _codes(kernel, kind)
     if not bool(jnp.isfinite(scale).all()):
-        raise ValueError("Cannot quantise a kernel with NaN or infinite values.")
+        raise ValueError("the kernel has NaN or infinite values.")
     return QuantizedKernel(codes, scale, kernel.shape[-2], jnp.dtype(kernel.dtype))
 
 

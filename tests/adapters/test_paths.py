@@ -68,4 +68,4 @@ def test_attributes_are_set_by_name_in_two_modules():
     by_name = re.compile(r"\b(setattr|delattr)\(|\.__class__ =")
     sources = (ROOT / "lorasp_jax").rglob("*.py")
     having = {path.name for path in sources if by_name.search(path.read_text())}
-    assert having == {"paths.py", "dense.py"}
+    assert having == {"paths.py", "layers.py"}

@@ -18,6 +18,7 @@ from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.config import ModelConfig
 from lorasp_jax.data.opening import open_source
 from lorasp_jax.models import inputs
+from lorasp_jax.models.checkpoints import loading
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import FullFineTuning, LoRA
 from lorasp_jax.policies.policy import Policy
@@ -88,7 +89,8 @@ def test_policies_of_lerobot_are_fed_as_they_say(config, tmp_path, monkeypatch):
         "output_features": {"action": {"shape": [3]}},
     }
     (tmp_path / "config.json").write_text(json.dumps(fields))
-    monkeypatch.setattr(models, "load", lambda _, wanted: SimpleNamespace(config=wanted))
+    weightless = lambda _, wanted: SimpleNamespace(config=wanted)  # noqa: E731
+    monkeypatch.setattr(loading.Found, "load", weightless)
     monkeypatch.setattr(models, "weights_hash", lambda _: "")
     model = ModelConfig(size="base", checkpoint=str(tmp_path))
     wanted = dataclasses.replace(
