@@ -104,7 +104,9 @@ def make_rollout(
     return rollout
 
 
-def compiled_rollout(config: Config, task: str) -> tuple[Env, Callable]:
+def compiled_rollout(
+    config: Config, task: str
+) -> tuple[Env, Callable[[Policy, jax.Array], Rollout]]:
     """The environment of a task, and its rollout, compiled when it is first called."""
     env = envs.make(
         task,
