@@ -36,7 +36,7 @@ class Launch(NamedTuple):
 
 FORWARD = Launch(16, 2, 816)
 BACKWARD = Launch(16, 4, 512)
-"""Own choices; the times above are measured with them."""
+"""Own choices; no sweep is recorded."""
 FEW, FEW_ROWS = Launch(1, 1, 8192), 1024
 """Launch of both passes for up to FEW_ROWS rows, where latency counts: one warp per row. Own
 choice."""
