@@ -1,14 +1,14 @@
-"""Names of tasks and robots, read from their file names without importing them."""
+"""Names of tasks and robots, read from their modules without importing them."""
 
-import pkgutil
+import re
 from pathlib import Path
 
 
 def names(kind: str) -> list[str]:
-    """List all names of a kind, "task" or "robot"; modules that begin with `_` are skipped."""
+    """List the modules that define a "task" or "robot", as a global `TASK` or `ROBOT`."""
+    defines = re.compile(rf"^{kind.upper()}\b", re.MULTILINE)
     folder = Path(__file__).parent / f"{kind}s"
-    modules = (module.name for module in pkgutil.iter_modules([str(folder)]))
-    return sorted(name for name in modules if not name.startswith("_"))
+    return sorted(p.stem for p in folder.glob("[!_]*.py") if defines.search(p.read_text("utf-8")))
 
 
 def check(kind: str, name: str) -> None:

@@ -14,6 +14,7 @@ from envs.scene import scene
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _KINDS = ("free", "ball", "slide", "hinge")
 _MAX_JOINTS = 16  # own choice: compile time grows with every joint
+_RADIANS_AS_DEGREES = np.deg2rad(4 * np.pi)  # rad, the widest range -2 pi to 2 pi read as degrees
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
@@ -100,7 +101,7 @@ def find_limits(model: mujoco.MjModel, arm: Arm) -> tuple[np.ndarray, np.ndarray
     """Return the lowest and highest angles [J] allowed by both hinges and servos [rad].
 
     Raises:
-        ValueError: the two ranges of a joint do not overlap.
+        ValueError: the two ranges of a joint do not overlap, or all seem to be in the wrong unit.
     """
     lower, upper = model.jnt_range[arm.joints].T
     control = np.where(
@@ -112,6 +113,11 @@ def find_limits(model: mujoco.MjModel, arm: Arm) -> tuple[np.ndarray, np.ndarray
     if empty := [joint for joint, span in zip(arm.joints, upper - lower, strict=True) if span <= 0]:
         raise ValueError(
             f"{_names(model, empty)}: range and the actuator's ctrlrange do not overlap"
+        )
+    if (upper - lower).max() < _RADIANS_AS_DEGREES:
+        raise ValueError(
+            "no hinge turns by more than 13 deg; if the file gives angles in radians, add "
+            '<compiler angle="radian"/>, since MuJoCo reads degrees by default'
         )
     return lower, upper
 

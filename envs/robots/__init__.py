@@ -1,23 +1,12 @@
-"""Robot arms: one file per robot, found by its name.
+"""Robot arms: one module per robot, found by the `ROBOT` that it defines.
 
-Modules that begin with `_` hold what all robots share.
+All robots share `arm_kinematics`, forward and inverse, and `_robot`, the definition of a robot.
 """
 
 import importlib
 import importlib.util
 from types import ModuleType
 
-from envs.robots._kinematics import (
-    Geometry,
-    forward_kinematics,
-    inverse_kinematics,
-    multiply,
-    rotation,
-    sine_axis,
-    tool_pose,
-    translation,
-    turn,
-)
 from envs.robots._robot import (
     TIP_LENGTH,
     TIP_RADIUS,
@@ -28,6 +17,17 @@ from envs.robots._robot import (
     Primitives,
     Robot,
     pose,
+)
+from envs.robots.arm_kinematics import (
+    Geometry,
+    forward_kinematics,
+    inverse_kinematics,
+    multiply,
+    rotation,
+    sine_axis,
+    tool_pose,
+    translation,
+    turn,
 )
 
 __all__ = [

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from envs import robots
+from envs.names import names
 from envs.robots import piper
 from tests import GOLDEN
 
@@ -22,6 +23,11 @@ def at_pose(scene, q) -> mujoco.MjData:
 
 def random_poses(robot, number: int) -> np.ndarray:
     return np.random.default_rng(0).uniform(robot.lower, robot.upper, (number, robot.num_joints))
+
+
+def test_only_modules_that_define_a_robot_are_robots():
+    assert {"panda", "piper"} <= {*names("robot")}
+    assert not {"_robot", "arm_kinematics"} & {*names("robot")}
 
 
 @pytest.mark.parametrize("offset", [0, 1])

@@ -99,6 +99,16 @@ _MISSING = (
         [('joint="pitch"/>', 'joint="pitch" ctrlrange="-3 -2"/>')],
     ),
     (
+        "no hinge turns by more than 13 deg; if the file gives angles in radians, add <compiler",
+        [
+            ('range="-150 150"', 'range="-2.6 2.6"'),
+            ('range="-100 100"', 'range="-1.7 1.7"'),
+            ('range="0 160" ref="10"', 'range="0 2.8"'),
+            ('range="-170 170"', 'range="-3 3"'),
+            ('range="-30 130"', 'range="-.5 2.3"'),
+        ],
+    ),
+    (
         "mocap body 'robot/column' is not a fixed child of world",
         [('childclass="robot"', 'childclass="robot" mocap="true"')],
     ),

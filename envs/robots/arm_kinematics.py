@@ -1,4 +1,4 @@
-"""Forward and inverse kinematics of a serial chain of hinges, in JAX."""
+"""Forward and inverse kinematics of an arm, a serial chain of hinges, in JAX."""
 
 from typing import NamedTuple
 
