@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from lorasp_jax.adapters.adaptation import Counts
-from lorasp_jax.adapters.paths import places
+from lorasp_jax.adapters.paths import locate
 from lorasp_jax.dense import Dense
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.pi0 import Pi0Config
@@ -88,9 +88,9 @@ def linear_layers(config: BackboneConfig) -> tuple[Shapes, int]:
     model = nnx.eval_shape(lambda: config.create(nnx.Rngs(0)))
     total = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(nnx.state(model, nnx.Param)))
     shapes = {
-        place.path: place.child.kernel.get_value().shape
-        for place in places(nnx.List([model]), Dense)
-        if place.path != "vision/patch_embed"
+        location.path: location.child.kernel.get_value().shape
+        for location in locate(nnx.List([model]), Dense)
+        if location.path != "vision/patch_embed"
     }
     shapes["language/lm_head"] = (config.language.width, config.vocabulary)
     if isinstance(config, Pi0Config):  # tied to the embedding; the expert has its own

@@ -79,12 +79,12 @@ def adapt(
     paths.check_method_rules(rules)
     nnx_layers.check_einsums(einsums)
     _check_statistics(statistics)
-    holder, key = _copy(model), given.rngs(rngs).params()
-    used = _attach_all(holder, rules, key, einsums, statistics) | free_all(holder, rules)
+    root, key = _copy(model), given.rngs(rngs).params()
+    used = _attach_all(root, rules, key, einsums, statistics) | unfreeze(root, rules)
     for i, (pattern, _) in enumerate(rules):
         if i not in used:
-            raise ValueError(_no_match(pattern, holder, einsums))
-    return holder[0]
+            raise ValueError(_no_match_message(pattern, root, einsums))
+    return root[0]
 
 
 def split(model: nnx.Module) -> tuple[nnx.GraphDef[Any], nnx.State[Any, Any], nnx.State[Any, Any]]:
@@ -115,14 +115,14 @@ def with_dropout(model: Model, key: jax.Array) -> Model:
       model: left untouched; without such adapters the result computes the same.
       key: typed random key.
     """
-    holder, key = _copy(model), _arguments.key(key)
-    for place in paths.once(paths.places(holder, AdaptedLayer)):
-        layer = place.child
+    root, key = _copy(model), _arguments.key(key)
+    for location in paths.unique(paths.locate(root, AdaptedLayer)):
+        layer = location.child
         if isinstance(layer.adapter, AdapterParam) and drop_rate(layer.method):
-            own = jax.random.fold_in(key, zlib.crc32(place.path.encode()))
+            own = jax.random.fold_in(key, zlib.crc32(location.path.encode()))
             leading = layer.stack_shape()
             layer.held_dropout_key = DropoutKey(jax.random.split(own, leading) if leading else own)
-    return holder[0]
+    return root[0]
 
 
 def count(model: nnx.Module) -> Counts:
@@ -135,7 +135,7 @@ def methods(model: nnx.Module) -> dict[str, Method]:
     """Method by path: of each layer with an adapter, and full fine-tuning of each parameter."""
     found = {}
     given.module(model)
-    for path, parent, name, _ in paths.places(nnx.List([model]), AdapterParam):
+    for path, parent, name, _ in paths.locate(nnx.List([model]), AdapterParam):
         if isinstance(parent, AdaptedLayer) and name == "adapter":
             found[path.rpartition("/")[0]] = parent.method
         else:
@@ -152,21 +152,21 @@ def merge(model: Model) -> Model:
     Raises:
       ValueError: a method whose delta depends on the input, or a model without values.
     """
-    holder = _copy(given.with_values(model))
-    paths.replace(paths.places(holder, AdaptedLayer), _merged)
-    _retype(paths.places(holder, AdapterParam), nnx.Param)
-    return holder[0]
+    root = _copy(given.with_values(model))
+    paths.replace(paths.locate(root, AdaptedLayer), _merged)
+    _convert_variables(paths.locate(root, AdapterParam), nnx.Param)
+    return root[0]
 
 
-def _merged(place: paths.Place) -> nnx.Module:
+def _merged(location: paths.Location) -> nnx.Module:
     """The layer without its adapter, whose delta its kernel has."""
-    layer = place.child
+    layer = location.child
     if layer.adapter is not None:
         try:
             kernel = layer.kernel_matrices()
             kernel = over_stack(layer.method.merge, kernel)(layer.adapter.get_value(), kernel)
         except ValueError as error:
-            raise ValueError(f"cannot merge {place.path}: {error}") from error
+            raise ValueError(f"cannot merge {location.path}: {error}") from error
         layer.set_kernel_matrices(kernel)
     return layer.without_adapter()
 
@@ -174,7 +174,7 @@ def _merged(place: paths.Place) -> nnx.Module:
 def penalties(model: nnx.Module) -> dict[str, jax.Array]:
     """Each loss on parameters alone, averaged over the adapted matrices whose method has it."""
     found: dict[str, list[jax.Array]] = {}
-    for _, _, _, layer in paths.places(nnx.List([given.module(model)]), AdaptedLayer):
+    for _, _, _, layer in paths.locate(nnx.List([given.module(model)]), AdaptedLayer):
         if layer.adapter is not None:
             penalty = over_stack(layer.method.penalty, layer.kernel_matrices())
             for name, values in penalty(layer.adapter.get_value()).items():
@@ -204,8 +204,8 @@ def attach(
         )
     if method.splits_kernel and isinstance(layer.kernel_matrices(), QuantizedKernel):
         raise ValueError("a quantised kernel cannot be split: adapt first, then quantise the rest.")
-    _retype(
-        [p for p in paths.places(nnx.List([layer]), AdapterParam) if p.name != "adapter"], nnx.Param
+    _convert_variables(
+        [p for p in paths.locate(nnx.List([layer]), AdapterParam) if p.name != "adapter"], nnx.Param
     )
     init = layer.adapter_init(method)
     params, kernel = init_stack(key, init, layer.kernel_matrices(), statistics)
@@ -240,7 +240,7 @@ def _copy(model: nnx.Module) -> nnx.List[Any]:
 
 
 def _attach_all(
-    holder: nnx.List[Any],
+    root: nnx.List[Any],
     rules: paths.Rules,
     key: jax.Array,
     einsums: nnx_layers.Einsums,
@@ -248,64 +248,64 @@ def _attach_all(
 ) -> set[int]:
     """Attaches adapters in place; returns the rules that were used."""
     used: dict[str, int] = {}
-    found = paths.layer_places(holder, einsums)
-    for place in found:
-        i = paths.governing(rules, place.path)
+    found = paths.locate_layers(root, einsums)
+    for location in found:
+        i = paths.find_rule(rules, location.path)
         method = None if i is None else rules[i][1]
         if i is not None and method is not None and not method.trains_base:
-            used[place.path] = i
+            used[location.path] = i
 
-    def attached(place: paths.Place) -> AdaptedLayer | None:
-        if place.path not in used:
+    def attached(location: paths.Location) -> AdaptedLayer | None:
+        if location.path not in used:
             return None
-        method = cast(Method, rules[used[place.path]][1])
-        own_key = jax.random.fold_in(key, zlib.crc32(place.path.encode()))
+        method = cast(Method, rules[used[location.path]][1])
+        own_key = jax.random.fold_in(key, zlib.crc32(location.path.encode()))
         try:
-            layer = nnx_layers.adapted(place.child, einsums)
-            attach(layer, method, own_key, statistics.get(place.path))
+            layer = nnx_layers.adapted(location.child, einsums)
+            attach(layer, method, own_key, statistics.get(location.path))
         except ValueError as error:
-            raise ValueError(f"cannot adapt {place.path or 'the model'}: {error}") from error
+            raise ValueError(f"cannot adapt {location.path or 'the model'}: {error}") from error
         return layer
 
     paths.replace(found, attached)
     return set(used.values())
 
 
-def free_all(holder: nnx.List[Any], rules: paths.Rules) -> set[int]:
+def unfreeze(root: nnx.List[Any], rules: paths.Rules) -> set[int]:
     """Makes base parameters trainable in place; returns the rules that were used."""
     used, freed = set(), []
-    for place in paths.places(holder, nnx.Param):
-        i = paths.governing(rules, place.path.rpartition("/")[0], place.path)
+    for location in paths.locate(root, nnx.Param):
+        i = paths.find_rule(rules, location.path.rpartition("/")[0], location.path)
         method = None if i is None else rules[i][1]
         if i is None or (method is not None and not method.trains_base):
             continue
         used.add(i)
-        if method is not None and not isinstance(place.child, AdapterParam):
-            if isinstance(place.child.get_value(), QuantizedKernel):
-                raise ValueError(f"{place.path} is quantised and cannot train in full.")
-            layer = place.parent if isinstance(place.parent, AdaptedLayer) else None
+        if method is not None and not isinstance(location.child, AdapterParam):
+            if isinstance(location.child.get_value(), QuantizedKernel):
+                raise ValueError(f"{location.path} is quantised and cannot train in full.")
+            layer = location.parent if isinstance(location.parent, AdaptedLayer) else None
             if layer and layer.adapter is None:
                 layer.method = method
-            elif layer and place.name == layer.kernel_name:
-                raise ValueError(f"{place.path} cannot train in full under the layer's adapter.")
-            if jnp.issubdtype(place.child.get_value().dtype, jnp.floating):
-                freed.append(place)
+            elif layer and location.name == layer.kernel_name:
+                raise ValueError(f"{location.path} cannot train in full under the layer's adapter.")
+            if jnp.issubdtype(location.child.get_value().dtype, jnp.floating):
+                freed.append(location)
     if shapes := [p for p in freed if isinstance(p.child.get_value(), jax.ShapeDtypeStruct)]:
         raise ValueError(f"{shapes[0].path} has no value: call this within nnx.eval_shape.")
-    _retype(freed, AdapterParam)
+    _convert_variables(freed, AdapterParam)
     return used
 
 
-def _retype(places: Sequence[paths.Place], kind: type[nnx.Param]) -> None:
+def _convert_variables(locations: Sequence[paths.Location], kind: type[nnx.Param]) -> None:
     """Replaces variables by ones of another type, shared ones by one; those that train are fp32."""
 
-    def renewed(place: paths.Place) -> nnx.Param:
-        value = place.child.get_value()
+    def renewed(location: paths.Location) -> nnx.Param:
+        value = location.child.get_value()
         if kind is AdapterParam:  # a copy: the train step may donate what trains
             value = jnp.array(value, jnp.float32, copy=True)
-        return kind(value, **place.child.get_metadata())
+        return kind(value, **location.child.get_metadata())
 
-    paths.replace(places, renewed)
+    paths.replace(locations, renewed)
 
 
 def init_stack(
@@ -338,11 +338,11 @@ def over_stack(function: Callable[..., Any], kernel: jax.Array) -> Callable[...,
     return function
 
 
-def _no_match(pattern: str, holder: nnx.List[Any], einsums: nnx_layers.Einsums) -> str:
-    known = [place.path for place in paths.layer_places(holder, einsums)]
-    others = paths.other_places(holder, einsums)
+def _no_match_message(pattern: str, root: nnx.List[Any], einsums: nnx_layers.Einsums) -> str:
+    known = [location.path for location in paths.locate_layers(root, einsums)]
+    others = paths.locate_other_matrices(root, einsums)
     classes = {p.path.rpartition("/")[0]: type(p.parent).__name__ for p in others}
-    return paths.no_match(pattern, known, classes)
+    return paths.no_match_message(pattern, known, classes)
 
 
 def _size(tree: Any) -> int:

@@ -27,7 +27,7 @@ from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.adapters.layers.einsum import to_matrices
 from lorasp_jax.adapters.layers.linen_layers import kind, layer_map, with_lora
 from lorasp_jax.adapters.layers.nnx_layers import Einsums
-from lorasp_jax.adapters.paths import Rules, check_method_rules, governing, no_match
+from lorasp_jax.adapters.paths import Rules, check_method_rules, find_rule, no_match_message
 from lorasp_jax.dense import KEPT, given
 from lorasp_jax.peft import Method, _arguments
 from lorasp_jax.peft._method import drop_rate
@@ -110,7 +110,7 @@ class LinenAdapter:
         base, trained = self._divided(flatten_dict(params), record)
         for i, (pattern, _) in enumerate(self.rules):
             if i not in record.used:
-                raise ValueError(no_match(pattern, record.seen, record.others))
+                raise ValueError(no_match_message(pattern, record.seen, record.others))
         trained = flatten_dict(variables.get("adapters", {})) | trained
         return {**variables, "params": unflatten_dict(base), "adapters": unflatten_dict(trained)}
 
@@ -198,7 +198,7 @@ class LinenAdapter:
 
     def _method(self, module: nn.Module) -> tuple[int, Method] | None:
         """The rule that gives the layer an adapter, and its method."""
-        i = governing(self.rules, "/".join(module.path))
+        i = find_rule(self.rules, "/".join(module.path))
         method = None if i is None else self.rules[i][1]
         return None if i is None or method is None or method.trains_base else (i, method)
 
@@ -247,7 +247,7 @@ class LinenAdapter:
         for path, value in params.items():
             i = None
             if ADAPTER not in path:
-                i = governing(self.rules, "/".join(path[:-1]), "/".join(path))
+                i = find_rule(self.rules, "/".join(path[:-1]), "/".join(path))
             method = None if i is None else self.rules[i][1]
             if i is not None and (method is None or method.trains_base):
                 record.used.add(i)

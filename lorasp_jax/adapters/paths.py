@@ -16,7 +16,7 @@ from lorasp_jax.peft._fields import short
 Rules = Sequence[tuple[str, Method | None]]
 
 
-class Place(NamedTuple):
+class Location(NamedTuple):
     """Where a layer or parameter hangs in a model: `getattr(parent, name)` is `child`."""
 
     path: str
@@ -25,29 +25,29 @@ class Place(NamedTuple):
     child: Any
 
 
-def places(holder: nnx.List[Any], kind: type | tuple[type, ...]) -> list[Place]:
+def locate(root: nnx.List[Any], kind: type | tuple[type, ...]) -> list[Location]:
     """All children of a type, with paths that start below the holder."""
 
-    def walk() -> Iterator[Place]:
-        for path, module in nnx.iter_modules(holder):
+    def walk() -> Iterator[Location]:
+        for path, module in nnx.iter_modules(root):
             for name, child in vars(module).items():
                 if isinstance(child, kind):
-                    yield Place("/".join(map(str, (*path, name)[1:])), module, name, child)
+                    yield Location("/".join(map(str, (*path, name)[1:])), module, name, child)
 
     return list(walk())
 
 
-def once(found: list[Place]) -> list[Place]:
+def unique(found: list[Location]) -> list[Location]:
     """Without the further places of a child that hangs in several."""
-    return list({id(place.child): place for place in reversed(found)}.values())[::-1]
+    return list({id(location.child): location for location in reversed(found)}.values())[::-1]
 
 
-def put(place: Place, child: Any) -> None:
+def set_child(location: Location, child: Any) -> None:
     """Hangs another child into a place: the parent is anyone's, so its attribute has any name."""
-    setattr(place.parent, place.name, child)
+    setattr(location.parent, location.name, child)
 
 
-def replace(found: Sequence[Place], make: Callable[[Place], Any]) -> None:
+def replace(found: Sequence[Location], make: Callable[[Location], Any]) -> None:
     """Hangs something else into the places of children.
 
     Args:
@@ -57,36 +57,36 @@ def replace(found: Sequence[Place], make: Callable[[Place], Any]) -> None:
         `nnx.Linear` gets its own, so that it has an adapter of its own there.
     """
     made: dict[Any, Any] = {}
-    for place in found:
-        if _one(place) not in made and (new := make(place)) is not None:
-            made[_one(place)] = new
-    for place in found:
-        if _one(place) in made:
-            put(place, made[_one(place)])
+    for location in found:
+        if _one(location) not in made and (new := make(location)) is not None:
+            made[_one(location)] = new
+    for location in found:
+        if _one(location) in made:
+            set_child(location, made[_one(location)])
 
 
-def _one(place: Place) -> Any:
+def _one(location: Location) -> Any:
     """What is the same for places that get the same."""
-    return place.path if isinstance(place.child, nnx.Linear) else id(place.child)
+    return location.path if isinstance(location.child, nnx.Linear) else id(location.child)
 
 
-def layer_places(
-    holder: nnx.List[Any], einsums: nnx_layers.Einsums = MappingProxyType({})
-) -> list[Place]:
+def locate_layers(
+    root: nnx.List[Any], einsums: nnx_layers.Einsums = MappingProxyType({})
+) -> list[Location]:
     """All layers that have an adapter or could."""
     return [
-        place
-        for place in places(holder, nnx.Module)
-        if isinstance(place.child, AdaptedLayer) or nnx_layers.kind(place.child, einsums)
+        location
+        for location in locate(root, nnx.Module)
+        if isinstance(location.child, AdaptedLayer) or nnx_layers.kind(location.child, einsums)
     ]
 
 
-def multiplying(
-    holder: nnx.List[Any], einsums: nnx_layers.Einsums = MappingProxyType({})
-) -> list[Place]:
+def locate_matmul_layers(
+    root: nnx.List[Any], einsums: nnx_layers.Einsums = MappingProxyType({})
+) -> list[Location]:
     """The layers that multiply their input by matrices: dense ones and einsums, adapted or not."""
-    found = layer_places(holder, einsums)
-    return [place for place in found if not isinstance(place.child, nnx.Embed | nnx.Conv)]
+    found = locate_layers(root, einsums)
+    return [location for location in found if not isinstance(location.child, nnx.Embed | nnx.Conv)]
 
 
 def check_rules(rules: Any, valid: Callable[[Any], bool], what: str) -> None:
@@ -127,27 +127,28 @@ def check_method_rules(rules: Any) -> None:
     check_rules(rules, lambda m: m is None or isinstance(m, Method), "method or None")
 
 
-def governing(rules: Rules, *paths: str) -> int | None:
+def find_rule(rules: Rules, *paths: str) -> int | None:
     """Index of the first rule that matches one of the paths."""
     hits = (i for i, (pattern, _) in enumerate(rules) if any(re.search(pattern, p) for p in paths))
     return next(hits, None)
 
 
-def other_places(
-    holder: nnx.List[Any], einsums: nnx_layers.Einsums = MappingProxyType({})
-) -> list[Place]:
+def locate_other_matrices(
+    root: nnx.List[Any], einsums: nnx_layers.Einsums = MappingProxyType({})
+) -> list[Location]:
     """Parameters of two axes or more of modules that no adapter applies to; norms' are no matrices,
     though a stack gives them an axis."""
-    known = {id(place.child) for place in layer_places(holder, einsums)}
+    known = {id(location.child) for location in locate_layers(root, einsums)}
     return [
-        place
-        for place in places(holder, nnx.Param)
-        if id(place.parent) not in known and len(getattr(place.child.get_value(), "shape", ())) > 1
-        if not isinstance(place.parent, AdaptedLayer) and place.name not in ("scale", "bias")
+        location
+        for location in locate(root, nnx.Param)
+        if id(location.parent) not in known
+        and len(getattr(location.child.get_value(), "shape", ())) > 1
+        if not isinstance(location.parent, AdaptedLayer) and location.name not in ("scale", "bias")
     ]
 
 
-def no_match(pattern: str, known: Sequence[str], others: Mapping[str, str]) -> str:
+def no_match_message(pattern: str, known: Sequence[str], others: Mapping[str, str]) -> str:
     """What to say of a rule that applies to nothing.
 
     Args:
@@ -161,10 +162,10 @@ def no_match(pattern: str, known: Sequence[str], others: Mapping[str, str]) -> s
         return f"{text}."
     close = difflib.get_close_matches(pattern, others, n=3, cutoff=0.3) or list(others)[:3]
     listed = ", ".join(f"{path or 'the model'} ({others[path]})" for path in close)
-    return f"{text}; of other classes: {listed}. {REACHED}."
+    return f"{text}; of other classes: {listed}. {EINSUMS_HINT}."
 
 
-REACHED = (
+EINSUMS_HINT = (
     "Where such a class is an einsum of input and parameter, einsums={Class: lambda layer: (name, "
     "equation)} takes it; FullFineTuning takes all"
 )

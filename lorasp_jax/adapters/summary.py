@@ -9,7 +9,7 @@ from flax import nnx
 
 from lorasp_jax.adapters.adaptation import Counts, count
 from lorasp_jax.adapters.layers.nnx_layers import kernel_of
-from lorasp_jax.adapters.paths import REACHED, layer_places, other_places, places
+from lorasp_jax.adapters.paths import EINSUMS_HINT, locate, locate_layers, locate_other_matrices
 from lorasp_jax.dense import KEPT, AdapterAux, AdapterParam, given
 from lorasp_jax.peft import Aux
 from lorasp_jax.peft._fields import short
@@ -56,9 +56,9 @@ def summary(model: nnx.Module, aux: Mapping[str, Aux] | None = None) -> str:
 def trained_share(model: nnx.Module) -> str:
     """One line: which share of the parameters trains, and which parts of the model are frozen."""
     trainable, total = count(model)
-    holder = nnx.List([model])
-    parts = dict.fromkeys(place.path.split("/")[0] for place in places(holder, nnx.Param))
-    touched = {place.path.split("/")[0] for place in places(holder, AdapterParam)}
+    root = nnx.List([model])
+    parts = dict.fromkeys(location.path.split("/")[0] for location in locate(root, nnx.Param))
+    touched = {location.path.split("/")[0] for location in locate(root, AdapterParam)}
     frozen = ", ".join(part for part in parts if part not in touched)
     share = f"{trainable / max(total, 1):.2%} of all parameters train, {trainable:,} of {total:,}"
     if trainable == total:
@@ -68,18 +68,18 @@ def trained_share(model: nnx.Module) -> str:
 
 def _rows(model: nnx.Module) -> list[Row]:
     """Of each layer, each other parameter that trains, and each matrix outside of such layers."""
-    holder, rows, inside = nnx.List([model]), [], set()
-    for path, _, _, layer in layer_places(holder):
+    root, rows, inside = nnx.List([model]), [], set()
+    for path, _, _, layer in locate_layers(root):
         inside |= {id(v) for v in vars(layer).values() if isinstance(v, nnx.Variable)}
         method, counts = getattr(layer, "method", None), count(layer)
         name = method.name if method else "full" if counts.trainable else "-"
         rank = getattr(method, "rank", "-")
         rows.append(_row(path, name, kernel_of(layer).get_value(), rank, counts))
-    for path, _, _, variable in places(holder, AdapterParam):
+    for path, _, _, variable in locate(root, AdapterParam):
         if id(variable) not in inside:
             counts = Counts(variable.get_value().size, variable.get_value().size)
             rows.append(_row(path, "full", variable.get_value(), "-", counts))
-    for path, _, _, variable in other_places(holder):
+    for path, _, _, variable in locate_other_matrices(root):
         if not isinstance(variable, AdapterParam):
             value = variable.get_value()
             rows.append(_row(path, "-", value, "-", Counts(0, math.prod(value.shape))))
@@ -88,11 +88,11 @@ def _rows(model: nnx.Module) -> list[Row]:
 
 def _others(model: nnx.Module) -> list[str]:
     """A line on the classes that adapters do not apply to, if there are matrices in some."""
-    found = other_places(nnx.List([model]))
-    classes = dict.fromkeys(type(place.parent).__name__ for place in found)
+    found = locate_other_matrices(nnx.List([model]))
+    classes = dict.fromkeys(type(location.parent).__name__ for location in found)
     if not classes:
         return []
-    return [f"no adapter applies by itself to {', '.join(classes)}. {REACHED}."]
+    return [f"no adapter applies by itself to {', '.join(classes)}. {EINSUMS_HINT}."]
 
 
 def _active_rank(aux: Aux | None) -> str:

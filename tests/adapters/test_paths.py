@@ -29,17 +29,17 @@ def net():
 
 
 def found(net):
-    return paths.places(nnx.List([net]), nnx.Module)
+    return paths.locate(nnx.List([net]), nnx.Module)
 
 
 def test_what_hangs_in_two_places_is_replaced_once(net):
     asked = []
 
-    def make(place):
-        asked.append(place.path)
-        return nnx.Dropout(0.5) if place.path in ("second", "linear", "again") else None
+    def make(location):
+        asked.append(location.path)
+        return nnx.Dropout(0.5) if location.path in ("second", "linear", "again") else None
 
-    paths.replace([place for place in found(net) if "several" not in place.path], make)
+    paths.replace([location for location in found(net) if "several" not in location.path], make)
     assert sorted(asked) == ["", "again", "first", "linear", "second"]
     assert net.first is net.second  # no answer for the first place, one for the second
     assert type(net.linear) is nnx.Dropout
@@ -47,8 +47,8 @@ def test_what_hangs_in_two_places_is_replaced_once(net):
 
 
 def test_a_child_is_put_into_a_list(net):
-    (place,) = (place for place in found(net) if place.path == "several/0")
-    paths.put(place, nnx.Dropout(0.5))
+    (location,) = (location for location in found(net) if location.path == "several/0")
+    paths.set_child(location, nnx.Dropout(0.5))
     assert type(net.several[0]) is nnx.Dropout
 
 

@@ -47,8 +47,8 @@ def test_layers_of_each_preset(backbone):
         "action": action,
     }
     assert wanted.keys() == presets.PRESETS.keys()
-    holder = nnx.List([nnx.eval_shape(lambda: backbone.Config.dummy().create(nnx.Rngs(0)))])
-    layers = {place.path for place in paths.layer_places(holder)}
+    root = nnx.List([nnx.eval_shape(lambda: backbone.Config.dummy().create(nnx.Rngs(0)))])
+    layers = {location.path for location in paths.locate_layers(root)}
     for name, layer_paths in wanted.items():
         rules = presets.patterns(name)
         assert {p for p in layers if any(re.search(rule, p) for rule in rules)} == layer_paths, name

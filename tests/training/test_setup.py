@@ -155,7 +155,7 @@ def test_eva_of_the_command_line_sees_the_demonstrations(config, tmp_path):
     moments = setup.input_moments(run, base, run.policy.processor)
     assert set(moments) == set(found)
     assert len(found) == 3
-    for path, parent, _, variable in paths.places(
+    for path, parent, _, variable in paths.locate(
         nnx.List([run.policy.model]), adaptation.AdapterParam
     ):
         a = np.float64(variable.get_value()["lora_a"])

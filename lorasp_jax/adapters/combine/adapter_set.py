@@ -88,7 +88,7 @@ class AdapterSet(Method):
     ) -> tuple[jax.Array, Aux]:
         """Each adapter's own z times its weight. There are no losses: a set does not train."""
         weights, bank = self._weights(params["choice"], rows), params["bank"]
-        own = _stacked([weights[name] for name in self.banked])
+        own = _stack([weights[name] for name in self.banked])
         columns = jnp.repeat(own * bank["scale"], bank["lora_a"].shape[-1], axis=-1)
         widths = [columns.shape[-1], *(side.shape[1] for side in self._sides(params, "down"))]
         first, *parts = jnp.split(rows, list(itertools.accumulate(widths))[:-1], axis=-1)
@@ -99,7 +99,7 @@ class AdapterSet(Method):
             run = method.fused(own_params) or method
             more, aux = run.between(method.middle(own_params), part, token_mask)
             z.append(weights[name][..., None] * more)
-            rank += _counted(weights[name], aux)
+            rank += _active_rank(weights[name], aux)
         return jnp.concatenate(z, axis=-1), Aux(jnp.broadcast_to(rank, rows.shape[:-1]))
 
     def up(self, params: Params) -> jax.Array:
@@ -128,7 +128,7 @@ class AdapterSet(Method):
                 adapted, other = method.apply(own, x, kernel, token_mask=token_mask)
                 change = adapted - x @ jax.lax.stop_gradient(kernel.astype(x.dtype))
                 y += weights[name].astype(x.dtype)[..., None] * change
-                rank += _counted(weights[name], other)
+                rank += _active_rank(weights[name], other)
         return y, dataclasses.replace(aux, active_rank=rank)
 
     def _adding(self) -> list[tuple[str, Method]]:
@@ -149,7 +149,7 @@ class AdapterSet(Method):
             raise ValueError("each example of a batch has its own adapters: choose for all first.")
         base, bank = kernel.astype(jnp.float32), params["bank"]
         weights = dict(zip(self.names, params["choice"], strict=True))
-        scale = bank["scale"] * _stacked([weights[name] for name in self.banked])
+        scale = bank["scale"] * _stack([weights[name] for name in self.banked])
         merged = base + jnp.einsum("ikr,k,kro->io", bank["lora_a"], scale, bank["lora_b"])
         for name, method in self.others.items():
             merged += weights[name] * (method.merge(params["others"][name], base) - base)
@@ -179,43 +179,43 @@ def empty_bank(size: int, rank: int, shape: tuple[int, ...]) -> Params:
     }
 
 
-def put(bank: Params, place: int, method: LoRA | None, params: Params) -> Params:
+def set_slot(bank: Params, slot: int, method: LoRA | None, params: Params) -> Params:
     """The bank with another LoRA in a place, or with none.
 
     Raises:
       ValueError: the LoRA's rank exceeds the bank's.
     """
     bank, rank = dict(bank), 0 if method is None else method.rank
-    room = bank["lora_a"].shape[-1]
-    if rank > room:
-        raise ValueError(f"a LoRA of rank {rank} needs more than the room for rank {room}.")
-    a, b = bank["lora_a"].at[..., place, :].set(0), bank["lora_b"].at[..., place, :, :].set(0)
+    capacity = bank["lora_a"].shape[-1]
+    if rank > capacity:
+        raise ValueError(f"a LoRA of rank {rank} needs more than the room for rank {capacity}.")
+    a, b = bank["lora_a"].at[..., slot, :].set(0), bank["lora_b"].at[..., slot, :, :].set(0)
     if method is not None:
-        a = a.at[..., place, :rank].set(params["lora_a"])
-        b = b.at[..., place, :rank, :].set(params["lora_b"])
-    scale = bank["scale"].at[..., place].set(0.0 if method is None else method.scale)
-    ranks = bank["rank"].at[..., place].set(rank)
+        a = a.at[..., slot, :rank].set(params["lora_a"])
+        b = b.at[..., slot, :rank, :].set(params["lora_b"])
+    scale = bank["scale"].at[..., slot].set(0.0 if method is None else method.scale)
+    ranks = bank["rank"].at[..., slot].set(rank)
     return {"lora_a": a, "lora_b": b, "scale": scale, "rank": ranks}
 
 
-def take(bank: Params, place: int) -> tuple[LoRA | None, Params]:
+def get_slot(bank: Params, slot: int) -> tuple[LoRA | None, Params]:
     """The LoRA in a place with its own rank and scale, or None and None; inverse of `put`."""
-    rank = int(bank["rank"][..., place].max())
+    rank = int(bank["rank"][..., slot].max())
     if not rank:
         return None, None
-    scale = float(bank["scale"][..., place].max())
+    scale = float(bank["scale"][..., slot].max())
     params = {
-        "lora_a": bank["lora_a"][..., place, :rank],
-        "lora_b": bank["lora_b"][..., place, :rank, :],
+        "lora_a": bank["lora_a"][..., slot, :rank],
+        "lora_b": bank["lora_b"][..., slot, :rank, :],
     }
     return LoRA(rank=rank, alpha=scale * rank), params
 
 
-def _counted(weight: jax.Array, aux: Aux) -> jax.Array:
+def _active_rank(weight: jax.Array, aux: Aux) -> jax.Array:
     """The active rank of an adapter, 0 where it has no weight."""
     return jnp.where(weight != 0, 0.0 if aux.active_rank is None else aux.active_rank, 0.0)
 
 
-def _stacked(values: list[jax.Array]) -> jax.Array:
+def _stack(values: list[jax.Array]) -> jax.Array:
     """Weights side by side, [..., K], also where K is 0."""
     return jnp.stack(values, axis=-1) if values else jnp.zeros(0)

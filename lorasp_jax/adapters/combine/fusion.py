@@ -87,31 +87,31 @@ def unmerge(merged: Model, adapted: nnx.Module) -> Model:
     if named.sets(given.with_values(adapted)):
         raise ValueError("the model to unmerge by has named adapters: extract one of them.")
     adapters = named.own_adapters(adapted)
-    own = {p.path: p.child.get_value() for p in paths.places(nnx.List([adapted]), AdapterParam)}
+    own = {p.path: p.child.get_value() for p in paths.locate(nnx.List([adapted]), AdapterParam)}
     freed = [path for path in adaptation.methods(adapted) if path not in adapters]
     if has := adaptation.methods(merged):
         raise ValueError(f"{min(has)} of the merged model has an adapter.")
-    holder = nnx.List([nnx.merge(*adaptation.split(merged))])
+    root = nnx.List([nnx.merge(*adaptation.split(merged))])
 
-    def taken_apart(place: paths.Place) -> AdaptedLayer | None:
-        if place.path not in adapters:
+    def taken_apart(location: paths.Location) -> AdaptedLayer | None:
+        if location.path not in adapters:
             return None
         try:
-            return _unmerged(place.child, adapters[place.path])
+            return _unmerged(location.child, adapters[location.path])
         except (ValueError, TypeError) as error:
-            raise ValueError(f"cannot unmerge {place.path}: {error}") from error
+            raise ValueError(f"cannot unmerge {location.path}: {error}") from error
 
-    found = paths.places(holder, nnx.Module)
+    found = paths.locate(root, nnx.Module)
     paths.replace(found, taken_apart)
-    if beyond := adapters.keys() - {place.path for place in found}:
+    if beyond := adapters.keys() - {location.path for location in found}:
         raise ValueError(f"the merged model has no layer {min(beyond)}.")
     full = [(f"^{re.escape(path)}$", FullFineTuning()) for path in freed]
-    for i in set(range(len(full))) - adaptation.free_all(holder, full):
+    for i in set(range(len(full))) - adaptation.unfreeze(root, full):
         raise ValueError(f"the merged model has no parameter {freed[i]}.")
-    for place in paths.places(holder, AdapterParam):
-        if place.path in freed:
-            place.child.set_value(own[place.path])
-    return holder[0]
+    for location in paths.locate(root, AdapterParam):
+        if location.path in freed:
+            location.child.set_value(own[location.path])
+    return root[0]
 
 
 def _unmerged(layer: nnx.Module, adapted: AdaptedLayer) -> AdaptedLayer:

@@ -30,11 +30,11 @@ from lorasp_jax.adapters.combine.adapter_set import (
     AdapterSet,
     NamedAdapters,
     empty_bank,
-    put,
-    take,
+    get_slot,
+    set_slot,
 )
 from lorasp_jax.adapters.layers import nnx_layers
-from lorasp_jax.adapters.paths import Place
+from lorasp_jax.adapters.paths import Location
 from lorasp_jax.dense import AdaptedLayer, AdapterParam, given
 from lorasp_jax.peft import LoRA, Method
 from lorasp_jax.peft._fields import short
@@ -73,14 +73,14 @@ def combine(models: Mapping[str, Model], *, rank: int | None = None) -> Model:
     adapters = {name: adapters_by_path(name, model) for name, model in models.items()}
     for name in known[1:]:
         _check_same(bases[known[0]], known[0], bases[name], name)
-    holder = nnx.List([bases[known[0]]])
+    root = nnx.List([bases[known[0]]])
 
-    def with_set(place: Place) -> AdaptedLayer | None:
-        found = {n: adapters[n][place.path] for n in known if place.path in adapters[n]}
-        return _with_set(place.child, known, found, rank) if found else None
+    def with_set(location: Location) -> AdaptedLayer | None:
+        found = {n: adapters[n][location.path] for n in known if location.path in adapters[n]}
+        return _with_set(location.child, known, found, rank) if found else None
 
-    paths.replace(paths.places(holder, nnx.Module), with_set)
-    return choose(holder[0], known[0])
+    paths.replace(paths.locate(root, nnx.Module), with_set)
+    return choose(root[0], known[0])
 
 
 def choose(model: Model, choice: One | Sequence[One] | jax.Array | np.ndarray) -> Model:
@@ -99,8 +99,8 @@ def choose(model: Model, choice: One | Sequence[One] | jax.Array | np.ndarray) -
     """
     chosen = weights(model, choice)
     model = nnx.clone(model)
-    for place in sets(model):
-        held = place.child.adapter
+    for location in sets(model):
+        held = location.child.adapter
         leading = held.params.get_value()["bank"]["scale"].shape[:-1]
         held.choice = AdapterChoice(jnp.broadcast_to(chosen, (*leading, *chosen.shape)))
     return model
@@ -144,8 +144,8 @@ def names(model: nnx.Module) -> tuple[str, ...]:
     Raises:
       ValueError: the model has none.
     """
-    for place in sets(model):
-        return place.child.method.names
+    for location in sets(model):
+        return location.child.method.names
     raise ValueError("the model has no named adapters: combine models first.")
 
 
@@ -166,7 +166,11 @@ def extract(model: Model, name: str | None) -> Model:
         return result
     index_of(known, name)
     return with_adapters(
-        result, {place.path: (place.child, *member(place.child, name)) for place in sets(model)}
+        result,
+        {
+            location.path: (location.child, *member(location.child, name))
+            for location in sets(model)
+        },
     )
 
 
@@ -181,17 +185,17 @@ def with_adapters(
         parameters.
     """
 
-    def with_own(place: Place) -> AdaptedLayer | None:
-        kind, method, params = adapters.get(place.path, (None, None, {}))
+    def with_own(location: Location) -> AdaptedLayer | None:
+        kind, method, params = adapters.get(location.path, (None, None, {}))
         if kind is None or method is None:
             return None
-        layer = nnx_layers.like(place.child, kind)
+        layer = nnx_layers.like(location.child, kind)
         layer.method, layer.adapter = method, AdapterParam(params)
         return layer
 
-    holder = nnx.List([base])
-    paths.replace(paths.places(holder, nnx.Module), with_own)
-    return holder[0]
+    root = nnx.List([base])
+    paths.replace(paths.locate(root, nnx.Module), with_own)
+    return root[0]
 
 
 def swap(model: Model, name: str, other: nnx.Module) -> Model:
@@ -212,17 +216,17 @@ def swap(model: Model, name: str, other: nnx.Module) -> Model:
     index, adapters = index_of(names(model), name), adapters_by_path(name, other)
     _check_same(bare(model), "the combined model", bare(other), name)
     model = nnx.clone(model)
-    places = sets(model)
-    if beyond := sorted(adapters.keys() - {place.path for place in places}):
+    locations = sets(model)
+    if beyond := sorted(adapters.keys() - {location.path for location in locations}):
         raise ValueError(f"{name} adapts {beyond[0]}, where the combined model has no adapters.")
-    for path, _, _, layer in places:
+    for path, _, _, layer in locations:
         method, params = adapters[path].carried() if path in adapters else (None, None)
         value = dict(layer.adapter.params.get_value())
         if layer.method.methods[index] != (None if _is_banked(method) else method):
             raise ValueError(f"{name} at {path} needs {layer.method.methods[index] or 'a LoRA'}.")
         if _is_banked(method):
-            place = layer.method.banked.index(name)
-            value["bank"] = put(value["bank"], place, method, params)
+            slot = layer.method.banked.index(name)
+            value["bank"] = set_slot(value["bank"], slot, method, params)
         else:
             value["others"] = value["others"] | {name: params}
         layer.adapter.params.set_value(value)
@@ -235,20 +239,20 @@ def bare(model: Model) -> Model:
     Raises:
       ValueError: an adapter holds a part of its kernel.
     """
-    holder = nnx.List([nnx.merge(*adaptation.split(model))])
+    root = nnx.List([nnx.merge(*adaptation.split(model))])
 
-    def without(place: Place) -> nnx.Module | None:
-        if place.child.adapter is None:
+    def without(location: Location) -> nnx.Module | None:
+        if location.child.adapter is None:
             return None
-        if place.child.method.splits_kernel:
+        if location.child.method.splits_kernel:
             raise ValueError(
-                f"the adapter of {place.path} holds a part of its kernel, so the base alone is not "
-                "there: merge it."
+                f"the adapter of {location.path} split the kernel, so the original base is not "
+                "available: merge the adapter first."
             )
-        return place.child.without_adapter()
+        return location.child.without_adapter()
 
-    paths.replace(paths.places(holder, AdaptedLayer), without)
-    return holder[0]
+    paths.replace(paths.locate(root, AdaptedLayer), without)
+    return root[0]
 
 
 def adapters_by_path(name: str, model: nnx.Module) -> Adapters:
@@ -267,8 +271,8 @@ def adapters_by_path(name: str, model: nnx.Module) -> Adapters:
 
 def own_adapters(model: nnx.Module) -> Adapters:
     """The layers with an adapter of their own, by path."""
-    places = paths.places(nnx.List([model]), AdaptedLayer)
-    return {p.path: p.child for p in places if isinstance(p.child.adapter, AdapterParam)}
+    locations = paths.locate(nnx.List([model]), AdaptedLayer)
+    return {p.path: p.child for p in locations if isinstance(p.child.adapter, AdapterParam)}
 
 
 def _check_same(one: nnx.Module, name: str, two: nnx.Module, other: str) -> None:
@@ -305,7 +309,7 @@ def _with_set(
     bank = empty_bank(len(banked), rank, shape)
     for i, name in enumerate(banked):
         method, params = own.get(name, (None, None))
-        bank = put(bank, i, method, params)  # pyright: ignore[reportArgumentType]
+        bank = set_slot(bank, i, method, params)  # pyright: ignore[reportArgumentType]
     params = {"bank": bank, "others": {n: p for n, (m, p) in own.items() if not _is_banked(m)}}
     layer.method = AdapterSet(known, tuple(None if _is_banked(m) else m for m in methods))
     layer.adapter = NamedAdapters(params, jnp.zeros((*shape[:-2], len(known))))
@@ -321,10 +325,10 @@ def _is_banked(method: Method | None) -> TypeGuard[LoRA | None]:
     return method is None or type(method) is LoRA
 
 
-def sets(model: nnx.Module) -> list[Place]:
+def sets(model: nnx.Module) -> list[Location]:
     """The layers that hold named adapters."""
-    places = paths.places(nnx.List([given.module(model)]), AdaptedLayer)
-    return [place for place in places if isinstance(place.child.adapter, NamedAdapters)]
+    locations = paths.locate(nnx.List([given.module(model)]), AdaptedLayer)
+    return [location for location in locations if isinstance(location.child.adapter, NamedAdapters)]
 
 
 def member(layer: Any, name: str) -> tuple[Method | None, Params]:
@@ -332,7 +336,7 @@ def member(layer: Any, name: str) -> tuple[Method | None, Params]:
     value = layer.adapter.params.get_value()
     if name in layer.method.others:
         return layer.method.others[name], value["others"][name]
-    return take(value["bank"], layer.method.banked.index(name))
+    return get_slot(value["bank"], layer.method.banked.index(name))
 
 
 def _row(known: tuple[str, ...], one: One) -> list[float]:

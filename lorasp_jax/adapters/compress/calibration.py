@@ -182,17 +182,17 @@ def _observed(
     model: nnx.Module, reports: dict[str, Report], others: Mapping[str, tuple[Method, Params]]
 ) -> nnx.Module:
     """A copy of the model that reports."""
-    holder = nnx.List([nnx.clone(model)])
-    nnx.pop(holder, AdapterAux)
-    for place in paths.multiplying(holder):
-        path = place.path
+    root = nnx.List([nnx.clone(model)])
+    nnx.pop(root, AdapterAux)
+    for location in paths.locate_matmul_layers(root):
+        path = location.path
         if path not in reports:
             continue
         try:
-            layer = nnx_layers.adapted(place.child, {})
+            layer = nnx_layers.adapted(location.child, {})
         except ValueError as error:
             raise ValueError(f"cannot observe {path}: {error}") from error
-        paths.put(place, layer)
+        paths.set_child(location, layer)
         if layer.adapter is None:
             adaptation.attach(layer, Observed(path, None, reports[path]), jax.random.key(0))
         else:
@@ -204,7 +204,7 @@ def _observed(
                 params = (params, its_params)
             layer.method = method
             layer.adapter = AdapterParam(params)
-    return holder[0]
+    return root[0]
 
 
 def _nodes(tree: Any) -> list[Any]:
@@ -233,7 +233,10 @@ def input_moments(
       ValueError: as for `observe`, or no such layer matches.
     """
     paths.check_rules([(pattern, None)], lambda _: True, "None")
-    known = [place.path for place in paths.multiplying(nnx.List([given.with_values(model)]))]
+    known = [
+        location.path
+        for location in paths.locate_matmul_layers(nnx.List([given.with_values(model)]))
+    ]
     reports = {path: second_moment for path in known if re.search(pattern, path)}
     if not reports:
         close = paths.near_misses(pattern, known) or "none"

@@ -122,8 +122,8 @@ def distill(
 
 def _lora_sp_layers(model: nnx.Module) -> dict[str, Any]:
     """The layers with a LoRA-SP adapter by path."""
-    places = paths.places(nnx.List([given.with_values(model)]), AdaptedLayer)
-    found = {p.path: p.child for p in places if isinstance(p.child.method, BankMethod)}
+    locations = paths.locate(nnx.List([given.with_values(model)]), AdaptedLayer)
+    found = {p.path: p.child for p in locations if isinstance(p.child.method, BankMethod)}
     if not found:
         raise ValueError("the model has no LoRA-SP layers.")
     return found
@@ -192,12 +192,12 @@ def _finished(
     forward: Forward,
 ) -> tuple[adaptation.Model, Compaction]:
     """The model with its new adapters, and what they cost."""
-    holder = nnx.List([nnx.clone(model)])
-    for place in paths.places(holder, AdaptedLayer):
-        if place.path in changed:
-            place.child.method, params = changed[place.path]
-            place.child.adapter = AdapterParam(params)
-    smaller = holder[0]
+    root = nnx.List([nnx.clone(model)])
+    for location in paths.locate(root, AdaptedLayer):
+        if location.path in changed:
+            location.child.method, params = changed[location.path]
+            location.child.adapter = AdapterParam(params)
+    smaller = root[0]
     return smaller, Compaction(ranks, *_errors(model, smaller, batches, changed, forward))
 
 

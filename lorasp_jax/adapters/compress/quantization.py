@@ -59,33 +59,33 @@ def quantize(model: nnx.Module, rules: Sequence[tuple[str, Kind | None]]) -> Qua
     kinds = " or ".join(map(repr, (*KINDS, None)))
     paths.check_rules(rules, lambda kind: kind in (*KINDS, None), kinds)
     given.with_values(model)
-    holder, errors, used = nnx.List([nnx.merge(*adaptation.split(model))]), {}, set()
+    root, errors, used = nnx.List([nnx.merge(*adaptation.split(model))]), {}, set()
     shared: Shared = {}
-    known = paths.multiplying(holder)
-    for place in known:
-        matching = [rule for rule in rules if re.search(rule[0], place.path)]
+    known = paths.locate_matmul_layers(root)
+    for location in known:
+        matching = [rule for rule in rules if re.search(rule[0], location.path)]
         if not matching:
             continue
         used.add(matching[0])
         if (kind := matching[0][1]) is not None:
             try:
-                layer, errors[place.path] = _quantized(place.child, kind, shared)
+                layer, errors[location.path] = _quantized(location.child, kind, shared)
             except ValueError as error:
-                raise ValueError(f"cannot quantise {place.path}: {error}") from error
-            paths.put(place, layer)
+                raise ValueError(f"cannot quantise {location.path}: {error}") from error
+            paths.set_child(location, layer)
     for rule in rules:
         if rule not in used:
-            close = paths.near_misses(rule[0], [place.path for place in known]) or "none"
+            close = paths.near_misses(rule[0], [location.path for location in known]) or "none"
             raise ValueError(
                 f"rule {short(rule[0])} governs nothing; dense layers and einsums here: {close}."
             )
-    return Quantized(holder[0], errors)
+    return Quantized(root[0], errors)
 
 
 def is_quantized(model: nnx.Module) -> bool:
     """Whether a kernel of the model is quantised."""
-    parameters = paths.places(nnx.List([model]), nnx.Param)
-    return any(isinstance(place.child.get_value(), QuantizedKernel) for place in parameters)
+    parameters = paths.locate(nnx.List([model]), nnx.Param)
+    return any(isinstance(location.child.get_value(), QuantizedKernel) for location in parameters)
 
 
 def _quantized(layer: nnx.Module, kind: Kind, shared: Shared) -> tuple[AdaptedLayer, float]:

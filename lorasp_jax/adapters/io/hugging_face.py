@@ -88,21 +88,21 @@ def load_peft(
         not have, or adapters that do not fit their layers.
     """
     nnx_layers.check_einsums(einsums)
-    holder = nnx.List([given.module(model)])
+    root = nnx.List([given.module(model)])
     shapes = {
-        place.path: nnx_layers.matrices_shape(place.child, einsums)
-        for place in paths.multiplying(holder, einsums)
+        location.path: nnx_layers.matrices_shape(location.child, einsums)
+        for location in paths.locate_matmul_layers(root, einsums)
     }
-    parameters = [p for p in paths.places(holder, nnx.Param) if p.name != "adapter"]
-    sizes = {place.path: place.child.get_value().shape for place in parameters}
+    parameters = [p for p in paths.locate(root, nnx.Param) if p.name != "adapter"]
+    sizes = {location.path: location.child.get_value().shape for location in parameters}
     rules, values, whole = matched(folder, shapes, sizes, names)
     adapted = adaptation.adapt(model, rules, rngs=nnx.Rngs(0), einsums=einsums)
-    for place in paths.places(nnx.List([adapted]), AdapterParam):
-        if place.path in whole:
-            place.child.set_value(jnp.asarray(whole[place.path]))
-    for place in paths.places(nnx.List([adapted]), AdaptedLayer):
-        if place.path in values:
-            place.child.adapter.set_value(jax.tree.map(jnp.asarray, values[place.path]))
+    for location in paths.locate(nnx.List([adapted]), AdapterParam):
+        if location.path in whole:
+            location.child.set_value(jnp.asarray(whole[location.path]))
+    for location in paths.locate(nnx.List([adapted]), AdaptedLayer):
+        if location.path in values:
+            location.child.adapter.set_value(jax.tree.map(jnp.asarray, values[location.path]))
     return adapted
 
 
@@ -189,17 +189,17 @@ def save_peft(
     kinds, rates = set(), set()
     methods = adaptation.methods(model).items()
     known = {p for p, method in methods if not method.trains_base and _is_known(p, method)}
-    for place in paths.places(nnx.List([model]), AdaptedLayer):
-        if place.path in known:
-            if isinstance(place.child, nnx_layers.LoRALayer):
+    for location in paths.locate(nnx.List([model]), AdaptedLayer):
+        if location.path in known:
+            if isinstance(location.child, nnx_layers.LoRALayer):
                 raise ValueError(
-                    f"{place.path} is neither dense nor an einsum: it cannot be in a PEFT folder."
+                    f"{location.path} is neither dense nor an einsum, so PEFT cannot store it."
                 )
-            kinds.add(isinstance(place.child.method, DoRA))
-            rates.add(drop_rate(place.child.method))
-            shape = place.child.kernel_matrices().shape[:-2]
+            kinds.add(isinstance(location.child.method, DoRA))
+            rates.add(drop_rate(location.child.method))
+            shape = location.child.kernel_matrices().shape[:-2]
             for index in np.ndindex(*shape):
-                modules[names(place.path, index)] = _exported(place.child, index)
+                modules[names(location.path, index)] = _exported(location.child, index)
     if len(kinds) != 1:
         raise ValueError("a PEFT folder holds either LoRA or DoRA, and at least one adapter.")
     if len(rates) != 1:
@@ -267,7 +267,10 @@ def _is_known(path: str, method: Any) -> bool:
     if not isinstance(method, LoRA | AdaLoRA):
         raise ValueError(f"{path} has {method.name}, which Hugging Face PEFT does not know.")
     if method.splits_kernel:
-        raise ValueError(f"{path} holds a part of its kernel, so it fits no other base: merge it.")
+        raise ValueError(
+            f"the adapter of {path} split the kernel, so it cannot be used with another base: "
+            "merge the adapter instead."
+        )
     return True
 
 

@@ -92,19 +92,22 @@ def exported_whole(
     Raises:
       ValueError: a parameter that PEFT has no counterpart for.
     """
-    places = [p for p in paths.places(nnx.List([model]), nnx.Param) if p.name != "adapter"]
-    free = [place for place in places if isinstance(place.child, AdapterParam)]
-    saved = {_module(place) for place in free if place.name != "bias"}
-    biases = {_module(place) for place in free} - saved
-    multiplying = paths.multiplying(nnx.List([model]))
-    shapes = {place.path: nnx_layers.matrices_shape(place.child, {}) for place in multiplying}
+    locations = [p for p in paths.locate(nnx.List([model]), nnx.Param) if p.name != "adapter"]
+    free = [location for location in locations if isinstance(location.child, AdapterParam)]
+    saved = {_module(location) for location in free if location.name != "bias"}
+    biases = {_module(location) for location in free} - saved
+    locate_matmul_layers = paths.locate_matmul_layers(nnx.List([model]))
+    shapes = {
+        location.path: nnx_layers.matrices_shape(location.child, {})
+        for location in locate_matmul_layers
+    }
     tensors: Adapter = {}
-    for place in places:
-        module = _module(place)
-        if module in saved or place in free:
+    for location in locations:
+        module = _module(location)
+        if module in saved or location in free:
             middle = ".base_layer" if module in adapted else ""
-            for index, value in _parts(place, shapes.get(module)):
-                name = f"{names(module, index)}{middle}.{_TORCH_NAMES[place.name]}"
+            for index, value in _parts(location, shapes.get(module)):
+                name = f"{names(module, index)}{middle}.{_TORCH_NAMES[location.name]}"
                 tensors[PREFIX + name] = value
     stems = {name.removeprefix(PREFIX).rpartition(".")[0] for name in tensors}
     kept = sorted(stem for stem in stems if f"{PREFIX}{stem}.weight" in tensors)
@@ -112,8 +115,8 @@ def exported_whole(
     return tensors, {"bias": bias, "modules_to_save": kept or None}
 
 
-def _module(place: paths.Place) -> str:
-    return place.path.rpartition("/")[0]
+def _module(location: paths.Location) -> str:
+    return location.path.rpartition("/")[0]
 
 
 def _stack(name: str, size: Sequence[int], matrices: Sequence[int] | None) -> tuple[int, ...]:
@@ -135,13 +138,13 @@ def _from_torch(kernel: np.ndarray) -> np.ndarray:
 
 
 def _parts(
-    place: paths.Place, matrices: Sequence[int] | None
+    location: paths.Location, matrices: Sequence[int] | None
 ) -> list[tuple[tuple[int, ...], np.ndarray]]:
     """Index in a stack and value in torch's layout, of each layer that shares a parameter."""
-    value, name = np.asarray(place.child.get_value(), np.float32), place.name
-    dense = isinstance(place.parent, nnx.Linear | Dense)
+    value, name = np.asarray(location.child.get_value(), np.float32), location.name
+    dense = isinstance(location.parent, nnx.Linear | Dense)
     if name not in _TORCH_NAMES or (name == "kernel" and not dense):
-        raise ValueError(f"{place.path} trains in full, which a PEFT folder cannot hold.")
+        raise ValueError(f"{location.path} trains in full, which a PEFT folder cannot hold.")
     found = []
     for index in np.ndindex(*_stack(name, value.shape, matrices)):
         part = value[index]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lorasp_jax import peft
-from lorasp_jax.adapters.combine.adapter_set import AdapterSet, empty_bank, put, take
+from lorasp_jax.adapters.combine.adapter_set import AdapterSet, empty_bank, get_slot, set_slot
 from lorasp_jax.peft import DoRA, LoRA, LoRAMoE, LoRASP
 
 D_IN, D_OUT = 6, 5
@@ -47,8 +47,8 @@ def members(kernel):
 @pytest.fixture(scope="module")
 def params(members):
     bank = empty_bank(2, 4, (D_IN, D_OUT))
-    for place, (name, method) in enumerate(LORAS.items()):
-        bank = put(bank, place, method, members[name])
+    for slot, (name, method) in enumerate(LORAS.items()):
+        bank = set_slot(bank, slot, method, members[name])
     return {"bank": bank, "others": {name: members[name] for name in OTHERS}}
 
 
@@ -151,9 +151,9 @@ def test_gradients(params, x, kernel):
 
     own, weights, inputs, base = jax.grad(of_floats, (0, 1, 2, 3))(floats, choice, x, kernel)
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(own))
-    place = own["bank"]["lora_b"]
-    assert (place[1] != 0).all()
-    assert not place[0].any()
+    lora_b = own["bank"]["lora_b"]
+    assert (lora_b[1] != 0).all()
+    assert not lora_b[0].any()
     assert (weights != 0).all()
     assert (inputs != 0).any()
     assert not base.any()
@@ -161,12 +161,12 @@ def test_gradients(params, x, kernel):
 
 def test_bank_gives_back_what_it_took(members):
     bank = empty_bank(2, 7, (D_IN, D_OUT))
-    bank = put(put(bank, 0, LORAS["b"], members["b"]), 0, LORAS["a"], members["a"])
-    method, params = take(bank, 0)
+    bank = set_slot(set_slot(bank, 0, LORAS["b"], members["b"]), 0, LORAS["a"], members["a"])
+    method, params = get_slot(bank, 0)
     assert (method.rank, method.scale) == (2, 1.5)
     np.testing.assert_array_equal(params["lora_a"], members["a"]["lora_a"])
     np.testing.assert_array_equal(params["lora_b"], members["a"]["lora_b"])
-    assert take(bank, 1) == (None, None)
-    assert take(put(bank, 0, None, None), 0) == (None, None)
+    assert get_slot(bank, 1) == (None, None)
+    assert get_slot(set_slot(bank, 0, None, None), 0) == (None, None)
     with pytest.raises(ValueError, match="rank 4 needs more than the room for rank 3"):
-        put(empty_bank(1, 3, (D_IN, D_OUT)), 0, LORAS["b"], members["b"])
+        set_slot(empty_bank(1, 3, (D_IN, D_OUT)), 0, LORAS["b"], members["b"])

@@ -34,9 +34,9 @@ IDS = ["default", "sample", "softmax", "normalized", "release"]
 
 def noisy(model, seed=0, size=1.0):
     """All adapters moved off their start, scores unlike each other; `size` is of their deltas."""
-    for i, place in enumerate(paths.places(nnx.List([model]), Dense)):
-        if place.child.adapter is not None:
-            params = place.child.adapter.get_value()
+    for i, location in enumerate(paths.locate(nnx.List([model]), Dense)):
+        if location.child.adapter is not None:
+            params = location.child.adapter.get_value()
             leaves, structure = jax.tree.flatten(params)
             keys = jax.random.split(jax.random.key(seed + i), len(leaves))
             pairs = zip(keys, leaves, strict=True)
@@ -45,7 +45,7 @@ def noisy(model, seed=0, size=1.0):
             params["bank"]["u"] *= size
             if "gain" in params["bank"]:
                 params["bank"]["gain"] += 0.3
-            place.child.adapter = AdapterParam(params)
+            location.child.adapter = AdapterParam(params)
     return model
 
 
@@ -74,11 +74,13 @@ def call(model, x):
 
 def banish(model, path, layer, directions):
     """Some directions of one layer of a stack can no longer be kept: their logits are far down."""
-    (place,) = (p for p in paths.places(nnx.List([model]), Dense) if p.path == path)
-    params = place.child.adapter.get_value()
+    (location,) = (p for p in paths.locate(nnx.List([model]), Dense) if p.path == path)
+    params = location.child.adapter.get_value()
     b2 = params["router"]["b2"].at[layer, jnp.array(directions)].set(-30.0)
     w2 = params["router"]["w2"].at[layer, :, jnp.array(directions)].set(0.0)
-    place.child.adapter = AdapterParam(params | {"router": params["router"] | {"b2": b2, "w2": w2}})
+    location.child.adapter = AdapterParam(
+        params | {"router": params["router"] | {"b2": b2, "w2": w2}}
+    )
     return model
 
 

@@ -26,12 +26,12 @@ def quantized(kind):
 
 def widened(model):
     """The model with every quantised kernel as an array again."""
-    holder = nnx.List([nnx.clone(model)])
-    for place in paths.places(holder, Dense):
-        kernel = place.child.kernel.get_value()
+    root = nnx.List([nnx.clone(model)])
+    for location in paths.locate(root, Dense):
+        kernel = location.child.kernel.get_value()
         if isinstance(kernel, QuantizedKernel):
-            place.child.kernel = nnx.Param(kernel.astype(kernel.dtype))
-    return holder[0]
+            location.child.kernel = nnx.Param(kernel.astype(kernel.dtype))
+    return root[0]
 
 
 def size(model):

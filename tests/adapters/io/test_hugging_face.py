@@ -395,7 +395,7 @@ def test_damaged_and_missing_files(copy, name):
     ("rules", "message"),
     [
         ([("lin/0", LoRASP(rank=4))], "lin/0 has lora_sp, which Hugging Face PEFT does not know"),
-        ([("lin/0", LoRA(rank=2, initialization="pissa"))], "holds a part of its kernel"),
+        ([("lin/0", LoRA(rank=2, initialization="pissa"))], "split the kernel, so it cannot"),
         ([("lin/0", LoRA(rank=2)), ("lin/1", DoRA(rank=2))], "either LoRA or DoRA"),
         ([], "at least one adapter"),
     ],

@@ -110,7 +110,7 @@ def test_shapes_counts_and_paths(heads):
 
 
 def layers(model):
-    return paths.layer_places(nnx.List([model]))
+    return paths.locate_layers(nnx.List([model]))
 
 
 def test_save_and_load(heads, vision, x, tmp_path):
@@ -273,7 +273,7 @@ def test_what_cannot_be_adapted(heads, vision, tmp_path):
         adapted(exact, ("", LoRA(rank=2)))
     with pytest.raises(ValueError, match="applies to nothing"):  # called differently, so unknown
         adapted(Scaled(2, 3, rngs=nnx.Rngs(0)), ("", LoRA(rank=2)))
-    with pytest.raises(ValueError, match="embed is neither dense nor an einsum: it cannot be in a"):
+    with pytest.raises(ValueError, match="embed is neither dense nor an einsum, so PEFT cannot"):
         save_peft(tmp_path, adapted(vision, ("embed", LoRA(rank=2))))
     with pytest.raises(ValueError, match="an adapted layer takes no out_sharding"):
         adapted(heads, ("split", SP)).split(jnp.ones((1, 6)), out_sharding=object())
