@@ -9,7 +9,7 @@ from flax import nnx
 import lorasp_jax
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io.native import load_adapters, save_adapters
-from lorasp_jax.kernels.quantized_kernel import KINDS, QuantizedKernel
+from lorasp_jax.kernels.quantized_weights import KINDS, QuantizedKernel
 from lorasp_jax.peft import LoRA, LoRASP
 from tests.cases import mostly_slow
 from tests.models.drawn import filled

@@ -28,7 +28,7 @@ from flax import nnx
 from lorasp_jax.adapters import paths
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.dense import AdaptedLayer, AdapterAux, AdapterParam, DropoutKey, given
-from lorasp_jax.kernels.quantized_kernel import QuantizedKernel
+from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.peft import FullFineTuning, Method, _arguments
 from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import Params, drop_rate

@@ -9,8 +9,6 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 import lorasp_jax
-from envs.cli.refusals import parsed
-from envs.compilation import alarms
 
 COMMANDS = {
     "train": ("lorasp_jax.cli.train", "adapt a policy to a robot"),
@@ -28,13 +26,18 @@ STOPPED = 130
 def main() -> NoReturn:
     """Run the command that the command line names."""
     stop_at_once()
+    from envs.cli.refusals import parsed
+
     first, rest = sys.argv[1:2], sys.argv[2:]
     command = parsed(_parser(), first).command
     run(command, rest, f"lorasp-jax {command}")
 
 
 def stop_at_once() -> None:
-    """Leave without a word at a signal: until a command starts there is nothing to save."""
+    """Exit silently on Ctrl-C or SIGTERM: until a command starts there is nothing to save.
+
+    Call it before the imports that start JAX, which take a second.
+    """
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: os._exit(STOPPED))
 
@@ -47,6 +50,8 @@ def run(command: str, arguments: Sequence[str], program: str) -> NoReturn:
         arguments: what follows it on the command line.
         program: how it was started, for its help.
     """
+    from envs.compilation import alarms
+
     alarms.silence()
     if code := importlib.import_module(COMMANDS[command][0]).main(arguments, program):
         from lorasp_jax.training.distributed import processes

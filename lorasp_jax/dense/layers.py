@@ -12,7 +12,7 @@ from flax.typing import Dtype, Initializer
 
 from lorasp_jax.dense import given
 from lorasp_jax.dense.functional import DenseLayer, computed_in, dense
-from lorasp_jax.kernels.quantized_kernel import QuantizedKernel
+from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.peft import Aux, Method
 from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import Params

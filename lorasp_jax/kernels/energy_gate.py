@@ -36,15 +36,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import pallas as pl
 
-from lorasp_jax.kernels.bisection import (
+from lorasp_jax.kernels.platform import platform
+from lorasp_jax.kernels.row_sharding import by_rows
+from lorasp_jax.kernels.threshold_search import (
     Boundary,
     Ratio,
     bisected_mask,
     block_boundary,
     energies,
 )
-from lorasp_jax.kernels.platform import platform
-from lorasp_jax.kernels.row_sharding import by_rows
 
 Implementation = Literal["pairwise", "sort", "bisection", "block", "pallas"]
 

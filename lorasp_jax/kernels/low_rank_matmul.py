@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 
 from lorasp_jax.kernels.platform import platform
-from lorasp_jax.kernels.quantized_kernel import QuantizedKernel
+from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 
 
 class Between(Protocol):

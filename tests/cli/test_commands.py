@@ -1,6 +1,7 @@
 """The console command: the same programs as `python train.py` and the modules, by one name."""
 
 import importlib
+import os
 import subprocess
 import sys
 
@@ -29,6 +30,15 @@ def test_what_is_no_command_is_refused():
     assert found.returncode == 2
     assert "'trian' (choose from" in found.stderr
     assert "Traceback" not in found.stderr
+
+
+def test_interrupt_during_imports_prints_nothing(tmp_path, monkeypatch):
+    """A stand-in for JAX sends SIGINT as soon as it is imported."""
+    interrupt = "import os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep(60)"
+    (tmp_path / "jax.py").write_text(interrupt)
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{ROOT}")
+    stopped = console("train")
+    assert (stopped.returncode, stopped.stdout, stopped.stderr) == (commands.STOPPED, "", "")
 
 
 @pytest.mark.parametrize("name", commands.COMMANDS)

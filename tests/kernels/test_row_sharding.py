@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from jax.sharding import NamedSharding, PartitionSpec
 
-from lorasp_jax.kernels import fused_rows as kernels
+from lorasp_jax.kernels import rowwise_kernel as kernels
 from lorasp_jax.kernels.row_sharding import by_rows
 from lorasp_jax.training.distributed import mesh as meshes
-from tests.kernels.test_fused_rows import WIDTHS, close, gated
+from tests.kernels.test_rowwise_kernel import WIDTHS, close, gated
 
 
 def doubled(shared, arrays):
@@ -63,7 +63,7 @@ def test_vmap():
     np.testing.assert_array_equal(totals, rows.sum(1))
 
 
-def test_fused_rows(monkeypatch):
+def test_rowwise_kernel(monkeypatch):
     """Tokens of a sharded batch through the fused kernel: values and gradients."""
     monkeypatch.setattr(kernels, "FEW_ROWS", 0)
     keys = jax.random.split(jax.random.key(0), 3)
@@ -75,7 +75,7 @@ def test_fused_rows(monkeypatch):
         def loss(shared, x):
             rows = jnp.sin(x).reshape(-1, 48)
             counts = rows[:, :1] > 0
-            output, sums, _ = kernels.fused_rows(
+            output, sums, _ = kernels.rowwise_kernel(
                 gated, shared, rows, WIDTHS, counts, interpret=True
             )
             return jnp.sin(output).sum() + sums["squares"].sum()

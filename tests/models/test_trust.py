@@ -90,7 +90,7 @@ def test_a_tokenizer_without_end(tmp_path):
     for name in ("tokenizer.json", "x.model"):
         (tmp_path / name).touch()
         os.truncate(tmp_path / name, 2**40)
-        with pytest.raises(ValueError, match=f"{name} is no tokenizer: it has more than"):
+        with pytest.raises(ValueError, match=f"{name} is not a tokenizer: it is larger than"):
             tokenizer.load_tokenizer(tmp_path / name)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lorasp_jax.models.pi0 import Pi0Config
-from lorasp_jax.policies import prompts, tokenizer
+from lorasp_jax.policies import offline_tokenizer, prompts, tokenizer
 from lorasp_jax.policies.prompt_table import PromptTable
 from tests import GOLDEN
 
@@ -23,7 +23,7 @@ def test_a_row_for_each_instruction():
     config = Pi0Config.nano()
     table = PromptTable.of(tokenizer.Offline(), TEXTS, config, num_joints=6)
     found = table.encode(jnp.array([1, 0, 1]), jnp.zeros((3, 7)))
-    wanted = tokenizer.encode([TEXTS[i] for i in (1, 0, 1)], config.max_tokens)
+    wanted = offline_tokenizer.encode([TEXTS[i] for i in (1, 0, 1)], config.max_tokens)
     for mine, theirs in zip(found, wanted, strict=True):
         np.testing.assert_array_equal(mine, theirs)
 
@@ -62,10 +62,10 @@ def test_prompts_with_a_state_are_the_tokenizers(words, numbers):
 def test_what_is_too_long_is_cut_as_the_tokenizer_cuts_it():
     words = tokenizer.load_tokenizer(SMOLVLM)
     config = dataclasses.replace(PI05, max_tokens=35, vocabulary=words.vocabulary)
-    with pytest.warns(UserWarning, match="is cut to 35"):
+    with pytest.warns(UserWarning, match="truncated to 35"):
         table = PromptTable.of(words, TEXTS, config, num_joints=6)
     state = np.full(7, 0.9, np.float32)
-    with pytest.warns(UserWarning, match="is cut to 35"):
+    with pytest.warns(UserWarning, match="truncated to 35"):
         wanted = words.encode([prompts.pi05(TEXTS[0], state)], 35, complete=True)
     found = table.encode(jnp.array([0]), jnp.asarray(state[None]))
     assert found.mask.all()

@@ -22,7 +22,7 @@ from flax import nnx
 from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.dense import AdaptedLayer, AdapterParam, given
-from lorasp_jax.kernels.quantized_kernel import KINDS, Kind, QuantizedKernel, quantized
+from lorasp_jax.kernels.quantized_weights import KINDS, Kind, QuantizedKernel, quantized
 from lorasp_jax.peft._fields import short
 
 # By identity of a variable, equation and kind: what replaces it, the variable itself, which so

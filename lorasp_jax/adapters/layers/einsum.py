@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 
 from lorasp_jax.dense import dense
-from lorasp_jax.kernels.quantized_kernel import QuantizedKernel
+from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.peft import Aux, Method
 from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import Params

@@ -16,7 +16,7 @@ from flax import linen, nnx
 from lorasp_jax import _compat
 from lorasp_jax.adapters.layers import einsum
 from lorasp_jax.dense import AdaptedLayer, Dense, computed_in, refuse_sharding, with_value
-from lorasp_jax.kernels.quantized_kernel import QuantizedKernel
+from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.peft import LoRA, Method
 from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import drop_rate, dropped

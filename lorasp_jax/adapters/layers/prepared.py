@@ -34,7 +34,7 @@ from flax import nnx
 
 from lorasp_jax.dense import Dense
 from lorasp_jax.kernels.low_rank_matmul import aligned, two_products
-from lorasp_jax.kernels.quantized_kernel import QuantizedKernel
+from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.peft import Aux
 from lorasp_jax.peft._fused import Fused, Mapped
 

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 
 from lorasp_jax.kernels.energy_gate import energy_gate, kept_energy
-from lorasp_jax.kernels.fused_rows import fused_rows
 from lorasp_jax.kernels.packing import PackedTree
+from lorasp_jax.kernels.rowwise_kernel import rowwise_kernel
 from lorasp_jax.peft._aux import Aux
 from lorasp_jax.peft._fused import Fused
 from lorasp_jax.peft.lora_sp.bank import select
@@ -47,7 +47,7 @@ class FusedRoute(Fused):
         """As `Fused.between_all`."""
         tokens, n = read.shape[:-1], len(columns)
         valid = jnp.ones(tokens, bool) if token_mask is None else token_mask
-        z, sums, statistics = fused_rows(
+        z, sums, statistics = rowwise_kernel(
             functools.partial(route, energy_target=self.energy_target, scale=self.scale),
             params,
             read.reshape(-1, read.shape[-1]),

@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from lorasp_jax.kernels.bisection import Ratio, bisected_mask
 from lorasp_jax.kernels.energy_gate import SMALLEST_TARGET, positive
+from lorasp_jax.kernels.threshold_search import Ratio, bisected_mask
 from lorasp_jax.peft import _fields
 
 PROGRESS = "progress"

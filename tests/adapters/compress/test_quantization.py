@@ -13,7 +13,7 @@ import lorasp_jax
 from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.adapters.io.native import load_adapters, save_adapters
 from lorasp_jax.dense import AdapterParam, Dense
-from lorasp_jax.kernels.quantized_kernel import KINDS, QuantizedKernel
+from lorasp_jax.kernels.quantized_weights import KINDS, QuantizedKernel
 from lorasp_jax.peft import FullFineTuning, LoRA
 from tests.cases import mostly_slow
 from tests.nets import METHODS, NET, SP, Net, X, assert_close, call, trained

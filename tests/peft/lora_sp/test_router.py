@@ -108,7 +108,7 @@ def test_one_token_needs_no_pool(x):
     params = arrays(LoRASP(rank=RANK))
     one = [LoRASP(rank=RANK, granularity=g).delta(params, x[0, 0]) for g in ("token", "sample")]
     for a, b in zip(jax.tree.leaves(one[0]), jax.tree.leaves(one[1]), strict=True):
-        np.testing.assert_array_equal(a, b)
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)  # a GPU rounds the two differently
 
 
 def test_usage_counts_valid_tokens(x):

@@ -67,7 +67,7 @@ Function = Callable[[Any, Columns, jax.Array, jax.Array | None], tuple]
 Body = Callable[..., tuple[list[Columns], Any]]
 
 
-def fused_rows(
+def rowwise_kernel(
     function: Function,
     shared: Any,
     rows: jax.Array,
@@ -122,7 +122,7 @@ def _forward(static: tuple, packed: PackedTree, rows: jax.Array, counts: jax.Arr
 def _run(
     static: tuple, packed: PackedTree, rows: jax.Array, counts: jax.Array, *, keep_mask: bool
 ) -> tuple[tuple, Sequence[jax.Array]]:
-    """Return the results of `fused_rows`, and [the mask for the backward pass, as bits] or []."""
+    """Return the results of `rowwise_kernel` and [the mask as bits, for the gradient] or []."""
     function, widths, start, (launch, _), interpret = static
 
     def block(shared: Any, columns: Columns, counts: Columns) -> tuple[list[Columns], Any]:
@@ -222,7 +222,7 @@ def _call(
         out_shape=(rows, _shape(jnp.float32, programs, num_functions, size)),
         compiler_params=triton.CompilerParams(num_warps=launch.warps, num_stages=1),
         interpret=interpret,
-        name="fused_rows",
+        name="rowwise_kernel",
     )(values, arrays)
     # All sums are in one array, so XLA reduces them in one kernel.
     return [output[:num_rows] for output in outputs], [partial_sums.sum(0)]

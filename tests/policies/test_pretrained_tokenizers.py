@@ -1,4 +1,4 @@
-"""Ids against openpi's tokenizer class and transformers, recorded in tests/golden/tokenizers."""
+"""Compare token ids with those of openpi and transformers, recorded in tests/golden/tokenizers."""
 
 import json
 import shutil
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import sentencepiece
 
-from lorasp_jax.policies import prompts, tokenizer
+from lorasp_jax.policies import offline_tokenizer, prompts, tokenizer
 from tests import GOLDEN
 
 GOLDEN = GOLDEN / "tokenizers"
@@ -19,22 +19,24 @@ FILES = {"paligemma": "paligemma_like.model", "smolvlm": "smolvlm_like_tokenizer
 
 @pytest.mark.parametrize("name", FILES)
 @pytest.mark.parametrize(("length", "suffix"), [(48, ""), (16, "_len16")])
-def test_ids_are_theirs(name, length, suffix):
-    """Too long prompts are cut, with a warning each; PaliGemma's stand-in has none above 48."""
+def test_ids_equal_the_reference(name, length, suffix):
+    """Each truncated prompt gives a warning; no PaliGemma prompt exceeds 48 tokens."""
     expected = np.load(GOLDEN / f"{name}_like_ids.npz")
-    found = tokenizer.load_tokenizer(GOLDEN / FILES[name])
-    with warnings.catch_warnings(record=True) as warned:
+    loaded = tokenizer.load_tokenizer(GOLDEN / FILES[name])
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        ids, mask = found.encode(PROMPTS, length)
-    cut = {("paligemma", 48): 0, ("paligemma", 16): 4, ("smolvlm", 48): 1, ("smolvlm", 16): 8}
-    assert [f"is cut to {length}" in str(w.message) for w in warned] == [True] * cut[name, length]
+        ids, mask = loaded.encode(PROMPTS, length)
+    num_cut = {("paligemma", 48): 0, ("paligemma", 16): 4, ("smolvlm", 48): 1, ("smolvlm", 16): 8}
+    assert [f"truncated to {length}" in str(w.message) for w in caught] == [True] * num_cut[
+        name, length
+    ]
     np.testing.assert_array_equal(ids, expected[f"tokens{suffix}"])
     np.testing.assert_array_equal(mask, expected[f"mask{suffix}"])
     assert (ids.dtype, mask.dtype) == (np.int32, bool)
-    assert found.vocabulary == expected["vocab_size"]
+    assert loaded.vocabulary == expected["vocab_size"]
 
 
-def test_padding_to_the_longest_only_cuts_what_is_masked():
+def test_padding_beyond_the_longest_prompt_is_mrequests():
     expected = np.load(GOLDEN / "smolvlm_like_ids.npz")
     ids, mask = tokenizer.load_tokenizer(GOLDEN / FILES["smolvlm"]).encode(PROMPTS[:4], 48)
     length = expected["tokens_longest"].shape[1]
@@ -48,7 +50,7 @@ def test_a_prompt_begins_with_bos_and_ends_with_a_newline():
 
 
 def test_prompt_of_pi05():
-    """Bins by their definition: 256 equal ones of [-1, 1), by the lower edge."""
+    """The state is binned into 256 equal bins of [-1, 1), each including its lower edge."""
     state = np.array([-2.0, -1.0, -0.999, 0.0, 0.5, 0.9999, 1.0, 7.0])
     text = prompts.pi05(" pick_up\nthe cup ", state)
     assert text == "Task: pick up the cup, State: -1 0 0 128 192 255 255 255;\nAction: "
@@ -59,47 +61,55 @@ def test_prompt_of_pi05():
     assert ids[0][mask[0]].tolist() == [2, *model.encode(text)]
 
 
-def test_a_folder_and_the_offline_tokenizer(tmp_path, monkeypatch):
+def test_load_from_folder_hub_and_offline(tmp_path, monkeypatch):
     shutil.copy(GOLDEN / FILES["smolvlm"], tmp_path / "tokenizer.json")
     ids, _ = tokenizer.load_tokenizer(tmp_path).encode(["push"], 4)
     np.testing.assert_array_equal(
         ids, tokenizer.load_tokenizer(GOLDEN / FILES["smolvlm"]).encode(["push"], 4)[0]
     )
     text = ["press the red button"]
-    for found, wanted in zip(
-        tokenizer.load_tokenizer("").encode(text, 6), tokenizer.encode(text, 6), strict=True
+    for actual, expected in zip(
+        tokenizer.load_tokenizer("").encode(text, 6),
+        offline_tokenizer.encode(text, 6),
+        strict=True,
     ):
-        np.testing.assert_array_equal(found, wanted)
-    asked = []
+        np.testing.assert_array_equal(actual, expected)
+    requests = []
 
     def download(name, *, repo_type, allow_patterns, **_):
-        asked.append((name, repo_type, allow_patterns))
+        requests.append((name, repo_type, allow_patterns))
         return tmp_path
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
     assert tokenizer.load_tokenizer("hf://owner/name").vocabulary
-    assert asked == [("owner/name", "model", ["tokenizer.json", "*.model"])]
+    assert requests == [("owner/name", "model", ["tokenizer.json", "*.model"])]
 
 
-def test_what_is_no_tokenizer_is_one_sentence(tmp_path):
-    with pytest.raises(ValueError, match=r"holds no tokenizer\.json and no \.model"):
+def test_invalid_files_raise_one_sentence(tmp_path):
+    with pytest.raises(ValueError, match=r"contains neither tokenizer\.json nor"):
         tokenizer.load_tokenizer(tmp_path)
-    for name, message in (("a.model", "no SentencePiece model"), ("a.json", "library tokenizers")):
+    for name, message in (
+        ("a.model", "not a SentencePiece model"),
+        ("a.json", "Hugging Face tokenizers"),
+    ):
         (tmp_path / name).write_text("{}")
         with pytest.raises(ValueError, match=message):
             tokenizer.load_tokenizer(tmp_path / name)
     model = bytearray((GOLDEN / FILES["paligemma"]).read_bytes())
-    model[43] ^= 1  # BOS is none any more
+    model[43] ^= 1  # removes BOS
     (tmp_path / "b.model").write_bytes(model)
     large = json.loads((GOLDEN / FILES["smolvlm"]).read_text())
     large["model"]["vocab"]["push"] = 2**31
     (tmp_path / "b.json").write_text(json.dumps(large))
-    for name, message in (("b.model", "no SentencePiece model"), ("b.json", "number 2147483648")):
+    for name, message in (
+        ("b.model", "not a SentencePiece model"),
+        ("b.json", "token id 2147483648"),
+    ):
         with pytest.raises(ValueError, match=message):
             tokenizer.load_tokenizer(tmp_path / name)
     bare = json.loads((GOLDEN / FILES["smolvlm"]).read_text())
     bare["added_tokens"] = []
     bare["model"]["vocab"].pop("<|im_end|>")
     (tmp_path / "tokenizer.json").write_text(json.dumps(bare))
-    with pytest.raises(ValueError, match=r"no token to pad with"):
+    with pytest.raises(ValueError, match=r"no padding token"):
         tokenizer.load_tokenizer(tmp_path / "tokenizer.json")

@@ -1,7 +1,7 @@
-"""Tokenizers of the published language models, read from their files.
+"""Tokenizers of published language models, loaded from their files.
 
-Each kind of file goes with one way to write a prompt: openpi reads PaliGemma's SentencePiece model,
-LeRobot reads files of the library `tokenizers`, for pi0 and SmolVLA alike.
+The file format implies the prompt template: openpi reads PaliGemma's SentencePiece model, LeRobot
+reads files of Hugging Face tokenizers for both pi0 and SmolVLA.
 """
 
 import warnings
@@ -15,22 +15,22 @@ import tokenizers
 from lorasp_jax.policies import prompts
 
 PAD_TOKENS = ("<pad>", "<|im_end|>")
-"""What fills up a prompt: PaliGemma's token, SmolVLM2's."""
+"""Padding tokens of PaliGemma and SmolVLM2."""
 
 
 class SentencePiece:
-    """A SentencePiece model, as openpi uses it (models/tokenizer.py at 15a9616a).
+    """A SentencePiece model with openpi's prompt (models/tokenizer.py at 15a9616a).
 
     Raises:
-        ValueError: no such model.
+        ValueError: the file is not a SentencePiece model with BOS.
     """
 
     def __init__(self, file: Path) -> None:
         try:
             self._model = sentencepiece.SentencePieceProcessor(model_file=str(file))
-            self._model.encode("", add_bos=True)  # as long as that works, every text does
+            self._model.encode("", add_bos=True)  # if this works, every text encodes
         except (OSError, RuntimeError, ValueError) as error:
-            raise ValueError(f"{file} is no SentencePiece model of PaliGemma's kind.") from error
+            raise ValueError(f"{file} is not a SentencePiece model like PaliGemma's.") from error
 
     @property
     def vocabulary(self) -> int:
@@ -40,65 +40,63 @@ class SentencePiece:
     def encode(
         self, texts: Sequence[str], max_tokens: int, *, complete: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """BOS, the cleaned text, a newline; see `tokenizer.Tokenizer`."""
+        """Encode as BOS, the cleaned text, a newline; see `tokenizer.Tokenizer`."""
         rows = [
             self._model.encode(t if complete else prompts.openpi(t), add_bos=True) for t in texts
         ]
         if not complete:
-            # Apart, as the answer's first token: it must not join the text's last piece.
+            # Encoded separately, so that it never merges with the last piece of the text.
             newline = self._model.encode("\n")
             rows = [row + newline for row in rows]
-        return _padded(texts, rows, max_tokens, pad=0)
+        return _pad(texts, rows, max_tokens, pad=0)
 
 
 class TokenizersFile:
-    """A tokenizer.json of Hugging Face, as LeRobot uses it.
+    """A Hugging Face tokenizer.json with LeRobot's prompt.
 
     Raises:
-        ValueError: no such file, or none of `PAD_TOKENS` in it.
+        ValueError: the file is invalid or has none of `PAD_TOKENS`.
     """
 
     def __init__(self, file: Path) -> None:
         try:
             self._model = tokenizers.Tokenizer.from_file(str(file))
-        except Exception as error:  # the library raises nothing more special
-            raise ValueError(f"{file} is no file of the library tokenizers.") from error
+        except Exception as error:  # the library raises plain Exception
+            raise ValueError(f"{file} is not a file of Hugging Face tokenizers.") from error
         self._model.no_truncation()
         self._model.no_padding()
         pads = [self._model.token_to_id(token) for token in PAD_TOKENS]
-        found = [pad for pad in pads if pad is not None]
-        if not found:
-            raise ValueError(
-                f"{file} has no token to pad with, which is {' or '.join(PAD_TOKENS)}."
-            )
-        self._pad = found[0]
+        pads = [pad for pad in pads if pad is not None]
+        if not pads:
+            raise ValueError(f"{file} has no padding token ({' or '.join(PAD_TOKENS)}).")
+        self._pad = pads[0]
         self.vocabulary: int = 1 + max(self._model.get_vocab().values())
-        """Number of tokens, those included that the file leaves out."""
+        """Largest token id + 1; the file may skip ids."""
         if self.vocabulary > np.iinfo(np.int32).max:
-            raise ValueError(f"{file} has a token of number {self.vocabulary - 1}.")
+            raise ValueError(f"{file} has token id {self.vocabulary - 1}, beyond int32.")
 
     def encode(
         self, texts: Sequence[str], max_tokens: int, *, complete: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The text with a newline at its end, and what the file itself puts around it, as BOS.
+        """Encode the text, a newline at its end, and the special tokens that the file adds (BOS).
 
         See `tokenizer.Tokenizer`.
         """
-        written = [text if complete else prompts.lerobot(text) for text in texts]
-        rows = [encoding.ids for encoding in self._model.encode_batch(written)]
-        return _padded(texts, rows, max_tokens, pad=self._pad)
+        full_prompts = [text if complete else prompts.lerobot(text) for text in texts]
+        rows = [encoding.ids for encoding in self._model.encode_batch(full_prompts)]
+        return _pad(texts, rows, max_tokens, pad=self._pad)
 
 
-def _padded(
+def _pad(
     texts: Sequence[str], rows: Sequence[Sequence[int]], max_tokens: int, pad: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """ids `[P, T]` int32 and valid `[P, T]` bool of rows, cut or padded on the right."""
+    """Truncate or right-pad the rows: ids `[P, T]` int32 and valid `[P, T]` bool."""
     ids = np.full((len(rows), max_tokens), pad, np.int32)
     valid = np.zeros((len(rows), max_tokens), bool)
     for i, (text, row) in enumerate(zip(texts, rows, strict=True)):
         if len(row) > max_tokens:
             warnings.warn(
-                f"{text!r} has {len(row)} tokens and is cut to {max_tokens}.", stacklevel=3
+                f"{text!r} has {len(row)} tokens; truncated to {max_tokens}.", stacklevel=3
             )
         ids[i, : len(row)] = row[:max_tokens]
         valid[i, : len(row)] = True

@@ -7,7 +7,7 @@ import pytest
 from jax.scipy.special import ndtri
 
 from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul
-from lorasp_jax.kernels.quantized_kernel import KINDS, NF4, quantized
+from lorasp_jax.kernels.quantized_weights import KINDS, NF4, quantized
 from tests import GOLDEN
 
 GOLDEN = GOLDEN / "quantized_kernels.npz"

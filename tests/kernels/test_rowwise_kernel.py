@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lorasp_jax.kernels import fused_rows as kernels
+from lorasp_jax.kernels import rowwise_kernel as kernels
 
 WIDTHS = (32, 16)
 
@@ -35,7 +35,7 @@ def run(fused, shared, rows, counts):
     def loss(shared, rows):
         if fused:
             interpret = jax.default_backend() != "gpu"
-            found = kernels.fused_rows(gated, shared, rows, WIDTHS, counts, interpret=interpret)
+            found = kernels.rowwise_kernel(gated, shared, rows, WIDTHS, counts, interpret=interpret)
         else:
             output, sums, _, statistics = gated(shared, jnp.split(rows, [32], 1), counts, None)
             found = output, sums, statistics
@@ -84,7 +84,10 @@ def test_dtypes_are_those_of_the_function(shared):
 
 def test_residuals_are_the_rows_and_the_packed_mask(shared):
     rows, counts = jnp.ones((32, 48)), jnp.ones((32, 1), bool)
-    call = lambda rows: kernels.fused_rows(gated, shared, rows, WIDTHS, counts, interpret=True)[0]  # noqa: E731
+
+    def call(rows):
+        return kernels.rowwise_kernel(gated, shared, rows, WIDTHS, counts, interpret=True)[0]
+
     _, pull_back = jax.eval_shape(lambda rows: jax.vjp(call, rows), rows)
     stored = {leaf.shape for leaf in jax.tree.leaves(pull_back) if leaf.shape}
     assert stored <= {(32, 48), (32, 32 // 8), (32, 1), (1, 16 * 32 + 32)}
@@ -110,7 +113,7 @@ def test_functions_side_by_side(shared, few, monkeypatch):
     counts = jax.random.bernoulli(jax.random.key(2), 0.7, (20, 1))
 
     def together(pair, rows):
-        output, sums, (number,) = kernels.fused_rows(
+        output, sums, (number,) = kernels.rowwise_kernel(
             gated, pair, rows, WIDTHS, counts, start=8, interpret=True
         )
         return jnp.sin(output).sum() + sums["squares"].sum(), (output, sums, number)

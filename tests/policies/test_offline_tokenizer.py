@@ -1,3 +1,5 @@
+"""Vocabulary and encoding of the offline tokenizer."""
+
 import hashlib
 
 import numpy as np
@@ -6,11 +8,11 @@ import pytest
 import envs
 from envs.names import names
 from lorasp_jax.models.pi0 import Pi0Config
-from lorasp_jax.policies import tokenizer
+from lorasp_jax.policies import offline_tokenizer as tokenizer
 
 
 def test_vocabulary_is_frozen():
-    """Shipped weights depend on every id. Only reserved entries may change, and then this hash."""
+    """Shipped weights depend on every id; only reserved entries may change, and so this hash."""
     assert len(tokenizer.VOCABULARY) == tokenizer.VOCABULARY_SIZE
     assert sorted(tokenizer.VOCABULARY.values()) == list(range(tokenizer.VOCABULARY_SIZE))
     digest = hashlib.sha256("\n".join(tokenizer.VOCABULARY).encode()).hexdigest()
@@ -28,8 +30,8 @@ def test_known_words_are_one_token():
     assert ids.dtype == np.int32
     assert valid.sum(axis=1).tolist() == [len(text.split()) for text in texts]
     assert not ids[~valid].any()
-    words = [list(tokenizer.VOCABULARY)[i] for i in ids[1, :4]]
-    assert words == ["press", "the", "red", "button"]
+    entries = [list(tokenizer.VOCABULARY)[i] for i in ids[1, :4]]
+    assert entries == ["press", "the", "red", "button"]
 
 
 def test_any_printable_ascii_text_encodes():
@@ -39,19 +41,19 @@ def test_any_printable_ascii_text_encodes():
 
 
 @pytest.mark.parametrize("text", ["", "press the red button now or never", "drücke 按"])
-def test_what_cannot_be_encoded_raises(text):
-    with pytest.raises(ValueError, match=r"valid are 1 to 4|tokenizer lacks"):
+def test_text_that_cannot_be_encoded_raises(text):
+    with pytest.raises(ValueError, match=r"valid are 1 to 4|cannot encode"):
         tokenizer.encode([text], 4)
 
 
-def test_limit_is_the_last_length_that_fits():
+def test_text_of_exactly_max_tokens_fits():
     assert tokenizer.encode(["press the red button"], 4)[1].all()
     with pytest.raises(ValueError, match="has 4 tokens; valid are 1 to 3"):
         tokenizer.encode(["press the red button"], 3)
     assert [array.shape for array in tokenizer.encode([], 3)] == [(0, 3), (0, 3)]
 
 
-def test_spacing_case_and_full_stops():
+def test_spacing_case_and_punctuation():
     texts = ["press the button", "  Press\tTHE\n button ", "press the button."]
     ids, valid = tokenizer.encode(texts, 6)
     np.testing.assert_array_equal(ids[0], ids[1])
@@ -59,7 +61,7 @@ def test_spacing_case_and_full_stops():
     assert valid.sum(axis=1).tolist() == [3, 3, 4]
 
 
-def test_unknown_words_are_spelled():
+def test_unknown_words_are_split_into_characters():
     entries = list(tokenizer.VOCABULARY)
     ids, valid = tokenizer.encode(["xylo", "yxlo"], 8)
     assert [entries[i] for i in ids[0][valid[0]]] == ["x", "##y", "##l", "##o"]
@@ -67,7 +69,7 @@ def test_unknown_words_are_spelled():
 
 
 @pytest.mark.parametrize("size", ["nano", "small"])
-def test_instructions_of_every_task_are_known_words(size):
+def test_instructions_of_every_task_have_one_token_per_word(size):
     limit = getattr(Pi0Config, size)().max_tokens
     for name in names("task"):
         texts = envs.make(name).instructions

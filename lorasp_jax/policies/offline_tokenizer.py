@@ -1,0 +1,87 @@
+"""Tokenizer of the project's own base weights: a tiny WordPiece over manipulation words, offline.
+
+Other words are split into characters, so every printable ASCII text encodes. The position of an
+entry is its id, and the shipped weights depend on it: entries are never moved or removed, and a new
+word replaces the next reserved entry.
+"""
+
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+import tokenizers
+from tokenizers import models, normalizers, pre_tokenizers
+
+from lorasp_jax.models.config import VOCABULARY_SIZE
+
+_SPECIAL = ("[PAD]", "[UNK]")
+_CHARACTERS = tuple(chr(code) for code in range(33, 127) if not chr(code).isupper())
+_WORDS = (
+    "a an the this that it its and then of",
+    "to in into on onto up down from off out with inside over above under by at for near",
+    "press push hit tap touch hold click button switch key",
+    "pick place put drop grab take lift move carry bring lay leave set get grasp pinch",
+    "grape fruit berry basket bowl box bin container tray",
+    "open close remove raise uncover pot lid cover pan top handle knob",
+    "pour tip empty tilt fill cup mug glass block cube contents",
+    "red green blue yellow purple orange black white grey brown dark light small big round",
+    "left right front back side middle center table robot arm gripper object please your",
+)
+
+
+def _vocabulary() -> dict[str, int]:
+    words = " ".join(_WORDS).split()
+    entries = dict.fromkeys((*_SPECIAL, *_CHARACTERS, *(f"##{c}" for c in _CHARACTERS), *words))
+    reserved = (f"[RESERVED{i}]" for i in range(VOCABULARY_SIZE - len(entries)))
+    return {entry: i for i, entry in enumerate((*entries, *reserved))}
+
+
+VOCABULARY = _vocabulary()
+"""Entry -> id; frozen."""
+
+
+@functools.cache
+def _tokenizer() -> tokenizers.Tokenizer:
+    tokenizer = tokenizers.Tokenizer(models.WordPiece(VOCABULARY, unk_token="[UNK]"))
+    tokenizer.normalizer = normalizers.BertNormalizer(lowercase=True)
+    tokenizer.pre_tokenizer = pre_tokenizers.BertPreTokenizer()
+    return tokenizer
+
+
+class Offline:
+    """The offline tokenizer behind the interface `tokenizer.Tokenizer`."""
+
+    vocabulary = VOCABULARY_SIZE
+
+    def encode(
+        self, texts: Sequence[str], max_tokens: int, *, complete: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Encode the instructions as they are, without a prompt template; see `encode`."""
+        del complete
+        return encode(texts, max_tokens)
+
+
+def encode(texts: Sequence[str], max_tokens: int) -> tuple[np.ndarray, np.ndarray]:
+    """Encode P texts, padded on the right with id 0.
+
+    Args:
+        texts: instructions; case is ignored.
+        max_tokens: T.
+
+    Returns:
+        ids `[P, T]` int32, valid `[P, T]` bool.
+
+    Raises:
+        ValueError: a text is empty, needs more than `max_tokens`, or has non-ASCII characters.
+    """
+    ids = np.zeros((len(texts), max_tokens), np.int32)
+    valid = np.zeros((len(texts), max_tokens), bool)
+    for row, text in enumerate(texts):
+        tokens = _tokenizer().encode(text).ids
+        if not 0 < len(tokens) <= max_tokens:
+            raise ValueError(f"{text!r} has {len(tokens)} tokens; valid are 1 to {max_tokens}.")
+        if VOCABULARY["[UNK]"] in tokens:
+            raise ValueError(f"{text!r} has characters that the offline tokenizer cannot encode.")
+        ids[row, : len(tokens)] = tokens
+        valid[row, : len(tokens)] = True
+    return ids, valid
