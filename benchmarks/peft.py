@@ -26,7 +26,7 @@ from rich.console import Console
 from benchmarks.measuring import best, machine, print_table
 from lorasp_jax import peft
 from lorasp_jax.kernels.energy_gate import energy_gate
-from lorasp_jax.peft._together import apply_together
+from lorasp_jax.peft._shared_input import apply_shared_input
 
 SHAPES = ((2048, 16384), (16384, 2048), (2048, 2048), (1152, 4304))
 # Query, key and value of pi0's language model and vision tower; gate and up of a smaller MLP.
@@ -111,7 +111,7 @@ def measure_together(
             return [method.apply(p, x, k) for p, k in zip(params, kernels, strict=True)]
 
         def together(params: Any, x: jax.Array, kernels: Any, method: Any = method) -> Any:
-            return apply_together([(method, *a) for a in zip(params, kernels, strict=True)], x)
+            return apply_shared_input([(method, *a) for a in zip(params, kernels, strict=True)], x)
 
         seconds = []
         for layers in (apart, together):

@@ -13,7 +13,7 @@ import lorasp_jax
 from lorasp_jax.adapters.io.native import load_adapters, save_adapters
 from lorasp_jax.dense import LinenDense
 from lorasp_jax.peft import AdaLoRA, DoRA, LoRA
-from lorasp_jax.peft._method import dropped
+from lorasp_jax.peft._method import dropout
 from lorasp_jax.peft.dora import column_factor
 from tests import nets
 from tests.test_scanned import EINSUMS, IDS, Llama
@@ -35,7 +35,7 @@ def same(a, b):
 
 
 def test_a_share_is_zero_and_the_rest_makes_up_for_it():
-    seen = dropped(jnp.ones((200, 100), jnp.bfloat16), 0.25, KEY)
+    seen = dropout(jnp.ones((200, 100), jnp.bfloat16), 0.25, KEY)
     assert seen.dtype == jnp.bfloat16
     np.testing.assert_allclose(jnp.unique(seen), [0, 4 / 3], rtol=4e-3)
     np.testing.assert_allclose((seen == 0).mean(), 0.25, atol=0.01)
@@ -46,7 +46,7 @@ def test_formula_of_peft(method):
     """PEFT 0.21.2: lora_B(lora_A(dropout(x))); DoRA's magnitude rescales W dropout(x) (dora.py)."""
     kernel = jax.random.normal(jax.random.key(1), (5, 4))
     params = away(method.init(jax.random.key(2), kernel)[0])
-    seen = dropped(X, RATE, KEY)
+    seen = dropout(X, RATE, KEY)
     a, b = params["lora_a"], params["lora_b"]
     if isinstance(method, AdaLoRA):
         a = a * params["lora_e"]
@@ -54,10 +54,12 @@ def test_formula_of_peft(method):
     if isinstance(method, DoRA):
         factor = column_factor(params["magnitude"], kernel + method.scale * a @ b)
         delta = (factor - 1) * (seen @ kernel) + factor * delta
-    y, aux = method.apply_dropped(params, X, kernel, KEY)
+    y, aux = method.apply_with_dropout(params, X, kernel, KEY)
     np.testing.assert_allclose(y, X @ kernel + delta, rtol=1e-4, atol=1e-5)
     assert aux.active_rank.shape == X.shape[:-1]
-    slope = jax.grad(lambda kernel: method.apply_dropped(params, X, kernel, KEY)[0].sum())(kernel)
+    slope = jax.grad(lambda kernel: method.apply_with_dropout(params, X, kernel, KEY)[0].sum())(
+        kernel
+    )
     assert not slope.any()  # as without dropout: the base is frozen
 
 

@@ -27,11 +27,11 @@ from flax import nnx
 
 from lorasp_jax.adapters import paths
 from lorasp_jax.adapters.layers import nnx_layers
-from lorasp_jax.dense import AdaptedLayer, AdapterAux, AdapterParam, DropoutKey, given
+from lorasp_jax.dense import AdaptedLayer, AdapterAux, AdapterParam, DropoutKey, validate
 from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.peft import FullFineTuning, Method, _arguments
 from lorasp_jax.peft._fields import short
-from lorasp_jax.peft._method import Params, drop_rate
+from lorasp_jax.peft._method import Params, dropout_rate
 
 Model = TypeVar("Model", bound=nnx.Module)
 
@@ -79,7 +79,7 @@ def adapt(
     paths.check_method_rules(rules)
     nnx_layers.check_einsums(einsums)
     _check_statistics(statistics)
-    root, key = _copy(model), given.rngs(rngs).params()
+    root, key = _copy(model), validate.rngs(rngs).params()
     used = _attach_all(root, rules, key, einsums, statistics) | unfreeze(root, rules)
     for i, (pattern, _) in enumerate(rules):
         if i not in used:
@@ -118,23 +118,25 @@ def with_dropout(model: Model, key: jax.Array) -> Model:
     root, key = _copy(model), _arguments.key(key)
     for location in paths.unique(paths.locate(root, AdaptedLayer)):
         layer = location.child
-        if isinstance(layer.adapter, AdapterParam) and drop_rate(layer.method):
+        if isinstance(layer.adapter, AdapterParam) and dropout_rate(layer.method):
             own = jax.random.fold_in(key, zlib.crc32(location.path.encode()))
             leading = layer.stack_shape()
-            layer.held_dropout_key = DropoutKey(jax.random.split(own, leading) if leading else own)
+            layer.stored_dropout_key = DropoutKey(
+                jax.random.split(own, leading) if leading else own
+            )
     return root[0]
 
 
 def count(model: nnx.Module) -> Counts:
     """How many parameters train, and how many there are; shapes suffice (`nnx.eval_shape`)."""
-    given.module(model)
+    validate.module(model)
     return Counts(_size(nnx.state(model, AdapterParam)), _size(nnx.state(model, nnx.Param)))
 
 
 def methods(model: nnx.Module) -> dict[str, Method]:
     """Method by path: of each layer with an adapter, and full fine-tuning of each parameter."""
     found = {}
-    given.module(model)
+    validate.module(model)
     for path, parent, name, _ in paths.locate(nnx.List([model]), AdapterParam):
         if isinstance(parent, AdaptedLayer) and name == "adapter":
             found[path.rpartition("/")[0]] = parent.method
@@ -152,7 +154,7 @@ def merge(model: Model) -> Model:
     Raises:
       ValueError: a method whose delta depends on the input, or a model without values.
     """
-    root = _copy(given.with_values(model))
+    root = _copy(validate.with_values(model))
     paths.replace(paths.locate(root, AdaptedLayer), _merged)
     _convert_variables(paths.locate(root, AdapterParam), nnx.Param)
     return root[0]
@@ -174,7 +176,7 @@ def _merged(location: paths.Location) -> nnx.Module:
 def penalties(model: nnx.Module) -> dict[str, jax.Array]:
     """Each loss on parameters alone, averaged over the adapted matrices whose method has it."""
     found: dict[str, list[jax.Array]] = {}
-    for _, _, _, layer in paths.locate(nnx.List([given.module(model)]), AdaptedLayer):
+    for _, _, _, layer in paths.locate(nnx.List([validate.module(model)]), AdaptedLayer):
         if layer.adapter is not None:
             penalty = over_stack(layer.method.penalty, layer.kernel_matrices())
             for name, values in penalty(layer.adapter.get_value()).items():
@@ -234,7 +236,7 @@ def _copy(model: nnx.Module) -> nnx.List[Any]:
 
     The holder gives a model that is itself one layer a parent to be replaced in.
     """
-    model = nnx.clone(given.module(model))
+    model = nnx.clone(validate.module(model))
     nnx.pop(model, nnx.Any(AdapterAux, DropoutKey))
     return nnx.List([model])
 

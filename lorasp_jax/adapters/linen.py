@@ -28,9 +28,9 @@ from lorasp_jax.adapters.layers.einsum import to_matrices
 from lorasp_jax.adapters.layers.linen_layers import kind, layer_map, with_lora
 from lorasp_jax.adapters.layers.nnx_layers import Einsums
 from lorasp_jax.adapters.paths import Rules, check_method_rules, find_rule, no_match_message
-from lorasp_jax.dense import KEPT, given
+from lorasp_jax.dense import AUX_NAME, validate
 from lorasp_jax.peft import Method, _arguments
-from lorasp_jax.peft._method import drop_rate
+from lorasp_jax.peft._method import dropout_rate
 
 ADAPTER = "lorasp_adapter"  # name of an adapter among its layer's parameters
 # Set on scopes of the model: its code may apply other modules, which have variables of their own,
@@ -101,7 +101,9 @@ class LinenAdapter:
           ValueError: a rule that governs nothing that it applies to (lists near misses), a layer
             that an adapter cannot take over, or adapters that are there already.
         """
-        if ADAPTER in {name for path in flatten_dict(given.variables(variables)) for name in path}:
+        if ADAPTER in {
+            name for path in flatten_dict(validate.variables(variables)) for name in path
+        }:
             raise ValueError("these variables have adapters already: start from the model's own.")
         rngs = _rngs(key)
         record = _Record()
@@ -189,7 +191,7 @@ class LinenAdapter:
             matrices = functools.partial(to_matrices, view.equation)
             found["/".join(module.path)] = jax.eval_shape(matrices, shaped).shape
 
-        self._visited(visit, given.variables(variables), *args, **kwargs)
+        self._visited(visit, validate.variables(variables), *args, **kwargs)
         return found
 
     def _kind(self, module: nn.Module) -> type[nn.Module] | None:
@@ -286,7 +288,7 @@ class LinenAdapter:
             y, aux = view.einsum(method, params, key)
         else:
             y, aux = with_lora(module, method, params, key, run(*args, **kwargs), *args, **kwargs)
-        module.sow("intermediates", KEPT, aux)
+        module.sow("intermediates", AUX_NAME, aux)
         return y
 
 
@@ -317,7 +319,7 @@ def _is_ours(module: nn.Module) -> bool:
 def _dropout_key(module: nn.Module, method: Method) -> jax.Array | None:
     """A key where the method has dropout and the call of the model got rngs for it, else None."""
     assert module.scope is not None
-    if not drop_rate(method) or not module.scope.has_flag(DROPS):
+    if not dropout_rate(method) or not module.scope.has_flag(DROPS):
         return None
     if not module.has_rng("dropout"):
         raise ValueError(
@@ -343,6 +345,6 @@ def _apply(model: nn.Module, variables: Any, *args: Any, method: Any = None, **k
 
 def _joined(variables: Mapping[str, Any]) -> dict[str, Any]:
     """The variables with everything that trains where the model looks for it."""
-    trained = flatten_dict(flax.core.unfreeze(given.variables(variables).get("adapters", {})))
+    trained = flatten_dict(flax.core.unfreeze(validate.variables(variables).get("adapters", {})))
     params = flatten_dict(flax.core.unfreeze(variables["params"])) | trained
     return {**variables, "params": unflatten_dict(params)}

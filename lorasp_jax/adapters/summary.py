@@ -10,7 +10,7 @@ from flax import nnx
 from lorasp_jax.adapters.adaptation import Counts, count
 from lorasp_jax.adapters.layers.nnx_layers import kernel_of
 from lorasp_jax.adapters.paths import EINSUMS_HINT, locate, locate_layers, locate_other_matrices
-from lorasp_jax.dense import KEPT, AdapterAux, AdapterParam, given
+from lorasp_jax.dense import AUX_NAME, AdapterAux, AdapterParam, validate
 from lorasp_jax.peft import Aux
 from lorasp_jax.peft._fields import short
 
@@ -30,7 +30,7 @@ def summary(model: nnx.Module, aux: Mapping[str, Aux] | None = None) -> str:
     Raises:
       ValueError: aux of a layer that the model lacks.
     """
-    rows = _rows(given.module(model))
+    rows = _rows(validate.module(model))
     if aux is not None and not (
         isinstance(aux, Mapping) and all(isinstance(one, Aux) for one in aux.values())
     ):
@@ -136,7 +136,7 @@ def collect_aux(model: nnx.Module | Mapping[str, Any]) -> dict[str, Aux]:
                 f"{short(model)}."
             )
         sown = flax.traverse_util.flatten_dict(kept)  # type: ignore
-        sown = {path: kept for path, kept in sown.items() if path[-1] == KEPT}
+        sown = {path: kept for path, kept in sown.items() if path[-1] == AUX_NAME}
         found = {path[:-1]: kept[-1] for path, kept in sown.items() if isinstance(kept, tuple)}
     if not found:
         raise ValueError(

@@ -16,21 +16,21 @@ A model that `jax.jit` closes over can be called too, but keeps nothing. Code th
 second result asks for it, `layer(x, return_aux=True)`, and then nothing is stored.
 """
 
-from lorasp_jax.dense.functional import DenseLayer, computed_in, dense, dense_together
+from lorasp_jax.dense.functional import DenseLayer, cast_input, dense, dense_shared_input
 from lorasp_jax.dense.layers import (
-    KEPT,
+    AUX_NAME,
     AdaptedLayer,
     AdapterAux,
     AdapterParam,
     Dense,
     DropoutKey,
-    refuse_sharding,
+    reject_out_sharding,
     with_value,
 )
 from lorasp_jax.dense.linen import LinenDense
 
 __all__ = [
-    "KEPT",
+    "AUX_NAME",
     "AdaptedLayer",
     "AdapterAux",
     "AdapterParam",
@@ -38,9 +38,9 @@ __all__ = [
     "DenseLayer",
     "DropoutKey",
     "LinenDense",
-    "computed_in",
+    "cast_input",
     "dense",
-    "dense_together",
-    "refuse_sharding",
+    "dense_shared_input",
+    "reject_out_sharding",
     "with_value",
 ]

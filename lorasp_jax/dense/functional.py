@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 from flax.typing import Dtype
 
-from lorasp_jax.dense import given
+from lorasp_jax.dense import validate
 from lorasp_jax.peft import Aux, Method, _arguments
 from lorasp_jax.peft._method import Params
-from lorasp_jax.peft._together import Adapted, apply_together
+from lorasp_jax.peft._shared_input import AdaptedKernel, apply_shared_input
 
 
 class DenseLayer(NamedTuple):
@@ -57,13 +57,13 @@ def dense(
     if method is None or params is None:
         found = x @ matrix.astype(x.dtype), Aux()
     elif dropout_key is not None:
-        found = method.apply_dropped(params, x, matrix, dropout_key, token_mask=token_mask)
+        found = method.apply_with_dropout(params, x, matrix, dropout_key, token_mask=token_mask)
     else:
         found = method.apply(params, x, matrix, token_mask=token_mask)
     return _with_bias(layer, x, found)
 
 
-def dense_together(
+def dense_shared_input(
     x: jax.Array, layers: Sequence[DenseLayer], *, token_mask: jax.Array | None = None
 ) -> list[tuple[jax.Array, Aux]]:
     """`dense` of several layers that share their input, which their adapters then read once.
@@ -81,13 +81,13 @@ def dense_together(
     """
     layers = [DenseLayer(*layer) for layer in layers]
     found: dict[int, tuple[jax.Array, Aux]] = {}
-    sharing: dict[int, Adapted] = {}
+    sharing: dict[int, AdaptedKernel] = {}
     for i, layer in enumerate(layers):
         if layer.method is None or layer.params is None or layer.dropout_key is not None:
             found[i] = dense(x, *layer, token_mask=token_mask)
         else:
             sharing[i] = layer.method, layer.params, _checked_matrix(layer, x, token_mask)
-    together = apply_together([*sharing.values()], x, token_mask=token_mask)
+    together = apply_shared_input([*sharing.values()], x, token_mask=token_mask)
     for i, one in zip(sharing, together, strict=True):
         found[i] = _with_bias(layers[i], x, one)
     return [found[i] for i in range(len(layers))]
@@ -96,7 +96,7 @@ def dense_together(
 def _checked_matrix(layer: DenseLayer, x: jax.Array, token_mask: jax.Array | None) -> jax.Array:
     """The layer's kernel as a matrix [I, O], once it fits the input."""
     _arguments.tokens(x, token_mask)
-    given.layer(layer, x.shape[-1])
+    validate.layer(layer, x.shape[-1])
     return layer.kernel.reshape(layer.kernel.shape[0], math.prod(layer.kernel.shape[1:]))
 
 
@@ -108,14 +108,14 @@ def _with_bias(
     return (y if layer.bias is None else y + layer.bias.astype(y.dtype)), aux
 
 
-def computed_in(dtype: Dtype | None, x: Any, kernel: Any) -> jax.Array:
+def cast_input(dtype: Dtype | None, x: Any, kernel: Any) -> jax.Array:
     """x in the type of a layer's computation; None: the type that x and the kernel promote to.
 
     Raises:
       ValueError: x is no array, or no such type is there, as for kernels of 8 bits.
     """
     try:
-        return given.array(x).astype(dtype or jnp.promote_types(x.dtype, kernel.dtype))
+        return validate.array(x).astype(dtype or jnp.promote_types(x.dtype, kernel.dtype))
     except jax.dtypes.TypePromotionError as error:
         raise ValueError(
             f"a layer with a kernel of {kernel.dtype} needs a dtype to compute {x.dtype} in, such "

@@ -10,14 +10,14 @@ import jax.numpy as jnp
 from flax import nnx
 from flax.typing import Dtype, Initializer
 
-from lorasp_jax.dense import given
-from lorasp_jax.dense.functional import DenseLayer, computed_in, dense
+from lorasp_jax.dense import validate
+from lorasp_jax.dense.functional import DenseLayer, cast_input, dense
 from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.peft import Aux, Method
 from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import Params
 
-KEPT = "kept_aux"
+AUX_NAME = "stored_aux"
 KERNEL_INIT = jax.nn.initializers.lecun_normal()  # of nnx.Linear and nn.Dense too
 
 
@@ -29,7 +29,7 @@ class AdapterAux(nnx.Intermediate[Any]):
     """What a drop-in layer kept in its last call."""
 
 
-def refuse_sharding(out_sharding: Any) -> None:
+def reject_out_sharding(out_sharding: Any) -> None:
     """Raises a ValueError unless it is None: some models pass it to every layer."""
     if out_sharding is not None:
         raise ValueError("an adapted layer takes no out_sharding: constrain what it returns.")
@@ -51,15 +51,15 @@ class AdaptedLayer(nnx.Module):
       kernel_name: name of the attribute that holds the layer's kernel.
       adapter: `AdapterParam` holding the method's parameters, or None.
       method: the adapter's method, static.
-      kept_aux: what the last call reported, and held_dropout_key: what `with_dropout` gives; where
+      stored_aux: what the last call reported, and stored_dropout_key: what `with_dropout` gives; where
         there is none, the layer lacks the attribute, so that its structure stays what it was.
     """
 
     kernel_name: str = "kernel"
     adapter: AdapterParam | None
     method: Method | None
-    kept_aux: AdapterAux
-    held_dropout_key: DropoutKey
+    stored_aux: AdapterAux
+    stored_dropout_key: DropoutKey
 
     def kernel_matrices(self) -> jax.Array:
         """The kernel as the adapter sees it, [..., I, O]; leading axes are stacks of layers."""
@@ -93,7 +93,7 @@ class AdaptedLayer(nnx.Module):
         """
         return method.init
 
-    def carried(self) -> tuple[Method, Params]:
+    def method_and_params(self) -> tuple[Method, Params]:
         """The method and the parameters of an adapter that is there."""
         assert self.method is not None
         assert self.adapter is not None
@@ -110,14 +110,14 @@ class AdaptedLayer(nnx.Module):
     @property
     def dropout_key(self) -> jax.Array | None:
         """The key of `with_dropout`, or None: nothing is dropped."""
-        held = getattr(self, "held_dropout_key", None)
+        held = getattr(self, "stored_dropout_key", None)
         return None if held is None else held.get_value()
 
-    def keep_aux(self, aux: Aux) -> None:
+    def store_aux(self, aux: Aux) -> None:
         """Stores aux for `collect_aux`, where the layer may be changed."""
         # A module of an outer trace cannot be changed; collect_aux then raises.
         with contextlib.suppress(flax.errors.TraceContextError):
-            self.kept_aux = AdapterAux(aux)
+            self.stored_aux = AdapterAux(aux)
 
 
 class Dense(AdaptedLayer):
@@ -158,11 +158,11 @@ class Dense(AdaptedLayer):
         Raises:
           ValueError: what is no width, method or source of keys.
         """
-        d_in, d_out = given.size("d_in", d_in), given.size("d_out", d_out)
-        given.method(method)
-        given.rngs(rngs)
-        given.real("param_dtype", param_dtype)
-        given.real("dtype", dtype or param_dtype)
+        d_in, d_out = validate.size("d_in", d_in), validate.size("d_out", d_out)
+        validate.method(method)
+        validate.rngs(rngs)
+        validate.floating_dtype("param_dtype", param_dtype)
+        validate.floating_dtype("dtype", dtype or param_dtype)
         base = AdapterParam if method is not None and method.trains_base else nnx.Param
         self.kernel: nnx.Param[Any] = base(kernel_init(rngs.params(), (d_in, d_out), param_dtype))
         bias = base(jnp.zeros(d_out, param_dtype)) if use_bias else None
@@ -184,20 +184,20 @@ class Dense(AdaptedLayer):
         out_sharding: None = None,
     ) -> Any:
         """y [...tokens, O], or (y, aux) if asked; see `dense`. An output sharding is refused."""
-        refuse_sharding(out_sharding)
-        y, aux = dense(self.as_input(x), *self.arrays(), token_mask=token_mask)
+        reject_out_sharding(out_sharding)
+        y, aux = dense(self.cast_input(x), *self.arrays(), token_mask=token_mask)
         if return_aux:
             return y, aux
         if self.adapter is not None:
-            self.keep_aux(aux)
+            self.store_aux(aux)
         return y
 
-    def as_input(self, x: jax.Array) -> jax.Array:
+    def cast_input(self, x: jax.Array) -> jax.Array:
         """x in the type of the computation."""
-        return computed_in(self.dtype, x, self.kernel.get_value())
+        return cast_input(self.dtype, x, self.kernel.get_value())
 
     def arrays(self) -> DenseLayer:
-        """What `dense` and `dense_together` take."""
+        """What `dense` and `dense_shared_input` take."""
         bias = None if self.bias is None else self.bias.get_value()
         params = None if self.adapter is None else self.adapter.get_value()
         return DenseLayer(self.kernel.get_value(), bias, params, self.method, self.dropout_key)

@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 from flax.typing import Dtype, Initializer
 
-from lorasp_jax.dense import given
-from lorasp_jax.dense.functional import computed_in, dense
-from lorasp_jax.dense.layers import KEPT, KERNEL_INIT
+from lorasp_jax.dense import validate
+from lorasp_jax.dense.functional import cast_input, dense
+from lorasp_jax.dense.layers import AUX_NAME, KERNEL_INIT
 from lorasp_jax.peft import Method
-from lorasp_jax.peft._method import Params, drop_rate
+from lorasp_jax.peft._method import Params, dropout_rate
 
 
 class LinenDense(nn.Module):
@@ -43,10 +43,10 @@ class LinenDense(nn.Module):
         self, x: jax.Array, *, token_mask: jax.Array | None = None, return_aux: bool = False
     ) -> Any:
         """y [...tokens, O], or (y, aux) if asked; see `dense`."""
-        given.method(self.method)
-        given.real("param_dtype", self.param_dtype)
-        given.real("dtype", self.dtype or self.param_dtype)
-        shape = (given.array(x).shape[-1], given.size("features", self.features))
+        validate.method(self.method)
+        validate.floating_dtype("param_dtype", self.param_dtype)
+        validate.floating_dtype("dtype", self.dtype or self.param_dtype)
+        shape = (validate.array(x).shape[-1], validate.size("features", self.features))
         kernel = self.param("kernel", self.kernel_init, shape, self.param_dtype)
         bias = None
         if self.use_bias:
@@ -54,14 +54,14 @@ class LinenDense(nn.Module):
         params = None
         if self.method is not None and not self.method.trains_base:
             params = self.variable("adapters", "adapter", self._init_adapter, kernel).value
-        x = computed_in(self.dtype, x, kernel)
-        drops = params is not None and drop_rate(self.method) and self.has_rng("dropout")
+        x = cast_input(self.dtype, x, kernel)
+        drops = params is not None and dropout_rate(self.method) and self.has_rng("dropout")
         key = self.make_rng("dropout") if drops else None
         y, aux = dense(x, kernel, bias, params, self.method, key, token_mask=token_mask)
         if return_aux:
             return y, aux
         if params is not None:
-            self.sow("intermediates", KEPT, aux)
+            self.sow("intermediates", AUX_NAME, aux)
         return y
 
     def _init_adapter(self, kernel: jax.Array) -> Params:

@@ -31,23 +31,23 @@ from lorasp_jax.kernels.platform import platform
 from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 
 
-class Between(Protocol):
+class Bottleneck(Protocol):
     """f of one layer."""
 
-    def between(
+    def bottleneck(
         self, params: Any, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Any]:
         """z [..., R] and a pytree, from rows [..., Q]."""
         ...
 
 
-class BetweenEach(Protocol):
+class BottleneckEach(Protocol):
     """f of several layers that are computed in one go."""
 
-    def between_each(
+    def bottleneck_each(
         self,
         params: Sequence[Any],
-        read: jax.Array,
+        projected: jax.Array,
         widths: Sequence[int],
         token_mask: jax.Array | None,
     ) -> list[tuple[jax.Array, Any]]:
@@ -55,14 +55,14 @@ class BetweenEach(Protocol):
 
         Args:
           params: of each layer.
-          read: the rows of all layers side by side, with perhaps more columns behind.
+          projected: the rows of all layers side by side, with perhaps more columns behind.
           widths: Q of each layer.
           token_mask: bool [...tokens] or None.
         """
         ...
 
 
-Methods = tuple[Between, ...] | BetweenEach
+Methods = tuple[Bottleneck, ...] | BottleneckEach
 
 
 class LowRankLayer(NamedTuple):
@@ -98,12 +98,12 @@ def low_rank_matmul(
       token_mask: handed to each f.
     """
     params, widths = [layer.params for layer in layers], _widths(layers)
-    read = jnp.matmul(x, _side_by_side(layers, x), preferred_element_type=rows_dtype)
+    projected = jnp.matmul(x, _side_by_side(layers, x), preferred_element_type=rows_dtype)
     if isinstance(methods, tuple):
-        each = zip(methods, params, _split(widths, read), strict=True)
-        written = [method.between(own, rows, token_mask) for method, own, rows in each]
+        each = zip(methods, params, _split(widths, projected), strict=True)
+        written = [method.bottleneck(own, rows, token_mask) for method, own, rows in each]
     else:
-        written = methods.between_each(params, read, widths, token_mask)
+        written = methods.bottleneck_each(params, projected, widths, token_mask)
     return [
         (two_products(x, z, layer.kernel, layer.up), aux)
         for layer, (z, aux) in zip(layers, written, strict=True)
@@ -119,17 +119,17 @@ def _forward(
 ) -> tuple:
     """`low_rank_matmul`, and what its gradient needs."""
     widths = _widths(layers)
-    read = jnp.matmul(x, _side_by_side(layers, x), preferred_element_type=rows_dtype)
+    projected = jnp.matmul(x, _side_by_side(layers, x), preferred_element_type=rows_dtype)
 
-    def inner(params: list[Any], read: jax.Array) -> list[tuple[jax.Array, Any]]:
+    def inner(params: list[Any], projected: jax.Array) -> list[tuple[jax.Array, Any]]:
         if isinstance(methods, tuple):
-            each = zip(methods, params, _split(widths, read), strict=True)
-            found = [method.between(own, rows, token_mask) for method, own, rows in each]
+            each = zip(methods, params, _split(widths, projected), strict=True)
+            found = [method.bottleneck(own, rows, token_mask) for method, own, rows in each]
         else:
-            found = methods.between_each(params, read, widths, token_mask)
+            found = methods.bottleneck_each(params, projected, widths, token_mask)
         return [(z.astype(x.dtype), aux) for z, aux in found]
 
-    written, pull_back = jax.vjp(inner, [layer.params for layer in layers], read)
+    written, pull_back = jax.vjp(inner, [layer.params for layer in layers], projected)
     found = [
         (two_products(x, z, layer.kernel, layer.up), aux)
         for layer, (z, aux) in zip(layers, written, strict=True)
@@ -163,8 +163,8 @@ def _backward(
             through_base, dz = jnp.split(g @ jnp.concatenate([w, u]).T, [d_in], axis=-1)
         through_bases.append(through_base)
         d_written.append((g @ u.T if dz is None else dz, d_aux))
-    d_params, d_read = pull_back(d_written)
-    q = d_read.astype(x.dtype)
+    d_params, d_projected = pull_back(d_written)
+    q = d_projected.astype(x.dtype)
     dx = _gradient_of_input(layers, x, gradients, through_bases, q)
     d_downs = _split(_widths(layers), _outer(x, q, layers[0].down.dtype))
     d_layers = [

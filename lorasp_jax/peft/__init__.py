@@ -12,7 +12,7 @@ from typing import Any
 from lorasp_jax.peft._aux import Aux
 from lorasp_jax.peft._fields import check_names, short
 from lorasp_jax.peft._method import Method
-from lorasp_jax.peft._settings import to_settings, upgraded
+from lorasp_jax.peft._settings import to_settings, upgrade
 from lorasp_jax.peft.ada_lora import AdaLoRA
 from lorasp_jax.peft.dora import DoRA
 from lorasp_jax.peft.full import FullFineTuning
@@ -78,7 +78,7 @@ def from_settings(settings: Any) -> Method:
     """
     if not isinstance(settings, dict) or not isinstance(settings.get("method"), str):
         raise ValueError(f"an adapter has settings {short(settings)}, which name no method.")
-    fields = upgraded(settings)
+    fields = upgrade(settings)
     if isinstance(schedule := fields.get("schedule"), dict):
         check_names(EnergySchedule, "schedule", (), schedule)
         fields["schedule"] = EnergySchedule(**schedule)

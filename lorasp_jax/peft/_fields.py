@@ -7,11 +7,11 @@ import typing
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-LARGEST_REAL = (2 - 2**-23) * 2.0**127
+MAX_FLOAT32 = (2 - 2**-23) * 2.0**127
 """Largest number of fp32."""
-LONGEST = 300
+MAX_QUOTED = 300
 """Characters that are quoted of a value."""
-LARGEST = 2**31 - 1
+MAX_INT = 2**31 - 1
 """Largest whole number that arrays and their sizes take everywhere."""
 
 
@@ -25,17 +25,17 @@ def check_fields(owner: Any, prefix: str = "") -> None:
 
     Raises:
         ValueError: a value of another kind, a number that is not finite, or a whole one beyond
-            `LARGEST`, or beyond what its field's metadata gives as "most".
+            `MAX_INT`, or beyond what its field's metadata gives as "most".
     """
     fields = dataclasses.fields(owner) if dataclasses.is_dataclass(owner) else ()
-    most = {field.name: field.metadata.get("most", LARGEST) for field in fields}
+    most = {field.name: field.metadata.get("most", MAX_INT) for field in fields}
     for name, kind in typing.get_type_hints(type(owner)).items():
         if typing.get_origin(kind) is typing.ClassVar:
             continue
         value = getattr(owner, name)
         if not _fits(value, kind):
             raise ValueError(f"{prefix}{name} must be {_called(kind)}, got {short(value)}")
-        if type(value) is int and abs(value) > most.get(name, LARGEST):
+        if type(value) is int and abs(value) > most.get(name, MAX_INT):
             raise ValueError(f"{prefix}{name} must be at most {most[name]}, got {value}")
 
 
@@ -53,7 +53,7 @@ def check_names(cls: type, name: str, values: Sequence[Any], fields: Iterable[st
             )
 
 
-def whole(name: str, value: Any, most: int = LARGEST) -> int:
+def positive_int(name: str, value: Any, most: int = MAX_INT) -> int:
     """The value; raises a ValueError for what is no whole number from 1 to `most`."""
     if type(value) is not int or not 1 <= value <= most:
         raise ValueError(f"{name} must be a whole number from 1 to {most}, got {short(value)}.")
@@ -65,7 +65,7 @@ def short(value: Any) -> str:
     if is_array(value):
         return f"{value.dtype} {list(value.shape)}"
     text = " ".join(repr(value).split())
-    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+    return text if len(text) <= MAX_QUOTED else f"{text[:MAX_QUOTED]}..."
 
 
 def is_array(value: Any) -> bool:
@@ -83,7 +83,7 @@ def _fits(value: Any, kind: Any) -> bool:
         return isinstance(value, tuple) and all(_fits(item, arguments[0]) for item in value)
     if kind is float:
         real = isinstance(value, int | float) and type(value) is not bool
-        return real and abs(value) <= LARGEST_REAL
+        return real and abs(value) <= MAX_FLOAT32
     if kind is int:
         return isinstance(value, int) and type(value) is not bool
     return isinstance(value, kind) if isinstance(kind, type) else True

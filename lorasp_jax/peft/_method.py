@@ -15,23 +15,23 @@ import optax
 from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul
 from lorasp_jax.peft import _arguments, _fields
 from lorasp_jax.peft._aux import Aux
-from lorasp_jax.peft._fused import Fused
+from lorasp_jax.peft._batched_bottleneck import BatchedBottleneck
 
 Params: TypeAlias = Any
 
 
-class Shaped(Protocol):
+class ShapeLike(Protocol):
     """What a jax.ShapeDtypeStruct has, whose own types JAX leaves open."""
 
     shape: Any
     dtype: Any
 
 
-Kernel: TypeAlias = jax.Array | Shaped
+Kernel: TypeAlias = jax.Array | ShapeLike
 
-LARGEST_SIZE = 2**20
+MAX_SIZE = 2**20
 """Of a rank, a width and the like: what is larger is a mistake, and would ask for all memory."""
-LARGEST_ALPHA = 1e30
+MAX_ALPHA = 1e30
 """Of α and 1/α: α/R is then neither infinite nor zero in fp32."""
 
 
@@ -52,13 +52,13 @@ class Method:
         """Raises a ValueError for a field of another type, or a number that no method can use."""
         for field in dataclasses.fields(self):  # pyright: ignore[reportArgumentType]
             value = getattr(self, field.name)
-            if type(value) is int and value > LARGEST_SIZE:
-                raise ValueError(f"{field.name} must be at most {LARGEST_SIZE}, got {value}.")
+            if type(value) is int and value > MAX_SIZE:
+                raise ValueError(f"{field.name} must be at most {MAX_SIZE}, got {value}.")
         _fields.check_fields(self)
         alpha = getattr(self, "alpha", None)
-        if alpha is not None and not 1 / LARGEST_ALPHA <= abs(alpha) <= LARGEST_ALPHA:
-            raise ValueError(f"alpha must not be 0 nor beyond {LARGEST_ALPHA:g}, got {alpha}.")
-        if not 0 <= (rate := drop_rate(self)) < 1:
+        if alpha is not None and not 1 / MAX_ALPHA <= abs(alpha) <= MAX_ALPHA:
+            raise ValueError(f"alpha must not be 0 nor beyond {MAX_ALPHA:g}, got {alpha}.")
+        if not 0 <= (rate := dropout_rate(self)) < 1:
             raise ValueError(f"dropout must be at least 0 and less than 1, got {rate}.")
 
     trains_base: ClassVar[bool] = False
@@ -72,12 +72,12 @@ class Method:
         return False
 
     @property
-    def reads_in_fp32(self) -> bool:
+    def down_in_fp32(self) -> bool:
         """True if x P must not be rounded to the type of x."""
         return False
 
     @property
-    def plain(self) -> bool:
+    def is_low_rank_sum(self) -> bool:
         """True if `apply` is x W + z U and nothing else."""
         return type(self).apply is Method.apply
 
@@ -124,18 +124,18 @@ class Method:
         """P [I, Q], the matrix that reads x."""
         raise NotImplementedError
 
-    def middle(self, params: Params) -> Params:
-        """What `between` reads of the parameters; all, unless a method says less."""
+    def bottleneck_params(self, params: Params) -> Params:
+        """What `bottleneck` reads of the parameters; all, unless a method says less."""
         return params
 
-    def between(
+    def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
         """What happens between the two matrices, row by row.
 
         Args:
-          params: from `middle`.
-          rows: x P, [...tokens, Q] in the type of x, or in fp32 where `reads_in_fp32`.
+          params: from `bottleneck_params`.
+          rows: x P, [...tokens, Q] in the type of x, or in fp32 where `down_in_fp32`.
           token_mask: as for `delta`.
 
         Returns:
@@ -143,8 +143,8 @@ class Method:
         """
         raise NotImplementedError
 
-    def fused(self, params: Params) -> Fused | None:
-        """`between` for parameters of these shapes as a GPU kernel, if the method has one here."""
+    def fused_kernel(self, params: Params) -> BatchedBottleneck | None:
+        """A fused GPU kernel for `bottleneck` at these shapes, or None."""
         del params
 
     def up(self, params: Params) -> jax.Array:
@@ -168,19 +168,19 @@ class Method:
         _arguments.tokens(x, token_mask)
         if not self.additive:
             raise ValueError(f"{type(self).__name__} is not additive and has no delta; use apply.")
-        z, aux = self.read(params, x, token_mask)
+        z, aux = self.bottleneck_from_input(params, x, token_mask)
         up = self.up(params).astype(x.dtype)
         self._check_params(params, (x.shape[-1], up.shape[-1]))
         return z @ up, dataclasses.replace(aux, token_mask=token_mask)
 
-    def read(
+    def bottleneck_from_input(
         self, params: Params, x: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
         """z [...tokens, R] in the type of x and aux, from x itself."""
         down = self.down(params).astype(x.dtype)
         rows = jnp.matmul(x, down, preferred_element_type=self.rows_dtype(x))
-        run = self.fused(params) or self
-        z, aux = run.between(self.middle(params), rows, token_mask)
+        run = self.fused_kernel(params) or self
+        z, aux = run.bottleneck(self.bottleneck_params(params), rows, token_mask)
         return z.astype(x.dtype), aux
 
     def apply(
@@ -200,11 +200,11 @@ class Method:
         """
         _arguments.tokens(x, token_mask)
         self.check(params, x, kernel)
-        run, layer = self.fused(params) or self, self.low_rank_layer(params, kernel)
+        run, layer = self.fused_kernel(params) or self, self.low_rank_layer(params, kernel)
         ((y, aux),) = low_rank_matmul((run,), self.rows_dtype(x), [layer], x, token_mask)
         return y, dataclasses.replace(aux, token_mask=token_mask)
 
-    def apply_dropped(
+    def apply_with_dropout(
         self,
         params: Params,
         x: jax.Array,
@@ -213,7 +213,7 @@ class Method:
         *,
         token_mask: jax.Array | None = None,
     ) -> tuple[jax.Array, Aux]:
-        """`apply` in training, where the adapter reads `dropped` x and the kernel all of x.
+        """`apply` in training, where the adapter reads x after `dropout` and the kernel all of x.
 
         A method that is not additive also rescales what the kernel makes of the dropped x, and
         leaves the rest of x W as it is (Hugging Face PEFT's DoRA).
@@ -225,7 +225,7 @@ class Method:
           key: typed random key.
           token_mask: as for `delta`.
         """
-        seen = dropped(x, drop_rate(self), key)
+        seen = dropout(x, dropout_rate(self), key)
         kernel = jax.lax.stop_gradient(kernel.astype(x.dtype))
         if self.additive:
             delta, aux = self.delta(params, seen, token_mask=token_mask)
@@ -235,11 +235,13 @@ class Method:
 
     def low_rank_layer(self, params: Params, kernel: jax.Array) -> LowRankLayer:
         """The arrays of one layer for `low_rank_matmul`."""
-        return LowRankLayer(self.middle(params), kernel, self.down(params), self.up(params))
+        return LowRankLayer(
+            self.bottleneck_params(params), kernel, self.down(params), self.up(params)
+        )
 
     def rows_dtype(self, x: jax.Array) -> Any:
         """The type of x P."""
-        return jnp.float32 if self.reads_in_fp32 else x.dtype
+        return jnp.float32 if self.down_in_fp32 else x.dtype
 
     def check(self, params: Params, x: jax.Array, kernel: jax.Array) -> None:
         """Raises a ValueError unless x, kernel and parameters fit each other."""
@@ -289,12 +291,12 @@ def name_of(cls: type[Method]) -> str:
     return folder.rpartition(".")[2] if file == "method" else file
 
 
-def drop_rate(method: Any) -> float:
+def dropout_rate(method: Any) -> float:
     """`dropout` of a method that has such a field, 0 of others."""
     return getattr(method, "dropout", 0.0)
 
 
-def dropped(x: jax.Array, rate: float, key: jax.Array) -> jax.Array:
+def dropout(x: jax.Array, rate: float, key: jax.Array) -> jax.Array:
     """x with each number at 0 with probability `rate`, and divided by 1 - rate otherwise."""
     kept = jax.random.bernoulli(key, 1 - rate, x.shape)
     return jnp.where(kept, x / (1 - rate), 0).astype(x.dtype)

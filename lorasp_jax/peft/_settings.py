@@ -26,7 +26,7 @@ def to_settings(method: Any) -> Settings:
     return {"method": method.name, **dataclasses.asdict(method.as_saved)}
 
 
-def upgraded(settings: Mapping[str, Any]) -> Settings:
+def upgrade(settings: Mapping[str, Any]) -> Settings:
     """A method's settings as this version writes them, from those of any version.
 
     Args:

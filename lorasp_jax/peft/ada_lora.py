@@ -5,7 +5,7 @@ sensitive the loss is to them; `AdaLoRA.transform` wraps the optimizer and does 
 jitted step, so a training loop cannot forget it. The arithmetic is that of Hugging Face PEFT
 0.21.2. One function per equation of the paper:
 
-    (1)  update          P Λ Q, here A diag(e) B                      `AdaLoRA.between`
+    (1)  update          P Λ Q, here A diag(e) B                      `AdaLoRA.bottleneck`
     (4)  orthogonality   ‖PᵀP − I‖ + ‖QQᵀ − I‖                        `AdaLoRA.penalty`
     (7)-(11) importance  Ī, Ū, S of each triplet                      `_sensitivity`, `_importance`
     (6)  allocation      the b(t) most important stay                 `_keep`
@@ -108,7 +108,7 @@ class AdaLoRA(Method):
         """A."""
         return params["lora_a"]
 
-    def between(
+    def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
         """Eq. (1): z = s x A diag(e); the active rank is the number of entries not 0."""
@@ -144,7 +144,7 @@ class AdaLoRA(Method):
           ValueError: if no step would be left between warm-up and final phase, or the parameters
             hold no AdaLoRA.
         """
-        _fields.whole("total_steps", total_steps)
+        _fields.positive_int("total_steps", total_steps)
         begin, end = round(self.warmup * total_steps), total_steps - round(self.final * total_steps)
         if begin >= end:
             raise ValueError(

@@ -121,7 +121,7 @@ class LoRA(Method):
         """A."""
         return params["lora_a"]
 
-    def between(
+    def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
         """Eq. (3) of Hu et al.: z = scale x A; every token uses the whole rank."""

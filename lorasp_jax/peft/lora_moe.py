@@ -55,7 +55,7 @@ class LoRAMoE(Method):
             raise ValueError(f"gate_gradient 'switch' needs routing 'top1', got {self.routing!r}.")
 
     @property
-    def reads_in_fp32(self) -> bool:
+    def down_in_fp32(self) -> bool:
         """True: the router's logits are sums in fp32."""
         return True
 
@@ -76,7 +76,7 @@ class LoRAMoE(Method):
         """[A, W_g]."""
         return jnp.concatenate([params["lora_a"], params["router"]], axis=1)
 
-    def between(
+    def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
         """Eq. (2) of LoRA-SP's paper: z = scale w(x) x A, a weight for each expert's R columns."""

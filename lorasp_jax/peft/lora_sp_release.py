@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from lorasp_jax.kernels.energy_gate import kept_energy
 from lorasp_jax.peft._aux import Aux, masked_mean
 from lorasp_jax.peft._method import Params, kaiming_uniform
-from lorasp_jax.peft.lora_sp.bank import BankMethod, init_bank, select
+from lorasp_jax.peft.lora_sp.bank import BankMethod, apply_masked_scores, init_bank
 from lorasp_jax.peft.lora_sp.router import bounded, init_scores
 
 
@@ -54,7 +54,7 @@ class LoRASPRelease(BankMethod):
             raise ValueError(f"hidden_width must be at least 1, got {self.hidden_width}.")
 
     @property
-    def scored_by(self) -> tuple[str, ...]:
+    def score_arrays(self) -> tuple[str, ...]:
         """Names of the router's arrays whose last axis is that of the scores."""
         return ("w1",) if self.hidden_width is None else ("w2",)
 
@@ -70,7 +70,7 @@ class LoRASPRelease(BankMethod):
             scores = init_scores(score_key, "softmax", self.hidden_width, self.rank)
         return {"bank": bank, "router": {"w1": w1, **scores}}
 
-    def between(
+    def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
         """z = scale Σ(x) V x from x [V, W1], with the gate's statistics and losses."""
@@ -81,7 +81,7 @@ class LoRASPRelease(BankMethod):
         mask &= jnp.arange(mask.shape[-1]) < self.rank  # the others were pruned
         usage = (mask & valid[..., None]).reshape(-1, mask.shape[-1]).astype(jnp.float32).sum(0)
         energy = kept_energy(scores, mask)
-        z = select(projected, self.scale * scores, mask, energy[..., None])
+        z = apply_masked_scores(projected, self.scale * scores, mask, energy[..., None])
         active_rank = mask.astype(jnp.float32).sum(-1)
         return z, Aux(active_rank, energy, release_losses(scores, mask, valid), usage=usage)
 

@@ -23,7 +23,7 @@ from envs.datasets.files import check_only_files, damage, read_bytes
 from envs.datasets.locks import acquire
 from envs.datasets.writing import UNFINISHED, write_text
 from lorasp_jax.config import Config
-from lorasp_jax.peft._settings import upgraded
+from lorasp_jax.peft._settings import upgrade
 from lorasp_jax.storage.digest import sealed, unsealed
 from lorasp_jax.storage.json_values import check
 from lorasp_jax.training import records
@@ -164,7 +164,7 @@ def _recorded(folder: Path) -> dict[str, Any]:
     if not (folder / RECORD).exists():
         raise ValueError(f"{folder} holds no run to resume: start it without --resume")
     found = read_json(folder / RECORD, records.CONFIG)
-    return {**found, "peft": upgraded(found["peft"])}
+    return {**found, "peft": upgrade(found["peft"])}
 
 
 def _differences(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> list[str]:

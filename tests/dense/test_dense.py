@@ -10,7 +10,7 @@ import pytest
 from flax import nnx
 
 import lorasp_jax
-from lorasp_jax.dense import AdapterParam, Dense, LinenDense, dense, dense_together
+from lorasp_jax.dense import AdapterParam, Dense, LinenDense, dense, dense_shared_input
 from lorasp_jax.peft import DoRA, FullFineTuning, LoRA, LoRASP
 from lorasp_jax.peft.lora_sp.router import router_scores
 
@@ -61,7 +61,7 @@ def test_layers_of_one_input(x):
             layer.adapter.set_value(
                 jax.tree.map(lambda p, d=draw: p + d[: p.size].reshape(p.shape), params)
             )
-    found = dense_together(x, [layer.arrays() for layer in layers], token_mask=mask)
+    found = dense_shared_input(x, [layer.arrays() for layer in layers], token_mask=mask)
     for layer, (y, aux) in zip(layers, found, strict=True):
         alone, expected = layer(x, token_mask=mask, return_aux=True)
         np.testing.assert_allclose(y, alone, rtol=1e-5, atol=1e-5)
@@ -69,7 +69,7 @@ def test_layers_of_one_input(x):
         for a, b in zip(jax.tree.leaves(aux), jax.tree.leaves(expected), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-5)
     with pytest.raises(ValueError, match="input of width 4 meets a kernel"):
-        dense_together(x[:, :4], [layers[0].arrays()])
+        dense_shared_input(x[:, :4], [layers[0].arrays()])
 
 
 def test_linen_equals_nnx(x):
@@ -234,4 +234,4 @@ def test_five_jumps_lead_from_a_layer_to_the_first_equation():
         layer(jnp.ones((2, 3)))
     finally:
         sys.setprofile(None)
-    assert passed == ["between", "low_rank_matmul", "apply", "dense", "__call__"]
+    assert passed == ["bottleneck", "low_rank_matmul", "apply", "dense", "__call__"]

@@ -35,9 +35,9 @@ def inner(params, rows, token_mask):
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """As the product asks for it."""
+    """The protocol that `low_rank_matmul` expects."""
 
-    between: Callable = inner
+    bottleneck: Callable = inner
 
 
 def inputs(d_in, d_out, dtype=jnp.float32):

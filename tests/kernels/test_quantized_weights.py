@@ -90,7 +90,7 @@ def test_stack_equals_its_layers(kind):
 
 
 class Identity:
-    def between(self, params, rows, token_mask):
+    def bottleneck(self, params, rows, token_mask):
         del params, token_mask
         return rows, ()
 

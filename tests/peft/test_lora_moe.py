@@ -94,7 +94,7 @@ def test_top1_uses_one_expert(method, x):
     delta, aux = method.delta(params, x)
     np.testing.assert_allclose(delta, method.scale * expected, rtol=1e-4, atol=1e-5)
     np.testing.assert_array_equal(aux.active_rank, RANK)
-    z, _ = method.between(params, x @ method.down(params), None)
+    z, _ = method.bottleneck(params, x @ method.down(params), None)
     used = (np.asarray(z) != 0).reshape(*x.shape[:-1], EXPERTS, RANK)
     np.testing.assert_array_equal(used.all(-1), used.any(-1))
     np.testing.assert_array_equal(used.any(-1).sum(-1), 1)

@@ -74,16 +74,16 @@ class AdapterSet(Method):
         return {n: m for n, m in zip(self.names, self.methods, strict=True) if m is not None}
 
     @property
-    def reads_in_fp32(self) -> bool:
+    def down_in_fp32(self) -> bool:
         """True if one of the adapters does."""
-        return any(method.reads_in_fp32 for method in self.others.values())
+        return any(method.down_in_fp32 for method in self.others.values())
 
     def down(self, params: Params) -> jax.Array:
         """[I, ...], of the bank and of all that add to x W, side by side."""
         bank = params["bank"]["lora_a"]
         return jnp.concatenate([bank.reshape(len(bank), -1), *self._sides(params, "down")], axis=1)
 
-    def between(
+    def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
         """Each adapter's own z times its weight. There are no losses: a set does not train."""
@@ -96,8 +96,8 @@ class AdapterSet(Method):
         rank = jnp.sum((own != 0) * bank["rank"], axis=-1).astype(jnp.float32)
         for (name, method), part in zip(self._adding(), parts, strict=True):
             own_params = params["others"][name]
-            run = method.fused(own_params) or method
-            more, aux = run.between(method.middle(own_params), part, token_mask)
+            run = method.fused_kernel(own_params) or method
+            more, aux = run.bottleneck(method.bottleneck_params(own_params), part, token_mask)
             z.append(weights[name][..., None] * more)
             rank += _active_rank(weights[name], aux)
         return jnp.concatenate(z, axis=-1), Aux(jnp.broadcast_to(rank, rows.shape[:-1]))

@@ -16,7 +16,7 @@ from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.adapters.adaptation import Model
 from lorasp_jax.adapters.combine import named
 from lorasp_jax.adapters.layers import nnx_layers
-from lorasp_jax.dense import AdaptedLayer, AdapterParam, given
+from lorasp_jax.dense import AdaptedLayer, AdapterParam, validate
 from lorasp_jax.peft import FullFineTuning, LoRA
 from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import Params
@@ -47,7 +47,7 @@ def fuse(model: nnx.Module, weights: Mapping[str, float], *, rank: int | None = 
       ValueError: as for `choose`; no weight, a rank below 1, or a method that is no LoRA.
     """
     if rank is not None:
-        given.size("rank", rank)
+        validate.size("rank", rank)
     if not isinstance(weights, Mapping) or not weights:
         raise ValueError(f"fuse needs weights by name, at least one, got {short(weights)}.")
     named.weights(model, weights)  # raises for an unknown name or a weight that is no number
@@ -83,8 +83,8 @@ def unmerge(merged: Model, adapted: nnx.Module) -> Model:
         adapter that did not just add a constant: DoRA rescaled the kernel, and what it was before
         is not in the result.
     """
-    given.with_values(merged)
-    if named.sets(given.with_values(adapted)):
+    validate.with_values(merged)
+    if named.sets(validate.with_values(adapted)):
         raise ValueError("the model to unmerge by has named adapters: extract one of them.")
     adapters = named.own_adapters(adapted)
     own = {p.path: p.child.get_value() for p in paths.locate(nnx.List([adapted]), AdapterParam)}
@@ -116,7 +116,7 @@ def unmerge(merged: Model, adapted: nnx.Module) -> Model:
 
 def _unmerged(layer: nnx.Module, adapted: AdaptedLayer) -> AdaptedLayer:
     """The layer with the adapter of the adapted one, less what it had added."""
-    method, params = adapted.carried()
+    method, params = adapted.method_and_params()
     if not method.additive:
         raise ValueError(f"{method} did not just add to its base.")
     layer = nnx_layers.like(layer, adapted)

@@ -35,10 +35,10 @@ from lorasp_jax.adapters.combine.adapter_set import (
 )
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.adapters.paths import Location
-from lorasp_jax.dense import AdaptedLayer, AdapterParam, given
+from lorasp_jax.dense import AdaptedLayer, AdapterParam, validate
 from lorasp_jax.peft import LoRA, Method
 from lorasp_jax.peft._fields import short
-from lorasp_jax.peft._method import LARGEST_SIZE, Params
+from lorasp_jax.peft._method import MAX_SIZE, Params
 
 One: TypeAlias = str | Mapping[str, float] | None
 Adapters: TypeAlias = dict[str, AdaptedLayer]
@@ -63,10 +63,10 @@ def combine(models: Mapping[str, Model], *, rank: int | None = None) -> Model:
     if not isinstance(models, Mapping) or not models or not all(map(_is_text, models)):
         raise ValueError("models to combine are a mapping by name, a text, and at least one.")
     for model in models.values():
-        given.with_values(model)
-    if rank is not None and not (type(rank) is int and 0 <= rank <= LARGEST_SIZE):
+        validate.with_values(model)
+    if rank is not None and not (type(rank) is int and 0 <= rank <= MAX_SIZE):
         raise ValueError(
-            f"rank must be a whole number up to {LARGEST_SIZE} or None, got {short(rank)}."
+            f"rank must be a whole number up to {MAX_SIZE} or None, got {short(rank)}."
         )
     known = tuple(models)
     bases = {name: bare(model) for name, model in models.items()}
@@ -212,7 +212,7 @@ def swap(model: Model, name: str, other: nnx.Module) -> Model:
     Raises:
       ValueError: as for `combine`, or an adapter that does not fit the place.
     """
-    given.with_values(other)
+    validate.with_values(other)
     index, adapters = index_of(names(model), name), adapters_by_path(name, other)
     _check_same(bare(model), "the combined model", bare(other), name)
     model = nnx.clone(model)
@@ -220,7 +220,7 @@ def swap(model: Model, name: str, other: nnx.Module) -> Model:
     if beyond := sorted(adapters.keys() - {location.path for location in locations}):
         raise ValueError(f"{name} adapts {beyond[0]}, where the combined model has no adapters.")
     for path, _, _, layer in locations:
-        method, params = adapters[path].carried() if path in adapters else (None, None)
+        method, params = adapters[path].method_and_params() if path in adapters else (None, None)
         value = dict(layer.adapter.params.get_value())
         if layer.method.methods[index] != (None if _is_banked(method) else method):
             raise ValueError(f"{name} at {path} needs {layer.method.methods[index] or 'a LoRA'}.")
@@ -300,7 +300,7 @@ def _with_set(
 ) -> AdaptedLayer:
     """The layer with what was found for it as a set, of whose weights all are 0."""
     layer = nnx_layers.like(layer, next(iter(found.values())))
-    own = {name: adapted.carried() for name, adapted in found.items()}
+    own = {name: adapted.method_and_params() for name, adapted in found.items()}
     methods = [own[name][0] if name in own else None for name in known]
     if rank is None:
         rank = max([m.rank for m in methods if type(m) is LoRA], default=0)
@@ -327,7 +327,7 @@ def _is_banked(method: Method | None) -> TypeGuard[LoRA | None]:
 
 def sets(model: nnx.Module) -> list[Location]:
     """The layers that hold named adapters."""
-    locations = paths.locate(nnx.List([given.module(model)]), AdaptedLayer)
+    locations = paths.locate(nnx.List([validate.module(model)]), AdaptedLayer)
     return [location for location in locations if isinstance(location.child.adapter, NamedAdapters)]
 
 

@@ -22,7 +22,7 @@ from flax import nnx
 
 from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.adapters.layers import nnx_layers
-from lorasp_jax.dense import AdapterAux, AdapterParam, given
+from lorasp_jax.dense import AdapterAux, AdapterParam, validate
 from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import Aux, Method, Params
 
@@ -196,7 +196,7 @@ def _observed(
         if layer.adapter is None:
             adaptation.attach(layer, Observed(path, None, reports[path]), jax.random.key(0))
         else:
-            own, params = layer.carried()
+            own, params = layer.method_and_params()
             method = Observed(path, own, reports[path])
             if path in others:
                 another, its_params = others[path]
@@ -235,7 +235,7 @@ def input_moments(
     paths.check_rules([(pattern, None)], lambda _: True, "None")
     known = [
         location.path
-        for location in paths.locate_matmul_layers(nnx.List([given.with_values(model)]))
+        for location in paths.locate_matmul_layers(nnx.List([validate.with_values(model)]))
     ]
     reports = {path: second_moment for path in known if re.search(pattern, path)}
     if not reports:

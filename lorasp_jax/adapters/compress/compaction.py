@@ -19,7 +19,7 @@ from flax import nnx
 from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.adapters.compress import calibration
 from lorasp_jax.adapters.compress.calibration import Forward, Layer, Sums
-from lorasp_jax.dense import AdaptedLayer, AdapterParam, given
+from lorasp_jax.dense import AdaptedLayer, AdapterParam, validate
 from lorasp_jax.peft import LoRA, Method
 from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import Params
@@ -122,7 +122,7 @@ def distill(
 
 def _lora_sp_layers(model: nnx.Module) -> dict[str, Any]:
     """The layers with a LoRA-SP adapter by path."""
-    locations = paths.locate(nnx.List([given.with_values(model)]), AdaptedLayer)
+    locations = paths.locate(nnx.List([validate.with_values(model)]), AdaptedLayer)
     found = {p.path: p.child for p in locations if isinstance(p.child.method, BankMethod)}
     if not found:
         raise ValueError("the model has no LoRA-SP layers.")
@@ -155,14 +155,14 @@ def _reordered(params: Params, order: jax.Array, *, method: BankMethod, rank: in
         unit = jnp.asarray(bank["u"].shape[1] ** -0.5)
         bank |= normalized_bank(bank | {"gain": unit})
     bank["u"], bank["v"] = bank["u"][order[:rank]], bank["v"][:, order[:rank]]
-    router |= {name: router[name][..., order] for name in method.scored_by if name in router}
+    router |= {name: router[name][..., order] for name in method.score_arrays if name in router}
     return {**params, "bank": bank, "router": router}
 
 
 def _regression(layer: Layer) -> Sums:
     """Σ x xᵀ and Σ x zᵀ, where the delta is z U."""
     assert layer.method is not None  # only layers with LoRA-SP are asked
-    z, _ = layer.method.read(layer.params, layer.x, layer.valid)
+    z, _ = layer.method.bottleneck_from_input(layer.params, layer.x, layer.valid)
     x, z = layer.rows(layer.x), layer.rows(z)
     return {"xx": x.T @ x, "xz": x.T @ z}
 

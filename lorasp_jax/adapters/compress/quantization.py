@@ -21,7 +21,7 @@ from flax import nnx
 
 from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.adapters.layers import nnx_layers
-from lorasp_jax.dense import AdaptedLayer, AdapterParam, given
+from lorasp_jax.dense import AdaptedLayer, AdapterParam, validate
 from lorasp_jax.kernels.quantized_weights import KINDS, Kind, QuantizedKernel, quantized
 from lorasp_jax.peft._fields import short
 
@@ -58,7 +58,7 @@ def quantize(model: nnx.Module, rules: Sequence[tuple[str, Kind | None]]) -> Qua
     """
     kinds = " or ".join(map(repr, (*KINDS, None)))
     paths.check_rules(rules, lambda kind: kind in (*KINDS, None), kinds)
-    given.with_values(model)
+    validate.with_values(model)
     root, errors, used = nnx.List([nnx.merge(*adaptation.split(model))]), {}, set()
     shared: Shared = {}
     known = paths.locate_matmul_layers(root)

@@ -26,10 +26,10 @@ from lorasp_jax.adapters.io.native import write_whole
 from lorasp_jax.adapters.io.peft_folders import CONFIG, PREFIX, TENSORS, Adapter, read
 from lorasp_jax.adapters.io.peft_whole import Names, check_biases, exported_whole, whole_parameters
 from lorasp_jax.adapters.layers import nnx_layers
-from lorasp_jax.dense import AdaptedLayer, AdapterParam, given
+from lorasp_jax.dense import AdaptedLayer, AdapterParam, validate
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA
 from lorasp_jax.peft._fields import short
-from lorasp_jax.peft._method import drop_rate
+from lorasp_jax.peft._method import dropout_rate
 
 
 def dotted(path: str, index: tuple[int, ...]) -> str:
@@ -88,7 +88,7 @@ def load_peft(
         not have, or adapters that do not fit their layers.
     """
     nnx_layers.check_einsums(einsums)
-    root = nnx.List([given.module(model)])
+    root = nnx.List([validate.module(model)])
     shapes = {
         location.path: nnx_layers.matrices_shape(location.child, einsums)
         for location in paths.locate_matmul_layers(root, einsums)
@@ -153,7 +153,7 @@ def matched(
 def _at_hand(folder: str | os.PathLike[str]) -> pathlib.Path:
     """The folder on this machine; only what begins with hf:// is asked of the hub."""
     if not isinstance(folder, str) or "://" not in folder:
-        return given.folder(folder)
+        return validate.folder(folder)
     from lorasp_jax.storage import hub
 
     return hub.local(folder, only=[CONFIG, TENSORS])
@@ -181,8 +181,8 @@ def save_peft(
       ValueError: adapters that PEFT has no counterpart for, LoRA and DoRA together, or several
         rates of dropout.
     """
-    folder, names = given.folder(folder), distinct(names)
-    given.with_values(model)
+    folder, names = validate.folder(folder), distinct(names)
+    validate.with_values(model)
     if not isinstance(base, str | None):
         raise ValueError(f"base must be a text, the name of the base, got {short(base)}.")
     modules: dict[str, tuple[float, Adapter]] = {}
@@ -196,7 +196,7 @@ def save_peft(
                     f"{location.path} is neither dense nor an einsum, so PEFT cannot store it."
                 )
             kinds.add(isinstance(location.child.method, DoRA))
-            rates.add(drop_rate(location.child.method))
+            rates.add(dropout_rate(location.child.method))
             shape = location.child.kernel_matrices().shape[:-2]
             for index in np.ndindex(*shape):
                 modules[names(location.path, index)] = _exported(location.child, index)

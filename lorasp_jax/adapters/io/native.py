@@ -24,7 +24,7 @@ from flax import nnx
 from lorasp_jax import peft
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.layers import nnx_layers
-from lorasp_jax.dense import AdapterParam, given
+from lorasp_jax.dense import AdapterParam, validate
 from lorasp_jax.peft import Method, to_settings
 from lorasp_jax.peft._fields import short
 from lorasp_jax.storage import digest
@@ -60,7 +60,7 @@ def save_adapters(
     Raises:
       ValueError: the model has nothing that trains, or metadata that JSON would not give back.
     """
-    folder, adapters = given.folder(folder), nnx.state(given.with_values(model), AdapterParam)
+    folder, adapters = validate.folder(folder), nnx.state(validate.with_values(model), AdapterParam)
     if not isinstance(base, str):
         raise ValueError(f"base must be a text, the name of the base, got {short(base)}.")
     tensors = {name: np.asarray(leaf) for name, leaf in _named(adapters).items()}
@@ -106,7 +106,7 @@ def load_adapters(
     Raises:
       ValueError: missing, damaged or foreign files, another base, or adapters that do not fit.
     """
-    folder = given.folder(folder)
+    folder = validate.folder(folder)
     description, tensors = _read(folder)
     if base is not None and description["base"] != base:
         raise ValueError(

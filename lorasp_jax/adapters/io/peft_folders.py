@@ -20,7 +20,7 @@ import numpy as np
 from lorasp_jax.adapters.io.name_patterns import values_of
 from lorasp_jax.adapters.io.native import read_tensors, read_whole
 from lorasp_jax.peft._fields import short
-from lorasp_jax.peft._method import LARGEST_ALPHA, LARGEST_SIZE
+from lorasp_jax.peft._method import MAX_ALPHA, MAX_SIZE
 
 CONFIG, TENSORS = "adapter_config.json", "adapter_model.safetensors"
 PREFIX = "base_model.model."
@@ -124,11 +124,11 @@ def _is_number(value: Any) -> bool:
 
 
 def _is_alpha(value: Any) -> bool:
-    return _is_number(value) and 1 / LARGEST_ALPHA <= abs(value) <= LARGEST_ALPHA
+    return _is_number(value) and 1 / MAX_ALPHA <= abs(value) <= MAX_ALPHA
 
 
 def _is_size(value: Any) -> bool:
-    return type(value) is int and 1 <= value <= LARGEST_SIZE
+    return type(value) is int and 1 <= value <= MAX_SIZE
 
 
 def _are_texts(value: Any) -> bool:
@@ -140,12 +140,12 @@ _KINDS: dict[str, tuple[Callable[[Any], bool], tuple[str, ...]]] = {
         lambda value: type(value) is bool,
         ("use_dora", "use_rslora", "use_qalora", "fan_in_fan_out", "inference_mode", "lora_bias"),
     ),
-    f"a number other than 0, up to {LARGEST_ALPHA:g}": (_is_alpha, ("lora_alpha",)),
+    f"a number other than 0, up to {MAX_ALPHA:g}": (_is_alpha, ("lora_alpha",)),
     "an object of such numbers": (
         lambda value: isinstance(value, dict) and all(map(_is_alpha, value.values())),
         ("alpha_pattern",),
     ),
-    f"a whole number from 1 to {LARGEST_SIZE}": (_is_size, ("r", "init_r", "target_r")),
+    f"a whole number from 1 to {MAX_SIZE}": (_is_size, ("r", "init_r", "target_r")),
     "a number from 0 on, less than 1": (
         lambda value: _is_number(value) and 0 <= value < 1,
         ("lora_dropout",),

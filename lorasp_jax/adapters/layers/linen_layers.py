@@ -15,9 +15,9 @@ from lorasp_jax.adapters.layers.einsum import (
     general_equation,
     to_matrices,
 )
-from lorasp_jax.dense import computed_in
+from lorasp_jax.dense import cast_input
 from lorasp_jax.peft import Aux, Method
-from lorasp_jax.peft._method import drop_rate, dropped
+from lorasp_jax.peft._method import dropout, dropout_rate
 
 
 def _general(layer: Any) -> tuple[str, str]:
@@ -90,7 +90,7 @@ class LayerMap(NamedTuple):
         """The einsum through an adapter, plus bias; and aux."""
         assert self.equation is not None
         kernel, bias = self.kernel(), nn.meta.unbox(self.module.get_variable("params", "bias"))
-        x = computed_in(getattr(self.module, "dtype", None), self.x, kernel)
+        x = cast_input(getattr(self.module, "dtype", None), self.x, kernel)
         return einsum(self.equation, x, kernel, bias, params, method, key)
 
 
@@ -124,7 +124,7 @@ def with_lora(
     a = params["lora_a"]
     conv = isinstance(module, nn.Conv)
     if conv and key is not None:
-        inputs = dropped(inputs, drop_rate(method), key)
+        inputs = dropout(inputs, dropout_rate(method), key)
     hidden = nnx_layers.convolved(module, a, inputs) if conv else nnx_layers.lookup(a, inputs)
-    z, aux = method.between(params, hidden.astype(y.dtype), None)
+    z, aux = method.bottleneck(params, hidden.astype(y.dtype), None)
     return y + z @ method.up(params).astype(y.dtype), aux

@@ -15,11 +15,11 @@ from flax import linen, nnx
 
 from lorasp_jax import _compat
 from lorasp_jax.adapters.layers import einsum
-from lorasp_jax.dense import AdaptedLayer, Dense, computed_in, refuse_sharding, with_value
+from lorasp_jax.dense import AdaptedLayer, Dense, cast_input, reject_out_sharding, with_value
 from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.peft import LoRA, Method
 from lorasp_jax.peft._fields import short
-from lorasp_jax.peft._method import drop_rate, dropped
+from lorasp_jax.peft._method import dropout, dropout_rate
 
 Einsums = Mapping[type, Callable[[Any], tuple[str, str | None]]]
 """By layer class, of NNX or Linen: a function of the layer that gives the name of its kernel and
@@ -58,13 +58,13 @@ class EinsumLayer(AdaptedLayer):
         Raises:
           ValueError: an output sharding was asked for.
         """
-        refuse_sharding(out_sharding)
+        reject_out_sharding(out_sharding)
         kernel = self.kernel_variable().get_value()
         bias = None if getattr(self, "bias", None) is None else self.bias.get_value()
         params = None if self.adapter is None else self.adapter.get_value()
         y, aux = einsum.einsum(
             self.kernel_equation,
-            computed_in(getattr(self, "dtype", None), x, kernel),
+            cast_input(getattr(self, "dtype", None), x, kernel),
             kernel,
             bias,
             params,
@@ -72,7 +72,7 @@ class EinsumLayer(AdaptedLayer):
             self.dropout_key,
         )
         if self.adapter is not None:
-            self.keep_aux(aux)
+            self.store_aux(aux)
         return y
 
     def kernel_matrices(self) -> jax.Array:
@@ -108,9 +108,9 @@ class LoRALayer(AdaptedLayer):
 
     def with_delta(self, y: jax.Array, read: Callable[[jax.Array], jax.Array]) -> jax.Array:
         """Y plus the delta, from what `read` makes of the input and A."""
-        method, params = self.carried()
-        z, aux = method.between(params, read(method.down(params)).astype(y.dtype), None)
-        self.keep_aux(aux)
+        method, params = self.method_and_params()
+        z, aux = method.bottleneck(params, read(method.down(params)).astype(y.dtype), None)
+        self.store_aux(aux)
         return y + z @ method.up(params).astype(y.dtype)
 
     def without_adapter(self) -> nnx.Module:
@@ -129,7 +129,7 @@ class EmbedLayer(LoRALayer):
     def attend(self, query: jax.Array, *args: Any, **kwargs: Any) -> jax.Array:
         """Inner products of queries [..., D] with the rows, [..., V]."""
         y = super().attend(query, *args, **kwargs)
-        return y + attend_delta(*self.carried(), query.astype(y.dtype))
+        return y + attend_delta(*self.method_and_params(), query.astype(y.dtype))
 
 
 class ConvLayer(LoRALayer):
@@ -139,7 +139,7 @@ class ConvLayer(LoRALayer):
         """The convolution, [..., *spatial, O]."""
         y = super().__call__(inputs, *args, **kwargs)
         if self.dropout_key is not None:
-            inputs = dropped(inputs, drop_rate(self.method), self.dropout_key)
+            inputs = dropout(inputs, dropout_rate(self.method), self.dropout_key)
         return self.with_delta(y, lambda a: convolved(self, a, inputs))
 
     def kernel_matrices(self) -> jax.Array:
@@ -159,7 +159,7 @@ def lookup(table: jax.Array, ids: jax.Array) -> jax.Array:
 def attend_delta(method: Method, params: Any, query: jax.Array) -> jax.Array:
     """What scale A B adds to the inner products of queries [..., D] with a table's rows."""
     down, up = (side.astype(query.dtype) for side in (method.down(params), method.up(params)))
-    return method.between(params, query @ up.T, None)[0].astype(query.dtype) @ down.T
+    return method.bottleneck(params, query @ up.T, None)[0].astype(query.dtype) @ down.T
 
 
 def convolved(layer: Any, a: jax.Array, inputs: jax.Array) -> jax.Array:

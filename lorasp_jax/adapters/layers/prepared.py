@@ -36,7 +36,7 @@ from lorasp_jax.dense import Dense
 from lorasp_jax.kernels.low_rank_matmul import aligned, two_products
 from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.peft import Aux
-from lorasp_jax.peft._fused import Fused, Mapped
+from lorasp_jax.peft._batched_bottleneck import BatchedBottleneck, VmapBottleneck
 
 Block = TypeVar("Block", bound="JoinsLayers")
 
@@ -49,7 +49,7 @@ LONG_SUM, SHORTEST_SUM = 2048, 512
 class Chain(NamedTuple):
     """f of n layers."""
 
-    method: Fused
+    method: BatchedBottleneck
     width: int
     """Q, the columns of P of one layer."""
     sizes: tuple[int, ...]
@@ -173,9 +173,9 @@ def _call_joined(
 ) -> tuple[Sequence[jax.Array], Aux]:
     """y of each layer, and aux [n, ...]."""
     ends = list(itertools.accumulate(joined.chain.sizes))
-    read = product(x, joined.read)
-    z, aux = _between(joined, read, ends[-1], token_mask)
-    y = read[..., : ends[-1]] + z @ joined.write
+    projected = product(x, joined.read)
+    z, aux = _bottleneck(joined, projected, ends[-1], token_mask)
+    y = projected[..., : ends[-1]] + z @ joined.write
     y = y if joined.bias is None else y + joined.bias
     return jnp.split(y, ends[:-1], axis=-1), aux
 
@@ -185,8 +185,8 @@ def _call_apart(
 ) -> tuple[Sequence[jax.Array], Aux]:
     """What `_call_joined` returns."""
     # XLA would make one product of x W and x P, for which it copies W.
-    read = product(jax.lax.optimization_barrier(x), apart.read)
-    z, aux = _between(apart, read, 0, token_mask)
+    projected = product(jax.lax.optimization_barrier(x), apart.read)
+    z, aux = _bottleneck(apart, projected, 0, token_mask)
     ys, zs = [], jnp.split(z, len(apart.write), axis=-1)
     for own, kernel, up, bias in zip(zs, apart.kernels, apart.write, apart.biases, strict=True):
         y = two_products(x, own, kernel, up)
@@ -194,14 +194,14 @@ def _call_apart(
     return ys, aux
 
 
-def _between(
-    ready: Joined | Apart, read: jax.Array, start: int, token_mask: jax.Array | None
+def _bottleneck(
+    ready: Joined | Apart, projected: jax.Array, start: int, token_mask: jax.Array | None
 ) -> tuple[jax.Array, Aux]:
-    """z of all layers side by side, in the type of `read`, whose rows begin at a column; aux."""
+    """Concatenated z of all layers, in the dtype of `projected`, and aux."""
     method, width, sizes = ready.chain
     columns = range(start, start + len(sizes) * width, width)
-    z, aux = method.between_all(ready.params, read, columns, token_mask)
-    return z.astype(read.dtype), aux
+    z, aux = method.bottleneck_all(ready.params, projected, columns, token_mask)
+    return z.astype(projected.dtype), aux
 
 
 def product(x: jax.Array, matrix: jax.Array) -> jax.Array:
@@ -237,17 +237,17 @@ def _can_join(layer: Layer) -> TypeGuard[Dense]:
     """Whether it is an adapted layer, not a stack, of a method that leaves `apply` as it is."""
     if type(layer) is not Dense or layer.adapter is None or layer.dtype is None:
         return False
-    method, _ = layer.carried()
-    plain = method.plain and not method.reads_in_fp32
-    return plain and len(layer.kernel_matrices().shape) == 2  # a quantised one has no ndim
+    method, _ = layer.method_and_params()
+    can_join = method.is_low_rank_sum and not method.down_in_fp32
+    return can_join and len(layer.kernel_matrices().shape) == 2  # a quantised one has no ndim
 
 
 def _matrices(
     layers: Sequence[Dense],
 ) -> tuple[list[jax.Array], list[jax.Array], list[jax.Array], list[jax.Array | None]]:
     """W, P, U and bias of each layer, in the type in which they compute."""
-    method, _ = layers[0].carried()
-    params, dtype = [layer.carried()[1] for layer in layers], layers[0].dtype
+    method, _ = layers[0].method_and_params()
+    params, dtype = [layer.method_and_params()[1] for layer in layers], layers[0].dtype
     biases = [None if layer.bias is None else layer.bias.get_value() for layer in layers]
     return (
         [layer.kernel_matrices().astype(dtype) for layer in layers],
@@ -259,17 +259,17 @@ def _matrices(
 
 def _chain(layers: Sequence[Dense], downs: Sequence[jax.Array]) -> tuple[Chain, Any]:
     """f, and what it needs, [n, ...]; None where shapes differ."""
-    carried = [layer.carried() for layer in layers]
-    kernels = {method.fused(params) or Mapped(method) for method, params in carried}
-    between = kernels.pop() if len(kernels) == 1 else Mapped(carried[0][0])
+    carried = [layer.method_and_params() for layer in layers]
+    kernels = {method.fused_kernel(params) or VmapBottleneck(method) for method, params in carried}
+    bottleneck = kernels.pop() if len(kernels) == 1 else VmapBottleneck(carried[0][0])
 
     def stacked(*leaves: jax.Array) -> jax.Array | None:
         return jnp.stack(leaves) if len({leaf.shape for leaf in leaves}) == 1 else None
 
-    packed = (between.pack(method.middle(params)) for method, params in carried)
+    packed = (bottleneck.pack(method.bottleneck_params(params)) for method, params in carried)
     params = jax.tree.map(stacked, *packed)
     sizes = tuple(layer.kernel_matrices().shape[1] for layer in layers)
-    return Chain(between, downs[0].shape[1], sizes), params
+    return Chain(bottleneck, downs[0].shape[1], sizes), params
 
 
 def _apart(layers: Sequence[Dense]) -> Apart:

@@ -9,7 +9,7 @@ import numpy as np
 from flax import nnx
 
 from lorasp_jax.adapters.layers.prepared import Layer, Prepared, join_one
-from lorasp_jax.dense import Dense, dense_together
+from lorasp_jax.dense import Dense, dense_shared_input
 from lorasp_jax.peft import Aux
 
 LayerAux = dict[str, Aux]
@@ -128,10 +128,12 @@ def together(
         y `[B, T, O]` of each layer, and the adapters' reports by name.
     """
     plain = [layer for layer in layers.values() if type(layer) is Dense]
-    inputs = [layer.as_input(x) for layer in plain]
+    inputs = [layer.cast_input(x) for layer in plain]
     fused = []
     if len({x.dtype for x in inputs}) == 1:
-        fused = dense_together(inputs[0], [one.arrays() for one in plain], token_mask=token_mask)
+        fused = dense_shared_input(
+            inputs[0], [one.arrays() for one in plain], token_mask=token_mask
+        )
     of_plain, found = iter(fused), []
     for layer in layers.values():
         if isinstance(layer, Prepared):

@@ -59,7 +59,7 @@ def _orthonormal(columns: jax.Array) -> jax.Array:
     return orthonormal * jnp.where(jnp.diagonal(triangular) < 0, -1.0, 1.0)
 
 
-def select(
+def apply_masked_scores(
     projected: jax.Array, scores: jax.Array, mask: jax.Array, energy: jax.Array
 ) -> jax.Array:
     """Eq. (11): Σ(x) V x with the pruned scores at zero, in the type of `projected` [..., n].
@@ -101,7 +101,7 @@ class BankMethod(Method):
         return 2.0 if self.alpha is None else self.alpha / self.rank
 
     @property
-    def scored_by(self) -> tuple[str, ...]:
+    def score_arrays(self) -> tuple[str, ...]:
         """Names of the router's arrays whose last axis is that of the scores."""
         raise NotImplementedError
 
@@ -109,7 +109,7 @@ class BankMethod(Method):
         """[V, W1]."""
         return jnp.concatenate([self._bank(params)["v"], params["router"]["w1"]], axis=1)
 
-    def middle(self, params: Params) -> Params:
+    def bottleneck_params(self, params: Params) -> Params:
         """The router but for W1, and what is neither bank nor router."""
         router = {name: p for name, p in params["router"].items() if name != "w1"}
         others = {name: p for name, p in params.items() if name not in ("bank", "router")}
@@ -124,7 +124,7 @@ class BankMethod(Method):
 
     def shapes(self, made: Shapes, found: Shapes) -> Shapes:
         """`made`, but for a router that scores more directions than the bank has left."""
-        scored = [f"router/{name}" for name in self.scored_by]
+        scored = [f"router/{name}" for name in self.score_arrays]
         sides = [found[name][-1] for name in scored if found.get(name)]
         widest = max([self.rank, *sides])
         return made | {name: (*made[name][:-1], widest) for name in scored if name in made}

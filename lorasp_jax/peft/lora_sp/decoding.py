@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from lorasp_jax.kernels.energy_gate import energy_gate
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.peft._method import Params
-from lorasp_jax.peft.lora_sp.bank import normalized_bank, select
+from lorasp_jax.peft.lora_sp.bank import apply_masked_scores, normalized_bank
 from lorasp_jax.peft.lora_sp.router import router_scores
 
 
@@ -74,5 +74,5 @@ def decode(
     mask, _, energy = energy_gate(scores, method.energy_target)
     mask, scores = mask[: method.rank], scores[: method.rank]
     largest, index = jax.lax.top_k(jnp.where(mask, scores, 0), capacity)
-    z = select(params.v[index] @ x, method.scale * largest, largest > 0, energy)
+    z = apply_masked_scores(params.v[index] @ x, method.scale * largest, largest > 0, energy)
     return z @ params.u[index], jnp.maximum(mask.sum() - capacity, 0)

@@ -2,11 +2,11 @@
 
 A small router scores the R directions of a bank for each token; only the fewest whose squared
 scores reach the energy target η stay active. `reference` is the paper in sixty lines; the functions
-that `LoRASP.between` puts together here compute the same, and faster:
+that `LoRASP.bottleneck` puts together here compute the same, and faster:
 
     (10) scores       s(x) = router(x) >= 0                           `router.router_scores`
     (12) energy gate  smallest k with E_k(x) >= η                     `energy_gate`
-    (11) update       ΔW(x) = U Σ(x) V                                `bank.select`
+    (11) update       ΔW(x) = U Σ(x) V                                `bank.apply_masked_scores`
     (13) spectral     L_spec(x) = 1 - E_k(x)                          `losses.spectral_loss`
     (14) router       L_router: balance and z                         `balance_loss`, `z_loss`
 
@@ -23,8 +23,8 @@ import optax
 from lorasp_jax.kernels.energy_gate import default_implementation, energy_gate, kept_energy
 from lorasp_jax.peft._aux import Aux
 from lorasp_jax.peft._method import Params, kaiming_uniform
-from lorasp_jax.peft.lora_sp.bank import BankMethod, init_bank, select
-from lorasp_jax.peft.lora_sp.fused import FusedRoute
+from lorasp_jax.peft.lora_sp.bank import BankMethod, apply_masked_scores, init_bank
+from lorasp_jax.peft.lora_sp.gpu_kernel import FusedBottleneck
 from lorasp_jax.peft.lora_sp.losses import Losses, loss_sums
 from lorasp_jax.peft.lora_sp.router import (
     Granularity,
@@ -84,7 +84,7 @@ class LoRASP(BankMethod):
         return cls(rank=rank, energy_target=energy_target, hidden_width=4, router="softmax")
 
     @property
-    def scored_by(self) -> tuple[str, ...]:
+    def score_arrays(self) -> tuple[str, ...]:
         """Names of the router's arrays whose last axis is that of the scores."""
         return "w2", "b2"
 
@@ -100,7 +100,7 @@ class LoRASP(BankMethod):
         params = {"bank": bank, "router": {"w1": w1, **scores}}
         return params | ({PROGRESS: jnp.zeros(())} if self.schedule else {})
 
-    def between(
+    def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
         """z = scale Σ(x) V x of eq. (9) from x [V, W1], with the gate's statistics and losses."""
@@ -110,7 +110,7 @@ class LoRASP(BankMethod):
         scores, logits = router_scores(params["router"], hidden, self.router)
         mask = self._mask(params, scores, valid)
         energy = kept_energy(scores, mask)[:, None]
-        z = select(projected, self.scale * scores, mask, energy)
+        z = apply_masked_scores(projected, self.scale * scores, mask, energy)
         sums = loss_sums(scores, logits, mask, energy, valid.reshape(-1, 1))
         active_rank = mask.astype(jnp.float32).sum(-1).reshape(tokens)
         aux = Aux(active_rank, energy.reshape(tokens), Losses(sums), usage=sums.kept)
@@ -128,13 +128,13 @@ class LoRASP(BankMethod):
             mask &= jnp.arange(scores.shape[-1]) < self.rank
         return jnp.broadcast_to(mask, by_token.shape).reshape(scores.shape)
 
-    def fused(self, params: Params) -> FusedRoute | None:
-        """All of `between` as one kernel on an NVIDIA GPU, for the default router and gate."""
+    def fused_kernel(self, params: Params) -> FusedBottleneck | None:
+        """All of `bottleneck` as one kernel on an NVIDIA GPU, for the default router and gate."""
         scored = params["router"]["w2"].shape[-1]
         default = (self.router, self.granularity, self.schedule) == ("gelu", "token", None)
         if not default or scored > self.rank or default_implementation(scored) != "pallas":
             return None
-        route = FusedRoute(self.rank, self.hidden_width, self.energy_target, self.scale)
+        route = FusedBottleneck(self.rank, self.hidden_width, self.energy_target, self.scale)
         return route if route.fits else None
 
     def transform(

@@ -81,7 +81,7 @@ def scheduling(
     It wraps the whole optimizer: nothing else decays or moves the value. Wrapping twice is the same
     as once.
     """
-    _fields.whole("total_steps", total_steps)
+    _fields.positive_int("total_steps", total_steps)
 
     def init(params: Any) -> ScheduleState:
         return ScheduleState(jnp.zeros((), jnp.int32), optimizer.init(params))

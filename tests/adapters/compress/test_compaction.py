@@ -222,7 +222,7 @@ def test_distill_is_the_best_update_of_its_rank(rank, batches):
 def _update_at(layer, token):
     """ΔW(x) of one token, as a matrix."""
     params, method = layer.adapter.get_value(), layer.method
-    z, _ = method.between(params, token @ method.down(params), None)
+    z, _ = method.bottleneck(params, token @ method.down(params), None)
     u = method.up(params)
     s = z / (token @ params["bank"]["v"])
     return np.float64(params["bank"]["v"] * s @ u)

@@ -17,7 +17,7 @@ from lorasp_jax import peft
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.config import Config
 from lorasp_jax.peft import EnergySchedule, LoRASP, LoRASPRelease
-from lorasp_jax.peft._settings import upgraded
+from lorasp_jax.peft._settings import upgrade
 from lorasp_jax.training import run_folder
 from tests import GOLDEN
 
@@ -92,4 +92,4 @@ def test_a_run_goes_on(tmp_path, file, method):
 def test_settings_are_those_of_the_method(method):
     settings = json.loads(json.dumps(peft.to_settings(method)))
     assert peft.from_settings(settings) == method
-    assert upgraded(settings) == settings
+    assert upgrade(settings) == settings

@@ -11,9 +11,9 @@ import pytest
 from lorasp_jax.kernels import rowwise_kernel
 from lorasp_jax.kernels.energy_gate import energy_gate
 from lorasp_jax.peft import EnergySchedule, LoRA, LoRASP
-from lorasp_jax.peft._together import apply_together
+from lorasp_jax.peft._shared_input import apply_shared_input
 from lorasp_jax.peft.lora_sp import bank, losses
-from lorasp_jax.peft.lora_sp.fused import FusedRoute
+from lorasp_jax.peft.lora_sp.gpu_kernel import FusedBottleneck
 from lorasp_jax.peft.lora_sp.router import router_scores
 from tests.jaxprs import primitives
 
@@ -111,7 +111,7 @@ def test_pruned_directions_get_no_task_gradient(x):
     def task(shift):
         scores = scores_of(params["router"], x)[0] + shift
         mask, _, energy = energy_gate(scores, 0.5)
-        z = bank.select(x @ params["bank"]["v"], scores, mask, energy[..., None])
+        z = bank.apply_masked_scores(x @ params["bank"]["v"], scores, mask, energy[..., None])
         return z.sum(), mask
 
     gradient, mask = jax.jit(jax.grad(task, has_aux=True))(jnp.zeros((3, 7, 16)))
@@ -134,10 +134,10 @@ def test_losses_of_uniform_and_concentrated_routing():
 class OnGPU(LoRASP):
     """One whose kernel is there on every machine: Triton's on a GPU, its interpreter elsewhere."""
 
-    def fused(self, params):
+    def fused_kernel(self, params):
         del params
         interpret = jax.default_backend() != "gpu"
-        return FusedRoute(
+        return FusedBottleneck(
             self.rank, self.hidden_width, self.energy_target, self.scale, interpret=interpret
         )
 
@@ -178,7 +178,7 @@ def test_layers_of_one_input_are_one_kernel(x):
 
     def together(params, x):
         layers = [(method, p, w) for p, w in zip(params, weights, strict=True)]
-        return apply_together(layers, x, token_mask=mask)
+        return apply_shared_input(layers, x, token_mask=mask)
 
     def alone(params, x):
         pairs = zip(params, weights, strict=True)

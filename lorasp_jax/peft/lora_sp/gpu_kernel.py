@@ -14,15 +14,15 @@ from lorasp_jax.kernels.energy_gate import energy_gate, kept_energy
 from lorasp_jax.kernels.packing import PackedTree
 from lorasp_jax.kernels.rowwise_kernel import rowwise_kernel
 from lorasp_jax.peft._aux import Aux
-from lorasp_jax.peft._fused import Fused
-from lorasp_jax.peft.lora_sp.bank import select
+from lorasp_jax.peft._batched_bottleneck import BatchedBottleneck
+from lorasp_jax.peft.lora_sp.bank import apply_masked_scores
 from lorasp_jax.peft.lora_sp.losses import Losses, LossSums, loss_sums
 from lorasp_jax.peft.lora_sp.router import router_scores
 
 
 @dataclasses.dataclass(frozen=True)
-class FusedRoute(Fused):
-    """`LoRASP.between` with a router "gelu", masks by token and a constant η."""
+class FusedBottleneck(BatchedBottleneck):
+    """`LoRASP.bottleneck` with a router "gelu", masks by token and a constant η."""
 
     rank: int
     hidden_width: int
@@ -41,16 +41,16 @@ class FusedRoute(Fused):
         """The router's numbers in a row."""
         return PackedTree.of(params["router"])
 
-    def between_all(
-        self, params: Any, read: jax.Array, columns: range, token_mask: jax.Array | None
+    def bottleneck_all(
+        self, params: Any, projected: jax.Array, columns: range, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
-        """As `Fused.between_all`."""
-        tokens, n = read.shape[:-1], len(columns)
+        """As `BatchedBottleneck.bottleneck_all`."""
+        tokens, n = projected.shape[:-1], len(columns)
         valid = jnp.ones(tokens, bool) if token_mask is None else token_mask
         z, sums, statistics = rowwise_kernel(
             functools.partial(route, energy_target=self.energy_target, scale=self.scale),
             params,
-            read.reshape(-1, read.shape[-1]),
+            projected.reshape(-1, projected.shape[-1]),
             (self.rank, self.hidden_width),
             valid.reshape(-1, 1),
             start=columns.start,
@@ -84,10 +84,10 @@ def route(
       z [n, R], the losses' sums over rows, the mask, and f32 [n, 1] each active rank and kept
       energy.
     """
-    projected, hidden = columns
+    v_x, hidden = columns
     scores, logits = router_scores(router, hidden, "gelu")
     mask = energy_gate(scores, energy_target, implementation="block")[0] if kept is None else kept
     energy = kept_energy(scores, mask)[:, None]
-    z = select(projected, scale * scores, mask, energy)
+    z = apply_masked_scores(v_x, scale * scores, mask, energy)
     active_rank = mask.astype(jnp.float32).sum(-1, keepdims=True)
     return z, loss_sums(scores, logits, mask, energy, valid), mask, [active_rank, energy]

@@ -12,15 +12,15 @@ from flax import linen, nnx
 
 from lorasp_jax.peft import Method, _arguments, _fields
 from lorasp_jax.peft._fields import short
-from lorasp_jax.peft._method import LARGEST_SIZE
+from lorasp_jax.peft._method import MAX_SIZE
 
-LONGEST_NAME = 255
+MAX_NAME_BYTES = 255
 """Bytes of the name of a file or folder."""
 
 
 def size(name: str, value: Any) -> int:
-    """A width; raises a ValueError for what is no whole number from 1 to `LARGEST_SIZE`."""
-    return _fields.whole(name, value, LARGEST_SIZE)
+    """A width; raises a ValueError for what is no whole number from 1 to `MAX_SIZE`."""
+    return _fields.positive_int(name, value, MAX_SIZE)
 
 
 def method(value: Any) -> Method | None:
@@ -50,7 +50,7 @@ def array(x: Any) -> Any:
     return x
 
 
-def real(name: str, dtype: Any) -> None:
+def floating_dtype(name: str, dtype: Any) -> None:
     """Raises a ValueError for a type that weights cannot have, or computations with them."""
     try:
         fits = jnp.issubdtype(jnp.dtype(dtype), jnp.floating)
@@ -123,8 +123,8 @@ def folder(value: Any) -> pathlib.Path:
     path = pathlib.Path(text)
     if len(path.parts) > 1 and path.parts[0].endswith(":"):  # of a Path, which has one slash
         raise ValueError(f"{text} is a URL; a folder of adapters lies on this machine.")
-    if any(len(part.encode(errors="replace")) > LONGEST_NAME for part in path.parts):
-        raise ValueError(f"a name in a path has {LONGEST_NAME} bytes at most, got {short(text)}.")
+    if any(len(part.encode(errors="replace")) > MAX_NAME_BYTES for part in path.parts):
+        raise ValueError(f"a name in a path has {MAX_NAME_BYTES} bytes at most, got {short(text)}.")
     if path.exists() and not path.is_dir():
         raise ValueError(f"{path} is no folder.")
     return path
