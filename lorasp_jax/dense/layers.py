@@ -51,8 +51,9 @@ class AdaptedLayer(nnx.Module):
       kernel_name: name of the attribute that holds the layer's kernel.
       adapter: `AdapterParam` holding the method's parameters, or None.
       method: the adapter's method, static.
-      stored_aux: what the last call reported, and stored_dropout_key: what `with_dropout` gives; where
-        there is none, the layer lacks the attribute, so that its structure stays what it was.
+      stored_aux: aux of the last call. Absent if there is none, so that the graph structure of the
+        layer does not change.
+      stored_dropout_key: the key set by `with_dropout`, absent otherwise.
     """
 
     kernel_name: str = "kernel"
