@@ -1,4 +1,4 @@
-"""Sizes that every backbone has."""
+"""Model sizes and runtime options shared by all backbones."""
 
 from __future__ import annotations
 
@@ -12,51 +12,49 @@ from lorasp_jax.models.inputs import OURS, InputConfig
 from lorasp_jax.peft import _fields
 
 VOCABULARY_SIZE = 320
-"""Rows of the embedding table of our own bases, those of reserved words included."""
+"""Rows of the embedding table of this project's own bases, reserved tokens included."""
 
 Remat = Literal["none", "products", "full"]
-_LARGEST = 2**24
-"""Of any size, far beyond every model there is: what a file says is bounded before it is used."""
-_DEEPEST = 1000
+_MAX_SIZE = 2**24
+"""Upper bound for any size, far beyond existing models; files may be untrusted."""
+_MAX_DEPTH = 1000
 
 
-def _check_sizes(part: Any) -> None:
-    """Raise ValueError where a size is not a positive whole number, or is absurd."""
-    for field in dataclasses.fields(part):
-        value = getattr(part, field.name)
-        largest = _DEEPEST if field.name == "depth" else _LARGEST
-        if field.type == "int" and not (type(value) is int and 0 < value <= largest):
-            raise ValueError(
-                f"{field.name} must be a whole number from 1 to {largest}, not {value!r}."
-            )
+def _check_sizes(config: Any) -> None:
+    """Raise ValueError if a size is not a positive integer or is implausibly large."""
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        limit = _MAX_DEPTH if field.name == "depth" else _MAX_SIZE
+        if field.type == "int" and not (type(value) is int and 0 < value <= limit):
+            raise ValueError(f"{field.name} must be an integer from 1 to {limit}, got {value!r}.")
 
 
 @dataclass(frozen=True)
 class VisionConfig:
-    """Size of the SigLIP tower."""
+    """Sizes of the SigLIP tower."""
 
     width: int
     depth: int
     mlp: int
     heads: int
     patch: int
-    """Height and width of a patch [pixels]."""
+    """Side of a patch [pixels]."""
     shuffle: int = 1
-    """Height and width of the square of tokens that the head reads as one [tokens]."""
+    """Side of the square of tokens that pixel shuffle merges into one [tokens]."""
 
     def __post_init__(self) -> None:
-        """Checks the sizes."""
+        """Validate the sizes."""
         _check_sizes(self)
 
     @property
-    def matrices(self) -> tuple[int, ...]:
-        """What the shapes of the matrices tell, heads left out."""
+    def kernel_sizes(self) -> tuple[int, ...]:
+        """The sizes that determine kernel shapes; the number of heads does not."""
         return self.width, self.depth, self.mlp, self.patch, self.shuffle
 
 
 @dataclass(frozen=True)
 class ExpertConfig:
-    """Size of one expert; both experts agree in depth, heads, kv_heads and head_dim."""
+    """Sizes of one expert; both experts must have equal depth, heads, kv_heads and head_dim."""
 
     width: int
     depth: int
@@ -66,31 +64,31 @@ class ExpertConfig:
     head_dim: int
 
     def __post_init__(self) -> None:
-        """Checks the sizes."""
+        """Validate the sizes."""
         _check_sizes(self)
 
     @property
-    def matrices(self) -> tuple[int, ...]:
-        """What the shapes of the matrices tell: heads and their size only as a product."""
+    def kernel_sizes(self) -> tuple[int, ...]:
+        """The sizes that determine kernel shapes; heads and head_dim enter only as a product."""
         inner, context = self.heads * self.head_dim, self.kv_heads * self.head_dim
         return self.width, self.depth, self.mlp, inner, context
 
 
 @dataclass(frozen=True)
 class BackboneConfig:
-    """Every size of a backbone.
+    """Sizes and runtime options of a backbone.
 
     Raises:
-        ValueError: sizes that do not fit together.
+        ValueError: inconsistent sizes.
     """
 
     vision: VisionConfig
     language: ExpertConfig
     action: ExpertConfig
     cameras: tuple[str, ...]
-    """Names of the pictures, in the order of their tokens."""
+    """Camera names, in token order."""
     image_size: int
-    """Height and width of the pictures [pixels]."""
+    """Height and width of the images [pixels]."""
     vocabulary: int
     """Rows of the embedding table."""
     max_tokens: int
@@ -100,37 +98,53 @@ class BackboneConfig:
     action_dim: int
     """Slots of state and action vectors, A."""
     inputs: InputConfig = OURS
-    """How pictures, states and actions are prepared."""
+    """How images, states and actions are preprocessed."""
     dtype: str = "float32"
-    """Type of the towers' matrix products; norms, softmax, projections and the loss are fp32."""
+    """Dtype of the towers' matmuls; norms, softmax, projections and the loss run in fp32."""
     param_dtype: str = "float32"
-    """Type the parameters are stored in."""
+    """Dtype of the stored parameters."""
     remat: Remat = "none"
-    """What the backward pass computes again: nothing; all but the results of matrix products
-    ("products": half the memory, a few percent more work); everything inside a layer ("full": the
-    least memory, a third more work)."""
+    """What the backward pass recomputes: nothing ("none"); everything except matmul results
+    ("products": half the memory, a few percent more work); whole layers ("full": the least memory,
+    a third more work)."""
     unroll: bool | None = None
-    """Straight-line code instead of a loop over layers: faster, the most for small ones (a loop
-    copies what the backward pass needs into stacks and out again), but two to three times as long
-    to compile. None: unless `remat` is "full", of which XLA keeps to the order in a loop alone."""
+    """Unroll the loop over layers. Faster, especially for small layers, because a loop copies the
+    backward pass's residuals into stacks and out again, but compiles two to three times as long.
+    None unrolls unless `remat` is "full": XLA preserves remat order only inside a loop."""
 
     def __post_init__(self) -> None:
-        """Checks that the parts fit."""
+        """Validate the sizes."""
         _check_sizes(self)
         language, action = self.language, self.action
         for name in ("depth", "heads", "kv_heads", "head_dim"):
             a, b = getattr(language, name), getattr(action, name)
             if a != b:
-                raise ValueError(f"experts share attention, but {name} is {a} and {b}.")
-        side = self.vision.patch * self.vision.shuffle
+                raise ValueError(
+                    f"{name} of both experts must be equal, because they share attention; "
+                    f"got {a} and {b}."
+                )
+        vision = self.vision
+        side = vision.patch * vision.shuffle
         if self.image_size % side:
             raise ValueError(
-                f"image_size {self.image_size} is not a multiple of the patch, {side}."
+                "image_size must be a multiple of vision.patch * vision.shuffle = "
+                f"{side}, got {self.image_size}."
             )
-        if self.vision.width % self.vision.heads or language.heads % language.kv_heads:
-            raise ValueError("heads must divide the vision width, kv_heads the experts' heads.")
+        if vision.width % vision.heads:
+            raise ValueError(
+                "vision.width must be a multiple of vision.heads, "
+                f"got {vision.width} and {vision.heads}."
+            )
+        if language.heads % language.kv_heads:
+            raise ValueError(
+                "heads must be a multiple of kv_heads, "
+                f"got {language.heads} and {language.kv_heads}."
+            )
         if language.head_dim % 2 or action.width % 2:
-            raise ValueError("head_dim and the action width must be even.")
+            raise ValueError(
+                "head_dim and action.width must be even, "
+                f"got {language.head_dim} and {action.width}."
+            )
 
     @classmethod
     def miniature(
@@ -144,7 +158,7 @@ class BackboneConfig:
         chunk: int = 10,
         unroll: bool | None = None,
     ) -> Self:
-        """A config for simulation: its two cameras, the offline tokenizer's words, a robot arm."""
+        """A config for the simulation: two cameras, offline tokenizer, one robot arm."""
         return cls(
             vision,
             language,
@@ -159,8 +173,8 @@ class BackboneConfig:
         )
 
     @property
-    def straight_line(self) -> bool:
-        """Whether layers are straight-line code."""
+    def unroll_layers(self) -> bool:
+        """Whether the loop over layers is unrolled; resolves `unroll` = None."""
         return self.remat != "full" if self.unroll is None else self.unroll
 
     @property
@@ -175,25 +189,25 @@ class BackboneConfig:
 
     @classmethod
     def from_dict(cls, fields: dict[str, Any]) -> Self:
-        """The config of `dataclasses.asdict`, also after JSON.
+        """Inverse of `dataclasses.asdict`, also after a JSON round trip.
 
         Raises:
-            TypeError, KeyError: missing or unknown fields, or types of arrays that there are not.
-            ValueError: values of other kinds than the fields'.
+            TypeError, KeyError: missing or unknown fields, or an unknown dtype.
+            ValueError: a field has a value of the wrong type.
         """
         inputs = fields.get("inputs", {}) if isinstance(fields, dict) else None
         if not isinstance(inputs, dict):
-            raise TypeError("a config and its inputs are objects")
-        parts = {
+            raise TypeError("a config and its inputs must be dicts")
+        nested = {
             "vision": VisionConfig(**fields["vision"]),
             "language": ExpertConfig(**fields["language"]),
             "action": ExpertConfig(**fields["action"]),
             "cameras": tuple(fields["cameras"]),
             "inputs": InputConfig(**{**inputs, "delta": tuple(inputs.get("delta", ()))}),
         }
-        config = cls(**{**fields, **parts})
+        config = cls(**{**fields, **nested})
         _fields.check_fields(config)
         _fields.check_fields(config.inputs, "inputs.")
         for name in (config.dtype, config.param_dtype):
-            jnp.dtype(name)  # raises TypeError
+            jnp.dtype(name)  # raises TypeError for an unknown dtype
         return config

@@ -33,7 +33,7 @@ class Checkpoints:
 
     def __init__(self, folder: Path, base_hash: str, console: Console) -> None:
         """Open `folder`/checkpoints for a run on the base identified by `base_hash`."""
-        orbax_folders.leave_echoes_out()
+        orbax_folders.suppress_repeated_errors()
         atomic = ocp.options.AtomicityOptions(mode=ocp.options.AtomicityMode.COMMIT_FILE)
         options = ocp.CheckpointManagerOptions(max_to_keep=2, atomicity_options=atomic)
         self._folder = (folder / "checkpoints").absolute()

@@ -9,7 +9,7 @@ from flax import nnx
 
 from lorasp_jax.models.checkpoints import layouts, published
 from lorasp_jax.models.checkpoints.native import base_arrays
-from lorasp_jax.models.pi0 import Pi0Config, openpi_lora, weights
+from lorasp_jax.models.pi0 import Pi0Config, openpi_lora, published_names
 from tests.models.drawn import drawn
 
 CONFIG = Pi0Config.dummy()
@@ -46,7 +46,7 @@ def leaves():
 
 @pytest.mark.parametrize(("tower", "suffix"), [("language", ""), ("action", "_1")])
 def test_the_layers_compute_openpis_einsums(model, leaves, tower, suffix):
-    adapted = openpi_lora.adapted(model, leaves, scale=SCALE)
+    adapted = openpi_lora.attach(model, leaves, scale=SCALE)
     size, layer = getattr(CONFIG, tower), 1
     rng = np.random.default_rng(2)
 
@@ -89,12 +89,12 @@ def test_the_layers_compute_openpis_einsums(model, leaves, tower, suffix):
 def test_a_checkpoint_with_lora_is_loaded(model, leaves, tmp_path):
     """As openpi saves one: base and LoRA in one tree. One expert may have none."""
     one = {name: leaf for name, leaf in leaves.items() if "_1" not in name}
-    base = layouts.write(weights.openpi_layout(CONFIG), base_arrays(model))
+    base = layouts.write(published_names.openpi_layout(CONFIG), base_arrays(model))
     tree = flax.traverse_util.unflatten_dict({**base, **one}, sep="/")
     ocp.PyTreeCheckpointer().save(tmp_path / "params", {"params": tree})
     found, unused = published.load_published(tmp_path, CONFIG)
     assert unused == []
-    wanted = openpi_lora.adapted(model, one)
+    wanted = openpi_lora.attach(model, one)
     assert wanted.action.blocks.q_proj.adapter is None
     found, wanted = (nnx.to_flat_state(nnx.state(m, nnx.Param)) for m in (found, wanted))
     for (path, leaf), (other, expected) in zip(found, wanted, strict=True):
@@ -108,9 +108,9 @@ def test_what_does_not_fit_is_named(model, leaves):
     missing = f"{LAYERS}/mlp_1/linear_lora_b"
     less = {name: leaf for name, leaf in leaves.items() if name != missing}
     with pytest.raises(ValueError, match=f"lacks {missing}"):
-        openpi_lora.adapted(model, less)
-    with pytest.raises(ValueError, match="no leaves state_proj/lora_a"):
-        openpi_lora.adapted(model, {**leaves, "state_proj/lora_a": np.zeros(1)})
+        openpi_lora.attach(model, less)
+    with pytest.raises(ValueError, match="unexpected state_proj/lora_a"):
+        openpi_lora.attach(model, {**leaves, "state_proj/lora_a": np.zeros(1)})
     wide = {**leaves, f"{LAYERS}/mlp/linear_lora_a": np.zeros((2, 7, 3), np.float32)}
-    with pytest.raises(ValueError, match="mlp/linear_lora_a and lora_b of shapes"):
-        openpi_lora.adapted(model, wide)
+    with pytest.raises(ValueError, match="mlp/linear_lora_a and lora_b have shapes"):
+        openpi_lora.attach(model, wide)

@@ -12,7 +12,7 @@ from flax import nnx
 import lorasp_jax
 from lorasp_jax.models import presets
 from lorasp_jax.models.checkpoints import layouts, native, published
-from lorasp_jax.models.pi0 import Pi0Config, weights
+from lorasp_jax.models.pi0 import Pi0Config, published_names
 from lorasp_jax.peft import LoRA
 from tests.models.drawn import drawn, observation
 
@@ -54,11 +54,11 @@ def test_published_names_and_shapes():
     """openpi's 51 leaves; LeRobot's tensors, a weight and a bias for each norm of 18 layers."""
     config = Pi0Config.base_pi05()
     ours = sizes(config)
-    rules = {layout: make(config) for layout, make in weights.LAYOUTS.items()}
+    rules = {layout: make(config) for layout, make in published_names.LAYOUTS.items()}
     names = {layout: [n for r in found for n in r.theirs] for layout, found in rules.items()}
     assert len(names["openpi"]) == 51
-    assert len(names["lerobot"]) + len(weights.UNUSED) == 778 + 37 - 2
-    assert all(weights.canonical_name(name) == name for name in names["lerobot"])
+    assert len(names["lerobot"]) + len(published_names.UNUSED) == 778 + 37 - 2
+    assert all(published_names.lerobot_name(name) == name for name in names["lerobot"])
 
     def saved(rule):
         zeros = [np.broadcast_to(np.zeros((), np.int8), ours[name]) for name in rule.ours]
@@ -101,7 +101,7 @@ def test_there_and_back(layout, model, tmp_path):
 
 def test_dense_of_a_norm_is_transposed_for_lerobot(model):
     arrays = {name: np.asarray(leaf) for name, leaf in native.named_arrays(model).items()}
-    theirs = layouts.write(weights.lerobot_layout(CONFIG), arrays)
+    theirs = layouts.write(published_names.lerobot_layout(CONFIG), arrays)
     name = "paligemma_with_expert.gemma_expert.model.layers.1.input_layernorm.dense.weight"
     wanted = arrays["action/blocks/input_layernorm/dense/kernel"][1].T
     np.testing.assert_array_equal(theirs[name], wanted)

@@ -52,11 +52,11 @@ def test_arrays_larger_than_their_files(tmp_path):
     handler = ocp.PyTreeCheckpointHandler(use_ocdbt=False)
     tree = {"params": {"a": np.ones((2, 3), np.float32)}}
     ocp.Checkpointer(handler).save(tmp_path / "params", tree)
-    assert published._restored(tmp_path / "params")["a"].shape == (2, 3)
+    assert published._restore(tmp_path / "params")["a"].shape == (2, 3)
     (header,) = (tmp_path / "params").rglob(".zarray")
     header.write_text(json.dumps(json.loads(header.read_text()) | {"shape": [10**6, 10**6]}))
-    with pytest.raises(ValueError, match="params is damaged or no Orbax checkpoint"):
-        published._restored(tmp_path / "params")
+    with pytest.raises(ValueError, match="params is damaged or not an Orbax checkpoint"):
+        published._restore(tmp_path / "params")
 
 
 def test_deep_and_large_numbers(tmp_path):
@@ -82,7 +82,7 @@ def test_files_larger_than_any_text(tmp_path):
 def test_weights_that_are_no_finite_real_numbers(value):
     rule = layouts.copied("ours", "theirs")
     theirs = {"theirs": np.array([1, value, 2])}
-    with pytest.raises(ValueError, match="x has theirs of numbers that are not real or not finite"):
+    with pytest.raises(ValueError, match="theirs of x must be floating point and finite"):
         layouts.read([rule], theirs, {"ours": (3,)}, "x", lambda name, array: array)
 
 

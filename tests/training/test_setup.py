@@ -90,7 +90,7 @@ def test_policies_of_lerobot_are_fed_as_they_say(config, tmp_path, monkeypatch):
     }
     (tmp_path / "config.json").write_text(json.dumps(fields))
     weightless = lambda _, wanted: SimpleNamespace(config=wanted)  # noqa: E731
-    monkeypatch.setattr(loading.Found, "load", weightless)
+    monkeypatch.setattr(loading.ModelFolder, "load", weightless)
     monkeypatch.setattr(models, "weights_hash", lambda _: "")
     model = ModelConfig(size="base", checkpoint=str(tmp_path))
     wanted = dataclasses.replace(

@@ -1,1 +1,1 @@
-"""Weights in files: this project's own layout and the published ones."""
+"""Load and save backbone weights, in this project's layout and in published ones."""

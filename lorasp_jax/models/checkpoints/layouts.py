@@ -1,8 +1,8 @@
-"""Other projects' layouts of a model's parameters: names and shapes, in and out.
+"""Convert between this project's parameter layout ("ours") and other projects' ("theirs").
 
-A layout is a list of rules; each says how some of their leaves become some of ours and back. Values
-are only sliced, transposed, stacked and reshaped, so they stay exact. A leaf of another shape is
-refused before it is rearranged: as many values would fit into other heads, too.
+A layout is a list of rules; each maps some of their leaves to some of ours, and back. Values are
+only sliced, transposed, stacked and reshaped, so the conversion is exact. Shapes are checked before
+reshaping, because a model with different heads can have the same number of elements.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
@@ -14,30 +14,30 @@ import numpy as np
 Shape = tuple[int, ...]
 
 
-class OtherModelError(ValueError):
-    """The leaves are those of another model, or of one of other sizes."""
+class ModelMismatchError(ValueError):
+    """The checkpoint belongs to a different model or model size."""
 
 
 class Rule(NamedTuple):
-    """Some of our leaves and some of theirs that hold the same values."""
+    """A set of our leaves and the set of their leaves that holds the same values."""
 
     ours: tuple[str, ...]
     theirs: tuple[str, ...]
     shapes: Callable[..., Sequence[Shape]]
-    """Shapes of ours -> shapes of theirs."""
+    """Shapes of our leaves -> shapes of theirs."""
     to_ours: Callable[[Iterator[np.ndarray]], Sequence[np.ndarray]]
-    """Their arrays, read as they are asked for -> ours."""
+    """Iterator over their arrays, each read when requested -> our arrays."""
     to_theirs: Callable[..., Sequence[np.ndarray]]
-    """Our arrays -> theirs."""
+    """Our arrays -> their arrays."""
 
 
 def copied(ours: str, theirs: str) -> Rule:
-    """The same array under two names."""
+    """The same array under another name."""
     return Rule((ours,), (theirs,), lambda shape: [shape], list, lambda a: [a])
 
 
 def reshaped(ours: str, theirs: str, ours_shape: Shape, theirs_shape: Shape) -> Rule:
-    """The same values in the same order."""
+    """The same values in the same order, in another shape."""
     return Rule(
         (ours,),
         (theirs,),
@@ -48,7 +48,7 @@ def reshaped(ours: str, theirs: str, ours_shape: Shape, theirs_shape: Shape) -> 
 
 
 def transposed(ours: str, theirs: str) -> Rule:
-    """A matrix [I, O] that is theirs [O, I], as PyTorch's linear layers have it."""
+    """Our matrix [I, O] stored as [O, I], as in PyTorch's linear layers."""
     return Rule(
         (ours,),
         (theirs,),
@@ -59,84 +59,89 @@ def transposed(ours: str, theirs: str) -> Rule:
 
 
 def stacked(ours: str, theirs: Iterable[str], *, transpose: bool = False) -> Rule:
-    """One of our arrays [L, ...] that is theirs layer by layer, perhaps as in `transposed`."""
+    """Our array [L, ...] stored as one array per layer, optionally transposed."""
     names = tuple(theirs)
 
-    def stacked_up(layers: Iterator[np.ndarray]) -> list[np.ndarray]:
-        first = turned(next(layers))
-        found = np.empty((len(names), *first.shape), first.dtype)
-        found[0] = first
+    def stack_layers(layers: Iterator[np.ndarray]) -> list[np.ndarray]:
+        first = maybe_transpose(next(layers))
+        stack = np.empty((len(names), *first.shape), first.dtype)
+        stack[0] = first
         for i, layer in enumerate(layers):
-            found[i + 1] = turned(layer)
-        return [found]
+            stack[i + 1] = maybe_transpose(layer)
+        return [stack]
 
-    def turned(array: np.ndarray) -> np.ndarray:
+    def maybe_transpose(array: np.ndarray) -> np.ndarray:
         return array.T if transpose else array
 
     def shapes(shape: Shape) -> list[Shape]:
         return [shape[:0:-1] if transpose else shape[1:]] * len(names)
 
-    return Rule((ours,), names, shapes, stacked_up, lambda a: [turned(layer) for layer in a])
+    def unstack_layers(stack: np.ndarray) -> list[np.ndarray]:
+        return [maybe_transpose(layer) for layer in stack]
+
+    return Rule((ours,), names, shapes, stack_layers, unstack_layers)
 
 
 def read(
     rules: Sequence[Rule],
     theirs: MutableMapping[str, Any],
     shapes: Mapping[str, Shape],
-    whose: str,
-    place: Callable[[str, np.ndarray], Any],
+    source: str,
+    convert: Callable[[str, np.ndarray], Any],
 ) -> dict[str, Any]:
-    """Their leaves as ours.
+    """Convert their leaves to ours.
 
     Args:
         rules: the layout.
-        theirs: their leaves by name; those that are used are taken out, to free their memory.
-        shapes: of our leaves, by path in our model.
-        whose: what to call them in an error.
-        place: what to keep of each of our leaves (name, array), called as soon as it is read.
+        theirs: their leaves by name; consumed leaves are popped to free their memory.
+        shapes: shapes of our leaves, by path in our model.
+        source: name of the checkpoint in error messages.
+        convert: called with (name, array) for each of our leaves as soon as it is read; its result
+            is stored.
 
     Returns:
-        What `place` gave, by path in our model.
+        Results of `convert`, by path in our model.
 
     Raises:
-        OtherModelError: a leaf is missing, some are left over, or one has another shape.
-        ValueError: a leaf is not of finite real numbers.
+        ModelMismatchError: missing, unexpected or wrongly shaped leaves.
+        ValueError: a leaf is not floating point or not finite.
     """
     missing = [name for rule in rules for name in rule.theirs if name not in theirs]
     unexpected = theirs.keys() - {name for rule in rules for name in rule.theirs}
-    for problem, names in (("lacks", missing), ("has, beyond this model,", sorted(unexpected))):
+    for problem, names in (("lacks", missing), ("has unexpected", sorted(unexpected))):
         if names:
-            raise OtherModelError(f"{whose} {problem} {_some(names)}.")
+            raise ModelMismatchError(f"{source} {problem} {_abbreviate(names)}.")
 
-    def taken(name: str, shape: Shape) -> np.ndarray:
+    def pop(name: str, shape: Shape) -> np.ndarray:
         array = np.asarray(theirs.pop(name))
         if array.shape != shape:
-            found = f"{whose} has {name} of shape {array.shape}"
-            raise OtherModelError(f"{found}, the model needs {shape}.")
+            raise ModelMismatchError(
+                f"{name} of {source} must have shape {shape}, got {array.shape}."
+            )
         if not jnp.issubdtype(array.dtype, jnp.floating) or not np.isfinite(array).all():
-            raise ValueError(f"{whose} has {name} of numbers that are not real or not finite.")
+            raise ValueError(f"{name} of {source} must be floating point and finite.")
         return array
 
-    found: dict[str, Any] = {}
+    converted: dict[str, Any] = {}
     for rule in rules:
-        wanted = rule.shapes(*(shapes[name] for name in rule.ours))
-        ours = rule.to_ours(taken(*each) for each in zip(rule.theirs, wanted, strict=True))
-        found |= {name: place(name, a) for name, a in zip(rule.ours, ours, strict=True)}
-        del ours  # or it would stay beside what the next rule reads
-    return found
+        expected = rule.shapes(*(shapes[name] for name in rule.ours))
+        ours = rule.to_ours(pop(*leaf) for leaf in zip(rule.theirs, expected, strict=True))
+        converted |= {name: convert(name, a) for name, a in zip(rule.ours, ours, strict=True)}
+        del ours  # free it before the next rule reads its arrays
+    return converted
 
 
 def write(rules: Sequence[Rule], ours: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Our leaves under their names and in their shapes, contiguous."""
-    found: dict[str, np.ndarray] = {}
+    """Convert our leaves to theirs, as contiguous arrays."""
+    theirs: dict[str, np.ndarray] = {}
     for rule in rules:
         arrays = rule.to_theirs(*(np.asarray(ours[name]) for name in rule.ours))
-        found |= {
+        theirs |= {
             name: np.ascontiguousarray(a) for name, a in zip(rule.theirs, arrays, strict=True)
         }
-    return found
+    return theirs
 
 
-def _some(names: Sequence[str], most: int = 8) -> str:
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
+def _abbreviate(names: Sequence[str], limit: int = 8) -> str:
+    more = f" and {len(names) - limit} more" if len(names) > limit else ""
+    return ", ".join(names[:limit]) + more

@@ -1,7 +1,7 @@
-"""LeRobot's config.json of a policy as a backbone's config.
+"""Convert a LeRobot policy's config.json to a backbone config.
 
-The package of a backbone has a module `lerobot` with `TYPES`: a policy's type -> function of the
-file's fields that gives a config with the towers' sizes. What all policies share is read here.
+Each backbone package provides a module `lerobot` with `TYPES`: policy type -> function (fields) ->
+config with the tower sizes. Fields that all policies share are read here.
 """
 
 import dataclasses
@@ -14,76 +14,77 @@ from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.inputs import Mode
 
 Fields = Mapping[str, Any]
-_IMAGES = ("observation.images.", "observation.")
-_FOREIGN = (AttributeError, KeyError, OverflowError, TypeError)
+_IMAGE_PREFIXES = ("observation.images.", "observation.")
+_WRONG_STRUCTURE = (AttributeError, KeyError, OverflowError, TypeError)
 _MODES = {mode.upper(): mode for mode in get_args(Mode)}
-# What this project's backbones do, and LeRobot's may do otherwise.
+# Options of LeRobot for which this project's backbones support a single value.
 _FIXED: Fields = {"min_period": 4e-3, "max_period": 4.0, "adapt_to_pi_aloha": False}
 
 
-def config_of(fields: Fields) -> BackboneConfig:
-    """The config of a policy of LeRobot's; what the fields leave out is as published.
+def parse(fields: Fields) -> BackboneConfig:
+    """Convert a LeRobot policy's config; missing fields default to the published values.
 
     Args:
-        fields: its config.json.
+        fields: content of config.json.
 
     Raises:
-        ValueError: a type that no backbone has, or something that no config here can say.
+        ValueError: an unknown policy type or an unsupported option.
     """
-    config = towers_of(fields)
+    config = parse_towers(fields)
     require(fields, _FIXED)
     try:
-        return dataclasses.replace(config, **_shared(config, fields))
-    except _FOREIGN as error:
-        raise ValueError(f"it is not as LeRobot writes it ({error!r})") from error
+        return dataclasses.replace(config, **_shared_fields(config, fields))
+    except _WRONG_STRUCTURE as error:
+        raise ValueError(f"not a LeRobot policy config ({error!r})") from error
 
 
-def towers_of(fields: Fields) -> BackboneConfig:
-    """A config with the policy's towers; all but these is as published.
+def parse_towers(fields: Fields) -> BackboneConfig:
+    """Convert only the tower sizes; all other fields have the published values.
 
     Raises:
-        ValueError: a type that no backbone has, or towers that no config here can say.
+        ValueError: an unknown policy type or unsupported towers.
     """
-    kind, types = str(fields.get("type")), _types()
-    if kind not in types:
-        raise ValueError(f"a policy of type {kind!r} is not one of {', '.join(types)}")
+    policy, types = str(fields.get("type")), _types()
+    if policy not in types:
+        raise ValueError(f"type must be one of {', '.join(types)}, got {policy!r}")
     try:
-        return types[kind](fields)
-    except _FOREIGN as error:
-        raise ValueError(f"it is not as LeRobot writes it ({error!r})") from error
+        return types[policy](fields)
+    except _WRONG_STRUCTURE as error:
+        raise ValueError(f"not a LeRobot policy config ({error!r})") from error
 
 
-def require(fields: Fields, fixed: Fields) -> None:
-    """Raise ValueError where a policy does something else than is fixed here."""
-    for name, only in fixed.items():
-        if fields.get(name, only) != only:
-            raise ValueError(f"{name} must be {only!r} here, not {fields[name]!r}")
+def require(fields: Fields, supported: Fields) -> None:
+    """Raise ValueError if a field has a value other than the supported one."""
+    for name, value in supported.items():
+        if fields.get(name, value) != value:
+            raise ValueError(f"{name} must be {value!r}, got {fields[name]!r}")
 
 
 def _types() -> dict[str, Callable[[Fields], BackboneConfig]]:
-    found = {}
+    types = {}
     for name in backbone.names():
         package = backbone.find(name).__module__.rpartition(".")[0]
-        found |= importlib.import_module(f"{package}.lerobot").TYPES
-    return found
+        types |= importlib.import_module(f"{package}.lerobot").TYPES
+    return types
 
 
-def _shared(config: BackboneConfig, fields: Fields) -> dict[str, Any]:
-    """What every policy of LeRobot's says."""
+def _shared_fields(config: BackboneConfig, fields: Fields) -> dict[str, Any]:
+    """Convert the fields that all LeRobot policies share."""
     dim, size = config.action_dim, [config.image_size, config.image_size]
     size = fields.get("image_resolution") or fields.get("resize_imgs_with_padding", size)
     dims = {fields.get(f"max_{name}_dim", dim) for name in ("state", "action")}
     if len(dims) > 1 or not size or size[0] != size[1]:
         raise ValueError(
-            f"state and action must have one length, pictures be square: {dims}, {size}"
+            "max_state_dim and max_action_dim must be equal and images square, "
+            f"got {dims} and {size}"
         )
     inputs = config.inputs
     modes = {"VISUAL": "IDENTITY", "STATE": inputs.state.upper(), "ACTION": inputs.action.upper()}
     modes |= fields.get("normalization_mapping", {})
     if modes["VISUAL"] != "IDENTITY" or not modes.keys() <= {"VISUAL", "STATE", "ACTION"}:
-        raise ValueError(f"pictures are not normalised here, but normalization_mapping is {modes}")
+        raise ValueError(f"VISUAL must be 'IDENTITY' in normalization_mapping, got {modes}")
     if unknown := sorted(set(modes.values()) - _MODES.keys()):
-        raise ValueError(f"normalisation {unknown[0]!r} is not one of {', '.join(_MODES)}")
+        raise ValueError(f"normalization must be one of {', '.join(_MODES)}, got {unknown[0]!r}")
     return {
         "cameras": _cameras(fields) or config.cameras,
         "image_size": size[0],
@@ -100,8 +101,8 @@ def _shared(config: BackboneConfig, fields: Fields) -> dict[str, Any]:
 
 
 def _delta(fields: Fields) -> tuple[bool, ...]:
-    """Which actions are relative: but those with an excluded word in their name, where they have
-    names (processor/relative_action_processor.py of 0.6)."""
+    """Mask of relative actions: all except those whose name contains an excluded word; actions
+    without a name are relative (LeRobot 0.6, processor/relative_action_processor.py)."""
     if not fields.get("use_relative_actions"):
         return ()
     size = fields["output_features"]["action"]["shape"][0]
@@ -112,11 +113,11 @@ def _delta(fields: Fields) -> tuple[bool, ...]:
 
 
 def _cameras(fields: Fields) -> tuple[str, ...]:
-    """Names of the pictures without LeRobot's prefix, those that are always missing last."""
-    found = []
+    """Camera names without LeRobot's prefix; cameras that are always empty come last."""
+    names = []
     for key, feature in (fields.get("input_features") or {}).items():
         if feature["type"] == "VISUAL":
-            prefix = next((p for p in _IMAGES if key.startswith(p)), "")
-            found.append(key.removeprefix(prefix))
+            prefix = next((p for p in _IMAGE_PREFIXES if key.startswith(p)), "")
+            names.append(key.removeprefix(prefix))
     empty = [f"empty_camera_{i}" for i in range(fields.get("empty_cameras", 0))]
-    return tuple(dict.fromkeys([*found, *empty]))
+    return tuple(dict.fromkeys([*names, *empty]))

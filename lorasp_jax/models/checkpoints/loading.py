@@ -1,4 +1,4 @@
-"""Models from wherever they are published, in whichever layout."""
+"""Load a model from a local folder, Hugging Face's Hub or a bucket, in any supported layout."""
 
 import dataclasses
 import functools
@@ -12,7 +12,7 @@ from typing import Any, Literal
 from envs.datasets.files import read_text
 from lorasp_jax.models import backbone
 from lorasp_jax.models.checkpoints import lerobot_config, native, published
-from lorasp_jax.models.checkpoints.layouts import OtherModelError
+from lorasp_jax.models.checkpoints.layouts import ModelMismatchError
 from lorasp_jax.models.checkpoints.tensor_files import weight_files
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.inputs import InputConfig
@@ -24,14 +24,14 @@ Layout = Literal["ours", "openpi", "lerobot"]
 
 
 @dataclasses.dataclass(frozen=True)
-class Found:
-    """A model's folder on this machine, inspected once.
+class ModelFolder:
+    """A local model folder, inspected once.
 
     Attributes:
         folder: its path.
-        layout: whose files they are: this project's config.json, openpi's Orbax folder `params`, or
-            LeRobot's safetensors with a config.json of the policy's type.
-        fields: the content of config.json, empty where there is none.
+        layout: "ours" (this project's config.json), "openpi" (Orbax folder `params`) or "lerobot"
+            (safetensors and a config.json with the policy type).
+        fields: content of config.json, empty if there is none.
     """
 
     folder: Path
@@ -40,10 +40,10 @@ class Found:
 
     @functools.cached_property
     def config(self) -> BackboneConfig:
-        """The config that `load` gives the model without one, before any weights are read.
+        """The config that `load` uses by default; no weights are read.
 
         Raises:
-            ValueError: the files say no sizes, or those of no model here.
+            ValueError: the folder specifies no sizes, or those of an unsupported model.
         """
         if self.layout == "ours":
             return native.load_config(self.folder)
@@ -53,76 +53,76 @@ class Found:
 
     @property
     def inputs(self) -> InputConfig | None:
-        """How a policy of LeRobot's is fed, by its config.json; None where that is not said.
+        """Input preprocessing from a LeRobot policy's config.json, or None without such a file.
 
         Raises:
-            ValueError: the file describes no model here.
+            ValueError: config.json describes an unsupported model.
         """
         return self.config.inputs if self.layout == "lerobot" and "type" in self.fields else None
 
     def load(self, config: BackboneConfig | None = None) -> Any:
-        """The model; arguments and errors as for `load`."""
+        """Load the model; arguments and errors as for the function `load`."""
         if self.layout == "ours":
             return native.load_native(self.folder, config)
         if config is not None and self.layout == "lerobot" and "type" in self.fields:
             _require_same_heads(config, self.folder, self.fields)
         try:
             model, unused = published.load_published(self.folder, config or self.config)
-        except OtherModelError as error:
+        except ModelMismatchError as error:
             if config is not None:
                 raise
-            raise ValueError(f"{error} {self._whence()}") from error
+            raise ValueError(f"{error} {self._size_source()}") from error
         if unused:
-            _log.info("%s: nothing reads %s, left out", self.folder, ", ".join(unused))
+            _log.info("%s: skipped unused tensors %s", self.folder, ", ".join(unused))
         return model
 
-    def _whence(self) -> str:
-        """Where the sizes come from, for whoever gave none."""
+    def _size_source(self) -> str:
+        """Explain where the sizes come from when the caller passed no config."""
         if self.layout == "openpi":
             return (
-                "Nothing in a folder of openpi's says its sizes, so the published pi0's were "
-                "taken: pass a config."
+                "openpi checkpoints do not store model sizes, so those of the published pi0 were "
+                "used: pass a config."
             )
         policy = self.fields["type"]
-        return f"So says {self.folder / native.CONFIG}, of a policy of type {policy!r}."
+        return f"The sizes come from {self.folder / native.CONFIG}, which has type {policy!r}."
 
 
-def find(where: str | os.PathLike[str]) -> Found:
-    """What is in a folder, a repository on Hugging Face's hub or a bucket.
+def find(where: str | os.PathLike[str]) -> ModelFolder:
+    """Find a model folder, downloading it if it is remote, and detect its layout.
 
     Args:
-        where: a folder; "hf://owner/name"; "gs://bucket/folder", see `hub.local`.
+        where: a folder, "hf://owner/name" or "gs://bucket/folder", see `hub.local`.
 
     Raises:
-        ValueError: the place cannot be reached, or its config.json is damaged.
+        ValueError: `where` cannot be reached, or its config.json is damaged.
     """
     folder = hub.local(where)
-    fields = _fields(folder)
+    fields = _read_fields(folder)
     if "backbone" in fields:
-        return Found(folder, "ours", fields)
-    return Found(folder, "openpi" if published.orbax_folder(folder) else "lerobot", fields)
+        return ModelFolder(folder, "ours", fields)
+    return ModelFolder(folder, "openpi" if published.orbax_folder(folder) else "lerobot", fields)
 
 
 def load(where: str | os.PathLike[str], config: Any = None) -> Any:
-    """A model from a folder, a repository on Hugging Face's hub or a bucket.
+    """Load a model from a folder, a repository on Hugging Face's Hub or a bucket.
 
-    Layouts are told apart by their files: this project's config.json, LeRobot's config.json with
-    the policy's type, openpi's Orbax folder `params`.
+    The layout is detected from the files: this project's config.json, LeRobot's config.json with
+    the policy type, or openpi's Orbax folder `params`.
 
     Args:
-        where: a folder; "hf://owner/name"; "gs://bucket/folder", see `hub.local`.
-        config: sizes of the model, and the types to compute and to store in. None takes the sizes
-            from LeRobot's or this project's config.json, and those of pi0 as published for openpi.
+        where: a folder, "hf://owner/name" or "gs://bucket/folder", see `hub.local`.
+        config: model sizes, dtype and param_dtype. None uses the sizes in this project's or
+            LeRobot's config.json; for openpi, those of the published pi0.
 
     Raises:
-        ValueError: the place cannot be reached, none of these layouts is there, files are damaged,
-            or the model is another one than `config` or config.json say.
+        ValueError: `where` cannot be reached or has none of these layouts, files are damaged, or
+            the weights do not match `config` or config.json.
     """
     return find(where).load(config)
 
 
 def load_config(where: str | os.PathLike[str]) -> Any:
-    """The config that `load` gives a model without one, before any weights are read.
+    """Return the config that `load` uses by default; no weights are read.
 
     Raises:
         ValueError: as `load`.
@@ -130,55 +130,56 @@ def load_config(where: str | os.PathLike[str]) -> Any:
     return find(where).config
 
 
-def _fields(folder: Path) -> dict[str, Any]:
-    """The content of config.json, empty where there is none."""
+def _read_fields(folder: Path) -> dict[str, Any]:
+    """Read config.json; empty if there is none."""
     path = folder / native.CONFIG
     try:
-        found = json.loads(read_text(path)) if path.exists() else {}
+        fields = json.loads(read_text(path)) if path.exists() else {}
     except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path} is damaged.") from error
-    if not isinstance(found, dict):
+    if not isinstance(fields, dict):
         raise ValueError(f"{path} is damaged.")
-    return found
+    return fields
 
 
 def _lerobot_config(folder: Path, fields: dict[str, Any]) -> BackboneConfig:
     config = folder / native.CONFIG
     if not fields and any(path.exists() for path in weight_files(folder)):
         raise ValueError(
-            f"{folder} holds weights, but no {config.name} that says their sizes: pass a config."
+            f"{folder} contains weights, but no {config.name} with their sizes: pass a config."
         )
     if not fields:
         raise ValueError(
-            f"{folder} holds no model: there is no {config.name} of this project or LeRobot, "
-            "and no params/_METADATA of openpi."
+            f"{folder} contains no model: expected this project's or LeRobot's {config.name}, "
+            "or openpi's params/_METADATA."
         )
     if "type" not in fields:
         raise ValueError(
-            f"{config} is neither this project's, which names a backbone, nor LeRobot's, "
-            "which names the policy's type."
+            f"{config} must have 'backbone' (this project) or 'type' (a LeRobot policy)."
         )
-    return _of_lerobot(lerobot_config.config_of, folder, fields)
+    return _parse_lerobot(lerobot_config.parse, folder, fields)
 
 
-def _of_lerobot(read: Callable[[dict[str, Any]], Any], folder: Path, fields: dict[str, Any]) -> Any:
+def _parse_lerobot(
+    parse: Callable[[dict[str, Any]], Any], folder: Path, fields: dict[str, Any]
+) -> Any:
     try:
-        return read(fields)
+        return parse(fields)
     except ValueError as error:
         raise ValueError(
-            f"{folder / native.CONFIG} fits no backbone: {str(error).rstrip('.')}."
+            f"{folder / native.CONFIG} does not match any backbone: {str(error).rstrip('.')}."
         ) from error
 
 
 def _require_same_heads(config: Any, folder: Path, fields: dict[str, Any]) -> None:
-    """Refuse what tensors of LeRobot's do not tell: other heads of the same matrices."""
-    stored = _of_lerobot(lerobot_config.towers_of, folder, fields)
+    """Raise ValueError if head counts differ; LeRobot's tensor shapes do not reveal them."""
+    stored = _parse_lerobot(lerobot_config.parse_towers, folder, fields)
     if not isinstance(config, type(stored)):
-        found, wanted = (type(each).__name__ for each in (stored, config))
-        raise ValueError(f"{folder / native.CONFIG} is of a {found}, not of a {wanted}.")
+        expected, actual = (type(c).__name__ for c in (stored, config))
+        raise ValueError(f"config must be a {expected} for the policy in {folder}, got {actual}.")
     for name in ("vision", "language", "action"):
-        one, other = getattr(stored, name), getattr(config, name)
-        if one.matrices == other.matrices and one != other:
+        expected, actual = getattr(stored, name), getattr(config, name)
+        if expected.kernel_sizes == actual.kernel_sizes and expected != actual:
             raise ValueError(
-                f"{folder} does not fit the model: heads of {name} are {one}, not {other}."
+                f"{folder} does not match the config: heads of {name} are {expected}, not {actual}."
             )

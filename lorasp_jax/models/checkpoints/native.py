@@ -1,9 +1,8 @@
-"""Backbone weights on disk: config.json (backbone and every size) and safetensors in bf16.
+"""Save and load backbone weights: config.json (backbone and sizes) and safetensors in bf16.
 
-Large models are cut into shards with the index that Hugging Face uses. Tensor names are "/"-joined
-paths; a stacked layer's tensors keep their leading layer axis. The hash in config.json binds the
-files together, sizes included, so a folder that is damaged or half written is not loaded, nor one
-whose matrices would be split into other heads.
+Large models are split into shards with Hugging Face's index. Tensor names are "/"-joined paths;
+tensors of stacked layers keep their leading layer axis. config.json holds a hash over sizes and
+weights, so that loading refuses a folder that is damaged, half written or has edited head counts.
 """
 
 import dataclasses
@@ -30,26 +29,26 @@ from lorasp_jax.models.checkpoints.tensor_files import INDEX, SINGLE, TensorFile
 
 CONFIG = "config.json"
 SHARD_BYTES = 15 * 2**20
-"""Largest shard, its header included; a larger tensor has a shard of its own."""
+"""Maximum shard size, including its header; a larger tensor gets its own shard."""
 HEADER_BYTES = 2**16
-"""Room for a shard's header: names, shapes and offsets of some hundred tensors."""
+"""Reserved for a shard's header: names, shapes and offsets of a few hundred tensors."""
 RUNTIME_FIELDS = ("dtype", "param_dtype", "remat", "unroll")
-"""Fields of a config that say how to compute, not what the model is."""
+"""Config fields that affect how the model runs, not its architecture."""
 
 Folder = str | os.PathLike[str]
 Model = TypeVar("Model", bound=nnx.Module)
 
 
 def save(folder: Folder, model: Any) -> None:
-    """Write a model without adapters; one that is already in the folder is replaced.
+    """Save a model without adapters, replacing any model in the folder.
 
     Args:
-        folder: made if absent.
-        model: a backbone, with `config`.
+        folder: created if missing.
+        model: a backbone.
 
     Raises:
-        ValueError: the model has adapters or quantised kernels, or is not as its config says; or
-            the folder is a URL.
+        ValueError: the model has adapters or quantized kernels or does not match its config, or the
+            folder is a URL.
     """
     check_local(folder := pathlib.Path(folder))
     arrays = {name: a.astype(jnp.bfloat16) for name, a in base_arrays(model).items()}
@@ -61,31 +60,31 @@ def save(folder: Folder, model: Any) -> None:
     shards = _shards(arrays)
     names = [f"model-{i + 1:05}-of-{len(shards):05}.safetensors" for i in range(len(shards))]
     names = names if len(shards) > 1 else [SINGLE]
-    where = {name: file for file, shard in zip(names, shards, strict=True) for name in shard}
+    weight_map = {name: file for file, shard in zip(names, shards, strict=True) for name in shard}
     files = {file: safetensors.numpy.save(shard) for file, shard in zip(names, shards, strict=True)}
     if len(shards) > 1:
         total = {"total_size": sum(array.nbytes for array in arrays.values())}
-        files[INDEX] = json.dumps({"metadata": total, "weight_map": where}, indent=1).encode()
+        files[INDEX] = json.dumps({"metadata": total, "weight_map": weight_map}, indent=1).encode()
     files[CONFIG] = (json.dumps(description, indent=1) + "\n").encode()
     _write(folder, files)
 
 
 def base_arrays(model: nnx.Module) -> dict[str, np.ndarray]:
-    """Every parameter of a model by "/"-joined path, in its stored type.
+    """Return every parameter of a model by "/"-joined path, in its param_dtype.
 
     Raises:
-        ValueError: the model has adapters or quantised kernels, or is not as its config says.
+        ValueError: the model has adapters or quantized kernels, or does not match its config.
     """
     if jax.tree.leaves(nnx.state(model, (AdapterParam, SetParam))):
         raise ValueError(
-            "models.save takes a model without adapters; merge them or save them alone."
+            "models.save needs a model without adapters: merge them or save them separately."
         )
     if is_quantized(model):
-        raise ValueError("models.save takes whole kernels: save a base before quantising it.")
+        raise ValueError("models.save needs unquantized kernels: save the base before quantizing.")
     arrays = named_arrays(model)
-    wanted = _shapes(named_arrays(nnx.eval_shape(lambda: model.config.create(nnx.Rngs(0)))))
-    if other := sorted(wanted.items() ^ _shapes(arrays).items()):
-        raise ValueError(f"the model is not as its config says: see {other[0][0]}.")
+    expected = _shapes(named_arrays(nnx.eval_shape(lambda: model.config.create(nnx.Rngs(0)))))
+    if mismatched := sorted(expected.items() ^ _shapes(arrays).items()):
+        raise ValueError(f"the model does not match its config: see {mismatched[0][0]}.")
     return {name: np.asarray(leaf) for name, leaf in arrays.items()}
 
 
@@ -94,7 +93,7 @@ def _shapes(arrays: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
 
 
 def _write(folder: pathlib.Path, files: Mapping[str, bytes]) -> None:
-    """Put files of a model, by name, in the place of those that are in the folder."""
+    """Write a model's files, by name, and delete weight files of a previous model."""
     folder.mkdir(parents=True, exist_ok=True)
     for file, data in files.items():
         write_bytes(folder / file, data)
@@ -104,52 +103,54 @@ def _write(folder: pathlib.Path, files: Mapping[str, bytes]) -> None:
 
 
 def load_native(folder: Folder, config: Any = None) -> Any:
-    """A model from a folder that `save` wrote.
+    """Load a model that `save` wrote.
 
     Args:
-        folder: where the files are.
-        config: must have the sizes of the stored model; says the types to compute and to store in.
-            None takes the stored sizes, in fp32.
+        folder: folder with config.json and safetensors.
+        config: sets the `RUNTIME_FIELDS`, such as dtypes; its other fields must match the stored
+            model. None uses the stored config, in fp32.
 
     Raises:
-        ValueError: missing, damaged or foreign files, or another model than `config`.
+        ValueError: files are missing, damaged or in another format, or do not match `config`.
     """
     folder = pathlib.Path(folder)
     description = _description(folder)
     stored = _config(folder, description)
     config = config or stored
     if type(config) is not type(stored) or _sizes(config) != _sizes(stored):
-        raise ValueError(f"{folder} does not fit the model: {_difference(stored, config)}.")
+        raise ValueError(f"{folder} does not match the config: {_difference(stored, config)}.")
     arrays = TensorFiles(weight_files(folder))
-    if _digest(description, arrays) != description["sha256"]:  # before the model needs the memory
-        raise ValueError(f"{folder} is damaged: weights and sizes lack the hash in {CONFIG}.")
+    if _digest(description, arrays) != description["sha256"]:  # before allocating the model
+        raise ValueError(
+            f"{folder} is damaged: its weights and sizes do not match the hash in {CONFIG}."
+        )
     model = nnx.eval_shape(lambda: config.create(nnx.Rngs(0)))
     try:
         model = set_arrays(model, arrays)
     except ValueError as error:
-        raise ValueError(f"{folder} does not fit its {CONFIG}: {error}") from error
+        raise ValueError(f"the weights in {folder} do not match its {CONFIG}: {error}") from error
     return model
 
 
 def load_config(folder: Folder) -> Any:
-    """The config of a stored model, with its sizes and fp32.
+    """Read the config of a stored model; `RUNTIME_FIELDS` have their defaults (fp32).
 
     Raises:
-        ValueError: no such folder, or a foreign one.
+        ValueError: the folder is missing or not in this project's format.
     """
     folder = pathlib.Path(folder)
     return _config(folder, _description(folder))
 
 
 def set_arrays(model: Model, arrays: Mapping[str, Any]) -> Model:
-    """A copy of a model with every parameter taken from arrays, in the model's types.
+    """Return a copy of a model with every parameter replaced, cast to the model's dtypes.
 
     Args:
         model: may be abstract, from `nnx.eval_shape`.
-        arrays: by "/"-joined path.
+        arrays: new values by "/"-joined path.
 
     Raises:
-        ValueError: missing or unexpected arrays, or other shapes.
+        ValueError: missing, unexpected or wrongly shaped arrays.
     """
     expected = named_arrays(model)
     for problem, names in (
@@ -160,11 +161,11 @@ def set_arrays(model: Model, arrays: Mapping[str, Any]) -> Model:
             raise ValueError(f"{problem} arrays: {', '.join(sorted(names))}.")
     values = []
     for name, leaf in expected.items():
-        array = arrays[name]  # perhaps read at this moment, so once
+        array = arrays[name]  # may read from disk, so access it once
         if array.shape != leaf.shape:
-            raise ValueError(f"{name} has shape {array.shape}, the model needs {leaf.shape}.")
+            raise ValueError(f"{name} must have shape {leaf.shape}, got {array.shape}.")
         values.append(jnp.asarray(array, leaf.dtype))
-        del array  # or it would stay beside the next one
+        del array  # free it before reading the next one
     graphdef, parameters, rest = nnx.split(model, nnx.Param, ...)
     parameters = jax.tree.unflatten(jax.tree.structure(parameters), values)
     return nnx.merge(graphdef, parameters, rest)
@@ -173,8 +174,8 @@ def set_arrays(model: Model, arrays: Mapping[str, Any]) -> Model:
 def weights_hash(source: Folder | nnx.Module) -> str:
     """SHA-256 of a model's base weights: names, shapes and values in fp32.
 
-    Adapters do not count, so it identifies the frozen base; a folder and the model loaded from it
-    agree, whatever the type the model stores its parameters in.
+    It identifies the frozen base: adapters are excluded, and a model in any param_dtype has the
+    same hash as the folder it was loaded from.
 
     Args:
         source: a folder that `save` wrote, or a model.
@@ -187,21 +188,21 @@ def weights_hash(source: Folder | nnx.Module) -> str:
 
 
 def named_arrays(model: nnx.Module, adapters: bool = True) -> dict[str, Any]:
-    """Parameters in tree order by "/"-joined path."""
+    """Return a model's parameters by "/"-joined path, in tree order."""
     state = nnx.state(model, nnx.Param if adapters else nnx.All(nnx.Param, nnx.Not(AdapterParam)))
     return by_path(nnx.to_pure_dict(state))
 
 
 def by_path(tree: Any) -> dict[str, Any]:
-    """Leaves of a tree by "/"-joined path, in its order."""
+    """Return the leaves of a pytree by "/"-joined path, in tree order."""
     leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
 
 
 def _digest(description: Mapping[str, Any], arrays: Mapping[str, Any]) -> str:
-    """SHA-256 of what a folder holds: the backbone's name, every size, and the weights."""
-    said = json.dumps([description["backbone"], description["config"]], sort_keys=True)
-    return hashlib.sha256(f"{said}{_hash(arrays)}".encode()).hexdigest()
+    """SHA-256 of a folder's content: backbone name, sizes and weights."""
+    text = json.dumps([description["backbone"], description["config"]], sort_keys=True)
+    return hashlib.sha256(f"{text}{_hash(arrays)}".encode()).hexdigest()
 
 
 def _hash(arrays: Mapping[str, Any]) -> str:
@@ -210,51 +211,51 @@ def _hash(arrays: Mapping[str, Any]) -> str:
         values = np.asarray(arrays[name]).astype(np.float32)
         digest.update(f"{name}{values.shape}".encode())
         digest.update(np.ascontiguousarray(values).data)
-        del values  # or it would stay beside the next one
+        del values  # free it before reading the next one
     return digest.hexdigest()
 
 
 def _shards(arrays: Mapping[str, np.ndarray]) -> list[dict[str, np.ndarray]]:
-    """The arrays in order, cut where a shard would grow past its limit."""
+    """Split the arrays, in order, into shards of at most `SHARD_BYTES`."""
     shards: list[dict[str, np.ndarray]] = [{}]
-    room = SHARD_BYTES - HEADER_BYTES
+    free_bytes = SHARD_BYTES - HEADER_BYTES
     for name, array in arrays.items():
-        if shards[-1] and array.nbytes > room:
+        if shards[-1] and array.nbytes > free_bytes:
             shards.append({})
-            room = SHARD_BYTES - HEADER_BYTES
+            free_bytes = SHARD_BYTES - HEADER_BYTES
         shards[-1][name] = array
-        room -= array.nbytes
+        free_bytes -= array.nbytes
     return shards
 
 
 def _sizes(config: Any) -> dict[str, Any]:
-    """A config as JSON gives it back, without the fields that only say how to compute."""
+    """A config's fields after a JSON round trip, without `RUNTIME_FIELDS`."""
     fields = json.loads(json.dumps(dataclasses.asdict(config)))
     return {name: value for name, value in fields.items() if name not in RUNTIME_FIELDS}
 
 
-def _difference(stored: Any, wanted: Any) -> str:
-    a, b = _sizes(stored), _sizes(wanted)
+def _difference(stored: Any, config: Any) -> str:
+    a, b = _sizes(stored), _sizes(config)
     pairs = [f"{k} is {a.get(k)}, not {b.get(k)}" for k in sorted(a | b) if a.get(k) != b.get(k)]
-    return "; ".join(pairs) or f"it is a {type(stored).__name__}"
+    return "; ".join(pairs) or f"the stored model is a {type(stored).__name__}"
 
 
 def _description(folder: pathlib.Path) -> dict[str, Any]:
-    foreign = f"{folder / CONFIG} is damaged or was not written by this project."
+    invalid = f"{folder / CONFIG} is damaged or was not written by this project."
     try:
-        found = json.loads(read_text(folder / CONFIG))
-        valid = isinstance(found["config"], dict) and isinstance(found["sha256"], str)
+        description = json.loads(read_text(folder / CONFIG))
+        valid = isinstance(description["config"], dict) and isinstance(description["sha256"], str)
     except FileNotFoundError as error:
-        raise ValueError(f"{folder} holds no model: there is no {CONFIG}.") from error
+        raise ValueError(f"{folder} contains no model: {CONFIG} is missing.") from error
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ValueError(foreign) from error
+        raise ValueError(invalid) from error
     if not valid:
-        raise ValueError(foreign)
-    return found
+        raise ValueError(invalid)
+    return description
 
 
 def _config(folder: pathlib.Path, description: Mapping[str, Any]) -> Any:
     try:
         return backbone.find(description["backbone"]).from_dict(description["config"])
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{folder / CONFIG} describes no backbone of this version.") from error
+        raise ValueError(f"{folder / CONFIG} does not describe a supported backbone.") from error

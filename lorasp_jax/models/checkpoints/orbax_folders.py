@@ -1,4 +1,4 @@
-"""Folders of Orbax: what is checked before it opens one, and what it must not print."""
+"""Checks of a folder before Orbax opens it, and filters for the errors that Orbax repeats."""
 
 import asyncio
 import functools
@@ -12,54 +12,53 @@ from typing import Any
 from envs.datasets.files import TEXT_BYTES, RefusedError, check_memory, check_only_files
 
 MANIFEST = "manifest.ocdbt"
-"""Where TensorStore's database begins, in one or more folders; it is read at once."""
+"""Root of a TensorStore database, in one or more folders; it is read into memory whole."""
 
 
 def check(folder: Path) -> None:
-    """Raise unless a folder can be given to Orbax, whose C++ would wait or end this process.
+    """Raise if Orbax cannot open a folder safely; its C++ code could hang or end this process.
 
     Raises:
-        RefusedError: something in it is no file, or larger than what can be.
-        OSError: a link leads to nothing, or a file must not be read.
+        RefusedError: an entry is not a regular file or is too large.
+        OSError: a link is broken or a file is not readable.
     """
     check_only_files(folder)
     for path in folder.rglob("*"):
         size = path.stat().st_size
         check_memory(size, path)
         if path.name == MANIFEST and size > TEXT_BYTES:
-            raise RefusedError(f"{path} has {size} bytes; it may have {TEXT_BYTES}")
+            raise RefusedError(f"{path} must have at most {TEXT_BYTES} bytes, got {size}.")
 
 
-def leave_echoes_out() -> None:
-    """Of reads and writes that fail say nothing but what Orbax raises of the first.
+def suppress_repeated_errors() -> None:
+    """When Orbax reads or writes fail, report only the exception that Orbax raises.
 
-    Of the others Orbax logs a traceback each, asyncio one for each task that nobody waits for, and
-    Python prints what their threads and forgotten coroutines raise.
+    Otherwise Orbax logs a traceback for every other failed operation, asyncio logs one for every
+    task that is never awaited, and Python prints the errors of their threads and coroutines.
     """
     for name in ("absl", "asyncio"):
-        logging.getLogger(name).addFilter(_is_news)
-    _hook_echoes()
+        logging.getLogger(name).addFilter(_is_not_from_orbax)
+    _filter_unraisable_errors()
 
 
-def _is_news(record: logging.LogRecord) -> bool:
-    """Whether a log record says more than an exception will."""
-    return not (record.exc_info and _is_echo(record.exc_info[2]))
+def _is_not_from_orbax(record: logging.LogRecord) -> bool:
+    return not (record.exc_info and _is_from_orbax(record.exc_info[2]))
 
 
-@functools.cache  # once a process
-def _hook_echoes() -> None:
-    """Let echoes pass `sys.unraisablehook` unsaid."""
-    before = sys.unraisablehook
+@functools.cache  # install the hook once per process
+def _filter_unraisable_errors() -> None:
+    """Hide Orbax's errors from `sys.unraisablehook`."""
+    original = sys.unraisablehook
 
-    def hook(failed: Any) -> None:
-        if not _is_echo(failed.exc_traceback):
-            before(failed)
+    def hook(unraisable: Any) -> None:
+        if not _is_from_orbax(unraisable.exc_traceback):
+            original(unraisable)
 
     sys.unraisablehook = hook
 
 
-def _is_echo(raised: TracebackType | None) -> bool:
-    """Whether an exception comes from Orbax, or from a thread that finds its event loop closed."""
+def _is_from_orbax(raised: TracebackType | None) -> bool:
+    """Whether an exception comes from Orbax, or from a thread whose event loop was closed."""
     frames = traceback.extract_tb(raised)
     closed = bool(frames) and frames[0].filename == asyncio.base_events.__file__
     return closed or any("/orbax/" in frame.filename for frame in frames)

@@ -1,14 +1,14 @@
-"""Checkpoints as others publish them, in and out: openpi's Orbax folders, LeRobot's safetensors.
+"""Load and save published checkpoints: openpi's Orbax folders, LeRobot's safetensors.
 
-The package of a backbone has a module `weights` with
+Each backbone package provides a module `published_names`:
 
-    LAYOUTS              layout's name -> function of a config that gives its rules
-    canonical_name(name) of a LeRobot tensor, whichever version of the libraries wrote it
-    UNUSED               LeRobot's tensors that no computation reads
-    TIED                 of those, name -> the tensor it equals
+    LAYOUTS              layout name -> function (config) -> rules
+    lerobot_name(name)   version-independent name of a LeRobot tensor
+    UNUSED               LeRobot tensors that the model does not use
+    TIED                 unused tensor -> the tensor it is tied to
 
-Arrays are read one after the other and let go once they are in the model, so that loading takes
-little more host memory than the model itself.
+Arrays are read one at a time and released once copied, so loading takes little more host memory
+than the model itself.
 """
 
 import importlib
@@ -34,152 +34,154 @@ from lorasp_jax.models.checkpoints.native import base_arrays, by_path, named_arr
 from lorasp_jax.models.checkpoints.tensor_files import INDEX, SINGLE, TensorFiles, weight_files
 from lorasp_jax.models.pi0 import openpi_lora
 
-_DENSITY, _SMALL = 20, 2**30  # bytes of arrays in a byte of files; bytes that do no harm
-_READ_AHEAD = 1  # GB that Orbax reads at once, beside the result
-_PREFIX = "model."  # of all tensors in a LeRobot policy's file
-_STATISTIC = re.compile(r"(?:un)?normalize_(?:inputs|targets|outputs)\.")  # of older policies
-_COMPILED = "_orig_mod."  # what PyTorch puts before the names of a compiled module
+_MAX_COMPRESSION = 20  # bytes of arrays per byte of files
+_UNCHECKED_BYTES = 2**30  # arrays below this size may have any compression ratio
+_CONCURRENT_READS = 1  # GB that Orbax may hold in addition to the result
+_PREFIX = "model."  # prefix of every tensor in a LeRobot policy
+_STATISTIC = re.compile(r"(?:un)?normalize_(?:inputs|targets|outputs)\.")  # in older policies
+_COMPILED = "_orig_mod."  # prefix that torch.compile adds
 
 
 def load_published(folder: Path, config: Any) -> tuple[Any, list[str]]:
-    """A model from a folder in one of the published layouts, which is found out.
+    """Load a published checkpoint, detecting its layout.
 
     Args:
-        folder: openpi's, with `params` or the content of that; or LeRobot's, with safetensors.
-        config: sizes of the model, and the type to store its parameters in.
+        folder: openpi's folder or its subfolder `params`, or LeRobot's folder with safetensors.
+        config: model sizes and parameter dtype.
 
     Returns:
-        The model, with adapters if openpi trained LoRA; and the names of tensors in the files that
-        no computation reads: heads, and the statistics that LeRobot once kept there, which
-        `statistics_files` reads.
+        The model, with adapters if openpi trained LoRA; and the names of unused tensors: heads, and
+        the normalization statistics of older LeRobot versions (read by `statistics_files`).
 
     Raises:
-        ValueError: neither layout, or damaged files.
-        OtherModelError: leaves are missing, left over or of other shapes; a ValueError, too.
+        ValueError: unknown layout or damaged files.
+        ModelMismatchError: missing, unexpected or wrongly shaped leaves; a ValueError.
     """
-    weights = _weights(config)
-    layout, theirs = _open(folder, weights.canonical_name)
+    published_names = _published_names(config)
+    layout, theirs = _open(folder, published_names.lerobot_name)
     unused: list[str] = []
     if isinstance(theirs, TensorFiles):
-        for head, twin in weights.TIED.items():
-            if head in theirs and twin not in theirs:  # as older files have it
-                theirs.rename(head, twin)
-        unused = [n for n in theirs if n in weights.UNUSED or _STATISTIC.match(n)]
+        for head, embedding in published_names.TIED.items():
+            if head in theirs and embedding not in theirs:  # older files store only the head
+                theirs.rename(head, embedding)
+        unused = [n for n in theirs if n in published_names.UNUSED or _STATISTIC.match(n)]
         for name in unused:
             del theirs[name]
-    lora = openpi_lora.taken(theirs) if layout == "openpi" else {}
+    lora = openpi_lora.pop_lora(theirs) if layout == "openpi" else {}
     model = nnx.eval_shape(lambda: config.create(nnx.Rngs(0)))
     leaves = named_arrays(model)
 
-    def place(name: str, array: np.ndarray) -> jax.Array:
-        # Converted by numpy: JAX would hold a second copy, and return before it is gone.
+    def convert(name: str, array: np.ndarray) -> jax.Array:
+        # Cast with NumPy: JAX would hold a second copy and return before freeing it.
         return jnp.asarray(np.asarray(array, leaves[name].dtype))
 
-    rules = weights.LAYOUTS[layout](config)
+    rules = published_names.LAYOUTS[layout](config)
     shapes = {name: leaf.shape for name, leaf in leaves.items()}
-    arrays = layouts.read(rules, theirs, shapes, f"{folder} (layout {layout})", place)
+    arrays = layouts.read(rules, theirs, shapes, f"{folder} (layout {layout})", convert)
     model = set_arrays(model, arrays)
-    return openpi_lora.adapted(model, lora) if lora else model, unused
+    return openpi_lora.attach(model, lora) if lora else model, unused
 
 
 def save(folder: Path, model: Any, layout: str, dtypes: Mapping[str, Any] | None = None) -> None:
-    """Writes a model's parameters for openpi (`folder`/params) or LeRobot (model.safetensors).
+    """Save a model's parameters for openpi (`folder`/params) or LeRobot (model.safetensors).
 
     Args:
-        folder: made if absent; must not hold such a checkpoint yet.
+        folder: created if missing; must not already contain a checkpoint of this layout.
         model: a backbone without adapters.
         layout: "openpi" or "lerobot".
-        dtypes: type of each of their leaves, as `stored_dtypes` tells; None: the model's types.
+        dtypes: dtype of each saved leaf, from `stored_dtypes`; None keeps the model's dtypes.
 
     Raises:
-        ValueError: unknown layout, adapters or quantised kernels, parameters of other shapes than
-            the model's config says; or the folder is a URL, or holds such a checkpoint.
+        ValueError: unknown layout; adapters or quantized kernels; parameter shapes that do not
+            match the model's config; or the folder is a URL or already contains a checkpoint.
     """
     check_local(folder)
-    weights = _weights(model.config)
-    if layout not in weights.LAYOUTS:
-        raise ValueError(f"layout {layout!r} is not one of {', '.join(weights.LAYOUTS)}.")
+    published_names = _published_names(model.config)
+    if layout not in published_names.LAYOUTS:
+        choices = ", ".join(published_names.LAYOUTS)
+        raise ValueError(f"layout must be one of {choices}, got {layout!r}.")
     target = folder / ("params" if layout == "openpi" else SINGLE)
     if target.exists():
-        raise ValueError(f"{target} exists already: choose another folder.")
-    rules = weights.LAYOUTS[layout](model.config)
+        raise ValueError(f"{target} already exists: choose another folder.")
+    rules = published_names.LAYOUTS[layout](model.config)
     theirs = layouts.write(rules, base_arrays(model))
     if dtypes is not None:
         theirs = {name: array.astype(dtypes[name]) for name, array in theirs.items()}
     folder.mkdir(parents=True, exist_ok=True)
     if layout == "lerobot":
-        theirs |= {name: theirs[twin] for name, twin in weights.TIED.items()}
+        theirs |= {head: theirs[tied] for head, tied in published_names.TIED.items()}
         tensors = {_PREFIX + name: array for name, array in theirs.items()}
-        with replacing(target) as unfinished:
-            safetensors.numpy.save_file(tensors, unfinished)
+        with replacing(target) as temporary:
+            safetensors.numpy.save_file(tensors, temporary)
     else:
         tree = jax.tree.map(jnp.asarray, flax.traverse_util.unflatten_dict(theirs, sep="/"))
         ocp.PyTreeCheckpointer().save(target.absolute(), {"params": tree})
 
 
 def stored_dtypes(folder: Path, config: Any) -> dict[str, np.dtype]:
-    """Type of each leaf in a published folder, for `save`.
+    """The dtype of each leaf in a published checkpoint, for `save`.
 
     Raises:
         ValueError: as `load_published`.
     """
-    _, theirs = _open(folder, _weights(config).canonical_name)
+    _, theirs = _open(folder, _published_names(config).lerobot_name)
     return {name: theirs[name].dtype for name in theirs}
 
 
-def _weights(config: Any) -> ModuleType:
+def _published_names(config: Any) -> ModuleType:
     package = type(config).__module__.rpartition(".")[0]
-    return importlib.import_module(f"{package}.weights")
+    return importlib.import_module(f"{package}.published_names")
 
 
-def _open(
-    folder: Path, canonical_name: Callable[[str], str]
-) -> tuple[str, MutableMapping[str, Any]]:
-    """The layout of a folder and its leaves."""
-    if place := orbax_folder(folder):
-        return "openpi", _restored(place)
+def _open(folder: Path, lerobot_name: Callable[[str], str]) -> tuple[str, MutableMapping[str, Any]]:
+    """Return a folder's layout and its leaves by name."""
+    if params := orbax_folder(folder):
+        return "openpi", _restore(params)
     files = weight_files(folder)
     if not ((folder / INDEX).exists() or files[0].exists()):
         raise ValueError(
-            f"{folder} holds neither an Orbax checkpoint of openpi (params/_METADATA) nor "
-            f"safetensors of LeRobot ({SINGLE})."
+            f"{folder} contains neither an openpi Orbax checkpoint (params/_METADATA) nor "
+            f"LeRobot safetensors ({SINGLE})."
         )
 
     def rename(name: str) -> str:
-        return canonical_name(name.removeprefix(_PREFIX).removeprefix(_COMPILED))
+        return lerobot_name(name.removeprefix(_PREFIX).removeprefix(_COMPILED))
 
     return "lerobot", TensorFiles(files, rename)
 
 
 def orbax_folder(folder: Path) -> Path | None:
-    """Where in a folder openpi's leaves are; None: it is not openpi's."""
-    places = (folder / "params", folder)
-    return next((place for place in places if (place / "_METADATA").exists()), None)
+    """Return openpi's Orbax folder, or None if this is not an openpi checkpoint."""
+    candidates = (folder / "params", folder)
+    return next((path for path in candidates if (path / "_METADATA").exists()), None)
 
 
-def _restored(place: Path) -> dict[str, np.ndarray]:
-    """Leaves of an Orbax checkpoint by path below `params`, without a trailing "/value"."""
-    handler = ocp.PyTreeCheckpointHandler(restore_concurrent_gb=_READ_AHEAD)
+def _restore(folder: Path) -> dict[str, np.ndarray]:
+    """Read an Orbax checkpoint: leaves by path below `params`, without a trailing "/value"."""
+    handler = ocp.PyTreeCheckpointHandler(restore_concurrent_gb=_CONCURRENT_READS)
     checkpointer = ocp.Checkpointer(handler)
-    orbax_folders.leave_echoes_out()
+    orbax_folders.suppress_repeated_errors()
     try:
-        orbax_folders.check(place)
-        found: Any = checkpointer.metadata(place.absolute())
-        tree = found.item_metadata.tree
-        _check_size(place, tree)
+        orbax_folders.check(folder)
+        metadata: Any = checkpointer.metadata(folder.absolute())
+        tree = metadata.item_metadata.tree
+        _check_size(folder, tree)
         as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), tree)
-        restored = checkpointer.restore(place.absolute(), restore_args=as_numpy)
-    except Exception as error:  # Orbax and its C++ parts raise many kinds
-        raise ValueError(f"{place} is damaged or no Orbax checkpoint.") from error
+        restored = checkpointer.restore(folder.absolute(), restore_args=as_numpy)
+    except Exception as error:  # Orbax and its C++ layer raise many exception types
+        raise ValueError(f"{folder} is damaged or not an Orbax checkpoint.") from error
     return {
         name.removeprefix("params/").removesuffix("/value"): leaf
         for name, leaf in by_path(restored).items()
     }
 
 
-def _check_size(place: Path, tree: Any) -> None:
-    """Raise ValueError if the arrays are far larger than the files: they may be all zeros."""
-    claimed = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
-    there = sum(path.stat().st_size for path in place.rglob("*") if path.is_file())
-    if claimed > max(_SMALL, _DENSITY * there):
-        raise ValueError(f"{claimed} bytes of arrays cannot be in {there} bytes of files")
+def _check_size(folder: Path, tree: Any) -> None:
+    """Raise ValueError if the arrays are implausibly larger than the files.
+
+    Orbax reads missing chunks as zeros, so a small folder can declare arrays of any size.
+    """
+    array_bytes = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
+    file_bytes = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    if array_bytes > max(_UNCHECKED_BYTES, _MAX_COMPRESSION * file_bytes):
+        raise ValueError(f"files of {file_bytes} bytes cannot hold arrays of {array_bytes} bytes.")

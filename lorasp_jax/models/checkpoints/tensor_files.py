@@ -1,4 +1,4 @@
-"""Tensors in safetensors files, one or several with an index as Hugging Face cuts them."""
+"""Lazy access to safetensors: a single file, or shards with Hugging Face's index."""
 
 import json
 import math
@@ -16,71 +16,73 @@ SINGLE, INDEX = "model.safetensors", "model.safetensors.index.json"
 
 
 def weight_files(folder: Path) -> list[Path]:
-    """The one safetensors file of a folder, or the shards that its index lists.
+    """List the shards in a folder's index, or its single safetensors file if it has no index.
 
     Raises:
-        ValueError: the index is damaged, or names files elsewhere.
+        ValueError: the index is damaged or names files outside the folder.
     """
     index = folder / INDEX
     if not index.exists():
         return [folder / SINGLE]
     try:
-        where = json.loads(read_text(index))["weight_map"]
-        names = sorted(set(where.values()))
+        weight_map = json.loads(read_text(index))["weight_map"]
+        names = sorted(set(weight_map.values()))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{index} is damaged.") from error
     return [beside(index, name) for name in names]
 
 
 class TensorFiles(MutableMapping[str, np.ndarray]):
-    """Tensors by name, each read when asked for and kept by nobody here.
+    """Mapping from names to tensors. Each access reads the tensor from its file; none are cached.
 
     Args:
         files: from `weight_files`.
-        rename: the name to give a stored one.
+        rename: stored name -> name in this mapping.
 
     Raises:
-        ValueError: a file is missing, damaged or cut short, or a name is there twice.
+        ValueError: a file is missing, damaged or truncated, or two tensors get the same name.
     """
 
     def __init__(self, files: list[Path], rename: Callable[[str], str] = str) -> None:
-        self._found: dict[str, tuple[Any, str]] = {}
+        self._tensors: dict[str, tuple[Any, str]] = {}
         for path in files:
             try:
                 if path.exists() and not path.is_file():
-                    raise OSError("it is no file")
+                    raise OSError("not a regular file")
                 file = safetensors.safe_open(path, framework="np")
             except FileNotFoundError as error:
                 raise ValueError(f"{path.parent} lacks {path.name}.") from error
             except (OSError, safetensors.SafetensorError) as error:
-                raise ValueError(f"{path} is damaged or cut short.") from error
-            for name in file.keys():  # noqa: SIM118, which is no mapping
-                short = rename(name)
-                if short in self._found:
-                    other = self._found[short][1]
-                    raise ValueError(f"{path} has one tensor under two names, {other} and {name}.")
-                self._found[short] = file, name
+                raise ValueError(f"{path} is damaged or truncated.") from error
+            for stored in file.keys():  # noqa: SIM118, safe_open is not iterable
+                name = rename(stored)
+                if name in self._tensors:
+                    other = self._tensors[name][1]
+                    raise ValueError(
+                        f"{path} has the same tensor under two names, {other} and {stored}."
+                    )
+                self._tensors[name] = file, stored
 
     def rename(self, old: str, new: str) -> None:
-        """Lets a tensor be found under another name."""
-        self._found[new] = self._found.pop(old)
+        """Rename a tensor in this mapping; the file stays unchanged."""
+        self._tensors[new] = self._tensors.pop(old)
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """The tensor; raises a ValueError for one beyond this machine's memory."""
-        file, stored = self._found[name]
-        part = file.get_slice(stored)
-        bits = re.search(r"\d+", part.get_dtype())  # "BF16", "F8_E4M3", "BOOL"
-        check_memory(math.prod(part.get_shape()) * (int(bits[0]) if bits else 8) // 8, name)
+        """Read a tensor; raise ValueError if it does not fit into this machine's memory."""
+        file, stored = self._tensors[name]
+        tensor = file.get_slice(stored)
+        bits = re.search(r"\d+", tensor.get_dtype())  # "BF16", "F8_E4M3", "BOOL"
+        check_memory(math.prod(tensor.get_shape()) * (int(bits[0]) if bits else 8) // 8, name)
         return file.get_tensor(stored)
 
     def __delitem__(self, name: str) -> None:
-        del self._found[name]
+        del self._tensors[name]
 
     def __setitem__(self, name: str, array: np.ndarray) -> None:
-        raise TypeError("files are only read")
+        raise TypeError("TensorFiles is read-only")
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._found)
+        return iter(self._tensors)
 
     def __len__(self) -> int:
-        return len(self._found)
+        return len(self._tensors)

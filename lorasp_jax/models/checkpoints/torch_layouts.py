@@ -1,6 +1,6 @@
-"""Rules for what PyTorch's policies are made of, under the names that transformers gives.
+"""Layout rules for the building blocks of PyTorch policies, named as in Hugging Face Transformers.
 
-PyTorch keeps a linear map as [O, I] and every layer for itself; ours are [I, O], a stack of them.
+PyTorch stores a linear layer as [O, I], one array per layer; ours are stacks [L, I, O].
 """
 
 from collections.abc import Iterable, Sequence
@@ -15,11 +15,11 @@ PROJECTIONS = (
     "action_time_mlp_out",
     "action_out_proj",
 )
-"""Linear maps around the towers of pi0 and SmolVLA, under one name everywhere."""
+"""Projections outside the towers of pi0 and SmolVLA; every layout uses these names."""
 
 
 def linear(ours: str, theirs: str) -> list[Rule]:
-    """A linear map with a bias."""
+    """Rules for a linear layer with a bias."""
     return [
         transposed(f"{ours}/kernel", f"{theirs}.weight"),
         copied(f"{ours}/bias", f"{theirs}.bias"),
@@ -27,7 +27,7 @@ def linear(ours: str, theirs: str) -> list[Rule]:
 
 
 def siglip(theirs: str, size: VisionConfig) -> list[Rule]:
-    """The tower "vision" without its head."""
+    """Rules for our `vision` tower without its head."""
     patches, norm = f"{theirs}.embeddings.patch_embedding", f"{theirs}.post_layernorm"
     rules = [
         _patches("vision/patch_embed/kernel", f"{patches}.weight", size),
@@ -46,22 +46,25 @@ def siglip(theirs: str, size: VisionConfig) -> list[Rule]:
 
 
 def decoder(ours: str, theirs: str, layers: Iterable[int], *, adaptive: bool = False) -> list[Rule]:
-    """Some layers of a Llama or Gemma as our stack `ours`, perhaps with pi0.5's adaptive norms."""
+    """Rules that stack some layers of a Llama or Gemma as `ours`.
+
+    adaptive: the norms are pi0.5's adaptive ones.
+    """
     paths = [f"{theirs}.layers.{i}" for i in layers]
     attention = (f"self_attn.{name}_proj" for name in "qkvo")
     kernels = (*attention, "mlp.gate_proj", "mlp.up_proj", "mlp.down_proj")
     rules = [_weights(ours, paths, name) for name in kernels]
     for name in ("input_layernorm", "post_attention_layernorm"):
         if adaptive:
-            inside = [f"{path}.{name}" for path in paths]
-            rules += [each(f"{ours}/{name}", inside, "dense") for each in (_weights, _biases)]
+            norms = [f"{path}.{name}" for path in paths]
+            rules += [rule(f"{ours}/{name}", norms, "dense") for rule in (_weights, _biases)]
         else:
             rules.append(_scales(ours, paths, name))
     return rules
 
 
 def _patches(ours: str, theirs: str, size: VisionConfig) -> Rule:
-    """`[O, rgb, y, x]`, ours `[y x rgb, O]`."""
+    """The patch embedding: their convolution `[O, rgb, y, x]`, our matrix `[y x rgb, O]`."""
     patch = size.patch
     return Rule(
         (ours,),
@@ -74,16 +77,18 @@ def _patches(ours: str, theirs: str, size: VisionConfig) -> Rule:
 
 def _weights(ours: str, layers: Sequence[str], name: str) -> Rule:
     names = [f"{layer}.{name}.weight" for layer in layers]
-    return stacked(f"{ours}/{_last(name)}/kernel", names, transpose=True)
+    return stacked(f"{ours}/{_basename(name)}/kernel", names, transpose=True)
 
 
 def _biases(ours: str, layers: Sequence[str], name: str) -> Rule:
-    return stacked(f"{ours}/{_last(name)}/bias", [f"{layer}.{name}.bias" for layer in layers])
+    return stacked(f"{ours}/{_basename(name)}/bias", [f"{layer}.{name}.bias" for layer in layers])
 
 
 def _scales(ours: str, layers: Sequence[str], name: str) -> Rule:
-    return stacked(f"{ours}/{_last(name)}/scale", [f"{layer}.{name}.weight" for layer in layers])
+    return stacked(
+        f"{ours}/{_basename(name)}/scale", [f"{layer}.{name}.weight" for layer in layers]
+    )
 
 
-def _last(name: str) -> str:
+def _basename(name: str) -> str:
     return name.rpartition(".")[2]

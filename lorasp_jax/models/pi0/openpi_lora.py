@@ -1,14 +1,14 @@
-"""LoRA as openpi trains and stores it, as adapters of our layers that compute the same.
+"""Convert openpi's LoRA weights to equivalent adapters of our layers.
 
 openpi has two matrices for each einsum kernel, with the kernel's head axes (its models/lora.py).
 W is a kernel, A and B its `lora_a` and `lora_b`, n a head, s = alpha / rank, or alpha / √rank:
 
     q_einsum, kv_einsum    [N, D, H]    ΔW[n] = s A[n] B[n], one pair for each head
-    attn_vec_einsum        [N, H, D]    ΔW[n] = s A[n] Σ_m B[m]: the heads are summed in between
-    gating_einsum, linear               ΔW = A B, whatever alpha is
+    attn_vec_einsum        [N, H, D]    ΔW[n] = s A[n] Σ_m B[m]: summed over heads before B
+    gating_einsum, linear               ΔW = A B, independent of alpha
 
-As one matrix the first is a LoRA of rank N r whose B is block-diagonal, the second one of rank r.
-Both are exact; under further training the zeros between the blocks fill like any other number.
+With a pair of rank r, the first is one LoRA of rank N r with a block-diagonal B, the second one of
+rank r. Both are exact. Further training also updates the zeros outside the blocks.
 """
 
 from collections.abc import Mapping, MutableMapping
@@ -19,65 +19,66 @@ import numpy as np
 from flax import nnx
 
 from lorasp_jax.dense import AdapterParam
-from lorasp_jax.models.checkpoints.layouts import OtherModelError
+from lorasp_jax.models.checkpoints.layouts import ModelMismatchError
 from lorasp_jax.models.config import ExpertConfig
 from lorasp_jax.peft import LoRA
 
 _LAYERS = "PaliGemma/llm/layers"
 _TOWERS = {"language": "", "action": "_1"}
+_ATTENTION = ("q_proj", "k_proj", "v_proj", "o_proj")
 Pair = tuple[np.ndarray, np.ndarray]
 """A [L, I, R] and B [L, R, O]."""
 
 
-def taken(leaves: MutableMapping[str, Any]) -> dict[str, Any]:
-    """openpi's leaves that belong to LoRA, by path; taken out of `leaves`."""
+def pop_lora(leaves: MutableMapping[str, Any]) -> dict[str, Any]:
+    """Remove openpi's LoRA leaves from `leaves` and return them, by path."""
     names = [name for name in leaves if name.endswith(("lora_a", "lora_b"))]
     return {name: leaves.pop(name) for name in names}
 
 
-def adapted(model: Any, leaves: Mapping[str, np.ndarray], *, scale: float = 1.0) -> Any:
-    """A pi0 with openpi's LoRA as its adapters.
+def attach(model: Any, leaves: Mapping[str, np.ndarray], *, scale: float = 1.0) -> Any:
+    """Attach openpi's LoRA to a pi0 as adapters.
 
     Args:
-        model: left untouched; the result shares its arrays.
-        leaves: openpi's arrays by "/"-joined path below `params`, those of `taken`, for one expert
-            or both.
-        scale: openpi's alpha / rank of the attention, alpha / √rank under its `rslora`; checkpoints
-            do not hold it. Its own variants have 1.
+        model: not modified; the result shares its arrays.
+        leaves: openpi's LoRA arrays by "/"-joined path below `params`, from `pop_lora`, for one
+            expert or both.
+        scale: openpi's alpha / rank of the attention layers, or alpha / √rank with its `rslora`.
+            Checkpoints do not store it; openpi's own variants use 1.
 
     Raises:
-        ValueError: a leaf is missing, left over or does not fit the model.
+        ValueError: a leaf is missing, unexpected or does not fit the model.
     """
-    pairs, left = {}, dict(leaves)
+    if not leaves:
+        raise ValueError("openpi's LoRA must have at least one leaf, got none.")
+    pairs, remaining = {}, dict(leaves)
     for tower, suffix in _TOWERS.items():
         if any(f"einsum{suffix}/lora_" in name for name in leaves):
-            pairs |= _expert(left, getattr(model.config, tower), f"{tower}/blocks", suffix)
-    if left or not pairs:
-        raise ValueError(f"openpi's LoRA has no leaves {', '.join(sorted(left)[:8]) or 'at all'}.")
+            pairs |= _expert_pairs(
+                remaining, getattr(model.config, tower), f"{tower}/blocks", suffix
+            )
+    if remaining:
+        raise ValueError(f"openpi's LoRA has unexpected {', '.join(sorted(remaining)[:8])}.")
     model = nnx.clone(model)
     for path, (a, b) in pairs.items():
         tower, _, name = path.split("/")
         layer = getattr(getattr(model, tower).blocks, name)
         rank = a.shape[-1]
-        layer.method = LoRA(rank, alpha=rank * (scale if _attends(name) else 1.0))
+        layer.method = LoRA(rank, alpha=rank * (scale if name in _ATTENTION else 1.0))
         values = {"lora_a": jnp.asarray(a, jnp.float32), "lora_b": jnp.asarray(b, jnp.float32)}
         layer.adapter = AdapterParam(values)
     return model
 
 
-def _attends(name: str) -> bool:
-    return name in ("q_proj", "k_proj", "v_proj", "o_proj")
-
-
-def _expert(
-    left: dict[str, np.ndarray], size: ExpertConfig, ours: str, suffix: str
+def _expert_pairs(
+    leaves: dict[str, np.ndarray], size: ExpertConfig, ours: str, suffix: str
 ) -> dict[str, Pair]:
-    """Pairs by path of our layer; takes what they are made of out of `left`."""
+    """Convert one expert's leaves, popping them: (A, B) by path of our layer."""
     layers, width, mlp = size.depth, size.width, size.mlp
     heads, kv_heads, head_dim = size.heads, size.kv_heads, size.head_dim
 
     def pair(name: str, *kernel: int) -> Pair:
-        return _pair(left, f"{_LAYERS}/{name}", (layers, *kernel))
+        return _pop_pair(leaves, f"{_LAYERS}/{name}", (layers, *kernel))
 
     q = pair(f"attn/q_einsum{suffix}/", heads, width, head_dim)
     keys_values = pair(f"attn/kv_einsum{suffix}/", 2, kv_heads, width, head_dim)
@@ -89,32 +90,32 @@ def _expert(
         f"{ours}/q_proj": _per_head(*q),
         f"{ours}/k_proj": _per_head(*k),
         f"{ours}/v_proj": _per_head(*v),
-        f"{ours}/o_proj": _summed(*out),
+        f"{ours}/o_proj": _sum_heads(*out),
         f"{ours}/gate_proj": gate,
         f"{ours}/up_proj": up,
         f"{ours}/down_proj": down,
     }
 
 
-def _pair(left: dict[str, np.ndarray], name: str, kernel: tuple[int, ...]) -> Pair:
-    """A [..., I, R] and B [..., R, O] of a kernel [..., I, O], taken out of `left`."""
-    names = f"{name}lora_a", f"{name}lora_b"
-    for each in names:
-        if each not in left:
-            raise ValueError(f"openpi's LoRA lacks {each}.")
-    a, b = (left.pop(each) for each in names)
+def _pop_pair(leaves: dict[str, np.ndarray], prefix: str, kernel: tuple[int, ...]) -> Pair:
+    """Pop A [..., I, R] and B [..., R, O] of a kernel [..., I, O] from `leaves`."""
+    names = f"{prefix}lora_a", f"{prefix}lora_b"
+    for name in names:
+        if name not in leaves:
+            raise ValueError(f"openpi's LoRA lacks {name}.")
+    a, b = (leaves.pop(name) for name in names)
     *outer, d_in, d_out = kernel
     rank = a.shape[-1] if a.ndim else 0
     if (a.shape, b.shape) != ((*outer, d_in, rank), (*outer, rank, d_out)):
-        raise OtherModelError(
-            f"openpi's LoRA has {names[0]} and lora_b of shapes {a.shape} and {b.shape}, "
-            f"but the model's kernel is {kernel}."
+        raise ModelMismatchError(
+            f"{names[0]} and lora_b have shapes {a.shape} and {b.shape}, "
+            f"which do not match the model's kernel {kernel}."
         )
     return a, b
 
 
 def _per_head(a: np.ndarray, b: np.ndarray) -> Pair:
-    """A [L, N, D, r], B [L, N, r, H] -> [L, D, N r] and the block-diagonal [L, N r, N H]."""
+    """A [L, N, D, r], B [L, N, r, H] -> A [L, D, N r], block-diagonal B [L, N r, N H]."""
     layers, heads, width, rank = a.shape
     blocks = np.zeros((layers, heads, rank, heads, b.shape[-1]), b.dtype)
     for n in range(heads):
@@ -122,6 +123,6 @@ def _per_head(a: np.ndarray, b: np.ndarray) -> Pair:
     return a.swapaxes(1, 2).reshape(layers, width, -1), blocks.reshape(layers, heads * rank, -1)
 
 
-def _summed(a: np.ndarray, b: np.ndarray) -> Pair:
-    """A [L, N, H, r], B [L, N, r, D] -> [L, N H, r] and [L, r, D]."""
+def _sum_heads(a: np.ndarray, b: np.ndarray) -> Pair:
+    """A [L, N, H, r], B [L, N, r, D] -> A [L, N H, r], B [L, r, D]."""
     return a.reshape(len(a), -1, a.shape[-1]), b.sum(axis=1)

@@ -121,7 +121,7 @@ class ActionExpert(nnx.Module):
             valid,
             odd,
             remat=self.config.remat,
-            unroll=self.config.straight_line,
+            unroll=self.config.unroll_layers,
         )
         return even, cross, under("cross_layer", aux)
 
@@ -165,6 +165,6 @@ class ActionExpert(nnx.Module):
             x.astype(self.config.dtype),
             (cache, cross),
             remat=self.config.remat,
-            unroll=self.config.straight_line,
+            unroll=self.config.unroll_layers,
         )
         return self.norm(x), aux

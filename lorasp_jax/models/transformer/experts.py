@@ -182,7 +182,7 @@ class Expert(nnx.Module):
             x.astype(self.config.dtype),
             cache,
             remat=self.config.remat,
-            unroll=self.config.straight_line,
+            unroll=self.config.unroll_layers,
         )
         x, _, norm_aux = self.norm.conditioned(x, condition)
         return x, own, aux | under("norm", norm_aux)

@@ -94,7 +94,7 @@ class SigLIP(nnx.Module):
             lambda block, x, _: block(x, mask),
             x.astype(self.config.dtype),
             remat=self.config.remat,
-            unroll=self.config.straight_line,
+            unroll=self.config.unroll_layers,
         )
         side = self.config.image_size // self.config.vision.patch
         norm = self.norm if self.config.remat == "none" else jax.checkpoint(self.norm)

@@ -3,7 +3,7 @@ import json
 
 import pytest
 
-from lorasp_jax.models.checkpoints.lerobot_config import config_of
+from lorasp_jax.models.checkpoints.lerobot_config import parse
 from lorasp_jax.models.inputs import LEROBOT, LEROBOT_CENTRED, LEROBOT_PI05
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.smolvla import SmolVLAConfig
@@ -33,12 +33,12 @@ SMOLVLA = {
 
 
 def test_published_fields_are_the_published_sizes():
-    assert config_of(SMOLVLA) == SmolVLAConfig.base()
-    assert config_of({"type": "smolvla"}) == SmolVLAConfig.base()
+    assert parse(SMOLVLA) == SmolVLAConfig.base()
+    assert parse({"type": "smolvla"}) == SmolVLAConfig.base()
     expected = dataclasses.replace(Pi0Config.base(), inputs=LEROBOT_CENTRED)
-    assert config_of({"type": "pi0", "image_resolution": [224, 224]}) == expected
+    assert parse({"type": "pi0", "image_resolution": [224, 224]}) == expected
     expected = dataclasses.replace(Pi0Config.base_pi05(), inputs=LEROBOT_PI05)
-    assert config_of({"type": "pi05", "tokenizer_max_length": 200}) == expected
+    assert parse({"type": "pi05", "tokenizer_max_length": 200}) == expected
     assert (expected.inputs.state, expected.inputs.action) == ("quantiles", "quantiles")
 
 
@@ -47,7 +47,7 @@ def test_what_differs_is_read():
         "observation.images.top": {"type": "VISUAL"},
         "observation.image": {"type": "VISUAL"},
     }
-    found = config_of(
+    found = parse(
         SMOLVLA
         | {
             "chunk_size": 10,
@@ -68,7 +68,7 @@ def test_what_differs_is_read():
     assert (found.language.width, found.action.width, found.action.mlp) == (960, 480, 1280)
     assert found.cameras == ("top", "image", "empty_camera_0")
     assert found.inputs == dataclasses.replace(LEROBOT, state="quantile10", action="min_max")
-    large = config_of({"type": "pi0", "action_expert_variant": "gemma_2b"})
+    large = parse({"type": "pi0", "action_expert_variant": "gemma_2b"})
     assert large.action == large.language
 
 
@@ -85,28 +85,34 @@ def test_relative_actions(names, kept, relative):
     """Names that hold an excluded word are absolute; without names nothing is."""
     fields = {"type": "pi0", "output_features": {"action": {"type": "ACTION", "shape": [3]}}}
     fields |= {"use_relative_actions": True, "action_feature_names": names, **kept}
-    config = config_of(fields)
+    config = parse(fields)
     assert config.inputs.delta == relative
-    assert config_of(fields | {"use_relative_actions": False}).inputs.delta == ()
+    assert parse(fields | {"use_relative_actions": False}).inputs.delta == ()
     assert Pi0Config.from_dict(json.loads(json.dumps(dataclasses.asdict(config)))) == config
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"type": "act"}, "of type 'act' is not one of pi0, pi05, smolvla"),
-        ({"attention_mode": "self_attn"}, "attention_mode must be 'cross_attn' here"),
-        ({"max_state_dim": 7}, "state and action must have one length"),
-        ({"resize_imgs_with_padding": [512, 256]}, "pictures be square"),
-        ({"resize_imgs_with_padding": None}, "pictures be square"),
-        ({"normalization_mapping": {"STATE": "QUANTILE5"}}, "'QUANTILE5' is not one of MEAN_STD"),
-        ({"use_relative_actions": True}, "not as LeRobot writes it"),
-        ({"normalization_mapping": {"VISUAL": "MEAN_STD"}}, "pictures are not normalised here"),
-        ({"type": "pi05", "use_visual_memory": True}, "use_visual_memory must be False here"),
+        ({"type": "act"}, "type must be one of pi0, pi05, smolvla, got 'act'"),
+        ({"attention_mode": "self_attn"}, "attention_mode must be 'cross_attn', got"),
+        ({"max_state_dim": 7}, "max_state_dim and max_action_dim must be equal"),
+        ({"resize_imgs_with_padding": [512, 256]}, "images square, got"),
+        ({"resize_imgs_with_padding": None}, "images square, got"),
+        (
+            {"normalization_mapping": {"STATE": "QUANTILE5"}},
+            "normalization must be one of MEAN_STD, .*, got 'QUANTILE5'",
+        ),
+        ({"use_relative_actions": True}, "not a LeRobot policy config"),
+        (
+            {"normalization_mapping": {"VISUAL": "MEAN_STD"}},
+            "VISUAL must be 'IDENTITY' in normalization_mapping",
+        ),
+        ({"type": "pi05", "use_visual_memory": True}, "use_visual_memory must be False, got True"),
         ({"num_expert_layers": 8}, "must be that of the language model, 16"),
-        ({"input_features": [1]}, "not as LeRobot writes it"),
+        ({"input_features": [1]}, "not a LeRobot policy config"),
     ],
 )
 def test_what_no_config_says_raises(change, message):
     with pytest.raises(ValueError, match=message):
-        config_of(SMOLVLA | change)
+        parse(SMOLVLA | change)

@@ -60,7 +60,7 @@ def test_hash_knows_the_base_and_not_its_adapters(folder, model):
     for has_adapters in (adapted, lorasp_jax.combine({"own": adapted})):
         with pytest.raises(ValueError, match="without adapters"):
             models.save(folder, has_adapters)
-    with pytest.raises(ValueError, match="save a base before quantising it"):
+    with pytest.raises(ValueError, match="save the base before quantizing"):
         models.save(folder, lorasp_jax.quantize(loaded, [("state_proj", "int8")]).model)
     with pytest.raises(ValueError, match="gs:/bucket/base is a URL"):
         models.save("gs://bucket/base", loaded)
@@ -85,7 +85,7 @@ def test_shards_stay_under_their_limit(tmp_path, model, monkeypatch):
 
 def test_other_sizes_raise(folder):
     other = dataclasses.replace(CONFIG, image_size=64)
-    with pytest.raises(ValueError, match=r"does not fit the model: image_size is 32, not 64\.$"):
+    with pytest.raises(ValueError, match=r"does not match the config: image_size is 32, not 64\.$"):
         models.load(folder, other)
 
 
@@ -95,18 +95,18 @@ def edit(folder, **change):
 
 
 def test_damaged_and_foreign_folders_raise(folder):
-    with pytest.raises(ValueError, match=r"holds no model: there is no config\.json"):
+    with pytest.raises(ValueError, match=r"contains no model: config\.json is missing"):
         native.load_native(folder / "nothing")
     sizes = json.loads((folder / "config.json").read_text())["config"]
     edit(folder, config={**sizes, "vocabulary": 7})
-    with pytest.raises(ValueError, match="weights and sizes lack the hash"):
+    with pytest.raises(ValueError, match="weights and sizes do not match the hash"):
         models.load(folder)
     edit(folder, config=sizes, sha256="0" * 64)
-    with pytest.raises(ValueError, match="weights and sizes lack the hash"):
+    with pytest.raises(ValueError, match="weights and sizes do not match the hash"):
         models.load(folder)
     for change in ({"backbone": "no_such"}, {"config": {"vision": {}}}):
         edit(folder, **{"config": sizes, "backbone": "pi0", **change})
-        with pytest.raises(ValueError, match="describes no backbone of this version"):
+        with pytest.raises(ValueError, match="does not describe a supported backbone"):
             models.load(folder)
     (folder / "config.json").write_text('{"architectures": []}')
     with pytest.raises(ValueError, match="was not written by this project"):
@@ -116,7 +116,7 @@ def test_damaged_and_foreign_folders_raise(folder):
 def test_a_file_cut_short_raises(folder):
     path = folder / "model.safetensors"
     path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(ValueError, match=r"model\.safetensors is damaged or cut short"):
+    with pytest.raises(ValueError, match=r"model\.safetensors is damaged or truncated"):
         models.load(folder)
 
 

@@ -15,7 +15,7 @@ import safetensors.numpy
 
 from lorasp_jax.models.checkpoints import published
 from lorasp_jax.models.checkpoints.native import named_arrays
-from lorasp_jax.models.pi0 import Pi0Config, weights
+from lorasp_jax.models.pi0 import Pi0Config, published_names
 from tests.models.test_pi0_parity import CONFIG, GOLDEN
 
 OPENPI = GOLDEN / "orbax"
@@ -109,10 +109,10 @@ def test_lerobot_has_the_documented_tensors(tensors, leaves):
 
 
 def test_lerobot_of_the_published_size():
-    rules = weights.lerobot_layout(Pi0Config.base())
-    names = {name for rule in rules for name in rule.theirs} | set(weights.UNUSED)
+    rules = published_names.lerobot_layout(Pi0Config.base())
+    names = {name for rule in rules for name in rule.theirs} | set(published_names.UNUSED)
     assert len(names) == 778
-    assert all(weights.canonical_name(name) == name for name in names)
+    assert all(published_names.lerobot_name(name) == name for name in names)
 
 
 def test_lerobot_there_and_back(model, tensors, tmp_path):
@@ -162,24 +162,24 @@ def test_lerobot_of_older_versions(model, tensors, tmp_path):
 
 def test_what_does_not_fit_is_named(model, tensors, tmp_path):
     lora = {**tensors, "model.extra.lora_A.weight": np.zeros((2, 2), np.float32)}
-    with pytest.raises(ValueError, match=r"has, beyond this model, extra\.lora_A\.weight"):
+    with pytest.raises(ValueError, match=r"has unexpected extra\.lora_A\.weight"):
         published.load_published(write(tmp_path / "more", lora), CONFIG)
     less = {name: a for name, a in tensors.items() if "layers.1.mlp.up_proj" not in name}
     with pytest.raises(ValueError, match=r"lacks .*layers\.1\.mlp\.up_proj\.weight"):
         published.load_published(write(tmp_path / "less", less), CONFIG)
     other = dataclasses.replace(CONFIG, action_dim=7)
     with pytest.raises(
-        ValueError, match=r"has state_proj/kernel of shape \(32, 64\), the model needs \(7, 64\)"
+        ValueError, match=r"state_proj/kernel of .* must have shape \(7, 64\), got \(32, 64\)"
     ):
         published.load_published(OPENPI, other)
     twice = {**tensors, "state_proj.bias": np.zeros(64, np.float32)}
-    with pytest.raises(ValueError, match="one tensor under two names"):
+    with pytest.raises(ValueError, match="the same tensor under two names"):
         published.load_published(write(tmp_path / "twice", twice), CONFIG)
-    with pytest.raises(ValueError, match="neither an Orbax checkpoint"):
+    with pytest.raises(ValueError, match="neither an openpi Orbax checkpoint"):
         published.load_published(tmp_path, CONFIG)
-    with pytest.raises(ValueError, match="exists already"):
+    with pytest.raises(ValueError, match="already exists"):
         published.save(tmp_path / "more", model, "lerobot")
-    with pytest.raises(ValueError, match="layout 'torch' is not one of openpi, lerobot"):
+    with pytest.raises(ValueError, match="layout must be one of openpi, lerobot, got 'torch'"):
         published.save(tmp_path / "new", model, "torch")
     with pytest.raises(ValueError, match="gs:/bucket/base is a URL"):
         published.save(Path("gs://bucket/base"), model, "openpi")

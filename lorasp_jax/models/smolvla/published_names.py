@@ -1,4 +1,4 @@
-"""The layout in which SmolVLA's parameters are published, LeRobot's (its policies/smolvla)."""
+"""Names and shapes of SmolVLA's parameters as LeRobot publishes them (its policies/smolvla)."""
 
 import re
 
@@ -7,7 +7,7 @@ from lorasp_jax.models.checkpoints.torch_layouts import PROJECTIONS, decoder, li
 from lorasp_jax.models.smolvla.smolvla import SmolVLAConfig
 
 UNUSED: tuple[str, ...] = ()
-"""The language model's head stays, as LeRobot trains and saves it."""
+"""Empty: the language model's head is loaded, because LeRobot trains and saves it."""
 TIED: dict[str, str] = {}
 
 _VLM = "vlm_with_expert.vlm"
@@ -16,14 +16,14 @@ _EXPERT = "vlm_with_expert.lm_expert"
 _ROOT = re.compile(r"(?:^|\.)((?:vlm_with_expert|state_proj|action_\w+)\..*)")
 
 
-def canonical_name(name: str) -> str:
-    """The name from its first known part on (LeRobot 0.4.4 to 0.6.1)."""
-    found = _ROOT.search(name)
-    return found[1] if found else name
+def lerobot_name(name: str) -> str:
+    """Strip the version-dependent prefix from a LeRobot tensor name (LeRobot 0.4.4 to 0.6.1)."""
+    match = _ROOT.search(name)
+    return match[1] if match else name
 
 
 def lerobot_layout(config: SmolVLAConfig) -> list[Rule]:
-    """LeRobot's tensors by name without the leading "model."."""
+    """Rules for LeRobot's tensors, named without the leading "model."."""
     connector = f"{_VLM}.model.connector.modality_projection.proj"
     depth = config.action.depth
     rules = [
@@ -43,4 +43,4 @@ def lerobot_layout(config: SmolVLAConfig) -> list[Rule]:
 
 
 LAYOUTS = {"lerobot": lerobot_layout}
-"""Function of a config that gives the rules, by the layout's name."""
+"""Layout name -> function (config) -> rules."""

@@ -1,8 +1,8 @@
-"""The layouts in which pi0's parameters are published: openpi's and LeRobot's.
+"""Names and shapes of pi0's parameters as openpi and LeRobot publish them.
 
-openpi keeps one einsum kernel for several linear maps (keys and values, gate and up) and separate
-head axes. LeRobot has PyTorch's transposed matrices, layer by layer. Ours are matrices under the
-names of Hugging Face, stacked over layers.
+openpi fuses several projections into one einsum kernel (keys and values, gate and up) and keeps
+separate head axes. LeRobot stores PyTorch's transposed matrices, one per layer. This project stores
+matrices [I, O] under Hugging Face's names, stacked over layers.
 """
 
 import numpy as np
@@ -19,13 +19,13 @@ _VISION = f"{_PALIGEMMA}.model.vision_tower.vision_model"
 _LANGUAGE = f"{_PALIGEMMA}.model.language_model"
 _PROJECTIONS05 = ("action_in_proj", "time_mlp_in", "time_mlp_out", "action_out_proj")
 UNUSED = (f"{_PALIGEMMA}.lm_head.weight", f"{_EXPERT}.lm_head.weight")
-"""LeRobot's heads, which no computation reads."""
+"""LeRobot's language-model heads, which the model does not use."""
 TIED = {UNUSED[0]: f"{_LANGUAGE}.embed_tokens.weight"}
-"""Of those, what is another tensor once more."""
+"""Unused tensor -> the tensor it is tied to."""
 
 
 def openpi_layout(config: Pi0Config) -> list[Rule]:
-    """openpi's leaves by "/"-joined path below `params` (models/pi0.py, gemma.py, siglip.py)."""
+    """Rules for openpi's "/"-joined paths below `params` (models/pi0.py, gemma.py, siglip.py)."""
     rules = [
         *_openpi_vision(config),
         copied("language/embedding", f"{_LLM}/embedder/input_embedding"),
@@ -45,13 +45,13 @@ def _openpi_vision(config: Pi0Config) -> list[Rule]:
     block, ours = f"{_IMG}/Transformer/encoderblock", "vision/blocks"
     attention = f"{block}/MultiHeadDotProductAttention_0"
     embedding, matrix = (patch, patch, 3, width), (layers, width, width)
-    pixels, places = patch * patch * 3, (config.patches, width)
+    pixels, positions = patch * patch * 3, (config.patches, width)
     rules = [
         reshaped(
             "vision/patch_embed/kernel", f"{_IMG}/embedding/kernel", (pixels, width), embedding
         ),
         copied("vision/patch_embed/bias", f"{_IMG}/embedding/bias"),
-        reshaped("vision/position_embedding", f"{_IMG}/pos_embedding", places, (1, *places)),
+        reshaped("vision/position_embedding", f"{_IMG}/pos_embedding", positions, (1, *positions)),
         reshaped(
             f"{ours}/out_proj/kernel", f"{attention}/out/kernel", matrix, (layers, *heads, width)
         ),
@@ -80,7 +80,7 @@ def _openpi_vision(config: Pi0Config) -> list[Rule]:
 
 
 def _openpi_expert(tower: str, size: ExpertConfig, suffix: str) -> list[Rule]:
-    """One expert; openpi marks the action expert's leaves with "_1"."""
+    """Rules for one expert's projections; openpi's action expert has the suffix "_1"."""
     layers, ours = f"{_LLM}/layers", f"{tower}/blocks"
     depth, width, heads, kv_heads = size.depth, size.width, size.heads, size.kv_heads
     inner = heads * size.head_dim
@@ -89,7 +89,7 @@ def _openpi_expert(tower: str, size: ExpertConfig, suffix: str) -> list[Rule]:
         return f"{ours}/{name}/kernel"
 
     return [
-        # [L, N, D, H]; keys and values [L, 2, K, D, H]; gate and up [L, 2, D, F].
+        # q: [L, N, D, H]; k and v: [L, 2, K, D, H]; gate and up: [L, 2, D, F].
         Rule(
             (kernel("q_proj"),),
             (f"{layers}/attn/q_einsum{suffix}/w",),
@@ -122,7 +122,7 @@ def _openpi_expert(tower: str, size: ExpertConfig, suffix: str) -> list[Rule]:
 
 
 def _openpi_norms(tower: str, suffix: str, *, adaptive: bool) -> list[Rule]:
-    """Norms of one expert; pi0.5's for actions have a dense layer each and no scale."""
+    """Rules for one expert's norms; an adaptive norm has a dense layer instead of a scale."""
     names = {
         f"{tower}/blocks/input_layernorm": f"{_LLM}/layers/pre_attention_norm{suffix}",
         f"{tower}/blocks/post_attention_layernorm": f"{_LLM}/layers/pre_ffw_norm{suffix}",
@@ -132,9 +132,9 @@ def _openpi_norms(tower: str, suffix: str, *, adaptive: bool) -> list[Rule]:
     if adaptive:
         leaves = {"dense/kernel": "Dense_0/kernel", "dense/bias": "Dense_0/bias"}
     return [
-        copied(f"{ours}/{leaf}", f"{theirs}/{twin}")
+        copied(f"{ours}/{our_leaf}", f"{theirs}/{their_leaf}")
         for ours, theirs in names.items()
-        for leaf, twin in leaves.items()
+        for our_leaf, their_leaf in leaves.items()
     ]
 
 
@@ -150,24 +150,24 @@ def _heads_first(kernel: np.ndarray, heads: int) -> np.ndarray:
     return kernel.reshape(layers, width, heads, -1).swapaxes(1, 2)
 
 
-def canonical_name(name: str) -> str:
-    """LeRobot's name of today for a tensor: its towers have moved between versions."""
+def lerobot_name(name: str) -> str:
+    """The current LeRobot name of a tensor; older versions keep the towers in other modules."""
     if name.endswith("lm_head.weight"):
         return UNUSED["gemma_expert." in name]
-    for mark, inner, tower in (
+    for marker, inner, tower in (
         ("vision_tower.", "vision_model.", _VISION),
         ("gemma_expert.", "model.", f"{_EXPERT}.model"),
         ("language_model.", "model.", _LANGUAGE),
         ("multi_modal_projector.", "", f"{_PALIGEMMA}.model.multi_modal_projector"),
     ):
-        _, found, rest = name.partition(mark)
-        if found:
+        _, matched, rest = name.partition(marker)
+        if matched:
             return f"{tower}.{rest.removeprefix(inner)}"
     return name
 
 
 def lerobot_layout(config: Pi0Config) -> list[Rule]:
-    """LeRobot's tensors by name without the leading "model." (its policies/pi0 and pi05)."""
+    """Rules for LeRobot's tensors, named without the leading "model." (policies/pi0 and pi05)."""
     rules = [
         *siglip(_VISION, config.vision),
         *linear("vision/head", f"{_PALIGEMMA}.model.multi_modal_projector.linear"),
@@ -187,4 +187,4 @@ def lerobot_layout(config: Pi0Config) -> list[Rule]:
 
 
 LAYOUTS = {"openpi": openpi_layout, "lerobot": lerobot_layout}
-"""Function of a config that gives the rules, by the layout's name."""
+"""Layout name -> function (config) -> rules."""
