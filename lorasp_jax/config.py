@@ -1,4 +1,4 @@
-"""What a run is: frozen dataclasses, one instance per experiment file in `configs/`."""
+"""Experiment configuration: frozen dataclasses; each file in `configs/` returns one `Config`."""
 
 import math
 from dataclasses import dataclass, field
@@ -7,91 +7,96 @@ from typing import Literal
 from lorasp_jax.peft import Method, _fields
 
 SCALES = ("smoke", "cpu", "accelerator")
-LONGEST_NAME = 200
-"""Bytes of a run's name; file systems take 255, and the name of a run's lock is longer."""
+MAX_NAME_BYTES = 200
+"""Maximum length of a run name [bytes]. File systems allow 255; the run's lock file adds a few."""
 
 
 def _at_least(low: int, owner: object, *names: str) -> None:
-    """Raise ValueError unless these fields are at least so much."""
+    """Raise ValueError if any of the named fields is below `low`."""
     for name in names:
         if getattr(owner, name) < low:
             raise ValueError(f"{name} must be at least {low}, got {getattr(owner, name)}")
 
 
 def _check_name(name: str) -> None:
-    """Raise ValueError unless it is that of a folder inside another one."""
-    plain = name not in ("", ".", "..") and "/" not in name and name.isprintable()
-    if not plain or len(name.encode()) > LONGEST_NAME:
+    """Raise ValueError unless `name` is a single path component."""
+    valid = name not in ("", ".", "..") and "/" not in name and name.isprintable()
+    if not valid or len(name.encode()) > MAX_NAME_BYTES:
         raise ValueError(
-            f"name must be a plain folder name of at most {LONGEST_NAME} bytes, got {name!r}"
+            "name must be a printable folder name without '/' and with at most "
+            f"{MAX_NAME_BYTES} bytes, got {name!r}"
         )
 
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """The backbone and its base weights."""
+    """Backbone and base weights."""
 
     backbone: str = "pi0"
     """pi0 or smolvla."""
     size: str = "nano"
-    """nano for a CPU, small for one accelerator, base as published; of pi0 also nano_pi05 and
-    base_pi05."""
+    """nano for a CPU, small for one accelerator, base for the published size; pi0 also has
+    nano_pi05 and base_pi05."""
     checkpoint: str = "assets/{backbone}_{size}"
-    """Where the base weights are: a folder, hf://owner/name, a bucket; empty for random ones.
-    Shipped bases are found from any folder. {backbone} and {size} stand for those fields."""
+    """Base weights: a folder, hf://owner/name or a bucket URL; empty: random initialization.
+    {backbone} and {size} are replaced by those fields. Bundled bases (assets/...) resolve from any
+    working directory."""
     tokenizer: str = ""
-    """A SentencePiece .model or tokenizer.json, a file or hf://owner/name; empty: the offline one
-    of nano and small."""
+    """SentencePiece .model or tokenizer.json: a file, hf://owner/name or a bucket URL; empty: the
+    bundled tokenizer of the nano and small sizes."""
     max_tokens: int = 0
-    """Longest instruction [tokens]; 0: what the size has."""
+    """Maximum instruction length [tokens]; 0: the default of the model size."""
     dtype: Literal["float32", "bfloat16"] = "float32"
-    """Type of the matrix products."""
+    """Compute dtype of matrix products."""
     param_dtype: Literal["float32", "bfloat16"] = "float32"
-    """Type the base is stored in; adapters are float32."""
+    """Storage dtype of the base parameters; adapters are always float32."""
     relative_actions: bool = False
-    """Joint targets relative to the state a chunk starts from, as openpi trained pi0."""
+    """Learn joint targets relative to the state at the start of the chunk, as openpi does for
+    pi0."""
     remat: Literal["auto", "none", "products", "full"] = "auto"
-    """What the backward pass computes again to save memory: nothing, all but matrix products, or
-    all inside a layer; auto is the first of these that fits into the device."""
+    """Rematerialization: the backward pass recomputes nothing (none), everything except matrix
+    products (products) or the whole layer (full); auto: the first that fits in device memory."""
     unroll: bool | None = None
-    """Layers as straight-line code, not as a loop: faster steps of the same memory, but a longer
-    compilation; None: unless remat is full."""
+    """Unroll the scan over layers: faster steps in the same memory, slower compilation; None:
+    unroll unless remat is full."""
 
     @property
     def source(self) -> str:
-        """`checkpoint` with the names filled in."""
+        """`checkpoint` with its placeholders filled in."""
         return self.checkpoint.replace("{backbone}", self.backbone).replace("{size}", self.size)
 
     def __post_init__(self) -> None:
-        """Checks the fields."""
+        """Validate the fields."""
         _fields.check_fields(self)
         _at_least(0, self, "max_tokens")
 
 
 @dataclass(frozen=True)
 class DataConfig:
-    """Demonstrations: made by the scripted expert, or a dataset."""
+    """Training data: demonstrations of the scripted expert, or a dataset."""
 
     source: str = ""
-    """A dataset in place of the expert: LeRobot (folder or hf://owner/name), RLDS, or a cache
-    (python -m lorasp_jax.data convert); it says robot and tasks. Empty: the expert."""
+    """Dataset to train on, which then also sets robot and tasks: LeRobot (folder or
+    hf://owner/name), RLDS, or a cache (python -m lorasp_jax.data convert). Empty: collect
+    demonstrations with the scripted expert."""
     episodes: int = 512
     """Successful demonstrations per task."""
     num_envs: int = 256
-    """Worlds simulated at a time while collecting."""
+    """Parallel worlds during collection."""
     action_noise: float = 0.005
-    """Standard deviation of the noise on executed joint targets [rad]; recorded ones are clean."""
+    """Standard deviation of the noise added to executed joint targets [rad]; recorded actions are
+    noise-free."""
     fresh_every: int = 0
-    """Steps after which as many other demonstrations take the place of the old, collected on the
-    device while these train; a multiple of log_every. 0: the same throughout."""
+    """Replace all demonstrations every this many steps with newly collected ones, which the device
+    collects while it trains; a multiple of log_every. 0: never."""
 
     def __post_init__(self) -> None:
-        """Checks the numbers."""
+        """Validate the fields."""
         _fields.check_fields(self)
         _at_least(1, self, "episodes", "num_envs")
         _at_least(0, self, "action_noise", "fresh_every")
         if self.fresh_every and self.source:
-            raise ValueError("a dataset has no fresh demonstrations: leave out data.fresh_every")
+            raise ValueError("data.fresh_every needs the scripted expert: drop it or data.source")
 
 
 @dataclass(frozen=True)
@@ -105,7 +110,7 @@ class OptimConfig:
     learning_rate: float = 1e-3
     """Peak learning rate."""
     final_learning_rate: float = 1e-5
-    """Learning rate at the last step."""
+    """Final learning rate."""
     warmup_steps: int = 100
     """Steps of linear warm-up from zero."""
     weight_decay: float = 1e-4
@@ -113,23 +118,23 @@ class OptimConfig:
     b2: float = 0.95
     """Decay of the second moment."""
     clip_norm: float = 1.0
-    """Largest global gradient norm."""
+    """Gradients are clipped to this global norm."""
     accumulate: int = 1
-    """Parts of a batch that a step takes one after the other, to need less memory; the task loss is
-    that of the whole batch, the auxiliary ones are means over the parts."""
+    """Gradient-accumulation micro-batches per step; more need less memory. The task loss is that of
+    the full batch, auxiliary losses are averaged over micro-batches."""
     ema: float = 0.0
-    """Decay a step of the moving average of what trains, which is then what is evaluated and
-    exported, such as 0.999; 0: no average."""
+    """Decay per step of the exponential moving average (EMA) of the trainable parameters, such as
+    0.999; the average is then evaluated and exported. 0: no average."""
     state_noise: float = 0.02
-    """Standard deviation of the noise on normalised robot states while training."""
+    """Standard deviation of the noise added to normalized robot states during training."""
     max_skipped: int = 10
-    """Steps in a row whose loss or gradient is not finite, or a spike, before the run stops."""
+    """Stop after this many consecutive skipped steps (loss or gradient non-finite or a spike)."""
     spike: float = 0.0
-    """Skip a step whose loss or gradient norm is beyond this factor times its running mean; 0: only
-    one that is not finite."""
+    """Skip a step whose loss or gradient norm exceeds this multiple of its running mean; 0: skip
+    only non-finite steps."""
 
     def __post_init__(self) -> None:
-        """Checks the numbers."""
+        """Validate the fields."""
         _fields.check_fields(self)
         _at_least(1, self, "steps", "batch_size", "accumulate", "max_skipped")
         _at_least(0, self, "learning_rate", "final_learning_rate", "warmup_steps")
@@ -157,10 +162,10 @@ class AuxiliaryConfig:
     orthogonality: float = 0.1
     """Weight of AdaLoRA's orthogonality penalty, eq. 4 of arXiv 2303.10512."""
     warmup: float = 0.02
-    """Share of the steps over which the weights rise linearly from zero."""
+    """Fraction of the steps over which the weights rise linearly from zero."""
 
     def __post_init__(self) -> None:
-        """Checks the numbers."""
+        """Validate the fields."""
         _fields.check_fields(self)
         _at_least(0, self, "spectral", "balance", "z", "orthogonality")
         if not 0 <= self.warmup <= 1:
@@ -174,22 +179,22 @@ class EvaluationConfig:
     episodes: int = 256
     """Episodes per task."""
     num_envs: int = 256
-    """Worlds simulated at a time."""
+    """Parallel worlds per task."""
     execute_steps: int = 5
-    """Actions of a chunk that are executed before the policy looks again."""
+    """Actions executed from each predicted chunk (execution horizon)."""
     denoise_steps: int = 10
     """Euler steps of the flow-matching sampler."""
     every: int = 0
-    """Steps between evaluations while training, at the log line that follows, each in num_envs
-    episodes a task; 0: only before and after."""
+    """Steps between evaluations during training, rounded up to the next log step; each runs
+    num_envs episodes per task. 0: evaluate only before and after training."""
 
     @property
     def worlds(self) -> int:
-        """Worlds that are simulated at a time."""
+        """Number of parallel worlds: `num_envs`, or `episodes` if there are fewer."""
         return min(self.episodes, self.num_envs)
 
     def __post_init__(self) -> None:
-        """Checks the numbers."""
+        """Validate the fields."""
         _fields.check_fields(self)
         _at_least(1, self, "episodes", "num_envs", "execute_steps", "denoise_steps")
         if self.every < 0:
@@ -205,22 +210,22 @@ class Config:
     """One experiment: robot, tasks, base, adapter method and how to train."""
 
     name: str
-    """The run's folder is runs/<name>."""
+    """Name of the run; its folder is runs/<name>."""
     scale: str
-    """Which sizes were chosen: smoke, cpu or accelerator."""
+    """Preset of sizes: smoke, cpu or accelerator."""
     peft: Method
     """Adapter method and its settings."""
     model: ModelConfig = field(default_factory=ModelConfig)
     """Backbone and base weights."""
     robot: str = "piper"
-    """Robot the demonstrations are made with and the policy is evaluated on."""
+    """Robot for demonstrations and evaluation: a name, or the path of an MJCF file (.xml)."""
     tasks: tuple[str, ...] = ("open_pot", "pour", "press", "pick_place")
-    """Tasks trained together; the default are the paper's four."""
+    """Tasks trained jointly; default: the paper's four."""
     targets: tuple[str, ...] = (".*",)
-    """What the method is attached to: presets (paper, all-linear, openpi, expert-only, vision,
-    language, action) and regular expressions of layers' paths."""
+    """Layers to adapt: presets (paper, all-linear, openpi, expert-only, vision, language, action)
+    and regular expressions over layer paths."""
     image_size: int = 64
-    """Height and width of the simulated cameras' pictures [pixels]; a backbone resizes them."""
+    """Height and width of simulated camera images [pixels]; the backbone resizes them."""
     data: DataConfig = field(default_factory=DataConfig)
     """Demonstrations."""
     optim: OptimConfig = field(default_factory=OptimConfig)
@@ -230,24 +235,24 @@ class Config:
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     """Evaluation in simulation."""
     control_dt: float = 0.1
-    """Seconds between two actions; demonstrations and base must agree."""
+    """Control period [s]; must match the demonstrations and the base."""
     fsdp: int = 1
-    """Devices over which large arrays are split: the base's, and what trains with its optimizer's
-    state, if that is as large; the rest of the mesh is data parallel."""
+    """Devices per FSDP group, over which large arrays (base, trainable parameters, optimizer state)
+    are sharded; the rest of the mesh is data parallel."""
     log_every: int = 50
-    """Steps per compiled call, and between log lines."""
+    """Steps per compiled call and between log entries."""
     checkpoint_every: int = 1000
     """Steps between checkpoints."""
     seed: int = field(default=0, metadata={"most": 2**32 - 1})
     """Seed of every random stream of the run."""
 
     def evaluates(self, step: int) -> bool:
-        """Whether the policy is evaluated at the log line after so many steps, not the last."""
-        every, before = self.evaluation.every, step - self.log_every
-        return bool(every) and step // every > before // every and step < self.optim.steps
+        """Whether to evaluate when logging `step`; the final evaluation is separate."""
+        every, previous = self.evaluation.every, step - self.log_every
+        return bool(every) and step // every > previous // every and step < self.optim.steps
 
     def __post_init__(self) -> None:
-        """Checks what no single field shows."""
+        """Validate the fields and their combinations."""
         _fields.check_fields(self)
         _fields.check_fields(self.peft, "peft.")
         _check_name(self.name)
@@ -263,4 +268,4 @@ class Config:
                 f"and {self.log_every}"
             )
         if not self.tasks or len(set(self.tasks)) < len(self.tasks):
-            raise ValueError(f"tasks must be different and at least one, got {self.tasks}")
+            raise ValueError(f"tasks must be non-empty and unique, got {self.tasks}")

@@ -62,7 +62,7 @@ def files():
         ([*MULTITASK, *NANO, "--method", "ada_lora", "--optim.ema", "0.9"], "has no budget"),
         ([*MULTITASK, *NANO, "--checkpoint-every", "0"], "must be at least 1, got 0"),
         ([*MULTITASK, *NANO, "--model.dtype", "float99"], "float99"),
-        ([*MULTITASK, *NANO, "--name", "../up"], "must be a plain folder name"),
+        ([*MULTITASK, *NANO, "--name", "../up"], "must be a printable folder name"),
     ],
 )
 def test_bad_input(arguments, message, capsys):

@@ -79,7 +79,7 @@ def test_each_generation_has_its_own_layouts(monkeypatch):
 
 
 def test_what_does_not_go_together():
-    with pytest.raises(ValueError, match="a dataset has no fresh demonstrations"):
+    with pytest.raises(ValueError, match="fresh_every needs the scripted expert"):
         dataclasses.replace(FRESH.data, source="somewhere")
     with pytest.raises(ValueError, match="multiple of log_every, got 3 and 2"):
         dataclasses.replace(FRESH, data=dataclasses.replace(FRESH.data, fresh_every=3))

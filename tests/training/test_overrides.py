@@ -68,7 +68,7 @@ def test_method_by_name_keeps_the_rank():
         (["--config", "configs/multitusk.py"], "no config configs/multitusk.py: found .*multitask"),
         ([], "no experiment was named"),
         (["--confg", "configs/multitask.py"], "unknown option --confg: did you mean --config?"),
-        ([*MULTITASK, "--tasks"], "^tasks must be different and at least one"),
+        ([*MULTITASK, "--tasks"], "^tasks must be non-empty and unique"),
         ([*MULTITASK, "--scale", "gpu"], "unknown scale 'gpu': it is one of auto, smoke"),
         ([*MULTITASK, "--method", "lorra"], "lorra.*lora_sp"),
         ([*MULTITASK, "--peft.rnk", "4"], "unknown option --peft.rnk: did you mean --peft.rank?"),
