@@ -32,7 +32,7 @@ def files():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--config", "missing.py"], "there is no config missing.py"),
+        (["--config", "missing.py"], "config missing.py does not exist"),
         ([*MULTITASK, *NANO, "--method", "lorra"], "unknown method 'lorra'"),
         ([*MULTITASK, *NANO, "--peft.rnk", "3"], "did you mean --peft.rank?"),
         ([*MULTITASK, *NANO, "--peft.energy-target", "1.5"], "must lie in (0, 1]"),
@@ -93,7 +93,10 @@ def test_full_disk(capsys, monkeypatch):
 
     monkeypatch.setattr(train, "run", write)
     assert train.main([*MULTITASK, *NANO]) == 2
-    assert capsys.readouterr().err == "error: No space left on device: make room and add --resume\n"
+    assert (
+        capsys.readouterr().err
+        == "error: No space left on device: free some memory or disk space and add --resume\n"
+    )
 
 
 @pytest.mark.parametrize(
@@ -140,5 +143,5 @@ def test_finished_run_is_not_run_again(capsys):
     assert record["peft"]["method"] == "LoRASP"
     write_json(Path("runs/multitask/results.json"), RESULTS)
     assert train.main([*MULTITASK, "--model.checkpoint", "nowhere", "--resume"]) == 0
-    assert "this run is finished: runs/multitask/report.html" in capsys.readouterr().out
+    assert "this run has finished: runs/multitask/report.html" in capsys.readouterr().out
     assert "The run goes on" not in Path("runs/multitask/report.html").read_text()

@@ -1,1 +1,1 @@
-"""The console command `lorasp-jax` and what each of its commands does."""
+"""The console command `lorasp-jax` and its subcommands."""

@@ -12,20 +12,20 @@ import lorasp_jax
 
 COMMANDS = {
     "train": ("lorasp_jax.cli.train", "adapt a policy to a robot"),
-    "envs": ("envs.__main__", "collect, film or play episodes of the scripted experts"),
+    "envs": ("envs.__main__", "collect, render or play episodes of the scripted experts"),
     "data": ("lorasp_jax.data.__main__", "inspect or convert datasets"),
-    "report": ("lorasp_jax.cli.report", "write the report of a run again"),
-    "completion": ("lorasp_jax.cli.completion", "print what completes these commands in a shell"),
+    "report": ("lorasp_jax.cli.report", "rebuild the report of a run"),
+    "completion": ("lorasp_jax.cli.completion", "print a shell completion script"),
 }
-"""Commands: the module and what it does. A module has `main(arguments, program)`, which returns the
-exit code, and `parser(program)`, the options that completion knows."""
-STOPPED = 130
-"""Exit code after a signal, as shells have it."""
+"""Module and help text of each command. A module has `main(arguments, program)`, which returns the
+exit code, and `parser(program)`, which returns its options for shell completion."""
+INTERRUPTED = 130
+"""Exit code after SIGINT or SIGTERM, as in shells."""
 
 
 def main() -> NoReturn:
-    """Run the command that the command line names."""
-    stop_at_once()
+    """Run the command named on the command line."""
+    exit_on_signals()
     from envs.cli.refusals import parsed
 
     first, rest = sys.argv[1:2], sys.argv[2:]
@@ -33,22 +33,22 @@ def main() -> NoReturn:
     run(command, rest, f"lorasp-jax {command}")
 
 
-def stop_at_once() -> None:
+def exit_on_signals() -> None:
     """Exit silently on Ctrl-C or SIGTERM: until a command starts there is nothing to save.
 
     Call it before the imports that start JAX, which take a second.
     """
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: os._exit(STOPPED))
+        signal.signal(number, lambda *_: os._exit(INTERRUPTED))
 
 
 def run(command: str, arguments: Sequence[str], program: str) -> NoReturn:
-    """Run one command and leave with its exit code.
+    """Run one command and exit with its exit code.
 
     Args:
         command: one of `COMMANDS`.
-        arguments: what follows it on the command line.
-        program: how it was started, for its help.
+        arguments: its command-line arguments.
+        program: program name in the help text.
     """
     from envs.compilation import alarms
 
@@ -56,7 +56,7 @@ def run(command: str, arguments: Sequence[str], program: str) -> NoReturn:
     if code := importlib.import_module(COMMANDS[command][0]).main(arguments, program):
         from lorasp_jax.training.distributed import processes
 
-        processes.leave(code)  # not waiting for threads that still compile, which cannot be stopped
+        processes.exit_all(code)  # without waiting for compilation threads, which cannot be stopped
     sys.exit()
 
 
@@ -64,7 +64,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="lorasp-jax",
         description="Adapt vision-language-action models to new robots with LoRA-SP.",
-        epilog="lorasp-jax COMMAND --help lists the options of a command.",
+        epilog="Run lorasp-jax COMMAND --help for the options of a command.",
     )
     version = f"lorasp-jax {lorasp_jax.__version__}"
     parser.add_argument("--version", action="version", version=version)

@@ -1,4 +1,4 @@
-"""What completes the commands in a shell: `lorasp-jax completion bash`."""
+"""Shell completion: `lorasp-jax completion bash`."""
 
 import argparse
 import importlib
@@ -10,7 +10,7 @@ from lorasp_jax.cli import commands
 
 
 def main(arguments: Sequence[str], program: str) -> int:
-    """Print a completion script; returns the exit code."""
+    """Print a completion script; return the exit code."""
     shell = parsed(parser(program), arguments).shell
     import shtab
 
@@ -23,33 +23,33 @@ def main(arguments: Sequence[str], program: str) -> int:
 
 
 def parser(program: str) -> argparse.ArgumentParser:
-    """The options of the command."""
+    """Return the parser of the command."""
     import shtab
 
     parser = argparse.ArgumentParser(
         prog=program,
-        description="Print a script that completes commands, options and fields with the Tab key.",
+        description="Print a script for Tab completion of commands, options and config fields.",
         epilog=f'In bash: eval "$({program} bash)". In zsh: {program} zsh > DIRECTORY/_lorasp-jax, '
-        "where DIRECTORY is one of fpath.",
+        "where DIRECTORY is in fpath.",
     )
     parser.add_argument("shell", choices=shtab.SUPPORTED_SHELLS)
     return parser
 
 
 def _tree() -> argparse.ArgumentParser:
-    """All commands with their options."""
+    """Return a parser with all commands and their options."""
     tree = argparse.ArgumentParser(prog="lorasp-jax")
-    found = tree.add_subparsers(metavar="command")
+    subparsers = tree.add_subparsers(metavar="command")
     for name, (module, text) in commands.COMMANDS.items():
         options = importlib.import_module(module).parser(f"lorasp-jax {name}")
-        found.add_parser(name, help=text, parents=[options], add_help=False)
+        subparsers.add_parser(name, help=text, parents=[options], add_help=False)
     return tree
 
 
 def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
-    """Every option and argument of a parser and of its commands."""
+    """Yield every option and argument of a parser and of its subparsers."""
     for action in parser._actions:
         yield action
         if isinstance(action, argparse._SubParsersAction):
-            for below in action.choices.values():
-                yield from _actions(below)
+            for subparser in action.choices.values():
+                yield from _actions(subparser)

@@ -1,4 +1,4 @@
-"""Write the report of a run again: `lorasp-jax report runs/NAME`."""
+"""Rebuild the report of a run: `lorasp-jax report runs/NAME`."""
 
 import argparse
 from collections.abc import Sequence
@@ -10,8 +10,8 @@ from envs.cli.refusals import parsed, refused
 
 
 def main(arguments: Sequence[str], program: str = "lorasp-jax report") -> int:
-    """Write report.html of a run; returns the exit code: 0 done, 2 bad input."""
-    options = parsed(parser(program), arguments)  # before the slow imports
+    """Write report.html of a run; return the exit code: 0 success, 2 invalid input."""
+    options = parsed(parser(program), arguments)  # before slow imports
     from lorasp_jax.report.html import write_report
 
     try:
@@ -23,9 +23,9 @@ def main(arguments: Sequence[str], program: str = "lorasp-jax report") -> int:
 
 
 def parser(program: str) -> argparse.ArgumentParser:
-    """The options of the command."""
+    """Return the parser of the command."""
     parser = argparse.ArgumentParser(
-        prog=program, description="Write the report of a run again, from the files it has left."
+        prog=program, description="Rebuild report.html of a run from the files in its folder."
     )
-    parser.add_argument("run", type=Path, help="folder of a run, such as runs/multitask")
+    parser.add_argument("run", type=Path, help="folder of the run, such as runs/multitask")
     return parser

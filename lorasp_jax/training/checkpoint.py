@@ -69,7 +69,7 @@ class Checkpoints:
         """
         for step in self._remove_unfinished():
             self._say(f"the writer of the checkpoint at step {step} was killed: it is removed")
-        processes.wait("removed")
+        processes.barrier("removed")
         damaged: dict[int, str] = {}
         for step in sorted(self._manager.all_steps(), reverse=True):
             leaves, reason = {}, ""
@@ -77,7 +77,7 @@ class Checkpoints:
                 leaves = self._read(step, _by_path(like))
             except _DamagedError as error:
                 reason = str(error)
-            if processes.anywhere(bool(reason)):
+            if processes.any_process(bool(reason)):
                 damaged[step] = reason or "another process cannot read it"
                 continue
             if damaged:
@@ -136,7 +136,7 @@ class Checkpoints:
                 f"the checkpoint at step {step} is damaged, {reason}: it is set aside as {aside}, "
                 f"and the run goes on from step {used}"
             )
-        processes.wait("set aside")
+        processes.barrier("set aside")
         self._manager.reload()
 
     def _steps(self) -> dict[int, bool]:

@@ -1,6 +1,6 @@
-"""What `--help` says of a field: its docstring as running text.
+"""Help text of config fields: their docstrings without line breaks.
 
-tyro keeps the line breaks of docstrings whose further lines are indented, as those of fields are.
+By itself, tyro keeps the line breaks of docstrings whose continuation lines are indented.
 """
 
 import dataclasses
@@ -12,12 +12,13 @@ import tyro
 from tyro.constructors import StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
 REGISTRY = tyro.constructors.ConstructorRegistry()
-"""For `tyro.cli`, whose default must be an instance. A field that holds None stays tyro's."""
+"""Registry for `tyro.cli`, called with an instance as default. Fields that are None are left to
+tyro."""
 
 
 @REGISTRY.struct_rule
 def _fields(info: StructTypeInfo) -> StructConstructorSpec | None:
-    """What tyro takes a dataclass for."""
+    """Describe a dataclass to tyro."""
     if not dataclasses.is_dataclass(info.type) or not isinstance(info.default, info.type):
         return None
     types = get_type_hints(info.type, include_extras=True)
@@ -35,7 +36,7 @@ def _fields(info: StructTypeInfo) -> StructConstructorSpec | None:
 
 
 def _text(owner: type, name: str) -> str | None:
-    """The docstring of a field, on one line."""
+    """Return the docstring of a field on one line."""
     for kind in owner.__mro__[:-1]:
         for field in docstring_parser.parse_from_object(kind).params:
             if field.arg_name == name and field.description:

@@ -57,8 +57,8 @@ def train(
     state = init_state(adapters, optimizer, ema=run.config.optim.ema > 0)
     mesh = meshes.make_mesh(run.config.fsdp, run.devices)
     shardings = meshes.shardings(state, mesh)
-    state = processes.put(state, shardings)
-    frozen = processes.put(frozen, meshes.shardings(frozen, mesh))
+    state = processes.device_put(state, shardings)
+    frozen = processes.device_put(frozen, meshes.shardings(frozen, mesh))
     processor = run.policy.processor
     policy = lambda state: Policy(nnx.merge(graphdef, state.best, frozen), processor)  # noqa: E731
     run.policy = policy(state)
@@ -76,7 +76,7 @@ def train(
     except RunError as error:
         for callback in callbacks:
             callback.on_stop(run, str(error))
-        processes.wait("stopped")  # or the first one might be ended before it has said why
+        processes.barrier("stopped")  # or the first one might be ended before it has said why
         raise
     finally:
         checkpoints.close()
@@ -105,10 +105,10 @@ def _call_on_log(
 @contextlib.contextmanager
 def _local_policy(run: Run, name: str) -> Iterator[None]:
     """In this block the run's policy is on this process's own device; at its end all wait."""
-    everywhere, run.policy = run.policy, processes.own(run.policy)
+    everywhere, run.policy = run.policy, processes.to_local(run.policy)
     yield
     run.policy = everywhere
-    processes.wait(name)
+    processes.barrier(name)
 
 
 def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) -> Callable:
@@ -194,7 +194,7 @@ def _loop(
             if done // config.checkpoint_every > saved // config.checkpoint_every:
                 checkpoints.save(state)
                 saved = done
-            stopped = processes.anywhere(stop.requested)
+            stopped = processes.any_process(stop.requested)
         checkpoints.save(state)
     if stopped:
         raise KeyboardInterrupt

@@ -1,4 +1,4 @@
-"""From the command line to a `Config`: an experiment file, a scale, a method, dotted overrides."""
+"""Parse the command line into a `Config`: experiment file, scale, method and dotted overrides."""
 
 import argparse
 import contextlib
@@ -29,13 +29,13 @@ HELP = {"-h", "--help"}
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """What the command line asks for.
+    """A parsed command line.
 
     Attributes:
-        config: the experiment.
-        resume: whether to go on with the run of this name; "auto": if there is one.
-        dry_run: whether to stop before anything is collected, trained or written.
-        wandb: project of Weights & Biases, or None.
+        config: configuration of the experiment.
+        resume: resume the run of this name; "auto": if it exists.
+        dry_run: stop before anything is collected, trained or written.
+        wandb: Weights & Biases project, or None.
     """
 
     config: Config
@@ -45,27 +45,27 @@ class Command:
 
 
 def parse(arguments: Sequence[str], program: str = "python train.py") -> Command:
-    """What `arguments` ask for.
+    """Parse command-line arguments.
 
     Args:
         arguments: the command line.
-        program: how it was started, for the help.
+        program: program name in the help text.
 
     Raises:
-        ValueError: an unknown config, scale, method, field, task or robot, or a value that does
-            not fit.
-        SystemExit: help was asked for and printed.
+        ValueError: an unknown config, scale, method, field, task or robot, or an invalid value.
+        SystemExit: after printing the help text.
     """
-    parser = _parser(program)
+    parser = _option_parser(program)
     try:
         known, rest = parser.parse_known_args(arguments)
     except argparse.ArgumentError as error:
         raise ValueError(str(error)) from error
-    if bare := [name for name, value in vars(known).items() if isinstance(value, list)]:
-        raise ValueError(f"--{bare[0]} needs a value, not --")  # which argparse drops
+    # For the value "--", argparse returns an empty list.
+    if missing := [name for name, value in vars(known).items() if isinstance(value, list)]:
+        raise ValueError(f"--{missing[0]} needs a value")
     wants_help = bool(HELP & set(rest))
     if wants_help and known.scale == "auto":
-        known.scale = "cpu"  # to look at the devices, JAX would have to start
+        known.scale = "cpu"  # avoids initializing JAX
     if known.config is not None:
         config = load(known.config, choose_scale(known.scale))
     elif wants_help:
@@ -73,24 +73,24 @@ def parse(arguments: Sequence[str], program: str = "python train.py") -> Command
     else:
         _check_names(rest, Config(name="NAME", scale=known.scale, peft=LoRASP()))
         parser.print_help()
-        raise ValueError("no experiment was named: add --config, such as configs/multitask.py")
+        raise ValueError("--config is required, such as --config configs/multitask.py")
     if wants_help:
-        _parser(program, config.peft.name).print_help()
-        print(f"\n{_on_scales(known.config, known.scale)}")
-        rest = ["--help"]  # it may stand where an option wants its value
+        _option_parser(program, config.peft.name).print_help()
+        print(f"\n{_scale_note(known.config, known.scale)}")
+        rest = ["--help"]  # alone, as it may stand in place of an option's value
     if known.method is not None:
-        config = dataclasses.replace(config, peft=_switch(config.peft, known.method))
+        config = dataclasses.replace(config, peft=_with_rank_of(config.peft, known.method))
     if known.resume and known.dry_run:
-        raise ValueError("a run is either resumed or tried dry: leave --resume or --dry-run out")
+        raise ValueError("--resume and --dry-run cannot be combined")
     config = override(config, rest, program)
     _check_simulated(config)
     return Command(config, known.resume, known.dry_run, known.wandb)
 
 
-def parser(program: str) -> argparse.ArgumentParser:
-    """All options with the default method's, for completion."""
+def completion_parser(program: str) -> argparse.ArgumentParser:
+    """Return a parser of all options, including the default method's, for shell completion."""
     parser = argparse.ArgumentParser(
-        prog=program, parents=[_parser(program)], add_help=False, conflict_handler="resolve"
+        prog=program, parents=[_option_parser(program)], add_help=False, conflict_handler="resolve"
     )
     for name, kind in _fields(Config(name="NAME", scale="cpu", peft=LoRASP())):
         choices = get_args(kind) if get_origin(kind) is Literal else None
@@ -99,23 +99,25 @@ def parser(program: str) -> argparse.ArgumentParser:
     return parser
 
 
-def _parser(program: str = "", method: str = "") -> argparse.ArgumentParser:
-    """The options that are no fields of a config.
+def _option_parser(program: str = "", method: str = "") -> argparse.ArgumentParser:
+    """Return a parser of the options that are not config fields.
 
     Args:
-        program: how it was started.
-        method: the experiment's, for its help.
+        program: program name in the help text.
+        method: the experiment's method, for the help text.
     """
     parser = argparse.ArgumentParser(
         prog=program,
         add_help=False,
         exit_on_error=False,
         allow_abbrev=False,
-        usage=f"{program} --config FILE [options] [fields]",
+        usage=f"{program} --config FILE [options] [--FIELD VALUE ...]",
     )
     parser.add_argument("--config", type=Path, help="experiment file, such as configs/multitask.py")
-    auto = "auto (the default: cpu on a CPU, accelerator elsewhere)"
-    parser.add_argument("--scale", default="auto", help=f"{auto}, {', '.join(SCALES)}")
+    auto = "auto (default: cpu on a CPU, accelerator elsewhere)"
+    parser.add_argument(
+        "--scale", default="auto", help=f"size preset: {', '.join(SCALES)} or {auto}"
+    )
     methods = ", ".join(peft.names())
     default = ", ".join(filter(None, ["the experiment's", method]))
     parser.add_argument("--method", help=f"adapter method: {methods} (default: {default})")
@@ -125,54 +127,55 @@ def _parser(program: str = "", method: str = "") -> argparse.ArgumentParser:
         const=True,
         default=False,
         choices=["auto"],
-        help="continue the run of this name; with auto, start it if there is none",
+        help="resume the run of this name; with auto, start it if it does not exist",
     )
     parser.add_argument(
-        "--dry-run", action="store_true", help="print sizes and memory, compile, stop"
+        "--dry-run", action="store_true", help="compile, print sizes and memory, then exit"
     )
     parser.add_argument(
-        "--wandb", metavar="PROJECT", help="log to Weights & Biases, too; needs pip install wandb"
+        "--wandb", metavar="PROJECT", help="also log to Weights & Biases; needs pip install wandb"
     )
     parser.add_argument(
         "--distributed",
         action="store_true",
-        help="train together with the other processes of the launcher, see docs/launch.md",
+        help="train in several processes started by a launcher, see docs/launch.md",
     )
     return parser
 
 
-def _on_scales(path: Path | None, scale: str) -> str:
-    """Which scale the fields in a help are of, and what another one would change."""
+def _scale_note(path: Path | None, scale: str) -> str:
+    """Describe the scales of an experiment, and which one the printed defaults are for."""
     if path is None:
-        return "the fields below have their own defaults; with --config FILE, the experiment's"
-    changed = differences(lambda scale: load(path, scale))
-    return f"{changed}the defaults below are those of --scale {scale}"
+        return "the defaults below are built-in; add --config FILE to see the experiment's"
+    table = differences(lambda scale: load(path, scale))
+    return f"{table}the defaults below are for --scale {scale}"
 
 
 def choose_scale(scale: str) -> str:
-    """The named scale; "auto" is cpu on a CPU backend and accelerator elsewhere."""
+    """Return the named scale; "auto" is cpu on a CPU backend and accelerator elsewhere."""
     if scale == "auto":
         return "cpu" if jax.default_backend() == "cpu" else "accelerator"
     if scale not in SCALES:
-        raise ValueError(f"unknown scale {scale!r}: it is one of auto, {', '.join(SCALES)}")
+        raise ValueError(f"unknown scale {scale!r}: choose one of auto, {', '.join(SCALES)}")
     return scale
 
 
 def load(path: Path, scale: str) -> Config:
-    """What the experiment file's `get_config(scale)` returns.
+    """Load an experiment file and call its `get_config(scale)`.
 
-    Shipped experiments, configs/multitask.py, are found from any folder.
+    Bundled experiments, such as configs/multitask.py, resolve from any working directory.
 
     Raises:
-        ValueError: there is no such file, its code fails, or it returns something else.
+        ValueError: the file does not exist, its code fails, or it does not return a `Config`.
     """
-    ours = shipped.ROOT / path
+    bundled = shipped.ROOT / path
     if shipped.is_one(path, shipped.EXPERIMENTS) and not os.path.exists(path):
-        path = ours if os.path.isfile(ours) else path
-    if not os.path.isfile(path):  # Path.is_file raises where a name is too long
+        path = bundled if os.path.isfile(bundled) else path
+    if not os.path.isfile(path):  # Path.is_file raises if a name is too long
         folder = path.parent if os.path.isdir(path.parent) else shipped.ROOT / shipped.EXPERIMENTS
-        found = ", ".join(str(file) for file in sorted(folder.glob("*.py")))
-        raise ValueError(f"there is no config {path}" + (f": found {found}" if found else ""))
+        available = ", ".join(str(file) for file in sorted(folder.glob("*.py")))
+        hint = f": available are {available}" if available else ""
+        raise ValueError(f"config {path} does not exist{hint}")
     spec = importlib.util.spec_from_file_location(path.stem, path)
     if spec is None or spec.loader is None:
         raise ValueError(f"{path} is not a Python file")
@@ -180,28 +183,28 @@ def load(path: Path, scale: str) -> Config:
     try:
         spec.loader.exec_module(module)
         if not hasattr(module, "get_config"):
-            raise ValueError("it has no function get_config(scale)")
+            raise ValueError("function get_config(scale) is missing")
         config = module.get_config(scale)
     except KeyboardInterrupt:
         raise
-    except BaseException as error:  # whatever a file's code raises
+    except BaseException as error:  # the file may raise anything
         reason = str(error).partition("\n")[0]
-        raise ValueError(f"{path} gives no config ({type(error).__name__}: {reason})") from error
+        raise ValueError(f"cannot load {path} ({type(error).__name__}: {reason})") from error
     if not isinstance(config, Config):
-        raise ValueError(f"{path} gives {type(config).__name__} in place of a Config")
+        raise ValueError(f"get_config in {path} must return a Config, got {type(config).__name__}")
     return config
 
 
 def override(config: Config, arguments: Sequence[str], program: str = "") -> Config:
     """Apply dotted overrides such as `--peft.rank 64 --optim.steps 100`."""
     wants_help = bool(HELP & set(arguments))
-    config, arguments = _with_parts(config, arguments, every=wants_help)
+    config, arguments = _with_subconfigs(config, arguments, create_all=wants_help)
     _check_names(arguments, config)
     printed = io.StringIO()
     quiet = contextlib.nullcontext() if wants_help else contextlib.redirect_stderr(printed)
     try:
         with quiet:
-            chosen = tyro.cli(
+            parsed = tyro.cli(
                 _concrete(config),
                 default=config,
                 args=list(arguments),
@@ -214,67 +217,69 @@ def override(config: Config, arguments: Sequence[str], program: str = "") -> Con
             raise
         raise ValueError(_sentence(printed.getvalue())) from error
     names = (field.name for field in dataclasses.fields(Config))
-    return Config(**{name: getattr(chosen, name) for name in names})
+    return Config(**{name: getattr(parsed, name) for name in names})
 
 
-def _with_parts(
-    config: Config, arguments: Sequence[str], *, every: bool
+def _with_subconfigs(
+    config: Config, arguments: Sequence[str], *, create_all: bool
 ) -> tuple[Config, list[str]]:
-    """The config with the optional parts of its method that are named, and the other arguments.
+    """Create the optional sub-configs of the method; return config and remaining arguments.
 
-    `--peft.schedule.start 0.5` adds a schedule, `--peft.schedule None` takes it away. `every`: as
-    if all parts were named, to list their options.
+    `--peft.schedule.start 0.5` creates a schedule, `--peft.schedule None` removes it. With
+    `create_all` every sub-config is created, to list its options in the help text.
     """
     method: Any = config.peft
     rest = [part for a in arguments for part in (a.split("=") if a.endswith("=None") else [a])]
-    parts: dict[str, Any] = {}
-    for name, kind in typing.get_type_hints(type(method)).items():
-        part: Any
-        for part in filter(dataclasses.is_dataclass, typing.get_args(kind)):
-            option, held = f"--peft.{name}", getattr(method, name)
+    changes: dict[str, Any] = {}
+    for name, hint in typing.get_type_hints(type(method)).items():
+        subconfig: Any
+        for subconfig in filter(dataclasses.is_dataclass, typing.get_args(hint)):
+            option, current = f"--peft.{name}", getattr(method, name)
             if [option, "None"] in map(list, itertools.pairwise(rest)):
-                at = rest.index(option)
-                del rest[at : at + 2]
-                parts[name] = None
-            elif held is None and (every or any(a.startswith(f"{option}.") for a in rest)):
-                parts[name] = part()
-    return dataclasses.replace(config, peft=dataclasses.replace(method, **parts)), rest
+                index = rest.index(option)
+                del rest[index : index + 2]
+                changes[name] = None
+            elif current is None and (create_all or any(a.startswith(f"{option}.") for a in rest)):
+                changes[name] = subconfig()
+    return dataclasses.replace(config, peft=dataclasses.replace(method, **changes)), rest
 
 
 def _check_names(arguments: Sequence[str], config: Config) -> None:
-    """Raise ValueError for an option that is neither a field nor one of ours."""
+    """Raise ValueError for an unknown option."""
     fields = ["--" + name for name, _ in _fields(config)]
     for argument in arguments:
         name = argument.split("=")[0].replace("_", "-")
         if name.startswith("--") and name not in (*fields, "--help"):
-            others = ["--" + name.replace("_", "-") for name in vars(_parser().parse_args([]))]
+            options = vars(_option_parser().parse_args([]))
+            others = ["--" + name.replace("_", "-") for name in options]
             close = difflib.get_close_matches(name, fields + others, n=1, cutoff=0.5)
-            hint = f": did you mean {close[0]}?" if close else f": fields are {' '.join(fields)}"
+            valid = f": valid fields are {' '.join(fields)}"
+            hint = f": did you mean {close[0]}?" if close else valid
             raise ValueError(f"unknown option {name}{hint}")
 
 
 def _check_simulated(config: Config) -> None:
-    """Raise ValueError for an unknown task or robot, before what simulates them is imported.
+    """Raise ValueError for an unknown task or robot, before the simulator is imported.
 
-    A dataset says its own.
+    A dataset brings its own tasks and robot, so then they are not checked.
     """
     if config.data.source:
         return
     for task in config.tasks:
         check("task", task)
-    if not config.robot.endswith(".xml"):  # a user's own
+    if not config.robot.endswith(".xml"):  # an MJCF file of the user's
         check("robot", config.robot)
 
 
 def _sentence(message: str) -> str:
-    """The first paragraph under the heading of tyro's framed error message, as one line."""
+    """Return the first paragraph of tyro's framed error message, without its title, on one line."""
     lines = [line.strip(" │╭╮╰╯─-") for line in message.splitlines()]
     body = itertools.takewhile(bool, itertools.dropwhile(lambda line: not line, lines[1:]))
     return " ".join(body).removeprefix("Error parsing ").removeprefix("Config: ")
 
 
-def _switch(current: peft.Method, name: str) -> peft.Method:
-    """Another method with the rank of the current one, where it has a rank."""
+def _with_rank_of(current: peft.Method, name: str) -> peft.Method:
+    """Create the method `name` with the rank of the current method, if both have one."""
     method = peft.create(name)
     if hasattr(method, "rank") and hasattr(current, "rank"):
         return dataclasses.replace(method, rank=current.rank)  # type: ignore[call-arg]
@@ -282,7 +287,7 @@ def _switch(current: peft.Method, name: str) -> peft.Method:
 
 
 def _fields(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted names of all fields, as options spell them, and their types."""
+    """Yield option names and types of all fields."""
     for field in dataclasses.fields(config):
         value, name = getattr(config, field.name), prefix + field.name.replace("_", "-")
         if dataclasses.is_dataclass(value):
@@ -292,9 +297,9 @@ def _fields(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _concrete(config: Config) -> type[Config]:
-    """`Config` with `peft` typed as the method that is chosen, so that its fields can be set.
+    """Return a `Config` class with `peft` typed as the chosen method, to expose its fields.
 
-    The scale is none of its options: it has chosen their defaults.
+    `scale` is not an option: it only selects defaults.
     """
     return dataclasses.make_dataclass(
         "Config",

@@ -1,4 +1,4 @@
-"""What an experiment's scales change, for its help."""
+"""Comparison of an experiment's scales, for its help text."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -7,13 +7,13 @@ from typing import Any
 from lorasp_jax.config import SCALES, Config
 
 
-def differences(at: Callable[[str], Config]) -> str:
-    """A table of the fields in which an experiment's scales differ; empty if in none.
+def differences(config_at: Callable[[str], Config]) -> str:
+    """Return a table of the fields that differ between scales; empty if all are equal.
 
     Args:
-        at: the experiment at a scale.
+        config_at: returns the experiment at a scale.
     """
-    configs = [dict(_values(at(scale))) for scale in SCALES]
+    configs = [dict(_values(config_at(scale))) for scale in SCALES]
     names = dict.fromkeys(name for config in configs for name in config)
     rows = [(name, *(config.get(name, "-") for config in configs)) for name in names]
     rows = [row for row in rows if len(set(row[1:])) > 1]
@@ -22,11 +22,11 @@ def differences(at: Callable[[str], Config]) -> str:
     table = [("--scale", *SCALES), *rows]
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     lines = ("  ".join(map(str.ljust, row, widths)).rstrip() for row in table)
-    return "what the scales change:\n" + "".join(f"  {line}\n" for line in lines)
+    return "fields set by --scale:\n" + "".join(f"  {line}\n" for line in lines)
 
 
 def _values(config: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Fields as their options spell them, with their values."""
+    """Yield option names and values of all fields except the scale."""
     for field in dataclasses.fields(config):
         value, name = getattr(config, field.name), prefix + field.name.replace("_", "-")
         if dataclasses.is_dataclass(value):

@@ -125,16 +125,16 @@ def prepare(config: Config, folder: Path, console: Console, started: float) -> R
     """
     built = build(config, folder)
     base, model = built.base, built.model
-    processes.agree("bases", {"base": built.base_hash, "remat": base.config.remat})
+    processes.agree("base models", {"base": built.base_hash, "remat": base.config.remat})
     console.print(headline(config, model))
     console.print(f"memory by device: {built.memory}; rematerialisation: {base.config.remat}")
     run = Run(config, folder, console, built.base_hash, started)
-    with run.timed("collect"), processes.first_goes_ahead("collected"):
+    with run.timed("collect"), processes.first_process_first("collected"):
         if built.source:
             _import(run, built.source, built.room)
         else:
             run.episodes = _collect(run, built.prompts.instructions)
-    run.streams = processes.anywhere(run.streams)  # all or none: they share every batch
+    run.streams = processes.any_process(run.streams)  # all or none: they share every batch
     relative = config.model.relative_actions
     found = processor([*run.episodes.values()], model.config, built.prompts, relative=relative)
     if config.peft.needs_statistics:

@@ -160,7 +160,7 @@ def make_stepper(
         if number:
             episodes = collect(run.config, number)
             steps = of_size(flatten(list(episodes.values())), len(steps.end))
-        return processes.put(steps, meshes.replicated(mesh))
+        return processes.device_put(steps, meshes.replicated(mesh))
 
     if run.config.data.fresh_every:
         return RefreshingStepper(jitted, frozen, speed, run.config, generation, start)

@@ -1,4 +1,4 @@
-"""The console command: the same programs as `python train.py` and the modules, by one name."""
+"""The console command: one name for `python train.py` and the modules."""
 
 import importlib
 import os
@@ -25,11 +25,11 @@ def console(*arguments, cwd=None):
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
 
 
-def test_what_is_no_command_is_refused():
-    found = console("trian")
-    assert found.returncode == 2
-    assert "'trian' (choose from" in found.stderr
-    assert "Traceback" not in found.stderr
+def test_unknown_commands_are_rejected():
+    result = console("trian")
+    assert result.returncode == 2
+    assert "'trian' (choose from" in result.stderr
+    assert "Traceback" not in result.stderr
 
 
 def test_interrupt_during_imports_prints_nothing(tmp_path, monkeypatch):
@@ -54,16 +54,16 @@ def test_every_command_has_help_under_its_own_name(name, capsys):
 
 def test_train_is_the_same_program(tmp_path):
     bad = ["--config", "configs/multitask.py", "--scale", "smoke", "--peft.rnk", "3"]
-    found = console("train", *bad, cwd=tmp_path)
+    result = console("train", *bad, cwd=tmp_path)
     script = [sys.executable, str(ROOT / "train.py"), *bad]
     other = subprocess.run(script, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert found.returncode == other.returncode == 2
-    assert found.stderr == other.stderr
-    assert "did you mean --peft.rank?" in found.stderr
+    assert result.returncode == other.returncode == 2
+    assert result.stderr == other.stderr
+    assert "did you mean --peft.rank?" in result.stderr
     assert not list(tmp_path.iterdir())
 
 
-def test_report_is_written_again(tmp_path, capsys):
+def test_report_is_rebuilt(tmp_path, capsys):
     folder = finish(tmp_path)
     assert report.main([str(folder)]) == 0
     assert capsys.readouterr().out == f"report: {folder / 'report.html'}\n"
@@ -101,15 +101,10 @@ def bash_script(tmp_path_factory):
         (["train", "--config", "run"], {"runs"}),
     ],
 )
-def test_the_tab_key(words, expected, bash_script, tmp_path):
+def test_bash_completion(words, expected, bash_script, tmp_path):
     (tmp_path / "runs").mkdir()
-    words = ["lorasp-jax", *words]
-    press = 'source "$0"; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1))\n'
-    press += (
-        '_shtab_lorasp_jax lorasp-jax "${@: -1}" "${@: -2:1}"\nprintf "%s\\n" "${COMPREPLY[@]}"'
-    )
     found = subprocess.run(
-        ["bash", "-c", press, bash_script, *words],
+        ["bash", "-c", TAB, bash_script, "lorasp-jax", *words],
         cwd=tmp_path,
         capture_output=True,
         text=True,

@@ -57,7 +57,7 @@ def test_handlers_are_put_back_after_an_error(block):
     [
         ("jax", signal.SIGTERM, ""),
         ("jax", signal.SIGINT, ""),
-        ("lorasp_jax.training.cost.dry_run", signal.SIGTERM, "stopped; to go on: python train.py"),
+        ("lorasp_jax.training.cost.dry_run", signal.SIGTERM, "stopped; to resume: python train.py"),
     ],
 )
 def test_a_process_that_starts(place, number, said, tmp_path):

@@ -85,7 +85,7 @@ def test_a_killed_run_resumes_to_the_bit(times, whole, tmp_path, capsys):
 
 def test_a_signal_to_another_process_stops_this_one_too(tmp_path, monkeypatch):
     asked = iter([False, True])  # at steps 1 and 2
-    monkeypatch.setattr(processes, "anywhere", lambda _: next(asked))
+    monkeypatch.setattr(processes, "any_process", lambda _: next(asked))
     assert work(tmp_path / "run", 6, devices=1) is None
     assert sorted(os.listdir(tmp_path / "run/checkpoints")) == ["1", "2"]
 

@@ -1,1 +1,1 @@
-"""Training on several devices and in several processes."""
+"""Training on several devices and in several processes: mesh, start, barriers and joint exit."""

@@ -1,7 +1,7 @@
-"""The ("data", "fsdp") device mesh and where each array lives on it.
+"""The ("data", "fsdp") device mesh and the shardings of arrays on it.
 
-One code path for one device and for many: the step is written for the global batch, `jax.jit`
-with `NamedSharding` does the rest. This is what "pmap'd training" means on today's JAX
+One code path serves one device and many: the step is written for the global batch, and `jax.jit`
+with `NamedSharding` parallelizes it. This is the successor of `pmap` in today's JAX
 (docs.jax.dev/en/latest/migrate_pmap.html).
 """
 
@@ -17,7 +17,7 @@ MINIMUM_SHARDED_BYTES = 4 * 2**20
 
 
 def make_mesh(fsdp: int = 1, devices: Sequence[Any] | None = None) -> Mesh:
-    """A mesh over `devices` (default: all) with axes ("data", "fsdp").
+    """Return a mesh over `devices` (default: all) with axes ("data", "fsdp").
 
     Raises:
         ValueError: the number of devices is not a multiple of `fsdp`.
@@ -30,19 +30,19 @@ def make_mesh(fsdp: int = 1, devices: Sequence[Any] | None = None) -> Mesh:
 
 
 def replicated(mesh: Mesh) -> NamedSharding:
-    """Every device holds the whole array."""
+    """Sharding with the whole array on every device."""
     return NamedSharding(mesh, PartitionSpec())
 
 
 def batch_sharding(mesh: Mesh) -> NamedSharding:
-    """The leading axis is split over all devices."""
+    """Sharding with the leading axis split over all devices."""
     return NamedSharding(mesh, PartitionSpec(("data", "fsdp")))
 
 
 def split_axis(shape: Sequence[int], size: int, fsdp: int, minimum: int) -> int | None:
-    """The axis of an array of `size` bytes that is split over `fsdp` devices; None: it is whole.
+    """Return the axis to shard over `fsdp` devices; None: replicate.
 
-    The largest that can be, of an array of at least `minimum` bytes.
+    It is the largest axis that `fsdp` divides; arrays of `size` < `minimum` bytes are replicated.
     """
     divisible = [axis for axis, length in enumerate(shape) if length % fsdp == 0]
     if fsdp == 1 or not divisible or size < minimum:
@@ -51,27 +51,27 @@ def split_axis(shape: Sequence[int], size: int, fsdp: int, minimum: int) -> int 
 
 
 def shardings(tree: Any, mesh: Mesh, minimum: int = MINIMUM_SHARDED_BYTES) -> Any:
-    """Where each array of a tree lies: large ones split over "fsdp", others on every device.
+    """Return a sharding per array of a tree: large arrays over "fsdp", the others replicated.
 
-    It follows from shapes alone, so that moments and averages lie as their parameters do.
+    It depends on shapes alone, so optimizer moments and averages are sharded like their parameters.
     """
 
-    def place(array: Any) -> NamedSharding:
-        size, spec = array.size * array.dtype.itemsize, [None] * array.ndim
+    def sharding(array: Any) -> NamedSharding:
+        size = array.size * array.dtype.itemsize
         axis = split_axis(array.shape, size, mesh.shape["fsdp"], minimum)
-        names = ("fsdp" if axis == own else None for own, _ in enumerate(spec))
+        names = ("fsdp" if i == axis else None for i in range(array.ndim))
         return NamedSharding(mesh, PartitionSpec(*names) if axis is not None else PartitionSpec())
 
-    return jax.tree.map(place, tree)
+    return jax.tree.map(sharding, tree)
 
 
 def bytes_on_device(tree: Any, fsdp: int, minimum: int = MINIMUM_SHARDED_BYTES) -> float:
-    """What one device holds of a tree that lies as `shardings` says."""
+    """Return the bytes per device of a tree sharded by `shardings`."""
 
-    def held(array: Any) -> float:
+    def local_bytes(array: Any) -> float:
         size = array.size * array.dtype.itemsize
-        whole = split_axis(array.shape, size, fsdp, minimum) is None
-        return size if whole else size / fsdp
+        is_whole = split_axis(array.shape, size, fsdp, minimum) is None
+        return size if is_whole else size / fsdp
 
     leaves = [leaf for leaf in jax.tree.leaves(tree) if hasattr(leaf, "dtype")]
-    return float(sum(held(leaf) for leaf in leaves))
+    return float(sum(local_bytes(leaf) for leaf in leaves))

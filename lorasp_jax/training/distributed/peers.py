@@ -1,4 +1,4 @@
-"""A process's connection to the others of its run, see `meeting`."""
+"""Client side of `rendezvous`: the connection of each process to the other processes of its run."""
 
 import contextlib
 import json
@@ -11,74 +11,84 @@ import time
 from collections.abc import Callable, Mapping
 from typing import IO, Any
 
-from lorasp_jax.training.distributed import meeting
+from lorasp_jax.training.distributed import rendezvous
 
-_TRY_EVERY, _ANSWER = 0.5, 5.0  # s
-_SILENCE = 3.0  # s without a connection after which that is said
-_PAUSE = 0.5  # s
+_CONNECT_TIMEOUT = 5.0  # s
+_ROOT_CAUSE_DELAY = 0.5  # s
 
 
 class Peers:
-    """The other processes, as this one knows them.
+    """The other processes of the run, as seen from this one.
 
     Attributes:
-        number: this one's.
-        last_words: why it ends, if it does.
+        number: index of this process.
+        exit_reason: why this process exits, reported to the others.
     """
 
     def __init__(
-        self, address: str, number: int, count: int, say: Callable[[str], None], advice: str
+        self,
+        address: str,
+        number: int,
+        count: int,
+        say: Callable[[str], None],
+        hint: str,
+        *,
+        retry_interval: float = 0.5,
+        notice_after: float = 3.0,
     ) -> None:
-        """Join them.
+        """Connect to the first process.
 
         Args:
-            address: host:port where they meet.
-            number: this process's, of `count`.
+            address: host:port of the rendezvous.
+            number: index of this process, 0 to `count` - 1.
+            count: number of processes.
             say: prints a line.
-            advice: what to do when the others are gone.
+            hint: what to do after the connection is lost.
+            retry_interval: time between two attempts to connect [s].
+            notice_after: time without a connection before a notice is printed [s].
 
         Raises:
             ValueError: the address cannot be reached.
         """
         self.number: int = number
-        self._address, self._say, self._advice = address, say, advice
+        self._address, self._say, self._hint = address, say, hint
         self._answers: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-        self.last_words: str = ""
+        self.exit_reason: str = ""
         self._code = None
-        self._socket, self._lines = _connected(address, number, say)
+        self._socket, self._lines = _connect(address, number, say, retry_interval, notice_after)
         self._send({"process": number, "of": count, "host": platform.node()})
-        self._listening = threading.Thread(target=self._listen, daemon=True)
-        self._listening.start()
+        self._listener = threading.Thread(target=self._listen, daemon=True)
+        self._listener.start()
 
     def agree(self, topic: str, facts: Mapping[str, Any]) -> None:
-        """Wait until all have said the same.
+        """Block until all processes report equal facts.
 
         Args:
-            topic: what the facts are, in the plural.
-            facts: JSON values by name; values may be such mappings again.
+            topic: plural noun for the facts, used in messages.
+            facts: JSON values by name, possibly nested mappings.
 
         Raises:
-            ValueError: another process says something else, or the run was refused before.
+            ValueError: the facts of another process differ, or the run was rejected earlier.
         """
-        self._send({"topic": topic, "facts": flat(facts)})
+        self._send({"topic": topic, "facts": flatten(facts)})
         answer = self._answers.get()
         if answer["refused"]:
             raise ValueError(answer["refused"])
 
-    def give_way(self) -> None:
-        """Let the end of another process, which may be why this one fails, be heard first."""
-        time.sleep(_PAUSE)
+    def wait_for_root_cause(self) -> None:
+        """Let a failing process report first: it may be the cause of this one's failure."""
+        time.sleep(_ROOT_CAUSE_DELAY)
 
-    def leave(self, code: int) -> None:
-        """Tell the others that this process ends; unless the code is 0, wait for them to end."""
+    def announce_exit(self, code: int) -> None:
+        """Tell the others that this process exits; wait for them unless the code is 0."""
         self._code = code
-        self._send({"leaving": code, "reason": self.last_words})
+        self._send({"leaving": code, "reason": self.exit_reason})
         if code:
-            self._listening.join(2 * meeting.GRACE)
+            self._listener.join(2 * rendezvous.EXIT_GRACE)
 
     def _listen(self) -> None:
-        """Hear the others until the end, which is this process's, too."""
-        # Cut off in the midst of a line, the connection is as lost as otherwise.
+        """Receive messages until the run ends, then exit this process."""
+        # A partial line means that the connection is lost.
         with self._socket, self._lines, contextlib.suppress(OSError, ValueError):
             for line in self._lines:
                 message = json.loads(line)
@@ -86,35 +96,35 @@ class Peers:
                     self._stop(message["leave"], message["say"])
                 self._answers.put(message)
         if self._code is None:
-            lost = f"the first process, at {self._address}, is gone without a word"
-            why = "it was killed, or its machine or network failed"
-            self._stop(1, f"{lost}: {why}; {self._advice}")
+            lost = f"the first process, at {self._address}, disconnected unexpectedly"
+            cause = "it was killed, or its machine or network failed"
+            self._stop(1, f"{lost}: {cause}; {self._hint}")
 
     def _stop(self, code: int, reason: str) -> None:
-        """End this process, whatever its other threads are doing."""
+        """Exit this process at once, whatever its other threads are doing."""
         if reason:
             self._say(reason)
         os._exit(self._code or code)
 
     def _send(self, message: dict[str, Any]) -> None:
-        with contextlib.suppress(OSError):  # the listener hears of it
-            self._socket.sendall(meeting.encode(message))
+        with contextlib.suppress(OSError):  # the listener thread notices a lost connection
+            self._socket.sendall(rendezvous.encode(message))
 
 
-def flat(facts: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested mappings as one, with dotted names."""
-    found: dict[str, Any] = {}
+def flatten(facts: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Flatten nested mappings into one with dotted names."""
+    flat: dict[str, Any] = {}
     for name, value in facts.items():
         nested = isinstance(value, Mapping)
-        found |= flat(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}": value}
-    return found
+        flat |= flatten(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}": value}
+    return flat
 
 
 def split_address(address: str) -> tuple[str, int]:
-    """Host and port.
+    """Split an address into host and port.
 
     Raises:
-        ValueError: it is not HOST:PORT.
+        ValueError: the address is not HOST:PORT.
     """
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 2**16:
@@ -125,10 +135,10 @@ def split_address(address: str) -> tuple[str, int]:
 
 
 def listen(address: str) -> socket.socket:
-    """Listen at an address of this host.
+    """Listen at the port of an address of this host.
 
     Raises:
-        ValueError: its port cannot be had.
+        ValueError: the port is not available.
     """
     _, port = split_address(address)
     dual = socket.has_dualstack_ipv6()
@@ -137,54 +147,59 @@ def listen(address: str) -> socket.socket:
         return socket.create_server(("", port), family=family, dualstack_ipv6=dual)
     except OSError as error:
         raise ValueError(
-            f"port {port} of {platform.node()} cannot be had ({error.strerror}): choose "
+            f"port {port} of {platform.node()} is not available ({error.strerror}): choose "
             "another one in JAX_COORDINATOR_ADDRESS or, under Slurm, in JAX_COORDINATOR_PORT"
         ) from error
 
 
-def _connected(
-    address: str, number: int, say: Callable[[str], None]
+def _connect(
+    address: str,
+    number: int,
+    say: Callable[[str], None],
+    retry_interval: float,
+    notice_after: float,
 ) -> tuple[socket.socket, IO[bytes]]:
-    """A connection to where the first process waits, or will, and the lines that come from there.
+    """Connect to the first process, retrying until it is up; return the socket and its lines.
 
     Raises:
-        ValueError: nobody answers there, or somebody else.
+        ValueError: nothing answers, or something other than a run.
     """
-    began, told = time.monotonic(), False
+    start, notified = time.monotonic(), False
     while True:
         try:
-            return _greeted(*split_address(address))
+            return _open_connection(*split_address(address))
         except OSError as error:
             reason = error.strerror or str(error)
-        waited = time.monotonic() - began
-        if waited > meeting.PATIENCE:
+        waited = time.monotonic() - start
+        if waited > rendezvous.JOIN_TIMEOUT:
             raise ValueError(
-                f"process {number} found no first process at {address} in {meeting.PATIENCE:.0f} "
-                f"s ({reason}): see that it was started, and that this is its address"
+                f"process {number} could not reach the first process at {address} within "
+                f"{rendezvous.JOIN_TIMEOUT:.0f} s ({reason}): check that it is running and that "
+                "this is its address"
             )
-        if waited > _SILENCE and not told:
-            say(f"process {number} waits for the first one at {address} ({reason})")
-            told = True
-        time.sleep(_TRY_EVERY)
+        if waited > notice_after and not notified:
+            say(f"process {number} is waiting for the first process at {address} ({reason})")
+            notified = True
+        time.sleep(retry_interval)
 
 
-def _greeted(host: str, port: int) -> tuple[socket.socket, IO[bytes]]:
-    """A connection to a run's first process.
+def _open_connection(host: str, port: int) -> tuple[socket.socket, IO[bytes]]:
+    """Connect to the first process of a run.
 
     Raises:
-        OSError: there is none.
+        OSError: nothing answers, or something other than a run that waits for processes.
     """
-    connection = socket.create_connection((host, port), timeout=_ANSWER)
+    connection = socket.create_connection((host, port), timeout=_CONNECT_TIMEOUT)
     with contextlib.ExitStack() as stack:
         stack.enter_context(connection)
         lines = stack.enter_context(connection.makefile("rb"))
         try:
-            greeting = json.loads(lines.readline(meeting.LONGEST))
+            greeting = json.loads(lines.readline(rendezvous.MAX_MESSAGE_BYTES))
         except ValueError:
             greeting = None
-        if greeting != meeting.GREETING:
-            raise OSError("what answers is no run, or one that has begun")
+        if greeting != rendezvous.GREETING:
+            raise OSError("the process listening there is not a run waiting for processes")
         connection.settimeout(None)
-        meeting.keep_alive(connection)
-        stack.pop_all()  # stays open
+        rendezvous.keep_alive(connection)
+        stack.pop_all()  # keep the connection open
     return connection, lines

@@ -1,7 +1,7 @@
-"""A run in several processes: what each does alone, and where they wait for one another.
+"""Runs in several processes: start, barriers, shared arrays and joint exit.
 
-All train; the first one alone collects, evaluates, prints and writes. The folder of runs must be
-one that all of them see. With one process nothing here does anything.
+All processes train; only the first one collects, evaluates, prints and writes. The runs folder must
+be on storage that all of them share. In a single process everything here is a no-op.
 """
 
 import atexit
@@ -25,65 +25,67 @@ from rich.console import Console
 
 from lorasp_jax import _compat
 from lorasp_jax.training.distributed import peers
-from lorasp_jax.training.distributed.meeting import PATIENCE, Meeting
+from lorasp_jax.training.distributed.rendezvous import JOIN_TIMEOUT, Rendezvous
 
-_LONGEST_WAIT = 24 * 3600 * 1000  # ms; the first process may collect and evaluate for hours
-_NAMES = ("JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
-_VERSIONED = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "mujoco", "mujoco-mjx")
-_FAILED = "ended by an error, its traceback is in its output"
+_BARRIER_TIMEOUT = 24 * 3600 * 1000  # ms; the first process may collect and evaluate for hours
+_VARIABLES = ("JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
+_PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "mujoco", "mujoco-mjx")
+_UNCAUGHT = "failed with an exception, see its output for the traceback"
 
-_others: peers.Peers | None = None
+_peers: peers.Peers | None = None
 
 
-def initialize(console: Console, advice: str) -> None:
-    """Join the other processes; before JAX starts its backend.
+def initialize(console: Console, hint: str) -> None:
+    """Connect to the other processes; call before JAX starts its backend.
 
-    From then on all of them end when one does, unless all have finished. JAX finds the address
-    itself under Slurm, Open MPI, Kubernetes and on TPU pods. Elsewhere JAX_COORDINATOR_ADDRESS
-    (host:port of the first process), JAX_NUM_PROCESSES and JAX_PROCESS_ID say it.
+    If one process exits early afterwards, all exit. JAX finds the address by itself under Slurm,
+    Open MPI, Kubernetes and on TPU pods. Elsewhere set JAX_COORDINATOR_ADDRESS (host:port of the
+    first process), JAX_NUM_PROCESSES and JAX_PROCESS_ID.
 
     Args:
-        console: where the first process says whom it waits for.
-        advice: what to do when another one is gone.
+        console: console for the status messages of the first process.
+        hint: what to do after another process died.
 
     Raises:
-        ValueError: nothing says where the others are, they cannot be reached, or another one runs
-            other versions.
+        ValueError: the environment does not describe the processes, they cannot be reached, or
+            their versions differ.
     """
-    global _others  # noqa: PLW0603
-    address, count, number = _whereabouts()
+    global _peers  # noqa: PLW0603
+    address, count, number = _cluster_info()
     if number == 0:
         listener = peers.listen(address)
         console.print(f"waiting for {count} processes at {address}", highlight=False)
-        Meeting(listener, address, count, advice)
-    _others = peers.Peers(address, number, count, _say, advice)
-    _others.agree("versions", _versions())
+        Rendezvous(listener, address, count, hint)
+    _peers = peers.Peers(address, number, count, _say, hint)
+    _peers.agree("versions", _versions())
     if os.environ.get("JAX_PLATFORMS") == "cpu":
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
-    jax.config.update("jax_enable_preemption_service", False)  # signals are `interrupt`'s
+    jax.config.update("jax_enable_preemption_service", False)  # `interrupt` handles signals
     jax.distributed.initialize(address, count, number)
-    _abort_slowly()
-    atexit.register(_others.leave, 0)  # before JAX, which waits for the others
-    sys.excepthook = _fail
+    _delay_abort()
+    atexit.register(_peers.announce_exit, 0)  # runs before JAX's own, which waits for the others
+    sys.excepthook = _exit_on_exception
 
 
-def _whereabouts() -> tuple[str, int, int]:
-    """The address where all meet, how many they are, and this one's number.
+def _cluster_info() -> tuple[str, int, int]:
+    """Return the coordinator's address, the number of processes and the index of this one.
 
     Raises:
-        ValueError: nothing says it, or something wrong.
+        ValueError: the environment does not describe them, or is invalid.
     """
     try:
-        count, number = (int(os.environ[name]) if name in os.environ else None for name in _NAMES)
+        count, number = (
+            int(os.environ[name]) if name in os.environ else None for name in _VARIABLES
+        )
         address, count, number, _ = _compat.find_processes(
-            os.environ.get("JAX_COORDINATOR_ADDRESS"), count, number, None, None, int(PATIENCE)
+            os.environ.get("JAX_COORDINATOR_ADDRESS"), count, number, None, None, int(JOIN_TIMEOUT)
         )
         if address is None or count is None or number is None:
-            raise ValueError("nothing says where they are")
+            raise ValueError("no coordinator address")
     except (ValueError, RuntimeError) as error:
         raise ValueError(
-            "--distributed found no other processes: start it by Slurm, Open MPI or on a TPU pod, "
-            f"or set JAX_COORDINATOR_ADDRESS, {' and '.join(_NAMES)} ({error})"
+            "--distributed found no launcher: start with Slurm, Open MPI or on a TPU pod, or set "
+            f"JAX_COORDINATOR_ADDRESS, {' and '.join(_VARIABLES)} ({error})"
         ) from error
     if not 0 <= number < count:
         raise ValueError(f"JAX_PROCESS_ID must be 0 to {count - 1}, got {number}")
@@ -91,24 +93,25 @@ def _whereabouts() -> tuple[str, int, int]:
 
 
 def _versions() -> dict[str, str]:
-    """What must be the same for all to compute the same."""
-    found = {name: importlib.metadata.version(name) for name in _VERSIONED}
+    """Return the versions that must match for all processes to compute the same."""
+    versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
     sources = hashlib.sha256()
     for package in ("envs", "lorasp_jax"):
         spec = importlib.util.find_spec(package)
         folder = Path(str(spec and spec.origin)).parent
         for file in sorted(folder.rglob("*.py")):
             sources.update(f"{file.relative_to(folder)}\n".encode() + file.read_bytes())
-    return found | {"source of lorasp_jax": sources.hexdigest()[:12]}
+    return versions | {"source of lorasp_jax": sources.hexdigest()[:12]}
 
 
-def _abort_slowly() -> None:
-    """Give a process that JAX aborts, because the first one is gone, the time to say so.
+def _delay_abort() -> None:
+    """Delay SIGABRT, by which JAX ends a process without its coordinator, to report the loss first.
 
-    A handler of SIGABRT in Python would never run. C's `sleep` may be one, as it is safe in signal
-    handlers: it is called with the signal's number, 6, for seconds. JAX's own ways end the same
-    (tried with 0.10.2 and 0.12): `jax_enable_recoverability` concerns the deaths of others than the
-    first, and the client's `missed_heartbeat_callback` ends in std::bad_cast before it is called.
+    Python signal handlers do not run during abort(). C's `sleep` is async-signal-safe and can be
+    the handler: called with the signal number, 6, it sleeps 6 s. JAX's own options do not help
+    (tested with 0.10.2 and 0.12): `jax_enable_recoverability` covers only failures of processes
+    other than the first, and the client's `missed_heartbeat_callback` dies of std::bad_cast before
+    it is called.
     """
     library = ctypes.CDLL(None)
     library.signal.argtypes = (ctypes.c_int, ctypes.c_void_p)
@@ -116,112 +119,112 @@ def _abort_slowly() -> None:
 
 
 def agree(topic: str, facts: Mapping[str, Any]) -> None:
-    """Wait until all processes have said the same.
+    """Block until all processes report equal facts.
 
     Args:
-        topic: what the facts are, in the plural.
-        facts: JSON values by name; values may be such mappings again.
+        topic: plural noun for the facts, used in messages.
+        facts: JSON values by name, possibly nested mappings.
 
     Raises:
-        ValueError: another process says something else.
+        ValueError: the facts of another process differ.
     """
-    if _others is not None:
-        _others.agree(topic, facts)
+    if _peers is not None:
+        _peers.agree(topic, facts)
 
 
-class LastWords(Console):
-    """Where a process says why it ends; of several, the first one says it for all."""
+class ExitConsole(Console):
+    """Console for the reason why this process exits; only the first process prints it."""
 
     def print(self, *objects: Any, **options: Any) -> None:
-        """As rich has it."""
-        if _others is not None:
-            _others.give_way()
-            _others.last_words = " ".join(map(str, objects))
-        if _others is None or _others.number == 0:
+        """See `rich.console.Console.print`."""
+        if _peers is not None:
+            _peers.wait_for_root_cause()
+            _peers.exit_reason = " ".join(map(str, objects))
+        if _peers is None or _peers.number == 0:
             super().print(*objects, **options)
 
 
-def leave(code: int) -> NoReturn:
-    """End this process at once, with all its threads, and the others with it."""
+def exit_all(code: int) -> NoReturn:
+    """Exit this process at once, with all its threads, and make the other processes exit."""
     sys.stdout.flush()
     sys.stderr.flush()
-    if _others is not None:
-        _others.leave(code)
+    if _peers is not None:
+        _peers.announce_exit(code)
     os._exit(code)
 
 
 def _say(text: str) -> None:
-    """Print what was heard of the others."""
+    """Print a message about the other processes."""
     errors = Console(stderr=True)
-    errors.show_cursor()  # which a progress bar hides
+    errors.show_cursor()  # a progress bar may have hidden it
     errors.print(text, style="red", soft_wrap=True, highlight=False, markup=False)
 
 
-def _fail(
+def _exit_on_exception(
     kind: type[BaseException], error: BaseException, traceback: TracebackType | None
 ) -> NoReturn:
-    """End by an error that nobody caught; JAX would wait for the others first."""
-    if _others is not None:
-        _others.give_way()
-        _others.last_words = _FAILED
+    """Exit at once on an uncaught exception; JAX would wait for the other processes first."""
+    if _peers is not None:
+        _peers.wait_for_root_cause()
+        _peers.exit_reason = _UNCAUGHT
     sys.__excepthook__(kind, error, traceback)
-    leave(1)
+    exit_all(1)
 
 
 def is_first() -> bool:
-    """Whether this process is the one that prints and writes."""
+    """Whether this is the first process, which prints and writes."""
     return jax.process_index() == 0
 
 
-def wait(name: str) -> None:
-    """Wait until all processes are here; on the host, as devices do not wait for hours."""
+def barrier(name: str) -> None:
+    """Wait for all processes, on the host: a collective on the devices would time out."""
     import orbax.checkpoint as ocp
 
-    ocp.multihost.get_barrier_sync_fn()(key=name, timeout_ms=_LONGEST_WAIT)
+    ocp.multihost.get_barrier_sync_fn()(key=name, timeout_ms=_BARRIER_TIMEOUT)
 
 
 @contextlib.contextmanager
-def first_goes_ahead(name: str) -> Iterator[None]:
-    """The first process runs this block, then all others do, which find what it wrote."""
+def first_process_first(name: str) -> Iterator[None]:
+    """Run the block in the first process, then in the others, which find the files it wrote."""
     if not is_first():
-        wait(name)
+        barrier(name)
     yield
     if is_first():
-        wait(name)
+        barrier(name)
 
 
-def anywhere(flag: bool) -> bool:
-    """Whether the flag is up in any process."""
+def any_process(flag: bool) -> bool:
+    """Whether `flag` is true in any process."""
     if jax.process_count() == 1:
         return flag
     return bool(multihost_utils.process_allgather(np.array(flag)).any())
 
 
-def put(tree: Any, shardings: Any) -> Any:
-    """Arrays that every process holds, on the devices of all of them.
+def device_put(tree: Any, shardings: Any) -> Any:
+    """Place arrays that every process holds on the devices of all processes.
 
     Args:
-        tree: of arrays, equal in all processes.
-        shardings: of each array, or one of all.
+        tree: pytree of arrays, equal in all processes.
+        shardings: a sharding per array, or one for all.
     """
     if jax.process_count() == 1:
         return jax.device_put(tree, shardings)
     if isinstance(shardings, jax.sharding.Sharding):
-        return jax.tree.map(lambda array: _spread(array, shardings), tree)
-    return jax.tree.map(_spread, tree, shardings)
+        return jax.tree.map(lambda array: _to_global(array, shardings), tree)
+    return jax.tree.map(_to_global, tree, shardings)
 
 
-def _spread(array: Any, sharding: jax.sharding.Sharding) -> jax.Array:
-    whole = np.asarray(array)
-    return jax.make_array_from_callback(whole.shape, sharding, lambda index: whole[index])
+def _to_global(array: Any, sharding: jax.sharding.Sharding) -> jax.Array:
+    host = np.asarray(array)
+    return jax.make_array_from_callback(host.shape, sharding, lambda index: host[index])
 
 
-def own(tree: Any) -> Any:
-    """Arrays that lie on the devices of all processes, whole on each one's first device."""
-    return jax.tree.map(_whole, tree) if jax.process_count() > 1 else tree
+def to_local(tree: Any) -> Any:
+    """Gather arrays sharded over all processes onto the first device of each process."""
+    return jax.tree.map(_gather, tree) if jax.process_count() > 1 else tree
 
 
-def _whole(array: Any) -> Any:
+def _gather(array: Any) -> Any:
     if not isinstance(array, jax.Array) or array.is_fully_addressable:
         return array
     if array.is_fully_replicated:

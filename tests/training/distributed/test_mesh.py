@@ -1,4 +1,4 @@
-"""One device and eight agree; large frozen arrays are split."""
+"""One device and eight agree; large frozen arrays are sharded."""
 
 import dataclasses
 import functools
@@ -30,7 +30,7 @@ REST = "(vision|action)/blocks/q_proj|down_proj"
     [(FEW, [(REST, LoRA(rank=8))]), pytest.param(CONFIG.targets, [], marks=pytest.mark.slow)],
 )
 def test_one_and_eight_devices_agree(tmp_path, targets, plain):
-    """LoRA-SP on layers alone and on stacks; LoRA, which compiles sooner, on the rest."""
+    """LoRA-SP on single and on scanned layers; LoRA, which compiles faster, on the rest."""
     run = make_run(tmp_path / "run", dataclasses.replace(CONFIG, targets=targets))
     model = run.policy.model
     if plain:
@@ -46,16 +46,16 @@ def test_one_and_eight_devices_agree(tmp_path, targets, plain):
     )
     weights = {"spectral": 1e-2, "balance": 1e-3, "z": 1e-3}
 
-    traced_once = jax.jit(jax.value_and_grad(loss_fn, has_aux=True), static_argnums=2)
+    value_and_grad = jax.jit(jax.value_and_grad(loss_fn, has_aux=True), static_argnums=2)
 
     def gradients(mesh):
-        place = meshes.replicated(mesh)
-        return traced_once(
-            jax.device_put(moved(adapters, 0.1), place),
+        replicated = meshes.replicated(mesh)
+        return value_and_grad(
+            jax.device_put(moved(adapters, 0.1), replicated),
             jax.device_put(frozen, meshes.shardings(frozen, mesh, minimum=1024)),
             graphdef,
             jax.device_put(batch, meshes.batch_sharding(mesh)),
-            jax.device_put(jax.random.key(1), place),
+            jax.device_put(jax.random.key(1), replicated),
             weights,
         )
 
@@ -74,23 +74,23 @@ def test_one_and_eight_devices_agree(tmp_path, targets, plain):
 def test_sharding_rule():
     mesh = meshes.make_mesh(4)
     assert dict(mesh.shape) == {"data": 2, "fsdp": 4}
-    big, odd, little = jnp.zeros((6, 4096, 1024)), jnp.zeros((1025, 1025)), jnp.zeros((8, 8))
-    state = init_state({"big": big, "odd": odd, "little": little}, optax.adam(0.1), ema=True)
+    big, odd, small = jnp.zeros((6, 4096, 1024)), jnp.zeros((1025, 1025)), jnp.zeros((8, 8))
+    state = init_state({"big": big, "odd": odd, "small": small}, optax.adam(0.1), ema=True)
     found = meshes.shardings(state, mesh)
     for tree in (found.adapters, found.opt_state[0].mu, found.opt_state[0].nu, found.average):
         assert tree["big"].spec == PartitionSpec(None, "fsdp", None)
-        assert tree["odd"].spec == tree["little"].spec == PartitionSpec()
-    assert meshes.shardings(little, mesh, minimum=1).spec == PartitionSpec("fsdp", None)
+        assert tree["odd"].spec == tree["small"].spec == PartitionSpec()
+    assert meshes.shardings(small, mesh, minimum=1).spec == PartitionSpec("fsdp", None)
     placed = jax.device_put(state, found)
     on_one = sum(x.addressable_shards[0].data.nbytes for x in jax.tree.leaves(placed))
     assert meshes.bytes_on_device(state, fsdp=4) == on_one < 0.3 * meshes.bytes_on_device(state, 1)
 
 
 @pytest.mark.slow
-def test_full_fine_tuning_is_split_and_the_numbers_are_those_of_one_device(tmp_path, monkeypatch):
-    """What trains, its moments and its average; a run in another mesh goes on with them."""
-    split = functools.partial(meshes.shardings, minimum=1024)
-    monkeypatch.setattr(meshes, "shardings", split)
+def test_sharded_full_fine_tuning_equals_one_device(tmp_path, monkeypatch):
+    """Parameters, moments and average are sharded; a run on another mesh resumes with them."""
+    sharded = functools.partial(meshes.shardings, minimum=1024)
+    monkeypatch.setattr(meshes, "shardings", sharded)
     optim = dataclasses.replace(CONFIG.optim, ema=0.5)
     config = dataclasses.replace(
         CONFIG, peft=FullFineTuning(), targets=("action",), fsdp=2, optim=optim

@@ -1,7 +1,8 @@
-"""The processes of a run meet, agree, and hear of each other's end; here as threads of one."""
+"""Processes of a run connect, agree and exit together; here they are threads of one process."""
 
 import contextlib
 import queue
+import re
 import socket
 import threading
 import time
@@ -10,176 +11,175 @@ from typing import ClassVar
 
 import pytest
 
-from lorasp_jax.training.distributed import meeting, peers
-from lorasp_jax.training.distributed.meeting import Meeting
+from lorasp_jax.training.distributed import peers, rendezvous
+from lorasp_jax.training.distributed.rendezvous import Rendezvous
 from tests.several import free_address
 
-ADVICE = "to go on: add --resume"
+HINT = "to go on: add --resume"
 
 
 class Process(peers.Peers):
-    """One that says how it ends in place of ending."""
+    """A process that records how it would exit."""
 
-    made: ClassVar[list] = []
+    created: ClassVar[list] = []
 
     def __init__(self, address, number, count=2):
-        self.said, self.end = [], queue.SimpleQueue()
-        self.made.append(self)
-        super().__init__(address, number, count, self.said.append, ADVICE)
+        self.printed, self.exits = [], queue.SimpleQueue()
+        self.created.append(self)
+        super().__init__(address, number, count, self.printed.append, HINT, retry_interval=0.05)
 
     def _stop(self, code, reason):
         self._code = self._code or code
-        self.end.put((self._code, reason))
+        self.exits.put((self._code, reason))
         self.die()
 
     def die(self):
-        """As SIGKILL closes its connection."""
-        with contextlib.suppress(OSError):  # it has
+        """Close the connection, as SIGKILL does."""
+        with contextlib.suppress(OSError):  # already closed
             self._socket.shutdown(socket.SHUT_RDWR)
 
-    def ended(self):
-        return self.end.get(timeout=10)
+    def exited(self):
+        """The exit code and the printed reason."""
+        return self.exits.get(timeout=10)
 
 
 @pytest.fixture(autouse=True)
-def _soon(monkeypatch):
-    monkeypatch.setattr(meeting, "PATIENCE", 1.0)
-    monkeypatch.setattr(meeting, "GRACE", 0.2)
-    monkeypatch.setattr(peers, "_TRY_EVERY", 0.05)
+def _short_timeouts(monkeypatch):
+    monkeypatch.setattr(rendezvous, "JOIN_TIMEOUT", 1.0)
+    monkeypatch.setattr(rendezvous, "EXIT_GRACE", 0.2)
     yield
-    while Process.made:
-        Process.made.pop().die()
+    while Process.created:
+        Process.created.pop().die()
 
 
-def meet(numbers=(0, 1), count=None):
-    """The processes of these numbers."""
+def connect(numbers=(0, 1), count=None):
+    """Start a rendezvous and connect the processes with these numbers."""
     address, count = free_address(), count or len(numbers)
-    Meeting(peers.listen(address), address, count, ADVICE)
+    Rendezvous(peers.listen(address), address, count, HINT)
     return [Process(address, number, count) for number in numbers]
 
 
 def agree(processes, *facts, topic="settings"):
-    """What each is refused for; None: all agree."""
+    """The error message of each process; None where all agree."""
     with ThreadPoolExecutor() as pool:
-        asked = [
-            pool.submit(process.agree, topic, said)
-            for process, said in zip(processes, facts, strict=True)
+        futures = [
+            pool.submit(process.agree, topic, values)
+            for process, values in zip(processes, facts, strict=True)
         ]
-        return [error and str(error) for error in (one.exception(30) for one in asked)]
+        return [error and str(error) for error in (future.exception(30) for future in futures)]
 
 
-def test_equal_facts_are_agreed_on_and_a_difference_is_named_to_all():
-    three = meet((0, 1, 2))
+def test_processes_agree_on_equal_facts_and_all_report_a_difference():
+    three = connect((0, 1, 2))
     same = {"seed": 0, "peft": {"rank": 8, "method": "LoRA"}, "tasks": ["press"]}
     for topic in ("versions", "settings"):
         assert agree(three, same, same, same, topic=topic) == [None] * 3
     other = same | {"seed": 5, "peft": {"rank": 8}}
-    reasons = agree(three, same, same, other, topic="bases")
+    reasons = agree(three, same, same, other, topic="base models")
     assert len({*reasons}) == 1
     assert reasons[0].startswith("process 2 on ")
-    assert "other bases than the first one" in reasons[0]
+    assert "different base models from the first process" in reasons[0]
     assert "(peft.method is None, not 'LoRA'; seed is 5, not 0): start all" in reasons[0]
 
 
-def test_many_differences_are_cut_short():
+def test_long_lists_of_differences_are_truncated():
     facts = [{f"field{i}": f"{i}{who}" for i in range(9)} for who in "ab"]
-    assert " and 4 more): start" in agree(meet(), *facts)[0]
+    assert " and 4 more): start" in agree(connect(), *facts)[0]
 
 
-def test_who_is_missing_is_said():
-    first, third = meet((0, 2), count=4)
+def test_missing_processes_are_listed():
+    first, third = connect((0, 2), count=4)
     reasons = agree([first, third], {}, {})
-    assert "2 of 4 processes came to 127.0.0.1:" in reasons[0]
-    assert "see that process 1, 3 was started" in reasons[0]
+    assert "2 of 4 processes joined at 127.0.0.1:" in reasons[0]
+    assert "check that process 1, 3 is running" in reasons[0]
     assert reasons[0] == reasons[1]
 
 
 @pytest.mark.parametrize(
     ("numbers", "counts", "reason"),
     [
-        ((0, 1, 1), (3, 3, 3), r"process 1 on \S+ has the number of process 1 on \S+: each"),
-        ((0, 1), (2, 3), r"process 1 on \S+ is one of 3, but the first one of 2"),
+        ((0, 1, 1), (3, 3, 3), r"process 1 on \S+ has the same number as process 1 on \S+: number"),
+        ((0, 1), (2, 3), r"process 1 on \S+ expects 3 processes, the first process 2"),
     ],
 )
-def test_a_wrong_number_is_everybodys_reason(numbers, counts, reason):
+def test_an_invalid_number_or_count_is_reported_by_all(numbers, counts, reason):
     address = free_address()
-    Meeting(peers.listen(address), address, counts[0], ADVICE)
+    Rendezvous(peers.listen(address), address, counts[0], HINT)
     pairs = zip(numbers, counts, strict=True)
-    found = agree([Process(address, *pair) for pair in pairs], *[{} for _ in numbers])
-    assert len({*found}) == 1
-    with pytest.raises(ValueError, match=reason):
-        raise ValueError(found[0])
+    reasons = agree([Process(address, *pair) for pair in pairs], *[{} for _ in numbers])
+    assert len({*reasons}) == 1
+    assert re.search(reason, reasons[0])
 
 
-def test_strangers_do_not_disturb():
+def test_foreign_connections_are_ignored():
     address = free_address()
-    Meeting(peers.listen(address), address, 2, ADVICE)
-    for words in (b"GET / HTTP/1.1\r\n\r\n", b"[1, 2]\n", b'{"process": "x"}\n', b"x" * 2**21):
-        with socket.create_connection(peers.split_address(address)) as stranger:
-            stranger.sendall(words)
+    Rendezvous(peers.listen(address), address, 2, HINT)
+    for content in (b"GET / HTTP/1.1\r\n\r\n", b"[1, 2]\n", b'{"process": "x"}\n', b"x" * 2**21):
+        with socket.create_connection(peers.split_address(address)) as foreign:
+            foreign.sendall(content)
     assert agree([Process(address, 0), Process(address, 1)], {}, {}) == [None, None]
 
 
-def test_when_one_dies_the_first_says_so_and_the_others_are_quiet():
-    first, second, third = meet((0, 1, 2))
+def test_only_the_first_process_reports_the_death_of_another():
+    first, second, third = connect((0, 1, 2))
     assert agree([first, second, third], {}, {}, {}) == [None] * 3
     second.die()
-    assert third.ended() == (1, "")
-    code, reason = first.ended()
+    assert third.exited() == (1, "")
+    code, reason = first.exited()
     assert code == 1
     assert reason.startswith("process 1 on ")
-    assert "is gone without a word: it was killed, or its machine" in reason
-    assert reason.endswith(ADVICE)
+    assert "disconnected unexpectedly: it was killed, or its machine" in reason
+    assert reason.endswith(HINT)
 
 
-def test_when_the_first_dies_every_other_one_says_so():
+def test_every_process_reports_the_death_of_the_first():
     listener = socket.create_server(("127.0.0.1", 0))
     address = f"127.0.0.1:{listener.getsockname()[1]}"
 
     def first():
         connection, _ = listener.accept()
-        connection.sendall(meeting.encode(meeting.GREETING))
+        connection.sendall(rendezvous.encode(rendezvous.GREETING))
         connection.close()
 
     threading.Thread(target=first).start()
-    code, reason = Process(address, 1).ended()
+    code, reason = Process(address, 1).exited()
     listener.close()
     assert code == 1
-    assert reason.startswith(f"the first process, at {address}, is gone without a word")
-    assert reason.endswith(ADVICE)
+    assert reason.startswith(f"the first process, at {address}, disconnected unexpectedly")
+    assert reason.endswith(HINT)
 
 
-def leave(process, code, reason=""):
-    process.last_words = reason
-    threading.Thread(target=process.leave, args=(code,), daemon=True).start()
+def announce_exit(process, code, reason=""):
+    process.exit_reason = reason
+    threading.Thread(target=process.announce_exit, args=(code,), daemon=True).start()
 
 
-def test_what_another_one_is_refused_for_is_said_by_the_first():
-    first, second = meet()
-    leave(second, 2, "error: there is no such file")
-    assert second.ended() == (2, "")
-    code, reason = first.ended()
+def test_the_first_process_reports_the_error_of_another():
+    first, second = connect()
+    announce_exit(second, 2, "error: there is no such file")
+    assert second.exited() == (2, "")
+    code, reason = first.exited()
     assert code == 2
     assert reason.endswith(": error: there is no such file")
 
 
-def test_the_first_one_says_itself_why_it_leaves(monkeypatch):
-    monkeypatch.setattr(meeting, "GRACE", 2.0)
-    first, second, third = meet((0, 1, 2))
-    leave(first, 2, "error: the folder holds a run")
-    time.sleep(0.3)  # whoever is heard first says why
-    leave(third, 130, "stopped")
-    assert [one.ended() for one in (second, third, first)] == [(2, ""), (130, ""), (2, "")]
+def test_the_first_process_reports_its_own_error(monkeypatch):
+    monkeypatch.setattr(rendezvous, "EXIT_GRACE", 2.0)
+    first, second, third = connect((0, 1, 2))
+    announce_exit(first, 2, "error: the folder holds a run")
+    time.sleep(0.3)  # the first reason received counts
+    announce_exit(third, 130, "stopped")
+    assert [one.exited() for one in (second, third, first)] == [(2, ""), (130, ""), (2, "")]
 
 
-def test_who_has_finished_is_not_missed():
-    first, second = meet()
-    second.leave(0)
+def test_processes_that_have_finished_may_disconnect():
+    first, second = connect()
+    second.announce_exit(0)
     second.die()
-    first.leave(0)
-    assert first.end.empty()
-    leave(first, 2)
-    assert first.ended() == (2, "")
+    first.announce_exit(0)
+    assert first.exits.empty()
+    announce_exit(first, 2)
+    assert first.exited() == (2, "")
 
 
 def test_an_address_needs_a_port():
@@ -189,23 +189,27 @@ def test_an_address_needs_a_port():
     assert peers.split_address("[::1]:1234") == ("::1", 1234)
 
 
-def test_a_port_in_use_is_said():
+def test_a_port_in_use_is_reported():
     address = free_address()
-    with peers.listen(address), pytest.raises(ValueError, match=r"cannot be had \(Address already"):
+    with (
+        peers.listen(address),
+        pytest.raises(ValueError, match=r"is not available \(Address already"),
+    ):
         peers.listen(address)
 
 
-def test_nobody_at_an_address_is_said(monkeypatch):
-    monkeypatch.setattr(peers, "_SILENCE", 0.2)
-    said = []
-    with pytest.raises(ValueError, match=r"process 1 found no first process at .*refused\)"):
-        peers.Peers(free_address(), 1, 2, said.append, ADVICE)
-    assert len(said) == 1
-    assert "process 1 waits for the first one at 127.0.0.1:" in said[0]
+def test_an_unreachable_address_is_reported():
+    printed = []
+    with pytest.raises(
+        ValueError, match=r"process 1 could not reach the first process at .*refused\)"
+    ):
+        peers.Peers(free_address(), 1, 2, printed.append, HINT, notice_after=0.2)
+    assert len(printed) == 1
+    assert "process 1 is waiting for the first process at 127.0.0.1:" in printed[0]
 
 
-def test_somebody_else_at_an_address_is_said(monkeypatch):
-    monkeypatch.setattr(meeting, "PATIENCE", 0.0)
+def test_a_foreign_server_at_the_address_is_reported(monkeypatch):
+    monkeypatch.setattr(rendezvous, "JOIN_TIMEOUT", 0.0)
     with socket.create_server(("127.0.0.1", 0)) as other:
         address = f"127.0.0.1:{other.getsockname()[1]}"
 
@@ -215,5 +219,5 @@ def test_somebody_else_at_an_address_is_said(monkeypatch):
                 connection.sendall(b"SSH-2.0\r\n")
 
         threading.Thread(target=answer, daemon=True).start()
-        with pytest.raises(ValueError, match=r"what answers is no run"):
-            peers.Peers(address, 1, 2, print, ADVICE)
+        with pytest.raises(ValueError, match=r"the process listening there is not a run"):
+            peers.Peers(address, 1, 2, print, HINT)

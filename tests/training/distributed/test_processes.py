@@ -1,4 +1,4 @@
-"""Several processes train as one does, and only the first one writes."""
+"""Several processes train like a single one, and only the first one writes."""
 
 import socket
 import subprocess
@@ -20,7 +20,7 @@ WORKER = ("-u", "-m", "tests.training.worker")
 @pytest.mark.slow
 @pytest.mark.parametrize("streams", [False, True])
 def test_two_processes_train_as_one(streams, tmp_path):
-    """Stopped by a signal to one of them, and resumed."""
+    """Including a stop by a signal to one of them, and a resume."""
     folders = {count: tmp_path / str(count) for count in (1, 2)}
     for count, folder in folders.items():
         arguments = ("-m", "tests.training.together", folder, streams)
@@ -35,22 +35,22 @@ def test_two_processes_train_as_one(streams, tmp_path):
             assert found[name] == pytest.approx(value, rel=1e-5), name
 
 
-def test_alone_nothing_is_waited_for():
-    processes.wait("name")
-    processes.wait("name")
-    with processes.first_goes_ahead("name"):
+def test_barriers_and_placement_in_a_single_process():
+    processes.barrier("name")
+    processes.barrier("name")
+    with processes.first_process_first("name"):
         assert processes.is_first()
-    assert [processes.anywhere(flag) for flag in (True, False)] == [True, False]
+    assert [processes.any_process(flag) for flag in (True, False)] == [True, False]
     tree = {"a": np.ones(8), "b": np.ones(3)}
     mesh = meshes.make_mesh(2)
-    placed = processes.put(tree, meshes.shardings(tree, mesh, minimum=1))
+    placed = processes.device_put(tree, meshes.shardings(tree, mesh, minimum=1))
     assert [placed[name].sharding.spec for name in tree] == [P("fsdp"), P()]
-    assert processes.own(placed) is placed
+    assert processes.to_local(placed) is placed
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 1])
-def test_when_one_is_killed_the_last_line_of_the_other_names_resume(number, tmp_path):
+def test_when_one_is_killed_the_last_line_of_the_other_mentions_resume(number, tmp_path):
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     children = start(2, *WORKER, tmp_path / "run", "--steps", 4000, **pipes)
     for child in children:
@@ -58,11 +58,11 @@ def test_when_one_is_killed_the_last_line_of_the_other_names_resume(number, tmp_
             pass
     killed, other = children[number], children[1 - number]
     killed.kill()
-    began = time.monotonic()
+    start_time = time.monotonic()
     last = other.communicate(timeout=60)[0].splitlines()[-1]
-    assert time.monotonic() - began < 20
+    assert time.monotonic() - start_time < 20
     assert other.returncode == 1
-    assert "is gone without a word: it was killed" in last
+    assert "disconnected unexpectedly: it was killed" in last
     assert last.endswith("add --resume")
     killed.communicate()
 
@@ -70,24 +70,24 @@ def test_when_one_is_killed_the_last_line_of_the_other_names_resume(number, tmp_
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 1])
 def test_an_error_in_one_ends_the_other_in_seconds(number, tmp_path):
-    """Without waiting for it, as JAX would, and without any noise over the traceback."""
+    """It does not wait for the other one, as JAX would, and prints nothing but the traceback."""
     pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
     command = (*WORKER, tmp_path / "run", "--steps", 4000)
     children = start(2, *command, own={number: ("--fails", 3)}, **pipes)
     failed, other = children[number], children[1 - number]
-    said = failed.communicate(timeout=400)[1]
-    began = time.monotonic()
-    heard = other.communicate(timeout=60)[1]
-    assert time.monotonic() - began < 30  # 8 s alone
+    failed_errors = failed.communicate(timeout=400)[1]
+    start_time = time.monotonic()
+    other_errors = other.communicate(timeout=60)[1]
+    assert time.monotonic() - start_time < 30  # 8 s on an idle machine
     assert [child.returncode for child in children] == [1, 1]
-    assert said.endswith("RuntimeError: nobody catches this\n")
-    told = [line for line in heard.splitlines() if not line.startswith("compil")]
-    assert len(told) == (number == 1)
-    assert number == 0 or told[0].startswith("process 1 on ")
+    assert failed_errors.endswith("RuntimeError: nobody catches this\n")
+    lines = [line for line in other_errors.splitlines() if not line.startswith("compil")]
+    assert len(lines) == (number == 1)
+    assert number == 0 or lines[0].startswith("process 1 on ")
 
 
-def joined(*environment, monkeypatch):
-    """Where this process would find the others."""
+def initialize(*environment, monkeypatch):
+    """Initialize with these values of the variables; None: unset."""
     for name in NAMES:
         monkeypatch.delenv(name, raising=False)
     for name, value in zip(NAMES, environment, strict=True):
@@ -99,7 +99,7 @@ def joined(*environment, monkeypatch):
 @pytest.mark.parametrize(
     ("environment", "reason"),
     [
-        ((None, None, None), "found no other processes: start it by Slurm.*nothing says where"),
+        ((None, None, None), "found no launcher: start with Slurm.*no coordinator address"),
         (("10.0.0.1:1", None, "0"), "or set JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and"),
         (("10.0.0.1:1", "2", "second"), "JAX_PROCESS_ID .*'second'"),
         (("10.0.0.1:1", "2", "2"), "JAX_PROCESS_ID must be 0 to 1, got 2"),
@@ -107,14 +107,14 @@ def joined(*environment, monkeypatch):
         (("localhost", "2", "1"), "must be host:port, such as 10.0.0.1:1234, got 'localhost'"),
     ],
 )
-def test_where_the_others_cannot_be_is_one_sentence(environment, reason, monkeypatch):
+def test_an_invalid_environment_is_one_sentence(environment, reason, monkeypatch):
     with pytest.raises(ValueError, match=reason) as caught:
-        joined(*environment, monkeypatch=monkeypatch)
+        initialize(*environment, monkeypatch=monkeypatch)
     assert "\n" not in str(caught.value)
 
 
 def test_a_port_in_use_is_one_sentence(monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"127.0.0.1:{taken.getsockname()[1]}"
-        with pytest.raises(ValueError, match=r"port \d+ of .* cannot be had .Address already in"):
-            joined(address, "2", "0", monkeypatch=monkeypatch)
+        with pytest.raises(ValueError, match=r"port \d+ of .* not available .Address already in"):
+            initialize(address, "2", "0", monkeypatch=monkeypatch)
