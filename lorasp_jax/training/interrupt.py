@@ -7,21 +7,21 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import FrameType
 
-_SAID = b"stopping at the next log line; once more stops at once\n"
+_MESSAGE = b"stopping at the next log step; another signal stops immediately\n"
 
 
 @dataclass
 class Stop:
-    """Whether a signal asked the run to stop."""
+    """Flag set by a signal that asks the run to stop."""
 
     requested: bool = False
 
 
 @contextlib.contextmanager
 def deferred() -> Iterator[Stop]:
-    """Inside this block the first SIGINT or SIGTERM only sets a flag; a second one interrupts.
+    """Inside this block the first SIGINT or SIGTERM only sets a flag; the second one interrupts.
 
-    The caller looks at the flag where its state is whole and can be saved.
+    The caller checks the flag whenever its state is consistent and can be saved.
     """
     stop = Stop()
 
@@ -29,7 +29,7 @@ def deferred() -> Iterator[Stop]:
         if stop.requested:
             raise KeyboardInterrupt
         stop.requested = True
-        os.write(1, _SAID)  # print raises where the signal finds this thread printing
+        os.write(1, _MESSAGE)  # print is not reentrant: it raises if the signal interrupts a print
 
     with _handlers(handle):
         yield stop
@@ -37,7 +37,7 @@ def deferred() -> Iterator[Stop]:
 
 @contextlib.contextmanager
 def sigterm_as_interrupt() -> Iterator[None]:
-    """Inside this block SIGTERM raises KeyboardInterrupt, as Ctrl-C does."""
+    """Inside this block SIGTERM raises KeyboardInterrupt, like Ctrl-C."""
 
     def handle(_number: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
@@ -48,11 +48,11 @@ def sigterm_as_interrupt() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _handlers(handle: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    """Install `handle` for both signals and put the former handlers back."""
+    """Install `handle` for both signals and restore the previous handlers afterwards."""
     numbers = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, handle) for number in numbers]
+    previous = [signal.signal(number, handle) for number in numbers]
     try:
         yield
     finally:
-        for number, handler in zip(numbers, before, strict=True):
+        for number, handler in zip(numbers, previous, strict=True):
             signal.signal(number, handler)

@@ -1,4 +1,4 @@
-"""Signals: the first one waits for a good moment, the second does not."""
+"""Signals: the first one sets a flag, the second interrupts."""
 
 import contextlib
 import os
@@ -16,7 +16,7 @@ import os, runpy, sys
 
 class Signal:
     def find_spec(self, name, *_):
-        if name == {place!r}:
+        if name == {module!r}:
             os.kill(os.getpid(), {number})
 
 sys.meta_path.insert(0, Signal())
@@ -27,14 +27,14 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 @pytest.mark.parametrize("first", SIGNALS)
-def test_first_signal_is_noted_and_second_interrupts(first, capfd):
+def test_the_first_signal_sets_a_flag_and_the_second_interrupts(first, capfd):
     with deferred() as stop:
         assert not stop.requested
         signal.raise_signal(first)
         assert stop.requested
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGTERM)
-    assert capfd.readouterr().out.count("once more stops at once") == 1
+    assert capfd.readouterr().out.count("another signal stops immediately") == 1
 
 
 def test_sigterm_is_like_ctrl_c():
@@ -44,7 +44,7 @@ def test_sigterm_is_like_ctrl_c():
 
 
 @pytest.mark.parametrize("block", [deferred, sigterm_as_interrupt])
-def test_handlers_are_put_back_after_an_error(block):
+def test_handlers_are_restored_after_an_error(block):
     before = [signal.getsignal(number) for number in SIGNALS]
     with contextlib.suppress(RuntimeError), block():
         assert signal.getsignal(signal.SIGTERM) not in before
@@ -53,23 +53,22 @@ def test_handlers_are_put_back_after_an_error(block):
 
 
 @pytest.mark.parametrize(
-    ("place", "number", "said"),
+    ("module", "number", "message"),
     [
         ("jax", signal.SIGTERM, ""),
         ("jax", signal.SIGINT, ""),
         ("lorasp_jax.training.cost.dry_run", signal.SIGTERM, "stopped; to resume: python train.py"),
     ],
 )
-def test_a_process_that_starts(place, number, said, tmp_path):
-    """Imports take seconds."""
+def test_signals_during_imports_stop_the_process(module, number, message, tmp_path):
     config = str(ROOT / "configs" / "multitask.py")
     arguments = ["train.py", "--config", config, "--scale", "smoke", "--dry-run"]
     path = str(ROOT / "train.py")
-    found = subprocess.run(
+    result = subprocess.run(
         [
             sys.executable,
             "-c",
-            IMPORTING.format(place=place, number=int(number), arguments=arguments, path=path),
+            IMPORTING.format(module=module, number=int(number), arguments=arguments, path=path),
         ],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
@@ -77,7 +76,7 @@ def test_a_process_that_starts(place, number, said, tmp_path):
         text=True,
         check=False,
     )
-    assert (found.returncode, found.stdout) == (130, "")
-    assert found.stderr.startswith(said)
-    assert found.stderr.count("\n") == bool(said)
+    assert (result.returncode, result.stdout) == (130, "")
+    assert result.stderr.startswith(message)
+    assert result.stderr.count("\n") == bool(message)
     assert not list(tmp_path.iterdir())
