@@ -118,7 +118,7 @@ def column(policies: list[Policy], told: dict, task: str, key: jax.Array) -> Col
 
 def prompted(policy: Policy, env: envs.Env) -> Policy:
     """The policy with the instructions of one environment."""
-    prompts = policy.processor.prompts.chosen(env.instructions)
+    prompts = policy.processor.prompts.select(env.instructions)
     return Policy(policy.model, dataclasses.replace(policy.processor, prompts=prompts))
 
 

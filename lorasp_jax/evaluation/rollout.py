@@ -206,7 +206,7 @@ def _result(runs: Sequence[Rollout]) -> Result:
 
 def _told(policy: Policy, env: Env) -> Policy:
     """The policy with the prompts of one environment, whose worlds index them."""
-    prompts = policy.processor.prompts.chosen(env.instructions)
+    prompts = policy.processor.prompts.select(env.instructions)
     return Policy(policy.model, dataclasses.replace(policy.processor, prompts=prompts))
 
 

@@ -1,4 +1,4 @@
-"""A network becomes a robot's policy: inputs, normalization, actions."""
+"""Turn a backbone into a robot policy: inputs, normalization, prompts, actions."""
 
 from lorasp_jax.policies import statistics_files, tokenizer
 from lorasp_jax.policies.policy import Policy

@@ -1,14 +1,14 @@
-"""Pictures of any size as a backbone sees them: square, in [-1, 1], black around."""
+"""Convert camera images of any size to square backbone inputs in [-1, 1], padded with black."""
 
 import jax
 import jax.numpy as jnp
 
 
 def to_unit(name: str, image: jax.Array) -> jax.Array:
-    """A camera's uint8 `[B, H, W, 3]` as f32 in [-1, 1].
+    """Scale a camera image, uint8 `[B, H, W, 3]`, to f32 in [-1, 1].
 
     Raises:
-        ValueError: another type or shape; names the camera.
+        ValueError: wrong dtype or shape; the message names the camera.
     """
     if image.dtype != jnp.uint8 or image.ndim != 4 or image.shape[-1] != 3:
         raise ValueError(
@@ -20,19 +20,21 @@ def to_unit(name: str, image: jax.Array) -> jax.Array:
 def resize_with_pad(
     images: jax.Array, size: int, *, centred: bool = True, antialias: bool = True
 ) -> jax.Array:
-    """`[B, H, W, 3]` in [-1, 1] -> `[B, size, size, 3]`: bilinear, aspect kept, black (-1) around.
+    """Resize `[B, H, W, 3]` to `[B, size, size, 3]`, bilinearly, keeping the aspect ratio.
+
+    The rest is padded with black (-1).
 
     Args:
-        images: pictures; those of the right size come back as they are.
+        images: in [-1, 1]; images of the right size are returned unchanged.
         size: height and width [pixels].
-        centred: the picture is in the middle, as in openpi (shared/image_tools.py) and LeRobot's
-            pi0; False: at the right and the bottom, as in LeRobot's SmolVLA.
-        antialias: smooth before shrinking, as openpi does and PyTorch, hence LeRobot, does not.
+        centred: center the image, as in openpi (shared/image_tools.py) and LeRobot's pi0; False:
+            align it right and bottom, as in LeRobot's SmolVLA.
+        antialias: smooth before downsampling, as in openpi; False as in PyTorch, hence LeRobot.
     """
     batch, height, width, channels = images.shape
     if height == width == size:
         return images
-    # In floats as both projects have it, where 116 pixels become 223 of 224.
+    # Floats, as in both projects, where rounding makes 116 pixels 223 instead of 224.
     ratio = max(width / size, height / size)
     inner = (max(1, int(height / ratio)), max(1, int(width / ratio)))
     shape = (batch, *inner, channels)

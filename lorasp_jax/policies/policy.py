@@ -1,4 +1,4 @@
-"""A policy: a backbone together with the processor of one robot and its tasks."""
+"""A policy: a backbone with the processor of one robot and its tasks."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -15,21 +15,21 @@ __all__ = ["Observation", "Policy"]
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Policy:
-    """From raw observations to commands. A pytree: `jax.jit`, `scan` and `device_put` take it.
+    """Maps raw observations to robot commands. A pytree, usable in `jax.jit` and `jax.lax.scan`.
 
     Attributes:
-        model: backbone, or its `sampler()` for many calls: what has `sample_actions`.
-        processor: what stands between the robot and the backbone.
+        model: backbone, or its `sampler()`; anything with `sample_actions`.
+        processor: converts between the robot and the backbone.
     """
 
     model: Any
     processor: Processor
 
     def with_sampler(self) -> Self:
-        """The same policy for many calls: what depends on weights alone is computed here, once.
+        """Return a policy for repeated calls, with all weight-only computations done once.
 
-        In a loop of `jax.lax`, call this before it: that XLA moves such work out of a loop is seen
-        on a CPU, and promised nowhere.
+        Call it before a `jax.lax` loop: XLA hoists this work out of the loop on a CPU, but does
+        not guarantee it.
         """
         return dataclasses.replace(self, model=self.model.sampler())
 
@@ -42,14 +42,14 @@ class Policy:
         num_steps: int = 10,
         return_aux: bool = False,
     ) -> Any:
-        """Draw one action chunk per row; `key` is consumed.
+        """Sample one action chunk per row; `key` is consumed.
 
         Args:
-            key: typed random key of the flow's starting noise.
-            observation: what `env.observe` returns, leading axis B.
-            instruction: `[B]` int32, rows of the processor's token table.
+            key: typed PRNG key for the initial noise of the flow.
+            observation: as returned by `env.observe`, leading axis B.
+            instruction: `[B]` int32, row indices of the processor's prompt table.
             num_steps: Euler steps of the flow-matching sampler.
-            return_aux: also return the adapters' reports, see the backbone's `sample_actions`.
+            return_aux: also return the adapters' `Aux`, see the backbone's `sample_actions`.
 
         Returns:
             `[B, C, J+1]` f32 joint targets [rad] and gripper opening [m], or (chunk, aux).

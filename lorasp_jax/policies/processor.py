@@ -1,8 +1,8 @@
-"""Between a robot and a backbone: pictures, statistics, slots, prompts; both ways.
+"""Convert robot observations to model inputs, and model outputs to robot actions.
 
-State and action vectors of a backbone have slots. With this project's own weights they are fixed:
-joints from slot 0, the gripper in slot 7; published weights have the robot's numbers side by side.
-Unused slots are zero.
+A robot uses some of the slots of a backbone's state and action vectors. This project's own weights
+have joints from slot 0 and the gripper in slot 7; published weights have the gripper right after
+the joints. Unused slots are zero.
 """
 
 import dataclasses
@@ -27,89 +27,86 @@ RawObservation = Mapping[str, Any]
 
 
 def robot_slots(num_joints: int, inputs: InputConfig = OURS) -> tuple[int, ...]:
-    """Slot of each of J joints and of the gripper.
+    """Return the slots of the J joints and the gripper.
 
-    PiPER has (0..5, 7) and Panda (0..6, 7); without a slot of the gripper's own, (0..6) and (0..7).
+    PiPER has (0..5, 7) and Panda (0..6, 7); without a dedicated gripper slot, (0..6) and (0..7).
 
     Raises:
-        ValueError: more joints than slots before the gripper's.
+        ValueError: more joints than there are slots before the gripper's.
     """
     gripper = num_joints if inputs.gripper_slot is None else inputs.gripper_slot
     if not 0 < num_joints <= gripper:
-        raise ValueError(f"a robot has 1 to {gripper} joints here, got {num_joints}.")
+        raise ValueError(f"num_joints must be 1 to {gripper} for this backbone, got {num_joints}.")
     return (*range(num_joints), gripper)
 
 
 def camera_slots(
     cameras: Sequence[str], robot: Mapping[str, str]
 ) -> tuple[tuple[str, str | None], ...]:
-    """Which of the robot's cameras each of a backbone's pictures comes from, for `Processor`.
+    """Pair each backbone camera with the robot camera that feeds it, or None, for `Processor`.
 
     Args:
-        cameras: the backbone's, `config.cameras`.
-        robot: backbone's name -> robot's name; what is not in it is missing.
+        cameras: the backbone's cameras, `config.cameras`.
+        robot: backbone camera -> robot camera; a camera that is not listed is missing.
 
     Raises:
-        ValueError: a name that the backbone does not have, or nothing at all.
+        ValueError: a camera that the backbone does not have, or an empty mapping.
     """
     unknown = sorted(robot.keys() - set(cameras))
     if unknown or not robot:
         raise ValueError(
-            f"the backbone's cameras are {', '.join(cameras)}, one of which is needed; "
-            f"got {', '.join(unknown) or 'none'}."
+            f"cameras must map at least one of the backbone's cameras ({', '.join(cameras)}) and "
+            f"no others, got {', '.join(unknown) or 'none'}."
         )
     return tuple((name, robot.get(name)) for name in cameras)
 
 
 def to_delta(actions: jax.Array, state: jax.Array, mask: Sequence[bool]) -> jax.Array:
-    """Actions relative to the state they start from (openpi, DeltaActions).
+    """Make actions relative to the state at the start of their chunk (openpi, DeltaActions).
 
     Args:
         actions: `[..., C, J]`.
         state: `[..., J]`.
-        mask: True where an action becomes relative, as joints do and grippers do not; may be
-            shorter than J.
+        mask: True for dimensions to make relative, usually the joints and not the gripper; missing
+            trailing entries are False.
     """
-    return actions - _start(actions, state, mask)
+    return actions - _offset(actions, state, mask)
 
 
 def to_absolute(actions: jax.Array, state: jax.Array, mask: Sequence[bool]) -> jax.Array:
-    """The inverse of `to_delta` (openpi, AbsoluteActions)."""
-    return actions + _start(actions, state, mask)
+    """Invert `to_delta` (openpi, AbsoluteActions)."""
+    return actions + _offset(actions, state, mask)
 
 
 def check_delta(mask: Sequence[bool], num_joints: int) -> None:
-    """Raise ValueError if more numbers than a robot has are said to be relative or not."""
+    """Raise ValueError if a delta mask is longer than the robot's action vector."""
     if len(mask) > num_joints + 1:
         raise ValueError(
-            f"relative actions are said of {len(mask)} numbers, the robot has {num_joints + 1}: "
-            "the weights are another robot's."
+            f"The delta mask has {len(mask)} entries, but the robot's actions have "
+            f"{num_joints + 1}: the weights belong to a different robot."
         )
 
 
-def _start(actions: jax.Array, state: jax.Array, mask: Sequence[bool]) -> jax.Array:
-    """The state `[..., 1, J]` f32 where the mask is True, else zero."""
-    whole = np.zeros(actions.shape[-1], bool)
-    whole[: len(mask)] = mask
-    return jnp.where(whole, state, 0)[..., None, :].astype(jnp.float32)
+def _offset(actions: jax.Array, state: jax.Array, mask: Sequence[bool]) -> jax.Array:
+    """Return the state `[..., 1, J]` f32 where the mask is True, else zero."""
+    full_mask = np.zeros(actions.shape[-1], bool)
+    full_mask[: len(mask)] = mask
+    return jnp.where(full_mask, state, 0)[..., None, :].astype(jnp.float32)
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Processor:
-    """Normalises observations and actions of one robot and its tasks. A pytree.
+    """Converts observations and actions of one robot and its tasks. A pytree.
 
     Attributes:
-        robot_slots: slot of each of the robot's J+1 numbers, see `robot_slots`.
-        statistics: of states and actions, per slot.
-        prompts: of the instructions.
-        image_size: height and width of the backbone's pictures [pixels].
-        inputs: what the backbone was trained to see.
-        cameras: (backbone's camera, robot's camera or None) each, see `camera_slots`; empty: the
-            robot's cameras have the backbone's names.
-
-    Raises:
-        ValueError: slots that the statistics do not have.
+        robot_slots: slots of the robot's J+1 dimensions, see `robot_slots`.
+        statistics: statistics of states and actions, by slot.
+        prompts: tokenized prompts of the instructions.
+        image_size: height and width of the backbone's images [pixels].
+        inputs: input conventions that the backbone was trained with.
+        cameras: pairs (backbone camera, robot camera or None), see `camera_slots`; empty if the
+            names are the same.
     """
 
     robot_slots: tuple[int, ...] = field(metadata={"static": True})
@@ -130,65 +127,66 @@ class Processor:
         cameras: Mapping[str, str] | None = None,
         delta: Sequence[bool] | None = None,
     ) -> "Processor":
-        """The processor that a backbone's config asks for.
+        """Create the processor for a backbone's config.
 
         Args:
-            config: sizes and inputs.
-            statistics: of the robot's numbers, in their order or already in slots.
-            prompts: of the instructions.
+            config: the backbone's sizes and input conventions.
+            statistics: of the robot's states and actions, in the robot's order or already in slots.
+            prompts: tokenized prompts of the instructions.
             num_joints: J.
-            cameras: backbone's name -> robot's name, see `camera_slots`; None: the same names.
-            delta: where actions are relative to the state, see `to_delta`; the statistics are
-                theirs. None: as the backbone's config says.
+            cameras: backbone camera -> robot camera, see `camera_slots`; None: the same names.
+            delta: mask of relative action dimensions, see `to_delta`; `statistics` must be those of
+                the relative actions. None: the mask in the config.
 
         Raises:
-            ValueError: joints, statistics or cameras that do not fit the backbone, or relative
-                actions that the robot does not have.
+            ValueError: joints, statistics or cameras do not fit the backbone, or the delta mask is
+                longer than the robot's actions.
         """
         slots = robot_slots(num_joints, config.inputs)
         if statistics.dim != config.action_dim:
-            statistics = statistics.placed(slots, config.action_dim)
-        chosen = () if cameras is None else camera_slots(config.cameras, cameras)
+            statistics = statistics.to_slots(slots, config.action_dim)
+        pairs = () if cameras is None else camera_slots(config.cameras, cameras)
         inputs = config.inputs
         if delta is not None:
             inputs = dataclasses.replace(inputs, delta=tuple(delta))
         check_delta(inputs.delta, num_joints)
-        return cls(slots, statistics, prompts, config.image_size, inputs, chosen)
+        return cls(slots, statistics, prompts, config.image_size, inputs, pairs)
 
     @property
     def slot_mask(self) -> np.ndarray:
-        """`[A]` bool, True in the robot's slots."""
+        """Mask of the robot's slots, `[A]` bool."""
         mask = np.zeros(self.statistics.dim, bool)
         mask[list(self.robot_slots)] = True
         return mask
 
     @property
     def flow_slots(self) -> np.ndarray:
-        """`[A]` bool, True in the slots that take part in the flow and its loss."""
+        """Mask of the slots that carry flow noise and count in the loss, `[A]` bool."""
         return self.slot_mask | (not self.inputs.quiet_slots)
 
     def encode(
         self, raw: RawObservation, instruction: jax.Array, *, state_noise: jax.Array | None = None
     ) -> Observation:
-        """Raw observation to model input; a missing camera's picture is black, with mask False.
+        """Convert a raw observation to model input; missing cameras give black, masked images.
 
         Args:
-            raw: pictures of any size and the robot's state.
-            instruction: `[B]` int32 rows of the table of prompts.
-            state_noise: `[B, A]` that the normalised state has on top in the robot's slots.
+            raw: images of any size and the robot's state.
+            instruction: `[B]` int32 rows of the prompt table.
+            state_noise: `[B, A]`, added to the normalized state in the robot's slots.
 
         Raises:
-            ValueError: pictures that are not uint8 `[B, H, W, 3]`, a camera that is not there, or a
-                state of the wrong length.
+            ValueError: an image is not uint8 `[B, H, W, 3]`, a camera is missing from `raw`, or the
+                state has the wrong length.
         """
         state = self._to_slots("state", raw["state"])
         if state_noise is not None:
             state = state + state_noise * self.slot_mask
         sources = dict(self.cameras) or {name: name for name in raw["image"]}
-        absent = sorted({name for name in sources.values() if name} - set(raw["image"]))
-        if absent:
+        missing = sorted({name for name in sources.values() if name} - set(raw["image"]))
+        if missing:
             raise ValueError(
-                f"camera {', '.join(absent)} is not among {', '.join(raw['image']) or 'none'}."
+                f"The observation lacks camera {', '.join(missing)}; it has "
+                f"{', '.join(raw['image']) or 'none'}."
             )
         prompt = self.prompts.encode(instruction, state[:, np.array(self.robot_slots)])
         black = jnp.full((len(state), self.image_size, self.image_size, 3), -1.0)
@@ -206,33 +204,35 @@ class Processor:
         )
 
     def normalize_actions(self, actions: jax.Array, state: jax.Array | None = None) -> jax.Array:
-        """Actions as the backbone learns them.
+        """Normalize actions and put them into the backbone's slots.
 
         Args:
             actions: `[..., C, J+1]` [rad, m].
-            state: `[..., J+1]` raw state at the chunk's start; needed where actions are relative.
+            state: `[..., J+1]` raw state at the start of the chunk; required for relative actions.
 
         Returns:
-            `[..., C, A]` normalised, in slots.
+            `[..., C, A]`.
         """
         if self.inputs.delta:
-            actions = to_delta(actions, _given(state), self.inputs.delta)
+            actions = to_delta(actions, _require_state(state), self.inputs.delta)
         return self._to_slots("action", actions)
 
     def decode(self, actions: jax.Array, state: jax.Array | None = None) -> jax.Array:
-        """The inverse of `normalize_actions`: `[..., C, A]` -> `[..., C, J+1]` f32 [rad, m]."""
+        """Invert `normalize_actions`: `[..., C, A]` -> `[..., C, J+1]` f32 [rad, m]."""
         slots, inputs = np.array(self.robot_slots), self.inputs
-        known = {name: array[slots] for name, array in self.statistics.action.items()}
-        actions = unnormalize(actions[..., slots], known, inputs.action, inputs.convention)
-        return to_absolute(actions, _given(state), inputs.delta) if inputs.delta else actions
+        stats = {name: array[slots] for name, array in self.statistics.action.items()}
+        actions = unnormalize(actions[..., slots], stats, inputs.action, inputs.convention)
+        return (
+            to_absolute(actions, _require_state(state), inputs.delta) if inputs.delta else actions
+        )
 
     def _to_slots(self, kind: str, values: jax.Array) -> jax.Array:
-        """Normalised states or actions `[..., J+1]`, `[..., A]`."""
+        """Normalize states or actions `[..., J+1]` and return them in slots, `[..., A]`."""
         slots, dim = np.array(self.robot_slots), self.statistics.dim
         check_slots(self.robot_slots, dim, values.shape[-1])
-        known = {name: array[slots] for name, array in getattr(self.statistics, kind).items()}
-        scaled = normalize(values, known, getattr(self.inputs, kind), self.inputs.convention)
-        return jnp.zeros((*values.shape[:-1], dim)).at[..., slots].set(scaled)
+        stats = {name: array[slots] for name, array in getattr(self.statistics, kind).items()}
+        normalized = normalize(values, stats, getattr(self.inputs, kind), self.inputs.convention)
+        return jnp.zeros((*values.shape[:-1], dim)).at[..., slots].set(normalized)
 
     def _image(self, name: str, image: jax.Array) -> jax.Array:
         centred, antialias = self.inputs.centred, self.inputs.antialias
@@ -240,7 +240,7 @@ class Processor:
         return resize_with_pad(unit, self.image_size, centred=centred, antialias=antialias)
 
 
-def _given(state: jax.Array | None) -> jax.Array:
+def _require_state(state: jax.Array | None) -> jax.Array:
     if state is None:
-        raise ValueError("actions are relative to the state here: give the raw state.")
+        raise ValueError("This backbone uses relative actions: pass the raw state.")
     return state

@@ -1,9 +1,9 @@
-"""Token ids of a robot's prompts, tabulated once: no tokenizer runs inside `jax.jit`.
+"""Token ids of a robot's prompts, tokenized once, since no tokenizer runs inside `jax.jit`.
 
-pi0.5's prompt tells the state, "Task: press the button, State: 12 130 7;\\nAction: ". Its ids are
-those of the text before the numbers, of each number with the blank before it, and of the last
-number with what follows, one after the other. That is so for a tokenizer that never joins a number
-with its neighbours; every number beside every other is looked at.
+pi0.5's prompt contains the state, "Task: press the button, State: 12 130 7;\\nAction: ". Its ids
+are assembled from those of the text before the numbers, of each number with its leading space, and
+of the last number with the text after it. This is correct if the tokenizer never merges a number
+with its neighbors, which is verified for every pair of numbers.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ class Ids(NamedTuple):
     mask: jax.Array
 
     def of(self, rows: jax.Array) -> "Ids":
-        """Those of rows `[B, ...]`, flat: `[B, n K]`."""
+        """Gather rows `[B, n]` or `[B]` and flatten each to `[B, n K]`."""
         return Ids(*(jnp.asarray(a)[rows].reshape(len(rows), -1) for a in self))
 
 
@@ -37,10 +37,11 @@ class PromptTable:
     """Prompts by instruction. A pytree.
 
     Attributes:
-        start: `[P, T]`, one row per instruction: the prompt, or what of it is before the state.
-        numbers: by bin, -1 first, where prompts tell the state: a number with its blank.
-        last: likewise, the last number with what ends the prompt.
-        instructions: P texts.
+        start: `[P, T]`, one row per instruction: the prompt, or the part of it before the state.
+        numbers: one row per bin, -1 first: a state value with its leading space. None if prompts do
+            not contain the state.
+        last: likewise, the last state value with the end of the prompt.
+        instructions: P strings.
     """
 
     start: Ids
@@ -57,17 +58,17 @@ class PromptTable:
         *,
         num_joints: int,
     ) -> "PromptTable":
-        """The table that a backbone reads.
+        """Tokenize the instructions for a backbone.
 
         Args:
             words: the tokenizer of the backbone's weights.
-            instructions: P texts.
-            config: the backbone's; `inputs.prompt_state` says what a prompt is.
+            instructions: P strings.
+            config: the backbone's; with `inputs.prompt_state` prompts contain the state.
             num_joints: J of the robot.
 
         Raises:
-            ValueError: token ids that the backbone does not have, what the tokenizer refuses, or a
-                tokenizer that joins a state's numbers.
+            ValueError: the tokenizer rejects an instruction, gives ids beyond the backbone's
+                vocabulary, or merges state values.
         """
         if config.inputs.prompt_state:
             table = _with_state(words, instructions, config.max_tokens, num_joints + 1)
@@ -76,29 +77,29 @@ class PromptTable:
         highest = max(int(leaf.max()) for leaf in jax.tree.leaves(table))
         if highest >= config.vocabulary:
             raise ValueError(
-                f"token {highest} is beyond the backbone's vocabulary of {config.vocabulary}: "
-                "the tokenizer is another model's."
+                f"Token {highest} is beyond the backbone's vocabulary of {config.vocabulary}: "
+                "the tokenizer belongs to a different model."
             )
         return dataclasses.replace(table, instructions=tuple(instructions))
 
-    def chosen(self, instructions: Sequence[str]) -> "PromptTable":
-        """The table of these of its instructions, in this order.
+    def select(self, instructions: Sequence[str]) -> "PromptTable":
+        """Return the table of some of its instructions, in the given order.
 
         Raises:
-            ValueError: one that it does not have.
+            ValueError: the table lacks one of them.
         """
         if missing := sorted(set(instructions) - set(self.instructions)):
-            raise ValueError(f"the policy has no prompt for {missing[0]!r}.")
+            raise ValueError(f"The policy has no prompt for {missing[0]!r}.")
         rows = np.array([self.instructions.index(text) for text in instructions])
         start = Ids(*(array[rows] for array in self.start))
         return dataclasses.replace(self, start=start, instructions=tuple(instructions))
 
     def encode(self, instruction: jax.Array, state: jax.Array) -> Ids:
-        """The prompts `[B, T]` of instructions in states.
+        """Return the prompts `[B, T]`.
 
         Args:
-            instruction: `[B]` int32 rows.
-            state: `[B, J+1]` the robot's normalised numbers; read only where prompts tell them.
+            instruction: `[B]` int32 rows of the table.
+            state: `[B, J+1]`, normalized; used only if prompts contain the state.
         """
         start = self.start.of(instruction)
         if self.numbers is None or self.last is None:
@@ -106,64 +107,73 @@ class PromptTable:
         rows = jnp.digitize(state, prompts.EDGES)  # bin -1 is row 0
         parts = start, self.numbers.of(rows[:, :-1]), self.last.of(rows[:, -1])
         ids, mask = (jnp.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
-        order = jnp.argsort(~mask, axis=1, stable=True)[:, : start.ids.shape[1]]  # padding last
+        order = jnp.argsort(~mask, axis=1, stable=True)[
+            :, : start.ids.shape[1]
+        ]  # stable: padding last
         return Ids(*(jnp.take_along_axis(a, order, axis=1) for a in (ids, mask)))
 
 
 def _with_state(
-    words: Tokenizer, instructions: Sequence[str], max_tokens: int, count: int
+    tokenizer: Tokenizer, instructions: Sequence[str], max_tokens: int, num_values: int
 ) -> PromptTable:
-    """The table of prompts that tell `count` numbers."""
+    """Return the table of prompts that contain a state of `num_values` dimensions."""
     starts = [prompts.pi05_start(text) for text in instructions]
-    numbers = [f"{starts[0]} {name}" for name in range(-1, prompts.STATE_BINS)]
-    last = [number + prompts.PI05_END for number in numbers]
-    ids, mask = _encoded(words, starts, max_tokens)
+    texts = [f"{starts[0]} {number}" for number in range(-1, prompts.STATE_BINS)]
+    last_texts = [text + prompts.PI05_END for text in texts]
+    ids, mask = _encode_complete(tokenizer, starts, max_tokens)
     skip = int(mask[0].sum())
-    middle, end = _ends(words, numbers, skip), _ends(words, last, skip)
-    _check(words, instructions, middle, end)
-    longest = _inside(np.full(count, middle.mask.sum(axis=1).argmax() - 1))
-    whole = [prompts.pi05(text, longest) for text in instructions]
-    words.encode(whole, max_tokens, complete=True)  # as it does with what is too long
-    return PromptTable(_ids(ids[:, :max_tokens], mask[:, :max_tokens]), middle, end)
+    numbers, last = _suffixes(tokenizer, texts, skip), _suffixes(tokenizer, last_texts, skip)
+    _check_merges(tokenizer, instructions, numbers, last)
+    longest = _bin_centers(np.full(num_values, numbers.mask.sum(axis=1).argmax() - 1))
+    full_prompts = [prompts.pi05(text, longest) for text in instructions]
+    tokenizer.encode(full_prompts, max_tokens, complete=True)  # warns or raises if one is too long
+    return PromptTable(_ids(ids[:, :max_tokens], mask[:, :max_tokens]), numbers, last)
 
 
-def _check(words: Tokenizer, instructions: Sequence[str], numbers: Ids, last: Ids) -> None:
-    """Raise ValueError unless a table gives what the tokenizer does, whatever the numbers are."""
-    names = np.arange(prompts.STATE_BINS + 1)
-    # A row for each number: it alternates with all of them, and is the first and the last.
-    others = (names[:, None] + 1 + names) % len(names)
-    state = _inside(np.stack([names[:, None] + 0 * others, others], -1).reshape(len(names), -1) - 1)
-    row = names % len(instructions)
-    texts = [prompts.pi05(instructions[i], own) for i, own in zip(row.tolist(), state, strict=True)]
-    wanted = _encoded(words, texts)
+def _check_merges(
+    tokenizer: Tokenizer, instructions: Sequence[str], numbers: Ids, last: Ids
+) -> None:
+    """Raise ValueError unless the assembled ids equal the tokenizer's for every pair of numbers."""
+    rows = np.arange(prompts.STATE_BINS + 1)
+    # One prompt per number, which alternates with every number and is the first and last value.
+    others = (rows[:, None] + 1 + rows) % len(rows)
+    pairs = np.stack([rows[:, None] + 0 * others, others], -1)
+    state = _bin_centers(pairs.reshape(len(rows), -1) - 1)
+    instruction = rows % len(instructions)
+    texts = [
+        prompts.pi05(instructions[i], values)
+        for i, values in zip(instruction.tolist(), state, strict=True)
+    ]
+    expected = _encode_complete(tokenizer, texts)
     starts = [prompts.pi05_start(text) for text in instructions]
-    start = _ids(*_encoded(words, starts, wanted[0].shape[1]))
-    found = PromptTable(start, numbers, last).encode(jnp.asarray(row), jnp.asarray(state))
-    if not all(np.array_equal(a, b) for a, b in zip(found, wanted, strict=True)):
+    start = _ids(*_encode_complete(tokenizer, starts, expected[0].shape[1]))
+    table = PromptTable(start, numbers, last)
+    actual = table.encode(jnp.asarray(instruction), jnp.asarray(state))
+    if not all(np.array_equal(a, b) for a, b in zip(actual, expected, strict=True)):
         raise ValueError(
-            "the tokenizer does not write a state's numbers one by one, so prompts that tell the "
-            "state cannot be tabulated: it is another model's."
+            "The tokenizer merges state values with their neighbors, so prompts that contain the "
+            "state cannot be tabulated: it belongs to a different model."
         )
 
 
-def _inside(bins: np.ndarray) -> np.ndarray:
-    """A number in the middle of each bin, f32."""
+def _bin_centers(bins: np.ndarray) -> np.ndarray:
+    """Return the centers of bins, f32; bin 0 starts at -1."""
     return ((2 * bins + 1) / prompts.STATE_BINS - 1).astype(np.float32)
 
 
-def _ends(words: Tokenizer, texts: Sequence[str], skip: int) -> Ids:
-    """Ids of prompts without their first `skip` tokens."""
-    ids, mask = _encoded(words, texts)
+def _suffixes(tokenizer: Tokenizer, texts: Sequence[str], skip: int) -> Ids:
+    """Return the ids of prompts without their first `skip` tokens."""
+    ids, mask = _encode_complete(tokenizer, texts)
     longest = mask.sum(axis=1).max()
     return _ids(ids[:, skip:longest], mask[:, skip:longest])
 
 
-def _encoded(
-    words: Tokenizer, texts: Sequence[str], least: int = 0
+def _encode_complete(
+    tokenizer: Tokenizer, texts: Sequence[str], min_tokens: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Ids and mask of whole prompts, uncut, of at least so many columns."""
-    room = max(len(text.encode()) for text in texts) + 8  # a token is a byte or more; BOS, EOS
-    return words.encode(texts, max(room, least), complete=True)
+    """Return ids and mask of complete prompts without truncation, at least `min_tokens` wide."""
+    upper_bound = max(len(text.encode()) for text in texts) + 8  # a byte per token; BOS, EOS
+    return tokenizer.encode(texts, max(upper_bound, min_tokens), complete=True)
 
 
 def _ids(ids: np.ndarray, mask: np.ndarray) -> Ids:

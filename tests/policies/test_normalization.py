@@ -1,4 +1,4 @@
-"""The formulas of openpi (transforms.py) and LeRobot (normalize_processor.py), written out."""
+"""Compare with the formulas of openpi (transforms.py) and LeRobot (normalize_processor.py)."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -6,7 +6,7 @@ import pytest
 
 from lorasp_jax.policies.normalization import SMALLEST_SPREAD, normalize, unnormalize
 
-KNOWN = {
+STATS = {
     "mean": [0.5, -1.0, 2.0, 0.1],
     "std": [2.0, 0.1, 1e-5, 0.0],
     "min": [-1.0, -2.0, 1.0, 3.0],
@@ -16,10 +16,10 @@ KNOWN = {
     "q10": [-0.5, -1.2, 1.0, 3.0],
     "q90": [2.1, 0.3, 1.0, 3.00001],
 }
-KNOWN = {name: np.array(values, np.float32) for name, values in KNOWN.items()}
+STATS = {name: np.array(values, np.float32) for name, values in STATS.items()}
 X = np.array([[0.7, -0.9, 2.0, 0.1], [-3.0, 1.0, 1.0, 3.0]], np.float32)
 Y = np.array([[0.3, -1.2, 0.0, 1.0]], np.float32)
-K = {name: values.astype(np.float64) for name, values in KNOWN.items()}
+K = {name: values.astype(np.float64) for name, values in STATS.items()}
 INNER = K["q90"] - K["q10"]
 SPAN, RANGE = K["q99"] - K["q01"], K["max"] - K["min"]
 
@@ -54,21 +54,21 @@ EXPECTED = {
 
 
 @pytest.mark.parametrize(("mode", "convention"), EXPECTED)
-def test_both_ways(mode, convention):
-    inside, outside = EXPECTED[mode, convention]
-    found = normalize(jnp.asarray(X), KNOWN, mode, convention)
-    np.testing.assert_allclose(found, inside, rtol=1e-4, atol=1e-6)
-    found = unnormalize(jnp.asarray(Y), KNOWN, mode, convention)
-    np.testing.assert_allclose(found, outside, rtol=1e-5, atol=1e-6)
+def test_normalize_and_unnormalize(mode, convention):
+    normalized, restored = EXPECTED[mode, convention]
+    actual = normalize(jnp.asarray(X), STATS, mode, convention)
+    np.testing.assert_allclose(actual, normalized, rtol=1e-4, atol=1e-6)
+    actual = unnormalize(jnp.asarray(Y), STATS, mode, convention)
+    np.testing.assert_allclose(actual, restored, rtol=1e-5, atol=1e-6)
 
 
-def test_bounds_become_minus_one_and_one():
-    ends = np.stack([KNOWN["min"], KNOWN["max"]])[:, :2]
-    known = {name: values[:2] for name, values in KNOWN.items()}
-    found = normalize(jnp.asarray(ends), known, "min_max", "lerobot")
-    np.testing.assert_allclose(found, [[-1, -1], [1, 1]], atol=1e-6)
+def test_bounds_map_to_minus_one_and_one():
+    ends = np.stack([STATS["min"], STATS["max"]])[:, :2]
+    stats = {name: values[:2] for name, values in STATS.items()}
+    actual = normalize(jnp.asarray(ends), stats, "min_max", "lerobot")
+    np.testing.assert_allclose(actual, [[-1, -1], [1, 1]], atol=1e-6)
 
 
-def test_what_is_not_known_is_named():
+def test_missing_statistics_are_named():
     with pytest.raises(ValueError, match="'quantiles' needs q01, q99; the statistics have mean"):
-        normalize(jnp.asarray(X), {"mean": KNOWN["mean"]}, "quantiles", "openpi")
+        normalize(jnp.asarray(X), {"mean": STATS["mean"]}, "quantiles", "openpi")

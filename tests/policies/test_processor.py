@@ -1,3 +1,5 @@
+"""Encoding observations and decoding actions, for our own and for published weights."""
+
 import dataclasses
 
 import jax
@@ -35,7 +37,7 @@ def test_slots(robot):
     slots, joints = ROBOTS[robot]
     assert robot_slots(joints) == slots
     assert np.flatnonzero(processor(joints).slot_mask).tolist() == list(slots)
-    with pytest.raises(ValueError, match="1 to 7 joints here, got 8"):
+    with pytest.raises(ValueError, match=r"num_joints must be 1 to 7 .*, got 8"):
         robot_slots(8)
 
 
@@ -43,10 +45,10 @@ def test_slots(robot):
 def test_decode_inverts_normalize(robot):
     own = processor(ROBOTS[robot][1])
     actions = RNG.normal(size=(3, 4, len(own.robot_slots))).astype(np.float32)
-    inside = own.normalize_actions(jnp.asarray(actions))
-    assert inside.shape == (3, 4, DIM)
-    assert not inside[..., ~own.slot_mask].any()
-    np.testing.assert_allclose(own.decode(inside), actions, atol=1e-5)
+    normalized = own.normalize_actions(jnp.asarray(actions))
+    assert normalized.shape == (3, 4, DIM)
+    assert not normalized[..., ~own.slot_mask].any()
+    np.testing.assert_allclose(own.decode(normalized), actions, atol=1e-5)
 
 
 def test_encode():
@@ -64,18 +66,18 @@ def test_encode():
     np.testing.assert_allclose(obs.state[:, 7], gripper, rtol=1e-5)
 
 
-def test_bad_observations_raise():
+def test_invalid_observations_raise():
     own = processor(6)
     state = jnp.zeros((2, 7))
     with pytest.raises(ValueError, match=r"'side' needs uint8 \[B, H, W, 3\], got float32"):
         own.encode(
             {"image": {"side": jnp.zeros((2, 16, 16, 3))}, "state": state}, jnp.zeros(2, int)
         )
-    with pytest.raises(ValueError, match="6 numbers need as many different slots"):
+    with pytest.raises(ValueError, match="slots must be 6 distinct integers from 0 to 7"):
         own.encode({"image": {}, "state": state[:, :6]}, jnp.zeros(2, int))
 
 
-def test_cameras_of_any_size_keep_their_names():
+def test_images_are_resized_under_their_names():
     own = processor(6)
     shades = {"wrist": ((2, 32, 32, 3), 255), "side": ((2, 8, 16, 3), 0)}
     raw = {
@@ -84,18 +86,18 @@ def test_cameras_of_any_size_keep_their_names():
         },
         "state": jnp.zeros((2, 7)),
     }
-    found = own.encode(raw, jnp.zeros(2, int)).images
-    assert {name: image.shape for name, image in found.items()} == dict.fromkeys(
+    images = own.encode(raw, jnp.zeros(2, int)).images
+    assert {name: image.shape for name, image in images.items()} == dict.fromkeys(
         shades, (2, 16, 16, 3)
     )
-    np.testing.assert_allclose(found["wrist"], 1, atol=1e-6)
-    np.testing.assert_allclose(found["side"], -1, atol=1e-6)
-    grey = {**raw, "image": {"side": raw["image"]["side"][..., 0]}}
+    np.testing.assert_allclose(images["wrist"], 1, atol=1e-6)
+    np.testing.assert_allclose(images["side"], -1, atol=1e-6)
+    gray = {**raw, "image": {"side": raw["image"]["side"][..., 0]}}
     with pytest.raises(ValueError, match=r"got uint8 \(2, 8, 16\)"):
-        own.encode(grey, jnp.zeros(2, int))
+        own.encode(gray, jnp.zeros(2, int))
 
 
-def test_unused_slots_reach_no_motor():
+def test_unused_slots_do_not_affect_actions():
     own = processor(6)
     chunk = jnp.asarray(RNG.normal(size=(2, 4, DIM)), jnp.float32)
     np.testing.assert_array_equal(own.decode(chunk), own.decode(chunk.at[..., 6].set(99.0)))
@@ -105,7 +107,7 @@ def test_unused_slots_reach_no_motor():
 
 
 def published(num_joints: int = 6, relative: tuple[bool, ...] = (), **choices) -> Processor:
-    """With openpi's inputs: one block of numbers, noise in all of the 32 slots."""
+    """Processor with openpi's inputs: contiguous dimensions, noise in all 32 slots."""
     inputs = dataclasses.replace(OPENPI, delta=relative)
     config = dataclasses.replace(Pi0Config.base(), image_size=28, inputs=inputs)
     state, action = RNG.normal(2.0, 3.0, (2, 20, num_joints + 1))
@@ -118,7 +120,7 @@ def published(num_joints: int = 6, relative: tuple[bool, ...] = (), **choices) -
     return Processor.of(config, statistics, prompts, num_joints=num_joints, **choices)
 
 
-def test_published_weights_have_one_block_of_numbers():
+def test_published_weights_use_contiguous_slots():
     own = published()
     assert own.robot_slots == (0, 1, 2, 3, 4, 5, 6)
     assert (own.slot_mask.sum(), own.flow_slots.sum()) == (7, 32)
@@ -133,7 +135,7 @@ def test_published_weights_have_one_block_of_numbers():
 
 
 def test_missing_cameras_are_black_and_masked():
-    """The robot's two cameras fill two of pi0's three pictures."""
+    """The robot has two cameras for pi0's three."""
     own = published(cameras={"base_0_rgb": "side", "left_wrist_0_rgb": "wrist"})
     raw = {
         "image": {
@@ -154,53 +156,53 @@ def test_missing_cameras_are_black_and_masked():
     assert (wrist[:, :7] == -1).all()
     assert obs.images["right_wrist_0_rgb"].shape == (2, 28, 28, 3)
     assert (obs.images["right_wrist_0_rgb"] == -1).all()
-    with pytest.raises(ValueError, match="camera wrist is not among side"):
+    with pytest.raises(ValueError, match="lacks camera wrist; it has side"):
         own.encode({**raw, "image": {"side": raw["image"]["side"]}}, jnp.zeros(2, int))
-    with pytest.raises(ValueError, match=r"backbone's cameras are base_0_rgb, .* got top"):
+    with pytest.raises(ValueError, match=r"backbone's cameras \(base_0_rgb, .* got top"):
         published(cameras={"top": "side"})
 
 
-def test_smolvla_has_its_bar_above():
+def test_smolvla_is_padded_at_the_top():
     config = dataclasses.replace(SmolVLAConfig.base(), image_size=64)
     own = processor(6)
     own = dataclasses.replace(own, image_size=64, inputs=config.inputs)
     own = dataclasses.replace(own, robot_slots=robot_slots(6, config.inputs))
     raw = {"image": {"side": jnp.full((1, 32, 64, 3), 255, jnp.uint8)}, "state": jnp.zeros((1, 7))}
-    found = own.encode(raw, jnp.zeros(1, int)).images["side"][0]
-    np.testing.assert_allclose(found[32:], 1, atol=1e-6)
-    assert (found[:32] == -1).all()
+    image = own.encode(raw, jnp.zeros(1, int)).images["side"][0]
+    np.testing.assert_allclose(image[32:], 1, atol=1e-6)
+    assert (image[:32] == -1).all()
 
 
 def test_delta_actions():
-    """Joints count from the state, the gripper does not; numbers by hand."""
+    """Joints are relative to the state, the gripper is not; values computed by hand."""
     state = jnp.array([[1.0, 2.0, 3.0]])
     actions = jnp.array([[[1.5, 2.0, 0.1], [0.0, 5.0, 0.2]]])
-    found = to_delta(actions, state, (True, True, False))
-    np.testing.assert_allclose(found, [[[0.5, 0.0, 0.1], [-1.0, 3.0, 0.2]]], atol=1e-6)
+    delta = to_delta(actions, state, (True, True, False))
+    np.testing.assert_allclose(delta, [[[0.5, 0.0, 0.1], [-1.0, 3.0, 0.2]]], atol=1e-6)
     np.testing.assert_allclose(to_delta(actions, state, (True,))[0, 1], [-1.0, 5.0, 0.2])
-    np.testing.assert_allclose(to_absolute(found, state, (True, True, False)), actions, atol=1e-6)
+    np.testing.assert_allclose(to_absolute(delta, state, (True, True, False)), actions, atol=1e-6)
 
 
-@pytest.mark.parametrize("said", ["by the caller", "by the backbone"])
-def test_policies_of_delta_actions_move_absolutely(said):
+@pytest.mark.parametrize("set_by", ["caller", "backbone"])
+def test_delta_actions_are_decoded_as_absolute(set_by):
     mask = (*[True] * 6, False)
-    own = published(delta=mask) if said == "by the caller" else published(relative=mask)
-    plain = published(relative=mask, delta=())
-    own = dataclasses.replace(own, statistics=plain.statistics)
+    own = published(delta=mask) if set_by == "caller" else published(relative=mask)
+    absolute = published(relative=mask, delta=())
+    own = dataclasses.replace(own, statistics=absolute.statistics)
     state = jnp.asarray(RNG.normal(size=(2, 7)), jnp.float32)
     actions = jnp.asarray(RNG.normal(size=(2, 4, 7)), jnp.float32)
     relative = actions - state[:, None].at[..., 6].set(0)
-    inside = own.normalize_actions(actions, state)
-    np.testing.assert_allclose(inside, plain.normalize_actions(relative), atol=1e-5)
-    np.testing.assert_allclose(own.decode(inside, state), actions, atol=1e-5)
-    with pytest.raises(ValueError, match="give the raw state"):
-        own.decode(inside)
-    with pytest.raises(ValueError, match="said of 14 numbers, the robot has 7"):
+    normalized = own.normalize_actions(actions, state)
+    np.testing.assert_allclose(normalized, absolute.normalize_actions(relative), atol=1e-5)
+    np.testing.assert_allclose(own.decode(normalized, state), actions, atol=1e-5)
+    with pytest.raises(ValueError, match="pass the raw state"):
+        own.decode(normalized)
+    with pytest.raises(ValueError, match="has 14 entries, but the robot's actions have 7"):
         published(relative=(True,) * 14)
 
 
-def test_prompts_tell_the_normalised_state():
-    """Of the robot's slots, with its noise; by the plain function."""
+def test_prompts_contain_the_normalized_state():
+    """The state is that of the robot's slots, with the added noise."""
     config, texts = Pi0Config.nano_pi05(), ["press the button", "push it"]
     state, action = RNG.normal(2.0, 3.0, (2, 50, 7))
     valid = np.ones(50, bool)
@@ -212,31 +214,33 @@ def test_prompts_tell_the_normalised_state():
     rows = RNG.integers(0, 2, 50)
     obs = jax.jit(Processor.encode)(own, raw, jnp.asarray(rows), state_noise=noise)
     low, high = np.quantile(state, [0.01, 0.99], axis=0)
-    numbers = 2 * (state - low) / (high - low) - 1 + noise[:, [0, 1, 2, 3, 4, 5, 7]]
-    np.testing.assert_allclose(obs.state[:, [0, 1, 2, 3, 4, 5, 7]], numbers, atol=1e-5)
-    numbers = np.asarray(obs.state[:, [0, 1, 2, 3, 4, 5, 7]])
-    wanted = [prompts.pi05(texts[row], mine) for row, mine in zip(rows, numbers, strict=True)]
-    ids, mask = Offline().encode(wanted, config.max_tokens, complete=True)
+    normalized = 2 * (state - low) / (high - low) - 1 + noise[:, [0, 1, 2, 3, 4, 5, 7]]
+    np.testing.assert_allclose(obs.state[:, [0, 1, 2, 3, 4, 5, 7]], normalized, atol=1e-5)
+    normalized = np.asarray(obs.state[:, [0, 1, 2, 3, 4, 5, 7]])
+    expected = [
+        prompts.pi05(texts[row], values) for row, values in zip(rows, normalized, strict=True)
+    ]
+    ids, mask = Offline().encode(expected, config.max_tokens, complete=True)
     np.testing.assert_array_equal(obs.tokens, ids)
     np.testing.assert_array_equal(obs.token_mask, mask)
 
 
-class Still:
-    """A backbone that answers its own state, which makes the whole path visible."""
+class EchoBackbone:
+    """A backbone that returns its own state."""
 
     def sample_actions(self, key, obs, *, num_steps, slots, return_aux):
         chunk = jnp.broadcast_to(obs.state[:, None] * slots, (2, 4, DIM))
         return chunk, {"steps": num_steps}
 
 
-def test_policy_goes_from_robot_to_robot():
+def test_policy_encodes_and_decodes():
     own = processor(6)
     raw = {
         "image": {},
         "state": jnp.asarray(own.statistics.state["mean"][jnp.array(own.robot_slots)]),
     }
     raw["state"] = jnp.broadcast_to(raw["state"], (2, 7))
-    policy = Policy(Still(), own)
+    policy = Policy(EchoBackbone(), own)
     actions, aux = policy.sample(
         jax.random.key(0), raw, jnp.zeros(2, int), num_steps=4, return_aux=True
     )

@@ -1,3 +1,5 @@
+"""Measuring, moving and serializing statistics."""
+
 import json
 
 import jax
@@ -13,12 +15,12 @@ PIPER, PANDA = (0, 1, 2, 3, 4, 5, 7), (0, 1, 2, 3, 4, 5, 6, 7)
 
 
 @pytest.mark.parametrize("slots", [PIPER, PANDA])
-def test_valid_steps_alone_count(slots):
+def test_measure_ignores_padding(slots):
     state = RNG.normal(size=(3, 6, len(slots))).astype(np.float32)
     valid = np.arange(6) < np.array([[2], [6], [4]])
     state[..., -1] = 0.07  # a gripper that never moves
     padded = np.where(valid[..., None], state, 1e6)
-    found = Statistics.measure(padded, 2 * padded, valid, slots=slots, dim=DIM)
+    measured = Statistics.measure(padded, 2 * padded, valid, slots=slots, dim=DIM)
     rows, used = state[valid], np.array(slots)
     expected = {
         "mean": rows.mean(0),
@@ -30,49 +32,49 @@ def test_valid_steps_alone_count(slots):
         "q10": np.percentile(rows, 10, axis=0),
         "q90": np.percentile(rows, 90, axis=0),
     }
-    assert found.state.keys() == set(NAMES)
+    assert measured.state.keys() == set(NAMES)
     for name, values in expected.items():
-        np.testing.assert_allclose(found.state[name][used], values, 1e-5, 1e-6, err_msg=name)
-    np.testing.assert_allclose(found.action["max"][used], 2 * expected["max"], 1e-5)
+        np.testing.assert_allclose(measured.state[name][used], values, 1e-5, 1e-6, err_msg=name)
+    np.testing.assert_allclose(measured.action["max"][used], 2 * expected["max"], 1e-5)
     unused = np.setdiff1d(np.arange(DIM), slots)
-    assert (found.state["std"][unused] == 1).all()
-    assert (found.state["q01"][unused] == -1).all()
+    assert (measured.state["std"][unused] == 1).all()
+    assert (measured.state["q01"][unused] == -1).all()
     with pytest.raises(ValueError, match="at least one valid step"):
         Statistics.measure(state, state, valid & False, slots=slots, dim=DIM)
-    with pytest.raises(ValueError, match="as many different slots below 8"):
+    with pytest.raises(ValueError, match=r"slots must be [78] distinct integers from 0 to 7"):
         Statistics.measure(state, state, valid, slots=slots[:-1], dim=DIM)
 
 
 def test_json_is_exact():
     values = RNG.normal(size=(20, 7)).astype(np.float32)
-    found = Statistics.measure(values, values**2, np.ones(20, bool), slots=PIPER, dim=DIM)
-    jax.tree.map(np.testing.assert_array_equal, Statistics.from_json(found.to_json()), found)
+    measured = Statistics.measure(values, values**2, np.ones(20, bool), slots=PIPER, dim=DIM)
+    jax.tree.map(np.testing.assert_array_equal, Statistics.from_json(measured.to_json()), measured)
 
 
-def test_json_of_shipped_bases_has_moments_alone():
-    text = {
+def test_json_may_have_only_moments():
+    content = {
         f"{k}_{n}": [float(i)] * 8 for i, k in enumerate(("state", "action")) for n in NAMES[:2]
     }
-    found = Statistics.from_json(json.dumps(text))
-    assert found.state.keys() == {"mean", "std"}
-    assert found.action["std"].tolist() == [1.0] * 8
+    statistics = Statistics.from_json(json.dumps(content))
+    assert statistics.state.keys() == {"mean", "std"}
+    assert statistics.action["std"].tolist() == [1.0] * 8
 
 
 @pytest.mark.parametrize(
     "change",
     [{"state_std": [1.0]}, {"action_mean": "x"}, {"more": 1}, {"state_q50": [0.0, 0.0]}, None],
 )
-def test_foreign_json_raises(change):
-    text = {f"{k}_{n}": [0.0, 1.0] for k in ("state", "action") for n in NAMES[:2]}
-    with pytest.raises(ValueError, match="statistics need lists of"):
-        Statistics.from_json(json.dumps({**text, **change} if change else {}))
+def test_invalid_json_raises(change):
+    content = {f"{k}_{n}": [0.0, 1.0] for k in ("state", "action") for n in NAMES[:2]}
+    with pytest.raises(ValueError, match="Statistics must be lists of"):
+        Statistics.from_json(json.dumps({**content, **change} if change else {}))
 
 
-def test_numbers_go_to_their_slots():
+def test_to_slots_reorders_and_drops_padding():
     values = np.arange(18, dtype=np.float32).reshape(2, 9)
     long = Statistics.measure(values, values, np.ones(2, bool), slots=range(9), dim=9)
-    found = long.placed(PIPER, DIM)
-    assert found.state["min"].tolist() == [0, 1, 2, 3, 4, 5, -1, 6]
-    assert found.state["mean"].tolist() == [4.5, 5.5, 6.5, 7.5, 8.5, 9.5, 0, 10.5]
-    with pytest.raises(ValueError, match="have 9 numbers, the robot 10"):
-        long.placed(range(10), 32)
+    statistics = long.to_slots(PIPER, DIM)
+    assert statistics.state["min"].tolist() == [0, 1, 2, 3, 4, 5, -1, 6]
+    assert statistics.state["mean"].tolist() == [4.5, 5.5, 6.5, 7.5, 8.5, 9.5, 0, 10.5]
+    with pytest.raises(ValueError, match="have 9 dimensions, the robot 10"):
+        long.to_slots(range(10), 32)

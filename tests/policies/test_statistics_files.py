@@ -1,4 +1,4 @@
-"""Files as openpi and LeRobot write them, by hand from their documented formats."""
+"""Read files built by hand from the documented formats of openpi and LeRobot."""
 
 import json
 
@@ -14,23 +14,23 @@ RNG = np.random.default_rng(0)
 STATE, ACTION = RNG.uniform(size=(2, len(NAMES), 7)).astype(np.float32)
 
 
-def known(values, names=NAMES):
+def by_name(values, names=NAMES):
     return {name: values[NAMES.index(name)] for name in names}
 
 
 def lists(values, names=NAMES):
-    return {name: array.tolist() for name, array in known(values, names).items()}
+    return {name: array.tolist() for name, array in by_name(values, names).items()}
 
 
-def assert_found(found: Statistics, names=NAMES, scale=1):
-    for mine, values in ((found.state, STATE), (found.action, ACTION)):
-        assert mine.keys() == set(names)
-        for name, array in known(values * scale, names).items():
-            np.testing.assert_array_equal(mine[name], array, err_msg=name)
+def assert_statistics(actual: Statistics, names=NAMES, scale=1):
+    for stats, values in ((actual.state, STATE), (actual.action, ACTION)):
+        assert stats.keys() == set(names)
+        for name, array in by_name(values * scale, names).items():
+            np.testing.assert_array_equal(stats[name], array, err_msg=name)
 
 
 def norm_stats(scale=1):
-    """openpi's; its older files have no quantiles, which are null then."""
+    """An openpi file; older ones have null for the quantiles."""
     names = ("mean", "std", "q01", "q99")
     both = {"state": lists(STATE * scale, names), "actions": lists(ACTION * scale, names)}
     return json.dumps({"norm_stats": both})
@@ -41,45 +41,45 @@ def test_openpi(tmp_path):
         (tmp_path / "assets" / name).mkdir(parents=True)
         (tmp_path / "assets" / name / "norm_stats.json").write_text(norm_stats(scale))
     names = ("mean", "std", "q01", "q99")
-    assert_found(statistics_files.read(tmp_path, dataset="trossen"), names)
-    found = statistics_files.read(tmp_path, dataset="physical-intelligence/libero")
-    assert_found(found, names, scale=2)
+    assert_statistics(statistics_files.read(tmp_path, dataset="trossen"), names)
+    libero = statistics_files.read(tmp_path, dataset="physical-intelligence/libero")
+    assert_statistics(libero, names, scale=2)
     file = tmp_path / "assets" / "trossen" / "norm_stats.json"
-    assert_found(statistics_files.read(file), names)
-    assert_found(statistics_files.read(file.parent), names)
+    assert_statistics(statistics_files.read(file), names)
+    assert_statistics(statistics_files.read(file.parent), names)
     with pytest.raises(ValueError, match="of 'physical-intelligence/libero', 'trossen', not of ''"):
         statistics_files.read(tmp_path)
     old = json.loads(norm_stats())
     old["norm_stats"]["state"] |= {"q01": None, "q99": None}
     old["norm_stats"]["actions"] |= {"q01": None, "q99": None}
     file.write_text(json.dumps(old))
-    assert_found(statistics_files.read(file), names[:2])
+    assert_statistics(statistics_files.read(file), names[:2])
 
 
-def test_a_dataset_of_lerobot_by_episodes():
-    """Version 2.1 has statistics of each episode; joined they are those of the same data in 3.0."""
-    found, wanted = (statistics_files.read(golden(version)) for version in ("v21", "v3"))
+def test_lerobot_dataset_by_episode():
+    """Aggregated per-episode statistics of version 2.1 equal those of the same data in 3.0."""
+    actual, expected = (statistics_files.read(golden(version)) for version in ("v21", "v3"))
     for kind in ("state", "action"):
-        known = getattr(found, kind)
-        assert set(known) == {"mean", "std", "min", "max"}
-        for name, array in known.items():
-            np.testing.assert_allclose(array, getattr(wanted, kind)[name], rtol=2e-6, atol=1e-7)
+        stats = getattr(actual, kind)
+        assert set(stats) == {"mean", "std", "min", "max"}
+        for name, array in stats.items():
+            np.testing.assert_allclose(array, getattr(expected, kind)[name], rtol=2e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize(
     "change",
     [{"count": [0]}, {"count": [1e999]}, {"mean": [0.0]}, {"std": ["x"] * 7}, {"min": None}],
 )
-def test_damaged_episodes_of_lerobot(change, tmp_path):
+def test_damaged_lerobot_episodes(change, tmp_path):
     (row,) = (golden("v21") / "meta" / "episodes_stats.jsonl").read_text().splitlines()[:1]
     row = json.loads(row)
     row["stats"]["action"] |= change
     (tmp_path / "episodes_stats.jsonl").write_text(json.dumps(row))
-    with pytest.raises(ValueError, match=r"^(the )?statistics "):
+    with pytest.raises(ValueError, match=r"^(Cannot read the s|S)tatistics "):
         statistics_files.read(tmp_path)
 
 
-def test_a_dataset_of_lerobot(tmp_path):
+def test_lerobot_dataset(tmp_path):
     (tmp_path / "meta").mkdir()
     extra = {"count": [126], "q50": [0.0] * 7}
     stats = {
@@ -88,8 +88,8 @@ def test_a_dataset_of_lerobot(tmp_path):
         "action": {**lists(ACTION), **extra},
     }
     (tmp_path / "meta" / "stats.json").write_text(json.dumps(stats))
-    assert_found(statistics_files.read(tmp_path))
-    assert_found(statistics_files.read(tmp_path / "meta" / "stats.json"))
+    assert_statistics(statistics_files.read(tmp_path))
+    assert_statistics(statistics_files.read(tmp_path / "meta" / "stats.json"))
 
 
 def test_ours(tmp_path):
@@ -97,11 +97,11 @@ def test_ours(tmp_path):
     both = {f"state_{k}": v for k, v in lists(STATE).items()}
     both |= {f"action_{k}": v for k, v in lists(ACTION).items()}
     path.write_text(json.dumps(both))
-    assert_found(statistics_files.read(tmp_path))
+    assert_statistics(statistics_files.read(tmp_path))
 
 
 def policy(folder, pre, post):
-    """A policy folder with tensors of the two processors."""
+    """Write a policy folder with the tensors of both processors."""
     for kind, number, tensors in (("pre", 5, pre), ("post", 0, post)):
         step = f"{'un' * (kind == 'post')}normalizer_processor"
         file = f"policy_{kind}processor_step_{number}_{step}.safetensors"
@@ -115,48 +115,52 @@ def policy(folder, pre, post):
 
 
 def tensors(prefix="", separator=".", names=NAMES):
-    state = {f"{prefix}observation{separator}state.{k}": v for k, v in known(STATE, names).items()}
-    return state | {f"{prefix}action.{k}": v for k, v in known(ACTION, names).items()}
+    state = {
+        f"{prefix}observation{separator}state.{k}": v for k, v in by_name(STATE, names).items()
+    }
+    return state | {f"{prefix}action.{k}": v for k, v in by_name(ACTION, names).items()}
 
 
-def test_a_policy_of_lerobot(tmp_path):
+def test_lerobot_policy(tmp_path):
     pre = {**tensors(), "observation.state.count": np.array([126])}
-    assert_found(statistics_files.read(policy(tmp_path, pre, tensors())))
+    assert_statistics(statistics_files.read(policy(tmp_path, pre, tensors())))
     other = {**tensors(), "action.mean": ACTION[0] + 1}
     with pytest.raises(ValueError, match=r"two different tensors for action\.mean"):
         statistics_files.read(policy(tmp_path, pre, other))
     several = tensors("so100.buffer.", names=("mean", "std"))
-    found = statistics_files.read(policy(tmp_path, several, several), dataset="so100")
-    assert_found(found, ("mean", "std"))
-    with pytest.raises(ValueError, match="has no tensors of statistics"):
+    selected = statistics_files.read(policy(tmp_path, several, several), dataset="so100")
+    assert_statistics(selected, ("mean", "std"))
+    with pytest.raises(ValueError, match="has no statistics tensors"):
         statistics_files.read(policy(tmp_path, {"x": STATE}, {"x": STATE}))
 
 
 @pytest.mark.parametrize("dataset", ["", "so100"])
-def test_an_older_policy_of_lerobot(tmp_path, dataset):
-    """Statistics among the weights, of one dataset or of several."""
+def test_older_lerobot_policy(tmp_path, dataset):
+    """Statistics are stored among the weights, for one or several datasets."""
     buffers = {"model.state_proj.bias": np.zeros(3, np.float32)}
     for name in {dataset, f"{dataset}-red"} if dataset else {""}:
         prefix = f"{name}_buffer_" if name else "buffer_"
         scale = np.float32(1 + (name != dataset))
         for key, array in tensors(prefix, "_", ("min", "max")).items():
-            side = ["normalize_targets", "unnormalize_outputs"]
-            for place in side if "action" in key else ["normalize_inputs"]:
-                buffers[f"{place}.{key}"] = array * scale
+            modules = ["normalize_targets", "unnormalize_outputs"]
+            for module in modules if "action" in key else ["normalize_inputs"]:
+                buffers[f"{module}.{key}"] = array * scale
     safetensors.numpy.save_file(buffers, tmp_path / "model.safetensors")
-    assert_found(statistics_files.read(tmp_path, dataset=dataset), ("min", "max"))
+    assert_statistics(statistics_files.read(tmp_path, dataset=dataset), ("min", "max"))
     if dataset:
         with pytest.raises(ValueError, match="of 'so100', 'so100-red', not of 'aloha'"):
             statistics_files.read(tmp_path, dataset="aloha")
 
 
-def test_what_cannot_be_read_is_one_sentence(tmp_path):
-    with pytest.raises(ValueError, match=r"holds no statistics: none of statistics\.json, norm_"):
+def test_invalid_files_raise_one_sentence(tmp_path):
+    with pytest.raises(
+        ValueError, match=r"contains no statistics: none of statistics\.json, norm_"
+    ):
         statistics_files.read(tmp_path)
     path = tmp_path / "norm_stats.json"
     for text in ("{", "{}", '{"norm_stats": {"state": 3, "actions": 4}}'):
         path.write_text(text)
-        with pytest.raises(ValueError, match="cannot be read"):
+        with pytest.raises(ValueError, match="Cannot read the statistics"):
             statistics_files.read(path)
     unset = json.loads(norm_stats())
     unset["norm_stats"]["state"]["mean"][0] = float("inf")
@@ -165,5 +169,5 @@ def test_what_cannot_be_read_is_one_sentence(tmp_path):
         statistics_files.read(path)
     unset["norm_stats"]["state"] |= {"mean": [0.0] * 7, "std": [1.0] * 6 + [-1e-3]}
     path.write_text(json.dumps(unset))
-    with pytest.raises(ValueError, match="have a standard deviation below 0"):
+    with pytest.raises(ValueError, match="have a negative standard deviation"):
         statistics_files.read(path)

@@ -104,7 +104,7 @@ def test_policies_of_lerobot_are_fed_as_they_say(config, tmp_path, monkeypatch):
     two_arms = dataclasses.replace(inputs.OURS, delta=(True,) * 14)
     found = drawn(dataclasses.replace(Pi0Config.dummy(), inputs=two_arms))
     monkeypatch.setattr(setup, "base_model", lambda *_, **__: (found, ""))
-    with pytest.raises(ValueError, match="said of 14 numbers, the robot has 7"):
+    with pytest.raises(ValueError, match="has 14 entries, but the robot's actions have 7"):
         setup.prepare(config, tmp_path, Console(file=io.StringIO()), time.perf_counter())
 
 
