@@ -38,7 +38,7 @@ def files():
         ([*MULTITASK, *NANO, "--peft.energy-target", "1.5"], "must lie in (0, 1]"),
         ([*MULTITASK, *NANO, "--robot", "pipper"], "unknown robot 'pipper': choose from panda"),
         ([*MULTITASK, *NANO, "--tasks", "juggle"], "unknown task 'juggle': choose from open_pot"),
-        ([*MULTITASK, *NANO, "--tasks", "press", "press"], "tasks must be different"),
+        ([*MULTITASK, *NANO, "--tasks", "press", "press"], "tasks must be non-empty and unique"),
         ([*MULTITASK, *NANO, "--model.size", "large"], "unknown size 'large'"),
         ([*MULTITASK, *NANO, "--model.size", "small"], "does not match the config"),
         (

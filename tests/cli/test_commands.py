@@ -38,7 +38,7 @@ def test_interrupt_during_imports_prints_nothing(tmp_path, monkeypatch):
     (tmp_path / "jax.py").write_text(interrupt)
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{ROOT}")
     stopped = console("train")
-    assert (stopped.returncode, stopped.stdout, stopped.stderr) == (commands.STOPPED, "", "")
+    assert (stopped.returncode, stopped.stdout, stopped.stderr) == (commands.INTERRUPTED, "", "")
 
 
 @pytest.mark.parametrize("name", commands.COMMANDS)
