@@ -85,7 +85,7 @@ def dataset(folder: Path) -> None:
 def read_dataset(folder: Path) -> Any:
     found = cache.Cache(folder)
     return (
-        found.facts,
+        found.metadata,
         [leaves(found.episode(n)) for n in range(len(found))],
         leaves(found.statistics),
     )
@@ -173,7 +173,9 @@ def test_a_pixel_is_looked_at_when_it_is_first_read(tmp_path, reading):
     pictures = found.steps.image["side"]
     assert pictures[np.arange(20)].shape == (20, 32, 32, 3)
     last = found.num_steps - 1
-    with pytest.raises(ValueError, match=rf"side\.npy is damaged \(picture {last} has another"):
+    with pytest.raises(
+        ValueError, match=rf"side\.npy is damaged \(wrong checksum of image {last}\)"
+    ):
         {
             "episode": lambda: found.episode(2),
             "steps": lambda: pictures[np.array([3, last])],

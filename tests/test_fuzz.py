@@ -43,7 +43,7 @@ def read(folder: Path) -> None:
 
 def go_on(folder: Path) -> None:
     """As a collection does that was interrupted."""
-    rlds.Parts(folder, {}).complete()
+    rlds.ShardWriter(folder, {}).complete()
 
 
 def seen(folder: Path) -> None:

@@ -65,7 +65,7 @@ def gallery(options: argparse.Namespace, console: Console) -> None:
             episode = _episode(options, console, task, robot)
             views = _views(episode)[::_EVERY]
             options.out.mkdir(parents=True, exist_ok=True)
-            with writing.replacing(file) as unfinished:
+            with writing.atomic_file(file) as unfinished:
                 video.write_gif(unfinished, views, _EVERY * episode.control_dt)
             console.print(str(file))
 
@@ -87,7 +87,7 @@ def play(options: argparse.Namespace, console: Console) -> None:
     episode = _episode(options, console, options.task, options.robot)
     views = _views(episode)
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    with writing.replacing(options.out) as unfinished:
+    with writing.atomic_file(options.out) as unfinished:
         video.write_video(unfinished, views, fps=1 / episode.control_dt)
     text = episode.instructions[int(episode.instruction[0])]
     console.print(f"{options.out}: {len(views)} steps, {text!r}")
@@ -162,7 +162,7 @@ def _side_by_side(
 
 def _collect(options: argparse.Namespace, env: envs.Env, out: Path, report: Report) -> str:
     """Collects one task, from where an earlier call was stopped; returns what was made."""
-    parts = rlds.Parts(_unfinished(out), recipes.recipe(options, env))
+    parts = rlds.ShardWriter(_unfinished(out), recipes.recipe(options, env))
     report(parts.num_episodes, options.num_episodes)
     for part in collection.gather(
         env,
@@ -184,8 +184,8 @@ def _collect(options: argparse.Namespace, env: envs.Env, out: Path, report: Repo
     else:
         writing.replace_folder(parts.folder, out, rlds.metadata)  # raises for all but datasets
     return (
-        f"{parts.num_episodes} episodes of {parts.attempted} tried, {parts.facts['steps']} steps, "
-        f"{size / 1e6:.0f} MB"
+        f"{parts.num_episodes} of {parts.attempted} attempted episodes, "
+        f"{parts.metadata['steps']} steps, {size / 1e6:.0f} MB"
     )
 
 
@@ -245,4 +245,4 @@ def _views(episode: Episodes) -> np.ndarray:
 def _refuse_existing(options: argparse.Namespace, file: Path) -> None:
     check_local(file)
     if file.exists() and not options.overwrite:
-        raise ValueError(f"{file} exists already: choose another --out or add --overwrite")
+        raise ValueError(f"{file} already exists: choose another --out or add --overwrite")

@@ -18,7 +18,7 @@ import numpy as np
 
 from envs.actions import MODES
 from envs.datasets.files import check_local, check_memory, damage, regular
-from envs.datasets.writing import replacing
+from envs.datasets.writing import atomic_file
 
 Array = jax.Array | np.ndarray
 
@@ -26,7 +26,7 @@ _FORMAT = "envs-episodes-1"
 SHARED = ("task", "robot", "control_dt", "physics_dt", "actions", "instructions")
 """What episodes must have in common to be joined."""
 _ARRAYS = ("state", "action", "length", "instruction")
-_FACTS = (*SHARED, "attempted")
+_METADATA = (*SHARED, "attempted")
 _IMAGE = "image/"
 _CAMERA = re.compile(r"[\w-][\w .-]{0,99}")
 _HEADERS: Any = {
@@ -36,7 +36,7 @@ _HEADERS: Any = {
 
 
 @functools.partial(
-    jax.tree_util.register_dataclass, data_fields=("image", *_ARRAYS), meta_fields=_FACTS
+    jax.tree_util.register_dataclass, data_fields=("image", *_ARRAYS), meta_fields=_METADATA
 )
 @dataclasses.dataclass(frozen=True)
 class Episodes:
@@ -77,7 +77,7 @@ class Episodes:
         arrays = {name: getattr(self, name) for name in _ARRAYS}
         arrays |= {_IMAGE + name: picture for name, picture in self.image.items()}
         shown = [f"{name}={_short(array)}" for name, array in arrays.items()]
-        shown += [f"{name}={getattr(self, name)!r}" for name in _FACTS]
+        shown += [f"{name}={getattr(self, name)!r}" for name in _METADATA]
         return f"Episodes({', '.join(shown)})"
 
     @property
@@ -102,12 +102,12 @@ class Episodes:
         """
         self.validate()
         check_local(path := Path(path))
-        facts = {name: getattr(self, name) for name in _FACTS}
+        facts = {name: getattr(self, name) for name in _METADATA}
         header = json.dumps({"format": _FORMAT, **facts}).encode()
         arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
         arrays |= {_IMAGE + name: np.asarray(picture) for name, picture in self.image.items()}
         path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as unfinished, open(unfinished, "wb") as file:
+        with atomic_file(path) as unfinished, open(unfinished, "wb") as file:
             np.savez(file, header=np.frombuffer(header, np.uint8), **arrays)
 
     @classmethod
@@ -130,14 +130,14 @@ class Episodes:
                 raise KeyError("format")
         except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
             raise ValueError(f"{path} is an .npz file, but holds no {_FORMAT} header") from error
-        missing = {*_ARRAYS} - arrays.keys() | {*_FACTS} - facts.keys()
+        missing = {*_ARRAYS} - arrays.keys() | {*_METADATA} - facts.keys()
         if missing:
             raise ValueError(f"{path} lacks {', '.join(sorted(missing))}")
         image: Any = {k.removeprefix(_IMAGE): v for k, v in arrays.items() if k.startswith(_IMAGE)}
         fields: dict[str, Any] = {name: arrays[name] for name in _ARRAYS}
         try:
             facts["instructions"] = tuple(facts["instructions"])
-            episodes = cls(image=image, **fields, **{name: facts[name] for name in _FACTS})
+            episodes = cls(image=image, **fields, **{name: facts[name] for name in _METADATA})
             episodes.validate()
         except (ValueError, TypeError) as error:
             raise ValueError(f"{path} is not valid: {error}") from error

@@ -36,9 +36,9 @@ from envs.datasets.rlds_reading import (
     metadata,
     read,
 )
-from envs.datasets.writing import creating, sync, write_text
+from envs.datasets.writing import atomic_folder, sync, write_text
 
-__all__ = ["METADATA", "Parts", "Reader", "metadata", "read", "write"]
+__all__ = ["METADATA", "ShardWriter", "Reader", "metadata", "read", "write"]
 
 _VERSION = "1.0.0"
 _DESCRIPTIONS = {
@@ -57,17 +57,17 @@ def write(episodes: Episodes, path: str | os.PathLike[str]) -> None:
         path: the folder to make.
 
     Raises:
-        ValueError: if the path exists already, another process is writing it, or the arrays do
+        ValueError: if the path already exists, another process is writing it, or the arrays do
             not fit one another.
         OSError: if there is no room for it.
     """
-    with locked(Path(path)), creating(path) as folder:
-        parts = Parts(folder, {})
+    with locked(Path(path)), atomic_folder(path) as folder:
+        parts = ShardWriter(folder, {})
         parts.append(episodes)
         parts.complete()
 
 
-class Parts:
+class ShardWriter:
     """A dataset that grows part by part in a folder.
 
     Its metadata names the finished parts and is replaced after each of them, so a process may be
@@ -91,14 +91,14 @@ class Parts:
             ValueError: if they do not, or if a part is damaged.
         """
         self.folder = folder
-        self.facts: dict[str, Any] = {"format": FORMAT, "options": dict(options), "parts": []}
-        self.facts |= {"steps": 0, "attempted": 0}
+        self.metadata: dict[str, Any] = {"format": FORMAT, "options": dict(options), "parts": []}
+        self.metadata |= {"steps": 0, "attempted": 0}
         if (folder / METADATA).exists():
-            self.facts = metadata(folder)
+            self.metadata = metadata(folder)
             for rest in folder.glob(f".{METADATA}.*"):  # of a process that was killed
                 rest.unlink()
-            _check_same(folder, self.facts["options"], options)
-            for number, episodes in enumerate(self.facts["parts"]):
+            _check_same(folder, self.metadata["options"], options)
+            for number, episodes in enumerate(self.metadata["parts"]):
                 _check_whole(self._file(number), episodes)
         else:
             folder.mkdir(parents=True, exist_ok=True)
@@ -107,12 +107,12 @@ class Parts:
     @property
     def num_episodes(self) -> int:
         """Episodes in finished parts."""
-        return sum(self.facts["parts"])
+        return sum(self.metadata["parts"])
 
     @property
     def attempted(self) -> int:
         """Episodes tried to get these."""
-        return self.facts["attempted"]
+        return self.metadata["attempted"]
 
     def append(self, episodes: Episodes) -> None:
         """Adds a part; `attempted` adds up.
@@ -126,23 +126,23 @@ class Parts:
         shared["instructions"] = list(episodes.instructions)
         shared["cameras"] = {name: list(x.shape[2:4]) for name, x in episodes.image.items()}
         features = rlds_schema.features(episodes)
-        if not self.facts["parts"]:
+        if not self.metadata["parts"]:
             features.save_config(str(self.folder))
-            self.facts |= shared
-        _check_same(self.folder, {name: self.facts[name] for name in shared}, shared)
+            self.metadata |= shared
+        _check_same(self.folder, {name: self.metadata[name] for name in shared}, shared)
         to = rlds_schema.serializer(features)
         record = functools.partial(rlds_schema.record, to, jax.device_get(episodes))
         first, numbers = self.num_episodes, range(episodes.num_episodes)
         data = THREADS.map(record, numbers, range(first, first + len(numbers)))
-        _write_records(self._file(len(self.facts["parts"])), data)
-        self.facts["parts"].append(len(numbers))
-        self.facts["steps"] += episodes.num_steps
-        self.facts["attempted"] += episodes.attempted
+        _write_records(self._file(len(self.metadata["parts"])), data)
+        self.metadata["parts"].append(len(numbers))
+        self.metadata["steps"] += episodes.num_steps
+        self.metadata["attempted"] += episodes.attempted
         self._save()
 
     def complete(self) -> None:
         """Describes the parts to tfds, which makes the folder a dataset."""
-        files = [self._file(number) for number in range(len(self.facts["parts"]))]
+        files = [self._file(number) for number in range(len(self.metadata["parts"]))]
         identity = tfds.core.DatasetIdentity(
             name=self._name,
             version=tfds.core.Version(_VERSION),
@@ -153,13 +153,13 @@ class Parts:
             features = rlds_schema.stored(self.folder)
         info = tfds.core.DatasetInfo(
             builder=identity,
-            description=_DESCRIPTIONS[bool(self.facts["physics_dt"])].format(**self.facts),
+            description=_DESCRIPTIONS[bool(self.metadata["physics_dt"])].format(**self.metadata),
             features=features,
         )
         info.set_file_format(tfds.core.FileFormat.ARRAY_RECORD)
         split = tfds.core.SplitInfo(
             name=SPLIT,
-            shard_lengths=self.facts["parts"],
+            shard_lengths=self.metadata["parts"],
             num_bytes=sum(file.stat().st_size for file in files),
             filename_template=self._template,
         )
@@ -168,12 +168,12 @@ class Parts:
         info.write_to_directory(self.folder)
 
     def _save(self) -> None:
-        write_text(self.folder / METADATA, json.dumps(self.facts, indent=2))
+        write_text(self.folder / METADATA, json.dumps(self.metadata, indent=2))
 
     @property
     def _name(self) -> str:
-        robot = Path(self.facts["robot"]).stem  # a user's is a path
-        name = f"{self.facts['task']}_{robot}"
+        robot = Path(self.metadata["robot"]).stem  # a user's is a path
+        name = f"{self.metadata['task']}_{robot}"
         return re.sub(r"[^\w.-]", "_", name)[:100]  # a part of the names of files
 
     @property

@@ -39,11 +39,11 @@ def read(path: str | os.PathLike[str]) -> Episodes:
     found = Reader(path)
     parts = list(THREADS.map(found.episode, range(len(found))))
     with damage(found.path):
-        return replace(concatenate(parts), attempted=found.facts["attempted"])
+        return replace(concatenate(parts), attempted=found.metadata["attempted"])
 
 
 def metadata(path: Path) -> dict[str, Any]:
-    """What all episodes of a dataset share, and how they were made; see `Parts`.
+    """What all episodes of a dataset share, and how they were made; see `ShardWriter`.
 
     Raises:
         FileNotFoundError: if there is no such folder.
@@ -73,7 +73,7 @@ class Reader:
     Attributes:
         kind: the format's name.
         path: its folder.
-        facts: see `Parts`.
+        facts: see `ShardWriter`.
         cameras: name of a camera -> name of its pictures.
         control_dt: time between two actions [s].
         num_steps: control steps of all episodes.
@@ -89,15 +89,15 @@ class Reader:
             ValueError: if it is damaged or not such a dataset.
         """
         self.path: Path = Path(path)
-        self.facts: dict[str, Any] = metadata(self.path)
+        self.metadata: dict[str, Any] = metadata(self.path)
         with damage(self.path):
-            cameras = self.facts["cameras"]
+            cameras = self.metadata["cameras"]
             self.cameras: dict[str, str] = {n: rlds_schema.picture_name(n) for n in cameras}
-            self.control_dt: float = float(self.facts["control_dt"])
-            self.num_steps: int = whole(self.facts["steps"])
-            self._shared: dict[str, Any] = {name: self.facts[name] for name in SHARED}
-            self._shared |= {"instructions": tuple(self.facts["instructions"]), "attempted": 1}
-            builder = _builder(self.path, self.facts["parts"])
+            self.control_dt: float = float(self.metadata["control_dt"])
+            self.num_steps: int = whole(self.metadata["steps"])
+            self._shared: dict[str, Any] = {name: self.metadata[name] for name in SHARED}
+            self._shared |= {"instructions": tuple(self.metadata["instructions"]), "attempted": 1}
+            builder = _builder(self.path, self.metadata["parts"])
             # Decoding is left to the schema: tfds would decode one picture after the other.
             encoded = {name: tfds.decode.SkipDecoding() for name in self.cameras.values()}
             decoders = {"steps": {"observation": encoded}}
@@ -120,7 +120,7 @@ class Reader:
         with damage(self.path):
             names = self.cameras if cameras is None else cameras
             wanted = {name: self.cameras[name] for name in names}
-            sizes = self.facts["cameras"]
+            sizes = self.metadata["cameras"]
             found = rlds_schema.episode(self._source[number], wanted, sizes, self._shared)
             found.validate_numbers()
             return found

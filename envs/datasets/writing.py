@@ -13,18 +13,18 @@ import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-UNFINISHED = ".tmp"
+TEMPORARY_SUFFIX = ".tmp"
 """How a name ends that a file or folder has until it is whole; it begins with a dot."""
 
 
 @contextlib.contextmanager
-def replacing(file: Path) -> Iterator[Path]:
+def atomic_file(file: Path) -> Iterator[Path]:
     """A path to write to, which replaces the file when the block ends without an exception.
 
     Raises:
         OSError: the file cannot be written, for want of room for example.
     """
-    unfinished = file.with_name(f".{file.name}.{secrets.token_hex(4)}{UNFINISHED}")
+    unfinished = file.with_name(f".{file.name}.{secrets.token_hex(4)}{TEMPORARY_SUFFIX}")
     try:
         yield unfinished
         sync(unfinished)
@@ -35,31 +35,31 @@ def replacing(file: Path) -> Iterator[Path]:
 
 
 def write_bytes(file: Path, data: bytes | bytearray) -> None:
-    """Replace a file, see `replacing`."""
-    with replacing(file) as unfinished:
+    """Replace a file, see `atomic_file`."""
+    with atomic_file(file) as unfinished:
         unfinished.write_bytes(data)
 
 
 def write_text(file: Path, text: str) -> None:
-    """Replace a text file in UTF-8, see `replacing`."""
+    """Replace a text file in UTF-8, see `atomic_file`."""
     write_bytes(file, text.encode())
 
 
 @contextlib.contextmanager
-def creating(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A new folder to fill, which is renamed to `path` when the block ends without an exception.
 
     One process at a time may create a path (`envs.datasets.locks.locked`): what a killed one left
     is deleted first.
 
     Raises:
-        ValueError: the path exists already.
+        ValueError: the path already exists.
         OSError: something cannot be written, for want of room for example.
     """
     path = Path(path)
     if path.exists():
-        raise ValueError(f"{path} exists already: choose another path")
-    folder = path.with_name(f".{path.name}{UNFINISHED}")
+        raise ValueError(f"{path} already exists: choose another path")
+    folder = path.with_name(f".{path.name}{TEMPORARY_SUFFIX}")
     if folder.exists():
         shutil.rmtree(folder)
     try:

@@ -1,4 +1,4 @@
-"""From episodes to training batches."""
+"""Datasets and training batches."""
 
 import importlib
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ _HOMES = {"Stream": "stream", "open_source": "opening"}
 
 
 def __getattr__(name: str) -> Any:
-    """Public names, imported when asked for: `--help` needs neither Grain nor PyArrow."""
+    """Import public names on access: `--help` needs neither Grain nor PyArrow."""
     if name in _HOMES:
         return getattr(importlib.import_module(f"lorasp_jax.data.{_HOMES[name]}"), name)
     raise AttributeError(f"module 'lorasp_jax.data' has no attribute {name!r}")

@@ -20,24 +20,24 @@ if TYPE_CHECKING:
 
 
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.data") -> int:
-    """Runs one command; returns the exit code: 0 done, 2 bad input, 130 stopped."""
+    """Run a command and return its exit code: 0 success, 2 invalid input, 130 interrupted."""
     options = parsed(parser(program), arguments)  # before slow imports, which help does not need
     import jax
 
-    jax.config.update("jax_platforms", "cpu")  # nothing here is worth taking an accelerator
+    jax.config.update("jax_platforms", "cpu")  # leave accelerators to others
     errors = Console(stderr=True)
     try:
         options.command(options, Console())
     except Exception as error:
         return refused(error, errors)
     except KeyboardInterrupt:
-        errors.print("stopped: no unfinished file is left")
+        errors.print("interrupted; temporary files were removed")
         return 130
     return 0
 
 
 def inspect(options: argparse.Namespace, console: Console) -> None:
-    """Prints what is in a dataset and writes a picture of it."""
+    """Print a summary of a dataset and write a contact sheet of its images."""
     from lorasp_jax.data import inspection
     from lorasp_jax.data.opening import open_source
 
@@ -45,72 +45,80 @@ def inspect(options: argparse.Namespace, console: Console) -> None:
     if options.out:
         check_local(options.out)
     if options.out and options.out.exists() and not options.overwrite:
-        raise ValueError(f"{options.out} exists already: add --overwrite or choose another --out")
-    path = options.out or inspection.place(options.path)
+        raise ValueError(f"{options.out} already exists: add --overwrite or choose another --out")
+    path = options.out or inspection.default_path(options.path)
     inspection.report(source, console)
     inspection.write_contact_sheet(source, path)
-    console.print(f"pictures: {path}", soft_wrap=True, highlight=False, markup=False)
+    console.print(f"contact sheet: {path}", soft_wrap=True, highlight=False, markup=False)
 
 
 def convert(options: argparse.Namespace, console: Console) -> None:
-    """Writes datasets as a cache, which training reads, or one as an RLDS dataset."""
+    """Convert datasets to a cache for training, or one dataset to RLDS."""
     from lorasp_jax.data import cache, rlds_export
     from lorasp_jax.data.opening import open_source
 
     keys = _keys(options)
     sources = [open_source(path, keys) for path in options.paths]
     if options.to == "rlds" and len(sources) > 1:
-        raise ValueError(f"an RLDS dataset is made of one dataset, not of {len(sources)}")
-    with _bar(f"writing {options.out.name}") as (progress, say):
+        raise ValueError(f"--to rlds converts exactly one dataset, got {len(sources)}")
+    with _progress_bar(f"writing {options.out.name}") as (progress, print_line):
         if options.to == "rlds":
             rlds_export.to_rlds(sources[0], options.out, progress)
         else:
-            wait = f"another process is writing {options.out}: waiting for it"
-            cache.write(sources, options.out, progress, waiting=lambda: say(wait))
+            wait = f"another process is writing {options.out}; waiting for it"
+            cache.write(sources, options.out, progress, waiting=lambda: print_line(wait))
     episodes = sum(len(source) for source in sources)
     console.print(f"{options.out}: {episodes} episodes", soft_wrap=True, highlight=False)
 
 
 def parser(program: str) -> argparse.ArgumentParser:
-    """The commands and their options."""
+    """Define the commands and their options."""
     parser = argparse.ArgumentParser(prog=program, description="Inspect or convert datasets.")
     subparsers = parser.add_subparsers(required=True, metavar="command")
-    where = "a LeRobot dataset (folder or hf://owner/name), an RLDS one, a cache or an .npz file"
+    where = "LeRobot dataset (folder or hf://owner/name), RLDS dataset, cache, or .npz file"
 
     text = inspect.__doc__
     sub = subparsers.add_parser("inspect", help=text, description=text)
     sub.set_defaults(command=inspect)
     sub.add_argument("path", help=where)
     sub.add_argument(
-        "--out", type=Path, help=".png file (default: one for each dataset in ~/.cache/lorasp_jax)"
+        "--out",
+        type=Path,
+        help="output .png file (default: one per dataset in ~/.cache/lorasp_jax)",
     )
-    sub.add_argument("--overwrite", action="store_true", help="replace the .png file")
+    sub.add_argument("--overwrite", action="store_true", help="replace an existing .png file")
     _add_keys(sub)
 
     text = convert.__doc__
     sub = subparsers.add_parser("convert", help=text, description=text)
     sub.set_defaults(command=convert)
     sub.add_argument("paths", nargs="+", metavar="path", help=where)
-    sub.add_argument("--out", type=Path, required=True, help="folder to make")
-    sub.add_argument("--to", choices=("cache", "rlds"), default="cache", help="(%(default)s)")
+    sub.add_argument("--out", type=Path, required=True, help="folder to create")
+    text = "output format (default: %(default)s)"
+    sub.add_argument("--to", choices=("cache", "rlds"), default="cache", help=text)
     _add_keys(sub)
     return parser
 
 
 def _add_keys(parser: argparse.ArgumentParser) -> None:
-    """The options that say what is what in a LeRobot dataset, see `Keys`."""
+    """Add the options that map the features of a LeRobot dataset, see `Keys`."""
     add = parser.add_argument_group("LeRobot datasets").add_argument
-    add("--state", default=Keys.state, help="feature with joints and gripper (%(default)s)")
-    add("--action", default=Keys.action, help="feature with their targets (%(default)s)")
-    names = "names or indices of its numbers, joints first, gripper last (all)"
-    add("--state-numbers", nargs="+", default=(), metavar="NAME", help=names)
-    add("--action-numbers", nargs="+", default=(), metavar="NAME", help=names)
-    text = "cameras wanted and what they are called here (all)"
+    default = "(default: %(default)s)"
+    add("--state", default=Keys.state, help=f"feature with measured joints and gripper {default}")
+    add("--action", default=Keys.action, help=f"feature with their targets {default}")
+    text = "dimensions to use, by name or index: joints first, gripper last (default: all)"
+    add("--state-numbers", nargs="+", default=(), metavar="NAME", help=text)
+    add("--action-numbers", nargs="+", default=(), metavar="NAME", help=text)
+    text = "cameras to use, with names of your choice (default: all)"
     add("--cameras", nargs="+", default=(), metavar="NAME=FEATURE", type=_camera, help=text)
-    add("--angles", choices=("radians", "degrees"), default=Keys.angles, help="(%(default)s)")
-    add("--gripper", choices=("metres", "millimetres"), default=Keys.gripper, help="(%(default)s)")
-    add("--every", type=int, default=1, help="take every so many-th frame (%(default)s)")
-    text = "longest side of a picture [pixels]; larger ones are reduced, 0: none (%(default)s)"
+    text = f"unit of the joints {default}"
+    add("--angles", choices=("radians", "degrees"), default=Keys.angles, help=text)
+    text = f"unit of the gripper opening {default}"
+    add("--gripper", choices=("metres", "millimetres"), default=Keys.gripper, help=text)
+    add("--every", type=int, default=1, help=f"keep every N-th frame {default}")
+    text = (
+        f"maximum longer side of an image [px], larger ones are downscaled; 0: no limit {default}"
+    )
     add("--image-size", type=int, default=224, help=text)
 
 
@@ -129,27 +137,29 @@ def _keys(options: argparse.Namespace) -> Keys:
 
 
 def _camera(text: str) -> tuple[str, str]:
-    """NAME=FEATURE; argparse says what is not."""
+    """Parse NAME=FEATURE."""
     name, equals, feature = text.partition("=")
     if not (name and equals and feature):
-        raise argparse.ArgumentTypeError(f"must be NAME=FEATURE, not {text}")
+        raise argparse.ArgumentTypeError(f"must be NAME=FEATURE, got {text}")
     return name, feature
 
 
 @contextmanager
-def _bar(title: str) -> Iterator[tuple["Report", Callable[[str], None]]]:
-    """A progress bar: what moves it, from when on it shows, and what prints a sentence above it."""
+def _progress_bar(title: str) -> Iterator[tuple["Report", Callable[[str], None]]]:
+    """Yield two functions: one moves a bar, which appears at its first call; one prints a line."""
     progress = bars(Console(stderr=True), "steps")
     bar = progress.add_task(title, total=None)
-    say = functools.partial(progress.console.print, soft_wrap=True, highlight=False, markup=False)
-    with ExitStack() as shown:
+    print_line = functools.partial(
+        progress.console.print, soft_wrap=True, highlight=False, markup=False
+    )
+    with ExitStack() as stack:
 
         def report(done: int, total: int) -> None:
             if not progress.live.is_started:
-                shown.enter_context(progress)
+                stack.enter_context(progress)
             progress.update(bar, completed=done, total=total)
 
-        yield report, say
+        yield report, print_line
 
 
 if __name__ == "__main__":

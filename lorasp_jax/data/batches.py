@@ -1,7 +1,7 @@
-"""Windows of demonstrations as training batches.
+"""Training batches: windows of demonstrations.
 
-Episodes lie as flat per-step arrays, on the device where they fit, else in files; a batch is a
-gather. What a step trains on is a function of the run's key or seed and the step number alone, so
+Episodes are stored as flat per-step arrays, on the device if they fit, else in files; a batch is a
+gather. The batch of a training step depends only on the run's key or seed and the step number, so
 the data position of a run is one integer.
 """
 
@@ -22,12 +22,12 @@ from lorasp_jax.policies.processor import Processor, RawObservation
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Batch:
-    """What one training step sees.
+    """Input of one training step.
 
     Attributes:
-        observation: normalised model input, leading axis B.
-        actions: `[B, C, A]` normalised action chunks in the policy's slots.
-        action_mask: `[B, C, A]` bool, True inside the episode and in the slots that flow.
+        observation: normalized model input, leading axis B.
+        actions: `[B, C, A]` normalized action chunks in the policy's slots.
+        action_mask: `[B, C, A]` bool, True within the episode and in `Processor.flow_slots`.
     """
 
     observation: Observation
@@ -38,13 +38,13 @@ class Batch:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Steps:
-    """Every step of every episode, one after the other.
+    """All steps of all episodes, concatenated.
 
     Attributes:
         image: camera name -> `[N, H, W, 3]` uint8.
         state: `[N, J+1]` joints [rad] and gripper opening [m].
         action: `[N, J+1]` joint targets [rad] and gripper opening [m].
-        end: `[N]` int32, index just past the last step of the same episode.
+        end: `[N]` int32, index after the last step of the same episode.
         instruction: `[N]` int32, row of the processor's token table.
     """
 
@@ -58,13 +58,13 @@ class Steps:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Raw:
-    """A batch before it is normalised: what was seen at B steps, and the actions from there on.
+    """A batch before normalization: the observations at B steps and the actions that follow.
 
     Attributes:
         image: camera name -> `[B, H, W, 3]` uint8.
         state: `[B, J+1]` joints [rad] and gripper opening [m].
         actions: `[B, C, J+1]` joint targets [rad] and gripper opening [m]; past the end of the
-            episode, its last action again.
+            episode, the last action is repeated.
         inside: `[B, C]` bool, False past the end of the episode.
         instruction: `[B]` int32, row of the processor's token table.
     """
@@ -77,7 +77,7 @@ class Raw:
 
 
 def flatten(episodes: Sequence[Episodes]) -> Steps:
-    """Concatenate the valid steps of sets of episodes; instructions are renumbered in order."""
+    """Concatenate the valid steps of all episodes; indices of instructions are offset."""
     parts: list[Steps] = []
     offset = phrase = 0
     for group in episodes:
@@ -101,25 +101,25 @@ def flatten(episodes: Sequence[Episodes]) -> Steps:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
-def of_size(steps: Steps, size: int) -> Steps:
-    """Exactly so many steps: what is too much is cut off, what is missing are the first again."""
+def fit_to_size(steps: Steps, size: int) -> Steps:
+    """Truncate to `size` steps, or repeat from the start until there are that many."""
     number = len(steps.end)
-    taken = np.arange(size) % number
-    found = jax.tree.map(lambda array: array[taken], steps)
-    end = found.end + np.int32(number) * (np.arange(size, dtype=np.int32) // number)
-    return dataclasses.replace(found, end=jnp.minimum(end, size))
+    rows = np.arange(size) % number
+    fitted = jax.tree.map(lambda array: array[rows], steps)
+    end = fitted.end + np.int32(number) * (np.arange(size, dtype=np.int32) // number)
+    return dataclasses.replace(fitted, end=jnp.minimum(end, size))
 
 
 def windows(steps: Steps, start: Array, chunk: int) -> tuple[Array, Array]:
-    """Chunks of steps; one that would reach past its episode repeats the last step there.
+    """Compute the step indices of chunks; past the end of an episode, its last step is repeated.
 
     Args:
-        steps: N of them.
-        start: `[B]` int32, index of each chunk's first step; a NumPy array gives NumPy arrays.
+        steps: the N steps to index.
+        start: `[B]` int32, first step of each chunk; a NumPy array gives NumPy results.
         chunk: C.
 
     Returns:
-        `[B, C]` int32 indices, and `[B, C]` bool, False where a step is a repetition.
+        `[B, C]` int32 indices, and `[B, C]` bool, False where a step is repeated.
     """
     xp = jnp if isinstance(start, jax.Array) else np
     window = start[:, None] + xp.arange(chunk)
@@ -128,7 +128,7 @@ def windows(steps: Steps, start: Array, chunk: int) -> tuple[Array, Array]:
 
 
 def gather(steps: Steps, start: Array, chunk: int) -> Raw:
-    """The windows that begin at the steps `start` `[B]`, see `windows`."""
+    """Gather the windows that start at the steps `start` `[B]`, see `windows`."""
     window, inside = windows(steps, start, chunk)
     return Raw(
         image={name: image[start] for name, image in steps.image.items()},
@@ -140,16 +140,16 @@ def gather(steps: Steps, start: Array, chunk: int) -> Raw:
 
 
 def encode(key: jax.Array, raw: Raw, processor: Processor, *, state_noise: float) -> Batch:
-    """A batch as the model sees it; `key` is consumed, for noise on the normalised state.
+    """Normalize a batch for the model; `key` is consumed, for noise on the normalized state.
 
-    The mask is False where a chunk repeats its episode's last action.
+    The action mask is False where a chunk repeats the last action of its episode.
     """
-    given: Any = jax.tree.map(jnp.asarray, raw)
-    seen: RawObservation = {"image": given.image, "state": given.state}
-    noise = state_noise * jax.random.normal(key, (len(given.state), processor.statistics.dim))
-    observation = processor.encode(seen, given.instruction, state_noise=noise)
-    actions = processor.normalize_actions(given.actions, given.state)
-    return Batch(observation, actions, given.inside[..., None] & processor.flow_slots)
+    batch: Any = jax.tree.map(jnp.asarray, raw)
+    observed: RawObservation = {"image": batch.image, "state": batch.state}
+    noise = state_noise * jax.random.normal(key, (len(batch.state), processor.statistics.dim))
+    observation = processor.encode(observed, batch.instruction, state_noise=noise)
+    actions = processor.normalize_actions(batch.actions, batch.state)
+    return Batch(observation, actions, batch.inside[..., None] & processor.flow_slots)
 
 
 def sample_batch(

@@ -1,13 +1,13 @@
-"""A flat cache of steps on disk: what training reads of a dataset, made from it once.
+"""A flat on-disk cache of a dataset's steps, written once and read by training.
 
     cache.write([open_source("my_dataset")], "my_cache", lambda done, total: None)
     steps = cache.Cache("my_cache").steps
 
-A folder of plain .npy files that are mapped into memory, raw pictures among them; cache.json with
-what all episodes share and the files' checksums; statistics.json. Pictures have a checksum each, in
-files of their own, and are compared when they are first read. A batch is one gather per file.
-Measured on two cores, 64 windows of two cameras at a time, shuffled: 128 x 128 pixels 37,000
-windows/s, 224 x 168 18,000; from array_record files of raw pictures 6,500 and 3,800.
+A folder of plain, memory-mapped .npy files, raw images included; cache.json with the metadata that
+all episodes share and the files' checksums; and statistics.json. Every image has its own checksum,
+in separate files, and is verified when it is first read. A batch is one gather per file. Measured
+on two cores, 64 shuffled windows of two cameras at a time: 128 x 128 pixels 37,000 windows/s,
+224 x 168 18,000; from array_record files of raw images 6,500 and 3,800.
 """
 
 import json
@@ -24,10 +24,10 @@ import numpy as np
 from envs.datasets.episodes import SHARED, Episodes, check_camera
 from envs.datasets.files import damage, read_json, read_text
 from envs.datasets.locks import locked
-from envs.datasets.writing import creating
+from envs.datasets.writing import atomic_folder
 from lorasp_jax.data.batches import Steps
-from lorasp_jax.data.cache_writer import Column, mapped
-from lorasp_jax.data.pictures import Pictures, checksum
+from lorasp_jax.data.cache_writer import Column, map_column
+from lorasp_jax.data.checked_images import CheckedImages, checksum
 from lorasp_jax.data.source import Progress, Source
 from lorasp_jax.policies.statistics import Statistics
 from lorasp_jax.storage.digest import DIGEST, sealed, unsealed
@@ -36,12 +36,12 @@ from lorasp_jax.storage.json_values import check
 FORMAT = "lorasp-cache-1"
 HEADER, STATISTICS = "cache.json", "statistics.json"
 ROWS = ("state", "action", "length", "instruction", "task")
-"""Files beside those of the cameras: of steps, of steps, of episodes, of episodes, of episodes."""
+"""Columns other than images: state and action per step; length, instruction, task per episode."""
 _IMAGE, _CHECKSUM = "image_", "crc32_"
-_KIND = {"state": np.float32, "action": np.float32, "image": np.uint8, "crc32": np.uint32}
-FACTS = tuple(name for name in SHARED if name not in ("task", "instructions"))
-"""What the episodes of a cache have in common."""
-_KINDS: dict[str, Any] = {
+_DTYPES = {"state": np.float32, "action": np.float32, "image": np.uint8, "crc32": np.uint32}
+METADATA = tuple(name for name in SHARED if name not in ("task", "instructions"))
+"""Fields of `Episodes` that are the same in all episodes of a cache."""
+_HEADER_TYPES: dict[str, Any] = {
     "format": str,
     **dict.fromkeys(("robot", "actions"), str),
     **dict.fromkeys(("control_dt", "physics_dt"), float),
@@ -51,7 +51,7 @@ _KINDS: dict[str, Any] = {
     "cameras": {str: (int, int)},
     "crc32": {str: int},
 }
-_KNOWN = {*_KINDS, DIGEST}
+_HEADER_FIELDS = {*_HEADER_TYPES, DIGEST}
 
 
 def write(
@@ -60,118 +60,122 @@ def write(
     progress: Progress,
     waiting: Callable[[], None] | None = None,
 ) -> None:
-    """Writes a cache folder, which is there only when all of it is.
+    """Write a cache folder, which appears only once it is complete.
 
     Args:
-        sources: datasets of one robot with pictures of one size; they are not changed.
-        path: the folder to make.
-        progress: told of the steps.
-        waiting: called once if another process is writing this folder; it is then waited for, and
-            what it wrote is kept if it is of these datasets. None: that is an error.
+        sources: datasets with the same robot and image size; only read.
+        path: folder to create.
+        progress: called with the steps done and the total.
+        waiting: called once if another process is writing this folder; then wait for it, and keep
+            its cache if it was made from these datasets. None: raise instead.
 
     Raises:
-        ValueError: the path exists already, or is another process's; or an episode is not as the
-            others or damaged.
-        OSError: there is no room for it.
+        ValueError: the path already exists or another process is writing it; or an episode is
+            damaged, or incompatible with the others.
+        OSError: the disk is full.
     """
     path, total = Path(path), sum(source.num_steps for source in sources)
-    there = path.exists()
+    existed = path.exists()
     with locked(path, waiting):
-        if path.exists() and not there:
-            _check(Cache(path), sources, total)
+        if path.exists() and not existed:
+            _check_same(Cache(path), sources, total)
             return
-        kind = _facts(sources[0].episode(0)) if sources[1:] else {}
-        for source in sources[1:]:  # now, not when hours of the first one's pictures are read
-            _check_kind(kind, source.episode(0))
-        with creating(path) as folder, Writer(folder) as writer, ThreadPoolExecutor(1) as reader:
-            for episode in _ahead(sources, reader):
+        shared = _metadata(sources[0].episode(0)) if sources[1:] else {}
+        for source in sources[1:]:  # fail now, not after hours of reading the first one's images
+            _check_compatible(shared, source.episode(0))
+        with (
+            atomic_folder(path) as folder,
+            Writer(folder) as writer,
+            ThreadPoolExecutor(1) as reader,
+        ):
+            for episode in _prefetch(sources, reader):
                 writer.append(episode)
                 progress(writer.num_steps, total)
 
 
-def _check(found: "Cache", sources: Sequence[Source], steps: int) -> None:
-    """Raise ValueError unless size and first episode of a cache are as of these datasets."""
-    first, wanted = found.episode(0), sources[0].episode(0)
+def _check_same(cache: "Cache", sources: Sequence[Source], steps: int) -> None:
+    """Raise ValueError unless a cache's size and first episode match these datasets."""
+    first, wanted = cache.episode(0), sources[0].episode(0)
     length = int(wanted.length[0])
-    same = found.num_steps == steps and _facts(first) == _facts(wanted)
+    same = cache.num_steps == steps and _metadata(first) == _metadata(wanted)
     for name in ("state", "action"):
         same = same and np.array_equal(getattr(first, name), getattr(wanted, name)[:, :length])
     if not same:
-        raise ValueError(f"another process has written {found.path}, of something else")
+        raise ValueError(f"{cache.path} was written by another process from different datasets")
 
 
-def _ahead(sources: Sequence[Source], reader: ThreadPoolExecutor) -> Iterator[Episodes]:
-    """All episodes, each read while the one before is written: two are in memory at a time."""
-    coming = None
+def _prefetch(sources: Sequence[Source], reader: ThreadPoolExecutor) -> Iterator[Episodes]:
+    """Yield all episodes, reading the next one meanwhile: two are in memory at a time."""
+    pending = None
     for source in sources:
         for number in range(len(source)):
-            ready = coming and coming.result()
-            coming = reader.submit(source.episode, number)
+            ready = pending and pending.result()
+            pending = reader.submit(source.episode, number)
             if ready:
                 yield ready
-    if coming:
-        yield coming.result()
+    if pending:
+        yield pending.result()
 
 
 class Writer:
-    """Writes a cache episode by episode; as a context it is complete where nothing was raised."""
+    """Write a cache episode by episode; a context manager that completes the cache on success."""
 
     def __init__(self, folder: Path) -> None:
-        """Begins in a folder that is there."""
+        """Start in an existing folder."""
         self.num_steps: int = 0
-        self._folder, self._facts = folder, {}
+        self._folder, self._metadata = folder, {}
         self._tasks: list[str] = []
         self._instructions: list[str] = []
         self._columns: dict[str, Column] = {}
 
     def __enter__(self) -> Self:
-        """Nothing is open yet."""
+        """Return the writer itself."""
         return self
 
-    def __exit__(self, kind: Any, *_: Any) -> None:
-        """Closes all files; describes them where nothing was raised."""
+    def __exit__(self, error: Any, *_: Any) -> None:
+        """Close all files; on success, write statistics and header."""
         for column in self._columns.values():
             column.close()
-        if kind is not None:
+        if error is not None:
             return
         if not self.num_steps:
-            raise ValueError("there is no episode to write")
+            raise ValueError("there are no episodes to write")
         checksums = [name for name in self._columns if name.startswith(_CHECKSUM)]
         rows = {name: np.load(self._folder / f"{name}.npy") for name in (*ROWS, *checksums)}
-        if self._facts["actions"] == "joint":
-            width, every = rows["state"].shape[1], np.ones(self.num_steps, bool)
+        if self._metadata["actions"] == "joint":
+            dim, every = rows["state"].shape[1], np.ones(self.num_steps, bool)
             state, action = rows["state"], rows["action"]
-            found = Statistics.measure(state, action, every, slots=range(width), dim=width)
-            (self._folder / STATISTICS).write_text(found.to_json())
-        facts = {"format": FORMAT, **self._facts, "steps": self.num_steps}
-        facts |= {"tasks": self._tasks, "instructions": self._instructions}
-        facts["crc32"] = {name: zlib.crc32(array.data) for name, array in rows.items()}
-        (self._folder / HEADER).write_text(json.dumps(sealed(facts), indent=1))
+            statistics = Statistics.measure(state, action, every, slots=range(dim), dim=dim)
+            (self._folder / STATISTICS).write_text(statistics.to_json())
+        header = {"format": FORMAT, **self._metadata, "steps": self.num_steps}
+        header |= {"tasks": self._tasks, "instructions": self._instructions}
+        header["crc32"] = {name: zlib.crc32(array.data) for name, array in rows.items()}
+        (self._folder / HEADER).write_text(json.dumps(sealed(header), indent=1))
 
     def append(self, episode: Episodes) -> None:
-        """Adds an `Episodes` of one.
+        """Append one episode, given as `Episodes` with E = 1.
 
         Raises:
-            ValueError: its arrays do not fit one another or the episodes before.
+            ValueError: its arrays are inconsistent, or differ from those of earlier episodes.
         """
         episode.validate()
-        self._facts = self._facts or _facts(episode)
-        _check_kind(self._facts, episode)
+        self._metadata = self._metadata or _metadata(episode)
+        _check_compatible(self._metadata, episode)
         length = int(episode.length[0])
         phrase = episode.instructions[int(episode.instruction[0])]
         lists = (self._tasks, [episode.task]), (self._instructions, episode.instructions)
         for known, new in lists:
             known += [text for text in new if text not in known]
         steps = {"state": episode.state, "action": episode.action}
-        steps |= {_IMAGE + name: picture for name, picture in episode.image.items()}
+        steps |= {_IMAGE + name: images for name, images in episode.image.items()}
         for name, array in steps.items():
             self._extend(name, np.asarray(array)[0, :length])
-        for name, pictures in episode.image.items():
-            found = [checksum(picture) for picture in np.asarray(pictures)[0, :length]]
-            self._extend(_CHECKSUM + name, np.array(found, np.uint32))
-        one = {"length": length, "instruction": self._instructions.index(phrase)}
-        one["task"] = self._tasks.index(episode.task)
-        for name, value in one.items():
+        for name, images in episode.image.items():
+            checksums = [checksum(image) for image in np.asarray(images)[0, :length]]
+            self._extend(_CHECKSUM + name, np.array(checksums, np.uint32))
+        row = {"length": length, "instruction": self._instructions.index(phrase)}
+        row["task"] = self._tasks.index(episode.task)
+        for name, value in row.items():
             self._extend(name, np.array([value], np.int32))
         self.num_steps += length
 
@@ -181,88 +185,65 @@ class Writer:
         self._columns[name].append(rows)
 
 
-def _check_kind(facts: dict[str, Any], episode: Episodes) -> None:
-    """Raise ValueError unless these are the facts of an episode."""
-    for name, value in _facts(episode).items():
-        if value != facts[name]:
+def _check_compatible(shared: dict[str, Any], episode: Episodes) -> None:
+    """Raise ValueError if an episode's metadata differ from what all episodes must share."""
+    for name, value in _metadata(episode).items():
+        if value != shared[name]:
             raise ValueError(
-                f"a cache holds episodes of one kind, but {name} is {facts[name]!r} in the first "
-                f"one and {value!r} in one of {episode.task}"
+                f"all episodes of a cache must have the same {name}, but it is {shared[name]!r} in "
+                f"the first one and {value!r} in one of {episode.task}"
             )
 
 
-def _facts(episode: Episodes) -> dict[str, Any]:
-    """What all episodes of a cache must have in common."""
-    facts = {name: getattr(episode, name) for name in FACTS}
-    facts["cameras"] = {name: list(x.shape[2:4]) for name, x in sorted(episode.image.items())}
-    facts["numbers"] = episode.state.shape[2]
-    return facts
+def _metadata(episode: Episodes) -> dict[str, Any]:
+    """Return the metadata that all episodes of a cache must share."""
+    metadata = {name: getattr(episode, name) for name in METADATA}
+    metadata["cameras"] = {name: list(x.shape[2:4]) for name, x in sorted(episode.image.items())}
+    metadata["numbers"] = episode.state.shape[2]
+    return metadata
 
 
 class Cache:
-    """A cache on disk, mapped into memory.
+    """A memory-mapped cache on disk.
 
     Attributes:
-        kind: the format's name.
+        kind: name of the format.
         path: the folder.
-        facts: cache.json: robot, tasks, instructions, control_dt and so on.
+        metadata: content of cache.json: robot, tasks, instructions, control_dt and so on.
         cameras: name -> height and width.
-        statistics: of states and actions, in the robot's own numbers; None where actions are of
-            another kind than states.
+        statistics: of states and actions, in the robot's units; None unless actions are joint
+            targets.
     """
 
     kind = "cache"
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        """Opens a cache.
+        """Open a cache.
 
         Raises:
-            ValueError: it is not there, damaged, or of another format.
+            ValueError: it is missing, damaged or of another format.
         """
         self.path: Path = Path(path)
         header = self.path / HEADER
         if not header.is_file():
-            raise ValueError(f"{path} is not a cache: there is no {HEADER} in it")
+            raise ValueError(f"{path} is not a cache: it has no {HEADER}")
         with damage(header):
-            self.facts: dict[str, Any] = read_json(header, self.path)
-            if DIGEST in self.facts:
-                self.facts = unsealed(self.facts)
-            if unknown := sorted(self.facts.keys() - _KNOWN):
-                raise ValueError(f"it has a field {unknown[0]!r}")
-            if self.facts["format"] != FORMAT:
-                raise ValueError(f"it is of format {self.facts['format']!r}, not {FORMAT!r}")
-            check(self.facts, _KINDS)
-            self.cameras: dict[str, list[int]] = self.facts["cameras"]
-            self.control_dt: float = self.facts["control_dt"]
-            self.num_steps: int = self.facts["steps"]
-            self.instructions: tuple[str, ...] = tuple(self.facts["instructions"])
-            width = self.facts["numbers"]
-            if not (0 < self.control_dt < math.inf and width > 0):
-                raise ValueError(f"control_dt is {self.control_dt} and numbers {width}")
-            sizes = {name: tuple(size) for name, size in self.cameras.items()}
-            for name in sizes:
-                check_camera(name)
-            if not self.facts["crc32"].keys() >= {*ROWS}:
-                raise ValueError("it lacks checksums")
+            self.metadata: dict[str, Any] = _read_header(header)
+        self.cameras: dict[str, list[int]] = self.metadata["cameras"]
+        self.control_dt: float = self.metadata["control_dt"]
+        self.num_steps: int = self.metadata["steps"]
+        self.instructions: tuple[str, ...] = tuple(self.metadata["instructions"])
         self._images: dict[str, Any] = {
-            name: self._pictures(name, size) for name, size in sizes.items()
+            name: self._map_images(name, size) for name, size in self.cameras.items()
         }
-        rows = {"state": (self.num_steps, width), "action": (self.num_steps, None)}
-        self._columns = {name: self._mapped(name, shape) for name, shape in rows.items()}
-        length = self._columns["length"] = self._mapped("length", (None,))
-        self._columns |= {name: self._mapped(name, length.shape) for name in ROWS[3:]}
-        self._end = np.cumsum(length, dtype=np.int64)
-        if not len(length) or length.min() < 1 or self._end[-1] != self.num_steps:
-            raise ValueError(f"{path} has episodes of {length} steps, not {self.num_steps} in all")
-        for name, texts in (("task", self.facts["tasks"]), ("instruction", self.instructions)):
-            low, high = self._columns[name].min(), self._columns[name].max()
-            if low < 0 or high >= len(texts):
-                raise ValueError(f"{path} is damaged (it has {name} {low} to {high})")
+        self._columns = self._map_columns()
+        self._end = np.cumsum(self._columns["length"], dtype=np.int64)
+        self._check_columns()
         with damage(header):
             self.episode(0, ()).validate_numbers()
             for name in ("state", "action"):
                 if not np.isfinite(self._columns[name]).all():
-                    raise ValueError(f"{name} holds numbers that are not finite")
+                    raise ValueError(f"{name} has values that are not finite")
         self.statistics: Statistics | None = self._statistics()
 
     def __len__(self) -> int:
@@ -271,7 +252,7 @@ class Cache:
 
     @property
     def steps(self) -> Steps:
-        """All steps, in files: indexing reads them."""
+        """All steps, memory-mapped: they are read on indexing."""
         length = self._columns["length"]
         return Steps(
             image={**self._images},
@@ -282,38 +263,83 @@ class Cache:
         )
 
     def episode(self, number: int, cameras: Sequence[str] | None = None) -> Episodes:
-        """One episode, with the pictures of these cameras; None: all."""
-        here = slice(self._end[number] - self._columns["length"][number], self._end[number])
-        one = slice(number, number + 1)
+        """Load one episode with the images of these cameras; None: all."""
+        rows = slice(self._end[number] - self._columns["length"][number], self._end[number])
+        row = slice(number, number + 1)
         wanted = self.cameras if cameras is None else cameras
         return Episodes(
-            image={name: self._images[name][here][None] for name in wanted},
-            state=self._columns["state"][None, here],
-            action=self._columns["action"][None, here],
-            length=self._columns["length"][one],
-            instruction=self._columns["instruction"][one],
+            image={name: self._images[name][rows][None] for name in wanted},
+            state=self._columns["state"][None, rows],
+            action=self._columns["action"][None, rows],
+            length=self._columns["length"][row],
+            instruction=self._columns["instruction"][row],
             instructions=self.instructions,
-            task=self.facts["tasks"][self._columns["task"][number]],
+            task=self.metadata["tasks"][self._columns["task"][number]],
             attempted=1,
-            **{name: self.facts[name] for name in FACTS},
+            **{name: self.metadata[name] for name in METADATA},
         )
 
-    def _mapped(self, name: str, shape: tuple[int | None, ...]) -> np.ndarray:
-        """An array in a file, whose shape must be this one where it is given."""
-        path, kind = self.path / f"{name}.npy", _KIND.get(name.partition("_")[0], np.int32)
-        return mapped(path, kind, shape, self.facts["crc32"].get(name))
+    def _map_columns(self) -> dict[str, np.ndarray]:
+        """Memory-map all `ROWS`."""
+        shapes = {"state": (self.num_steps, self.metadata["numbers"])}
+        shapes |= {"action": (self.num_steps, None), "length": (None,)}
+        columns = {name: self._map(name, shape) for name, shape in shapes.items()}
+        return columns | {name: self._map(name, columns["length"].shape) for name in ROWS[3:]}
 
-    def _pictures(self, name: str, size: Sequence[int]) -> np.ndarray | Pictures:
-        """Those of a camera; caches of old have no checksums of them."""
-        array = self._mapped(_IMAGE + name, (self.num_steps, *size, 3))
-        if _CHECKSUM + name not in self.facts["crc32"]:
+    def _check_columns(self) -> None:
+        """Raise ValueError if lengths or indices of episodes are impossible."""
+        length = self._columns["length"]
+        if not len(length) or length.min() < 1 or self._end[-1] != self.num_steps:
+            total = int(self._end[-1]) if len(length) else 0
+            raise ValueError(
+                f"{self.path} has {len(length)} episodes of {total} steps in all, but must have "
+                f"{self.num_steps} steps and no empty episode"
+            )
+        for name, texts in (("task", self.metadata["tasks"]), ("instruction", self.instructions)):
+            low, high = self._columns[name].min(), self._columns[name].max()
+            if low < 0 or high >= len(texts):
+                raise ValueError(
+                    f"{self.path} is damaged ({name} has indices {low} to {high}, valid are 0 to "
+                    f"{len(texts) - 1})"
+                )
+
+    def _map(self, name: str, shape: tuple[int | None, ...]) -> np.ndarray:
+        """Memory-map a column and check its dtype and shape; None matches any dimension."""
+        path, dtype = self.path / f"{name}.npy", _DTYPES.get(name.partition("_")[0], np.int32)
+        return map_column(path, dtype, shape, self.metadata["crc32"].get(name))
+
+    def _map_images(self, name: str, size: Sequence[int]) -> np.ndarray | CheckedImages:
+        """Memory-map a camera's images; old caches have no checksums for them."""
+        array = self._map(_IMAGE + name, (self.num_steps, *size, 3))
+        if _CHECKSUM + name not in self.metadata["crc32"]:
             return array
-        checksums = self._mapped(_CHECKSUM + name, (None,))
-        return Pictures(self.path / f"{_IMAGE}{name}.npy", array, checksums)
+        checksums = self._map(_CHECKSUM + name, (None,))
+        return CheckedImages(self.path / f"{_IMAGE}{name}.npy", array, checksums)
 
     def _statistics(self) -> Statistics | None:
         path = self.path / STATISTICS
-        if self.facts["actions"] != "joint":
+        if self.metadata["actions"] != "joint":
             return None
         with damage(path):
             return Statistics.from_json(read_text(path, self.path))
+
+
+def _read_header(path: Path) -> dict[str, Any]:
+    """Read and check cache.json."""
+    header: dict[str, Any] = read_json(path, path.parent)
+    if DIGEST in header:
+        header = unsealed(header)
+    if unknown := sorted(header.keys() - _HEADER_FIELDS):
+        raise ValueError(f"unknown field {unknown[0]!r}")
+    if header["format"] != FORMAT:
+        raise ValueError(f"format must be {FORMAT!r}, got {header['format']!r}")
+    check(header, _HEADER_TYPES)
+    if not 0 < header["control_dt"] < math.inf:
+        raise ValueError(f"control_dt must be positive and finite, got {header['control_dt']}")
+    if header["numbers"] < 1:
+        raise ValueError(f"numbers, the state dimension, must be positive, got {header['numbers']}")
+    for name in header["cameras"]:
+        check_camera(name)
+    if not header["crc32"].keys() >= {*ROWS}:
+        raise ValueError("checksums are missing")
+    return header

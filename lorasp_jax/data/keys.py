@@ -1,4 +1,4 @@
-"""What is what in a LeRobot dataset; apart from its reader, which is slow to import."""
+"""Feature mapping of a LeRobot dataset; a module of its own, since the reader imports slowly."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -9,24 +9,23 @@ from lorasp_jax.peft import _fields
 
 @dataclasses.dataclass(frozen=True)
 class Keys:
-    """Which of a dataset's features are what, and in which units.
+    """Features of a dataset that hold state, action and images, and their units.
 
-    State and action are joints first, the gripper's opening last.
+    State and action list the joints first, then the gripper opening.
 
     Attributes:
-        state: the feature with the measured joints and gripper.
-        action: the feature with the commanded ones.
-        state_numbers: names or indices of the state's numbers that are wanted, in order; empty:
-            all.
-        action_numbers: likewise of the action's.
-        cameras: name here -> feature; empty: all pictures, without the
-            observation.images. of their names.
+        state: feature with the measured joints and gripper.
+        action: feature with the commanded joints and gripper.
+        state_numbers: names or indices of the state dimensions to use, in order; empty: all.
+        action_numbers: the same for the action.
+        cameras: camera -> feature; empty: all image features, without the prefix
+            observation.images.
         angles: unit of the joints.
-        gripper: unit of the gripper.
-        every: only every so many-th frame is taken, with the last action before the next one that
-            is: 3 makes 10 Hz of 30 Hz.
-        image_size: pictures are reduced so that the longer side has at most so many pixels; 0: as
-            they are.
+        gripper: unit of the gripper opening.
+        every: keep every N-th frame, with the last action before the next kept frame; 3 turns
+            30 Hz into 10 Hz.
+        image_size: maximum length of the longer image side [px], larger images are downscaled; 0:
+            no limit.
     """
 
     state: str = "observation.state"
@@ -40,13 +39,13 @@ class Keys:
     image_size: int = 0
 
     def __post_init__(self) -> None:
-        """Checks the fields."""
+        """Check the fields."""
         _fields.check_fields(self)
         if not isinstance(self.cameras, Mapping):
             raise ValueError(f"cameras must be a mapping, name -> feature, got {self.cameras!r}")
         for name, feature in self.cameras.items():
             if not isinstance(name, str) or not isinstance(feature, str):
-                raise ValueError(f"cameras must be texts, got {name!r} -> {feature!r}")
+                raise ValueError(f"cameras must be names and features, got {name!r} -> {feature!r}")
         if self.every < 1 or self.image_size < 0:
             raise ValueError(
                 f"every must be at least 1 and image_size at least 0, "

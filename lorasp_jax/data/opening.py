@@ -1,4 +1,4 @@
-"""Datasets of every kind that is known, told apart by what lies in their folder."""
+"""Open a dataset of any supported format, recognized by its files."""
 
 import dataclasses
 import os
@@ -15,20 +15,21 @@ from lorasp_jax.storage import hub
 
 
 def open_source(where: str | os.PathLike[str], keys: Keys | None = None) -> Source:
-    """A dataset of LeRobot or RLDS, a cache, or a file of episodes.
+    """Open a LeRobot or RLDS dataset, a cache, or an .npz file of episodes.
 
     Args:
         where: a path, or hf://owner/name of a LeRobot dataset on the hub.
-        keys: what is what in a LeRobot dataset; the others say it themselves.
+        keys: feature mapping of a LeRobot dataset; the other formats need none.
 
     Raises:
-        ValueError: it is not there, is of no known kind, or is damaged; or keys for another kind.
+        ValueError: the dataset is missing, damaged or of unknown format; or `keys` select features
+            of a dataset that is not LeRobot's.
     """
     path = hub.local(where, repository="dataset")
     if is_lerobot(path):
         return LeRobot(path, keys, name=Path(where).name)
     if keys and dataclasses.replace(keys, image_size=0) != Keys():
-        raise ValueError(f"{where} is no LeRobot dataset: it says itself which numbers are what")
+        raise ValueError(f"{where} is not a LeRobot dataset: feature options do not apply to it")
     if (path / HEADER).is_file():
         return Cache(path)
     if (path / rlds.METADATA).is_file():
@@ -36,13 +37,13 @@ def open_source(where: str | os.PathLike[str], keys: Keys | None = None) -> Sour
     if path.suffix == ".npz":
         return _File(path)
     raise ValueError(
-        f"{where} is no dataset: it has neither meta/info.json (LeRobot) nor {rlds.METADATA} "
-        f"(RLDS, of python -m envs collect) nor {HEADER} (a cache), and is no .npz file"
+        f"{where} is not a dataset: expected a folder with meta/info.json (LeRobot), "
+        f"{rlds.METADATA} (RLDS, from python -m envs collect) or {HEADER} (cache), or an .npz file"
     )
 
 
 class _File:
-    """Episodes in an .npz file, see `Episodes.save`."""
+    """An .npz file of episodes, see `Episodes.save`."""
 
     kind = "npz"
 
@@ -57,9 +58,11 @@ class _File:
     def episode(self, number: int, cameras: Sequence[str] | None = None) -> Episodes:
         names = self.cameras if cameras is None else cameras
         image = {name: self._episodes.image[name] for name in names}
-        one = dataclasses.replace(self._episodes, image=image, attempted=1).select([number])
-        length = int(one.length[0])
-        short = {name: picture[:, :length] for name, picture in one.image.items()}
+        episode = dataclasses.replace(self._episodes, image=image, attempted=1).select([number])
+        length = int(episode.length[0])  # without padding
         return dataclasses.replace(
-            one, image=short, state=one.state[:, :length], action=one.action[:, :length]
+            episode,
+            image={name: images[:, :length] for name, images in episode.image.items()},
+            state=episode.state[:, :length],
+            action=episode.action[:, :length],
         )

@@ -1,4 +1,4 @@
-"""What every kind of dataset gives."""
+"""The interface that all dataset formats share."""
 
 from collections.abc import Callable, Collection, Sequence
 from typing import Protocol
@@ -6,20 +6,20 @@ from typing import Protocol
 from envs.datasets.episodes import Episodes
 
 Progress = Callable[[int, int], None]
-"""Called with steps done and steps in all."""
+"""Called with the steps done and the total."""
 
 
 class Source(Protocol):
-    """Episodes that are read one by one."""
+    """A dataset whose episodes are loaded one at a time."""
 
     @property
     def kind(self) -> str:
-        """The format."""
+        """Name of the format."""
         ...
 
     @property
     def cameras(self) -> Collection[str]:
-        """Names."""
+        """Names of the cameras."""
         ...
 
     @property
@@ -29,7 +29,7 @@ class Source(Protocol):
 
     @property
     def num_steps(self) -> int:
-        """Control steps of all episodes."""
+        """Total number of control steps."""
         ...
 
     def __len__(self) -> int:
@@ -37,5 +37,5 @@ class Source(Protocol):
         ...
 
     def episode(self, number: int, cameras: Sequence[str] | None = None) -> Episodes:
-        """One episode in host memory, with the pictures of these cameras; None: all."""
+        """Load one episode into host memory, with the images of these cameras; None: all."""
         ...

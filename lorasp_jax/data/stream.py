@@ -1,9 +1,9 @@
-"""Windows from a cache in endless, shuffled order, by Grain; the position is one integer.
+"""Endless, shuffled batches of windows from a cache, loaded by Grain; the position is one integer.
 
     for raw in Stream(Cache("my_cache").steps, batch_size=32, chunk=50, seed=0, start=1000):
 
-A batch is a function of seed and position alone. All processes together see the same batches, row
-for row, however many they are, so a run may go on with another number of them.
+A batch depends on seed and position alone. The global batch is the same, row for row, for any
+number of processes, so a run may resume with a different number.
 """
 
 from typing import Any
@@ -13,14 +13,15 @@ import numpy as np
 
 from lorasp_jax.data.batches import Raw, Steps, gather
 
-_THREADS, _AHEAD = 1, 4  # that gather batches (a second one waits for Python); batches ready
+_THREADS = 1  # a second one would only wait for Python's lock
+_PREFETCH = 4  # batches
 
 
 class Stream:
     """An endless iterator of `Raw` batches in host memory.
 
     Attributes:
-        position: batches given so far, counted from the very beginning.
+        position: index of the next batch, counted from the start of training.
     """
 
     def __init__(
@@ -33,18 +34,19 @@ class Stream:
         start: int = 0,
         process: tuple[int, int] = (0, 1),
     ) -> None:
-        """Begins to read ahead in threads.
+        """Start to prefetch in threads.
 
         Args:
-            steps: as `Cache.steps` has them.
+            steps: steps to sample from, see `Cache.steps`.
             batch_size: windows in a batch, over all processes.
             chunk: C, actions in a window.
-            seed: of the order; every epoch has another one.
-            start: `position` to go on from.
-            process: index of this process and their number; each gets its share of a batch.
+            seed: seed of the order, which differs in every epoch.
+            start: `position` to resume from.
+            process: index of this process and number of processes; each gets its share of a batch.
 
         Raises:
-            ValueError: the processes cannot share a batch evenly, or another number is impossible.
+            ValueError: an argument is out of range, or `batch_size` is not a multiple of the number
+                of processes.
         """
         index, count = process
         if batch_size < 1 or chunk < 1 or start < 0 or batch_size % count:
@@ -62,16 +64,16 @@ class Stream:
 
         order: Any = grain.MapDataset.range(len(steps.end)).seed(seed).shuffle().repeat()
         batches = order.batch(batch_size).map(read)
-        ahead = grain.ReadOptions(num_threads=_THREADS, prefetch_buffer_size=_AHEAD)
-        self._iterator: Any = iter(batches.to_iter_dataset(ahead))
+        options = grain.ReadOptions(num_threads=_THREADS, prefetch_buffer_size=_PREFETCH)
+        self._iterator: Any = iter(batches.to_iter_dataset(options))
         self._iterator.set_state({"next_index": start})
 
     def __iter__(self) -> "Stream":
-        """Itself."""
+        """Return the stream itself."""
         return self
 
     def __next__(self) -> Raw:
-        """The batch at `position`."""
+        """Return the batch at `position` and advance."""
         raw = next(self._iterator)
         self.position += 1
         return raw

@@ -13,7 +13,7 @@ from rich.progress import Progress
 
 from envs.cli.bars import bars
 from envs.compilation import messages
-from envs.datasets.writing import replacing
+from envs.datasets.writing import atomic_file
 from envs.env import Env
 from envs.physics import physics
 from envs.state import Poses
@@ -90,7 +90,7 @@ class Evaluation(Callback):
         for task, result in results.items():
             first = {name: np.asarray(i[0, 0]) for name, i in run.episodes[task].image.items()}
             video.write_picture(run.folder / f"cameras_{task}.png", video.side_by_side(first))
-            with replacing(run.folder / f"rollout_{task}.mp4") as unfinished:
+            with atomic_file(run.folder / f"rollout_{task}.mp4") as unfinished:
                 self._film(self._tasks[task][0], result.poses, unfinished)
 
     def _measure(self, run: Run, when: str, episodes: int = 0) -> dict[str, Result]:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from envs.datasets.locks import locked
-from envs.datasets.writing import creating, replacing
+from envs.datasets.writing import atomic_file, atomic_folder
 from lorasp_jax.storage import shipped
 
 HUB = "hf://"
@@ -133,7 +133,7 @@ def _fetch(store: Any, root: str, target: Path) -> None:
     if not names:
         raise FileNotFoundError("there is nothing of that name")
     is_file = names == [root]
-    with (replacing if is_file else creating)(target) as unfinished:
+    with (atomic_file if is_file else atomic_folder)(target) as unfinished:
         for name in names:
             file = unfinished if is_file else unfinished / name[len(root) :].lstrip("/")
             file.parent.mkdir(parents=True, exist_ok=True)

@@ -76,7 +76,7 @@ def outline(found: Cache) -> dict[str, Episodes]:
     """A cache's numbers by task; in place of all pictures, the task's first ones."""
     every = [found.episode(number, ()) for number in range(len(found))]
     groups: dict[str, Episodes] = {}
-    for task in found.facts["tasks"]:
+    for task in found.metadata["tasks"]:
         numbers = [number for number, episode in enumerate(every) if episode.task == task]
         groups[task] = _padded(found, [every[number] for number in numbers], numbers[0])
     return groups
@@ -104,7 +104,7 @@ def _padded(found: Cache, episodes: list[Episodes], first: int) -> Episodes:
         instructions=found.instructions,
         task=episodes[0].task,
         attempted=len(episodes),
-        **{name: found.facts[name] for name in cache.FACTS},
+        **{name: found.metadata[name] for name in cache.METADATA},
     )
 
 
@@ -114,5 +114,5 @@ def is_simulated(found: Cache) -> bool:
     A real robot's recordings may be called as a task is, but show and say other things.
     """
     known = set(names("task")), set(names("robot"))
-    is_known = set(found.facts["tasks"]) <= known[0] and found.facts["robot"] in known[1]
-    return is_known and found.facts["physics_dt"] > 0
+    is_known = set(found.metadata["tasks"]) <= known[0] and found.metadata["robot"] in known[1]
+    return is_known and found.metadata["physics_dt"] > 0

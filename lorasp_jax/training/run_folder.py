@@ -21,7 +21,7 @@ from tensorboardX.proto.summary_pb2 import Summary
 
 from envs.datasets.files import check_only_files, damage, read_bytes
 from envs.datasets.locks import acquire
-from envs.datasets.writing import UNFINISHED, write_text
+from envs.datasets.writing import TEMPORARY_SUFFIX, write_text
 from lorasp_jax.config import Config
 from lorasp_jax.peft._settings import upgrade
 from lorasp_jax.storage.digest import sealed, unsealed
@@ -105,7 +105,7 @@ def _begin(config: Config, folder: Path) -> None:
     names = (RECORD, CLOCK, DATASET)
     allowed = {folder / name for name in names}
     for name in names:
-        allowed |= {*folder.glob(f".{name}.*{UNFINISHED}")}  # of a process that was killed
+        allowed |= {*folder.glob(f".{name}.*{TEMPORARY_SUFFIX}")}  # of a process that was killed
     if any(path not in allowed for path in folder.rglob("*") if not path.is_dir()):
         raise ValueError(
             f"{folder} already holds a run: add --resume to continue it, "

@@ -22,7 +22,7 @@ from lorasp_jax.adapters import adaptation, summary
 from lorasp_jax.adapters.compress import calibration
 from lorasp_jax.config import Config
 from lorasp_jax.data.batches import Batch, encode, flatten, sample_batch, windows
-from lorasp_jax.data.pictures import loaded
+from lorasp_jax.data.checked_images import load_images
 from lorasp_jax.data.source import Source
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.models import presets
@@ -235,7 +235,7 @@ def _drawing(run: Run, processor: Processor, chunk: int) -> Callable[[jax.Array]
     if run.streams:
         stream = Stream(run.steps, batch_size=size, chunk=chunk, seed=run.config.seed)
         return lambda key: encode(key, next(stream), processor, state_noise=noise)
-    steps = jax.device_put(loaded(run.steps))
+    steps = jax.device_put(load_images(run.steps))
     return jax.jit(
         lambda key: sample_batch(
             key, steps, processor, batch_size=size, chunk=chunk, state_noise=noise
@@ -286,7 +286,7 @@ def _import(run: Run, source: Source, room: float) -> None:
         report = lambda done, total: progress.update(bar, completed=done, total=total)  # noqa: E731
         found = cached(source, run.folder, report)
         progress.update(bar, completed=found.num_steps, total=found.num_steps)
-    facts = found.facts
+    facts = found.metadata
     run.dataset, run.episodes, run.simulated = found.steps, outline(found), is_simulated(found)
     known = {name: facts[name] for name in ("crc32", "instructions")}
     streams = sum(x.nbytes for x in jax.tree.leaves(run.dataset)) > room

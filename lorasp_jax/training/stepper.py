@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from envs.compilation import fast_cpu, messages
 from envs.datasets.episodes import Episodes
 from lorasp_jax.config import Config
-from lorasp_jax.data.batches import Raw, Steps, flatten, of_size
-from lorasp_jax.data.pictures import loaded
+from lorasp_jax.data.batches import Raw, Steps, fit_to_size, flatten
+from lorasp_jax.data.checked_images import load_images
 from lorasp_jax.data.stream import Stream
 from lorasp_jax.training.cost import flops, preflight
 from lorasp_jax.training.cost.speed import Speed
@@ -156,10 +156,10 @@ def make_stepper(
         return StreamingStepper(jitted, frozen, _batches(run, mesh, start), speed)
 
     def generation(number: int) -> Steps:
-        steps = loaded(run.steps)
+        steps = load_images(run.steps)
         if number:
             episodes = collect(run.config, number)
-            steps = of_size(flatten(list(episodes.values())), len(steps.end))
+            steps = fit_to_size(flatten(list(episodes.values())), len(steps.end))
         return processes.device_put(steps, meshes.replicated(mesh))
 
     if run.config.data.fresh_every:

@@ -41,7 +41,7 @@ def simulated(tmp_path_factory):
 
 
 def test_two_tasks_are_no_rlds_folder(simulated, tmp_path):
-    with pytest.raises(ValueError, match="one task, not pour, press"):
+    with pytest.raises(ValueError, match="one task, got pour, press"):
         rlds_export.to_rlds(simulated[1], tmp_path / "rlds", pytest.fail)
 
 
@@ -133,7 +133,7 @@ def test_all_or_nothing(tmp_path, simulated):
         written(tmp_path / "cache", Broken(one()))
     assert not list(tmp_path.iterdir())
     before = digest(simulated[1].path)
-    with pytest.raises(ValueError, match="exists already"):
+    with pytest.raises(ValueError, match="already exists"):
         written(simulated[1].path, Broken(one()))
     assert digest(simulated[1].path) == before
     with pytest.raises(ValueError, match="no episode"):
@@ -154,9 +154,9 @@ def test_no_room(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"robot": "panda"}, "robot is 'piper' in the first one and 'panda'"),
-        ({"control_dt": 0.05}, r"control_dt is 0\.1"),
-        ({"image": {"side": np.zeros((1, 9, 16, 32, 3), np.uint8)}}, "cameras is"),
+        ({"robot": "panda"}, "same robot, but it is 'piper' in the first one and 'panda'"),
+        ({"control_dt": 0.05}, r"same control_dt, but it is 0\.1"),
+        ({"image": {"side": np.zeros((1, 9, 16, 32, 3), np.uint8)}}, "same cameras, but"),
         ({"state": np.zeros((1, 9, 8), np.float32)}, "action must have shape"),
         ({"action": np.full((1, 9, 7), np.nan, np.float32)}, "action is not finite"),
     ],
@@ -169,7 +169,9 @@ def test_episodes_of_another_kind(changes, sentence, tmp_path):
 
 def test_datasets_of_another_kind_are_refused_before_the_first_is_read(tmp_path):
     sources, told = [Broken(one(), one()), Broken(one(robot="panda"))], []
-    with pytest.raises(ValueError, match="robot is 'piper' in the first one and 'panda'"):
+    with pytest.raises(
+        ValueError, match="same robot, but it is 'piper' in the first one and 'panda'"
+    ):
         cache.write(sources, tmp_path / "cache", lambda *steps: told.append(steps))
     assert not told
     assert not list(tmp_path.iterdir())
@@ -237,29 +239,29 @@ def test_opening(tmp_path, simulated):
     assert open_source(simulated[1].path).kind == "cache"
     assert open_source(simulated[1].path, Keys(image_size=64)).kind == "cache"
     for where, sentence in (
-        (tmp_path, "is no dataset: it has neither"),
+        (tmp_path, "is not a dataset: expected a folder"),
         (tmp_path / "nothing", "does not exist"),
     ):
         with pytest.raises(ValueError, match=sentence):
             open_source(where)
-    with pytest.raises(ValueError, match="is no LeRobot dataset: it says itself"):
+    with pytest.raises(ValueError, match="is not a LeRobot dataset: feature options"):
         open_source(simulated[1].path, Keys(angles="degrees"))
 
 
 @pytest.mark.parametrize(
     ("name", "change", "sentence"),
     [
-        ("state", lambda x: x.astype(">f4"), "it is >f4"),
-        ("state", np.asfortranarray, "not <f4"),
+        ("state", lambda x: x.astype(">f4"), "got >f4"),
+        ("state", np.asfortranarray, "Fortran order"),
         ("action", lambda x: x * np.float32(np.nan), "not finite"),
-        ("length", lambda x: x[:0], "has episodes of"),
+        ("length", lambda x: x[:0], "and no empty episode"),
         (
             "length",
             lambda x: x * np.where(np.arange(len(x)), 1, -1).astype(np.int32),
-            "has episodes of",
+            "and no empty episode",
         ),
-        ("task", lambda x: x[:-1], "not <i4"),
-        ("instruction", lambda x: x - np.int32(9), "it has instruction -"),
+        ("task", lambda x: x[:-1], "expected <i4"),
+        ("instruction", lambda x: x - np.int32(9), "instruction has indices -"),
     ],
 )
 def test_arrays_of_others(name, change, sentence, simulated, tmp_path):

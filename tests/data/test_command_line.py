@@ -33,7 +33,7 @@ def test_inspect(capsys, tmp_path, monkeypatch):
     for text in (
         "LeRobot v3.0",
         "side 128 x 96, wrist 128 x 96",
-        "4, of 25 to 40 steps",
+        "4, 25 to 40 steps each",
         "126 at 10 Hz",
         "2  press the green button",
         "state[0] joint_1",
@@ -41,7 +41,7 @@ def test_inspect(capsys, tmp_path, monkeypatch):
     ):
         assert text in out
     (sheet,) = tmp_path.rglob("*.png")
-    assert f"pictures: {sheet}" in out
+    assert f"contact sheet: {sheet}" in out
     with Image.open(sheet) as picture:
         assert picture.size[1] > 100
     sheet.write_bytes(b"")
@@ -58,7 +58,7 @@ def test_where_pictures_go(capsys, tmp_path):
     out = tmp_path / "new" / "sheet.png"
     assert run(capsys, "inspect", golden("v3"), "--out", out)[0] == 0
     code, text, err = run(capsys, "inspect", golden("v3"), "--out", out)
-    assert (code, text, "sheet.png exists already: add --overwrite" in err) == (2, "", True)
+    assert (code, text, "sheet.png already exists: add --overwrite" in err) == (2, "", True)
     assert run(capsys, "inspect", golden("v3"), "--out", out, "--overwrite")[0] == 0
 
 
@@ -117,9 +117,9 @@ def test_a_film_that_ends_too_early(to, capsys, tmp_path):
     ("arguments", "sentence"),
     [
         (["inspect", "nothing"], "nothing does not exist"),
-        (["convert", golden("v3"), golden("v21"), "--to", "rlds"], "one dataset, not of 2"),
+        (["convert", golden("v3"), golden("v21"), "--to", "rlds"], "one dataset, got 2"),
         (["convert", golden("v3"), "--every", "0"], "every must be at least 1"),
-        (["convert", golden("v3"), "--state-numbers", "0", "1"], "2 for state and 7 for action"),
+        (["convert", golden("v3"), "--state-numbers", "0", "1"], "2 state and 7 action dimensions"),
     ],
 )
 def test_bad_input(arguments, sentence, capsys, tmp_path):

@@ -112,9 +112,9 @@ def test_outline(simulated):
 
 def test_what_can_be_simulated(simulated):
     assert dataset.is_simulated(simulated)
-    facts = dict(simulated.facts)
+    facts = dict(simulated.metadata)
     # The last: recordings of a real robot.
     for changed in ({"robot": "so101"}, {"tasks": ["press", "fold"]}, {"physics_dt": 0.0}):
-        simulated.facts = facts | changed
+        simulated.metadata = facts | changed
         assert not dataset.is_simulated(simulated)
-    simulated.facts = facts
+    simulated.metadata = facts

@@ -17,7 +17,7 @@ def source():
 
 
 def test_summary(source):
-    found = inspection.summarise(source)
+    found = inspection.summarize(source)
     with np.load(GOLDEN / "lerobot_v3" / "truth.npz") as truth:
         np.testing.assert_array_equal(found.state, truth["all/state"])
         np.testing.assert_array_equal(found.action, truth["all/action"])
@@ -35,14 +35,17 @@ def test_numbers_have_names(actions, source):
     joints = [f"joint_{number}" for number in range(1, 7)]
     found = inspection._names(episode)
     assert found["state"] == [*joints, "gripper"]
-    assert found["action"] == [*(joints if actions == "joint" else inspection._TOOL), "gripper"]
-    assert inspection.summarise(source).names["action"] == [*joints, "gripper"]
+    assert found["action"] == [
+        *(joints if actions == "joint" else inspection._END_EFFECTOR),
+        "gripper",
+    ]
+    assert inspection.summarize(source).names["action"] == [*joints, "gripper"]
     chosen = LeRobot(golden("v3"), Keys(state_numbers=("gripper", "0"), action_numbers=("6", "1")))
     assert chosen.names == {"state": ["gripper", "joint_1"], "action": ["gripper", "joint_2"]}
 
 
 def test_units_are_doubted(source):
-    found = inspection.summarise(source)
+    found = inspection.summarize(source)
     scale = np.array([57.3] * 6 + [1000], np.float32)
     degrees, millimetres = inspection.hints(dataclasses.replace(found, state=found.state * scale))
     assert "--angles degrees" in degrees

@@ -87,7 +87,7 @@ def test_numbers_are_chosen_and_converted(tmp_path):
     edit_rows(folder, widen)
     edit_info(folder, describe)
     with pytest.raises(
-        ValueError, match=r"8 for state and 7 for action: choose .*3\.pos, torque, j"
+        ValueError, match=r"8 state and 7 action dimensions: choose .*3\.pos, torque, j"
     ):
         LeRobot(folder)
     joints = tuple(f"joint_{i + 1}.pos" for i in range(6))
@@ -152,21 +152,21 @@ BROKEN = {
     "no feature": (lambda f: edit_info(f, lambda i: i["features"].pop("action")), "lacks 'action'"),
     "no pictures": (
         lambda f: edit_info(f, lambda i: [i["features"].pop(k) for k in [*i["features"]][2:4]]),
-        "no pictures at all",
+        "has no cameras: at least one",
     ),
     "other width": (
         lambda f: edit_info(f, lambda i: i["features"]["action"].update(shape=[6])),
-        "7 for state and 6 for action",
+        "7 state and 6 action dimensions",
     ),
     "wrong width": (
         lambda f: edit_info(
             f, lambda i: [i["features"][k].update(shape=[6]) for k in [*i["features"]][:2]]
         ),
-        r"\['7'\] numbers in observation.state of episode 0, not 6",
+        r"7 dimensions in observation.state of episode 0, but 6",
     ),
     "one short row": (
         lambda f: edit_rows(f, set_value("action", 3, lambda x: x[:-1])),
-        r"\['6', '7'\] numbers in action",
+        r"6 or 7 dimensions in action",
     ),
     "no number": (break_numbers(None), "not finite in number 6 at step 3|damaged"),
     "nan": (break_numbers(math.nan), "state is not finite in number 6 at step 3 of episode 0"),
@@ -174,8 +174,11 @@ BROKEN = {
         lambda f: edit_rows(f, lambda t: replaced(t, "action", pa.array(["up"] * len(t)))),
         "damaged",
     ),
-    "other fps": (lambda f: edit_info(f, lambda i: i.update(fps=30)), "not the rate of 30 frames"),
-    "no fps": (lambda f: edit_info(f, lambda i: i.update(fps=0)), "0 frames a second"),
+    "other fps": (lambda f: edit_info(f, lambda i: i.update(fps=30)), "does not match the 30 fps"),
+    "no fps": (
+        lambda f: edit_info(f, lambda i: i.update(fps=0)),
+        "fps must be positive and finite, got 0",
+    ),
     "mixed fps": (
         lambda f: edit_rows(f, set_value("timestamp", 20, lambda x: x / 2)),
         "frame 20 of episode 0 at 1.000 s",
@@ -183,14 +186,17 @@ BROKEN = {
     "lost frame": (lambda f: edit_rows(f, lambda t: t.slice(1)), "must have frames 0 to 24"),
     "unknown task": (
         lambda f: edit_rows(f, lambda t: replaced(t, "task_index", pa.array([7] * len(t)))),
-        r"one task that meta lists, not \[7\]",
+        r"one task, listed in meta, got task indices \[7\]",
     ),
     "version": (lambda f: edit_info(f, lambda i: i.update(codebase_version="v1.6")), "'v1.6'"),
-    "count": (lambda f: edit_info(f, lambda i: i.update(total_frames=125)), "is 125 .* lists 126"),
+    "count": (
+        lambda f: edit_info(f, lambda i: i.update(total_frames=125)),
+        "total_frames 125 .* lists 126",
+    ),
     "cut parquet": (lambda f: cut(f / "data", "*.parquet", 0.7), "parquet is damaged"),
     "cut json": (lambda f: cut(f, "info.json", 0.7), "info.json is damaged"),
     "no info": (lambda f: (f / "meta" / "info.json").unlink(), "not a LeRobot dataset"),
-    "cut video": (lambda f: cut(f, "*.mp4", 0.6), "mp4 (is no whole video|gives)"),
+    "cut video": (lambda f: cut(f, "*.mp4", 0.6), "mp4 (cannot be read as a video|has only)"),
     "no video": (lambda f: next(iter(f.rglob("*.mp4"))).unlink(), "mp4 is missing"),
 }
 
@@ -233,7 +239,7 @@ def test_film_of_another_rate(tmp_path):
     edit_rows(folder, set_value(name, 1, lambda time: time + 0.05), of="meta/episodes")
     dataset = LeRobot(folder)
     dataset.episode(0)
-    with pytest.raises(ValueError, match="does not run at the dataset's 10 frames a second"):
+    with pytest.raises(ValueError, match="does not match the dataset's 10 fps"):
         dataset.episode(1)
 
 
@@ -272,7 +278,7 @@ def test_any_change_of_the_description_is_read_or_refused(version, tmp_path):
     ],
 )
 def test_wrong_keys_name_what_there_is(keys):
-    with pytest.raises(ValueError, match=r"there are|lacks|no joint_9 .* joint_6, gripper"):
+    with pytest.raises(ValueError, match=r"its cameras are|lacks|no joint_9 .* joint_6, gripper"):
         LeRobot(golden("v3"), Keys(**keys))
     with pytest.raises(ValueError, match="every must be at least 1"):
         Keys(every=0)

@@ -21,7 +21,7 @@ MOMENTS = {
     "in the middle of a part": (rlds_schema, "record", 9),
     "before the second part counts": (os, "replace", 3),
     "before a further part": (sys.modules[__name__], "fake_record", 4),
-    "when all parts are there": (rlds.Parts, "complete", 1),
+    "when all parts are there": (rlds.ShardWriter, "complete", 1),
     "before the dataset is in place": (os, "rename", 1),
 }
 

@@ -74,7 +74,7 @@ def test_no_module_is_imported(form, path):
     with pytest.raises(ValueError, match=r"press[^ ]* (has|is damaged)"):
         rlds.read(path)
     with pytest.raises(ValueError, match=r"press[^ ]* (has|is damaged)"):
-        rlds.Parts(path, {}).complete()
+        rlds.ShardWriter(path, {}).complete()
 
 
 @pytest.mark.parametrize(

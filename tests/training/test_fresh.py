@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from lorasp_jax.data.batches import flatten, of_size, windows
+from lorasp_jax.data.batches import fit_to_size, flatten, windows
 from lorasp_jax.training import demonstrations
 from lorasp_jax.training.loop import train
 from tests.runs import CONFIG, Miniature, Terminate, make_run, random_episodes, repeatable
@@ -60,7 +60,7 @@ def test_generations_train_one_after_the_other(tmp_path):
 def test_of_size(size):
     """Windows stay within their episode, also where one is cut off or comes again."""
     steps = flatten([random_episodes("press", 0)])  # 5, 9 and 7 steps
-    found = of_size(steps, size)
+    found = fit_to_size(steps, size)
     start = np.arange(size)
     window, inside = windows(found, start, 4)
     assert len(found.end) == size

@@ -28,7 +28,7 @@ import safetensors.numpy
 from flax import nnx
 
 from envs.datasets.files import check_local
-from envs.datasets.writing import replacing
+from envs.datasets.writing import atomic_file
 from lorasp_jax.models.checkpoints import layouts, orbax_folders
 from lorasp_jax.models.checkpoints.native import base_arrays, by_path, named_arrays, set_arrays
 from lorasp_jax.models.checkpoints.tensor_files import INDEX, SINGLE, TensorFiles, weight_files
@@ -111,7 +111,7 @@ def save(folder: Path, model: Any, layout: str, dtypes: Mapping[str, Any] | None
     if layout == "lerobot":
         theirs |= {head: theirs[tied] for head, tied in published_names.TIED.items()}
         tensors = {_PREFIX + name: array for name, array in theirs.items()}
-        with replacing(target) as temporary:
+        with atomic_file(target) as temporary:
             safetensors.numpy.save_file(tensors, temporary)
     else:
         tree = jax.tree.map(jnp.asarray, flax.traverse_util.unflatten_dict(theirs, sep="/"))

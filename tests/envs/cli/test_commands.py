@@ -53,7 +53,7 @@ def test_bad_input_is_one_sentence(tmp_path, run, monkeypatch):
     photos.mkdir()
     press = "--task press --robot piper --out"
     for text, out, message in (
-        (f"collect {press}", existing, "exists already"),
+        (f"collect {press}", existing, "already exists"),
         (f"collect --overwrite {press}", photos, "photos is not a folder of envs-rlds-1 episodes"),
         (f"collect --num-episodes 0 {press}", tmp_path / "new", "num_episodes"),
         (f"collect --num-envs 0 {press}", tmp_path / "new", "num_envs must be at least 1"),
@@ -114,7 +114,7 @@ def test_collect_writes_what_the_library_gives(tmp_path, run):
     assert expected.attempted > 20
     found = rlds.read(tmp_path / "press")
     assert_equal(found, trimmed(expected))
-    assert f"20 episodes of {found.attempted} tried, {found.num_steps} steps" in said
+    assert f"20 of {found.attempted} attempted episodes, {found.num_steps} steps" in said
     assert os.listdir(tmp_path) == ["press"]
     assert (
         rlds.metadata(tmp_path / "press")["options"].items() >= {"seed": 0, "num_envs": 6}.items()
@@ -170,7 +170,7 @@ def test_interrupted_simulation_goes_on_bit_for_bit(tmp_path, run, env, monkeypa
 
 
 def test_interrupted_before_anything(tmp_path, run, monkeypatch):
-    monkeypatch.setattr(rlds, "Parts", stopping(rlds.Parts, 0))
+    monkeypatch.setattr(rlds, "ShardWriter", stopping(rlds.ShardWriter, 0))
     code, said = run(COLLECT, "--out", tmp_path / "press")
     assert code == 130
     assert said.endswith("stopped: no unfinished file is left")
@@ -197,7 +197,7 @@ def test_several_tasks_go_on_where_they_were(tmp_path, run, monkeypatch):
     assert_equal(rlds.read(tmp_path / "press"), rlds.read(out / "press"))
     code, said = run(text, "--out", out, "--seed", 1)
     assert code == 2
-    assert "open_pot exists already: choose another --out or add --overwrite" in said
+    assert "open_pot already exists: choose another --out or add --overwrite" in said
 
 
 def test_one_bad_task_stops_the_others(tmp_path, run):
@@ -225,7 +225,7 @@ def test_overwriting_keeps_the_old_until_the_new_is_whole(tmp_path, run, monkeyp
     run(COLLECT, "--out", out)
     before = rlds.read(out)
     with monkeypatch.context() as patch:
-        patch.setattr(rlds.Parts, "complete", stopping(rlds.Parts.complete, 0))
+        patch.setattr(rlds.ShardWriter, "complete", stopping(rlds.ShardWriter.complete, 0))
         code, said = run(COLLECT, "--out", out, "--seed", 1, "--overwrite")
     assert (code, "20 of 20 episodes are kept" in said) == (130, True)
     assert_equal(rlds.read(out), before)
@@ -237,7 +237,7 @@ def test_overwriting_keeps_the_old_until_the_new_is_whole(tmp_path, run, monkeyp
 def test_a_damaged_part_is_refused(tmp_path, run, monkeypatch):
     out = tmp_path / "press"
     with monkeypatch.context() as patch:
-        patch.setattr(rlds.Parts, "complete", stopping(rlds.Parts.complete, 0))
+        patch.setattr(rlds.ShardWriter, "complete", stopping(rlds.ShardWriter.complete, 0))
         run(COLLECT, "--out", out)
     file = sorted((tmp_path / "press.partial").glob("*array_record*"))[1]
     file.write_bytes(file.read_bytes()[:-9])
@@ -252,13 +252,13 @@ def test_an_edited_robot_is_another(tmp_path, run):
     text = COLLECT.replace("piper", str(user_arm.write(tmp_path)))
     assert run(text, "--out", tmp_path / "done")[0] == 0
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rlds.Parts, "complete", stopping(rlds.Parts.complete, 0))
+        patch.setattr(rlds.ShardWriter, "complete", stopping(rlds.ShardWriter.complete, 0))
         assert run(text, "--out", tmp_path / "begun")[0] == 130
     code, said = run(text, "--out", tmp_path / "done")
     assert (code, "is there already" in said) == (0, True)
     user_arm.write(tmp_path, ('kp="150"', 'kp="140"'))
     code, said = run(text, "--out", tmp_path / "done")
-    assert (code, "exists already" in said) == (2, True)
+    assert (code, "already exists" in said) == (2, True)
     code, said = run(text, "--out", tmp_path / "begun")
     assert (code, "was begun with model" in said) == (2, True)
 
@@ -293,11 +293,11 @@ def test_killed_while_the_old_is_replaced(tmp_path, run, moment):
 def test_a_file_of_others_survives_parts_that_are_whole(tmp_path, run, monkeypatch):
     out = tmp_path / "press.npz"
     with monkeypatch.context() as patch:
-        patch.setattr(rlds.Parts, "complete", stopping(rlds.Parts.complete, 0))
+        patch.setattr(rlds.ShardWriter, "complete", stopping(rlds.ShardWriter.complete, 0))
         run(COLLECT, "--out", out)
     make().save(out)
     code, said = run(COLLECT, "--out", out)
-    assert (code, "exists already" in said) == (2, True)
+    assert (code, "already exists" in said) == (2, True)
     assert_equal(Episodes.load(out), make())
     assert run(f"{COLLECT} --overwrite", "--out", out)[0] == 0
     assert os.listdir(tmp_path) == ["press.npz"]

@@ -111,7 +111,7 @@ def test_plain_tfds_reads_it_without_tensorflow(path):
 
 def test_what_stands_there_is_not_touched(path):
     rlds.write(make(), path)
-    with pytest.raises(ValueError, match="exists already"):
+    with pytest.raises(ValueError, match="already exists"):
         rlds.write(make(2), path)
     assert rlds.read(path).num_episodes == 3
 
@@ -178,13 +178,13 @@ def test_foreign_folders(tmp_path, path):
 def test_parts_add_up(tmp_path):
     folder, options = tmp_path / "parts", {"seed": 0}
     first, second = make(2, 3), make(3, 5)
-    parts = rlds.Parts(folder, options)
+    parts = rlds.ShardWriter(folder, options)
     parts.append(first)
     shutil.copytree(folder, tmp_path / "copy")
     parts.append(second)
 
     # As if it had been killed while the second part was written, then continued.
-    again = rlds.Parts(tmp_path / "copy", options)
+    again = rlds.ShardWriter(tmp_path / "copy", options)
     assert (again.num_episodes, again.attempted) == (2, 3)
     (torn,) = {file.name for file in folder.iterdir()} - {p.name for p in again.folder.iterdir()}
     (again.folder / torn).write_bytes(b"half")
@@ -195,10 +195,10 @@ def test_parts_add_up(tmp_path):
 
 
 def test_parts_belong_together(tmp_path):
-    parts = rlds.Parts(tmp_path / "parts", {"seed": 0})
+    parts = rlds.ShardWriter(tmp_path / "parts", {"seed": 0})
     parts.append(make())
     with pytest.raises(ValueError, match="was begun with seed 0, not 1: finish it with that, or"):
-        rlds.Parts(parts.folder, {"seed": 1})
+        rlds.ShardWriter(parts.folder, {"seed": 1})
     small = {name: np.zeros((3, 4, 2, 2, 3), np.uint8) for name in ("side", "wrist")}
     for changes, message in (
         ({"robot": "panda"}, "was begun with robot 'piper', not 'panda'"),
@@ -206,27 +206,27 @@ def test_parts_belong_together(tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             parts.append(make(**changes))
-    assert rlds.Parts(parts.folder, {"seed": 0}).num_episodes == 3
+    assert rlds.ShardWriter(parts.folder, {"seed": 0}).num_episodes == 3
 
 
 @pytest.mark.parametrize("how", ["flipped", "cut", "empty", "missing"])
 def test_a_damaged_part_is_refused(tmp_path, how):
-    parts = rlds.Parts(tmp_path / "parts", {})
+    parts = rlds.ShardWriter(tmp_path / "parts", {})
     parts.append(make(2))
     (file,) = parts.folder.glob("*array_record*")
     damage(file, how) if how != "missing" else file.unlink()
     with pytest.raises(ValueError, match=r"0 is (damaged \(.*\)|missing): delete .*parts to"):
-        rlds.Parts(parts.folder, {})
+        rlds.ShardWriter(parts.folder, {})
 
 
 def test_parts_of_another_dataset_are_noticed(tmp_path):
-    one, two = (rlds.Parts(tmp_path / name, {}) for name in ("one", "two"))
+    one, two = (rlds.ShardWriter(tmp_path / name, {}) for name in ("one", "two"))
     one.append(make(2))
     two.append(make(3))
     (file,) = one.folder.glob("*array_record*")
     os.replace(file, two.folder / file.name)
     with pytest.raises(ValueError, match=r"is damaged \(it holds 2 episodes, not 3\)"):
-        rlds.Parts(two.folder, {})
+        rlds.ShardWriter(two.folder, {})
 
 
 def test_a_robot_by_path(path, tmp_path):
@@ -237,7 +237,7 @@ def test_a_robot_by_path(path, tmp_path):
 
 def test_no_room_for_a_part(tmp_path):
     folder = tmp_path / "parts"
-    parts = rlds.Parts(folder, {})
+    parts = rlds.ShardWriter(folder, {})
     parts.append(make(2))
     facts = rlds.metadata(folder)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -248,6 +248,6 @@ def test_no_room_for_a_part(tmp_path):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert rlds.metadata(folder) == facts
-    again = rlds.Parts(folder, {})
+    again = rlds.ShardWriter(folder, {})
     again.append(make(60))
     assert again.num_episodes == 62

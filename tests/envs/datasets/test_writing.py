@@ -19,7 +19,7 @@ os.replace = os.rename = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
 path = pathlib.Path(sys.argv[1])
 if path.is_file():
     writing.write_text(path, "new")
-with writing.creating(path) as folder:
+with writing.atomic_folder(path) as folder:
     (folder / "part").write_text("new")
 """
 FULL = """
@@ -30,7 +30,7 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))  # as a disk of so many 
 try:
     if sys.argv[2] == "file":
         writing.write_bytes(pathlib.Path(sys.argv[1]), bytes(2000))
-    with writing.creating(sys.argv[1]) as folder:
+    with writing.atomic_folder(sys.argv[1]) as folder:
         (folder / "part").write_bytes(bytes(2000))
 except OSError as error:
     print(error.strerror)
@@ -56,7 +56,7 @@ def test_killed_before_a_folder_is_renamed(tmp_path):
     path = tmp_path / "folder"
     assert run(KILLED, path).returncode == -signal.SIGKILL
     assert not path.exists()
-    with writing.creating(path) as folder:
+    with writing.atomic_folder(path) as folder:
         assert not os.listdir(folder)  # what the killed one left is gone
     assert os.listdir(tmp_path) == ["folder"]
 
@@ -90,7 +90,7 @@ def test_all_is_on_disk_before_it_is_renamed(tmp_path, monkeypatch):
     assert aside.startswith(".file.")
     assert rest == ["renamed", tmp_path.name]
     synced.clear()
-    with writing.creating(tmp_path / "folder") as folder:
+    with writing.atomic_folder(tmp_path / "folder") as folder:
         (folder / "part").touch()
     assert synced == ["part", ".folder.tmp", "renamed", tmp_path.name]
 
@@ -100,7 +100,7 @@ def test_a_write_that_fails_keeps_the_old_file(tmp_path):
     file.write_text("old")
     with (
         pytest.raises(TypeError),
-        writing.replacing(file) as unfinished,
+        writing.atomic_file(file) as unfinished,
         unfinished.open("w") as half,
     ):
         half.writelines(["half", b"no text"])
@@ -108,8 +108,8 @@ def test_a_write_that_fails_keeps_the_old_file(tmp_path):
 
 
 def test_what_exists_is_not_created_again(tmp_path):
-    refused = pytest.raises(ValueError, match="exists already: choose another path")
-    with refused, writing.creating(tmp_path):
+    refused = pytest.raises(ValueError, match="already exists: choose another path")
+    with refused, writing.atomic_folder(tmp_path):
         pass
 
 
