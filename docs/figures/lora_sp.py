@@ -152,12 +152,13 @@ def energies(axes: Axes, facts: dict[str, np.ndarray], colors: dict[str, str], w
     axes.plot(place, running, color=colors["ink"], lw=1.4)
     axes.axhline(target, color=colors["soft"], lw=1, ls=(0, (4, 3)))
     axes.plot([kept], [running[kept - 1]], "o", color=color, ms=6, zorder=3)
+    above_left = kept > len(share) / 2
     axes.annotate(
         f"$k$ = {kept}",
         (kept, running[kept - 1]),
-        xytext=(-7, 6),
+        xytext=(-7, 6) if above_left else (7, -18),
         textcoords="offset points",
-        ha="right",
+        ha="right" if above_left else "left",
         color=color,
         weight="bold",
         size=12,
