@@ -43,7 +43,7 @@ def files():
         ([*MULTITASK, *NANO, "--model.size", "small"], "does not match the config"),
         (
             [*MULTITASK, *NANO, "--model.backbone", "pi5"],
-            "unknown backbone 'pi5': it is one of pi0, smol",
+            "unknown backbone 'pi5': choose one of pi0, smol",
         ),
         ([*MULTITASK, *NANO, "--model.backbone", "smolvla"], "does not match the config"),
         ([*MULTITASK, "--model.checkpoint", "nowhere"], "nowhere"),

@@ -12,7 +12,7 @@ from films import prompted
 import envs
 from envs.compilation import cache
 from envs.rendering.renderer import RayRenderer
-from lorasp_jax.models.transformer.depth import unstacked
+from lorasp_jax.models.transformer.depth import unstack
 from lorasp_jax.models.transformer.siglip import patches
 from lorasp_jax.peft.lora_sp import reference
 from lorasp_jax.policies import Policy
@@ -43,7 +43,7 @@ def measure(run: Path, task: str, steps: int) -> dict[str, Any]:
     policy = load_policy(run)
     told = read_json(run / "adapter.json")["metadata"]
     config, tower = policy.model.config, policy.model.vision
-    block = unstacked(tower.blocks)[0]
+    block = unstack(tower.blocks)[0]
     layer = block.k_proj
     if layer.adapter is None or layer.method.name != "lora_sp":
         raise ValueError(f"{run} has no LoRA-SP in its vision tower")
@@ -51,7 +51,7 @@ def measure(run: Path, task: str, steps: int) -> dict[str, Any]:
     policy = prompted(policy, env)
     state = acted(policy, env, steps)
     seen = policy.processor.encode(env.observe(state), state.info["instruction"])
-    _, _, aux = jax.jit(lambda model, seen: model.look(seen))(policy.model, seen)
+    _, _, aux = jax.jit(lambda model, obs: model.encode_images(obs))(policy.model, seen)
     number = config.cameras.index(CAMERA)
     ranks = aux["vision"]["k_proj"].active_rank[0].reshape(WORLDS, len(config.cameras), -1)
     x, _ = tower.patch_embed(patches(seen.images[CAMERA], config.vision.patch), return_aux=True)

@@ -1,4 +1,4 @@
-"""Backbones, policies and what surrounds them; a backbone is a folder here, found by its name."""
+"""Vision-language-action backbones and their checkpoints; each backbone is a subpackage here."""
 
 from lorasp_jax.models import pi0, smolvla
 from lorasp_jax.models.checkpoints import published

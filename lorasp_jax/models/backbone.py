@@ -1,4 +1,4 @@
-"""What every backbone does: look at pictures, match flows, draw action chunks."""
+"""Base class of VLA backbones: image encoding, flow-matching loss, action sampling."""
 
 import importlib
 import pkgutil
@@ -19,9 +19,9 @@ from lorasp_jax.models.transformer.layers import (
     LayerAux,
     ModelAux,
     block_mask,
+    merge_action_aux,
     positions,
     time_embedding,
-    with_action,
 )
 from lorasp_jax.models.transformer.siglip import SigLIP
 
@@ -29,30 +29,30 @@ _PACKAGE = __name__.rpartition(".")[0]
 
 
 def names() -> list[str]:
-    """Names of the backbones: the folders beside this file that define a `Config`."""
-    here = importlib.import_module(_PACKAGE).__path__
-    folders = [module.name for module in pkgutil.iter_modules(here) if module.ispkg]
+    """List the available backbones: sibling packages that define a `Config`."""
+    path = importlib.import_module(_PACKAGE).__path__
+    packages = [module.name for module in pkgutil.iter_modules(path) if module.ispkg]
     return sorted(
-        n for n in folders if hasattr(importlib.import_module(f"{_PACKAGE}.{n}"), "Config")
+        n for n in packages if hasattr(importlib.import_module(f"{_PACKAGE}.{n}"), "Config")
     )
 
 
 def find(name: str) -> type[BackboneConfig]:
-    """The class of configs of a backbone.
+    """Return the config class of a backbone.
 
     Raises:
-        ValueError: there is no such backbone; lists what exists.
+        ValueError: unknown backbone; the message lists the available ones.
     """
     if name not in names():
-        raise ValueError(f"unknown backbone {name!r}: it is one of {', '.join(names())}.")
+        raise ValueError(f"unknown backbone {name!r}: choose one of {', '.join(names())}.")
     return importlib.import_module(f"{_PACKAGE}.{name}").Config
 
 
 class Backbone(nnx.Module):
     """A vision-language model with an action expert.
 
-    A backbone says what is computed once per observation, `run_prefix`, and what in every step of
-    the flow, `run_suffix`.
+    Subclasses implement `run_prefix`, which runs once per observation, and `run_suffix`, which runs
+    at every flow step.
     """
 
     config: BackboneConfig
@@ -63,17 +63,17 @@ class Backbone(nnx.Module):
     """The action expert, with stacked `blocks`."""
 
     def _make_projections(self, state_width: int, rngs: nnx.Rngs) -> None:
-        """The linear maps around the towers: of state, noisy actions, their time and velocity."""
+        """Create the projections of state, noisy actions, flow time and velocity."""
         width, dim = self.config.action.width, self.config.action_dim
-        kinds: Any = {"dtype": jnp.float32, "param_dtype": self.config.param_dtype, "rngs": rngs}
-        self.state_proj: Layer = Dense(dim, state_width, **kinds)
-        self.action_in_proj: Layer = Dense(dim, width, **kinds)
-        self.action_time_mlp_in: Layer = Dense(2 * width, width, **kinds)
-        self.action_time_mlp_out: Layer = Dense(width, width, **kinds)
-        self.action_out_proj: Layer = Dense(width, dim, **kinds)
+        options: Any = {"dtype": jnp.float32, "param_dtype": self.config.param_dtype, "rngs": rngs}
+        self.state_proj: Layer = Dense(dim, state_width, **options)
+        self.action_in_proj: Layer = Dense(dim, width, **options)
+        self.action_time_mlp_in: Layer = Dense(2 * width, width, **options)
+        self.action_time_mlp_out: Layer = Dense(width, width, **options)
+        self.action_out_proj: Layer = Dense(width, dim, **options)
 
     def join_layers(self, *, copy_kernels: bool = True) -> None:
-        """See `prepared.JoinsLayers`: the linear maps around the towers, each by itself."""
+        """See `prepared.JoinsLayers`; the projections outside the towers share no input."""
         self.state_proj = join_one(self.state_proj, copy_kernels=copy_kernels)
         self.action_in_proj = join_one(self.action_in_proj, copy_kernels=copy_kernels)
         self.action_time_mlp_in = join_one(self.action_time_mlp_in, copy_kernels=copy_kernels)
@@ -83,27 +83,28 @@ class Backbone(nnx.Module):
     def action_tokens(
         self, x_t: jax.Array, flow_time: jax.Array, action_valid: jax.Array | None
     ) -> tuple[jax.Array, LayerAux]:
-        """Tokens of noisy actions that carry their time.
+        """Embed noisy actions and flow time as action tokens.
 
         Args:
             x_t: `[B, C, A]`.
             flow_time: `[B]`.
-            action_valid: `[B, C]` bool, what the adapters count; None counts all.
+            action_valid: `[B, C]` bool, steps that adapter aux includes; None includes all.
 
         Returns:
-            `[B, C, D]` f32, and the adapters' reports.
+            `[B, C, D]` f32, and the adapters' aux.
         """
         aux: LayerAux = {}
-        x_t, counted = x_t.astype(jnp.float32), action_valid
-        h, aux["action_in_proj"] = self.action_in_proj(x_t, token_mask=counted, return_aux=True)
+        x_t, token_mask = x_t.astype(jnp.float32), action_valid
+        h, aux["action_in_proj"] = self.action_in_proj(x_t, token_mask=token_mask, return_aux=True)
         time = time_embedding(flow_time, h.shape[-1])[:, None]
         h = jnp.concatenate([h, jnp.broadcast_to(time, h.shape)], axis=-1)
-        h, mixed = self.action_time_mlp_in(h, token_mask=counted, return_aux=True)
-        h, out = self.action_time_mlp_out(jax.nn.silu(h), token_mask=counted, return_aux=True)
-        return h, aux | {"action_time_mlp_in": mixed, "action_time_mlp_out": out}
+        h, in_aux = self.action_time_mlp_in(h, token_mask=token_mask, return_aux=True)
+        h = jax.nn.silu(h)
+        h, out_aux = self.action_time_mlp_out(h, token_mask=token_mask, return_aux=True)
+        return h, aux | {"action_time_mlp_in": in_aux, "action_time_mlp_out": out_aux}
 
     def run_prefix(self, obs: Observation) -> tuple[Any, ModelAux]:
-        """Everything that does not depend on the actions, once per observation."""
+        """Encode the observation, independent of the actions."""
         raise NotImplementedError
 
     def run_suffix(
@@ -114,35 +115,37 @@ class Backbone(nnx.Module):
         flow_time: jax.Array,
         action_valid: jax.Array | None = None,
     ) -> tuple[jax.Array, LayerAux]:
-        """Velocity `[B, C, A]` f32 given the prefix.
+        """Predict the velocity `[B, C, A]` f32, given the prefix.
 
         Args:
             prefix: from `run_prefix`.
-            obs: what the prefix was made of.
+            obs: the observation that the prefix was computed from.
             x_t: `[B, C, A]`.
             flow_time: `[B]`.
-            action_valid: `[B, C]` bool, what the adapters count; None counts all.
+            action_valid: `[B, C]` bool, steps that adapter aux includes; None includes all.
         """
         raise NotImplementedError
 
-    def look(self, obs: Observation) -> tuple[jax.Array, jax.Array, ModelAux]:
-        """Tokens of the pictures, camera by camera.
+    def encode_images(self, obs: Observation) -> tuple[jax.Array, jax.Array, ModelAux]:
+        """Encode the images as tokens, ordered by camera.
 
         Returns:
-            tokens `[B, P, D]`, valid `[B, P]` bool, reports of the vision tower's adapters.
+            tokens `[B, P, D]`, valid `[B, P]` bool, aux of the vision tower's adapters.
 
         Raises:
-            ValueError: a camera is missing or a picture has the wrong size.
+            ValueError: a camera is missing or an image has the wrong size.
         """
         cameras, size = self.config.cameras, self.config.image_size
         for name in cameras:
             if name not in obs.images or obs.images[name].shape[1:] != (size, size, 3):
-                found = {camera: image.shape[1:] for camera, image in obs.images.items()}
-                raise ValueError(f"need pictures {(size, size, 3)} of {cameras}, got {found}.")
+                shapes = {camera: image.shape[1:] for camera, image in obs.images.items()}
+                raise ValueError(
+                    f"images of cameras {cameras} must have shape {(size, size, 3)}, got {shapes}."
+                )
         images = jnp.stack([obs.images[name] for name in cameras], axis=1)
         present = jnp.stack([obs.image_masks[name] for name in cameras], axis=1)
-        seen, aux = self.vision(images.reshape(-1, size, size, 3), present.reshape(-1))
-        tokens = seen.reshape(images.shape[0], -1, seen.shape[-1])
+        features, aux = self.vision(images.reshape(-1, size, size, 3), present.reshape(-1))
+        tokens = features.reshape(images.shape[0], -1, features.shape[-1])
         valid = jnp.repeat(present, self.config.image_tokens, axis=1)
         return tokens, valid, {"vision": aux}
 
@@ -161,19 +164,19 @@ class Backbone(nnx.Module):
         noise: jax.Array | None = None,
         flow_time: jax.Array | None = None,
     ) -> tuple[jax.Array, ModelAux]:
-        """Flow-matching error; the key is consumed.
+        """Flow-matching loss. Do not reuse the key.
 
         Args:
-            key: typed random key for what of `noise`, `flow_time` is not given.
-            obs: what the policy sees.
-            actions: `[B, C, A]` normalised.
-            action_mask: `[B, C, A]` bool. Slots without any valid step are held at zero in x_t, and
-                adapters do not count steps without any valid slot. The error itself is not masked.
+            key: typed PRNG key; draws `noise` and `flow_time` if they are not given.
+            obs: the observation.
+            actions: `[B, C, A]` normalized.
+            action_mask: `[B, C, A]` bool. Slots with no valid step are zero in x_t; steps with no
+                valid slot are excluded from adapter aux. The returned loss is not masked.
             noise: `[B, C, A]`.
             flow_time: `[B]`.
 
         Returns:
-            `[B, C, A]` f32 squared errors, not reduced, and the adapters' reports.
+            `[B, C, A]` f32 per-element squared errors, and the adapters' aux.
         """
         slots = None if action_mask is None else action_mask.any(axis=1, keepdims=True)
         valid = None if action_mask is None else action_mask.any(axis=2)
@@ -186,31 +189,31 @@ class Backbone(nnx.Module):
             noise=noise,
             flow_time=flow_time,
         )
-        return per_element, with_action(aux, action_aux)
+        return per_element, merge_action_aux(aux, action_aux)
 
     def sample_actions(self, key: jax.Array, obs: Observation, **options: Any) -> Any:
-        """Draw action chunks: `Sampler.sample_actions`, whose options it takes."""
+        """Sample action chunks; arguments as for `Sampler.sample_actions`."""
         return self.sampler().sample_actions(key, obs, **options)
 
     def sampler(self) -> Sampler:
-        """Itself for many calls of `sample_actions`."""
-        return Sampler.of(self)
+        """Create a sampler for repeated calls of `sample_actions`."""
+        return Sampler.from_model(self)
 
 
-def suffix_view(
+def suffix_mask_and_positions(
     prefix_valid: jax.Array, prefix_block: np.ndarray, block: np.ndarray
 ) -> tuple[jax.Array, jax.Array]:
-    """What tokens behind the prefix see, and where they are.
+    """Attention mask and positions of the suffix tokens, which are all valid.
 
     Args:
         prefix_valid: `[B, P]` bool.
-        prefix_block: `[P]` int, number of the block each prefix token belongs to.
-        block: `[T]` int, of the tokens behind it, all of them valid.
+        prefix_block: `[P]` int, block number of each prefix token, see `block_mask`.
+        block: `[T]` int, block number of each suffix token.
 
     Returns:
-        mask `[B, T, P + T]` bool, positions `[B, T]` int32, counted on from the prefix.
+        mask `[B, T, P + T]` bool, and positions `[B, T]` int32 that continue the prefix's.
     """
     valid = jnp.ones((len(prefix_valid), len(block)), bool)
-    seen = np.concatenate([prefix_block, block])
-    mask = block_mask(block, seen, valid, jnp.concatenate([prefix_valid, valid], axis=1))
+    key_block = np.concatenate([prefix_block, block])
+    mask = block_mask(block, key_block, valid, jnp.concatenate([prefix_valid, valid], axis=1))
     return mask, jnp.sum(prefix_valid, axis=1, dtype=jnp.int32)[:, None] + positions(valid)

@@ -1,4 +1,4 @@
-"""Action chunks by integrating the flow, with what depends on weights alone computed once."""
+"""Sample action chunks by integrating the flow, with weight-only computation done up front."""
 
 import dataclasses
 import functools
@@ -13,13 +13,13 @@ from lorasp_jax.adapters.layers import prepared
 from lorasp_jax.models import flow_matching
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.observation import Observation
-from lorasp_jax.models.transformer.depth import unstacked
-from lorasp_jax.models.transformer.layers import LayerAux, ModelAux, with_action
+from lorasp_jax.models.transformer.depth import unstack
+from lorasp_jax.models.transformer.layers import LayerAux, ModelAux, merge_action_aux
 from lorasp_jax.peft import Method
 
 
 class FlowModel(prepared.JoinsLayers, Protocol):
-    """What a sampler reads of a backbone, see `backbone.Backbone`."""
+    """Backbone interface that a sampler requires, see `backbone.Backbone`."""
 
     config: BackboneConfig
     vision: Any
@@ -27,13 +27,13 @@ class FlowModel(prepared.JoinsLayers, Protocol):
     action: Any
 
     def run_prefix(self, obs: Observation) -> tuple[Any, ModelAux]:
-        """What is computed once per observation."""
+        """Encode the observation."""
         ...
 
     def run_suffix(
         self, prefix: Any, obs: Observation, x_t: jax.Array, flow_time: jax.Array
     ) -> tuple[jax.Array, LayerAux]:
-        """What is computed in every step of the flow."""
+        """Compute the velocity at one flow step."""
         ...
 
 
@@ -44,30 +44,31 @@ class FlowModel(prepared.JoinsLayers, Protocol):
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sampler:
-    """A backbone that draws action chunks, with what depends on weights alone computed once.
+    """Samples action chunks from a backbone, with weight-only computation done once, up front.
 
-    That takes the memory of the backbone's weights once more if nobody lets go of the backbone. Its
-    arrays are a plain list: to give `jax.jit` a module of a thousand takes longer than some robots
-    have.
+    It holds a second copy of the weights, unless the caller drops its reference to the backbone.
+    The weights are a flat list, because passing a module with about a thousand arrays to a jitted
+    function adds too much dispatch latency for some control loops.
     """
 
     weights: list[jax.Array]
     structure: Any
-    """Graphs and tree that make modules of the weights."""
+    """Graph definitions and treedef that rebuild the modules from `weights`."""
     config: BackboneConfig
     methods: tuple[Method, ...]
-    """Of the backbone's adapters, each once."""
+    """Distinct adapter methods of the backbone."""
 
     @classmethod
-    def of(cls, model: FlowModel) -> Self:
-        """The sampler of a backbone, which stays as it is."""
-        graphdefs, states = zip(*map(nnx.split, (_reading(model), _acting(model))), strict=True)
+    def from_model(cls, model: FlowModel) -> Self:
+        """Create a sampler; the backbone is not modified."""
+        models = (_prefix_model(model), _suffix_model(model))
+        graphdefs, states = zip(*map(nnx.split, models), strict=True)
         weights, tree = jax.tree.flatten(states)
         methods = dict.fromkeys(adaptation.methods(cast(nnx.Module, model)).values())
         return cls(weights, (graphdefs, tree), model.config, tuple(methods))
 
     def sampler(self) -> Self:
-        """Itself, as it is ready for many calls."""
+        """Return self, for callers that accept a backbone or a sampler."""
         return self
 
     def sample_actions(
@@ -80,53 +81,54 @@ class Sampler:
         slots: jax.Array | None = None,
         return_aux: bool = False,
     ) -> Any:
-        """Draw action chunks; the key is consumed for `noise` if that is not given.
+        """Sample action chunks.
 
         Args:
-            key: typed random key.
-            obs: what the policy sees.
+            key: typed PRNG key; used only if `noise` is None.
+            obs: the observation.
             num_steps: Euler steps.
-            noise: `[B, C, A]` start of the flow.
-            slots: `[A]` bool, the robot's slots; the others stay zero. None: all.
-            return_aux: also return the adapters' reports; those of "action" get a leading axis of
-                steps, before the layers'. What ran once counts as if it had run in every step.
+            noise: `[B, C, A]` initial noise of the flow.
+            slots: `[A]` bool, slots to sample; the others stay zero. None samples all.
+            return_aux: also return the adapters' aux. `aux["action"]` has a leading step axis,
+                before the layer axis; aux of layers that run once is broadcast over the steps.
 
         Returns:
-            `[B, C, A]` f32 normalised actions, or (actions, aux).
+            `[B, C, A]` f32 normalized actions, or (actions, aux).
         """
         if noise is None:
             shape = (obs.state.shape[0], self.config.chunk, self.config.action_dim)
             noise = jax.random.normal(key, shape)
         graphdefs, tree = self.structure
-        reading, acting = map(nnx.merge, graphdefs, jax.tree.unflatten(tree, self.weights))
-        prefix, aux = reading.run_prefix(obs)
+        states = jax.tree.unflatten(tree, self.weights)
+        prefix_model, suffix_model = map(nnx.merge, graphdefs, states)
+        prefix, aux = prefix_model.run_prefix(obs)
         actions, action_aux = flow_matching.sample(
-            lambda x_t, t: acting.run_suffix(prefix, obs, x_t, t),
+            lambda x_t, t: suffix_model.run_suffix(prefix, obs, x_t, t),
             noise,
             num_steps=num_steps,
             slots=slots,
         )
         if not return_aux:
             return actions
-        once = jax.tree.map(
+        prefix_action_aux = jax.tree.map(
             lambda a: jnp.broadcast_to(a, (num_steps, *a.shape)), aux.get("action", {})
         )
-        return actions, with_action({**aux, "action": once}, action_aux)
+        return actions, merge_action_aux({**aux, "action": prefix_action_aux}, action_aux)
 
 
-def _reading(model: FlowModel) -> FlowModel:
-    """A copy for a prefix without gradient, in which no loop copies each layer's weights."""
+def _prefix_model(model: FlowModel) -> FlowModel:
+    """Inference copy for the prefix, with unstacked blocks so that no loop copies weights."""
     model = nnx.merge(*nnx.split(model))
     for tower in (model.vision, model.language):
-        tower.blocks = unstacked(prepared.join_stack(tower.blocks))
+        tower.blocks = unstack(prepared.join_stack(tower.blocks))
     return model
 
 
-def _acting(model: FlowModel) -> FlowModel:
-    """A copy for the steps of a flow, in which nothing depends on weights alone any more."""
+def _suffix_model(model: FlowModel) -> FlowModel:
+    """Inference copy for the flow steps, with weight-only products precomputed."""
     model = nnx.merge(*nnx.split(model))
     del model.vision, model.language
-    model.action.blocks = unstacked(model.action.blocks)
+    model.action.blocks = unstack(model.action.blocks)
     for module in (model, *(module for _, module in nnx.iter_modules(model.action))):
         if isinstance(module, prepared.JoinsLayers):
             module.join_layers()

@@ -91,7 +91,7 @@ def test_base_has_the_published_tensors(base):
 
 def test_config_says_what_is_wrong():
     odd = [dataclasses.replace(part, depth=3) for part in (CONFIG.language, CONFIG.action)]
-    with pytest.raises(ValueError, match="the depth must be even, not 3"):
+    with pytest.raises(ValueError, match=r"depth must be even, .* got 3"):
         dataclasses.replace(CONFIG, language=odd[0], action=odd[1])
     with pytest.raises(ValueError, match=r"image_size must be a multiple of .* = 16, got"):
         dataclasses.replace(CONFIG, image_size=40)

@@ -79,7 +79,7 @@ def close(found, wanted, atol):
 
 
 def test_prefix(model, obs, expected):
-    both = jax.jit(lambda model: (model.look(obs)[0], model.embed_prefix(obs)[:2]))
+    both = jax.jit(lambda model: (model.encode_images(obs)[0], model.embed_prefix(obs)[:2]))
     seen, (tokens, valid) = both(model)
     wanted = [expected[f"image_tokens_unscaled/{name}"] for name in CONFIG.cameras]
     close(seen, np.concatenate(wanted, axis=1), 1e-5)

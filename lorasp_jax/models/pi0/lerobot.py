@@ -1,4 +1,4 @@
-"""Which pi0 a config.json of LeRobot's means (policies/pi0 and policies/pi05 of 0.6)."""
+"""Convert config.json of a LeRobot 0.6 pi0 or pi0.5 (policies/pi0, policies/pi05)."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -9,8 +9,8 @@ from lorasp_jax.models.inputs import LEROBOT_CENTRED, LEROBOT_PI05
 from lorasp_jax.models.pi0.pi0 import Pi0Config
 
 
-def pi0(fields: Mapping[str, Any]) -> Pi0Config:
-    """The published sizes, each expert in one of the two that there are."""
+def pi0_config(fields: Mapping[str, Any]) -> Pi0Config:
+    """Use the published sizes with the file's Gemma variant for each expert."""
     config = Pi0Config.base()
     sizes = {"gemma_2b": config.language, "gemma_300m": config.action}
     return dataclasses.replace(
@@ -21,18 +21,18 @@ def pi0(fields: Mapping[str, Any]) -> Pi0Config:
     )
 
 
-def pi05(fields: Mapping[str, Any]) -> Pi0Config:
-    """pi0.5 with the same choice.
+def pi05_config(fields: Mapping[str, Any]) -> Pi0Config:
+    """As `pi0_config`, for pi0.5.
 
     Raises:
-        ValueError: it remembers past observations.
+        ValueError: the policy uses memory of past observations.
     """
     require(fields, {"use_visual_memory": False, "use_proprioceptive_memory": False})
     config = Pi0Config.base_pi05()
     return dataclasses.replace(
-        pi0(fields), pi05=True, max_tokens=config.max_tokens, inputs=LEROBOT_PI05
+        pi0_config(fields), pi05=True, max_tokens=config.max_tokens, inputs=LEROBOT_PI05
     )
 
 
-TYPES = {"pi0": pi0, "pi05": pi05}
-"""Function of a config.json that gives the config, by the policy's type."""
+TYPES = {"pi0": pi0_config, "pi05": pi05_config}
+"""Policy type -> function (fields of config.json) -> config."""

@@ -1,10 +1,11 @@
 """pi0 (Black et al., arXiv 2410.24164): flow matching over actions on a vision-language model.
 
-Tokens fall into three blocks: [pictures, instruction], [state], [noisy actions]; each sees itself
-and the blocks before it. The first is the prefix, the other two the suffix of the action expert.
+Tokens form three blocks: [images, instruction], [state], [noisy actions]. Each block attends to
+itself and to earlier blocks. The first block is the prefix, processed by the language expert; the
+other two are the suffix, processed by the action expert.
 
-pi0.5 (arXiv 2504.16054) has no block [state], its prompt tells the state; and the flow time is not
-mixed into the actions' tokens but conditions the action expert's norms.
+pi0.5 (arXiv 2504.16054) has no [state] block: the state is part of the prompt. The flow time
+conditions the action expert's norms instead of being mixed into the action tokens.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from flax import nnx
 
 from lorasp_jax.adapters.layers.prepared import Layer, join_one
 from lorasp_jax.dense import Dense
-from lorasp_jax.models.backbone import Backbone, suffix_view
+from lorasp_jax.models.backbone import Backbone, suffix_mask_and_positions
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig, VisionConfig
 from lorasp_jax.models.inputs import OPENPI, OPENPI_PI05, OURS_PI05
 from lorasp_jax.models.observation import Observation
@@ -36,14 +37,14 @@ from lorasp_jax.models.transformer.siglip import SigLIP
 
 @dataclasses.dataclass(frozen=True)
 class Pi0Config(BackboneConfig):
-    """Every size of a pi0, or of a pi0.5."""
+    """Sizes and runtime options of a pi0 or pi0.5."""
 
     pi05: bool = False
-    """pi0.5: the flow time reaches the action expert through its norms, not through the tokens, and
-    there is no token of the state, which the prompt tells instead."""
+    """Build pi0.5: the flow time conditions the action expert's norms, and the state is part of the
+    prompt instead of a token."""
 
     def create(self, rngs: nnx.Rngs) -> Pi0:
-        """A model with random weights; works under `nnx.eval_shape`."""
+        """Create a model with random weights; works under `nnx.eval_shape`."""
         return (Pi05 if self.pi05 else Pi0)(self, rngs=rngs)
 
     @classmethod
@@ -70,7 +71,7 @@ class Pi0Config(BackboneConfig):
 
     @classmethod
     def small(cls) -> Pi0Config:
-        """For one accelerator: about 9.5 M parameters, 64 tokens a camera."""
+        """For one accelerator: about 9.5 M parameters, 64 tokens per camera."""
         return cls.miniature(
             vision=VisionConfig(width=256, depth=4, mlp=768, heads=4, patch=8),
             language=ExpertConfig(192, 6, 512, heads=8, kv_heads=1, head_dim=32),
@@ -79,7 +80,7 @@ class Pi0Config(BackboneConfig):
 
     @classmethod
     def nano(cls) -> Pi0Config:
-        """For a CPU: about 1 M parameters, 16 tokens a camera."""
+        """For a CPU: about 1 M parameters, 16 tokens per camera."""
         return cls.miniature(
             vision=VisionConfig(width=96, depth=2, mlp=256, heads=3, patch=16),
             language=ExpertConfig(96, 3, 192, heads=4, kv_heads=1, head_dim=32),
@@ -88,7 +89,7 @@ class Pi0Config(BackboneConfig):
 
     @classmethod
     def nano_pi05(cls) -> Pi0Config:
-        """pi0.5 for a CPU; the offline tokenizer's prompts with a robot's state fit."""
+        """pi0.5 for a CPU, with room for the offline tokenizer's prompts including the state."""
         return dataclasses.replace(cls.nano(), pi05=True, max_tokens=64, inputs=OURS_PI05)
 
     @classmethod
@@ -106,7 +107,7 @@ class Pi0Config(BackboneConfig):
 
 
 class Prefix(NamedTuple):
-    """Pictures and instruction as the action expert needs them.
+    """Encoded images and instruction, as input to the action expert.
 
     Attributes:
         cache: keys and values `[L, B, P, K, H]` of every layer.
@@ -133,16 +134,16 @@ class Pi0(Backbone):
         self._make_projections(config.action.width, rngs)
 
     def embed_prefix(self, obs: Observation) -> tuple[jax.Array, jax.Array, ModelAux]:
-        """Tokens of pictures and instruction.
+        """Embed images and instruction as tokens.
 
         Returns:
-            tokens `[B, P, D]`, valid `[B, P]` bool, reports of the vision tower's adapters.
+            tokens `[B, P, D]`, valid `[B, P]` bool, aux of the vision tower's adapters.
 
         Raises:
-            ValueError: a camera is missing or a picture has the wrong size.
+            ValueError: a camera is missing or an image has the wrong size.
         """
-        seen, image_valid, aux = self.look(obs)
-        tokens = jnp.concatenate([seen, self.language.embed(obs.tokens)], axis=1)
+        image_tokens, image_valid, aux = self.encode_images(obs)
+        tokens = jnp.concatenate([image_tokens, self.language.embed(obs.tokens)], axis=1)
         return tokens, jnp.concatenate([image_valid, obs.token_mask], axis=1), aux
 
     def embed_suffix(
@@ -152,24 +153,24 @@ class Pi0(Backbone):
         flow_time: jax.Array,
         action_valid: jax.Array | None = None,
     ) -> tuple[jax.Array, LayerAux]:
-        """Tokens of the state and the noisy actions.
+        """Embed state and noisy actions as tokens.
 
         Args:
-            obs: the state is read.
+            obs: only the state is used.
             x_t: `[B, C, A]`.
             flow_time: `[B]`.
-            action_valid: `[B, C]` bool, what the adapters count; None counts all.
+            action_valid: `[B, C]` bool, steps that adapter aux includes; None includes all.
 
         Returns:
-            `[B, 1 + C, D]` f32, and the adapters' reports.
+            `[B, 1 + C, D]` f32, and the adapters' aux.
         """
-        one, state = jnp.ones((x_t.shape[0], 1), bool), obs.state[:, None].astype(jnp.float32)
-        state_token, state_aux = self.state_proj(state, token_mask=one, return_aux=True)
+        valid, state = jnp.ones((x_t.shape[0], 1), bool), obs.state[:, None].astype(jnp.float32)
+        state_token, state_aux = self.state_proj(state, token_mask=valid, return_aux=True)
         h, aux = self.action_tokens(x_t, flow_time, action_valid)
         return jnp.concatenate([state_token, h], axis=1), {"state_proj": state_aux, **aux}
 
     def run_prefix(self, obs: Observation) -> tuple[Prefix, ModelAux]:
-        """Everything that does not depend on the actions, once per observation."""
+        """Encode images and instruction, independent of the actions."""
         tokens, valid, vision_aux = self.embed_prefix(obs)
         block = np.zeros(valid.shape[1], int)
         mask = block_mask(block, block, valid, valid)
@@ -184,25 +185,26 @@ class Pi0(Backbone):
         flow_time: jax.Array,
         action_valid: jax.Array | None = None,
     ) -> tuple[jax.Array, LayerAux]:
-        """Velocity `[B, C, A]` f32 given the prefix; arguments as in `embed_suffix`."""
+        """Predict the velocity `[B, C, A]` f32 given the prefix; arguments as in `embed_suffix`."""
         batch, chunk = x_t.shape[:2]
         if action_valid is None:
             action_valid = jnp.ones((batch, chunk), bool)
         tokens, aux = self.embed_suffix(obs, x_t, flow_time, action_valid)
-        condition, time_aux = self.condition(flow_time)
+        condition, time_aux = self.norm_condition(flow_time)
         states = tokens.shape[1] - chunk
+        prefix_block = np.zeros(prefix.valid.shape[1], int)
         block = np.array([1] * states + [2] * chunk)
-        mask, position = suffix_view(prefix.valid, np.zeros(prefix.valid.shape[1], int), block)
-        counted = jnp.concatenate([jnp.ones((batch, states), bool), action_valid], axis=1)
+        mask, position = suffix_mask_and_positions(prefix.valid, prefix_block, block)
+        token_mask = jnp.concatenate([jnp.ones((batch, states), bool), action_valid], axis=1)
         out, _, expert_aux = self.action(
-            tokens, position, mask, prefix.cache, token_mask=counted, condition=condition
+            tokens, position, mask, prefix.cache, token_mask=token_mask, condition=condition
         )
         out = out[:, -chunk:].astype(jnp.float32)
         v_t, out_aux = self.action_out_proj(out, token_mask=action_valid, return_aux=True)
         return v_t, {**expert_aux, **aux, **time_aux, "action_out_proj": out_aux}
 
-    def condition(self, flow_time: jax.Array) -> tuple[jax.Array | None, LayerAux]:
-        """What the action expert's norms follow at `[B]` times, none here; adapters' reports."""
+    def norm_condition(self, flow_time: jax.Array) -> tuple[jax.Array | None, LayerAux]:
+        """Compute the condition of adaptive norms; None and no aux here. See `Pi05`."""
         del flow_time
         return None, {}
 
@@ -213,17 +215,17 @@ class Pi05(Pi0):
     make_expert = AdaptiveExpert
 
     def _make_projections(self, state_width: int, rngs: nnx.Rngs) -> None:
-        """The linear maps around the towers: of noisy actions, their time and velocity."""
+        """Create the projections of noisy actions, flow time and velocity."""
         del state_width
         width, dim = self.config.action.width, self.config.action_dim
-        kinds: Any = {"dtype": jnp.float32, "param_dtype": self.config.param_dtype, "rngs": rngs}
-        self.action_in_proj: Layer = Dense(dim, width, **kinds)
-        self.time_mlp_in: Layer = Dense(width, width, **kinds)
-        self.time_mlp_out: Layer = Dense(width, width, **kinds)
-        self.action_out_proj: Layer = Dense(width, dim, **kinds)
+        options: Any = {"dtype": jnp.float32, "param_dtype": self.config.param_dtype, "rngs": rngs}
+        self.action_in_proj: Layer = Dense(dim, width, **options)
+        self.time_mlp_in: Layer = Dense(width, width, **options)
+        self.time_mlp_out: Layer = Dense(width, width, **options)
+        self.action_out_proj: Layer = Dense(width, dim, **options)
 
     def join_layers(self, *, copy_kernels: bool = True) -> None:
-        """See `prepared.JoinsLayers`: the linear maps around the towers, each by itself."""
+        """See `prepared.JoinsLayers`; the projections outside the towers share no input."""
         self.action_in_proj = join_one(self.action_in_proj, copy_kernels=copy_kernels)
         self.time_mlp_in = join_one(self.time_mlp_in, copy_kernels=copy_kernels)
         self.time_mlp_out = join_one(self.time_mlp_out, copy_kernels=copy_kernels)
@@ -236,21 +238,21 @@ class Pi05(Pi0):
         flow_time: jax.Array,
         action_valid: jax.Array | None = None,
     ) -> tuple[jax.Array, LayerAux]:
-        """Tokens `[B, C, D]` f32 of the noisy actions, as in `Pi0`, and the adapters' reports.
+        """Embed noisy actions as tokens `[B, C, D]` f32; also return the adapters' aux.
 
-        The state is in the prompt and the time in the norms, so `obs` and `flow_time` are not read.
+        `obs` and `flow_time` are unused: the state is in the prompt, the time in the norms.
         """
         del obs, flow_time
         x_t = x_t.astype(jnp.float32)
         h, aux = self.action_in_proj(x_t, token_mask=action_valid, return_aux=True)
         return h, {"action_in_proj": aux}
 
-    def condition(self, flow_time: jax.Array) -> tuple[jax.Array, LayerAux]:
-        """What the action expert's norms follow at `[B]` times, `[B, 1, D]` f32, and reports."""
+    def norm_condition(self, flow_time: jax.Array) -> tuple[jax.Array, LayerAux]:
+        """Embed times `[B]` as the condition `[B, 1, D]` f32 of the adaptive norms; also aux."""
         aux: LayerAux = {}
-        one = jnp.ones((flow_time.shape[0], 1), bool)
+        valid = jnp.ones((flow_time.shape[0], 1), bool)
         h = time_embedding(flow_time, self.config.action.width)[:, None]
-        h, aux["time_mlp_in"] = self.time_mlp_in(h, token_mask=one, return_aux=True)
+        h, aux["time_mlp_in"] = self.time_mlp_in(h, token_mask=valid, return_aux=True)
         h = jax.nn.silu(h)
-        h, aux["time_mlp_out"] = self.time_mlp_out(h, token_mask=one, return_aux=True)
+        h, aux["time_mlp_out"] = self.time_mlp_out(h, token_mask=valid, return_aux=True)
         return jax.nn.silu(h), aux

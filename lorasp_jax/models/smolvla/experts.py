@@ -1,8 +1,8 @@
-"""SmolVLA's experts: SmolLM2 (arXiv 2502.02737) and the action expert that reads its cache.
+"""SmolVLA's experts: SmolLM2 (arXiv 2502.02737), and an action expert that attends to its cache.
 
-The action expert's even layers attend to the language model's keys and values next to their own, as
-pi0's do. Its odd layers only look at the language model: they project the keys and values of its
-layer of the same depth, and action tokens do not see each other there.
+Even layers of the action expert attend to the language model's keys and values and to their own, as
+in pi0. Odd layers are cross-attention: they attend only to projections of the keys and values of
+the same layer of the language model, so action tokens do not attend to each other there.
 """
 
 import functools
@@ -19,37 +19,37 @@ from lorasp_jax.models.transformer.experts import ExpertBlock, KeysValues, Langu
 from lorasp_jax.models.transformer.layers import (
     LayerAux,
     RMSNorm,
+    nest_aux,
     positions,
     rope,
     rope_table,
-    under,
 )
 
 
 class SelfBlock(ExpertBlock):
-    """One layer of SmolLM2: as Gemma's, with SiLU and norms that store their whole factor."""
+    """One SmolLM2 layer: a Gemma layer with SiLU and norms that store the factor itself."""
 
     make_norm = staticmethod(functools.partial(RMSNorm, eps=1e-5, offset=0.0))
     activation = staticmethod(jax.nn.silu)
 
 
 class CrossBlock(SelfBlock):
-    """A layer of the action expert that attends to the language model's keys and values alone."""
+    """An action-expert layer that attends only to the language model's keys and values."""
 
     def __init__(self, size: ExpertConfig, config: BackboneConfig, *, rngs: nnx.Rngs) -> None:
         super().__init__(size, config, context=size.kv_heads * size.head_dim, rngs=rngs)
 
     def join_layers(self, *, copy_kernels: bool = True) -> None:
-        """See `prepared.JoinsLayers`; queries, keys and values each read another input."""
+        """See `prepared.JoinsLayers`; q_proj, k_proj and v_proj have different inputs here."""
         self.q_proj = join_one(self.q_proj, copy_kernels=copy_kernels)
         self.k_proj = join_one(self.k_proj, copy_kernels=copy_kernels)
         self.v_proj = join_one(self.v_proj, copy_kernels=copy_kernels)
-        self.join_rest(copy_kernels=copy_kernels)
+        self.join_output_and_mlp(copy_kernels=copy_kernels)
 
-    def read(self, cache: KeysValues, valid: jax.Array) -> tuple[KeysValues, LayerAux]:
-        """Own keys and values `[B, P, K, H]` from the language model's of the same shape.
+    def project_cache(self, cache: KeysValues, valid: jax.Array) -> tuple[KeysValues, LayerAux]:
+        """Compute this layer's keys and values `[B, P, K, H]` from the language model's.
 
-        The language model has rotated its keys already; they are not rotated again.
+        The language model has already applied RoPE to its keys; it is not applied again.
         """
         aux: LayerAux = {}
         keys, values = cache
@@ -64,30 +64,38 @@ class CrossBlock(SelfBlock):
         x: jax.Array,
         table: tuple[jax.Array, jax.Array],
         mask: jax.Array,
-        own: KeysValues,
+        keys_values: KeysValues,
         token_mask: jax.Array,
     ) -> tuple[jax.Array, LayerAux]:
-        """x `[B, T, D]` after this layer, given what `read` made; mask `[B, T, P]`."""
-        h, *_ = self.input_layernorm.conditioned(x, None)
+        """Apply the layer to x `[B, T, D]`.
+
+        Args:
+            x: `[B, T, D]`.
+            table: RoPE sine and cosine for these tokens, from `rope_table`.
+            mask: `[B, T, P]` bool.
+            keys_values: from `project_cache`.
+            token_mask: `[B, T]` bool, tokens that adapter aux includes.
+        """
+        h, *_ = self.input_layernorm.normalize(x, None)
         q, q_aux = self.q_proj(h, token_mask=token_mask, return_aux=True)
         q = q.reshape(*x.shape[:2], -1, self.head_dim)
         q = rope(q, table, scale=self.head_dim**-0.5)
-        x, aux = self.finish(x, attention(q, *own, mask), token_mask)
+        x, aux = self.output_and_mlp(x, attention(q, *keys_values, mask), token_mask)
         return x, {"q_proj": q_aux, **aux}
 
 
-class Language(LanguageExpert):
-    """SmolLM2. Its `lm_head` takes no part in acting; it is kept to be saved as it was loaded."""
+class SmolLM2(LanguageExpert):
+    """SmolLM2. Actions do not depend on `lm_head`; it is loaded so that it can be saved again."""
 
     block = SelfBlock
 
     def __init__(self, size: ExpertConfig, config: BackboneConfig, *, rngs: nnx.Rngs) -> None:
         super().__init__(size, config, rngs=rngs)
-        self.lm_head = nnx.Param(jnp.array(self.embedding.get_value()))  # a buffer of its own
+        self.lm_head = nnx.Param(jnp.array(self.embedding.get_value()))  # a separate buffer
 
 
-class Pair(nnx.Module):
-    """Two layers of the action expert, one of each kind."""
+class LayerPair(nnx.Module):
+    """A self-attention layer and a cross-attention layer of the action expert."""
 
     def __init__(self, size: ExpertConfig, config: BackboneConfig, *, rngs: nnx.Rngs) -> None:
         self.self_layer = SelfBlock(size, config, rngs=rngs)
@@ -95,35 +103,37 @@ class Pair(nnx.Module):
 
 
 class ActionExpert(nnx.Module):
-    """Layers with self- and cross-attention in turn, and a final norm."""
+    """Alternating self-attention and cross-attention layers, and a final norm."""
 
     def __init__(self, size: ExpertConfig, config: BackboneConfig, *, rngs: nnx.Rngs) -> None:
         self.config = config
         self.head_dim = size.head_dim
-        self.blocks = stack(lambda rngs: Pair(size, config, rngs=rngs), size.depth // 2, rngs)
+        self.blocks = stack(lambda rngs: LayerPair(size, config, rngs=rngs), size.depth // 2, rngs)
         self.norm = SelfBlock.make_norm(size.width, param_dtype=config.param_dtype)
 
-    def read(self, cache: KeysValues, valid: jax.Array) -> tuple[KeysValues, KeysValues, LayerAux]:
-        """What the layers attend to, once per observation.
+    def project_cache(
+        self, cache: KeysValues, valid: jax.Array
+    ) -> tuple[KeysValues, KeysValues, LayerAux]:
+        """Compute the prefix keys and values of all layers, once per observation.
 
         Args:
             cache: keys and values `[L, B, P, K, H]` of the language model.
             valid: `[B, P]` bool.
 
         Returns:
-            Keys and values `[L / 2, B, P, K, H]` for the self-attention and for the cross-attention
-            layers, and the adapters' reports.
+            Keys and values `[L / 2, B, P, K, H]` for the self-attention layers and for the
+            cross-attention layers, and the adapters' aux.
         """
         even, odd = (jax.tree.map(lambda a, i=i: a[i::2], cache) for i in (0, 1))
         _, (cross, aux) = scan_depth(
             self.blocks.cross_layer,
-            lambda block, valid, cache: (valid, block.read(cache, valid)),
+            lambda block, valid, cache: (valid, block.project_cache(cache, valid)),
             valid,
             odd,
             remat=self.config.remat,
             unroll=self.config.unroll_layers,
         )
-        return even, cross, under("cross_layer", aux)
+        return even, cross, nest_aux("cross_layer", aux)
 
     def __call__(
         self,
@@ -135,29 +145,30 @@ class ActionExpert(nnx.Module):
         *,
         token_mask: jax.Array,
     ) -> tuple[jax.Array, LayerAux]:
-        """All layers.
+        """Apply all layers and the final norm.
 
         Args:
             x: `[B, T, D]`.
-            position: `[B, T]` int32, counted on from the prefix; cross-attention counts from zero.
+            position: `[B, T]` int32, continuing the prefix's; cross-attention starts from zero.
             mask: `[B, T, P + T]` bool.
-            cache: keys and values for self-attention, from `read`.
-            cross: for cross-attention, from `read`.
-            token_mask: `[B, T]` bool, what the adapters count.
+            cache: prefix keys and values for self-attention, from `project_cache`.
+            cross: prefix keys and values for cross-attention, from `project_cache`.
+            token_mask: `[B, T]` bool, tokens that adapter aux includes.
 
         Returns:
-            `[B, T, D]` after the final norm, and the adapters' reports, stacked over pairs.
+            `[B, T, D]`, and the adapters' aux, stacked over layer pairs.
         """
-        table = rope_table(position, self.head_dim)
-        own_table = rope_table(positions(jnp.ones(x.shape[:2], bool)), self.head_dim)
+        self_table = rope_table(position, self.head_dim)
+        cross_table = rope_table(positions(jnp.ones(x.shape[:2], bool)), self.head_dim)
         prefix_mask = mask[:, :, : -x.shape[1]]
 
         def call(
-            pair: Pair, x: jax.Array, read: tuple[KeysValues, KeysValues]
+            pair: LayerPair, x: jax.Array, prefix: tuple[KeysValues, KeysValues]
         ) -> tuple[jax.Array, LayerAux]:
-            x, (_, own) = pair.self_layer(x, table, mask, read[0], token_mask)
-            x, other = pair.cross_layer.attend(x, own_table, prefix_mask, read[1], token_mask)
-            return x, under("self_layer", own) | under("cross_layer", other)
+            cache, cross = prefix
+            x, (_, self_aux) = pair.self_layer(x, self_table, mask, cache, token_mask)
+            x, cross_aux = pair.cross_layer.attend(x, cross_table, prefix_mask, cross, token_mask)
+            return x, nest_aux("self_layer", self_aux) | nest_aux("cross_layer", cross_aux)
 
         x, aux = scan_depth(
             self.blocks,

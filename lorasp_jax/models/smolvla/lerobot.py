@@ -1,4 +1,4 @@
-"""Which SmolVLA a config.json of LeRobot 0.6 means (policies/smolvla/configuration_smolvla.py)."""
+"""Convert config.json of a LeRobot 0.6 SmolVLA (policies/smolvla/configuration_smolvla.py)."""
 
 import dataclasses
 import math
@@ -8,7 +8,7 @@ from typing import Any
 from lorasp_jax.models.checkpoints.lerobot_config import require
 from lorasp_jax.models.smolvla.smolvla import SmolVLAConfig
 
-# What this backbone does, and LeRobot's may do otherwise.
+# Options of LeRobot for which this backbone supports a single value.
 _FIXED = {
     "attention_mode": "cross_attn",
     "self_attn_every_n_layers": 2,
@@ -16,21 +16,22 @@ _FIXED = {
 }
 
 
-def smolvla(fields: Mapping[str, Any]) -> SmolVLAConfig:
-    """The published vision tower; as many language layers and as wide an expert as it says.
+def smolvla_config(fields: Mapping[str, Any]) -> SmolVLAConfig:
+    """Use the published sizes with the file's language depth and expert width.
 
     Raises:
-        ValueError: another kind of attention or of tokens.
+        ValueError: unsupported attention, special tokens or number of expert layers.
     """
     config = SmolVLAConfig.base()
     depth = fields.get("num_vlm_layers", config.language.depth)
     require(fields, _FIXED)
     if fields.get("num_expert_layers", -1) not in {-1, 0, depth}:
-        raise ValueError(f"num_expert_layers must be that of the language model, {depth}")
+        layers = fields["num_expert_layers"]
+        raise ValueError(f"num_expert_layers must equal num_vlm_layers = {depth}, got {layers!r}")
     action = config.action
     if "expert_width_multiplier" in fields:
         width = int(config.language.width * fields["expert_width_multiplier"])
-        # Two thirds of four times the width, in whole 256s (smolvlm_with_expert.py).
+        # 2/3 of 4 width, rounded up to a multiple of 256 (smolvlm_with_expert.py).
         mlp = 256 * math.ceil(4 * int(2 * width / 3) / 256)
         action = dataclasses.replace(action, width=width, mlp=mlp)
     return dataclasses.replace(
@@ -40,5 +41,5 @@ def smolvla(fields: Mapping[str, Any]) -> SmolVLAConfig:
     )
 
 
-TYPES = {"smolvla": smolvla}
-"""Function of a config.json that gives the config, by the policy's type."""
+TYPES = {"smolvla": smolvla_config}
+"""Policy type -> function (fields of config.json) -> config."""

@@ -1,8 +1,8 @@
 """SmolVLA (Shukor et al., arXiv 2506.01844): flow matching on a small vision-language model.
 
-Tokens fall into blocks: [pictures, instruction], [state], and each noisy action by itself; each
-block sees itself and those before it. Pictures, instruction and state are the prefix of the
-language model, the actions the suffix of the action expert.
+Tokens form blocks: [images, instruction], [state], and one block per noisy action. Each block
+attends to itself and to earlier blocks. Images, instruction and state are the prefix, processed by
+the language model; the actions are the suffix, processed by the action expert.
 """
 
 from __future__ import annotations
@@ -16,35 +16,41 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax.models.backbone import Backbone, suffix_view
+from lorasp_jax.models.backbone import Backbone, suffix_mask_and_positions
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig, VisionConfig
 from lorasp_jax.models.inputs import LEROBOT
 from lorasp_jax.models.observation import Observation
-from lorasp_jax.models.smolvla.experts import ActionExpert, Language
+from lorasp_jax.models.smolvla.experts import ActionExpert, SmolLM2
 from lorasp_jax.models.transformer.experts import KeysValues
-from lorasp_jax.models.transformer.layers import LayerAux, ModelAux, block_mask, positions
+from lorasp_jax.models.transformer.layers import (
+    LayerAux,
+    ModelAux,
+    block_mask,
+    merge_action_aux,
+    positions,
+)
 from lorasp_jax.models.transformer.siglip import SigLIP
 
 
 @dataclasses.dataclass(frozen=True)
 class SmolVLAConfig(BackboneConfig):
-    """Every size of a SmolVLA.
+    """Sizes and runtime options of a SmolVLA.
 
     Raises:
-        ValueError: sizes that do not fit together.
+        ValueError: inconsistent sizes.
     """
 
     def __post_init__(self) -> None:
-        """Checks that the parts fit."""
+        """Validate the sizes."""
         super().__post_init__()
         if self.action.depth % 2:
             raise ValueError(
-                "self- and cross-attention alternate, so the depth must be even, "
-                f"not {self.action.depth}."
+                "depth must be even, because self- and cross-attention alternate; "
+                f"got {self.action.depth}."
             )
 
     def create(self, rngs: nnx.Rngs) -> SmolVLA:
-        """A model with random weights; works under `nnx.eval_shape`."""
+        """Create a model with random weights; works under `nnx.eval_shape`."""
         return SmolVLA(self, rngs=rngs)
 
     @classmethod
@@ -70,7 +76,7 @@ class SmolVLAConfig(BackboneConfig):
 
     @classmethod
     def small(cls) -> SmolVLAConfig:
-        """For one accelerator: about 9 M parameters, 16 tokens a camera of 64 patches."""
+        """For one accelerator: about 9 M parameters, 64 patches and 16 tokens per camera."""
         return cls.miniature(
             vision=VisionConfig(width=256, depth=4, mlp=768, heads=4, patch=8, shuffle=2),
             language=ExpertConfig(256, 6, 640, heads=6, kv_heads=2, head_dim=32),
@@ -79,7 +85,7 @@ class SmolVLAConfig(BackboneConfig):
 
     @classmethod
     def nano(cls) -> SmolVLAConfig:
-        """For a CPU: about 1 M parameters, 16 tokens a camera."""
+        """For a CPU: about 1 M parameters, 16 tokens per camera."""
         return cls.miniature(
             vision=VisionConfig(width=96, depth=2, mlp=256, heads=3, patch=8, shuffle=2),
             language=ExpertConfig(96, 4, 192, heads=3, kv_heads=1, head_dim=32),
@@ -101,11 +107,11 @@ class SmolVLAConfig(BackboneConfig):
 
 
 class Prefix(NamedTuple):
-    """Pictures, instruction and state as the action expert needs them.
+    """Encoded images, instruction and state, as input to the action expert.
 
     Attributes:
         cache: keys and values `[L / 2, B, P, K, H]` of the language model's even layers.
-        cross: what the expert's odd layers made of the odd ones, in the same shape.
+        cross: those of its odd layers, projected by the action expert; same shape.
         valid: `[B, P]` bool.
     """
 
@@ -122,28 +128,28 @@ class SmolVLA(Backbone):
     def __init__(self, config: SmolVLAConfig, *, rngs: nnx.Rngs) -> None:
         self.config = config
         self.vision = SigLIP(config, head_bias=False, rngs=rngs)
-        self.language = Language(config.language, config, rngs=rngs)
+        self.language = SmolLM2(config.language, config, rngs=rngs)
         self.action = ActionExpert(config.action, config, rngs=rngs)
         self._make_projections(config.language.width, rngs)
 
     def embed_prefix(self, obs: Observation) -> tuple[jax.Array, jax.Array, ModelAux]:
-        """Tokens of pictures, instruction and state.
+        """Embed images, instruction and state as tokens.
 
         Returns:
-            tokens `[B, P, D]`, valid `[B, P]` bool, reports of the adapters.
+            tokens `[B, P, D]`, valid `[B, P]` bool, the adapters' aux.
 
         Raises:
-            ValueError: a camera is missing or a picture has the wrong size.
+            ValueError: a camera is missing or an image has the wrong size.
         """
-        seen, image_valid, aux = self.look(obs)
-        one = jnp.ones((obs.state.shape[0], 1), bool)
+        image_tokens, image_valid, aux = self.encode_images(obs)
+        state_valid = jnp.ones((obs.state.shape[0], 1), bool)
         state = obs.state[:, None].astype(jnp.float32)
-        state, state_aux = self.state_proj(state, token_mask=one, return_aux=True)
-        # Unlike pi0's, the pictures' tokens have the scale of the language's.
-        seen = seen * math.sqrt(seen.shape[-1])
+        state, state_aux = self.state_proj(state, token_mask=state_valid, return_aux=True)
+        # Unlike pi0, SmolVLA scales image tokens like language tokens.
+        image_tokens = image_tokens * math.sqrt(image_tokens.shape[-1])
         text = self.language.embed(obs.tokens)
-        tokens = jnp.concatenate([seen, text, state.astype(text.dtype)], axis=1)
-        valid = jnp.concatenate([image_valid, obs.token_mask, one], axis=1)
+        tokens = jnp.concatenate([image_tokens, text, state.astype(text.dtype)], axis=1)
+        valid = jnp.concatenate([image_valid, obs.token_mask, state_valid], axis=1)
         return tokens, valid, {**aux, "action": {"state_proj": state_aux}}
 
     def embed_suffix(
@@ -153,29 +159,29 @@ class SmolVLA(Backbone):
         flow_time: jax.Array,
         action_valid: jax.Array | None = None,
     ) -> tuple[jax.Array, LayerAux]:
-        """Tokens of the noisy actions.
+        """Embed noisy actions as tokens.
 
         Args:
-            obs: not read, the state is in the prefix.
+            obs: unused; the state is in the prefix.
             x_t: `[B, C, A]`.
             flow_time: `[B]`.
-            action_valid: `[B, C]` bool, what the adapters count; None counts all.
+            action_valid: `[B, C]` bool, steps that adapter aux includes; None includes all.
 
         Returns:
-            `[B, C, D]` f32, and the adapters' reports.
+            `[B, C, D]` f32, and the adapters' aux.
         """
         del obs
         return self.action_tokens(x_t, flow_time, action_valid)
 
     def run_prefix(self, obs: Observation) -> tuple[Prefix, ModelAux]:
-        """Everything that does not depend on the actions, once per observation."""
+        """Encode images, instruction and state, independent of the actions."""
         tokens, valid, aux = self.embed_prefix(obs)
-        block = _prefix_blocks(valid.shape[1])
+        block = _prefix_block(valid.shape[1])
         mask = block_mask(block, block, valid, valid)
-        _, cache, language = self.language(tokens, positions(valid), mask, token_mask=valid)
-        own, cross, read = self.action.read(cache, valid)
-        prefix = Prefix(own, cross, valid)
-        return prefix, {**aux, "language": language, "action": {**aux["action"], **read}}
+        _, cache, language_aux = self.language(tokens, positions(valid), mask, token_mask=valid)
+        even, cross, action_aux = self.action.project_cache(cache, valid)
+        prefix = Prefix(even, cross, valid)
+        return prefix, merge_action_aux({**aux, "language": language_aux}, action_aux)
 
     def run_suffix(
         self,
@@ -185,13 +191,13 @@ class SmolVLA(Backbone):
         flow_time: jax.Array,
         action_valid: jax.Array | None = None,
     ) -> tuple[jax.Array, LayerAux]:
-        """Velocity `[B, C, A]` f32 given the prefix; arguments as in `embed_suffix`."""
+        """Predict the velocity `[B, C, A]` f32 given the prefix; arguments as in `embed_suffix`."""
         if action_valid is None:
             action_valid = jnp.ones(x_t.shape[:2], bool)
         tokens, aux = self.embed_suffix(obs, x_t, flow_time, action_valid)
         block = 2 + np.arange(tokens.shape[1])
-        before = _prefix_blocks(prefix.valid.shape[1])
-        mask, position = suffix_view(prefix.valid, before, block)
+        prefix_block = _prefix_block(prefix.valid.shape[1])
+        mask, position = suffix_mask_and_positions(prefix.valid, prefix_block, block)
         out, expert_aux = self.action(
             tokens, position, mask, prefix.cache, prefix.cross, token_mask=action_valid
         )
@@ -200,6 +206,6 @@ class SmolVLA(Backbone):
         return v_t, {**expert_aux, **aux, "action_out_proj": out_aux}
 
 
-def _prefix_blocks(tokens: int) -> np.ndarray:
-    """`[P]` blocks of the prefix: pictures and instruction, then the state."""
+def _prefix_block(tokens: int) -> np.ndarray:
+    """Block numbers `[P]` of the prefix tokens: images and instruction, then the state."""
     return np.array([0] * (tokens - 1) + [1])

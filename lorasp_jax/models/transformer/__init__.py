@@ -1,1 +1,1 @@
-"""The parts that both backbones are made of."""
+"""Transformer components shared by the backbones."""

@@ -1,4 +1,4 @@
-"""Attention: grouped queries, masks, softmax in fp32."""
+"""Grouped-query attention with masks and fp32 softmax."""
 
 import functools
 
@@ -6,42 +6,43 @@ import jax
 import jax.numpy as jnp
 
 MASKED = -2.3819763e38
-"""Logit of a forbidden key; finite, so a row without any key gets a uniform softmax, not NaN."""
+"""Logit of a masked key. Finite, so that a fully masked row gets a uniform softmax, not NaN."""
 
-CUDNN_TOKENS, CUDNN_WIDTH = 128, 64
-"""Fewest queries and narrowest heads for which attention goes through cuDNN: those of published
-sizes, while the miniatures repeat themselves bit for bit."""
+CUDNN_MIN_QUERIES, CUDNN_MIN_HEAD_DIM = 128, 64
+"""Minimum sizes for which attention uses cuDNN. Published models reach them; the miniatures do not,
+so their results are bitwise reproducible."""
 
-ALIGNED, LONG = 128, 512
-"""What the number of keys is made a multiple of, and from how many on."""
+KEY_MULTIPLE, MIN_PADDED_KEYS = 128, 512
+"""Without cuDNN, at least `MIN_PADDED_KEYS` keys are padded to a multiple of `KEY_MULTIPLE`."""
 
-CUDNN_ALIGNED = 8
-"""What cuDNN gets a multiple of, queries and keys: 16 bytes of a mask."""
+CUDNN_MULTIPLE = 8
+"""cuDNN needs query and key counts divisible by 8: 16 bytes of a mask."""
 
 
 def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) -> jax.Array:
-    """Grouped-query attention, softmax in fp32; long bf16 sequences through cuDNN on NVIDIA GPUs.
+    """Grouped-query attention with fp32 softmax; uses cuDNN for long bf16 sequences on NVIDIA GPUs.
 
-    cuDNN's gradient adds up in any order: two runs differ in the last bits. Hence `CUDNN_WIDTH`.
+    cuDNN accumulates gradients in nondeterministic order, so two runs differ in the last bits;
+    `CUDNN_MIN_HEAD_DIM` therefore keeps small models away from it.
 
     Args:
         q: `[B, T, N, H]`, already scaled.
         k: `[B, S, K, H]`; each key head serves N / K query heads.
         v: `[B, S, K, H]`.
-        mask: `[B, T, S]` bool, or None for all pairs.
+        mask: `[B, T, S]` bool, or None to attend everywhere.
 
     Returns:
         `[B, T, N H]`.
     """
     batch, tokens, heads, size = q.shape
-    if _suits_cudnn(q, k, mask):
+    if _use_cudnn(q, k, mask):
         attend = functools.partial(jax.nn.dot_product_attention, implementation="cudnn", scale=1.0)
         if mask is not None:
-            q, k, v, mask = _filled_up(q, k, v, mask)
+            q, k, v, mask = _pad_for_cudnn(q, k, v, mask)
         y = attend(q, k, v, mask=None if mask is None else mask[:, None])
         return y[:, :tokens].reshape(batch, tokens, heads * size)
-    k, v, mask = _aligned(k, v, mask)
-    # With K = 1 no axis of q, weights or result moves in memory.
+    k, v, mask = _pad_keys(k, v, mask)
+    # For K = 1, this axis order needs no transposes of q, weights or result.
     q = q.reshape(batch, tokens, k.shape[2], -1, size)
     logits = jnp.einsum("BTKGH,BSKH->BKTGS", q, k, preferred_element_type=jnp.float32)
     if mask is not None:
@@ -50,37 +51,39 @@ def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) 
     return jnp.einsum("BKTGS,BSKH->BTKGH", weights, v).reshape(batch, tokens, heads * size)
 
 
-def _aligned(
+def _pad_keys(
     k: jax.Array, v: jax.Array, mask: jax.Array | None
 ) -> tuple[jax.Array, jax.Array, jax.Array | None]:
-    """Forbidden keys behind the others: XLA would write the weights once more to pad them."""
-    more = -k.shape[1] % ALIGNED
-    if mask is None or more == 0 or k.shape[1] < LONG:
+    """Append masked keys; otherwise XLA pads the attention weights, which costs another copy."""
+    padding = -k.shape[1] % KEY_MULTIPLE
+    if mask is None or padding == 0 or k.shape[1] < MIN_PADDED_KEYS:
         return k, v, mask
-    return _longer(k, more), _longer(v, more), jnp.pad(mask, ((0, 0), (0, 0), (0, more)))
+    mask = jnp.pad(mask, ((0, 0), (0, 0), (0, padding)))
+    return _pad_tokens(k, padding), _pad_tokens(v, padding), mask
 
 
-def _suits_cudnn(q: jax.Array, k: jax.Array, mask: jax.Array | None) -> bool:
-    """Whether cuDNN takes these arrays and is worth its launch."""
-    tokens, size, others = q.shape[1], q.shape[3], k.shape[1]
-    half = q.dtype in (jnp.bfloat16, jnp.float16)
-    even = mask is not None or (tokens % 2 == 0 and others % 2 == 0)
-    fits = CUDNN_WIDTH <= size <= 256 and size % 8 == 0 and even
-    return jax.default_backend() == "gpu" and half and fits and tokens >= CUDNN_TOKENS
+def _use_cudnn(q: jax.Array, k: jax.Array, mask: jax.Array | None) -> bool:
+    """Whether cuDNN supports these arrays and is worth its launch overhead."""
+    queries, head_dim, keys = q.shape[1], q.shape[3], k.shape[1]
+    half_precision = q.dtype in (jnp.bfloat16, jnp.float16)
+    even = mask is not None or (queries % 2 == 0 and keys % 2 == 0)
+    supported = CUDNN_MIN_HEAD_DIM <= head_dim <= 256 and head_dim % 8 == 0 and even
+    large = queries >= CUDNN_MIN_QUERIES
+    return jax.default_backend() == "gpu" and half_precision and supported and large
 
 
-def _filled_up(
+def _pad_for_cudnn(
     q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """The same with numbers of queries and keys that cuDNN takes.
+    """Append masked keys and fully masked queries up to multiples of `CUDNN_MULTIPLE`.
 
-    The further keys are forbidden, and so are all of a further query, whose result is not read.
+    The caller drops the results of the appended queries.
     """
-    queries, keys = (-a.shape[1] % CUDNN_ALIGNED for a in (q, k))
-    q, k, v = (_longer(a, more) for a, more in ((q, queries), (k, keys), (v, keys)))
+    queries, keys = (-a.shape[1] % CUDNN_MULTIPLE for a in (q, k))
+    q, k, v = (_pad_tokens(a, n) for a, n in ((q, queries), (k, keys), (v, keys)))
     return q, k, v, jnp.pad(mask, ((0, 0), (0, queries), (0, keys)))
 
 
-def _longer(x: jax.Array, more: int) -> jax.Array:
-    """x `[B, T, N, H]` with zeros behind the T tokens."""
-    return jnp.pad(x, ((0, 0), (0, more), (0, 0), (0, 0))) if more else x
+def _pad_tokens(x: jax.Array, padding: int) -> jax.Array:
+    """Append zeros to the token axis of x `[B, T, N, H]`."""
+    return jnp.pad(x, ((0, 0), (0, padding), (0, 0), (0, 0))) if padding else x

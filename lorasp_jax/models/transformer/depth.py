@@ -1,4 +1,4 @@
-"""Stacks of equal layers and how x runs through them: in a loop or in straight-line code."""
+"""Stacks of identical layers, applied with `lax.scan` or unrolled."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
@@ -12,30 +12,30 @@ from jax.ad_checkpoint import checkpoint_name
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.models.config import Remat
 
-_SLOW_TO_REPEAT = ("dot_product_attention_fwd_wrapper", "custom_vmap_call")
-"""Primitives of cuDNN's attention and of the adapters' kernel (`kernels.row_sharding`)."""
-_NAMED = "stored"
+_EXPENSIVE_TO_RECOMPUTE = ("dot_product_attention_fwd_wrapper", "custom_vmap_call")
+"""Primitives of cuDNN attention and of the adapters' fused kernel (`kernels.row_sharding`)."""
+_SAVED = "saved"
 
 
-def stored(x: jax.Array) -> jax.Array:
-    """x, which a layer stores for its backward pass instead of the products it was made of."""
-    return checkpoint_name(x, _NAMED)
+def save_for_backward(x: jax.Array) -> jax.Array:
+    """Mark x to be saved for the backward pass instead of the matmuls that produced it."""
+    return checkpoint_name(x, _SAVED)
 
 
-def _keep_products(primitive: Any, *shapes: Any, **params: Any) -> Any:
-    """Results of matrix products are stored, what is slow to repeat, and what has a name."""
-    if primitive.name in _SLOW_TO_REPEAT or params.get("name") == _NAMED:
+def _save_products(primitive: Any, *shapes: Any, **params: Any) -> Any:
+    """Save matmul results, expensive primitives and values marked by `save_for_backward`."""
+    if primitive.name in _EXPENSIVE_TO_RECOMPUTE or params.get("name") == _SAVED:
         return True
     return jax.checkpoint_policies.dots_with_no_batch_dims_saveable(primitive, *shapes, **params)
 
 
-_KEPT = {"products": _keep_products, "full": None}
+_REMAT_POLICIES = {"products": _save_products, "full": None}
 
 Block = TypeVar("Block", bound=nnx.Module)
 
 
 def stack(make: Callable[[nnx.Rngs], Block], depth: int, rngs: nnx.Rngs) -> Block:
-    """`depth` independently drawn blocks as one module whose parameters have a leading axis L."""
+    """Initialize `depth` blocks as one module whose parameters have a leading axis L."""
     keys = jax.random.split(rngs.params(), depth)
     return jax.vmap(lambda key: make(nnx.Rngs(params=key)))(keys)
 
@@ -49,101 +49,107 @@ def scan_depth(
     remat: Remat = "none",
     unroll: bool = False,
 ) -> tuple[jax.Array, Any]:
-    """Run x through stacked blocks.
+    """Apply stacked blocks to x.
 
     Args:
-        blocks: from `stack` or `unstacked`.
-        call: (block, x, its slice of `per_layer`) -> (x, what to keep).
+        blocks: from `stack` or `unstack`.
+        call: (block, x, its slice of `per_layer`) -> (x, per-layer output).
         x: `[B, T, D]`.
         per_layer: pytree with a leading axis L, or None.
-        remat: what of a block is computed again in the backward pass instead of stored.
-        unroll: straight-line code instead of a loop.
+        remat: what the backward pass recomputes, see `BackboneConfig.remat`.
+        unroll: unroll the loop over layers instead of using `lax.scan`.
 
     Returns:
-        `[B, T, D]`, and what the blocks gave to keep, stacked to `[L, ...]`.
+        `[B, T, D]`, and the per-layer outputs stacked to `[L, ...]`.
     """
-    one_by_one = isinstance(blocks, nnx.List)
-    graphdef, *state = nnx.split(blocks[0] if one_by_one else blocks, AdapterParam, ...)
+    unstacked = isinstance(blocks, nnx.List)
+    graphdef, *state = nnx.split(blocks[0] if unstacked else blocks, AdapterParam, ...)
 
     def layer(x: jax.Array, scanned: tuple[Any, Any]) -> tuple[jax.Array, Any]:
-        own, other = scanned
-        block: Any = nnx.merge(graphdef, *(own.taken() if isinstance(own, _Part) else own))
-        return call(block, x, other)
+        params, inputs = scanned
+        arrays = params.materialize() if isinstance(params, _LayerSlice) else params
+        block: Any = nnx.merge(graphdef, *arrays)
+        return call(block, x, inputs)
 
     if remat != "none":
-        layer = jax.checkpoint(layer, prevent_cse=unroll, policy=_KEPT[remat])
-    if not one_by_one and not unroll:
+        layer = jax.checkpoint(layer, prevent_cse=unroll, policy=_REMAT_POLICIES[remat])
+    if not unstacked and not unroll:
         return jax.lax.scan(layer, x, (state, per_layer))
-    states = (
+    layer_params = (
         [nnx.state(block, AdapterParam, ...) for block in blocks]
-        if one_by_one
-        else _parts_of(*state)
+        if unstacked
+        else _lazy_slices(*state)
     )
-    others = [None] * len(states) if per_layer is None else _layers_of(per_layer)
-    layer, kept = jax.jit(layer, inline=True), []  # traced once
-    for own, other in zip(states, others, strict=True):
-        x, keep = layer(x, (own, other))
-        kept.append(keep)
-    return x, jax.tree.map(lambda *layers: jnp.stack(layers), *kept)
+    layer_inputs = [None] * len(layer_params) if per_layer is None else _split_layers(per_layer)
+    layer, outputs = jax.jit(layer, inline=True), []  # trace the layer once
+    for params, inputs in zip(layer_params, layer_inputs, strict=True):
+        x, output = layer(x, (params, inputs))
+        outputs.append(output)
+    return x, jax.tree.map(lambda *layers: jnp.stack(layers), *outputs)
 
 
-def _layers_of(stacked: Any) -> list[Any]:
-    """Each layer's part of arrays [L, ...]; their gradients are stacked, not added up."""
+def _split_layers(stacked: Any) -> list[Any]:
+    """Split arrays [L, ...] into layers. The backward pass concatenates the layers' gradients.
+
+    Indexing each layer instead would sum L gradients padded with zeros.
+    """
     leaves, structure = jax.tree.flatten(stacked)
-    parts = zip(*(jax.lax.split(leaf, [1] * len(leaf)) for leaf in leaves), strict=True)
+    slices = zip(*(jax.lax.split(leaf, [1] * len(leaf)) for leaf in leaves), strict=True)
     return [
-        jax.tree.unflatten(structure, [jax.lax.squeeze(part, [0]) for part in layer])
-        for layer in parts
+        jax.tree.unflatten(structure, [jax.lax.squeeze(array, [0]) for array in layer])
+        for layer in slices
     ]
 
 
-class _Part(NamedTuple):
-    """One layer's part of a stack, taken where it is needed.
+class _LayerSlice(NamedTuple):
+    """Lazy slice of one layer from stacked arrays.
 
-    Within `jax.checkpoint` the backward pass then takes it again from the stack, which is there
-    anyway, instead of keeping every layer's part from the forward pass on.
+    Under `jax.checkpoint` the backward pass slices the stack again, instead of saving every layer's
+    slice in the forward pass.
     """
 
     trained: Any
-    """Stacked arrays [L, ...]."""
+    """Stacked trainable arrays [L, ...]."""
     frozen: Any
-    """The same."""
+    """Stacked frozen arrays [L, ...]."""
     index: np.int32
-    gradients: Any
-    """The layer's part of `trained`: not read, but where its gradient goes."""
+    gradient_sinks: Any
+    """Slice of `trained` whose value is unused; it receives the layer's gradient."""
 
-    def taken(self) -> tuple[Any, Any]:
-        """The layer's arrays [...], trained and frozen."""
+    def materialize(self) -> tuple[Any, Any]:
+        """Return the layer's trainable and frozen arrays [...]."""
         trained = jax.tree.map(
-            lambda stack, own: _taken(stack, self.index, own), self.trained, self.gradients
+            lambda stack, sink: _slice_with_gradient(stack, self.index, sink),
+            self.trained,
+            self.gradient_sinks,
         )
-        return trained, jax.tree.map(lambda stack: _at(stack, self.index), self.frozen)
+        return trained, jax.tree.map(lambda stack: _slice(stack, self.index), self.frozen)
 
 
-def _at(stack: jax.Array, index: np.int32) -> jax.Array:
+def _slice(stack: jax.Array, index: np.int32) -> jax.Array:
     return jax.lax.dynamic_index_in_dim(stack, index, keepdims=False)
 
 
 @jax.custom_jvp
-def _taken(stack: jax.Array, index: np.int32, own: jax.Array) -> jax.Array:
-    """stack[index], which `own` is too; its gradient is that of `own`."""
-    del own
-    return _at(stack, index)
+def _slice_with_gradient(stack: jax.Array, index: np.int32, sink: jax.Array) -> jax.Array:
+    """stack[index]; its gradient flows to `sink`, which has the same value."""
+    del sink
+    return _slice(stack, index)
 
 
-@_taken.defjvp
+@_slice_with_gradient.defjvp
 def _(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
-    return _at(*primals[:2]), tangents[2]
+    return _slice(*primals[:2]), tangents[2]
 
 
-def _parts_of(trained: Any, frozen: Any) -> list[_Part]:
-    """Each layer's part of arrays [L, ...]."""
+def _lazy_slices(trained: Any, frozen: Any) -> list[_LayerSlice]:
+    """Slice arrays [L, ...] lazily, one slice per layer."""
     depth = len(jax.tree.leaves((trained, frozen))[0])
-    gradients = _layers_of(trained) or [trained] * depth  # nothing may train
-    return [_Part(trained, frozen, np.int32(i), own) for i, own in enumerate(gradients)]
+    sinks = _split_layers(trained) or [trained] * depth  # there may be no trainable arrays
+    return [_LayerSlice(trained, frozen, np.int32(i), sink) for i, sink in enumerate(sinks)]
 
 
-def unstacked(blocks: nnx.Module) -> nnx.List[Any]:
-    """Stacked blocks one by one: a loop around them then slices no weights."""
+def unstack(blocks: nnx.Module) -> nnx.List[Any]:
+    """Split stacked blocks into a list, so that an outer loop does not slice weights."""
     graphdef, state = nnx.split(blocks)
-    return nnx.List([nnx.merge(graphdef, layer) for layer in _layers_of(state)])
+    return nnx.List([nnx.merge(graphdef, layer) for layer in _split_layers(state)])

@@ -1,8 +1,8 @@
 """Experts that share attention: a mixture of transformers (pi0, arXiv 2410.24164).
 
-An expert's tokens attend to the keys and values that earlier experts left for the same layer.
-Since language tokens never see action tokens, the language expert runs first, whole, and the action
-expert follows with its cache; training and sampling take the same path.
+An expert's tokens also attend to the cached keys and values that the preceding expert computed in
+the same layer. Language tokens never attend to action tokens, so the whole language expert runs
+first and the action expert then uses its cache, both in training and in sampling.
 """
 
 import functools
@@ -17,26 +17,26 @@ from lorasp_jax.adapters.layers.prepared import Layer, join, join_one
 from lorasp_jax.dense import Dense
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig
 from lorasp_jax.models.transformer.attention import attention
-from lorasp_jax.models.transformer.depth import scan_depth, stack, stored
+from lorasp_jax.models.transformer.depth import save_for_backward, scan_depth, stack
 from lorasp_jax.models.transformer.layers import (
     AdaptiveRMSNorm,
     LayerAux,
     Norm,
     RMSNorm,
+    apply_to_shared_input,
+    nest_aux,
     rope,
     rope_table,
-    together,
-    under,
 )
 
 KeysValues = tuple[jax.Array, jax.Array]
-"""Keys after the rotation and values, each `[B, S, K, H]`, or `[L, B, S, K, H]` for all layers."""
+"""Keys after RoPE, and values: each `[B, S, K, H]`, or `[L, B, S, K, H]` for all layers."""
 
 
 class ExpertBlock(nnx.Module):
     """One Gemma layer (arXiv 2403.08295): RMS norms, rotary grouped-query attention, GeGLU.
 
-    There are no biases. Subclasses have other norms and activations.
+    It has no biases. Subclasses override the norm and the activation.
     """
 
     make_norm = staticmethod(RMSNorm)
@@ -50,8 +50,8 @@ class ExpertBlock(nnx.Module):
         context: int | None = None,
         rngs: nnx.Rngs,
     ) -> None:
-        """Draws the weights; keys and values are read from width `context`, its own by default."""
-        kinds: dict[str, Any] = {
+        """Initialize the weights. `context` is the input width of k_proj and v_proj."""
+        options: dict[str, Any] = {
             "use_bias": False,
             "dtype": config.dtype,
             "param_dtype": config.param_dtype,
@@ -60,26 +60,26 @@ class ExpertBlock(nnx.Module):
         width, inner, context = size.width, size.heads * size.head_dim, context or size.width
         self.head_dim = size.head_dim
         self.input_layernorm: Norm = self.make_norm(width, param_dtype=config.param_dtype)
-        self.q_proj: Layer = Dense(width, inner, **kinds)
-        self.k_proj: Layer = Dense(context, size.kv_heads * size.head_dim, **kinds)
-        self.v_proj: Layer = Dense(context, size.kv_heads * size.head_dim, **kinds)
-        self.o_proj: Layer = Dense(inner, width, **kinds)
+        self.q_proj: Layer = Dense(width, inner, **options)
+        self.k_proj: Layer = Dense(context, size.kv_heads * size.head_dim, **options)
+        self.v_proj: Layer = Dense(context, size.kv_heads * size.head_dim, **options)
+        self.o_proj: Layer = Dense(inner, width, **options)
         self.post_attention_layernorm: Norm = self.make_norm(width, param_dtype=config.param_dtype)
-        self.gate_proj: Layer = Dense(width, size.mlp, **kinds)
-        self.up_proj: Layer = Dense(width, size.mlp, **kinds)
-        self.down_proj: Layer = Dense(size.mlp, width, **kinds)
+        self.gate_proj: Layer = Dense(width, size.mlp, **options)
+        self.up_proj: Layer = Dense(width, size.mlp, **options)
+        self.down_proj: Layer = Dense(size.mlp, width, **options)
 
     def join_layers(self, *, copy_kernels: bool = True) -> None:
         """See `prepared.JoinsLayers`."""
         qkv = self.q_proj, self.k_proj, self.v_proj
         self.q_proj, self.k_proj, self.v_proj = join(qkv, copy_kernels=copy_kernels)
-        self.join_rest(copy_kernels=copy_kernels)
+        self.join_output_and_mlp(copy_kernels=copy_kernels)
 
-    def join_rest(self, *, copy_kernels: bool) -> None:
-        """Joins what `finish` calls."""
+    def join_output_and_mlp(self, *, copy_kernels: bool) -> None:
+        """Join the layers that `output_and_mlp` calls."""
         self.o_proj = join_one(self.o_proj, copy_kernels=copy_kernels)
-        gated = self.gate_proj, self.up_proj
-        self.gate_proj, self.up_proj = join(gated, copy_kernels=copy_kernels)
+        gate_up = self.gate_proj, self.up_proj
+        self.gate_proj, self.up_proj = join(gate_up, copy_kernels=copy_kernels)
         self.down_proj = join_one(self.down_proj, copy_kernels=copy_kernels)
 
     def __call__(
@@ -91,33 +91,33 @@ class ExpertBlock(nnx.Module):
         token_mask: jax.Array,
         condition: jax.Array | None = None,
     ) -> tuple[jax.Array, tuple[KeysValues, LayerAux]]:
-        """One layer.
+        """Apply the layer.
 
         Args:
             x: `[B, T, D]`.
-            table: rotation of these tokens, from `rope_table`.
-            mask: `[B, T, S + T]` bool over the cache's keys and the own ones, in this order.
-            cache: keys and values of earlier tokens, or None (S = 0).
-            token_mask: `[B, T]` bool, what the adapters count.
-            condition: `[B, 1, D]` of adaptive norms, or None.
+            table: RoPE sine and cosine for these tokens, from `rope_table`.
+            mask: `[B, T, S + T]` bool over the cached keys, then this layer's keys.
+            cache: keys and values of preceding tokens, or None (S = 0).
+            token_mask: `[B, T]` bool, tokens that adapter aux includes.
+            condition: `[B, 1, D]` for adaptive norms, or None.
 
         Returns:
-            x, then the own keys and values and the adapters' reports.
+            x, then this layer's keys and values, and the adapters' aux.
         """
-        h, gate, norm_aux = self.input_layernorm.conditioned(x, condition)
+        h, gate, norm_aux = self.input_layernorm.normalize(x, condition)
         qkv = {"q_proj": self.q_proj, "k_proj": self.k_proj, "v_proj": self.v_proj}
-        read, aux = together(h, token_mask, **qkv)
-        q, k, v = (y.reshape(*x.shape[:2], -1, self.head_dim) for y in read)
+        projected, aux = apply_to_shared_input(h, token_mask, **qkv)
+        q, k, v = (y.reshape(*x.shape[:2], -1, self.head_dim) for y in projected)
         q, k = rope(q, table, scale=self.head_dim**-0.5), rope(k, table)
-        keys, values = k, v = stored(k), stored(v)
+        keys, values = k, v = save_for_backward(k), save_for_backward(v)
         if cache is not None:
             keys = jnp.concatenate([cache[0], k], axis=1)
             values = jnp.concatenate([cache[1], v], axis=1)
         attended = attention(q, keys, values, mask)
-        x, rest = self.finish(x, attended, token_mask, gate, condition)
-        return x, ((k, v), aux | under("input_layernorm", norm_aux) | rest)
+        x, mlp_aux = self.output_and_mlp(x, attended, token_mask, gate, condition)
+        return x, ((k, v), aux | nest_aux("input_layernorm", norm_aux) | mlp_aux)
 
-    def finish(
+    def output_and_mlp(
         self,
         x: jax.Array,
         attended: jax.Array,
@@ -125,23 +125,23 @@ class ExpertBlock(nnx.Module):
         gate: jax.Array | int = 1,
         condition: jax.Array | None = None,
     ) -> tuple[jax.Array, LayerAux]:
-        """x `[B, T, D]` after the attention's result `[B, T, N H]` and the gated MLP.
+        """Add the output projection of attention `[B, T, N H]` and the gated MLP to x `[B, T, D]`.
 
-        `gate` multiplies what the attention adds, see `AdaptiveRMSNorm`.
+        `gate` multiplies the attention branch, see `AdaptiveRMSNorm`.
         """
         y, o_aux = self.o_proj(attended, token_mask=token_mask, return_aux=True)
         x = x + gate * y
-        h, gate, norm_aux = self.post_attention_layernorm.conditioned(x, condition)
-        gated = {"gate_proj": self.gate_proj, "up_proj": self.up_proj}
-        (opened, up), aux = together(h, token_mask, **gated)
-        h = self.activation(opened) * up
+        h, gate, norm_aux = self.post_attention_layernorm.normalize(x, condition)
+        gate_up = {"gate_proj": self.gate_proj, "up_proj": self.up_proj}
+        (mlp_gate, up), aux = apply_to_shared_input(h, token_mask, **gate_up)
+        h = self.activation(mlp_gate) * up
         y, aux["down_proj"] = self.down_proj(h, token_mask=token_mask, return_aux=True)
-        aux |= {"o_proj": o_aux, **under("post_attention_layernorm", norm_aux)}
+        aux |= {"o_proj": o_aux, **nest_aux("post_attention_layernorm", norm_aux)}
         return x + gate * y, aux
 
 
 class Expert(nnx.Module):
-    """A stack of layers with its final norm."""
+    """A stack of layers and a final norm."""
 
     block = ExpertBlock
 
@@ -161,22 +161,22 @@ class Expert(nnx.Module):
         token_mask: jax.Array,
         condition: jax.Array | None = None,
     ) -> tuple[jax.Array, KeysValues, LayerAux]:
-        """All layers.
+        """Apply all layers and the final norm.
 
         Args:
             x: `[B, T, D]`.
             position: `[B, T]` int32.
-            mask: `[B, T, S + T]` bool.
-            cache: keys and values `[L, B, S, K, H]` of earlier tokens, or None (S = 0).
-            token_mask: `[B, T]` bool.
-            condition: `[B, 1, D]` of adaptive norms, or None.
+            mask: `[B, T, S + T]` bool over the cached keys, then this expert's keys.
+            cache: keys and values `[L, B, S, K, H]` of preceding tokens, or None (S = 0).
+            token_mask: `[B, T]` bool, tokens that adapter aux includes.
+            condition: `[B, 1, D]` for adaptive norms, or None.
 
         Returns:
-            `[B, T, D]` after the final norm, the own keys and values `[L, B, T, K, H]`, and the
-            adapters' reports, stacked over layers.
+            `[B, T, D]`, this expert's keys and values `[L, B, T, K, H]`, and the adapters' aux,
+            stacked over layers.
         """
         table = rope_table(position, self.head_dim)
-        x, (own, aux) = scan_depth(
+        x, (keys_values, aux) = scan_depth(
             self.blocks,
             lambda block, x, cache: block(x, table, mask, cache, token_mask, condition),
             x.astype(self.config.dtype),
@@ -184,12 +184,12 @@ class Expert(nnx.Module):
             remat=self.config.remat,
             unroll=self.config.unroll_layers,
         )
-        x, _, norm_aux = self.norm.conditioned(x, condition)
-        return x, own, aux | under("norm", norm_aux)
+        x, _, norm_aux = self.norm.normalize(x, condition)
+        return x, keys_values, aux | nest_aux("norm", norm_aux)
 
 
 class AdaptiveBlock(ExpertBlock):
-    """A layer whose norms follow a condition."""
+    """A layer with adaptive norms."""
 
     def __init__(self, size: ExpertConfig, config: BackboneConfig, *, rngs: nnx.Rngs) -> None:
         super().__init__(size, config, rngs=rngs)
@@ -198,7 +198,7 @@ class AdaptiveBlock(ExpertBlock):
 
 
 class AdaptiveExpert(Expert):
-    """An expert whose norms follow a condition, pi0.5's for actions."""
+    """An expert with adaptive norms, such as pi0.5's action expert."""
 
     block = AdaptiveBlock
 
@@ -208,13 +208,13 @@ class AdaptiveExpert(Expert):
 
 
 def adaptive_norm(size: ExpertConfig, config: BackboneConfig, rngs: nnx.Rngs) -> AdaptiveRMSNorm:
-    """A norm of an expert's tokens."""
-    kinds = {"dtype": config.dtype, "param_dtype": config.param_dtype, "rngs": rngs}
-    return AdaptiveRMSNorm(size.width, **kinds)
+    """Create an adaptive norm of an expert's width."""
+    options = {"dtype": config.dtype, "param_dtype": config.param_dtype, "rngs": rngs}
+    return AdaptiveRMSNorm(size.width, **options)
 
 
 class LanguageExpert(Expert):
-    """The expert that owns the token embedding."""
+    """An expert with a token embedding."""
 
     def __init__(self, size: ExpertConfig, config: BackboneConfig, *, rngs: nnx.Rngs) -> None:
         super().__init__(size, config, rngs=rngs)
@@ -223,6 +223,6 @@ class LanguageExpert(Expert):
         self.embedding = nnx.Param(draw * size.width**-0.5)
 
     def embed(self, tokens: jax.Array) -> jax.Array:
-        """`[B, T]` int32 -> `[B, T, D]`, scaled by sqrt(D)."""
+        """Embed tokens `[B, T]` int32 as `[B, T, D]`, scaled by sqrt(D)."""
         table = self.embedding.get_value()
         return (table[tokens] * math.sqrt(table.shape[-1])).astype(self.config.dtype)

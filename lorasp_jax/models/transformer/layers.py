@@ -1,4 +1,4 @@
-"""What the backbones share: norms, layers that read one input, rotary positions and masks."""
+"""Building blocks shared by the backbones: norms, shared-input layers, RoPE and masks."""
 
 import math
 from typing import Any, TypeAlias
@@ -13,21 +13,21 @@ from lorasp_jax.dense import Dense, dense_shared_input
 from lorasp_jax.peft import Aux
 
 LayerAux = dict[str, Aux]
-"""Adapters' reports by layer name."""
+"""Adapter aux by layer name."""
 ModelAux = dict[str, LayerAux]
-"""Adapters' reports by tower ("vision", "language", "action") and layer name."""
+"""Adapter aux by tower ("vision", "language", "action") and layer name."""
 
 
-def normalized(x: jax.Array, eps: float) -> jax.Array:
+def rms_normalize(x: jax.Array, eps: float) -> jax.Array:
     """x / sqrt(mean(x^2) + eps) over the last axis, in fp32."""
-    wide = x.astype(jnp.float32)
-    return wide * jax.lax.rsqrt(jnp.mean(jnp.square(wide), axis=-1, keepdims=True) + eps)
+    x = x.astype(jnp.float32)
+    return x * jax.lax.rsqrt(jnp.mean(jnp.square(x), axis=-1, keepdims=True) + eps)
 
 
 class RMSNorm(nnx.Module):
-    """x / sqrt(mean(x^2) + eps) * (offset + scale) in fp32, back in the type of x.
+    """x / sqrt(mean(x^2) + eps) * (offset + scale), computed in fp32, returned in the dtype of x.
 
-    Gemma stores its factor minus one (offset 1), other models the factor itself (offset 0).
+    Gemma stores the factor minus one (offset 1), other models store the factor itself (offset 0).
     """
 
     def __init__(
@@ -45,52 +45,52 @@ class RMSNorm(nnx.Module):
     def __call__(self, x: jax.Array) -> jax.Array:
         """x `[..., D]`."""
         factor = self.offset + self.scale.get_value().astype(jnp.float32)
-        return (normalized(x, self.eps) * factor).astype(x.dtype)
+        return (rms_normalize(x, self.eps) * factor).astype(x.dtype)
 
-    def conditioned(
+    def normalize(
         self, x: jax.Array, condition: jax.Array | None
     ) -> tuple[jax.Array, int, LayerAux]:
-        """What `AdaptiveRMSNorm.conditioned` returns, without a condition and with a gate of 1."""
+        """Same interface as `AdaptiveRMSNorm.normalize`; ignores the condition, gate 1, no aux."""
         del condition
         return self(x), 1, {}
 
 
 class AdaptiveRMSNorm(nnx.Module):
-    """RMSNorm with a factor, an offset and a gate from a condition, as pi0.5 has them ("adaRMS").
+    """RMSNorm with scale, shift and gate computed from a condition, pi0.5's "adaRMS".
 
         y = x / sqrt(mean(x^2) + eps) * (1 + scale) + shift
         scale, shift, gate = split(dense(condition))
 
-    The gate multiplies the residual branch that reads y. The dense layer starts at zero, and so
-    do the branches (openpi, models/gemma.py).
+    The gate multiplies the output of the residual branch that takes y as its input. The dense layer
+    is initialized to zero, so the branches initially contribute nothing (openpi, models/gemma.py).
     """
 
     def __init__(self, width: int, *, dtype: Any, param_dtype: Any, rngs: nnx.Rngs) -> None:
-        kinds = {"dtype": dtype, "param_dtype": param_dtype, "rngs": rngs}
-        self.dense: Layer = Dense(width, 3 * width, kernel_init=nnx.initializers.zeros, **kinds)
+        options = {"dtype": dtype, "param_dtype": param_dtype, "rngs": rngs}
+        self.dense: Layer = Dense(width, 3 * width, kernel_init=nnx.initializers.zeros, **options)
         self.eps = 1e-6
 
     def join_layers(self, *, copy_kernels: bool = True) -> None:
         """See `prepared.JoinsLayers`."""
         self.dense = join_one(self.dense, copy_kernels=copy_kernels)
 
-    def conditioned(
+    def normalize(
         self, x: jax.Array, condition: jax.Array | None
     ) -> tuple[jax.Array, jax.Array, LayerAux]:
-        """y, the gate and the adapter's report.
+        """Compute y and the gate.
 
         Args:
             x: `[B, T, D]`.
             condition: `[B, 1, D]`.
 
         Returns:
-            `[B, T, D]` and `[B, 1, D]` in the type of x, and the report of `dense`.
+            y `[B, T, D]` and gate `[B, 1, D]` in the dtype of x, and the aux of `dense`.
         """
-        assert condition is not None  # whoever has such norms makes one
-        every = jnp.ones(condition.shape[:2], bool)
-        modulation, aux = self.dense(condition, token_mask=every, return_aux=True)
+        assert condition is not None  # models with adaptive norms always pass one
+        valid = jnp.ones(condition.shape[:2], bool)
+        modulation, aux = self.dense(condition, token_mask=valid, return_aux=True)
         scale, shift, gate = jnp.split(modulation.astype(jnp.float32), 3, axis=-1)
-        y = normalized(x, self.eps) * (1 + scale) + shift
+        y = rms_normalize(x, self.eps) * (1 + scale) + shift
         return y.astype(x.dtype), gate.astype(x.dtype), {"dense": aux}
 
 
@@ -98,7 +98,7 @@ Norm: TypeAlias = RMSNorm | AdaptiveRMSNorm
 
 
 class LayerNorm(nnx.Module):
-    """(x - mean) / sqrt(variance + eps) * scale + bias in fp32, back in the type of x."""
+    """(x - mean) / sqrt(variance + eps) * scale + bias, computed in fp32, returned in x's dtype."""
 
     def __init__(self, width: int, *, eps: float = 1e-6, param_dtype: Any = jnp.float32) -> None:
         self.scale = nnx.Param(jnp.ones((width,), param_dtype))
@@ -107,68 +107,67 @@ class LayerNorm(nnx.Module):
 
     def __call__(self, x: jax.Array) -> jax.Array:
         """x `[..., D]`."""
-        wide = x.astype(jnp.float32)
-        wide = wide - jnp.mean(wide, axis=-1, keepdims=True)
-        wide = wide * jax.lax.rsqrt(jnp.mean(jnp.square(wide), axis=-1, keepdims=True) + self.eps)
+        h = x.astype(jnp.float32)
+        h = h - jnp.mean(h, axis=-1, keepdims=True)
+        h = h * jax.lax.rsqrt(jnp.mean(jnp.square(h), axis=-1, keepdims=True) + self.eps)
         scale, bias = self.scale.get_value(), self.bias.get_value()
-        return (wide * scale.astype(jnp.float32) + bias.astype(jnp.float32)).astype(x.dtype)
+        return (h * scale.astype(jnp.float32) + bias.astype(jnp.float32)).astype(x.dtype)
 
 
-def together(
+def apply_to_shared_input(
     x: jax.Array, token_mask: jax.Array | None, **layers: Layer
 ) -> tuple[list[jax.Array], LayerAux]:
-    """Layers that read the same x `[B, T, I]`, which adapters of `Dense` then read once.
+    """Apply layers to the same input; adapters of `Dense` layers share one matmul with x.
 
     Args:
         x: `[B, T, I]`.
-        token_mask: `[B, T]` bool, what the adapters count; None counts all.
-        layers: by name, in the order in which they were joined if they are joined.
+        token_mask: `[B, T]` bool, tokens that adapter aux includes; None includes all.
+        layers: by name. Prepared layers must be in the order in which they were joined.
 
     Returns:
-        y `[B, T, O]` of each layer, and the adapters' reports by name.
+        y `[B, T, O]` of each layer, and the adapters' aux by layer name.
     """
-    plain = [layer for layer in layers.values() if type(layer) is Dense]
-    inputs = [layer.cast_input(x) for layer in plain]
+    dense = [layer for layer in layers.values() if type(layer) is Dense]
+    inputs = [layer.cast_input(x) for layer in dense]
     fused = []
     if len({x.dtype for x in inputs}) == 1:
-        fused = dense_shared_input(
-            inputs[0], [one.arrays() for one in plain], token_mask=token_mask
-        )
-    of_plain, found = iter(fused), []
+        arrays = [layer.arrays() for layer in dense]
+        fused = dense_shared_input(inputs[0], arrays, token_mask=token_mask)
+    fused_results, results = iter(fused), []
     for layer in layers.values():
         if isinstance(layer, Prepared):
-            found += layer.results(x, token_mask)
+            results += layer.results(x, token_mask)
         elif fused and type(layer) is Dense:
-            found.append(next(of_plain))
+            results.append(next(fused_results))
         else:
-            found.append(layer(x, token_mask=token_mask, return_aux=True))
-    ys, reports = zip(*found, strict=True)
-    return list(ys), dict(zip(layers, reports, strict=True))
+            results.append(layer(x, token_mask=token_mask, return_aux=True))
+    ys, auxes = zip(*results, strict=True)
+    return list(ys), dict(zip(layers, auxes, strict=True))
 
 
-def under(name: str, aux: LayerAux) -> LayerAux:
-    """Reports of the layers of a module called `name`, by their path from its parent on."""
-    return {f"{name}/{layer}": report for layer, report in aux.items()}
+def nest_aux(module: str, aux: LayerAux) -> LayerAux:
+    """Prepend a module's name to the layer names."""
+    return {f"{module}/{layer}": layer_aux for layer, layer_aux in aux.items()}
 
 
-def with_action(aux: ModelAux, action: LayerAux) -> ModelAux:
-    """Reports with those of the action expert's steps next to what it did in the prefix."""
+def merge_action_aux(aux: ModelAux, action: LayerAux) -> ModelAux:
+    """Merge the aux of the flow steps into the "action" aux of the prefix."""
     return {**aux, "action": {**aux.get("action", {}), **action}}
 
 
 def positions(valid: jax.Array) -> jax.Array:
-    """`[B, T]` int32 positions that count valid tokens; padding repeats the last one."""
+    """Number the valid tokens from 0, `[B, T]` int32; padding repeats the previous number."""
     return jnp.cumsum(valid, axis=-1, dtype=jnp.int32) - 1
 
 
 def block_mask(
     query_block: np.ndarray, key_block: np.ndarray, query_valid: jax.Array, key_valid: jax.Array
 ) -> jax.Array:
-    """Who sees whom: keys of the same block and of earlier ones, valid tokens only.
+    """Attention mask: queries attend to valid keys of their own block and of earlier blocks.
 
     Args:
-        query_block: `[T]` int, number of the block each query token belongs to.
-        key_block: `[S]` int.
+        query_block: `[T]` int, block number of each query token.
+        key_block: `[S]` int, block number of each key token.
         query_valid: `[B, T]` bool.
         key_valid: `[B, S]` bool.
 
@@ -180,24 +179,36 @@ def block_mask(
 
 
 def rope_table(position: jax.Array, head_dim: int) -> tuple[jax.Array, jax.Array]:
-    """Sine and cosine, f32 `[B, T, 1, H/2]`, of position / 10000^(2i/H) (arXiv 2104.09864)."""
+    """Compute RoPE's sine and cosine of position / 10000^(2i/H) (arXiv 2104.09864).
+
+    Args:
+        position: `[B, T]` int32.
+        head_dim: H.
+
+    Returns:
+        `[B, T, 1, H/2]` f32, twice.
+    """
     wavelength = 10_000.0 ** (np.arange(0, head_dim, 2, dtype=np.float32) / head_dim)
     angle = position[:, :, None, None].astype(jnp.float32) / wavelength
     return jnp.sin(angle), jnp.cos(angle)
 
 
 def rope(x: jax.Array, table: tuple[jax.Array, jax.Array], scale: float = 1.0) -> jax.Array:
-    """Rotate the two halves of each head of x `[B, T, N, H]` in fp32, times `scale`."""
+    """Apply RoPE to x `[B, T, N, H]` in fp32 and multiply by `scale`.
+
+    Each head's first half is rotated against its second half.
+    """
     sin, cos = table
     first, second = jnp.split(x.astype(jnp.float32), 2, axis=-1)
-    turned = [first * cos - second * sin, second * cos + first * sin]
-    return (scale * jnp.concatenate(turned, axis=-1)).astype(x.dtype)
+    rotated = [first * cos - second * sin, second * cos + first * sin]
+    return (scale * jnp.concatenate(rotated, axis=-1)).astype(x.dtype)
 
 
 def time_embedding(flow_time: jax.Array, width: int) -> jax.Array:
-    """`[B, width]` f32: sines, then cosines, of `[B]` times at periods from 4e-3 to 4.
+    """Sinusoidal embedding `[B, width]` f32 of times `[B]`, with periods from 4e-3 to 4.
 
-    Periods: openpi, src/openpi/models/pi0.py, `create_sinusoidal_pos_embedding`.
+    Sines come first, then cosines; periods as in openpi, src/openpi/models/pi0.py,
+    `create_sinusoidal_pos_embedding`.
     """
     period = 4e-3 * (4.0 / 4e-3) ** np.linspace(0, 1, width // 2)
     angle = flow_time[:, None].astype(jnp.float32) * (2 * math.pi / period).astype(np.float32)

@@ -1,4 +1,4 @@
-"""SigLIP vision tower (Zhai et al., arXiv 2303.15343) with its projection to language tokens."""
+"""SigLIP vision tower (Zhai et al., arXiv 2303.15343) with a projection to language tokens."""
 
 import jax
 import jax.numpy as jnp
@@ -9,24 +9,24 @@ from lorasp_jax.dense import Dense
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.transformer.attention import attention
 from lorasp_jax.models.transformer.depth import scan_depth, stack
-from lorasp_jax.models.transformer.layers import LayerAux, LayerNorm, together
+from lorasp_jax.models.transformer.layers import LayerAux, LayerNorm, apply_to_shared_input
 
 
 class VisionBlock(nnx.Module):
-    """Pre-norm transformer layer: x + attention(norm(x)), x + mlp(norm(x)), tanh-GELU, biases."""
+    """Pre-norm transformer layer with biases: attention, then an MLP with tanh-GELU."""
 
     def __init__(self, config: BackboneConfig, *, rngs: nnx.Rngs) -> None:
         width, mlp = config.vision.width, config.vision.mlp
-        kinds = {"dtype": config.dtype, "param_dtype": config.param_dtype, "rngs": rngs}
+        options = {"dtype": config.dtype, "param_dtype": config.param_dtype, "rngs": rngs}
         self.heads = config.vision.heads
         self.layer_norm1 = LayerNorm(width, param_dtype=config.param_dtype)
-        self.q_proj: Layer = Dense(width, width, **kinds)
-        self.k_proj: Layer = Dense(width, width, **kinds)
-        self.v_proj: Layer = Dense(width, width, **kinds)
-        self.out_proj: Layer = Dense(width, width, **kinds)
+        self.q_proj: Layer = Dense(width, width, **options)
+        self.k_proj: Layer = Dense(width, width, **options)
+        self.v_proj: Layer = Dense(width, width, **options)
+        self.out_proj: Layer = Dense(width, width, **options)
         self.layer_norm2 = LayerNorm(width, param_dtype=config.param_dtype)
-        self.fc1: Layer = Dense(width, mlp, **kinds)
-        self.fc2: Layer = Dense(mlp, width, **kinds)
+        self.fc1: Layer = Dense(width, mlp, **options)
+        self.fc2: Layer = Dense(mlp, width, **options)
 
     def join_layers(self, *, copy_kernels: bool = True) -> None:
         """See `prepared.JoinsLayers`."""
@@ -37,10 +37,10 @@ class VisionBlock(nnx.Module):
         self.fc2 = join_one(self.fc2, copy_kernels=copy_kernels)
 
     def __call__(self, x: jax.Array, token_mask: jax.Array) -> tuple[jax.Array, LayerAux]:
-        """x `[B, T, D]` -> x `[B, T, D]` and the adapters' reports."""
+        """Apply the layer to x `[B, T, D]`; also return the adapters' aux."""
         qkv = {"q_proj": self.q_proj, "k_proj": self.k_proj, "v_proj": self.v_proj}
-        read, aux = together(self.layer_norm1(x), token_mask, **qkv)
-        q, k, v = (y.reshape(*x.shape[:2], self.heads, -1) for y in read)
+        projected, aux = apply_to_shared_input(self.layer_norm1(x), token_mask, **qkv)
+        q, k, v = (y.reshape(*x.shape[:2], self.heads, -1) for y in projected)
         h = attention(q * q.shape[-1] ** -0.5, k, v, None)
         y, aux["out_proj"] = self.out_proj(h, token_mask=token_mask, return_aux=True)
         x = x + y
@@ -51,16 +51,16 @@ class VisionBlock(nnx.Module):
 
 
 class SigLIP(nnx.Module):
-    """Pictures to language tokens.
+    """Encodes images as language tokens.
 
-    The patch embedding, a dense layer over flattened patches, equals the usual strided convolution.
-    The head reads `config.vision.shuffle` by as many neighbouring tokens as one (pixel shuffle).
+    The patch embedding is a dense layer over flattened patches, equal to the usual strided
+    convolution. The head merges squares of `config.vision.shuffle`^2 tokens (pixel shuffle).
     """
 
     def __init__(self, config: BackboneConfig, *, head_bias: bool = True, rngs: nnx.Rngs) -> None:
-        vision, kinds = config.vision, {"param_dtype": config.param_dtype, "rngs": rngs}
+        vision, options = config.vision, {"param_dtype": config.param_dtype, "rngs": rngs}
         self.config = config
-        self.patch_embed = Dense(3 * vision.patch**2, vision.width, dtype=jnp.float32, **kinds)
+        self.patch_embed = Dense(3 * vision.patch**2, vision.width, dtype=jnp.float32, **options)
         shape = (config.patches, vision.width)
         draw = jax.random.normal(rngs.params(), shape, config.param_dtype)
         self.position_embedding = nnx.Param(draw * vision.width**-0.5)
@@ -71,25 +71,25 @@ class SigLIP(nnx.Module):
             config.language.width,
             use_bias=head_bias,
             dtype=config.dtype,
-            **kinds,
+            **options,
         )
 
     def __call__(self, images: jax.Array, present: jax.Array) -> tuple[jax.Array, LayerAux]:
-        """Encode pictures.
+        """Encode images.
 
         Args:
             images: `[B, H, W, 3]` f32 in [-1, 1].
             present: `[B]` bool, False for a missing camera's placeholder.
 
         Returns:
-            `[B, T, D]` tokens of the language width, and the adapters' reports.
+            `[B, T, D]` tokens of the language model's width, and the adapters' aux.
         """
         mask = jnp.broadcast_to(present[:, None], (images.shape[0], self.config.patches))
-        own: LayerAux = {}
+        aux: LayerAux = {}
         x = patches(images, self.config.vision.patch)
-        x, own["patch_embed"] = self.patch_embed(x, token_mask=mask, return_aux=True)
+        x, aux["patch_embed"] = self.patch_embed(x, token_mask=mask, return_aux=True)
         x = x + self.position_embedding.get_value().astype(x.dtype)
-        x, aux = scan_depth(
+        x, block_aux = scan_depth(
             self.blocks,
             lambda block, x, _: block(x, mask),
             x.astype(self.config.dtype),
@@ -100,12 +100,15 @@ class SigLIP(nnx.Module):
         norm = self.norm if self.config.remat == "none" else jax.checkpoint(self.norm)
         grid = norm(x).reshape(x.shape[0], side, side, -1)
         x, mask = patches(grid, self.config.vision.shuffle), mask[:, : self.config.image_tokens]
-        x, own["head"] = self.head(x, token_mask=mask, return_aux=True)
-        return x, aux | own
+        x, aux["head"] = self.head(x, token_mask=mask, return_aux=True)
+        return x, block_aux | aux
 
 
 def patches(images: jax.Array, size: int) -> jax.Array:
-    """`[B, H, W, C]` -> `[B, T, C size^2]`: patches row by row, each flattened as (y, x, c)."""
+    """Split images `[B, H, W, C]` into patches `[B, T, C size^2]`.
+
+    Patches are in row-major order, each flattened as (y, x, c).
+    """
     batch, height, width, channels = images.shape
     grid = images.reshape(batch, height // size, size, width // size, size, channels)
     return grid.swapaxes(2, 3).reshape(batch, -1, size * size * channels)

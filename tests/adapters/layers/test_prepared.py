@@ -13,7 +13,7 @@ from lorasp_jax.adapters.layers import prepared
 from lorasp_jax.dense import Dense
 from lorasp_jax.models import pi0, smolvla
 from lorasp_jax.models.sampling import Sampler
-from lorasp_jax.models.transformer.layers import together
+from lorasp_jax.models.transformer.layers import apply_to_shared_input
 from tests.cases import mostly_slow
 from tests.models.drawn import drawn, observation
 from tests.nets import METHODS, trained
@@ -37,7 +37,9 @@ class Readers(nnx.Module):
         self.third = prepared.join_one(self.third, copy_kernels=copy_kernels)
 
     def __call__(self, x, token_mask=None):
-        (first, second), aux = together(x, token_mask, first=self.first, second=self.second)
+        (first, second), aux = apply_to_shared_input(
+            x, token_mask, first=self.first, second=self.second
+        )
         y, aux["third"] = self.third(first, token_mask=token_mask, return_aux=True)
         return y + second[..., :8], aux
 

@@ -109,7 +109,7 @@ def test_relative_actions(names, kept, relative):
             "VISUAL must be 'IDENTITY' in normalization_mapping",
         ),
         ({"type": "pi05", "use_visual_memory": True}, "use_visual_memory must be False, got True"),
-        ({"num_expert_layers": 8}, "must be that of the language model, 16"),
+        ({"num_expert_layers": 8}, "num_expert_layers must equal num_vlm_layers = 16, got 8"),
         ({"input_features": [1]}, "not a LeRobot policy config"),
     ],
 )

@@ -8,7 +8,7 @@ from flax import nnx
 
 from lorasp_jax.adapters import adaptation
 from lorasp_jax.dense import AdapterParam, Dense
-from lorasp_jax.models.transformer.depth import scan_depth, stack, stored
+from lorasp_jax.models.transformer.depth import save_for_backward, scan_depth, stack
 from lorasp_jax.peft import LoRA
 from tests.nets import METHODS, trained
 from tests.peft.lora_sp.test_method import OnGPU
@@ -105,7 +105,7 @@ def test_what_has_a_name_is_stored_in_place_of_its_products():
         pull_back = jax.eval_shape(lambda x: jax.vjp(run, x)[1], jnp.ones((1, TOKENS, WIDTH)))
         return sum(leaf.shape[-2:] == (TOKENS, INNER) for leaf in jax.tree.leaves(pull_back))
 
-    assert (inner(lambda x: x), inner(stored)) == (2, 1)
+    assert (inner(lambda x: x), inner(save_for_backward)) == (2, 1)
 
 
 @pytest.mark.parametrize("unroll", [False, True])
