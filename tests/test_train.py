@@ -48,7 +48,7 @@ def files():
         ([*MULTITASK, *NANO, "--model.backbone", "smolvla"], "does not match the config"),
         ([*MULTITASK, "--model.checkpoint", "nowhere"], "nowhere"),
         ([*MULTITASK, *NANO, "--targets", "[a-z]+_prj"], "rule '[a-z]+_prj' applies to nothing"),
-        ([*MULTITASK, *NANO, "--targets", "expert-onyl"], "there is no preset 'expert-onyl'"),
+        ([*MULTITASK, *NANO, "--targets", "expert-onyl"], "unknown preset 'expert-onyl'"),
         ([*MULTITASK, *NANO, "--control-dt", "0.2"], "with control_dt 0.1 s, this run has 0.2"),
         ([*MULTITASK, *NANO, "--evaluation.execute-steps", "11"], "must be 1 to the chunk, 10"),
         ([*MULTITASK, *NANO, "--evaluation.episodes", "24"], "must be a multiple of num_envs"),

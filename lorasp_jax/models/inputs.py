@@ -1,4 +1,4 @@
-"""What a backbone's weights were trained to see: pictures, numbers, slots."""
+"""Input preprocessing that a backbone's weights were trained with: images, normalization, slots."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -10,42 +10,42 @@ Convention = Literal["ours", "openpi", "lerobot"]
 
 @dataclass(frozen=True)
 class InputConfig:
-    """How raw observations and actions become a backbone's; a field of its config."""
+    """Preprocessing of raw observations and actions; a field of the backbone config."""
 
     centred: bool = True
-    """A picture of another aspect has black bars on both sides; False: one, left or above."""
+    """Pad images of another aspect ratio on both sides; False pads only the left or the top."""
     antialias: bool = True
-    """Pictures are smoothed before they are shrunk."""
+    """Antialias when downscaling images."""
     state: Mode = "mean_std"
-    """How states are normalised, see `normalization`."""
+    """Normalization of states, see `policies.normalization`."""
     action: Mode = "mean_std"
-    """How actions are."""
+    """Normalization of actions."""
     delta: tuple[bool, ...] = ()
-    """Which actions are relative to the state that a chunk starts from, see `processing.to_delta`;
-    the robot's statistics are then those of such actions."""
+    """Mask of action dimensions relative to the state at the start of the chunk, see
+    `policies.processor.to_delta`. The action statistics are then those of relative actions."""
     convention: Convention = "ours"
-    """Whose way to avoid a division by zero."""
+    """Project whose guard against division by zero normalization uses."""
     gripper_slot: int | None = 7
-    """Slot of the gripper in state and action vectors; None: the next one after the joints'."""
+    """Slot of the gripper in state and action vectors; None is the first slot after the joints."""
     quiet_slots: bool = True
-    """Slots that a robot does not use stay zero in the flow; False: they carry noise and count in
-    the loss, with zero as their value, as other slots do."""
+    """Keep slots that the robot does not use at zero in the flow. False treats them like the
+    others: noise in the flow, zero as data, included in the loss."""
     prompt_state: bool = False
-    """The prompt tells the robot's normalised numbers, see `prompts.pi05`."""
+    """Put the normalized state into the prompt, see `policies.prompts.pi05`."""
     masks_missing: bool = True
-    """A missing camera's picture is black and masked; False: it has no place at all."""
+    """Replace a missing camera's image with a black, masked one; False omits the camera."""
 
 
 OURS = InputConfig()
-"""This project's own weights."""
+"""Weights trained by this project."""
 OPENPI = InputConfig(convention="openpi", gripper_slot=None, quiet_slots=False)
 """pi0 in openpi (shared/image_tools.py, transforms.py at 15a9616a)."""
 _PI05 = {"state": "quantiles", "action": "quantiles", "prompt_state": True}
 OURS_PI05, OPENPI_PI05 = (dataclasses.replace(inputs, **_PI05) for inputs in (OURS, OPENPI))
 """pi0.5, ours and in openpi (training/config.py, use_quantile_norm, ModelTransformFactory)."""
-LEROBOT_CENTRED = dataclasses.replace(OPENPI, antialias=False, convention="lerobot")
+LEROBOT_PI0 = dataclasses.replace(OPENPI, antialias=False, convention="lerobot")
 """pi0 in LeRobot 0.6 (policies/common/vla_utils.py, processor/normalize_processor.py)."""
-LEROBOT_PI05 = dataclasses.replace(LEROBOT_CENTRED, **_PI05)
+LEROBOT_PI05 = dataclasses.replace(LEROBOT_PI0, **_PI05)
 """pi0.5 in LeRobot 0.6 (policies/pi05/processor_pi05.py, configuration_pi05.py)."""
-LEROBOT = dataclasses.replace(LEROBOT_CENTRED, centred=False, masks_missing=False)
+LEROBOT_SMOLVLA = dataclasses.replace(LEROBOT_PI0, centred=False, masks_missing=False)
 """SmolVLA in LeRobot 0.6 (policies/smolvla/modeling_smolvla.py)."""

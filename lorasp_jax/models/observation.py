@@ -1,4 +1,4 @@
-"""What a vision-language-action model sees, already normalised and tokenised."""
+"""Observations as backbone inputs, normalized and tokenized."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -18,7 +18,7 @@ class Observation:
         image_masks: camera name -> `[B]` bool, False where the camera is missing.
         tokens: `[B, T]` int32 ids of the instruction, padded.
         token_mask: `[B, T]` bool, False at padding.
-        state: `[B, A]` f32, normalised robot state in the policy's slots.
+        state: `[B, A]` f32, normalized robot state, arranged in the backbone's slots.
     """
 
     images: dict[str, jax.Array]
@@ -29,16 +29,16 @@ class Observation:
 
 
 def abstract_observation(config: BackboneConfig, batch: int) -> Observation:
-    """Shapes of what a backbone sees, without arrays."""
+    """An observation of a backbone's input shapes, with ShapeDtypeStructs instead of arrays."""
 
-    def shape(dtype: str, *sides: int) -> Any:
-        return jax.ShapeDtypeStruct((batch, *sides), dtype)
+    def abstract(dtype: str, *shape: int) -> Any:
+        return jax.ShapeDtypeStruct((batch, *shape), dtype)
 
     size = config.image_size
     return Observation(
-        images={name: shape("float32", size, size, 3) for name in config.cameras},
-        image_masks={name: shape("bool") for name in config.cameras},
-        tokens=shape("int32", config.max_tokens),
-        token_mask=shape("bool", config.max_tokens),
-        state=shape("float32", config.action_dim),
+        images={name: abstract("float32", size, size, 3) for name in config.cameras},
+        image_masks={name: abstract("bool") for name in config.cameras},
+        tokens=abstract("int32", config.max_tokens),
+        token_mask=abstract("bool", config.max_tokens),
+        state=abstract("float32", config.action_dim),
     )

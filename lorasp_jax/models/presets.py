@@ -1,10 +1,10 @@
-"""Named choices of layers, for every backbone here: what a method is attached to.
+"""Presets: named sets of layers to adapt, for every backbone.
 
     model = adapt(model, presets.rules("expert-only", LoRASP(rank=64)), rngs=rngs)
     model = adapt(model, presets.rules(["vision", "language/.*q_proj"], LoRA()), rngs=rngs)
 
-A preset is some regular expressions over layer paths, as `lorasp_jax.adapt` takes them, so it also
-says what `FullFineTuning` frees, norms and embeddings included. What no rule names stays frozen.
+A preset is a list of regular expressions over layer paths, as in `lorasp_jax.adapt`. With
+`FullFineTuning` they also match norms and embeddings. Anything that no rule matches stays frozen.
 """
 
 import difflib
@@ -14,59 +14,58 @@ from collections.abc import Sequence
 from lorasp_jax.adapters.paths import Rules
 from lorasp_jax.peft import Method
 
-_AROUND = r"^(state_proj|action_in_proj|action_out_proj|(action_)?time_mlp_(in|out))"
-"""The linear maps around the towers."""
+_PROJECTIONS = r"^(state_proj|action_in_proj|action_out_proj|(action_)?time_mlp_(in|out))"
+"""Projections outside the towers."""
 
 PRESETS: dict[str, tuple[str, ...]] = {
-    # Every linear layer of Table I of arXiv 2603.07404 that computes something: its code adapts
-    # each `nn.Linear`, and there the patch embedding is a convolution.
+    # The linear layers of Table I of arXiv 2603.07404 that affect the actions: its code adapts
+    # every `nn.Linear`, and its patch embedding is a convolution.
     "paper": ("^(?!vision/patch_embed)",),
-    # The patch embedding too, which is a linear map of a patch.
+    # Includes the patch embedding, a linear layer here.
     "all-linear": (".*",),
-    # What openpi's variants "gemma_2b_lora" and "gemma_300m_lora" adapt (its models/gemma.py).
+    # The layers that openpi's "gemma_2b_lora" and "gemma_300m_lora" adapt (its models/gemma.py).
     "openpi": (r"^(language|action)/blocks/(.*/)?[a-z]+_proj$",),
-    # What LeRobot trains under `train_expert_only`.
-    "expert-only": ("^action/", _AROUND),
+    # The layers that LeRobot trains with `train_expert_only`.
+    "expert-only": ("^action/", _PROJECTIONS),
     "vision": ("^vision/",),
     "language": ("^language/",),
     "action": ("^action/",),
 }
-"""Regular expressions over layer paths by the preset's name."""
+"""Preset name -> regular expressions over layer paths."""
 
-_NAME = re.compile(r"[a-z]+(-[a-z]+)+")  # in no path there is a hyphen
+_PRESET_NAME = re.compile(r"[a-z]+(-[a-z]+)+")  # layer paths contain no hyphens
 _WORD = re.compile(r"[A-Za-z_ -]+")
 
 
 def patterns(targets: str | Sequence[str]) -> list[str]:
-    """The regular expressions that targets stand for.
+    """Expand preset names in a list of targets to regular expressions.
 
     Args:
-        targets: names of presets and regular expressions over layer paths, in any mixture.
+        targets: preset names and regular expressions over layer paths, in any combination.
 
     Raises:
-        ValueError: a hyphenated word that names no preset, or a word that is nearly the name of one
-            and no part of it.
+        ValueError: a misspelled or unknown preset name.
     """
     targets = [targets] if isinstance(targets, str) else targets
     for target in targets:
-        close = _meant(target)
-        if target not in PRESETS and (close or _NAME.fullmatch(target)):
-            hint = f" (did you mean {close!r}?)" if close else ""
+        suggestion = _suggestion(target)
+        if target not in PRESETS and (suggestion or _PRESET_NAME.fullmatch(target)):
+            hint = f" (did you mean {suggestion!r}?)" if suggestion else ""
             raise ValueError(
-                f"there is no preset {target!r}{hint}: it is one of {', '.join(PRESETS)}."
+                f"unknown preset {target!r}{hint}: choose one of {', '.join(PRESETS)}."
             )
     return [pattern for target in targets for pattern in PRESETS.get(target, (target,))]
 
 
-def _meant(target: str) -> str | None:
-    """The preset whose name is misspelt here; a part of a name is a good regular expression."""
-    parts = (part for name, patterns in PRESETS.items() for part in (name, *patterns))
-    if not _WORD.fullmatch(target) or any(target in part for part in parts):
+def _suggestion(target: str) -> str | None:
+    """Find the preset that a target misspells; substrings of presets are valid patterns."""
+    texts = (text for name, patterns in PRESETS.items() for text in (name, *patterns))
+    if not _WORD.fullmatch(target) or any(target in text for text in texts):
         return None
-    known = difflib.get_close_matches(target.lower(), PRESETS, n=1, cutoff=0.8)
-    return known[0] if known else None
+    matches = difflib.get_close_matches(target.lower(), PRESETS, n=1, cutoff=0.8)
+    return matches[0] if matches else None
 
 
 def rules(targets: str | Sequence[str], method: Method | None) -> Rules:
-    """The rules for `adapt` that attach one method to targets; see `patterns`."""
+    """Build rules for `adapt` that attach one method to all targets; see `patterns`."""
     return [(pattern, method) for pattern in patterns(targets)]

@@ -107,7 +107,7 @@ def test_what_is_frozen_is_said():
     [("expert-onyl", "expert-only"), ("expert_only", "expert-only"), ("Vision", "vision")],
 )
 def test_a_wrong_name(wrong, meant):
-    message = f"no preset {wrong!r} (did you mean {meant!r}?): it is one of paper, all-linear"
+    message = f"unknown preset {wrong!r} (did you mean {meant!r}?): choose one of paper, all-linear"
     with pytest.raises(ValueError, match=re.escape(message)):
         presets.rules(["q_proj", wrong], LoRA())
 

@@ -94,7 +94,7 @@ def test_policies_of_lerobot_are_fed_as_they_say(config, tmp_path, monkeypatch):
     monkeypatch.setattr(models, "weights_hash", lambda _: "")
     model = ModelConfig(size="base", checkpoint=str(tmp_path))
     wanted = dataclasses.replace(
-        inputs.LEROBOT_CENTRED, state="quantile10", action="min_max", delta=(True, True, False)
+        inputs.LEROBOT_PI0, state="quantile10", action="min_max", delta=(True, True, False)
     )
     found, _ = BASE_MODEL(dataclasses.replace(config, model=model))
     assert found.config.inputs == wanted

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from lorasp_jax.models.checkpoints.lerobot_config import require
-from lorasp_jax.models.inputs import LEROBOT_CENTRED, LEROBOT_PI05
+from lorasp_jax.models.inputs import LEROBOT_PI0, LEROBOT_PI05
 from lorasp_jax.models.pi0.pi0 import Pi0Config
 
 
@@ -17,7 +17,7 @@ def pi0_config(fields: Mapping[str, Any]) -> Pi0Config:
         config,
         language=sizes[fields.get("paligemma_variant", "gemma_2b")],
         action=sizes[fields.get("action_expert_variant", "gemma_300m")],
-        inputs=LEROBOT_CENTRED,
+        inputs=LEROBOT_PI0,
     )
 
 

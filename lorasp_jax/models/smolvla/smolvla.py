@@ -18,7 +18,7 @@ from flax import nnx
 
 from lorasp_jax.models.backbone import Backbone, suffix_mask_and_positions
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig, VisionConfig
-from lorasp_jax.models.inputs import LEROBOT
+from lorasp_jax.models.inputs import LEROBOT_SMOLVLA
 from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.smolvla.experts import ActionExpert, SmolLM2
 from lorasp_jax.models.transformer.experts import KeysValues
@@ -70,7 +70,7 @@ class SmolVLAConfig(BackboneConfig):
             max_tokens=48,
             chunk=50,
             action_dim=32,
-            inputs=LEROBOT,
+            inputs=LEROBOT_SMOLVLA,
             dtype="bfloat16",
         )
 

@@ -4,7 +4,7 @@ import json
 import pytest
 
 from lorasp_jax.models.checkpoints.lerobot_config import parse
-from lorasp_jax.models.inputs import LEROBOT, LEROBOT_CENTRED, LEROBOT_PI05
+from lorasp_jax.models.inputs import LEROBOT_SMOLVLA, LEROBOT_PI0, LEROBOT_PI05
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.smolvla import SmolVLAConfig
 
@@ -35,7 +35,7 @@ SMOLVLA = {
 def test_published_fields_are_the_published_sizes():
     assert parse(SMOLVLA) == SmolVLAConfig.base()
     assert parse({"type": "smolvla"}) == SmolVLAConfig.base()
-    expected = dataclasses.replace(Pi0Config.base(), inputs=LEROBOT_CENTRED)
+    expected = dataclasses.replace(Pi0Config.base(), inputs=LEROBOT_PI0)
     assert parse({"type": "pi0", "image_resolution": [224, 224]}) == expected
     expected = dataclasses.replace(Pi0Config.base_pi05(), inputs=LEROBOT_PI05)
     assert parse({"type": "pi05", "tokenizer_max_length": 200}) == expected
@@ -67,7 +67,9 @@ def test_what_differs_is_read():
     # Two thirds of 4 * 480, in whole 256s: 1280.
     assert (found.language.width, found.action.width, found.action.mlp) == (960, 480, 1280)
     assert found.cameras == ("top", "image", "empty_camera_0")
-    assert found.inputs == dataclasses.replace(LEROBOT, state="quantile10", action="min_max")
+    assert found.inputs == dataclasses.replace(
+        LEROBOT_SMOLVLA, state="quantile10", action="min_max"
+    )
     large = parse({"type": "pi0", "action_expert_variant": "gemma_2b"})
     assert large.action == large.language
 
