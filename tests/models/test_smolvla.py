@@ -100,7 +100,7 @@ def test_config_says_what_is_wrong():
 def test_own_checkpoint_round_trip(model, tmp_path):
     models.save(tmp_path, model)
     loaded = models.load(tmp_path)
-    assert loaded.config == dataclasses.replace(CONFIG, unroll=None)  # not of the model
+    assert loaded.config == dataclasses.replace(CONFIG, unroll=None)  # unroll is not saved
     jax.tree.map(
         lambda a, b: np.testing.assert_array_equal(a, np.asarray(b, jnp.bfloat16)),
         parameters(loaded),
@@ -109,15 +109,15 @@ def test_own_checkpoint_round_trip(model, tmp_path):
 
 
 def test_pixel_shuffle():
-    """Token (i, j) of the head holds its square of tokens row by row, their channels last."""
+    """Merged token (i, j) holds its square of tokens in row-major order, channels last."""
     grid = np.arange(8 * 8 * 3).reshape(1, 8, 8, 3)
-    found = patches(jnp.asarray(grid), 4)
+    merged = patches(jnp.asarray(grid), 4)
     square = [grid[0, 4 + dy, dx, c] for dy in range(4) for dx in range(4) for c in range(3)]
-    assert found.shape == (1, 4, 48)
-    np.testing.assert_array_equal(found[0, 2], square)
+    assert merged.shape == (1, 4, 48)
+    np.testing.assert_array_equal(merged[0, 2], square)
 
 
-def test_actions_see_earlier_ones_only(model):
+def test_actions_attend_only_to_earlier_actions(model):
     images = {name: normal(i, BATCH, 32, 32, 3) for i, name in enumerate(CONFIG.cameras)}
     obs = Observation(
         images=images,
@@ -134,7 +134,7 @@ def test_actions_see_earlier_ones_only(model):
 
 
 def test_cross_attention(model):
-    """Against attention written out: no key is rotated again, a token sees valid keys alone."""
+    """Compare with a NumPy implementation: no second RoPE on keys, only valid keys attended."""
     graphdef, stacked = nnx.split(model.action.blocks.cross_layer)
     block = nnx.merge(graphdef, jax.tree.map(lambda a: a[1], stacked))
     size, tokens, keys = CONFIG.action, 3, 5
@@ -142,8 +142,8 @@ def test_cross_attention(model):
     valid = jnp.array([[True, True, False, True, True]])
     x, table = normal(6, 1, tokens, size.width), rope_table(jnp.arange(tokens)[None], 16)
     mask = jnp.broadcast_to(valid[:, None], (1, tokens, keys))
-    own, _ = block.read(cache, valid)
-    found, aux = block.attend(x, table, mask, own, jnp.ones((1, tokens), bool))
+    keys_values, _ = block.project_cache(cache, valid)
+    result, aux = block.attend(x, table, mask, keys_values, jnp.ones((1, tokens), bool))
     assert aux.keys() == {"q_proj", "o_proj", "gate_proj", "up_proj", "down_proj"}
 
     kernel = {name: np.asarray(getattr(block, name).kernel[...], np.float64) for name in LINEARS}
@@ -155,15 +155,15 @@ def test_cross_attention(model):
     q = rope(jnp.asarray((h @ kernel["q_proj"]).reshape(1, tokens, -1, 16)), table)[0]
     attended = np.zeros((tokens, size.heads, 16))
     for head in range(size.heads):
-        served = head // (size.heads // size.kv_heads)
-        logits = np.asarray(q, np.float64)[:, head] @ k[:, served].T / 4
+        kv_head = head // (size.heads // size.kv_heads)
+        logits = np.asarray(q, np.float64)[:, head] @ k[:, kv_head].T / 4
         weight = np.exp(logits - logits.max(1, keepdims=True)) * np.asarray(valid)
-        attended[:, head] = (weight / weight.sum(1, keepdims=True)) @ v[:, served]
+        attended[:, head] = (weight / weight.sum(1, keepdims=True)) @ v[:, kv_head]
     y = np.asarray(x, np.float64)[0] + attended.reshape(tokens, -1) @ kernel["o_proj"]
     h = norm(y, block.post_attention_layernorm)
     gate = h @ kernel["gate_proj"]
     y += (gate / (1 + np.exp(-gate)) * (h @ kernel["up_proj"])) @ kernel["down_proj"]
-    np.testing.assert_allclose(found[0], y, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(result[0], y, rtol=1e-5, atol=1e-5)
 
 
 def norm(x: np.ndarray, layer: nnx.Module) -> np.ndarray:

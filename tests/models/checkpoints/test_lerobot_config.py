@@ -4,7 +4,7 @@ import json
 import pytest
 
 from lorasp_jax.models.checkpoints.lerobot_config import parse
-from lorasp_jax.models.inputs import LEROBOT_SMOLVLA, LEROBOT_PI0, LEROBOT_PI05
+from lorasp_jax.models.inputs import LEROBOT_PI0, LEROBOT_PI05, LEROBOT_SMOLVLA
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.smolvla import SmolVLAConfig
 
