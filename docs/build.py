@@ -1,6 +1,6 @@
-"""What mkdocs adds to docs/: README as the first page, pictures from outside, pages of the API.
+"""MkDocs hooks: add the README as the home page, files outside docs/, and the API reference.
 
-The Markdown stays right on GitHub; links that leave docs/ are turned here.
+The Markdown links work on GitHub; these hooks rewrite those that leave docs/.
 """
 
 import ast
@@ -32,7 +32,7 @@ API = {
         "envs.compilation.cache",
     ],
 }
-"""Public modules by page."""
+"""API pages and the public modules on each."""
 OUTSIDE = (
     "assets/**/*.gif",
     "assets/*.png",
@@ -41,9 +41,9 @@ OUTSIDE = (
     "LICENSE",
     "CITATION.cff",
 )
-"""What pages link to beside docs/; the site has copies."""
-REFERENCE, LISTING = "lorasp_jax/peft/lora_sp/reference.py", "methods/reference.md"
-"""A source file that pages link to, and its page."""
+"""Files outside docs/ that pages link to; the site gets copies."""
+REFERENCE, REFERENCE_PAGE = "lorasp_jax/peft/lora_sp/reference.py", "methods/reference.md"
+"""Source file that pages link to, and the page that shows it."""
 LINK = re.compile(r"(\]\(|src=\"|srcset=\")(?![a-z]+:|#)([^)\"#]+)")
 PICTURE = re.compile(
     r"<picture>.*?srcset=\"(?P<dark>[^\"]+)\".*?"
@@ -52,8 +52,8 @@ PICTURE = re.compile(
 )
 
 
-def names(module: str) -> list[str]:
-    """The public names of a module: its `__all__`, or what it defines without an underscore."""
+def public_names(module: str) -> list[str]:
+    """Return `__all__` of a module, or its classes and functions without a leading underscore."""
     path = ROOT / module.replace(".", "/")
     file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
     body = ast.parse(file.read_text()).body
@@ -61,42 +61,42 @@ def names(module: str) -> list[str]:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
             return sorted(ast.literal_eval(node.value), key=str.lower)
     kinds = (ast.FunctionDef, ast.ClassDef)
-    found = [node.name for node in body if isinstance(node, kinds)]
-    return [name for name in found if not name.startswith("_")]
+    defined = [node.name for node in body if isinstance(node, kinds)]
+    return [name for name in defined if not name.startswith("_")]
 
 
 def is_module(parent: str, name: str) -> bool:
-    """Whether a public name is a module, as `lorasp_jax.peft` is."""
+    """Return whether a public name is a module, like `lorasp_jax.peft`."""
     folder = ROOT / parent.replace(".", "/")
     file = folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")
     for node in ast.parse(file.read_text()).body:
         for imported in ast.walk(node):
             if isinstance(imported, ast.ImportFrom) and name in {a.name for a in imported.names}:
-                home = ROOT / (imported.module or "").replace(".", "/") / name
-                return home.is_dir() or home.with_suffix(".py").is_file()
+                path = ROOT / (imported.module or "").replace(".", "/") / name
+                return path.is_dir() or path.with_suffix(".py").is_file()
     return False
 
 
 def api_page(title: str, modules: list[str]) -> str:
-    """Markdown from which mkdocstrings makes a page: every public name with its docstring."""
+    """Return the Markdown of an API page: a mkdocstrings directive for every public name."""
     parts = [f"# {title}"]
     for module in modules:
         parts += [f"# `{module}`"] * (len(modules) > 1)
-        for name in names(module):
-            alone = "\n    options:\n      members: false" * is_module(module, name)
-            parts.append(f"::: {module}.{name}{alone}")
+        for name in public_names(module):
+            options = "\n    options:\n      members: false" * is_module(module, name)
+            parts.append(f"::: {module}.{name}{options}")
     return "\n\n".join(parts) + "\n"
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the first page, the API and what lies outside of docs/."""
+    """Add the home page, the API pages and the files outside docs/."""
     readme = (ROOT / "README.md").read_text()
     files.append(File.generated(config, "index.md", content=readme))
     for title, modules in API.items():
         page = api_page(title, modules)
         files.append(File.generated(config, f"api/{title}.md", content=page))
-    listing = f"# LoRA-SP in one sitting\n\n```python\n{(ROOT / REFERENCE).read_text()}```\n"
-    files.append(File.generated(config, LISTING, content=listing))
+    reference = f"# LoRA-SP in 60 lines\n\n```python\n{(ROOT / REFERENCE).read_text()}```\n"
+    files.append(File.generated(config, REFERENCE_PAGE, content=reference))
     for pattern in OUTSIDE:
         for file in sorted(ROOT.glob(pattern)):
             uri = file.relative_to(ROOT).as_posix()
@@ -105,33 +105,33 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Put the API into the navigation."""
+    """Add the API pages to the navigation."""
     assert config.nav is not None
     config.nav.append({"API": [{title: f"api/{title}.md"} for title in API]})
     return config
 
 
 def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
-    """Turn links from where a page lies in the repository to where it lies on the site."""
+    """Rewrite links that are relative to the repository as links within the site."""
     uri = page.file.src_uri
-    if uri.startswith("api/") or uri == LISTING:
+    if uri.startswith("api/") or uri == REFERENCE_PAGE:
         return markdown
     folder = "" if uri in ("index.md", "CONTRIBUTING.md") else posixpath.dirname(f"docs/{uri}")
-    pages = {"README.md": "index.md", REFERENCE: LISTING}
+    pages = {"README.md": "index.md", REFERENCE: REFERENCE_PAGE}
 
-    def turned(match: re.Match) -> str:
+    def rewrite(match: re.Match) -> str:
         target = posixpath.normpath(posixpath.join(folder, match[2]))
         target = pages.get(target, target.removeprefix("docs/"))
         here = posixpath.dirname(uri) or "."
         return match[1] + posixpath.relpath(target, here)
 
-    return PICTURE.sub(by_scheme, LINK.sub(turned, markdown))
+    return PICTURE.sub(images_by_scheme, LINK.sub(rewrite, markdown))
 
 
-def by_scheme(match: re.Match) -> str:
-    """A picture that follows the site's own switch between light and dark."""
-    one = "![{alt}]({path}#only-{scheme})"
+def images_by_scheme(match: re.Match) -> str:
+    """Return Markdown for an image that follows the site's light/dark switch."""
+    image = "![{alt}]({path}#only-{scheme})"
     return "\n".join(
-        one.format(alt=match["alt"], path=match[scheme], scheme=scheme)
+        image.format(alt=match["alt"], path=match[scheme], scheme=scheme)
         for scheme in ("light", "dark")
     )

@@ -1,4 +1,4 @@
-"""The scripts that draw the README's pictures."""
+"""Test the scripts that draw the README's figure and videos."""
 
 import importlib
 
@@ -16,23 +16,23 @@ def script(monkeypatch):
     return importlib.import_module
 
 
-def test_the_figure_is_drawn_again_from_what_was_measured(script, tmp_path):
+def test_figure_is_redrawn_from_saved_measurements(script, tmp_path):
     figure = script("lora_sp")
-    facts = dict(np.load(FOLDER / "lora_sp.npz"))
+    measurements = dict(np.load(FOLDER / "lora_sp.npz"))
     sizes = set()
     for scheme, colors in figure.SCHEMES.items():
         path = tmp_path / f"{scheme}.svg"
-        figure.draw(facts, colors, path)
+        figure.draw(measurements, colors, path)
         assert colors["ink"] in path.read_text()
         sizes.add(path.stat().st_size)
     assert min(sizes) > 50_000
 
 
 @pytest.mark.parametrize("size", [16, 128])
-def test_the_figure_takes_banks_and_pictures_of_any_size(script, tmp_path, size):
+def test_figure_supports_any_bank_and_image_size(script, tmp_path, size):
     figure, rng = script("lora_sp"), np.random.default_rng(0)
     scores = rng.random((2, size))
-    facts = {
+    measurements = {
         "image": np.zeros((64, 64, 3), np.uint8),
         "active_rank": rng.integers(1, size, (8, 8)),
         "token": np.array([0, 63]),
@@ -40,17 +40,17 @@ def test_the_figure_takes_banks_and_pictures_of_any_size(script, tmp_path, size)
         "mask": scores > 0.5,
         "energy_target": np.array(0.9),
     }
-    figure.draw(facts, figure.SCHEMES["light"], tmp_path / "figure.svg")
+    figure.draw(measurements, figure.SCHEMES["light"], tmp_path / "figure.svg")
 
 
-def test_short_films_wait_and_success_is_framed(script):
+def test_short_videos_hold_their_last_image_and_success_gets_a_border(script):
     films = script("films")
 
-    def film(length, success):
-        return films.Film(np.zeros((length, films.TILE, films.TILE, 3), np.uint8), success)
+    def video(length, success):
+        return films.Video(np.zeros((length, films.TILE, films.TILE, 3), np.uint8), success)
 
-    columns = [films.Column("press", film(2, False), film(4, True), 0.1)] * 2
-    frames = films.strip(columns)
+    columns = [films.Column("press", video(2, False), video(4, True), 0.1)] * 2
+    frames = films.draw_frames(columns)
     assert len(frames) == 4 + films.HOLD
     corner = (3 * films.BAR, films.BAR + films.TILE + films.GAP)
     assert frames[0].getpixel(corner)[:3] == (0, 0, 0)

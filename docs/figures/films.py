@@ -1,10 +1,10 @@
-"""Film a run's policy before and after adaptation, task by task, as one animated strip.
+"""Render a run's policy before and after adaptation as one animation with a column per task.
 
     python docs/figures/films.py runs/multitask --out docs/figures/films.webp
 
-Each column is one episode, filmed twice from the same start: by the frozen base (above) and by the
-policy that the run trained (below). Of `WORLDS` starts a task, the first one shown is one in which
-the base fails and the trained policy succeeds, if there is one.
+Each column shows two episodes from the same initial state: the frozen base (top) and the trained
+policy (bottom). Out of `WORLDS` initial states per task, the column uses the first one from which
+the base fails and the trained policy succeeds, or the very first if there is none.
 """
 
 import argparse
@@ -29,30 +29,30 @@ from lorasp_jax.training import load_policy
 from lorasp_jax.training.run_folder import read_json
 
 WORLDS = 8
-"""Starts per task; a rollout keeps the poses of as many."""
+"""Initial states per task; a rollout records the poses of this many worlds."""
 TILE, GAP, BAR = 216, 6, 26
-"""Side of a film, space between two, height of a caption [pixels]."""
+"""Video side, space between videos, caption height [pixels]."""
 SPEED, EVERY = 2.0, 2
-"""How much faster than life, and every how many control steps there is a frame."""
+"""Playback speed relative to real time, and control steps per frame."""
 HOLD = 8
-"""Frames that the last picture stays."""
+"""Frames to hold the last image."""
 INK, PAPER = (110, 118, 129), (255, 255, 255, 0)
-"""Grey that reads on a light and on a dark page."""
+"""Gray text, legible on light and dark pages, and a transparent background."""
 SUCCESS = (18, 184, 134)
-"""Color of the frame around an episode that succeeded."""
+"""Color of the border around a successful episode."""
 
 
 def main() -> None:
-    """Write the strip that the command line asks for."""
+    """Write the animation requested on the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, help="folder of a finished run")
     parser.add_argument("--out", type=Path, default=Path("docs/figures/films.webp"))
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--quality", type=int, default=60, help="of the pictures, 0 to 100")
+    parser.add_argument("--quality", type=int, default=60, help="WebP quality, 0 to 100")
     options = parser.parse_args()
     cache.enable()
-    columns = films(options.run, jax.random.key(options.seed))
-    frames = strip(columns)
+    columns = record_run(options.run, jax.random.key(options.seed))
+    frames = draw_frames(columns)
     seconds = EVERY * columns[0].control_dt / SPEED
     first, *rest = frames
     options.out.parent.mkdir(parents=True, exist_ok=True)
@@ -68,79 +68,80 @@ def main() -> None:
     print(f"{options.out}: {options.out.stat().st_size / 1e6:.2f} MB, {len(frames)} frames")
 
 
-class Film(NamedTuple):
-    """Pictures uint8 `[T, TILE, TILE, 3]` of an episode."""
+class Video(NamedTuple):
+    """One episode: images uint8 `[T, TILE, TILE, 3]`, and whether it succeeded."""
 
-    pictures: np.ndarray
+    images: np.ndarray
     success: bool
 
 
 class Column(NamedTuple):
-    """One task, filmed before and after."""
+    """One task, before and after adaptation."""
 
     task: str
-    before: Film
-    after: Film
+    before: Video
+    after: Video
     control_dt: float
 
 
-def films(run: Path, key: jax.Array) -> list[Column]:
-    """A column per task of a run.
+def record_run(run: Path, key: jax.Array) -> list[Column]:
+    """Record every task of a run.
 
     Raises:
-        ValueError: no run finished there, or it trained the base itself.
+        ValueError: the run is not finished, or it trained the base itself.
     """
-    trained, told = load_policy(run), read_json(run / "adapter.json")["metadata"]
-    base = models.load(hub.found_again(told["base"]), trained.model.config)
+    trained, metadata = load_policy(run), read_json(run / "adapter.json")["metadata"]
+    base = models.load(hub.found_again(metadata["base"]), trained.model.config)
     policies = [policy.with_sampler() for policy in (Policy(base, trained.processor), trained)]
-    return [column(policies, told, task, key) for task in told["tasks"]]
+    return [record_task(policies, metadata, task, key) for task in metadata["tasks"]]
 
 
-def column(policies: list[Policy], told: dict, task: str, key: jax.Array) -> Column:
-    """Film one task twice from the same start."""
+def record_task(policies: list[Policy], metadata: dict, task: str, key: jax.Array) -> Column:
+    """Record one task with both policies from the same initial state."""
     env = envs.make(
         task,
-        robot=told["robot"],
+        robot=metadata["robot"],
         num_envs=WORLDS,
         image_size=policies[0].processor.image_size,
-        control_dt=told["control_dt"],
+        control_dt=metadata["control_dt"],
     )
     rollout = jax.jit(make_rollout(env))
-    before, after = (rollout(prompted(policy, env), key) for policy in policies)
-    better = np.asarray(after.success & ~before.success)
-    world = int(np.argmax(better))
+    before, after = (rollout(with_prompts(policy, env), key) for policy in policies)
+    improved = np.asarray(after.success & ~before.success)
+    world = int(np.argmax(improved))
     print(f"{task}: {int(before.success.sum())} and {int(after.success.sum())} of {WORLDS}")
     camera = RayRenderer(env.render_model, 2 * TILE, 1)
     render = jax.jit(dataclasses.replace(env, renderer=camera).render)
-    films = [film(render, one, world) for one in (before, after)]
-    return Column(task, films[0], films[1], env.control_dt)
+    base, adapted = (render_video(render, rollout, world) for rollout in (before, after))
+    return Column(task, base, adapted, env.control_dt)
 
 
-def prompted(policy: Policy, env: envs.Env) -> Policy:
-    """The policy with the instructions of one environment."""
+def with_prompts(policy: Policy, env: envs.Env) -> Policy:
+    """Return the policy with the instructions of one environment."""
     prompts = policy.processor.prompts.select(env.instructions)
     return Policy(policy.model, dataclasses.replace(policy.processor, prompts=prompts))
 
 
-def film(render: Callable, rollout: Rollout, world: int) -> Film:
-    """What the side camera saw of one world until it was done."""
+def render_video(render: Callable, rollout: Rollout, world: int) -> Video:
+    """Render one world from the side camera until it is done."""
     steps = max(int(rollout.steps[world]), 1)
     poses = jax.tree.map(lambda x: x[:steps:EVERY, world : world + 1], rollout.poses)
-    pictures = []
+    images = []
     for i in range(len(poses.geom_xpos)):
         large = np.asarray(render(jax.tree.map(lambda x, i=i: x[i], poses))["side"][0])
-        pictures.append(np.asarray(Image.fromarray(large).resize((TILE, TILE))))
-    return Film(np.stack(pictures), bool(rollout.success[world]))
+        images.append(np.asarray(Image.fromarray(large).resize((TILE, TILE))))
+    return Video(np.stack(images), bool(rollout.success[world]))
 
 
-def strip(columns: list[Column]) -> list[Image.Image]:
-    """All columns side by side, frame by frame; short ones wait at their end."""
-    films = [film for column in columns for film in (column.before, column.after)]
-    return [draw(columns, i) for i in range(max(len(film.pictures) for film in films) + HOLD)]
+def draw_frames(columns: list[Column]) -> list[Image.Image]:
+    """Draw all columns side by side; shorter videos hold their last image."""
+    videos = [video for column in columns for video in (column.before, column.after)]
+    length = max(len(video.images) for video in videos) + HOLD
+    return [draw_frame(columns, index) for index in range(length)]
 
 
-def draw(columns: list[Column], frame: int) -> Image.Image:
-    """One frame of the strip."""
+def draw_frame(columns: list[Column], index: int) -> Image.Image:
+    """Draw one frame of the animation."""
     left = 3 * BAR
     size = left + len(columns) * (TILE + GAP), BAR + 2 * (TILE + GAP)
     sheet = Image.new("RGBA", size, PAPER)
@@ -148,13 +149,13 @@ def draw(columns: list[Column], frame: int) -> Image.Image:
     for row, label in enumerate(("base", "LoRA-SP")):
         middle = BAR + row * (TILE + GAP) + TILE // 2
         pen.text((left - 10, middle), label, INK, font, anchor="rm")
-    for i, one in enumerate(columns):
+    for i, column in enumerate(columns):
         x = left + i * (TILE + GAP)
-        pen.text((x + TILE // 2, BAR // 2), one.task.replace("_", " "), INK, font, anchor="mm")
-        for row, film in enumerate((one.before, one.after)):
-            y, done = BAR + row * (TILE + GAP), frame >= len(film.pictures) - 1
-            sheet.paste(Image.fromarray(film.pictures[-1 if done else frame]), (x, y))
-            if done and film.success:
+        pen.text((x + TILE // 2, BAR // 2), column.task.replace("_", " "), INK, font, anchor="mm")
+        for row, video in enumerate((column.before, column.after)):
+            y, done = BAR + row * (TILE + GAP), index >= len(video.images) - 1
+            sheet.paste(Image.fromarray(video.images[-1 if done else index]), (x, y))
+            if done and video.success:
                 pen.rectangle((x, y, x + TILE - 1, y + TILE - 1), outline=SUCCESS, width=4)
     return sheet
 
