@@ -1,21 +1,20 @@
-"""x W + f(x P) U with W frozen, for one layer or several that read the same x.
+"""x W + f(x P) U with frozen W, for one or more layers with the same input x.
 
-P [I, Q] reads the input, U [R, O] writes the output, and f, small, works on rows in between. The
-reference is that formula. The function here computes the same and differs in what the products
-cost, since at these sizes each pass over a wide array takes as long as the adapter itself:
+P [I, Q] projects down, U [R, O] projects up, and f acts on the projected rows. `low_rank_matmul`
+computes this formula with fewer passes over wide arrays, because at these sizes one pass costs as
+much as the adapter itself:
 
-- no gradient is ever computed for W;
-- the P of all layers are one product with x, and in the backward pass one more gives their
-  gradients and one the gradient of x through them;
-- where the output is at least as wide as the input, x W + z U is one product, [x, z] [W; U];
-- where it is far wider, so are g Wᵀ and g Uᵀ of the gradient g of y, g [W; U]ᵀ;
-- where the input is at least as wide as the outputs, the gradient of x is one product,
-  [g, q] [W, P]ᵀ with q the gradient of x P.
+- no gradient is computed for W;
+- the P of all layers are concatenated into one matmul with x; the backward pass takes one more
+  matmul for their gradients and one for the gradient of x through them;
+- if O >= I, x W + z U is one matmul, [x, z] [W; U];
+- if O > 2 I, so are g Wᵀ and g Uᵀ for the gradient g of y: g [W; U]ᵀ;
+- if the outputs of all layers together are at most as wide as x, its gradient is one matmul,
+  [g, q] [W, P]ᵀ, with q the gradient of x P.
 
-The last three only where there are more tokens than inputs: for few, the copy of W is what costs;
-and not on a CPU, which multiplies both as fast and takes three times as long to compile the copies.
-W is cast to the type of x in each pass and kept between them as it came, so a quantised one is not
-widened in memory for long.
+The last three apply only to at least I tokens, since for fewer the copy of W dominates, and not on
+a CPU, where they save no time and triple the compile time. W is cast to the dtype of x within each
+pass and stored in its own dtype, so quantized weights are only briefly dequantized.
 """
 
 import functools
@@ -32,17 +31,17 @@ from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 
 
 class Bottleneck(Protocol):
-    """f of one layer."""
+    """f of one layer; must be hashable."""
 
     def bottleneck(
         self, params: Any, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Any]:
-        """z [..., R] and a pytree, from rows [..., Q]."""
+        """Return z [..., R] and a pytree of auxiliary outputs, from projected rows [..., Q]."""
         ...
 
 
 class BottleneckEach(Protocol):
-    """f of several layers that are computed in one go."""
+    """f of several layers in one call; must be hashable."""
 
     def bottleneck_each(
         self,
@@ -51,11 +50,11 @@ class BottleneckEach(Protocol):
         widths: Sequence[int],
         token_mask: jax.Array | None,
     ) -> list[tuple[jax.Array, Any]]:
-        """z and a pytree of each layer.
+        """Return z and the auxiliary outputs of each layer.
 
         Args:
-          params: of each layer.
-          projected: the rows of all layers side by side, with perhaps more columns behind.
+          params: parameters of each layer.
+          projected: projected rows of all layers, concatenated, possibly with trailing padding.
           widths: Q of each layer.
           token_mask: bool [...tokens] or None.
         """
@@ -66,19 +65,19 @@ Methods = tuple[Bottleneck, ...] | BottleneckEach
 
 
 class LowRankLayer(NamedTuple):
-    """What multiplies the common input."""
+    """Arrays of one layer."""
 
     params: Any
-    """What f needs."""
+    """Parameters of f."""
     kernel: jax.Array | QuantizedKernel | Any
-    """W [I, O] of any type, frozen: its cotangent is zero by definition."""
+    """W [I, O] of any dtype; frozen: no gradient is computed."""
     down: jax.Array
-    """P [I, Q], fp32, used in the type of x."""
+    """P [I, Q], fp32, cast to the dtype of x on use."""
     up: jax.Array
-    """U [R, O], fp32, used in the type of x."""
+    """U [R, O], fp32, cast to the dtype of x on use."""
 
 
-# Traced and lowered once for all equal layers of a model.
+# jit traces and lowers it once for all layers of equal shapes.
 @functools.partial(jax.jit, static_argnums=(0, 1))
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def low_rank_matmul(
@@ -88,26 +87,36 @@ def low_rank_matmul(
     x: jax.Array,
     token_mask: jax.Array | None,
 ) -> list[tuple[jax.Array, Any]]:
-    """Of each layer x W + z U in the type of x and aux, with z, aux = f(params, x P, token_mask).
+    """Return (x W + z U, aux) of each layer, where z, aux = f(params, x P, token_mask).
 
     Args:
-      methods: f of each layer, or of all; hashable, and equal ones are taken to do the same.
-      rows_dtype: type of the rows, which are summed in fp32.
+      methods: f of each layer, or of all; objects that compare equal must compute the same.
+      rows_dtype: dtype of x P, which is accumulated in fp32.
       layers: arrays of each layer.
-      x: [..., I].
-      token_mask: handed to each f.
+      x: [..., I]; x W + z U has its dtype.
+      token_mask: bool [...tokens] or None, passed to each f.
     """
-    params, widths = [layer.params for layer in layers], _widths(layers)
-    projected = jnp.matmul(x, _side_by_side(layers, x), preferred_element_type=rows_dtype)
-    if isinstance(methods, tuple):
-        each = zip(methods, params, _split(widths, projected), strict=True)
-        written = [method.bottleneck(own, rows, token_mask) for method, own, rows in each]
-    else:
-        written = methods.bottleneck_each(params, projected, widths, token_mask)
+    projected = jnp.matmul(x, _concat_downs(layers, x), preferred_element_type=rows_dtype)
+    params = [layer.params for layer in layers]
+    z_aux = _bottlenecks(methods, params, projected, _widths(layers), token_mask)
     return [
-        (two_products(x, z, layer.kernel, layer.up), aux)
-        for layer, (z, aux) in zip(layers, written, strict=True)
+        (base_plus_low_rank(x, z, layer.kernel, layer.up), aux)
+        for layer, (z, aux) in zip(layers, z_aux, strict=True)
     ]
+
+
+def _bottlenecks(
+    methods: Methods,
+    params: Sequence[Any],
+    projected: jax.Array,
+    widths: Sequence[int],
+    token_mask: jax.Array | None,
+) -> list[tuple[jax.Array, Any]]:
+    """Apply f of every layer to its columns of the projected rows."""
+    if not isinstance(methods, tuple):
+        return methods.bottleneck_each(params, projected, widths, token_mask)
+    calls = zip(methods, params, _split(widths, projected), strict=True)
+    return [method.bottleneck(p, rows, token_mask) for method, p, rows in calls]
 
 
 def _forward(
@@ -117,33 +126,29 @@ def _forward(
     x: jax.Array,
     token_mask: jax.Array | None,
 ) -> tuple:
-    """`low_rank_matmul`, and what its gradient needs."""
+    """Compute `low_rank_matmul` and the residuals of its backward pass."""
     widths = _widths(layers)
-    projected = jnp.matmul(x, _side_by_side(layers, x), preferred_element_type=rows_dtype)
+    projected = jnp.matmul(x, _concat_downs(layers, x), preferred_element_type=rows_dtype)
 
     def inner(params: list[Any], projected: jax.Array) -> list[tuple[jax.Array, Any]]:
-        if isinstance(methods, tuple):
-            each = zip(methods, params, _split(widths, projected), strict=True)
-            found = [method.bottleneck(own, rows, token_mask) for method, own, rows in each]
-        else:
-            found = methods.bottleneck_each(params, projected, widths, token_mask)
-        return [(z.astype(x.dtype), aux) for z, aux in found]
+        z_aux = _bottlenecks(methods, params, projected, widths, token_mask)
+        return [(z.astype(x.dtype), aux) for z, aux in z_aux]
 
-    written, pull_back = jax.vjp(inner, [layer.params for layer in layers], projected)
-    found = [
-        (two_products(x, z, layer.kernel, layer.up), aux)
-        for layer, (z, aux) in zip(layers, written, strict=True)
+    z_aux, vjp = jax.vjp(inner, [layer.params for layer in layers], projected)
+    outputs = [
+        (base_plus_low_rank(x, z, layer.kernel, layer.up), aux)
+        for layer, (z, aux) in zip(layers, z_aux, strict=True)
     ]
-    return found, (layers, x, pull_back, [z for z, _ in written])
+    return outputs, (layers, x, vjp, [z for z, _ in z_aux])
 
 
-def two_products(
+def base_plus_low_rank(
     x: jax.Array, z: jax.Array, kernel: jax.Array | QuantizedKernel, up: jax.Array
 ) -> jax.Array:
-    """x W + z U, [..., O], in the type of x [..., I], of z [..., R]."""
+    """Compute x W + z U, [..., O], in the dtype of x [..., I], from z [..., R]."""
     w, u, z = kernel.astype(x.dtype), up.astype(x.dtype), z.astype(x.dtype)
     d_in, d_out = w.shape
-    if d_out >= d_in and _joins(w, x):
+    if d_out >= d_in and _should_concat(w, x):
         return jnp.concatenate([x, z], axis=-1) @ jnp.concatenate([w, u])
     return x @ w + z @ u
 
@@ -152,75 +157,75 @@ def _backward(
     methods: Methods, rows_dtype: Any, residuals: tuple, cotangents: Sequence[tuple]
 ) -> tuple:
     del methods, rows_dtype
-    layers, x, pull_back, written = residuals
+    layers, x, vjp, z_of_layers = residuals
     gradients = [g for g, _ in cotangents]
-    through_bases, d_written = [], []
+    base_input_grads, dz_aux = [], []
     for layer, (g, d_aux) in zip(layers, cotangents, strict=True):
         d_in, d_out = layer.kernel.shape
         w, u = layer.kernel.astype(x.dtype), layer.up.astype(x.dtype)
-        through_base, dz = None, None
-        if d_out > 2 * d_in and _joins(w, x):
-            through_base, dz = jnp.split(g @ jnp.concatenate([w, u]).T, [d_in], axis=-1)
-        through_bases.append(through_base)
-        d_written.append((g @ u.T if dz is None else dz, d_aux))
-    d_params, d_projected = pull_back(d_written)
+        base_input_grad, dz = None, None
+        if d_out > 2 * d_in and _should_concat(w, x):
+            base_input_grad, dz = jnp.split(g @ jnp.concatenate([w, u]).T, [d_in], axis=-1)
+        base_input_grads.append(base_input_grad)
+        dz_aux.append((g @ u.T if dz is None else dz, d_aux))
+    d_params, d_projected = vjp(dz_aux)
     q = d_projected.astype(x.dtype)
-    dx = _gradient_of_input(layers, x, gradients, through_bases, q)
+    dx = _input_gradient(layers, x, gradients, base_input_grads, q)
     d_downs = _split(_widths(layers), _outer(x, q, layers[0].down.dtype))
     d_layers = [
-        LowRankLayer(of_params, None, d_down, _outer(z, g, layer.up.dtype))
-        for layer, of_params, d_down, z, g in zip(
-            layers, d_params, d_downs, written, gradients, strict=True
+        LowRankLayer(d_param, None, d_down, _outer(z, g, layer.up.dtype))
+        for layer, d_param, d_down, z, g in zip(
+            layers, d_params, d_downs, z_of_layers, gradients, strict=True
         )
     ]
     return d_layers, dx, None
 
 
-def _gradient_of_input(
+def _input_gradient(
     layers: Sequence[LowRankLayer],
     x: jax.Array,
     gradients: Sequence[jax.Array],
-    through_bases: Sequence[jax.Array | None],
+    base_input_grads: Sequence[jax.Array | None],
     q: jax.Array,
 ) -> jax.Array:
-    """Σ g Wᵀ + q Pᵀ, [..., I]; `through_bases` holds those g Wᵀ that are there already."""
-    p = _side_by_side(layers, x)
+    """Compute Σ g Wᵀ + q Pᵀ, [..., I]; `base_input_grads` holds each g Wᵀ if already computed."""
+    p = _concat_downs(layers, x)
     w = [layer.kernel.astype(x.dtype) for layer in layers]
-    if sum(g.shape[-1] for g in gradients) <= x.shape[-1] and _joins(w[0], x):
+    if sum(g.shape[-1] for g in gradients) <= x.shape[-1] and _should_concat(w[0], x):
         return jnp.concatenate([*gradients, q], axis=-1) @ jnp.concatenate([*w, p], axis=1).T
     dx = q @ p.T
-    for g, kernel, through_base in zip(gradients, w, through_bases, strict=True):
-        dx += g @ kernel.T if through_base is None else through_base
+    for g, kernel, base_input_grad in zip(gradients, w, base_input_grads, strict=True):
+        dx += g @ kernel.T if base_input_grad is None else base_input_grad
     return dx
 
 
-def _joins(w: jax.Array, x: jax.Array) -> bool:
-    """Whether copying W next to U costs less than it saves: so many tokens, and no CPU."""
+def _should_concat(w: jax.Array, x: jax.Array) -> bool:
+    """Return whether concatenating W pays off: with at least I tokens, and not on a CPU."""
     return math.prod(x.shape[:-1]) >= w.shape[0] and platform() != "cpu"
 
 
-def _side_by_side(layers: Sequence[LowRankLayer], x: jax.Array) -> jax.Array:
-    """The P of all layers, [I, ΣQ], in the type of x."""
-    return aligned(jnp.concatenate([layer.down.astype(x.dtype) for layer in layers], axis=1))
+def _concat_downs(layers: Sequence[LowRankLayer], x: jax.Array) -> jax.Array:
+    """Concatenate the P of all layers, [I, ΣQ], padded, in the dtype of x."""
+    return pad_columns(jnp.concatenate([layer.down.astype(x.dtype) for layer in layers], axis=1))
 
 
 def _widths(layers: Sequence[LowRankLayer]) -> list[int]:
-    """Q of each."""
+    """Return Q of each layer."""
     return [layer.down.shape[1] for layer in layers]
 
 
 def _split(widths: Sequence[int], columns: jax.Array) -> list[jax.Array]:
-    """Each layer's share [..., Q] of columns [..., ΣQ or more]."""
+    """Split columns [..., at least ΣQ] into [..., Q] of each layer, without the padding."""
     return jnp.split(columns, list(itertools.accumulate(widths)), axis=-1)[:-1]
 
 
-def aligned(matrix: jax.Array) -> jax.Array:
-    """Zeros up to a multiple of 8 columns: 132 made LoRA-MoE's backward pass twice as long."""
+def pad_columns(matrix: jax.Array) -> jax.Array:
+    """Zero-pad to a multiple of 8 columns; 132 columns doubled the time of LoRA-MoE's backward."""
     return jnp.pad(matrix, [(0, 0)] * (matrix.ndim - 1) + [(0, -matrix.shape[-1] % 8)])
 
 
 def _outer(left: jax.Array, right: jax.Array, dtype: Any) -> jax.Array:
-    """Sum over all tokens of the outer products of left [..., M] and right [..., N], [M, N]."""
+    """Sum the outer products of left [..., M] and right [..., N] over all tokens, [M, N]."""
     return jnp.einsum("...m,...n->mn", left, right, preferred_element_type=dtype)
 
 

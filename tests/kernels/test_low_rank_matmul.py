@@ -1,4 +1,4 @@
-"""The frozen-base product equals its formula and never computes a gradient for W."""
+"""`low_rank_matmul` equals its formula and computes no gradient for W."""
 
 import dataclasses
 import math
@@ -12,22 +12,22 @@ import pytest
 
 from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul
 
-# Every code path for 10 tokens: output wider than the input, far wider, square, input wider; then
-# with more inputs than tokens.
+# (I, O), every code path for 10 tokens: output wider, more than twice as wide, square, input wider;
+# then I above the number of tokens.
 SHAPES = [(9, 10), (6, 20), (10, 10), (10, 7), (12, 30), (12, 12), (12, 7)]
-READ, RANK = 4, 3
+DOWN, RANK = 4, 3
 
 
 @pytest.fixture(autouse=True)
 def full_precision(monkeypatch):
-    """Avoid TF32 on GPU, and take the GPU's code path, which joins matrices, on CPU too."""
+    """Avoid TF32 on GPU, and take the GPU's code path, which concatenates matrices, on CPU too."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     with jax.default_matmul_precision("highest"):
         yield
 
 
 def inner(params, rows, token_mask):
-    """A nonlinear f with R < Q, a loss and a statistic."""
+    """Nonlinear f with R < Q, a loss and a statistic."""
     rows = rows if token_mask is None else jnp.where(token_mask[..., None], rows, 0)
     z = jnp.tanh(rows[..., :RANK] * params["scale"]) * rows[..., RANK:]
     return z, {"loss": jnp.square(rows).mean(), "statistic": rows.max(-1)}
@@ -35,14 +35,14 @@ def inner(params, rows, token_mask):
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """The protocol that `low_rank_matmul` expects."""
+    """Implements the protocol `Bottleneck`."""
 
     bottleneck: Callable = inner
 
 
 def inputs(d_in, d_out, dtype=jnp.float32):
     keys = jax.random.split(jax.random.key(0), 4)
-    shapes = [(2, 5, d_in), (d_in, d_out), (d_in, READ), (RANK, d_out)]
+    shapes = [(2, 5, d_in), (d_in, d_out), (d_in, DOWN), (RANK, d_out)]
     x, kernel, down, up = (jax.random.normal(k, s) for k, s in zip(keys, shapes, strict=True))
     return {"scale": jnp.full(RANK, 0.3)}, x.astype(dtype), kernel.astype(dtype), down, up
 
@@ -60,9 +60,9 @@ def reference(params, x, kernel, down, up, mask=MASK):
     return x @ kernel + z @ up, aux
 
 
-def loss_of(product):
+def loss_of(function):
     def loss(params, x, kernel, down, up):
-        y, aux = product(params, x, kernel, down, up)
+        y, aux = function(params, x, kernel, down, up)
         return jnp.sum(jnp.sin(y)) + 0.7 * aux["loss"], aux
 
     return loss
@@ -70,85 +70,86 @@ def loss_of(product):
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_equals_the_formula(shape):
-    def everything(product):
-        gradient = jax.value_and_grad(jax.checkpoint(loss_of(product)), (0, 1, 3, 4), has_aux=True)
-        return jax.jit(gradient)(*inputs(*shape))
+    def value_and_grad(function):
+        loss = jax.checkpoint(loss_of(function))
+        return jax.jit(jax.value_and_grad(loss, (0, 1, 3, 4), has_aux=True))(*inputs(*shape))
 
-    found, expected = everything(ours), everything(reference)
-    assert jax.tree.structure(found) == jax.tree.structure(expected)
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+    actual, expected = value_and_grad(ours), value_and_grad(reference)
+    assert jax.tree.structure(actual) == jax.tree.structure(expected)
+    for a, b in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
         assert np.linalg.norm(b) > 0
 
 
 @pytest.mark.parametrize("d_outs", [(4, 3), (12, 9), (30, 20, 3)])
-def test_several_layers_of_one_input(d_outs):
-    """Every path to the gradient of x: one product for all, separate ones, through [W; U]."""
+def test_several_layers_with_one_input(d_outs):
+    """Every way to compute the gradient of x: one matmul, separate matmuls, through [W; U]."""
     params, x, *_ = inputs(9, 1)
     layers = [LowRankLayer(params, *inputs(9, d_out)[2:]) for d_out in d_outs]
 
-    def together(params, x, layers):
+    def grouped(params, x, layers):
         layers = [layer._replace(params=p) for p, layer in zip(params, layers, strict=True)]
         return low_rank_matmul((Method(),) * len(layers), x.dtype, layers, x, MASK)
 
-    def apart(params, x, layers):
+    def separate(params, x, layers):
         return [reference(p, x, *layer[1:]) for p, layer in zip(params, layers, strict=True)]
 
-    def everything(several):
+    def value_and_grad(apply):
         def loss(params, x, layers):
-            found = several(params, x, layers)
-            total = sum(jnp.sum(jnp.sin((i + 1) * y)) for i, (y, _) in enumerate(found))
-            return total + sum(0.3 * i * aux["loss"] for i, (_, aux) in enumerate(found)), found
+            outputs = apply(params, x, layers)
+            total = sum(jnp.sum(jnp.sin((i + 1) * y)) for i, (y, _) in enumerate(outputs))
+            return total + sum(0.3 * i * aux["loss"] for i, (_, aux) in enumerate(outputs)), outputs
 
-        (_, found), gradients = jax.value_and_grad(loss, (0, 1, 2), has_aux=True)(
+        (_, outputs), gradients = jax.value_and_grad(loss, (0, 1, 2), has_aux=True)(
             [{"scale": params["scale"] * (i + 1)} for i in range(len(layers))], x, layers
         )
-        of_params, of_x, of_layers = gradients
-        return found, of_params, of_x, [layer[2:] for layer in of_layers]
+        d_params, dx, d_layers = gradients
+        return outputs, d_params, dx, [layer[2:] for layer in d_layers]
 
-    found, expected = (jax.jit(everything, static_argnums=0)(way) for way in (together, apart))
-    assert jax.tree.structure(found) == jax.tree.structure(expected)
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+    run = jax.jit(value_and_grad, static_argnums=0)
+    actual, expected = run(grouped), run(separate)
+    assert jax.tree.structure(actual) == jax.tree.structure(expected)
+    for a, b in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-3)
 
 
-def test_several_layers_read_once():
+def test_several_layers_share_the_down_projection():
     params, x, *_ = inputs(9, 1)
     layers = [LowRankLayer(params, *inputs(9, d_out)[2:]) for d_out in (4, 3, 2)]
     program = jax.make_jaxpr(lambda x: low_rank_matmul((Method(),) * 3, x.dtype, layers, x, MASK))(
         x
     )
-    products = [line for line in str(program).splitlines() if "dot_general" in line]
-    assert len(products) == 1 + 3 * 2  # x P; x W and z U of each
+    matmuls = [line for line in str(program).splitlines() if "dot_general" in line]
+    assert len(matmuls) == 1 + 3 * 2  # x P; x W and z U of each
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_no_gradient_of_the_kernel(shape):
-    """No product in the gradient's jaxpr has the kernel's shape, so there is no buffer for it."""
+    """No matmul in the gradient's jaxpr has the shape of W, so it is never allocated."""
     arguments = inputs(*shape)
 
-    def gradient(product):
-        return jax.grad(loss_of(product), argnums=(2, 3), has_aux=True)
+    def gradient(function):
+        return jax.grad(loss_of(function), argnums=(2, 3), has_aux=True)
 
-    def program(product):
-        return str(jax.make_jaxpr(gradient(product))(*arguments))
+    def program(function):
+        return str(jax.make_jaxpr(gradient(function))(*arguments))
 
     d_in, d_out = shape
     sides = rf"({d_in}|{d_in + RANK}|{d_out})"
-    products = rf"f32\[{sides},{sides}\] = dot_general"
-    assert not re.search(products, program(ours))
-    assert re.search(products, program(reference))
+    matmul = rf"f32\[{sides},{sides}\] = dot_general"
+    assert not re.search(matmul, program(ours))
+    assert re.search(matmul, program(reference))
     np.testing.assert_array_equal(gradient(ours)(*arguments)[0][0], 0)
 
 
 def test_dtypes():
-    """y in the dtype of x, gradients of fp32 matrices in fp32, rows in `rows_dtype`."""
+    """y has the dtype of x, gradients of fp32 matrices are fp32, rows have `rows_dtype`."""
     arguments = inputs(6, 10, jnp.bfloat16)
     y, aux = jax.eval_shape(ours, *arguments)
     assert (y.dtype, aux["statistic"].dtype) == (jnp.bfloat16, jnp.bfloat16)
     gradient = jax.grad(loss_of(ours), argnums=(1, 3, 4), has_aux=True)
-    of_x, of_down, of_up = jax.eval_shape(gradient, *arguments)[0]
-    assert (of_x.dtype, of_down.dtype, of_up.dtype) == (jnp.bfloat16, jnp.float32, jnp.float32)
+    dx, d_down, d_up = jax.eval_shape(gradient, *arguments)[0]
+    assert (dx.dtype, d_down.dtype, d_up.dtype) == (jnp.bfloat16, jnp.float32, jnp.float32)
     params, x, *matrices = arguments
     layers = [LowRankLayer(params, *matrices)]
     exact = jax.jit(lambda x: low_rank_matmul((Method(),), jnp.float32, layers, x, MASK)[0])
@@ -165,22 +166,22 @@ def test_vmap():
 
 
 @pytest.mark.parametrize("shape", [(9, 20), (10, 10), (10, 7), (12, 30), (12, 12), (12, 7)])
-def test_kernels_are_joined_for_many_tokens_only(shape):
+def test_kernels_are_concatenated_only_for_many_tokens(shape):
     params, x, *rest = inputs(*shape)
 
     def gradients(*arrays):
-        y, pull_back = jax.vjp(lambda *a: ours(*a)[0], *arrays)
-        return pull_back(y)
+        y, vjp = jax.vjp(lambda *a: ours(*a)[0], *arrays)
+        return vjp(y)
 
     program = str(jax.make_jaxpr(gradients)(params, x, *rest))
-    joined = re.findall(r"f32\[(\d+),(\d+)\] = concatenate", program)
-    copies = [sides for sides in joined if math.prod(map(int, sides)) > math.prod(shape)]
+    concatenated = re.findall(r"f32\[(\d+),(\d+)\] = concatenate", program)
+    copies = [sides for sides in concatenated if math.prod(map(int, sides)) > math.prod(shape)]
     assert bool(copies) == (shape[0] <= 10)
 
 
-def test_no_joined_kernels_on_cpu(monkeypatch):
+def test_no_concatenated_kernels_on_cpu(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
-    jax.clear_caches()  # what was traced for a GPU
+    jax.clear_caches()  # drop traces for the GPU
     program = str(jax.make_jaxpr(lambda *a: jax.vjp(ours, *a)[0])(*inputs(9, 20)))
     assert "dot_general" in program
     assert not re.search(r"f32\[\d+,20\] = concatenate", program)
@@ -196,15 +197,15 @@ def test_equal_layers_are_traced_once():
     methods = (Method(counting),)
     params, x, *rest = inputs(9, 9)
 
-    def loss(params, x, several):
-        for _ in range(several):
+    def loss(params, x, depth):
+        for _ in range(depth):
             ((x, aux),) = low_rank_matmul(methods, x.dtype, [LowRankLayer(params, *rest)], x, MASK)
         return x.sum() + aux["loss"]
 
-    traced = []
-    for several in (2, 6):  # the first input has no gradient
+    num_traces = []
+    for depth in (2, 6):  # at least 2: the first layer needs no gradient of its input
         jax.clear_caches()
         calls.clear()
-        jax.jit(jax.grad(loss), static_argnums=2).lower(params, x, several)
-        traced.append(len(calls))
-    assert traced[0] == traced[1]
+        jax.jit(jax.grad(loss), static_argnums=2).lower(params, x, depth)
+        num_traces.append(len(calls))
+    assert num_traces[0] == num_traces[1]

@@ -33,7 +33,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from lorasp_jax.dense import Dense
-from lorasp_jax.kernels.low_rank_matmul import aligned, two_products
+from lorasp_jax.kernels.low_rank_matmul import base_plus_low_rank, pad_columns
 from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.peft import Aux
 from lorasp_jax.peft._batched_bottleneck import BatchedBottleneck, VmapBottleneck
@@ -189,7 +189,7 @@ def _call_apart(
     z, aux = _bottleneck(apart, projected, 0, token_mask)
     ys, zs = [], jnp.split(z, len(apart.write), axis=-1)
     for own, kernel, up, bias in zip(zs, apart.kernels, apart.write, apart.biases, strict=True):
-        y = two_products(x, own, kernel, up)
+        y = base_plus_low_rank(x, own, kernel, up)
         ys.append(y if bias is None else y + bias)
     return ys, aux
 
@@ -276,7 +276,7 @@ def _apart(layers: Sequence[Dense]) -> Apart:
     wide, downs, ups, biases = _matrices(layers)
     own = [layer.kernel_matrices() for layer in layers]
     kernels = [k if isinstance(k, QuantizedKernel) else w for k, w in zip(own, wide, strict=True)]
-    read = aligned(jnp.concatenate(downs, axis=1))
+    read = pad_columns(jnp.concatenate(downs, axis=1))
     return Apart(*_chain(layers, downs), read, ups, kernels, biases)
 
 
@@ -289,7 +289,7 @@ def _join(layers: Sequence[Dense]) -> Joined:
     has_bias = any(bias is not None for bias in biases)
     return Joined(
         *_chain(layers, downs),
-        read=aligned(jnp.concatenate(kernels + downs, axis=1)),
+        read=pad_columns(jnp.concatenate(kernels + downs, axis=1)),
         write=jax.scipy.linalg.block_diag(*ups),
         bias=jnp.concatenate(filled) if has_bias else None,
     )
