@@ -1,1 +1,1 @@
-"""Numerical kernels. Each has a plain XLA reference and gives the same results on every backend."""
+"""Numerical kernels. Each has an XLA reference and gives the same results on every backend."""

@@ -1,27 +1,26 @@
 """Energy gate of LoRA-SP: keep the fewest directions whose squared scores reach an energy target.
 
-For scores s >= 0 let E_k be the energy share of the k largest squares (paper eq. 12). The gate
-keeps the smallest k with E_k >= η; ties go to the lowest index. Implementations:
+For scores s >= 0 let E_k be the fraction of the energy Σ s² in the k largest scores (paper eq. 12).
+The gate keeps the smallest k with E_k >= η; ties go to the lowest index. Implementations:
 
-- "pairwise": for each direction, sum the energy of all that rank before it. R² work, vectorised
-  over rows and R; the fastest on CPU up to R = 32.
-- "sort": sort the values, accumulate energy, threshold. The reference; on a rare row its running
-  sum rounds across η.
-- "bisection": no sort. Binary search for the threshold on its bits, since non-negative fp32
-  numbers sort like their bit patterns.
-- "block": bisection for the few rows of a kernel's block, stopping early. The body of a kernel.
+- "pairwise": for each direction, sum the energy of all directions that rank before it. O(R²),
+  vectorized over rows and R; fastest on CPU up to R = 32.
+- "sort": sort the scores, accumulate energy, threshold. The reference; in rare rows the rounding of
+  its cumulative sum crosses η.
+- "bisection": binary search for the threshold, bit by bit, without a sort.
+- "block": bisection that stops early, for the few rows of a kernel's block.
 - "pallas": "block" as a Triton kernel, one row per warp, scores in registers.
 
-"sort", "block" and "pallas" reduce each row to its `Boundary`, the last kept (score, index); the
-mask follows elementwise.
+"sort", "block" and "pallas" reduce each row to its `Boundary`, the last kept (score, index), from
+which the mask follows elementwise.
 
-η is the decimal as written: 0.9 means 9/10, and E_k >= 9/10 is tested as 10 Σ_k >= 9 Σ, so a row
-that reaches the target exactly is not lost to the rounding of 0.9.
+η is the decimal as written: 0.9 means 9/10, and E_k >= 9/10 is tested as 10 Σ_k >= 9 Σ, so that
+rounding of 0.9 does not change rows that reach the target exactly.
 
 All implementations agree at the limits of fp32:
 
-- The largest score holds at least 1/R of the energy, so every η up to 1/R keeps one direction.
-- Infinite scores share the energy equally; finite scores in the same row have none.
+- The largest score has at least 1/R of the energy, so every η up to 1/R keeps one direction.
+- Infinite scores share the energy equally; finite scores in the same row have zero energy.
 - A row with NaN keeps nothing and its kept_energy is NaN.
 """
 
@@ -48,16 +47,16 @@ from lorasp_jax.kernels.threshold_search import (
 
 Implementation = Literal["pairwise", "sort", "bisection", "block", "pallas"]
 
-SMALLEST_TARGET = 2.0**-64
-"""Smaller η are raised to this: they would underflow in fp32, and keep one direction anyway, since
-no bank has 2^64 directions."""
+MIN_TARGET = 2.0**-64
+"""Smaller η are raised to this value: they would underflow in fp32, and both keep one direction,
+since no bank has 2^64 directions."""
 
 PAIRWISE_RANK = 32
-"""Largest R for which pairwise is the default on CPU: beyond it bisection is faster (two cores)."""
+"""Largest R with "pairwise" as the default on CPU; above it bisection is faster (on two cores)."""
 
 
 def exact_ratio(energy_target: float) -> Ratio:
-    """Convert η to an exact ratio, reading it as the decimal it was written as.
+    """Convert η to an exact ratio, interpreting it as a decimal.
 
     Raises:
       ValueError: η is not a number in (0, 1].
@@ -68,7 +67,7 @@ def exact_ratio(energy_target: float) -> Ratio:
         ratio = fractions.Fraction(0)
     if not 0 < ratio <= 1:
         raise ValueError(f"energy_target must lie in (0, 1], got {energy_target!r}.")
-    ratio = max(ratio, fractions.Fraction(SMALLEST_TARGET))
+    ratio = max(ratio, fractions.Fraction(MIN_TARGET))
     power = 2 ** ratio.denominator.bit_length()  # scale both without rounding
     return Ratio(ratio.numerator / power, ratio.denominator / power)
 
@@ -80,16 +79,16 @@ def energy_gate(
     implementation: Implementation | None = None,
     interpret: bool = False,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Keep the smallest set of directions whose energy share reaches the target (eq. 12).
+    """Keep the fewest directions whose fraction of the energy reaches the target (eq. 12).
 
     No gradient flows through the mask; `kept_energy` is differentiable in the scores. A row of
     zeros keeps nothing and has `kept_energy` 1. η = 1 keeps every positive score.
 
     Args:
-      scores: [..., R], non-negative, computed in fp32. Negative scores count by magnitude.
-      energy_target: η in (0, 1], a Python number, read as an exact decimal.
-      implementation: how to compute the mask; None for `default_implementation(R)`.
-      interpret: run the kernel of "pallas" without a GPU, its body as XLA operations.
+      scores: [..., R], non-negative, cast to fp32. For negative scores the magnitude is used.
+      energy_target: η in (0, 1], a Python number, interpreted as an exact decimal.
+      implementation: see the module docstring; None for `default_implementation(R)`.
+      interpret: run the kernel of "pallas" as XLA operations, without a GPU.
 
     Returns:
       mask bool [..., R], active_rank f32 [...] = k, kept_energy f32 [...] = E_k.
@@ -101,14 +100,14 @@ def energy_gate(
     name = implementation or default_implementation(scores.shape[-1])
     compute_mask = _mask_function(name, interpret)
     scores = scores.astype(jnp.float32)
-    constant = jnp.abs(jax.lax.stop_gradient(scores))  # also turns -0, whose sign bit is set, to 0
+    constant = jnp.abs(jax.lax.stop_gradient(scores))  # also turns -0 into 0, without the sign bit
     keep_all = ratio.numerator == ratio.denominator
     mask = positive(constant) if keep_all else compute_mask(constant, ratio)
     return mask, mask.sum(-1).astype(jnp.float32), kept_energy(scores, mask)
 
 
 def default_implementation(rank: int) -> Implementation:
-    """Choose "pallas" on NVIDIA GPUs, "pairwise" for small banks on CPU, else "bisection"."""
+    """Choose "pallas" on GPU, "pairwise" for small banks on CPU, else "bisection"."""
     backend = platform()
     if backend == "cpu" and rank <= PAIRWISE_RANK:
         return "pairwise"
@@ -129,24 +128,24 @@ def _mask_function(implementation: str, interpret: bool) -> Callable[[jax.Array,
         valid = ", ".join(get_args(Implementation))
         raise ValueError(f"Unknown energy gate {implementation!r}; valid are {valid}.")
     boundary = boundaries[implementation]
-    # A kernel computes the scores once. XLA may compute them twice, for the boundary and for the
-    # comparison with it, and round them differently; the barrier prevents that.
-    fixed = (lambda scores: scores) if implementation == "block" else jax.lax.optimization_barrier
+    # XLA may compute the scores twice, for the boundary and for the comparison with it, and round
+    # them differently; the barrier prevents this. A kernel computes them once.
+    barrier = (lambda scores: scores) if implementation == "block" else jax.lax.optimization_barrier
 
     def compute_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
-        scores = fixed(scores)
+        scores = barrier(scores)
         return kept_mask(scores, boundary(scores, ratio))
 
     return compute_mask
 
 
 def positive(scores: jax.Array) -> jax.Array:
-    """Return the mask at η = 1, bool [..., R]: every positive score; none in a row with NaN."""
+    """Return the mask at η = 1, bool [..., R]: positive scores, except in rows with NaN."""
     return (scores > 0) & (scores.sum(-1, keepdims=True) > 0)
 
 
 def _pairwise_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
-    """Keep each direction before which the energy falls short of the target; never keep zeros."""
+    """Keep each positive score before which the energy falls short of the target."""
     energy = energies(scores)
     position = np.arange(scores.shape[-1])
 
@@ -161,7 +160,7 @@ def _pairwise_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
 
 
 def kept_mask(scores: jax.Array, last: Boundary) -> jax.Array:
-    """Return the mask, bool [..., R], of all scores up to the boundary."""
+    """Return the mask of the scores up to the boundary, bool [..., R]."""
     position = jax.lax.broadcasted_iota(jnp.int32, scores.shape, scores.ndim - 1)
     return (scores > last.score) | ((scores == last.score) & (position <= last.index))
 
@@ -178,14 +177,14 @@ def kept_energy(scores: jax.Array, mask: jax.Array) -> jax.Array:
 
 
 def energy_share(scores: jax.Array) -> jax.Array:
-    """Compute each direction's share of its row's energy, f32 [..., R]; a row of zeros gives 0."""
+    """Compute each direction's fraction of its row's energy, f32 [..., R]; rows of zeros give 0."""
     energy = energies(scores)
     total = energy.sum(-1, keepdims=True)
     return energy * (1 / jnp.where(total == 0, 1, total))
 
 
 def _sorted_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
-    """Reference: value sort, cumulative energy, threshold; no argsort, nothing scattered back."""
+    """Find the boundaries by sorting scores, the reference; needs neither argsort nor scatter."""
     rows = scores.reshape(-1, scores.shape[-1])
     last = jax.vmap(lambda row: _sorted_row_boundary(row, ratio))(rows)
     return jax.tree.map(lambda leaf: leaf.reshape(*scores.shape[:-1], 1), last)
@@ -213,7 +212,7 @@ def _pallas_boundary(scores: jax.Array, ratio: Ratio, *, interpret: bool) -> Bou
 
 
 def _call_kernel(ratio: Ratio, interpret: bool, _: Any, arrays: Sequence[jax.Array]) -> tuple:
-    """Compute the columns of `Boundary` for rows of scores; `by_rows` also expects sums: none."""
+    """Compute the columns of `Boundary` for rows of scores, and no sums for `by_rows`."""
     from jax.experimental.pallas import triton  # absent from builds without NVIDIA support
 
     (rows,), column = arrays, pl.BlockSpec((1, 1), lambda i: (i, 0))

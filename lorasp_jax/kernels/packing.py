@@ -16,10 +16,10 @@ import jax.numpy as jnp
 )
 @dataclasses.dataclass(frozen=True)
 class PackedTree:
-    """A pytree of fp32 arrays in one flat array: one operand for a kernel, one copy for XLA."""
+    """A pytree of fp32 arrays in one flat array: one operand of a kernel, one copy in XLA."""
 
     values: jax.Array
-    """All leaves end to end: [N], or [n, N] for n stacked trees."""
+    """Concatenated leaves: [N], or [n, N] for n stacked trees."""
     structure: Any
     shapes: tuple[tuple[int, ...], ...]
 
@@ -33,10 +33,10 @@ class PackedTree:
         shapes = tuple(leaf.shape[axes:] for leaf in leaves)
         return cls(jnp.concatenate(flat, axis=-1), structure, shapes)
 
-    def tree(self, part: Callable[[int, int], jax.Array] | None = None) -> Any:
-        """Unpack; `part`, (start, size) -> [..., size], overrides how a slice is read."""
-        read = part or (lambda start, size: self.values[..., start : start + size])
-        parts = [read(*span) for span in spans(tuple(map(math.prod, self.shapes)))]
+    def tree(self, load: Callable[[int, int], jax.Array] | None = None) -> Any:
+        """Unpack; `load`, (start, size) -> [..., size], replaces slicing of `values`."""
+        load = load or (lambda start, size: self.values[..., start : start + size])
+        parts = [load(*span) for span in spans(tuple(map(math.prod, self.shapes)))]
         leaves = [
             p.reshape(*p.shape[:-1], *shape) for p, shape in zip(parts, self.shapes, strict=True)
         ]
@@ -44,5 +44,5 @@ class PackedTree:
 
 
 def spans(widths: tuple[int, ...]) -> list[tuple[int, int]]:
-    """Return (start, width) of adjacent columns of these widths."""
+    """Return (start, width) of adjacent columns with these widths."""
     return list(zip(itertools.accumulate(widths[:-1], initial=0), widths, strict=True))

@@ -1,13 +1,14 @@
-"""The kind of device that a function is traced for."""
+"""The platform that a function is traced for."""
 
 import jax
 
 
 def platform() -> str:
-    """ "cpu", "gpu" or "tpu": the abstract mesh's device where one is in use, else JAX's default.
+    """Return "cpu", "gpu" or "tpu": the platform of the abstract mesh if there is one, else JAX's
+    default.
 
-    So a CPU lowers what an NVIDIA GPU is to run, under `jax.sharding.use_abstract_mesh` with a mesh
-    whose `abstract_device` is of platform "cuda". JAX traces a function anew under another mesh.
+    A CPU can thus lower a program for an NVIDIA GPU, under `jax.sharding.use_abstract_mesh` with an
+    `abstract_device` of platform "cuda". JAX retraces a function under a different mesh.
     """
     device = jax.sharding.get_abstract_mesh().abstract_device
     if device is None:

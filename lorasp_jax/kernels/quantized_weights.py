@@ -1,10 +1,10 @@
-"""Frozen kernels in 8 or 4 bits: int8 with a scale per column, nf4 in blocks of 64 inputs.
+"""Frozen weights quantized to 8 or 4 bits: int8 per column, nf4 per block of 64 inputs.
 
-Quantisation is symmetric; each scale is the largest magnitude of its group. nf4 is the 4-bit
-NormalFloat of QLoRA (Dettmers et al., arXiv 2305.14314, appendix E) without double quantisation of
-the scales: 4.5 bits per weight. With m the largest magnitude of a group, the error of a weight is
-at most m/255 in int8 and 0.152 m, half the widest gap of the table, in nf4. Adapted layers
-dequantise the kernel right where they multiply, in both passes, and store the codes alone.
+Quantization is symmetric, with one scale per group. nf4 is the 4-bit NormalFloat of QLoRA (Dettmers
+et al., arXiv 2305.14314, appendix E) without double quantization of the scales: 4.5 bits per
+weight. If m is the largest magnitude of a group, the error of a weight is at most m/255 in int8 and
+0.152 m, half the widest gap of the table, in nf4. Adapted layers store only the codes and scales,
+and dequantize the kernel at each matmul, in both passes.
 """
 
 import dataclasses
@@ -21,9 +21,9 @@ KINDS: tuple[Kind, ...] = ("int8", "nf4")
 NF4_BLOCK = 64
 """Inputs per scale in nf4 (arXiv 2305.14314, section 3)."""
 INT8_BOUND = 127.5
-"""Divisor of int8 scales: half a step above 127, so that the outermost codes get a full bin (as in
-qwix 0.1.8, which the tests compare with)."""
-# Quantiles of a normal distribution with 0 among them, scaled to [-1, 1]; arXiv 2305.14314,
+"""The scale is the largest magnitude divided by this: half a step above 127, so that the outermost
+codes get a full bin (as in qwix 0.1.8, with which the tests compare)."""
+# Quantiles of a normal distribution, including 0, scaled to [-1, 1]; arXiv 2305.14314,
 # appendix E.
 NF4 = (
     -1.0, -0.6961928009986877, -0.5250730514526367, -0.39491748809814453, -0.28444138169288635,
@@ -36,23 +36,23 @@ NF4 = (
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class QuantizedKernel:
-    """A quantised kernel [..., I, O] with the `shape`, `dtype` and `astype` of an array.
+    """A quantized kernel [..., I, O] with the `shape`, `dtype` and `astype` of an array.
 
-    A pytree whose arrays keep the leading axes, so it passes through scan, vmap and sharding.
+    A pytree of arrays that keep the leading axes, so it works with scan, vmap and sharding.
     """
 
     codes: jax.Array
-    """int8 [..., 1, I, O]; or nf4, uint8 [..., I/64, 32, O]: row i of a block in the low half of a
-    byte, row i + 32 in the high half."""
+    """int8: [..., 1, I, O]. nf4: uint8 [..., I/64, 32, O], with row i of a block in the low four
+    bits and row i + 32 in the high four."""
     scale: jax.Array
     """f32 [..., 1 or I/64, 1, O]."""
     d_in: int = dataclasses.field(metadata={"static": True})
-    """I; the last block is padded if 64 does not divide it."""
+    """I; the last nf4 block is padded unless I is a multiple of 64."""
     dtype: Any = dataclasses.field(metadata={"static": True})
     """Dtype of the original kernel."""
     axes: tuple[int, ...] | None = dataclasses.field(default=None, metadata={"static": True})
-    """Shape of the einsum kernel that this one replaces, without stack axes; None if it replaces a
-    matrix. Codes and `astype` stay matrices."""
+    """Shape of the original einsum kernel without stacked axes; None for a matrix. Codes and the
+    result of `astype` are matrices in either case."""
     batch: int = dataclasses.field(default=0, metadata={"static": True})
     """Number of leading axes of the codes that belong to `axes`."""
 
@@ -70,18 +70,18 @@ class QuantizedKernel:
         return self.codes.nbytes + self.scale.nbytes
 
     def astype(self, dtype: Any) -> jax.Array:
-        """Dequantise to an array [..., I, O]."""
+        """Dequantize to an array [..., I, O]."""
         if self.codes.dtype == jnp.int8:
             values = self.codes.astype(jnp.float32)
         else:
             halves = [self.codes & 15, self.codes >> 4]
             values = jnp.array(NF4, jnp.float32)[jnp.concatenate(halves, axis=-2)]
         *leading, blocks, rows, d_out = values.shape
-        whole = (values * self.scale).astype(dtype).reshape(*leading, blocks * rows, d_out)
-        return whole[..., : self.d_in, :]
+        kernel = (values * self.scale).astype(dtype).reshape(*leading, blocks * rows, d_out)
+        return kernel[..., : self.d_in, :]
 
     def reshape(self, *shape: Any) -> "QuantizedKernel":
-        """Reshape the leading axes; -1 works as in `jnp.reshape`.
+        """Reshape the leading axes; -1 is inferred, as in `jnp.reshape`.
 
         Raises:
           ValueError: the shape does not end in [I, O].
@@ -89,7 +89,7 @@ class QuantizedKernel:
         *leading, d_in, d_out = np.empty(self.shape, np.void).reshape(*shape).shape
         if (d_in, d_out) != self.shape[-2:]:
             raise ValueError(
-                f"Cannot reshape a quantised kernel {self.shape} to {shape}; "
+                f"Cannot reshape a quantized kernel {self.shape} to {shape}: "
                 "only its leading axes may change."
             )
         arrays = {n: getattr(self, n) for n in ("codes", "scale")}
@@ -98,14 +98,14 @@ class QuantizedKernel:
         )
 
 
-def quantized(kernel: jax.Array, kind: Kind) -> QuantizedKernel:
-    """Quantise a kernel [..., I, O] to int8 or nf4, rounding to the nearest code.
+def quantize_kernel(kernel: jax.Array, kind: Kind) -> QuantizedKernel:
+    """Quantize a kernel [..., I, O] to int8 or nf4, rounding to the nearest code.
 
     Raises:
-      ValueError: an unknown kind, or a kernel with non-finite values.
+      ValueError: unknown kind, or non-finite values.
     """
     if kind not in KINDS:
-        raise ValueError(f"Unknown quantisation {kind!r}; valid are {', '.join(KINDS)}.")
+        raise ValueError(f"Unknown quantization {kind!r}; valid are {', '.join(KINDS)}.")
     codes, scale = _codes(kernel, kind)
     if not bool(jnp.isfinite(scale).all()):
         raise ValueError("the kernel has NaN or infinite values.")

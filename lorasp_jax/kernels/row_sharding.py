@@ -1,8 +1,8 @@
-"""Run row-wise kernels on arrays whose rows are sharded over devices.
+"""Run row-wise kernels on arrays with rows sharded over devices.
 
-A kernel is opaque to XLA, which would gather all rows on every device and run it on all of them.
-With a sharding rule (jax.experimental.custom_partitioning) each device runs the kernel on its own
-rows, for any mesh shape and axis names.
+A kernel is opaque to XLA, which would gather all rows on every device. With a sharding rule
+(jax.experimental.custom_partitioning) each device runs the kernel on its own rows, for any mesh
+shape and axis names.
 """
 
 import itertools
@@ -20,31 +20,31 @@ Kernel = Callable[[Arrays, Arrays], tuple[Arrays, Arrays]]
 
 
 def by_rows(kernel: Kernel, shared: Arrays, arrays: Arrays) -> tuple[Arrays, Arrays]:
-    """Run the kernel with each device working on its own rows.
+    """Run the kernel with each device processing its own rows.
 
-    Under `jax.vmap` every device runs it on all rows. No gradient is defined.
+    Under `jax.vmap` every device processes all rows. No gradient is defined.
 
     Args:
       kernel: (shared, arrays) -> (outputs, sums). Row i of the outputs depends only on row i of the
-        arrays; the sums add up over rows.
+        arrays; sums are additive over rows.
       shared: replicated arrays of any shape.
       arrays: [T, ...] each, sharded over T.
 
     Returns:
       outputs [T, ...] each, sharded like the arrays, and sums of any shape.
     """
-    count = len(shared)
+    num_shared = len(shared)
 
     def flat(*operands: jax.Array) -> tuple[Arrays, Arrays]:
-        return kernel(operands[:count], operands[count:])
+        return kernel(operands[:num_shared], operands[num_shared:])
 
     @custom_vmap
     def call(*operands: jax.Array) -> tuple[Arrays, Arrays]:
         results = jax.eval_shape(flat, *operands)
         partitioned = custom_partitioning(flat)
         partitioned.def_partition(
-            lambda mesh, operands, results: _partition(flat, count, mesh, operands, results),
-            sharding_rule=_rule(count, operands, *results),
+            lambda mesh, operands, results: _partition(flat, num_shared, mesh, operands, results),
+            sharding_rule=_rule(num_shared, operands, *results),
         )
         return partitioned(*operands)
 
@@ -57,13 +57,13 @@ def by_rows(kernel: Kernel, shared: Arrays, arrays: Arrays) -> tuple[Arrays, Arr
     return call(*shared, *arrays)
 
 
-def _partition(flat: Callable, count: int, mesh: Any, operands: Any, results: Any) -> tuple:
-    """Return the shardings of results and operands, and the function each device runs."""
-    first = operands[count]
+def _partition(flat: Callable, num_shared: int, mesh: Any, operands: Any, results: Any) -> tuple:
+    """Return the per-device function and the shardings of results and operands."""
+    first = operands[num_shared]
     axes = first.sharding.spec[0]
     names = axes if isinstance(axes, tuple) else () if axes is None else (axes,)
     if first.shape[0] % math.prod(mesh.shape[name] for name in names):
-        names = ()  # XLA would pad the shards with rows that the sums must not include
+        names = ()  # XLA would pad the shards, and the sums would include the padding
     rows, replicated = (NamedSharding(mesh, PartitionSpec(axes)) for axes in (names or None, None))
 
     def own_rows(*operands: jax.Array) -> tuple[Arrays, Arrays]:
@@ -72,17 +72,17 @@ def _partition(flat: Callable, count: int, mesh: Any, operands: Any, results: An
 
     outputs, sums = results
     out_shardings = jax.tree.map(lambda _: rows, outputs), jax.tree.map(lambda _: replicated, sums)
-    in_shardings = tuple(replicated if i < count else rows for i in range(len(operands)))
+    in_shardings = tuple(replicated if i < num_shared else rows for i in range(len(operands)))
     return mesh, own_rows, out_shardings, in_shardings
 
 
-def _rule(count: int, operands: Arrays, outputs: Arrays, sums: Arrays) -> str:
-    """Return the sharding rule, such as "c0, rows c1 -> rows c2, c3": only rows are shared."""
+def _rule(num_shared: int, operands: Arrays, outputs: Arrays, sums: Arrays) -> str:
+    """Return the sharding rule, such as "c0, rows c1 -> rows c2, c3": only rows are sharded."""
     others = (f"c{i}" for i in itertools.count())
 
     def axes(array: jax.Array, *, has_rows: bool) -> str:
         return " ".join(["rows"] * has_rows + [next(others) for _ in array.shape[has_rows:]])
 
-    left = [axes(array, has_rows=i >= count) for i, array in enumerate(operands)]
+    left = [axes(array, has_rows=i >= num_shared) for i, array in enumerate(operands)]
     right = [axes(a, has_rows=True) for a in outputs] + [axes(a, has_rows=False) for a in sums]
     return f"{', '.join(left)} -> {', '.join(right)}"

@@ -1,13 +1,13 @@
-"""Run a row-wise function as one GPU kernel, and its gradient as another.
+"""Trace a row-wise function into one GPU kernel, and its gradient into another.
 
-Between its matrix products an adapter applies a chain of small operations to each token: a
-nonlinearity, a gate, losses. XLA compiles the chain to a dozen kernels, stores the residuals of
-each, and copies all of them once more under a scan over depth. Here the chain is traced into one
-Triton kernel. The backward kernel recomputes the chain block by block and applies its VJP, so the
-only residuals are the chain's input and the mask that the function asks to keep, as bits.
+Between its matmuls an adapter applies a chain of small operations to each token: a nonlinearity, a
+gate, losses. XLA compiles the chain to a dozen kernels, stores the residuals of each, and copies
+all of them once more in a scan over layers. Here the chain is traced into one Triton kernel. The
+backward kernel recomputes the chain block by block and applies its VJP, so the only residuals are
+the input rows and, bit-packed, the function's mask.
 
 The reference is the function itself, applied to all rows at once. LoRA-SP's chain with its gradient
-on an H200 (35k bf16 rows, R = 64, H = 32): 180 us fused, 500 us in XLA.
+on an H200 (35k bf16 rows, R = 64, H = 32): 180 us as kernels, 500 us in XLA.
 """
 
 import dataclasses
@@ -24,43 +24,43 @@ from lorasp_jax.kernels.row_sharding import by_rows
 
 
 class Launch(NamedTuple):
-    """How rows are spread over the GPU."""
+    """Launch parameters of a kernel."""
 
     rows: int
-    """Rows per block: 1, or at least 16, the smallest side of a matrix product in Triton."""
+    """Rows per block: 1, or at least 16, the minimum dimension of a matmul in Triton."""
     warps: int
     """Warps per program."""
     programs: int
-    """Upper bound on the programs that share the blocks; each writes one partial sum."""
+    """Maximum number of programs that share the blocks; each writes one partial sum."""
 
 
 FORWARD = Launch(16, 2, 816)
 BACKWARD = Launch(16, 4, 512)
-"""Own choices; no sweep is recorded."""
+"""Chosen by hand; no sweep is recorded."""
 FEW, FEW_ROWS = Launch(1, 1, 8192), 1024
-"""Launch of both passes for up to FEW_ROWS rows, where latency counts: one warp per row. Own
-choice."""
+"""Launch parameters of both passes for up to FEW_ROWS rows, where latency matters: one warp per
+row. Chosen by hand."""
 
 
 Columns = list[jax.Array]
-"""Arrays [n, width], adjacent columns of one array [n, sum of widths]."""
+"""Column groups [n, width], adjacent in one array [n, sum of widths]."""
 Widths = tuple[int, ...]
 
 
 class Operand(NamedTuple):
-    """An array [T, ...] and the columns of it that each of n functions reads or writes."""
+    """An array [T, ...] and the column groups that each of n functions reads or writes."""
 
     array: Any
     widths: Widths
-    """Widths of the columns of one function."""
+    """Widths of the column groups of one function."""
     start: int = 0
     """First column of the first function."""
     stride: int = 0
-    """Distance to the columns of the next function; 0 if all functions share the same columns."""
+    """Offset to the columns of the next function; 0 if all functions share the same columns."""
 
     def spans(self, i: Any) -> list[tuple[Any, int]]:
-        """Return (start, width) of each column of the i-th function."""
-        return [(self.start + i * self.stride + at, size) for at, size in spans(self.widths)]
+        """Return (start, width) of each column group of function i."""
+        return [(self.start + i * self.stride + at, width) for at, width in spans(self.widths)]
 
 
 Function = Callable[[Any, Columns, jax.Array, jax.Array | None], tuple]
@@ -72,65 +72,64 @@ def rowwise_kernel(
     shared: Any,
     rows: jax.Array,
     widths: Widths,
-    counts: jax.Array,
+    valid: jax.Array,
     *,
     start: int = 0,
     interpret: bool = False,
 ) -> tuple[jax.Array, Any, Columns]:
-    """Apply `function` to all rows in one kernel, and its gradient in another.
+    """Apply `function` to all rows in one kernel; its gradient is another kernel.
 
-    With n trees stacked in `shared`, n functions run side by side, each on its own columns of
-    `rows`.
+    If `shared` stacks n trees, the kernel applies n functions, each to its own columns of `rows`.
 
     Args:
-      function: (shared, columns, counts, kept) -> (output, sums, kept, statistics) on a block of n
-        rows, n one or a power of two. columns: [n, width] each. counts: bool [n, 1]. output:
-        [n, O]. sums: pytree of fp32 arrays, added up over blocks. kept: bool [n, K], K >= 8,
-        computed if None is passed (forward) and constant in the gradient. statistics: list of
-        [n, 1] without gradient. Operations are limited to Triton's: sides are powers of two, at
-        least 16 in a matrix product.
-      shared: pytree of small fp32 arrays used by every row, plain or packed, or n of them stacked.
+      function: (shared, columns, valid, mask) -> (output, sums, mask, statistics) on a block of b
+        rows, where b is 1 or a power of two. columns: [b, width] each. valid: bool [b, 1]. output:
+        [b, O]. sums: pytree of fp32 arrays, summed over blocks. mask: bool [b, K], K >= 8; None in
+        the forward pass, which computes it; a constant in the backward pass. statistics: list of
+        [b, 1] without gradient. Triton limits the operations: dimensions must be powers of two, at
+        least 16 in a matmul.
+      shared: small fp32 arrays used by every row, a pytree or `PackedTree`, or n of them stacked.
       rows: [T, at least start + n * sum(widths)].
-      widths: widths of the columns that one `function` takes.
-      counts: bool [T, 1], passed on to `function`.
+      widths: widths of the column groups of one function.
+      valid: bool [T, 1], passed to `function`.
       start: first column of `rows` to use.
       interpret: run the kernel bodies without a GPU, slowly.
 
     Returns:
-      output [T, O], sums, statistics [T, 1] each; with n stacked trees output [T, n O], sums with a
-      leading axis n, statistics [T, n]. Gradients reach `shared` and `rows`.
+      output [T, O], sums, statistics [T, 1] each; for n stacked trees output [T, n O], sums with a
+      leading axis n, statistics [T, n]. Differentiable in `shared` and `rows`.
     """
     launches = (FEW, FEW) if len(rows) <= FEW_ROWS else (FORWARD, BACKWARD)
-    packed, counts = PackedTree.of(shared), counts.astype(jnp.int8)
+    packed, valid = PackedTree.of(shared), valid.astype(jnp.int8)
     single = packed.values.ndim == 1
     packed = dataclasses.replace(packed, values=jnp.atleast_2d(packed.values))
-    results: Any = _fused((function, widths, start, launches, interpret), packed, rows, counts)
+    results: Any = _rowwise((function, widths, start, launches, interpret), packed, rows, valid)
     output, sums, statistics = results
     return output, jax.tree.map(lambda leaf: leaf[0], sums) if single else sums, statistics
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _fused(static: tuple, packed: PackedTree, rows: jax.Array, counts: jax.Array) -> tuple:
-    return _run(static, packed, rows, counts, keep_mask=False)[0]
+def _rowwise(static: tuple, packed: PackedTree, rows: jax.Array, valid: jax.Array) -> tuple:
+    return _run(static, packed, rows, valid, keep_mask=False)[0]
 
 
-def _forward(static: tuple, packed: PackedTree, rows: jax.Array, counts: jax.Array) -> tuple:
-    results, kept = _run(static, packed, rows, counts, keep_mask=True)
-    return results, (packed, rows, counts, *kept)
+def _forward(static: tuple, packed: PackedTree, rows: jax.Array, valid: jax.Array) -> tuple:
+    results, mask = _run(static, packed, rows, valid, keep_mask=True)
+    return results, (packed, rows, valid, *mask)
 
 
 def _run(
-    static: tuple, packed: PackedTree, rows: jax.Array, counts: jax.Array, *, keep_mask: bool
+    static: tuple, packed: PackedTree, rows: jax.Array, valid: jax.Array, *, keep_mask: bool
 ) -> tuple[tuple, Sequence[jax.Array]]:
     """Return the results of `rowwise_kernel` and [the mask as bits, for the gradient] or []."""
     function, widths, start, (launch, _), interpret = static
 
-    def block(shared: Any, columns: Columns, counts: Columns) -> tuple[list[Columns], Any]:
-        output, sums, kept, statistics = function(shared, columns, counts[0] != 0, None)
-        columns = [output, *statistics, *([_pack_bits(kept)] if keep_mask else [])]
+    def block(shared: Any, columns: Columns, valid: Columns) -> tuple[list[Columns], Any]:
+        output, sums, mask, statistics = function(shared, columns, valid[0] != 0, None)
+        columns = [output, *statistics, *([_pack_bits(mask)] if keep_mask else [])]
         return [[column] for column in columns], sums
 
-    inputs = [Operand(rows, widths, start, sum(widths)), Operand(counts, (1,))]
+    inputs = [Operand(rows, widths, start, sum(widths)), Operand(valid, (1,))]
     (output, *others), sums = _map_blocks(block, packed, inputs, launch, interpret)
     end = len(others) - keep_mask
     return (output, sums.tree(), others[:end]), others[end:]
@@ -138,41 +137,41 @@ def _run(
 
 def _backward(static: tuple, residuals: tuple, cotangents: tuple) -> tuple:
     function, widths, start, (_, launch), interpret = static
-    packed, rows, counts, kept = residuals
+    packed, rows, valid, mask = residuals
     d_output, d_sums, _ = cotangents
 
     def block(constants: tuple, columns: Columns, *others: Columns) -> tuple[list[Columns], Any]:
         shared, d_sums = constants
-        counts, kept, d_output = (column for (column,) in others)
+        valid, mask, d_output = (column for (column,) in others)
 
         def differentiable(shared: Any, columns: Columns) -> tuple:
-            return function(shared, columns, counts != 0, _unpack_bits(kept))[:2]
+            return function(shared, columns, valid != 0, _unpack_bits(mask))[:2]
 
-        _, pull_back = jax.vjp(differentiable, shared, columns)
-        d_shared, d_columns = pull_back((d_output, d_sums))
+        _, vjp = jax.vjp(differentiable, shared, columns)
+        d_shared, d_columns = vjp((d_output, d_sums))
         return [d_columns], d_shared
 
-    each = [array.shape[1] // len(packed.values) for array in (kept, d_output)]
-    inputs = [Operand(rows, widths, start, sum(widths)), Operand(counts, (1,))]
-    inputs += [Operand(a, (w,), stride=w) for a, w in zip((kept, d_output), each, strict=True)]
+    sizes = [array.shape[1] // len(packed.values) for array in (mask, d_output)]
+    inputs = [Operand(rows, widths, start, sum(widths)), Operand(valid, (1,))]
+    inputs += [Operand(a, (w,), stride=w) for a, w in zip((mask, d_output), sizes, strict=True)]
     constants = PackedTree.of((packed.tree(), d_sums), axes=1)
     (d_rows,), d_packed = _map_blocks(block, constants, inputs, launch, interpret)
     unused = rows.shape[1] - start - d_rows.shape[1]
     return d_packed, jnp.pad(d_rows, ((0, 0), (start, unused))), None
 
 
-_fused.defvjp(_forward, _backward)
+_rowwise.defvjp(_forward, _backward)
 
 
 class _Blocks(NamedTuple):
-    """The body of a kernel and the layout of its operands."""
+    """Body of a kernel and layout of its operands."""
 
     body: Body
     launch: Launch
     shared_tree: Callable[[Callable], Any]
     inputs: list[Operand]
     outputs: list[Operand]
-    """Inputs and outputs hold dtypes in place of arrays."""
+    """Operands of `inputs` and `outputs` hold dtypes in place of arrays."""
     sums: Any
     """Shapes of the sums over rows."""
 
@@ -203,16 +202,16 @@ def _call(
 ) -> tuple[list[jax.Array], list[jax.Array]]:
     """Launch the kernel; return the outputs and the packed sums.
 
-    Each program runs over consecutive blocks of one function and adds up their sums; XLA adds up
-    the sums of all programs.
+    Each program loops over consecutive blocks of one function and accumulates their sums; XLA
+    reduces the sums of all programs.
     """
     from jax.experimental.pallas import triton  # absent from builds without NVIDIA support
 
     (values,), launch, num_rows = shared, blocks.launch, len(arrays[0])
     arrays = [jnp.pad(array, ((0, -num_rows % launch.rows), (0, 0))) for array in arrays]
     num_blocks, num_functions = len(arrays[0]) // launch.rows, len(values)
-    most = pl.cdiv(num_blocks, launch.programs)
-    per_program = next(n for n in range(most, 0, -1) if num_blocks % n == 0)
+    max_blocks = pl.cdiv(num_blocks, launch.programs)
+    per_program = next(n for n in range(max_blocks, 0, -1) if num_blocks % n == 0)
     programs = num_blocks // per_program
     size = sum(leaf.size for leaf in jax.tree.leaves(blocks.sums))
     rows = [_shape(o.array, len(arrays[0]), num_functions * sum(o.widths)) for o in blocks.outputs]
@@ -224,19 +223,19 @@ def _call(
         interpret=interpret,
         name="rowwise_kernel",
     )(values, arrays)
-    # All sums are in one array, so XLA reduces them in one kernel.
+    # All sums are in one array, so that XLA reduces them in one kernel.
     return [output[:num_rows] for output in outputs], [partial_sums.sum(0)]
 
 
-def _pack_bits(kept: jax.Array) -> jax.Array:
+def _pack_bits(mask: jax.Array) -> jax.Array:
     """Pack bools [n, K] into bits, uint8 [n, K / 8]."""
-    rows, width = kept.shape
-    bits = kept.astype(jnp.int32).reshape(rows, 8, width // 8)
+    rows, width = mask.shape
+    bits = mask.astype(jnp.int32).reshape(rows, 8, width // 8)
     return jax.lax.shift_left(bits, _bit_numbers(bits)).sum(1, dtype=jnp.int32).astype(jnp.uint8)
 
 
 def _unpack_bits(packed: jax.Array) -> jax.Array:
-    """Undo `_pack_bits`: bools [n, K] from uint8 [n, K / 8]."""
+    """Unpack bools [n, K] from bits, uint8 [n, K / 8]."""
     rows, width = packed.shape
     bits = jnp.broadcast_to(packed.astype(jnp.int32)[:, None, :], (rows, 8, width))
     return (jax.lax.shift_right_logical(bits, _bit_numbers(bits)) & 1).reshape(rows, -1) != 0
@@ -246,9 +245,9 @@ def _bit_numbers(bits: jax.Array) -> jax.Array:
     return jax.lax.broadcasted_iota(jnp.int32, bits.shape, 1)
 
 
-def _shape(dtype: Any, *sides: int) -> jax.ShapeDtypeStruct:
-    """Describe an array of this dtype with these side lengths."""
-    return jax.ShapeDtypeStruct(sides, dtype)
+def _shape(dtype: Any, *shape: int) -> jax.ShapeDtypeStruct:
+    """Return a ShapeDtypeStruct of this dtype and shape."""
+    return jax.ShapeDtypeStruct(shape, dtype)
 
 
 def _kernel(

@@ -1,8 +1,7 @@
-"""Sort-free search for the energy gate's threshold.
+"""Find the energy gate's threshold by bisection, without a sort.
 
-Non-negative fp32 numbers sort like their bit patterns, so a binary search over those bits finds the
-threshold with nothing but comparisons and row sums: over all rows in XLA, or over a few rows in the
-body of a kernel.
+Non-negative fp32 numbers sort like their bit patterns, so a binary search over these bits needs
+only comparisons and row sums: over all rows at once in XLA, or over a few rows in a kernel body.
 """
 
 import functools
@@ -15,7 +14,7 @@ import numpy as np
 
 
 class Boundary(NamedTuple):
-    """Last kept position of each row: s > score is kept, s == score up to and including `index`."""
+    """Last kept position of each row: s > score is kept, and s == score up to index, inclusive."""
 
     score: jax.Array  # f32 [..., 1], [] for a single row; NaN where nothing is kept
     index: jax.Array  # int32, same shape
@@ -29,14 +28,14 @@ class Ratio(NamedTuple):
 
 
 def energies(scores: jax.Array) -> jax.Array:
-    """Square the scores, after scaling each row by a power of two to a maximum in [1/2, 1).
+    """Square the scores after scaling each row by a power of two to a maximum in [1/2, 1).
 
-    The scaling is exact and cancels in E_k, and it keeps the squares from under- and overflowing.
+    The scaling is exact, cancels in E_k and keeps the squares from overflow and underflow.
     For a maximum with exponent field e the factor is 2^(126 - e), whose own field is 253 - e (at
     least 1, so that it stays normal).
 
-    A row with infinite scores gives the limit: energy 1 for those, 0 for finite ones. NaN stays
-    NaN, even on backends whose maximum ignores it (Triton's does).
+    In a row with infinite scores these get energy 1 and finite ones 0, the limit. NaN stays NaN,
+    even on backends whose maximum ignores it, such as Triton.
     """
     largest = _by_row(jnp.max, jnp.abs(jax.lax.stop_gradient(scores)))
     exponent = jax.lax.shift_right_logical(_bits(largest), 23)
@@ -61,7 +60,7 @@ def _float(bits: jax.Array) -> jax.Array:
 class _Bracket(NamedTuple):
     """Search interval on the bits of scores, int32 [..., 1].
 
-    The scores >= `low` reach the target together, the scores >= `high` do not.
+    The energy of the scores >= `low` reaches the target, that of the scores >= `high` does not.
     """
 
     low: jax.Array
@@ -73,12 +72,12 @@ class _Bracket(NamedTuple):
 
 
 def bisected_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
-    """Compute the mask, bool [..., R], by searching all rows at once in XLA.
+    """Compute the mask, bool [..., R], with a search over all rows at once in XLA.
 
-    The search fixes, bit by bit, the largest threshold at which the scores >= threshold reach the
-    target. Each step also decides scores: if a threshold falls short, every score above it is kept;
-    if it reaches the target, every score below it is dropped. At the end only ties with the
-    threshold are undecided; each is kept as long as the energy before it falls short.
+    The search sets, bit by bit, the largest threshold at which the scores >= threshold reach the
+    target. Each step also decides scores: if a candidate falls short of the target, all scores >=
+    candidate are kept; if it reaches the target, all scores below it are dropped. At the end only
+    ties with the threshold are undecided; a tie is kept if the energy before it falls short.
 
     Scores are decided inside the loop because the threshold must not be compared with them outside:
     XLA may recompute the scores there and round them differently.
@@ -105,12 +104,12 @@ def bisected_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
 
 
 def block_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
-    """Find the boundary of a block of rows [..., R] inside a kernel, which computes scores once.
+    """Find the boundaries of a block of rows [..., R] inside a kernel.
 
     One binary search finds the largest score s such that all scores >= s reach the target, a second
-    one the last tie of s that is needed. Both use elementwise operations and row sums only. The
+    one the last tie of s that is needed. Both use only elementwise operations and row sums. The
     loop stops once all rows of the block are decided (after 11 of 31 steps for softplus scores,
-    R = 128). A single row works on scalars, which cost a kernel nothing to compare.
+    R = 128). For a single row the comparisons are on scalars, which are free in a kernel.
     """
     if scores.size == scores.shape[-1]:
         scores = scores.reshape(-1)
@@ -123,29 +122,31 @@ def block_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
         count = _by_row(jnp.sum, above.astype(jnp.int32), dtype=jnp.int32)
         reached = _by_row(jnp.sum, jnp.where(above, energy, 0))
         is_low = ratio.denominator * reached >= target
-        upper = bracket._replace(low=middle, num_low=count)
-        lower = bracket._replace(high=middle, num_high=count)
-        return jax.tree.map(functools.partial(jnp.where, is_low), upper, lower)
+        upper_half = bracket._replace(low=middle, num_low=count)
+        lower_half = bracket._replace(high=middle, num_high=count)
+        return jax.tree.map(functools.partial(jnp.where, is_low), upper_half, lower_half)
 
     lowest, highest = (_bits(_by_row(f, scores)) for f in (jnp.min, jnp.max))
-    none = jnp.zeros_like(lowest)
+    zero = jnp.zeros_like(lowest)
     bracket = jax.lax.while_loop(
         lambda b: _any((b.high - b.low > 1) & (b.num_low - b.num_high > 1)),
         halve,
-        _Bracket(lowest, highest + 1, none + scores.shape[-1], none),
+        _Bracket(lowest, highest + 1, zero + scores.shape[-1], zero),
     )
-    # The bracket now holds one score, or several equal ones.
+    # The bracket now holds a single score or ties.
     score = _by_row(jnp.max, jnp.where(scores <= _float(bracket.high - 1), scores, -1))
     last_tie = functools.partial(_last_tie, scores, energy, score, target, ratio)
     has_ties = _any(bracket.num_low - bracket.num_high > 1)
-    last = jnp.where(target > 0, score, jnp.nan)
-    return Boundary(last, jax.lax.cond(has_ties, last_tie, lambda: none + scores.shape[-1]))
+    boundary_score = jnp.where(target > 0, score, jnp.nan)
+    return Boundary(
+        boundary_score, jax.lax.cond(has_ties, last_tie, lambda: zero + scores.shape[-1])
+    )
 
 
 def _last_tie(
     scores: jax.Array, energy: jax.Array, score: jax.Array, target: jax.Array, ratio: Ratio
 ) -> jax.Array:
-    """Find the index of the last tie of `score` that is kept, int32 [..., 1].
+    """Find the index of the last kept tie of `score`, int32 [..., 1].
 
     All ties have the same energy; a tie is kept if the energy before it falls short of the target.
     """

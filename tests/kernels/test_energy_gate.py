@@ -1,4 +1,4 @@
-"""The energy gate against exact arithmetic, and its behaviour under JAX's transformations."""
+"""Compare the energy gate with exact arithmetic, also under JAX transformations."""
 
 import functools
 
@@ -21,31 +21,31 @@ def golden():
 
 
 def energy_gate(scores, eta, implementation=None):
-    """Run the gate, the Triton kernel in the interpreter where there is no GPU."""
+    """Run the gate; without a GPU the Triton kernel runs in the interpreter."""
     interpret = jax.default_backend() != "gpu"
     return gate.energy_gate(scores, eta, implementation=implementation, interpret=interpret)
 
 
-def scores_like(shape, seed=0):
+def random_scores(shape, seed=0):
     return jax.nn.softplus(2 * jax.random.normal(jax.random.key(seed), shape))
 
 
 @pytest.mark.parametrize(
-    ("implementation", "may_miss"),
+    ("implementation", "max_misses"),
     [("pairwise", 0), ("bisection", 0), ("block", 0), ("pallas", 0), ("sort", 1)],
 )
 @pytest.mark.parametrize("eta", [0.5, 0.7, 0.8, 0.9, 0.99])
-def test_equals_exact_arithmetic(golden, implementation, may_miss, eta):
-    """`k` and `order` come from big-integer arithmetic; "sort" rounds across η on one row."""
+def test_equals_exact_arithmetic(golden, implementation, max_misses, eta):
+    """`k` and `order` come from big-integer arithmetic; rounding in "sort" crosses η in one row."""
     row = [round(100 * eta) for eta in (0.5, 0.7, 0.8, 0.9, 0.99, 1)].index(round(100 * eta))
     k, order = golden["k"][row], golden["order"]
     run = jax.jit(lambda s: energy_gate(s, eta, implementation))
     mask, active_rank, kept_energy = map(np.asarray, run(golden["scores"]))
     expected = np.argsort(order, axis=1) < k[:, None]
-    assert (mask != expected).any(1).sum() <= may_miss
+    assert (mask != expected).any(1).sum() <= max_misses
     np.testing.assert_array_equal(active_rank, mask.sum(1))
-    some = (k > 0) & (mask == expected).all(1)
-    np.testing.assert_allclose(kept_energy[some], golden["E_k"][row][some], rtol=1e-6)
+    rows = (k > 0) & (mask == expected).all(1)
+    np.testing.assert_allclose(kept_energy[rows], golden["E_k"][row][rows], rtol=1e-6)
 
 
 def test_target_of_one_keeps_every_positive_score(golden):
@@ -89,7 +89,7 @@ EXTREME = [
     ],
 )
 def test_limits_of_fp32(implementation, eta, expected):
-    """Infinite scores share the energy, NaN keeps nothing, -0 is 0, signs do not matter."""
+    """Infinite scores share the energy, rows with NaN keep nothing, signs are ignored."""
     rows = np.array([*EXTREME, [NAN, 1, INF, 2]], np.float32)
     run = jax.jit(lambda s: energy_gate(s, eta, implementation))
     mask, rank, kept = run(rows)
@@ -102,7 +102,7 @@ def test_limits_of_fp32(implementation, eta, expected):
 
 @pytest.mark.parametrize("implementation", ["pairwise", "bisection", "block", "pallas"])
 def test_nan_with_a_maximum_that_ignores_it(monkeypatch, implementation):
-    """Triton's maximum ignores NaN, which the rows of `test_limits_of_fp32` show only with INF."""
+    """Triton's maximum ignores NaN; emulate it with a patched `jnp.max`."""
     largest = jnp.max
     monkeypatch.setattr(jnp, "max", lambda a, **o: largest(jnp.where(a == a, a, -INF), **o))
     rows = np.array([[NAN, 1, INF, 2], [1, NAN, 3, 0], [NAN] * 4, [INF, 1, 2, 0]], np.float32)
@@ -119,8 +119,8 @@ def test_gradients_at_the_limits_of_fp32(eta):
     assert np.isfinite(gradient).all()
 
 
-def test_a_direction_stays_whose_score_is_computed_twice():
-    """Unoptimised, XLA rounds scores for the search in one way, for what follows in another."""
+def test_scores_that_xla_computes_twice():
+    """Without optimization XLA rounds the scores differently for the search and for later use."""
     method = LoRASP(rank=8, hidden_width=4, energy_target=0.5, schedule=EnergySchedule(0.5))
     params = method.init_params(jax.random.key(0), 6, 5)
     params["router"]["w2"] = jax.random.normal(jax.random.key(1), (4, 8))
@@ -130,15 +130,15 @@ def test_a_direction_stays_whose_score_is_computed_twice():
 
 
 def test_block_takes_any_leading_axes():
-    scores = scores_like((1, 5, 7))
+    scores = random_scores((1, 5, 7))
     run = jax.jit(lambda s, name: gate.energy_gate(s, 0.9, implementation=name), static_argnums=1)
-    for found, expected in zip(run(scores, "block"), run(scores, "pairwise"), strict=True):
-        np.testing.assert_array_equal(found, expected)
+    for actual, expected in zip(run(scores, "block"), run(scores, "pairwise"), strict=True):
+        np.testing.assert_array_equal(actual, expected)
 
 
 @pytest.mark.parametrize("shape", [(3, 1), (2, 5, 100)])
 def test_pallas_takes_any_shape(shape):
-    scores = scores_like(shape)
+    scores = random_scores(shape)
     (pallas,) = jax.jit(jax.vmap(lambda s: energy_gate(s, 0.9, "pallas")[0]))(scores[None])
     bisected = jax.jit(lambda s: energy_gate(s, 0.9, "bisection")[0])(scores)
     np.testing.assert_array_equal(pallas, bisected)
@@ -152,15 +152,15 @@ def test_transformations_agree(implementation):
         scanned = jax.lax.scan(lambda _, s: (None, run(s)), None, scores)[1]
         return run(scores), scanned, jax.vmap(run)(scores), jax.checkpoint(run)(scores)
 
-    plain, *others = all_ways(scores_like((4, 6, 33)))
+    direct, *others = all_ways(random_scores((4, 6, 33)))
     for other in others:
-        np.testing.assert_array_equal(other[0], plain[0])
-        np.testing.assert_allclose(other[2], plain[2], rtol=1e-6)
+        np.testing.assert_array_equal(other[0], direct[0])
+        np.testing.assert_allclose(other[2], direct[2], rtol=1e-6)
 
 
 def test_gradient_of_the_kept_energy():
     """d(1 - E)/ds_i = -2 s_i (m_i - E) / Σ s² for a constant mask; zero rows have zero gradient."""
-    scores = scores_like((5, 16)).at[0].set(0)
+    scores = random_scores((5, 16)).at[0].set(0)
 
     def loss(scores):
         mask, _, kept = gate.energy_gate(scores, 0.8)
@@ -175,14 +175,14 @@ def test_gradient_of_the_kept_energy():
 
 
 def test_target_is_an_exact_decimal():
-    """Nine of ten equal energies are exactly 9/10, however 0.9 is rounded."""
+    """Nine of ten equal energies are exactly 9/10, although 0.9 is rounded in fp32."""
     etas = [0.9, np.float32(0.9), 0.900001]
     ranks = jax.jit(lambda s: [gate.energy_gate(s, eta)[1] for eta in etas])(jnp.ones(10))
     assert ranks == [9, 9, 10]
 
 
-@pytest.mark.parametrize("eta", [0, -0.1, 1.0001, float("nan"), float("inf"), "much"])
-def test_bad_target(eta):
+@pytest.mark.parametrize("eta", [0, -0.1, 1.0001, float("nan"), float("inf"), "high"])
+def test_invalid_target(eta):
     with pytest.raises(ValueError, match=r"energy_target must lie in \(0, 1\]"):
         gate.energy_gate(jnp.ones(3), eta)
 

@@ -1,4 +1,4 @@
-"""int8 and nf4 kernels against their bounds, their definitions and qwix."""
+"""Compare int8 and nf4 kernels with their error bounds, their definitions and qwix."""
 
 import jax
 import jax.numpy as jnp
@@ -7,23 +7,23 @@ import pytest
 from jax.scipy.special import ndtri
 
 from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul
-from lorasp_jax.kernels.quantized_weights import KINDS, NF4, quantized
+from lorasp_jax.kernels.quantized_weights import KINDS, NF4, quantize_kernel
 from tests import GOLDEN
 
 GOLDEN = GOLDEN / "quantized_kernels.npz"
-WORST = {"int8": 1 / 255, "nf4": (NF4[1] - NF4[0]) / 2}
+MAX_ERROR = {"int8": 1 / 255, "nf4": (NF4[1] - NF4[0]) / 2}
 
 
 def normal(*shape, seed=0):
     return jax.random.normal(jax.random.key(seed), shape)
 
 
-def whole(kernel, kind):
-    return np.asarray(quantized(kernel, kind).astype(jnp.float32))
+def dequantized(kernel, kind):
+    return np.asarray(quantize_kernel(kernel, kind).astype(jnp.float32))
 
 
 def test_nf4_table():
-    """QLoRA's construction: normal quantiles of both halves, 8 below 0 and 9 above, maximum 1."""
+    """QLoRA's construction: normal quantiles, 8 up to 0 and 9 from 0, scaled to [-1, 1]."""
     offset = (1 / 32 + 1 / 30) / 2
     below = ndtri(jnp.linspace(offset, 0.5, 8))
     above = -ndtri(jnp.linspace(offset, 0.5, 9))
@@ -36,32 +36,33 @@ def test_nf4_table():
 def test_qwix(kind):
     """Codes and scales equal those of qwix 0.1.8, per column and in blocks of 64 inputs."""
     with np.load(GOLDEN) as golden:
-        np.testing.assert_allclose(whole(golden["kernel"], kind), golden[kind], rtol=1e-6)
+        np.testing.assert_allclose(dequantized(golden["kernel"], kind), golden[kind], rtol=1e-6)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("shape", [(256, 12), (100, 7), (5, 3), (2, 130, 6)])
 def test_error_bound(kind, shape):
     kernel = np.asarray(normal(*shape))
-    smaller = quantized(kernel, kind)
-    assert (smaller.shape, smaller.dtype) == (shape, jnp.float32)
+    kernel_q = quantize_kernel(kernel, kind)
+    assert (kernel_q.shape, kernel_q.dtype) == (shape, jnp.float32)
     block = 64 if kind == "nf4" else shape[-2]
     for start in range(0, shape[-2], block):
         rows = np.s_[..., start : start + block, :]
         largest = np.abs(kernel[rows]).max(-2, keepdims=True)
         assert (
-            np.abs(whole(kernel, kind)[rows] - kernel[rows]) <= 1.0001 * WORST[kind] * largest
+            np.abs(dequantized(kernel, kind)[rows] - kernel[rows])
+            <= 1.0001 * MAX_ERROR[kind] * largest
         ).all()
 
 
 @pytest.mark.parametrize(("kind", "error"), [("int8", 0.0069), ("nf4", 0.092)])
 def test_error_and_bytes(kind, error):
-    """Relative error on normal weights in 4 blocks; 8 and 4.5 bits per weight plus int8 scales."""
+    """Relative error of normal weights; bits per weight: 8 plus scales for int8, 4.5 for nf4."""
     kernel = np.asarray(normal(256, 512))
-    lost = np.linalg.norm(whole(kernel, kind) - kernel) / np.linalg.norm(kernel)
-    assert lost == pytest.approx(error, rel=0.02)
+    relative_error = np.linalg.norm(dequantized(kernel, kind) - kernel) / np.linalg.norm(kernel)
+    assert relative_error == pytest.approx(error, rel=0.02)
     bits = {"int8": 8 + 32 / 256, "nf4": 4 + 32 / 64}[kind]
-    assert quantized(kernel, kind).nbytes * 8 == bits * kernel.size
+    assert quantize_kernel(kernel, kind).nbytes * 8 == bits * kernel.size
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -70,18 +71,18 @@ def test_representable_values_are_exact(kind):
     kernel = np.random.default_rng(0).choice(table, (64, 9)).astype(np.float32)
     kernel[0] = 1.0
     kernel[:, 3] = 0.0
-    np.testing.assert_allclose(whole(kernel, kind)[1:], kernel[1:], atol=1e-6)
+    np.testing.assert_allclose(dequantized(kernel, kind)[1:], kernel[1:], atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_stack_equals_its_layers(kind):
     kernel = normal(2, 3, 70, 5)
-    stack = quantized(kernel, kind)
-    each = [[whole(matrix, kind) for matrix in row] for row in kernel]
-    np.testing.assert_array_equal(stack.astype(jnp.float32), each)
+    stack = quantize_kernel(kernel, kind)
+    layers = [[dequantized(matrix, kind) for matrix in row] for row in kernel]
+    np.testing.assert_array_equal(stack.astype(jnp.float32), layers)
     flat = stack.reshape(-1, 70, 5)
     assert flat.shape == (6, 70, 5)
-    np.testing.assert_array_equal(flat.astype(jnp.float32)[4], each[1][1])
+    np.testing.assert_array_equal(flat.astype(jnp.float32)[4], layers[1][1])
     with pytest.raises(ValueError, match=r"kernel \(2, 3, 70, 5\) to \(6, 350\)"):
         stack.reshape(6, 350)
     scanned = jax.lax.scan(lambda _, k: (None, k.astype(jnp.bfloat16)), None, flat)[1]
@@ -95,38 +96,38 @@ class Identity:
         return rows, ()
 
 
-def product(x, kernel, p, u):
-    """x W + (x P) U."""
+def low_rank(x, kernel, p, u):
+    """Compute x W + (x P) U."""
     layers = [LowRankLayer((), kernel, p, u)]
     return low_rank_matmul((Identity(),), x.dtype, layers, x, None)[0][0]
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("shape", [(6, 10), (10, 6)])
-def test_product_and_gradients_equal_those_of_the_dequantised_kernel(kind, shape):
-    smaller = quantized(normal(*shape), kind)
+def test_values_and_gradients_equal_the_dequantized_kernel(kind, shape):
+    kernel_q = quantize_kernel(normal(*shape), kind)
     x, p, u = normal(4, shape[0], seed=1), normal(shape[0], 3, seed=2), normal(3, shape[1], seed=3)
 
     def loss(x, p, u, kernel):
-        return jnp.sum(jnp.sin(product(x, kernel, p, u)))
+        return jnp.sum(jnp.sin(low_rank(x, kernel, p, u)))
 
-    ours = jax.jit(jax.value_and_grad(loss, (0, 1, 2)))(x, p, u, smaller)
-    theirs = jax.value_and_grad(loss, (0, 1, 2))(x, p, u, smaller.astype(jnp.float32))
-    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+    actual = jax.jit(jax.value_and_grad(loss, (0, 1, 2)))(x, p, u, kernel_q)
+    expected = jax.value_and_grad(loss, (0, 1, 2))(x, p, u, kernel_q.astype(jnp.float32))
+    for a, b in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_residuals_hold_codes_not_the_dequantised_kernel(kind):
-    smaller = quantized(normal(64, 64), kind)
+def test_residuals_contain_only_the_codes(kind):
+    kernel_q = quantize_kernel(normal(64, 64), kind)
     x, p, u = normal(2, 64), normal(64, 1), normal(1, 64)
-    _, pull = jax.vjp(lambda x, p, u: product(x, smaller, p, u), x, p, u)
-    kept = sum(leaf.nbytes for leaf in jax.tree.leaves(pull))
-    assert kept <= smaller.nbytes + x.nbytes + p.nbytes + u.nbytes + 2 * 4  # z [2, 1]
+    _, vjp = jax.vjp(lambda x, p, u: low_rank(x, kernel_q, p, u), x, p, u)
+    residual_bytes = sum(leaf.nbytes for leaf in jax.tree.leaves(vjp))
+    assert residual_bytes <= kernel_q.nbytes + x.nbytes + p.nbytes + u.nbytes + 2 * 4  # z [2, 1]
 
 
-def test_bad_input():
-    with pytest.raises(ValueError, match="Unknown quantisation 'int4'; valid are int8, nf4"):
-        quantized(normal(4, 4), "int4")
+def test_invalid_input():
+    with pytest.raises(ValueError, match="Unknown quantization 'int4'; valid are int8, nf4"):
+        quantize_kernel(normal(4, 4), "int4")
     with pytest.raises(ValueError, match="NaN or infinite values"):
-        quantized(jnp.array([[1.0, jnp.nan]]), "int8")
+        quantize_kernel(jnp.array([[1.0, jnp.nan]]), "int8")

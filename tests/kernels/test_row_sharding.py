@@ -1,4 +1,4 @@
-"""A kernel on sharded rows: each device runs on its own rows, and nothing is gathered."""
+"""On sharded rows each device runs the kernel on its own rows, and nothing is gathered."""
 
 import functools
 
@@ -15,7 +15,7 @@ from tests.kernels.test_rowwise_kernel import WIDTHS, close, gated
 
 
 def doubled(shared, arrays):
-    """Double the rows, sum them, and report how many rows one call saw."""
+    """Double the rows, sum them, and report the number of rows per call."""
     (rows,) = arrays
     return [shared[0] * rows, jnp.full((len(rows), 1), len(rows))], [rows.sum(0)]
 
@@ -25,32 +25,32 @@ def call(factor, rows, function=doubled):
     return by_rows(function, [factor], [rows])
 
 
-def placed(rows, fsdp=2, axes=("data", "fsdp")):
+def shard(rows, fsdp=2, axes=("data", "fsdp")):
     return jax.device_put(rows, NamedSharding(meshes.make_mesh(fsdp), PartitionSpec(axes)))
 
 
 @pytest.mark.parametrize(
-    ("num_rows", "axes", "at_a_time"),
+    ("num_rows", "axes", "rows_per_call"),
     # sharded over all 8 devices, over 4 pairs, over 2 groups of 4, replicated
     [(16, ("data", "fsdp"), 2), (16, "data", 4), (16, "fsdp", 8), (16, None, 16)],
 )
-def test_each_device_has_its_own_rows(num_rows, axes, at_a_time):
+def test_each_device_has_its_own_rows(num_rows, axes, rows_per_call):
     rows = jnp.arange(num_rows * 3.0).reshape(num_rows, 3)
-    (twice, numbers), (total,) = call(jnp.float32(2), placed(rows, axes=axes))
+    (twice, counts), (total,) = call(jnp.float32(2), shard(rows, axes=axes))
     np.testing.assert_array_equal(twice, 2 * rows)
-    np.testing.assert_array_equal(numbers, at_a_time)
+    np.testing.assert_array_equal(counts, rows_per_call)
     np.testing.assert_array_equal(total, rows.sum(0))
 
 
 def test_rows_that_do_not_divide_are_gathered():
-    """12 rows on 8 devices: the padding of the shards would end up in the sums."""
+    """With 12 rows on 8 devices, the sums would include the padding of the shards."""
 
     @jax.jit
-    def cut(rows):
+    def sliced(rows):
         return by_rows(doubled, [jnp.float32(2)], [rows[:12] + 1])
 
     rows = jnp.arange(16 * 3.0).reshape(16, 3)
-    (twice, _), (total,) = cut(placed(rows))
+    (twice, _), (total,) = sliced(shard(rows))
     np.testing.assert_array_equal(twice, 2 * rows[:12] + 2)
     np.testing.assert_array_equal(total, (rows[:12] + 1).sum(0))
 
@@ -64,7 +64,7 @@ def test_vmap():
 
 
 def test_rowwise_kernel(monkeypatch):
-    """Tokens of a sharded batch through the fused kernel: values and gradients."""
+    """Values and gradients of the row-wise kernel on tokens of a sharded batch."""
     monkeypatch.setattr(kernels, "FEW_ROWS", 0)
     keys = jax.random.split(jax.random.key(0), 3)
     shared = {"w": jax.random.normal(keys[0], (16, 32)), "b": jax.random.normal(keys[1], (32,))}
@@ -74,14 +74,14 @@ def test_rowwise_kernel(monkeypatch):
     def gradients(shared, x):
         def loss(shared, x):
             rows = jnp.sin(x).reshape(-1, 48)
-            counts = rows[:, :1] > 0
+            valid = rows[:, :1] > 0
             output, sums, _ = kernels.rowwise_kernel(
-                gated, shared, rows, WIDTHS, counts, interpret=True
+                gated, shared, rows, WIDTHS, valid, interpret=True
             )
             return jnp.sin(output).sum() + sums["squares"].sum()
 
         return jax.value_and_grad(loss, argnums=(0, 1))(shared, x)
 
-    split = gradients.lower(shared, placed(x)).compile()
-    assert "all-gather" not in split.as_text()
-    jax.tree.map(close, split(shared, placed(x)), gradients(shared, x))
+    compiled = gradients.lower(shared, shard(x)).compile()
+    assert "all-gather" not in compiled.as_text()
+    jax.tree.map(close, compiled(shared, shard(x)), gradients(shared, x))

@@ -22,7 +22,7 @@ from flax import nnx
 from lorasp_jax.adapters import adaptation, paths
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.dense import AdaptedLayer, AdapterParam, validate
-from lorasp_jax.kernels.quantized_weights import KINDS, Kind, QuantizedKernel, quantized
+from lorasp_jax.kernels.quantized_weights import KINDS, Kind, QuantizedKernel, quantize_kernel
 from lorasp_jax.peft._fields import short
 
 # By identity of a variable, equation and kind: what replaces it, the variable itself, which so
@@ -98,7 +98,7 @@ def _quantized(layer: nnx.Module, kind: Kind, shared: Shared) -> tuple[AdaptedLa
         raise ValueError("its kernel is quantised already.")
     key = id(variable), getattr(layer, "kernel_equation", ""), kind
     if key not in shared:
-        smaller = quantized(kernel, kind)
+        smaller = quantize_kernel(kernel, kind)
         layer.set_kernel_matrices(smaller)
         shared[key] = layer.kernel_variable(), variable, float(_error(kernel, smaller))
     new, _, error = shared[key]

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from lorasp_jax.kernels.energy_gate import SMALLEST_TARGET, positive
+from lorasp_jax.kernels.energy_gate import MIN_TARGET, positive
 from lorasp_jax.kernels.threshold_search import Ratio, bisected_mask
 from lorasp_jax.peft import _fields
 
@@ -62,7 +62,7 @@ def gate_at(scores: jax.Array, target: jax.Array) -> jax.Array:
     As exact as η itself, which is the fp32 number here and not a decimal.
     """
     constant = jnp.abs(jax.lax.stop_gradient(scores.astype(jnp.float32)))
-    below_one = bisected_mask(constant, Ratio(jnp.maximum(target, SMALLEST_TARGET), 1))
+    below_one = bisected_mask(constant, Ratio(jnp.maximum(target, MIN_TARGET), 1))
     return jnp.where(target >= 1, positive(constant), below_one)
 
 
