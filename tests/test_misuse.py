@@ -22,17 +22,17 @@ NET = nnx.Dict(inp=nnx.Linear(5, 4, rngs=nnx.Rngs(0)), head=nnx.Linear(4, 2, rng
 @pytest.mark.parametrize(
     ("rules", "message"),
     [
-        ({"inp": METHOD}, "got a dict: give list(rules.items())"),
-        (("inp", METHOD), "one rule alone is [(pattern, ...)]"),
-        ("inp", "at least one, got 'inp'"),
-        ([], "at least one, got none"),
-        (None, "at least one, got None"),
-        ([("inp",)], "got ('inp',) among them"),
-        ([(3, None)], "got (3, None) among them"),
+        ({"inp": METHOD}, "got a dict: pass list(rules.items())"),
+        (("inp", METHOD), "write [(pattern, ...)] for a single rule"),
+        ("inp", "pairs, got 'inp'"),
+        ([], "pairs, got an empty list"),
+        (None, "pairs, got None"),
+        ([("inp",)], "got the item ('inp',)"),
+        ([(3, None)], "got the item (3, None)"),
         ([("inp", LoRA)], "rule 'inp' has the class LoRA: write LoRA()"),
-        ([("inp", "lora")], "rule 'inp' has 'lora' where method or None belongs"),
-        ([("(", METHOD)], "rule '(' is no regular expression"),
-        ([("a{99999999999}", METHOD)], "is no regular expression: the repetition number"),
+        ([("inp", "lora")], "rule 'inp' must have method or None, got 'lora'"),
+        ([("(", METHOD)], "rule '(' is not a valid regular expression"),
+        ([("a{99999999999}", METHOD)], "is not a valid regular expression: the repetition number"),
     ],
 )
 def test_rules(rules, message):
@@ -313,19 +313,22 @@ def test_models_without_values(tmp_path):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda _: lorasp_jax.summary(adapted(), 5), "aux is what collect_aux returned, got 5"),
+        (
+            lambda _: lorasp_jax.summary(adapted(), 5),
+            "aux must be the result of collect_aux, got 5",
+        ),
         (lambda _: lorasp_jax.collect_aux(None), "variables that a Linen model returned, got None"),
         (lambda _: lorasp_jax.collect_aux({"intermediates": 5}), "got {'intermediates': 5}"),
         (lambda _: lorasp_jax.auxiliary_losses({"a": 5}), "aux must be a tree of Aux"),
         (
             lambda _: lorasp_jax.adapt(NET, [("inp", METHOD)], **RNGS, statistics=5),
-            "statistics are those of calibration.input_moments, by path, got 5",
+            "statistics must be a mapping from calibration.input_moments, got 5",
         ),
         (
             lambda _: lorasp_jax.adapt(
                 NET, [("inp", METHOD)], **RNGS, statistics={"inp": jnp.full((5, 5), jnp.nan)}
             ),
-            "statistics of inp must be finite numbers [I, I], got float32 [5, 5]",
+            "statistics of inp must be finite, of shape [..., I, I], got float32 [5, 5]",
         ),
         (lambda _: lorasp_jax.with_dropout(NET, 5), "key must be one such as jax.random.key(0)"),
         (lambda _: lorasp_jax.save_adapters(5, adapted()), "a folder is a text or a path, got 5"),

@@ -121,7 +121,7 @@ def test_the_documented_loop(remat, scanned, tmp_path):
     save_adapters(tmp_path, trained)
     loaded = load_adapters(tmp_path, base, einsums=EINSUMS)
     np.testing.assert_array_equal(loaded(IDS), trained(IDS))
-    with pytest.raises(ValueError, match=r"of other classes: .*layers(/0)?/[qo] \(Einsum\)"):
+    with pytest.raises(ValueError, match=r"unsupported classes: .*layers(/0)?/[qo] \(Einsum\)"):
         load_adapters(tmp_path, base)
 
 

@@ -1,18 +1,18 @@
 """Adapting a whole model: attach methods by path rules, split, count, merge.
 
-A rule is (pattern, method). Patterns are `re.search`ed in "/"-joined paths, and the first rule that
-matches a path governs it, whether it can apply there or not: with [("vision", LoRA()),
-(".*", FullFineTuning())] the vision tower's norms stay frozen. `None` leaves a path alone.
+A rule is (pattern, method). Patterns are searched (`re.search`) in "/"-joined paths. The first
+match wins, even if its method cannot apply to that path: with [("vision", LoRA()),
+(".*", FullFineTuning())] the vision tower's norms stay frozen. The method `None` skips the path.
 
-What Hugging Face PEFT has options for are rules here, the special ones first:
+Hugging Face PEFT's options map to rules, most specific first:
 
     rank_pattern, alpha_pattern    ("attn/q", LoRA(rank=4, alpha=32)), (".*", LoRA(rank=8))
     modules_to_save                ("head", FullFineTuning()), (".*", LoRA())
     bias="all"                     ("bias$", FullFineTuning()), (".*", LoRA())
     exclude_modules                ("head", None), (".*", LoRA())
 
-A rule ("bias$", FullFineTuning()) frees biases of layers that another rule gives adapters to, since
-their kernels have other paths.
+A rule ("bias$", FullFineTuning()) also unfreezes the biases of layers that another rule adapts,
+since their kernels have different paths.
 """
 
 import math
@@ -37,7 +37,7 @@ Model = TypeVar("Model", bound=nnx.Module)
 
 
 class Counts(NamedTuple):
-    """Numbers of parameters."""
+    """Parameter counts."""
 
     trainable: int
     total: int
@@ -51,35 +51,37 @@ def adapt(
     einsums: nnx_layers.Einsums = MappingProxyType({}),
     statistics: Mapping[str, jax.Array] = MappingProxyType({}),
 ) -> Model:
-    """Attaches adapters to layers, or frees base weights for full fine-tuning, by path rules.
+    """Attach adapters to layers, or unfreeze base weights for full fine-tuning, by path rules.
 
     Adapters apply to every `Dense`, `nnx.Linear` (which becomes a `Dense`), `nnx.LinearGeneral` and
-    `nnx.Einsum` at its path, for instance "language/gate_proj"; LoRA to `nnx.Embed` and `nnx.Conv`
-    too. A stacked kernel [L, I, O] gets stacked adapters. The layer's own weights are frozen.
-    Subclasses that are called differently are left alone.
-    `FullFineTuning` applies to every parameter under the paths it matches, norms, embeddings and
-    biases included, which becomes an fp32 `AdapterParam` in its place.
+    `nnx.Einsum` at its path, for instance "language/gate_proj"; LoRA also applies to `nnx.Embed`
+    and `nnx.Conv`. A stacked kernel [L, I, O] gets stacked adapters. The layer's own weights are
+    frozen. Subclasses that override `__call__` are skipped.
+    `FullFineTuning` applies to every parameter under the paths it matches, including norms,
+    embeddings and biases, and converts each to an fp32 `AdapterParam`.
 
     Args:
-      model: left untouched; the result shares its frozen arrays.
+      model: not modified; the result shares its frozen arrays.
       rules: (pattern, method or None) pairs, first match wins.
-      rngs: source of the adapters' keys. A layer's adapter depends on the key and its path alone.
-      einsums: further layer classes that do nothing but an einsum of their input and a parameter,
-        each with a function of the layer that gives the parameter's name and the equation, as in
+      rngs: source of the adapters' keys. A layer's initial adapter depends only on the key and the
+        layer's path.
+      einsums: extra layer classes that compute one einsum of their input and a parameter, mapped to
+        a function layer -> (parameter name, equation), as in
         {gemma.Einsum: lambda layer: ("w", layer.einsum_str)}.
-      statistics: by path, [..., I, I] of `calibration.input_moments`, for what starts from data.
+      statistics: [..., I, I] by path from `calibration.input_moments`, for data-driven
+        initialization.
 
     Returns:
       The adapted model.
 
     Raises:
-      ValueError: a rule that is no regular expression or governs nothing that it applies to (lists
-        near misses), a layer that an adapter cannot take over, or one that has an adapter already.
+      ValueError: a pattern is not a valid regular expression, a rule applies to nothing (the
+        message lists near misses), or a layer is unsupported or already has an adapter.
     """
     paths.check_method_rules(rules)
     nnx_layers.check_einsums(einsums)
     _check_statistics(statistics)
-    root, key = _copy(model), validate.rngs(rngs).params()
+    root, key = _wrapped_copy(model), validate.rngs(rngs).params()
     used = _attach_all(root, rules, key, einsums, statistics) | unfreeze(root, rules)
     for i, (pattern, _) in enumerate(rules):
         if i not in used:
@@ -88,34 +90,34 @@ def adapt(
 
 
 def split(model: nnx.Module) -> tuple[nnx.GraphDef[Any], nnx.State[Any, Any], nnx.State[Any, Any]]:
-    """(graphdef, adapters, frozen): the structure, what trains, and everything else.
+    """Split a model into (graphdef, adapters, frozen); `adapters` is the trainable state.
 
-    A step takes its gradient with respect to `adapters` alone. In a model trained as a whole,
-    biases and layers without an adapter would train too.
+    Differentiate with respect to `adapters` only: differentiating the whole model would also train
+    biases and unadapted layers.
 
-    `nnx.merge(graphdef, adapters, frozen, copy=True)` gives the model back, also inside jit and
-    grad. Without `copy`, a model whose code has `nnx.scan` or `nnx.remat` cannot be called there.
+    `nnx.merge(graphdef, adapters, frozen, copy=True)` restores the model, also inside jit and grad.
+    Without `copy=True`, models that use `nnx.scan` or `nnx.remat` cannot be called there.
     """
-    graphdef, adapters, frozen = nnx.split(_copy(model)[0], AdapterParam, ...)
+    graphdef, adapters, frozen = nnx.split(_wrapped_copy(model)[0], AdapterParam, ...)
     return graphdef, adapters, frozen
 
 
 def with_dropout(model: Model, key: jax.Array) -> Model:
-    """The model for one training step, in which adapters with a `dropout` see parts of their input.
+    """Enable the adapters' `dropout` for one training step.
 
-    Called inside the loss, with another key for each step:
+    Call it inside the loss, with a fresh key per step:
 
         model = with_dropout(nnx.merge(graphdef, adapters, frozen, copy=True), key)
 
-    All other models evaluate: those of `adapt` and `load_adapters`, and what `split`, `merge` and
-    other functions make of the result. The layers of a stack draw apart from each other; a layer
-    that is called twice drops the same places of both inputs, if they are of one shape.
+    Every other function, such as `adapt`, `load_adapters`, `split` and `merge`, returns a model
+    with dropout off. Layers of a stack use independent masks; a layer called twice reuses its mask
+    for inputs of equal shape.
 
     Args:
-      model: left untouched; without such adapters the result computes the same.
-      key: typed random key.
+      model: not modified; adapters without dropout are unaffected.
+      key: typed PRNG key.
     """
-    root, key = _copy(model), _arguments.key(key)
+    root, key = _wrapped_copy(model), _arguments.key(key)
     for location in paths.unique(paths.locate(root, AdaptedLayer)):
         layer = location.child
         if isinstance(layer.adapter, AdapterParam) and dropout_rate(layer.method):
@@ -128,40 +130,40 @@ def with_dropout(model: Model, key: jax.Array) -> Model:
 
 
 def count(model: nnx.Module) -> Counts:
-    """How many parameters train, and how many there are; shapes suffice (`nnx.eval_shape`)."""
+    """Count trainable and total parameters; also works on shapes (`nnx.eval_shape`)."""
     validate.module(model)
     return Counts(_size(nnx.state(model, AdapterParam)), _size(nnx.state(model, nnx.Param)))
 
 
 def methods(model: nnx.Module) -> dict[str, Method]:
-    """Method by path: of each layer with an adapter, and full fine-tuning of each parameter."""
-    found = {}
+    """Methods by path: of adapters by layer, `FullFineTuning` by parameter."""
+    methods_by_path = {}
     validate.module(model)
     for path, parent, name, _ in paths.locate(nnx.List([model]), AdapterParam):
         if isinstance(parent, AdaptedLayer) and name == "adapter":
-            found[path.rpartition("/")[0]] = parent.method
+            methods_by_path[path.rpartition("/")[0]] = parent.method
         else:
-            found[path] = FullFineTuning()
-    return found
+            methods_by_path[path] = FullFineTuning()
+    return methods_by_path
 
 
 def merge(model: Model) -> Model:
-    """A model without adapters that computes the same: deltas folded into kernels, all frozen.
+    """Fold the adapters into the kernels; the result has no adapters and is entirely frozen.
 
-    Of an embedding, `attend` is adapted as lookups are; a table that the model reads past both is
-    not, but merging changes it. A quantised kernel under an adapter becomes an array again.
+    For embeddings, both lookup and `attend` use the adapter. Code that reads the table directly
+    does not, yet merging changes the table. An adapted quantized kernel is dequantized.
 
     Raises:
-      ValueError: a method whose delta depends on the input, or a model without values.
+      ValueError: a method's delta depends on the input, or the model holds shapes only.
     """
-    root = _copy(validate.with_values(model))
+    root = _wrapped_copy(validate.with_values(model))
     paths.replace(paths.locate(root, AdaptedLayer), _merged)
     _convert_variables(paths.locate(root, AdapterParam), nnx.Param)
     return root[0]
 
 
 def _merged(location: paths.Location) -> nnx.Module:
-    """The layer without its adapter, whose delta its kernel has."""
+    """Fold the adapter into the kernel and return the layer without it."""
     layer = location.child
     if layer.adapter is not None:
         try:
@@ -174,38 +176,38 @@ def _merged(location: paths.Location) -> nnx.Module:
 
 
 def penalties(model: nnx.Module) -> dict[str, jax.Array]:
-    """Each loss on parameters alone, averaged over the adapted matrices whose method has it."""
-    found: dict[str, list[jax.Array]] = {}
+    """Regularization losses by name, each averaged over the matrices whose method defines it."""
+    losses: dict[str, list[jax.Array]] = {}
     for _, _, _, layer in paths.locate(nnx.List([validate.module(model)]), AdaptedLayer):
         if layer.adapter is not None:
             penalty = over_stack(layer.method.penalty, layer.kernel_matrices())
             for name, values in penalty(layer.adapter.get_value()).items():
-                found.setdefault(name, []).append(values.ravel())
-    return {name: jnp.concatenate(values).mean() for name, values in found.items()}
+                losses.setdefault(name, []).append(values.ravel())
+    return {name: jnp.concatenate(values).mean() for name, values in losses.items()}
 
 
 def attach(
     layer: AdaptedLayer, method: Method, key: jax.Array, statistics: jax.Array | None = None
 ) -> None:
-    """Gives the layer a fresh adapter and freezes its own weights.
+    """Attach a newly initialized adapter to the layer and freeze its own weights.
 
     Args:
-      layer: changed in place. Leading axes of its kernel are layers of a scanned stack.
-      method: an additive method.
-      key: typed random key.
-      statistics: [..., I, I] of the layer's inputs, where the method starts from them.
+      layer: modified in place. Leading axes of its kernel are layers of a scanned stack.
+      method: the adapter's method.
+      key: typed PRNG key.
+      statistics: [..., I, I] of the layer's inputs, if the method requires them.
 
     Raises:
-      ValueError: a method that the layer cannot carry, a layer that has an adapter, or a quantised
-        kernel of which the method would take a part.
+      ValueError: the layer does not support the method, it already has an adapter, or the method
+        would split a quantized kernel.
     """
     if layer.adapter is not None and layer.method is not None:
         raise ValueError(
-            f"its {layer.method.name} adapter would be lost: adapt the base instead, merge the "
-            "model first, or leave this layer out by a rule with None in front."
+            f"the layer already has a {layer.method.name} adapter: adapt the base instead, merge "
+            "the model first, or exclude this layer with a leading (pattern, None) rule."
         )
     if method.splits_kernel and isinstance(layer.kernel_matrices(), QuantizedKernel):
-        raise ValueError("a quantised kernel cannot be split: adapt first, then quantise the rest.")
+        raise ValueError("a quantized kernel cannot be split: adapt first, then quantize.")
     _convert_variables(
         [p for p in paths.locate(nnx.List([layer]), AdapterParam) if p.name != "adapter"], nnx.Param
     )
@@ -218,23 +220,24 @@ def attach(
 
 
 def _check_statistics(statistics: Any) -> None:
-    """Raises a ValueError unless these are matrices of finite numbers by path."""
+    """Raise ValueError unless `statistics` maps paths to finite square matrices."""
     if not isinstance(statistics, Mapping):
-        wanted = "statistics are those of calibration.input_moments, by path"
-        raise ValueError(f"{wanted}, got {short(statistics)}.")
+        raise ValueError(
+            f"statistics must be a mapping from calibration.input_moments, got {short(statistics)}."
+        )
     for path, value in statistics.items():
         shape = getattr(value, "shape", (0, 1))
         traced = isinstance(value, jax.core.Tracer)
         if shape[-2:] != shape[-1:] * 2 or not (traced or jnp.isfinite(value).all()):
             raise ValueError(
-                f"statistics of {path} must be finite numbers [I, I], got {short(value)}."
+                f"statistics of {path} must be finite, of shape [..., I, I], got {short(value)}."
             )
 
 
-def _copy(model: nnx.Module) -> nnx.List[Any]:
-    """A holder of one copy of the model that shares its arrays, free of what calls need or leave.
+def _wrapped_copy(model: nnx.Module) -> nnx.List[Any]:
+    """Copy the model, sharing its arrays, without stored aux and dropout keys.
 
-    The holder gives a model that is itself one layer a parent to be replaced in.
+    The copy is wrapped in a List, so that a model that is itself one layer can be replaced in it.
     """
     model = nnx.clone(validate.module(model))
     nnx.pop(model, nnx.Any(AdapterAux, DropoutKey))
@@ -248,34 +251,34 @@ def _attach_all(
     einsums: nnx_layers.Einsums,
     statistics: Mapping[str, jax.Array],
 ) -> set[int]:
-    """Attaches adapters in place; returns the rules that were used."""
+    """Attach adapters in place; return the indices of the rules used."""
     used: dict[str, int] = {}
-    found = paths.locate_layers(root, einsums)
-    for location in found:
+    layers = paths.locate_layers(root, einsums)
+    for location in layers:
         i = paths.find_rule(rules, location.path)
         method = None if i is None else rules[i][1]
         if i is not None and method is not None and not method.trains_base:
             used[location.path] = i
 
-    def attached(location: paths.Location) -> AdaptedLayer | None:
+    def attach_to(location: paths.Location) -> AdaptedLayer | None:
         if location.path not in used:
             return None
         method = cast(Method, rules[used[location.path]][1])
-        own_key = jax.random.fold_in(key, zlib.crc32(location.path.encode()))
+        layer_key = jax.random.fold_in(key, zlib.crc32(location.path.encode()))
         try:
             layer = nnx_layers.adapted(location.child, einsums)
-            attach(layer, method, own_key, statistics.get(location.path))
+            attach(layer, method, layer_key, statistics.get(location.path))
         except ValueError as error:
             raise ValueError(f"cannot adapt {location.path or 'the model'}: {error}") from error
         return layer
 
-    paths.replace(found, attached)
+    paths.replace(layers, attach_to)
     return set(used.values())
 
 
 def unfreeze(root: nnx.List[Any], rules: paths.Rules) -> set[int]:
-    """Makes base parameters trainable in place; returns the rules that were used."""
-    used, freed = set(), []
+    """Unfreeze base parameters in place; return the indices of the rules used."""
+    used, unfrozen = set(), []
     for location in paths.locate(root, nnx.Param):
         i = paths.find_rule(rules, location.path.rpartition("/")[0], location.path)
         method = None if i is None else rules[i][1]
@@ -284,30 +287,32 @@ def unfreeze(root: nnx.List[Any], rules: paths.Rules) -> set[int]:
         used.add(i)
         if method is not None and not isinstance(location.child, AdapterParam):
             if isinstance(location.child.get_value(), QuantizedKernel):
-                raise ValueError(f"{location.path} is quantised and cannot train in full.")
+                raise ValueError(f"{location.path} is quantized and cannot be fully fine-tuned.")
             layer = location.parent if isinstance(location.parent, AdaptedLayer) else None
             if layer and layer.adapter is None:
                 layer.method = method
             elif layer and location.name == layer.kernel_name:
-                raise ValueError(f"{location.path} cannot train in full under the layer's adapter.")
+                raise ValueError(
+                    f"{location.path} cannot be fully fine-tuned: its layer has an adapter."
+                )
             if jnp.issubdtype(location.child.get_value().dtype, jnp.floating):
-                freed.append(location)
-    if shapes := [p for p in freed if isinstance(p.child.get_value(), jax.ShapeDtypeStruct)]:
-        raise ValueError(f"{shapes[0].path} has no value: call this within nnx.eval_shape.")
-    _convert_variables(freed, AdapterParam)
+                unfrozen.append(location)
+    if shapes := [p for p in unfrozen if isinstance(p.child.get_value(), jax.ShapeDtypeStruct)]:
+        raise ValueError(f"{shapes[0].path} holds a shape only: call this inside nnx.eval_shape.")
+    _convert_variables(unfrozen, AdapterParam)
     return used
 
 
 def _convert_variables(locations: Sequence[paths.Location], kind: type[nnx.Param]) -> None:
-    """Replaces variables by ones of another type, shared ones by one; those that train are fp32."""
+    """Convert variables to `kind`, preserving sharing; trainable ones become fp32."""
 
-    def renewed(location: paths.Location) -> nnx.Param:
+    def convert(location: paths.Location) -> nnx.Param:
         value = location.child.get_value()
-        if kind is AdapterParam:  # a copy: the train step may donate what trains
+        if kind is AdapterParam:  # a copy, since the train step may donate trainable arrays
             value = jnp.array(value, jnp.float32, copy=True)
         return kind(value, **location.child.get_metadata())
 
-    paths.replace(locations, renewed)
+    paths.replace(locations, convert)
 
 
 def init_stack(
@@ -316,9 +321,9 @@ def init_stack(
     kernel: jax.Array,
     statistics: jax.Array | None = None,
 ) -> tuple[Params, Any]:
-    """A method's `init` for a kernel [..., I, O]: one draw per leading index.
+    """Apply a method's `init` to a kernel [..., I, O], with an independent key per matrix.
 
-    Not jitted as a whole: its random draws compile once for each I instead of for each shape.
+    Not jitted as a whole, so that random draws compile once per I, not once per shape.
     """
     if len(getattr(kernel, "shape", ())) < 2:
         raise ValueError(f"an adapter needs a kernel [..., I, O], got {short(kernel)}.")
@@ -329,12 +334,12 @@ def init_stack(
         statistics = statistics.reshape(-1, d_in, d_in)
     keys = jax.random.split(key, math.prod(leading))
     each = jax.vmap(lambda key, kernel, own: init(key, kernel, statistics=own))
-    found = each(keys, kernel.reshape(-1, d_in, d_out), statistics)
-    return jax.tree.map(lambda leaf: leaf.reshape(*leading, *leaf.shape[1:]), found)
+    stacked = each(keys, kernel.reshape(-1, d_in, d_out), statistics)
+    return jax.tree.map(lambda leaf: leaf.reshape(*leading, *leaf.shape[1:]), stacked)
 
 
 def over_stack(function: Callable[..., Any], kernel: jax.Array) -> Callable[..., Any]:
-    """A function of one layer's arrays, over the leading axes of a kernel [..., I, O]."""
+    """Map a function of one layer's arrays over the leading axes of a kernel [..., I, O]."""
     for _ in kernel.shape[:-2]:
         function = jax.vmap(function)
     return function

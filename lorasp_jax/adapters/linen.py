@@ -93,7 +93,7 @@ class LinenAdapter:
 
         Args:
           key: as for `init`.
-          variables: with "params"; left untouched.
+          variables: with "params"; not modified.
           *args: as for a call of the model.
           **kwargs: as for a call of the model.
 

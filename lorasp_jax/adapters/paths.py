@@ -1,8 +1,8 @@
-"""Where things are in a model: paths, and the rules that match them."""
+"""Locate modules and parameters in a model by path, and match path rules against them."""
 
 import difflib
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ Rules = Sequence[tuple[str, Method | None]]
 
 
 class Location(NamedTuple):
-    """Where a layer or parameter hangs in a model: `getattr(parent, name)` is `child`."""
+    """Path and parent of a module or parameter: `getattr(parent, name)` is `child`."""
 
     path: str
     parent: Any
@@ -26,7 +26,12 @@ class Location(NamedTuple):
 
 
 def locate(root: nnx.List[Any], kind: type | tuple[type, ...]) -> list[Location]:
-    """All children of a type, with paths that start below the holder."""
+    """List all modules or variables of a type.
+
+    Args:
+      root: `nnx.List([model])`; paths start at the model.
+      kind: type or types to look for.
+    """
 
     def walk() -> Iterator[Location]:
         for path, module in nnx.iter_modules(root):
@@ -37,43 +42,43 @@ def locate(root: nnx.List[Any], kind: type | tuple[type, ...]) -> list[Location]
     return list(walk())
 
 
-def unique(found: list[Location]) -> list[Location]:
-    """Without the further places of a child that hangs in several."""
-    return list({id(location.child): location for location in reversed(found)}.values())[::-1]
+def unique(locations: list[Location]) -> list[Location]:
+    """Keep only the first location of each shared child."""
+    return list({id(location.child): location for location in reversed(locations)}.values())[::-1]
 
 
 def set_child(location: Location, child: Any) -> None:
-    """Hangs another child into a place: the parent is anyone's, so its attribute has any name."""
+    """Replace the child at a location. The parent may be a third-party class, hence `setattr`."""
     setattr(location.parent, location.name, child)
 
 
-def replace(found: Sequence[Location], make: Callable[[Location], Any]) -> None:
-    """Hangs something else into the places of children.
+def replace(locations: Sequence[Location], make: Callable[[Location], Any]) -> None:
+    """Replace children in place, preserving sharing.
 
     Args:
-      found: the places.
-      make: what to put into a place, or None to try the child's next one. It is asked once for a
-        child that hangs in several places, all of which get the same; but each place of an
-        `nnx.Linear` gets its own, so that it has an adapter of its own there.
+      locations: of the children to replace.
+      make: returns the replacement for a location, or None to skip it. A shared child is replaced
+        once, by the first result that is not None, at all its locations. A shared `nnx.Linear` is
+        replaced separately at each location, so that each one has its own adapter.
     """
-    made: dict[Any, Any] = {}
-    for location in found:
-        if _one(location) not in made and (new := make(location)) is not None:
-            made[_one(location)] = new
-    for location in found:
-        if _one(location) in made:
-            set_child(location, made[_one(location)])
+    replacements: dict[Hashable, Any] = {}
+    for location in locations:
+        if _identity(location) not in replacements and (new := make(location)) is not None:
+            replacements[_identity(location)] = new
+    for location in locations:
+        if _identity(location) in replacements:
+            set_child(location, replacements[_identity(location)])
 
 
-def _one(location: Location) -> Any:
-    """What is the same for places that get the same."""
+def _identity(location: Location) -> Hashable:
+    """Key that is equal for locations with the same replacement."""
     return location.path if isinstance(location.child, nnx.Linear) else id(location.child)
 
 
 def locate_layers(
     root: nnx.List[Any], einsums: nnx_layers.Einsums = MappingProxyType({})
 ) -> list[Location]:
-    """All layers that have an adapter or could."""
+    """List all layers that have or can have an adapter."""
     return [
         location
         for location in locate(root, nnx.Module)
@@ -84,51 +89,52 @@ def locate_layers(
 def locate_matmul_layers(
     root: nnx.List[Any], einsums: nnx_layers.Einsums = MappingProxyType({})
 ) -> list[Location]:
-    """The layers that multiply their input by matrices: dense ones and einsums, adapted or not."""
-    found = locate_layers(root, einsums)
-    return [location for location in found if not isinstance(location.child, nnx.Embed | nnx.Conv)]
+    """List dense layers and einsums, adapted or not; embeddings and convolutions are skipped."""
+    layers = locate_layers(root, einsums)
+    return [layer for layer in layers if not isinstance(layer.child, nnx.Embed | nnx.Conv)]
 
 
 def check_rules(rules: Any, valid: Callable[[Any], bool], what: str) -> None:
-    """Raises a ValueError unless these are rules of regular expressions.
+    """Raise ValueError unless `rules` is a non-empty list of (pattern, value) pairs.
 
     Args:
-      rules: what somebody gave.
-      valid: whether something can be in the second place.
-      what: such things in words.
+      rules: user input.
+      valid: whether the second item of a pair is valid.
+      what: valid second items, for the error message.
     """
-    pairs = f"rules are a list of (pattern, {what}) pairs"
+    pairs = f"rules must be a list of (pattern, {what}) pairs"
     if isinstance(rules, Mapping):
-        raise ValueError(f"{pairs}, got a {type(rules).__name__}: give list(rules.items()).")
+        raise ValueError(f"{pairs}, got a {type(rules).__name__}: pass list(rules.items()).")
     if not isinstance(rules, Sequence) or isinstance(rules, str) or not rules:
-        shown = "none" if isinstance(rules, list | tuple) else short(rules)
-        raise ValueError(f"{pairs}, at least one, got {shown}.")
+        shown = "an empty list" if isinstance(rules, list | tuple) else short(rules)
+        raise ValueError(f"{pairs}, got {shown}.")
     if isinstance(rules[0], str):
-        raise ValueError(f"{pairs}, got {short(rules)}: one rule alone is [(pattern, ...)].")
+        raise ValueError(f"{pairs}, got {short(rules)}: write [(pattern, ...)] for a single rule.")
     for rule in rules:
         if not isinstance(rule, tuple | list) or len(rule) != 2 or not isinstance(rule[0], str):
-            raise ValueError(f"{pairs}, got {short(rule)} among them.")
+            raise ValueError(f"{pairs}, got the item {short(rule)}.")
         pattern, value = rule
         if isinstance(value, type):
             name = value.__name__
             raise ValueError(f"rule {short(pattern)} has the class {name}: write {name}().")
         if not valid(value):
-            raise ValueError(f"rule {short(pattern)} has {short(value)} where {what} belongs.")
+            raise ValueError(f"rule {short(pattern)} must have {what}, got {short(value)}.")
         try:
             re.compile(pattern)
         except (re.error, OverflowError, RecursionError) as error:
             raise ValueError(
-                f"rule {short(pattern)} is no regular expression: {short(str(error))[1:-1]}."
+                f"rule {short(pattern)} is not a valid regular expression: "
+                f"{short(str(error))[1:-1]}."
             ) from error
 
 
 def check_method_rules(rules: Any) -> None:
-    """`check_rules` for rules that attach methods."""
+    """Raise ValueError unless `rules` is a list of (pattern, method or None) pairs."""
     check_rules(rules, lambda m: m is None or isinstance(m, Method), "method or None")
 
 
 def find_rule(rules: Rules, *paths: str) -> int | None:
-    """Index of the first rule that matches one of the paths."""
+    """Index of the first rule that matches at least one of the paths, or None."""
     hits = (i for i, (pattern, _) in enumerate(rules) if any(re.search(pattern, p) for p in paths))
     return next(hits, None)
 
@@ -136,41 +142,43 @@ def find_rule(rules: Rules, *paths: str) -> int | None:
 def locate_other_matrices(
     root: nnx.List[Any], einsums: nnx_layers.Einsums = MappingProxyType({})
 ) -> list[Location]:
-    """Parameters of two axes or more of modules that no adapter applies to; norms' are no matrices,
-    though a stack gives them an axis."""
-    known = {id(location.child) for location in locate_layers(root, einsums)}
+    """List parameters of two or more axes in modules that adapters do not support.
+
+    Scales and biases are skipped: those of stacked norms have a second axis, but are not matrices.
+    """
+    supported = {id(location.child) for location in locate_layers(root, einsums)}
     return [
         location
         for location in locate(root, nnx.Param)
-        if id(location.parent) not in known
+        if id(location.parent) not in supported
         and len(getattr(location.child.get_value(), "shape", ())) > 1
         if not isinstance(location.parent, AdaptedLayer) and location.name not in ("scale", "bias")
     ]
 
 
-def no_match_message(pattern: str, known: Sequence[str], others: Mapping[str, str]) -> str:
-    """What to say of a rule that applies to nothing.
+def no_match_message(pattern: str, layers: Sequence[str], others: Mapping[str, str]) -> str:
+    """Error message for a rule that applies to nothing.
 
     Args:
-      pattern: of the rule.
-      known: paths of the layers that adapters apply to.
-      others: class by path of other modules that hold matrices.
+      pattern: the rule's pattern.
+      layers: paths of the layers that adapters support.
+      others: class names of other modules with matrices, by path.
     """
-    close = near_misses(pattern, known) or "none"
-    text = f"rule {short(pattern)} applies to nothing; layers here: {close}"
+    close = near_misses(pattern, layers) or "none"
+    text = f"rule {short(pattern)} applies to nothing; available layers: {close}"
     if not others:
         return f"{text}."
     close = difflib.get_close_matches(pattern, others, n=3, cutoff=0.3) or list(others)[:3]
     listed = ", ".join(f"{path or 'the model'} ({others[path]})" for path in close)
-    return f"{text}; of other classes: {listed}. {EINSUMS_HINT}."
+    return f"{text}; unsupported classes: {listed}. {EINSUMS_HINT}."
 
 
 EINSUMS_HINT = (
-    "Where such a class is an einsum of input and parameter, einsums={Class: lambda layer: (name, "
-    "equation)} takes it; FullFineTuning takes all"
+    "If such a class is an einsum of its input and a parameter, pass einsums={Class: lambda layer: "
+    "(name, equation)}; FullFineTuning supports every class"
 )
 
 
-def near_misses(wanted: str, known: Sequence[str]) -> str:
-    """A few of the known names, those that are most like the wanted one, or the first."""
-    return ", ".join(difflib.get_close_matches(wanted, known, n=5, cutoff=0.3) or known[:5])
+def near_misses(query: str, names: Sequence[str]) -> str:
+    """Up to five names, comma-separated: the ones most similar to the query, else the first."""
+    return ", ".join(difflib.get_close_matches(query, names, n=5, cutoff=0.3) or names[:5])

@@ -1,4 +1,4 @@
-"""What an adapted model consists of, as a table, and what its layers reported."""
+"""Summary table of an adapted model, and collection of the aux that its layers stored."""
 
 import math
 from collections.abc import Mapping
@@ -18,27 +18,27 @@ Row = tuple[str, ...]
 
 
 def summary(model: nnx.Module, aux: Mapping[str, Aux] | None = None) -> str:
-    """A table of the layers, of every other parameter that trains and every other matrix.
+    """Format a table of a model's layers, other trainable parameters and other matrices.
 
-    Columns: path, method, kernel shape, rank, parameters (base and adapter), trainable ones, and
-    with `aux` the mean active rank. Below it, the share that trains and what is frozen.
+    Columns: path, method, kernel shape, rank, parameters (base and adapter), trainable parameters,
+    and with `aux` the mean active rank. A line below gives the trainable share and what is frozen.
 
     Args:
       model: adapted or not.
-      aux: what `collect_aux` returned after a call of the model, by path.
+      aux: by path, from `collect_aux` after a call of the model.
 
     Raises:
-      ValueError: aux of a layer that the model lacks.
+      ValueError: aux has the path of a layer that the model lacks.
     """
     rows = _rows(validate.module(model))
     if aux is not None and not (
-        isinstance(aux, Mapping) and all(isinstance(one, Aux) for one in aux.values())
+        isinstance(aux, Mapping) and all(isinstance(value, Aux) for value in aux.values())
     ):
-        raise ValueError(f"aux is what collect_aux returned, got {short(aux)}.")
+        raise ValueError(f"aux must be the result of collect_aux, got {short(aux)}.")
     if aux is not None:
         if unknown := aux.keys() - {row[0] for row in rows}:
             raise ValueError(
-                f"there is aux for {short(min(unknown, key=str))}, which is no layer of the model."
+                f"aux has {short(min(unknown, key=str))}, which is not a layer of the model."
             )
         rows = [(*row, _active_rank(aux.get(row[0]))) for row in rows]
     trainable, total = count(model)
@@ -54,20 +54,20 @@ def summary(model: nnx.Module, aux: Mapping[str, Aux] | None = None) -> str:
 
 
 def trained_share(model: nnx.Module) -> str:
-    """One line: which share of the parameters trains, and which parts of the model are frozen."""
+    """One line with the trainable share and the top-level modules that are entirely frozen."""
     trainable, total = count(model)
     root = nnx.List([model])
     parts = dict.fromkeys(location.path.split("/")[0] for location in locate(root, nnx.Param))
-    touched = {location.path.split("/")[0] for location in locate(root, AdapterParam)}
-    frozen = ", ".join(part for part in parts if part not in touched)
-    share = f"{trainable / max(total, 1):.2%} of all parameters train, {trainable:,} of {total:,}"
+    trained = {location.path.split("/")[0] for location in locate(root, AdapterParam)}
+    frozen = ", ".join(part for part in parts if part not in trained)
+    share = f"{trainable / max(total, 1):.2%} of parameters trainable ({trainable:,} of {total:,})"
     if trainable == total:
         return f"{share}; nothing is frozen"
-    return f"{share}; the others are frozen" + (f", all of {frozen} among them" if frozen else "")
+    return share + (f"; entirely frozen: {frozen}" if frozen else "")
 
 
 def _rows(model: nnx.Module) -> list[Row]:
-    """Of each layer, each other parameter that trains, and each matrix outside of such layers."""
+    """Rows of layers, then of other trainable parameters, then of other matrices."""
     root, rows, inside = nnx.List([model]), [], set()
     for path, _, _, layer in locate_layers(root):
         inside |= {id(v) for v in vars(layer).values() if isinstance(v, nnx.Variable)}
@@ -87,12 +87,12 @@ def _rows(model: nnx.Module) -> list[Row]:
 
 
 def _others(model: nnx.Module) -> list[str]:
-    """A line on the classes that adapters do not apply to, if there are matrices in some."""
+    """List with one line on the unsupported classes that have matrices, if there are any."""
     found = locate_other_matrices(nnx.List([model]))
     classes = dict.fromkeys(type(location.parent).__name__ for location in found)
     if not classes:
         return []
-    return [f"no adapter applies by itself to {', '.join(classes)}. {EINSUMS_HINT}."]
+    return [f"no built-in adapter support for {', '.join(classes)}. {EINSUMS_HINT}."]
 
 
 def _active_rank(aux: Aux | None) -> str:
@@ -106,41 +106,41 @@ def _row(path: str, method: str, kernel: Any, rank: Any, counts: Counts) -> Row:
 
 
 def _align(row: Row, widths: list[int]) -> list[str]:
-    """The first three cells to the left, numbers to the right."""
+    """Left-align the first three cells and right-align the others."""
     left, right = zip(row[:3], widths[:3], strict=True), zip(row[3:], widths[3:], strict=True)
     return [cell.ljust(w) for cell, w in left] + [cell.rjust(w) for cell, w in right]
 
 
 def collect_aux(model: nnx.Module | Mapping[str, Any]) -> dict[str, Aux]:
-    """What the drop-in layers of a model kept in the last call, by layer path; taken out of it.
+    """Collect the aux that adapted layers stored in the model's last call.
 
     Args:
-      model: an NNX model that was just called, or the variables a Linen model returned from
-        `apply(..., mutable=["intermediates"])`.
+      model: an NNX model that was just called (its stored aux is removed), or the variables that a
+        Linen model returned from `apply(..., mutable=["intermediates"])`.
 
     Returns:
       Aux by "/"-joined path of the layer.
 
     Raises:
-      ValueError: no adapted layer kept anything.
+      ValueError: no adapted layer stored any aux.
     """
     if isinstance(model, nnx.Module):
-        kept = nnx.to_flat_state(nnx.pop(model, AdapterAux))
-        found = {path[:-1]: variable.get_value() for path, variable in kept}
+        stored = nnx.to_flat_state(nnx.pop(model, AdapterAux))
+        aux_by_path = {path[:-1]: variable.get_value() for path, variable in stored}
     else:
         sown: dict[tuple[str, ...], Any]
-        kept = model.get("intermediates", {}) if isinstance(model, Mapping) else None
-        if not isinstance(kept, Mapping):
+        stored = model.get("intermediates", {}) if isinstance(model, Mapping) else None
+        if not isinstance(stored, Mapping):
             raise ValueError(
-                "the model must be an NNX module or the variables that a Linen model returned, got "
+                "model must be an NNX module or the variables returned by a Linen model, got "
                 f"{short(model)}."
             )
-        sown = flax.traverse_util.flatten_dict(kept)  # type: ignore
-        sown = {path: kept for path, kept in sown.items() if path[-1] == AUX_NAME}
-        found = {path[:-1]: kept[-1] for path, kept in sown.items() if isinstance(kept, tuple)}
-    if not found:
+        sown = flax.traverse_util.flatten_dict(stored)  # type: ignore
+        sown = {path: values for path, values in sown.items() if path[-1] == AUX_NAME}
+        aux_by_path = {path[:-1]: v[-1] for path, v in sown.items() if isinstance(v, tuple)}
+    if not aux_by_path:
         raise ValueError(
-            "no adapted layer kept anything: call the model first, inside the same traced function "
+            "no adapted layer stored any aux: call the model first, in the same traced function "
             "(NNX) or with mutable=['intermediates'] (Linen)."
         )
-    return {"/".join(map(str, path)): aux for path, aux in found.items()}
+    return {"/".join(map(str, path)): aux for path, aux in aux_by_path.items()}

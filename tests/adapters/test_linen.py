@@ -190,7 +190,9 @@ def test_layers_described_by_the_user():
 
 
 def test_rules_that_apply_to_nothing(published, ids):
-    with pytest.raises(ValueError, match=r"rule 'frist' applies to nothing; layers here: first/"):
+    with pytest.raises(
+        ValueError, match=r"rule 'frist' applies to nothing; available layers: first/"
+    ):
         attached(published, ids, ("frist", SP))
     with pytest.raises(ValueError, match="rule 'dense' applies to nothing"):  # shadowed
         attached(published, ids, (MATRICES, SP), ("dense", LoRA(rank=2)))

@@ -91,7 +91,7 @@ def with_kernel(value):
         (lambda: lorasp_jax.prune(SP, [X[:0]]), "the batches hold no token that counts"),
         (lambda: lorasp_jax.prune(SP, [X * jnp.nan]), "that are not finite reach the model"),
         (lambda: lorasp_jax.distill(SP, [X], forward=5), "a function of model and batch, got 5"),
-        (lambda: calibration.input_moments(NET, [X], b"a"), "rules are a list of (pattern"),
+        (lambda: calibration.input_moments(NET, [X], b"a"), "rules must be a list of (pattern"),
         (lambda: calibration.input_moments(SHAPES, [X]), "the model holds shapes without values"),
         (lambda: lorasp_jax.swap(named(), "a", SHAPES), "the model holds shapes without values"),
         (lambda: lorasp_jax.choose(named(), np.ones((0, 2))), "weights of 2 adapters are floats"),

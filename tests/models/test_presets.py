@@ -80,26 +80,24 @@ def test_share_of_the_published_sizes(config, adapters, base, share):
     """Sum of I + O over all linear layers but the lm_heads, times the rank."""
     model = adapted(config, "paper", LoRA(rank=128))
     line = summary.trained_share(model)
-    assert line.startswith(
-        f"{share} of all parameters train, {adapters:,} of {adapters + base:,}; the others are"
-    )
+    assert line.startswith(f"{share} of parameters trainable ({adapters:,} of {adapters + base:,})")
 
 
-def test_what_is_frozen_is_said():
-    """LeRobot's `train_expert_only` frees as many parameters; no adapter, nothing trains."""
+def test_trained_share_lists_frozen_modules():
+    """LeRobot's `train_expert_only` trains as many parameters; a bare model has none."""
     config = smolvla.Config.base()
     model = adapted(config, "expert-only", FullFineTuning())
     assert adaptation.count(model).trainable == 99_880_992
-    line = "22.19% of all parameters train, 99,880,992 of 450,046,176; the others are frozen, all "
-    assert summary.trained_share(model) == f"{line}of language, vision among them"
+    line = "22.19% of parameters trainable (99,880,992 of 450,046,176); entirely frozen: "
+    assert summary.trained_share(model) == f"{line}language, vision"
     dummy = smolvla.Config.dummy()
     line = summary.trained_share(adapted(dummy, "all-linear", LoRA(rank=2)))
-    assert line.endswith("; the others are frozen")
+    assert line.endswith(")")
     line = summary.trained_share(adapted(dummy, ".*", FullFineTuning()))
     assert line.startswith("100.00%")
     assert line.endswith("; nothing is frozen")
     bare = nnx.eval_shape(lambda: dummy.create(nnx.Rngs(0)))
-    assert summary.trained_share(bare).startswith("0.00% of all parameters train, 0 of ")
+    assert summary.trained_share(bare).startswith("0.00% of parameters trainable (0 of ")
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,7 @@ def fuse(model: nnx.Module, weights: Mapping[str, float], *, rank: int | None = 
     """The weighted sum of some of a combined model's LoRAs as one LoRA.
 
     Args:
-      model: from `combine`; left untouched.
+      model: from `combine`; not modified.
       weights: w_i by name, of any sign.
       rank: None: their ranks together, which is exact. Else at most that, by singular values.
 
@@ -74,7 +74,7 @@ def unmerge(merged: Model, adapted: nnx.Module) -> Model:
     that train in full, biases for instance, are those of the adapted model and train again.
 
     Args:
-      merged: from `merge`; left untouched.
+      merged: from `merge`; not modified.
       adapted: a model with the adapters, of which nothing else is read: for a saved adapter,
         `load_adapters(folder, merged, any_base=True)`, unless it holds a part of its kernel.
 

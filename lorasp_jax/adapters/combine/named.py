@@ -52,7 +52,7 @@ def combine(models: Mapping[str, Model], *, rank: int | None = None) -> Model:
     be of every kind that `adapt` knows. Nothing trains in the result.
 
     Args:
-      models: adapted from one base, by name; left untouched. The result shares their base. A bare
+      models: adapted from one base, by name; not modified. The result shares their base. A bare
         base is an empty place for `swap`.
       rank: room for each LoRA in each adapted layer, None: the largest that is there.
 
@@ -87,7 +87,7 @@ def choose(model: Model, choice: One | Sequence[One] | jax.Array | np.ndarray) -
     """The model with another choice among its adapters; also inside jit.
 
     Args:
-      model: from `combine`; left untouched, the result shares its arrays.
+      model: from `combine`; not modified, the result shares its arrays.
       choice: a name, weights by name, or None for the base; a sequence of those, one for each
         example of the batch; or an array of `weights`, f32 [A] or [B, A]. The batch is the first
         axis of a layer's input, of an einsum's the first that its kernel lacks. Where the model
@@ -155,7 +155,7 @@ def extract(model: Model, name: str | None) -> Model:
     A LoRA comes back with its rank and scale, however they were stated.
 
     Args:
-      model: from `combine`; left untouched.
+      model: from `combine`; not modified.
       name: of the adapter; None for the bare base.
 
     Raises:
@@ -205,7 +205,7 @@ def swap(model: Model, name: str, other: nnx.Module) -> Model:
     need the same settings. What is chosen stays chosen.
 
     Args:
-      model: from `combine`; left untouched.
+      model: from `combine`; not modified.
       name: the place; it keeps its name.
       other: adapted from the same base.
 

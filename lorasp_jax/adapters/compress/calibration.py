@@ -115,7 +115,7 @@ def observe(
     """The reports of some layers, summed over batches.
 
     Args:
-      model: left untouched.
+      model: not modified.
       batches: of one shape each, or it compiles for each.
       reports: by path of a layer, of those of `paths.multiplying`.
       forward: how to call the model.

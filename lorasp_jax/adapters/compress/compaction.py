@@ -58,7 +58,7 @@ def prune(
     stack have one rank, the largest that one of them needs; the others keep more of their own.
 
     Args:
-      model: left untouched; the result shares its frozen arrays, and can be trained on.
+      model: not modified; the result shares its frozen arrays, and can be trained on.
       batches: calibration set.
       tolerance: largest share of tokens, in [0, 1), of what is dropped.
       forward: how to call the model on a batch; see `lorasp_jax.adapters.compress.calibration`.
@@ -94,7 +94,7 @@ def distill(
     would ignore that the scores depend on the very x that they multiply.
 
     Args:
-      model: left untouched.
+      model: not modified.
       batches: calibration set; fewer tokens than a layer has inputs leave its update undetermined
         where the set has no energy, and there it is zero.
       rank: of the LoRA. None, or more than a bank has, is the bank's own, where the best of any

@@ -47,7 +47,7 @@ def quantize(model: nnx.Module, rules: Sequence[tuple[str, Kind | None]]) -> Qua
     """Quantises the kernels of dense layers and einsums by path rules.
 
     Args:
-      model: left untouched; the result shares everything else with it.
+      model: not modified; the result shares everything else with it.
       rules: (pattern, "int8" or "nf4" or None) pairs over the paths of `Dense`, `nnx.Linear`,
         `nnx.LinearGeneral`, `nnx.Einsum` and of other einsum classes that are adapted already, as
         for `adapt`: the first that matches governs, None leaves alone.

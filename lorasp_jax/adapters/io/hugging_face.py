@@ -79,7 +79,7 @@ def load_peft(
     Args:
       folder: with adapter_config.json and adapter_model.safetensors; or a repository on the hub,
         hf://owner/name, of which only these two files are fetched.
-      model: left untouched; adapters that it has elsewhere than the folder stay.
+      model: not modified; adapters that it has elsewhere than the folder stay.
       names: module of the layer at a path and an index in its stack, () outside of stacks.
       einsums: as for `adapt`.
 

@@ -29,7 +29,7 @@ def load_peft_linen(
     Args:
       folder: as for `hugging_face.load_peft`.
       model: any Linen module.
-      variables: of the bare model, with "params"; left untouched.
+      variables: of the bare model, with "params"; not modified.
       *args: as for a call of the model, which tells what its layers do.
       names: as for `hugging_face.load_peft`.
       einsums: as for `LinenAdapter`.

@@ -35,7 +35,7 @@ def values_of(patterns: Mapping[str, Any], names: Collection[str], default: Any)
         try:
             ways += len(names) * _ways(_parse(pattern), longest)
         except re.error as error:
-            raise ValueError(f"{given!r} is no regular expression: {error}") from error
+            raise ValueError(f"{given!r} is not a valid regular expression: {error}") from error
         if ways > MOST_WAYS:
             raise ValueError(f"the pattern {given!r} could take too long for {len(names)} names.")
     compiled = [(re.compile(pattern), value) for pattern, value in whole.items()]

@@ -96,7 +96,7 @@ def load_adapters(
 
     Args:
       folder: written by `save_adapters`.
-      model: left untouched.
+      model: not modified.
       base: if given, must equal the name of the base that the adapters were saved for.
       any_base: take the adapters onto other weights, too. Otherwise each array of the base must be
         the one they were trained on, up to rounding to bf16; what is quantised on one side only, or

@@ -233,7 +233,7 @@ def like(layer: Any, other: AdaptedLayer) -> AdaptedLayer:
     Args:
       layer: of the other's kind, adapted or not; left as it is, but one that can carry adapters is
         returned itself.
-      other: left untouched.
+      other: not modified.
 
     Raises:
       ValueError: a layer of another class.

@@ -136,7 +136,7 @@ def test_named_adapters_over_one_quantised_base():
 
 def test_split_kernels_come_first():
     pissa = LoRA(rank=2, initialization="pissa")
-    with pytest.raises(ValueError, match="adapt first, then quantise the rest"):
+    with pytest.raises(ValueError, match="adapt first, then quantize"):
         adaptation.adapt(quantized("int8"), [("inp", pissa)], rngs=nnx.Rngs(0))
     model, errors = lorasp_jax.quantize(trained(("inp", pissa), seed=1), [("inp", "nf4")])
     assert_close(call(model, X), call(widened(model), X))
@@ -168,8 +168,8 @@ def test_rules():
             r"rule 'blcks' governs nothing; dense layers and einsums here: blocks",
         ),
         ([("", "nf4"), ("out", "int8")], "rule 'out' governs nothing"),
-        ([("out", "fp4")], "rule 'out' has 'fp4' where 'int8' or 'nf4' or None belongs"),
-        ([("(", "nf4")], r"rule '\(' is no regular expression"),
+        ([("out", "fp4")], "rule 'out' must have 'int8' or 'nf4' or None, got 'fp4'"),
+        ([("(", "nf4")], r"rule '\(' is not a valid regular expression"),
     ):
         with pytest.raises(ValueError, match=message):
             lorasp_jax.quantize(NET, rules)

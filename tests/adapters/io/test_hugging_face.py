@@ -245,7 +245,7 @@ def test_stacks(tmp_path):
         ({"use_rslora": "x"}, "use_rslora must be true or false, got 'x'"),
         ({"use_dora": 1}, "use_dora must be true or false, got 1"),
         ({"alpha_pattern": {"lin.0": "8"}}, "alpha_pattern must be an object of such numbers"),
-        ({"alpha_pattern": {"l(": 8}}, r"'l\(' is no regular expression"),
+        ({"alpha_pattern": {"l(": 8}}, r"'l\(' is not a valid regular expression"),
         ({"r": 8.5}, "r must be a whole number from 1"),
         ({"target_modules": 3}, "target_modules must be a text or a list of texts"),
         ({"bias": 0}, "bias must be 'none', 'all' or 'lora_only', got 0"),

@@ -137,7 +137,7 @@ def test_aux_summary_and_print(heads, x):
     assert float(rows["experts"][-1]) == pytest.approx(found, abs=0.06)
     assert (rows["join"][-1], rows["blocks"][-1]) == ("2.0", "-")
     assert "active" not in lorasp_jax.summary(model)
-    with pytest.raises(ValueError, match="there is aux for 'other', which is no layer"):
+    with pytest.raises(ValueError, match="aux has 'other', which is not a layer"):
         lorasp_jax.summary(model, {"other": aux["join"]})
 
 
@@ -240,9 +240,9 @@ def test_layers_described_by_the_user(x, tmp_path):
     for wrong, message in WRONG_EINSUMS:
         with pytest.raises(ValueError, match=message):
             adapted(product, ("", SP), einsums=wrong)
-    with pytest.raises(ValueError, match=r"of other classes: the model \(Product\)\. Where such"):
+    with pytest.raises(ValueError, match=r"unsupported classes: the model \(Product\)\. If such"):
         adapted(product, ("", SP))
-    assert "no adapter applies by itself to Product" in lorasp_jax.summary(product)
+    assert "no built-in adapter support for Product" in lorasp_jax.summary(product)
     model = adapted(product, ("", SP), einsums=einsums)
     save_adapters(tmp_path, model)
     loaded = load_adapters(tmp_path, product, einsums=einsums)
