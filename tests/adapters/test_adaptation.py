@@ -157,7 +157,7 @@ def test_adapting_what_trained_in_full_freezes_it(net):
     model = adapted(full, ("inp", LoRA(rank=2)), (".*", None))
     assert isinstance(model.inp, nnx.Linear) or model.inp.method == LoRA(rank=2)
     assert not isinstance(model.inp.kernel, AdapterParam)
-    with pytest.raises(ValueError, match="inp/kernel cannot train in full under"):
+    with pytest.raises(ValueError, match="inp/kernel cannot be fully fine-tuned"):
         adapted(net, ("kernel$", FullFineTuning()), ("inp", LoRA(rank=2)))
 
 

@@ -1,22 +1,21 @@
-"""Adapted layers made ready for inference: what does not depend on the input is computed once.
+"""Adapted layers prepared for inference: precompute whatever does not depend on the input.
 
-A layer that is called again and again on a few tokens, as in the steps of a flow, is as fast as its
-kernels are few. So layers that read one input get one matrix for all that reads it and one for all
-that adapters write:
+For layers called repeatedly on few tokens, as in flow sampling, kernel launches dominate. Layers
+with a shared input are therefore fused into one input matrix and one output matrix:
 
-    [x W, x P] = x [W, P]         for the W and P of all layers
+    [x W, x P] = x [W, P]         W and P of all layers, concatenated
     y = x W + z diag(U)           with z = f(x P)
 
-Their chains f between the matrices run as one. Stacked layers that are called once, as those that
-read the pictures, get P and U alone, in the type in which they compute: a copy of W would cost more
-than it saves. The layers themselves go. For training there is `lorasp_jax.kernels.low_rank_matmul`.
+The functions f of all layers run as one kernel. Stacked layers that run once, such as the vision
+tower's, only get P and U cast to the compute dtype: copying W would cost more than it saves. The
+original layers are removed. For training, see `lorasp_jax.kernels.low_rank_matmul`.
 """
 
 import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import (
     Any,
     Literal,
@@ -38,214 +37,223 @@ from lorasp_jax.kernels.quantized_weights import QuantizedKernel
 from lorasp_jax.peft import Aux
 from lorasp_jax.peft._batched_bottleneck import BatchedBottleneck, VmapBottleneck
 
-Block = TypeVar("Block", bound="JoinsLayers")
+Block = TypeVar("Block", bound="FusableModule")
 
-TILE, PROGRAMS = 64, 256
-"""Side of the tiles of a product's result, and how many of them at once keep a GPU busy."""
-LONG_SUM, SHORTEST_SUM = 2048, 512
-"""Inputs from which on a product is worth parts, and the least to a part."""
+TILE, MIN_TILES = 64, 256
+"""Output tile size of a matmul, and the number of tiles that saturate a GPU."""
+MIN_SPLIT_INPUTS, MIN_SPLIT_SIZE = 2048, 512
+"""Minimum I for a split-K matmul, and minimum K per split."""
 
 
-class Chain(NamedTuple):
+class BottleneckSpec(NamedTuple):
     """f of n layers."""
 
-    method: BatchedBottleneck
+    kernel: BatchedBottleneck
     width: int
-    """Q, the columns of P of one layer."""
-    sizes: tuple[int, ...]
+    """Q, the number of columns of one layer's P."""
+    out_sizes: tuple[int, ...]
     """O of each layer."""
 
 
-_pytree = functools.partial(jax.tree_util.register_dataclass, meta_fields=["chain"])
+_pytree = functools.partial(jax.tree_util.register_dataclass, meta_fields=["bottleneck"])
 
 
-@functools.partial(_pytree, data_fields=["params", "read", "write", "bias"])
+@functools.partial(_pytree, data_fields=["params", "input_matrix", "output_matrix", "bias"])
 @dataclasses.dataclass(frozen=True)
-class Joined:
-    """Layers of one method that read the same input."""
+class FusedLayers:
+    """Layers of one method with a shared input."""
 
-    chain: Chain
+    bottleneck: BottleneckSpec
     params: Any
-    """What f needs of the adapters of the n layers, [n, ...]; None where shapes differ."""
-    read: jax.Array
-    """[W, P], [I, sum of O and of Q or a little more]."""
-    write: jax.Array
-    """Each layer's U [R, O] on the diagonal, [n R, sum of O]."""
+    """Parameters of f, stacked [n, ...]; a leaf is None if the layers' shapes differ."""
+    input_matrix: jax.Array
+    """[W, P], [I, ΣO + ΣQ], padded."""
+    output_matrix: jax.Array
+    """Block-diagonal matrix of each layer's U [R, O], [n R, ΣO]."""
     bias: jax.Array | None
-    """[sum of O], None if no layer has one."""
+    """[ΣO], or None if no layer has a bias."""
 
 
-@functools.partial(_pytree, data_fields=["params", "read", "write", "kernels", "biases"])
+@functools.partial(_pytree, data_fields=["params", "down", "ups", "kernels", "biases"])
 @dataclasses.dataclass(frozen=True)
-class Apart:
-    """The same for layers whose W are read where they are."""
+class SharedProjection:
+    """As `FusedLayers`, but W is not copied."""
 
-    chain: Chain
+    bottleneck: BottleneckSpec
     params: Any
-    """As in `Joined`."""
-    read: jax.Array
-    """P of all layers, [I, sum of Q or a little more]."""
-    write: list[jax.Array]
+    """As in `FusedLayers`."""
+    down: jax.Array
+    """P of all layers, [I, ΣQ], padded."""
+    ups: list[jax.Array]
     """U [R, O] of each layer."""
     kernels: list[jax.Array | QuantizedKernel]
-    """W [I, O] of each layer; a quantised one stays so."""
+    """W [I, O] of each layer; kept quantized."""
     biases: list[jax.Array | None]
     """[O] of each layer."""
 
 
-class Ready(nnx.Variable[Any]):
-    """`Joined` or `Apart`."""
+class FusedArrays(nnx.Variable[Any]):
+    """Variable that holds `FusedLayers` or `SharedProjection`."""
 
 
 class Prepared(nnx.Module):
-    """Joined layers in the place of the first of them; the others' places hold an empty one."""
+    """Fused layers, stored in place of the first; an empty `Prepared` replaces each of the others."""
 
-    def __init__(self, arrays: Joined | Apart | None = None) -> None:
-        self.ready = None if arrays is None else Ready(arrays)
+    def __init__(self, arrays: FusedLayers | SharedProjection | None = None) -> None:
+        self.arrays = None if arrays is None else FusedArrays(arrays)
 
     def __call__(
         self, x: jax.Array, *, token_mask: jax.Array | None, return_aux: Literal[True]
     ) -> tuple[jax.Array, Aux]:
-        """y `[..., O]` and aux of the only layer."""
+        """Compute y `[..., O]` and aux, for a `Prepared` with exactly one layer."""
         del return_aux
         (result,) = self.results(x, token_mask)
         return result
 
     def results(self, x: jax.Array, token_mask: jax.Array | None) -> list[tuple[jax.Array, Aux]]:
-        """y and aux of each of the layers for x `[..., I]`; none if it is empty."""
-        if self.ready is None:
+        """Compute y and aux of each layer for x `[..., I]`; an empty list if there are no layers."""
+        if self.arrays is None:
             return []
-        joined = self.ready.get_value()
-        compute: Callable = _call_joined if isinstance(joined, Joined) else _call_apart
-        ys, aux = compute(joined, x.astype(joined.read.dtype), token_mask)
-        of_each = [jax.tree.map(lambda a, i=i: a[i], aux) for i in range(len(ys))]
-        reports = [dataclasses.replace(one, token_mask=token_mask) for one in of_each]
+        arrays = self.arrays.get_value()
+        if isinstance(arrays, FusedLayers):
+            ys, aux = _call_fused(arrays, x.astype(arrays.input_matrix.dtype), token_mask)
+        else:
+            ys, aux = _call_shared(arrays, x.astype(arrays.down.dtype), token_mask)
+        per_layer = [jax.tree.map(lambda a, i=i: a[i], aux) for i in range(len(ys))]
+        reports = [dataclasses.replace(aux, token_mask=token_mask) for aux in per_layer]
         return list(zip(ys, reports, strict=True))
 
 
 Layer: TypeAlias = Dense | Prepared
-"""What stands where a `Dense` was."""
+"""A `Dense` or its prepared replacement."""
 
 
 @runtime_checkable
-class JoinsLayers(Protocol):
-    """A module that knows which of its layers read the same input."""
+class FusableModule(Protocol):
+    """Module that can fuse its layers with shared inputs."""
 
-    def join_layers(self, *, copy_kernels: bool = True) -> None:
-        """Puts joined layers in the place of its own, children's left out; see `join`."""
+    def fuse_projections(self, *, copy_kernels: bool = True) -> None:
+        """Replace this module's layers, but not its children's, by fused ones; see `fuse_layers`."""
         ...
 
 
-def join(layers: Sequence[Layer], *, copy_kernels: bool = True) -> list[Layer]:
-    """What takes the places of layers that read the same input.
+def fuse_layers(layers: Sequence[Layer], *, copy_kernels: bool = True) -> list[Layer]:
+    """Return replacements for layers with a shared input.
 
-    Layers of the kind `Dense` with a type of their own are joined, if their method is x W + z U:
-    all of them, or each by itself where they differ in method or type. The others stay.
+    `Dense` layers with an explicit dtype and a method that computes just x W + z U are fused:
+    together if they agree on method and dtype, else individually. Other layers are returned
+    unchanged.
 
     Args:
         layers: in the order in which they are called together.
-        copy_kernels: for layers that are called again and again.
+        copy_kernels: whether to fuse W too; use it for layers called repeatedly.
     """
-    can = [layer for layer in layers if _can_join(layer)]
-    arrays = _join if copy_kernels else _apart
-    if len(can) == len(layers) and len({(layer.method, layer.dtype) for layer in can}) == 1:
-        return [Prepared(arrays(can)), *(Prepared() for _ in can[1:])]
-    return [Prepared(arrays([layer])) if _can_join(layer) else layer for layer in layers]
+    fusable = [layer for layer in layers if _is_fusable(layer)]
+    fuse = _fused_layers if copy_kernels else _shared_projection
+    if len(fusable) == len(layers) and len({(layer.method, layer.dtype) for layer in fusable}) == 1:
+        return [Prepared(fuse(fusable)), *(Prepared() for _ in fusable[1:])]
+    return [Prepared(fuse([layer])) if _is_fusable(layer) else layer for layer in layers]
 
 
-def join_one(layer: Layer, *, copy_kernels: bool = True) -> Layer:
-    """`join` for a layer whose input no other reads."""
-    return join([layer], copy_kernels=copy_kernels)[0]
+def fuse_layer(layer: Layer, *, copy_kernels: bool = True) -> Layer:
+    """`fuse_layers` for a single layer."""
+    return fuse_layers([layer], copy_kernels=copy_kernels)[0]
 
 
-def join_stack(blocks: Block) -> Block:
-    """Stacked blocks [L, ...] for one run through them, adapters' matrices cast all at once."""
+def fuse_stack(blocks: Block) -> Block:
+    """Prepare stacked blocks [L, ...] for a single pass: cast all adapter matrices up front."""
 
-    def joined(block: Block) -> Block:
-        block.join_layers(copy_kernels=False)
+    def fuse(block: Block) -> Block:
+        block.fuse_projections(copy_kernels=False)
         return block
 
-    return jax.vmap(joined)(blocks)
+    return jax.vmap(fuse)(blocks)
 
 
-def _call_joined(
-    joined: Joined, x: jax.Array, token_mask: jax.Array | None
+def _call_fused(
+    fused: FusedLayers, x: jax.Array, token_mask: jax.Array | None
 ) -> tuple[Sequence[jax.Array], Aux]:
     """y of each layer, and aux [n, ...]."""
-    ends = list(itertools.accumulate(joined.chain.sizes))
-    projected = product(x, joined.read)
-    z, aux = _bottleneck(joined, projected, ends[-1], token_mask)
-    y = projected[..., : ends[-1]] + z @ joined.write
-    y = y if joined.bias is None else y + joined.bias
+    ends = list(itertools.accumulate(fused.bottleneck.out_sizes))
+    projected = matmul(x, fused.input_matrix)
+    z, aux = _bottleneck(fused, projected, ends[-1], token_mask)
+    y = projected[..., : ends[-1]] + z @ fused.output_matrix
+    y = y if fused.bias is None else y + fused.bias
     return jnp.split(y, ends[:-1], axis=-1), aux
 
 
-def _call_apart(
-    apart: Apart, x: jax.Array, token_mask: jax.Array | None
+def _call_shared(
+    shared: SharedProjection, x: jax.Array, token_mask: jax.Array | None
 ) -> tuple[Sequence[jax.Array], Aux]:
-    """What `_call_joined` returns."""
-    # XLA would make one product of x W and x P, for which it copies W.
-    projected = product(jax.lax.optimization_barrier(x), apart.read)
-    z, aux = _bottleneck(apart, projected, 0, token_mask)
-    ys, zs = [], jnp.split(z, len(apart.write), axis=-1)
-    for own, kernel, up, bias in zip(zs, apart.kernels, apart.write, apart.biases, strict=True):
-        y = base_plus_low_rank(x, own, kernel, up)
+    """As `_call_fused`."""
+    # Without the barrier XLA fuses x W and x P into one matmul and copies W.
+    projected = matmul(jax.lax.optimization_barrier(x), shared.down)
+    z, aux = _bottleneck(shared, projected, 0, token_mask)
+    ys, zs = [], jnp.split(z, len(shared.ups), axis=-1)
+    for layer_z, kernel, up, bias in zip(zs, shared.kernels, shared.ups, shared.biases, strict=True):
+        y = base_plus_low_rank(x, layer_z, kernel, up)
         ys.append(y if bias is None else y + bias)
     return ys, aux
 
 
 def _bottleneck(
-    ready: Joined | Apart, projected: jax.Array, start: int, token_mask: jax.Array | None
+    arrays: FusedLayers | SharedProjection,
+    projected: jax.Array,
+    start: int,
+    token_mask: jax.Array | None,
 ) -> tuple[jax.Array, Aux]:
-    """Concatenated z of all layers, in the dtype of `projected`, and aux."""
-    method, width, sizes = ready.chain
-    columns = range(start, start + len(sizes) * width, width)
-    z, aux = method.bottleneck_all(ready.params, projected, columns, token_mask)
+    """z of all layers, concatenated, in the dtype of `projected`, and aux.
+
+    The down-projections x P start at column `start` of `projected`.
+    """
+    kernel, width, out_sizes = arrays.bottleneck
+    columns = range(start, start + len(out_sizes) * width, width)
+    z, aux = kernel.bottleneck_all(arrays.params, projected, columns, token_mask)
     return z.astype(projected.dtype), aux
 
 
-def product(x: jax.Array, matrix: jax.Array) -> jax.Array:
-    """x @ matrix in the type of x, as a sum over parts where that fills a GPU better.
+def matmul(x: jax.Array, matrix: jax.Array) -> jax.Array:
+    """x @ matrix in the dtype of x, as a split-K matmul where that uses a GPU better.
 
-    A GPU computes tiles of the result side by side, and each sums over all inputs one after the
-    other. A few rows times a narrow matrix with a long sum keep few of its processors busy.
+    A GPU computes output tiles in parallel, but each tile sums over I sequentially. Few rows and a
+    narrow matrix leave most SMs idle.
 
     Args:
       x: [..., I].
       matrix: [I, O].
     """
     d_in, d_out = matrix.shape
-    parts = _parts(math.prod(x.shape[:-1]), d_in, d_out)
-    if parts == 1:
+    splits = _num_splits(math.prod(x.shape[:-1]), d_in, d_out)
+    if splits == 1:
         return x @ matrix
-    x = x.reshape(*x.shape[:-1], parts, d_in // parts)
-    matrix = matrix.reshape(parts, d_in // parts, d_out)
-    wide = jnp.einsum("...pi,pio->p...o", x, matrix, preferred_element_type=jnp.float32)
-    return wide.sum(0).astype(x.dtype)
+    x = x.reshape(*x.shape[:-1], splits, d_in // splits)
+    matrix = matrix.reshape(splits, d_in // splits, d_out)
+    partial_sums = jnp.einsum("...pi,pio->p...o", x, matrix, preferred_element_type=jnp.float32)
+    return partial_sums.sum(0).astype(x.dtype)
 
 
-def _parts(rows: int, d_in: int, d_out: int) -> int:
-    """How many parts [rows, I] @ [I, O] is best summed over: a power of two that divides I."""
+def _num_splits(rows: int, d_in: int, d_out: int) -> int:
+    """Number of K splits of [rows, I] @ [I, O], a power of two that divides I."""
     tiles = math.ceil(rows / TILE) * math.ceil(d_out / TILE)
-    parts = 1
-    while 2 * parts * tiles <= PROGRAMS and d_in % (2 * parts * SHORTEST_SUM) == 0:
-        parts *= 2
-    return parts if d_in >= LONG_SUM else 1
+    splits = 1
+    while 2 * splits * tiles <= MIN_TILES and d_in % (2 * splits * MIN_SPLIT_SIZE) == 0:
+        splits *= 2
+    return splits if d_in >= MIN_SPLIT_INPUTS else 1
 
 
-def _can_join(layer: Layer) -> TypeGuard[Dense]:
-    """Whether it is an adapted layer, not a stack, of a method that leaves `apply` as it is."""
+def _is_fusable(layer: Layer) -> TypeGuard[Dense]:
+    """Whether this is a single (unstacked) adapted `Dense` that computes just x W + z U."""
     if type(layer) is not Dense or layer.adapter is None or layer.dtype is None:
         return False
     method, _ = layer.method_and_params()
-    can_join = method.is_low_rank_sum and not method.down_in_fp32
-    return can_join and len(layer.kernel_matrices().shape) == 2  # a quantised one has no ndim
+    is_sum = method.is_low_rank_sum and not method.down_in_fp32
+    return is_sum and len(layer.kernel_matrices().shape) == 2  # quantized kernels have no ndim
 
 
 def _matrices(
     layers: Sequence[Dense],
 ) -> tuple[list[jax.Array], list[jax.Array], list[jax.Array], list[jax.Array | None]]:
-    """W, P, U and bias of each layer, in the type in which they compute."""
+    """W, P, U and bias of each layer, in the compute dtype."""
     method, _ = layers[0].method_and_params()
     params, dtype = [layer.method_and_params()[1] for layer in layers], layers[0].dtype
     biases = [None if layer.bias is None else layer.bias.get_value() for layer in layers]
@@ -257,39 +265,42 @@ def _matrices(
     )
 
 
-def _chain(layers: Sequence[Dense], downs: Sequence[jax.Array]) -> tuple[Chain, Any]:
-    """f, and what it needs, [n, ...]; None where shapes differ."""
-    carried = [layer.method_and_params() for layer in layers]
-    kernels = {method.fused_kernel(params) or VmapBottleneck(method) for method, params in carried}
-    bottleneck = kernels.pop() if len(kernels) == 1 else VmapBottleneck(carried[0][0])
+def _bottleneck_spec(
+    layers: Sequence[Dense], downs: Sequence[jax.Array]
+) -> tuple[BottleneckSpec, Any]:
+    """f and its parameters, stacked [n, ...]; a leaf is None if the layers' shapes differ."""
+    adapters = [layer.method_and_params() for layer in layers]
+    kernels = {method.fused_kernel(params) or VmapBottleneck(method) for method, params in adapters}
+    kernel = kernels.pop() if len(kernels) == 1 else VmapBottleneck(adapters[0][0])
 
-    def stacked(*leaves: jax.Array) -> jax.Array | None:
+    def stack(*leaves: jax.Array) -> jax.Array | None:
         return jnp.stack(leaves) if len({leaf.shape for leaf in leaves}) == 1 else None
 
-    packed = (bottleneck.pack(method.bottleneck_params(params)) for method, params in carried)
-    params = jax.tree.map(stacked, *packed)
-    sizes = tuple(layer.kernel_matrices().shape[1] for layer in layers)
-    return Chain(bottleneck, downs[0].shape[1], sizes), params
+    packed = (kernel.pack(method.bottleneck_params(params)) for method, params in adapters)
+    params = jax.tree.map(stack, *packed)
+    out_sizes = tuple(layer.kernel_matrices().shape[1] for layer in layers)
+    return BottleneckSpec(kernel, downs[0].shape[1], out_sizes), params
 
 
-def _apart(layers: Sequence[Dense]) -> Apart:
-    wide, downs, ups, biases = _matrices(layers)
-    own = [layer.kernel_matrices() for layer in layers]
-    kernels = [k if isinstance(k, QuantizedKernel) else w for k, w in zip(own, wide, strict=True)]
-    read = pad_columns(jnp.concatenate(downs, axis=1))
-    return Apart(*_chain(layers, downs), read, ups, kernels, biases)
+def _shared_projection(layers: Sequence[Dense]) -> SharedProjection:
+    cast, downs, ups, biases = _matrices(layers)
+    stored = [layer.kernel_matrices() for layer in layers]
+    pairs = zip(stored, cast, strict=True)
+    kernels = [k if isinstance(k, QuantizedKernel) else w for k, w in pairs]
+    down = pad_columns(jnp.concatenate(downs, axis=1))
+    return SharedProjection(*_bottleneck_spec(layers, downs), down, ups, kernels, biases)
 
 
-def _join(layers: Sequence[Dense]) -> Joined:
+def _fused_layers(layers: Sequence[Dense]) -> FusedLayers:
     kernels, downs, ups, biases = _matrices(layers)
-    filled = [
+    dense_biases = [
         jnp.zeros(kernel.shape[1], kernel.dtype) if bias is None else bias
         for kernel, bias in zip(kernels, biases, strict=True)
     ]
     has_bias = any(bias is not None for bias in biases)
-    return Joined(
-        *_chain(layers, downs),
-        read=pad_columns(jnp.concatenate(kernels + downs, axis=1)),
-        write=jax.scipy.linalg.block_diag(*ups),
-        bias=jnp.concatenate(filled) if has_bias else None,
+    return FusedLayers(
+        *_bottleneck_spec(layers, downs),
+        input_matrix=pad_columns(jnp.concatenate(kernels + downs, axis=1)),
+        output_matrix=jax.scipy.linalg.block_diag(*ups),
+        bias=jnp.concatenate(dense_biases) if has_bias else None,
     )

@@ -179,7 +179,7 @@ def test_rules():
     broken.out.kernel.set_value(broken.out.kernel.get_value().at[0].set(jnp.inf))
     with pytest.raises(ValueError, match="cannot quantise out: the kernel has NaN"):
         lorasp_jax.quantize(broken, [("", "nf4")])
-    with pytest.raises(ValueError, match="out/kernel is quantised"):
+    with pytest.raises(ValueError, match="out/kernel is quantized"):
         adaptation.adapt(model, [("out", FullFineTuning())], rngs=nnx.Rngs(0))
 
 
