@@ -307,7 +307,9 @@ def test_models_without_values(tmp_path):
     ):
         refuses(call, SHAPES)
     bare = nnx.eval_shape(lambda: nnx.clone(NET))
-    refuses(lambda: adapted(FullFineTuning(), bare), "inp/bias holds a shape only: call this inside")
+    refuses(
+        lambda: adapted(FullFineTuning(), bare), "inp/bias holds a shape only: call this inside"
+    )
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax.adapters.layers.prepared import Layer, join_one
+from lorasp_jax.adapters.layers.prepared import Layer, fuse_layer
 from lorasp_jax.dense import Dense
 from lorasp_jax.models import flow_matching
 from lorasp_jax.models.config import BackboneConfig
@@ -72,13 +72,13 @@ class Backbone(nnx.Module):
         self.action_time_mlp_out: Layer = Dense(width, width, **options)
         self.action_out_proj: Layer = Dense(width, dim, **options)
 
-    def join_layers(self, *, copy_kernels: bool = True) -> None:
-        """See `prepared.JoinsLayers`; the projections outside the towers share no input."""
-        self.state_proj = join_one(self.state_proj, copy_kernels=copy_kernels)
-        self.action_in_proj = join_one(self.action_in_proj, copy_kernels=copy_kernels)
-        self.action_time_mlp_in = join_one(self.action_time_mlp_in, copy_kernels=copy_kernels)
-        self.action_time_mlp_out = join_one(self.action_time_mlp_out, copy_kernels=copy_kernels)
-        self.action_out_proj = join_one(self.action_out_proj, copy_kernels=copy_kernels)
+    def fuse_projections(self, *, copy_kernels: bool = True) -> None:
+        """See `prepared.FusableModule`; the projections outside the towers share no input."""
+        self.state_proj = fuse_layer(self.state_proj, copy_kernels=copy_kernels)
+        self.action_in_proj = fuse_layer(self.action_in_proj, copy_kernels=copy_kernels)
+        self.action_time_mlp_in = fuse_layer(self.action_time_mlp_in, copy_kernels=copy_kernels)
+        self.action_time_mlp_out = fuse_layer(self.action_time_mlp_out, copy_kernels=copy_kernels)
+        self.action_out_proj = fuse_layer(self.action_out_proj, copy_kernels=copy_kernels)
 
     def action_tokens(
         self, x_t: jax.Array, flow_time: jax.Array, action_valid: jax.Array | None

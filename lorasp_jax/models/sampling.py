@@ -18,7 +18,7 @@ from lorasp_jax.models.transformer.layers import LayerAux, ModelAux, merge_actio
 from lorasp_jax.peft import Method
 
 
-class FlowModel(prepared.JoinsLayers, Protocol):
+class FlowModel(prepared.FusableModule, Protocol):
     """Backbone interface that a sampler requires, see `backbone.Backbone`."""
 
     config: BackboneConfig
@@ -120,7 +120,7 @@ def _prefix_model(model: FlowModel) -> FlowModel:
     """Inference copy for the prefix, with unstacked blocks so that no loop copies weights."""
     model = nnx.merge(*nnx.split(model))
     for tower in (model.vision, model.language):
-        tower.blocks = unstack(prepared.join_stack(tower.blocks))
+        tower.blocks = unstack(prepared.fuse_stack(tower.blocks))
     return model
 
 
@@ -130,6 +130,6 @@ def _suffix_model(model: FlowModel) -> FlowModel:
     del model.vision, model.language
     model.action.blocks = unstack(model.action.blocks)
     for module in (model, *(module for _, module in nnx.iter_modules(model.action))):
-        if isinstance(module, prepared.JoinsLayers):
-            module.join_layers()
+        if isinstance(module, prepared.FusableModule):
+            module.fuse_projections()
     return model

@@ -97,7 +97,7 @@ class FusedArrays(nnx.Variable[Any]):
 
 
 class Prepared(nnx.Module):
-    """Fused layers, stored in place of the first; an empty `Prepared` replaces each of the others."""
+    """Fused layers, stored in place of the first; empty instances replace the others."""
 
     def __init__(self, arrays: FusedLayers | SharedProjection | None = None) -> None:
         self.arrays = None if arrays is None else FusedArrays(arrays)
@@ -111,7 +111,7 @@ class Prepared(nnx.Module):
         return result
 
     def results(self, x: jax.Array, token_mask: jax.Array | None) -> list[tuple[jax.Array, Aux]]:
-        """Compute y and aux of each layer for x `[..., I]`; an empty list if there are no layers."""
+        """Compute y and aux of each layer for x `[..., I]`; the list is empty without layers."""
         if self.arrays is None:
             return []
         arrays = self.arrays.get_value()
@@ -120,7 +120,7 @@ class Prepared(nnx.Module):
         else:
             ys, aux = _call_shared(arrays, x.astype(arrays.down.dtype), token_mask)
         per_layer = [jax.tree.map(lambda a, i=i: a[i], aux) for i in range(len(ys))]
-        reports = [dataclasses.replace(aux, token_mask=token_mask) for aux in per_layer]
+        reports = [dataclasses.replace(layer_aux, token_mask=token_mask) for layer_aux in per_layer]
         return list(zip(ys, reports, strict=True))
 
 
@@ -133,7 +133,7 @@ class FusableModule(Protocol):
     """Module that can fuse its layers with shared inputs."""
 
     def fuse_projections(self, *, copy_kernels: bool = True) -> None:
-        """Replace this module's layers, but not its children's, by fused ones; see `fuse_layers`."""
+        """Fuse this module's own layers in place, not its children's; see `fuse_layers`."""
         ...
 
 
@@ -190,7 +190,9 @@ def _call_shared(
     projected = matmul(jax.lax.optimization_barrier(x), shared.down)
     z, aux = _bottleneck(shared, projected, 0, token_mask)
     ys, zs = [], jnp.split(z, len(shared.ups), axis=-1)
-    for layer_z, kernel, up, bias in zip(zs, shared.kernels, shared.ups, shared.biases, strict=True):
+    for layer_z, kernel, up, bias in zip(
+        zs, shared.kernels, shared.ups, shared.biases, strict=True
+    ):
         y = base_plus_low_rank(x, layer_z, kernel, up)
         ys.append(y if bias is None else y + bias)
     return ys, aux

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax.adapters.layers.prepared import join_one
+from lorasp_jax.adapters.layers.prepared import fuse_layer
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig
 from lorasp_jax.models.transformer.attention import attention
 from lorasp_jax.models.transformer.depth import scan_depth, stack
@@ -39,11 +39,11 @@ class CrossBlock(SelfBlock):
     def __init__(self, size: ExpertConfig, config: BackboneConfig, *, rngs: nnx.Rngs) -> None:
         super().__init__(size, config, context=size.kv_heads * size.head_dim, rngs=rngs)
 
-    def join_layers(self, *, copy_kernels: bool = True) -> None:
-        """See `prepared.JoinsLayers`; q_proj, k_proj and v_proj have different inputs here."""
-        self.q_proj = join_one(self.q_proj, copy_kernels=copy_kernels)
-        self.k_proj = join_one(self.k_proj, copy_kernels=copy_kernels)
-        self.v_proj = join_one(self.v_proj, copy_kernels=copy_kernels)
+    def fuse_projections(self, *, copy_kernels: bool = True) -> None:
+        """See `prepared.FusableModule`; q_proj, k_proj and v_proj have different inputs here."""
+        self.q_proj = fuse_layer(self.q_proj, copy_kernels=copy_kernels)
+        self.k_proj = fuse_layer(self.k_proj, copy_kernels=copy_kernels)
+        self.v_proj = fuse_layer(self.v_proj, copy_kernels=copy_kernels)
         self.join_output_and_mlp(copy_kernels=copy_kernels)
 
     def project_cache(self, cache: KeysValues, valid: jax.Array) -> tuple[KeysValues, LayerAux]:

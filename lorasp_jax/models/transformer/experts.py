@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax.adapters.layers.prepared import Layer, join, join_one
+from lorasp_jax.adapters.layers.prepared import Layer, fuse_layer, fuse_layers
 from lorasp_jax.dense import Dense
 from lorasp_jax.models.config import BackboneConfig, ExpertConfig
 from lorasp_jax.models.transformer.attention import attention
@@ -69,18 +69,18 @@ class ExpertBlock(nnx.Module):
         self.up_proj: Layer = Dense(width, size.mlp, **options)
         self.down_proj: Layer = Dense(size.mlp, width, **options)
 
-    def join_layers(self, *, copy_kernels: bool = True) -> None:
-        """See `prepared.JoinsLayers`."""
+    def fuse_projections(self, *, copy_kernels: bool = True) -> None:
+        """See `prepared.FusableModule`."""
         qkv = self.q_proj, self.k_proj, self.v_proj
-        self.q_proj, self.k_proj, self.v_proj = join(qkv, copy_kernels=copy_kernels)
+        self.q_proj, self.k_proj, self.v_proj = fuse_layers(qkv, copy_kernels=copy_kernels)
         self.join_output_and_mlp(copy_kernels=copy_kernels)
 
     def join_output_and_mlp(self, *, copy_kernels: bool) -> None:
         """Join the layers that `output_and_mlp` calls."""
-        self.o_proj = join_one(self.o_proj, copy_kernels=copy_kernels)
+        self.o_proj = fuse_layer(self.o_proj, copy_kernels=copy_kernels)
         gate_up = self.gate_proj, self.up_proj
-        self.gate_proj, self.up_proj = join(gate_up, copy_kernels=copy_kernels)
-        self.down_proj = join_one(self.down_proj, copy_kernels=copy_kernels)
+        self.gate_proj, self.up_proj = fuse_layers(gate_up, copy_kernels=copy_kernels)
+        self.down_proj = fuse_layer(self.down_proj, copy_kernels=copy_kernels)
 
     def __call__(
         self,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lorasp_jax.adapters.layers.prepared import Layer, Prepared, join_one
+from lorasp_jax.adapters.layers.prepared import Layer, Prepared, fuse_layer
 from lorasp_jax.dense import Dense, dense_shared_input
 from lorasp_jax.peft import Aux
 
@@ -70,9 +70,9 @@ class AdaptiveRMSNorm(nnx.Module):
         self.dense: Layer = Dense(width, 3 * width, kernel_init=nnx.initializers.zeros, **options)
         self.eps = 1e-6
 
-    def join_layers(self, *, copy_kernels: bool = True) -> None:
-        """See `prepared.JoinsLayers`."""
-        self.dense = join_one(self.dense, copy_kernels=copy_kernels)
+    def fuse_projections(self, *, copy_kernels: bool = True) -> None:
+        """See `prepared.FusableModule`."""
+        self.dense = fuse_layer(self.dense, copy_kernels=copy_kernels)
 
     def normalize(
         self, x: jax.Array, condition: jax.Array | None

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from lorasp_jax.adapters.layers.prepared import Layer, join, join_one
+from lorasp_jax.adapters.layers.prepared import Layer, fuse_layer, fuse_layers
 from lorasp_jax.dense import Dense
 from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.models.transformer.attention import attention
@@ -28,13 +28,13 @@ class VisionBlock(nnx.Module):
         self.fc1: Layer = Dense(width, mlp, **options)
         self.fc2: Layer = Dense(mlp, width, **options)
 
-    def join_layers(self, *, copy_kernels: bool = True) -> None:
-        """See `prepared.JoinsLayers`."""
+    def fuse_projections(self, *, copy_kernels: bool = True) -> None:
+        """See `prepared.FusableModule`."""
         qkv = self.q_proj, self.k_proj, self.v_proj
-        self.q_proj, self.k_proj, self.v_proj = join(qkv, copy_kernels=copy_kernels)
-        self.out_proj = join_one(self.out_proj, copy_kernels=copy_kernels)
-        self.fc1 = join_one(self.fc1, copy_kernels=copy_kernels)
-        self.fc2 = join_one(self.fc2, copy_kernels=copy_kernels)
+        self.q_proj, self.k_proj, self.v_proj = fuse_layers(qkv, copy_kernels=copy_kernels)
+        self.out_proj = fuse_layer(self.out_proj, copy_kernels=copy_kernels)
+        self.fc1 = fuse_layer(self.fc1, copy_kernels=copy_kernels)
+        self.fc2 = fuse_layer(self.fc2, copy_kernels=copy_kernels)
 
     def __call__(self, x: jax.Array, token_mask: jax.Array) -> tuple[jax.Array, LayerAux]:
         """Apply the layer to x `[B, T, D]`; also return the adapters' aux."""

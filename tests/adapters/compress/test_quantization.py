@@ -67,7 +67,7 @@ def test_methods_over_a_quantised_base(name):
     """By discovery: attached after or before, the same as over the widened kernels."""
     method = METHODS[name]
     if method.trains_base:
-        with pytest.raises(ValueError, match="inp/kernel is quantised and cannot train in full"):
+        with pytest.raises(ValueError, match="inp/kernel is quantized and cannot be fully"):
             adaptation.adapt(quantized("nf4"), [("inp", method)], rngs=nnx.Rngs(0))
         with pytest.raises(ValueError, match="cannot quantise inp: its kernel trains"):
             lorasp_jax.quantize(trained(("inp", method), seed=0), [("", "nf4")])

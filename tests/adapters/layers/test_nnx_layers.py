@@ -249,7 +249,7 @@ def test_layers_described_by_the_user(x, tmp_path):
     np.testing.assert_array_equal(loaded(x), model(x))
     np.testing.assert_allclose(model(x), product(x), rtol=1e-5, atol=1e-6)
     assert (model.width, isinstance(model, Product)) == (2, True)
-    with pytest.raises(ValueError, match="w cannot train in full under the layer's adapter"):
+    with pytest.raises(ValueError, match="w cannot be fully fine-tuned"):
         adapted(product, ("w", FullFineTuning()), ("", LoRA(rank=2)), einsums=einsums)
     free = adapted(product, ("w", FullFineTuning()))
     assert isinstance(free.w, AdapterParam)

@@ -1,4 +1,4 @@
-"""Joined layers compute what they did, with fewer products."""
+"""Fused layers compute the same as the original ones, with fewer matmuls."""
 
 import functools
 
@@ -19,11 +19,11 @@ from tests.models.drawn import drawn, observation
 from tests.nets import METHODS, trained
 from tests.peft.lora_sp.test_method import OnGPU
 
-JOINED = [name for name in METHODS if name not in ("full", "dora", "lora_moe")]
+FUSABLE = [name for name in METHODS if name not in ("full", "dora", "lora_moe")]
 
 
-class Readers(nnx.Module):
-    """Three layers that read x, one with a bias, and one that reads their sum."""
+class Net(nnx.Module):
+    """Two layers with a shared input, one of them with a bias, and a third one."""
 
     def __init__(self, dtype="bfloat16"):
         kinds = {"dtype": dtype, "rngs": nnx.Rngs(0)}
@@ -31,10 +31,10 @@ class Readers(nnx.Module):
         self.second = Dense(8, 12, **kinds)
         self.third = Dense(8, 8, **kinds)
 
-    def join_layers(self, *, copy_kernels=True):
+    def fuse_projections(self, *, copy_kernels=True):
         pair = self.first, self.second
-        self.first, self.second = prepared.join(pair, copy_kernels=copy_kernels)
-        self.third = prepared.join_one(self.third, copy_kernels=copy_kernels)
+        self.first, self.second = prepared.fuse_layers(pair, copy_kernels=copy_kernels)
+        self.third = prepared.fuse_layer(self.third, copy_kernels=copy_kernels)
 
     def __call__(self, x, token_mask=None):
         (first, second), aux = apply_to_shared_input(
@@ -45,47 +45,50 @@ class Readers(nnx.Module):
 
 
 def adapted(method, dtype="bfloat16"):
-    net = Readers(dtype)
+    net = Net(dtype)
     net.second.bias.set_value(jnp.arange(12.0))
     return trained((".*", method), seed=1, net=net)
 
 
-def ready(model):
+def prepare(model):
     model = nnx.merge(*nnx.split(model))
-    model.join_layers()
+    model.fuse_projections()
     return model
 
 
-def joined_sizes(model):
-    """How many layers are joined in the place of each; those that stay count as none."""
-    layers = [getattr(layer, "ready", None) for layer in (model.first, model.second, model.third)]
-    return [0 if ready is None else len(ready.get_value().chain.sizes) for ready in layers]
+def fused_counts(model):
+    """Number of fused layers stored at each layer; 0 for unchanged and empty ones."""
+    variables = [
+        getattr(layer, "arrays", None) for layer in (model.first, model.second, model.third)
+    ]
+    values = [None if variable is None else variable.get_value() for variable in variables]
+    return [0 if value is None else len(value.bottleneck.out_sizes) for value in values]
 
 
-@pytest.mark.parametrize("name", mostly_slow(JOINED, ["lora_sp"]))
+@pytest.mark.parametrize("name", mostly_slow(FUSABLE, ["lora_sp"]))
 def test_computes_the_same(name):
     model, x = adapted(METHODS[name], "float32"), jnp.sin(jnp.arange(96.0)).reshape(2, 6, 8)
     mask = jnp.arange(12).reshape(2, 6) % 5 != 0
     run = jax.jit(lambda model, x: model(x, mask))
     expected, aux = run(model, x)
-    joined = ready(model)
-    assert joined_sizes(joined) == [2, 0, 1]
-    found, other = run(joined, x)
+    fused = prepare(model)
+    assert fused_counts(fused) == [2, 0, 1]
+    found, other = run(fused, x)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
     assert jax.tree.structure(other) == jax.tree.structure(aux)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), other, aux)
 
 
-@pytest.mark.parametrize("name", mostly_slow(JOINED, ["lora_sp"]))
+@pytest.mark.parametrize("name", mostly_slow(FUSABLE, ["lora_sp"]))
 def test_a_stack_computes_the_same(name):
-    """On rows fewer and more than inputs, for which W and U are joined."""
+    """With fewer and with more rows than inputs."""
     model = adapted(METHODS[name], "float32")
     stack = jax.tree.map(lambda leaf: jnp.stack([leaf, 0.5 * leaf]), model)
     run = jax.jit(jax.vmap(lambda model, x: model(x), in_axes=(0, None)))
-    joined = prepared.join_stack(stack)
+    fused = prepared.fuse_stack(stack)
     for rows in (4, 12):
         x = jnp.sin(jnp.arange(8.0 * rows)).reshape(1, rows, 8)
-        (expected, aux), (found, other) = run(stack, x), run(joined, x)
+        (expected, aux), (found, other) = run(stack, x), run(fused, x)
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
         assert jax.tree.structure(other) == jax.tree.structure(aux)
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), other, aux)
@@ -100,88 +103,88 @@ def test_a_stacks_adapters_are_cast_before_the_loop():
         (loop,) = (e for e in jax.make_jaxpr(run)(x, stack).eqns if e.primitive.name == "scan")
         return str(loop.params["jaxpr"]).count(primitive)
 
-    joined = prepared.join_stack(stack)
-    casts = [in_loop("convert_element_type", one) for one in (stack, joined)]
+    fused = prepared.fuse_stack(stack)
+    casts = [in_loop("convert_element_type", one) for one in (stack, fused)]
     assert casts[0] - casts[1] >= 6  # P and U of three layers
-    assert in_loop("optimization_barrier", joined) == 2  # one for each input
+    assert in_loop("optimization_barrier", fused) == 2  # one for each input
 
 
-def test_a_kernel_gets_the_routers_numbers_joined_once():
+def test_a_kernel_gets_the_packed_router_parameters():
     model = adapted(OnGPU(rank=32, hidden_width=16), "float32")
     x = jnp.sin(jnp.arange(96.0)).reshape(2, 6, 8)
-    joined = ready(model)
-    params = joined.first.ready.get_value().params
+    fused = prepare(model)
+    params = fused.first.arrays.get_value().params
     assert [leaf.shape for leaf in jax.tree.leaves(params)] == [(2, 16 * 32 + 16 + 32)]
     run = jax.jit(lambda model, x: model(x))
     close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-4)
-    jax.tree.map(close, run(joined, x), run(model, x))
+    jax.tree.map(close, run(fused, x), run(model, x))
 
 
-def test_a_quantised_base_computes_the_same():
+def test_a_quantized_base_computes_the_same():
     model = quantize(adapted(METHODS["lora"], "float32"), [(".*", "int8")]).model
-    joined, x = ready(model), jnp.sin(jnp.arange(48.0)).reshape(6, 8)
-    assert joined_sizes(joined) == [2, 0, 1]
-    np.testing.assert_allclose(joined(x)[0], model(x)[0], rtol=1e-4, atol=1e-4)
+    fused, x = prepare(model), jnp.sin(jnp.arange(48.0)).reshape(6, 8)
+    assert fused_counts(fused) == [2, 0, 1]
+    np.testing.assert_allclose(fused(x)[0], model(x)[0], rtol=1e-4, atol=1e-4)
 
 
-def test_a_quantised_base_stays_so_where_it_is_not_copied():
+def test_a_quantized_base_is_kept_if_kernels_are_not_copied():
     model = quantize(adapted(METHODS["lora"], "float32"), [(".*", "int8")]).model
     expected, x = model(jnp.ones((6, 8)))[0], jnp.ones((6, 8))
-    model.join_layers(copy_kernels=False)
+    model.fuse_projections(copy_kernels=False)
     codes = [leaf for leaf in jax.tree.leaves(nnx.state(model)) if leaf.dtype == jnp.int8]
     assert len(codes) == 3
     np.testing.assert_allclose(model(x)[0], expected, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize(
-    ("rows", "d_in", "d_out", "parts"),
+    ("rows", "d_in", "d_out", "splits"),
     [
-        (51, 4096, 1184, 8),  # the action expert's last product
+        (51, 4096, 1184, 8),  # the action expert's last matmul
         (51, 2048, 1184, 4),
-        (51, 1024, 8512, 1),  # not long
+        (51, 1024, 8512, 1),  # few inputs
         (816, 4096, 2208, 1),  # many tiles
         (51, 2050, 64, 1),  # does not divide
     ],
 )
-def test_a_long_sum_of_few_rows_is_split(rows, d_in, d_out, parts):
-    assert prepared._parts(rows, d_in, d_out) == parts
+def test_split_k_for_few_rows_and_many_inputs(rows, d_in, d_out, splits):
+    assert prepared._num_splits(rows, d_in, d_out) == splits
 
 
-def test_a_sum_over_parts_is_the_product():
+def test_split_k_equals_matmul():
     keys = jax.random.split(jax.random.key(0))
     x, matrix = (
         jax.random.normal(k, s) for k, s in zip(keys, ((2, 3, 4096), (4096, 8)), strict=True)
     )
-    assert "reduce_sum" in str(jax.make_jaxpr(prepared.product)(x, matrix))
-    np.testing.assert_allclose(prepared.product(x, matrix), x @ matrix, rtol=1e-4, atol=1e-3)
-    half = prepared.product(x.astype(jnp.bfloat16), matrix.astype(jnp.bfloat16))
+    assert "reduce_sum" in str(jax.make_jaxpr(prepared.matmul)(x, matrix))
+    np.testing.assert_allclose(prepared.matmul(x, matrix), x @ matrix, rtol=1e-4, atol=1e-3)
+    half = prepared.matmul(x.astype(jnp.bfloat16), matrix.astype(jnp.bfloat16))
     assert half.dtype == jnp.bfloat16
     np.testing.assert_allclose(half.astype(jnp.float32), x @ matrix, atol=1)
 
 
-def test_layers_of_one_input_are_two_products():
+def test_layers_with_a_shared_input_run_two_matmuls():
     model, x = adapted(METHODS["lora"]), jnp.ones((2, 8), jnp.bfloat16)
-    products = lambda model: str(jax.make_jaxpr(lambda x: model(x)[0])(x)).count("dot_general")  # noqa: E731
-    assert products(model) > products(ready(model)) == 4
+    matmuls = lambda model: str(jax.make_jaxpr(lambda x: model(x)[0])(x)).count("dot_general")  # noqa: E731
+    assert matmuls(model) > matmuls(prepare(model)) == 4
 
 
 @pytest.mark.parametrize(
-    ("name", "dtype"),  # another product, rows in fp32, no type of its own
+    ("name", "dtype"),  # overrides `apply`, down-projects in fp32, has no explicit dtype
     [("dora", "bfloat16"), ("lora_moe", "bfloat16"), ("lora", None)],
 )
-def test_what_cannot_be_joined_stays(name, dtype):
-    model = ready(adapted(METHODS[name], dtype))
+def test_other_layers_are_unchanged(name, dtype):
+    model = prepare(adapted(METHODS[name], dtype))
     assert {type(layer) for layer in (model.first, model.second, model.third)} == {Dense}
 
 
 @pytest.mark.parametrize("second", ["ada_lora", "dora", None])
-def test_layers_of_two_methods_are_joined_alone(second):
-    """Or left as they are: the last two."""
+def test_layers_of_two_methods_are_fused_individually(second):
+    """Or unchanged, for the last two."""
     rules = [("second", second and METHODS[second]), (".*", METHODS["lora"])]
-    model, x = trained(*rules, seed=1, net=Readers("float32")), jnp.ones((2, 8))
-    joined = ready(model)
-    assert joined_sizes(joined) == [1, int(second == "ada_lora"), 1]
-    (found, other), (expected, aux) = joined(x), model(x)
+    model, x = trained(*rules, seed=1, net=Net("float32")), jnp.ones((2, 8))
+    fused = prepare(model)
+    assert fused_counts(fused) == [1, int(second == "ada_lora"), 1]
+    (found, other), (expected, aux) = fused(x), model(x)
     np.testing.assert_allclose(found, expected, rtol=1e-4)
     assert jax.tree.structure(other) == jax.tree.structure(aux)
 
@@ -206,4 +209,4 @@ def test_sampling_follows_the_velocity(backbone):
 
     for _ in range(2):
         np.testing.assert_allclose(sample(model.sampler()), expected, rtol=1e-4, atol=1e-5)
-    assert traced == [Sampler]  # two samplers of one model share a program
+    assert traced == [Sampler]  # samplers of one model share a compiled function
