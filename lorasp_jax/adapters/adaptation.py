@@ -266,7 +266,7 @@ def _attach_all(
         method = cast(Method, rules[used[location.path]][1])
         layer_key = jax.random.fold_in(key, zlib.crc32(location.path.encode()))
         try:
-            layer = nnx_layers.adapted(location.child, einsums)
+            layer = nnx_layers.make_adaptable(location.child, einsums)
             attach(layer, method, layer_key, statistics.get(location.path))
         except ValueError as error:
             raise ValueError(f"cannot adapt {location.path or 'the model'}: {error}") from error

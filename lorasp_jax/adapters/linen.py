@@ -25,7 +25,7 @@ from lorasp_jax import _compat
 from lorasp_jax.adapters.adaptation import init_stack, over_stack
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.adapters.layers.einsum import to_matrices
-from lorasp_jax.adapters.layers.linen_layers import kind, layer_map, with_lora
+from lorasp_jax.adapters.layers.linen_layers import layer_call, supported_class, with_lora
 from lorasp_jax.adapters.layers.nnx_layers import Einsums
 from lorasp_jax.adapters.paths import Rules, check_method_rules, find_rule, no_match_message
 from lorasp_jax.dense import AUX_NAME, validate
@@ -182,21 +182,25 @@ class LinenAdapter:
         found: dict[str, tuple[int, ...]] = {}
 
         def visit(module: nn.Module, args: Any, kwargs: Any) -> None:
-            view = layer_map(module, self.einsums, args, kwargs) if self._kind(module) else None
-            if view is None or view.equation is None:
+            layer = (
+                layer_call(module, self.einsums, args, kwargs)
+                if self._supported_class(module)
+                else None
+            )
+            if layer is None or layer.equation is None:
                 return
             own = functools.reduce(operator.getitem, module.path, variables["params"])
-            kernel = nn.meta.unbox(own[view.name])  # with the axes of a scanned stack
+            kernel = nn.meta.unbox(own[layer.name])  # with the axes of a scanned stack
             shaped = jax.ShapeDtypeStruct(kernel.shape, kernel.dtype)
-            matrices = functools.partial(to_matrices, view.equation)
+            matrices = functools.partial(to_matrices, layer.equation)
             found["/".join(module.path)] = jax.eval_shape(matrices, shaped).shape
 
         self._visited(visit, validate.variables(variables), *args, **kwargs)
         return found
 
-    def _kind(self, module: nn.Module) -> type[nn.Module] | None:
+    def _supported_class(self, module: nn.Module) -> type[nn.Module] | None:
         """The known class that a layer of the model is called as."""
-        return kind(module, self.einsums) if _is_ours(module) else None
+        return supported_class(module, self.einsums) if _is_ours(module) else None
 
     def _method(self, module: nn.Module) -> tuple[int, Method] | None:
         """The rule that gives the layer an adapter, and its method."""
@@ -207,7 +211,7 @@ class LinenAdapter:
     def _attach(self, record: "_Record", module: nn.Module, args: Any, kwargs: Any) -> None:
         """Puts an adapter among the layer's parameters, if the rules say so."""
         path = "/".join(module.path)
-        if not self._kind(module):
+        if not self._supported_class(module):
             own = module.variables.get("params", {})
             matrices = [n for n, value in own.items() if len(getattr(value, "shape", ())) > 1]
             record.others |= {path: type(module).__name__} if matrices else {}
@@ -218,29 +222,29 @@ class LinenAdapter:
             return
         i, method = found
         try:
-            view = layer_map(module, self.einsums, args, kwargs)
-            init, own_key = view.adapter_init(method), module.make_rng("params")
-            params, rest = init_stack(own_key, init, view.matrices())
+            layer = layer_call(module, self.einsums, args, kwargs)
+            init, own_key = layer.adapter_init(method), module.make_rng("params")
+            params, rest = init_stack(own_key, init, layer.matrices())
         except ValueError as error:
             raise ValueError(f"cannot adapt {path or 'the model'}: {error}") from error
         if method.splits_kernel:
-            view.put_matrices(rest)
+            layer.set_matrices(rest)
         module.put_variable("params", ADAPTER, params)
         record.used.add(i)
-        record.kernels.add((*module.path, view.name))
+        record.kernels.add((*module.path, layer.name))
 
     def _merge(self, module: nn.Module, args: Any, kwargs: Any) -> None:
         """Folds the layer's adapter into its kernel."""
         params, found = module.get_variable("params", ADAPTER), self._method(module)
         if params is None or found is None:
             return
-        view = layer_map(module, self.einsums, args, kwargs)
-        matrices = view.matrices()
+        layer = layer_call(module, self.einsums, args, kwargs)
+        matrices = layer.matrices()
         try:
             merged = over_stack(found[1].merge, matrices)(flax.core.unfreeze(params), matrices)
         except ValueError as error:
             raise ValueError(f"cannot merge {'/'.join(module.path)}: {error}") from error
-        view.put_matrices(merged)
+        layer.set_matrices(merged)
         module.put_variable("params", ADAPTER, None)  # a layer may be called twice
 
     def _divided(self, params: dict[tuple, Any], record: "_Record") -> tuple[dict, dict]:
@@ -267,7 +271,7 @@ class LinenAdapter:
     def _call(self, run: Next, args: Any, kwargs: Any, context: Any) -> Any:
         """The interceptor that computes adapted layers."""
         module = context.module
-        if context.method_name not in ("__call__", "attend") or not self._kind(module):
+        if context.method_name not in ("__call__", "attend") or not self._supported_class(module):
             return run(*args, **kwargs)
         params, found = module.get_variable("params", ADAPTER), self._method(module)
         if (params is None) != (found is None):
@@ -282,10 +286,10 @@ class LinenAdapter:
         if context.method_name == "attend":
             y = run(*args, **kwargs)
             return y + nnx_layers.attend_delta(method, params, *args, **kwargs).astype(y.dtype)
-        view = layer_map(module, self.einsums, args, kwargs)
+        layer = layer_call(module, self.einsums, args, kwargs)
         key = _dropout_key(module, method)
-        if view.equation:
-            y, aux = view.einsum(method, params, key)
+        if layer.equation:
+            y, aux = layer.einsum(method, params, key)
         else:
             y, aux = with_lora(module, method, params, key, run(*args, **kwargs), *args, **kwargs)
         module.sow("intermediates", AUX_NAME, aux)

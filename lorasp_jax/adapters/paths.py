@@ -82,7 +82,8 @@ def locate_layers(
     return [
         location
         for location in locate(root, nnx.Module)
-        if isinstance(location.child, AdaptedLayer) or nnx_layers.kind(location.child, einsums)
+        if isinstance(location.child, AdaptedLayer)
+        or nnx_layers.supported_class(location.child, einsums)
     ]
 
 

@@ -185,9 +185,9 @@ def test_rules_that_apply_to_nothing(net):
         adapted(net, ("haeds", None), (".*", SP))
 
 
-def test_linear_with_its_own_product_is_refused():
+def test_linear_with_a_custom_precision_is_rejected():
     net = nnx.Linear(3, 4, precision="highest", rngs=nnx.Rngs(0))
-    with pytest.raises(ValueError, match="own dot_general or precision cannot be adapted"):
+    with pytest.raises(ValueError, match="with a custom precision cannot be adapted"):
         adapted(net, ("", LoRA(rank=2)))
 
 

@@ -198,7 +198,7 @@ def test_rules_that_apply_to_nothing(published, ids):
         attached(published, ids, (MATRICES, SP), ("dense", LoRA(rank=2)))
     with pytest.raises(ValueError, match="rule 'norm' applies to nothing"):
         attached(published, ids, ("norm", SP))
-    with pytest.raises(ValueError, match="cannot adapt embed: Embed takes LoRA that starts"):
+    with pytest.raises(ValueError, match="cannot adapt embed: Embed only supports LoRA whose"):
         attached(published, ids, (".*", SP))
     with pytest.raises(ValueError, match="dense/kernel cannot train in full under"):
         attached(published, ids, ("kernel$", FullFineTuning()), ("dense", SP))
@@ -217,5 +217,7 @@ def test_wrong_variables(published, ids):
     with pytest.raises(ValueError, match="cannot merge dense: LoRA-SP"):
         adapter.merge(variables, ids)
     exact = LinenAdapter(nn.Dense(3, precision="highest"), [("", SP)])
-    with pytest.raises(ValueError, match=r"cannot adapt the model: a Dense with .* sets precision"):
+    with pytest.raises(
+        ValueError, match=r"cannot adapt the model: a Dense with a custom precision"
+    ):
         exact.init(jax.random.key(0), jnp.ones((1, 2)))

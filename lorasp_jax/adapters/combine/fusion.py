@@ -119,7 +119,7 @@ def _unmerged(layer: nnx.Module, adapted: AdaptedLayer) -> AdaptedLayer:
     method, params = adapted.method_and_params()
     if not method.additive:
         raise ValueError(f"{method} did not just add to its base.")
-    layer = nnx_layers.like(layer, adapted)
+    layer = nnx_layers.make_adaptable_like(layer, adapted)
     kernel = layer.kernel_matrices()
     delta = adaptation.over_stack(method.merge, kernel)(params, jnp.zeros(kernel.shape))
     base = (kernel.astype(jnp.float32) - delta).astype(kernel.dtype)

@@ -189,7 +189,7 @@ def with_adapters(
         kind, method, params = adapters.get(location.path, (None, None, {}))
         if kind is None or method is None:
             return None
-        layer = nnx_layers.like(location.child, kind)
+        layer = nnx_layers.make_adaptable_like(location.child, kind)
         layer.method, layer.adapter = method, AdapterParam(params)
         return layer
 
@@ -299,7 +299,7 @@ def _with_set(
     layer: nnx.Module, known: tuple[str, ...], found: Adapters, rank: int | None
 ) -> AdaptedLayer:
     """The layer with what was found for it as a set, of whose weights all are 0."""
-    layer = nnx_layers.like(layer, next(iter(found.values())))
+    layer = nnx_layers.make_adaptable_like(layer, next(iter(found.values())))
     own = {name: adapted.method_and_params() for name, adapted in found.items()}
     methods = [own[name][0] if name in own else None for name in known]
     if rank is None:

@@ -189,7 +189,7 @@ def _observed(
         if path not in reports:
             continue
         try:
-            layer = nnx_layers.adapted(location.child, {})
+            layer = nnx_layers.make_adaptable(location.child, {})
         except ValueError as error:
             raise ValueError(f"cannot observe {path}: {error}") from error
         paths.set_child(location, layer)

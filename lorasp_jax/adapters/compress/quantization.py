@@ -90,7 +90,7 @@ def is_quantized(model: nnx.Module) -> bool:
 
 def _quantized(layer: nnx.Module, kind: Kind, shared: Shared) -> tuple[AdaptedLayer, float]:
     """The layer with a quantised kernel, and its relative error; shared kernels stay shared."""
-    layer = nnx_layers.adapted(layer, {})
+    layer = nnx_layers.make_adaptable(layer, {})
     variable, kernel = layer.kernel_variable(), layer.kernel_matrices()
     if isinstance(variable, AdapterParam):
         raise ValueError("its kernel trains, and what trains needs all of its bits.")

@@ -1,15 +1,15 @@
 """Adapted einsums: kernels with any number of input, output and batch axes.
 
-An equation "x,kernel->y" has one "..." at most in x and y. It says what each kernel axis is:
+In an equation "x,kernel->y", x and y may each contain one "...". Each kernel axis is one of
 
-    batch    in x, kernel and y: one map for each index, for instance one per expert
+    batch    in x, kernel and y: a separate linear map per index, for instance one per expert
     input    in x and kernel: summed over
     output   in kernel and y
 
-To an adapter the kernel is a stack of matrices [*batch, I, O], inputs and outputs flattened in the
-order of the kernel's axes; an adapter has the batch axes in front, as it has those of a scanned
-stack. "BTD,NDH->BTNH" thus has one adapter of D inputs and N·H outputs. A quantised kernel is kept
-as that stack of matrices, with the sizes of its axes beside it.
+An adapter treats the kernel as a stack of matrices [*batch, I, O], with inputs and outputs
+flattened in the order of the kernel's axes; its parameters have the batch axes as leading axes,
+like those of a scanned stack. For example, "BTD,NDH->BTNH" has one adapter with D inputs and N·H
+outputs. A quantized kernel is stored as that stack of matrices, along with the sizes of its axes.
 """
 
 import dataclasses
@@ -33,7 +33,7 @@ _EQUATION = re.compile(r"{0},([a-zA-Z]+)->{0}".format(r"([a-zA-Z]*(?:\.\.\.)?[a-
 
 
 class Axes(NamedTuple):
-    """Letters of an equation; those of x and y may hold "..."."""
+    """Axis letters of x, kernel and y in an equation; those of x and y may contain "..."."""
 
     x: str
     kernel: str
@@ -41,7 +41,7 @@ class Axes(NamedTuple):
 
     @property
     def batch(self) -> str:
-        """Kernel axes that x and y have too, in the kernel's order."""
+        """Kernel axes that are also in x and y, in the kernel's order."""
         return "".join(c for c in self.kernel if c in self.x and c in self.y)
 
     @property
@@ -51,49 +51,52 @@ class Axes(NamedTuple):
 
     @property
     def outputs(self) -> str:
-        """Kernel axes that x lacks, in the kernel's order."""
+        """Kernel axes that are not in x, in the kernel's order."""
         return "".join(c for c in self.kernel if c not in self.x)
 
     def expanded(self, ndim: int) -> "Axes":
-        """The same for an x of so many axes, letters in place of the dots.
+        """Replace "..." by letters, for an x with `ndim` axes.
 
         Raises:
-          ValueError: an equation for another number of axes.
+          ValueError: the equation does not allow `ndim` axes.
         """
         letters = (c for c in string.ascii_letters if c not in self.x + self.kernel + self.y)
         count = ndim - len(self.x.replace("...", ""))
         if count < 0 or (count and "..." not in self.x):
-            raise ValueError(f"{self.x},{self.kernel}->{self.y} meets an input of {ndim} axes.")
+            raise ValueError(
+                f"input with {ndim} axes does not match the equation "
+                f"{self.x},{self.kernel}->{self.y}."
+            )
         dots = "".join(next(letters) for _ in range(count))
         return Axes(self.x.replace("...", dots), self.kernel, self.y.replace("...", dots))
 
 
 def parse(equation: str) -> Axes:
-    """The axes of an equation.
+    """Parse an equation.
 
     Raises:
-      ValueError: it is no linear map from x to y, one at each index of the batch axes.
+      ValueError: it is not a linear map from x to y for each index of the batch axes.
     """
-    found = _EQUATION.fullmatch(equation.replace(" ", ""))
-    axes = Axes(*found.groups()) if found else Axes("", "", "")
+    match = _EQUATION.fullmatch(equation.replace(" ", ""))
+    axes = Axes(*match.groups()) if match else Axes("", "", "")
     letters = [part.replace("...", "") for part in axes]
     x, kernel, y = map(set, letters)
     unique = all(len(set(part)) == len(part) for part in letters)
     same_dots = ("..." in axes.x) == ("..." in axes.y)
     if not (unique and same_dots and kernel and x ^ y <= kernel <= x | y):
         raise ValueError(
-            f"the einsum {short(equation)} cannot be adapted: it must be 'x,kernel->y', explicit, "
-            "where each axis is in two or all of the three."
+            f"the einsum {short(equation)} cannot be adapted: it must be explicit, 'x,kernel->y', "
+            "with each axis in at least two of the three."
         )
     return axes
 
 
 def general_equation(axis: Sequence[int], batch: Sequence[int], outputs: int) -> str:
-    """The equation of a general dense layer, whose kernel is [*batch, *inputs, *outputs].
+    """Equation of a general dense layer with a kernel [*batch, *inputs, *outputs].
 
     Args:
-      axis: axes of x that are summed over; negative ones count from the end.
-      batch: leading axes of x that the kernel has too, from 0.
+      axis: axes of x to sum over; negative ones count from the end.
+      batch: leading axes of x, from 0, that the kernel also has.
       outputs: number of output axes.
     """
     letters = iter(string.ascii_letters)
@@ -109,7 +112,7 @@ def general_equation(axis: Sequence[int], batch: Sequence[int], outputs: int) ->
 
 
 def to_matrices(equation: str, kernel: Any) -> Any:
-    """A kernel, which may have further leading axes of a stack, as [..., *batch, I, O]."""
+    """Rearrange a kernel, or a stack of kernels, to [..., *batch, I, O]."""
     if isinstance(kernel, QuantizedKernel):
         return dataclasses.replace(kernel, axes=None, batch=0)
     axes, order = _order(equation, kernel.ndim)
@@ -120,7 +123,7 @@ def to_matrices(equation: str, kernel: Any) -> Any:
 
 
 def from_matrices(equation: str, matrices: Any, shape: Sequence[int]) -> Any:
-    """The inverse of `to_matrices` for a kernel of this shape."""
+    """Inverse of `to_matrices`, for a kernel of this shape."""
     axes, order = _order(equation, len(shape))
     if isinstance(matrices, QuantizedKernel):
         sizes = tuple(shape[len(shape) - len(axes.kernel) :])
@@ -138,39 +141,41 @@ def einsum(
     method: Method | None = None,
     dropout_key: jax.Array | None = None,
 ) -> tuple[jax.Array, Aux]:
-    """The einsum of x and kernel through an adapter, or plainly without one, plus bias.
+    """Einsum of x and kernel plus bias, with an adapter if `method` and `params` are given.
 
     Args:
-      equation: as above.
-      x, kernel: as the equation says.
-      bias: the kernel's axes that y has, in the order of y, or None.
+      equation: "x,kernel->y", see the module.
+      x, kernel: of the shapes in the equation.
+      bias: with the kernel axes that are also in y, in the order of y; or None.
       params: the adapter's parameters for `to_matrices(equation, kernel)`, or None.
-      method: the adapter's method, given with `params`.
+      method: the adapter's method; required with `params`.
       dropout_key: as for `dense`.
 
     Returns:
-      y in the type of x, and the adapter's aux, all with leading batch axes but the losses, which
-      are averaged over them.
+      y in the dtype of x, and the adapter's aux; its arrays have leading batch axes, except the
+      losses, which are averaged over them.
 
     Raises:
-      ValueError: an equation that is no adaptable map, or shapes that do not fit it.
+      ValueError: the equation cannot be adapted, or the shapes do not match it.
     """
     axes, sizes = _sizes(equation, x, kernel)
     tokens = "".join(c for c in axes.x if c not in axes.kernel)
     order = [axes.x.index(c) for c in axes.batch + tokens + axes.inputs]
-    width = math.prod(sizes[c] for c in axes.inputs)  # no -1: there may be no rows
+    width = math.prod(sizes[c] for c in axes.inputs)  # -1 is ambiguous with zero rows
     rows = x.transpose(order).reshape(*(sizes[c] for c in axes.batch + tokens), width)
 
-    def one(x: jax.Array, matrix: jax.Array, params: Any, key: Any) -> tuple[jax.Array, Aux]:
+    def apply_dense(
+        x: jax.Array, matrix: jax.Array, params: Any, key: Any
+    ) -> tuple[jax.Array, Aux]:
         return dense(x, matrix, None, params, method, key)
 
     for _ in axes.batch:
-        one = jax.vmap(one)
+        apply_dense = jax.vmap(apply_dense)
     if dropout_key is not None:
         dropout_key = jax.random.split(dropout_key, tuple(sizes[c] for c in axes.batch))
-    y, aux = one(rows, to_matrices(equation, kernel), params, dropout_key)
-    found = axes.batch + tokens + axes.outputs
-    y = y.reshape([sizes[c] for c in found]).transpose([found.index(c) for c in axes.y])
+    y, aux = apply_dense(rows, to_matrices(equation, kernel), params, dropout_key)
+    layout = axes.batch + tokens + axes.outputs
+    y = y.reshape([sizes[c] for c in layout]).transpose([layout.index(c) for c in axes.y])
     if bias is not None:
         shape = [sizes[c] if c in axes.kernel else 1 for c in axes.y]
         y = y + bias.reshape(shape).astype(y.dtype)
@@ -179,18 +184,18 @@ def einsum(
 
 
 def _sizes(equation: str, x: jax.Array, kernel: Any) -> tuple[Axes, dict[str, int]]:
-    """Axes for such an x, and their sizes."""
+    """Axes with "..." expanded for x, and their sizes."""
     axes, shape = parse(equation).expanded(x.ndim), kernel.shape
     if len(shape) == len(axes.kernel):
         sizes = dict(zip(axes.kernel + axes.x, shape + x.shape, strict=True))
         if shape == tuple(sizes[c] for c in axes.kernel):
             return axes, sizes
-    raise ValueError(f"{equation!r} meets shapes {x.shape} and {shape}.")
+    raise ValueError(f"shapes {x.shape} and {shape} do not match the equation {equation!r}.")
 
 
 def _order(equation: str, ndim: int) -> tuple[Axes, list[int]]:
-    """Axes, and where those of a kernel [..., *batch, *inputs, *outputs] come from."""
+    """Axes, and the transpose order that makes a kernel [..., *batch, *inputs, *outputs]."""
     axes = parse(equation)
     outer = ndim - len(axes.kernel)
-    wanted = axes.batch + axes.inputs + axes.outputs
-    return axes, [*range(outer), *(outer + axes.kernel.index(c) for c in wanted)]
+    layout = axes.batch + axes.inputs + axes.outputs
+    return axes, [*range(outer), *(outer + axes.kernel.index(c) for c in layout)]

@@ -1,4 +1,4 @@
-"""What the layers of Linen models do with their kernels, seen from one call of a layer."""
+"""How Linen layers use their kernels, determined from one call of a layer."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -35,20 +35,20 @@ EINSUMS: nnx_layers.Einsums = {
 }
 
 
-def kind(module: nn.Module, einsums: nnx_layers.Einsums) -> type[nn.Module] | None:
-    """The known class that the layer is called as; a subclass with a call of its own has none."""
-    known = (nn.Embed, nn.Conv, *EINSUMS, *einsums)
-    calls = (cls for cls in known if isinstance(module, cls))
-    return next((cls for cls in calls if type(module).__call__ is cls.__call__), None)
+def supported_class(module: nn.Module, einsums: nnx_layers.Einsums) -> type[nn.Module] | None:
+    """Supported class whose `__call__` the layer uses; None if it overrides `__call__`."""
+    classes = (nn.Embed, nn.Conv, *EINSUMS, *einsums)
+    matches = (cls for cls in classes if isinstance(module, cls))
+    return next((cls for cls in matches if type(module).__call__ is cls.__call__), None)
 
 
-class LayerMap(NamedTuple):
-    """What a layer does in a call.
+class LayerCall(NamedTuple):
+    """The kernel, equation and input of a layer in one call.
 
     Attributes:
       module: the layer.
-      name: its kernel's name among its parameters.
-      equation: for einsums; None for an embedding or a convolution.
+      name: parameter name of the kernel.
+      equation: of an einsum; None for an embedding or a convolution.
       x: the einsum's input.
     """
 
@@ -58,18 +58,18 @@ class LayerMap(NamedTuple):
     x: Any = None
 
     def kernel(self) -> jax.Array:
-        """The kernel without the box of sharding metadata it may be in."""
+        """The kernel, without any sharding metadata box."""
         return nn.meta.unbox(self.module.get_variable("params", self.name))
 
     def matrices(self) -> jax.Array:
-        """The kernel as its adapter sees it, [*batch, I, O]."""
+        """The kernel as a stack of matrices [*batch, I, O], as its adapter uses it."""
         kernel = self.kernel()
         if self.equation is None:
             return kernel.reshape(-1, kernel.shape[-1])
         return to_matrices(self.equation, kernel)
 
-    def put_matrices(self, matrices: jax.Array) -> None:
-        """Gives the layer another kernel, in the same box."""
+    def set_matrices(self, matrices: jax.Array) -> None:
+        """Replace the layer's kernel, keeping its sharding metadata box."""
         shape = self.kernel().shape
         if self.equation is None:
             kernel = matrices.reshape(shape)
@@ -79,52 +79,53 @@ class LayerMap(NamedTuple):
         self.module.put_variable("params", self.name, boxed)
 
     def adapter_init(self, method: Method) -> Callable[[jax.Array, jax.Array], Any]:
-        """What makes a method's parameters from a key and a kernel [I, O].
+        """Function (key, kernel [I, O]) that initializes a method's parameters.
 
         Raises:
-          ValueError: a method that this kind of layer cannot carry.
+          ValueError: the layer does not support the method.
         """
         return method.init if self.equation else nnx_layers.lora_init(self.module, method)
 
     def einsum(self, method: Method, params: Any, key: Any) -> tuple[jax.Array, Aux]:
-        """The einsum through an adapter, plus bias; and aux."""
+        """The adapted einsum plus bias, and aux."""
         assert self.equation is not None
         kernel, bias = self.kernel(), nn.meta.unbox(self.module.get_variable("params", "bias"))
         x = cast_input(getattr(self.module, "dtype", None), self.x, kernel)
         return einsum(self.equation, x, kernel, bias, params, method, key)
 
 
-def layer_map(module: nn.Module, einsums: nnx_layers.Einsums, args: Any, kwargs: Any) -> LayerMap:
-    """What a layer of a known kind does in a call with these arguments.
+def layer_call(module: nn.Module, einsums: nnx_layers.Einsums, args: Any, kwargs: Any) -> LayerCall:
+    """Inspect a call of a supported layer with these arguments.
 
     Raises:
-      ValueError: a layer with its own matrix product, precision or the like.
+      ValueError: the layer has a custom matmul or precision, or lacks its equation, input or
+        kernel.
     """
-    known = kind(module, einsums)
-    if known is nn.Embed or known is nn.Conv:
-        return LayerMap(module, "embedding" if known is nn.Embed else "kernel")
-    assert known is not None
-    nnx_layers.check_plain(module)
-    name, equation = nnx_layers.described({**EINSUMS, **einsums}[known], module)
-    given = [*args, *kwargs.values()]
-    texts = [value for value in given if isinstance(value, str)]
-    arrays = [value for value in given if isinstance(value, jax.Array | np.ndarray)]
-    if equation is None and not texts:
-        raise ValueError(f"a {known.__name__} was called without the equation it was to get.")
+    cls = supported_class(module, einsums)
+    if cls is nn.Embed or cls is nn.Conv:
+        return LayerCall(module, "embedding" if cls is nn.Embed else "kernel")
+    assert cls is not None
+    nnx_layers.check_settings(module)
+    name, equation = nnx_layers.describe_einsum({**EINSUMS, **einsums}[cls], module)
+    arguments = [*args, *kwargs.values()]
+    strings = [value for value in arguments if isinstance(value, str)]
+    arrays = [value for value in arguments if isinstance(value, jax.Array | np.ndarray)]
+    if equation is None and not strings:
+        raise ValueError(f"a {cls.__name__} was called without its equation.")
     if not arrays or not module.has_variable("params", name):
         lacks = f"parameter {name!r}" if arrays else "input"
-        raise ValueError(f"a {known.__name__} has no {lacks}.")
-    return LayerMap(module, name, equation or texts[0], arrays[0])
+        raise ValueError(f"a {cls.__name__} has no {lacks}.")
+    return LayerCall(module, name, equation or strings[0], arrays[0])
 
 
 def with_lora(
     module: nn.Module, method: Any, params: Any, key: Any, y: jax.Array, inputs: jax.Array
 ) -> tuple[jax.Array, Aux]:
-    """y of an embedding or a convolution plus the delta, and aux."""
+    """Add LoRA's delta to the output y of an embedding or a convolution; return it with aux."""
     a = params["lora_a"]
     conv = isinstance(module, nn.Conv)
     if conv and key is not None:
         inputs = dropout(inputs, dropout_rate(method), key)
-    hidden = nnx_layers.convolved(module, a, inputs) if conv else nnx_layers.lookup(a, inputs)
+    hidden = nnx_layers.convolve(module, a, inputs) if conv else nnx_layers.lookup(a, inputs)
     z, aux = method.bottleneck(params, hidden.astype(y.dtype), None)
     return y + z @ method.up(params).astype(y.dtype), aux

@@ -1,8 +1,8 @@
-"""Layers of other people's NNX models with an adapter inside: einsums, lookups, convolutions.
+"""Adapted einsums, embeddings and convolutions in third-party NNX models.
 
-An adapted layer takes the layer's place with the same attributes and its class as a base class, so
-that what the model reads of it is still there; `without_adapter` gives one of the old class again.
-`nnx.Linear` becomes a `Dense`.
+An adapted layer replaces the original one. It has the same attributes and subclasses the original
+class, so model code that accesses the layer still works; `without_adapter` restores the original
+class. `nnx.Linear` becomes a `Dense`.
 """
 
 import functools
@@ -22,8 +22,8 @@ from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import dropout, dropout_rate
 
 Einsums = Mapping[type, Callable[[Any], tuple[str, str | None]]]
-"""By layer class, of NNX or Linen: a function of the layer that gives the name of its kernel and
-its equation; None where the equation comes with the call, as a text, which only Linen's may."""
+"""NNX or Linen layer class -> function of the layer that returns (kernel name, equation). A Linen
+layer that takes its equation as a str argument of its call has None instead."""
 
 EINSUMS: Einsums = {
     nnx.LinearGeneral: lambda layer: (
@@ -32,8 +32,8 @@ EINSUMS: Einsums = {
     ),
     nnx.Einsum: lambda layer: ("kernel", layer.einsum_str),
 }
-# Settings that an adapted layer does not follow, and the values that ask for nothing.
-_PLAIN: dict[str, tuple[Any, ...]] = {
+# Settings that adapted layers do not support, and their default values.
+_DEFAULT_SETTINGS: dict[str, tuple[Any, ...]] = {
     "dot_general": (None, jax.lax.dot_general),
     "dot_general_cls": (None,),
     "einsum_op": (jnp.einsum,),
@@ -44,19 +44,19 @@ _PLAIN: dict[str, tuple[Any, ...]] = {
 
 
 class EinsumLayer(AdaptedLayer):
-    """Mixin for a layer that is an einsum of its input and its kernel.
+    """Mixin for a layer that computes an einsum of its input and its kernel.
 
     Attributes:
-      kernel_equation: the einsum, see `lorasp_jax.adapters.layers.einsum`.
+      kernel_equation: the equation, see `lorasp_jax.adapters.layers.einsum`.
     """
 
     kernel_equation: str
 
     def __call__(self, x: jax.Array, *, out_sharding: None = None) -> jax.Array:
-        """y, see `einsum.einsum`.
+        """Compute y, see `einsum.einsum`.
 
         Raises:
-          ValueError: an output sharding was asked for.
+          ValueError: out_sharding is not None.
         """
         reject_out_sharding(out_sharding)
         kernel = self.kernel_variable().get_value()
@@ -80,49 +80,49 @@ class EinsumLayer(AdaptedLayer):
         return einsum.to_matrices(self.kernel_equation, super().kernel_matrices())
 
     def stack_shape(self) -> tuple[int, ...]:
-        """As for every layer; axes of the einsum are none of them."""
+        """Sizes of the stack axes, which exclude the axes of the equation."""
         shape = super().kernel_matrices().shape
         return tuple(shape[: len(shape) - len(einsum.parse(self.kernel_equation).kernel)])
 
     def set_kernel_matrices(self, matrices: jax.Array | QuantizedKernel) -> None:
-        """Gives the layer another kernel."""
+        """Replace the kernel by one given as [..., *batch, I, O]."""
         old = self.kernel_variable()
         kernel = einsum.from_matrices(self.kernel_equation, matrices, old.get_value().shape)
         self.set_kernel_variable(with_value(old, kernel))
 
     def without_adapter(self) -> nnx.Module:
-        """The layer in its own class again, unless that cannot read a quantised kernel."""
+        """Restore the original class, unless the kernel is quantized."""
         if isinstance(super().kernel_matrices(), QuantizedKernel):
             return super().without_adapter()
-        layer = _plain(self)
+        layer = _restore_class(self)
         del layer.kernel_equation
         return layer
 
 
 class LoRALayer(AdaptedLayer):
-    """Mixin for a layer that adds LoRA's low-rank map, or several, to what its class computes."""
+    """Mixin for a layer that adds the delta of one or more LoRAs to its class's output."""
 
     def adapter_init(self, method: Method) -> Callable[[jax.Array, jax.Array], Any]:
-        """As for every layer, but see `lora_init`."""
+        """See `lora_init`."""
         return lora_init(self, method)
 
-    def with_delta(self, y: jax.Array, read: Callable[[jax.Array], jax.Array]) -> jax.Array:
-        """Y plus the delta, from what `read` makes of the input and A."""
+    def with_delta(self, y: jax.Array, project: Callable[[jax.Array], jax.Array]) -> jax.Array:
+        """Add the delta to y; `project` applies A to the layer's input."""
         method, params = self.method_and_params()
-        z, aux = method.bottleneck(params, read(method.down(params)).astype(y.dtype), None)
+        z, aux = method.bottleneck(params, project(method.down(params)).astype(y.dtype), None)
         self.store_aux(aux)
         return y + z @ method.up(params).astype(y.dtype)
 
     def without_adapter(self) -> nnx.Module:
-        """The layer in its own class again."""
-        return _plain(self)
+        """Restore the original class."""
+        return _restore_class(self)
 
 
 class EmbedLayer(LoRALayer):
-    """Mixin for `nnx.Embed`: the rows looked up, and the logits of `attend`, see W + scale A B."""
+    """Mixin for `nnx.Embed`: both lookups and the logits of `attend` use W + scale A B."""
 
     def __call__(self, inputs: jax.Array, *args: Any, **kwargs: Any) -> jax.Array:
-        """Rows of the table for ids [...], [..., D]."""
+        """Look up the rows [..., D] of ids [...]."""
         y = super().__call__(inputs, *args, **kwargs)
         return self.with_delta(y, lambda a: lookup(a, inputs))
 
@@ -133,14 +133,14 @@ class EmbedLayer(LoRALayer):
 
 
 class ConvLayer(LoRALayer):
-    """Mixin for `nnx.Conv`: A is a convolution onto R channels, B one of size 1."""
+    """Mixin for `nnx.Conv`: A is a convolution to R channels, B a pointwise convolution."""
 
     def __call__(self, inputs: jax.Array, *args: Any, **kwargs: Any) -> jax.Array:
-        """The convolution, [..., *spatial, O]."""
+        """Compute the convolution [..., *spatial, O]."""
         y = super().__call__(inputs, *args, **kwargs)
         if self.dropout_key is not None:
             inputs = dropout(inputs, dropout_rate(self.method), self.dropout_key)
-        return self.with_delta(y, lambda a: convolved(self, a, inputs))
+        return self.with_delta(y, lambda a: convolve(self, a, inputs))
 
     def kernel_matrices(self) -> jax.Array:
         """The kernel [..., *sizes, I, O] as [..., sizes · I, O]."""
@@ -150,25 +150,25 @@ class ConvLayer(LoRALayer):
 
 
 def lookup(table: jax.Array, ids: jax.Array) -> jax.Array:
-    """Rows of a table for ids, as `nnx.Embed` finds them: one row serves any id."""
+    """Look up rows of a table as `nnx.Embed` does: a table of one row ignores the ids."""
     if table.shape[0] == 1:
         return jnp.broadcast_to(table, (*ids.shape, table.shape[1]))
     return jnp.take(table, ids, axis=0)
 
 
 def attend_delta(method: Method, params: Any, query: jax.Array) -> jax.Array:
-    """What scale A B adds to the inner products of queries [..., D] with a table's rows."""
-    down, up = (side.astype(query.dtype) for side in (method.down(params), method.up(params)))
+    """Delta of scale A B to the inner products of queries [..., D] with a table's rows."""
+    down, up = (matrix.astype(query.dtype) for matrix in (method.down(params), method.up(params)))
     return method.bottleneck(params, query @ up.T, None)[0].astype(query.dtype) @ down.T
 
 
-def convolved(layer: Any, a: jax.Array, inputs: jax.Array) -> jax.Array:
-    """inputs [..., *spatial, I] under A [sizes · I, R], moved over them like the layer's kernel.
+def convolve(layer: Any, a: jax.Array, inputs: jax.Array) -> jax.Array:
+    """Convolve inputs with A, using the layer's strides, padding and other settings.
 
     Args:
-      layer: a convolution of NNX or Linen; their settings have the same names.
-      a: LoRA's A.
-      inputs: the layer's input.
+      layer: an NNX or Linen convolution; both name their settings alike.
+      a: LoRA's A, [sizes · I, R].
+      inputs: [..., *spatial, I].
     """
     sizes = (layer.kernel_size,) if isinstance(layer.kernel_size, int) else layer.kernel_size
     same = ("strides", "padding", "input_dilation", "kernel_dilation", "dtype", "precision")
@@ -185,86 +185,87 @@ def convolved(layer: Any, a: jax.Array, inputs: jax.Array) -> jax.Array:
 
 
 def lora_init(layer: Any, method: Method) -> Callable[[jax.Array, jax.Array], Any]:
-    """What makes LoRA's parameters for an embedding or a convolution from a key and a kernel.
+    """Function (key, kernel) that initializes LoRA for an embedding or a convolution.
 
     Raises:
-      ValueError: another method, or a convolution in groups or with a mask.
+      ValueError: the method is not LoRA or its initialization needs the kernel or statistics, or
+        the convolution is grouped or masked.
     """
     if type(method) is not LoRA or method.splits_kernel or method.needs_statistics:
         raise ValueError(
-            f"{type(layer).__name__} takes LoRA that starts without the kernel or data, not "
-            f"{method}: put a rule with None, or with such a LoRA, in front."
+            f"{type(layer).__name__} only supports LoRA whose initialization needs neither kernel "
+            f"nor data, got {method}: add a leading rule with such a LoRA or None for this layer."
         )
     if not isinstance(layer, nnx.Conv | linen.Conv):
         return method.init_table
     if layer.feature_group_count != 1 or layer.mask is not None:
-        raise ValueError("a convolution in groups or with a mask cannot be adapted.")
+        raise ValueError("grouped and masked convolutions cannot be adapted.")
     return method.init
 
 
-def adapted(layer: nnx.Module, einsums: Einsums) -> AdaptedLayer:
-    """The layer as one that can carry an adapter.
+def make_adaptable(layer: nnx.Module, einsums: Einsums) -> AdaptedLayer:
+    """Convert a layer to one that can carry an adapter.
 
     Args:
-      layer: of a known kind; left as it is, but one with an adapter is returned itself.
-      einsums: further layer classes that are einsums.
+      layer: of a supported class, not modified; an `AdaptedLayer` is returned as is.
+      einsums: extra einsum layer classes.
 
     Raises:
-      ValueError: a layer with its own matrix product, precision or the like.
+      ValueError: the layer has a custom matmul or precision.
     """
     if isinstance(layer, AdaptedLayer):
         return layer
-    known = kind(layer, einsums)
+    known = supported_class(layer, einsums)
     if isinstance(layer, nnx.Linear) and known is nnx.Linear:
-        return as_dense(layer)
+        return to_dense(layer)
     if known not in (nnx.Embed, nnx.Conv):
-        check_plain(layer)
+        check_settings(layer)
     if known is nnx.Embed:
-        return _carrying(layer, EmbedLayer, "embedding")
+        return _with_mixin(layer, EmbedLayer, "embedding")
     if known is nnx.Conv:
-        return _carrying(layer, ConvLayer, "kernel")
+        return _with_mixin(layer, ConvLayer, "kernel")
     name, equation = kernel_and_equation(layer, known, einsums)
-    return _carrying(layer, EinsumLayer, name, equation)
+    return _with_mixin(layer, EinsumLayer, name, equation)
 
 
-def like(layer: Any, other: AdaptedLayer) -> AdaptedLayer:
-    """The layer as one that can carry the adapters of another, which has been adapted.
+def make_adaptable_like(layer: Any, other: AdaptedLayer) -> AdaptedLayer:
+    """Convert a layer to one that can carry the adapter of another layer.
 
     Args:
-      layer: of the other's kind, adapted or not; left as it is, but one that can carry adapters is
-        returned itself.
-      other: not modified.
+      layer: of the other layer's class, adapted or not; not modified. Returned as is if it can
+        already carry the adapter.
+      other: the adapted layer, not modified.
 
     Raises:
-      ValueError: a layer of another class.
+      ValueError: the layer is of a different class.
     """
     if isinstance(layer, type(other)):
         return layer
-    mixin, plain = (Dense, nnx.Linear) if isinstance(other, Dense) else type(other).__bases__
-    if not isinstance(layer, plain):
-        raise ValueError(f"a {type(layer).__name__} is there instead of a {plain.__name__}.")
+    mixin, original = (Dense, nnx.Linear) if isinstance(other, Dense) else type(other).__bases__
+    if not isinstance(layer, original):
+        raise ValueError(f"the layer must be a {original.__name__}, got a {type(layer).__name__}.")
     if mixin is Dense:
-        return as_dense(layer)
-    return _carrying(layer, mixin, other.kernel_name, getattr(other, "kernel_equation", None))
+        return to_dense(layer)
+    return _with_mixin(layer, mixin, other.kernel_name, getattr(other, "kernel_equation", None))
 
 
-def kind(layer: Any, einsums: Einsums) -> type[nnx.Module] | None:
-    """The known class that the layer is called as; a subclass with a call of its own has none."""
-    known = (nnx.Linear, nnx.Embed, nnx.Conv, *EINSUMS, *einsums)
-    calls = (cls for cls in known if isinstance(layer, cls))
-    return next((cls for cls in calls if type(layer).__call__ is cls.__call__), None)
+def supported_class(layer: Any, einsums: Einsums) -> type[nnx.Module] | None:
+    """Supported class whose `__call__` the layer uses; None if it overrides `__call__`."""
+    classes = (nnx.Linear, nnx.Embed, nnx.Conv, *EINSUMS, *einsums)
+    matches = (cls for cls in classes if isinstance(layer, cls))
+    return next((cls for cls in matches if type(layer).__call__ is cls.__call__), None)
 
 
 def kernel_and_equation(layer: Any, known: type | None, einsums: Einsums) -> tuple[str, str]:
-    """The name of an einsum layer's kernel and its equation.
+    """Kernel name and equation of an einsum layer.
 
     Raises:
-      ValueError: an equation that is no adaptable map, or no such kernel.
+      ValueError: the equation cannot be adapted, or the layer has no such kernel.
     """
     assert known is not None
-    name, equation = described({**EINSUMS, **einsums}[known], layer)
+    name, equation = describe_einsum({**EINSUMS, **einsums}[known], layer)
     if equation is None:
-        raise ValueError(f"the equation of a {type(layer).__name__} must be known before its call.")
+        raise ValueError(f"einsums must return the equation of a {type(layer).__name__}, got None.")
     if not isinstance(getattr(layer, name, None), nnx.Param):
         raise ValueError(f"a {type(layer).__name__} has no parameter {name!r}.")
     einsum.parse(equation)
@@ -272,39 +273,39 @@ def kernel_and_equation(layer: Any, known: type | None, einsums: Einsums) -> tup
 
 
 def check_einsums(einsums: Any) -> None:
-    """Raises a ValueError unless these are layer classes with a function each."""
+    """Raise ValueError unless `einsums` maps layer classes to functions."""
     pairs = einsums.items() if isinstance(einsums, Mapping) else [(None, None)]
     if not all(isinstance(cls, type) and callable(describe) for cls, describe in pairs):
         raise ValueError(
-            "einsums are {layer class: function of a layer that gives (its kernel's name, "
-            f"equation)}}, got {short(einsums)}."
+            "einsums must map layer classes to functions layer -> (kernel name, equation), got "
+            f"{short(einsums)}."
         )
 
 
-def described(describe: Callable[[Any], Any], layer: Any) -> tuple[str, str | None]:
-    """What a function of `Einsums` says of a layer; raises a ValueError if that is nothing."""
+def describe_einsum(describe: Callable[[Any], Any], layer: Any) -> tuple[str, str | None]:
+    """Call a function of `Einsums`; raise ValueError if it fails or returns another type."""
     try:
         name, equation = describe(layer)
     except (TypeError, ValueError, AttributeError) as error:
         raise ValueError(f"einsums cannot describe a {type(layer).__name__}: {error}") from error
     if not isinstance(name, str) or not isinstance(equation, str | None):
-        raise ValueError(f"einsums give (name, equation), got {short((name, equation))}.")
+        raise ValueError(f"einsums must return (name, equation), got {short((name, equation))}.")
     return name, equation
 
 
 def matrices_shape(layer: Any, einsums: Einsums) -> tuple[int, ...]:
-    """[..., *batch, I, O], the shape of a layer's kernel as an adapter sees it.
+    """Shape [..., *batch, I, O] of a layer's kernel as a stack of matrices.
 
     Args:
       layer: dense or an einsum, adapted or not.
-      einsums: further layer classes that are einsums.
+      einsums: extra einsum layer classes.
 
     Raises:
-      ValueError: an equation that is no adaptable map.
+      ValueError: the equation cannot be adapted.
     """
     if isinstance(layer, AdaptedLayer):
         return tuple(layer.kernel_matrices().shape)
-    known = kind(layer, einsums)
+    known = supported_class(layer, einsums)
     if known is nnx.Linear:
         return layer.kernel.get_value().shape
     name, equation = kernel_and_equation(layer, known, einsums)
@@ -314,30 +315,27 @@ def matrices_shape(layer: Any, einsums: Einsums) -> tuple[int, ...]:
 
 
 def kernel_of(layer: Any) -> nnx.Param[Any]:
-    """The kernel of a layer of a known kind, adapted or not."""
+    """The kernel variable of a supported layer, adapted or not."""
     name = "embedding" if isinstance(layer, nnx.Embed) else "kernel"
     return getattr(layer, getattr(layer, "kernel_name", name))
 
 
-def check_plain(layer: Any) -> None:
-    """Raises a ValueError for settings that an adapted layer would not follow."""
-    for name, plain in _PLAIN.items():
-        if getattr(layer, name, plain[0]) not in plain:
-            raise ValueError(
-                f"a {type(layer).__name__} with its own dot_general or precision cannot be "
-                f"adapted: it sets {name}."
-            )
+def check_settings(layer: Any) -> None:
+    """Raise ValueError for settings that adapted layers do not support."""
+    for name, defaults in _DEFAULT_SETTINGS.items():
+        if getattr(layer, name, defaults[0]) not in defaults:
+            raise ValueError(f"a {type(layer).__name__} with a custom {name} cannot be adapted.")
 
 
-def as_dense(linear: Dense | nnx.Linear) -> Dense:
-    """A `Dense` that holds a linear layer's own variables; one that is there already as it is.
+def to_dense(linear: Dense | nnx.Linear) -> Dense:
+    """Convert `nnx.Linear` to a `Dense` that shares its variables; a `Dense` is returned as is.
 
     Raises:
-      ValueError: a layer with its own matrix product, precision or the like.
+      ValueError: the layer has a custom matmul or precision.
     """
     if isinstance(linear, Dense):
         return linear
-    check_plain(linear)
+    check_settings(linear)
     has_bias, zeros = linear.bias is not None, nnx.initializers.zeros
     layer = Dense(1, 1, use_bias=has_bias, dtype=linear.dtype, kernel_init=zeros, rngs=nnx.Rngs(0))
     layer.kernel, layer.bias = linear.kernel, linear.bias
@@ -345,46 +343,46 @@ def as_dense(linear: Dense | nnx.Linear) -> Dense:
 
 
 @functools.cache
-def _class(mixin: type[AdaptedLayer], base: type[nnx.Module]) -> type[AdaptedLayer]:
-    """One class for each base, so that equal models have equal graph definitions."""
+def _mixed_class(mixin: type[AdaptedLayer], base: type[nnx.Module]) -> type[AdaptedLayer]:
+    """Subclass of mixin and base, cached so that equal models have equal graph definitions."""
     return type(f"Adapted{base.__name__}", (mixin, base), {"__doc__": mixin.__doc__})
 
 
-def _carrying(
+def _with_mixin(
     layer: nnx.Module, mixin: type[AdaptedLayer], name: str, equation: str | None = None
 ) -> AdaptedLayer:
-    """A layer that shares the variables of one and has the mixin in front of its class.
+    """Copy a layer, sharing its variables, with the mixin added to its class.
 
     Args:
-      layer: left as it is.
-      mixin: what it does with an adapter.
-      name: of its kernel.
+      layer: not modified.
+      mixin: class that applies the adapter.
+      name: attribute name of the kernel.
       equation: of an einsum.
 
     Raises:
-      ValueError: the layer has an attribute of a name that is needed.
+      ValueError: the layer already has an attribute that the mixin needs.
     """
     names = ("adapter", "method", "kernel_name") + (("kernel_equation",) if equation else ())
     if taken := [name for name in names if hasattr(layer, name)]:
-        raise ValueError(f"{type(layer).__name__} has an attribute {taken[0]} of its own.")
-    new = _in_class(layer, _class(mixin, type(layer)))
+        raise ValueError(f"{type(layer).__name__} already has an attribute {taken[0]!r}.")
+    new = _with_class(layer, _mixed_class(mixin, type(layer)))
     new.adapter, new.method, new.kernel_name = nnx.data(None), None, name
     if equation:
         new.kernel_equation = equation
     return new
 
 
-def _plain(layer: AdaptedLayer) -> Any:
-    """What `_carrying` was given, with the variables of now."""
-    plain = _in_class(layer, type(layer).__bases__[1])
-    del plain.adapter, plain.method, plain.kernel_name
-    return plain
+def _restore_class(layer: AdaptedLayer) -> Any:
+    """Undo `_with_mixin`, with the layer's current variables."""
+    original = _with_class(layer, type(layer).__bases__[1])
+    del original.adapter, original.method, original.kernel_name
+    return original
 
 
-def _in_class(layer: nnx.Module, kind: type[nnx.Module]) -> Any:
-    """A layer of another class with the same attributes, of which one class adds none to the other.
+def _with_class(layer: nnx.Module, kind: type[nnx.Module]) -> Any:
+    """Copy a layer as an instance of another class, which declares no additional attributes.
 
-    Like copies of `copy.copy`, it does not run `__init__`, whose arguments nobody knows any more.
+    Like `copy.copy`, this skips `__init__`, whose arguments are no longer known.
     """
     new = object.__new__(kind)
     vars(new).update(vars(layer))

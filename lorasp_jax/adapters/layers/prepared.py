@@ -100,7 +100,7 @@ class Prepared(nnx.Module):
     """Fused layers, stored in place of the first; empty instances replace the others."""
 
     def __init__(self, arrays: FusedLayers | SharedProjection | None = None) -> None:
-        self.arrays = None if arrays is None else FusedArrays(arrays)
+        self.fused = None if arrays is None else FusedArrays(arrays)
 
     def __call__(
         self, x: jax.Array, *, token_mask: jax.Array | None, return_aux: Literal[True]
@@ -112,13 +112,13 @@ class Prepared(nnx.Module):
 
     def results(self, x: jax.Array, token_mask: jax.Array | None) -> list[tuple[jax.Array, Aux]]:
         """Compute y and aux of each layer for x `[..., I]`; the list is empty without layers."""
-        if self.arrays is None:
+        if self.fused is None:
             return []
-        arrays = self.arrays.get_value()
-        if isinstance(arrays, FusedLayers):
-            ys, aux = _call_fused(arrays, x.astype(arrays.input_matrix.dtype), token_mask)
+        fused = self.fused.get_value()
+        if isinstance(fused, FusedLayers):
+            ys, aux = _call_fused(fused, x.astype(fused.input_matrix.dtype), token_mask)
         else:
-            ys, aux = _call_shared(arrays, x.astype(arrays.down.dtype), token_mask)
+            ys, aux = _call_shared(fused, x.astype(fused.down.dtype), token_mask)
         per_layer = [jax.tree.map(lambda a, i=i: a[i], aux) for i in range(len(ys))]
         reports = [dataclasses.replace(layer_aux, token_mask=token_mask) for layer_aux in per_layer]
         return list(zip(ys, reports, strict=True))

@@ -59,7 +59,7 @@ def prepare(model):
 def fused_counts(model):
     """Number of fused layers stored at each layer; 0 for unchanged and empty ones."""
     variables = [
-        getattr(layer, "arrays", None) for layer in (model.first, model.second, model.third)
+        getattr(layer, "fused", None) for layer in (model.first, model.second, model.third)
     ]
     values = [None if variable is None else variable.get_value() for variable in variables]
     return [0 if value is None else len(value.bottleneck.out_sizes) for value in values]
@@ -113,7 +113,7 @@ def test_a_kernel_gets_the_packed_router_parameters():
     model = adapted(OnGPU(rank=32, hidden_width=16), "float32")
     x = jnp.sin(jnp.arange(96.0)).reshape(2, 6, 8)
     fused = prepare(model)
-    params = fused.first.arrays.get_value().params
+    params = fused.first.fused.get_value().params
     assert [leaf.shape for leaf in jax.tree.leaves(params)] == [(2, 16 * 32 + 16 + 32)]
     run = jax.jit(lambda model, x: model(x))
     close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-4)
