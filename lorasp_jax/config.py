@@ -243,7 +243,7 @@ class Config:
     """Steps per compiled call and between log entries."""
     checkpoint_every: int = 1000
     """Steps between checkpoints."""
-    seed: int = field(default=0, metadata={"most": 2**32 - 1})
+    seed: int = field(default=0, metadata={"max": 2**32 - 1})
     """Seed of every random stream of the run."""
 
     def evaluates(self, step: int) -> bool:

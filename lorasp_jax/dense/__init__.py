@@ -1,19 +1,19 @@
-"""The integration point: one functional adapted dense layer and its two shells.
+"""Adapted dense layers: a functional core and its Flax NNX and Linen wrappers.
 
 `dense` works on arrays. `Dense` (Flax NNX) and `LinenDense` (Flax Linen) are drop-ins for
-`nnx.Linear` and `nn.Dense`. All reach the same `Method.apply`, the only place that adds a delta.
+`nnx.Linear` and `nn.Dense`. All call `Method.apply`, the only place that adds the adapter's delta.
 
-Called as a drop-in, where `layer(x)` gives `y` alone, a layer keeps what it would report for
-`collect_aux`. With NNX that works wherever the module may be changed: eagerly, or inside a jitted
-function that gets the model as an argument or merges it itself,
+As a drop-in, `layer(x)` returns `y` alone and stores its aux for `collect_aux`. With NNX this works
+wherever the module is mutable: eagerly, or inside a jitted function that takes the model as an
+argument or merges it itself,
 
     def loss(adapters):
         model = nnx.merge(graphdef, adapters, frozen, copy=True)
         y = model(x)
         aux = lorasp_jax.collect_aux(model)
 
-A model that `jax.jit` closes over can be called too, but keeps nothing. Code that can handle a
-second result asks for it, `layer(x, return_aux=True)`, and then nothing is stored.
+A model captured in a closure by `jax.jit` also works, but stores no aux. Alternatively,
+`layer(x, return_aux=True)` returns aux as a second result and stores nothing.
 """
 
 from lorasp_jax.dense.functional import DenseLayer, cast_input, dense, dense_shared_input

@@ -1,4 +1,4 @@
-"""What layers with an adapter have in common, and the drop-in for Flax NNX's `nnx.Linear`."""
+"""Base class of adapted layers, and the drop-in for Flax NNX's `nnx.Linear`."""
 
 import contextlib
 from collections.abc import Callable
@@ -18,37 +18,39 @@ from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import Params
 
 AUX_NAME = "stored_aux"
-KERNEL_INIT = jax.nn.initializers.lecun_normal()  # of nnx.Linear and nn.Dense too
+KERNEL_INIT = jax.nn.initializers.lecun_normal()  # same as nnx.Linear and nn.Dense
 
 
 class AdapterParam(nnx.LoRAParam[Any]):
-    """What trains, and the only thing that does: an adapter's parameters, or a base weight."""
+    """A trainable parameter: an adapter's, or a base weight. No other variables are trainable."""
 
 
 class AdapterAux(nnx.Intermediate[Any]):
-    """What a drop-in layer kept in its last call."""
+    """Aux of a drop-in layer's last call."""
 
 
 def reject_out_sharding(out_sharding: Any) -> None:
-    """Raises a ValueError unless it is None: some models pass it to every layer."""
+    """Raise ValueError unless out_sharding is None. (Some models pass it to every layer.)"""
     if out_sharding is not None:
-        raise ValueError("an adapted layer takes no out_sharding: constrain what it returns.")
+        raise ValueError(
+            "adapted layers do not support out_sharding: constrain the output's sharding instead."
+        )
 
 
 class DropoutKey(nnx.Variable[Any]):
-    """What `with_dropout` gives a layer for one training step."""
+    """Dropout key of a layer for one training step, set by `with_dropout`."""
 
 
 def with_value(variable: Any, value: Any) -> Any:
-    """A variable of its own with another value: the old one may be shared with other layers."""
+    """A new variable with the same metadata; the old one may be shared with other layers."""
     return type(variable)(value, **variable.get_metadata())
 
 
 class AdaptedLayer(nnx.Module):
-    """A layer that can carry an adapter: what adaptation, tables and files know of it.
+    """A layer that can have an adapter: the interface used by adaptation, summaries and file I/O.
 
     Attributes:
-      kernel_name: name of the attribute that holds the layer's kernel.
+      kernel_name: attribute name of the layer's kernel.
       adapter: `AdapterParam` holding the method's parameters, or None.
       method: the adapter's method, static.
       stored_aux: aux of the last call. Absent if there is none, so that the graph structure of the
@@ -63,60 +65,62 @@ class AdaptedLayer(nnx.Module):
     stored_dropout_key: DropoutKey
 
     def kernel_matrices(self) -> jax.Array:
-        """The kernel as the adapter sees it, [..., I, O]; leading axes are stacks of layers."""
+        """The kernel as matrices [..., I, O]; leading axes index stacked layers."""
         kernel = self.kernel_variable()
         if not isinstance(kernel, nnx.Variable):
-            raise ValueError(f"its {self.kernel_name} is {short(kernel)}, no parameter.")
+            raise ValueError(
+                f"its {self.kernel_name} must be an nnx.Variable, got {short(kernel)}."
+            )
         return kernel.get_value()
 
     def kernel_variable(self) -> Any:
-        """What holds the kernel, under whichever name the layer's own class gives it."""
+        """The variable that holds the kernel."""
         return getattr(self, self.kernel_name)
 
     def set_kernel_variable(self, variable: Any) -> None:
-        """Gives the layer what holds another kernel, or one shared with other layers."""
+        """Replace the variable that holds the kernel; it may be shared with other layers."""
         setattr(self, self.kernel_name, variable)
 
     def stack_shape(self) -> tuple[int, ...]:
-        """Sizes of the stacks of layers that this one is; () for one layer."""
+        """Leading axes of a stack of layers; () for a single layer."""
         return tuple(self.kernel_matrices().shape[:-2])
 
     def set_kernel_matrices(self, matrices: jax.Array | QuantizedKernel) -> None:
-        """Gives the layer another kernel in a variable of its own: the old one may be shared."""
+        """Set the kernel in a new variable, because the old one may be shared."""
         old = self.kernel_variable()
         self.set_kernel_variable(with_value(old, matrices.reshape(old.get_value().shape)))
 
     def adapter_init(self, method: Method) -> Callable[[jax.Array, jax.Array], tuple[Params, Any]]:
-        """What makes a method's parameters, and the kernel it leaves, from a key and one [I, O].
+        """Return the initializer (key, kernel [I, O]) -> (params, kernel or residual).
 
         Raises:
-          ValueError: a method that this kind of layer cannot carry.
+          ValueError: this kind of layer does not support the method.
         """
         return method.init
 
     def method_and_params(self) -> tuple[Method, Params]:
-        """The method and the parameters of an adapter that is there."""
+        """The adapter's method and parameters; the layer must have an adapter."""
         assert self.method is not None
         assert self.adapter is not None
         return self.method, self.adapter.get_value()
 
     def without_adapter(self) -> nnx.Module:
-        """The layer as it was before adaptation, or as near as it comes, with its kernel of now.
+        """Return the layer without its adapter, with its current kernel.
 
-        One of another class is a new object that shares the variables.
+        If adaptation changed the class, this is a new object that shares the variables.
         """
         self.adapter, self.method = None, None
         return self
 
     @property
     def dropout_key(self) -> jax.Array | None:
-        """The key of `with_dropout`, or None: nothing is dropped."""
-        held = getattr(self, "stored_dropout_key", None)
-        return None if held is None else held.get_value()
+        """The key set by `with_dropout`, or None if dropout is off."""
+        key = getattr(self, "stored_dropout_key", None)
+        return None if key is None else key.get_value()
 
     def store_aux(self, aux: Aux) -> None:
-        """Stores aux for `collect_aux`, where the layer may be changed."""
-        # A module of an outer trace cannot be changed; collect_aux then raises.
+        """Store aux for `collect_aux` if the layer is mutable."""
+        # A module of an outer trace is immutable; collect_aux then raises.
         with contextlib.suppress(flax.errors.TraceContextError):
             self.stored_aux = AdapterAux(aux)
 
@@ -126,7 +130,7 @@ class Dense(AdaptedLayer):
 
     Attributes:
       kernel: [I, O] (an `AdapterParam` under full fine-tuning). In a model that scans over its
-        depth it carries leading layer axes, and so does the adapter.
+        layers, kernel and adapter have leading layer axes.
       bias: [O] or None.
       adapter: `AdapterParam` holding the method's parameters, or None.
       method: the adapter's method, static.
@@ -144,20 +148,20 @@ class Dense(AdaptedLayer):
         kernel_init: Initializer = KERNEL_INIT,
         rngs: nnx.Rngs,
     ) -> None:
-        """Draws the weights.
+        """Initialize the weights.
 
         Args:
           d_in: I.
           d_out: O.
-          use_bias: whether to add a bias, zero at first.
+          use_bias: whether to add a bias, initially zero.
           method: adapter method, or None.
-          dtype: type of the computation; None promotes input and kernel.
-          param_dtype: type of kernel and bias; adapters are always fp32.
+          dtype: compute dtype; None promotes the dtypes of input and kernel.
+          param_dtype: dtype of kernel and bias; adapters are always fp32.
           kernel_init: initializer of the kernel.
           rngs: source of the random keys.
 
         Raises:
-          ValueError: what is no width, method or source of keys.
+          ValueError: an invalid width, method, dtype or rngs.
         """
         d_in, d_out = validate.size("d_in", d_in), validate.size("d_out", d_out)
         validate.method(method)
@@ -168,7 +172,7 @@ class Dense(AdaptedLayer):
         self.kernel: nnx.Param[Any] = base(kernel_init(rngs.params(), (d_in, d_out), param_dtype))
         bias = base(jnp.zeros(d_out, param_dtype)) if use_bias else None
         self.bias: nnx.Param[Any] | None = bias
-        self.adapter = nnx.data(None)  # may hold a variable later
+        self.adapter = nnx.data(None)  # may be set to a variable later
         self.method = method
         self.dtype = dtype
         if method is not None and not method.trains_base:
@@ -184,7 +188,7 @@ class Dense(AdaptedLayer):
         return_aux: bool = False,
         out_sharding: None = None,
     ) -> Any:
-        """y [...tokens, O], or (y, aux) if asked; see `dense`. An output sharding is refused."""
+        """y [...tokens, O], or (y, aux) if `return_aux`; see `dense`. out_sharding must be None."""
         reject_out_sharding(out_sharding)
         y, aux = dense(self.cast_input(x), *self.arrays(), token_mask=token_mask)
         if return_aux:
@@ -194,11 +198,11 @@ class Dense(AdaptedLayer):
         return y
 
     def cast_input(self, x: jax.Array) -> jax.Array:
-        """x in the type of the computation."""
+        """Cast x to the compute dtype."""
         return cast_input(self.dtype, x, self.kernel.get_value())
 
     def arrays(self) -> DenseLayer:
-        """What `dense` and `dense_shared_input` take."""
+        """The layer's arguments for `dense` and `dense_shared_input`."""
         bias = None if self.bias is None else self.bias.get_value()
         params = None if self.adapter is None else self.adapter.get_value()
         return DenseLayer(self.kernel.get_value(), bias, params, self.method, self.dropout_key)

@@ -17,17 +17,17 @@ from lorasp_jax.peft._method import Params, dropout_rate
 class LinenDense(nn.Module):
     """A dense layer with an optional adapter, a drop-in for `nn.Dense`.
 
-    The kernel and bias are in the collection "params", the adapter's parameters in "adapters": what
-    trains is a collection. Full fine-tuning trains "params" and adds nothing. With "intermediates"
-    mutable, aux is sown there for `collect_aux`. The method's dropout is on in calls that get rngs
-    for "dropout".
+    Kernel and bias are in the collection "params", the adapter's parameters in "adapters", so that
+    the trainable parameters form a collection. Full fine-tuning trains "params" and has no
+    "adapters". If "intermediates" is mutable, aux is sown there for `collect_aux`. Calls that pass
+    rngs for "dropout" enable the method's dropout.
 
     Attributes:
       features: O.
       use_bias: whether to add a bias.
       method: adapter method, or None.
-      dtype: type of the computation; None promotes input and kernel.
-      param_dtype: type of kernel and bias; adapters are always fp32.
+      dtype: compute dtype; None promotes the dtypes of input and kernel.
+      param_dtype: dtype of kernel and bias; adapters are always fp32.
       kernel_init: initializer of the kernel.
     """
 
@@ -42,7 +42,7 @@ class LinenDense(nn.Module):
     def __call__(
         self, x: jax.Array, *, token_mask: jax.Array | None = None, return_aux: bool = False
     ) -> Any:
-        """y [...tokens, O], or (y, aux) if asked; see `dense`."""
+        """y [...tokens, O], or (y, aux) if `return_aux`; see `dense`."""
         validate.method(self.method)
         validate.floating_dtype("param_dtype", self.param_dtype)
         validate.floating_dtype("dtype", self.dtype or self.param_dtype)
@@ -55,8 +55,8 @@ class LinenDense(nn.Module):
         if self.method is not None and not self.method.trains_base:
             params = self.variable("adapters", "adapter", self._init_adapter, kernel).value
         x = cast_input(self.dtype, x, kernel)
-        drops = params is not None and dropout_rate(self.method) and self.has_rng("dropout")
-        key = self.make_rng("dropout") if drops else None
+        use_dropout = params is not None and dropout_rate(self.method) and self.has_rng("dropout")
+        key = self.make_rng("dropout") if use_dropout else None
         y, aux = dense(x, kernel, bias, params, self.method, key, token_mask=token_mask)
         if return_aux:
             return y, aux
@@ -68,7 +68,7 @@ class LinenDense(nn.Module):
         assert self.method is not None
         if self.method.splits_kernel:
             raise ValueError(
-                "Linen cannot change a kernel that is there already, which this method's "
-                "initialization asks for: use `adapt` on an NNX model or another initialization."
+                "this initialization changes the kernel, which Linen does not allow: choose "
+                "another one, or use `adapt` on an NNX model."
             )
         return self.method.init(self.make_rng("params"), kernel)[0]

@@ -1,7 +1,7 @@
-"""Adapter methods, framework-free: one frozen dataclass in one file or folder each.
+"""Framework-agnostic adapter methods, one frozen dataclass per file or folder.
 
-`create("lora_sp", rank=64)` finds a method by its file's name; a new file is a new method. Names
-that begin with `_` hold what methods share.
+`create("lora_sp", rank=64)` finds a method by its file name, so adding a method takes one new file.
+Modules that begin with `_` are shared by the methods.
 """
 
 import difflib
@@ -41,15 +41,15 @@ __all__ = [
 
 
 def names() -> list[str]:
-    """Names of the methods: the files and folders of this package, but for `_names`."""
+    """Names of the methods: the modules of this package that do not begin with `_`."""
     return sorted(m.name for m in pkgutil.iter_modules(__path__) if not m.name.startswith("_"))
 
 
 def find(name: str) -> type[Method]:
-    """The method class in the file `name`.
+    """Return the method class defined in the module `name`.
 
     Raises:
-      ValueError: there is no such file; lists what exists.
+      ValueError: unknown method; the message lists the valid names.
     """
     if name not in names():
         close = difflib.get_close_matches(str(name), names(), n=1)
@@ -62,22 +62,22 @@ def find(name: str) -> type[Method]:
 
 
 def create(name: str, **fields: Any) -> Method:
-    """The method `name` (a file name: lora, lora_sp, full) with some fields set.
+    """Create the method `name` (a file name such as lora, lora_sp or full) with the given fields.
 
     Raises:
-      ValueError: unknown method, unknown field or a bad value.
+      ValueError: unknown method, unknown field or invalid value.
     """
     return find(name)(**fields)
 
 
 def from_settings(settings: Any) -> Method:
-    """The method that `to_settings` wrote, in this version or an earlier one.
+    """Create a method from the settings that `to_settings` wrote, in this or an earlier version.
 
     Raises:
-      ValueError: no settings of a method, or as for `create`.
+      ValueError: `settings` does not name a method, or as for `create`.
     """
     if not isinstance(settings, dict) or not isinstance(settings.get("method"), str):
-        raise ValueError(f"an adapter has settings {short(settings)}, which name no method.")
+        raise ValueError(f"adapter settings must name a method, got {short(settings)}.")
     fields = upgrade(settings)
     if isinstance(schedule := fields.get("schedule"), dict):
         check_names(EnergySchedule, "schedule", (), schedule)

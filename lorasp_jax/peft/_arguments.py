@@ -1,4 +1,4 @@
-"""Whether arrays, keys and parameters can be what a method is called with."""
+"""Validate the arrays, keys and parameters passed to a method."""
 
 import functools
 from typing import Any
@@ -14,50 +14,51 @@ Shapes = dict[str, tuple[int, ...]]
 
 
 def key(value: Any) -> jax.Array:
-    """One key of `jax.random`; raises a ValueError for anything else."""
+    """Return a single `jax.random` key; raise ValueError for anything else."""
     dtype, shape = (value.dtype, value.shape) if is_array(value) else (None, None)
     typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key) and shape == ()
-    if not typed and (dtype != jnp.uint32 or shape not in ((2,), (4,))):  # raw, threefry's, rbg's
-        raise ValueError(f"key must be one such as jax.random.key(0), got {short(value)}.")
+    # Raw keys: threefry has 2 words, rbg 4.
+    if not typed and (dtype != jnp.uint32 or shape not in ((2,), (4,))):
+        raise ValueError(f"key must be a key such as jax.random.key(0), got {short(value)}.")
     return value
 
 
 def tokens(x: Any, token_mask: Any) -> None:
-    """Raises a ValueError unless x is inexact [...tokens, I] and a mask bool [...tokens]."""
+    """Raise ValueError unless x is inexact [...tokens, I] and the mask bool [...tokens] or None."""
     if not (is_array(x) and x.shape and jnp.issubdtype(x.dtype, jnp.inexact)):
-        shown = f"{x.dtype} {list(x.shape)}" if is_array(x) else type(x).__name__
-        raise ValueError(f"x must be floating-point numbers [...tokens, I], got {shown}.")
+        actual = f"{x.dtype} {list(x.shape)}" if is_array(x) else type(x).__name__
+        raise ValueError(f"x must be a floating-point array [...tokens, I], got {actual}.")
     if token_mask is not None:
-        found = getattr(token_mask, "dtype", type(token_mask).__name__), np.shape(token_mask)
-        if found != (bool, x.shape[:-1]):
-            wanted = f"token_mask must be bool {list(x.shape[:-1])}"
-            raise ValueError(f"{wanted}, got {found[0]} {list(found[1])}.")
+        actual = getattr(token_mask, "dtype", type(token_mask).__name__), np.shape(token_mask)
+        if actual != (bool, x.shape[:-1]):
+            expected = f"token_mask must be bool {list(x.shape[:-1])}"
+            raise ValueError(f"{expected}, got {actual[0]} {list(actual[1])}.")
 
 
-def check_params(method: Any, found: Any, shape: tuple[int, ...]) -> None:
-    """Raises a ValueError for parameters that a method would not make for a kernel [I, O].
+def check_params(method: Any, params: Any, shape: tuple[int, ...]) -> None:
+    """Raise ValueError if the parameters do not fit the method and a kernel [I, O].
 
-    Some would be taken without an error, and computed with the scale of another rank.
+    Some would otherwise run without an error, but with the scale of a different rank.
     """
-    held = _shapes(found)
-    for name, wanted in method.shapes(_made_shapes(method, shape), held).items():
-        if held.get(name) != wanted:
+    actual = _shapes(params)
+    for name, expected in method.shapes(_initial_shapes(method, shape), actual).items():
+        if actual.get(name) != expected:
             raise ValueError(
-                f"{method.name} of a kernel {list(shape)} needs {name} {list(wanted)}, got "
-                f"{held.get(name)}."
+                f"{method.name} for a kernel {list(shape)} needs {name} {list(expected)}, got "
+                f"{actual.get(name)}."
             )
 
 
 def matrix(kernel: Any) -> None:
-    """Raises a ValueError unless it is one of real numbers, or such a shape."""
+    """Raise ValueError unless the kernel is a floating-point matrix, or the shape of one."""
     shape, dtype = getattr(kernel, "shape", ()), getattr(kernel, "dtype", int)
     if len(shape) != 2 or 0 in shape or not jnp.issubdtype(dtype, jnp.floating):
-        found = f"{dtype} {list(shape)}" if hasattr(kernel, "dtype") else type(kernel).__name__
-        raise ValueError(f"an adapter needs a kernel [I, O] of real numbers, got {found}.")
+        actual = f"{dtype} {list(shape)}" if hasattr(kernel, "dtype") else type(kernel).__name__
+        raise ValueError(f"an adapter needs a floating-point kernel [I, O], got {actual}.")
 
 
-@functools.lru_cache(maxsize=1024)  # layers of a model are alike, and traced again and again
-def _made_shapes(method: Any, shape: tuple[int, ...]) -> Shapes:
+@functools.lru_cache(maxsize=1024)  # a model's layers share shapes and are traced repeatedly
+def _initial_shapes(method: Any, shape: tuple[int, ...]) -> Shapes:
     return _shapes(jax.eval_shape(lambda: method.init_params(jax.random.key(0), *shape)))
 
 

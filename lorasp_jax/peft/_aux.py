@@ -1,4 +1,4 @@
-"""What an adapted layer reports beside its output; padding stays out of everything it averages."""
+"""Auxiliary outputs of an adapted layer. Padding is excluded from every average."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -13,14 +13,14 @@ from lorasp_jax.peft._fields import short
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Aux:
-    """What an adapted layer reports beside its output.
+    """Auxiliary outputs of an adapted layer.
 
     Attributes:
-      active_rank: f32 [...tokens], directions in use; None where a method has no rank.
+      active_rank: f32 [...tokens], number of active directions; None if the method has no rank.
       kept_energy: f32 [...tokens], E_k of eq. (12); None without a gate.
-      losses: fp32 scalars by name, already averaged over the valid tokens.
-      token_mask: bool [...tokens], True where a token counts; None means all do.
-      usage: f32 [R], for how many valid tokens each direction was in use; None without a gate.
+      losses: fp32 scalars by name, averaged over the valid tokens.
+      token_mask: bool [...tokens], True for valid tokens; None if all are valid.
+      usage: f32 [R], number of valid tokens that use each direction; None without a gate.
       statistics: sums over valid tokens by layer path, during calibration
         (`lorasp_jax.adapters.compress.calibration`).
     """
@@ -50,15 +50,17 @@ def auxiliary_losses(aux: Any) -> dict[str, jax.Array]:
     """Each auxiliary loss averaged over the adapted layers that have it, f32 scalars by name.
 
     Args:
-      aux: any tree of `Aux`, such as what `collect_aux` gives. One that a scan over depth stacked
-        holds a value of each layer, and counts as so many.
+      aux: any tree of `Aux`, such as the result of `collect_aux`. An `Aux` stacked by a scan over
+        depth counts as one layer per entry.
 
     Raises:
-      ValueError: it holds something else.
+      ValueError: a leaf of the tree is not an `Aux`.
     """
     layers = jax.tree.leaves(aux, is_leaf=lambda node: isinstance(node, Aux))
-    if others := [layer for layer in layers if not isinstance(layer, Aux)]:
-        raise ValueError(f"aux must be a tree of Aux, as of collect_aux, got {short(others[0])}.")
+    if invalid := [layer for layer in layers if not isinstance(layer, Aux)]:
+        raise ValueError(
+            f"aux must be a tree of Aux, as from collect_aux, got {short(invalid[0])}."
+        )
     names = sorted({name for layer in layers for name in layer.losses})
     return {
         name: jnp.concatenate(

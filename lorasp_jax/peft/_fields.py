@@ -1,4 +1,4 @@
-"""Whether values are of the kinds that the fields of a dataclass must have."""
+"""Check the fields of a dataclass against their annotations."""
 
 import dataclasses
 import difflib
@@ -8,39 +8,39 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 MAX_FLOAT32 = (2 - 2**-23) * 2.0**127
-"""Largest number of fp32."""
+"""Largest finite fp32 value."""
 MAX_QUOTED = 300
-"""Characters that are quoted of a value."""
+"""Maximum length of a value quoted in an error message [characters]."""
 MAX_INT = 2**31 - 1
-"""Largest whole number that arrays and their sizes take everywhere."""
+"""Upper bound for integers unless stated otherwise: the int32 maximum."""
 
 
 def check_fields(owner: Any, prefix: str = "") -> None:
-    """Compares a dataclass with its annotations; an int is a float, a bool is no number.
+    """Check field values against their annotations. Ints are valid floats, bools are not numbers.
 
     Args:
-        owner: an instance; of its fields' types, classes, unions, `Literal` and tuples of one type
-            are looked at.
-        prefix: what the fields' names begin with, such as "optim.".
+        owner: a dataclass instance. Only annotations that are classes, unions, `Literal` or
+            homogeneous tuples are checked.
+        prefix: prefix of field names in messages, such as "optim.".
 
     Raises:
-        ValueError: a value of another kind, a number that is not finite, or a whole one beyond
-            `MAX_INT`, or beyond what its field's metadata gives as "most".
+        ValueError: a value of the wrong type, a number that is not finite, or an integer above
+            `MAX_INT` or the "max" in its field's metadata.
     """
     fields = dataclasses.fields(owner) if dataclasses.is_dataclass(owner) else ()
-    most = {field.name: field.metadata.get("most", MAX_INT) for field in fields}
+    maximum = {field.name: field.metadata.get("max", MAX_INT) for field in fields}
     for name, kind in typing.get_type_hints(type(owner)).items():
         if typing.get_origin(kind) is typing.ClassVar:
             continue
         value = getattr(owner, name)
         if not _fits(value, kind):
-            raise ValueError(f"{prefix}{name} must be {_called(kind)}, got {short(value)}")
-        if type(value) is int and abs(value) > most.get(name, MAX_INT):
-            raise ValueError(f"{prefix}{name} must be at most {most[name]}, got {value}")
+            raise ValueError(f"{prefix}{name} must be {_describe(kind)}, got {short(value)}")
+        if type(value) is int and abs(value) > maximum.get(name, MAX_INT):
+            raise ValueError(f"{prefix}{name} must be at most {maximum[name]}, got {value}")
 
 
 def check_names(cls: type, name: str, values: Sequence[Any], fields: Iterable[str]) -> None:
-    """Raises a ValueError unless these are values and names for the fields of a class."""
+    """Raise ValueError for too many positional values, or for an unknown field name."""
     valid = [field.name for field in dataclasses.fields(cls)]
     if len(values) > len(valid):
         raise ValueError(f"{name} has {len(valid)} fields, not {len(values)}: {', '.join(valid)}.")
@@ -53,15 +53,15 @@ def check_names(cls: type, name: str, values: Sequence[Any], fields: Iterable[st
             )
 
 
-def positive_int(name: str, value: Any, most: int = MAX_INT) -> int:
-    """The value; raises a ValueError for what is no whole number from 1 to `most`."""
-    if type(value) is not int or not 1 <= value <= most:
-        raise ValueError(f"{name} must be a whole number from 1 to {most}, got {short(value)}.")
+def positive_int(name: str, value: Any, maximum: int = MAX_INT) -> int:
+    """Return the value; raise ValueError unless it is an integer from 1 to `maximum`."""
+    if type(value) is not int or not 1 <= value <= maximum:
+        raise ValueError(f"{name} must be an integer from 1 to {maximum}, got {short(value)}.")
     return value
 
 
 def short(value: Any) -> str:
-    """What a message says of a value: it on one line, cut where it is long, as a model may be."""
+    """A short representation of a value for an error message, on one line."""
     if is_array(value):
         return f"{value.dtype} {list(value.shape)}"
     text = " ".join(repr(value).split())
@@ -69,16 +69,16 @@ def short(value: Any) -> str:
 
 
 def is_array(value: Any) -> bool:
-    """Whether it has a type and a shape; `nnx.Rngs` has an attribute of every name."""
+    """Whether a value has a dtype and a shape. (`nnx.Rngs` answers to any attribute name.)"""
     return hasattr(value, "dtype") and isinstance(getattr(value, "shape", None), tuple)
 
 
 def _fits(value: Any, kind: Any) -> bool:
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
-        return any(_fits(value, one) for one in arguments)
+        return any(_fits(value, member) for member in arguments)
     if origin is typing.Literal:
-        return any(type(value) is type(one) and value == one for one in arguments)
+        return any(type(value) is type(option) and value == option for option in arguments)
     if origin is tuple:
         return isinstance(value, tuple) and all(_fits(item, arguments[0]) for item in value)
     if kind is float:
@@ -89,10 +89,10 @@ def _fits(value: Any, kind: Any) -> bool:
     return isinstance(value, kind) if isinstance(kind, type) else True
 
 
-def _called(kind: Any) -> str:
-    """A kind in words."""
+def _describe(kind: Any) -> str:
+    """Describe an annotation for an error message."""
     if typing.get_origin(kind) in (typing.Union, types.UnionType):
-        return " or ".join(map(_called, typing.get_args(kind)))
+        return " or ".join(map(_describe, typing.get_args(kind)))
     if kind is types.NoneType:
         return "None"
     if typing.get_origin(kind) is typing.Literal:

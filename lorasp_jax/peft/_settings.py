@@ -1,4 +1,4 @@
-"""A method as JSON, in adapter files and records of runs; and as earlier versions wrote it."""
+"""Convert methods to and from JSON settings, including the settings of earlier versions."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -6,7 +6,7 @@ from typing import Any
 
 Settings = dict[str, Any]
 
-_EARLIER = {
+_EARLIER_FIELDS = {
     "score_function",
     "rule",
     "energy_start",
@@ -15,36 +15,36 @@ _EARLIER = {
     "pruned",
     "gate",
 }
-"""Fields that LoRA-SP had."""
-_RELEASES = {"lora_sp": "lora_sp_release", "LoRASP": "LoRASPRelease"}
-_ROUTERS = {"softplus": "gelu", "relu": "gelu_relu", "softmax": "gelu_softmax"}
-"""A router "gelu" by its score function."""
+"""Fields of LoRA-SP in earlier versions."""
+_RELEASE_NAMES = {"lora_sp": "lora_sp_release", "LoRASP": "LoRASPRelease"}
+_GELU_ROUTERS = {"softplus": "gelu", "relu": "gelu_relu", "softmax": "gelu_softmax"}
+"""Current router names by the score function that earlier versions stored beside "gelu"."""
 
 
 def to_settings(method: Any) -> Settings:
-    """Name and fields of a method, of those that belong to a saved adapter."""
+    """The name of a method and its fields, as stored with an adapter."""
     return {"method": method.name, **dataclasses.asdict(method.as_saved)}
 
 
 def upgrade(settings: Mapping[str, Any]) -> Settings:
-    """A method's settings as this version writes them, from those of any version.
+    """Convert a method's settings from any version to the current format.
 
     Args:
-      settings: "method", a name or that of the class, and the fields.
+      settings: the fields, and "method", the name of the method or of its class.
     """
-    found = dict(settings)
-    if str(found.get("method")) not in _RELEASES or not _EARLIER & found.keys():
-        return found
-    now = {name: value for name, value in found.items() if name not in _EARLIER}
-    if found.get("rule") == "release":
-        projects = now.pop("router", None) == "softmax"
-        now["hidden_width"] = now.get("hidden_width") if projects else None
-        now.pop("granularity", None)
-        return {**now, "method": _RELEASES[found["method"]]}
-    score_function = found.get("score_function", "softplus")
-    if now.get("router", "gelu") == "gelu":
-        now["router"] = _ROUTERS.get(str(score_function), score_function)
-    start = found.get("energy_start")
-    curve, share = found.get("energy_curve", "linear"), found.get("energy_share", 0.5)
-    moves = {"start": start, "curve": curve, "share": share}
-    return {**now, "schedule": None if start is None else moves}
+    old = dict(settings)
+    if str(old.get("method")) not in _RELEASE_NAMES or not _EARLIER_FIELDS & old.keys():
+        return old
+    upgraded = {name: value for name, value in old.items() if name not in _EARLIER_FIELDS}
+    if old.get("rule") == "release":
+        has_hidden_layer = upgraded.pop("router", None) == "softmax"
+        upgraded["hidden_width"] = upgraded.get("hidden_width") if has_hidden_layer else None
+        upgraded.pop("granularity", None)
+        return {**upgraded, "method": _RELEASE_NAMES[old["method"]]}
+    score_function = old.get("score_function", "softplus")
+    if upgraded.get("router", "gelu") == "gelu":
+        upgraded["router"] = _GELU_ROUTERS.get(str(score_function), score_function)
+    start = old.get("energy_start")
+    curve, share = old.get("energy_curve", "linear"), old.get("energy_share", 0.5)
+    schedule = {"start": start, "curve": curve, "share": share}
+    return {**upgraded, "schedule": None if start is None else schedule}

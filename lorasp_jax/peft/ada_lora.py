@@ -1,14 +1,14 @@
-"""AdaLoRA: ΔW = s A diag(e) B whose rank is pruned to a budget over all layers (arXiv 2303.10512).
+"""AdaLoRA: ΔW = s A diag(e) B, pruned to a rank budget shared by all layers (arXiv 2303.10512).
 
-Which triplets (a column of A, an entry of e, a row of B) stay is decided while training, from how
-sensitive the loss is to them; `AdaLoRA.transform` wraps the optimizer and does that in the same
-jitted step, so a training loop cannot forget it. The arithmetic is that of Hugging Face PEFT
-0.21.2. One function per equation of the paper:
+During training, the triplets (a column of A, an entry of e, a row of B) to which the loss is least
+sensitive are pruned. `AdaLoRA.transform` wraps the optimizer to do this in the same jitted step, so
+that a training loop cannot omit it. The arithmetic matches Hugging Face PEFT 0.21.2. One function
+per equation of the paper:
 
     (1)  update          P Λ Q, here A diag(e) B                      `AdaLoRA.bottleneck`
     (4)  orthogonality   ‖PᵀP − I‖ + ‖QQᵀ − I‖                        `AdaLoRA.penalty`
     (7)-(11) importance  Ī, Ū, S of each triplet                      `_sensitivity`, `_importance`
-    (6)  allocation      the b(t) most important stay                 `_keep`
+    (6)  allocation      keep the b(t) most important triplets        `_keep`
     (12) budget          b(t), cubic                                  `budgets`
 """
 
@@ -33,70 +33,70 @@ Triplets = dict[str, jax.Array]
 
 @dataclasses.dataclass(frozen=True)
 class AdaLoRA(Method):
-    """Adapter whose rank is allocated while training.
+    """Adapter whose rank is allocated during training.
 
-    Parameters: lora_a [I, R], lora_e [R], lora_b [R, O], (I + O + 1) R numbers. Where a triplet is
-    pruned, lora_e is exactly 0.
+    Parameters: lora_a [I, R], lora_e [R], lora_b [R, O]: (I + O + 1) R in total. Pruned
+    triplets have a lora_e of exactly 0.
 
     Raises:
-      ValueError: a rank, interval or share that makes no sense.
+      ValueError: an invalid rank, interval, fraction or decay.
     """
 
     rank: int = 128
-    """R at the start."""
+    """Initial rank R."""
     target_rank: int | None = None
-    """Mean rank of a layer at the end, None: half of R; see `match_budget`."""
+    """Mean final rank per layer. Defaults to R / 2, rounded up; see `match_budget`."""
     alpha: float | None = None
-    """α of the scale α/R; None is 2 R. R stays that of the start, as in PEFT."""
+    """α of the scale α/R, where R is the initial rank throughout, as in PEFT. Defaults to 2 R."""
     warmup: float = 0.1
-    """Share of the steps before anything is pruned."""
+    """Fraction of the training steps before pruning starts."""
     final: float = 0.3
-    """Share of the steps, the last ones, in which what is pruned no longer changes."""
+    """Fraction of the training steps, at the end, with a fixed set of pruned triplets."""
     interval: int = 10
-    """Steps from one pruning to the next."""
+    """Steps between prunings."""
     importance_decay: float = 0.85
-    """β1 of the mean importance."""
+    """β1, EMA decay of the importance."""
     uncertainty_decay: float = 0.85
-    """β2 of the mean deviation from it."""
+    """β2, EMA decay of the uncertainty, the deviation from the mean importance."""
     dropout: float = 0.0
-    """Probability with which the adapter sees a number of its input as 0, in training alone:
-    `with_dropout` of NNX models, rngs={"dropout": key} of Linen's."""
+    """Dropout rate on the adapter's input, in training only. Enable it with `with_dropout` (NNX) or
+    rngs={"dropout": key} (Linen)."""
 
     def __post_init__(self) -> None:
-        """Checks the fields."""
+        """Validate the fields."""
         super().__post_init__()
         if self.rank < 1 or not 1 <= self.final_rank <= self.rank or self.interval < 1:
             raise ValueError(
-                "target_rank must be 1 to rank and interval at least 1, got "
-                f"{self.target_rank}, {self.rank}, {self.interval}."
+                "rank and interval must be at least 1 and target_rank 1 to rank, got "
+                f"rank={self.rank}, target_rank={self.target_rank}, interval={self.interval}."
             )
         if self.warmup < 0 or self.final < 0 or self.warmup + self.final >= 1:
             raise ValueError(
-                "warmup and final are shares of the steps that leave some between them, got "
-                f"{self.warmup}, {self.final}."
+                "warmup and final must be non-negative and sum to less than 1, got "
+                f"{self.warmup} and {self.final}."
             )
         if not (0 <= self.importance_decay < 1 and 0 <= self.uncertainty_decay < 1):
             raise ValueError(
-                "importance_decay and uncertainty_decay must lie in [0, 1), got "
-                f"{self.importance_decay}, {self.uncertainty_decay}."
+                "importance_decay and uncertainty_decay must be in [0, 1), got "
+                f"{self.importance_decay} and {self.uncertainty_decay}."
             )
 
     @property
     def final_rank(self) -> int:
-        """Mean rank of a layer at the end."""
+        """Mean final rank per layer."""
         return (self.rank + 1) // 2 if self.target_rank is None else self.target_rank
 
     @property
     def scale(self) -> float:
-        """α/(R + 1e-5), the constant of PEFT and of the authors' code included."""
+        """α/(R + 1e-5); the 1e-5 is that of PEFT and the authors' code."""
         return (2 * self.rank if self.alpha is None else self.alpha) / (self.rank + 1e-5)
 
     def match_budget(self, mean_active_rank: float) -> "AdaLoRA":
-        """The same with the rank that LoRA-SP was measured to use, as in the paper's Table I."""
+        """Copy with LoRA-SP's measured mean active rank as `target_rank` (paper, Table I)."""
         return dataclasses.replace(self, target_rank=round(mean_active_rank))
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
-        """A and B normal with deviation 0.02, e zero: the delta starts at exactly zero."""
+        """Initialize A and B from N(0, 0.02²) and e to zero; the delta is exactly zero."""
         a_key, b_key = jax.random.split(key)
         return {
             "lora_a": _INIT_STD * jax.random.normal(a_key, (d_in, self.rank)),
@@ -111,7 +111,7 @@ class AdaLoRA(Method):
     def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
-        """Eq. (1): z = s x A diag(e); the active rank is the number of entries not 0."""
+        """Eq. (1): z = s x A diag(e). The active rank is the number of nonzero entries of e."""
         del token_mask
         rank = (params["lora_e"] != 0).sum().astype(jnp.float32)
         z = rows * (self.scale * params["lora_e"]).astype(rows.dtype)
@@ -122,7 +122,7 @@ class AdaLoRA(Method):
         return params["lora_b"]
 
     def penalty(self, params: Params) -> dict[str, jax.Array]:
-        """Eq. (4) as PEFT has it: the mean of ‖AᵀA − I‖ and ‖BBᵀ − I‖, Frobenius, not squared."""
+        """Eq. (4) as in PEFT: the mean of ‖AᵀA − I‖ and ‖BBᵀ − I‖, Frobenius norms, not squared."""
         a, b = params["lora_a"], params["lora_b"]
         norms = [_norm(gram - jnp.eye(len(gram))) for gram in (a.T @ a, b @ b.T)]
         return {"orthogonality": (norms[0] + norms[1]) / 2}
@@ -130,41 +130,41 @@ class AdaLoRA(Method):
     def transform(
         self, optimizer: optax.GradientTransformation, total_steps: int
     ) -> optax.GradientTransformation:
-        """The optimizer, after each step of which the budget of all layers is allocated.
+        """Wrap the optimizer so that its steps also allocate the rank budget across all layers.
 
-        It wraps the whole optimizer, learning rate included, and what is chained behind it would
-        undo the pruning; clipping goes before it. Importance is that of the updated parameters.
-        All AdaLoRA layers in the tree share one budget.
+        Wrap the complete optimizer, including its learning rate. Gradient clipping may be chained
+        before it; any transformation after it would undo the pruning. Importance is computed from
+        the updated parameters. All AdaLoRA layers in the tree share one budget.
 
         Args:
-          optimizer: of any tree of parameters, some of them made by `init`.
+          optimizer: for any parameter tree that includes AdaLoRA parameters.
           total_steps: T.
 
         Raises:
-          ValueError: if no step would be left between warm-up and final phase, or the parameters
-            hold no AdaLoRA.
+          ValueError: no steps remain between warm-up and final phase, or, in `init`, the tree has
+            no AdaLoRA parameters.
         """
         _fields.positive_int("total_steps", total_steps)
         begin, end = round(self.warmup * total_steps), total_steps - round(self.final * total_steps)
         if begin >= end:
             raise ValueError(
-                f"AdaLoRA cannot prune in {total_steps} steps: {begin} are warm-up and "
-                f"{total_steps - end} final."
+                f"AdaLoRA cannot prune in {total_steps} steps: warm-up takes {begin} and the final "
+                f"phase {total_steps - end}."
             )
 
         def init(params: Any) -> AllocationState:
-            return _begun(params, optimizer.init(params))
+            return _initial_state(params, optimizer.init(params))
 
         def update(updates: Any, state: Any, params: Any = None) -> Any:
             grads, (updates, inner) = updates, optimizer.update(updates, state.inner, params)
-            found = _triplets(params)
+            old = _triplets(params)
             new = [
-                jax.tree.map(jnp.add, *pair) for pair in zip(found, _triplets(updates), strict=True)
+                jax.tree.map(jnp.add, *pair) for pair in zip(old, _triplets(updates), strict=True)
             ]
-            means = _sensitivity(self, state, new, _triplets(grads), learn=state.step < end)
-            kept, pruned = _allocate(self, state, _importance(*means), begin, end)
-            updates = _replaced(updates, found, pruned)
-            return updates, AllocationState(state.step + 1, *means, kept, inner)
+            averages = _sensitivity(self, state, new, _triplets(grads), active=state.step < end)
+            kept, pruned = _allocate(self, state, _importance(*averages), begin, end)
+            updates = _zero_pruned(updates, old, pruned)
+            return updates, AllocationState(state.step + 1, *averages, kept, inner)
 
         return optax.GradientTransformation(init, update)
 
@@ -175,52 +175,52 @@ class AdaLoRA(Method):
 
 
 class AllocationState(NamedTuple):
-    """What the allocation remembers; lists over the adapted layers, in the tree's order."""
+    """Optimizer state. Each list has one entry per adapted layer, in tree order."""
 
     step: jax.Array
     importance: list[Triplets]
-    """Ī of every parameter."""
+    """Ī, EMA of each parameter's importance."""
     uncertainty: list[Triplets]
-    """Ū of every parameter."""
+    """Ū, EMA of each parameter's uncertainty."""
     kept: list[jax.Array]
-    """bool, of the shape of lora_e: what the last allocation kept."""
+    """Bool mask shaped like lora_e: the entries that the last allocation kept."""
     inner: Any
 
 
 def budgets(initial: int, target: int, begin: int, end: int) -> np.ndarray:
-    """Eq. (12): triplets that stay by step, int32 [end + 1]: all, then fewer by a cubic."""
+    """Eq. (12): number of triplets to keep at each step, int32 [end + 1]; cubic after `begin`."""
     steps = np.arange(end + 1)
-    left = 1 - np.clip((steps - begin) / (end - begin), 0.0, 1.0)
-    return (target + (initial - target) * left**3).astype(np.int32)
+    remaining = 1 - np.clip((steps - begin) / (end - begin), 0.0, 1.0)
+    return (target + (initial - target) * remaining**3).astype(np.int32)
 
 
-def _begun(params: Any, inner: Any) -> AllocationState:
-    """The state before the first step."""
-    if not (found := _triplets(params)):
-        raise ValueError("there is no AdaLoRA among the parameters of AdaLoRA's optimizer.")
-    importance, uncertainty = (jax.tree.map(jnp.zeros_like, found) for _ in range(2))
-    kept = [jnp.ones(t["lora_e"].shape, bool) for t in found]
+def _initial_state(params: Any, inner: Any) -> AllocationState:
+    """The state before the first step. Raise ValueError if there are no AdaLoRA parameters."""
+    if not (triplets := _triplets(params)):
+        raise ValueError("the parameters passed to AdaLoRA's optimizer contain no AdaLoRA adapter.")
+    importance, uncertainty = (jax.tree.map(jnp.zeros_like, triplets) for _ in range(2))
+    kept = [jnp.ones(t["lora_e"].shape, bool) for t in triplets]
     return AllocationState(jnp.zeros((), jnp.int32), importance, uncertainty, kept, inner)
 
 
 def _allocate(
     method: AdaLoRA, state: AllocationState, scores: list[jax.Array], begin: int, end: int
 ) -> tuple[list[jax.Array], list[jax.Array]]:
-    """What to keep from now on, and what to prune at once, as lora_e is shaped.
+    """Masks shaped like lora_e: entries kept by the last allocation, and entries to zero now.
 
-    Between two allocations pruned entries train on; after the last one they stay pruned.
+    Between allocations pruned entries may train and return; after the last one they stay 0.
     """
-    step, number = state.step, sum(s.size for s in scores)
-    table = budgets(number, number // method.rank * method.final_rank, begin, end)
-    fewer = number - jnp.asarray(table)[jnp.minimum(step, end)]
-    due = ((step > begin) & (step < end) & (step % method.interval == 0)) | (step == end)
-    pairs = zip(_keep(scores, fewer), state.kept, strict=True)
-    kept = [jnp.where(due, new, old) for new, old in pairs]
-    return kept, [(due | (step > end)) & ~keep for keep in kept]
+    step, total = state.step, sum(s.size for s in scores)
+    table = budgets(total, total // method.rank * method.final_rank, begin, end)
+    num_pruned = total - jnp.asarray(table)[jnp.minimum(step, end)]
+    allocate = ((step > begin) & (step < end) & (step % method.interval == 0)) | (step == end)
+    pairs = zip(_keep(scores, num_pruned), state.kept, strict=True)
+    kept = [jnp.where(allocate, new, old) for new, old in pairs]
+    return kept, [(allocate | (step > end)) & ~keep for keep in kept]
 
 
 def _norm(matrix: jax.Array) -> jax.Array:
-    """Frobenius norm, whose gradient is 0 where all is 0."""
+    """Frobenius norm, with gradient 0 for a zero matrix."""
     total = jnp.square(matrix).sum()
     return jnp.where(total > 0, jnp.sqrt(jnp.where(total > 0, total, 1.0)), 0.0)
 
@@ -230,27 +230,27 @@ def _is_triplets(node: Any) -> bool:
 
 
 def _triplets(tree: Any) -> list[Triplets]:
-    """The parameters of all AdaLoRA layers of a tree; stacked layers count as one."""
+    """The parameters of each AdaLoRA layer in a tree; a stack of layers is one entry."""
     nodes = jax.tree.leaves(tree, is_leaf=_is_triplets)
     return [dict(node) for node in nodes if _is_triplets(node)]
 
 
 def _sensitivity(
-    method: AdaLoRA, state: AllocationState, params: Any, grads: Any, learn: jax.Array
+    method: AdaLoRA, state: AllocationState, params: Any, grads: Any, active: jax.Array
 ) -> tuple[Any, Any]:
-    """Eqs. (8)-(10): I = |w g|, its moving mean Ī, and Ū, that of |I − Ī|."""
+    """Eqs. (8)-(10): Ī, the EMA of I = |w g|, and Ū, the EMA of |I − Ī|, updated if `active`."""
 
-    def mean(decay: float, old: jax.Array, new: jax.Array) -> jax.Array:
-        return jnp.where(learn, decay * old + (1 - decay) * new, old).astype(old.dtype)
+    def average(decay: float, old: jax.Array, new: jax.Array) -> jax.Array:
+        return jnp.where(active, decay * old + (1 - decay) * new, old).astype(old.dtype)
 
-    now = jax.tree.map(lambda w, g: jnp.abs(w * g), params, grads)
+    current = jax.tree.map(lambda w, g: jnp.abs(w * g), params, grads)
     importance = jax.tree.map(
-        lambda old, i: mean(method.importance_decay, old, i), state.importance, now
+        lambda old, i: average(method.importance_decay, old, i), state.importance, current
     )
     uncertainty = jax.tree.map(
-        lambda old, i, m: mean(method.uncertainty_decay, old, jnp.abs(i - m)),
+        lambda old, i, m: average(method.uncertainty_decay, old, jnp.abs(i - m)),
         state.uncertainty,
-        now,
+        current,
         importance,
     )
     return importance, uncertainty
@@ -262,21 +262,21 @@ def _importance(importance: list[Triplets], uncertainty: list[Triplets]) -> list
     return [s["lora_e"] + s["lora_a"].mean(-2) + s["lora_b"].mean(-1) for s in scores]
 
 
-def _keep(scores: list[jax.Array], fewer: jax.Array) -> list[jax.Array]:
-    """Eq. (6): all but the `fewer` least important of all layers; ties at the threshold go too."""
+def _keep(scores: list[jax.Array], num_pruned: jax.Array) -> list[jax.Array]:
+    """Eq. (6): keep all but the `num_pruned` least important triplets; ties are pruned too."""
     ordered = jnp.sort(jnp.concatenate([s.ravel() for s in scores]))
-    threshold = jnp.where(fewer > 0, ordered[jnp.maximum(fewer - 1, 0)], -jnp.inf)
+    threshold = jnp.where(num_pruned > 0, ordered[jnp.maximum(num_pruned - 1, 0)], -jnp.inf)
     return [s > threshold for s in scores]
 
 
-def _replaced(updates: Any, params: list[Triplets], pruned: list[jax.Array]) -> Any:
-    """The updates, under which pruned entries of lora_e become exactly 0."""
+def _zero_pruned(updates: Any, params: list[Triplets], pruned: list[jax.Array]) -> Any:
+    """Replace updates so that pruned entries of lora_e become exactly 0."""
     pairs = iter(zip(params, pruned, strict=True))
 
     def replace(node: Any) -> Any:
         if not _is_triplets(node):
             return node
-        old, gone = next(pairs)
-        return {**node, "lora_e": jnp.where(gone, -old["lora_e"], node["lora_e"])}
+        old, pruned_mask = next(pairs)
+        return {**node, "lora_e": jnp.where(pruned_mask, -old["lora_e"], node["lora_e"])}
 
     return jax.tree.map(replace, updates, is_leaf=_is_triplets)

@@ -1,12 +1,12 @@
-"""DoRA: a kernel's direction is adapted by LoRA, its columns' lengths on their own.
+"""DoRA: LoRA adapts the direction of each kernel column, a trained magnitude its length.
 
 Liu et al., arXiv 2402.09353. With V = W + scale A B and a trained magnitude m per output,
 
     y = x V · m / ‖V‖,
 
-‖V‖ being V's L2 norms over the input dimension, one per output. m starts as ‖W‖, so the map starts
-as x W. The norm is a constant to the gradient (section 4.3 of the paper); the layer's bias is added
-outside and not rescaled. Both are as in Hugging Face PEFT.
+where ‖V‖ is the L2 norm over the input dimension, one per output. m is initialized to ‖W‖, so the
+layer initially computes x W. The norm is treated as a constant in the gradient (section 4.3 of the
+paper), and the layer's bias is added afterwards without rescaling, both as in Hugging Face PEFT.
 """
 
 import dataclasses
@@ -22,9 +22,9 @@ from lorasp_jax.peft.lora import LoRA
 
 @dataclasses.dataclass(frozen=True)
 class DoRA(LoRA):
-    """Fixed-rank adapter with a magnitude per output; fields, scale and initialisation of LoRA.
+    """Fixed-rank adapter with a magnitude per output. Fields, scale and initialization as in LoRA.
 
-    Parameters: lora_a [I, R], lora_b [R, O], magnitude [O], (I + O) R + O numbers.
+    Parameters: lora_a [I, R], lora_b [R, O], magnitude [O]: (I + O) R + O in total.
 
     Raises:
       ValueError: a rank below 1.
@@ -35,20 +35,20 @@ class DoRA(LoRA):
     def init(
         self, key: jax.Array, kernel: Kernel, *, statistics: Any = None
     ) -> tuple[Params, Kernel]:
-        """LoRA's parameters, and the norms of the kernel's columns as the magnitude.
+        """Initialize LoRA's parameters, and the magnitude to the norms of the kernel's columns.
 
-        Arguments and results as for `Method.init`, but the kernel's values are read.
+        Arguments and results as for `Method.init`, except that the kernel must have values.
 
         Raises:
-          ValueError: the kernel is not a matrix, or is a shape without values.
+          ValueError: the kernel is not a matrix, or only a shape.
         """
         if isinstance(kernel, jax.ShapeDtypeStruct):
             raise ValueError(
-                "DoRA starts from the norms of the kernel and so needs its values, got only "
+                "DoRA's magnitude is initialized from the kernel's values, got only "
                 f"the shape {kernel.shape}."
             )
-        params, rest = super().init(key, kernel, statistics=statistics)
-        return params | {"magnitude": norms(kernel)}, rest
+        params, residual = super().init(key, kernel, statistics=statistics)
+        return params | {"magnitude": column_norms(kernel)}, residual
 
     def apply(
         self,
@@ -58,9 +58,9 @@ class DoRA(LoRA):
         *,
         token_mask: jax.Array | None = None,
     ) -> tuple[jax.Array, Aux]:
-        """Eq. (5): (x W + scale x A B) · m / ‖V‖, [...tokens, O]; no gradient reaches the kernel.
+        """Eq. (5): (x W + scale x A B) · m / ‖V‖, [...tokens, O]. The kernel receives no gradient.
 
-        The factor is applied in fp32: in bf16 it would be off by up to 0.4 % for a whole column.
+        The factor is applied in fp32; in bf16 it would scale a whole column wrongly by up to 0.4 %.
         """
         y, aux = super().apply(params, x, kernel, token_mask=token_mask)
         factor = column_factor(params["magnitude"], self._adapted(params, kernel))
@@ -77,19 +77,20 @@ class DoRA(LoRA):
 
 
 def column_factor(magnitude: jax.Array, adapted: jax.Array) -> jax.Array:
-    """m / ‖V‖, f32 [O], for magnitude [O] and V [I, O], which is a constant to the gradient.
+    """m / ‖V‖, f32 [O], for magnitude [O] and V [I, O]. V receives no gradient.
 
-    V is formed to take its norms. ‖w‖² + 2 s (wᵀA) b + s² bᵀ(AᵀA) b for a column w + s A b would
-    spare that, but costs as much, I O R for WᵀA, and cancels where V is much shorter than W.
+    V is formed explicitly to compute its norms. Expanding them per column w + s A b as
+    ‖w‖² + 2 s (wᵀA) b + s² bᵀ(AᵀA) b would avoid that, but costs as much (I O R for WᵀA) and
+    suffers from cancellation where V is much shorter than W.
 
-    A column of zeros has no direction to rescale: its factor is 1 with m = 0, as it starts in a
-    kernel of zeros, so that B can learn.
+    A zero column has no direction to rescale. Its factor is m + 1, that is 1 for the initial m = 0,
+    so that B can learn even from a zero kernel.
     """
-    norm = norms(jax.lax.stop_gradient(adapted))
-    empty = norm == 0
-    return (magnitude + empty) / (norm + empty)
+    norm = column_norms(jax.lax.stop_gradient(adapted))
+    is_zero = norm == 0
+    return (magnitude + is_zero) / (norm + is_zero)
 
 
-def norms(kernel: Any) -> jax.Array:
+def column_norms(kernel: Any) -> jax.Array:
     """L2 norms over the input dimension of a kernel [I, O], f32 [O]."""
     return jnp.linalg.norm(kernel.astype(jnp.float32), axis=0)

@@ -1,4 +1,4 @@
-"""Full fine-tuning as a method: the base weights themselves are what trains."""
+"""Full fine-tuning as a method: train the base weights themselves."""
 
 import dataclasses
 from typing import Any, ClassVar
@@ -12,10 +12,10 @@ from lorasp_jax.peft._method import Kernel, Method, Params
 
 @dataclasses.dataclass(frozen=True)
 class FullFineTuning(Method):
-    """Trains the kernel.
+    """Train the kernel.
 
-    As a pure method its parameters are {"kernel": [I, O]}. The NNX and Linen shells make no second
-    copy: there the layer's own weights become the trained ones.
+    Its parameters are {"kernel": [I, O]}. The NNX and Linen wrappers make no second copy: they
+    train the layer's own weights.
     """
 
     trains_base: ClassVar[bool] = True
@@ -24,7 +24,7 @@ class FullFineTuning(Method):
     def init(
         self, key: jax.Array, kernel: Kernel, *, statistics: Any = None
     ) -> tuple[Params, Kernel]:
-        """The kernel is its own starting point."""
+        """Use the kernel itself as the parameter."""
         del key, statistics
         return {"kernel": kernel}, kernel
 
@@ -36,10 +36,10 @@ class FullFineTuning(Method):
         *,
         token_mask: jax.Array | None = None,
     ) -> tuple[jax.Array, Aux]:
-        """x @ the trained kernel, [...tokens, O]."""
+        """x @ params["kernel"], [...tokens, O]."""
         del kernel
         return x @ params["kernel"].astype(x.dtype), Aux(token_mask=token_mask)
 
     def merge(self, params: Params, kernel: jax.Array) -> jax.Array:
-        """The trained kernel in the base's type."""
+        """The trained kernel in the dtype of `kernel`."""
         return jnp.asarray(params["kernel"], kernel.dtype)

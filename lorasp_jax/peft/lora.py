@@ -1,8 +1,8 @@
-"""LoRA: ΔW = (α/R) A B of fixed rank (Hu et al., arXiv 2106.09685), with rsLoRA scaling on request.
+"""LoRA: ΔW = (α/R) A B of fixed rank (Hu et al., arXiv 2106.09685), optionally with rsLoRA scaling.
 
-Conventions and initialisations are those of Hugging Face PEFT: A Kaiming-uniform with a = √5, that
-is U(±1/√I), or gaussian, and B = 0; or a part of the kernel, which leaves the rest frozen. Scale
-α/R, or α/√R for rsLoRA (Kalajdzievski, arXiv 2312.03732).
+Conventions and initializations follow Hugging Face PEFT. Either B = 0 and A is Kaiming-uniform with
+a = √5, which is U(±1/√I), or Gaussian; or A B is split off the kernel and the residual is frozen.
+The scale is α/R, or α/√R for rsLoRA (Kalajdzievski, arXiv 2312.03732).
 """
 
 import dataclasses
@@ -15,52 +15,52 @@ from lorasp_jax.peft import _arguments
 from lorasp_jax.peft._aux import Aux
 from lorasp_jax.peft._method import Kernel, Method, Params, kaiming_uniform
 
-_SPLITS = ("pissa", "olora")
+_SPLIT_INITIALIZATIONS = ("pissa", "olora")
 
 
 @dataclasses.dataclass(frozen=True)
 class LoRA(Method):
     """Fixed-rank adapter.
 
-    Parameters: lora_a [I, R], lora_b [R, O], (I + O) R numbers.
+    Parameters: lora_a [I, R], lora_b [R, O]: (I + O) R in total.
 
     Raises:
       ValueError: a rank below 1, an unknown initialization, or a dropout outside [0, 1).
     """
 
     rank: int = 128
-    """R; it may exceed the kernel's sides, unless A and B start as parts of the kernel. 128 is the
-    paper's main baseline."""
+    """R. It may exceed I and O unless A B is split off the kernel. 128 is the main baseline of the
+    LoRA-SP paper."""
     alpha: float | None = None
-    """α; None is 2 R, the scale 2 of LoRA-SP's defaults."""
+    """α. Defaults to 2 R, a scale of 2 as in LoRA-SP."""
     rank_stabilized: bool = False
     """Scale by α/√R (rsLoRA) instead of α/R."""
     initialization: Literal["kaiming", "gaussian", "pissa", "olora", "eva"] = "kaiming"
-    """"kaiming": A in U(±1/√I). "gaussian": A in N(0, 1/R²). "pissa": A B is the kernel's best
-    approximation of rank R (`principal_part`), "olora": the first R columns of its QR
-    decomposition (`orthogonal_part`); what trains is then taken out of the kernel. "eva": A spans
-    most of what the layer's inputs contain (`principal_inputs`), for which `adapt` needs
-    statistics."""
+    """Initial A and B. "kaiming": A from U(±1/√I), B = 0. "gaussian": A from N(0, 1/R²), B = 0.
+    "pissa": scale A B is the best rank-R approximation of the kernel (`principal_part`). "olora":
+    A B is the kernel's QR decomposition, truncated to rank R (`orthogonal_part`). Both leave the
+    residual W - scale A B in the kernel. "eva": A spans the principal directions of the layer's
+    inputs (`principal_inputs`), B = 0; `adapt` then needs `statistics`."""
     dropout: float = 0.0
-    """Probability with which the adapter sees a number of its input as 0, in training alone:
-    `with_dropout` of NNX models, rngs={"dropout": key} of Linen's."""
+    """Dropout rate on the adapter's input, in training only. Enable it with `with_dropout` (NNX) or
+    rngs={"dropout": key} (Linen)."""
 
     def __post_init__(self) -> None:
-        """Checks the fields."""
+        """Validate the fields."""
         super().__post_init__()
         if self.rank < 1:
             raise ValueError(f"rank must be at least 1, got {self.rank}.")
         if self.initialization == "pissa" and self.scale < 0:
-            raise ValueError(f"'pissa' takes roots of W / scale: alpha {self.alpha} is negative.")
+            raise ValueError(f"'pissa' needs a positive alpha, got {self.alpha}.")
 
     @property
     def splits_kernel(self) -> bool:
-        """True if A and B start as a part of the kernel."""
-        return self.initialization in _SPLITS
+        """True if the initial A B is split off the kernel."""
+        return self.initialization in _SPLIT_INITIALIZATIONS
 
     @property
     def needs_statistics(self) -> bool:
-        """True if A starts from the layer's inputs."""
+        """True if A is initialized from the layer's inputs."""
         return self.initialization == "eva"
 
     @property
@@ -72,13 +72,13 @@ class LoRA(Method):
     def init(
         self, key: jax.Array, kernel: Kernel, *, statistics: Any = None
     ) -> tuple[Params, Kernel]:
-        """A and B, and the kernel, less scale A B where they start as a part of it.
+        """Initialize A and B; if they are split off the kernel, return the residual W - scale A B.
 
         Arguments and results as for `Method.init`.
 
         Raises:
-          ValueError: the kernel is not a matrix; or, where it is split, it is a shape without
-            values or has a side below the rank; or statistics are missing or of another layer.
+          ValueError: the kernel is not a matrix; or it must be split, but is only a shape or has
+            fewer than R rows or columns; or statistics are missing or of the wrong shape.
         """
         if self.needs_statistics:
             _arguments.matrix(kernel)
@@ -88,18 +88,18 @@ class LoRA(Method):
             return super().init(key, kernel, statistics=statistics)
         _arguments.matrix(kernel)
         if isinstance(kernel, jax.ShapeDtypeStruct) or self.rank > min(kernel.shape):
-            has = "a shape" if isinstance(kernel, jax.ShapeDtypeStruct) else "a kernel"
+            given = "a shape" if isinstance(kernel, jax.ShapeDtypeStruct) else "a kernel"
             raise ValueError(
-                f"{self.initialization!r} splits a kernel, so it needs its values and a rank up to "
-                f"its smaller side, got rank {self.rank} and {has} {list(kernel.shape)}."
+                f"initialization {self.initialization!r} needs the kernel's values and a rank of "
+                f"at most min(I, O), got rank {self.rank} and {given} {list(kernel.shape)}."
             )
-        part = principal_part if self.initialization == "pissa" else orthogonal_part
-        a, b = part(kernel.astype(jnp.float32), self.rank, self.scale)
+        split = principal_part if self.initialization == "pissa" else orthogonal_part
+        a, b = split(kernel.astype(jnp.float32), self.rank, self.scale)
         params = {"lora_a": a, "lora_b": b}
         return params, (kernel.astype(jnp.float32) - self.scale * (a @ b)).astype(kernel.dtype)
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
-        """A random, B zero: the delta starts at exactly zero."""
+        """Initialize A randomly and B to zero, so that the initial delta is exactly zero."""
         shape = (d_in, self.rank)
         gaussian = self.initialization == "gaussian"
         a = jax.random.normal(key, shape) / self.rank if gaussian else kaiming_uniform(key, shape)
@@ -108,9 +108,9 @@ class LoRA(Method):
     def init_table(
         self, key: jax.Array, table: Kernel, *, statistics: Any = None
     ) -> tuple[Params, Kernel]:
-        """Parameters for an embedding [V, D]: A zero, B in N(0, 1), as in Hugging Face PEFT.
+        """Initialize parameters for an embedding [V, D]: A zero, B from N(0, 1), as in PEFT.
 
-        Only the rows of A that were looked up get a gradient, so A is what must start at zero.
+        Only the rows of A that were looked up receive a gradient, so A must be the zero factor.
         """
         del statistics
         entries, width = table.shape
@@ -124,7 +124,7 @@ class LoRA(Method):
     def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
-        """Eq. (3) of Hu et al.: z = scale x A; every token uses the whole rank."""
+        """Eq. (3) of Hu et al.: z = scale x A. Every token uses the full rank."""
         del params, token_mask
         return self.scale * rows, Aux(jnp.full(rows.shape[:-1], self.rank, jnp.float32))
 
@@ -134,7 +134,7 @@ class LoRA(Method):
 
     @property
     def as_saved(self) -> "LoRA":
-        """The same without "eva", whose statistics are needed for the start alone."""
+        """This method, with "eva" replaced: its statistics are only needed to initialize."""
         if self.needs_statistics:
             return dataclasses.replace(self, initialization="kaiming")
         return self
@@ -146,9 +146,10 @@ class LoRA(Method):
 
 
 def principal_part(kernel: jax.Array, rank: int, scale: float) -> tuple[jax.Array, jax.Array]:
-    """A [I, R] and B [R, O] with scale A B the R largest terms of the kernel's SVD.
+    """A [I, R] and B [R, O] such that scale A B is the kernel's SVD truncated to rank R.
 
-    PiSSA (Meng et al., arXiv 2404.02948, eqs. 2-4): the singular values go to both in halves.
+    PiSSA (Meng et al., arXiv 2404.02948, eqs. 2-4): each factor gets the square root of the
+    singular values.
     """
     left, values, right = jnp.linalg.svd(kernel, full_matrices=False)
     root = jnp.sqrt(values[:rank] / scale)
@@ -156,7 +157,7 @@ def principal_part(kernel: jax.Array, rank: int, scale: float) -> tuple[jax.Arra
 
 
 def orthogonal_part(kernel: jax.Array, rank: int, scale: float) -> tuple[jax.Array, jax.Array]:
-    """A [I, R] and B [R, O], the rows of B orthonormal: QR of the kernel's transpose, cut at R.
+    """A [I, R] and B [R, O] with orthonormal rows of B: QR of the kernel's transpose, rank R.
 
     OLoRA (Büyükakyüz, arXiv 2406.01775, algorithm 1), which does not divide by the scale.
     """
@@ -168,26 +169,26 @@ def orthogonal_part(kernel: jax.Array, rank: int, scale: float) -> tuple[jax.Arr
 def principal_inputs(moment: jax.Array | None, d_in: int, rank: int) -> jax.Array:
     """A [I, R]: the R leading right singular vectors of the stacked inputs x [T, I].
 
-    EVA (Paischer et al., arXiv 2410.07170, section 3.1), without its redistribution of ranks; as
-    eigenvectors of Σ x xᵀ, which is summed over batches.
+    EVA (Paischer et al., arXiv 2410.07170, section 3.1), without its redistribution of ranks. They
+    are computed as eigenvectors of Σ x xᵀ, which can be summed over batches.
 
     Args:
-      moment: Σ x xᵀ, [I, I], not centred.
+      moment: Σ x xᵀ, [I, I], not centered.
       d_in: I.
       rank: R, at most I.
 
     Raises:
-      ValueError: no moment, one of another layer, or a rank above I.
+      ValueError: the moment is missing or has the wrong shape, or R exceeds I.
     """
     if moment is None:
         raise ValueError(
-            "initialization 'eva' needs the inputs' statistics: pass those of "
-            "calibration.input_moments to adapt."
+            "initialization 'eva' needs statistics of the inputs: pass the result of "
+            "`input_moments` to `adapt`."
         )
     if moment.shape != (d_in, d_in) or rank > d_in:
         raise ValueError(
-            f"initialization 'eva' needs statistics [{d_in}, {d_in}] and a rank up to {d_in}, got "
-            f"{list(moment.shape)} and {rank}."
+            f"initialization 'eva' needs statistics [{d_in}, {d_in}] and a rank of at most {d_in}, "
+            f"got {list(moment.shape)} and {rank}."
         )
     _, vectors = jnp.linalg.eigh(moment.astype(jnp.float32))
     return vectors[:, ::-1][:, :rank]

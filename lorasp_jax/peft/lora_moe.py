@@ -2,11 +2,11 @@
 
     ΔW(x) = (α/R) Σ_i w_i(x) A_i B_i,    p(x) = softmax(x W_g)
 
-"weighted" takes w = p, as LoRAMoE (Dou et al., arXiv 2312.09979); "top1" keeps the likeliest expert
-alone, as Switch (Fedus et al., arXiv 2101.03961). Both are baselines of LoRA-SP (arXiv 2603.07404),
-whose released code has 4 experts of rank 32 in every linear layer; those are the defaults here.
-The router losses are Switch's and ST-MoE's; LoRAMoE's localised balancing, which needs the
-type of each task, is left out as in that code.
+"weighted" uses w = p, as in LoRAMoE (Dou et al., arXiv 2312.09979); "top1" keeps only the most
+likely expert, as in Switch (Fedus et al., arXiv 2101.03961). Both are baselines of LoRA-SP (arXiv
+2603.07404), whose released code has 4 experts of rank 32 in every linear layer, the defaults here.
+The router losses are those of Switch and ST-MoE. LoRAMoE's localized balancing, which needs a type
+for each task, is omitted, as in the released code.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from lorasp_jax.peft._aux import Aux, masked_mean
 from lorasp_jax.peft._method import Method, Params, kaiming_uniform
-from lorasp_jax.peft.lora_sp.router import bounded
+from lorasp_jax.peft.lora_sp.router import clip_hidden
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,7 +25,7 @@ class LoRAMoE(Method):
     """Mixture of E adapters of rank R each.
 
     Parameters: lora_a [I, E R], lora_b [E R, O], expert i in columns (rows) i R to (i + 1) R, and
-    router [I, E]: (I + O) E R + I E numbers.
+    router [I, E]: (I + O) E R + I E in total.
 
     Raises:
       ValueError: a count or rank below 1, an unknown routing or gate gradient, or "switch" without
@@ -37,15 +37,16 @@ class LoRAMoE(Method):
     rank: int = 32
     """R of each expert."""
     alpha: float | None = None
-    """α of the scale α/R; None is 2 R."""
+    """α of the scale α/R. Defaults to 2 R."""
     routing: Literal["weighted", "top1"] = "weighted"
-    """"weighted": all experts by their probabilities. "top1": for each token its likeliest one."""
+    """"weighted": all experts, weighted by probability. "top1": the most likely one per token."""
     gate_gradient: Literal["hard", "switch"] = "hard"
-    """Only for "top1". "hard": the chosen expert counts 1, so the router learns from its losses
-    alone, as in LoRA-SP's code. "switch": it counts p, through which the task's gradient comes."""
+    """For "top1" only. "hard": the chosen expert has weight 1, so that the router learns from its
+    losses alone, as in LoRA-SP's code. "switch": its weight is p, which passes the task gradient on
+    to the router."""
 
     def __post_init__(self) -> None:
-        """Checks the fields."""
+        """Validate the fields."""
         super().__post_init__()
         if self.experts < 1 or self.rank < 1:
             raise ValueError(
@@ -56,7 +57,7 @@ class LoRAMoE(Method):
 
     @property
     def down_in_fp32(self) -> bool:
-        """True: the router's logits are sums in fp32."""
+        """True: the router's logits stay in fp32."""
         return True
 
     @property
@@ -65,9 +66,9 @@ class LoRAMoE(Method):
         return 2.0 if self.alpha is None else self.alpha / self.rank
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
-        """A and the router uniform, B zero: the delta starts at exactly zero."""
+        """Initialize A and the router uniformly and B to zero; the delta is exactly zero."""
         width = self.experts * self.rank
-        # A and the router both read x and share one distribution: one draw, which compiles once.
+        # A and the router share a distribution: draw them together to compile once.
         inputs = kaiming_uniform(key, (d_in, width + self.experts))
         lora_a, router = jnp.split(inputs, [width], axis=1)
         return {"lora_a": lora_a, "lora_b": jnp.zeros((width, d_out)), "router": router}
@@ -79,13 +80,13 @@ class LoRAMoE(Method):
     def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
-        """Eq. (2) of LoRA-SP's paper: z = scale w(x) x A, a weight for each expert's R columns."""
+        """Eq. (2) of the LoRA-SP paper: z = scale w(x) x A, one weight per expert's R columns."""
         del params
-        projected, logits = jnp.split(rows, [self.experts * self.rank], axis=-1)
-        logits = bounded(logits)
+        expert_inputs, logits = jnp.split(rows, [self.experts * self.rank], axis=-1)
+        logits = clip_hidden(logits)
         probabilities = jax.nn.softmax(logits)
         columns = jnp.repeat(self.scale * self._weights(probabilities), self.rank, axis=-1)
-        z = projected * columns
+        z = expert_inputs * columns
         active = self.rank * (1 if self.routing == "top1" else self.experts)
         losses = {
             "balance": balance_loss(probabilities, token_mask),
@@ -98,55 +99,56 @@ class LoRAMoE(Method):
         return params["lora_b"]
 
     def _weights(self, probabilities: jax.Array) -> jax.Array:
-        """w [..., E] of probabilities [..., E]."""
+        """Expert weights w [..., E] from probabilities [..., E]."""
         if self.routing == "weighted":
             return probabilities
-        chosen = _chosen(probabilities)
-        return chosen if self.gate_gradient == "hard" else chosen * probabilities
+        one_hot = _one_hot_argmax(probabilities)
+        return one_hot if self.gate_gradient == "hard" else one_hot * probabilities
 
     def merge(self, params: Params, kernel: jax.Array) -> jax.Array:
-        """Raises: the delta depends on the input."""
+        """Raise ValueError: the delta depends on the input."""
         del params, kernel
         raise ValueError(
-            "LoRA-MoE's delta depends on the input and cannot be merged into one kernel: keep its "
-            "adapter beside the base."
+            "LoRA-MoE's delta depends on the input and cannot be merged into the kernel: keep the "
+            "adapter separate."
         )
 
 
-def _chosen(probabilities: jax.Array) -> jax.Array:
-    """1 at the largest of probabilities [..., E], the first if several are; it has no gradient."""
+def _one_hot_argmax(probabilities: jax.Array) -> jax.Array:
+    """One-hot argmax of probabilities [..., E], ties to the lowest index. No gradient."""
     return jax.nn.one_hot(probabilities.argmax(-1), probabilities.shape[-1])
 
 
 def balance_loss(probabilities: jax.Array, valid: jax.Array | None) -> jax.Array:
-    """Load balancing, E Σ_i f_i P_i: 1 where all experts are used alike, at most E.
+    """Load balancing, E Σ_i f_i P_i: 1 if all experts are used equally, at most E.
 
-    Fedus et al. (arXiv 2101.03961, eq. 4): f_i is the fraction of valid tokens whose likeliest
+    Fedus et al. (arXiv 2101.03961, eq. 4): f_i is the fraction of valid tokens whose most likely
     expert is i (no gradient), P_i the mean of p_i over valid tokens. All valid tokens are pooled,
-    as in the paper; Hugging Face's Switch averages one such loss per sequence instead.
+    as in the paper; Hugging Face's Switch computes the loss per sequence and averages.
 
     Args:
       probabilities: the router's softmax, f32 [...tokens, E].
-      valid: bool [...tokens], False for padding; None means all are valid.
+      valid: bool [...tokens], False for padding; None if all are valid.
 
     Returns:
-      f32 scalar, 0 without valid tokens.
+      f32 scalar, 0 if no token is valid.
     """
     mean = jax.vmap(masked_mean, in_axes=(-1, None))
-    fractions, shares = mean(_chosen(probabilities), valid), mean(probabilities, valid)
-    return len(shares) * jnp.sum(fractions * shares)
+    fractions = mean(_one_hot_argmax(probabilities), valid)
+    mean_probabilities = mean(probabilities, valid)
+    return len(fractions) * jnp.sum(fractions * mean_probabilities)
 
 
 def z_loss(logits: jax.Array, valid: jax.Array | None) -> jax.Array:
-    """Mean of logsumexp(logits)² over the valid tokens, which keeps logits small.
+    """Mean of logsumexp(logits)² over the valid tokens, which keeps the logits small.
 
-    Zoph et al. (arXiv 2202.08906, eq. 5), with the ln E that zero logits give.
+    Zoph et al. (arXiv 2202.08906, eq. 5), unchanged: zero logits give (ln E)².
 
     Args:
       logits: f32 [...tokens, E].
-      valid: bool [...tokens], False for padding; None means all are valid.
+      valid: bool [...tokens], False for padding; None if all are valid.
 
     Returns:
-      f32 scalar, 0 without valid tokens.
+      f32 scalar, 0 if no token is valid.
     """
     return masked_mean(jnp.square(jax.nn.logsumexp(logits, axis=-1)), valid)

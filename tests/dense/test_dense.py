@@ -68,7 +68,7 @@ def test_layers_of_one_input(x):
         assert jax.tree.structure(aux) == jax.tree.structure(expected)
         for a, b in zip(jax.tree.leaves(aux), jax.tree.leaves(expected), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-5)
-    with pytest.raises(ValueError, match="input of width 4 meets a kernel"):
+    with pytest.raises(ValueError, match="input width 4 does not match kernel shape"):
         dense_shared_input(x[:, :4], [layers[0].arrays()])
 
 
@@ -174,7 +174,7 @@ def test_compute_type(x, dtype, kind, expected):
 
 
 def test_wrong_input_width(net):
-    with pytest.raises(ValueError, match=r"input of width 7 meets a kernel \(5, 6\)"):
+    with pytest.raises(ValueError, match=r"input width 7 does not match kernel shape \[5, 6\]"):
         net(jnp.ones((2, 7)))
 
 
@@ -203,7 +203,7 @@ def test_what_one_more_layer_adds_to_a_program(method, most):
 @pytest.mark.parametrize(
     ("x", "mask", "message"),
     [
-        (jnp.ones((2, 4), int), None, r"floating-point numbers .* got int32 \[2, 4\]"),
+        (jnp.ones((2, 4), int), None, r"floating-point array .* got int32 \[2, 4\]"),
         (jnp.ones(()), None, r"got float32 \[\]"),
         ([[1.0] * 4], None, "got list"),
         (jnp.ones((2, 4)), jnp.ones((3, 3), bool), r"bool \[2\], got bool \[3, 3\]"),

@@ -39,18 +39,21 @@ def with_kernel(value):
     ("call", "message"),
     [
         # methods alone
-        (lambda: METHOD.init(0, KERNEL), "key must be one such as jax.random.key(0), got 0"),
-        (lambda: METHOD.init(nnx.Rngs(0), KERNEL), "key must be one such as"),
-        (lambda: METHOD.apply(PARAMS, X[:, 1:], KERNEL), "width 4 meets a kernel [5, 4]"),
-        (lambda: METHOD.apply(KERNEL, X, PARAMS), "a kernel [I, O] of real numbers, got dict"),
-        (lambda: METHOD.apply({}, X, KERNEL), "lora of a kernel [5, 4] needs lora_a [5, 2]"),
+        (lambda: METHOD.init(0, KERNEL), "key must be a key such as jax.random.key(0), got 0"),
+        (lambda: METHOD.init(nnx.Rngs(0), KERNEL), "key must be a key such as"),
+        (
+            lambda: METHOD.apply(PARAMS, X[:, 1:], KERNEL),
+            "width 4 does not match kernel shape [5, 4]",
+        ),
+        (lambda: METHOD.apply(KERNEL, X, PARAMS), "a floating-point kernel [I, O], got dict"),
+        (lambda: METHOD.apply({}, X, KERNEL), "lora for a kernel [5, 4] needs lora_a [5, 2]"),
         # α/R of another rank would be the scale.
         (
             lambda: LoRA(rank=3, alpha=2.0).apply(PARAMS, X, KERNEL),
-            "lora of a kernel [5, 4] needs lora_a [5, 3], got (5, 2)",
+            "lora for a kernel [5, 4] needs lora_a [5, 3], got (5, 2)",
         ),
         (lambda: LoRA(rank=3).delta(PARAMS, X), "needs lora_a [5, 3], got (5, 2)"),
-        (lambda: METHOD.delta(PARAMS, [1.0]), "floating-point numbers [...tokens, I], got list"),
+        (lambda: METHOD.delta(PARAMS, [1.0]), "a floating-point array [...tokens, I], got list"),
         # One number for three tokens would count three times.
         (
             lambda: MOE.delta(MOE_PARAMS, X, token_mask=jnp.ones(1, bool)),
@@ -62,17 +65,17 @@ def with_kernel(value):
         ),
         (
             lambda: AdaLoRA(rank=2).transform(optax.sgd(0.1), 1.5),
-            "total_steps must be a whole number from 1 to 2147483647, got 1.5",
+            "total_steps must be an integer from 1 to 2147483647, got 1.5",
         ),
         (
             lambda: LoRASP(schedule=EnergySchedule()).transform(optax.sgd(0.1), 0),
-            "total_steps must be a whole number from 1",
+            "total_steps must be an integer from 1",
         ),
         # Linen
-        (lambda: LINEN.init(0, X), "key must be one such as jax.random.key(0), got 0"),
+        (lambda: LINEN.init(0, X), "key must be a key such as jax.random.key(0), got 0"),
         (lambda: LINEN.init({"dropout": KEY}, X), "need a key for \"params\", got ['dropout']"),
-        (lambda: LINEN.attach(None, VARIABLES["params"], X), 'a dictionary with "params"'),
-        (lambda: LINEN.attach(None, {"params": {}}, X), "key must be one such as"),
+        (lambda: LINEN.attach(None, VARIABLES["params"], X), 'a dict whose "params" is a dict'),
+        (lambda: LINEN.attach(None, {"params": {}}, X), "key must be a key such as"),
         (
             lambda: LINEN.apply(with_kernel(None), X),
             '"params" must hold arrays, got None at kernel',
@@ -81,7 +84,7 @@ def with_kernel(value):
         (lambda: LINEN.kernel_shapes({"params": {"a": [None]}}, X), "got None at a/0"),
         (
             lambda: LinenDense(4, param_dtype=int).init(KEY, X),
-            "param_dtype must be a floating-point type",
+            "param_dtype must be a floating-point dtype",
         ),
         # models
         (lambda: count(5), "the model must be an NNX module, got int"),

@@ -163,7 +163,7 @@ def test_a_zero_kernel_starts_at_zero_and_learns():
 
 def test_needs_the_kernels_values():
     shape = jax.ShapeDtypeStruct((D_IN, D_OUT), jnp.float32)
-    with pytest.raises(ValueError, match=r"norms of the kernel .* needs its values.*\(6, 10\)"):
+    with pytest.raises(ValueError, match=r"from the kernel's values, got only the shape \(6, 10\)"):
         METHOD.init(jax.random.key(0), shape)
     shapes, _ = jax.eval_shape(METHOD.init, jax.random.key(0), shape)  # there it is a tracer
     assert {name: leaf.shape for name, leaf in shapes.items()} == {

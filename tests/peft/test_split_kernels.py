@@ -128,7 +128,7 @@ def test_an_adapter_that_holds_a_part_is_not_thrown_away(name):
 
 @SPLIT
 def test_linen_says_that_it_cannot(name):
-    with pytest.raises(ValueError, match="Linen cannot change a kernel"):
+    with pytest.raises(ValueError, match="changes the kernel, which Linen does not allow"):
         LinenDense(14, method=lora(name)).init(jax.random.key(0), X)
     assert isinstance(LinenDense(14, method=LoRA(rank=2)), nn.Module)
 
@@ -139,14 +139,14 @@ def test_values_and_a_fitting_rank_are_needed(name, cls):
     shape = jax.ShapeDtypeStruct((9, 14), jnp.float32)
     with pytest.raises(ValueError, match="values"):
         lora(name, cls).init(jax.random.key(0), shape)
-    with pytest.raises(ValueError, match="a rank up to its smaller side, got rank 10"):
+    with pytest.raises(ValueError, match=r"a rank of at most min\(I, O\), got rank 10"):
         lora(name, cls, rank=10).init(jax.random.key(0), KERNEL)
 
 
 @SPLIT
 def test_a_matrix_is_needed(name):
     with pytest.raises(
-        ValueError, match=r"needs a kernel \[I, O\] of real numbers, got float32 \[2, 9, 14\]"
+        ValueError, match=r"needs a floating-point kernel \[I, O\], got float32 \[2, 9, 14\]"
     ):
         lora(name).init(jax.random.key(0), jnp.zeros((2, 9, 14)))
 

@@ -78,7 +78,7 @@ def test_method_by_name_keeps_the_rank():
         ([*MULTITASK, "--optim.steps", "many"], "--optim.steps.*'many'"),
         ([*MULTITASK, "--peft.energy-target", "1.5"], "^peft: .*1.5"),
         ([*MULTITASK, "--peft.energy-target", "0"], "0"),
-        ([*MULTITASK, "--peft.schedule.start", "2"], r"schedule.start must lie in \(0, 1\], got 2"),
+        ([*MULTITASK, "--peft.schedule.start", "2"], r"schedule.start must be in \(0, 1\], got 2"),
         ([*MULTITASK, "--peft.schedule.strat", "1"], "did you mean --peft.schedule.start?"),
     ],
 )

@@ -6,44 +6,44 @@ import jax.numpy as jnp
 from lorasp_jax.kernels.energy_gate import exact_ratio
 from lorasp_jax.peft._arguments import Shapes
 from lorasp_jax.peft._method import Method, Params
-from lorasp_jax.peft.lora_sp.router import clipped
+from lorasp_jax.peft.lora_sp.router import clip
 
 Bank = dict[str, jax.Array]
 
-LARGEST_READ = 2.0**120
-"""|z| from which on it counts as this much: its sum over a bank has room below 2^128."""
+MAX_Z = 2.0**120
+"""Bound to which |z| is clipped, so that a sum over the bank stays below fp32's 2^128."""
 
 
 def init_bank(key: jax.Array, v: jax.Array, d_out: int, *, normalized: bool) -> Bank:
-    """The bank that starts with V [I, R] and a ΔW of exactly zero: U is zero, or its gain.
+    """Initialize a bank with V [I, R] and ΔW exactly zero: U = 0, or gain = 0 if normalized.
 
     Raises:
-      ValueError: a normalised bank with more directions than either side.
+      ValueError: a normalized bank with R > max(I, O).
     """
     d_in, rank = v.shape
     if not normalized:
         return {"u": jnp.zeros((rank, d_out)), "v": v}
     if rank > max(d_in, d_out):
         raise ValueError(
-            f"a normalised bank of {rank} directions needs a kernel with a side of at least that, "
-            f"got {d_in} x {d_out}."
+            f"a normalized bank needs rank <= max(I, O), got rank {rank} for a kernel "
+            f"[{d_in}, {d_out}]."
         )
     return {"u": jax.random.normal(key, (rank, d_out)), "v": v, "gain": jnp.zeros(())}
 
 
 def normalized_bank(bank: Bank) -> Bank:
-    """The bank for which eq. (4) holds: the scores' energy is that of ΔW, c² Σ_i s_i².
+    """Normalize a bank so that eq. (4) holds: ‖ΔW‖² is the score energy times c², c² Σ_i s_i².
 
-    The rank-one terms u_i v_i are orthonormal in the Frobenius product, which is a product of two,
-    (u_i u_j)(v_i v_j): it is enough that one factor is orthonormal, the one on the wider side, and
-    the other of unit norm. So c is common to all, gain √O; with it the entries of U start to move
-    as fast as those of a bank that is not normalised.
+    The rank-one terms u_i v_i must be orthonormal under the Frobenius inner product, which factors
+    into (u_i u_j)(v_i v_j). It suffices to orthonormalize the factor on the wider side of the
+    kernel and to scale the other's vectors to unit norm. All terms share c = gain √O, which makes
+    the entries of U change at first as fast as in a bank that is not normalized.
 
     Args:
-      bank: u [R, O] and v [I, R], any of full rank, and gain [].
+      bank: u [R, O] and v [I, R], both of full rank, and gain [].
 
     Returns:
-      u [R, O] and v [I, R] that take their place.
+      The normalized u [R, O], scaled by c, and v [I, R].
     """
     u, v = bank["u"], bank["v"]
     if v.shape[0] >= u.shape[1]:
@@ -54,33 +54,33 @@ def normalized_bank(bank: Bank) -> Bank:
 
 
 def _orthonormal(columns: jax.Array) -> jax.Array:
-    """Gram-Schmidt of columns [n, R], R <= n: smooth, as no sign depends on LAPACK's choice."""
+    """Orthonormalize columns [n, R], R <= n. Fixed signs make it smooth; LAPACK's may flip."""
     orthonormal, triangular = jnp.linalg.qr(columns)
     return orthonormal * jnp.where(jnp.diagonal(triangular) < 0, -1.0, 1.0)
 
 
 def apply_masked_scores(
-    projected: jax.Array, scores: jax.Array, mask: jax.Array, energy: jax.Array
+    v_x: jax.Array, scores: jax.Array, mask: jax.Array, energy: jax.Array
 ) -> jax.Array:
-    """Eq. (11): Σ(x) V x with the pruned scores at zero, in the type of `projected` [..., n].
+    """Eq. (11): Σ(x) V x with masked scores at zero, in the dtype of v_x = V x [..., n].
 
-    Scores and mask may be wider; what is beyond n has no direction any more. NaN scores keep no
-    direction, and show all the same: a row whose energy [..., 1] is NaN is all NaN.
+    Scores and mask may be wider than n: the trailing ones belong to pruned directions. NaN scores
+    are masked, but still propagate: a row whose energy [..., 1] is NaN becomes NaN.
     """
-    here, dtype = projected.shape[-1], projected.dtype
-    if here < scores.shape[-1]:
-        scores, mask = scores[..., :here], mask[..., :here]
-    largest = min(LARGEST_READ, float(jnp.finfo(dtype).max))
-    product = clipped(projected.astype(jnp.float32) * scores, largest)
+    n, dtype = v_x.shape[-1], v_x.dtype
+    if n < scores.shape[-1]:
+        scores, mask = scores[..., :n], mask[..., :n]
+    limit = min(MAX_Z, float(jnp.finfo(dtype).max))
+    product = clip(v_x.astype(jnp.float32) * scores, limit)
     return jnp.where(mask, product, 0 * jax.lax.stop_gradient(energy)).astype(dtype)
 
 
 class BankMethod(Method):
-    """What methods share whose router weighs the directions of a bank for each token.
+    """Base of methods whose router scores the directions of a bank for each token.
 
-    Parameters: bank.u [R, O], bank.v [I, R], bank.gain [] if the bank is normalised; router.w1
-    [I, H] and what else the router has. Pruning drops directions from the bank alone: the router
-    still scores them, behind the R others, as their energy counts in E_k.
+    Parameters: bank.u [R, O], bank.v [I, R], bank.gain [] if the bank is normalized; router.w1
+    [I, H] and the router's other arrays. Pruning removes directions from the bank only. The router
+    still scores them, after the R remaining ones, because their energy is part of E_k.
     """
 
     rank: int
@@ -89,7 +89,7 @@ class BankMethod(Method):
     normalized_bank: bool
 
     def __post_init__(self) -> None:
-        """Checks the fields."""
+        """Validate the fields."""
         super().__post_init__()
         exact_ratio(self.energy_target)
         if self.rank < 1:
@@ -102,7 +102,7 @@ class BankMethod(Method):
 
     @property
     def score_arrays(self) -> tuple[str, ...]:
-        """Names of the router's arrays whose last axis is that of the scores."""
+        """Names of the router's arrays whose last axis indexes the scores."""
         raise NotImplementedError
 
     def down(self, params: Params) -> jax.Array:
@@ -110,7 +110,7 @@ class BankMethod(Method):
         return jnp.concatenate([self._bank(params)["v"], params["router"]["w1"]], axis=1)
 
     def bottleneck_params(self, params: Params) -> Params:
-        """The router but for W1, and what is neither bank nor router."""
+        """The router without W1, and everything outside bank and router."""
         router = {name: p for name, p in params["router"].items() if name != "w1"}
         others = {name: p for name, p in params.items() if name not in ("bank", "router")}
         return {"router": router, **others}
@@ -122,17 +122,18 @@ class BankMethod(Method):
     def _bank(self, params: Params) -> Params:
         return normalized_bank(params["bank"]) if self.normalized_bank else params["bank"]
 
-    def shapes(self, made: Shapes, found: Shapes) -> Shapes:
-        """`made`, but for a router that scores more directions than the bank has left."""
-        scored = [f"router/{name}" for name in self.score_arrays]
-        sides = [found[name][-1] for name in scored if found.get(name)]
-        widest = max([self.rank, *sides])
-        return made | {name: (*made[name][:-1], widest) for name in scored if name in made}
+    def shapes(self, initial: Shapes, actual: Shapes) -> Shapes:
+        """`initial`, except that the router may score more directions than the bank has left."""
+        paths = [f"router/{name}" for name in self.score_arrays]
+        num_scores = max([self.rank, *(actual[path][-1] for path in paths if actual.get(path))])
+        return initial | {
+            path: (*initial[path][:-1], num_scores) for path in paths if path in initial
+        }
 
     def merge(self, params: Params, kernel: jax.Array) -> jax.Array:
-        """Raises: the delta depends on the input."""
+        """Raise ValueError: the delta depends on the input."""
         del params, kernel
         raise ValueError(
-            "LoRA-SP chooses its directions per input and cannot be merged into one kernel; "
-            "prune it (drop directions that stay inactive) or distill it into a LoRA first."
+            "LoRA-SP chooses its directions per input and cannot be merged into the kernel; "
+            "distill it into a LoRA first."
         )

@@ -1,9 +1,9 @@
-"""LoRA-SP for one token at a time, reading only the directions that are active.
+"""LoRA-SP for a single token, which loads only the active directions.
 
-A dense product with the bank costs the same whatever the mask says. For a single token the bank's
-memory traffic is the cost, and reading k of R rows of U and Vᵀ saves most of it. For several tokens
-each has its own directions, and the dense product is the better one; hence one token only. Where it
-pays is measured by `python -m benchmarks.decoding`.
+A dense matmul with the bank costs the same for any mask. A single token is bound by the memory
+traffic of the bank, most of which is saved by gathering k of R rows of U and Vᵀ. Several tokens
+have different directions, and then the dense matmul is faster; hence a single token only.
+`python -m benchmarks.decoding` measures where it pays off.
 """
 
 from typing import NamedTuple
@@ -19,7 +19,7 @@ from lorasp_jax.peft.lora_sp.router import router_scores
 
 
 class DecodingParams(NamedTuple):
-    """A layer's adapter, laid out so that a direction is contiguous in memory."""
+    """A layer's adapter, with each direction contiguous in memory."""
 
     u: jax.Array
     """[R, O]."""
@@ -28,18 +28,18 @@ class DecodingParams(NamedTuple):
     w1: jax.Array
     """[I, H]."""
     router: dict[str, jax.Array]
-    """The rest of the router."""
+    """The router without W1."""
 
 
 def prepare(method: LoRASP, params: Params, dtype: jax.typing.DTypeLike) -> DecodingParams:
-    """The parameters of one layer for `decode`, bank and W1 in the type of the computation.
+    """Convert the parameters of one layer for `decode`, with bank and W1 in the compute dtype.
 
     Raises:
-      ValueError: a method whose masks depend on more than the token.
+      ValueError: the masks of the method depend on more than the token.
     """
     if (method.granularity, method.schedule) != ("token", None):
         raise ValueError(
-            f"decoding by token needs granularity 'token' and no schedule, got {method}."
+            f"decoding single tokens needs granularity 'token' and no schedule, got {method}."
         )
     bank = normalized_bank(params["bank"]) if method.normalized_bank else params["bank"]
     router = dict(params["router"])
@@ -50,29 +50,30 @@ def prepare(method: LoRASP, params: Params, dtype: jax.typing.DTypeLike) -> Deco
 def decode(
     method: LoRASP, params: DecodingParams, x: jax.Array, *, capacity: int
 ) -> tuple[jax.Array, jax.Array]:
-    """The delta of one token from its active directions: z = Σ(x) V x, then z U, by gathered rows.
+    """Compute the delta of one token from gathered rows of the bank: z = Σ(x) V x, then z U.
 
     Args:
       method: static.
       params: from `prepare`.
-      x: [I], in the type given there.
-      capacity: most directions that are read, 1 to R, static.
+      x: [I], in the compute dtype.
+      capacity: maximum number of directions to gather, 1 to R, static.
 
     Returns:
-      delta [O], that of `method.delta` to rounding while at most `capacity` directions are active;
-      and how many active ones found no room, int32 []. Those with the lowest scores are left out.
+      delta [O], equal to `method.delta` up to rounding if at most `capacity` directions are active;
+      and the number of active directions beyond `capacity`, int32 []. Those with the lowest scores
+      are left out.
 
     Raises:
-      ValueError: a capacity outside 1 to R, or more than one token.
+      ValueError: `capacity` is not in 1 to R, or x has more than one token.
     """
     if not 1 <= capacity <= method.rank or x.ndim != 1:
         raise ValueError(
-            f"decode takes one token [I] and a capacity of 1 to {method.rank}, got "
+            f"decode needs a single token [I] and a capacity of 1 to {method.rank}, got "
             f"{list(x.shape)} and {capacity}."
         )
     scores, _ = router_scores(params.router, x @ params.w1, method.router)
     mask, _, energy = energy_gate(scores, method.energy_target)
     mask, scores = mask[: method.rank], scores[: method.rank]
-    largest, index = jax.lax.top_k(jnp.where(mask, scores, 0), capacity)
-    z = apply_masked_scores(params.v[index] @ x, method.scale * largest, largest > 0, energy)
+    top_scores, index = jax.lax.top_k(jnp.where(mask, scores, 0), capacity)
+    z = apply_masked_scores(params.v[index] @ x, method.scale * top_scores, top_scores > 0, energy)
     return z @ params.u[index], jnp.maximum(mask.sum() - capacity, 0)

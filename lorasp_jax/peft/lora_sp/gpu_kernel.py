@@ -1,6 +1,6 @@
-"""LoRA-SP between its two matrix products as one GPU kernel, for the default router and gate.
+"""`LoRASP.bottleneck` as a single GPU kernel, for the default router and gate.
 
-Layers that read one input share a kernel, which finds their columns side by side.
+Layers with a shared input share one launch, with their columns concatenated.
 """
 
 import dataclasses
@@ -22,33 +22,33 @@ from lorasp_jax.peft.lora_sp.router import router_scores
 
 @dataclasses.dataclass(frozen=True)
 class FusedBottleneck(BatchedBottleneck):
-    """`LoRASP.bottleneck` with a router "gelu", masks by token and a constant η."""
+    """`LoRASP.bottleneck` with router "gelu", one mask per token and a constant η."""
 
     rank: int
     hidden_width: int
     energy_target: float
     scale: float
     interpret: bool = False
-    """Run the kernels' bodies without a GPU, slowly."""
+    """Interpret the kernels, which is slow but needs no GPU."""
 
     @property
-    def fits(self) -> bool:
-        """Whether Triton takes the sides: blocks with powers of two, products of 16 or more."""
-        sides = self.rank, self.hidden_width
-        return all(side >= 16 and side.bit_count() == 1 for side in sides)
+    def is_supported(self) -> bool:
+        """Whether Triton supports the sizes: powers of two, and at least 16 for its matmuls."""
+        sizes = self.rank, self.hidden_width
+        return all(size >= 16 and size.bit_count() == 1 for size in sizes)
 
     def pack(self, params: Any) -> Any:
-        """The router's numbers in a row."""
+        """Pack the router into one flat array."""
         return PackedTree.of(params["router"])
 
     def bottleneck_all(
         self, params: Any, projected: jax.Array, columns: range, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
-        """As `BatchedBottleneck.bottleneck_all`."""
+        """See `BatchedBottleneck.bottleneck_all`."""
         tokens, n = projected.shape[:-1], len(columns)
         valid = jnp.ones(tokens, bool) if token_mask is None else token_mask
         z, sums, statistics = rowwise_kernel(
-            functools.partial(route, energy_target=self.energy_target, scale=self.scale),
+            functools.partial(bottleneck_block, energy_target=self.energy_target, scale=self.scale),
             params,
             projected.reshape(-1, projected.shape[-1]),
             (self.rank, self.hidden_width),
@@ -61,32 +61,33 @@ class FusedBottleneck(BatchedBottleneck):
         return z.reshape(*tokens, z.shape[-1]), aux
 
 
-def route(
+def bottleneck_block(
     router: dict[str, jax.Array],
     columns: list[jax.Array],
     valid: jax.Array,
-    kept: jax.Array | None,
+    mask: jax.Array | None,
     *,
     energy_target: float,
     scale: float,
 ) -> tuple[jax.Array, LossSums, jax.Array, list[jax.Array]]:
-    """A block of n rows, within the kernel.
+    """Compute the bottleneck for a block of n rows, inside the kernel.
 
     Args:
       router: b1 [H], w2 [H, R], b2 [R].
-      columns: V x [n, R] and W1 x [n, H] in one type.
+      columns: V x [n, R] and W1 x [n, H], of the same dtype.
       valid: bool [n, 1], False for padding.
-      kept: bool [n, R], the gate's mask where it is known already; it has no gradient.
+      mask: bool [n, R], the gate's mask if already known, else None; it has no gradient.
       energy_target: η.
       scale: α/R.
 
     Returns:
-      z [n, R], the losses' sums over rows, the mask, and f32 [n, 1] each active rank and kept
-      energy.
+      z [n, R], the losses' sums over rows, the mask, and active rank and kept energy, f32 [n, 1]
+      each.
     """
     v_x, hidden = columns
     scores, logits = router_scores(router, hidden, "gelu")
-    mask = energy_gate(scores, energy_target, implementation="block")[0] if kept is None else kept
+    if mask is None:
+        mask = energy_gate(scores, energy_target, implementation="block")[0]
     energy = kept_energy(scores, mask)[:, None]
     z = apply_masked_scores(v_x, scale * scores, mask, energy)
     active_rank = mask.astype(jnp.float32).sum(-1, keepdims=True)

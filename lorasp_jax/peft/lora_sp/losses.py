@@ -1,6 +1,6 @@
 """LoRA-SP's auxiliary losses, eqs. (13) and (14) of the paper (arXiv 2603.07404), in fp32.
 
-A layer sums over its valid tokens what they need; padding stays out.
+Each layer sums the quantities they need over its valid tokens, excluding padding.
 """
 
 import dataclasses
@@ -15,27 +15,28 @@ from lorasp_jax.kernels.energy_gate import energy_share
 
 
 class LossSums(NamedTuple):
-    """What the auxiliary losses need, summed over the valid rows: f32 [1], kept and share [R]."""
+    """Sums over the valid rows, from which the losses are computed. f32 [1], kept and share [R]."""
 
     rows: jax.Array
+    """1 for each valid row."""
     spectral: jax.Array
     """1 - E_k."""
     z: jax.Array
-    """Squared mean logit, on the scale of exponentials."""
+    """(logsumexp(logits) - ln n)² for n logits."""
     kept: jax.Array
-    """1 for each kept direction; no gradient."""
+    """Active directions, 0 or 1 each; no gradient."""
     share: jax.Array
-    """Share of the energy."""
+    """Each direction's share of the energy."""
 
 
 def loss_sums(
-    scores: jax.Array, logits: jax.Array, mask: jax.Array, energy: jax.Array, counts: jax.Array
+    scores: jax.Array, logits: jax.Array, mask: jax.Array, energy: jax.Array, valid: jax.Array
 ) -> LossSums:
-    """The sums for scores and mask [n, R], logits [n, :], kept energy and counts [n, 1].
+    """Sum over n rows: scores and mask [n, R], logits [n, :], kept energy and valid [n, 1].
 
-    A row of zeros is not valid: it teaches the router nothing. NaN shows in the sums.
+    Rows with all-zero scores are excluded: they carry no signal for the router. NaN propagates.
     """
-    valid = (scores.max(-1, keepdims=True) != 0) & counts
+    valid = (scores.max(-1, keepdims=True) != 0) & valid
     mean_logit = jax.nn.logsumexp(logits, axis=-1, keepdims=True) - math.log(logits.shape[-1])
 
     def total(values: jax.Array) -> jax.Array:
@@ -53,14 +54,14 @@ def loss_sums(
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class Losses(Mapping[str, jax.Array]):
-    """The auxiliary losses of eq. (14) by name, f32, of one layer or of several, [L].
+    """The auxiliary losses of eq. (14) by name: f32 [], or [L] for stacked layers.
 
-    They are computed where they are asked for: of stacked layers all at once, not in each layer in
-    a dozen steps on a few numbers.
+    They are computed on access: once for all stacked layers, instead of a dozen tiny operations in
+    each layer.
     """
 
     sums: LossSums
-    """[L, ...] for several layers."""
+    """With a leading axis [L, ...] for stacked layers."""
 
     def __getitem__(self, name: str) -> jax.Array:
         return _LOSSES[name](self.sums)
@@ -80,22 +81,22 @@ def spectral_loss(sums: LossSums) -> jax.Array:
 
 @jax.jit
 def balance_loss(sums: LossSums) -> jax.Array:
-    """Balance term of eq. (14): R Σ_i f_i P_i, 1 where all directions are used alike.
+    """Balance term of eq. (14): R Σ_i f_i P_i, 1 if all directions are used equally.
 
-    The load-balancing loss of Fedus et al. (arXiv 2101.03961, eq. 4) for k(x) choices a token: f_i
-    is direction i's share of all kept places (no gradient), P_i its mean share of the energy.
+    The load-balancing loss of Fedus et al. (arXiv 2101.03961, eq. 4) for k(x) choices per token:
+    f_i is direction i's share of all active directions (no gradient), P_i its mean energy share.
     """
     kept = jax.lax.stop_gradient(sums.kept)
-    used = kept / jnp.maximum(kept.sum(-1, keepdims=True), 1)
-    return kept.shape[-1] * _mean(jnp.sum(used * sums.share, -1, keepdims=True), sums)
+    frequency = kept / jnp.maximum(kept.sum(-1, keepdims=True), 1)
+    return kept.shape[-1] * _mean(jnp.sum(frequency * sums.share, -1, keepdims=True), sums)
 
 
 @jax.jit
 def z_loss(sums: LossSums) -> jax.Array:
-    """z term of eq. (14): (logsumexp(logits) - ln n)², n = logits' width, over valid rows.
+    """z term of eq. (14): mean of (logsumexp(logits) - ln n)² over valid rows, for n logits.
 
-    Zoph et al. (arXiv 2202.08906, eq. 5) without the ln n, which would push the logits of a wide
-    router down even where they are all zero.
+    Zoph et al. (arXiv 2202.08906, eq. 5) do not subtract ln n, and so push down the logits of a
+    wide router even when they are all zero.
     """
     return _mean(sums.z, sums)
 

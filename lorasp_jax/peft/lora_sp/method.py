@@ -1,8 +1,8 @@
 """LoRA-SP, Select-Prune (arXiv 2603.07404): a wide bank of rank-one directions, pruned per token.
 
-A small router scores the R directions of a bank for each token; only the fewest whose squared
-scores reach the energy target η stay active. `reference` is the paper in sixty lines; the functions
-that `LoRASP.bottleneck` puts together here compute the same, and faster:
+A small router scores the R directions of a bank for each token; only the smallest set whose squared
+scores reach the energy target η stays active. `reference` implements the paper in sixty lines.
+`LoRASP.bottleneck` computes the same result faster, from these functions:
 
     (10) scores       s(x) = router(x) >= 0                           `router.router_scores`
     (12) energy gate  smallest k with E_k(x) >= η                     `energy_gate`
@@ -10,8 +10,8 @@ that `LoRASP.bottleneck` puts together here compute the same, and faster:
     (13) spectral     L_spec(x) = 1 - E_k(x)                          `losses.spectral_loss`
     (14) router       L_router: balance and z                         `balance_loss`, `z_loss`
 
-Where the paper is silent (activation, initialisation, scale, form of the router losses) the choices
-are this project's; each is stated where it is made.
+The paper leaves the activation, initialization, scale and form of the router losses open. The
+choices here are our own, documented where they are made.
 """
 
 import dataclasses
@@ -33,65 +33,65 @@ from lorasp_jax.peft.lora_sp.router import (
     pooled_scores,
     router_scores,
 )
-from lorasp_jax.peft.lora_sp.schedule import PROGRESS, EnergySchedule, gate_at, scheduling
+from lorasp_jax.peft.lora_sp.schedule import PROGRESS, EnergySchedule, scheduled_gate, with_schedule
 
 
 @dataclasses.dataclass(frozen=True)
 class LoRASP(BankMethod):
     """Adapter with an input-dependent active rank.
 
-    Parameters: bank.u [R, O], bank.v [I, R]; router.w1 [I, H], w2 [H, R] and, but for a "softmax"
-    router, b1 [H], b2 [R]. With H the hidden width: R (I + O) + H (I + R), and H + R biases. One
-    number more each for a normalised bank (bank.gain) and for a moving η (progress).
+    Parameters: bank.u [R, O], bank.v [I, R]; router.w1 [I, H], w2 [H, R] and, unless the router is
+    "softmax", b1 [H], b2 [R]. In total R (I + O) + H (I + R), plus H + R for the biases. A
+    normalized bank adds a scalar (bank.gain), and so does a schedule of η (progress).
 
     Raises:
       ValueError: a rank or width below 1, or η outside (0, 1].
     """
 
     rank: int = 128
-    """R, size of the bank; it may exceed the kernel's sides (paper: 128 everywhere)."""
+    """R, size of the bank; it may exceed I and O (128 throughout the paper)."""
     energy_target: float = 0.9
-    """η, read as an exact decimal."""
+    """η, interpreted as an exact decimal fraction."""
     alpha: float | None = None
-    """α of the scale α/R; None is 2 R."""
+    """α of the scale α/R. Defaults to 2 R."""
     hidden_width: int = 32
     """H, width of the router's hidden layer."""
     router: Router = "gelu"
-    """"gelu": a GELU layer with biases and softplus scores, 1 at the start. "gelu_relu",
-    "gelu_softmax": the same with ReLU, or with R times the softmax over the directions. "softmax":
-    softmax over H, no biases, second layer starting as a 0/1 matrix (paper's Table I)."""
+    """"gelu": GELU hidden layer with biases, softplus scores that are initially 1. "gelu_relu": the
+    same with ReLU scores. "gelu_softmax": the same with R times the softmax over directions.
+    "softmax": softmax hidden layer, no biases, 0/1 matrix as initial second layer (Table I)."""
     granularity: Granularity = "token"
-    """What shares a mask, that of its `pooled_scores`: nothing ("token"), the tokens of a "sample"
-    (the last token axis), or all of a "layer" (the whole batch)."""
+    """Scope of a mask: one per "token", per "sample" (shared over the last token axis), or per
+    "layer" (shared over the whole batch). Shared masks use `pooled_scores`."""
     schedule: EnergySchedule | None = None
-    """How η reaches `energy_target` while training; None: it is that from the start."""
+    """Training schedule of η, ending at `energy_target`; None keeps η constant."""
     normalized_bank: bool = False
-    """Keep the bank's directions orthonormal, so that the scores' energy is that of ΔW and eq. (4),
-    ‖ΔW - ΔW_k‖ = √(1 - E_k) ‖ΔW‖, holds (see `bank`). Needs a side of at least R."""
+    """Keep the bank's directions orthonormal, so that score energy equals ΔW energy and eq. (4),
+    ‖ΔW - ΔW_k‖ = √(1 - E_k) ‖ΔW‖, holds (see `bank`). Requires R <= max(I, O)."""
 
     def __post_init__(self) -> None:
-        """Checks the fields."""
+        """Validate the fields."""
         super().__post_init__()
         if self.hidden_width < 1:
             raise ValueError(f"hidden_width must be at least 1, got {self.hidden_width}.")
 
     @classmethod
     def paper(cls, *, rank: int = 128, energy_target: float = 0.9) -> "LoRASP":
-        """The router whose parameter count is that of Table I: softmax over 4, no biases.
+        """Configuration with the parameter count of Table I: router "softmax" of hidden width 4.
 
-        The width is not in the paper; 4 is the only one that reproduces both of its percentages.
+        The paper does not state the width; only 4 reproduces both of its percentages.
         """
         return cls(rank=rank, energy_target=energy_target, hidden_width=4, router="softmax")
 
     @property
     def score_arrays(self) -> tuple[str, ...]:
-        """Names of the router's arrays whose last axis is that of the scores."""
+        """Names of the router's arrays whose last axis indexes the scores."""
         return "w2", "b2"
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
-        """V and the router random, U (or its gain) zero: the delta starts at exactly zero."""
+        """Initialize V and the router randomly, U (or its gain) to zero; the delta is zero."""
         input_key, score_key = jax.random.split(key)
-        # V and W1 both read x and share one distribution: one draw, which compiles once.
+        # V and W1 share a distribution: draw them together to compile once.
         inputs = kaiming_uniform(input_key, (d_in, self.rank + self.hidden_width))
         v, w1 = jnp.split(inputs, [self.rank], axis=1)
         bank_key = jax.random.fold_in(key, 1)
@@ -103,42 +103,44 @@ class LoRASP(BankMethod):
     def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
-        """z = scale Σ(x) V x of eq. (9) from x [V, W1], with the gate's statistics and losses."""
+        """z = scale Σ(x) V x of eq. (9) from x [V, W1], and the gate's statistics and losses."""
         tokens = rows.shape[:-1]
         valid = jnp.ones(tokens, bool) if token_mask is None else token_mask
-        projected, hidden = jnp.split(rows.reshape(-1, rows.shape[-1]), [self.rank], axis=1)
+        v_x, hidden = jnp.split(rows.reshape(-1, rows.shape[-1]), [self.rank], axis=1)
         scores, logits = router_scores(params["router"], hidden, self.router)
         mask = self._mask(params, scores, valid)
         energy = kept_energy(scores, mask)[:, None]
-        z = apply_masked_scores(projected, self.scale * scores, mask, energy)
+        z = apply_masked_scores(v_x, self.scale * scores, mask, energy)
         sums = loss_sums(scores, logits, mask, energy, valid.reshape(-1, 1))
         active_rank = mask.astype(jnp.float32).sum(-1).reshape(tokens)
         aux = Aux(active_rank, energy.reshape(tokens), Losses(sums), usage=sums.kept)
         return z.reshape(*tokens, self.rank), aux
 
     def _mask(self, params: Params, scores: jax.Array, valid: jax.Array) -> jax.Array:
-        """The gate's mask, bool like scores [T, R or more]; what was pruned is never kept."""
+        """Bool mask of the gate, shaped like scores [T, >= R]; False for pruned directions."""
         by_token = scores.reshape(*valid.shape, scores.shape[-1])
         pooled = pooled_scores(by_token, valid, self.granularity)
         if self.schedule is None:
             mask, _, _ = energy_gate(pooled, self.energy_target)
         else:
-            mask = gate_at(pooled, self.schedule.target(params[PROGRESS], self.energy_target))
+            mask = scheduled_gate(
+                pooled, self.schedule.target(params[PROGRESS], self.energy_target)
+            )
         if scores.shape[-1] > self.rank:
             mask &= jnp.arange(scores.shape[-1]) < self.rank
         return jnp.broadcast_to(mask, by_token.shape).reshape(scores.shape)
 
     def fused_kernel(self, params: Params) -> FusedBottleneck | None:
-        """All of `bottleneck` as one kernel on an NVIDIA GPU, for the default router and gate."""
-        scored = params["router"]["w2"].shape[-1]
+        """A fused kernel for NVIDIA GPUs, for the default router and gate."""
+        num_scores = params["router"]["w2"].shape[-1]
         default = (self.router, self.granularity, self.schedule) == ("gelu", "token", None)
-        if not default or scored > self.rank or default_implementation(scored) != "pallas":
+        if not default or num_scores > self.rank or default_implementation(num_scores) != "pallas":
             return None
-        route = FusedBottleneck(self.rank, self.hidden_width, self.energy_target, self.scale)
-        return route if route.fits else None
+        kernel = FusedBottleneck(self.rank, self.hidden_width, self.energy_target, self.scale)
+        return kernel if kernel.is_supported else None
 
     def transform(
         self, optimizer: optax.GradientTransformation, total_steps: int
     ) -> optax.GradientTransformation:
-        """The optimizer, which also moves a scheduled η over its `total_steps` steps."""
-        return optimizer if self.schedule is None else scheduling(optimizer, total_steps)
+        """Wrap the optimizer to advance a scheduled η over `total_steps` steps."""
+        return optimizer if self.schedule is None else with_schedule(optimizer, total_steps)

@@ -1,12 +1,12 @@
-"""LoRA-SP as the paper writes it (arXiv 2603.07404), in plain JAX: read this first.
+"""LoRA-SP as in the paper (arXiv 2603.07404), in plain JAX. Start reading here.
 
     y = x W + ΔW(x) x,    ΔW(x) = U Σ(x) V                                        (9)
 
-W is frozen. V reads R directions from the input and U writes them to the output. For each token a
-small router scores the directions; only the fewest that hold a share η of the energy stay active.
-`lorasp_jax.peft.lora_sp.method` computes the same, faster; a test holds it to this file.
+W is frozen. V projects the input onto R directions, U maps these to the output. For each token a
+small router scores the directions; only the smallest set that holds a fraction η of the energy
+stays active. `lorasp_jax.peft.lora_sp.method` computes the same faster; a test compares the two.
 
-T tokens, I inputs, O outputs, R directions, H the router's hidden width.
+T: tokens, I: input width, O: output width, R: directions, H: the router's hidden width.
 """
 
 import math
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 
 def router_scores(router: dict[str, jax.Array], x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Eq. (10): scores s(x) >= 0 and the logits behind them, both [T, R]."""
+    """Eq. (10): scores s(x) >= 0 and the logits before the softplus, both [T, R]."""
     hidden = jax.nn.gelu(x @ router["w1"] + router["b1"])
     logits = hidden @ router["w2"] + router["b2"]
     return jax.nn.softplus(logits), logits
@@ -29,9 +29,9 @@ def update(bank: dict[str, jax.Array], x: jax.Array, scores: jax.Array) -> jax.A
 
 
 def energy_gate(scores: jax.Array, energy_target: float) -> tuple[jax.Array, jax.Array]:
-    """Eq. (12): keep the k largest scores, k the smallest with E_k(x) >= η; ties by index.
+    """Eq. (12): keep the k largest scores for the smallest k with E_k(x) >= η, ties by index.
 
-    Returns the mask, bool [T, R], a constant to the gradient, and E_k(x), [T].
+    Returns the mask, bool [T, R], without a gradient, and E_k(x), [T].
     """
     energy = scores**2
     order = jnp.argsort(-jax.lax.stop_gradient(energy), axis=-1)
@@ -44,18 +44,18 @@ def energy_gate(scores: jax.Array, energy_target: float) -> tuple[jax.Array, jax
 
 def losses(scores: Any, logits: Any, mask: Any, kept_energy: Any) -> dict[str, jax.Array]:
     """Eq. (13), L_spec = 1 - E_k(x), and the balance and z terms of eq. (14), means over tokens."""
-    frequency = mask.mean(0) / mask.mean(0).sum()  # how often each direction is kept
-    share = jnp.mean(scores**2 / (scores**2).sum(-1, keepdims=True), axis=0)  # its energy
+    frequency = mask.mean(0) / mask.mean(0).sum()  # share of active directions
+    share = jnp.mean(scores**2 / (scores**2).sum(-1, keepdims=True), axis=0)  # share of the energy
     num_directions = scores.shape[-1]
-    size = jax.nn.logsumexp(logits, axis=-1) - math.log(num_directions)
+    mean_logit = jax.nn.logsumexp(logits, axis=-1) - math.log(num_directions)
     balance = num_directions * jnp.sum(frequency * share)
-    return {"spectral": jnp.mean(1 - kept_energy), "balance": balance, "z": jnp.mean(size**2)}
+    return {"spectral": jnp.mean(1 - kept_energy), "balance": balance, "z": jnp.mean(mean_logit**2)}
 
 
 def lora_sp(
     params: Any, x: jax.Array, kernel: jax.Array, energy_target: float = 0.9, scale: float = 2.0
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Eqs. (9)-(14): y [T, O] for x [T, I] and W [I, O], and the losses of eq. (14)."""
+    """Eqs. (9)-(14): y [T, O] for x [T, I] and W [I, O], and the losses of eqs. (13), (14)."""
     scores, logits = router_scores(params["router"], x)
     mask, kept_energy = energy_gate(scores, energy_target)
     y = x @ jax.lax.stop_gradient(kernel) + scale * update(params["bank"], x, mask * scores)

@@ -1,8 +1,8 @@
-"""An energy target η that moves while training.
+"""Schedule of the energy target η during training.
 
-The share of the training that is done lies in the adapter's own parameters, as `progress`, so that
-it reaches a layer inside any model, scanned, rematerialised or sharded, is saved and resumed with
-it, and changes nothing that is compiled. The optimizer moves it (`scheduling`), never the gradient.
+The training progress is stored among the adapter's parameters, as `progress`. It thus reaches the
+layers of any model, scanned, rematerialized or sharded, is saved and resumed with it, and never
+triggers recompilation. Only the optimizer (`with_schedule`) updates it; it has no gradient.
 """
 
 import dataclasses
@@ -23,43 +23,43 @@ PROGRESS = "progress"
 
 @dataclasses.dataclass(frozen=True)
 class EnergySchedule:
-    """How η goes from a start to its target.
+    """Schedule from an initial η to the energy target.
 
     Raises:
-      ValueError: a start or a share outside (0, 1], or an unknown curve.
+      ValueError: `start` or `share` outside (0, 1], or an unknown curve.
     """
 
     start: float = 1.0
-    """η at the first step; at 1 nothing is pruned."""
+    """Initial η; 1 prunes nothing."""
     curve: Literal["linear", "cosine"] = "linear"
-    """"cosine": half a period of it, flat at both ends."""
+    """Interpolation from `start` to the target; "cosine" is half a period, flat at both ends."""
     share: float = 0.5
-    """Share of the steps in which it gets there."""
+    """Fraction of the training steps after which η reaches the target."""
 
     def __post_init__(self) -> None:
-        """Checks the fields."""
+        """Validate the fields."""
         _fields.check_fields(self, "schedule.")
         for name in ("start", "share"):
             if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"schedule.{name} must lie in (0, 1], got {getattr(self, name)}.")
+                raise ValueError(f"schedule.{name} must be in (0, 1], got {getattr(self, name)}.")
 
     def target(self, progress: jax.Array, end: float) -> jax.Array:
-        """η, f32 [].
+        """η at the given progress, f32 [].
 
         Args:
-          progress: f32 [], share of the training that is done.
-          end: η once `share` of the training is done.
+          progress: f32 [], fraction of the training steps taken.
+          end: final η, reached at progress `share`.
         """
-        done = jnp.clip(jax.lax.stop_gradient(progress) / self.share, 0, 1)
+        fraction = jnp.clip(jax.lax.stop_gradient(progress) / self.share, 0, 1)
         if self.curve == "cosine":
-            done = (1 - jnp.cos(math.pi * done)) / 2
-        return self.start + (end - self.start) * done
+            fraction = (1 - jnp.cos(math.pi * fraction)) / 2
+        return self.start + (end - self.start) * fraction
 
 
-def gate_at(scores: jax.Array, target: jax.Array) -> jax.Array:
+def scheduled_gate(scores: jax.Array, target: jax.Array) -> jax.Array:
     """The mask of `energy_gate`, bool [..., R], for a traced η f32 [].
 
-    As exact as η itself, which is the fp32 number here and not a decimal.
+    Exact for η as an fp32 number; `energy_gate` instead takes η as a decimal fraction.
     """
     constant = jnp.abs(jax.lax.stop_gradient(scores.astype(jnp.float32)))
     below_one = bisected_mask(constant, Ratio(jnp.maximum(target, MIN_TARGET), 1))
@@ -67,19 +67,19 @@ def gate_at(scores: jax.Array, target: jax.Array) -> jax.Array:
 
 
 class ScheduleState(NamedTuple):
-    """Steps taken, int32 [], and the state of the optimizer inside."""
+    """Steps taken, int32 [], and the state of the wrapped optimizer."""
 
     step: jax.Array
     inner: Any
 
 
-def scheduling(
+def with_schedule(
     optimizer: optax.GradientTransformation, total_steps: int
 ) -> optax.GradientTransformation:
-    """The optimizer, after each step of which every `progress` is the share of steps taken.
+    """Wrap an optimizer so that each step sets every `progress` to the fraction of steps taken.
 
-    It wraps the whole optimizer: nothing else decays or moves the value. Wrapping twice is the same
-    as once.
+    Wrap the complete optimizer, so that no weight decay or other update changes the value. Wrapping
+    twice is equivalent to wrapping once.
     """
     _fields.positive_int("total_steps", total_steps)
 
@@ -88,14 +88,14 @@ def scheduling(
 
     def update(updates: Any, state: Any, params: Any = None) -> Any:
         updates, inner = optimizer.update(updates, state.inner, params)
-        done = (state.step + 1) / total_steps
+        progress = (state.step + 1) / total_steps
 
-        def move(update: Any, node: Any) -> Any:
+        def set_progress(update: Any, node: Any) -> Any:
             if not _has_progress(node):
                 return update
-            return {**update, PROGRESS: (done - node[PROGRESS]).astype(node[PROGRESS].dtype)}
+            return {**update, PROGRESS: (progress - node[PROGRESS]).astype(node[PROGRESS].dtype)}
 
-        updates = jax.tree.map(move, updates, params, is_leaf=_has_progress)
+        updates = jax.tree.map(set_progress, updates, params, is_leaf=_has_progress)
         return updates, ScheduleState(state.step + 1, inner)
 
     return optax.GradientTransformation(init, update)

@@ -89,7 +89,7 @@ def test_what_does_not_fuse():
         lorasp_jax.fuse(pair(), {"pour": 1.0, "sp": 0.5})
     with pytest.raises(ValueError, match="no adapter 'pure'; the model has pour"):
         lorasp_jax.fuse(pair(), {"pure": 1.0})
-    with pytest.raises(ValueError, match="rank must be a whole number from 1 to 1048576, got 0"):
+    with pytest.raises(ValueError, match="rank must be an integer from 1 to 1048576, got 0"):
         lorasp_jax.fuse(pair(), WEIGHTS, rank=0)
     with pytest.raises(ValueError, match="needs weights by name, at least one"):
         lorasp_jax.fuse(pair(), {})

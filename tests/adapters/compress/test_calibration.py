@@ -106,9 +106,9 @@ def test_eva_in_a_stack_saves_as_a_lora(net, batches, moments, tmp_path):
 @pytest.mark.parametrize(
     ("rank", "statistics", "message"),
     [
-        (2, {}, "needs the inputs' statistics: pass those of calibration.input_moments"),
+        (2, {}, "needs statistics of the inputs: pass the result of `input_moments`"),
         (2, {"inp": jnp.eye(4)}, r"needs statistics \[5, 5\] .* got \[4, 4\] and 2"),
-        (6, {"inp": jnp.eye(5)}, r"a rank up to 5, got \[5, 5\] and 6"),
+        (6, {"inp": jnp.eye(5)}, r"a rank of at most 5, got \[5, 5\] and 6"),
     ],
 )
 def test_eva_needs_statistics_of_its_layer(rank, statistics, message, net):

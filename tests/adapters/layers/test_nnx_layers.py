@@ -280,7 +280,7 @@ def test_unsupported_layers(heads, vision, tmp_path):
         adapted(Scaled(2, 3, rngs=nnx.Rngs(0)), ("", LoRA(rank=2)))
     with pytest.raises(ValueError, match="embed is neither dense nor an einsum, so PEFT cannot"):
         save_peft(tmp_path, adapted(vision, ("embed", LoRA(rank=2))))
-    with pytest.raises(ValueError, match="an adapted layer takes no out_sharding"):
+    with pytest.raises(ValueError, match="adapted layers do not support out_sharding"):
         adapted(heads, ("split", SP)).split(jnp.ones((1, 6)), out_sharding=object())
 
 

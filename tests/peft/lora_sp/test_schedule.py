@@ -34,7 +34,7 @@ def test_values():
 def test_the_traced_gate_is_the_gate(target):
     scores = jax.nn.softplus(3 * jax.random.normal(jax.random.key(0), (200, 24)))
     scores = scores.at[:3].set(0).at[3:9].set(2.0)
-    found = jax.jit(schedule.gate_at)(scores, jnp.float32(target))
+    found = jax.jit(schedule.scheduled_gate)(scores, jnp.float32(target))
     np.testing.assert_array_equal(found, energy_gate(scores, target, implementation="sort")[0])
 
 
@@ -99,8 +99,8 @@ def test_progress_has_no_gradient_and_only_a_moving_target_has_it():
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"start": 0.0}, r"schedule.start must lie in \(0, 1\], got 0.0"),
-        ({"share": 0.0}, r"schedule.share must lie in \(0, 1\], got 0.0"),
+        ({"start": 0.0}, r"schedule.start must be in \(0, 1\], got 0.0"),
+        ({"share": 0.0}, r"schedule.share must be in \(0, 1\], got 0.0"),
         ({"curve": "square"}, "schedule.curve must be one of 'linear', 'cosine', got 'square'"),
     ],
 )
