@@ -12,93 +12,102 @@ from rich.console import Console
 
 from envs import actions
 from envs.cli import commands
-from envs.cli.refusals import parsed, refused
+from envs.cli.errors import parse_arguments, report_error
 from envs.compilation import alarms, cache
 from envs.experts.collection import Record
 from envs.names import names
 from envs.scene import distractors
 
+_DEFAULT = "(default: %(default)s)"
+
 
 def main(
     arguments: Sequence[str], program: str = "python -m envs", record: Record | None = None
 ) -> int:
-    """Runs one command; returns the exit code: 0 done, 2 bad input, 130 stopped.
+    """Run a command and return its exit code: 0 success, 2 invalid input, 130 interrupted.
 
     Args:
-        arguments: of the command line.
-        program: its name in help and errors.
-        record: as for `envs.collect`.
+        arguments: command-line arguments.
+        program: program name for help and errors.
+        record: as in `envs.collect`.
     """
-    options = parsed(parser(program), arguments)
+    options = parse_arguments(parser(program), arguments)
     options.record = record
     console = Console(stderr=True)
-    # JAX would reserve most of a GPU at its start, which takes a second (measured) for a command of
-    # half a minute.
+    # Reserving most of a GPU at startup takes a second (measured) of a command's half minute.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     cache.enable()
     try:
         options.command(options, console)
     except Exception as error:
-        return refused(error, console)
+        return report_error(error, console)
     except KeyboardInterrupt as stop:
-        console.print(f"stopped: {str(stop) or 'no unfinished file is left'}", soft_wrap=True)
+        state = str(stop) or "temporary files were removed"
+        console.print(f"interrupted; {state}", soft_wrap=True)
         return 130
     return 0
 
 
 def parser(program: str) -> argparse.ArgumentParser:
-    """The commands and their options."""
-    parser = argparse.ArgumentParser(prog=program, description="Scripted expert episodes.")
+    """Define the commands and their options."""
+    parser = argparse.ArgumentParser(prog=program, description="Episodes of scripted experts.")
     subparsers = parser.add_subparsers(required=True, metavar="command")
     tasks = ", ".join(names("task"))
     robots = f"{', '.join(names('robot'))}, or the path of an MJCF file"
 
-    def add(command: Callable[..., None], image_size: int, of: str = "") -> Callable[..., Any]:
-        text = command.__doc__
-        sub = subparsers.add_parser(command.__name__, help=text, description=text)
-        sub.set_defaults(command=command)
-        sub.add_argument("--overwrite", action="store_true", help=f"{of}replace what is there")
-        pixels = f"{of}pixels (%(default)s)"
-        sub.add_argument("--image-size", type=int, default=image_size, help=pixels)
-        sub.add_argument("--seed", type=seed, default=0, help="of all randomness (%(default)s)")
-        return sub.add_argument
-
-    option = add(commands.collect, image_size=64)
-    option("--task", required=True, nargs="+", help=f"{tasks}; all for all")
+    option = _add_command(subparsers, commands.collect, image_size=64)
+    option("--task", required=True, nargs="+", help=f"{tasks}; or all")
     option("--robot", required=True, help=robots)
-    option("--out", required=True, type=Path, help="folder; one task: a dataset or an .npz file")
-    option("--num-episodes", type=int, default=64, help="of each task (%(default)s)")
-    option("--num-envs", type=int, help="worlds at once (default: by device)")
-    option("--control-dt", type=finite, default=0.1, help="s between two actions (%(default)s)")
-    option("--actions", default="joint", help=f"{', '.join(actions.MODES)} (%(default)s)")
-    option("--action-noise", type=finite, default=0.0, help="rad (%(default)s)")
-    option("--distractors", type=int, default=0, help=f"up to {distractors.MOST} (%(default)s)")
-    option("--randomize", action="store_true", help="masses, cameras, light and more differ")
-    option("--antialias", type=int, default=1, help="rays a pixel, squared (%(default)s)")
+    option("--out", required=True, type=Path, help="dataset or .npz file; folder of several tasks")
+    option("--num-episodes", type=int, default=64, help=f"episodes per task {_DEFAULT}")
+    option("--num-envs", type=int, help="parallel worlds (default: depends on the device)")
+    option("--control-dt", type=finite, default=0.1, help=f"time between actions [s] {_DEFAULT}")
+    option("--actions", default="joint", help=f"{', '.join(actions.MODES)} {_DEFAULT}")
+    text = f"standard deviation of noise on joint targets [rad] {_DEFAULT}"
+    option("--action-noise", type=finite, default=0.0, help=text)
+    text = f"unrelated objects on the table, up to {distractors.MOST} {_DEFAULT}"
+    option("--distractors", type=int, default=0, help=text)
+    text = "randomize masses, cameras, light and more between worlds"
+    option("--randomize", action="store_true", help=text)
+    option("--antialias", type=int, default=1, help=f"n, for n x n rays per pixel {_DEFAULT}")
 
-    option = add(commands.gallery, image_size=128)
+    option = _add_command(subparsers, commands.gallery, image_size=128)
     option("--task", help=f"{tasks} (default: all)")
     option("--robot", help=f"{robots} (default: all)")
-    option("--out", required=True, type=Path, help="folder")
+    option("--out", required=True, type=Path, help="output folder")
 
-    option = add(commands.play, image_size=256, of="with --out: ")
+    option = _add_command(subparsers, commands.play, image_size=256, prefix="with --out: ")
     option("--task", required=True, help=tasks)
     option("--robot", required=True, help=robots)
-    option("--out", type=Path, help=".mp4 file (default: a window)")
+    option("--out", type=Path, help="output .mp4 file (default: show a window)")
     return parser
 
 
+def _add_command(
+    subparsers: Any, command: Callable[..., None], image_size: int, prefix: str = ""
+) -> Callable[..., Any]:
+    """Add a command with the options that all commands have; return its `add_argument`."""
+    text = command.__doc__
+    sub = subparsers.add_parser(command.__name__, help=text, description=text)
+    sub.set_defaults(command=command)
+    sub.add_argument("--overwrite", action="store_true", help=f"{prefix}replace existing output")
+    text = f"{prefix}height and width of images [px] {_DEFAULT}"
+    sub.add_argument("--image-size", type=int, default=image_size, help=text)
+    sub.add_argument("--seed", type=seed, default=0, help=f"random seed {_DEFAULT}")
+    return sub.add_argument
+
+
 def seed(text: str) -> int:
-    """A seed of JAX, which takes no more than 32 bits of one; argparse says what does not fit."""
+    """Parse a seed; JAX uses only 32 bits of one."""
     if not 0 <= (value := int(text)) < 2**32:
-        raise argparse.ArgumentTypeError(f"must be 0 to {2**32 - 1}, not {value}")
+        raise argparse.ArgumentTypeError(f"must be 0 to {2**32 - 1}, got {value}")
     return value
 
 
 def finite(text: str) -> float:
-    """A number, neither infinite nor nan; argparse says what is none."""
+    """Parse a finite number."""
     if not math.isfinite(value := float(text)):
-        raise argparse.ArgumentTypeError(f"must be a finite number, not {text}")
+        raise argparse.ArgumentTypeError(f"must be a finite number, got {text}")
     return value
 
 

@@ -17,19 +17,19 @@ from rich.progress import (
 from rich.text import Text
 
 Report = Callable[[int, int], None]
-"""Called with what is done and what is wanted."""
+"""Called with the number done and the total."""
 _PERIOD = 600.0
-"""Seconds of which the rate is the mean; there is none where no two updates fall into them."""
+"""Window of the rate [s]; without two updates in it, no rate is shown."""
 
 
 def bars(console: Console, unit: str, *, per_step: int = 1, shown: bool = True) -> Progress:
-    """Bars with counts, a rate and the remaining time.
+    """Make progress bars with counts, a rate and the remaining time.
 
     Args:
-        console: where they are drawn.
-        unit: what is counted, such as "episodes".
-        per_step: units to a step of the bar.
-        shown: False while other bars are; a terminal shows one group at a time.
+        console: console to draw on.
+        unit: unit of the rate, such as "episodes".
+        per_step: units per step of the bar.
+        shown: False to hide the bars, since a console shows one `Progress` at a time.
     """
     columns = (
         TextColumn("{task.description}"),
@@ -42,9 +42,9 @@ def bars(console: Console, unit: str, *, per_step: int = 1, shown: bool = True) 
 
 
 def collecting(progress: Progress, title: str, stop: threading.Event) -> Report:
-    """A report that moves a bar, which appears with the first report, before all is compiled.
+    """Make a progress callback that moves a bar; its first call, before compilation, adds the bar.
 
-    Where `stop` is set, a report raises a KeyboardInterrupt.
+    The callback raises KeyboardInterrupt once `stop` is set.
     """
     bar: TaskID | None = None
 
@@ -61,7 +61,7 @@ def collecting(progress: Progress, title: str, stop: threading.Event) -> Report:
 
 
 class _Rate(ProgressColumn):
-    """Units per second; nothing before there are two points in time."""
+    """Units per second; empty before the second update."""
 
     def __init__(self, unit: str, per_step: int) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""The commands of `python -m envs`: each gets the parsed options and a console to report to."""
+"""The commands of `python -m envs`; each takes the parsed options and a console for output."""
 
 import argparse
 import contextlib
@@ -25,37 +25,35 @@ from envs.names import names
 from envs.rendering import video
 
 WORLDS = 4
-"""Tries at once for a window, which draws but one: the expert may fail in one."""
-_EVERY = 2  # control steps to a picture of a GIF
+"""Parallel attempts of `play`, which shows one success: the expert may fail."""
+_EVERY = 2  # control steps per frame of a GIF
 
 
 def collect(options: argparse.Namespace, console: Console) -> None:
-    """Writes successful expert episodes, an RLDS dataset for every task; continues if stopped."""
+    """Collect successful expert episodes, one RLDS dataset per task; run again to resume."""
     tasks = names("task") if options.task == ["all"] else list(dict.fromkeys(options.task))
     out: Path = options.out
     if len(tasks) > 1 and out.suffix == ".npz":
-        raise ValueError(f"{out} can hold one task, not {len(tasks)}: give a folder as --out")
+        raise ValueError(f"an .npz file holds one task, got {len(tasks)}: give a folder as --out")
     files = [out / task for task in tasks] if len(tasks) > 1 else [out]
-    scenes = [_scene(options, task) for task in tasks]  # bad input shows before any work
+    scenes = [_env(options, task) for task in tasks]  # fail early on bad input
     with contextlib.ExitStack() as locks:
         for file in files:
             locks.enter_context(locked(file))
             writing.recover_folder(file)
-        left = {f: e for f, e in zip(files, scenes, strict=True) if not _is_done(options, e, f)}
+        todo = {f: e for f, e in zip(files, scenes, strict=True) if not _is_done(options, e, f)}
         try:
-            found = _side_by_side(options, left, console)
+            summaries = _collect_concurrently(options, todo, console)
         except KeyboardInterrupt:
-            kept = [_kept(f, options.num_episodes) for f in left if _unfinished(f).exists()]
-            raise KeyboardInterrupt("; ".join(kept)) from None
+            saved = [_progress(f, options.num_episodes) for f in todo if _partial(f).exists()]
+            raise KeyboardInterrupt("; ".join(saved)) from None
     for file in files:
-        if file in found:
-            console.print(f"{file}: {found[file]}", soft_wrap=True)
-        else:
-            console.print(f"{file} is there already", soft_wrap=True)
+        summary = f": {summaries[file]}" if file in summaries else " is already complete"
+        console.print(f"{file}{summary}", soft_wrap=True)
 
 
 def gallery(options: argparse.Namespace, console: Console) -> None:
-    """Writes a GIF of an expert episode, all cameras together, for every task and robot."""
+    """Write a GIF of an expert episode, cameras side by side, for every task and robot."""
     tasks = [options.task] if options.task else names("task")
     robots = [options.robot] if options.robot else names("robot")
     for task in tasks:
@@ -65,13 +63,13 @@ def gallery(options: argparse.Namespace, console: Console) -> None:
             episode = _episode(options, console, task, robot)
             views = _views(episode)[::_EVERY]
             options.out.mkdir(parents=True, exist_ok=True)
-            with writing.atomic_file(file) as unfinished:
-                video.write_gif(unfinished, views, _EVERY * episode.control_dt)
+            with writing.atomic_file(file) as temporary:
+                video.write_gif(temporary, views, _EVERY * episode.control_dt)
             console.print(str(file))
 
 
 def play(options: argparse.Namespace, console: Console) -> None:
-    """Shows an expert episode in a window, or writes a video of it, all cameras together."""
+    """Show an expert episode in a window, or write a video of it, cameras side by side."""
     if options.out is None:
         from envs.cli import viewer  # opens a connection to the display
 
@@ -82,19 +80,19 @@ def play(options: argparse.Namespace, console: Console) -> None:
         viewer.show(scene, positions, env.control_dt)
         return
     if options.image_size % 2:
-        raise ValueError(f"a video needs an even --image-size, not {options.image_size}")
+        raise ValueError(f"--image-size of a video must be even, got {options.image_size}")
     _refuse_existing(options, options.out)
     episode = _episode(options, console, options.task, options.robot)
     views = _views(episode)
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    with writing.atomic_file(options.out) as unfinished:
-        video.write_video(unfinished, views, fps=1 / episode.control_dt)
+    with writing.atomic_file(options.out) as temporary:
+        video.write_video(temporary, views, fps=1 / episode.control_dt)
     text = episode.instructions[int(episode.instruction[0])]
     console.print(f"{options.out}: {len(views)} steps, {text!r}")
 
 
-def _scene(options: argparse.Namespace, task: str) -> envs.Env:
-    """The worlds to collect in."""
+def _env(options: argparse.Namespace, task: str) -> envs.Env:
+    """Make the environment to collect in."""
     env = collection.make_repeatable(
         task,
         options.robot,
@@ -111,42 +109,42 @@ def _scene(options: argparse.Namespace, task: str) -> envs.Env:
 
 
 def _is_done(options: argparse.Namespace, env: envs.Env, file: Path) -> bool:
-    """Whether the same command has made this dataset before.
+    """Return whether the same command has already completed this dataset.
 
     Raises:
-        ValueError: if something else stands there that must not be replaced.
+        ValueError: another file or dataset exists and must not be replaced.
     """
     if not file.exists():
         return False
-    recipe, left = recipes.recipe(options, env), _unfinished(file)
+    recipe, partial = recipes.recipe(options, env), _partial(file)
     if file.suffix != ".npz":
-        made = rlds.metadata(file)["options"]  # nothing but a dataset is ever replaced
-        if made == recipe and not options.overwrite:
+        existing = rlds.metadata(file)["options"]  # raises unless it is a dataset
+        if existing == recipe and not options.overwrite:
             return True
-    elif left.exists() and _is_complete(rlds.metadata(left), recipe):
-        return False  # perhaps killed when all but these parts was in order: `_save` finds out
+    elif partial.exists() and _is_complete(rlds.metadata(partial), recipe):
+        return False  # possibly killed before deleting the shards: `_save` compares both
     _refuse_existing(options, file)
     return False
 
 
-def _is_complete(facts: Mapping[str, Any], recipe: Mapping[str, Any]) -> bool:
-    """Whether parts with these facts are all that was asked for."""
-    return facts["options"] == recipe and sum(facts["parts"]) == recipe["num_episodes"]
+def _is_complete(metadata: Mapping[str, Any], recipe: Mapping[str, Any]) -> bool:
+    """Return whether shards with this metadata hold all episodes of a recipe."""
+    return metadata["options"] == recipe and sum(metadata["parts"]) == recipe["num_episodes"]
 
 
-def _side_by_side(
+def _collect_concurrently(
     options: argparse.Namespace, scenes: Mapping[Path, envs.Env], console: Console
 ) -> dict[Path, str]:
-    """Collects all tasks at once, because compilation is most of the time; returns what was made.
+    """Collect all tasks concurrently, since compilation dominates; return their summaries.
 
     Raises:
-        KeyboardInterrupt: after Ctrl-C, once the parts under way are finished.
+        KeyboardInterrupt: after Ctrl-C, once the current shards are complete.
     """
     stop = threading.Event()
     running: dict[Path, Future[str]] = {}
     with bars(console, "episodes") as progress, ThreadPoolExecutor() as pool:
         try:
-            # The longest first: it runs while the others are still traced.
+            # Longest first, so that it runs while the others are still being traced.
             for file, env in sorted(scenes.items(), key=lambda item: -item[1].expert_steps):
                 report = collecting(progress, f"{env.task.name}, {env.robot.name}", stop)
                 running[file] = pool.submit(_collect, options, env, file, report)
@@ -154,46 +152,46 @@ def _side_by_side(
         finally:
             stop.set()
     errors = [future.exception() for future in running.values()]
-    # Where one failed, the others were stopped.
+    # An error stops the other tasks with KeyboardInterrupt, so raise the error first.
     for error in sorted(filter(None, errors), key=lambda e: isinstance(e, KeyboardInterrupt)):
         raise error
     return {file: future.result() for file, future in running.items()}
 
 
 def _collect(options: argparse.Namespace, env: envs.Env, out: Path, report: Report) -> str:
-    """Collects one task, from where an earlier call was stopped; returns what was made."""
-    parts = rlds.ShardWriter(_unfinished(out), recipes.recipe(options, env))
-    report(parts.num_episodes, options.num_episodes)
-    for part in collection.gather(
+    """Collect one task, resuming an interrupted call; return a summary."""
+    writer = rlds.ShardWriter(_partial(out), recipes.recipe(options, env))
+    report(writer.num_episodes, options.num_episodes)
+    for shard in collection.gather(
         env,
         options.num_episodes,
         jax.random.key(options.seed),
         options.action_noise,
         recipes.ranges(options),
-        kept=parts.num_episodes,
-        attempted=parts.attempted,
+        kept=writer.num_episodes,
+        attempted=writer.attempted,
         record=options.record,
     ):
-        parts.append(part)
-        report(parts.num_episodes, options.num_episodes)
-    parts.complete()
-    size = sum(file.stat().st_size for file in parts.folder.iterdir())
+        writer.append(shard)
+        report(writer.num_episodes, options.num_episodes)
+    writer.complete()
+    size = sum(file.stat().st_size for file in writer.folder.iterdir())
     if out.suffix == ".npz":
-        _save(options, parts.folder, out)
+        _save(options, writer.folder, out)
         size = out.stat().st_size
     else:
-        writing.replace_folder(parts.folder, out, rlds.metadata)  # raises for all but datasets
+        writing.replace_folder(writer.folder, out, rlds.metadata)  # raises unless it is a dataset
     return (
-        f"{parts.num_episodes} of {parts.attempted} attempted episodes, "
-        f"{parts.metadata['steps']} steps, {size / 1e6:.0f} MB"
+        f"{writer.num_episodes} of {writer.attempted} attempted episodes, "
+        f"{writer.metadata['steps']} steps, {size / 1e6:.0f} MB"
     )
 
 
 def _save(options: argparse.Namespace, folder: Path, out: Path) -> None:
-    """Makes one file of a dataset, which it deletes; an earlier call may have been killed between.
+    """Convert a dataset to an .npz file and delete the dataset; safe to repeat after a kill.
 
     Raises:
-        ValueError: if another file stands there that must not be replaced.
+        ValueError: another file exists and must not be replaced.
     """
     episodes = rlds.read(folder)
     if options.overwrite or not (out.exists() and _are_same(episodes, Episodes.load(out))):
@@ -203,26 +201,26 @@ def _save(options: argparse.Namespace, folder: Path, out: Path) -> None:
 
 
 def _are_same(one: Episodes, other: Episodes) -> bool:
-    """Whether arrays and facts agree."""
+    """Return whether arrays and metadata are equal."""
     trees = [jax.tree.flatten(episodes) for episodes in (one, other)]
-    (leaves, facts), (other_leaves, other_facts) = trees
-    return facts == other_facts and all(map(np.array_equal, leaves, other_leaves))
+    (leaves, metadata), (other_leaves, other_metadata) = trees
+    return metadata == other_metadata and all(map(np.array_equal, leaves, other_leaves))
 
 
-def _unfinished(out: Path) -> Path:
-    """Where the finished parts of a dataset are until all are there."""
+def _partial(out: Path) -> Path:
+    """Return the folder that holds the shards of an incomplete dataset."""
     return out.with_name(f"{out.name}.partial")
 
 
-def _kept(out: Path, num_episodes: int) -> str:
-    """What a stopped collection has left."""
-    folder = _unfinished(out)
-    kept = sum(rlds.metadata(folder)["parts"])
-    return f"{kept} of {num_episodes} episodes are kept in {folder}, the same command goes on there"
+def _progress(out: Path, num_episodes: int) -> str:
+    """Describe the progress of an interrupted collection."""
+    folder = _partial(out)
+    done = sum(rlds.metadata(folder)["parts"])
+    return f"{done} of {num_episodes} episodes are in {folder}; run the same command to resume"
 
 
 def _episode(options: argparse.Namespace, console: Console, task: str, robot: str) -> Episodes:
-    """One episode of the expert."""
+    """Collect one successful episode of the expert."""
     with bars(console, "episodes") as progress:
         return envs.collect(
             task,
@@ -230,16 +228,16 @@ def _episode(options: argparse.Namespace, console: Console, task: str, robot: st
             num_episodes=1,
             key=jax.random.key(options.seed),
             image_size=options.image_size,
-            num_envs=1,  # pictures are most of the work; where the expert fails, it tries again
+            num_envs=1,  # rendering dominates; a failed attempt is repeated
             antialias=2,
             progress=collecting(progress, f"{task}, {robot}", threading.Event()),
         )
 
 
 def _views(episode: Episodes) -> np.ndarray:
-    """The first episode as seen by all cameras beside one another, uint8 [T, H, K W, 3]."""
+    """Return the first episode's images from K cameras side by side, uint8 [T, H, K W, 3]."""
     steps = int(episode.length[0])
-    return video.side_by_side({k: np.asarray(p[0, :steps]) for k, p in episode.image.items()})
+    return video.side_by_side({k: np.asarray(x[0, :steps]) for k, x in episode.image.items()})
 
 
 def _refuse_existing(options: argparse.Namespace, file: Path) -> None:

@@ -1,4 +1,4 @@
-"""How a dataset is made: what must be the same for the same episodes to come out."""
+"""Recipes of datasets: all settings that determine the episodes."""
 
 import argparse
 import dataclasses
@@ -12,11 +12,11 @@ from envs.experts import traced
 
 
 def recipe(options: argparse.Namespace, env: envs.Env) -> dict[str, Any]:
-    """All that the episodes depend on."""
+    """Return everything that the episodes depend on, as JSON values."""
     return {
         "task": env.task.name,
         "robot": options.robot,
-        "model": traced.digest(env),  # a user may edit the robot's file
+        "model": traced.digest(env),  # changes if the user edits the robot's file
         "num_episodes": options.num_episodes,
         "num_envs": env.num_envs,
         "image_size": env.image_size,
@@ -35,5 +35,5 @@ def recipe(options: argparse.Namespace, env: envs.Env) -> dict[str, Any]:
 
 
 def ranges(options: argparse.Namespace) -> envs.Randomization | None:
-    """What differs from world to world."""
+    """Return what is randomized between worlds, if anything."""
     return envs.Randomization.typical() if options.randomize else None

@@ -1,4 +1,4 @@
-"""An expert episode in MuJoCo's own window, in real time, over and over."""
+"""Show an expert episode in MuJoCo's viewer, in real time and repeatedly."""
 
 import itertools
 import time
@@ -20,11 +20,11 @@ from envs.state import State
 
 
 def check_display() -> None:
-    """Raises a ValueError if no window can be opened here."""
+    """Raise a ValueError if no window can be opened."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", glfw.GLFWError)  # the answer says it
+        warnings.simplefilter("ignore", glfw.GLFWError)  # `init` returns False as well
         if not glfw.init():
-            raise ValueError("there is no display to open a window on: add --out FILE.mp4")
+            raise ValueError("cannot open a window without a display: add --out FILE.mp4")
 
 
 def episode(
@@ -35,22 +35,25 @@ def episode(
     plan: Callable[[Env, State, jax.Array], Any] | None = None,
     act: Callable[[Env, Any, State], jax.Array] | None = None,
 ) -> tuple[mujoco.MjModel, np.ndarray]:
-    """A successful episode of the expert: the scene of its world and all positions `[T, nq]` in it.
+    """Simulate a successful episode of the expert.
 
     Args:
-        env: W worlds.
-        key: all randomness.
-        tries: layouts of all worlds to try.
-        plan: as `expert.plan`, which is compiled by default.
-        act: as `expert.act`, which is compiled by default.
+        env: environment with W parallel attempts.
+        key: source of all randomness.
+        tries: maximum number of resets.
+        plan: replacement for `expert.plan`; by default that, compiled.
+        act: replacement for `expert.act`; by default that, compiled.
+
+    Returns:
+        Model of the successful world, and the joint positions `[T, nq]` over time.
 
     Raises:
-        ValueError: if the expert never succeeds.
+        ValueError: the expert never succeeds.
     """
     plan, act = plan or _plan, act or _act
     for _ in range(tries):
         key, try_key = jax.random.split(key)
-        reset_key, plan_key, _ = jax.random.split(try_key, 3)  # as envs.experts.collection does it
+        reset_key, plan_key, _ = jax.random.split(try_key, 3)  # as in envs.experts.collection
         state = env.reset(reset_key)
         planned = plan(env, state, plan_key)
         states = [state]
@@ -62,21 +65,21 @@ def episode(
             steps = int(states[-1].info["steps"][world])
             positions = [np.asarray(state.data.qpos[world]) for state in states[: steps + 1]]
             return placing.placed(env.model, states[0].info["layout"], world), np.stack(positions)
-    raise ValueError(f"the expert failed in all of {tries * env.num_envs} layouts")
+    raise ValueError(f"the expert failed in all {tries * env.num_envs} layouts")
 
 
 def show(model: mujoco.MjModel, positions: np.ndarray, seconds: float) -> None:
-    """Shows positions `[T, nq]`, each for some seconds, over and over until the window closes.
+    """Replay joint positions `[T, nq]` until the window is closed, each for `seconds`.
 
     Raises:
-        ValueError: if no window can be opened.
+        ValueError: no window can be opened.
     """
     data = mujoco.MjData(model)
     try:
-        # Its panels would take two thirds of the window.
+        # The panels would take two thirds of the window.
         window = mujoco.viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
-    except RuntimeError as error:  # on macOS, where a window needs mjpython
-        raise ValueError(f"no window can be opened ({error}): add --out FILE.mp4") from error
+    except RuntimeError as error:  # on macOS, where the viewer needs mjpython
+        raise ValueError(f"cannot open a window ({error}): add --out FILE.mp4") from error
     with window:
         for qpos in itertools.cycle(positions):
             start = time.monotonic()

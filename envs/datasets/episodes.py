@@ -24,7 +24,7 @@ Array = jax.Array | np.ndarray
 
 _FORMAT = "envs-episodes-1"
 SHARED = ("task", "robot", "control_dt", "physics_dt", "actions", "instructions")
-"""What episodes must have in common to be joined."""
+"""Fields that must match in episodes to concatenate."""
 _ARRAYS = ("state", "action", "length", "instruction")
 _METADATA = (*SHARED, "attempted")
 _IMAGE = "image/"
@@ -43,20 +43,20 @@ class Episodes:
     """E episodes of one task and robot, padded to T control steps.
 
     Attributes:
-        image: camera name -> uint8 `[E, T, H, W, 3]`, before each action.
+        image: camera name -> uint8 `[E, T, H, W, 3]`, observed before each action.
         state: f32 `[E, T, J + 1]` measured joint angles [rad] and gripper opening [m], before each
             action.
-        action: f32 `[E, T, A]` commanded; by default A = J + 1 joint targets [rad] and gripper
+        action: f32 `[E, T, A]` commands; by default A = J + 1 joint targets [rad] and gripper
             opening [m].
-        length: int32 `[E]` steps that count, 1 to T; what follows them is padding.
+        length: int32 `[E]` number of valid steps, 1 to T; the rest is padding.
         instruction: int32 `[E]` index into `instructions`.
         instructions: phrasings of the task.
         task: name of the task.
         robot: name of the robot.
         control_dt: time between two actions [s].
-        physics_dt: time step of the simulation [s]; 0 where nothing was simulated.
-        attempted: episodes tried to get these; the others failed.
-        actions: what an action means, see `envs.actions`.
+        physics_dt: time step of the simulation [s]; 0 for recordings of real robots.
+        attempted: number of attempts that these episodes are the successes of.
+        actions: action mode, see `envs.actions`.
     """
 
     image: dict[str, Array]
@@ -73,12 +73,12 @@ class Episodes:
     actions: str = "joint"
 
     def __repr__(self) -> str:
-        """Facts, and of arrays the types and shapes."""
+        """Show the metadata, and the dtype and shape of every array."""
         arrays = {name: getattr(self, name) for name in _ARRAYS}
-        arrays |= {_IMAGE + name: picture for name, picture in self.image.items()}
-        shown = [f"{name}={_short(array)}" for name, array in arrays.items()]
-        shown += [f"{name}={getattr(self, name)!r}" for name in _METADATA]
-        return f"Episodes({', '.join(shown)})"
+        arrays |= {_IMAGE + name: images for name, images in self.image.items()}
+        fields = [f"{name}={_dtype_and_shape(array)}" for name, array in arrays.items()]
+        fields += [f"{name}={getattr(self, name)!r}" for name in _METADATA]
+        return f"Episodes({', '.join(fields)})"
 
     @property
     def num_episodes(self) -> int:
@@ -87,85 +87,85 @@ class Episodes:
 
     @property
     def num_steps(self) -> int:
-        """Control steps that count, over all episodes."""
+        """Total number of valid control steps."""
         return int(np.sum(self.length))
 
     def select(self, indices: Sequence[int] | Array) -> Self:
-        """The episodes with these numbers, in this order."""
+        """Select episodes by index, in this order."""
         return jax.tree.map(lambda x: x[np.asarray(indices)], self)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes one uncompressed .npz file; an existing file is replaced only when all is written.
+        """Write an uncompressed .npz file, replacing an existing one atomically.
 
         Raises:
-            ValueError: if the arrays do not fit one another.
+            ValueError: the arrays are inconsistent.
         """
         self.validate()
         check_local(path := Path(path))
-        facts = {name: getattr(self, name) for name in _METADATA}
-        header = json.dumps({"format": _FORMAT, **facts}).encode()
+        metadata = {name: getattr(self, name) for name in _METADATA}
+        header = json.dumps({"format": _FORMAT, **metadata}).encode()
         arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
-        arrays |= {_IMAGE + name: np.asarray(picture) for name, picture in self.image.items()}
+        arrays |= {_IMAGE + name: np.asarray(images) for name, images in self.image.items()}
         path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_file(path) as unfinished, open(unfinished, "wb") as file:
+        with atomic_file(path) as temporary, open(temporary, "wb") as file:
             np.savez(file, header=np.frombuffer(header, np.uint8), **arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], *, control_dt: float | None = None) -> Self:
-        """Reads what `save` wrote, into host memory.
+        """Read a file written by `save` into host memory.
 
         Args:
             path: the file.
-            control_dt: if given, the control period [s] that the episodes must have.
+            control_dt: required control period [s]; None: any.
 
         Raises:
-            FileNotFoundError: if there is no such file.
-            ValueError: if the file is damaged, not of this format, or of another control period.
+            FileNotFoundError: the file does not exist.
+            ValueError: the file is damaged, of another format, or has another control period.
         """
         arrays = _read(Path(path))
         try:
-            facts = {"actions": "joint"}  # the only ones there were before it was written down
-            facts |= json.loads(arrays.pop("header").tobytes())
-            if facts.pop("format") != _FORMAT:
+            metadata = {"actions": "joint"}  # for files from before this field existed
+            metadata |= json.loads(arrays.pop("header").tobytes())
+            if metadata.pop("format") != _FORMAT:
                 raise KeyError("format")
         except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
-            raise ValueError(f"{path} is an .npz file, but holds no {_FORMAT} header") from error
-        missing = {*_ARRAYS} - arrays.keys() | {*_METADATA} - facts.keys()
+            raise ValueError(f"{path} is an .npz file without a valid {_FORMAT} header") from error
+        missing = {*_ARRAYS} - arrays.keys() | {*_METADATA} - metadata.keys()
         if missing:
             raise ValueError(f"{path} lacks {', '.join(sorted(missing))}")
         image: Any = {k.removeprefix(_IMAGE): v for k, v in arrays.items() if k.startswith(_IMAGE)}
         fields: dict[str, Any] = {name: arrays[name] for name in _ARRAYS}
         try:
-            facts["instructions"] = tuple(facts["instructions"])
-            episodes = cls(image=image, **fields, **{name: facts[name] for name in _METADATA})
+            metadata["instructions"] = tuple(metadata["instructions"])
+            episodes = cls(image=image, **fields, **{name: metadata[name] for name in _METADATA})
             episodes.validate()
         except (ValueError, TypeError) as error:
-            raise ValueError(f"{path} is not valid: {error}") from error
+            raise ValueError(f"{path} is invalid: {error}") from error
         if control_dt is not None and abs(episodes.control_dt - control_dt) > 1e-9:
             raise ValueError(
-                f"{path} has control_dt {episodes.control_dt} s, but {control_dt} s is needed"
+                f"{path} must have control_dt {control_dt} s, got {episodes.control_dt} s"
             )
         return episodes
 
     def validate(self) -> None:
-        """Raises a ValueError if the arrays do not fit one another or a number is not finite."""
+        """Raise a ValueError if the arrays are inconsistent or a value is not finite."""
         self.validate_numbers()
         steps = self.state.shape[:2]
         if not self.image:
-            raise ValueError("image holds no camera, but at least one is needed")
-        for name, picture in self.image.items():
+            raise ValueError("image must have at least one camera")
+        for name, images in self.image.items():
             check_camera(name)
-            if picture.shape[:2] != steps or picture.shape[4:] != (3,) or picture.dtype != np.uint8:
+            if images.shape[:2] != steps or images.shape[4:] != (3,) or images.dtype != np.uint8:
                 raise ValueError(
                     f"image {name!r} must be uint8 [{steps[0]}, {steps[1]}, H, W, 3], "
-                    f"not {picture.dtype} {list(picture.shape)}"
+                    f"got {images.dtype} {list(images.shape)}"
                 )
 
     def validate_numbers(self) -> None:
-        """`validate` without the pictures."""
-        self._validate_facts()
+        """Do the checks of `validate` except for images."""
+        self._validate_metadata()
         if self.state.ndim != 3 or not self.state.size:
-            raise ValueError(f"state must have shape [E, T, J + 1], not {self.state.shape}")
+            raise ValueError(f"state must have shape [E, T, J + 1], got {self.state.shape}")
         steps = self.state.shape[:2]
         self._validate_action()
         for name, low, high in (
@@ -175,93 +175,95 @@ class Episodes:
             values = np.asarray(getattr(self, name))
             if values.shape != steps[:1] or not np.issubdtype(values.dtype, np.integer):
                 raise ValueError(
-                    f"{name} must be integers of shape {steps[:1]}, not {values.shape}"
+                    f"{name} must be integers of shape {steps[:1]}, got {values.dtype} of shape "
+                    f"{values.shape}"
                 )
             if values.min() < low or values.max() > high:
                 raise ValueError(
-                    f"{name} must lie in {low} to {high}, not {values.min()} to {values.max()}"
+                    f"{name} must be {low} to {high}, got {values.min()} to {values.max()}"
                 )
 
-    def _validate_facts(self) -> None:
+    def _validate_metadata(self) -> None:
         texts = {"task": self.task, "robot": self.robot, "actions": self.actions}
         texts |= {f"instruction {i}": text for i, text in enumerate(self.instructions)}
         for name, text in texts.items():
             if not isinstance(text, str):
-                raise ValueError(f"{name} must be a text, not {text!r}")
+                raise ValueError(f"{name} must be a string, got {text!r}")
         for name in ("control_dt", "physics_dt"):
             time = getattr(self, name)
             if not isinstance(time, numbers.Real) or not 0 <= float(time) < math.inf:
-                raise ValueError(f"{name} must be a time in s, not {time!r}")
+                raise ValueError(f"{name} must be a finite time in s, at least 0, got {time!r}")
         if not self.control_dt:
             raise ValueError("control_dt must be above 0 s")
 
     def _validate_action(self) -> None:
         if self.actions not in MODES:
-            raise ValueError(f"actions must be one of {', '.join(MODES)}, not {self.actions!r}")
+            raise ValueError(f"actions must be one of {', '.join(MODES)}, got {self.actions!r}")
         expected = (
             (*self.state.shape[:2], 7) if self.actions == "end_effector" else self.state.shape
         )
         if self.action.shape != expected:
-            raise ValueError(f"action must have shape {expected}, not {self.action.shape}")
+            raise ValueError(f"action must have shape {expected}, got {self.action.shape}")
         for name in ("state", "action"):
             if getattr(self, name).dtype != np.float32:
-                raise ValueError(f"{name} must be float32, not {getattr(self, name).dtype}")
+                raise ValueError(f"{name} must be float32, got {getattr(self, name).dtype}")
             wrong = np.argwhere(~np.isfinite(np.asarray(getattr(self, name))))
             if len(wrong):
-                episode, step, number = map(int, wrong[0])
+                episode, step, dimension = map(int, wrong[0])
                 raise ValueError(
-                    f"{name} is not finite in number {number} at step {step} of episode {episode}"
+                    f"{name} is not finite in dimension {dimension} at step {step} of episode "
+                    f"{episode}"
                 )
 
 
 def check_camera(name: str) -> None:
-    """Raises a ValueError unless files can be called after a camera of this name."""
+    """Raise a ValueError if a camera's name cannot be part of a file name."""
     if not _CAMERA.fullmatch(name):
         raise ValueError(
-            f"a camera is called {name[:80]!r}: valid are letters, digits, - _ . and spaces"
+            f"invalid camera name {name[:80]!r}: use letters, digits, - _ . and spaces"
         )
 
 
 def concatenate(parts: Sequence[Episodes]) -> Episodes:
-    """All episodes of several collections of one task and robot, padded to the longest.
+    """Concatenate episodes of the same task and robot, padding them to the longest.
 
     Raises:
-        ValueError: if there are none, or they differ in more than length and number.
+        ValueError: `parts` is empty, or they differ in metadata or image size.
     """
     if not parts:
         raise ValueError("there is nothing to concatenate: parts is empty")
     for name in SHARED:
         values = {getattr(part, name) for part in parts}
         if len(values) > 1:
-            raise ValueError(f"only episodes of one {name} can be joined, not {sorted(values)}")
+            raise ValueError(f"cannot concatenate episodes of different {name}: {sorted(values)}")
     shapes = {tuple(sorted((k, v.shape[2:]) for k, v in part.image.items())) for part in parts}
     if len(shapes) > 1:
-        raise ValueError(f"only episodes of equal pictures can be joined, not {sorted(shapes)}")
+        raise ValueError(f"cannot concatenate episodes of different images: {sorted(shapes)}")
     steps = max(part.state.shape[1] for part in parts)
 
     def join(*arrays: Array) -> Array:
         xp = np if all(isinstance(x, np.ndarray) for x in arrays) else jnp
-        return xp.concatenate([_padded(xp, x, steps) for x in arrays])
+        return xp.concatenate([_pad(xp, x, steps) for x in arrays])
 
     attempted = sum(part.attempted for part in parts)
     same = [dataclasses.replace(part, attempted=attempted) for part in parts]
     return jax.tree.map(join, *same)
 
 
-def _short(array: Any) -> str:
-    """Type and shape, of a tracer too; what a tree map has put in its place, as it is."""
+def _dtype_and_shape(array: Any) -> str:
+    """Describe an array or tracer; other leaves, which a tree map may have put there, as `repr`."""
     return f"{array.dtype}{list(array.shape)}" if hasattr(array, "dtype") else repr(array)
 
 
-def _padded(xp: Any, array: Array, steps: int) -> Array:
-    """`[E, ...]` as it is, `[E, T, ...]` with zeros up to `steps`."""
+def _pad(xp: Any, array: Array, steps: int) -> Array:
+    """Pad `[E, T, ...]` with zeros to T = `steps`; return `[E]` unchanged."""
     if array.ndim == 1 or array.shape[1] == steps:
         return array
     return xp.pad(array, [(0, 0), (0, steps - array.shape[1])] + [(0, 0)] * (array.ndim - 2))
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an .npz file."""
+    """Read all arrays of an .npz file."""
     regular(path)
     with damage(path), zipfile.ZipFile(path) as archive:
         members = archive.infolist()
@@ -270,12 +272,12 @@ def _read(path: Path) -> dict[str, np.ndarray]:
 
 
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
-    """One array, of which there are as many bytes as its header says: NumPy would not ask."""
+    """Read one array, after checking its size against its header, which NumPy trusts."""
     with archive.open(member) as file:
         if (version := np.lib.format.read_magic(file)) not in _HEADERS:
-            raise ValueError(f"{member.filename} is of version {version}")
+            raise ValueError(f"{member.filename} has unsupported .npy version {version}")
         shape, _, dtype = _HEADERS[version](file)
         if math.prod(shape) * dtype.itemsize != member.file_size - file.tell():
-            raise ValueError(f"{member.filename} does not hold {dtype} {list(shape)}")
+            raise ValueError(f"the size of {member.filename} is not that of {dtype} {list(shape)}")
     with archive.open(member) as file:
         return np.lib.format.read_array(file, allow_pickle=False)

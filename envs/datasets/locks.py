@@ -1,4 +1,4 @@
-"""A file or folder that one process at a time may write."""
+"""Locks that let one process at a time write a file or folder."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -10,24 +10,24 @@ import filelock
 
 from envs.datasets.files import check_local
 
-_RETRY = 0.2  # seconds; a lock file deleted by its last holder is made anew at the second attempt
+_RETRY = 0.2  # s, time for a second attempt, in case the last holder deletes the lock file
 
 
 @contextlib.contextmanager
 def locked(path: Path, waiting: Callable[[], None] | None = None) -> Iterator[None]:
-    """Keep other processes and threads from writing the same file or folder meanwhile.
+    """Keep other processes and threads from writing the same file or folder.
 
-    They share a lock file beside it, which is deleted at the end. If something is raised inside,
-    empty folders that were made for it are deleted, too.
+    The lock is a file beside it, which is deleted at the end. If the block raises, empty folders
+    created for the lock file are deleted, too.
 
     Args:
         path: the file or folder.
-        waiting: called once if another process holds the lock, which is then waited for; None: that
-            is an error.
+        waiting: called once if another process holds the lock, before waiting for it; None: raise
+            instead.
 
     Raises:
-        ValueError: another process holds the lock and `waiting` is None, the path is a URL, or as
-            `acquire`.
+        ValueError: another process holds the lock and `waiting` is None, the path is a URL, or the
+            lock file cannot be opened.
     """
     check_local(path)
     missing = [folder for folder in path.parents if not folder.exists()]
@@ -47,30 +47,30 @@ def locked(path: Path, waiting: Callable[[], None] | None = None) -> Iterator[No
                 file.unlink(missing_ok=True)
     except BaseException:
         for folder in missing:
-            with contextlib.suppress(OSError):  # it is not empty, or was not made
+            with contextlib.suppress(OSError):  # not empty, or never created
                 folder.rmdir()
         raise
 
 
 def acquire(file: Path, *, wait: bool = False) -> AbstractContextManager[Any]:
-    """Lock a file, made where there is none; the lock is released at the end of a `with` block.
+    """Lock a file, creating it if necessary; use the result in a `with` block.
 
-    The operating system releases it when the process ends, in whatever way.
+    The operating system releases the lock when the process ends, even if it is killed.
 
     Args:
         file: the lock file itself.
-        wait: until no other process holds the lock.
+        wait: wait until no other process holds the lock.
 
     Raises:
-        filelock.Timeout: another process holds the lock, and it is not waited for.
+        filelock.Timeout: another process holds the lock and `wait` is False.
         ValueError: the file cannot be opened or locked.
     """
     try:
         if file.is_fifo():
-            raise OSError(None, "it is a pipe", str(file))
+            raise OSError(None, "not a regular file but a pipe", str(file))
         lock = filelock.FileLock(file, fallback_to_soft=False)
         return lock.acquire(timeout=-1 if wait else _RETRY)
-    except filelock.Timeout:  # an OSError, too
+    except filelock.Timeout:  # is an OSError, too
         raise
     except OSError as error:
-        raise ValueError(f"{error.filename or file} cannot be opened: {error.strerror}") from error
+        raise ValueError(f"cannot open {error.filename or file}: {error.strerror}") from error

@@ -1,12 +1,12 @@
-"""Episodes on disk as an RLDS dataset of tensorflow-datasets, written and read without TensorFlow.
+"""RLDS datasets of tensorflow-datasets (tfds), written and read without TensorFlow.
 
     rlds.write(episodes, "data/press")
     episodes = rlds.read("data/press")
-    source = tfds.builder_from_directory("data/press").as_data_source("train")  # anybody else
+    source = tfds.builder_from_directory("data/press").as_data_source("train")  # with tfds alone
 
-Pictures are PNG: whoever trains on them sees the same pixels as whoever made them. What all
-episodes share is in the dataset's metadata (`builder.info.metadata`, the file metadata.json), and
-once more in every episode's own, there rounded to float32.
+Images are lossless PNG. Metadata that all episodes share are those of the dataset
+(`builder.info.metadata`, the file metadata.json), and are repeated in every episode, where floats
+are rounded to float32.
 """
 
 import contextlib
@@ -45,81 +45,81 @@ _DESCRIPTIONS = {
     True: "Scripted expert episodes of {task} by {robot} in simulation.",
     False: "Recorded episodes of {task} by {robot}.",
 }
-# One episode is read at a time, and PNG does not shrink any further (measured: 7 times as fast).
+# Episodes are read one by one, and PNG does not compress further (measured: 7 times as fast).
 _RECORDS = "group_size:1,uncompressed"
 
 
 def write(episodes: Episodes, path: str | os.PathLike[str]) -> None:
-    """Writes a dataset folder, which is there only when all of it is.
+    """Write a dataset folder, which appears only once it is complete.
 
     Args:
-        episodes: successful ones, as `envs.collect` gives them: the last step has reward 1.
-        path: the folder to make.
+        episodes: successful episodes, as from `envs.collect`: the last step gets reward 1.
+        path: folder to create.
 
     Raises:
-        ValueError: if the path already exists, another process is writing it, or the arrays do
-            not fit one another.
-        OSError: if there is no room for it.
+        ValueError: the path already exists, another process is writing it, or the arrays are
+            inconsistent.
+        OSError: the disk is full.
     """
     with locked(Path(path)), atomic_folder(path) as folder:
-        parts = ShardWriter(folder, {})
-        parts.append(episodes)
-        parts.complete()
+        writer = ShardWriter(folder, {})
+        writer.append(episodes)
+        writer.complete()
 
 
 class ShardWriter:
-    """A dataset that grows part by part in a folder.
+    """Write a dataset shard by shard, resuming if its folder exists.
 
-    Its metadata names the finished parts and is replaced after each of them, so a process may be
-    killed at any moment: a part is there whole or does not count.
+    The metadata list the complete shards and are replaced atomically after each one, so the process
+    may be killed at any time: an incomplete shard does not count.
 
     Attributes:
-        folder: where the parts are.
-        facts: the metadata: what `Episodes` says of itself; `options`, how the episodes were made;
-            `parts`, the number of episodes in each; `steps`, control steps in all; `cameras`, rows
-            and columns of each one's pictures.
+        folder: folder of the shards.
+        metadata: content of metadata.json: fields of `Episodes`; `options`, how the episodes were
+            made; `parts`, the number of episodes in each shard; `steps`, the total of control
+            steps; `cameras`, height and width of each camera's images.
     """
 
     def __init__(self, folder: Path, options: Mapping[str, Any]):
-        """Opens a folder, to continue what is there.
+        """Open or create a folder.
 
         Args:
-            folder: made if it does not exist.
-            options: JSON values that must agree with those that the folder was begun with.
+            folder: created if it does not exist.
+            options: JSON values, which must equal those that the folder was created with.
 
         Raises:
-            ValueError: if they do not, or if a part is damaged.
+            ValueError: the options differ, or a shard is damaged.
         """
         self.folder = folder
         self.metadata: dict[str, Any] = {"format": FORMAT, "options": dict(options), "parts": []}
         self.metadata |= {"steps": 0, "attempted": 0}
         if (folder / METADATA).exists():
             self.metadata = metadata(folder)
-            for rest in folder.glob(f".{METADATA}.*"):  # of a process that was killed
-                rest.unlink()
+            for leftover in folder.glob(f".{METADATA}.*"):  # of a killed process
+                leftover.unlink()
             _check_same(folder, self.metadata["options"], options)
             for number, episodes in enumerate(self.metadata["parts"]):
-                _check_whole(self._file(number), episodes)
+                _check_shard(self._file(number), episodes)
         else:
             folder.mkdir(parents=True, exist_ok=True)
             self._save()
 
     @property
     def num_episodes(self) -> int:
-        """Episodes in finished parts."""
+        """Number of episodes in complete shards."""
         return sum(self.metadata["parts"])
 
     @property
     def attempted(self) -> int:
-        """Episodes tried to get these."""
+        """Number of attempts that these episodes are the successes of."""
         return self.metadata["attempted"]
 
     def append(self, episodes: Episodes) -> None:
-        """Adds a part; `attempted` adds up.
+        """Append a shard, and add its attempts to `attempted`.
 
         Raises:
-            ValueError: if the arrays do not fit one another or the episodes not those before.
-            OSError: if there is no room for it; the parts before it are as they were.
+            ValueError: the arrays are inconsistent, or the metadata differ from earlier shards'.
+            OSError: the disk is full; earlier shards are unaffected.
         """
         episodes.validate()
         shared: dict[str, Any] = {name: getattr(episodes, name) for name in SHARED}
@@ -130,18 +130,18 @@ class ShardWriter:
             features.save_config(str(self.folder))
             self.metadata |= shared
         _check_same(self.folder, {name: self.metadata[name] for name in shared}, shared)
-        to = rlds_schema.serializer(features)
-        record = functools.partial(rlds_schema.record, to, jax.device_get(episodes))
+        serializer = rlds_schema.serializer(features)
+        record = functools.partial(rlds_schema.record, serializer, jax.device_get(episodes))
         first, numbers = self.num_episodes, range(episodes.num_episodes)
-        data = THREADS.map(record, numbers, range(first, first + len(numbers)))
-        _write_records(self._file(len(self.metadata["parts"])), data)
+        records = THREADS.map(record, numbers, range(first, first + len(numbers)))
+        _write_records(self._file(len(self.metadata["parts"])), records)
         self.metadata["parts"].append(len(numbers))
         self.metadata["steps"] += episodes.num_steps
         self.metadata["attempted"] += episodes.attempted
         self._save()
 
     def complete(self) -> None:
-        """Describes the parts to tfds, which makes the folder a dataset."""
+        """Write tfds's description of the shards, which completes the dataset."""
         files = [self._file(number) for number in range(len(self.metadata["parts"]))]
         identity = tfds.core.DatasetIdentity(
             name=self._name,
@@ -149,7 +149,7 @@ class ShardWriter:
             data_dir=str(self.folder),
             module_name="",
         )
-        with damage(self.folder, ": delete it to start anew"):
+        with damage(self.folder, ": delete it to start over"):
             features = rlds_schema.stored(self.folder)
         info = tfds.core.DatasetInfo(
             builder=identity,
@@ -164,7 +164,7 @@ class ShardWriter:
             filename_template=self._template,
         )
         info.set_splits(tfds.core.SplitDict([split]))
-        (self.folder / rlds_schema.INFO).unlink(missing_ok=True)  # of a process that was killed
+        (self.folder / rlds_schema.INFO).unlink(missing_ok=True)  # of a killed process
         info.write_to_directory(self.folder)
 
     def _save(self) -> None:
@@ -172,9 +172,9 @@ class ShardWriter:
 
     @property
     def _name(self) -> str:
-        robot = Path(self.metadata["robot"]).stem  # a user's is a path
+        robot = Path(self.metadata["robot"]).stem  # a path for a user's own robot
         name = f"{self.metadata['task']}_{robot}"
-        return re.sub(r"[^\w.-]", "_", name)[:100]  # a part of the names of files
+        return re.sub(r"[^\w.-]", "_", name)[:100]  # becomes part of file names
 
     @property
     def _template(self) -> tfds.core.ShardedFileTemplate:
@@ -190,40 +190,40 @@ class ShardWriter:
         return Path(self._template.sharded_filepath(shard_index=number, num_shards=None))
 
 
-def _check_same(folder: Path, there: Mapping[str, Any], new: Mapping[str, Any]) -> None:
-    """Raises a ValueError that names the first difference."""
-    for name in sorted(there.keys() | new.keys()):
-        if there.get(name) != new.get(name):
+def _check_same(folder: Path, old: Mapping[str, Any], new: Mapping[str, Any]) -> None:
+    """Raise a ValueError that names the first difference."""
+    for name in sorted(old.keys() | new.keys()):
+        if old.get(name) != new.get(name):
             raise ValueError(
-                f"{folder} was begun with {name} {there.get(name)!r}, not {new.get(name)!r}: "
-                "finish it with that, or delete it to start anew"
+                f"{folder} was started with {name} {old.get(name)!r}, not {new.get(name)!r}: "
+                "continue with the same value, or delete the folder to start over"
             )
 
 
 def _write_records(file: Path, records: Iterable[bytes]) -> None:
-    """Raises an OSError if there is no room for all; the library's own error is another one."""
+    """Write a file of records, raising OSError in place of the library's RuntimeError."""
     writer = array_record_module.ArrayRecordWriter(str(file), _RECORDS)
     for record in records:
-        with _failure_in_one_sentence(file):
+        with _as_os_error(file):
             writer.write(record)
-    with _failure_in_one_sentence(file):
+    with _as_os_error(file):
         writer.close()
     sync(file)
 
 
-def _check_whole(file: Path, episodes: int) -> None:
-    """Raises a ValueError if a part is damaged; every record has a checksum."""
-    with damage(file, f": delete {file.parent} to start anew"):
+def _check_shard(file: Path, episodes: int) -> None:
+    """Raise a ValueError if a shard is damaged; reading verifies each record's checksum."""
+    with damage(file, f": delete {file.parent} to start over"):
         reader = array_record_module.ArrayRecordReader(str(regular(file, file.parent)))
         if reader.num_records() != episodes or len(reader.read_all()) != episodes:
-            raise ValueError(f"it holds {reader.num_records()} episodes, not {episodes}")
+            raise ValueError(f"expected {episodes} episodes, found {reader.num_records()}")
         reader.close()
 
 
 @contextlib.contextmanager
-def _failure_in_one_sentence(file: Path) -> Iterator[None]:
+def _as_os_error(file: Path) -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        why = reason(error).partition("; ")[0]  # the rest is where in the file
-        raise OSError(f"{file} could not be written ({why})") from error
+        cause = reason(error).partition("; ")[0]  # the rest is a position in the file
+        raise OSError(f"cannot write {file} ({cause})") from error

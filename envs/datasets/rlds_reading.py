@@ -1,4 +1,4 @@
-"""Datasets in RLDS form, read without TensorFlow; `envs.datasets.rlds` writes them."""
+"""Read RLDS datasets without TensorFlow; `envs.datasets.rlds` writes them."""
 
 import contextlib
 import os
@@ -18,87 +18,87 @@ from envs.datasets.files import RefusedError, read_json, regular, whole
 
 FORMAT, SPLIT = "envs-rlds-1", "train"
 METADATA = "metadata.json"
-"""File in a dataset's folder, where tfds looks for it, too."""
+"""File of metadata in a dataset's folder, with the name that tfds looks for."""
 THREADS = ThreadPoolExecutor(8)
-"""Shared by all datasets that are made at once: more threads would only wait for Python's lock."""
-# Of metadata, in a folder that was begun, and where there are parts.
-_BEGUN: dict[str, Any] = {"options": dict, "parts": list, "steps": int, "attempted": int}
-_FILLED: dict[str, Any] = {"task": str, "robot": str, "actions": str, "instructions": list}
-_FILLED |= {"cameras": dict, "control_dt": int | float, "physics_dt": int | float}
+"""Shared by all datasets in progress: more threads would only wait for Python's lock."""
+# Types of metadata: of every dataset, and of one with at least one shard.
+_TYPES: dict[str, Any] = {"options": dict, "parts": list, "steps": int, "attempted": int}
+_SHARD_TYPES: dict[str, Any] = {"task": str, "robot": str, "actions": str, "instructions": list}
+_SHARD_TYPES |= {"cameras": dict, "control_dt": int | float, "physics_dt": int | float}
 
 
 def read(path: str | os.PathLike[str]) -> Episodes:
-    """All episodes of a dataset that `write` or `python -m envs collect` made, in host memory.
+    """Read a dataset of `write` or `python -m envs collect` into host memory.
 
-    They are padded with zeros to the longest.
+    Episodes are padded with zeros to the longest one.
 
     Raises:
-        FileNotFoundError: if there is no such folder.
-        ValueError: if it is damaged or not such a dataset.
+        FileNotFoundError: the folder does not exist.
+        ValueError: it is damaged or not a dataset of this format.
     """
-    found = Reader(path)
-    parts = list(THREADS.map(found.episode, range(len(found))))
-    with damage(found.path):
-        return replace(concatenate(parts), attempted=found.metadata["attempted"])
+    reader = Reader(path)
+    parts = list(THREADS.map(reader.episode, range(len(reader))))
+    with damage(reader.path):
+        return replace(concatenate(parts), attempted=reader.metadata["attempted"])
 
 
 def metadata(path: Path) -> dict[str, Any]:
-    """What all episodes of a dataset share, and how they were made; see `ShardWriter`.
+    """Read the metadata of a dataset, see `ShardWriter`.
 
     Raises:
-        FileNotFoundError: if there is no such folder.
-        ValueError: if it is damaged or not such a dataset.
+        FileNotFoundError: the folder does not exist.
+        ValueError: it is damaged or not a dataset of this format.
     """
     if not path.exists():
-        raise FileNotFoundError(f"there is no dataset {path}")
+        raise FileNotFoundError(f"{path} does not exist")
     try:
-        facts = read_json(path / METADATA, path)
-        if facts["format"] != FORMAT:
+        content = read_json(path / METADATA, path)
+        if content["format"] != FORMAT:
             raise KeyError("format")
-        kinds = _BEGUN | (_FILLED if facts["parts"] else {})
-        wrong = [name for name, kind in kinds.items() if not isinstance(facts.get(name), kind)]
+        types = _TYPES | (_SHARD_TYPES if content["parts"] else {})
+        wrong = [name for name, kind in types.items() if not isinstance(content.get(name), kind)]
     except RefusedError:
         raise
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path} is not a folder of {FORMAT} episodes") from error
     if wrong:
-        value = repr(facts.get(wrong[0]))[:80]
+        value = repr(content.get(wrong[0]))[:80]
         raise ValueError(f"{path} is damaged ({METADATA} has {wrong[0]} {value})")
-    return facts
+    return content
 
 
 class Reader:
-    """A dataset that `write` or `python -m envs collect` made, an episode at a time.
+    """A dataset of `write` or `python -m envs collect`, read one episode at a time.
 
     Attributes:
-        kind: the format's name.
+        kind: name of the format.
         path: its folder.
-        facts: see `ShardWriter`.
-        cameras: name of a camera -> name of its pictures.
+        metadata: see `ShardWriter`.
+        cameras: camera -> feature of its images.
         control_dt: time between two actions [s].
-        num_steps: control steps of all episodes.
+        num_steps: total number of control steps.
     """
 
     kind = "RLDS"
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        """Opens a dataset.
+        """Open a dataset.
 
         Raises:
-            FileNotFoundError: if there is no such folder.
-            ValueError: if it is damaged or not such a dataset.
+            FileNotFoundError: the folder does not exist.
+            ValueError: it is damaged or not a dataset of this format.
         """
         self.path: Path = Path(path)
         self.metadata: dict[str, Any] = metadata(self.path)
         with damage(self.path):
             cameras = self.metadata["cameras"]
-            self.cameras: dict[str, str] = {n: rlds_schema.picture_name(n) for n in cameras}
+            self.cameras: dict[str, str] = {n: rlds_schema.image_feature(n) for n in cameras}
             self.control_dt: float = float(self.metadata["control_dt"])
             self.num_steps: int = whole(self.metadata["steps"])
             self._shared: dict[str, Any] = {name: self.metadata[name] for name in SHARED}
             self._shared |= {"instructions": tuple(self.metadata["instructions"]), "attempted": 1}
             builder = _builder(self.path, self.metadata["parts"])
-            # Decoding is left to the schema: tfds would decode one picture after the other.
+            # The schema decodes images: tfds would decode one after the other.
             encoded = {name: tfds.decode.SkipDecoding() for name in self.cameras.values()}
             decoders = {"steps": {"observation": encoded}}
             self._source = builder.as_data_source(SPLIT, decoders=decoders)
@@ -108,42 +108,42 @@ class Reader:
         return len(self._source)
 
     def episode(self, number: int, cameras: Sequence[str] | None = None) -> Episodes:
-        """One episode, in host memory.
+        """Load one episode into host memory.
 
         Args:
-            number: which.
-            cameras: those whose pictures are wanted; None: all.
+            number: index of the episode.
+            cameras: cameras to load; None: all.
 
         Raises:
-            ValueError: if it is damaged or lacks something.
+            ValueError: it is damaged or incomplete.
         """
         with damage(self.path):
             names = self.cameras if cameras is None else cameras
             wanted = {name: self.cameras[name] for name in names}
             sizes = self.metadata["cameras"]
-            found = rlds_schema.episode(self._source[number], wanted, sizes, self._shared)
-            found.validate_numbers()
-            return found
+            episode = rlds_schema.episode(self._source[number], wanted, sizes, self._shared)
+            episode.validate_numbers()
+            return episode
 
 
 def _builder(folder: Path, parts: Sequence[int]) -> Any:
-    """What reads a folder of parts of so many episodes, once its files are what they should be."""
+    """Make tfds's builder for a folder, after checking its files and the episodes in each shard."""
     rlds_schema.check_description(folder, rlds_schema.FEATURES, rlds_schema.INFO)
     builder: Any = tfds.builder_from_directory(folder)
     split = builder.info.splits[SPLIT]
     if builder.info.file_format != tfds.core.FileFormat.ARRAY_RECORD:
-        raise ValueError(f"it holds files of {builder.info.file_format}")
+        raise ValueError(f"its file format is {builder.info.file_format}, expected ARRAY_RECORD")
     if list(split.shard_lengths) != list(parts):
-        raise ValueError(f"it describes {sum(split.shard_lengths)} episodes, not {sum(parts)}")
+        raise ValueError(f"it lists {sum(split.shard_lengths)} episodes, expected {sum(parts)}")
     for file, episodes in zip(split.filepaths, parts, strict=True):
         path = regular(files.inside(folder, os.path.relpath(file, folder)), folder)
         reader = array_record_module.ArrayRecordReader(str(path))
         if reader.num_records() != episodes:
-            raise ValueError(f"{file} holds {reader.num_records()} episodes, not {episodes}")
+            raise ValueError(f"{file} has {reader.num_records()} episodes, expected {episodes}")
         reader.close()
     return builder
 
 
 def damage(path: Path, remedy: str = "") -> contextlib.AbstractContextManager[None]:
-    """`files.damage`, of protobuf's errors too."""
+    """Convert errors as `files.damage` does, protobuf's included."""
     return files.damage(path, ParseError, remedy=remedy)

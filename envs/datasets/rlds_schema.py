@@ -1,6 +1,6 @@
-"""What a step is called in RLDS, and how an episode becomes one record of tensorflow-datasets.
+"""The schema of RLDS datasets: an episode as one record of tensorflow-datasets (tfds).
 
-The names are those of Open X-Embodiment.
+Features have the names of Open X-Embodiment.
 """
 
 import io
@@ -19,11 +19,11 @@ from envs.datasets.episodes import Episodes
 from envs.datasets.files import RefusedError, read_json
 
 FEATURES, INFO = "features.json", "dataset_info.json"
-"""Files in a dataset's folder in which tfds keeps its description."""
+"""Files in a dataset's folder in which tfds describes it."""
 FILES = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_INDEX}"
-"""What the files of records are called, as tfds.core.SequentialWriter calls them."""
-_MAIN = {"side": "image"}  # the main camera's pictures; those of the others are <name>_image
-_COMPRESSION = 1  # of zlib, the fastest
+"""Template of shard names, as used by tfds.core.SequentialWriter."""
+_MAIN = {"side": "image"}  # feature of the main camera; the others are <name>_image
+_COMPRESSION = 1  # level of zlib, the fastest
 _ACTION = {
     "joint": "targets of {joints} [rad], gripper opening [m]",
     "delta_joint": "changes of the targets of {joints} [rad], gripper opening [m]",
@@ -55,116 +55,120 @@ _NAMES = {
     "jsonFeature": [],
     "json_feature": [],
 }
-"""Fields by which a description names something, as tfds and protobuf spell them -> what they may
-say. The last two, and an outermost "type", hold features of older forms, which name classes too."""
+"""Fields of a description that tfds interprets, in the spelling of tfds and protobuf -> allowed
+values. The last two, and a "type" at the top level, hold features in older formats, which name
+classes too."""
 
 
 def features(episodes: Episodes) -> tfds.features.FeaturesDict:
-    """The features of a dataset of such episodes, with joint names and units as documentation."""
-    of = tfds.features
+    """Define the features of a dataset of these episodes, documenting joint names and units."""
+    types = tfds.features
     joints = ", ".join(f"joint_{i + 1}" for i in range(episodes.state.shape[2] - 1))
-    pictures = {
-        picture_name(camera): of.Image(
-            shape=images.shape[2:], encoding_format="png", doc=f"{camera} camera, before the action"
+    images = {
+        image_feature(camera): types.Image(
+            shape=array.shape[2:], encoding_format="png", doc=f"{camera} camera, before the action"
         )
-        for camera, images in episodes.image.items()
+        for camera, array in episodes.image.items()
     }
-    state = of.Tensor(
+    state = types.Tensor(
         shape=episodes.state.shape[2:],
         dtype=np.float32,
         doc=f"measured before the action: {joints} [rad], gripper opening [m]",
     )
-    action = of.Tensor(
+    action = types.Tensor(
         shape=episodes.action.shape[2:],
         dtype=np.float32,
         doc=_ACTION[episodes.actions].format(joints=joints),
     )
     step = {
-        "observation": of.FeaturesDict(pictures | {"state": state}),
+        "observation": types.FeaturesDict(images | {"state": state}),
         "action": action,
-        "language_instruction": of.Text(),
-        "reward": of.Scalar(np.float32, doc="1 on the last step, where the task is done"),
-        "discount": of.Scalar(np.float32, doc="always 1"),
-        "is_first": of.Scalar(np.bool_),
-        "is_last": of.Scalar(np.bool_),
-        "is_terminal": of.Scalar(np.bool_, doc="the same as is_last: the task is done"),
+        "language_instruction": types.Text(),
+        "reward": types.Scalar(np.float32, doc="1 on the last step, where the task is done"),
+        "discount": types.Scalar(np.float32, doc="always 1"),
+        "is_first": types.Scalar(np.bool_),
+        "is_last": types.Scalar(np.bool_),
+        "is_terminal": types.Scalar(np.bool_, doc="the same as is_last: the task is done"),
     }
-    return of.FeaturesDict({"steps": of.Dataset(step), "episode_metadata": _metadata()})
+    return types.FeaturesDict({"steps": types.Dataset(step), "episode_metadata": _metadata()})
 
 
 def _metadata() -> tfds.features.FeaturesDict:
-    """What is said of every episode."""
-    of = tfds.features
+    """Define the metadata features of an episode."""
+    types = tfds.features
     metadata = {
-        "episode_id": of.Scalar(np.int64, doc="number of the episode in the dataset, from 0"),
-        "instruction": of.Scalar(np.int64, doc="number of the phrasing in the metadata's list"),
-        "task": of.Text(),
-        "robot": of.Text(),
-        "control_dt": of.Scalar(np.float32, doc="time between two actions [s]"),
-        "physics_dt": of.Scalar(np.float32, doc="time step of the simulation [s]"),
+        "episode_id": types.Scalar(np.int64, doc="index of the episode in the dataset"),
+        "instruction": types.Scalar(np.int64, doc="index of the phrasing in the metadata's list"),
+        "task": types.Text(),
+        "robot": types.Text(),
+        "control_dt": types.Scalar(np.float32, doc="time between two actions [s]"),
+        "physics_dt": types.Scalar(np.float32, doc="time step of the simulation [s]"),
     }
-    return of.FeaturesDict(metadata)
+    return types.FeaturesDict(metadata)
 
 
 def stored(folder: Path) -> tfds.features.FeaturesDict:
-    """The features that a folder describes.
+    """Read the features that a folder describes.
 
     Raises:
-        ValueError: as `check_description`, or they are damaged.
+        ValueError: they are damaged, or refused by `check_description`.
     """
     check_description(folder, FEATURES)
-    found: Any = tfds.features.FeaturesDict.from_config(str(folder))
-    return found
+    loaded: Any = tfds.features.FeaturesDict.from_config(str(folder))
+    return loaded
 
 
 def check_description(folder: Path, *names: str) -> None:
-    """Raise unless tfds may read these files: it imports the modules and formats the names in them.
+    """Raise unless these files are safe for tfds, which imports classes and formats names in them.
 
     Raises:
-        RefusedError: a file names another class than those of `features`, or other files of records
-            than `FILES`.
+        RefusedError: a file names classes other than those of `features`, or shards other than
+            `FILES`.
         ValueError: a file is damaged.
-        OSError: there is none.
+        OSError: a file is missing.
     """
     for path in (folder / name for name in names):
         description = read_json(path, folder)
         fields = _NAMES | ({"type": ()} if path.name == FEATURES and "type" in description else {})
-        for field, value in _named(description, fields):
+        for field, value in _values(description, fields):
             if value not in fields[field]:
+                allowed = " or ".join(fields[field])
                 raise RefusedError(
-                    f"{path} has {field} {str(value)[:80]!r}: it may be "
-                    f"{' or '.join(fields[field]) or 'absent only'}"
+                    f"{path} has {field} {str(value)[:80]!r}, which "
+                    + (f"must be {allowed}" if allowed else "is not allowed")
                 )
 
 
-def _named(value: Any, fields: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Values of these fields anywhere in a JSON value."""
+def _values(value: Any, fields: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield the values of these fields anywhere in a JSON value."""
     if isinstance(value, dict):
         yield from ((field, value[field]) for field in fields if field in value)
         value = list(value.values())
     for item in value if isinstance(value, list) else ():
-        yield from _named(item, fields)
+        yield from _values(item, fields)
 
 
-def serializer(form: tfds.features.FeaturesDict) -> ExampleSerializer:
-    """What `record` needs of the features.
+def serializer(features: tfds.features.FeaturesDict) -> ExampleSerializer:
+    """Make the serializer for `record`.
 
-    It takes whole columns; `form.serialize_example` takes a step at a time and twice as long.
+    It takes whole columns; `features.serialize_example` goes step by step and takes twice as long.
     """
-    columns: Any = form.get_serialized_info()
+    columns: Any = features.get_serialized_info()
     return ExampleSerializer(columns)
 
 
-def record(to: ExampleSerializer, episodes: Episodes, number: int, episode_id: int) -> bytes:
-    """One of the episodes, whose arrays lie in host memory, as the bytes of a record."""
+def record(
+    serializer: ExampleSerializer, episodes: Episodes, number: int, episode_id: int
+) -> bytes:
+    """Serialize one of the episodes, which must be in host memory."""
     steps, phrase = int(episodes.length[number]), int(episodes.instruction[number])
-    pictures = {
-        picture_name(camera): _encode(images[number, :steps])
-        for camera, images in episodes.image.items()
+    images = {
+        image_feature(camera): _encode(array[number, :steps])
+        for camera, array in episodes.image.items()
     }
     last = np.arange(steps) == steps - 1
     columns: dict[str, Any] = {
-        "observation": pictures | {"state": episodes.state[number, :steps]},
+        "observation": images | {"state": episodes.state[number, :steps]},
         "action": episodes.action[number, :steps],
         "language_instruction": [episodes.instructions[phrase].encode()] * steps,
         "reward": last.astype(np.float32),
@@ -182,71 +186,69 @@ def record(to: ExampleSerializer, episodes: Episodes, number: int, episode_id: i
         "physics_dt": np.float32(episodes.physics_dt),
     }
     example: dict[str, Any] = {"steps": columns, "episode_metadata": metadata}
-    return to.serialize_example(example)
+    return serializer.serialize_example(example)
 
 
 def episode(
     example: Mapping[str, Any],
     cameras: Mapping[str, str],
     sizes: Mapping[str, Any],
-    facts: Mapping[str, Any],
+    metadata: Mapping[str, Any],
 ) -> Episodes:
-    """One episode, in host memory.
+    """Convert an example of tfds to an episode in host memory.
 
     Args:
-        example: what tfds gives, pictures not decoded.
-        cameras: name of a camera -> name of its pictures.
-        sizes: name of a camera -> height and width of its pictures.
-        facts: what the episode does not hold itself: the facts of `Episodes`.
+        example: an example from tfds, with encoded images.
+        cameras: camera -> feature of its images.
+        sizes: camera -> height and width of its images.
+        metadata: the metadata fields of `Episodes`.
     """
     steps = list(example["steps"])
-    seen = [step["observation"] for step in steps]
+    observations = [step["observation"] for step in steps]
     return Episodes(
         image={
-            camera: np.stack([_decode(observation[name], sizes[camera]) for observation in seen])[
-                None
-            ]
-            for camera, name in cameras.items()
+            camera: np.stack([_decode(step[feature], sizes[camera]) for step in observations])[None]
+            for camera, feature in cameras.items()
         },
-        state=np.stack([observation["state"] for observation in seen])[None],
+        state=np.stack([step["state"] for step in observations])[None],
         action=np.stack([step["action"] for step in steps])[None],
         length=np.array([len(steps)], np.int32),
         instruction=np.array([int(example["episode_metadata"]["instruction"])], np.int32),
-        **facts,
+        **metadata,
     )
 
 
-def picture_name(camera: str) -> str:
-    """What the pictures of a camera are called."""
+def image_feature(camera: str) -> str:
+    """Return the name of the feature that holds a camera's images."""
     return _MAIN.get(camera, f"{camera}_image")
 
 
 def _encode(images: Any) -> list[bytes]:
-    """PNG files (ISO/IEC 15948) of uint8 `[T, H, W, 3]` pictures in host memory.
+    """Encode uint8 `[T, H, W, 3]` images in host memory as PNG files (ISO/IEC 15948).
 
-    Written here because no library is as fast: zlib's work needs no lock of Python's, and rendered
-    pictures shrink most without a filter. Measured on pictures of 128 px and 16 cores, 8 threads
-    take 56 us a picture; ffmpeg's encoder 88 at best, OpenCV's 141 and PIL's 177, larger by 15 %.
+    No library is as fast: zlib releases Python's lock, and rendered images compress best without a
+    filter. Measured for images of 128 px on 16 cores: 8 threads take 56 us per image; ffmpeg's
+    encoder takes 88 at best, OpenCV's 141 and PIL's 177, with files larger by 15 %.
     """
     count, height, width, _ = images.shape
     rows = np.zeros((count, height, 1 + 3 * width), np.uint8)  # each begins with 0: no filter
     rows[..., 1:] = images.reshape(count, height, 3 * width)
-    kind = struct.pack(">2I5B", width, height, 8, 2, 0, 0, 0)  # 8 bits a channel, RGB
-    start, end = b"\x89PNG\r\n\x1a\n" + _chunk(b"IHDR", kind), _chunk(b"IEND", b"")
+    header = struct.pack(">2I5B", width, height, 8, 2, 0, 0, 0)  # 8 bits per channel, RGB
+    start, end = b"\x89PNG\r\n\x1a\n" + _chunk(b"IHDR", header), _chunk(b"IEND", b"")
     return [
-        start + _chunk(b"IDAT", zlib.compress(picture.data, _COMPRESSION)) + end for picture in rows
+        start + _chunk(b"IDAT", zlib.compress(image.data, _COMPRESSION)) + end for image in rows
     ]
 
 
 def _chunk(kind: bytes, data: bytes) -> bytes:
-    """A piece of a PNG file: length, kind, data, checksum."""
+    """Make a chunk of a PNG file: length, type, data, checksum."""
     length, check = len(data), zlib.crc32(data, zlib.crc32(kind))
     return struct.pack(">I", length) + kind + data + struct.pack(">I", check)
 
 
 def _decode(file: bytes, size: Any) -> np.ndarray:
-    """A uint8 `[H, W, 3]` picture; raises a ValueError if its H and W are others than these."""
-    with Image.open(io.BytesIO(file), formats=("PNG",)) as picture:
-        if [picture.height, picture.width] != list(size):  # nothing is decoded so far
-            raise ValueError(f"a picture has {picture.height} x {picture.width} pixels, not {size}")
-        return np.asarray(picture)
+    """Decode an image to uint8 `[H, W, 3]`; raise ValueError if its size is not `size`."""
+    with Image.open(io.BytesIO(file), formats=("PNG",)) as image:
+        if [image.height, image.width] != list(size):  # checked before decoding
+            raise ValueError(f"an image has {image.height} x {image.width} pixels, expected {size}")
+        return np.asarray(image)

@@ -1,8 +1,8 @@
-"""Write files and folders aside, then rename them: others see the old one or the new one, whole.
+"""Atomic writes of files and folders: write under a temporary name, then rename.
 
-Everything is on disk before it gets its name, and so is the name when the call returns: after a
-power cut, too, a name never stands for half a file. Where anything is raised, a full disk for
-example, nothing is left behind and the old file stays.
+Contents are synced to disk before the rename and the rename before the call returns, so a crash or
+a power failure never leaves a partial file under the final name. If anything raises, a full disk
+for example, the temporary file is deleted and the old one stays.
 """
 
 import contextlib
@@ -14,30 +14,30 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 TEMPORARY_SUFFIX = ".tmp"
-"""How a name ends that a file or folder has until it is whole; it begins with a dot."""
+"""Suffix of temporary names, which also start with a dot."""
 
 
 @contextlib.contextmanager
 def atomic_file(file: Path) -> Iterator[Path]:
-    """A path to write to, which replaces the file when the block ends without an exception.
+    """Yield a path to write to, which replaces the file if the block succeeds.
 
     Raises:
-        OSError: the file cannot be written, for want of room for example.
+        OSError: the file cannot be written, for example because the disk is full.
     """
-    unfinished = file.with_name(f".{file.name}.{secrets.token_hex(4)}{TEMPORARY_SUFFIX}")
+    temporary = file.with_name(f".{file.name}.{secrets.token_hex(4)}{TEMPORARY_SUFFIX}")
     try:
-        yield unfinished
-        sync(unfinished)
-        os.replace(unfinished, file)
+        yield temporary
+        sync(temporary)
+        os.replace(temporary, file)
         sync(file.parent)
     finally:
-        unfinished.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def write_bytes(file: Path, data: bytes | bytearray) -> None:
     """Replace a file, see `atomic_file`."""
-    with atomic_file(file) as unfinished:
-        unfinished.write_bytes(data)
+    with atomic_file(file) as temporary:
+        temporary.write_bytes(data)
 
 
 def write_text(file: Path, text: str) -> None:
@@ -47,14 +47,14 @@ def write_text(file: Path, text: str) -> None:
 
 @contextlib.contextmanager
 def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A new folder to fill, which is renamed to `path` when the block ends without an exception.
+    """Yield a new folder to fill, which is renamed to `path` if the block succeeds.
 
-    One process at a time may create a path (`envs.datasets.locks.locked`): what a killed one left
-    is deleted first.
+    Only one process at a time may create a path, see `envs.datasets.locks.locked`: what a killed
+    process left is deleted first.
 
     Raises:
         ValueError: the path already exists.
-        OSError: something cannot be written, for want of room for example.
+        OSError: something cannot be written, for example because the disk is full.
     """
     path = Path(path)
     if path.exists():
@@ -74,12 +74,12 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def replace_folder(new: Path, path: Path, check: Callable[[Path], object]) -> None:
-    """Rename a complete folder to `path`; one that stands there is deleted afterwards.
+    """Rename a complete folder to `path`, then delete the folder that it replaces, if any.
 
     Args:
         new: the complete folder.
-        path: its new name. After a kill, `recover_folder` ends what was begun.
-        check: called with `path` where something stands there; raises if that must not be deleted.
+        path: its new name. If the process is killed, `recover_folder` completes the replacement.
+        check: called with `path` if it exists; raises if it must not be deleted.
     """
     if path.exists():
         check(path)
@@ -89,7 +89,7 @@ def replace_folder(new: Path, path: Path, check: Callable[[Path], object]) -> No
 
 
 def recover_folder(path: Path) -> None:
-    """After a killed `replace_folder`: keep the new folder if it is in place, else the old one."""
+    """Complete a killed `replace_folder`: keep the new folder if in place, else the old one."""
     if not path.exists() and _old(path).exists():
         rename(_old(path), path)
     elif _old(path).exists():
@@ -97,22 +97,22 @@ def recover_folder(path: Path) -> None:
 
 
 def rename(old: Path, new: Path) -> None:
-    """Rename a file or folder within its file system; the new name is on disk afterwards."""
+    """Rename a file or folder within a file system, and sync the new name to disk."""
     os.rename(old, new)
     sync(new.parent)
 
 
 def sync(path: Path) -> None:
-    """Wait until a file's content, or the names in a folder, are on disk.
+    """Wait until a file's content, or the entries of a folder, are on disk.
 
     Raises:
-        OSError: they cannot be written, for want of room for example.
+        OSError: they cannot be written, for example because the disk is full.
     """
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     except OSError as error:
-        if error.errno != errno.EINVAL:  # not a file system's (SMB) that cannot sync folders
+        if error.errno != errno.EINVAL:  # some file systems (SMB) cannot sync folders
             raise
     finally:
         os.close(descriptor)

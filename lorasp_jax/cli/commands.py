@@ -26,10 +26,10 @@ INTERRUPTED = 130
 def main() -> NoReturn:
     """Run the command named on the command line."""
     exit_on_signals()
-    from envs.cli.refusals import parsed
+    from envs.cli.errors import parse_arguments
 
     first, rest = sys.argv[1:2], sys.argv[2:]
-    command = parsed(_parser(), first).command
+    command = parse_arguments(_parser(), first).command
     run(command, rest, f"lorasp-jax {command}")
 
 

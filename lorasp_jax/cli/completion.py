@@ -5,13 +5,13 @@ import importlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from envs.cli.refusals import parsed
+from envs.cli.errors import parse_arguments
 from lorasp_jax.cli import commands
 
 
 def main(arguments: Sequence[str], program: str) -> int:
     """Print a completion script; return the exit code."""
-    shell = parsed(parser(program), arguments).shell
+    shell = parse_arguments(parser(program), arguments).shell
     import shtab
 
     tree = _tree()

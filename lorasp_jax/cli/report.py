@@ -6,18 +6,18 @@ from pathlib import Path
 
 from rich.console import Console
 
-from envs.cli.refusals import parsed, refused
+from envs.cli.errors import parse_arguments, report_error
 
 
 def main(arguments: Sequence[str], program: str = "lorasp-jax report") -> int:
     """Write report.html of a run; return the exit code: 0 success, 2 invalid input."""
-    options = parsed(parser(program), arguments)  # before slow imports
+    options = parse_arguments(parser(program), arguments)  # before slow imports
     from lorasp_jax.report.html import write_report
 
     try:
         path = write_report(options.run)
     except Exception as error:
-        return refused(error, Console(stderr=True))
+        return report_error(error, Console(stderr=True))
     Console().print(f"report: {path}", soft_wrap=True, highlight=False, markup=False)
     return 0
 

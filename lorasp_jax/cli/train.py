@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from envs.cli.refusals import refused
+from envs.cli.errors import report_error
 from envs.compilation import cache
 from lorasp_jax.cli.commands import INTERRUPTED
 
@@ -43,7 +43,7 @@ def main(arguments: Sequence[str], program: str = "python train.py") -> int:
             processes.agree("settings", to_json(command.config) | options)
             _execute(command, console, started)
     except Exception as error:  # invalid input: one sentence; bugs: raised again
-        return refused(error, errors, ": free some memory or disk space and add --resume")
+        return report_error(error, errors, ": free some memory or disk space and add --resume")
     except KeyboardInterrupt:
         message = f"stopped; to resume: {resume_command(arguments, program)}"
         errors.print(message, soft_wrap=True, highlight=False, markup=False)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from envs.cli.bars import bars
-from envs.cli.refusals import parsed, refused
+from envs.cli.errors import parse_arguments, report_error
 from envs.datasets.files import check_local
 from lorasp_jax.data.keys import Keys
 
@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.data") -> int:
     """Run a command and return its exit code: 0 success, 2 invalid input, 130 interrupted."""
-    options = parsed(parser(program), arguments)  # before slow imports, which help does not need
+    options = parse_arguments(
+        parser(program), arguments
+    )  # before slow imports, which help does not need
     import jax
 
     jax.config.update("jax_platforms", "cpu")  # leave accelerators to others
@@ -29,7 +31,7 @@ def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.data") -
     try:
         options.command(options, Console())
     except Exception as error:
-        return refused(error, errors)
+        return report_error(error, errors)
     except KeyboardInterrupt:
         errors.print("interrupted; temporary files were removed")
         return 130

@@ -17,7 +17,7 @@ import jax
 import orbax.checkpoint as ocp
 from rich.console import Console
 
-from envs.cli.refusals import DISK_FULL
+from envs.cli.errors import DISK_FULL
 from envs.datasets.writing import rename
 from lorasp_jax.models.checkpoints import orbax_folders
 from lorasp_jax.storage.digest import digest

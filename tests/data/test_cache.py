@@ -181,7 +181,9 @@ def test_a_broken_dataset_leaves_no_cache(tmp_path):
     folder = copied("v3", tmp_path)
     edit_rows(folder, set_value("action", 100, lambda x: [np.nan] * len(x)))
     before = digest(folder)
-    with pytest.raises(ValueError, match="action is not finite in number 0 at step 2 of episode 0"):
+    with pytest.raises(
+        ValueError, match="action is not finite in dimension 0 at step 2 of episode 0"
+    ):
         written(tmp_path / "cache", LeRobot(folder))
     assert digest(folder) == before
     assert [path.name for path in tmp_path.iterdir()] == ["dataset"]

@@ -134,7 +134,7 @@ def test_output_goes_to_this_machine(command, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     code, _, err = run(capsys, command, golden("v3"), "--out", "gs://bucket/folder")
     assert code == 2
-    assert "gs:/bucket/folder is a URL: what is written goes to a folder of this machine" in err
+    assert "cannot write to the URL gs:/bucket/folder: give a path on this machine" in err
     assert not list(tmp_path.iterdir())
 
 

@@ -76,7 +76,7 @@ def test_what_does_not_fit_is_said_at_once(changes, model, sentence, tmp_path):
         ({"actions": "delta_joint"}, "has actions of the kind delta_joint, policies learn joint"),
         (
             dict.fromkeys(("state", "action"), np.zeros((3, 9, 14), np.float32)),
-            "1 to 7 joints here, got 13. Choose with .* --state-numbers",
+            "1 to 7 for this backbone, got 13. Choose with .* --state-numbers",
         ),
     ],
 )

@@ -168,8 +168,8 @@ BROKEN = {
         lambda f: edit_rows(f, set_value("action", 3, lambda x: x[:-1])),
         r"6 or 7 dimensions in action",
     ),
-    "no number": (break_numbers(None), "not finite in number 6 at step 3|damaged"),
-    "nan": (break_numbers(math.nan), "state is not finite in number 6 at step 3 of episode 0"),
+    "no number": (break_numbers(None), "not finite in dimension 6 at step 3|damaged"),
+    "nan": (break_numbers(math.nan), "state is not finite in dimension 6 at step 3 of episode 0"),
     "text": (
         lambda f: edit_rows(f, lambda t: replaced(t, "action", pa.array(["up"] * len(t)))),
         "damaged",

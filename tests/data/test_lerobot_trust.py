@@ -44,7 +44,7 @@ def read(folder):
         ("{0}", "lacks '0'"),
         ("{{}}", "invalid path template"),
         ({"a": 1}, "invalid path template"),
-        ("", "no name of a file"),
+        ("", "not a valid file name"),
     ],
 )
 def test_paths(version, of, path, sentence, tmp_path):
@@ -70,7 +70,7 @@ def test_links_and_pipes(version, pattern, tmp_path):
     (tmp_path / "outside").write_bytes(path.read_bytes())
     path.unlink()
     path.symlink_to(tmp_path / "outside")
-    with pytest.raises(ValueError, match=f"{path.name} leads to .*outside, out of .*dataset"):
+    with pytest.raises(ValueError, match=f"{path.name} links to .*outside, outside of .*dataset"):
         read(folder)
     path.unlink()
     os.mkfifo(path)
@@ -160,7 +160,7 @@ def test_numbers_of_the_index(name, value, tmp_path):
 
     edit_rows(folder, change, of="meta/episodes")
     edit_info(folder, lambda info: info.pop("total_frames"))
-    with pytest.raises(ValueError, match=r"is no whole number|starts at|must have frames") as found:
+    with pytest.raises(ValueError, match=r"is not an integer|starts at|must have frames") as found:
         read(folder)
     assert "\n" not in str(found.value)
     assert digest(folder / "data") == before
@@ -173,5 +173,5 @@ def test_lines_of_the_index(tmp_path):
     for name, value in (("length", 25.5), ("length", float("inf")), ("episode_index", "1")):
         broken = [lines[0] | {name: value}, *lines[1:]]
         path.write_text("\n".join(map(json.dumps, broken)))
-        with pytest.raises(ValueError, match=r"episodes.jsonl is damaged .*is no whole number"):
+        with pytest.raises(ValueError, match=r"episodes.jsonl is damaged .*is not an integer"):
             LeRobot(folder)

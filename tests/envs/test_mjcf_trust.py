@@ -63,14 +63,14 @@ def test_meshes_outside(name, compiler, robots):
     (robots / "robot" / "link.obj").symlink_to("../other/a.obj")
     (robots / "robot" / "linked").symlink_to("../other")
     path = model(robots, mesh(name.format(root=robots)), compiler.format(root=robots))
-    with pytest.raises(ValueError, match=r"leads to .*other/a.obj, out of .*robot"):
+    with pytest.raises(ValueError, match=r"links to .*other/a.obj, outside of .*robot"):
         reading.read(path)
     assert reading.read(path, robots)[1].nmesh == 1
 
 
 def test_load(robots):
     path = model(robots, mesh("../other/a.obj"))
-    with pytest.raises(ValueError, match=r"robot .*x.xml: .*a.obj leads to .*, out of .*robot"):
+    with pytest.raises(ValueError, match=r"robot .*x.xml: .*a.obj links to .*, outside of .*robot"):
         mjcf.load(path)
     with pytest.raises(ValueError, match="the fingers need two slide joints"):
         mjcf.load(path, folder=robots)
@@ -90,7 +90,7 @@ def test_other_files_outside(asset, robots):
     (robots / "robot" / "parts" / "b.xml").write_text(
         '<mujoco><include file="../../other/a.xml"/></mujoco>'
     )
-    with pytest.raises(ValueError, match=r"leads to .*other/a\.\w+, out of .*robot"):
+    with pytest.raises(ValueError, match=r"links to .*other/a\.\w+, outside of .*robot"):
         reading.read(model(robots, asset, body=""))
 
 

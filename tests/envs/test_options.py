@@ -9,11 +9,11 @@ from tests.envs.children import COLLECT
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("--seed 99999999999999999999", "argument --seed: must be 0 to 4294967295, not 99"),
+        ("--seed 99999999999999999999", "argument --seed: must be 0 to 4294967295, got 99"),
         ("--seed -1", "argument --seed: must be 0 to"),
         ("--seed one", "argument --seed: invalid seed value: 'one'"),
-        ("--control-dt inf", "argument --control-dt: must be a finite number, not inf"),
-        ("--action-noise nan", "argument --action-noise: must be a finite number, not nan"),
+        ("--control-dt inf", "argument --control-dt: must be a finite number, got inf"),
+        ("--action-noise nan", "argument --action-noise: must be a finite number, got nan"),
     ],
 )
 def test_numbers_that_are_none(tmp_path, capsys, text, message):
@@ -25,8 +25,8 @@ def test_numbers_that_are_none(tmp_path, capsys, text, message):
 
 def test_help_says_what_options_are_for(capsys):
     for command, texts in (
-        ("play", ("with --out: pixels", "with --out: replace", "or the path of an MJCF file")),
-        ("collect", ("replace what is there", "or the path of an MJCF file")),
+        ("play", ("with --out: height", "with --out: replace", "or the path of an MJCF file")),
+        ("collect", ("replace existing output", "or the path of an MJCF file")),
     ):
         with pytest.raises(SystemExit, match="0"):
             command_line.main([command, "--help"])

@@ -80,11 +80,15 @@ def test_no_module_is_imported(form, path):
 @pytest.mark.parametrize(
     ("where", "value", "sentence"),
     [
-        ("filepathTemplate", "../{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_INDEX}", "it may be"),
-        ("filepathTemplate", "{DATASET:>0999999999}", "it may be"),
-        ("filepathTemplate", "{DATASET.__class__}", "it may be"),
-        ("shardLengths", ["999999999999"], "describes 999999999999 episodes, not 3"),
-        ("shardLengths", [], "describes 0 episodes"),
+        (
+            "filepathTemplate",
+            "../{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_INDEX}",
+            "must be {DATASET}-",
+        ),
+        ("filepathTemplate", "{DATASET:>0999999999}", "must be {DATASET}-"),
+        ("filepathTemplate", "{DATASET.__class__}", "must be {DATASET}-"),
+        ("shardLengths", ["999999999999"], "lists 999999999999 episodes, expected 3"),
+        ("shardLengths", [], "lists 0 episodes"),
         ("name", "test", "damaged"),
     ],
 )
@@ -105,7 +109,7 @@ def test_a_name_that_leaves_the_folder(path, tmp_path):
 def test_more_episodes_than_there_are(path):
     edit(path / "metadata.json", lambda found: found.update(parts=[10**12]))
     edit(path / "dataset_info.json", lambda i: i["splits"][0].update(shardLengths=[str(10**12)]))
-    with pytest.raises(ValueError, match="holds 3 episodes, not 1000000000000"):
+    with pytest.raises(ValueError, match="has 3 episodes, expected 1000000000000"):
         rlds.Reader(path)
 
 
@@ -116,7 +120,7 @@ def test_more_episodes_than_there_are(path):
 def test_links_and_pipes(name, path, tmp_path):
     (path / name).rename(tmp_path / "outside")
     (path / name).symlink_to(tmp_path / "outside")
-    with pytest.raises(ValueError, match=f"{name} leads to .*outside, out of .*press"):
+    with pytest.raises(ValueError, match=f"{name} links to .*outside, outside of .*press"):
         rlds.Reader(path)
     (path / name).unlink()
     os.mkfifo(path / name)
@@ -127,7 +131,7 @@ def test_links_and_pipes(name, path, tmp_path):
 def test_pictures_of_another_size(path):
     """They are refused before they are decoded."""
     edit(path / "metadata.json", lambda found: found["cameras"].update(side=[60, 80]))
-    with pytest.raises(ValueError, match=r"a picture has 6 x 8 pixels, not \[60, 80\]"):
+    with pytest.raises(ValueError, match=r"an image has 6 x 8 pixels, expected \[60, 80\]"):
         rlds.read(path)
 
 
@@ -144,6 +148,6 @@ def test_names_of_tasks_and_robots_are_no_paths(name, path, tmp_path):
 def test_names_of_cameras_are_no_paths(name, tmp_path):
     episodes = make()
     images = {name: episodes.image["side"]}
-    with pytest.raises(ValueError, match="a camera is called"):
+    with pytest.raises(ValueError, match="invalid camera name"):
         rlds.write(dataclasses.replace(episodes, image=images), tmp_path / "other")
     assert not list(tmp_path.iterdir())

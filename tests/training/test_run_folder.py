@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from envs.cli.refusals import DISK_FULL
+from envs.cli.errors import DISK_FULL
 from lorasp_jax.config import Config, DataConfig
 from lorasp_jax.peft import LoRASP
 from lorasp_jax.training import run_folder
@@ -244,7 +244,9 @@ def test_a_run_that_leads_elsewhere_is_not_gone_on_with(tmp_path):
     folder = open_run(CONFIG, tmp_path / "runs", resume=False)
     (tmp_path / "precious.mp4").write_text("precious")
     (folder / "unfinished_press.mp4").symlink_to("../../precious.mp4")
-    with pytest.raises(ValueError, match=r"unfinished_press.mp4 leads to .*precious.mp4, out of"):
+    with pytest.raises(
+        ValueError, match=r"unfinished_press.mp4 links to .*precious.mp4, outside of"
+    ):
         open_run(CONFIG, tmp_path / "runs", resume=True)
 
 

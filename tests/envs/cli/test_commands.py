@@ -62,8 +62,8 @@ def test_bad_input_is_one_sentence(tmp_path, run, monkeypatch):
         (f"collect --actions voltage {press}", tmp_path / "new", "joint, delta_joint, end_eff"),
         (f"collect --distractors 5 {press}", tmp_path / "new", "distractors must be at most 4"),
         ("collect --task press dance --robot piper --out", tmp_path / "new", "dance"),
-        ("collect --task all --robot piper --out", tmp_path / "e.npz", "e.npz can hold one task"),
-        (f"play --image-size 33 {press}", tmp_path / "a.mp4", "even --image-size"),
+        ("collect --task all --robot piper --out", tmp_path / "e.npz", "npz file holds one task"),
+        (f"play --image-size 33 {press}", tmp_path / "a.mp4", "must be even, got 33"),
         ("play --task dance --robot piper --out", tmp_path / "a.mp4", "dance"),
         ("gallery --task press --robot r2d2 --out", tmp_path / "g", "r2d2"),
         (f"collect {press}", "gs://bucket/press", "gs:/bucket/press is a URL"),
@@ -143,7 +143,10 @@ def test_killed_and_continued(tmp_path, run, moment):
 
     code, said = run(COLLECT, "--out", out, "--seed", 1)
     assert code == 2
-    assert "killed.partial was begun with seed 0, not 1: finish it with that, or delete it" in said
+    assert (
+        "killed.partial was started with seed 0, not 1: continue with the same value, or delete"
+        in said
+    )
 
     code, said = run(COLLECT, "--out", out)
     assert code == 0, said
@@ -163,7 +166,7 @@ def test_interrupted_simulation_goes_on_bit_for_bit(tmp_path, run, env, monkeypa
     expert = collection.record_expert
     code, said = run(text, "--out", out, record=stopping(expert, 2))
     assert code == 130
-    assert f"stopped: 8 of 10 episodes are kept in {out}.partial, the same command" in said
+    assert f"interrupted; 8 of 10 episodes are in {out}.partial; run the same command" in said
     assert run(text, "--out", out, record=expert)[0] == 0
     whole = envs.collect("press", num_episodes=10, key=jax.random.key(0))
     assert_equal(rlds.read(out), trimmed(whole))
@@ -173,7 +176,7 @@ def test_interrupted_before_anything(tmp_path, run, monkeypatch):
     monkeypatch.setattr(rlds, "ShardWriter", stopping(rlds.ShardWriter, 0))
     code, said = run(COLLECT, "--out", tmp_path / "press")
     assert code == 130
-    assert said.endswith("stopped: no unfinished file is left")
+    assert said.endswith("interrupted; temporary files were removed")
     assert not list(tmp_path.iterdir())
 
 
@@ -185,12 +188,12 @@ def test_several_tasks_go_on_where_they_were(tmp_path, run, monkeypatch):
     assert code == 130
     done, rest = ([f for f in out.iterdir() if (f.suffix == ".partial") == p] for p in (0, 1))
     assert len(done) >= 2
-    assert all(f"of 20 episodes are kept in {folder}, the same" in said for folder in rest)
+    assert all(f"of 20 episodes are in {folder}; run the same" in said for folder in rest)
     before = {folder: folder.stat() for folder in done}
     code, said = run(text, "--out", out)
     assert code == 0, said
     for folder in done:
-        assert f"{folder} is there already" in said
+        assert f"{folder} is already complete" in said
         assert folder.stat() == before[folder]
     assert sorted(os.listdir(out)) == ["open_pot", "pick_place", "pour", "press"]
     run(COLLECT, "--out", tmp_path / "press")
@@ -216,7 +219,7 @@ def test_ctrl_c_keeps_the_part_under_way(tmp_path):
     child = run_child(f"collect_and_interrupt({str(out)!r})")
     assert child.returncode == 130, child.stderr
     assert len(rlds.metadata(tmp_path / "press.partial")["parts"]) == 2
-    assert b"are kept in" in child.stderr
+    assert b"episodes are in" in child.stderr
     assert b"Traceback" not in child.stderr
 
 
@@ -227,7 +230,7 @@ def test_overwriting_keeps_the_old_until_the_new_is_whole(tmp_path, run, monkeyp
     with monkeypatch.context() as patch:
         patch.setattr(rlds.ShardWriter, "complete", stopping(rlds.ShardWriter.complete, 0))
         code, said = run(COLLECT, "--out", out, "--seed", 1, "--overwrite")
-    assert (code, "20 of 20 episodes are kept" in said) == (130, True)
+    assert (code, "20 of 20 episodes are in" in said) == (130, True)
     assert_equal(rlds.read(out), before)
     assert run(COLLECT, "--out", out, "--seed", 1, "--overwrite")[0] == 0
     assert os.listdir(tmp_path) == ["press"]
@@ -244,7 +247,7 @@ def test_a_damaged_part_is_refused(tmp_path, run, monkeypatch):
     code, said = run(COLLECT, "--out", out)
     assert code == 2
     assert f"{file} is damaged" in said
-    assert said.endswith(f"delete {file.parent} to start anew")
+    assert said.endswith(f"delete {file.parent} to start over")
 
 
 @pytest.mark.slow
@@ -255,12 +258,12 @@ def test_an_edited_robot_is_another(tmp_path, run):
         patch.setattr(rlds.ShardWriter, "complete", stopping(rlds.ShardWriter.complete, 0))
         assert run(text, "--out", tmp_path / "begun")[0] == 130
     code, said = run(text, "--out", tmp_path / "done")
-    assert (code, "is there already" in said) == (0, True)
+    assert (code, "is already complete" in said) == (0, True)
     user_arm.write(tmp_path, ('kp="150"', 'kp="140"'))
     code, said = run(text, "--out", tmp_path / "done")
     assert (code, "already exists" in said) == (2, True)
     code, said = run(text, "--out", tmp_path / "begun")
-    assert (code, "was begun with model" in said) == (2, True)
+    assert (code, "was started with model" in said) == (2, True)
 
 
 def test_a_second_process_is_refused(tmp_path, run):

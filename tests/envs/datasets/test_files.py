@@ -32,7 +32,7 @@ def test_names_that_stay(name, tmp_path):
     ],
 )
 def test_names_that_leave(name, tmp_path):
-    with pytest.raises(files.RefusedError, match=re.escape(f"{tmp_path} names a file {name!r}")):
+    with pytest.raises(files.RefusedError, match=re.escape(f"{tmp_path} refers to {name!r}")):
         files.inside(tmp_path, name)
 
 
@@ -45,7 +45,9 @@ def test_links(folder, tmp_path):
     (folder / "c.json").symlink_to("../secret.json")
     (folder / "out").symlink_to("..")
     for path in (folder / "c.json", folder / "out" / "secret.json"):
-        with pytest.raises(files.RefusedError, match=r"leads to .*secret.json, out of .*dataset"):
+        with pytest.raises(
+            files.RefusedError, match=r"links to .*secret.json, outside of .*dataset"
+        ):
             files.regular(path, folder)
         assert files.regular(path) == path
     (folder / "loop").symlink_to("loop")
@@ -72,7 +74,7 @@ def test_a_snapshot_of_the_hub(shared, tmp_path):
         assert files.read_json(place / "meta" / "info.json", place / "meta") == [1]
     (snapshot / "other").symlink_to(tmp_path / "hub" / "datasets--owner--name")
     (snapshot.parent.parent / "refs").write_text("x")
-    with pytest.raises(files.RefusedError, match="out of"):
+    with pytest.raises(files.RefusedError, match="outside of"):
         files.regular(snapshot / "other" / "refs", snapshot)
 
 
@@ -106,7 +108,7 @@ def test_sizes(folder):
 def test_whole_numbers():
     assert [files.whole(n) for n in (3, 3.0, -1, 2**62)] == [3, 3, -1, 2**62]
     for bad in (2.5, float("nan"), float("inf"), -1e300, 10**30, True, None, "3", [3]):
-        with pytest.raises(ValueError, match="is no whole number"):
+        with pytest.raises(ValueError, match="is not an integer"):
             files.whole(bad)
     assert json.loads("1e999") == float("inf")
 
@@ -116,7 +118,7 @@ def test_only_files(folder, tmp_path):
     for name, target in (("file", "../../secret.json"), ("folder", "../..")):
         (folder / "data" / name).symlink_to(target)
         files.check_only_files(folder)
-        with pytest.raises(files.RefusedError, match=rf"{name} leads to .*, out of .*dataset"):
+        with pytest.raises(files.RefusedError, match=rf"{name} links to .*, outside of .*dataset"):
             files.check_only_files(folder, folder)
         (folder / "data" / name).unlink()
     os.mkfifo(folder / "data" / "pipe")

@@ -100,6 +100,6 @@ def test_a_lock_that_is_no_file_is_refused(path, kind):
         "folder": lock.mkdir,
         "pipe": lambda: os.mkfifo(lock),
     }[kind]()
-    with pytest.raises(ValueError, match=r"press\.lock cannot be opened"), locks.locked(path):
+    with pytest.raises(ValueError, match=r"cannot open .*press\.lock"), locks.locked(path):
         pass
     assert [file.name for file in path.parent.iterdir()] == [lock.name]

@@ -1,0 +1,104 @@
+"""Report errors of a command in one sentence; only bugs keep their traceback.
+
+Bad input raises ValueError everywhere in the project. Inaccessible files and exhausted memory are
+problems of the machine. If the reader of a pipe has left, nothing is reported.
+"""
+
+import argparse
+import errno
+import os
+import select
+import sys
+from collections.abc import Sequence
+
+from rich.console import Console
+
+REFUSED = 2
+"""Exit code after bad input."""
+BROKEN_PIPE = 141
+"""Exit code if the reader of the output has left, as shells report SIGPIPE."""
+MAX_LENGTH = 1000
+"""Maximum characters of a message."""
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Error numbers of writes that found no space."""
+_STDOUT = 1
+
+
+def parse_arguments(
+    parser: argparse.ArgumentParser, arguments: Sequence[str]
+) -> argparse.Namespace:
+    """Parse the options of a command.
+
+    Raises:
+        SystemExit: after help or bad options, as in argparse; with `BROKEN_PIPE` if the reader of
+            the help has left.
+    """
+    try:
+        return parser.parse_args(arguments)
+    except SystemExit:
+        try:
+            sys.stdout.flush()  # otherwise Python flushes at exit and reports an error
+        except BrokenPipeError as error:
+            if _reader_left():
+                raise SystemExit(BROKEN_PIPE) from error
+            raise
+        raise
+
+
+def report_error(error: Exception, errors: Console, remedy: str = "") -> int:
+    """Print why a command failed.
+
+    Args:
+        error: the exception; raised again if it is a bug.
+        errors: console to print to.
+        remedy: end of the sentence that says what to do if disk or memory is full.
+
+    Returns:
+        The exit code.
+    """
+    if isinstance(error, BrokenPipeError) and _reader_left():
+        return BROKEN_PIPE
+    if (reason := describe(error, remedy)) is None:
+        raise error
+    # Names on the command line are not always valid Unicode.
+    text = f"error: {reason}".encode(errors="backslashreplace").decode()
+    errors.print(text, style="red", soft_wrap=True, highlight=False, markup=False)
+    return REFUSED
+
+
+def describe(error: Exception, remedy: str = "") -> str | None:
+    """Describe an error on one line; return None for a bug."""
+    if isinstance(error, MemoryError) or _is_out_of_memory(error):
+        text = "out of memory"
+        return f"{text} ({_one_line(error)[:200]}){remedy}" if str(error) else f"{text}{remedy}"
+    if isinstance(error, ValueError):
+        return _one_line(error)
+    if not isinstance(error, OSError):
+        return None
+    if error.strerror is None:  # raised with a message of its own
+        return _one_line(error)
+    prefix = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
+    return f"{prefix}{error.strerror}{remedy if error.errno in DISK_FULL else ''}"
+
+
+def _reader_left() -> bool:
+    """Return whether the reader of stdout has left; if so, discard further output."""
+    poll = select.poll()
+    poll.register(_STDOUT, select.POLLOUT)
+    if not any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0)):
+        return False
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, _STDOUT)  # otherwise Python flushes again at exit and reports an error
+    os.close(null)
+    return True
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    """Return whether a JAX device ran out of memory; by name, so that JAX need not be imported."""
+    return type(error).__name__ == "JaxRuntimeError" and "RESOURCE_EXHAUSTED" in str(error)
+
+
+def _one_line(error: Exception) -> str:
+    """Return the message on one line, keeping both ends of a long one, which may quote a file."""
+    text, half = " ".join(str(error).split()), MAX_LENGTH // 2
+    return text if len(text) <= MAX_LENGTH else f"{text[:half]} ... {text[-half:]}"
