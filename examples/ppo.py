@@ -1,11 +1,11 @@
 """Train PPO on a task's privileged state, with physics and learning in one jitted step.
 
-    python examples/ppo.py                                  # press, on a CPU, in minutes
+    python examples/ppo.py                                          # press, minutes on a CPU
     python examples/ppo.py --num-envs 2048 --learning-rate 3e-4     # every field is an option
 
-PPO is Schulman et al. 2017 (arXiv 1707.06347), with generalised advantage estimation (arXiv
-1506.02438). For this package's dense reward, pass the learner's discount to the environment, and
-bootstrap from the last state of an episode that ran out of time: only success is terminal.
+PPO is Schulman et al. 2017 (arXiv 1707.06347), with generalized advantage estimation (arXiv
+1506.02438). With this package's dense reward, pass the learner's discount to the environment, and
+bootstrap from the last state of an episode that reaches the time limit: only success is terminal.
 """
 
 import dataclasses
@@ -28,28 +28,28 @@ from envs.datasets.files import check_local
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Task and hyperparameters; defaults are own choices that solve press in minutes on a CPU."""
+    """Task and hyperparameters; the defaults, our own choice, solve press in minutes on a CPU."""
 
     task: str = "press"
     robot: str = "piper"
-    num_envs: int = 64  # worlds W
+    num_envs: int = 64  # parallel worlds W
     steps: int = 32  # T, steps per world between updates
     updates: int = 40
-    epochs: int = 8  # passes over these T x W steps, each in `minibatches` parts
+    epochs: int = 8  # passes over these T x W steps, each split into `minibatches`
     minibatches: int = 4
     learning_rate: float = 1e-3
     discount: float = 0.97
-    trace: float = 0.9  # lambda of generalised advantage estimation
-    clip: float = 0.2  # largest change of the probability ratio from 1
-    width: int = 64  # of both hidden layers
+    trace: float = 0.9  # lambda of generalized advantage estimation
+    clip: float = 0.2  # maximum deviation of the probability ratio from 1
+    width: int = 64  # of the two hidden layers
     std: float = 0.5  # initial standard deviation of actions in [-1, 1]
-    episodes: int = 256  # for evaluation
+    episodes: int = 256  # evaluation episodes
     seed: int = 0
     out: Path = Path("runs/ppo")
 
 
 class Learner(NamedTuple):
-    """Training state: networks, optimizer, running moments of the observations, worlds."""
+    """Training state: networks, optimizer state, observation statistics, environment state."""
 
     params: Any
     opt_state: Any
@@ -58,7 +58,7 @@ class Learner(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """Recorded steps, [T, W, ...] in a rollout and [T W, ...] for learning."""
+    """Recorded steps, [T, W, ...] in a rollout, flattened to [T W, ...] for the updates."""
 
     x: jax.Array
     action: jax.Array
@@ -70,7 +70,7 @@ class Batch(NamedTuple):
 
 
 def network(key: jax.Array, *sizes: int) -> list[tuple[jax.Array, jax.Array]]:
-    """Initialise the weights and biases of an MLP, its last layer near zero."""
+    """Initialize the weights and biases of an MLP, with the last layer near zero."""
     keys, scales = jax.random.split(key, len(sizes) - 1), [1.4] * (len(sizes) - 2) + [0.01]
     return [
         (jax.nn.initializers.orthogonal(scale)(k, (i, o)), jnp.zeros(o))
@@ -79,21 +79,21 @@ def network(key: jax.Array, *sizes: int) -> list[tuple[jax.Array, jax.Array]]:
 
 
 def apply(layers: list[tuple[jax.Array, jax.Array]], x: jax.Array) -> jax.Array:
-    """Map inputs [..., I] to outputs [..., O]."""
+    """Apply an MLP to inputs [..., I]; return outputs [..., O]."""
     for weight, bias in layers[:-1]:
         x = jnp.tanh(x @ weight + bias)
     return x @ layers[-1][0] + layers[-1][1]
 
 
 def observe(env: envs.Env, moments: dict[str, jax.Array], state: envs.State) -> jax.Array:
-    """Return the full state [W, D], normalised by its running mean and variance."""
+    """Return the full state [W, D], normalized by its running mean and variance."""
     return jnp.clip(
         (env.full_state(state) - moments["mean"]) / jnp.sqrt(moments["variance"] + 1e-6), -5.0, 5.0
     )
 
 
 def act(env: envs.Env, state: envs.State, action: jax.Array) -> envs.State:
-    """Take a step with actions [W, A] in [-1, 1], rescaled to the environment's limits."""
+    """Step the environment with actions [W, A] in [-1, 1], rescaled to its limits."""
     low, high = jnp.asarray(env.action_low), jnp.asarray(env.action_high)
     return env.step(state, low + (jnp.clip(action, -1.0, 1.0) + 1) / 2 * (high - low))
 
@@ -105,7 +105,7 @@ def log_prob(params: Any, x: jax.Array, action: jax.Array) -> jax.Array:
 
 
 def rollout(env: envs.Env, config: Config, learner: Learner, key: jax.Array) -> Any:
-    """Take T steps in every world, restarting those that are done; return worlds and steps."""
+    """Take T steps in every world, restarting finished worlds; return final state and steps."""
     params, moments = learner.params, learner.moments
 
     def value(x: jax.Array) -> jax.Array:
@@ -126,7 +126,7 @@ def rollout(env: envs.Env, config: Config, learner: Learner, key: jax.Array) -> 
 
 
 def advantages(config: Config, batch: Batch) -> jax.Array:
-    """Compute generalised advantages [T, W]: discounted sums of TD errors within each episode."""
+    """Compute generalized advantages [T, W]: discounted sums of TD errors within each episode."""
 
     def body(later: jax.Array, step: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         error, done = step
@@ -147,13 +147,13 @@ def loss(params: Any, config: Config, batch: Batch, advantage: jax.Array) -> jax
 
 
 def optimizer(config: Config) -> optax.GradientTransformation:
-    """Make Adam with gradients clipped by their global norm."""
+    """Return Adam with global-norm gradient clipping."""
     return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(config.learning_rate))
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def update(env: envs.Env, config: Config, learner: Learner, key: jax.Array) -> Any:
-    """Collect and learn from steps; return the learner and counts of ended and won episodes."""
+    """Run one PPO iteration; return the learner, and counts of finished and successful episodes."""
     rollout_key, order_key = jax.random.split(key)
     state, steps = rollout(env, config, learner, rollout_key)
     data = steps, advantages(config, steps)
@@ -161,10 +161,10 @@ def update(env: envs.Env, config: Config, learner: Learner, key: jax.Array) -> A
 
     def body(carry: Any, rows: jax.Array) -> tuple[Any, None]:
         params, opt_state = carry
-        part = jax.tree.map(lambda x: x[rows], data)
-        grads = jax.grad(loss)(params, config, *part)
-        changes, opt_state = optimizer(config).update(grads, opt_state)
-        return (optax.apply_updates(params, changes), opt_state), None
+        minibatch = jax.tree.map(lambda x: x[rows], data)
+        grads = jax.grad(loss)(params, config, *minibatch)
+        updates, opt_state = optimizer(config).update(grads, opt_state)
+        return (optax.apply_updates(params, updates), opt_state), None
 
     keys = jax.random.split(order_key, config.epochs)
     rows = jax.vmap(lambda k: jax.random.permutation(k, config.steps * config.num_envs))(keys)
@@ -175,28 +175,29 @@ def update(env: envs.Env, config: Config, learner: Learner, key: jax.Array) -> A
 
 
 def update_moments(moments: dict[str, jax.Array], new: jax.Array) -> dict[str, jax.Array]:
-    """Update count, mean and variance of all observations with W new ones [W, D]."""
+    """Update the count, mean and variance of observations with a batch of new ones [W, D]."""
     count = moments["count"] + len(new)
-    share, shift = len(new) / count, jnp.mean(new, axis=0) - moments["mean"]
-    variance = (1 - share) * (moments["variance"] + share * shift**2) + share * jnp.var(new, axis=0)
-    return {"count": count, "mean": moments["mean"] + share * shift, "variance": variance}
+    weight, shift = len(new) / count, jnp.mean(new, axis=0) - moments["mean"]
+    variance = (1 - weight) * (moments["variance"] + weight * shift**2)
+    variance += weight * jnp.var(new, axis=0)
+    return {"count": count, "mean": moments["mean"] + weight * shift, "variance": variance}
 
 
 def init(env: envs.Env, config: Config, key: jax.Array) -> Learner:
-    """Initialise a learner, in fresh worlds."""
+    """Initialize the learner and reset the environment."""
     reset_key, actor_key, critic_key = jax.random.split(key, 3)
     state = env.reset(reset_key)
     observation, actions = env.full_state(state), len(env.action_low)
-    hidden = observation.shape[1], config.width, config.width
+    sizes = observation.shape[1], config.width, config.width
     params = {
-        "actor": network(actor_key, *hidden, actions),
-        "critic": network(critic_key, *hidden, 1),
+        "actor": network(actor_key, *sizes, actions),
+        "critic": network(critic_key, *sizes, 1),
         "log_std": jnp.full(actions, jnp.log(config.std), jnp.float32),
     }
     empty = {
         "count": jnp.float32(0),
-        "mean": jnp.zeros(hidden[0]),
-        "variance": jnp.ones(hidden[0]),
+        "mean": jnp.zeros(sizes[0]),
+        "variance": jnp.ones(sizes[0]),
     }
     moments = update_moments(empty, observation)
     return Learner(params, optimizer(config).init(params), moments, state)
@@ -206,7 +207,7 @@ def init(env: envs.Env, config: Config, key: jax.Array) -> Learner:
 def evaluate(
     env: envs.Env, params: Any, moments: dict[str, jax.Array], key: jax.Array
 ) -> jax.Array:
-    """Return whether the actor, without noise, solves each of W fresh layouts, bool [W]."""
+    """Return whether the noise-free policy solves each of W unseen layouts, bool [W]."""
 
     def body(state: envs.State, _: None) -> tuple[envs.State, None]:
         return act(env, state, apply(params["actor"], observe(env, moments, state))), None
@@ -215,7 +216,7 @@ def evaluate(
 
 
 def train(config: Config) -> tuple[Learner, np.ndarray]:
-    """Train; return the learner, and a row of steps, seconds, episodes, successes per update."""
+    """Train; return the learner and (steps, seconds, episodes, successes) for each update."""
     env = make(config, config.num_envs, reward="dense", discount=config.discount)
     key, start = jax.random.key(config.seed), time.perf_counter()
     learner, rows = init(env, config, key), []
@@ -223,17 +224,18 @@ def train(config: Config) -> tuple[Learner, np.ndarray]:
     for number in range(1, config.updates + 1):
         key_now = jax.random.fold_in(key, number)
         with calls.first("an update"):
-            learner, (ended, won) = update(env, config, learner, key_now)
+            learner, (finished, succeeded) = update(env, config, learner, key_now)
         steps, seconds = number * config.steps * config.num_envs, time.perf_counter() - start
-        rows.append((steps, seconds, int(ended), int(won)))
+        rows.append((steps, seconds, int(finished), int(succeeded)))
         print(
-            f"{steps:9,} steps, {seconds:5.0f} s: {won} of {ended} episodes succeeded", flush=True
+            f"{steps:9,} steps, {seconds:5.0f} s: {succeeded} of {finished} episodes succeeded",
+            flush=True,
         )
     return learner, np.array(rows)
 
 
 def make(config: Config, num_envs: int, **options: Any) -> envs.Env:
-    """Make an environment with end-effector actions."""
+    """Create an environment with end-effector actions."""
     return envs.make(
         config.task, config.robot, num_envs=num_envs, actions="end_effector", **options
     )
@@ -242,13 +244,13 @@ def make(config: Config, num_envs: int, **options: Any) -> envs.Env:
 def draw(config: Config, curve: np.ndarray) -> None:
     """Plot the learning curve: success rate over windows of three updates.
 
-    Over shorter windows it would be biased: a success ends early, a failure only at the time limit.
+    Shorter windows would be biased: successes end early, failures only at the time limit.
     """
-    steps, _, ended, won = curve.T
-    ended, won = (np.convolve(x, np.ones(3))[2 : len(x)] for x in (ended, won))
+    steps, _, *counts = curve.T
+    finished, succeeded = (np.convolve(x, np.ones(3))[2 : len(x)] for x in counts)
     figure, axes = plt.subplots(figsize=(6, 3.5), layout="constrained")
-    axes.plot(steps[2:], 100 * won / np.maximum(ended, 1), marker=".")
-    axes.set(xlabel="steps of all worlds", ylabel="episodes that succeed [%]", ylim=(0, 102))
+    axes.plot(steps[2:], 100 * succeeded / np.maximum(finished, 1), marker=".")
+    axes.set(xlabel="environment steps", ylabel="success rate [%]", ylim=(0, 102))
     axes.set_title(f"{config.task}, {config.robot}: PPO from the full state")
     axes.grid(alpha=0.3)
     config.out.mkdir(parents=True, exist_ok=True)
@@ -256,16 +258,16 @@ def draw(config: Config, curve: np.ndarray) -> None:
 
 
 def main(config: Config) -> float:
-    """Train, plot, and evaluate on new layouts; return the success rate."""
+    """Train, plot the learning curve and evaluate on unseen layouts; return the success rate."""
     check_local(config.out)
     learner, curve = train(config)
     draw(config, curve)
     key = jax.random.key(config.seed + 1_000_000)
     env = make(config, config.episodes)
-    with messages.announced(f"the evaluation of {config.task}, its episodes included"):
+    with messages.announced(f"the evaluation of {config.task} (including its episodes)"):
         success = float(np.mean(evaluate(env, learner.params, learner.moments, key)))
     print(
-        f"{success:.1%} of {config.episodes} fresh layouts, {time.process_time():.0f} CPU seconds"
+        f"{success:.1%} of {config.episodes} unseen layouts, {time.process_time():.0f} CPU seconds"
     )
     return success
 
