@@ -1,4 +1,4 @@
-"""The documentation's examples run as they stand, and its tables say what the code says."""
+"""Test that the documentation's examples run as is and that its tables match the code."""
 
 import ast
 import dataclasses
@@ -12,7 +12,7 @@ from tests import ROOT, test_imports
 
 PAGES = sorted([*ROOT.glob("docs/*.md"), *ROOT.glob("docs/methods/*.md")])
 WITHOUT_EXAMPLES = {"runs", "benchmarks", "architecture"}
-"""Pages that look things up."""
+"""Reference pages."""
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 OPTION = re.compile(r"^\| `(\w+)` \| `([^`]+)` \| \S", re.MULTILINE)
 LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)|src(?:set)?=\"([^\":]+)\"")
@@ -22,12 +22,12 @@ NODE = re.compile(r"^    (\w+)\[", re.MULTILINE)
 ARROWS = re.compile(r"^    (\w+(?: --> \w+)+)$", re.MULTILINE)
 
 
-def page_of(name):
+def method_page(name):
     return ROOT / "docs" / "methods" / f"{name}.md"
 
 
 def examples(page):
-    """All of a page's examples as one program, whose line numbers are those of the page."""
+    """Join the examples of a page into one program with the page's line numbers."""
     text, lines = page.read_text(), []
     for match in BLOCK.finditer(text):
         start = text.count("\n", 0, match.start(1))
@@ -43,40 +43,40 @@ def test_examples_run(page, tmp_path, monkeypatch):
     exec(compile(code, str(page), "exec"), {"__name__": "documentation"})
 
 
-def test_pages_are_those_of_the_methods():
+def test_every_method_has_a_page():
     pages = {page.stem for page in PAGES if page.parent.name == "methods"}
     assert pages == set(peft.names())
 
 
 @pytest.mark.parametrize("name", peft.names())
-def test_option_table_is_that_of_the_method(name):
+def test_option_table_matches_the_method(name):
     options = [
-        (field, ast.literal_eval(d)) for field, d in OPTION.findall(page_of(name).read_text())
+        (field, ast.literal_eval(d)) for field, d in OPTION.findall(method_page(name).read_text())
     ]
     fields = dataclasses.fields(peft.find(name))
     assert options == [(field.name, field.default) for field in fields]
 
 
 @pytest.mark.parametrize("name", peft.names())
-def test_page_shows_the_method_at_work(name):
-    code = examples(page_of(name))
+def test_page_uses_the_method(name):
+    code = examples(method_page(name))
     assert peft.find(name).__name__ in code
 
 
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda page: page.stem)
-def test_links_lead_somewhere(page):
+def test_links_resolve(page):
     for link, source in LINK.findall(BLOCK.sub("", page.read_text())):
         target = link or source
         assert (page.parent / target).exists(), f"{page} links to {target}"
 
 
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda page: page.stem)
-def test_files_are_where_a_page_says(page):
+def test_named_files_exist(page):
     assert [file for file in FILE.findall(page.read_text()) if not (ROOT / file).is_file()] == []
 
 
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda page: page.stem)
-def test_functions_are_where_a_page_says(page):
+def test_named_functions_exist(page):
     for file, name in FUNCTION.findall(page.read_text()):
         tree = ast.parse((ROOT / file).read_text())
         kinds = (ast.FunctionDef, ast.ClassDef)
@@ -84,15 +84,15 @@ def test_functions_are_where_a_page_says(page):
         assert name in defined, f"{page} names {file}::{name}"
 
 
-def drawn():
-    """Rooms of the diagram in its order, and its arrows."""
+def diagram():
+    """Return the packages of the diagram in order, and its arrows."""
     text = (ROOT / "docs" / "architecture.md").read_text()
     chains = [chain.split(" --> ") for chain in ARROWS.findall(text)]
     return NODE.findall(text), [pair for chain in chains for pair in itertools.pairwise(chain)]
 
 
-def test_the_diagram_has_the_rooms_and_what_leads_to_them():
-    nodes, arrows = drawn()
+def test_diagram_has_all_packages_and_imports():
+    nodes, arrows = diagram()
     rooms = [room.removeprefix("lorasp_jax.") for room in test_imports.ROOMS]
     assert nodes == rooms
     reached = {room: {room} for room in rooms}

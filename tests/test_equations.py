@@ -1,4 +1,4 @@
-"""The table of equations points at functions that exist and name their equations."""
+"""Test that the equation table points at functions whose docstrings name the equations."""
 
 import ast
 import re
@@ -14,7 +14,7 @@ ROWS = [row for page in PAGES for row in ROW.findall(page.read_text())]
 
 
 def docstring(file, name):
-    """That of a function, method or class; None if there is no such thing."""
+    """Return the docstring of a function, method or class, or None if it does not exist."""
     node = ast.parse((ROOT / file).read_text())
     for part in name.split("."):
         defined = [
@@ -29,26 +29,26 @@ def docstring(file, name):
 
 
 def numbers(text):
-    """Those of equations, of ranges all."""
-    found = re.sub(r"\((\d+)\)-\((\d+)\)", _spelled_out, text)
-    return set(NUMBER.findall(found)) | set(re.findall(r"\beqs?\. (\d+)", found))
+    """Return the equation numbers in a text, with ranges expanded."""
+    expanded = re.sub(r"\((\d+)\)-\((\d+)\)", _expand, text)
+    return set(NUMBER.findall(expanded)) | set(re.findall(r"\beqs?\. (\d+)", expanded))
 
 
-def _spelled_out(match):
+def _expand(match):
     return " ".join(f"({n})" for n in range(int(match[1]), int(match[2]) + 1))
 
 
-def test_the_paper_is_in_the_table():
-    found = {
+def test_table_covers_the_paper():
+    listed = {
         n for equation, _, _ in ROWS if equation.startswith("LoRA-SP") for n in numbers(equation)
     }
-    assert {"4", "9", "10", "11", "12", "13", "14"} <= found
+    assert {"4", "9", "10", "11", "12", "13", "14"} <= listed
     methods = ("LoRA-SP", "LoRA ", "DoRA", "AdaLoRA", "Switch", "full fine-tuning")
     assert not [name for name in methods if not any(row[0].startswith(name) for row in ROWS)]
 
 
 @pytest.mark.parametrize(("equation", "file", "name"), ROWS, ids=lambda text: text)
-def test_a_row_points_at_its_function(equation, file, name):
-    found = docstring(file, name)
-    assert found is not None, f"{file} defines no {name}"
-    assert numbers(equation) <= numbers(found), f"{name} does not name {equation}: {found}"
+def test_row_points_at_a_function_that_names_the_equation(equation, file, name):
+    text = docstring(file, name)
+    assert text is not None, f"{file} does not define {name}"
+    assert numbers(equation) <= numbers(text), f"{name} does not name {equation}: {text}"
