@@ -88,7 +88,7 @@ class Backbone(nnx.Module):
         Args:
             x_t: `[B, C, A]`.
             flow_time: `[B]`.
-            action_valid: `[B, C]` bool, steps that adapter aux includes; None includes all.
+            action_valid: `[B, C]` bool, False for steps to exclude from the adapters' aux.
 
         Returns:
             `[B, C, D]` f32, and the adapters' aux.
@@ -122,7 +122,7 @@ class Backbone(nnx.Module):
             obs: the observation that the prefix was computed from.
             x_t: `[B, C, A]`.
             flow_time: `[B]`.
-            action_valid: `[B, C]` bool, steps that adapter aux includes; None includes all.
+            action_valid: `[B, C]` bool, False for steps to exclude from the adapters' aux.
         """
         raise NotImplementedError
 
@@ -171,7 +171,7 @@ class Backbone(nnx.Module):
             obs: the observation.
             actions: `[B, C, A]` normalized.
             action_mask: `[B, C, A]` bool. Slots with no valid step are zero in x_t; steps with no
-                valid slot are excluded from adapter aux. The returned loss is not masked.
+                valid slot are excluded from the adapters' aux. The returned loss is not masked.
             noise: `[B, C, A]`.
             flow_time: `[B]`.
 

@@ -16,7 +16,7 @@ VOCABULARY_SIZE = 320
 
 Remat = Literal["none", "products", "full"]
 _MAX_SIZE = 2**24
-"""Upper bound for any size, far beyond existing models; files may be untrusted."""
+"""Upper bound for any size, far beyond existing models; rejects absurd values in config files."""
 _MAX_DEPTH = 1000
 
 
@@ -108,9 +108,9 @@ class BackboneConfig:
     ("products": half the memory, a few percent more work); whole layers ("full": the least memory,
     a third more work)."""
     unroll: bool | None = None
-    """Unroll the loop over layers. Faster, especially for small layers, because a loop copies the
-    backward pass's residuals into stacks and out again, but compiles two to three times as long.
-    None unrolls unless `remat` is "full": XLA preserves remat order only inside a loop."""
+    """Unroll the loop over layers: faster, especially for small layers, but takes two to three times
+    as long to compile. (A loop copies the backward pass's residuals into stacks and out again.)
+    None unrolls unless `remat` is "full", because XLA preserves remat order only inside a loop."""
 
     def __post_init__(self) -> None:
         """Validate the sizes."""

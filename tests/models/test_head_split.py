@@ -115,7 +115,7 @@ def test_own_config_is_under_the_hash(part, model, tmp_path):
     fields = json.loads(path.read_text())
     fields["config"] |= json.loads(json.dumps(dataclasses.asdict(OTHERS[part])))
     path.write_text(json.dumps(fields))
-    with pytest.raises(ValueError, match="weights and sizes do not match the hash"):
+    with pytest.raises(ValueError, match="weights and config do not match the hash"):
         models.load(tmp_path)
 
 

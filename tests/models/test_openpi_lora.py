@@ -89,7 +89,7 @@ def test_the_layers_compute_openpis_einsums(model, leaves, tower, suffix):
 def test_a_checkpoint_with_lora_is_loaded(model, leaves, tmp_path):
     """As openpi saves one: base and LoRA in one tree. One expert may have none."""
     one = {name: leaf for name, leaf in leaves.items() if "_1" not in name}
-    base = layouts.write(published_names.openpi_layout(CONFIG), base_arrays(model))
+    base = layouts.to_theirs(published_names.openpi_layout(CONFIG), base_arrays(model))
     tree = flax.traverse_util.unflatten_dict({**base, **one}, sep="/")
     ocp.PyTreeCheckpointer().save(tmp_path / "params", {"params": tree})
     found, unused = published.load_published(tmp_path, CONFIG)

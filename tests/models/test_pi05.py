@@ -101,7 +101,7 @@ def test_there_and_back(layout, model, tmp_path):
 
 def test_dense_of_a_norm_is_transposed_for_lerobot(model):
     arrays = {name: np.asarray(leaf) for name, leaf in native.named_arrays(model).items()}
-    theirs = layouts.write(published_names.lerobot_layout(CONFIG), arrays)
+    theirs = layouts.to_theirs(published_names.lerobot_layout(CONFIG), arrays)
     name = "paligemma_with_expert.gemma_expert.model.layers.1.input_layernorm.dense.weight"
     wanted = arrays["action/blocks/input_layernorm/dense/kernel"][1].T
     np.testing.assert_array_equal(theirs[name], wanted)

@@ -129,7 +129,7 @@ def test_loss_and_gradients(model, obs, inputs, expected):
     close(loss, expected["loss"], 3e-4)
     close(mean, expected["mean_loss"], 3e-4)
     grads = native.base_arrays(nnx.merge(graphdef, grads))
-    theirs = layouts.write(published_names.lerobot_layout(CONFIG), grads)
+    theirs = layouts.to_theirs(published_names.lerobot_layout(CONFIG), grads)
     grads = {f"model.{name}": grad for name, grad in theirs.items()}
     recorded = [name.removeprefix("grad/") for name in expected if name.startswith("grad/")]
     assert len(recorded) == 3

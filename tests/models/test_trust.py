@@ -83,7 +83,7 @@ def test_weights_that_are_no_finite_real_numbers(value):
     rule = layouts.copied("ours", "theirs")
     theirs = {"theirs": np.array([1, value, 2])}
     with pytest.raises(ValueError, match="theirs of x must be floating point and finite"):
-        layouts.read([rule], theirs, {"ours": (3,)}, "x", lambda name, array: array)
+        layouts.to_ours([rule], theirs, {"ours": (3,)}, "x", lambda name, array: array)
 
 
 def test_a_tokenizer_without_end(tmp_path):

@@ -82,7 +82,7 @@ def stacked(ours: str, theirs: Iterable[str], *, transpose: bool = False) -> Rul
     return Rule((ours,), names, shapes, stack_layers, unstack_layers)
 
 
-def read(
+def to_ours(
     rules: Sequence[Rule],
     theirs: MutableMapping[str, Any],
     shapes: Mapping[str, Shape],
@@ -131,7 +131,7 @@ def read(
     return converted
 
 
-def write(rules: Sequence[Rule], ours: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def to_theirs(rules: Sequence[Rule], ours: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Convert our leaves to theirs, as contiguous arrays."""
     theirs: dict[str, np.ndarray] = {}
     for rule in rules:

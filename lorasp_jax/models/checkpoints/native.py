@@ -1,8 +1,9 @@
-"""Save and load backbone weights: config.json (backbone and sizes) and safetensors in bf16.
+"""Save and load backbone weights: config.json and safetensors in bf16.
 
 Large models are split into shards with Hugging Face's index. Tensor names are "/"-joined paths;
-tensors of stacked layers keep their leading layer axis. config.json holds a hash over sizes and
-weights, so that loading refuses a folder that is damaged, half written or has edited head counts.
+tensors of stacked layers keep their leading layer axis. config.json names the backbone and its
+sizes and holds a hash over config and weights, so that loading refuses a folder that is damaged,
+half written or has edited head counts.
 """
 
 import dataclasses
@@ -54,7 +55,7 @@ def save(folder: Folder, model: Any) -> None:
     arrays = {name: a.astype(jnp.bfloat16) for name, a in base_arrays(model).items()}
     description = {
         "backbone": type(model).__module__.split(".")[-2],
-        "config": _sizes(model.config),
+        "config": _saved_fields(model.config),
     }
     description["sha256"] = _digest(description, arrays)
     shards = _shards(arrays)
@@ -117,12 +118,12 @@ def load_native(folder: Folder, config: Any = None) -> Any:
     description = _description(folder)
     stored = _config(folder, description)
     config = config or stored
-    if type(config) is not type(stored) or _sizes(config) != _sizes(stored):
+    if type(config) is not type(stored) or _saved_fields(config) != _saved_fields(stored):
         raise ValueError(f"{folder} does not match the config: {_difference(stored, config)}.")
     arrays = TensorFiles(weight_files(folder))
     if _digest(description, arrays) != description["sha256"]:  # before allocating the model
         raise ValueError(
-            f"{folder} is damaged: its weights and sizes do not match the hash in {CONFIG}."
+            f"{folder} is damaged: its weights and config do not match the hash in {CONFIG}."
         )
     model = nnx.eval_shape(lambda: config.create(nnx.Rngs(0)))
     try:
@@ -200,7 +201,7 @@ def by_path(tree: Any) -> dict[str, Any]:
 
 
 def _digest(description: Mapping[str, Any], arrays: Mapping[str, Any]) -> str:
-    """SHA-256 of a folder's content: backbone name, sizes and weights."""
+    """SHA-256 of a folder's content: backbone name, config and weights."""
     text = json.dumps([description["backbone"], description["config"]], sort_keys=True)
     return hashlib.sha256(f"{text}{_hash(arrays)}".encode()).hexdigest()
 
@@ -228,14 +229,14 @@ def _shards(arrays: Mapping[str, np.ndarray]) -> list[dict[str, np.ndarray]]:
     return shards
 
 
-def _sizes(config: Any) -> dict[str, Any]:
+def _saved_fields(config: Any) -> dict[str, Any]:
     """A config's fields after a JSON round trip, without `RUNTIME_FIELDS`."""
     fields = json.loads(json.dumps(dataclasses.asdict(config)))
     return {name: value for name, value in fields.items() if name not in RUNTIME_FIELDS}
 
 
 def _difference(stored: Any, config: Any) -> str:
-    a, b = _sizes(stored), _sizes(config)
+    a, b = _saved_fields(stored), _saved_fields(config)
     pairs = [f"{k} is {a.get(k)}, not {b.get(k)}" for k in sorted(a | b) if a.get(k) != b.get(k)]
     return "; ".join(pairs) or f"the stored model is a {type(stored).__name__}"
 

@@ -77,7 +77,7 @@ def load_published(folder: Path, config: Any) -> tuple[Any, list[str]]:
 
     rules = published_names.LAYOUTS[layout](config)
     shapes = {name: leaf.shape for name, leaf in leaves.items()}
-    arrays = layouts.read(rules, theirs, shapes, f"{folder} (layout {layout})", convert)
+    arrays = layouts.to_ours(rules, theirs, shapes, f"{folder} (layout {layout})", convert)
     model = set_arrays(model, arrays)
     return openpi_lora.attach(model, lora) if lora else model, unused
 
@@ -104,7 +104,7 @@ def save(folder: Path, model: Any, layout: str, dtypes: Mapping[str, Any] | None
     if target.exists():
         raise ValueError(f"{target} already exists: choose another folder.")
     rules = published_names.LAYOUTS[layout](model.config)
-    theirs = layouts.write(rules, base_arrays(model))
+    theirs = layouts.to_theirs(rules, base_arrays(model))
     if dtypes is not None:
         theirs = {name: array.astype(dtypes[name]) for name, array in theirs.items()}
     folder.mkdir(parents=True, exist_ok=True)

@@ -159,7 +159,7 @@ class Pi0(Backbone):
             obs: only the state is used.
             x_t: `[B, C, A]`.
             flow_time: `[B]`.
-            action_valid: `[B, C]` bool, steps that adapter aux includes; None includes all.
+            action_valid: `[B, C]` bool, False for steps to exclude from the adapters' aux.
 
         Returns:
             `[B, 1 + C, D]` f32, and the adapters' aux.

@@ -74,7 +74,7 @@ class CrossBlock(SelfBlock):
             table: RoPE sine and cosine for these tokens, from `rope_table`.
             mask: `[B, T, P]` bool.
             keys_values: from `project_cache`.
-            token_mask: `[B, T]` bool, tokens that adapter aux includes.
+            token_mask: `[B, T]` bool, False for tokens to exclude from the adapters' aux.
         """
         h, *_ = self.input_layernorm.normalize(x, None)
         q, q_aux = self.q_proj(h, token_mask=token_mask, return_aux=True)
@@ -153,7 +153,7 @@ class ActionExpert(nnx.Module):
             mask: `[B, T, P + T]` bool.
             cache: prefix keys and values for self-attention, from `project_cache`.
             cross: prefix keys and values for cross-attention, from `project_cache`.
-            token_mask: `[B, T]` bool, tokens that adapter aux includes.
+            token_mask: `[B, T]` bool, False for tokens to exclude from the adapters' aux.
 
         Returns:
             `[B, T, D]`, and the adapters' aux, stacked over layer pairs.

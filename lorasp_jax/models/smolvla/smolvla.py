@@ -165,7 +165,7 @@ class SmolVLA(Backbone):
             obs: unused; the state is in the prefix.
             x_t: `[B, C, A]`.
             flow_time: `[B]`.
-            action_valid: `[B, C]` bool, steps that adapter aux includes; None includes all.
+            action_valid: `[B, C]` bool, False for steps to exclude from the adapters' aux.
 
         Returns:
             `[B, C, D]` f32, and the adapters' aux.

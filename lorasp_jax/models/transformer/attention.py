@@ -16,14 +16,14 @@ KEY_MULTIPLE, MIN_PADDED_KEYS = 128, 512
 """Without cuDNN, at least `MIN_PADDED_KEYS` keys are padded to a multiple of `KEY_MULTIPLE`."""
 
 CUDNN_MULTIPLE = 8
-"""cuDNN needs query and key counts divisible by 8: 16 bytes of a mask."""
+"""cuDNN needs query and key counts divisible by 8 (16 bytes of the mask)."""
 
 
 def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) -> jax.Array:
     """Grouped-query attention with fp32 softmax; uses cuDNN for long bf16 sequences on NVIDIA GPUs.
 
     cuDNN accumulates gradients in nondeterministic order, so two runs differ in the last bits;
-    `CUDNN_MIN_HEAD_DIM` therefore keeps small models away from it.
+    `CUDNN_MIN_HEAD_DIM` keeps small models on the deterministic path.
 
     Args:
         q: `[B, T, N, H]`, already scaled.

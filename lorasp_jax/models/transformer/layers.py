@@ -13,9 +13,9 @@ from lorasp_jax.dense import Dense, dense_shared_input
 from lorasp_jax.peft import Aux
 
 LayerAux = dict[str, Aux]
-"""Adapter aux by layer name."""
+"""The adapters' aux (losses and statistics) by layer name."""
 ModelAux = dict[str, LayerAux]
-"""Adapter aux by tower ("vision", "language", "action") and layer name."""
+"""The adapters' aux by tower ("vision", "language", "action") and layer name."""
 
 
 def rms_normalize(x: jax.Array, eps: float) -> jax.Array:
@@ -50,7 +50,7 @@ class RMSNorm(nnx.Module):
     def normalize(
         self, x: jax.Array, condition: jax.Array | None
     ) -> tuple[jax.Array, int, LayerAux]:
-        """Same interface as `AdaptiveRMSNorm.normalize`; ignores the condition, gate 1, no aux."""
+        """As `AdaptiveRMSNorm.normalize`, but ignore the condition: gate 1, empty aux."""
         del condition
         return self(x), 1, {}
 
@@ -121,7 +121,7 @@ def apply_to_shared_input(
 
     Args:
         x: `[B, T, I]`.
-        token_mask: `[B, T]` bool, tokens that adapter aux includes; None includes all.
+        token_mask: `[B, T]` bool, False for tokens to exclude from the adapters' aux.
         layers: by name. Prepared layers must be in the order in which they were joined.
 
     Returns:
@@ -186,7 +186,7 @@ def rope_table(position: jax.Array, head_dim: int) -> tuple[jax.Array, jax.Array
         head_dim: H.
 
     Returns:
-        `[B, T, 1, H/2]` f32, twice.
+        Sine and cosine, each `[B, T, 1, H/2]` f32.
     """
     wavelength = 10_000.0 ** (np.arange(0, head_dim, 2, dtype=np.float32) / head_dim)
     angle = position[:, :, None, None].astype(jnp.float32) / wavelength

@@ -99,10 +99,10 @@ def test_damaged_and_foreign_folders_raise(folder):
         native.load_native(folder / "nothing")
     sizes = json.loads((folder / "config.json").read_text())["config"]
     edit(folder, config={**sizes, "vocabulary": 7})
-    with pytest.raises(ValueError, match="weights and sizes do not match the hash"):
+    with pytest.raises(ValueError, match="weights and config do not match the hash"):
         models.load(folder)
     edit(folder, config=sizes, sha256="0" * 64)
-    with pytest.raises(ValueError, match="weights and sizes do not match the hash"):
+    with pytest.raises(ValueError, match="weights and config do not match the hash"):
         models.load(folder)
     for change in ({"backbone": "no_such"}, {"config": {"vision": {}}}):
         edit(folder, **{"config": sizes, "backbone": "pi0", **change})
