@@ -110,7 +110,7 @@ class BackboneConfig:
     unroll: bool | None = None
     """Unroll the loop over layers: faster, especially for small layers, but takes two to three times
     as long to compile. (A loop copies the backward pass's residuals into stacks and out again.)
-    None unrolls unless `remat` is "full", because XLA preserves remat order only inside a loop."""
+    None unrolls unless `remat` is "full": XLA preserves remat order only inside a loop."""
 
     def __post_init__(self) -> None:
         """Validate the sizes."""
