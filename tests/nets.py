@@ -13,7 +13,7 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.dense import Dense
 from lorasp_jax.peft import LoRA, LoRASP
 from tests import GOLDEN
-from tests.models.drawn import filled, moved
+from tests.models.random_models import with_noise, with_random_parameters
 
 SP = LoRASP(rank=8, hidden_width=4)
 SIZES = {"rank": 8, "hidden_width": 4}
@@ -67,7 +67,7 @@ class Kinds(nnx.Module):
         return self.out(scan(x, self.blocks)[0])
 
 
-NET = filled(Net)
+NET = with_random_parameters(Net)
 X = jnp.asarray(np.random.default_rng(0).normal(size=(4, 3, 5)), jnp.float32)
 
 
@@ -80,7 +80,7 @@ def trained(*rules, seed, net=NET, size=0.5):
     """An adapted model whose adapters have moved off their start, this far."""
     model = adaptation.adapt(net, rules, rngs=nnx.Rngs(seed))
     graphdef, adapters, frozen = adaptation.split(model)
-    return nnx.merge(graphdef, moved(adapters, size, seed), frozen)
+    return nnx.merge(graphdef, with_noise(adapters, size, seed), frozen)
 
 
 def assert_close(actual, expected):

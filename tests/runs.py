@@ -25,7 +25,7 @@ from lorasp_jax.policies.prompt_table import PromptTable
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import MetricsLog, read_metrics, to_json, write_json
 from lorasp_jax.training.setup import processor
-from tests.models.drawn import drawn
+from tests.models.random_models import random_backbone
 
 TIMED = ("speed/", "memory/")
 
@@ -114,7 +114,7 @@ def make_run(
 ) -> Run:
     """By default of the dummy backbone, on one device: that compiles in a quarter of the time."""
     folder.mkdir(exist_ok=True)
-    model = model or drawn(Pi0Config.dummy())
+    model = model or random_backbone(Pi0Config.dummy())
     model = adaptation.adapt(
         model, [(path, config.peft) for path in config.targets], rngs=nnx.Rngs(1)
     )

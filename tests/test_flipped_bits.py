@@ -22,7 +22,7 @@ from lorasp_jax.policies import statistics_files
 from lorasp_jax.policies.statistics import Statistics
 from lorasp_jax.training.base import TRAINING
 from lorasp_jax.training.run_folder import MetricsLog, read_json, read_metrics, write_json
-from tests.models.drawn import drawn
+from tests.models.random_models import random_backbone
 from tests.runs import leaves, random_episodes
 
 HEADERS = 200
@@ -63,7 +63,7 @@ def read_run(folder: Path) -> Any:
 
 
 def base(folder: Path) -> None:
-    models.save(folder, drawn(Pi0Config.dummy()))
+    models.save(folder, random_backbone(Pi0Config.dummy()))
     state = np.random.default_rng(0).normal(size=(9, 7))
     known = Statistics.measure(state, state, np.ones(9, bool), slots=range(7), dim=8)
     (folder / "statistics.json").write_text(known.to_json() + "\n")

@@ -17,14 +17,14 @@ from lorasp_jax.adapters.compress import calibration
 from lorasp_jax.adapters.io import native
 from lorasp_jax.dense import AdapterParam, Dense
 from lorasp_jax.peft import DoRA, LoRA, LoRASP
-from tests.models.drawn import filled
+from tests.models.random_models import with_random_parameters
 from tests.nets import Kinds, assert_close, call, trained
 
 SP = LoRASP(rank=6, hidden_width=4, energy_target=0.6)
 WEIGHTS = {"a": 0.6, "b": -0.3}
 
 
-NET = filled(Kinds)
+NET = with_random_parameters(Kinds)
 KINDS = ["blocks", "conv", "embed", "experts", "join", "out", "split"]
 EINSUMS = ["blocks", "experts", "join", "split"]
 IDS = list(jnp.asarray(np.random.default_rng(0).integers(0, 7, (3, 4, 5))))

@@ -12,10 +12,10 @@ from lorasp_jax.adapters.io.native import load_adapters, save_adapters
 from lorasp_jax.kernels.quantized_weights import KINDS, QuantizedKernel
 from lorasp_jax.peft import LoRA, LoRASP
 from tests.cases import mostly_slow
-from tests.models.drawn import filled
+from tests.models.random_models import with_random_parameters
 from tests.nets import Kinds, assert_close, call, trained
 
-NET = filled(Kinds)
+NET = with_random_parameters(Kinds)
 IDS = jax.random.randint(jax.random.key(0), (4, 5), 0, 7)
 LORA = (".*", LoRA(rank=2))
 MATRICES = {

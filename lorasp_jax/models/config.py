@@ -108,8 +108,8 @@ class BackboneConfig:
     ("products": half the memory, a few percent more work); whole layers ("full": the least memory,
     a third more work)."""
     unroll: bool | None = None
-    """Unroll the loop over layers: faster, especially for small layers, but takes two to three times
-    as long to compile. (A loop copies the backward pass's residuals into stacks and out again.)
+    """Unroll the loop over layers: faster, especially for small layers, but two to three times as
+    long to compile. (A loop copies the backward pass's residuals into stacks and out again.)
     None unrolls unless `remat` is "full": XLA preserves remat order only inside a loop."""
 
     def __post_init__(self) -> None:

@@ -11,7 +11,7 @@ import lorasp_jax
 from lorasp_jax import LinenAdapter, peft
 from lorasp_jax.peft import DoRA, FullFineTuning, LoRA, LoRASP
 from tests.cases import mostly_slow
-from tests.models.drawn import moved
+from tests.models.random_models import with_noise
 
 SP = LoRASP(rank=8, hidden_width=4)
 
@@ -48,7 +48,7 @@ def ids():
 def published(ids):
     """Parameters that somebody else trained: biases are not zero."""
     shapes = jax.eval_shape(Net().init, jax.random.key(0), ids)
-    return moved(jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes), 0.4)
+    return with_noise(jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes), 0.4)
 
 
 def attached(published, ids, *rules):
@@ -69,7 +69,7 @@ def test_every_method_starts_at_the_base(published, ids, name):
     adapter, variables = attached(published, ids, ("split|experts|dense", method))
     expected = call(Net(), published, ids)
     np.testing.assert_allclose(call(adapter, variables, ids), expected, rtol=1e-4, atol=1e-4)
-    other = variables | {"adapters": moved(variables["adapters"], 0.3)}
+    other = variables | {"adapters": with_noise(variables["adapters"], 0.3)}
     assert jnp.abs(call(adapter, other, ids) - expected).max() > 1e-2
     if not method.trains_base:
         jax.tree.map(np.testing.assert_array_equal, variables["params"], published["params"])
@@ -113,7 +113,7 @@ def test_merged_equals_adapted(published, ids, rules):
     adapter, variables = attached(published, ids, *rules)
     expected = call(Net(), published, ids)
     np.testing.assert_allclose(call(adapter, variables, ids), expected, rtol=1e-3, atol=1e-3)
-    variables = variables | {"adapters": moved(variables["adapters"], 0.3)}
+    variables = variables | {"adapters": with_noise(variables["adapters"], 0.3)}
     merged = jax.jit(adapter.merge)(variables, ids)
     assert jax.tree.map(jnp.shape, merged) == jax.tree.map(jnp.shape, published)
     y = call(adapter, variables, ids)
@@ -122,7 +122,7 @@ def test_merged_equals_adapted(published, ids, rules):
 
 def test_against_a_kernel_made_by_hand(published, ids):
     adapter, variables = attached(published, ids, ("embed|blocks/split", LoRA(rank=2, alpha=6)))
-    variables = variables | {"adapters": moved(variables["adapters"], 0.3)}
+    variables = variables | {"adapters": with_noise(variables["adapters"], 0.3)}
     trained = variables["adapters"]
     params = jax.tree.map(lambda v: v, published["params"])
     delta = {
@@ -144,7 +144,7 @@ def test_gradients_and_aux(published, ids):
         y, kept = adapter.apply(full, ids, mutable=["intermediates"])
         return jnp.sum(y**2), lorasp_jax.collect_aux(kept)
 
-    gradients, aux = jax.jit(jax.grad(loss, has_aux=True))(moved(variables["adapters"], 0.3))
+    gradients, aux = jax.jit(jax.grad(loss, has_aux=True))(with_noise(variables["adapters"], 0.3))
     assert all(jnp.abs(g).max() > 0 for g in jax.tree.leaves(gradients))
     assert {"embed", "conv", "first/split", "first/experts", "first/join", "dense"} == set(aux)
     assert aux["first/experts"].active_rank.shape == (2, 2)
@@ -180,7 +180,7 @@ def test_layers_described_by_the_user():
     x = jax.random.normal(jax.random.key(0), (4, 6))
     einsums = {Product: lambda layer: ("w", None)}  # the equation comes with the call
     adapter = LinenAdapter(Outer(), [("q", LoRA(rank=2))], einsums)
-    variables = moved(adapter.init(jax.random.key(0), x), 0.3)
+    variables = with_noise(adapter.init(jax.random.key(0), x), 0.3)
     own = variables["adapters"]["q"]["lorasp_adapter"]
     assert own["lora_a"].shape == (6, 2)
     w = variables["params"]["q"]["w"]

@@ -12,7 +12,7 @@ from flax import nnx
 import lorasp_jax
 from lorasp_jax.models import pi0, smolvla
 from lorasp_jax.peft import LoRA, LoRASP
-from tests.models.drawn import drawn, observation
+from tests.models.random_models import observation, random_backbone
 
 BATCH, RANK, STEPS = 2, 4, 2
 MLP = "gate_proj up_proj down_proj"
@@ -35,7 +35,7 @@ def config(backbone):
 
 @pytest.fixture(scope="module")
 def model(config):
-    return drawn(config)
+    return random_backbone(config)
 
 
 @pytest.fixture(scope="module")

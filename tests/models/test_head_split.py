@@ -13,7 +13,7 @@ from lorasp_jax import models
 from lorasp_jax.models.checkpoints import published
 from lorasp_jax.models.pi0 import Pi0Config, openpi_lora
 from lorasp_jax.models.smolvla import SmolVLAConfig
-from tests.models.drawn import drawn
+from tests.models.random_models import random_backbone
 
 CONFIG = Pi0Config.dummy()
 
@@ -33,7 +33,7 @@ OTHERS = {
 
 @pytest.fixture(scope="module")
 def model():
-    return drawn(CONFIG)
+    return random_backbone(CONFIG)
 
 
 @pytest.mark.parametrize("part", OTHERS)
@@ -121,7 +121,7 @@ def test_own_config_is_under_the_hash(part, model, tmp_path):
 
 @pytest.mark.parametrize("layout", ["openpi", "lerobot", "own"])
 def test_nothing_is_saved_under_sizes_of_another_model(layout, tmp_path):
-    model = drawn(CONFIG)
+    model = random_backbone(CONFIG)
     model.config = dataclasses.replace(CONFIG, vocabulary=CONFIG.vocabulary + 1)
     save = models.save if layout == "own" else functools.partial(published.save, layout=layout)
     with pytest.raises(ValueError, match="does not match its config: see language/embedding"):
@@ -143,7 +143,7 @@ UNRELATED = [
 @pytest.mark.parametrize(("fields", "message"), UNRELATED)
 def test_an_unrelated_config_beside_smolvla(fields, message, tmp_path):
     config = SmolVLAConfig.dummy()
-    published.save(tmp_path, drawn(config), "lerobot")
+    published.save(tmp_path, random_backbone(config), "lerobot")
     with pytest.raises(ValueError, match="contains weights, but no config"):
         models.load(tmp_path)
     (tmp_path / "config.json").write_text(json.dumps(fields))

@@ -10,7 +10,7 @@ from flax import nnx
 from lorasp_jax.models.checkpoints import layouts, published
 from lorasp_jax.models.checkpoints.native import base_arrays
 from lorasp_jax.models.pi0 import Pi0Config, openpi_lora, published_names
-from tests.models.drawn import drawn
+from tests.models.random_models import random_backbone
 
 CONFIG = Pi0Config.dummy()
 SCALE = 0.5
@@ -22,7 +22,7 @@ BATCH, TOKENS = 2, 3
 
 @pytest.fixture(scope="module")
 def model():
-    return drawn(CONFIG)
+    return random_backbone(CONFIG)
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from flax import nnx
 
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.models.transformer.layers import block_mask
-from tests.models.drawn import drawn, observation
+from tests.models.random_models import observation, random_backbone
 
 CONFIG = Pi0Config.dummy()
 BATCH = 2
@@ -31,7 +31,7 @@ def obs():
 
 @pytest.fixture(scope="module")
 def model():
-    return drawn(CONFIG)
+    return random_backbone(CONFIG)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from lorasp_jax.models import presets
 from lorasp_jax.models.checkpoints import layouts, native, published
 from lorasp_jax.models.pi0 import Pi0Config, published_names
 from lorasp_jax.peft import LoRA
-from tests.models.drawn import drawn, observation
+from tests.models.random_models import observation, random_backbone
 
 CONFIG = dataclasses.replace(Pi0Config.dummy(), pi05=True)
 BATCH = 2
@@ -24,7 +24,7 @@ AROUND = {"action_in_proj", "action_out_proj", "time_mlp_in", "time_mlp_out"}
 
 @pytest.fixture(scope="module")
 def model():
-    return drawn(CONFIG)
+    return random_backbone(CONFIG)
 
 
 @pytest.fixture(scope="module")

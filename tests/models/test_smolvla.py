@@ -13,7 +13,7 @@ from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.smolvla import SmolVLAConfig, published_names
 from lorasp_jax.models.transformer.layers import rope, rope_table
 from lorasp_jax.models.transformer.siglip import patches
-from tests.models.drawn import drawn
+from tests.models.random_models import random_backbone
 
 CONFIG = SmolVLAConfig.dummy()
 BATCH = 2
@@ -34,7 +34,7 @@ def normal(seed: int, *shape: int) -> jax.Array:
 
 @pytest.fixture(scope="module")
 def model():
-    return drawn(CONFIG)
+    return random_backbone(CONFIG)
 
 
 @pytest.fixture(scope="module")

@@ -26,7 +26,7 @@ from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.run_folder import read_metrics, to_json, write_json
 from lorasp_jax.training.stepper import StreamingStepper, _batches
-from tests.models.drawn import drawn
+from tests.models.random_models import random_backbone
 from tests.runs import CONFIG, Terminate, leaves, make_run, random_episodes, repeatable
 
 
@@ -98,7 +98,7 @@ def test_a_streamed_run_on_eight_devices(tmp_path):
 
 
 def prepare(folder, monkeypatch, source, room=2**40):
-    model = drawn(Pi0Config.dummy())
+    model = random_backbone(Pi0Config.dummy())
     monkeypatch.setattr(setup, "base_model", lambda *_, **__: (model, ""))
     monkeypatch.setattr(preflight, "available_bytes", lambda: room)
     evaluation = dataclasses.replace(CONFIG.evaluation, execute_steps=1)

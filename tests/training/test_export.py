@@ -25,13 +25,13 @@ from lorasp_jax.policies.processor import Statistics
 from lorasp_jax.storage.digest import sealed
 from lorasp_jax.training import base, export, setup
 from tests import ROOT
-from tests.models.drawn import drawn
+from tests.models.random_models import random_backbone
 from tests.runs import CONFIG, leaves, make_run
 
 BASES = sorted(path.parent for path in Path("assets").glob("*/config.json"))
 
 
-def moved(run):
+def perturbed(run):
     """The run with every trainable number changed, as training would."""
     run.policy = changed(run.policy)
     return run
@@ -47,13 +47,13 @@ def changed(policy):
 
 @pytest.mark.slow
 def test_adapters(tmp_path):
-    run = moved(make_run(tmp_path / "run"))
+    run = perturbed(make_run(tmp_path / "run"))
     export.write(run)
     assert {path.name for path in run.folder.iterdir()} == {"adapter.safetensors", "adapter.json"}
     metadata = json.loads((run.folder / "adapter.json").read_text())["metadata"]
     assert (metadata["robot"], metadata["control_dt"]) == ("piper", 0.1)
     assert Statistics.from_json(json.dumps(metadata["policy"]["statistics"]))
-    bare = drawn(Pi0Config.dummy())
+    bare = random_backbone(Pi0Config.dummy())
     loaded = native.load_adapters(run.folder, bare, base=run.base_hash)
     expected = leaves(adaptation.split(run.policy.model)[1])
     for name, value in leaves(adaptation.split(loaded)[1]).items():
@@ -64,7 +64,7 @@ def test_adapters(tmp_path):
 
 @pytest.mark.parametrize("method", [CONFIG.peft, FullFineTuning()], ids=["adapters", "base"])
 def test_a_policy_comes_back(tmp_path, method):
-    models.save(tmp_path / "base", drawn(Pi0Config.dummy()))
+    models.save(tmp_path / "base", random_backbone(Pi0Config.dummy()))
     chosen = dataclasses.replace(CONFIG.model, checkpoint=str(tmp_path / "base"))
     config = dataclasses.replace(CONFIG, model=chosen, peft=method)
     run = make_run(tmp_path / "run", config, models.load(tmp_path / "base"))
@@ -100,14 +100,14 @@ def test_a_policy_comes_back_in_another_folder(tmp_path, monkeypatch, kind):
         chosen = ModelConfig()
     else:
         monkeypatch.chdir(tmp_path)
-        models.save("base", drawn(Pi0Config.dummy()))
+        models.save("base", random_backbone(Pi0Config.dummy()))
         chosen = dataclasses.replace(CONFIG.model, checkpoint="base")
     model = models.load(chosen.source)
     run = make_run(tmp_path / "run", dataclasses.replace(CONFIG, model=chosen), model)
     run.base_hash = models.weights_hash(model)
     export.write(run)
     elsewhere = tmp_path / "elsewhere"
-    models.save(elsewhere / chosen.source, drawn(Pi0Config.dummy(), seed=1))
+    models.save(elsewhere / chosen.source, random_backbone(Pi0Config.dummy(), seed=1))
     command = [sys.executable, "-c", ELSEWHERE, str(run.folder)]
     env = os.environ | {"PYTHONPATH": str(ROOT)}
     found = subprocess.run(
@@ -118,7 +118,7 @@ def test_a_policy_comes_back_in_another_folder(tmp_path, monkeypatch, kind):
 
 def test_a_base_that_is_gone_is_named_with_the_way_out(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    models.save("base", drawn(Pi0Config.dummy()))
+    models.save("base", random_backbone(Pi0Config.dummy()))
     chosen = dataclasses.replace(CONFIG.model, checkpoint="base")
     run = make_run(tmp_path / "run", dataclasses.replace(CONFIG, model=chosen), models.load("base"))
     run.base_hash = models.weights_hash("base")
@@ -130,14 +130,14 @@ def test_a_base_that_is_gone_is_named_with_the_way_out(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=message):
         export.load_policy("run")
     assert export.load_policy("run", base="moved").model
-    models.save("moved", drawn(Pi0Config.dummy(), seed=1))
+    models.save("moved", random_backbone(Pi0Config.dummy(), seed=1))
     with pytest.raises(ValueError, match="was trained on another base"):
         export.load_policy("run", base="moved")
     assert export.load_policy("run", base="moved", any_base=True).model
 
 
 def test_another_tokenizer_is_refused(tmp_path, monkeypatch):
-    models.save(tmp_path / "base", drawn(Pi0Config.dummy()))
+    models.save(tmp_path / "base", random_backbone(Pi0Config.dummy()))
     chosen = dataclasses.replace(CONFIG.model, checkpoint=str(tmp_path / "base"))
     config = dataclasses.replace(CONFIG, model=chosen)
     run = make_run(tmp_path / "run", config, models.load(tmp_path / "base"))
@@ -170,7 +170,7 @@ def test_a_policy_that_cannot_come_back(tmp_path, changes):
 @pytest.mark.slow
 def test_base(tmp_path):
     config = dataclasses.replace(CONFIG, peft=FullFineTuning(), targets=(".*",))
-    run = moved(make_run(tmp_path / "run", config))
+    run = perturbed(make_run(tmp_path / "run", config))
     counts = adaptation.count(run.policy.model)
     assert counts.trainable == counts.total
     export.write(run)

@@ -30,7 +30,7 @@ from lorasp_jax.training.overrides import override
 from lorasp_jax.training.run import Run
 from tests import GOLDEN
 from tests.data.lerobots import golden
-from tests.models.drawn import drawn
+from tests.models.random_models import random_backbone
 from tests.runs import CONFIG, leaves, random_episodes
 
 BASE_MODEL = setup.base_model
@@ -46,7 +46,9 @@ def config(monkeypatch):
     """No simulation, and the dummy backbone."""
     worlds = world(*random_episodes("", 0).instructions)
     monkeypatch.setattr(setup.envs, "make", lambda *_, **__: worlds)
-    monkeypatch.setattr(setup, "base_model", lambda *_, **__: (drawn(Pi0Config.dummy()), ""))
+    monkeypatch.setattr(
+        setup, "base_model", lambda *_, **__: (random_backbone(Pi0Config.dummy()), "")
+    )
     monkeypatch.setattr(
         setup, "demonstrations", lambda c, *_: {t: random_episodes(t, 0) for t in c.tasks}
     )
@@ -102,7 +104,7 @@ def test_policies_of_lerobot_are_fed_as_they_say(config, tmp_path, monkeypatch):
     found, _ = BASE_MODEL(dataclasses.replace(config, model=model))
     assert found.config.inputs == inputs.OPENPI
     two_arms = dataclasses.replace(inputs.OURS, delta=(True,) * 14)
-    found = drawn(dataclasses.replace(Pi0Config.dummy(), inputs=two_arms))
+    found = random_backbone(dataclasses.replace(Pi0Config.dummy(), inputs=two_arms))
     monkeypatch.setattr(setup, "base_model", lambda *_, **__: (found, ""))
     with pytest.raises(ValueError, match="has 14 entries, but the robot's actions have 7"):
         setup.prepare(config, tmp_path, Console(file=io.StringIO()), time.perf_counter())
@@ -151,7 +153,7 @@ def test_eva_of_the_command_line_sees_the_demonstrations(config, tmp_path):
     run = setup.prepare(config, tmp_path, Console(file=io.StringIO()), time.perf_counter())
     found = adaptation.methods(run.policy.model)
     assert {method.initialization for method in found.values()} == {"eva"}
-    base = drawn(Pi0Config.dummy())
+    base = random_backbone(Pi0Config.dummy())
     moments = setup.input_moments(run, base, run.policy.processor)
     assert set(moments) == set(found)
     assert len(found) == 3

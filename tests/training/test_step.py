@@ -14,7 +14,7 @@ from lorasp_jax.data.batches import Batch, flatten, sample_batch
 from lorasp_jax.peft import Aux, LoRA
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.step import active_ranks, gradients, init_state, train_step
-from tests.models.drawn import moved
+from tests.models.random_models import with_noise
 from tests.runs import CONFIG, Terminate, leaves, make_run
 
 
@@ -50,7 +50,7 @@ def small(tmp_path_factory):
     steps, chunk = flatten(list(run.episodes.values())), run.policy.model.config.chunk
     sizes = {"batch_size": 16, "chunk": chunk, "state_noise": 0.0}
     batch = sample_batch(jax.random.key(0), steps, run.policy.processor, **sizes)
-    return graphdef, moved(adapters, 0.1), frozen, batch
+    return graphdef, with_noise(adapters, 0.1), frozen, batch
 
 
 def test_a_batch_in_parts_is_the_whole_batch(small):

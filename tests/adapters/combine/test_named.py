@@ -17,7 +17,7 @@ from lorasp_jax.models.observation import Observation
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA, LoRAMoE
 from tests.cases import mostly_slow
-from tests.models.drawn import filled
+from tests.models.random_models import with_random_parameters
 from tests.nets import METHODS, NET, SP, Net, X, assert_close, call, golden_models, trained
 
 NAMES = ("pour", "press", "open", "pick")
@@ -160,7 +160,7 @@ def test_unknown_names():
 
 
 def test_models_that_do_not_combine():
-    other = filled(Net)
+    other = with_random_parameters(Net)
     other.inp.kernel.set_value(other.inp.kernel.get_value() + 1)
     with pytest.raises(ValueError, match="pour and b have different bases, first at 'inp/kernel'"):
         lorasp_jax.combine({"pour": models()["pour"], "b": other})

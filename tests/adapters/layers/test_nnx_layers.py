@@ -14,7 +14,7 @@ from lorasp_jax.adapters.io.native import load_adapters, save_adapters
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.peft import DoRA, FullFineTuning, LoRA, LoRASP
 from tests.cases import mostly_slow
-from tests.models.drawn import filled, moved
+from tests.models.random_models import with_noise, with_random_parameters
 
 SP = LoRASP(rank=8, hidden_width=4)
 
@@ -52,7 +52,7 @@ def adapted(model, *rules, **settings):
 def perturbed(model):
     """The model with adapters that do something."""
     graphdef, adapters, frozen = adaptation.split(model)
-    return nnx.merge(graphdef, moved(adapters, 0.3), frozen)
+    return nnx.merge(graphdef, with_noise(adapters, 0.3), frozen)
 
 
 call = jax.jit(lambda model, *args: model(*args))
@@ -60,7 +60,7 @@ call = jax.jit(lambda model, *args: model(*args))
 
 @pytest.fixture(scope="module")
 def heads():
-    return filled(lambda: Heads(nnx.Rngs(0)))
+    return with_random_parameters(lambda: Heads(nnx.Rngs(0)))
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def x():
 
 @pytest.fixture(scope="module")
 def vision():
-    return filled(lambda: Vision(nnx.Rngs(0)))
+    return with_random_parameters(lambda: Vision(nnx.Rngs(0)))
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from lorasp_jax.models import pi0, smolvla
 from lorasp_jax.models.sampling import Sampler
 from lorasp_jax.models.transformer.layers import apply_to_shared_input
 from tests.cases import mostly_slow
-from tests.models.drawn import drawn, observation
+from tests.models.random_models import observation, random_backbone
 from tests.nets import METHODS, trained
 from tests.peft.lora_sp.test_method import OnGPU
 
@@ -194,7 +194,7 @@ def test_layers_of_two_methods_are_fused_individually(second):
 )
 def test_sampling_follows_the_velocity(backbone):
     config = backbone.Config.dummy()
-    model = trained((".*_proj", METHODS["lora"]), seed=1, net=drawn(config), size=0.1)
+    model = trained((".*_proj", METHODS["lora"]), seed=1, net=random_backbone(config), size=0.1)
     obs = observation(config, 2)
     noise = jax.random.normal(jax.random.key(0), (2, config.chunk, config.action_dim))
     velocity = jax.jit(lambda model, x, t: model.velocity(obs, x, jnp.full(2, t)))

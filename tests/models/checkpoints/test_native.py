@@ -12,14 +12,14 @@ from lorasp_jax import models
 from lorasp_jax.models.checkpoints import native
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.peft import LoRA
-from tests.models.drawn import drawn
+from tests.models.random_models import random_backbone
 
 CONFIG = Pi0Config.dummy()
 
 
 @pytest.fixture(scope="module")
 def model():
-    return drawn(CONFIG)
+    return random_backbone(CONFIG)
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.overrides import Command, load
 from lorasp_jax.training.run import Run
 from tests import ROOT
-from tests.models.drawn import drawn
+from tests.models.random_models import random_backbone
 from tests.runs import CONFIG, random_episodes
 
 LIMIT, EPISODES = 50, 6
@@ -40,7 +40,9 @@ def config(monkeypatch):
     mesh = meshes.make_mesh(1, jax.devices()[:1])
     monkeypatch.setattr(meshes, "make_mesh", lambda *_: mesh)
     monkeypatch.setattr(setup.envs, "make", lambda *_, **__: world)
-    monkeypatch.setattr(setup, "base_model", lambda *_, **__: (drawn(Pi0Config.dummy()), ""))
+    monkeypatch.setattr(
+        setup, "base_model", lambda *_, **__: (random_backbone(Pi0Config.dummy()), "")
+    )
     monkeypatch.setattr(setup, "demonstrations", lambda *_: pytest.fail("it collects"))
     evaluation = dataclasses.replace(CONFIG.evaluation, execute_steps=1)
     data = DataConfig(episodes=EPISODES)

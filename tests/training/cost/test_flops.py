@@ -6,7 +6,7 @@ import pytest
 
 from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.training.cost import flops
-from tests.models.drawn import drawn, observation
+from tests.models.random_models import observation, random_backbone
 
 X, W = jnp.ones((6, 8)), jnp.ones((8, 5))
 PRODUCT = 2 * 6 * 8 * 5
@@ -41,7 +41,7 @@ def test_shapes_are_enough():
 
 def test_a_backbone_needs_what_xla_says():
     config = Pi0Config.nano()
-    model, obs = drawn(config), observation(config, 2)
+    model, obs = random_backbone(config), observation(config, 2)
     actions = jnp.zeros((2, config.chunk, config.action_dim))
 
     def loss(model, obs):

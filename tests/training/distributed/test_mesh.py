@@ -18,7 +18,7 @@ from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.loop import train
 from lorasp_jax.training.run_folder import read_metrics
 from lorasp_jax.training.step import init_state, loss_fn
-from tests.models.drawn import moved
+from tests.models.random_models import with_noise
 from tests.runs import CONFIG, Terminate, leaves, make_run
 
 FEW = ("patch_embed", "language/blocks/q_proj", "action_out_proj")
@@ -51,7 +51,7 @@ def test_one_and_eight_devices_agree(tmp_path, targets, plain):
     def gradients(mesh):
         replicated = meshes.replicated(mesh)
         return value_and_grad(
-            jax.device_put(moved(adapters, 0.1), replicated),
+            jax.device_put(with_noise(adapters, 0.1), replicated),
             jax.device_put(frozen, meshes.shardings(frozen, mesh, minimum=1024)),
             graphdef,
             jax.device_put(batch, meshes.batch_sharding(mesh)),

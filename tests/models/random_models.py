@@ -1,6 +1,6 @@
-"""Models with random parameters, norms and biases too.
+"""Models with random parameters, including norms and biases.
 
-NumPy draws them: JAX would compile a program for every shape.
+NumPy draws them, because JAX would compile a program for every shape.
 """
 
 from collections.abc import Callable
@@ -14,13 +14,13 @@ from flax import nnx
 from lorasp_jax.models.observation import Observation
 
 
-def drawn(config: Any, seed: int = 0) -> Any:
-    """A backbone of these sizes."""
-    return filled(lambda: config.create(nnx.Rngs(0)), seed)
+def random_backbone(config: Any, seed: int = 0) -> Any:
+    """Create a backbone with random parameters."""
+    return with_random_parameters(lambda: config.create(nnx.Rngs(0)), seed)
 
 
-def filled(build: Callable[[], nnx.Module], seed: int = 0) -> Any:
-    """What `build` makes, with other numbers in it."""
+def with_random_parameters(build: Callable[[], nnx.Module], seed: int = 0) -> Any:
+    """Create the module that `build` returns, with random parameters."""
     rng = np.random.default_rng(seed)
 
     def draw(leaf: jax.ShapeDtypeStruct) -> jax.Array:
@@ -31,15 +31,15 @@ def filled(build: Callable[[], nnx.Module], seed: int = 0) -> Any:
     return nnx.merge(graphdef, jax.tree.map(draw, parameters))
 
 
-def moved(tree: Any, size: float, seed: int = 0) -> Any:
-    """Arrays as after some training: at their start, half of the gradients vanish."""
+def with_noise(tree: Any, scale: float, seed: int = 0) -> Any:
+    """Add noise, as if after some training: at initialization half of the gradients vanish."""
     rng = np.random.default_rng(seed)
-    step = lambda x: size * rng.normal(size=x.shape)  # noqa: E731
-    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x) + step(x), x.dtype), tree)
+    noise = lambda x: scale * rng.normal(size=x.shape)  # noqa: E731
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x) + noise(x), x.dtype), tree)
 
 
 def observation(config: Any, batch: int) -> Observation:
-    """What a policy of these sizes sees; the second example lacks a camera, both have padding."""
+    """A random observation; the second example lacks a camera, and both have padding."""
     keys = jax.random.split(jax.random.key(0), 3)
     shape = (batch, config.image_size, config.image_size, 3)
     return Observation(
