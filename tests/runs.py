@@ -148,6 +148,6 @@ def finish(folder: Path) -> Path:
         log.write(step, {"task": 1 / step, "spectral": 0.1, "active_rank/vision": 4.0})
     log.close()
     frames = np.random.default_rng(0).integers(0, 255, (4, 32, 64, 3), np.uint8)
-    video.write_picture(folder / "cameras_press.png", frames[0])
+    video.write_image(folder / "cameras_press.png", frames[0])
     video.write_video(folder / "rollout_press.mp4", frames, fps=10)
     return folder

@@ -1,4 +1,4 @@
-"""Success in simulation before, while and after training, with a video of each task."""
+"""Measure success in simulation before, during and after training, with a video per task."""
 
 import contextlib
 import functools
@@ -31,127 +31,126 @@ TOWERS = ("vision", "language", "action")
 
 
 class Evaluation(Callback):
-    """Measures every task of a run before the first and after the last step, and in between.
+    """Evaluates every task of a run before, during and after training.
 
-    Adapters start at exactly zero, so the policy before the first step is the unadapted base; all
-    measurements share one compilation, the layouts of the last one differ from the others'.
-    Training goes on while videos are made.
+    Adapters start at exactly zero, so the policy before the first step is the unadapted base. All
+    evaluations share one compilation; the final one has layouts of its own. Videos are rendered in
+    the background while training continues.
     """
 
     def __init__(
         self,
-        compiled: Callable[[Config, str], tuple[Env, Callable]] = compiled_rollout,
+        compile_rollout: Callable[[Config, str], tuple[Env, Callable]] = compiled_rollout,
         evaluate: Callable[..., Result] = evaluate,
-        film: Callable[[Env, Poses, Path], None] = video.write_film,
+        write_video: Callable[[Env, Poses, Path], None] = video.write_episode,
     ) -> None:
-        """Compile nothing yet.
+        """Create the callback; compilation waits until the first evaluation.
 
         Args:
-            compiled: gives a task's environment and jitted rollout.
-            evaluate: measures a policy.
-            film: writes a video of an episode's poses to a file.
+            compile_rollout: returns a task's environment and jitted rollout.
+            evaluate: evaluates a policy.
+            write_video: writes a video of an episode's poses to a file.
         """
-        self._compile, self._evaluate, self._film = compiled, evaluate, film
-        self._tasks: dict[str, tuple[Env, Callable]] = {}
-        self._films = ThreadPoolExecutor(1)
-        self._filming: Future | None = None
+        self._compile_rollout, self._evaluate = compile_rollout, evaluate
+        self._write_video = write_video
+        self._rollouts: dict[str, tuple[Env, Callable]] = {}
+        self._video_thread = ThreadPoolExecutor(1)
+        self._pending_videos: Future | None = None
 
     def on_start(self, run: Run) -> None:
-        """Measure the base and record it, for a resumed run too."""
-        results = self._measure(run, "before")
+        """Evaluate the base, also in a resumed run, and write before.json."""
+        results = self._evaluate_tasks(run, "before")
         write_json(run.folder / "before.json", {t: success(r) for t, r in results.items()})
 
     def on_log(self, run: Run, step: int, metrics: dict[str, float]) -> dict[str, float]:  # noqa: ARG002
-        """Measure the policy in one batch of episodes a task, if it is time to; film it.
+        """Evaluate the policy in one batch of episodes per task, if due, and render videos.
 
         Returns:
             `success/<task>`.
         """
         if not run.config.evaluates(step):
             return {}
-        results = self._measure(run, f"at step {step}", run.config.evaluation.worlds)
-        if self._filming:
-            self._filming.result()
-        self._filming = self._films.submit(self._record, run, results)
+        results = self._evaluate_tasks(run, f"at step {step}", run.config.evaluation.worlds)
+        if self._pending_videos:
+            self._pending_videos.result()
+        self._pending_videos = self._video_thread.submit(self._write_media, run, results)
         return {f"success/{task}": result.success for task, result in results.items()}
 
     def on_end(self, run: Run) -> None:
-        """Measure the trained policy and write results.json and the videos."""
-        results = self._measure(run, "after")
-        if self._filming:
-            self._filming.result()
-        self._films.shutdown()
+        """Evaluate the trained policy; write results.json and the videos."""
+        results = self._evaluate_tasks(run, "after")
+        if self._pending_videos:
+            self._pending_videos.result()
+        self._video_thread.shutdown()
         with run.console.status("rendering videos ..."):
-            self._record(run, results)
-        write_json(run.folder / "results.json", summarise(run, results))
+            self._write_media(run, results)
+        write_json(run.folder / "results.json", summarize(run, results))
 
-    def _record(self, run: Run, results: dict[str, Result]) -> None:
-        """Write a video and the first pictures of each task."""
+    def _write_media(self, run: Run, results: dict[str, Result]) -> None:
+        """Write a video and the first camera images of each task."""
         for task, result in results.items():
             first = {name: np.asarray(i[0, 0]) for name, i in run.episodes[task].image.items()}
-            video.write_picture(run.folder / f"cameras_{task}.png", video.side_by_side(first))
+            video.write_image(run.folder / f"cameras_{task}.png", video.side_by_side(first))
             with atomic_file(run.folder / f"rollout_{task}.mp4") as unfinished:
-                self._film(self._tasks[task][0], result.poses, unfinished)
+                self._write_video(self._rollouts[task][0], result.poses, unfinished)
 
-    def _measure(self, run: Run, when: str, episodes: int = 0) -> dict[str, Result]:
-        """Results by task, of the config's number of episodes or another; compilations run side by
-        side.
-        """
-        shown = bars(run.console, "episodes", shown=not episodes)
-        with run.timed("evaluate"), shown as progress:
-            one = functools.partial(self._measure_task, run, when, episodes, progress)
+    def _evaluate_tasks(self, run: Run, when: str, episodes: int = 0) -> dict[str, Result]:
+        """Evaluate all tasks, compiling concurrently; `episodes` overrides the config if not 0."""
+        progress_bars = bars(run.console, "episodes", shown=not episodes)
+        with run.timed("evaluate"), progress_bars as progress:
+            evaluate_task = functools.partial(self._evaluate_task, run, when, episodes, progress)
             tasks = run.config.tasks
-            # Warp is not for threads.
-            each = map if physics.default_backend() == "warp" else side_by_side
-            results = dict(zip(tasks, each(one, tasks), strict=True))
+            # Warp is not thread-safe.
+            mapped = map if physics.default_backend() == "warp" else side_by_side
+            results = dict(zip(tasks, mapped(evaluate_task, tasks), strict=True))
         for task, result in results.items():
             low, high = (100 * bound for bound in result.ci95)
             run.console.print(
                 f"{task} {when}: {100 * result.success:.1f} % success "
-                f"(95 % interval {low:.0f}-{high:.0f} %) in {result.episodes} episodes"
+                f"(95 % CI {low:.0f}-{high:.0f} %) in {result.episodes} episodes"
             )
         return results
 
-    def _measure_task(
+    def _evaluate_task(
         self, run: Run, when: str, episodes: int, progress: Progress, task: str
     ) -> Result:
-        """The result of one task, with a progress bar."""
+        """Evaluate one task with a progress bar."""
         episodes = episodes or run.config.evaluation.episodes
-        bar = progress.add_task(f"compiling evaluation of {task} ...", total=episodes)
+        bar = progress.add_task(f"compiling the evaluation of {task} ...", total=episodes)
         number = 2 * run.config.tasks.index(task) + (when == "after")
         key = RandomStream.EVALUATION.key(run.config.seed, number)
         with contextlib.ExitStack() as compiles:
-            if task not in self._tasks:
-                what = f"the evaluation of {task}, its first episodes included"
+            if task not in self._rollouts:
+                what = f"the evaluation of {task} and running its first episodes"
                 compiles.enter_context(messages.announced(what))
 
             def report(done: int, _: int) -> None:
                 compiles.close()
                 progress.update(bar, completed=done, description=f"evaluating {task} {when}")
 
-            if task not in self._tasks:
-                self._tasks[task] = self._compile(run.config, task)
-            env, rollout = self._tasks[task]
+            if task not in self._rollouts:
+                self._rollouts[task] = self._compile_rollout(run.config, task)
+            env, rollout = self._rollouts[task]
             return self._evaluate(run.policy, env, key, episodes, rollout=rollout, progress=report)
 
 
 class NoEvaluation(Callback):
-    """For a dataset whose tasks cannot be simulated: results without success rates."""
+    """Replaces `Evaluation` for tasks that cannot be simulated: results without success rates."""
 
     def on_end(self, run: Run) -> None:
-        """Say so and write results.json."""
+        """Print a note and write results.json."""
         tasks, robot = ", ".join(run.config.tasks), run.config.robot
-        run.console.print(f"not evaluated: there is no simulation of {tasks} with {robot}")
-        write_json(run.folder / "results.json", summarise(run, {}))
+        run.console.print(f"skipping evaluation: no simulation of {tasks} with {robot}")
+        write_json(run.folder / "results.json", summarize(run, {}))
 
 
 def success(result: Result) -> dict[str, Any]:
-    """The part of a result that results.json keeps per task."""
+    """Return a task's entry in results.json."""
     return {"success": result.success, "episodes": result.episodes, "ci95": list(result.ci95)}
 
 
-def summarise(run: Run, after: dict[str, Result]) -> dict[str, Any]:
-    """The content of results.json."""
+def summarize(run: Run, after: dict[str, Result]) -> dict[str, Any]:
+    """Return the content of results.json."""
     before = read_json(run.folder / "before.json", records.BEFORE) if after else {}
     layers = _mean([result.active_rank for result in after.values()])
     modules = {
@@ -172,7 +171,7 @@ def summarise(run: Run, after: dict[str, Result]) -> dict[str, Any]:
         },
         "active_rank": modules,
         "layer_active_rank": layers,
-        "active_rank_histogram": _joined(
+        "active_rank_histogram": _map_trees(
             lambda *counts: sum(counts).tolist(),
             [result.active_rank_histogram for result in after.values()],
         ),
@@ -182,11 +181,11 @@ def summarise(run: Run, after: dict[str, Result]) -> dict[str, Any]:
 
 
 def _mean(trees: list[Any]) -> Any:
-    """Mean of equal trees whose leaves are lists of numbers."""
+    """Average trees of the same structure with lists of numbers as leaves."""
     is_list = lambda node: isinstance(node, list)  # noqa: E731
-    return _joined(lambda *v: np.mean(v, axis=0).tolist(), trees, is_leaf=is_list)
+    return _map_trees(lambda *v: np.mean(v, axis=0).tolist(), trees, is_leaf=is_list)
 
 
-def _joined(function: Callable, trees: list[Any], **options: Any) -> Any:
-    """`jax.tree.map` over any number of trees; of none, an empty one."""
+def _map_trees(function: Callable, trees: list[Any], **options: Any) -> Any:
+    """Apply `jax.tree.map` to any number of trees; without trees return {}."""
     return jax.tree.map(function, *trees, **options) if trees else {}

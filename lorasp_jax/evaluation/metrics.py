@@ -1,4 +1,4 @@
-"""Success rates with intervals; active ranks of one look of a policy."""
+"""Confidence intervals of success rates; active ranks of one policy call."""
 
 import math
 
@@ -8,17 +8,17 @@ import jax.numpy as jnp
 from lorasp_jax.peft import Aux
 
 Reports = dict[str, dict[str, Aux]]
-"""Tower -> linear map -> what its adapters report, `[..., W, T]`.
+"""Tower -> linear layer -> `Aux` of its adapters, `[..., W, T]`.
 
-Several pictures of a world are folded into W; leading axes are layers, and before them, in the
-action expert, denoising steps."""
+The images of a world are folded into W. The leading axis is layers, in the action expert preceded
+by denoising steps."""
 
 LayerRanks = dict[str, dict[str, jax.Array]]
-"""Tower -> linear map -> active rank `[L]`."""
+"""Tower -> linear layer -> active rank `[L]`."""
 
 
 def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
-    """Wilson score interval of a success rate (Wilson 1927, J. Am. Stat. Assoc. 22, 209-212).
+    """Return the Wilson score interval of a success rate (Wilson 1927, J. Am. Stat. Assoc. 22, 209).
 
     Args:
         successes: number of successful trials.
@@ -26,51 +26,51 @@ def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[f
         z: normal quantile; the default gives 95 %.
 
     Returns:
-        Lower and upper bound of the rate.
+        Lower and upper bound.
 
     Raises:
-        ValueError: `trials` is not positive or `successes` lies outside 0..`trials`.
+        ValueError: `trials` is not positive, or `successes` is not in 0..`trials`.
     """
     if trials < 1 or not 0 <= successes <= trials:
-        raise ValueError(f"{successes} successes in {trials} trials is not a success rate")
+        raise ValueError(f"successes must be in 0..trials, got {successes} of {trials}")
     rate = successes / trials
     spread = z * math.sqrt(rate * (1 - rate) / trials + z**2 / (4 * trials**2))
-    centre = rate + z**2 / (2 * trials)
+    center = rate + z**2 / (2 * trials)
     scale = 1 + z**2 / trials
-    return max((centre - spread) / scale, 0.0), min((centre + spread) / scale, 1.0)
+    return max((center - spread) / scale, 0.0), min((center + spread) / scale, 1.0)
 
 
 def layer_ranks(reports: Reports, running: jax.Array) -> LayerRanks:
-    """Active rank of every layer: mean over valid tokens, running worlds and denoising steps.
+    """Average each layer's active rank over valid tokens, running worlds and denoising steps.
 
     Args:
-        reports: of one look; linear maps without a rank are left out.
-        running: `[W]` bool, the worlds that count.
+        reports: reports of one policy call; linear layers without a rank are omitted.
+        running: `[W]` bool, unfinished worlds.
     """
 
     def mean(rank: jax.Array, valid: jax.Array) -> jax.Array:
         total = jnp.where(valid, rank, 0.0).sum((-2, -1))
         return total / jnp.maximum(valid.sum((-2, -1)), 1)
 
-    found = {
+    ranks = {
         tower: {name: mean(rank, valid) for name, (rank, valid) in linears.items()}
         for tower, linears in _tokens(reports, running).items()
     }
-    if "action" in found:
-        found["action"] = {name: rank.mean(0) for name, rank in found["action"].items()}
-    return jax.tree.map(jnp.atleast_1d, found)
+    if "action" in ranks:
+        ranks["action"] = {name: rank.mean(0) for name, rank in ranks["action"].items()}
+    return jax.tree.map(jnp.atleast_1d, ranks)
 
 
 def rank_histogram(reports: Reports, running: jax.Array, rank: int) -> dict[str, jax.Array]:
-    """How many tokens of a tower had which active rank, over its layers and linear maps.
+    """Count the tokens of a tower with each active rank, over all its layers.
 
     Args:
-        reports: of one look; towers without a rank are left out.
-        running: `[W]` bool, the worlds that count.
-        rank: R, the largest active rank there can be.
+        reports: reports of one policy call; towers without a rank are omitted.
+        running: `[W]` bool, unfinished worlds.
+        rank: R, the maximum active rank.
 
     Returns:
-        `[R + 1]` int32 by tower, entry k for an active rank of k.
+        `[R + 1]` int32 per tower; entry k is the number of tokens with active rank k.
     """
 
     def count(active: jax.Array, valid: jax.Array) -> jax.Array:
@@ -87,12 +87,12 @@ def rank_histogram(reports: Reports, running: jax.Array, rank: int) -> dict[str,
 def _tokens(
     reports: Reports, running: jax.Array
 ) -> dict[str, dict[str, tuple[jax.Array, jax.Array]]]:
-    """Active rank and whether it counts, `[..., W, T]` each, of the linear maps that have one."""
+    """Return active rank and validity, `[..., W, T]` each, of the linear layers with a rank."""
 
     def worlds(linear: Aux) -> tuple[jax.Array, jax.Array]:
         rank, mask = linear.active_rank, linear.token_mask
         assert rank is not None
-        assert mask is not None  # the backbones always say which tokens count
+        assert mask is not None  # backbones always set it
         shape = (*rank.shape[:-2], running.shape[0], -1)
         valid = running[:, None] & jnp.broadcast_to(mask, rank.shape).reshape(shape)
         return rank.reshape(shape), valid

@@ -1,4 +1,4 @@
-"""Policy in the loop: look, predict a chunk, execute part of it, look again - all in one jit."""
+"""Closed-loop rollouts in one jit: observe, predict a chunk, execute part of it, repeat."""
 
 import dataclasses
 import functools
@@ -18,8 +18,8 @@ from lorasp_jax.config import Config
 from lorasp_jax.evaluation import metrics
 from lorasp_jax.policies.policy import Policy
 
-FILMED_WORLDS = 8
-"""Worlds whose poses are kept, to choose one of them for the video."""
+RECORDED_WORLDS = 8
+"""Number of worlds whose poses are recorded, from which the video is chosen."""
 
 
 @jax.tree_util.register_dataclass
@@ -30,10 +30,10 @@ class Rollout:
     Attributes:
         success: `[W]` bool.
         steps: `[W]` int32, control steps until success or the time limit.
-        active_rank: `[L]` per linear map, mean over tokens and the looks of worlds not yet done.
-        active_rank_histogram: `[looks, R + 1]` int32 per tower, see `metrics.rank_histogram`; R is
-            the largest bank.
-        poses: the first worlds at every control step, leading axes `[time, worlds]`.
+        active_rank: `[L]` per linear layer, mean over tokens and policy calls in unfinished worlds.
+        active_rank_histogram: `[calls, R + 1]` int32 per tower, see `metrics.rank_histogram`; R is
+            the largest adapter rank.
+        poses: poses of the first worlds at every control step, leading axes `[time, worlds]`.
     """
 
     success: jax.Array
@@ -48,14 +48,14 @@ class Result:
     """Closed-loop success of a policy on one task.
 
     Attributes:
-        success: share of successful episodes.
+        success: fraction of successful episodes.
         episodes: number of episodes.
-        ci95: Wilson 95 % interval of the share.
+        ci95: 95 % Wilson interval of the success rate.
         steps: mean control steps per episode.
-        active_rank: one value a layer, per tower and linear map.
-        active_rank_histogram: `[R + 1]` int64 per tower, how many tokens had this active rank, over
-            layers, linear maps and all looks of worlds not yet done; R is the largest bank.
-        poses: one filmed episode, a successful one if there is any, leading axis time.
+        active_rank: mean active rank of each layer, by tower and linear layer.
+        active_rank_histogram: `[R + 1]` int64 per tower, number of tokens with each active rank
+            over all layers and policy calls in unfinished worlds; R is the largest adapter rank.
+        poses: poses of one recorded episode, successful if possible, leading axis time.
     """
 
     success: float
@@ -74,22 +74,24 @@ def make_rollout(
     denoise_steps: int = 10,
     ranges: Randomization | None = None,
 ) -> Callable[[Policy, jax.Array], Rollout]:
-    """The rollout of `env.num_envs` episodes, a pure function of policy and key, ready for jit.
+    """Create a rollout of `env.num_envs` episodes, a pure function of policy and key to be jitted.
 
-    Every `execute_steps` control steps the policy looks and draws a new chunk with `denoise_steps`
-    Euler steps. `ranges` are those of `env.reset`; the recorded poses know nothing of colours.
+    Every `execute_steps` control steps the policy observes and samples a new chunk in
+    `denoise_steps` Euler steps. For `ranges` see `env.reset`; recorded poses do not include colors.
     """
-    looks = -(-env.max_steps // execute_steps)
+    num_calls = -(-env.max_steps // execute_steps)
 
     def rollout(policy: Policy, key: jax.Array) -> Rollout:
         chunk = policy.model.config.chunk
         if not 1 <= execute_steps <= chunk:
-            raise ValueError(f"execute_steps must be 1 to the chunk, {chunk}, got {execute_steps}")
+            raise ValueError(
+                f"execute_steps must be 1 to the chunk length, {chunk}, got {execute_steps}"
+            )
         reset_key, sample_key = jax.random.split(key)
         policy = policy.with_sampler()
-        look = functools.partial(_look, env, policy, execute_steps, denoise_steps)
+        block = functools.partial(_control_block, env, policy, execute_steps, denoise_steps)
         state, (poses, ranks, histogram, running) = jax.lax.scan(
-            look, env.reset(reset_key, ranges), jax.random.split(sample_key, looks)
+            block, env.reset(reset_key, ranges), jax.random.split(sample_key, num_calls)
         )
         weights = running / jnp.maximum(running.sum(), 1)
         mean = functools.partial(jnp.tensordot, weights, axes=1, precision="highest")
@@ -107,7 +109,7 @@ def make_rollout(
 def compiled_rollout(
     config: Config, task: str
 ) -> tuple[Env, Callable[[Policy, jax.Array], Rollout]]:
-    """The environment of a task, and its rollout, compiled when it is first called."""
+    """Create the environment of a task and its jitted rollout, which compiles when first called."""
     env = envs.make(
         task,
         robot=config.robot,
@@ -132,26 +134,26 @@ def evaluate(
     rollout: Callable[[Policy, jax.Array], Rollout] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Result:
-    """Success of `policy` on the task of `env` in fresh episodes.
+    """Measure the success rate of `policy` on the task of `env`.
 
     Args:
         policy: for the robot of `env`; its processor has prompts for `env.instructions`.
-        env: where to evaluate; `num_envs` episodes run at a time.
-        key: consumed; the same key gives the same layouts.
+        env: the environment, which runs `num_envs` episodes in parallel.
+        key: PRNG key, which determines the layouts; consumed.
         num_episodes: a multiple of `env.num_envs`.
-        rollout: jitted `make_rollout(env)`; pass the same one again to compile only once.
-        progress: called with episodes done and episodes wanted.
+        rollout: jitted `make_rollout(env)`; reuse it to compile only once.
+        progress: called with (completed, total) episodes.
 
     Raises:
-        ValueError: `num_episodes` is not a positive multiple of `env.num_envs`, or the policy was
-            never told one of the instructions.
+        ValueError: `num_episodes` is not a positive multiple of `env.num_envs`, or the policy has
+            no prompt for one of the instructions.
     """
     batches, rest = divmod(num_episodes, env.num_envs)
     if rest or batches < 1:
         raise ValueError(
-            f"{num_episodes} episodes are not a positive multiple of the {env.num_envs} worlds"
+            f"num_episodes must be a positive multiple of {env.num_envs}, got {num_episodes}"
         )
-    policy = _told(policy, env)
+    policy = _with_prompts(policy, env)
     rollout = rollout or fast_cpu.jit(make_rollout(env))
     runs: list[Rollout] = []
     for batch_key in jax.random.split(key, batches):
@@ -161,32 +163,32 @@ def evaluate(
     return _result(runs)
 
 
-def _look(
+def _control_block(
     env: Env, policy: Policy, execute_steps: int, denoise_steps: int, state: State, key: jax.Array
 ) -> tuple[State, tuple]:
-    """Look, predict and execute: the state after it, and what a rollout keeps of it."""
+    """Observe, predict, execute; return the next state and the recorded data."""
     actions, aux = policy.sample(
         key, env.observe(state), state.info["instruction"], num_steps=denoise_steps, return_aux=True
     )
     running = ~state.done
     ranks = metrics.layer_ranks(aux, running)
-    histogram = metrics.rank_histogram(aux, running, _largest_bank(policy))
+    histogram = metrics.rank_histogram(aux, running, _max_rank(policy))
 
     def act(state: State, action: jax.Array) -> tuple[State, Poses]:
         state = env.step(state, action)
-        return state, jax.tree.map(lambda x: x[:FILMED_WORLDS], Poses.of(state.data))
+        return state, jax.tree.map(lambda x: x[:RECORDED_WORLDS], Poses.of(state.data))
 
     state, poses = jax.lax.scan(act, state, jnp.moveaxis(actions[:, :execute_steps], 1, 0))
     return state, (poses, ranks, histogram, running.sum())
 
 
-def _largest_bank(policy: Policy) -> int:
-    """R of the widest adapter of a policy `with_sampler`; 0 if no method has a rank."""
+def _max_rank(policy: Policy) -> int:
+    """Return the largest adapter rank of a policy `with_sampler`; 0 if no method has a rank."""
     return max((getattr(method, "rank", 0) for method in policy.model.methods), default=0)
 
 
 def _result(runs: Sequence[Rollout]) -> Result:
-    """Batches of episodes as one."""
+    """Aggregate batches of episodes."""
     success = np.concatenate([run.success for run in runs])
     successes, episodes = int(success.sum()), len(success)
     ranks, histograms = zip(*((r.active_rank, r.active_rank_histogram) for r in runs), strict=True)
@@ -196,21 +198,21 @@ def _result(runs: Sequence[Rollout]) -> Result:
         ci95=metrics.wilson_interval(successes, episodes),
         steps=float(np.mean([run.steps for run in runs])),
         active_rank=jax.tree.map(lambda *r: np.mean(r, axis=0).tolist(), *ranks),
-        # All looks together are too many tokens for 32 bits.
+        # int64: the tokens of all policy calls overflow 32 bits.
         active_rank_histogram=jax.tree.map(
             lambda *counts: np.sum(counts, axis=(0, 1), dtype=np.int64), *histograms
         ),
-        poses=_film(runs[0]),
+        poses=_recorded_episode(runs[0]),
     )
 
 
-def _told(policy: Policy, env: Env) -> Policy:
-    """The policy with the prompts of one environment, whose worlds index them."""
+def _with_prompts(policy: Policy, env: Env) -> Policy:
+    """Restrict the prompt table to the environment's instructions, in its order."""
     prompts = policy.processor.prompts.select(env.instructions)
     return Policy(policy.model, dataclasses.replace(policy.processor, prompts=prompts))
 
 
-def _film(run: Rollout) -> Poses:
-    """The poses of the first filmed world that succeeded, or of world 0, until it was done."""
-    world = int(jnp.argmax(run.success[:FILMED_WORLDS]))
+def _recorded_episode(run: Rollout) -> Poses:
+    """Return the poses of the first successful recorded world, else of world 0, until its end."""
+    world = int(jnp.argmax(run.success[:RECORDED_WORLDS]))
     return jax.tree.map(lambda x: x[: max(int(run.steps[world]), 1), world], run.poses)

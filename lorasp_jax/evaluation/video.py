@@ -1,4 +1,4 @@
-"""Pictures and videos of recorded episodes."""
+"""Images and videos of recorded episodes."""
 
 import dataclasses
 from pathlib import Path
@@ -12,26 +12,26 @@ from envs.rendering.renderer import RayRenderer
 from envs.rendering.video import side_by_side, write_video
 from envs.state import Poses
 
-__all__ = ["FILM_SIZE", "side_by_side", "write_film", "write_picture", "write_video"]
+__all__ = ["VIDEO_SIZE", "side_by_side", "write_episode", "write_image", "write_video"]
 
-FILM_SIZE = 192
+VIDEO_SIZE = 192
 """Height and width of each camera in a video [pixels]."""
 
 
-def write_picture(path: Path, image: np.ndarray) -> None:
-    """Write a `[H, W, 3]` uint8 picture."""
+def write_image(path: Path, image: np.ndarray) -> None:
+    """Write an image, `[H, W, 3]` uint8."""
     Image.fromarray(image).save(path)
 
 
-def write_film(env: Env, poses: Poses, path: Path) -> None:
-    """Render an episode at film size and write it at the control rate.
+def write_episode(env: Env, poses: Poses, path: Path) -> None:
+    """Render a recorded episode and write it as a video at the control rate.
 
     Args:
-        env: where it was recorded.
-        poses: of geoms and cameras, leading axis `[T]`.
-        path: an MP4 file.
+        env: the environment of the episode.
+        poses: poses of geoms and cameras, leading axis `[T]`.
+        path: MP4 file.
     """
-    camera = dataclasses.replace(env, renderer=RayRenderer(env.render_model, FILM_SIZE, 1))
-    images = jax.jit(camera.render)(poses)
+    renderer = dataclasses.replace(env, renderer=RayRenderer(env.render_model, VIDEO_SIZE, 1))
+    images = jax.jit(renderer.render)(poses)
     frames = side_by_side({name: np.asarray(image) for name, image in images.items()})
     write_video(path, frames, fps=1 / env.control_dt)

@@ -1,4 +1,4 @@
-"""Success while training: when it is measured, and that training does not wait for the films."""
+"""Evaluation during training: when it runs, and that training does not wait for the videos."""
 
 import dataclasses
 import io
@@ -22,47 +22,47 @@ def run(tmp_path):
     config = dataclasses.replace(CONFIG, evaluation=settings, optim=optim, log_every=40)
     run = Run(config, tmp_path, Console(file=io.StringIO()), "")
     run.episodes = {task: random_episodes(task, 0) for task in config.tasks}
-    run.policy = cast(Any, None)  # what measures it is not called
+    run.policy = cast(Any, None)  # never evaluated
     return run
 
 
-def test_every_hundred_steps_at_the_next_log_line(run):
-    asked, filmed, go = [], [], threading.Event()
+def test_evaluation_runs_at_the_next_log_step(run):
+    evaluated, rendered, may_render = [], [], threading.Event()
 
     def evaluate(policy, env, key, episodes, **_):
-        asked.append((env, episodes))
+        evaluated.append((env, episodes))
         return Result(0.5, episodes, (0.4, 0.6), 30.0, {}, {}, poses=())
 
-    def film(env, poses, path):
-        assert go.wait(60)
-        filmed.append(env)
+    def write_video(env, poses, path):
+        assert may_render.wait(60)
+        rendered.append(env)
         path.touch()
 
-    evaluation = Evaluation(lambda _, task: (task, None), evaluate, film)
+    evaluation = Evaluation(lambda _, task: (task, None), evaluate, write_video)
     steps = [*range(40, 300, 40), 300]
     with run.timed("train"):
-        found = {step: evaluation.on_log(run, step, {}) for step in steps[:3]}
-    assert {step for step, value in found.items() if value} == {120}
-    assert found[120] == {"success/press": 0.5, "success/pick_place": 0.5}
-    assert sorted(asked) == [("pick_place", 4), ("press", 4)]  # one batch of worlds
+        logged = {step: evaluation.on_log(run, step, {}) for step in steps[:3]}
+    assert {step for step, value in logged.items() if value} == {120}
+    assert logged[120] == {"success/press": 0.5, "success/pick_place": 0.5}
+    assert sorted(evaluated) == [("pick_place", 4), ("press", 4)]  # one batch of worlds
     assert "press at step 120: 50.0 % success" in run.console.file.getvalue()
-    assert not filmed  # and yet training went on
-    go.set()
-    found = {step: evaluation.on_log(run, step, {}) for step in steps[3:]}
-    assert {step for step, value in found.items() if value} == {200}  # 300 is the end's
-    evaluation._films.shutdown()
-    assert filmed == 2 * [*run.config.tasks]
+    assert not rendered  # training did not wait
+    may_render.set()
+    logged = {step: evaluation.on_log(run, step, {}) for step in steps[3:]}
+    assert {step for step, value in logged.items() if value} == {200}  # step 300 is left to on_end
+    evaluation._video_thread.shutdown()
+    assert rendered == 2 * [*run.config.tasks]
     assert {path.name for path in run.folder.glob("*.mp4")} == {
         "rollout_press.mp4",
         "rollout_pick_place.mp4",
     }
     assert set(run.seconds) == {"train", "evaluate", "total"}
-    parts = run.seconds["train"] + run.seconds["evaluate"]
-    assert parts <= run.seconds["total"]  # an evaluation is not counted as training, too
+    phases = run.seconds["train"] + run.seconds["evaluate"]
+    assert phases <= run.seconds["total"]  # evaluation is not counted as training
 
 
-def test_without_it_nothing_is_measured(run):
-    evaluation = Evaluation(evaluate=lambda *_, **__: pytest.fail("it measures"))
+def test_evaluation_can_be_disabled(run):
+    evaluation = Evaluation(evaluate=lambda *_, **__: pytest.fail("evaluated"))
     settings = dataclasses.replace(run.config.evaluation, every=0)
     run.config = dataclasses.replace(run.config, evaluation=settings)
     assert evaluation.on_log(run, 40, {}) == {}

@@ -1,4 +1,4 @@
-"""Wilson intervals; which tokens active ranks are taken over."""
+"""Wilson intervals; the tokens over which active ranks are averaged."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,13 +25,13 @@ def test_bounds_and_symmetry():
 
 
 @pytest.mark.parametrize(("successes", "trials"), [(0, 0), (3, 2), (-1, 4)])
-def test_impossible_counts(successes: int, trials: int):
-    with pytest.raises(ValueError, match="not a success rate"):
+def test_invalid_counts(successes: int, trials: int):
+    with pytest.raises(ValueError, match=r"successes must be in 0\.\.trials"):
         wilson_interval(successes, trials)
 
 
 def reports(rank):
-    """Two layers, three worlds, four tokens, the last two of which are padding in world 1."""
+    """Two layers, three worlds, four tokens; the last two tokens of world 1 are padding."""
     mask = jnp.ones((2, 3, 4), bool).at[:, 1, 2:].set(False)
     return {
         "vision": {"fc1": Aux(rank, token_mask=mask)},
@@ -44,29 +44,29 @@ def reports(rank):
     }
 
 
-def test_ranks_leave_out_padding_and_finished_worlds():
-    found = layer_ranks(reports(jnp.arange(24.0).reshape(2, 3, 4)), RUNNING)
-    np.testing.assert_allclose(found["vision"]["fc1"], [4.5, 16.5])
-    np.testing.assert_allclose(found["action"]["fc1"], [9.5, 21.5])
-    assert "none" not in found["action"]
-    assert not found["language"]
+def test_ranks_ignore_padding_and_finished_worlds():
+    ranks = layer_ranks(reports(jnp.arange(24.0).reshape(2, 3, 4)), RUNNING)
+    np.testing.assert_allclose(ranks["vision"]["fc1"], [4.5, 16.5])
+    np.testing.assert_allclose(ranks["action"]["fc1"], [9.5, 21.5])
+    assert "none" not in ranks["action"]
+    assert not ranks["language"]
 
 
 def test_histogram_counts_the_same_tokens():
-    found = rank_histogram(reports(jnp.arange(24.0).reshape(2, 3, 4)), RUNNING, 30)
-    assert set(found) == {"vision", "action"}
+    histogram = rank_histogram(reports(jnp.arange(24.0).reshape(2, 3, 4)), RUNNING, 30)
+    assert set(histogram) == {"vision", "action"}
     for tower, expected in (("vision", [4, 5, 16, 17]), ("action", [4, 5, 14, 15, 16, 17, 26, 27])):
-        assert found[tower].shape == (31,)
-        assert np.flatnonzero(found[tower]).tolist() == expected
-        assert found[tower].sum() == len(expected)
+        assert histogram[tower].shape == (31,)
+        assert np.flatnonzero(histogram[tower]).tolist() == expected
+        assert histogram[tower].sum() == len(expected)
 
 
-def test_histogram_of_several_pictures_a_world():
-    """Pictures are folded into the worlds: [W 2 pictures, T]; their linear maps add up."""
+def test_histogram_of_several_images_per_world():
+    """Two images per world are folded into W, and the counts of linear layers are added."""
     rank = jnp.array([[1.0, 2.0], [2.0, 2.0], [3.0, 3.0], [3.0, 3.0]])
     mask = jnp.array([[True, True], [True, False], [True, True], [True, True]])
     aux = {"vision": {name: Aux(rank, token_mask=mask) for name in ("fc1", "fc2")}}
-    found = rank_histogram(aux, jnp.array([True, False]), 3)
-    assert found["vision"].tolist() == [0, 2, 4, 0]
+    histogram = rank_histogram(aux, jnp.array([True, False]), 3)
+    assert histogram["vision"].tolist() == [0, 2, 4, 0]
     assert rank_histogram(aux, jnp.array([False, False]), 3)["vision"].tolist() == [0] * 4
     assert rank_histogram({"vision": {"fc1": Aux()}}, jnp.array([True]), 0) == {}

@@ -1,4 +1,4 @@
-"""The policy in the loop: one jit, on every platform; what it reports."""
+"""Closed-loop rollouts: lowering for every platform, and their results."""
 
 import dataclasses
 
@@ -10,7 +10,7 @@ import pytest
 import envs
 from envs.state import Poses
 from lorasp_jax.evaluation import evaluate, make_rollout
-from lorasp_jax.evaluation.rollout import Rollout, _largest_bank, _result, _told
+from lorasp_jax.evaluation.rollout import Rollout, _max_rank, _result, _with_prompts
 from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.prompt_table import PromptTable
@@ -41,7 +41,7 @@ def policy_with(folder, env, targets=CONFIG.targets, **fields):
     ],
 )
 def test_lowers_for(platform, kind, gate, env, tmp_path):
-    policy = _told(policy_with(tmp_path / "run", env, ("q_proj",)), env)
+    policy = _with_prompts(policy_with(tmp_path / "run", env, ("q_proj",)), env)
     device = jax.sharding.AbstractDevice(device_kind=kind, num_cores=None, platform=platform)
     mesh = jax.sharding.AbstractMesh((), (), abstract_device=device)
     shapes = jax.eval_shape(lambda: (policy, jax.random.key(0)))
@@ -52,19 +52,19 @@ def test_lowers_for(platform, kind, gate, env, tmp_path):
 
 
 @pytest.mark.slow
-def test_evaluate_reports_what_happened(env, tmp_path):
+def test_evaluate(env, tmp_path):
     policy = policy_with(tmp_path / "run", env)
     rollout = jax.jit(make_rollout(env, execute_steps=4, denoise_steps=1))
-    seen = []
+    reported = []
     result = evaluate(
         policy,
         env,
         jax.random.key(0),
         4,
         rollout=rollout,
-        progress=lambda done, total: seen.append((done, total)),
+        progress=lambda done, total: reported.append((done, total)),
     )
-    assert seen == [(2, 4), (4, 4)]
+    assert reported == [(2, 4), (4, 4)]
     assert result.episodes == 4
     assert result.ci95[0] <= result.success <= result.ci95[1]
     assert 0 < result.steps <= env.max_steps
@@ -83,38 +83,38 @@ def test_evaluate_reports_what_happened(env, tmp_path):
     assert result.poses[0].shape[0] <= env.max_steps
     again = evaluate(policy, env, jax.random.key(0), 4, rollout=rollout)
     assert (again.success, again.steps) == (result.success, result.steps)
-    with pytest.raises(ValueError, match="3 episodes are not a positive multiple of the 2 worlds"):
+    with pytest.raises(ValueError, match="num_episodes must be a positive multiple of 2, got 3"):
         evaluate(policy, env, jax.random.key(0), 3, rollout=rollout)
 
 
 @pytest.mark.slow
-def test_a_sampler_reports_what_its_backbone_does(env, tmp_path):
-    policy = _told(policy_with(tmp_path / "run", env), env)
+def test_a_sampler_gives_the_same_rollout(env, tmp_path):
+    policy = _with_prompts(policy_with(tmp_path / "run", env), env)
     rollout = make_rollout(env, execute_steps=4, denoise_steps=1)
     trace = jax.make_jaxpr(rollout, return_shape=True)
     (one, shapes), (other, others) = (
-        trace(each, jax.random.key(0)) for each in (policy, policy.with_sampler())
+        trace(p, jax.random.key(0)) for p in (policy, policy.with_sampler())
     )
     assert shapes == others
     assert shapes.active_rank_histogram["action"].shape[-1] == 9
-    assert looks(one) == looks(other)  # the sampler is made before the loop
+    assert loop_body(one) == loop_body(other)  # the sampler is created before the loop
     assert len(one.eqns) > len(other.eqns)
 
 
-def looks(jaxpr):
-    """The body of a rollout's loop."""
+def loop_body(jaxpr):
+    """Return the body of a rollout's loop."""
     (body,) = (e.params["jaxpr"] for e in jaxpr.eqns if e.primitive.name == "scan")
     return str(body)
 
 
-def test_methods_without_a_choice(tmp_path):
+def test_max_rank(tmp_path):
     lora = make_run(tmp_path / "lora", dataclasses.replace(CONFIG, peft=LoRA(rank=5))).policy
     full = make_run(tmp_path / "full", dataclasses.replace(CONFIG, peft=FullFineTuning())).policy
-    assert [_largest_bank(policy.with_sampler()) for policy in (lora, full)] == [5, 0]
+    assert [_max_rank(policy.with_sampler()) for policy in (lora, full)] == [5, 0]
 
 
 def batch(success, steps, counts):
-    """A rollout whose poses say where they come from: world + time / 100."""
+    """A rollout with poses world + time / 100."""
     pose = np.arange(9)[:, None] / 100 + np.arange(len(success))
     return Rollout(
         success=jnp.array(success),
@@ -125,15 +125,15 @@ def batch(success, steps, counts):
     )
 
 
-def test_batches_add_up():
-    many = 2**31 - 1
-    first = batch([False, True, True], [9, 4, 6], [[0, many], [1, many]])
+def test_batches_are_aggregated():
+    max_int32 = 2**31 - 1
+    first = batch([False, True, True], [9, 4, 6], [[0, max_int32], [1, max_int32]])
     second = batch([False, False, False], [9, 9, 9], [[0, 5], [2, 0]])
     result = _result([first, second])
     assert (result.success, result.episodes) == (pytest.approx(1 / 3), 6)
     assert result.steps == pytest.approx(46 / 6)
     assert result.active_rank == {"vision": {"fc1": [1.0, 3.0]}}
-    assert result.active_rank_histogram["vision"].tolist() == [3, 2 * many + 5]
-    np.testing.assert_allclose(result.poses[0], [1.0, 1.01, 1.02, 1.03])  # until it was done
+    assert result.active_rank_histogram["vision"].tolist() == [3, 2 * max_int32 + 5]
+    np.testing.assert_allclose(result.poses[0], [1.0, 1.01, 1.02, 1.03])  # up to its end
     assert "poses" not in repr(result)
     np.testing.assert_allclose(_result([second]).poses[0], np.arange(9) / 100)

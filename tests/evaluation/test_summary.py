@@ -1,4 +1,4 @@
-"""results.json has the fields that readers rely on."""
+"""results.json has the documented fields."""
 
 import json
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lorasp_jax.evaluation import Result
-from lorasp_jax.evaluation.callback import success, summarise
+from lorasp_jax.evaluation.callback import success, summarize
 from lorasp_jax.training.run_folder import read_json, write_json
 from tests.runs import make_run
 
@@ -25,21 +25,21 @@ def test_summary(tmp_path):
     with run.timed("train"):
         pass
     after = {"press": result(0.9, RANKS), "pick_place": result(0.5, RANKS)}
-    found = json.loads(json.dumps(summarise(run, after)))
-    assert found["scale"] == "smoke"
-    assert found["tasks"]["press"]["before"] == {
+    summary = json.loads(json.dumps(summarize(run, after)))
+    assert summary["scale"] == "smoke"
+    assert summary["tasks"]["press"]["before"] == {
         "success": 0.1,
         "episodes": 64,
         "ci95": [0.0, 0.2],
     }
-    assert found["tasks"]["pick_place"]["after"]["success"] == 0.5
-    assert found["active_rank"] == {"vision": 5.0, "action": 1.0, "mean": pytest.approx(11 / 3)}
-    assert found["active_rank_histogram"] == {tower: [0, 4, 2] for tower in RANKS}
-    assert found["seconds"].keys() == {"train", "total"}
-    assert 0 < found["trainable_parameters"] < found["total_parameters"]
+    assert summary["tasks"]["pick_place"]["after"]["success"] == 0.5
+    assert summary["active_rank"] == {"vision": 5.0, "action": 1.0, "mean": pytest.approx(11 / 3)}
+    assert summary["active_rank_histogram"] == {tower: [0, 4, 2] for tower in RANKS}
+    assert summary["seconds"].keys() == {"train", "total"}
+    assert 0 < summary["trainable_parameters"] < summary["total_parameters"]
 
 
-def test_time_adds_up_over_processes(tmp_path):
+def test_time_accumulates_over_processes(tmp_path):
     run = make_run(tmp_path / "run")
     with pytest.raises(KeyboardInterrupt), run.timed("train"):
         raise KeyboardInterrupt
