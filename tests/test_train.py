@@ -144,4 +144,4 @@ def test_finished_run_is_not_run_again(capsys):
     write_json(Path("runs/multitask/results.json"), RESULTS)
     assert train.main([*MULTITASK, "--model.checkpoint", "nowhere", "--resume"]) == 0
     assert "this run has finished: runs/multitask/report.html" in capsys.readouterr().out
-    assert "The run goes on" not in Path("runs/multitask/report.html").read_text()
+    assert "Running: step" not in Path("runs/multitask/report.html").read_text()

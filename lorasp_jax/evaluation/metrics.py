@@ -18,7 +18,9 @@ LayerRanks = dict[str, dict[str, jax.Array]]
 
 
 def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
-    """Return the Wilson score interval of a success rate (Wilson 1927, J. Am. Stat. Assoc. 22, 209).
+    """Return the Wilson score interval of a success rate.
+
+    Wilson 1927, J. Am. Stat. Assoc. 22, 209-212.
 
     Args:
         successes: number of successful trials.

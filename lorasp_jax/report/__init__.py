@@ -1,1 +1,1 @@
-"""What a finished run shows a person; reads the files of a run folder only."""
+"""Reports on a run, generated only from the files in its folder."""

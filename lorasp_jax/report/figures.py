@@ -1,4 +1,4 @@
-"""Figures of one run, from `metrics.jsonl` and `results.json`."""
+"""Figures of a run, drawn from metrics.jsonl and results.json."""
 
 import io
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 COLORS = {"vision": "#4269d0", "language": "#efb118", "action": "#3ca951", "before": "#9498a0"}
-"""One color per tower in every figure; grey for what was there before."""
+"""Color of each tower in every figure; gray for results before training."""
 
 _STYLE: Any = {
     "font.size": 10,
@@ -21,14 +21,14 @@ _STYLE: Any = {
 }
 
 _BARS = {"before": (-0.18, "before"), "after": (0.18, "vision")}
-"""Where a bar lies, and its color."""
+"""Offset and color of each bar."""
 
 Rows = Sequence[dict[str, float]]
 
 
 @mpl.rc_context(_STYLE)
 def svg(figure: Figure) -> str:
-    """A figure as SVG text."""
+    """Render a figure as SVG."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None})
     return buffer.getvalue()
@@ -36,7 +36,7 @@ def svg(figure: Figure) -> str:
 
 @mpl.rc_context(_STYLE)
 def success(results: dict[str, Any]) -> Figure:
-    """Bars of success before and, at the end of a run, after with their 95 % intervals."""
+    """Plot success before training and, in a finished run, after, with 95 % intervals."""
     tasks = results["tasks"]
     figure = Figure(figsize=(6, 1.1 + 0.8 * len(tasks)), layout="constrained")
     axes = figure.subplots()
@@ -64,7 +64,7 @@ def success(results: dict[str, Any]) -> Figure:
 
 @mpl.rc_context(_STYLE)
 def losses(rows: Rows) -> Figure:
-    """Task loss and auxiliary losses over the steps."""
+    """Plot task loss and auxiliary losses over steps."""
     figure = Figure(figsize=(9, 3), layout="constrained")
     left, right = figure.subplots(1, 2)
     _line(left, rows, "task", "#4269d0", "flow matching")
@@ -83,7 +83,7 @@ def losses(rows: Rows) -> Figure:
 
 @mpl.rc_context(_STYLE)
 def success_over_steps(rows: Rows) -> Figure:
-    """Success of each task while training."""
+    """Plot the success of each task during training."""
     names = sorted({name for row in rows for name in row if name.startswith("success/")})
     figure = Figure(figsize=(9, 3), layout="constrained")
     axes = figure.subplots()
@@ -91,14 +91,14 @@ def success_over_steps(rows: Rows) -> Figure:
         _line(axes, rows, name, f"C{number}", name.removeprefix("success/"))
     axes.set_ylim(0, 1.03)
     axes.set_xlabel("step")
-    axes.set_title("success while training, in fewer episodes than at the end", loc="left")
+    axes.set_title("success during training, in fewer episodes than at the end", loc="left")
     axes.legend(frameon=False, loc="lower right")
     return figure
 
 
 @mpl.rc_context(_STYLE)
 def active_rank(rows: Rows, rank: int) -> Figure:
-    """Active rank of each tower over training."""
+    """Plot the active rank of each tower over steps."""
     figure = Figure(figsize=(9, 3), layout="constrained")
     axes = figure.subplots()
     for tower in ("vision", "language", "action"):
@@ -106,14 +106,14 @@ def active_rank(rows: Rows, rank: int) -> Figure:
     axes.axhline(rank, color="black", lw=1, ls=":")
     axes.set_ylim(0, 1.06 * rank)
     axes.set_xlabel("step")
-    axes.set_title(f"mean active rank by tower, bank size {rank} dotted", loc="left")
+    axes.set_title(f"mean active rank by tower (dotted: bank size {rank})", loc="left")
     axes.legend(frameon=False, loc="lower left")
     return figure
 
 
 @mpl.rc_context(_STYLE)
 def layer_ranks(layers: dict[str, dict[str, Sequence[float]]], rank: int) -> Figure:
-    """Active rank of every adapted layer after training, one panel per tower that has any."""
+    """Plot the active rank of every adapted layer after training, one panel per adapted tower."""
     layers = {tower: linears for tower, linears in layers.items() if linears}
     figure = Figure(figsize=(9, 3.4), layout="constrained")
     panels = figure.subplots(1, len(layers), sharey=True, squeeze=False)[0]
@@ -123,23 +123,23 @@ def layer_ranks(layers: dict[str, dict[str, Sequence[float]]], rank: int) -> Fig
         axes.set_xticks(range(len(linears)), list(linears), rotation=70, ha="right")
         axes.set_ylim(0, 1.06 * rank)
         axes.set_title(tower, loc="left")
-    panels[0].set_ylabel("active rank, one dot a layer")
+    panels[0].set_ylabel("active rank, one dot per layer")
     return figure
 
 
 @mpl.rc_context(_STYLE)
 def rank_histogram(histogram: dict[str, Sequence[int]]) -> Figure:
-    """Share of tokens at each active rank, one panel per tower.
+    """Plot the distribution of active rank over tokens, one panel per tower.
 
     Args:
-        histogram: tower -> how many tokens had active rank 0, 1, ...
+        histogram: tower -> number of tokens with active rank 0, 1, ...
     """
     figure = Figure(figsize=(9, 2.8), layout="constrained")
     panels = figure.subplots(1, len(histogram), sharey=True, squeeze=False)[0]
     for axes, (tower, counts) in zip(panels, histogram.items(), strict=True):
         total = max(sum(counts), 1)
-        shares = [100 * count / total for count in counts]
-        axes.bar(range(len(counts)), shares, width=1.0, color=_color(tower))
+        percentages = [100 * count / total for count in counts]
+        axes.bar(range(len(counts)), percentages, width=1.0, color=_color(tower))
         axes.set_xlim(-0.5, len(counts) - 0.5)
         axes.set_xlabel("active rank of a token")
         axes.set_title(tower, loc="left")
@@ -148,12 +148,12 @@ def rank_histogram(histogram: dict[str, Sequence[int]]) -> Figure:
 
 
 def _color(tower: str) -> str:
-    """A tower's color; of one that only another version knows, grey."""
+    """Return a tower's color; gray for a tower that this version does not know."""
     return COLORS.get(tower, COLORS["before"])
 
 
 def _line(axes: Any, rows: Rows, name: str, color: str, label: str) -> None:
-    """Draw one metric where it was recorded."""
+    """Plot one metric at the steps that recorded it."""
     points = [(row["step"], row[name]) for row in rows if name in row]
     if points:
         axes.plot(*zip(*points, strict=True), color=color, label=label, lw=1.5)

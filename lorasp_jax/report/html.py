@@ -1,4 +1,4 @@
-"""One self-contained HTML page per run, made from the files in its folder."""
+"""Write one self-contained HTML page per run from the files in its folder."""
 
 import base64
 import html
@@ -50,15 +50,15 @@ pre { background: var(--box); padding: 1rem; overflow-x: auto; font-size: 13px; 
 def write_report(folder: Path) -> Path:
     """Write `folder`/report.html from its results.json, metrics.jsonl, config.json and videos.
 
-    Of a run without results.json it has what there is so far, and loads itself again and again.
+    For an unfinished run the page shows partial results and refreshes itself.
 
     Raises:
-        ValueError: the folder holds no run, or damaged files.
+        ValueError: the folder has no run, or damaged files.
     """
     rows = read_metrics(folder)
     config = read_json(folder / RECORD, records.WITH_RANK if _has_rank(rows) else records.CONFIG)
     if not config:
-        raise ValueError(f"{folder} holds no run: there is no {RECORD}")
+        raise ValueError(f"no run in {folder}: {RECORD} is missing")
     finished = read_json(folder / "results.json", records.RESULTS)
     results = finished or _unfinished(folder)
     parts = [
@@ -67,12 +67,12 @@ def write_report(folder: Path) -> Path:
         *(() if finished else _progress(folder, config, rows)),
         *_success(results),
         "<h2>Training</h2>",
-        _image(figures.losses(rows)) if rows else "<p>Nothing is logged yet.</p>",
+        _image(figures.losses(rows)) if rows else "<p>No metrics logged yet.</p>",
         *_skipped(rows),
-        *_while_training(rows),
+        *_success_over_steps(rows),
         *_speed(rows),
         *_active_rank(results, rows, config["peft"].get("rank")),
-        *_media(folder, [t for t in results["tasks"] if finished or _filmed(folder, t).exists()]),
+        *_media(folder, [t for t in results["tasks"] if finished or _video(folder, t).exists()]),
         "<h2>Time</h2>",
         _table(("phase", "seconds"), ((k, f"{v:.1f}") for k, v in results["seconds"].items())),
         "<h2>Settings</h2>",
@@ -91,7 +91,7 @@ def write_report(folder: Path) -> Path:
 
 
 def _unfinished(folder: Path) -> dict[str, Any]:
-    """What results.json will have, as far as it is known."""
+    """Return the available part of results.json."""
     before = read_json(folder / "before.json", records.BEFORE).items()
     return {
         "seconds": read_json(folder / CLOCK, records.TIMES),
@@ -101,105 +101,105 @@ def _unfinished(folder: Path) -> dict[str, Any]:
 
 
 def _progress(folder: Path, config: dict[str, Any], rows: figures.Rows) -> Iterable[str]:
-    """How far a run is that is not finished; or why it stopped."""
+    """Show the progress of an unfinished run, or why it stopped."""
     stopped = read_json(folder / STOPPED, records.STOPPED)
     if stopped:
         yield f"<p><b>The run stopped:</b> {html.escape(stopped['reason'])}.</p>"
         return
-    done, steps = rows[-1]["step"] if rows else 0, config["optim"]["steps"]
-    yield f"<p>The run goes on: step {done:.0f} of {steps}.</p>"
+    step, steps = rows[-1]["step"] if rows else 0, config["optim"]["steps"]
+    yield f"<p>Running: step {step:.0f} of {steps}.</p>"
     yield _REFRESH
 
 
 def _skipped(rows: figures.Rows) -> Iterable[str]:
-    """How many steps were skipped, if any were."""
-    found = [(row["step"], row["skipped"]) for row in rows if row.get("skipped")]
-    if found:
+    """Show the number of skipped steps, if any."""
+    skipped = [(row["step"], row["skipped"]) for row in rows if row.get("skipped")]
+    if skipped:
         yield (
-            f"<p>{sum(count for _, count in found):.0f} steps were skipped, as loss or gradient "
-            f"was not finite or a spike: the first up to step {found[0][0]:.0f}, the last up to "
-            f"{found[-1][0]:.0f}.</p>"
+            f"<p>{sum(count for _, count in skipped):.0f} steps were skipped because the loss or "
+            f"the gradient was not finite or spiked, first logged at step {skipped[0][0]:.0f}, last at "
+            f"step {skipped[-1][0]:.0f}.</p>"
         )
 
 
 def _subtitle(config: dict[str, Any], results: dict[str, Any]) -> str:
-    """One line: method, backbone, robot, at the end of a run parameters, scale."""
+    """One line: method, backbone, robot, parameters (of a finished run), scale."""
     line = (
         f"{config['peft']['method']} on {config['model']['backbone']} {config['model']['size']}, "
         f"robot {config['robot']}"
     )
     if "total_parameters" in results:
         trainable, total = results["trainable_parameters"], results["total_parameters"]
-        share = 100 * trainable / total
-        line += f": {trainable:,} trainable of {total:,} parameters ({share:.1f} %)"
+        percentage = 100 * trainable / total
+        line += f": {trainable:,} trainable of {total:,} parameters ({percentage:.1f} %)"
     return html.escape(f"{line}, scale {config['scale']}")
 
 
 def _success(results: dict[str, Any]) -> Iterable[str]:
-    """Success rates; nothing for a run that was not evaluated."""
+    """Success rates; empty if the run was not evaluated."""
     if results["tasks"]:
         yield "<h2>Success before and after</h2>"
         yield _image(figures.success(results))
         yield _success_table(results)
 
 
-def _while_training(rows: figures.Rows) -> Iterable[str]:
-    """Success over the steps; nothing for a run that did not measure it."""
+def _success_over_steps(rows: figures.Rows) -> Iterable[str]:
+    """Success over steps; empty if it was not measured during training."""
     if any(name.startswith("success/") for row in rows for name in row):
         yield _image(figures.success_over_steps(rows))
 
 
 def _success_table(results: dict[str, Any]) -> str:
-    """Task, before, after, with intervals."""
+    """Table of success before and after training, with intervals."""
     tasks = results["tasks"].items()
     rows = ((task, *map(success_cell, value.values())) for task, value in tasks)
     return _table(("task", *next(iter(results["tasks"].values()))), rows)
 
 
 def success_cell(value: dict[str, Any]) -> str:
-    """A success rate with its interval."""
+    """Format a success rate with its interval."""
     low, high = value["ci95"]
     rate = f"{100 * value['success']:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
     return f"{rate} of {value['episodes']}"
 
 
 def _speed(rows: figures.Rows) -> Iterable[str]:
-    """What was measured beside the losses; nothing for a run that logged none of it."""
-    found = speed(rows)
-    if found:
-        yield _table(("over the run", ""), found.items())
+    """Table of throughput and memory; empty if neither was logged."""
+    summary = speed(rows)
+    if summary:
+        yield _table(("run statistics", ""), summary.items())
 
 
 def speed(rows: figures.Rows) -> dict[str, str]:
-    """What a run's rows say of its speed and memory, with units, by what it is.
+    """Summarize throughput and memory as label -> value with unit.
 
-    Medians; of waiting the share of all time, of memory the highest.
+    Medians, except for the fraction of all time spent waiting for data and the peak memory.
     """
-    known = {
-        "samples a second": ("speed/samples_per_second", median, "{:,.4g}".format),
-        "FLOP utilisation": ("speed/flop_utilisation", median, "{:.1%}".format),
-        "time waiting for data": ("waited", sum, "{:.1%}".format),
-        "memory at its highest": ("memory/peak_gib", max, _memory),
+    entries = {
+        "samples/s": ("speed/samples_per_second", median, "{:,.4g}".format),
+        "FLOP utilization": ("speed/flop_utilisation", median, "{:.1%}".format),
+        "data wait": ("waited", sum, "{:.1%}".format),
+        "peak memory": ("memory/peak_gib", max, _memory),
     }
-    found, rows = {}, [*_waited(rows)]
-    for label, (name, summary, form) in known.items():
+    labeled, rows = {}, [*_with_wait(rows)]
+    for label, (name, reduce, form) in entries.items():
         values = [row[name] for row in rows if name in row]
         if values:
-            found[label] = form(summary(values))
-    return found
+            labeled[label] = form(reduce(values))
+    return labeled
 
 
 def _memory(gib: float) -> str:
-    """Memory in a unit that suits it."""
+    """Format memory in GiB, or in MiB below 1 GiB."""
     return f"{gib:.2f} GiB" if gib >= 1 else f"{1024 * gib:.1f} MiB"
 
 
-def _waited(rows: figures.Rows) -> Iterable[dict[str, float]]:
-    """The rows, with "waited": the share of the run's time that passed waiting in theirs."""
+def _with_wait(rows: figures.Rows) -> Iterable[dict[str, float]]:
+    """Add "waited" to the rows: the fraction of the run's time spent waiting for data in each."""
     rate, wait = "speed/samples_per_second", "speed/data_wait"
-    every = sum(1 / row[rate] for row in rows if rate in row)
+    total = sum(1 / row[rate] for row in rows if rate in row)
     for row in rows:
-        yield row | {"waited": row[wait] / row[rate] / every} if wait in row else row
+        yield row | {"waited": row[wait] / row[rate] / total} if wait in row else row
 
 
 def _has_rank(rows: figures.Rows) -> bool:
@@ -207,7 +207,7 @@ def _has_rank(rows: figures.Rows) -> bool:
 
 
 def _active_rank(results: dict[str, Any], rows: figures.Rows, rank: Any) -> Iterable[str]:
-    """Active rank in training and in closed loop; nothing for a method without one."""
+    """Active rank in training and in closed loop; empty for methods without one."""
     if not _has_rank(rows):
         return
     yield "<h2>Active rank</h2>"
@@ -222,7 +222,7 @@ def _active_rank(results: dict[str, Any], rows: figures.Rows, rank: Any) -> Iter
 
 
 def _table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """An HTML table; every column but the first holds numbers."""
+    """HTML table; all columns except the first contain numbers."""
     head = "".join(f"<th>{html.escape(name)}</th>" for name in header)
     body = ""
     for first, *rest in rows:
@@ -232,36 +232,36 @@ def _table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def _image(figure: Figure) -> str:
-    """A figure as an image of its own, so that identifiers of several do not clash."""
+    """Embed a figure as <img>, so that the ids in several SVGs do not clash."""
     data = base64.b64encode(figures.svg(figure).encode()).decode()
     return f'<img alt="figure" src="data:image/svg+xml;base64,{data}">'
 
 
-def _filmed(folder: Path, task: str) -> Path:
-    """The video of a task."""
+def _video(folder: Path, task: str) -> Path:
+    """Path of a task's video."""
     return inside(folder, f"rollout_{task}.mp4")
 
 
 def _media(folder: Path, tasks: Collection[str]) -> Iterable[str]:
-    """Video and first camera pictures of every task."""
+    """First camera images and video of every task."""
     if tasks:
-        yield "<h2>What the policy sees and does</h2>"
+        yield "<h2>Observations and rollouts</h2>"
     for task in tasks:
-        picture, video = inside(folder, f"cameras_{task}.png"), _filmed(folder, task)
-        if missing := [path.name for path in (picture, video) if not path.exists()]:
-            gone = html.escape(" and ".join(missing))
-            yield f"<h3>{html.escape(task)}</h3><p>{gone} missing.</p>"
+        image, video = inside(folder, f"cameras_{task}.png"), _video(folder, task)
+        if missing := [path.name for path in (image, video) if not path.exists()]:
+            names = html.escape(", ".join(missing))
+            yield f"<h3>{html.escape(task)}</h3><p>Missing: {names}.</p>"
             continue
-        shown = base64.b64encode(read_bytes(picture, folder)).decode()
-        played = base64.b64encode(read_bytes(video, folder)).decode()
+        image_data = base64.b64encode(read_bytes(image, folder)).decode()
+        video_data = base64.b64encode(read_bytes(video, folder)).decode()
         yield (
             f"<h3>{html.escape(task)}</h3>"
-            f'<figure><img class=camera width=400 alt="side and wrist camera" '
-            f'src="data:image/png;base64,{shown}">'
-            "<figcaption class=muted>side and wrist camera at policy resolution</figcaption>"
+            f'<figure><img class=camera width=400 alt="side and wrist cameras" '
+            f'src="data:image/png;base64,{image_data}">'
+            "<figcaption class=muted>side and wrist cameras at policy resolution</figcaption>"
             "</figure>"
             "<figure><video width=400 controls autoplay loop muted "
-            f'src="data:video/mp4;base64,{played}"></video>'
+            f'src="data:video/mp4;base64,{video_data}"></video>'
             "<figcaption class=muted>one closed-loop episode of the adapted policy</figcaption>"
             "</figure>"
         )

@@ -1,4 +1,4 @@
-"""The report grows while a run goes on, and its end is a table in the terminal."""
+"""The report is updated during a run, and a table is printed at its end."""
 
 import io
 import json
@@ -17,19 +17,19 @@ from tests.runs import RESULTS
 @pytest.fixture
 def run(folder, monkeypatch):  # noqa: F811
     (folder / "results.json").unlink()
-    monkeypatch.setattr(callback, "EVERY", 0.0)
+    monkeypatch.setattr(callback, "INTERVAL", 0.0)
     return SimpleNamespace(folder=folder, console=Console(file=io.StringIO(), width=150))
 
 
-def test_it_grows(run):
+def test_report_is_updated(run):
     report, path = callback.Report(), run.folder / "report.html"
     report.on_start(run)
-    report._last.result()
+    report._latest.result()
     assert "step 4 of 4" in path.read_text()
     with (run.folder / "metrics.jsonl").open("a") as file:
         file.write(json.dumps(sealed({"step": 5, "task": 0.125})) + "\n")
     report.on_log(run, 5, {})
-    report._last.result()
+    report._latest.result()
     assert "step 5 of 4" in path.read_text()
     write_json(run.folder / "results.json", RESULTS)
     report.on_end(run)
@@ -40,44 +40,44 @@ def test_it_grows(run):
     assert cells["press"] == ["3.1 % [0.9, 10.7] of 64", "75.0 % [63.2, 84.0] of 64"]
     assert cells["flow-matching loss at steps 2 and 5"] == ["0.5000", "0.1250"]
     assert cells["active rank, mean"][1] == "3.1"
-    assert cells["parameters that train"][1] == "10 of 1,000"
+    assert cells["trainable parameters"][1] == "10 of 1,000"
     assert cells["time, total"][1] == "7 s"
 
 
-def test_the_table_keeps_numbers_on_one_line(folder):  # noqa: F811
+def test_table_keeps_numbers_on_one_line(folder):  # noqa: F811
     console = Console(width=80, record=True, file=io.StringIO())
     console.print(callback.final_table(folder))
     assert "75.0 % [63.2, 84.0] of 64" in console.export_text()
 
 
-def test_a_run_that_stops_has_a_last_report(run):
+def test_a_stopped_run_has_a_final_report(run):
     report, path = callback.Report(), run.folder / "report.html"
     report.on_start(run)
     report.on_stop(run, "the loss was nan")
     assert "The run stopped:</b> the loss was nan" in path.read_text()
-    assert f"what led to it: {path}" in run.console.file.getvalue().replace("\n", "")
+    assert f"report up to this step: {path}" in run.console.file.getvalue().replace("\n", "")
     resumed = callback.Report()
     resumed.on_log(run, 6, {})
-    resumed._last.result()
-    assert "The run goes on" in path.read_text()
+    resumed._latest.result()
+    assert "Running: step" in path.read_text()
 
 
-def test_training_does_not_wait_and_hears_of_failures(run, monkeypatch):
+def test_errors_of_the_thread_are_raised_at_the_next_report(run, monkeypatch):
     report, written = callback.Report(), []
     monkeypatch.setattr(callback, "write_report", written.append)
-    monkeypatch.setattr(callback, "EVERY", 100.0)
+    monkeypatch.setattr(callback, "INTERVAL", 100.0)
     report.on_start(run)
     report.on_log(run, 2, {})
-    report._last.result()
+    report._latest.result()
     assert written == [run.folder]  # the next one is not due yet
-    monkeypatch.setattr(callback, "EVERY", 0.0)
+    monkeypatch.setattr(callback, "INTERVAL", 0.0)
     (run.folder / "config.json").unlink()
     monkeypatch.undo()
-    report._begin(run.folder)
-    with pytest.raises(ValueError, match="holds no run"):
-        report._begin(run.folder)
+    report._submit(run.folder)
+    with pytest.raises(ValueError, match="no run in"):
+        report._submit(run.folder)
 
 
-def test_no_table_of_a_run_that_is_not_finished(run):
-    with pytest.raises(ValueError, match="holds no finished run"):
+def test_no_table_for_an_unfinished_run(run):
+    with pytest.raises(ValueError, match="no finished run in"):
         callback.final_table(run.folder)

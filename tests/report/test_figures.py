@@ -1,4 +1,4 @@
-"""Figures draw the numbers they are given."""
+"""Figures plot the given values."""
 
 import numpy as np
 import pytest
@@ -34,11 +34,11 @@ def test_success_over_steps():
     rows = [{"step": 2.0, "success/press": 0.25}, {"step": 4.0, "task": 1.0}]
     rows += [{"step": 6.0, "success/press": 0.5, "success/pour": 1.0}]
     (axes,) = figures.success_over_steps(rows).axes
-    found = {line.get_label(): line.get_xydata().tolist() for line in axes.lines}
-    assert found == {"press": [[2, 0.25], [6, 0.5]], "pour": [[6, 1]]}
+    curves = {line.get_label(): line.get_xydata().tolist() for line in axes.lines}
+    assert curves == {"press": [[2, 0.25], [6, 0.5]], "pour": [[6, 1]]}
 
 
-def test_losses_are_drawn_where_they_were_recorded():
+def test_losses_are_plotted_where_recorded():
     task, auxiliary = figures.losses(ROWS).axes
     np.testing.assert_array_equal(task.lines[0].get_xydata(), [[2, 1], [4, 0.5]])
     assert [line.get_label() for line in auxiliary.lines] == ["spectral"]
@@ -46,26 +46,26 @@ def test_losses_are_drawn_where_they_were_recorded():
     assert not figures.losses([{"step": 2.0, "task": 1.0}]).axes[1].lines
 
 
-def test_active_rank_and_its_bank():
+def test_active_rank_and_bank_size():
     (axes,) = figures.active_rank(ROWS, 8).axes
     assert [line.get_ydata()[0] for line in axes.lines] == [6, 8]
 
 
-def test_every_layer_is_a_dot():
+def test_one_dot_per_layer():
     layers = {"vision": {"fc1": [1.0, 2.0], "fc2": [3.0]}, "language": {}, "action": {"fc1": [4.0]}}
     panels = figures.layer_ranks(layers, 8).axes
     assert [axes.get_title(loc="left") for axes in panels] == ["vision", "action"]
-    dots = [dot for part in panels[0].collections for dot in part.get_offsets().tolist()]
+    dots = [dot for points in panels[0].collections for dot in points.get_offsets().tolist()]
     assert dots == [[0, 1], [0, 2], [1, 3]]
 
 
-def test_histogram_shows_shares_of_tokens():
+def test_histogram_shows_percentages_of_tokens():
     panels = figures.rank_histogram({"vision": [0, 3, 1], "action": [0, 0, 0]}).axes
-    for axes, shares in zip(panels, ([0, 75, 25], [0, 0, 0]), strict=True):
-        assert [bar.get_height() for bar in axes.patches] == shares
+    for axes, percentages in zip(panels, ([0, 75, 25], [0, 0, 0]), strict=True):
+        assert [bar.get_height() for bar in axes.patches] == percentages
         assert [bar.get_center()[0] for bar in axes.patches] == pytest.approx([0, 1, 2])
 
 
-def test_same_numbers_give_the_same_file():
-    once, again = (figures.svg(figures.success({"tasks": TASKS})) for _ in range(2))
-    assert once == again
+def test_svg_is_deterministic():
+    first, second = (figures.svg(figures.success({"tasks": TASKS})) for _ in range(2))
+    assert first == second

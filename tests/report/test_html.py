@@ -1,4 +1,4 @@
-"""The report: self-contained, from the files of a run folder alone."""
+"""The report is self-contained and needs only the files of a run folder."""
 
 import json
 import re
@@ -16,7 +16,7 @@ def folder(tmp_path):
     return finish(tmp_path)
 
 
-def test_report_shows_the_results_and_needs_no_other_file(folder):
+def test_report_shows_the_results_and_is_self_contained(folder):
     page = write_report(folder).read_text()
     assert "75.0 % [63.2, 84.0] of 64" in page
     assert "3.1 % [0.9, 10.7] of 64" in page
@@ -29,7 +29,7 @@ def test_report_shows_the_results_and_needs_no_other_file(folder):
     assert "http" not in re.sub(r'src="[^"]*"', "", page)
 
 
-def test_histogram_is_drawn_where_it_was_recorded(folder):
+def test_histogram_is_drawn_if_recorded(folder):
     results = {**RESULTS, "active_rank_histogram": {"vision": [0, 3, 1], "action": [0, 0, 4]}}
     write_json(folder / "results.json", results)
     assert write_report(folder).read_text().count("image/svg") == 5
@@ -44,14 +44,14 @@ def test_full_fine_tuning_has_no_ranks(folder):
     assert "Active rank" not in write_report(folder).read_text()
 
 
-def test_a_run_that_goes_on(folder):
-    """From the first moment on there is a page, with what is known."""
+def test_unfinished_run(folder):
+    """There is a page from the start, with partial results."""
     before = {"press": RESULTS["tasks"]["press"]["before"]}
     for name in ("results.json", "rollout_press.mp4", "cameras_press.png"):
         (folder / name).unlink()
     write_json(folder / "before.json", before)
     page = write_report(folder).read_text()
-    assert "The run goes on: step 4 of 4." in page
+    assert "Running: step 4 of 4." in page
     assert "http-equiv=refresh" in page
     assert "3.1 % [0.9, 10.7] of 64" in page
     assert "<th>before</th></tr>" in page
@@ -60,14 +60,14 @@ def test_a_run_that_goes_on(folder):
         (folder / name).unlink()
     page = write_report(folder).read_text()
     assert "step 0 of 4" in page
-    assert "Nothing is logged yet" in page
+    assert "No metrics logged yet" in page
     assert "image/svg" not in page
     (folder / "config.json").unlink()
-    with pytest.raises(ValueError, match="holds no run"):
+    with pytest.raises(ValueError, match="no run in"):
         write_report(folder)
 
 
-def test_a_run_that_stopped_says_why(folder):
+def test_stopped_run_shows_the_reason(folder):
     assert "were skipped" not in write_report(folder).read_text()
     results = (folder / "results.json").read_text()
     (folder / "results.json").unlink()
@@ -78,13 +78,13 @@ def test_a_run_that_stopped_says_why(folder):
     page = write_report(folder).read_text()
     assert "<b>The run stopped:</b> the loss was &lt;nan&gt;." in page
     assert "4 steps were skipped" in page
-    assert "the first up to step 6, the last up to 8" in page
+    assert "first logged at step 6, last at step 8" in page
     assert "http-equiv=refresh" not in page
-    (folder / "results.json").write_text(results)  # resumed and finished after all
+    (folder / "results.json").write_text(results)  # resumed and finished
     assert "stopped" not in write_report(folder).read_text()
 
 
-def test_a_run_that_is_evaluated_while_it_goes_on(folder):
+def test_run_that_is_evaluated_during_training(folder):
     (folder / "results.json").unlink()
     before = RESULTS["tasks"]["press"]["before"]
     write_json(folder / "before.json", dict.fromkeys(("press", "pour"), before))
@@ -93,42 +93,42 @@ def test_a_run_that_is_evaluated_while_it_goes_on(folder):
     log.close()
     page = write_report(folder).read_text()
     assert page.count("image/svg") == 3  # success before, losses, success over the steps
-    assert page.count("<video") == 1  # pour is not filmed yet
+    assert page.count("<video") == 1  # pour has no video yet
     assert "<h3>pour" not in page
 
 
-def test_speed_is_the_middle_and_memory_the_highest(folder):
-    assert "samples a second" not in write_report(folder).read_text()
+def test_median_speed_and_peak_memory(folder):
+    assert "samples/s" not in write_report(folder).read_text()
     log = MetricsLog(folder)
-    for step, (rate, used) in enumerate([(1.0, 2.0), (30.0, 3.5), (20.0, 1.0)]):
-        log.write(step, {"task": 1.0, "speed/samples_per_second": rate, "memory/peak_gib": used})
+    for step, (rate, peak) in enumerate([(1.0, 2.0), (30.0, 3.5), (20.0, 1.0)]):
+        log.write(step, {"task": 1.0, "speed/samples_per_second": rate, "memory/peak_gib": peak})
     log.close()
     page = write_report(folder).read_text()
-    assert "samples a second</td><td class=number>20<" in page
+    assert "samples/s</td><td class=number>20<" in page
     assert "3.50 GiB" in page
-    assert "waiting" not in page
+    assert "data wait" not in page
 
 
 def test_small_memory_is_not_zero(folder):
-    assert speed([{"memory/peak_gib": 3 / 1024}]) == {"memory at its highest": "3.0 MiB"}
+    assert speed([{"memory/peak_gib": 3 / 1024}]) == {"peak memory": "3.0 MiB"}
 
 
-def test_a_phone_shows_the_page_at_its_own_width_light_or_dark(folder):
+def test_page_adapts_to_screen_width_and_color_scheme(folder):
     page = write_report(folder).read_text()
     assert "<meta name=viewport content='width=device-width, initial-scale=1'>" in page
     style = page.partition("<style>")[2].partition("</style>")[0]
     assert "color-scheme: light dark" in style
     assert "@media (prefers-color-scheme: dark)" in style
-    assert not re.search(r"#[0-9a-f]{3,6}", style.partition("body {")[2])  # only by name below
+    assert not re.search(r"#[0-9a-f]{3,6}", style.partition("body {")[2])  # otherwise by variable
 
 
-def test_waiting_is_a_share_of_all_time():
+def test_data_wait_is_a_fraction_of_all_time():
     rate, wait = "speed/samples_per_second", "speed/data_wait"
     rows = [{rate: 10.0}, {rate: 10.0, wait: 0.0}, {rate: 5.0, wait: 0.5}]  # 1, 1 and 2 seconds
-    assert speed(rows)["time waiting for data"] == "25.0%"
+    assert speed(rows)["data wait"] == "25.0%"
 
 
-def test_video_can_be_read_back(folder):
+def test_video_is_readable(folder):
     import av
 
     with av.open(str(folder / "rollout_press.mp4")) as container:
@@ -138,8 +138,8 @@ def test_video_can_be_read_back(folder):
 
 
 @pytest.mark.parametrize("name", ["cameras_press.png", "rollout_press.mp4"])
-def test_pictures_that_are_gone_are_named(folder, name):
+def test_missing_media_are_named(folder, name):
     (folder / name).unlink()
     page = write_report(folder).read_text()
-    assert f"{name} missing." in page
+    assert f"Missing: {name}." in page
     assert "75.0 % [63.2, 84.0] of 64" in page
