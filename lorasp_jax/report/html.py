@@ -115,10 +115,11 @@ def _skipped(rows: figures.Rows) -> Iterable[str]:
     """Show the number of skipped steps, if any."""
     skipped = [(row["step"], row["skipped"]) for row in rows if row.get("skipped")]
     if skipped:
+        total = sum(count for _, count in skipped)
         yield (
-            f"<p>{sum(count for _, count in skipped):.0f} steps were skipped because the loss or "
-            f"the gradient was not finite or spiked, first logged at step {skipped[0][0]:.0f}, last at "
-            f"step {skipped[-1][0]:.0f}.</p>"
+            f"<p>{total:.0f} steps were skipped because the loss or the gradient was not finite "
+            f"or spiked, first logged at step {skipped[0][0]:.0f}, last at step "
+            f"{skipped[-1][0]:.0f}.</p>"
         )
 
 
