@@ -63,7 +63,7 @@ def run_config(method: peft.Method, targets: tuple[str, ...], batch: int) -> Con
 
 
 def arrays(config: BackboneConfig, run: Config | None) -> tuple[Any, Any, Any]:
-    """Initialise graph, adapters and frozen arrays on a device; no adapters without a run."""
+    """Initialize graph, adapters and frozen arrays on a device; no adapters without a run."""
 
     def model(key: jax.Array) -> Backbone:
         return preflight.adapted(run, config, key) if run else config.create(nnx.Rngs(key))
@@ -138,7 +138,7 @@ def training(name: str, label: str, run: Config, options: argparse.Namespace, re
     step, size = Step(config, run).load(*arrays(config, run)[1:]), run.optim.batch_size
     seconds = best(step, calls=options.calls)
     operations = preflight.operations(run, sized(name, options))
-    share = flops.utilisation(operations, seconds)
+    share = flops.utilization(operations, seconds)
     return {
         "backbone": name,
         "trains": label,

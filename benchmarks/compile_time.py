@@ -34,7 +34,7 @@ class Stack(nnx.Module):
     """A sequence of dense layers, not scanned."""
 
     def __init__(self, depth: int, width: int, dtype: Any) -> None:
-        """Initialise the weights."""
+        """Initialize the weights."""
         options = {"dtype": dtype, "param_dtype": dtype, "rngs": nnx.Rngs(0)}
         self.layers = nnx.List([nnx.Linear(width, width, **options) for _ in range(depth)])
 

@@ -151,8 +151,8 @@ def texture(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
     frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width))
     frequency[0, 0] = np.inf
     noise = np.fft.fft2(rng.standard_normal((4, height, width))) / frequency**1.6
-    grey, *colours = (layer / layer.std() for layer in np.fft.ifft2(noise).real)
-    return (128 + 45 * (grey[..., None] + 0.3 * np.stack(colours, -1))).astype(np.float32)
+    gray, *colors = (layer / layer.std() for layer in np.fft.ifft2(noise).real)
+    return (128 + 45 * (gray[..., None] + 0.3 * np.stack(colors, -1))).astype(np.float32)
 
 
 def importing(folder: Path, codec: str, image_size: int) -> dict[str, Any]:
@@ -182,7 +182,7 @@ def decoding(folder: Path, codec: str) -> dict[str, Any]:
 
 
 def statistics(steps: int) -> dict[str, Any]:
-    """Time the computation of normalisation statistics over this many steps."""
+    """Time the computation of normalization statistics over this many steps."""
     rows = np.random.default_rng(0).standard_normal((steps, 7), np.float32)
     valid = np.ones(steps, bool)
     call = lambda: Statistics.measure(rows, rows, valid, slots=range(7), dim=7)  # noqa: E731

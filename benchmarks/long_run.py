@@ -1,4 +1,4 @@
-"""Endurance test: many randomised expert episodes in a row, checking physics and memory.
+"""Endurance test: many randomized expert episodes in a row, checking physics and memory.
 
     python -m benchmarks.long_run --tasks pour --backend warp --episodes 200 --num-envs 256
 
