@@ -200,7 +200,7 @@ def test_logits_keep_fp32_sums_in_low_precision(x):
 
 
 def test_merge_says_what_to_do_instead():
-    with pytest.raises(ValueError, match=r"depends on the input .* keep its adapter"):
+    with pytest.raises(ValueError, match=r"depends on the input .* keep the adapter"):
         ALL[0].merge(arrays(), jnp.zeros((D_IN, D_OUT)))
 
 

@@ -1,4 +1,4 @@
-"""A normalised bank: eq. (4) for any U and V."""
+"""A normalized bank: eq. (4) for any U and V."""
 
 import dataclasses
 
@@ -82,5 +82,5 @@ def test_signs_do_not_depend_on_the_decomposition():
 
 
 def test_needs_a_side_as_wide_as_the_bank():
-    with pytest.raises(ValueError, match=r"bank of 8 directions needs .* got 6 x 7"):
+    with pytest.raises(ValueError, match=r"rank <= max\(I, O\), got rank 8 for a kernel \[6, 7\]"):
         METHOD.init(jax.random.key(0), jnp.zeros((6, 7)))
