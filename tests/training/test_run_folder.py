@@ -108,7 +108,7 @@ def test_something_else_is_where_the_folder_should_be(tmp_path, place):
     else:
         (root / place).parent.mkdir(exist_ok=True)
         (root / place).write_text("a file")
-    with pytest.raises(ValueError, match=r"is a file|cannot be opened"):
+    with pytest.raises(ValueError, match=r"is a file|cannot open"):
         open_run(CONFIG, root, resume=False)
 
 
@@ -233,7 +233,7 @@ def test_a_lock_that_is_a_link_leaves_what_it_leads_to(tmp_path):
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / f".{CONFIG.name}.lock").symlink_to(precious)
     with (
-        pytest.raises(ValueError, match="lock cannot be opened"),
+        pytest.raises(ValueError, match="cannot open .*lock"),
         run_folder.open_run(CONFIG, tmp_path / "runs", resume=False),
     ):
         pass

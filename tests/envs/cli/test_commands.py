@@ -66,8 +66,8 @@ def test_bad_input_is_one_sentence(tmp_path, run, monkeypatch):
         (f"play --image-size 33 {press}", tmp_path / "a.mp4", "must be even, got 33"),
         ("play --task dance --robot piper --out", tmp_path / "a.mp4", "dance"),
         ("gallery --task press --robot r2d2 --out", tmp_path / "g", "r2d2"),
-        (f"collect {press}", "gs://bucket/press", "gs:/bucket/press is a URL"),
-        (f"play {press}", "gs://bucket/press.mp4", "press.mp4 is a URL"),
+        (f"collect {press}", "gs://bucket/press", "cannot write to the URL gs:/bucket/press"),
+        (f"play {press}", "gs://bucket/press.mp4", "cannot write to the URL gs:/bucket/press.mp4"),
         ("gallery --task press --robot piper --out", "gs://bucket", "press_piper.gif is a URL"),
     ):
         code, said = run(text, out)
