@@ -113,7 +113,7 @@ class Env:
 
         Args:
             key: source of all randomness.
-            ranges: domain randomisation; None for none.
+            ranges: domain randomization; None for none.
 
         Raises:
             TypeError, ValueError: the key or a range is invalid.
@@ -253,7 +253,7 @@ class Env:
 
         Args:
             poses: of all geoms and cameras, leading axis N.
-            draw: randomised values of these worlds, leading axis N, from `State.info`.
+            draw: randomized values of these worlds, leading axis N, from `State.info`.
         """
         appearance, size = jax.vmap(self._appearance)(draw) if draw else (None, None)
         images = self.renderer(poses, appearance, size)
@@ -354,7 +354,7 @@ class Env:
         return self._with_cameras(draw, self.physics.start(self._changes(draw, layout), qpos))
 
     def _changes(self, draw: Draw | None, layout: Layout) -> Changes:
-        """Return the fields of one world's model: randomised values, poses of fixed bodies."""
+        """Return the fields of one world's model: randomized values, poses of fixed bodies."""
         changes = randomization.changes(draw, self.model, self._objects) if draw else {}
         return changes | placing.fixed_bodies(self.model, layout, changes)
 

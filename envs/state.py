@@ -82,7 +82,7 @@ class State:
             `env.instructions`; command f32 [W, J + 1], the last targets sent to the robot [rad, m];
             earlier, the targets before those; held int32 [W], consecutive control steps at the
             goal; broken bool [W], frozen at the last finite state because physics diverged; layout,
-            body name -> [W, 4] at reset: x, y, z [m], yaw [rad]; draw, randomised values from
+            body name -> [W, 4] at reset: x, y, z [m], yaw [rad]; draw, randomized values from
             `envs.scene.randomization`, or None.
     """
 

@@ -45,7 +45,7 @@ class Rollout:
         length: int32 [W] control steps until the world was done.
         success: bool [W].
         instruction: int32 [W] index into the task's instructions.
-        draw: randomised values of the worlds, or None.
+        draw: randomized values of the worlds, or None.
     """
 
     state: jax.Array
@@ -70,7 +70,7 @@ def rollout(
         key: source of all randomness.
         action_noise: standard deviation [rad] of Gaussian noise on the executed joint targets.
             Recorded actions are without noise, so they demonstrate recovery.
-        ranges: domain randomisation, see `envs.scene.randomization`.
+        ranges: domain randomization, see `envs.scene.randomization`.
     """
     reset_key, plan_key, noise_key = jax.random.split(key, 3)
     first = env.reset(reset_key, ranges)

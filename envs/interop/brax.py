@@ -45,7 +45,7 @@ class BraxEnv(base.Env):
 
     Attributes:
         env: the wrapped environment, with one world.
-        ranges: domain randomisation.
+        ranges: domain randomization.
     """
 
     def __init__(self, env: Env, *, ranges: Randomization | None = None):

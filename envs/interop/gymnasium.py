@@ -50,7 +50,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     Attributes:
         env: the wrapped environment.
-        ranges: domain randomisation.
+        ranges: domain randomization.
         state: the W worlds, for access to metrics and layouts; None before `reset`.
     """
 

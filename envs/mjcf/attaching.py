@@ -16,7 +16,7 @@ from envs.robots import Robot
 _BASE = "base"
 _PREFIX = "robot/"  # for all names in the user's file, to avoid clashes with the scene and tasks
 _LEFT_OUT = ("keys", "sensors", "actuators", "tendons", "equalities", "pairs", "excludes", "lights")
-_UNSET = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default colour; such a geom takes its material's
+_UNSET = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default color; such a geom takes its material's
 _SMALL = 0.01  # m, half-extent below which a mesh is not drawn; own choice
 _HIDDEN_GROUP = 3
 
@@ -137,7 +137,7 @@ def _redefine(joint: Any, sign: float, shift: float) -> None:
 def _make_visual(model: mujoco.MjModel, geom_id: int, geom: Any) -> None:
     """Disable a geom's collisions; if it is a visible mesh, add primitives to draw in its place.
 
-    Colours are moved from materials to geoms, since MuJoCo Warp prefers a material's colour, which
+    Colors are moved from materials to geoms, since MuJoCo Warp prefers a material's color, which
     `Appearance` does not change; only materials with a texture stay.
     """
     geom.contype = geom.conaffinity = 0

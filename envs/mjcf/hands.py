@@ -19,7 +19,7 @@ class Pad(NamedTuple):
     position: np.ndarray  # of the box
     rotation: np.ndarray
     size: np.ndarray  # half-extents of the box
-    tip: np.ndarray  # centre of the sphere
+    tip: np.ndarray  # center of the sphere
 
 
 class Hand(NamedTuple):
@@ -59,7 +59,7 @@ def find(model: mujoco.MjModel, arm: Arm, tcp: str | None) -> Hand:
     gap = left[0, 1] - right[1, 1]
     if gap < 2 * TIP_RADIUS:
         raise ValueError(f"the fingers are only {1000 * gap:.0f} mm apart when they are open")
-    pose = _pose(axes @ _centre(data, axes, left, right, site), axes)
+    pose = _pose(axes @ _center(data, axes, left, right, site), axes)
     carrier = model.body_parentid[model.jnt_bodyid[arm.fingers[0]]]
     frames = [np.eye(4), *(_frame(model, data, joint) for joint in arm.joints)]
     return Hand(
@@ -89,10 +89,10 @@ def _open(model: mujoco.MjModel, data: mujoco.MjData, arm: Arm) -> tuple[np.ndar
     if abs(along[1]) < _PARALLEL:
         raise ValueError(f"the fingers slide {_degrees(along[1])} deg apart, not along one line")
     address = model.jnt_qposadr[arm.fingers]
-    centres = [_corners(model, data, joint).mean(axis=(0, 1)) @ line for joint in arm.fingers]
+    centers = [_corners(model, data, joint).mean(axis=(0, 1)) @ line for joint in arm.fingers]
 
     def offset(ends: tuple[float, ...]) -> float:
-        first, second = centres + along * (ends - data.qpos[address])
+        first, second = centers + along * (ends - data.qpos[address])
         return first - second
 
     ends = max(itertools.product(*model.jnt_range[arm.fingers]), key=lambda e: abs(offset(e)))
@@ -110,9 +110,9 @@ def _corners(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> np.ndarr
         while body > finger:  # parents have smaller ids than their children
             body = model.body_parentid[body]
         if body == finger:
-            centre, half = model.geom_aabb[geom].reshape(2, 3)
+            center, half = model.geom_aabb[geom].reshape(2, 3)
             rotation = data.geom_xmat[geom].reshape(3, 3)
-            corners.append(data.geom_xpos[geom] + (centre + half * _CORNERS) @ rotation.T)
+            corners.append(data.geom_xpos[geom] + (center + half * _CORNERS) @ rotation.T)
     if not corners:
         raise ValueError(
             f"finger {model.joint(joint).name} needs a geom that collides; its body "
@@ -165,7 +165,7 @@ def _end(corners: np.ndarray) -> np.ndarray:
     return np.stack([near.min(axis=0), near.max(axis=0)])
 
 
-def _centre(
+def _center(
     data: mujoco.MjData, axes: np.ndarray, left: np.ndarray, right: np.ndarray, site: str | None
 ) -> np.ndarray:
     """Compute the coordinates of the tcp [3] along the hand's axes."""
@@ -201,11 +201,11 @@ def _pad(data: mujoco.MjData, body: int, pose: np.ndarray, box: np.ndarray) -> P
     side = np.sign(low[1] + high[1])
     inner, outer = sorted((low[1], high[1]), key=abs)
     thick = max(abs(outer - inner), 2 * TIP_RADIUS)  # objects would tunnel through a thin pad
-    centre, half = (low + high) / 2, (high - low) / 2
-    centre[1], half[1] = inner + side * thick / 2, thick / 2
+    center, half = (low + high) / 2, (high - low) / 2
+    center[1], half[1] = inner + side * thick / 2, thick / 2
     tip = np.array([0.0, inner + side * TIP_RADIUS, TIP_LENGTH - TIP_RADIUS])
     turn = data.xmat[body].reshape(3, 3)
-    position, tip = (turn.T @ (axes @ p + origin - data.xpos[body]) for p in (centre, tip))
+    position, tip = (turn.T @ (axes @ p + origin - data.xpos[body]) for p in (center, tip))
     return Pad(position, turn.T @ axes, half, tip)
 
 

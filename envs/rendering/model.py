@@ -11,7 +11,7 @@ import numpy as np
 
 from envs.rendering.intersections import BOX, CAPSULE, CYLINDER, PLANE, SPHERE
 
-# Defaults where a model does not specify them; own choices by eye. Shares of light, sky colour at
+# Defaults where a model does not specify them; own choices by eye. Shares of light, sky color at
 # the horizon and at the zenith, edge [m] and contrast of the checker on planes.
 AMBIENT, HEADLIGHT, DIFFUSE = 0.35, 0.25, 0.5
 SKY = ((0.80, 0.84, 0.88), (0.45, 0.58, 0.75))
@@ -36,13 +36,13 @@ class Appearance:
     """Everything that an image depends on except geometry. Every field is traced.
 
     Attributes:
-        rgba: `[G, 4]` colour of each geom of the MuJoCo model, 0 to 1; alpha is ignored, `build`
+        rgba: `[G, 4]` color of each geom of the MuJoCo model, 0 to 1; alpha is ignored, `build`
             decides what is visible.
         light: `[3]` direction towards the (directional) light in world axes, of any length.
-        ambient: `[]` share of a geom's colour that needs no light.
+        ambient: `[]` share of a geom's color that needs no light.
         headlight: `[]` share lit from the camera, without shadows.
         diffuse: `[]` share lit by `light`, with shadows.
-        sky: `[2, 3]` colour at the horizon and at the zenith.
+        sky: `[2, 3]` color at the horizon and at the zenith.
         checker: `[2]` edge [m] and contrast (0 to 1) of the checker on planes.
         fovy: `[N]` vertical field of view of each camera of the MuJoCo model [deg].
     """
@@ -67,7 +67,7 @@ class RenderModel:
     """The visible geoms of a MuJoCo model, sorted by kind, and the cameras to render.
 
     Attributes:
-        appearance: the model's own colours, light and fields of view.
+        appearance: the model's own colors, light and fields of view.
         size: `[G, 3]` size of each geom of the MuJoCo model [m].
         geoms: V ids of the visible geoms in the MuJoCo model.
         kinds: V kinds of `intersections`, ascending.
@@ -138,7 +138,7 @@ def unit_shapes(model: RenderModel, size: jax.Array | np.ndarray) -> tuple[jax.A
 
 
 def _default_appearance(mj_model: mujoco.MjModel) -> Appearance:
-    """Take colours, fields of view and the first light from the model, the rest from defaults."""
+    """Take colors, fields of view and the first light from the model, the rest from defaults."""
     values = Appearance(
         rgba=mj_model.geom_rgba,
         light=-mj_model.light_dir[0] if mj_model.nlight else np.array([0.3, -0.4, 0.87]),

@@ -6,11 +6,11 @@ Geoms are sorted by kind when the model is built. Rendering an image takes three
    index share one int32 (the bits of a positive float sort like an integer; the lowest few hold the
    index), so the loop carries a single array and XLA compiles each iteration to one vectorised
    kernel. On two CPU cores a [geoms, pixels] table with argmin was 3 to 5 times slower.
-2. Gather pose, size and colour of the nearest geom per pixel, and compute one normal.
+2. Gather pose, size and color of the nearest geom per pixel, and compute one normal.
 3. Loop once more for hard shadows: does another geom block the way to the light?
 
 `samples` > 1 takes several rays per pixel for smooth edges; all steps run once for each. Light,
-colours and fields of view (`Appearance`) and geom sizes are traced, so they can differ between
+colors and fields of view (`Appearance`) and geom sizes are traced, so they can differ between
 worlds. Cameras follow MuJoCo (looking along -z, y up). Geoms that contain the camera are not drawn.
 """
 
@@ -72,7 +72,7 @@ def render(
 
     def image(geoms: Geom, view: View) -> jax.Array:
         pixel = jnp.arange(height * width, dtype=jnp.int32)
-        rgb = shading.colours(_table(geoms), model.kinds, view, raster, pixel)
+        rgb = shading.colors(_table(geoms), model.kinds, view, raster, pixel)
         return jnp.stack(rgb, axis=-1).reshape(height, width, 3)
 
     return jax.vmap(image)(geoms, views)
@@ -166,9 +166,9 @@ def cast(
     Returns:
         Geom id in the MuJoCo model, int32 `[K, height, width]`, -1 for none; depth along the
         camera's axis [m], f32 `[K, height, width]`, +inf for none. Depth is rounded down by less
-        than 2^-16 of its value (for up to 127 visible geoms): 15 micrometres at a metre. Single
+        than 2^-16 of its value (for up to 127 visible geoms): 15 micrometers at a meter. Single
         precision adds more for a small geom far away: 0.1 mm, measured, on a sphere of radius 4 mm
-        at a metre.
+        at a meter.
     """
     size = model.size if size is None else size
     raster = Raster(height, width, samples=1)

@@ -1,4 +1,4 @@
-"""Compute pixel colours.
+"""Compute pixel colors.
 
 Nothing here slices or gathers: a view is a tree of scalars, geoms are looked up by index through a
 function, and pixels are one axis of any length.
@@ -14,15 +14,15 @@ from envs.rendering.intersections import PLANE, Geoms, Matrix, Vec, along, dot, 
 
 
 class View(NamedTuple):
-    """One camera and its light; every leaf is a scalar. Shares and colours as in `Appearance`."""
+    """One camera and its light; every leaf is a scalar. Shares and colors as in `Appearance`."""
 
     position: Vec
     rotation: Matrix
-    pixel: jax.Array  # half a pixel's edge, one metre away [m]
+    pixel: jax.Array  # half a pixel's edge, one meter away [m]
     ambient: jax.Array
     headlight: jax.Array
     diffuse: jax.Array
-    horizon: Vec  # colour of the sky
+    horizon: Vec  # color of the sky
     zenith: Vec
     square: jax.Array  # edge of the checker on planes [m]
     contrast: jax.Array
@@ -41,12 +41,12 @@ def pack(tree: Any) -> jax.Array:
     return jnp.stack([jnp.asarray(leaf, jnp.float32) for leaf in jax.tree.leaves(tree)])
 
 
-def colours(
+def colors(
     geoms: Geoms, kinds: tuple[int, ...], view: View, raster: Raster, pixel: jax.Array
 ) -> Vec:
-    """Compute pixel colours, a triple of uint8 `[P]`: the mean of `samples` x `samples` rays.
+    """Compute pixel colors, a triple of uint8 `[P]`: the mean of `samples` x `samples` rays.
 
-    Each ray's colour is clipped to [0, 1] before averaging (there is no gamma to undo), as if a
+    Each ray's color is clipped to [0, 1] before averaging (there is no gamma to undo), as if a
     larger image were scaled down; otherwise overexposed edges would stay jagged.
 
     Args:
@@ -64,8 +64,8 @@ def colours(
         shifts = (
             ((j + 0.5) / n - 0.5) * 2 * view.pixel for j in (jax.lax.rem(i, n), jax.lax.div(i, n))
         )
-        colour = _colour(geoms, kinds, view, *(z + s for z, s in zip((x, y), shifts, strict=True)))
-        return tuple(t + jnp.clip(c, 0, 1) for t, c in zip(total, colour, strict=True))
+        color = _color(geoms, kinds, view, *(z + s for z, s in zip((x, y), shifts, strict=True)))
+        return tuple(t + jnp.clip(c, 0, 1) for t, c in zip(total, color, strict=True))
 
     zero = jnp.zeros(pixel.shape, jnp.float32)
     total = jax.lax.fori_loop(0, n * n, add, (zero, zero, zero))
@@ -81,8 +81,8 @@ def slopes(view: View, raster: Raster, pixel: jax.Array) -> tuple[jax.Array, jax
     return view.pixel * x, view.pixel * y
 
 
-def _colour(geoms: Geoms, kinds: tuple[int, ...], view: View, x: jax.Array, y: jax.Array) -> Vec:
-    """Compute the colour that each ray sees, a triple of `[P]`."""
+def _color(geoms: Geoms, kinds: tuple[int, ...], view: View, x: jax.Array, y: jax.Array) -> Vec:
+    """Compute the color that each ray sees, a triple of `[P]`."""
     number, depth = intersections.nearest(geoms, kinds, x, y)
     hit = depth < jnp.inf
     depth = jnp.where(hit, depth, 0)

@@ -109,7 +109,7 @@ class WarpRenderer:
         )
         # Lights are the same for all pixels of a call, so each camera has its own lamp.
         position = jnp.repeat(cam_xpos[:, self.model.cameras, None], self._mujoco.nlight, axis=2)
-        per_world = (size, appearance.rgba, self._material_colours(appearance), appearance.fovy)
+        per_world = (size, appearance.rgba, self._material_colors(appearance), appearance.fovy)
         lights = (direction, *jnp.moveaxis(position, 1, 0))
         packed = self._render(*per_world, geom_xpos, geom_xmat, cam_xpos, cam_xmat, *lights)
         rays = (side, self.samples) * 2
@@ -119,14 +119,14 @@ class WarpRenderer:
         bright = (appearance.ambient / own.ambient).reshape(-1, 1, 1, 1, 1)
         return (jnp.clip(rgb * bright, 0, 255) + 0.5).astype(jnp.uint8)
 
-    def _material_colours(self, appearance: Appearance) -> jax.Array:
-        """Colour materials like the geoms that use them, [worlds, materials, 4]."""
-        colours = jnp.broadcast_to(
+    def _material_colors(self, appearance: Appearance) -> jax.Array:
+        """Color materials like the geoms that use them, [worlds, materials, 4]."""
+        colors = jnp.broadcast_to(
             jnp.asarray(self._mujoco.mat_rgba, jnp.float32),
             (self._num_worlds, self._mujoco.nmat, 4),
         )
         table = self._mujoco.geom("table").id
-        return colours.at[:, self._mujoco.geom_matid[table]].set(appearance.rgba[:, table])
+        return colors.at[:, self._mujoco.geom_matid[table]].set(appearance.rgba[:, table])
 
     def _callable(self) -> Any:
         """Make the JAX callable: fields of model and data, a light position for each camera."""

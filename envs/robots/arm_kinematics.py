@@ -31,7 +31,7 @@ class Geometry(NamedTuple):
 
 
 def translation(x: float, y: float, z: float) -> np.ndarray:
-    """Return the [4, 4] transform that moves by (x, y, z) metres."""
+    """Return the [4, 4] transform that moves by (x, y, z) meters."""
     transform = np.eye(4)
     transform[:3, 3] = x, y, z
     return transform
@@ -135,5 +135,5 @@ def sine_axis(rotation: jax.Array) -> jax.Array:
 
 
 def multiply(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Compute a @ b in full precision; bf16 or TF32 would cost millimetres."""
+    """Compute a @ b in full precision; bf16 or TF32 would cost millimeters."""
     return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)

@@ -75,14 +75,14 @@ def to_sdk_zeros(q: jax.Array) -> jax.Array:
     return q - jax.numpy.asarray(_SDK_OFFSET, q.dtype)
 
 
-# Shapes and colours are own choices; masses [kg] are Menagerie's; link 6 with gripper weighs .45.
-_DARK, _GREY = 'rgba=".13 .14 .16 1"', 'rgba=".30 .32 .35 1"'
+# Shapes and colors are own choices; masses [kg] are Menagerie's; link 6 with gripper weighs .45.
+_DARK, _GRAY = 'rgba=".13 .14 .16 1"', 'rgba=".30 .32 .35 1"'
 _LINKS = (
-    f'<geom type="capsule" size=".042" fromto="0 0 -.035 0 0 .01" mass=".098" {_GREY}/>',
+    f'<geom type="capsule" size=".042" fromto="0 0 -.035 0 0 .01" mass=".098" {_GRAY}/>',
     f'<geom type="capsule" size=".034" fromto="0 0 0 .285 0 0" mass=".291" {_DARK}/>',
-    f'<geom type="capsule" size=".030" fromto="0 0 0 -.022 -.24 0" mass=".291" {_GREY}/>',
+    f'<geom type="capsule" size=".030" fromto="0 0 0 -.022 -.24 0" mass=".291" {_GRAY}/>',
     f'<geom type="sphere" size=".034" mass=".127" {_DARK}/>',
-    f'<geom type="capsule" size=".028" fromto="0 0 0 0 -.06 0" mass=".145" {_GREY}/>',
+    f'<geom type="capsule" size=".028" fromto="0 0 0 0 -.06 0" mass=".145" {_GRAY}/>',
     f'<geom type="cylinder" size=".03 .012" pos="0 0 .008" mass=".1" {_DARK}/>',
 )
 
@@ -106,7 +106,7 @@ ROBOT = robots.Robot(
         armature=0.005,
         base=f'<geom type="cylinder" size=".055 .045" pos="0 0 .045" mass=".163" {_DARK}/>',
         links=_LINKS,
-        hand=f'<geom type="box" size=".02 .055 .026" pos="0 0 -.077" mass=".35" {_GREY}/>',
+        hand=f'<geom type="box" size=".02 .055 .026" pos="0 0 -.077" mass=".35" {_GRAY}/>',
         finger=f'<geom class="pad" size=".012 .004 .03" pos="0 .004 -.018" mass=".026" {_DARK}/>',
         tip_offset=0.004,
     ),

@@ -1,1 +1,1 @@
-"""The scene: table, cameras, objects and their randomisation."""
+"""The scene: table, cameras, objects and their randomization."""

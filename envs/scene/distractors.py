@@ -5,8 +5,8 @@ import jax.numpy as jnp
 
 from envs.tasks import Layout
 
-_SIZE = 0.016  # m, half the width of each, and the height of its centre; own choice
-_SHAPES = (  # own choices, in colours that no task uses
+_SIZE = 0.016  # m, half the width of each, and the height of its center; own choice
+_SHAPES = (  # own choices, in colors that no task uses
     f'type="box" size="{_SIZE} {_SIZE} {_SIZE}" rgba=".15 .55 .30 1"',
     f'type="sphere" size="{_SIZE}" rgba=".95 .75 .15 1"',
     f'type="box" size="{_SIZE / 2} {1.5 * _SIZE} {_SIZE}" rgba=".90 .90 .86 1"',
@@ -15,7 +15,7 @@ _SHAPES = (  # own choices, in colours that no task uses
 MOST = len(_SHAPES)
 
 _LOW, _HIGH = (0.27, -0.21), (0.45, 0.21)  # m, part of the table that the side camera sees
-_CLEARANCE = 0.10  # m between centres, where there is room; own choice
+_CLEARANCE = 0.10  # m between centers, where there is room; own choice
 _TRIES = 64  # random positions per distractor; own choice
 
 

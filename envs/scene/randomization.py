@@ -1,4 +1,4 @@
-"""Domain randomisation: worlds that differ in physics, cameras, light and colours.
+"""Domain randomization: worlds that differ in physics, cameras, light and colors.
 
     ranges = envs.Randomization(mass=(0.5, 2.0), latency=(0.0, 0.04))
     state = env.reset(key, ranges)

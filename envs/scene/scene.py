@@ -68,7 +68,7 @@ _VISUALS = """
       rgba="{table}"/>
   </asset>
 """
-_TABLE, _TABLE_SIZE = ".62 .66 .68 1", 2.0  # colour; half the edge [m]
+_TABLE, _TABLE_SIZE = ".62 .66 .68 1", 2.0  # color; half the edge [m]
 _SIDE_EYE, _SIDE_TARGET = (0.76, -0.49, 0.42), (0.34, 0.0, 0.065)  # m; own choices
 
 
@@ -111,7 +111,7 @@ def mjcf(objects: str, robot: Robot) -> str:
 
 
 def _visuals() -> str:
-    horizon, up = (" ".join(map(str, colour)) for colour in SKY)
+    horizon, up = (" ".join(map(str, color)) for color in SKY)
     return _VISUALS.format(
         ambient=AMBIENT,
         headlight=HEADLIGHT,

@@ -102,7 +102,7 @@ class View:
 
     @property
     def tcp(self) -> jax.Array:
-        """Position [3] of the tool centre point between the fingers [m]."""
+        """Position [3] of the tool center point between the fingers [m]."""
         return self.data.site_xpos[self.model.site("tcp").id]
 
     @property
@@ -225,10 +225,10 @@ def route(
     return Waypoints(position, reach * same, tool_down(position), lean * same, angles, *columns)
 
 
-def scatter(key: jax.Array, centre: tuple[float, ...], spread: tuple[float, ...]) -> jax.Array:
-    """Sample a pose [4] on the table, uniform within `spread` [m] of `centre` [m], with yaw 0."""
+def scatter(key: jax.Array, center: tuple[float, ...], spread: tuple[float, ...]) -> jax.Array:
+    """Sample a pose [4] on the table, uniform within `spread` [m] of `center` [m], with yaw 0."""
     shift = jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0) * jnp.array(spread)
-    return jnp.concatenate([jnp.array(centre) + shift, jnp.zeros(2)])
+    return jnp.concatenate([jnp.array(center) + shift, jnp.zeros(2)])
 
 
 def raised(place: jax.Array, height: float) -> jax.Array:

@@ -21,7 +21,7 @@ from envs.tasks import (
 
 _INSIDE, _WALL, _HEIGHT = 0.043, 0.005, 0.055  # m, of the pot: half the inner width, half a wall
 _FOOT = 0.005  # m, radius of the lid's feet, which stand on the middle of the walls
-_KNOB, _KNOB_HEIGHT = 0.010, 0.030  # m, radius of the knob, and its centre above the feet
+_KNOB, _KNOB_HEIGHT = 0.010, 0.030  # m, radius of the knob, and its center above the feet
 _LID = 0.055  # m, radius
 _POT, _POT_RANGE = (0.36, 0.10), (0.04, 0.04)  # m, of the random position
 _BESIDE = 0.175  # m from pot to lid, to the robot's right

@@ -233,7 +233,7 @@ def test_a_lock_that_is_a_link_leaves_what_it_leads_to(tmp_path):
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / f".{CONFIG.name}.lock").symlink_to(precious)
     with (
-        pytest.raises(ValueError, match="cannot open .*lock"),
+        pytest.raises(ValueError, match=r"cannot open .*lock"),
         run_folder.open_run(CONFIG, tmp_path / "runs", resume=False),
     ):
         pass

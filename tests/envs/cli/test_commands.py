@@ -68,7 +68,7 @@ def test_bad_input_is_one_sentence(tmp_path, run, monkeypatch):
         ("gallery --task press --robot r2d2 --out", tmp_path / "g", "r2d2"),
         (f"collect {press}", "gs://bucket/press", "cannot write to the URL gs:/bucket/press"),
         (f"play {press}", "gs://bucket/press.mp4", "cannot write to the URL gs:/bucket/press.mp4"),
-        ("gallery --task press --robot piper --out", "gs://bucket", "press_piper.gif is a URL"),
+        ("gallery --task press --robot piper --out", "gs://bucket", "press_piper.gif: give a path"),
     ):
         code, said = run(text, out)
         assert code == 2
