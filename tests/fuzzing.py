@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from lorasp_jax.storage.digest import DIGEST, sealed
+from lorasp_jax.storage.digest import DIGEST, with_digest
 
 Change = Callable[[random.Random, list[Path]], None]
 VALUES: list[Any] = [
@@ -57,7 +57,7 @@ def _sealed(value: Any) -> Any:
     if not isinstance(value, dict) or DIGEST not in value:
         return value
     with contextlib.suppress(TypeError, RecursionError):
-        return sealed({name: item for name, item in value.items() if name != DIGEST})
+        return with_digest({name: item for name, item in value.items() if name != DIGEST})
     return value
 
 

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import safetensors.numpy
 
 from envs.datasets.files import RefusedError
-from lorasp_jax.storage.digest import DIGEST, sealed
+from lorasp_jax.storage.digest import DIGEST, with_digest
 from tests import ROOT
 
 Damage = Callable[[Path], None]
@@ -77,7 +77,7 @@ def fields(pattern: str, values: dict[str, list[Any]], line: int | None = None) 
                 else:
                     owner[key] = value
                 if isinstance(content, dict) and content.pop(DIGEST, None):
-                    content = sealed(content)  # what is wrong shows behind the digest, too
+                    content = with_digest(content)  # what is wrong shows behind the digest, too
                 lines[line or 0] = json.dumps(content)
                 path.write_text("\n".join(lines))
 

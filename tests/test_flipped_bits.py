@@ -156,7 +156,7 @@ def test_a_digest_that_is_gone_is_missed(tmp_path):
     facts = json.loads(path.read_text())
     del facts["digest"]
     path.write_text(json.dumps(facts))
-    with pytest.raises(ValueError, match="it has no digest"):
+    with pytest.raises(ValueError, match="the digest is missing"):
         read_description(path.parent)
 
 

@@ -20,7 +20,7 @@ from lorasp_jax.adapters.io.native import load_adapters, save_adapters
 from lorasp_jax.data import cache
 from lorasp_jax.data.opening import open_source
 from lorasp_jax.peft import LoRASP
-from lorasp_jax.storage.digest import sealed
+from lorasp_jax.storage.digest import with_digest
 from tests import malformed
 from tests.data.lerobots import GOLDEN, digest, golden
 from tests.malformed import ABSENT, HUGE, TENSORS, Cases, Damage, check_refusal
@@ -155,7 +155,7 @@ def _rehashed(damage: Damage) -> Damage:
         data = (folder / "adapter.safetensors").read_bytes()
         del description["digest"]
         description["sha256"] = hashlib.sha256(data).hexdigest()
-        (folder / "adapter.json").write_text(json.dumps(sealed(description)))
+        (folder / "adapter.json").write_text(json.dumps(with_digest(description)))
 
     return spoil
 
@@ -202,7 +202,7 @@ def _escaped(values: dict[str, list[Any]]) -> Cases:
                 owner[key] = value
                 if value is ABSENT:
                     del owner[key]
-                path.write_text(json.dumps(sealed(content)))
+                path.write_text(json.dumps(with_digest(content)))
 
             yield f"{place} {'absent' if value is ABSENT else value!r}", spoil
 

@@ -91,7 +91,7 @@ def record_run(run: Path, key: jax.Array) -> list[Column]:
         ValueError: the run is not finished, or it trained the base itself.
     """
     trained, metadata = load_policy(run), read_json(run / "adapter.json")["metadata"]
-    base = models.load(hub.found_again(metadata["base"]), trained.model.config)
+    base = models.load(hub.resolve_portable(metadata["base"]), trained.model.config)
     policies = [policy.with_sampler() for policy in (Policy(base, trained.processor), trained)]
     return [record_task(policies, metadata, task, key) for task in metadata["tasks"]]
 

@@ -30,7 +30,7 @@ from lorasp_jax.data.cache_writer import Column, map_column
 from lorasp_jax.data.checked_images import CheckedImages, checksum
 from lorasp_jax.data.source import Progress, Source
 from lorasp_jax.policies.statistics import Statistics
-from lorasp_jax.storage.digest import DIGEST, sealed, unsealed
+from lorasp_jax.storage.digest import DIGEST, verify_digest, with_digest
 from lorasp_jax.storage.json_values import check
 
 FORMAT = "lorasp-cache-1"
@@ -150,7 +150,7 @@ class Writer:
         header = {"format": FORMAT, **self._metadata, "steps": self.num_steps}
         header |= {"tasks": self._tasks, "instructions": self._instructions}
         header["crc32"] = {name: zlib.crc32(array.data) for name, array in rows.items()}
-        (self._folder / HEADER).write_text(json.dumps(sealed(header), indent=1))
+        (self._folder / HEADER).write_text(json.dumps(with_digest(header), indent=1))
 
     def append(self, episode: Episodes) -> None:
         """Append one episode, given as `Episodes` with E = 1.
@@ -328,7 +328,7 @@ def _read_header(path: Path) -> dict[str, Any]:
     """Read and check cache.json."""
     header: dict[str, Any] = read_json(path, path.parent)
     if DIGEST in header:
-        header = unsealed(header)
+        header = verify_digest(header)
     if unknown := sorted(header.keys() - _HEADER_FIELDS):
         raise ValueError(f"unknown field {unknown[0]!r}")
     if header["format"] != FORMAT:

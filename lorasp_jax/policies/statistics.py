@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lorasp_jax.policies.normalization import SMALLEST_SPREAD
-from lorasp_jax.storage.digest import DIGEST, sealed, unsealed
+from lorasp_jax.storage.digest import DIGEST, verify_digest, with_digest
 
 NAMES = ("mean", "std", "min", "max", "q01", "q99", "q10", "q90")
 """Names of all supported statistics."""
@@ -96,7 +96,7 @@ class Statistics:
             for name in NAMES
             if name in stats
         }
-        return json.dumps(sealed(lists), indent=1)
+        return json.dumps(with_digest(lists), indent=1)
 
     @classmethod
     def from_json(cls, text: str) -> "Statistics":
@@ -108,7 +108,7 @@ class Statistics:
         both: dict[str, dict[str, np.ndarray]] = {"state": {}, "action": {}}
         try:
             content = json.loads(text)
-            for key, values in (unsealed(content) if DIGEST in content else content).items():
+            for key, values in (verify_digest(content) if DIGEST in content else content).items():
                 kind, _, name = key.partition("_")
                 with np.errstate(over="ignore"):  # overflows to inf, which is rejected below
                     both[kind][name] = np.asarray(values, np.float32)

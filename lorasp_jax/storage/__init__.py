@@ -1,1 +1,1 @@
-"""Where files are, and how one knows that they are what was written."""
+"""Locate model files, and detect corrupted ones."""

@@ -1,8 +1,8 @@
-"""Digests: by them what was read is known to be what was written.
+"""Digests that detect corrupted data.
 
-Of arrays they are computed where these lie, the same on any number of devices. Orbax's files notice
-much damage, not all of it: numbers that do not compress are stored as they are, and a flipped bit
-among them is restored as another number. Of JSON they stand beside the values, under "digest".
+Array digests are computed on the arrays' devices and do not depend on their sharding. Orbax misses
+some corruption: incompressible data is stored raw, and a flipped bit in it is restored as a
+different value. JSON digests are stored next to the values, under "digest".
 """
 
 import functools
@@ -20,72 +20,74 @@ DIGEST = "digest"
 """Key of a JSON object's digest."""
 
 
-def digest(arrays: Mapping[str, jax.Array], *notes: str) -> str:
-    """SHA-256, in hexadecimal, of names, types, shapes and sums of the arrays, and of the notes."""
+def digest(arrays: Mapping[str, jax.Array], *extra: str) -> str:
+    """Return the SHA-256 of the arrays' names, dtypes, shapes and sums, and of `extra`, in hex."""
     sums = jax.device_get({name: _sum(array) for name, array in arrays.items()})
-    facts = [
+    entries = [
         [name, str(array.dtype), list(array.shape), int(sums[name])]
         for name, array in sorted(arrays.items())
     ]
-    return hashlib.sha256(json.dumps([facts, notes]).encode()).hexdigest()
+    return hashlib.sha256(json.dumps([entries, extra]).encode()).hexdigest()
 
 
 def fingerprints(weights: Mapping[str, Any]) -> dict[str, str]:
-    """Eight hexadecimal digits of each array's values, rounded to bf16: the types that weights are
-    kept in agree.
+    """Return eight hexadecimal digits per array, computed from its values in bf16, so that fp32 and
+    bf16 copies match.
     """
     sums = jax.device_get({name: _sum(array, rounded=True) for name, array in weights.items()})
-    return {name: f"{int(found):08x}" for name, found in sums.items()}
+    return {name: f"{int(value):08x}" for name, value in sums.items()}
 
 
-def sealed(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """JSON values with their digest.
-
-    Raises:
-        TypeError: something that JSON cannot hold.
-    """
-    return {**facts, DIGEST: _json_digest(facts)}
-
-
-def unsealed(found: Any) -> dict[str, Any]:
-    """What was sealed.
+def with_digest(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Add the digest of JSON values to them.
 
     Raises:
-        ValueError: it is no such object, or not as it was.
+        TypeError: a value is not JSON-serializable.
     """
-    if not isinstance(found, dict) or DIGEST not in found:
-        raise ValueError("it has no digest")
-    facts = {name: value for name, value in found.items() if name != DIGEST}
-    if found[DIGEST] != _json_digest(facts):
-        raise ValueError("its digest is another one")
-    return facts
+    return {**values, DIGEST: _json_digest(values)}
 
 
-def _json_digest(facts: Mapping[str, Any]) -> str:
-    """The first 16 digits of SHA-256 of the values, however they are laid out in a file."""
-    plain = json.loads(json.dumps(facts))  # keys are texts there
-    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
+def verify_digest(content: Any) -> dict[str, Any]:
+    """Verify the digest added by `with_digest` and return the values without it.
+
+    Raises:
+        ValueError: the digest is missing or does not match.
+    """
+    if not isinstance(content, dict) or DIGEST not in content:
+        raise ValueError("the digest is missing")
+    values = {name: value for name, value in content.items() if name != DIGEST}
+    if content[DIGEST] != _json_digest(values):
+        raise ValueError("the digest does not match")
+    return values
+
+
+def _json_digest(values: Mapping[str, Any]) -> str:
+    """Return the first 16 digits of the values' SHA-256, independent of their formatting."""
+    normalized = json.loads(json.dumps(values))  # turns keys into strings
+    return hashlib.sha256(json.dumps(normalized, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _sum(array: Any, *, rounded: bool = False) -> Any:
-    """`mixed_sum`, where asked for of floating-point numbers in bf16; by NumPy where that can read
-    the array, since then nothing need be compiled for its shape."""
+    """Compute `mixed_sum`, optionally of floats rounded to bf16.
+
+    Arrays in host memory use NumPy, which compiles nothing for their shapes.
+    """
     rounded = rounded and jnp.issubdtype(array.dtype, jnp.floating)
-    at_hand = isinstance(array, np.ndarray) or (
+    on_host = isinstance(array, np.ndarray) or (
         array.is_fully_addressable and all(d.platform == "cpu" for d in array.devices())
     )
-    if not at_hand:
+    if not on_host:
         return mixed_sum(array, rounded=rounded)
     array = np.asarray(array)
     return host_sum(array.astype(jnp.bfloat16) if rounded else array)
 
 
-def host_sum(array: np.ndarray, part: int = 2**18) -> int:
-    """`mixed_sum` by NumPy, so many words at a time: a cache holds them."""
+def host_sum(array: np.ndarray, block: int = 2**18) -> int:
+    """Compute `mixed_sum` in NumPy, in blocks of words that fit the CPU cache."""
     words = np.ascontiguousarray(array).reshape(-1).view(f"uint{min(8 * array.itemsize, 32)}")
     total = 0
-    for start in range(0, len(words), part):
-        mixed = words[start : start + part].astype(np.uint32)
+    for start in range(0, len(words), block):
+        mixed = words[start : start + block].astype(np.uint32)
         mixed ^= np.arange(start, start + len(mixed)).astype(np.uint32) * np.uint32(0x9E3779B9)
         mixed = (mixed ^ (mixed >> 16)) * np.uint32(0x85EBCA6B)
         mixed = (mixed ^ (mixed >> 13)) * np.uint32(0xC2B2AE35)
@@ -95,16 +97,16 @@ def host_sum(array: np.ndarray, part: int = 2**18) -> int:
 
 @functools.partial(jax.jit, static_argnames="rounded")
 def mixed_sum(array: jax.Array, *, rounded: bool = False) -> jax.Array:
-    """`[]` uint32, the sum of all elements' bits, in bf16 if rounded, each mixed with its position.
+    """Sum the bits of all elements (in bf16 if rounded), each mixed with its position: `[]` uint32.
 
-    Mixing is the finalizer of MurmurHash3 (github.com/aappleby/smhasher, MurmurHash3.cpp:68), a
-    permutation of the 32-bit words: no change of a single word stays unseen, another one with a
-    probability of 2^-32. Sums of integers do not depend on their order.
+    The mixing is the finalizer of MurmurHash3 (github.com/aappleby/smhasher, MurmurHash3.cpp:68), a
+    permutation of the 32-bit words: a change of a single word is always detected, any other change
+    is missed with probability 2^-32. Integer sums do not depend on the order.
     """
     if rounded or array.dtype == bool:
         array = array.astype(jnp.bfloat16 if rounded else jnp.uint8)
-    kind = jnp.dtype(f"uint{min(8 * array.dtype.itemsize, 32)}")
-    words = jax.lax.bitcast_convert_type(array, kind).astype(jnp.uint32)
+    word = jnp.dtype(f"uint{min(8 * array.dtype.itemsize, 32)}")
+    words = jax.lax.bitcast_convert_type(array, word).astype(jnp.uint32)
     position = jnp.zeros(words.shape, jnp.uint32)
     for axis in range(words.ndim):
         stride = jnp.uint32(math.prod(words.shape[axis + 1 :]) % 2**32)

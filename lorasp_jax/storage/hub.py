@@ -1,7 +1,6 @@
-"""Files of models wherever they are: on this machine, on Hugging Face's hub, in a bucket.
+"""Resolve model files: local paths, Hugging Face Hub repositories, cloud buckets.
 
-Only what begins with hf:// is asked of the hub: a folder that is not there never becomes somebody's
-repository of the same name.
+Only hf:// paths reach the Hub, so a missing folder never resolves to a repository of the same name.
 """
 
 import os
@@ -15,14 +14,23 @@ from envs.datasets.writing import atomic_file, atomic_folder
 from lorasp_jax.storage import shipped
 
 HUB = "hf://"
-"""How a repository on the hub begins, as in hf://owner/name."""
+"""URL prefix of Hub repositories, hf://owner/name."""
 REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
-"""A repository's id on the hub, owner/name."""
+"""Repository id on the Hub, owner/name."""
 BUCKET = re.compile(r"(gs|s3|memory)://[\w.-]+(/[\w.+=@-]+)*/?")
-"""A folder or file in a bucket: other URLs may be anything, a web page or a file of this machine's.
-In memory (fsspec's) are those of tests."""
-LEFT_OUT = ("train_state/*", "*.bin", "*.pt", "*.pth", "*.onnx", "*.gguf", "*.msgpack", "*.h5")
-"""What nothing here reads: optimizer states, and the same weights for other libraries."""
+"""Folder or file in a bucket; other URLs, such as web pages or file://, are rejected. memory:// is
+fsspec's in-memory store, for tests."""
+IGNORED_PATTERNS = (
+    "train_state/*",
+    "*.bin",
+    "*.pt",
+    "*.pth",
+    "*.onnx",
+    "*.gguf",
+    "*.msgpack",
+    "*.h5",
+)
+"""Files not to download: optimizer states, and the weights in formats of other libraries."""
 
 
 def local(
@@ -31,33 +39,33 @@ def local(
     only: list[str] | None = None,
     repository: Literal["model", "dataset"] = "model",
 ) -> Path:
-    """The file or folder on this machine; it is downloaded first if it is somewhere else.
+    """Return a local path, downloading if necessary.
 
     Args:
-        where: a path; or a repository on the hub, hf://owner/name, kept in its own cache; or a URL
-            of a bucket, gs://bucket/folder, kept below the user's cache folder, lorasp_jax/. A
-            shipped base, assets/pi0_nano, is found from any folder.
-        only: patterns of the files that are wanted from a repository; None: all but `LEFT_OUT`.
-        repository: what kind of repository on the hub.
+        where: a path; a Hub repository, hf://owner/name, cached by the Hub client; or a bucket URL,
+            gs://bucket/folder, cached in lorasp_jax/ under the user's cache folder. Shipped bases,
+            such as assets/pi0_nano, resolve from any folder.
+        only: file patterns to download from a repository; None: all but `IGNORED_PATTERNS`.
+        repository: type of the Hub repository.
 
     Raises:
-        ValueError: it is not there, cannot be reached, or is another kind of URL.
+        ValueError: not found, not reachable, or an unsupported URL.
     """
     name, path = os.fspath(where), Path(where)
     if name.startswith(HUB):
         return _from_hub(name.removeprefix(HUB), only, repository)
     if "://" in name:
         if not BUCKET.fullmatch(name) or ".." in name.split("/"):
-            raise ValueError(f"{name} is no folder in a bucket: that is gs://bucket/folder.")
+            raise ValueError(f"{name} is not a bucket URL, gs://bucket/folder.")
         return _from_bucket(name)
-    for found in (path, shipped.ROOT / path) if _is_shipped(path) else (path,):
-        if os.path.exists(found):  # Path.exists raises where a name is too long
-            return found
-    raise ValueError(_nowhere(name, path))
+    for candidate in (path, shipped.ROOT / path) if _is_shipped(path) else (path,):
+        if os.path.exists(candidate):  # Path.exists raises if a name is too long
+            return candidate
+    raise ValueError(_not_found_message(name, path))
 
 
-def lasting(where: str) -> str:
-    """A place as it is written down, for `found_again` from any other folder; empty stays empty."""
+def portable_path(where: str) -> str:
+    """Return the form of a path to record, which resolves from any folder; "" stays ""."""
     if not where or "://" in where:
         return where
     path = Path(where)
@@ -68,44 +76,44 @@ def lasting(where: str) -> str:
     return path.relative_to(shipped.ROOT).as_posix() if inside else str(path)
 
 
-def found_again(where: str) -> str:
-    """What `lasting` wrote down, for `local`: no other folder takes the place of a shipped base."""
+def resolve_portable(where: str) -> str:
+    """Resolve a recorded path for `local`; shipped bases take precedence over local folders."""
     return str(shipped.ROOT / where) if _is_shipped(Path(where)) else where
 
 
 def _is_shipped(path: Path) -> bool:
-    return shipped.is_one(path, shipped.BASES)
+    return shipped.is_under(path, shipped.BASES)
 
 
-def _nowhere(name: str, path: Path) -> str:
-    """Why a path leads nowhere, and what else may have been meant."""
+def _not_found_message(name: str, path: Path) -> str:
+    """Return the error message for a missing path, with suggestions."""
     inside = path.relative_to(shipped.ROOT) if path.is_relative_to(shipped.ROOT) else path
     if _is_shipped(inside):
-        return shipped.no_base(name)
+        return shipped.missing_base_message(name)
     if REPOSITORY.fullmatch(name):
-        return f"there is no folder {name}; a repository on the hub is written {HUB}{name}"
-    return f"{name} does not exist, and is neither {HUB}owner/name on the hub nor gs://bucket/path"
+        return f"{name} does not exist; a Hub repository is written {HUB}{name}"
+    return f"{name} does not exist; it is neither {HUB}owner/name nor gs://bucket/path"
 
 
-def is_elsewhere(where: str | os.PathLike[str]) -> bool:
-    """Whether a place is the hub or a bucket, from which `local` downloads."""
+def is_remote(where: str | os.PathLike[str]) -> bool:
+    """Return whether `local` downloads from here: the Hub or a bucket."""
     return "://" in os.fspath(where)
 
 
 def _from_hub(name: str, only: list[str] | None, repository: str) -> Path:
     if not REPOSITORY.fullmatch(name):
-        raise ValueError(f"{HUB}{name} is no repository on the hub: that is {HUB}owner/name.")
+        raise ValueError(f"{HUB}{name} is not a Hub repository, {HUB}owner/name.")
     import huggingface_hub
     from huggingface_hub.errors import HfHubHTTPError
 
     try:
-        found = huggingface_hub.snapshot_download(
-            name, repo_type=repository, allow_patterns=only, ignore_patterns=list(LEFT_OUT)
+        folder = huggingface_hub.snapshot_download(
+            name, repo_type=repository, allow_patterns=only, ignore_patterns=list(IGNORED_PATTERNS)
         )
-        return Path(found)
+        return Path(folder)
     except (OSError, ValueError, HfHubHTTPError) as error:
         raise ValueError(
-            f"the hub did not give {HUB}{name}, for want of it, of a permission or of a connection "
+            f"Cannot download {HUB}{name}: not found, access denied, or no connection "
             f"({_first_line(error)})."
         ) from error
 
@@ -115,23 +123,23 @@ def _from_bucket(url: str) -> Path:
 
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "lorasp_jax"
     target = cache / url.rstrip("/").replace("://", "/", 1)
-    waiting = f"another process is fetching {url}: waiting for it"
+    waiting = f"waiting: another process is downloading {url}"
     try:
         with locked(target, lambda: print(waiting, file=sys.stderr)):
             if not target.exists():
-                _fetch(*fsspec.core.url_to_fs(url), target)
-    except ImportError as error:  # fsspec's own sentence names the store's package alone
+                _copy(*fsspec.core.url_to_fs(url), target)
+    except ImportError as error:  # fsspec's message names only the backend package
         raise ValueError(f'{url} needs a package: pip install "lorasp_jax[buckets]"') from error
-    except Exception as error:  # every store raises its own kinds
-        raise ValueError(f"{url} cannot be fetched: {_first_line(error)}.") from error
+    except Exception as error:  # each backend raises its own errors
+        raise ValueError(f"Cannot download {url}: {_first_line(error)}.") from error
     return target
 
 
-def _fetch(store: Any, root: str, target: Path) -> None:
-    """Copy a file or folder of a bucket."""
+def _copy(store: Any, root: str, target: Path) -> None:
+    """Copy a file or folder from a bucket, without optimizer states."""
     names = [name for name in store.find(root) if "/train_state/" not in name]
     if not names:
-        raise FileNotFoundError("there is nothing of that name")
+        raise FileNotFoundError("no such file or folder")
     is_file = names == [root]
     with (atomic_file if is_file else atomic_folder)(target) as unfinished:
         for name in names:

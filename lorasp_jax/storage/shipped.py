@@ -1,28 +1,28 @@
-"""What comes with the project, written the same way in every folder: configs/ and assets/.
+"""Files shipped with the project, configs/ and assets/, available under these paths in any folder.
 
-A checkout has both beside the package. A wheel has them inside it, with the nano bases alone.
+A checkout has both beside the package; a wheel has them inside it, with only the nano bases.
 """
 
 from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parents[1]
 ROOT = PACKAGE if (PACKAGE / "assets").is_dir() else PACKAGE.parent
-"""The folder with configs/ and assets/: of a checkout its root, else the installed package."""
+"""Folder with configs/ and assets/: the root of a checkout, or the installed package."""
 BASES, EXPERIMENTS = "assets", "configs"
 
 
-def is_one(path: Path, folder: str) -> bool:
-    """Whether a relative path is one of a shipped file or folder, such as assets/pi0_nano."""
+def is_under(path: Path, folder: str) -> bool:
+    """Return whether a relative path is below a shipped folder, such as assets/pi0_nano."""
     return path.parts[:1] == (folder,) and len(path.parts) > 1 and ".." not in path.parts
 
 
-def no_base(name: str) -> str:
-    """Why there is no base at a path below assets/, and where one is."""
-    found = ", ".join(sorted(file.parent.name for file in ROOT.glob(f"{BASES}/*/config.json")))
-    missing = f"{name} is not there: the bases in {ROOT / BASES} are {found or 'none'}"
+def missing_base_message(name: str) -> str:
+    """Explain which bases exist if there is none at a path below assets/."""
+    bases = ", ".join(sorted(file.parent.name for file in ROOT.glob(f"{BASES}/*/config.json")))
+    message = f"{name} does not exist; the bases in {ROOT / BASES} are {bases or 'none'}"
     if ROOT != PACKAGE:
-        return missing
+        return message
     return (
-        f"{missing}; take {Path(name).name} from a checkout of the project or make it by "
-        f"{EXPERIMENTS}/pretrain.py, and name its folder, or choose a size that is there"
+        f"{message}; choose one of these, or pass the folder of {Path(name).name} in a checkout of "
+        f"the project or of a base made with {EXPERIMENTS}/pretrain.py"
     )

@@ -42,7 +42,7 @@ def base_model(config: Config, *, shapes: bool = False) -> tuple[Backbone, str]:
     wanted = dataclasses.replace(wanted, **kinds)
     if not wanted.inputs.masks_missing:
         wanted = dataclasses.replace(wanted, cameras=wanted.cameras[: len(envs.Env.cameras)])
-    if shapes and (not chosen.source or hub.is_elsewhere(chosen.source)):
+    if shapes and (not chosen.source or hub.is_remote(chosen.source)):
         return nnx.eval_shape(lambda: wanted.create(nnx.Rngs(0))), ""
     if chosen.source:
         found = loading.find(chosen.source)

@@ -47,7 +47,7 @@ def write(run: Run) -> None:
         (folder / "statistics.json").write_text(statistics + "\n")
         write_json(folder / TRAINING, facts)
         return
-    metadata = {"base": hub.lasting(config.model.source), **facts}
+    metadata = {"base": hub.portable_path(config.model.source), **facts}
     native.save_adapters(run.folder, run.policy.model, base=run.base_hash, metadata=metadata)
 
 
@@ -63,7 +63,7 @@ def _facts(run: Run) -> dict[str, Any]:
         "policy": {
             "backbone": config.model.backbone,
             "config": dataclasses.asdict(run.policy.model.config),
-            "tokenizer": hub.lasting(config.model.tokenizer),
+            "tokenizer": hub.portable_path(config.model.tokenizer),
             "prompts": _prompts_digest(processor.prompts),
             "instructions": list(processor.prompts.instructions),
             "num_joints": len(processor.robot_slots) - 1,
@@ -99,7 +99,7 @@ def load_policy(
     told = read_json(path) if trained else native.read_description(folder)["metadata"]
     try:
         config = backbone.find(told["policy"]["backbone"]).from_dict(told["policy"]["config"])
-        source = folder / BASE if trained else base or hub.found_again(told["base"])
+        source = folder / BASE if trained else base or hub.resolve_portable(told["base"])
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} does not say what its policy needs") from error
     if not source:
@@ -121,7 +121,7 @@ def _processor(told: Mapping[str, Any], config: Any, words: str) -> Processor:
     """The processor of an exported policy."""
     joints = told["num_joints"]
     try:
-        found = tokenizer.load_tokenizer(words or hub.found_again(told["tokenizer"]))
+        found = tokenizer.load_tokenizer(words or hub.resolve_portable(told["tokenizer"]))
     except ValueError as error:
         raise ValueError(f"{error} (words= says where the policy's tokenizer is now)") from error
     prompts = PromptTable.of(found, told["instructions"], config, num_joints=joints)

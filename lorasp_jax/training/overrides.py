@@ -169,7 +169,7 @@ def load(path: Path, scale: str) -> Config:
         ValueError: the file does not exist, its code fails, or it does not return a `Config`.
     """
     bundled = shipped.ROOT / path
-    if shipped.is_one(path, shipped.EXPERIMENTS) and not os.path.exists(path):
+    if shipped.is_under(path, shipped.EXPERIMENTS) and not os.path.exists(path):
         path = bundled if os.path.isfile(bundled) else path
     if not os.path.isfile(path):  # Path.is_file raises if a name is too long
         folder = path.parent if os.path.isdir(path.parent) else shipped.ROOT / shipped.EXPERIMENTS

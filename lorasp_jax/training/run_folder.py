@@ -24,7 +24,7 @@ from envs.datasets.locks import acquire
 from envs.datasets.writing import TEMPORARY_SUFFIX, write_text
 from lorasp_jax.config import Config
 from lorasp_jax.peft._settings import upgrade
-from lorasp_jax.storage.digest import sealed, unsealed
+from lorasp_jax.storage.digest import verify_digest, with_digest
 from lorasp_jax.storage.json_values import check
 from lorasp_jax.training import records
 from lorasp_jax.training.distributed import processes
@@ -45,7 +45,7 @@ def to_json(config: Config) -> dict[str, Any]:
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
     """Write a JSON object with its digest so that readers never see half of it."""
-    write_text(path, json.dumps(sealed(value), indent=2) + "\n")
+    write_text(path, json.dumps(with_digest(value), indent=2) + "\n")
 
 
 def read_json(path: Path, kind: Mapping[Any, Any] = MappingProxyType({})) -> dict[str, Any]:
@@ -61,7 +61,7 @@ def read_json(path: Path, kind: Mapping[Any, Any] = MappingProxyType({})) -> dic
     if not path.exists():
         return {}
     with damage(path, remedy=": put back a whole one"):
-        found = unsealed(json.loads(read_bytes(path)))
+        found = verify_digest(json.loads(read_bytes(path)))
         check(found, kind)
         return found
 
@@ -244,7 +244,7 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
     rows = []
     for number, line in enumerate(lines, 1):
         try:
-            rows.append(unsealed(json.loads(line)))
+            rows.append(verify_digest(json.loads(line)))
             check(rows[-1], records.ROW)
         except (ValueError, RecursionError) as error:
             raise ValueError(
@@ -254,4 +254,4 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
 
 
 def _line(row: Mapping[str, float]) -> str:
-    return json.dumps(sealed(row)) + "\n"
+    return json.dumps(with_digest(row)) + "\n"

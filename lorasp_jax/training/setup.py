@@ -97,7 +97,7 @@ def build(config: Config, folder: Path, *, shapes: bool = False) -> Built:
     sizes = {"image_size": config.image_size, "control_dt": config.control_dt}
     tasks = () if config.data.source else config.tasks
     worlds = [envs.make(task, robot=config.robot, **sizes) for task in tasks]
-    stands_in = shapes and hub.is_elsewhere(config.model.tokenizer)
+    stands_in = shapes and hub.is_remote(config.model.tokenizer)
     words = tokenizer.load_tokenizer("" if stands_in else config.model.tokenizer)
     base, base_hash = base_model(config, shapes=shapes)
     base = changed(base, max_tokens=config.model.max_tokens or base.config.max_tokens)

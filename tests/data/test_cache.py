@@ -15,7 +15,7 @@ from lorasp_jax.data import cache, rlds_export
 from lorasp_jax.data.batches import flatten, gather
 from lorasp_jax.data.lerobot import Keys, LeRobot
 from lorasp_jax.data.opening import open_source
-from lorasp_jax.storage.digest import DIGEST, sealed
+from lorasp_jax.storage.digest import DIGEST, with_digest
 from tests.data.lerobots import GOLDEN, VERSIONS, copied, digest, edit_rows, golden, set_value
 from tests.runs import random_episodes
 
@@ -276,6 +276,6 @@ def test_arrays_of_others(name, change, sentence, simulated, tmp_path):
     facts = json.loads(header.read_text())
     facts["crc32"][name] = zlib.crc32(array.tobytes())
     del facts[DIGEST]
-    header.write_text(json.dumps(sealed(facts)))
+    header.write_text(json.dumps(with_digest(facts)))
     with pytest.raises(ValueError, match=sentence):
         cache.Cache(folder)

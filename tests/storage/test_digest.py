@@ -1,4 +1,4 @@
-"""Digests of arrays are the same wherever they are computed."""
+"""Array digests are the same on host and device, and detect flipped bits."""
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ VALUES = np.random.default_rng(0).normal(size=(3, 5, 7)) * 100
 
 @pytest.fixture
 def compiled():
-    """What JAX has compiled so far, or taken from its cache."""
+    """Events of JAX compiling a program or loading it from its cache."""
     events = []
 
     def listen(event, *_, **__):
@@ -29,15 +29,15 @@ def compiled():
     "dtype", ["float32", "bfloat16", "float8_e4m3fn", "int32", "uint8", "bool", "float16"]
 )
 @pytest.mark.parametrize("rounded", [False, True])
-def test_the_host_finds_what_a_device_finds(dtype, rounded):
+def test_host_equals_device(dtype, rounded):
     array = jnp.asarray(VALUES).astype(dtype)
     rounded = rounded and jnp.issubdtype(dtype, jnp.floating)
-    held = np.asarray(array.astype(jnp.bfloat16) if rounded else array)
-    found = digest.host_sum(held, part=16)  # several parts, the last one shorter
-    assert found == digest.host_sum(held) == int(digest.mixed_sum(array, rounded=rounded))
+    on_host = np.asarray(array.astype(jnp.bfloat16) if rounded else array)
+    blocked = digest.host_sum(on_host, block=16)  # several blocks, the last one shorter
+    assert blocked == digest.host_sum(on_host) == int(digest.mixed_sum(array, rounded=rounded))
 
 
-def test_nothing_is_compiled_on_a_cpu(compiled):
+def test_nothing_is_compiled_on_cpu(compiled):
     arrays = {"a": jnp.ones((2, 37)), "b": np.ones(2), "c": jnp.zeros(()), "d": jnp.ones((0, 4))}
     other = arrays | {"c": jnp.ones(())}
     compiled.clear()
@@ -49,7 +49,7 @@ def test_nothing_is_compiled_on_a_cpu(compiled):
 
 @pytest.mark.parametrize("index", [0, 41, 104])
 @pytest.mark.parametrize("bit", [0, 31])
-def test_one_bit_more_is_another_digest(index, bit):
+def test_a_flipped_bit_changes_the_digest(index, bit):
     words = VALUES.astype(np.float32).view(np.uint32).copy()
     before = digest.digest({"x": jax.device_put(words)})
     words.flat[index] ^= np.uint32(1 << bit)

@@ -1,4 +1,4 @@
-"""Nothing here touches a network: the hub is replaced, the bucket lies in memory."""
+"""No test uses the network: the Hub client is patched, and the bucket is in memory."""
 
 import re
 
@@ -10,7 +10,7 @@ from huggingface_hub.errors import LocalEntryNotFoundError
 from lorasp_jax.storage import hub, shipped
 
 
-def test_what_is_here_stays_here(tmp_path, monkeypatch):
+def test_local_paths_are_unchanged(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "runs" / "base").mkdir(parents=True)
     assert hub.local("runs/base").samefile(tmp_path / "runs" / "base")
@@ -18,43 +18,45 @@ def test_what_is_here_stays_here(tmp_path, monkeypatch):
 
 
 def test_hub(tmp_path, monkeypatch):
-    asked = {}
+    request = {}
 
     def snapshot_download(name, **options):
-        asked.update(options, name=name)
+        request.update(options, name=name)
         return str(tmp_path)
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
     assert hub.local("hf://lerobot/smolvla_base", only=["*.json"]) == tmp_path
-    assert (asked["name"], asked["allow_patterns"]) == ("lerobot/smolvla_base", ["*.json"])
-    assert "train_state/*" in asked["ignore_patterns"]
-    assert asked["repo_type"] == "model"
+    assert (request["name"], request["allow_patterns"]) == ("lerobot/smolvla_base", ["*.json"])
+    assert "train_state/*" in request["ignore_patterns"]
+    assert request["repo_type"] == "model"
     hub.local("hf://lerobot/pusht", repository="dataset")
-    assert asked["repo_type"] == "dataset"
+    assert request["repo_type"] == "dataset"
 
 
-def test_offline_is_one_sentence(monkeypatch):
+def test_hub_errors_are_one_sentence(monkeypatch):
     def snapshot_download(name, **_):
         raise LocalEntryNotFoundError("Got: no connection\nand a page of explanations")
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
-    with pytest.raises(ValueError, match=r"did not give hf://a/b, .*no connection\)\.$") as caught:
+    with pytest.raises(
+        ValueError, match=r"Cannot download hf://a/b: .*no connection\)\.$"
+    ) as caught:
         hub.local("hf://a/b")
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["/a/b", "a", "a/b/c", "n" * 300, "/" + "n" * 300, "a\0b"])
-def test_nowhere(name, no_hub):
+def test_missing_paths(name, no_hub):
     with pytest.raises(ValueError, match=f"^{re.escape(name)} does not exist"):
         hub.local(name)
 
 
 @pytest.mark.parametrize("name", ["runs/base", "lerobot/smolvla_base"])
-def test_a_folder_that_is_not_there_is_never_asked_of_the_hub(name, tmp_path, monkeypatch, no_hub):
+def test_missing_folders_never_resolve_to_the_hub(name, tmp_path, monkeypatch, no_hub):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match=f"no folder {name}; .* is written hf://{name}$"):
+    with pytest.raises(ValueError, match=f"{name} does not exist; .* is written hf://{name}$"):
         hub.local(name)
-    with pytest.raises(ValueError, match=r"is no repository on the hub: that is hf://owner/name"):
+    with pytest.raises(ValueError, match=r"is not a Hub repository, hf://owner/name"):
         hub.local("hf://too/many/parts")
 
 
@@ -63,38 +65,41 @@ def no_hub(monkeypatch):
     monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda *_, **__: 1 / 0)
 
 
-def test_shipped_bases_are_found_from_any_folder(tmp_path, monkeypatch, no_hub):
+def test_shipped_bases_resolve_from_any_folder(tmp_path, monkeypatch, no_hub):
     monkeypatch.chdir(tmp_path)
     assert (hub.local("assets/pi0_nano") / "config.json").is_file()
     for name in ("assets/pi0_nan", "assets/../runs/pi0"):
         with pytest.raises(
-            ValueError, match=r"is not there: the bases in .* are pi0_nano, |does not exist"
+            ValueError,
+            match=r"does not exist; the bases in .* are pi0_nano, |does not exist; it is",
         ):
             hub.local(name)
 
 
-def test_an_installed_package_names_the_bases_it_lacks(tmp_path, monkeypatch, no_hub):
+def test_an_installed_package_names_its_bases(tmp_path, monkeypatch, no_hub):
     (tmp_path / "assets" / "pi0_nano").mkdir(parents=True)
     (tmp_path / "assets" / "pi0_nano" / "config.json").touch()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(shipped, "ROOT", tmp_path)
     monkeypatch.setattr(shipped, "PACKAGE", tmp_path)
-    with pytest.raises(ValueError, match=r"the bases in .*/assets are pi0_nano; take pi0_small "):
+    with pytest.raises(
+        ValueError, match=r"the bases in .*/assets are pi0_nano; choose one .* of pi0_small "
+    ):
         hub.local("assets/pi0_small")
 
 
-def test_what_is_written_down_is_found_from_any_other_folder(tmp_path, monkeypatch):
+def test_portable_paths_resolve_from_any_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine").mkdir()
     for where in ("mine", str(tmp_path / "mine")):
-        assert hub.lasting(where) == str(tmp_path / "mine")
+        assert hub.portable_path(where) == str(tmp_path / "mine")
     for where in ("assets/pi0_nano", str(shipped.ROOT / "assets" / "pi0_nano")):
-        assert hub.lasting(where) == "assets/pi0_nano"
+        assert hub.portable_path(where) == "assets/pi0_nano"
     for where in ("", "gs://bucket/folder", "hf://owner/name"):
-        assert hub.found_again(hub.lasting(where)) == where
+        assert hub.resolve_portable(hub.portable_path(where)) == where
     (tmp_path / "assets" / "pi0_nano").mkdir(parents=True)
-    assert hub.lasting("assets/pi0_nano") == str(tmp_path / "assets" / "pi0_nano")
-    assert hub.found_again("assets/pi0_nano") == str(shipped.ROOT / "assets" / "pi0_nano")
+    assert hub.portable_path("assets/pi0_nano") == str(tmp_path / "assets" / "pi0_nano")
+    assert hub.resolve_portable("assets/pi0_nano") == str(shipped.ROOT / "assets" / "pi0_nano")
 
 
 @pytest.fixture
@@ -107,28 +112,30 @@ def bucket(tmp_path, monkeypatch):
     store.rm("/models", recursive=True)
 
 
-def test_bucket_is_fetched_once(bucket, tmp_path):
-    found = hub.local("memory://models/pi0/")
-    assert found == tmp_path / "lorasp_jax" / "memory" / "models" / "pi0"
-    files = {path.relative_to(found).as_posix() for path in found.rglob("*") if path.is_file()}
+def test_bucket_is_downloaded_once(bucket, tmp_path):
+    folder = hub.local("memory://models/pi0/")
+    assert folder == tmp_path / "lorasp_jax" / "memory" / "models" / "pi0"
+    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     assert files == {"params/_METADATA", "params/d/0"}
-    assert (found / "params" / "d" / "0").read_text() == "params/d/0"
+    assert (folder / "params" / "d" / "0").read_text() == "params/d/0"
     bucket.pipe("/models/pi0/params/d/0", b"new")
     assert (hub.local("memory://models/pi0") / "params" / "d" / "0").read_text() == "params/d/0"
-    one = hub.local("memory://models/pi0/params/_METADATA")
-    assert one.read_text() == "params/_METADATA"
+    file = hub.local("memory://models/pi0/params/_METADATA")
+    assert file.read_text() == "params/_METADATA"
     assert not list(tmp_path.rglob(".*"))
 
 
-def test_bucket_that_cannot_be_read(bucket, tmp_path, monkeypatch):
-    with pytest.raises(ValueError, match=r"models/no cannot be fetched: .*nothing of that name\.$"):
+def test_unreadable_bucket(bucket, tmp_path, monkeypatch):
+    with pytest.raises(
+        ValueError, match=r"Cannot download .*models/no: .*no such file or folder\.$"
+    ):
         hub.local("memory://models/no")
 
     def get_file(*_, **__):
         raise OSError("connection lost")
 
     monkeypatch.setattr(type(bucket), "get_file", get_file)
-    with pytest.raises(ValueError, match=r"cannot be fetched: OSError: connection lost\.$"):
+    with pytest.raises(ValueError, match=r"Cannot download .*: OSError: connection lost\.$"):
         hub.local("memory://models/pi0")
     assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".")]
 
@@ -141,13 +148,13 @@ def test_bucket_that_cannot_be_read(bucket, tmp_path, monkeypatch):
         *("zip://x::/tmp/x.zip", "simplecache::file:///etc/passwd", "local:///etc/passwd"),
     ],
 )
-def test_only_buckets_are_asked_and_only_the_cache_is_written(where, monkeypatch):
+def test_other_urls_are_rejected(where, monkeypatch):
     monkeypatch.delattr("fsspec.core.url_to_fs")
-    with pytest.raises(ValueError, match="is no folder in a bucket: that is gs://bucket/folder"):
+    with pytest.raises(ValueError, match="is not a bucket URL, gs://bucket/folder"):
         hub.local(where)
 
 
-def test_a_store_whose_package_is_missing_names_our_extra(monkeypatch):
+def test_a_missing_package_names_the_extra(monkeypatch):
     def url_to_fs(url):
         raise ImportError("Please install gcsfs to access Google Storage")
 

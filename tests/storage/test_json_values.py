@@ -1,4 +1,4 @@
-"""Values of a JSON file are checked where it is read."""
+"""JSON values are checked against a schema."""
 
 import re
 
@@ -15,30 +15,30 @@ from lorasp_jax.storage.json_values import check
         *[({"a": 1, "b": None}, {"a": int}), ({"x": {"y": [0]}}, {str: {str: [int]}})],
     ],
 )
-def test_what_is_right(value, kind):
+def test_valid_values(value, kind):
     check(value, kind)
 
 
 @pytest.mark.parametrize(
-    ("value", "kind", "sentence"),
+    ("value", "kind", "message"),
     [
-        (True, int, "x must be a whole number, not True"),
-        (1.5, int, "x must be a whole number, not 1.5"),
-        (10**39, int, "x must be a whole number, not 1000"),
-        (False, float, "x must be a number, not False"),
-        (float("nan"), float, "x must be a number, not nan"),
-        (float("inf"), float, "x must be a number, not inf"),
-        ("1", float, "x must be a number, not '1'"),
-        (1, bool, "x must be a flag, not 1"),
-        (None, str, "x must be a text, not None"),
-        ({}, [int], "x must be a list, not {}"),
-        ([1], (int, int), "x must be a list of 2, not [1]"),
-        ([1, "a"], [int], "x[1] must be a whole number, not 'a'"),
-        ([], {}, "x must be an object, not []"),
+        (True, int, "x must be a whole number, got True"),
+        (1.5, int, "x must be a whole number, got 1.5"),
+        (10**39, int, "x must be a whole number, got 1000"),
+        (False, float, "x must be a number, got False"),
+        (float("nan"), float, "x must be a number, got nan"),
+        (float("inf"), float, "x must be a number, got inf"),
+        ("1", float, "x must be a number, got '1'"),
+        (1, bool, "x must be true or false, got 1"),
+        (None, str, "x must be a string, got None"),
+        ({}, [int], "x must be a list, got {}"),
+        ([1], (int, int), "x must be a list of 2, got [1]"),
+        ([1, "a"], [int], "x[1] must be a whole number, got 'a'"),
+        ([], {}, "x must be an object, got []"),
         ({"a": {}}, {"a": {"b": int}}, "x.a lacks 'b'"),
-        ({"a": {"c": 0.5}}, {str: {str: int}}, "x.a.c must be a whole number, not 0.5"),
+        ({"a": {"c": 0.5}}, {str: {str: int}}, "x.a.c must be a whole number, got 0.5"),
     ],
 )
-def test_what_is_wrong_is_named(value, kind, sentence):
-    with pytest.raises(ValueError, match=re.escape(sentence)):
+def test_invalid_values_are_named(value, kind, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
         check(value, kind, "x")

@@ -22,7 +22,7 @@ from lorasp_jax.peft import FullFineTuning
 from lorasp_jax.policies import tokenizer
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Statistics
-from lorasp_jax.storage.digest import sealed
+from lorasp_jax.storage.digest import with_digest
 from lorasp_jax.training import base, export, setup
 from tests import ROOT
 from tests.models.random_models import random_backbone
@@ -162,7 +162,7 @@ def test_a_policy_that_cannot_come_back(tmp_path, changes):
     }
     facts = {"format": native.FORMAT, "version": native.VERSION, "metadata": told | changes}
     facts |= {"base": "", "weights": {}, "methods": {}, "sha256": ""}
-    (tmp_path / "adapter.json").write_text(json.dumps(sealed(facts)))
+    (tmp_path / "adapter.json").write_text(json.dumps(with_digest(facts)))
     with pytest.raises(ValueError, match=r"does not say what its policy needs|was random"):
         export.load_policy(tmp_path)
 

@@ -13,8 +13,8 @@ from tests.runs import RESULTS, finish
     ("name", "value", "sentence"),
     [
         ("tasks", {"press": {"success": 0.5}}, "tasks.press lacks 'before'"),
-        ("tasks", 5, "tasks must be an object, not 5"),
-        ("seconds", {"train": "long"}, "seconds.train must be a number, not 'long'"),
+        ("tasks", 5, "tasks must be an object, got 5"),
+        ("seconds", {"train": "long"}, "seconds.train must be a number, got 'long'"),
         ("layer_active_rank", {"vision": [1]}, "layer_active_rank.vision must be an object"),
         ("total_parameters", None, "total_parameters must be a whole number"),
     ],

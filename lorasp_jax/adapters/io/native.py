@@ -76,7 +76,7 @@ def save_adapters(
         "methods": {path: to_settings(m) for path, m in adaptation.methods(model).items()},
         "metadata": _checked_metadata({} if metadata is None else metadata),
     }
-    text = json.dumps(digest.sealed(description), indent=2)
+    text = json.dumps(digest.with_digest(description), indent=2)
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / TENSORS, data)
     write_whole(folder / DESCRIPTION, text.encode())
@@ -282,7 +282,7 @@ def read_description(folder: pathlib.Path) -> dict[str, Any]:
         found = json.loads(read_whole(path))
         known = (found["format"], found["version"]) == (FORMAT, VERSION)
         if known:
-            found = digest.unsealed(found)
+            found = digest.verify_digest(found)
             wrong = [name for name, kind in FIELDS.items() if not isinstance(found[name], kind)]
             if wrong:
                 raise ValueError(f"its {wrong[0]} is {short(found[wrong[0]])}")

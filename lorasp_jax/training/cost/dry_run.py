@@ -42,7 +42,7 @@ def dry_run(config: Config, folder: Path, console: Console) -> None:
     """
     built = setup.build(config, folder, shapes=True)
     remote = (config.model.source, config.model.tokenizer)
-    if names := [name for name in remote if hub.is_elsewhere(name)]:
+    if names := [name for name in remote if hub.is_remote(name)]:
         console.print(f"not downloaded, its shapes suffice: {', '.join(names)}", soft_wrap=True)
     console.print(setup.headline(config, built.model))
     console.print(_parameters(built.model))

@@ -14,7 +14,7 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io.native import load_adapters, save_adapters
 from lorasp_jax.dense import Dense
 from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP
-from lorasp_jax.storage.digest import sealed
+from lorasp_jax.storage.digest import with_digest
 
 SP = LoRASP(rank=8, hidden_width=4, energy_target=0.8)
 
@@ -122,7 +122,7 @@ def test_sizes_beyond_any_memory(saved, field, size):
     del description["digest"]
     for settings in description["methods"].values():
         settings[field] = size
-    path.write_text(json.dumps(sealed(description)))
+    path.write_text(json.dumps(with_digest(description)))
     with pytest.raises(ValueError, match=r"does not fit|has shape") as caught:
         load_adapters(saved, Net(nnx.Rngs(0)))
     assert "\n" not in str(caught.value)
@@ -134,7 +134,7 @@ def resealed(old, new):
     def damage(data):
         facts = json.loads(data.replace(old, new))
         del facts["digest"]
-        return json.dumps(sealed(facts)).encode()
+        return json.dumps(with_digest(facts)).encode()
 
     return damage
 
@@ -146,8 +146,8 @@ def resealed(old, new):
         ("adapter.safetensors", lambda _: b"", "is damaged or belongs to another"),
         ("adapter.json", lambda data: data[:50], "is damaged or no adapter description"),
         ("adapter.json", lambda _: b'{"r": 8}', "is damaged or no adapter description"),
-        ("adapter.json", lambda data: data.replace(b"0.8", b"0.9"), "digest is another one"),
-        ("adapter.json", lambda data: data.replace(b'"abc"', b'"abd"'), "digest is another one"),
+        ("adapter.json", lambda data: data.replace(b"0.8", b"0.9"), "digest does not match"),
+        ("adapter.json", lambda data: data.replace(b'"abc"', b'"abd"'), "digest does not match"),
         ("adapter.json", lambda _: b"[1]", "is damaged or no adapter description"),
         ("adapter.json", lambda d: d.replace(b'"version": 2', b'"version": 9'), "of version 2"),
         ("adapter.json", resealed(b"lora_sp", b"lora_ps"), "did you mean 'lora_sp'"),

@@ -85,7 +85,7 @@ def test_published_models_need_no_download(file, monkeypatch):
     for place in ("_from_hub", "_from_bucket"):
         monkeypatch.setattr(hub, place, lambda *_: pytest.fail("it downloads"))
     config = load(ROOT / "configs" / f"{file}.py", "smoke")
-    assert all(hub.is_elsewhere(x) for x in (config.model.source, config.model.tokenizer))
+    assert all(hub.is_remote(x) for x in (config.model.source, config.model.tokenizer))
     model = dataclasses.replace(config.model, size="nano")
     optim = dataclasses.replace(config.optim, batch_size=jax.device_count())
     config = dataclasses.replace(config, model=model, optim=optim, tasks=("press",))
