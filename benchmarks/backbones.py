@@ -34,7 +34,7 @@ from lorasp_jax.models.backbone import Backbone
 from lorasp_jax.models.config import BackboneConfig, Remat
 from lorasp_jax.models.sampling import Sampler
 from lorasp_jax.training.cost import flops, preflight
-from lorasp_jax.training.cost.preflight import GIB, REMATS, abstract_batch, expected
+from lorasp_jax.training.cost.preflight import GIB, REMATS, abstract_batch, estimate_memory
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
 from lorasp_jax.training.step import init_state, train_step
@@ -66,7 +66,7 @@ def arrays(config: BackboneConfig, run: Config | None) -> tuple[Any, Any, Any]:
     """Initialize graph, adapters and frozen arrays on a device; no adapters without a run."""
 
     def model(key: jax.Array) -> Backbone:
-        return preflight.adapted(run, config, key) if run else config.create(nnx.Rngs(key))
+        return preflight.adapted_model(run, config, key) if run else config.create(nnx.Rngs(key))
 
     graphdef = adaptation.split(nnx.eval_shape(lambda: model(jax.random.key(0))))[0]
     draw = jax.jit(lambda key: adaptation.split(model(key))[1:])
@@ -137,7 +137,7 @@ def training(name: str, label: str, run: Config, options: argparse.Namespace, re
     config = sized(name, options, remat)
     step, size = Step(config, run).load(*arrays(config, run)[1:]), run.optim.batch_size
     seconds = best(step, calls=options.calls)
-    operations = preflight.operations(run, sized(name, options))
+    operations = preflight.step_flops(run, sized(name, options))
     share = flops.utilization(operations, seconds)
     return {
         "backbone": name,
@@ -147,7 +147,7 @@ def training(name: str, label: str, run: Config, options: argparse.Namespace, re
         "ms": 1e3 * seconds,
         "samples/s": size / seconds,
         "GiB": step.bytes / GIB,
-        "expected": expected(run, config).peak / GIB,
+        "expected": estimate_memory(run, config).peak / GIB,
         "TFLOP": operations / 1e12,
         "MFU": "" if share is None else share,
     }
@@ -159,7 +159,7 @@ def largest(name: str, run: Config, options: argparse.Namespace) -> int:
 
     def bytes_of(batch: int) -> float:
         optim = dataclasses.replace(run.optim, batch_size=batch)
-        return expected(dataclasses.replace(run, optim=optim), config).peak
+        return estimate_memory(dataclasses.replace(run, optim=optim), config).peak
 
     one, nine = bytes_of(1), bytes_of(9)
     each = (nine - one) / 8

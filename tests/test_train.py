@@ -39,7 +39,7 @@ def files():
         ([*MULTITASK, *NANO, "--robot", "pipper"], "unknown robot 'pipper': choose from panda"),
         ([*MULTITASK, *NANO, "--tasks", "juggle"], "unknown task 'juggle': choose from open_pot"),
         ([*MULTITASK, *NANO, "--tasks", "press", "press"], "tasks must be non-empty and unique"),
-        ([*MULTITASK, *NANO, "--model.size", "large"], "unknown size 'large'"),
+        ([*MULTITASK, *NANO, "--model.size", "large"], "unknown size 'large': choose one of"),
         ([*MULTITASK, *NANO, "--model.size", "small"], "does not match the config"),
         (
             [*MULTITASK, *NANO, "--model.backbone", "pi5"],
@@ -50,16 +50,19 @@ def files():
         ([*MULTITASK, *NANO, "--targets", "[a-z]+_prj"], "rule '[a-z]+_prj' applies to nothing"),
         ([*MULTITASK, *NANO, "--targets", "expert-onyl"], "unknown preset 'expert-onyl'"),
         ([*MULTITASK, *NANO, "--control-dt", "0.2"], "with control_dt 0.1 s, this run has 0.2"),
-        ([*MULTITASK, *NANO, "--evaluation.execute-steps", "11"], "must be 1 to the chunk, 10"),
+        (
+            [*MULTITASK, *NANO, "--evaluation.execute-steps", "11"],
+            "must be between 1 and the chunk length 10",
+        ),
         ([*MULTITASK, *NANO, "--evaluation.episodes", "24"], "must be a multiple of num_envs"),
         ([*MULTITASK, *NANO, "--optim.batch-size", "9"], "multiple of the 8 devices"),
         ([*MULTITASK, *NANO, "--fsdp", "3"], "fsdp = 3 does not divide the 8 devices"),
         (
             [*MULTITASK, *NANO, "--optim.batch-size", "24", "--optim.accumulate", "2"],
-            "multiple of the 8 devices times 2 parts, got 24",
+            "multiple of the 8 devices times 2 micro-batches, got 24",
         ),
         ([*MULTITASK, *NANO, "--optim.ema", "1"], "ema must lie in [0, 1), got 1"),
-        ([*MULTITASK, *NANO, "--method", "ada_lora", "--optim.ema", "0.9"], "has no budget"),
+        ([*MULTITASK, *NANO, "--method", "ada_lora", "--optim.ema", "0.9"], "cannot be combined"),
         ([*MULTITASK, *NANO, "--checkpoint-every", "0"], "must be at least 1, got 0"),
         ([*MULTITASK, *NANO, "--model.dtype", "float99"], "float99"),
         ([*MULTITASK, *NANO, "--name", "../up"], "must be a printable folder name"),
@@ -133,7 +136,7 @@ def test_base_without_its_control_period(content, capsys):
     elif content is not None:
         write_json(Path("base/training.json"), content)
     assert train.main([*MULTITASK, "--model.checkpoint", "base"]) == 2
-    message = r"does not say the control_dt|training.json is damaged|trained with control_dt 0.2"
+    message = r"is missing or lacks control_dt|training.json is damaged|trained with control_dt 0.2"
     assert re.search(message, capsys.readouterr().err)
 
 

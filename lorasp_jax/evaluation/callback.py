@@ -22,7 +22,7 @@ from lorasp_jax.config import Config
 from lorasp_jax.evaluation import video
 from lorasp_jax.evaluation.rollout import Result, compiled_rollout, evaluate
 from lorasp_jax.training import records
-from lorasp_jax.training.demonstrations import side_by_side
+from lorasp_jax.training.demonstrations import map_threads
 from lorasp_jax.training.random_streams import RandomStream
 from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import read_json, write_json
@@ -101,7 +101,7 @@ class Evaluation(Callback):
             evaluate_task = functools.partial(self._evaluate_task, run, when, episodes, progress)
             tasks = run.config.tasks
             # Warp is not thread-safe.
-            mapped = map if physics.default_backend() == "warp" else side_by_side
+            mapped = map if physics.default_backend() == "warp" else map_threads
             results = dict(zip(tasks, mapped(evaluate_task, tasks), strict=True))
         for task, result in results.items():
             low, high = (100 * bound for bound in result.ci95)

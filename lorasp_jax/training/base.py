@@ -1,4 +1,4 @@
-"""The frozen base of a run: loaded from a checkpoint, or random."""
+"""The frozen base of a run: loaded from a checkpoint or randomly initialized."""
 
 import dataclasses
 from pathlib import Path
@@ -19,58 +19,62 @@ from lorasp_jax.training.run_folder import read_json
 
 SIZES = ("nano", "small", "base", "nano_pi05", "base_pi05")
 TRAINING = "training.json"
-"""File beside base weights: what they were trained on, with the control period."""
+"""File next to base weights that describes their training, including the control period."""
 
 
-def base_model(config: Config, *, shapes: bool = False) -> tuple[Backbone, str]:
-    """The frozen base and its hash: loaded from the checkpoint, or random where none is named.
+def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str]:
+    """Load the frozen base, or initialize it randomly without a checkpoint; also return its hash.
 
     Args:
-        config: of the run.
-        shapes: what would be drawn or downloaded is abstract, without a hash.
+        config: configuration of the run.
+        abstract: return only shapes, and no hash, for a random or remote base.
 
     Raises:
-        ValueError: an unknown backbone or size, or a base of another one.
+        ValueError: an unknown backbone or size, or a checkpoint of a different one.
     """
-    chosen, kind = config.model, backbone.find(config.model.backbone)
-    sizes = [size for size in SIZES if hasattr(kind, size)]
-    if chosen.size not in sizes:
-        raise ValueError(f"unknown size {chosen.size!r}: it is one of {', '.join(sizes)}")
-    wanted: BackboneConfig = getattr(kind, chosen.size)()
-    unroll = wanted.unroll if chosen.unroll is None else chosen.unroll
-    kinds = {"dtype": chosen.dtype, "param_dtype": chosen.param_dtype, "unroll": unroll}
-    wanted = dataclasses.replace(wanted, **kinds)
-    if not wanted.inputs.masks_missing:
-        wanted = dataclasses.replace(wanted, cameras=wanted.cameras[: len(envs.Env.cameras)])
-    if shapes and (not chosen.source or hub.is_remote(chosen.source)):
-        return nnx.eval_shape(lambda: wanted.create(nnx.Rngs(0))), ""
-    if chosen.source:
-        found = loading.find(chosen.source)
-        wanted = dataclasses.replace(wanted, inputs=found.inputs or wanted.inputs)
-        model = found.load(wanted)
-        if found.layout == "ours":
-            _check_time(found.folder, config.control_dt)
+    options, backbone_class = config.model, backbone.find(config.model.backbone)
+    sizes = [size for size in SIZES if hasattr(backbone_class, size)]
+    if options.size not in sizes:
+        raise ValueError(f"unknown size {options.size!r}: choose one of {', '.join(sizes)}")
+    model_config: BackboneConfig = getattr(backbone_class, options.size)()
+    model_config = dataclasses.replace(
+        model_config,
+        dtype=options.dtype,
+        param_dtype=options.param_dtype,
+        unroll=model_config.unroll if options.unroll is None else options.unroll,
+    )
+    if not model_config.inputs.masks_missing:
+        cameras = model_config.cameras[: len(envs.Env.cameras)]
+        model_config = dataclasses.replace(model_config, cameras=cameras)
+    if abstract and (not options.source or hub.is_remote(options.source)):
+        return nnx.eval_shape(lambda: model_config.create(nnx.Rngs(0))), ""
+    if options.source:
+        checkpoint = loading.find(options.source)
+        inputs = checkpoint.inputs or model_config.inputs
+        model = checkpoint.load(dataclasses.replace(model_config, inputs=inputs))
+        if checkpoint.layout == "ours":
+            _check_control_dt(checkpoint.folder, config.control_dt)
         return model, models.weights_hash(model)
-    model = wanted.create(nnx.Rngs(RandomStream.BASE.key(config.seed)))
+    model = model_config.create(nnx.Rngs(RandomStream.BASE.key(config.seed)))
     return model, models.weights_hash(model)
 
 
-def changed(model: Backbone, **changes: Any) -> Backbone:
-    """The same parameters in a model whose config differs in what no parameter depends on."""
-    wanted = dataclasses.replace(model.config, **changes)
-    if wanted == model.config:
+def with_config(model: Backbone, **changes: Any) -> Backbone:
+    """Return the model with changed config fields on which no parameter depends."""
+    model_config = dataclasses.replace(model.config, **changes)
+    if model_config == model.config:
         return model
-    abstract = nnx.eval_shape(lambda: wanted.create(nnx.Rngs(0)))
+    abstract = nnx.eval_shape(lambda: model_config.create(nnx.Rngs(0)))
     return nnx.merge(nnx.graphdef(abstract), nnx.state(model))
 
 
-def _check_time(folder: Path, control_dt: float) -> None:
-    """Raise ValueError unless the base in a folder was trained at this control period."""
+def _check_control_dt(folder: Path, control_dt: float) -> None:
+    """Raise ValueError unless the base in `folder` was trained with this control period."""
     path = folder / TRAINING
-    if "control_dt" not in (told := read_json(path)):
-        raise ValueError(f"{path} does not say the control_dt that the base needs")
-    found = told["control_dt"]
-    if found != control_dt:
+    if "control_dt" not in (training := read_json(path)):
+        raise ValueError(f"{path} is missing or lacks control_dt, the control period of the base")
+    trained = training["control_dt"]
+    if trained != control_dt:
         raise ValueError(
-            f"{folder} was trained with control_dt {found} s, this run has {control_dt}"
+            f"{folder} was trained with control_dt {trained} s, this run has {control_dt}"
         )

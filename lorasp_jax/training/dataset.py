@@ -1,4 +1,4 @@
-"""A run's dataset: as a cache, made once where it is none, and what else a run asks of it."""
+"""The dataset of a run: opened, converted to a cache once, and summarized per task."""
 
 from pathlib import Path
 
@@ -16,55 +16,56 @@ from lorasp_jax.models.config import BackboneConfig
 from lorasp_jax.policies.processor import robot_slots
 
 _CACHE = Path("cache", "steps")
-_SAME_TIME = 0.01  # relative; a rate of 30 Hz has no short decimals
+_DT_TOLERANCE = 0.01  # relative; 1/30 s has no exact decimal representation
 
 
-def opened(config: Config, model: BackboneConfig, folder: Path) -> Source:
-    """The dataset of `config.data.source`, or the cache of it that the run already has.
+def open_dataset(config: Config, model: BackboneConfig, folder: Path) -> Source:
+    """Open the dataset of `config.data.source`, or the run's cache of it.
 
     Args:
-        config: the run's.
-        model: the backbone's; a LeRobot dataset's pictures are kept as large as it sees them.
-        folder: the run's.
+        config: configuration of the run.
+        model: the backbone's config; images of a LeRobot dataset are resized to its image size.
+        folder: folder of the run.
 
     Raises:
-        ValueError: it is no dataset, is damaged, or does not fit the run.
+        ValueError: not a dataset, corrupt, or incompatible with the run.
     """
-    made = folder / _CACHE
-    where = made if made.exists() else config.data.source
-    source = open_source(where, Keys(image_size=model.image_size))
-    if abs(source.control_dt / config.control_dt - 1) > _SAME_TIME:
+    cache_folder = folder / _CACHE
+    path = cache_folder if cache_folder.exists() else config.data.source
+    source = open_source(path, Keys(image_size=model.image_size))
+    if abs(source.control_dt / config.control_dt - 1) > _DT_TOLERANCE:
         raise ValueError(
-            f"{where} has {source.control_dt:.4g} s between two steps, this run has --control-dt "
-            f"{config.control_dt:g}: python -m lorasp_jax.data convert --every N takes every N-th"
+            f"{path} has a control period of {source.control_dt:.4g} s, this run has --control-dt "
+            f"{config.control_dt:g}: keep every N-th step with python -m lorasp_jax.data convert "
+            "--every N"
         )
     if len(source.cameras) > len(model.cameras):
         raise ValueError(
-            f"{where} has the cameras {', '.join(source.cameras)}, the backbone places for "
+            f"{path} has cameras {', '.join(source.cameras)}, but the backbone takes at most "
             f"{len(model.cameras)}: choose with python -m lorasp_jax.data convert --cameras"
         )
-    _check_numbers(source.episode(0, ()), model, where)
+    _check_state_and_actions(source.episode(0, ()), model, path)
     return source
 
 
-def _check_numbers(first: Episodes, model: BackboneConfig, where: object) -> None:
-    """Raise ValueError unless an episode's numbers are what a policy learns."""
+def _check_state_and_actions(first: Episodes, model: BackboneConfig, path: object) -> None:
+    """Raise ValueError unless a policy can learn from the states and actions of an episode."""
     if first.actions != "joint":
         raise ValueError(
-            f"{where} has actions of the kind {first.actions}, policies learn joint targets: "
+            f"{path} has {first.actions} actions, policies learn joint targets: "
             "collect with --actions joint"
         )
     try:
         robot_slots(first.state.shape[-1] - 1, model.inputs)
     except ValueError as error:
         raise ValueError(
-            f"{where} does not fit the backbone: {error} Choose with python -m lorasp_jax.data "
+            f"{path} does not fit the backbone: {error} Choose with python -m lorasp_jax.data "
             "convert --state-numbers and --action-numbers"
         ) from error
 
 
-def cached(source: Source, folder: Path, progress: Progress) -> Cache:
-    """A dataset as a cache in the folder of a run, unless it is one or another process made it."""
+def as_cache(source: Source, folder: Path, progress: Progress) -> Cache:
+    """Convert a dataset to a cache in the run's folder, unless that is done or it is a cache."""
     if isinstance(source, Cache):
         return source
     if not (folder / _CACHE).exists():
@@ -72,47 +73,49 @@ def cached(source: Source, folder: Path, progress: Progress) -> Cache:
     return Cache(folder / _CACHE)
 
 
-def outline(found: Cache) -> dict[str, Episodes]:
-    """A cache's numbers by task; in place of all pictures, the task's first ones."""
-    every = [found.episode(number, ()) for number in range(len(found))]
+def outline(dataset: Cache) -> dict[str, Episodes]:
+    """Return states and actions per task, with the task's first images in place of all others."""
+    every = [dataset.episode(index, ()) for index in range(len(dataset))]
     groups: dict[str, Episodes] = {}
-    for task in found.metadata["tasks"]:
-        numbers = [number for number, episode in enumerate(every) if episode.task == task]
-        groups[task] = _padded(found, [every[number] for number in numbers], numbers[0])
+    for task in dataset.metadata["tasks"]:
+        indices = [index for index, episode in enumerate(every) if episode.task == task]
+        groups[task] = _pad(dataset, [every[index] for index in indices], indices[0])
     return groups
 
 
-def _padded(found: Cache, episodes: list[Episodes], first: int) -> Episodes:
-    """Episodes of one task as one, with zeros up to the longest."""
+def _pad(dataset: Cache, episodes: list[Episodes], first: int) -> Episodes:
+    """Stack the episodes of one task, padded with zeros to the longest."""
     length = np.array([episode.num_steps for episode in episodes], np.int32)
     shape = (len(episodes), int(length.max()))
-    begin = found.episode(first).image
+    images = dataset.episode(first).image
 
     def pad(name: str) -> np.ndarray:
         rows = [np.asarray(getattr(episode, name))[0] for episode in episodes]
         padded = np.zeros((*shape, rows[0].shape[1]), np.float32)
-        for to, row in zip(padded, rows, strict=True):
-            to[: len(row)] = row
+        for target, row in zip(padded, rows, strict=True):
+            target[: len(row)] = row
         return padded
 
     return Episodes(
-        image={name: np.broadcast_to(x[0, 0], (*shape, *x.shape[2:])) for name, x in begin.items()},
+        image={
+            name: np.broadcast_to(x[0, 0], (*shape, *x.shape[2:])) for name, x in images.items()
+        },
         state=pad("state"),
         action=pad("action"),
         length=length,
         instruction=np.concatenate([episode.instruction for episode in episodes]),
-        instructions=found.instructions,
+        instructions=dataset.instructions,
         task=episodes[0].task,
         attempted=len(episodes),
-        **{name: found.metadata[name] for name in cache.METADATA},
+        **{name: dataset.metadata[name] for name in cache.METADATA},
     )
 
 
-def is_simulated(found: Cache) -> bool:
-    """Whether a dataset is of simulated tasks and a robot that can be simulated here.
+def is_simulated(dataset: Cache) -> bool:
+    """Whether a dataset was recorded in simulation, with tasks and a robot available here.
 
-    A real robot's recordings may be called as a task is, but show and say other things.
+    Matching names do not suffice: recordings of a real robot may bear the name of a task.
     """
-    known = set(names("task")), set(names("robot"))
-    is_known = set(found.metadata["tasks"]) <= known[0] and found.metadata["robot"] in known[1]
-    return is_known and found.metadata["physics_dt"] > 0
+    metadata = dataset.metadata
+    is_known = set(metadata["tasks"]) <= set(names("task")) and metadata["robot"] in names("robot")
+    return is_known and metadata["physics_dt"] > 0

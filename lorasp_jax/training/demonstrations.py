@@ -1,4 +1,4 @@
-"""Demonstrations of a run: collected once by the scripted expert, then read from its cache."""
+"""Demonstrations of a run: collected once by the scripted expert, then read from a cache."""
 
 import functools
 from collections.abc import Callable, Iterable
@@ -14,32 +14,31 @@ from lorasp_jax.config import Config
 from lorasp_jax.training.random_streams import RandomStream
 
 Progress = Callable[[str, int, int], None]
-"""Called with task, episodes done and episodes wanted."""
+"""Called with task, number of episodes collected and total."""
 
 
 def demonstrations(config: Config, folder: Path, progress: Progress) -> dict[str, Episodes]:
-    """Episodes of every task of `config`, from `folder`/cache where they are already there."""
+    """Return episodes of every task, from `folder`/cache or collected and cached there."""
     paths = [folder / "cache" / f"{task}.npz" for task in config.tasks]
-    one = functools.partial(_task_demonstrations, config, progress=progress)
-    return dict(
-        zip(config.tasks, side_by_side(one, paths, config.tasks, _keys(config)), strict=True)
-    )
+    load = functools.partial(_load_or_collect, config, progress=progress)
+    episodes = map_threads(load, paths, config.tasks, _keys(config))
+    return dict(zip(config.tasks, episodes, strict=True))
 
 
 def fresh_demonstrations(config: Config, generation: int) -> dict[str, Episodes]:
-    """Other episodes of every task for each generation, 1 and on, which no file ever holds."""
+    """Collect new episodes of every task for generation 1, 2, ...; they are not cached."""
     keys = jax.vmap(lambda key: jax.random.fold_in(key, generation))(_keys(config))
-    one = functools.partial(_collected, config)
-    return dict(zip(config.tasks, side_by_side(one, config.tasks, keys), strict=True))
+    collect = functools.partial(_collect, config)
+    return dict(zip(config.tasks, map_threads(collect, config.tasks, keys), strict=True))
 
 
 def _keys(config: Config) -> jax.Array:
-    """One for each task."""
+    """Return one random key per task."""
     return jax.random.split(RandomStream.DEMONSTRATIONS.key(config.seed), len(config.tasks))
 
 
-def side_by_side(function: Callable, *arguments: Iterable[Any]) -> list[Any]:
-    """`map` in threads, because compilation is most of the time; an interrupt does not wait."""
+def map_threads(function: Callable, *arguments: Iterable[Any]) -> list[Any]:
+    """`map` in threads, as most of the time is compilation; an interrupt does not wait for them."""
     pool = ThreadPoolExecutor()
     try:
         return list(pool.map(function, *arguments))
@@ -47,23 +46,23 @@ def side_by_side(function: Callable, *arguments: Iterable[Any]) -> list[Any]:
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _task_demonstrations(
+def _load_or_collect(
     config: Config, path: Path, task: str, key: jax.Array, *, progress: Progress
 ) -> Episodes:
-    """Episodes of one task."""
+    """Load the episodes of one task, or collect and save them."""
     if path.exists():
         return Episodes.load(path, control_dt=config.control_dt)
-    told = lambda done, total: progress(task, done, total)  # noqa: E731
-    episodes = _collected(config, task, key, told)
+    report = lambda done, total: progress(task, done, total)  # noqa: E731
+    episodes = _collect(config, task, key, report)
     path.parent.mkdir(parents=True, exist_ok=True)
     episodes.save(path)
     return episodes
 
 
-def _collected(
+def _collect(
     config: Config, task: str, key: jax.Array, progress: Callable[[int, int], None] | None = None
 ) -> Episodes:
-    """Episodes of one task from the expert."""
+    """Collect episodes of one task with the scripted expert."""
     return envs.collect(
         task,
         robot=config.robot,

@@ -194,4 +194,4 @@ def _speed(run: Run) -> Speed:
     size = run.config.optim.batch_size
     if flops.peak() is None:
         return Speed(size, None)
-    return Speed(size, preflight.operations(run.config, run.policy.model.config))
+    return Speed(size, preflight.step_flops(run.config, run.policy.model.config))

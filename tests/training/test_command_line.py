@@ -1,5 +1,6 @@
-"""Every method trains from the command line, on both backbones; published sizes at least build."""
+"""Every method trains from the command line on both backbones; configs of published sizes parse."""
 
+import functools
 from pathlib import Path
 
 import jax
@@ -22,7 +23,7 @@ COMMAND = [
 
 @pytest.fixture(scope="module")
 def demonstrations(tmp_path_factory):
-    """A folder that the first run fills and the others copy."""
+    """A cache folder that the first run fills and the others read."""
     return tmp_path_factory.mktemp("demonstrations")
 
 
@@ -31,14 +32,15 @@ def demonstrations(tmp_path_factory):
 @pytest.mark.parametrize("name", backbone.names())
 @pytest.mark.parametrize("method", peft.names())
 def test_twenty_steps(name, method, demonstrations, tmp_path, monkeypatch):
+    from lorasp_jax.training import demonstrations as collected
     from lorasp_jax.training import setup
 
-    collect = setup.demonstrations
-    monkeypatch.setattr(setup, "demonstrations", lambda c, _, p: collect(c, demonstrations, p))
+    collect = lambda c, _, p: collected.demonstrations(c, demonstrations, p)  # noqa: E731
+    monkeypatch.setattr(setup, "prepare", functools.partial(setup.prepare, collect=collect))
     monkeypatch.setattr(meshes, "make_mesh", one_device(meshes.make_mesh))
     monkeypatch.chdir(tmp_path)
-    chosen = ["--model.backbone", name, "--method", method]
-    assert train.main([*COMMAND, *chosen, "--optim.steps", "20"]) == 0
+    options = ["--model.backbone", name, "--method", method]
+    assert train.main([*COMMAND, *options, "--optim.steps", "20"]) == 0
     rows = read_metrics(Path("runs/multitask"))
     assert rows[-1]["step"] == 20
     assert all(np.isfinite(row["loss"]) for row in rows)
@@ -46,12 +48,12 @@ def test_twenty_steps(name, method, demonstrations, tmp_path, monkeypatch):
 
 
 def one_device(make):
-    """Compiles in a quarter of the time."""
+    """Use one device, which compiles in a quarter of the time."""
     return lambda fsdp, _=None: make(fsdp, jax.devices()[:1])
 
 
 @pytest.mark.parametrize("name", backbone.names())
-def test_published_sizes_are_configs_of_their_own(name):
+def test_published_models_have_their_own_configs(name):
     config = parse(["--config", f"{ROOT}/configs/multitask_{name}.py", "--scale", "smoke"]).config
     assert (config.model.backbone, config.model.size) == (name, "base")
     assert config.targets == ("paper",)
@@ -59,7 +61,7 @@ def test_published_sizes_are_configs_of_their_own(name):
     assert config.evaluation.execute_steps <= backbone.find(name).base().chunk
 
 
-def test_a_task_by_its_name():
+def test_a_task_is_chosen_by_name():
     config = parse(["--config", f"{ROOT}/configs/single_task.py", "--tasks", "pour"]).config
     assert config.tasks == ("pour",)
     assert config.peft == parse(["--config", f"{ROOT}/configs/multitask.py"]).config.peft
@@ -68,12 +70,12 @@ def test_a_task_by_its_name():
 @pytest.mark.slow
 @pytest.mark.parametrize("version", ["v21", "v3"])
 def test_a_lerobot_dataset(version, tmp_path, monkeypatch):
-    """From the files that LeRobot writes to adapters, without simulation."""
+    """Train adapters on LeRobot files, without simulation."""
     monkeypatch.setattr(meshes, "make_mesh", one_device(meshes.make_mesh))
     monkeypatch.chdir(tmp_path)
     source = str(ROOT / "tests" / "golden" / f"lerobot_{version}" / "dataset")
-    chosen = ["--model.max-tokens", "16", "--data.source", source]
-    assert train.main([*COMMAND, *chosen, "--optim.steps", "20"]) == 0
+    options = ["--model.max-tokens", "16", "--data.source", source]
+    assert train.main([*COMMAND, *options, "--optim.steps", "20"]) == 0
     first, *_, last = read_metrics(Path("runs/multitask"))
     assert last["task"] < first["task"]
     for name in ("report.html", "adapter.safetensors", "cache/steps/statistics.json"):

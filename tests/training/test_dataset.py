@@ -1,4 +1,4 @@
-"""Runs on a dataset: prepared from the command's fields, streamed from files to the bit."""
+"""Runs on a dataset: preparation from the command line, and exact streaming from files."""
 
 import dataclasses
 import functools
@@ -58,36 +58,36 @@ def test_a_streamed_run_resumes_to_the_bit(tmp_path):
 
 @pytest.mark.slow
 def test_every_step_has_the_next_batch(tmp_path):
-    """From the step on at which a run continues, in however many calls."""
+    """Starting at the step where the run resumes, for any number of calls."""
     run = streamed(tmp_path / "run")
     mesh = meshes.make_mesh()
 
     @functools.partial(jax.jit, static_argnames="count")
-    def note(frozen, raw, state, key, count):
+    def record(frozen, raw, state, key, count):
         assert count == 1
-        return state + 1, {"seen": jnp.atleast_1d(raw.state.sum() + frozen)}
+        return state + 1, {"sum": jnp.atleast_1d(raw.state.sum() + frozen)}
 
-    def seen(start, *counts):
-        stepper = StreamingStepper(note, 1.0, _batches(run, mesh, start), Speed(8, None))
-        state, found = start, []
+    def sums(start, *counts):
+        stepper = StreamingStepper(record, 1.0, _batches(run, mesh, start), Speed(8, None))
+        state, totals = start, []
         for count in counts:
             state, metrics = stepper(state, jax.random.key(0), count)
-            assert metrics["seen"].shape == (count,)
-            found += [float(metrics["seen"].sum())]
+            assert metrics["sum"].shape == (count,)
+            totals += [float(metrics["sum"].sum())]
         assert state == start + sum(counts)
-        return found
+        return totals
 
     batches = _batches(run, mesh, 0)
     each = [float(next(batches).state.sum() + 1) for _ in range(9)]
-    np.testing.assert_allclose(seen(0, 2, 4, 3), [sum(each[:2]), sum(each[2:6]), sum(each[6:])])
-    np.testing.assert_allclose(seen(5, 1, 3), [each[5], sum(each[6:])])
+    np.testing.assert_allclose(sums(0, 2, 4, 3), [sum(each[:2]), sum(each[2:6]), sum(each[6:])])
+    np.testing.assert_allclose(sums(5, 1, 3), [each[5], sum(each[6:])])
     shards = next(batches).image["side"].addressable_shards
     assert [shard.data.shape[0] for shard in shards] == [1] * 8
 
 
 @pytest.mark.slow
 def test_a_streamed_run_on_eight_devices(tmp_path):
-    """The batch is split over them; the numbers are those of one."""
+    """The batch is sharded over them; the losses equal those of one device."""
     many = streamed(tmp_path / "many", devices=8)
     train(many)
     one = streamed(tmp_path / "one")
@@ -97,25 +97,26 @@ def test_a_streamed_run_on_eight_devices(tmp_path):
         assert found["task"] == pytest.approx(expected["task"], rel=1e-5)
 
 
-def prepare(folder, monkeypatch, source, room=2**40):
+def prepare(folder, monkeypatch, source, available=2**40):
     model = random_backbone(Pi0Config.dummy())
-    monkeypatch.setattr(setup, "base_model", lambda *_, **__: (model, ""))
-    monkeypatch.setattr(preflight, "available_bytes", lambda: room)
+    monkeypatch.setattr(preflight, "available_bytes", lambda: available)
     evaluation = dataclasses.replace(CONFIG.evaluation, execute_steps=1)
     data = DataConfig(source=str(source))
     config = dataclasses.replace(CONFIG, data=data, evaluation=evaluation)
-    return setup.prepare(config, folder, Console(file=io.StringIO()), time.perf_counter())
+    console = Console(file=io.StringIO(), width=200)
+    load_base = lambda *_, **__: (model, "")  # noqa: E731
+    return setup.prepare(config, folder, console, time.perf_counter(), load_base=load_base)
 
 
-def test_prepared(tmp_path, monkeypatch):
+def test_prepare(tmp_path, monkeypatch):
     group = random_episodes("press", 0)
     group.save(tmp_path / "press.npz")
     run = prepare(tmp_path, monkeypatch, tmp_path / "press.npz")
     assert (run.config.tasks, run.config.robot, run.simulated) == (("press",), "piper", True)
     assert not run.streams
-    places = [place for place, _ in run.policy.processor.cameras]
-    said = f"cameras: side (32 x 32) as {places[0]}, wrist (32 x 32) as {places[1]}; the backbone "
-    assert said in run.console.file.getvalue()
+    slots = [slot for slot, _ in run.policy.processor.cameras]
+    summary = f"cameras: side (32 x 32) -> {slots[0]}, wrist (32 x 32) -> {slots[1]}; resized to "
+    assert summary in run.console.file.getvalue()
     expected = flatten([group])
     for name in ("state", "action", "end", "instruction"):
         np.testing.assert_array_equal(getattr(run.steps, name), getattr(expected, name))
@@ -126,13 +127,13 @@ def test_prepared(tmp_path, monkeypatch):
     monkeypatch.setattr(
         preflight, "choose_remat", lambda *_: ("none", preflight.Memory(*5 * [0.0]))
     )
-    assert not prepare(tmp_path, monkeypatch, "gone, but cached", small).streams
+    assert not prepare(tmp_path, monkeypatch, "removed, but cached", small).streams
     (tmp_path / "dataset.json").unlink()
-    assert prepare(tmp_path, monkeypatch, "gone, but cached", small // 64).streams
-    assert prepare(tmp_path, monkeypatch, "gone, but cached", small).streams  # as it began
+    assert prepare(tmp_path, monkeypatch, "removed, but cached", small // 64).streams
+    assert prepare(tmp_path, monkeypatch, "removed, but cached", small).streams  # as at the start
 
 
-def test_without_simulation_there_is_a_report(tmp_path):
+def test_a_run_without_simulation_has_a_report(tmp_path):
     run = make_run(tmp_path / "run")
     with run.timed("train"):
         pass

@@ -1,4 +1,4 @@
-"""Demonstrations are collected once and then read from the run's cache."""
+"""Demonstrations are collected once, then read from the run's cache."""
 
 import dataclasses
 import threading
@@ -7,46 +7,46 @@ import numpy as np
 import pytest
 
 import envs
-from lorasp_jax.training.demonstrations import demonstrations, side_by_side
+from lorasp_jax.training.demonstrations import demonstrations, map_threads
 from tests.runs import CONFIG, random_episodes
 
 
 def test_collected_once(tmp_path, monkeypatch):
-    asked = []
+    calls = []
 
     def collect(task, **settings):
-        asked.append((task, settings["robot"], settings["num_episodes"], settings["control_dt"]))
+        calls.append((task, settings["robot"], settings["num_episodes"], settings["control_dt"]))
         settings["progress"](3, 3)
         return random_episodes(task, len(task))
 
     monkeypatch.setattr(envs, "collect", collect)
-    seen = []
-    first = demonstrations(CONFIG, tmp_path, lambda *now: seen.append(now))
-    assert sorted(asked) == [("pick_place", "piper", 512, 0.1), ("press", "piper", 512, 0.1)]
-    assert sorted(seen) == [("pick_place", 3, 3), ("press", 3, 3)]
+    reports = []
+    first = demonstrations(CONFIG, tmp_path, lambda *now: reports.append(now))
+    assert sorted(calls) == [("pick_place", "piper", 512, 0.1), ("press", "piper", 512, 0.1)]
+    assert sorted(reports) == [("pick_place", 3, 3), ("press", 3, 3)]
     second = demonstrations(CONFIG, tmp_path, lambda *now: None)
-    assert len(asked) == 2
+    assert len(calls) == 2
     assert list(first) == list(second) == ["press", "pick_place"]
     for task, episodes in second.items():
         assert episodes.task == task
         np.testing.assert_array_equal(episodes.action, first[task].action)
 
 
-def test_cache_of_another_control_period_is_refused(tmp_path):
+def test_a_cache_with_another_control_period_is_rejected(tmp_path):
     random_episodes("press", 0).save(tmp_path / "cache" / "press.npz")
     config = dataclasses.replace(CONFIG, tasks=("press",), control_dt=0.2)
     with pytest.raises(ValueError, match=r"0\.2"):
         demonstrations(config, tmp_path, lambda *now: None)
 
 
-def test_side_by_side_keeps_order_and_does_not_wait_for_the_others():
+def test_map_threads_keeps_order_and_does_not_wait_after_an_error():
     barrier = threading.Barrier(2, timeout=20)
 
     def meet(number):
         barrier.wait()  # passes only if both run at the same time
         return number
 
-    assert side_by_side(meet, [1, 2]) == [1, 2]
+    assert map_threads(meet, [1, 2]) == [1, 2]
     release = threading.Event()
 
     def fail_or_hang(number):
@@ -55,5 +55,5 @@ def test_side_by_side_keeps_order_and_does_not_wait_for_the_others():
         release.wait(20)
 
     with pytest.raises(ValueError, match="first"):
-        side_by_side(fail_or_hang, [0, 1])
+        map_threads(fail_or_hang, [0, 1])
     release.set()

@@ -23,7 +23,7 @@ from lorasp_jax.policies import tokenizer
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.policies.processor import Statistics
 from lorasp_jax.storage.digest import with_digest
-from lorasp_jax.training import base, export, setup
+from lorasp_jax.training import base, export
 from tests import ROOT
 from tests.models.random_models import random_backbone
 from tests.runs import CONFIG, leaves, make_run
@@ -188,7 +188,7 @@ def test_base(tmp_path):
 def test_shipped_bases_load_and_say_what_they_are(path):
     backbone, size = path.name.split("_")
     chosen = ModelConfig(backbone=backbone, size=size, dtype="bfloat16")
-    model, base_hash = setup.base_model(dataclasses.replace(CONFIG, model=chosen))
+    model, base_hash = base.base_model(dataclasses.replace(CONFIG, model=chosen))
     assert base_hash == models.weights_hash(path)
     assert f"{adaptation.count(model).total:,} parameters" in (path / "README.md").read_text()
     assert model.config.dtype == "bfloat16"

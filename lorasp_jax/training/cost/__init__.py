@@ -1,1 +1,1 @@
-"""What a run will cost, and what it does."""
+"""Cost of a run: memory, floating-point operations and speed, estimated and measured."""

@@ -1,4 +1,4 @@
-"""What a run will need, from shapes alone: sizes, memory, work of a step."""
+"""Dry run: parameter counts, memory and FLOPs of a run, from shapes alone."""
 
 import dataclasses
 import functools
@@ -21,54 +21,59 @@ from lorasp_jax.dense import AdaptedLayer
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.storage import hub
 from lorasp_jax.training import loop, setup
+from lorasp_jax.training.base import base_model
 from lorasp_jax.training.cost import preflight
-from lorasp_jax.training.cost.preflight import HEADROOM, unit_of
+from lorasp_jax.training.cost.preflight import HEADROOM, byte_unit
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.optim import make_optimizer
 from lorasp_jax.training.run import Run
 from lorasp_jax.training.step import init_state
 
 
-def dry_run(config: Config, folder: Path, console: Console) -> None:
-    """Build the run, compile its training step and print what both need; writes nothing.
+def dry_run(
+    config: Config, folder: Path, console: Console, load_base: setup.LoadBase = base_model
+) -> None:
+    """Build the run, compile its training step and print their cost; writes nothing.
 
     Args:
-        config: of the run.
-        folder: the run's; read for the cache of its dataset, if that is there.
-        console: where to print.
+        config: configuration of the run.
+        folder: folder of the run; a dataset cache in it is used.
+        console: console to print on.
+        load_base: loads the frozen base and its hash.
 
     Raises:
-        ValueError: as `setup.build`.
+        ValueError: see `setup.build`.
     """
-    built = setup.build(config, folder, shapes=True)
+    built = setup.build(config, folder, abstract=True, load_base=load_base)
     remote = (config.model.source, config.model.tokenizer)
     if names := [name for name in remote if hub.is_remote(name)]:
-        console.print(f"not downloaded, its shapes suffice: {', '.join(names)}", soft_wrap=True)
+        console.print(f"not downloaded for a dry run: {', '.join(names)}", soft_wrap=True)
     console.print(setup.headline(config, built.model))
-    console.print(_parameters(built.model))
+    console.print(_parameter_table(built.model))
     run = Run(config, folder, console, built.base_hash)
-    data = _prepared(run, built)
+    data = _abstract_data(run, built)
     with messages.announced("the training step"):
         options = fast_cpu.without_simulation()
-        compiled = _lowered(run, data).compile(compiler_options=options)
-    console.print(_memory(built, _bytes(data) / _split(data), compiled.memory_analysis()))
-    operations = preflight.operations(config, built.base.config)
+        compiled = _lower(run, data).compile(compiler_options=options)
+    local_bytes = _bytes(data) / _shards(data)
+    console.print(_memory_table(built, local_bytes, compiled.memory_analysis()))
+    step_flops = preflight.step_flops(config, built.base.config)
     console.print(
-        f"a step of {config.optim.batch_size} windows: {operations / 1e12:.4g} TFLOP; "
-        f"all {config.optim.steps} steps: {operations * config.optim.steps / 1e15:.4g} PFLOP"
+        f"one step of {config.optim.batch_size} windows: {step_flops / 1e12:.4g} TFLOP; "
+        f"all {config.optim.steps} steps: {step_flops * config.optim.steps / 1e15:.4g} PFLOP"
     )
     console.print("dry run: nothing was collected, trained or written")
 
 
-def _prepared(run: Run, built: setup.Built) -> Any:
-    """Shapes of what a step is given, `Steps` or `Raw`; the run gets its policy.
+def _abstract_data(run: Run, built: setup.RunSetup) -> Any:
+    """Return the shapes of a step's data, `Steps` or `Raw`; also set the policy of the run.
 
-    Statistics are those of one episode; of the expert, which has not begun, all steps are zero, and
-    there are as many as the tasks' time limits allow.
+    The statistics are those of the dataset's first episode. Without a dataset they are those of a
+    blank step, and every demonstration is assumed to last as long as its task allows.
     """
     config, source = run.config, built.source
-    first = source.episode(0) if source else _blank(config, built)
-    limits = sum(world.max_steps for world in built.worlds)
+    first = source.episode(0) if source else _blank_episode(config, built)
+    limits = sum(env.max_steps for env in built.environments)
     count = source.num_steps if source else config.data.episodes * limits
     model = built.base.config
     relative = config.model.relative_actions
@@ -76,23 +81,23 @@ def _prepared(run: Run, built: setup.Built) -> Any:
         built.model, setup.processor([first], model, built.prompts, relative=relative)
     )
     mesh = meshes.make_mesh(config.fsdp, run.devices)
-    one = jax.eval_shape(lambda: flatten([first]))
-    steps = jax.tree.map(lambda x: jax.ShapeDtypeStruct((count, *x.shape[1:]), x.dtype), one)
-    if source is None or _bytes(steps) <= built.room:
-        return _placed(steps, meshes.replicated(mesh))
+    episode = jax.eval_shape(lambda: flatten([first]))
+    steps = jax.tree.map(lambda x: jax.ShapeDtypeStruct((count, *x.shape[1:]), x.dtype), episode)
+    if source is None or _bytes(steps) <= built.free_bytes:
+        return _with_sharding(steps, meshes.replicated(mesh))
     starts = jax.ShapeDtypeStruct((config.optim.batch_size,), jnp.int32)
     raw = jax.eval_shape(functools.partial(gather, chunk=model.chunk), steps, starts)
-    return _placed(raw, meshes.batch_sharding(mesh))
+    return _with_sharding(raw, meshes.batch_sharding(mesh))
 
 
-def _blank(config: Config, built: setup.Built) -> Episodes:
-    """One step of the first task, all zeros."""
-    world, size = built.worlds[0], config.image_size
-    numbers = np.zeros((1, 1, built.joints + 1), np.float32)
+def _blank_episode(config: Config, built: setup.RunSetup) -> Episodes:
+    """Return an episode of the first task with a single step, all zeros."""
+    env, size = built.environments[0], config.image_size
+    zeros = np.zeros((1, 1, built.joints + 1), np.float32)
     return Episodes(
-        image={name: np.zeros((1, 1, size, size, 3), np.uint8) for name in world.cameras},
-        state=numbers,
-        action=numbers,
+        image={name: np.zeros((1, 1, size, size, 3), np.uint8) for name in env.cameras},
+        state=zeros,
+        action=zeros,
         length=np.ones(1, np.int32),
         instruction=np.zeros(1, np.int32),
         instructions=tuple(built.prompts.instructions),
@@ -104,8 +109,8 @@ def _blank(config: Config, built: setup.Built) -> Episodes:
     )
 
 
-def _lowered(run: Run, data: Steps | Raw) -> Any:
-    """The steps that `loop.train` compiles first, from shapes."""
+def _lower(run: Run, data: Steps | Raw) -> Any:
+    """Lower, from shapes, the steps that `loop.train` compiles first."""
     config, model = run.config, run.policy.model
     optimizer = make_optimizer(config.optim, adaptation.methods(model).values())
     mesh = meshes.make_mesh(config.fsdp, run.devices)
@@ -113,22 +118,22 @@ def _lowered(run: Run, data: Steps | Raw) -> Any:
     state = jax.eval_shape(
         functools.partial(init_state, optimizer=optimizer, ema=config.optim.ema > 0), adapters
     )
-    placed = meshes.shardings(state, mesh)
-    frozen = jax.tree.map(_placed, frozen, meshes.shardings(frozen, mesh))
-    state = jax.tree.map(_placed, state, placed)
+    shardings = meshes.shardings(state, mesh)
+    frozen = jax.tree.map(_with_sharding, frozen, meshes.shardings(frozen, mesh))
+    state = jax.tree.map(_with_sharding, state, shardings)
     count = 1 if isinstance(data, Raw) else min(config.log_every, config.optim.steps)
-    steps = loop.jit_steps(run, graphdef, optimizer, placed)
+    steps = loop.jit_steps(run, graphdef, optimizer, shardings)
     return steps.lower(frozen, data, state, jax.random.key(0), count)
 
 
-def _placed(tree: Any, sharding: jax.sharding.Sharding) -> Any:
-    """Shapes of arrays, and where they lie."""
-    place = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding)  # noqa: E731
-    return jax.tree.map(place, tree)
+def _with_sharding(tree: Any, sharding: jax.sharding.Sharding) -> Any:
+    """Return shapes with a sharding."""
+    shape = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding)  # noqa: E731
+    return jax.tree.map(shape, tree)
 
 
-def _split(data: Steps | Raw) -> int:
-    """Devices that share the data."""
+def _shards(data: Steps | Raw) -> int:
+    """Return the number of devices that the data is sharded over."""
     return jax.device_count() if isinstance(data, Raw) else 1
 
 
@@ -136,59 +141,60 @@ def _bytes(shapes: Any) -> float:
     return float(sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(shapes)))
 
 
-def _parameters(model: nnx.Module) -> Table:
-    """Numbers of parameters by tower; the layers around the towers are its projections."""
+def _parameter_table(model: nnx.Module) -> Table:
+    """Tabulate parameter counts per tower; layers outside the towers count as projections."""
     counts: dict[str, adaptation.Counts] = {}
     for name, child in vars(model).items():
         if isinstance(child, nnx.Module):
             part = "projections" if isinstance(child, AdaptedLayer) else name
-            more, before = adaptation.count(child), counts.get(part, adaptation.Counts(0, 0))
-            counts[part] = adaptation.Counts(*map(sum, zip(more, before, strict=True)))
-    table = _table("part", "parameters", "that train", "share")
+            pair = adaptation.count(child), counts.get(part, adaptation.Counts(0, 0))
+            counts[part] = adaptation.Counts(*map(sum, zip(*pair, strict=True)))
+    table = _table("part", "parameters", "trainable", "share")
     for part, (trainable, total) in (counts | {"all": adaptation.count(model)}).items():
         table.add_row(part, f"{total:,}", f"{trainable:,}", f"{trainable / max(total, 1):.2%}")
     return table
 
 
-def _memory(built: setup.Built, data: float, program: Any) -> Table:
-    """What was expected beside what the compiled program takes, by device.
+def _memory_table(built: setup.RunSetup, data: float, analysis: Any) -> Table:
+    """Tabulate estimated memory and the compiled program's memory, per device.
 
     Args:
-        built: what was expected.
-        data: bytes of demonstrations, or of a streamed batch.
-        program: `memory_analysis` of the compiled step; None where a backend has none.
+        built: setup of the run, with the estimate.
+        data: size of the demonstrations, or of a streamed batch [bytes].
+        analysis: `memory_analysis` of the compiled step; None if the backend has none.
     """
-    expected = {"demonstrations": data, **dataclasses.asdict(built.memory)}
-    kept = ("base", "adapters", "optimizer", "demonstrations")
-    arguments = sum(expected[name] for name in kept)
-    temporaries = sum(expected[name] for name in expected if name not in kept)
+    estimate = {"demonstrations": data, **dataclasses.asdict(built.memory)}
+    resident = ("base", "adapters", "optimizer", "demonstrations")
+    arguments = sum(estimate[name] for name in resident)
+    temporaries = sum(estimate[name] for name in estimate if name not in resident)
     headroom = built.memory.peak * (1 - 1 / HEADROOM)
-    found: list[Any] = [None, None, None]
-    if program is not None:
-        takes, needs = program.argument_size_in_bytes, program.temp_size_in_bytes
-        more = program.output_size_in_bytes - program.alias_size_in_bytes
-        found = [takes, needs + more, takes + needs + more]
+    compiled: list[Any] = [None, None, None]
+    if analysis is not None:
+        inputs, temporary = analysis.argument_size_in_bytes, analysis.temp_size_in_bytes
+        temporary += analysis.output_size_in_bytes - analysis.alias_size_in_bytes
+        compiled = [inputs, temporary, inputs + temporary]
     peak = arguments + temporaries + headroom
-    unit, name = unit_of(max(peak, found[2] or 0))
+    unit, name = byte_unit(max(peak, compiled[2] or 0))
 
     def add(part: str, *values: float | None) -> None:
         table.add_row(part, *("not reported" if v is None else f"{v / unit:.3f}" for v in values))
 
-    table = _table(f"{name} of {built.available / unit:,.0f} a device", "expected", "compiled")
-    for part in kept:
-        add(f"  {part}", expected[part])
-    add("arguments", arguments, found[0])
+    title = f"{name} per device, {built.available / unit:,.0f} available"
+    table = _table(title, "estimated", "compiled")
+    for part in resident:
+        add(f"  {part}", estimate[part])
+    add("arguments", arguments, compiled[0])
     for part in ("gradients", "activations"):
-        add(f"  {part}", expected[part])
+        add(f"  {part}", estimate[part])
     add("  headroom", headroom)
-    add("temporary", temporaries + headroom, found[1])
-    add("peak", peak, found[2])
+    add("temporary", temporaries + headroom, compiled[1])
+    add("peak", peak, compiled[2])
     return table
 
 
-def _table(first: str, *numbers: str) -> Table:
-    """An empty table whose columns but the first hold numbers."""
+def _table(first: str, *numeric: str) -> Table:
+    """Create an empty table with a text column followed by right-aligned numeric columns."""
     table = Table(first)
-    for name in numbers:
+    for name in numeric:
         table.add_column(name, justify="right")
     return table

@@ -1,8 +1,8 @@
-"""Floating-point operations of a JAX function: those of its matrix products, as it is traced.
+"""Count the FLOPs (floating-point operations) of a JAX function's matrix products in its jaxpr.
 
-Model FLOP utilisation is this number a second over the device's peak (Chowdhery et al., arXiv
-2204.02311, appendix B). Trace the function without rematerialisation: what the backward pass
-computes again does not count as work. Elementwise operations are left out.
+Model FLOPs utilization is this count per second divided by the device's peak (Chowdhery et al.,
+arXiv 2204.02311, appendix B). Trace the function without rematerialization: recomputation in the
+backward pass does not count as work. Elementwise operations are not counted.
 """
 
 import math
@@ -14,33 +14,33 @@ import jax
 from lorasp_jax import _compat
 
 PEAK = {"NVIDIA H200": 989e12, "NVIDIA H100": 989e12, "NVIDIA A100": 312e12, "TPU v5p": 459e12}
-"""Dense bf16 operations a second by how a device's name begins (NVIDIA's and Google's data sheets,
-SXM and without sparsity)."""
+"""Dense bf16 FLOP/s by prefix of the device name (NVIDIA's and Google's data sheets; SXM variants,
+without sparsity)."""
 
 _CUDNN = {"dot_product_attention_fwd_wrapper": 4, "dot_product_attention_bwd_wrapper": 8}
-"""Operations of attention by cuDNN, B N T S H of them: two products forwards, four backwards (a
-fifth repeats one)."""
+"""FLOPs of cuDNN attention in units of B N T S H: two matrix products in the forward pass, four in
+the backward pass (a fifth recomputes one)."""
 
 
 def count(function: Callable, *arguments: Any) -> float:
-    """Operations of one call, two for each multiplication and addition; none for what is not used.
+    """Count the FLOPs of one call, two per multiply-add; unused results are not counted.
 
     Args:
-      function: what `jax.jit` takes.
-      arguments: arrays, or `jax.ShapeDtypeStruct`s; only shapes are read.
+      function: a function that `jax.jit` accepts.
+      arguments: arrays or `jax.ShapeDtypeStruct`s; only shapes and dtypes matter.
     """
     jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
     return _of_jaxpr(_compat.without_unused(jaxpr, [True] * len(jaxpr.outvars))[0])
 
 
-def utilisation(operations: float, seconds: float) -> float | None:
-    """Share of the first device's peak, or None where that is not known."""
-    fastest = peak()
-    return fastest and operations / seconds / fastest
+def utilization(flop_count: float, seconds: float) -> float | None:
+    """Return the fraction of the first device's peak; None if the peak is unknown."""
+    peak_flops = peak()
+    return peak_flops and flop_count / seconds / peak_flops
 
 
 def peak() -> float | None:
-    """Operations a second that the first device can do, see `PEAK`; None where not known."""
+    """Return the peak FLOP/s of the first device, see `PEAK`; None if unknown."""
     kind = jax.devices()[0].device_kind
     return next((value for name, value in PEAK.items() if kind.startswith(name)), None)
 
@@ -61,7 +61,7 @@ def _of_equation(equation: Any) -> float:
         return float(_CUDNN[name] * batch * heads * tokens * key[1] * size)
     if name == "cond":
         return max(_of_jaxpr(branch.jaxpr) for branch in params["branches"])
-    if name == "while":  # how often is not known: once
+    if name == "while":  # the number of iterations is unknown: count one
         return _of_jaxpr(params["body_jaxpr"].jaxpr)
     inner = [getattr(value, "jaxpr", value) for value in params.values()]
     once = sum(_of_jaxpr(jaxpr) for jaxpr in inner if hasattr(jaxpr, "eqns"))

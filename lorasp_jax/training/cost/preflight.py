@@ -1,8 +1,8 @@
-"""What a training step will need of the device's memory, from shapes alone, before compilation.
+"""Estimate the device memory of a training step from shapes alone, before compilation.
 
-The base, the adapters, their gradients and the optimizer's state are counted exactly; activations
-are what JAX stores for the backward pass, which XLA can only lessen. What a layer needs while it
-runs comes on top: `HEADROOM`.
+Base, adapters, gradients and optimizer state are counted exactly. Activations are the residuals
+that JAX saves for the backward pass, an upper bound that XLA may reduce. `HEADROOM` covers the
+temporaries of a layer.
 """
 
 import dataclasses
@@ -28,19 +28,19 @@ from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
 from lorasp_jax.training.step import Metrics, init_state, loss_fn
 
 HEADROOM = 1.1
-"""Factor on the sum for what is not counted: temporary arrays, the compiled program, fragments."""
+"""Factor on the sum for memory that is not counted: temporaries, executable, fragmentation."""
 REMATS: tuple[Remat, ...] = ("none", "products", "full")
 GIB, MIB = 2**30, 2**20
 
 
-def unit_of(size: float) -> tuple[int, str]:
-    """In what to tell so many bytes, and its name: GiB, or MiB where that would be mostly zeros."""
+def byte_unit(size: float) -> tuple[int, str]:
+    """Return the unit (bytes, name) in which to print `size` bytes: GiB, or MiB below 1 GiB."""
     return (GIB, "GiB") if size >= GIB else (MIB, "MiB")
 
 
 @dataclasses.dataclass(frozen=True)
 class Memory:
-    """Bytes on one device."""
+    """Memory of one device [bytes]."""
 
     base: float
     adapters: float
@@ -50,24 +50,24 @@ class Memory:
 
     @property
     def peak(self) -> float:
-        """What to expect at the worst moment."""
+        """Estimated peak memory."""
         return HEADROOM * sum(dataclasses.astuple(self))
 
     def __str__(self) -> str:
-        """All parts, in the unit that suits the sum."""
-        unit, name = unit_of(self.peak)
+        """List all parts and the peak in GiB or MiB."""
+        unit, name = byte_unit(self.peak)
         parts = [f"{part} {value / unit:.2f}" for part, value in dataclasses.asdict(self).items()]
         return f"{', '.join(parts)}, peak {self.peak / unit:.2f} {name}"
 
 
 class AbstractStep(NamedTuple):
-    """What a training step differentiates, for a look at it without arrays.
+    """Loss function of a training step and the shapes of its inputs.
 
     Attributes:
-        loss: function of the other three that gives the loss and its metrics.
-        adapters: shapes of what trains.
-        frozen: of the base.
-        batch: of what the step sees.
+        loss: (adapters, frozen, batch) -> loss, metrics.
+        adapters: shapes of the trainable parameters.
+        frozen: shapes of the frozen parameters.
+        batch: shapes of the batch.
     """
 
     loss: Callable[[Any, Any, Batch], tuple[jax.Array, Metrics]]
@@ -76,111 +76,115 @@ class AbstractStep(NamedTuple):
     batch: Batch
 
 
-def choose_remat(config: Config, wanted: BackboneConfig, available: float) -> tuple[Remat, Memory]:
-    """The least rematerialisation that fits into `available` bytes a device, and what it needs.
+def choose_remat(
+    config: Config, backbone: BackboneConfig, available: float
+) -> tuple[Remat, Memory]:
+    """Return the least rematerialization that fits in `available` bytes per device, and its memory.
 
     Raises:
-        ValueError: nothing that the config allows fits; says what would help.
+        ValueError: no allowed setting fits; the message suggests changes.
     """
-    asked = config.model.remat
-    choices = REMATS if asked == "auto" else (asked,)
-    for remat in choices:
-        memory = expected(config, dataclasses.replace(wanted, remat=remat))
+    remat = config.model.remat
+    choices = REMATS if remat == "auto" else (remat,)
+    for choice in choices:
+        memory = estimate_memory(config, dataclasses.replace(backbone, remat=choice))
         if memory.peak <= available:
-            return remat, memory
-    raise ValueError(_refusal(config, memory, choices[-1], available))
+            return choice, memory
+    raise ValueError(_out_of_memory_message(config, memory, choices[-1], available))
 
 
-def _refusal(config: Config, memory: Memory, remat: Remat, available: float) -> str:
-    """Why a run cannot begin, and what would help."""
+def _out_of_memory_message(config: Config, memory: Memory, remat: Remat, available: float) -> str:
+    """Return an error message that suggests settings which need less memory."""
     batch, fixed = config.optim.batch_size, memory.peak - HEADROOM * memory.activations
     fitting = math.floor(batch * (available - fixed) / (memory.peak - fixed))
     fitting -= fitting % (jax.device_count() * config.optim.accumulate)
     hints = [f"--optim.batch-size {fitting}"] if 0 < fitting < batch else []
-    parts = 2 * config.optim.accumulate
-    if batch % (jax.device_count() * parts) == 0:
-        hints += [f"--optim.accumulate {parts}"]
+    accumulate = 2 * config.optim.accumulate
+    if batch % (jax.device_count() * accumulate) == 0:
+        hints += [f"--optim.accumulate {accumulate}"]
     hints += ["--model.remat full"] if remat != "full" else []
     hints += ["--model.param-dtype bfloat16"] if config.model.param_dtype != "bfloat16" else []
-    hints += [f"--fsdp {2 * config.fsdp} on as many devices"]
+    hints += [f"--fsdp {2 * config.fsdp} on {2 * config.fsdp} or more devices"]
     return (
-        f"this run needs about {memory.peak / GIB:.1f} GiB of memory and there are "
-        f"{available / GIB:.1f} ({memory}); try {', '.join(hints)}"
+        f"this run needs about {memory.peak / GIB:.1f} GiB per device, but only "
+        f"{available / GIB:.1f} GiB are available ({memory}); try {', '.join(hints)}"
     )
 
 
-def expected(config: Config, wanted: BackboneConfig) -> Memory:
-    """Memory of one training step; large arrays are split over `config.fsdp` devices.
+def estimate_memory(config: Config, backbone: BackboneConfig) -> Memory:
+    """Estimate the memory of one training step, sharded over `config.fsdp` devices.
 
     Args:
-        config: the run.
-        wanted: the backbone's config.
+        config: configuration of the run.
+        backbone: config of the backbone.
     """
-    own = max(1, config.optim.batch_size // jax.device_count())
-    step = abstract_step(config, wanted, max(1, own // config.optim.accumulate))
+    local_batch = max(1, config.optim.batch_size // jax.device_count())
+    step = abstract_step(config, backbone, max(1, local_batch // config.optim.accumulate))
     optimizer = make_optimizer(config.optim, {config.peft.as_saved})
 
-    start = functools.partial(init_state, optimizer=optimizer, ema=config.optim.ema > 0)
+    init = functools.partial(init_state, optimizer=optimizer, ema=config.optim.ema > 0)
 
-    def stored(adapters: Any, frozen: Any, batch: Batch) -> Any:
+    def vjp(adapters: Any, frozen: Any, batch: Batch) -> Any:
         return jax.vjp(lambda a: step.loss(a, frozen, batch), adapters, has_aux=True)[1]
 
-    jaxpr = jax.make_jaxpr(stored)(step.adapters, step.frozen, step.batch).jaxpr
-    kept = {id(v): v.aval for v in jaxpr.outvars}
-    for variable in (*jaxpr.invars, *jaxpr.constvars):  # there anyway
-        kept.pop(id(variable), None)
-    held = functools.partial(meshes.bytes_on_device, fsdp=config.fsdp)
-    adapters = held(step.adapters)
+    jaxpr = jax.make_jaxpr(vjp)(step.adapters, step.frozen, step.batch).jaxpr
+    residuals = {id(v): v.aval for v in jaxpr.outvars}
+    for variable in (*jaxpr.invars, *jaxpr.constvars):  # inputs are counted separately
+        residuals.pop(id(variable), None)
+    local_bytes = functools.partial(meshes.bytes_on_device, fsdp=config.fsdp)
+    adapters = local_bytes(step.adapters)
     return Memory(
-        base=held(step.frozen),
+        base=local_bytes(step.frozen),
         adapters=adapters,
         gradients=adapters * (1 if config.optim.accumulate == 1 else 2),
-        optimizer=held(jax.eval_shape(start, step.adapters)) - adapters,
-        activations=_bytes(list(kept.values())) + _bytes(abstract_batch(wanted, own)),
+        optimizer=local_bytes(jax.eval_shape(init, step.adapters)) - adapters,
+        activations=_bytes(list(residuals.values()))
+        + _bytes(abstract_batch(backbone, local_batch)),
     )
 
 
-def adapted(config: Config, wanted: BackboneConfig, key: jax.Array) -> Backbone:
-    """A random model with the run's adapters; works under `nnx.eval_shape`."""
+def adapted_model(config: Config, backbone: BackboneConfig, key: jax.Array) -> Backbone:
+    """Create a random model with the run's adapters; works under `nnx.eval_shape`."""
     base, adapters = (nnx.Rngs(k) for k in jax.random.split(key))
     rules = presets.rules(config.targets, config.peft.as_saved)
-    return adaptation.adapt(wanted.create(base), rules, rngs=adapters)
+    return adaptation.adapt(backbone.create(base), rules, rngs=adapters)
 
 
-def abstract_model(config: Config, wanted: BackboneConfig) -> Backbone:
-    """The shapes of `adapted`."""
-    return nnx.eval_shape(lambda: adapted(config, wanted, jax.random.key(0)))
+def abstract_model(config: Config, backbone: BackboneConfig) -> Backbone:
+    """Return `adapted_model` with shapes in place of arrays."""
+    return nnx.eval_shape(lambda: adapted_model(config, backbone, jax.random.key(0)))
 
 
-def abstract_step(config: Config, wanted: BackboneConfig, batch_size: int) -> AbstractStep:
-    """The loss of a run, whose auxiliary losses weigh nothing, and shapes of what it takes."""
-    graphdef, adapters, frozen = adaptation.split(abstract_model(config, wanted))
+def abstract_step(config: Config, backbone: BackboneConfig, batch_size: int) -> AbstractStep:
+    """Return the run's loss, with auxiliary weights of zero, and the shapes of its inputs."""
+    graphdef, adapters, frozen = adaptation.split(abstract_model(config, backbone))
     weights: Any = dict.fromkeys(auxiliary_weights(config.auxiliary, 1), 0.0)
 
     def loss(adapters: Any, frozen: Any, batch: Batch) -> tuple[jax.Array, Metrics]:
         return loss_fn(adapters, frozen, graphdef, batch, jax.random.key(0), weights)
 
-    return AbstractStep(loss, adapters, frozen, abstract_batch(wanted, batch_size))
+    return AbstractStep(loss, adapters, frozen, abstract_batch(backbone, batch_size))
 
 
-def operations(config: Config, wanted: BackboneConfig) -> float:
-    """Floating-point operations of one training step over all devices, nothing counted twice."""
-    step = abstract_step(config, dataclasses.replace(wanted, remat="none"), config.optim.batch_size)
+def step_flops(config: Config, backbone: BackboneConfig) -> float:
+    """Count the FLOPs of one training step over all devices, without recomputation."""
+    backbone = dataclasses.replace(backbone, remat="none")
+    step = abstract_step(config, backbone, config.optim.batch_size)
     gradient = jax.grad(step.loss, has_aux=True)
     return flops.count(gradient, step.adapters, step.frozen, step.batch)
 
 
 def abstract_batch(config: BackboneConfig, size: int) -> Batch:
-    """Shapes of a batch of `size` windows."""
+    """Return the shapes of a batch of `size` windows."""
     shape = (size, config.chunk, config.action_dim)
     actions: Any
     mask: Any
-    actions, mask = (jax.ShapeDtypeStruct(shape, kind) for kind in ("float32", "bool"))
+    actions, mask = (jax.ShapeDtypeStruct(shape, dtype) for dtype in ("float32", "bool"))
     return Batch(abstract_observation(config, size), actions, mask)
 
 
 def available_bytes() -> float:
-    """Memory of the first device that JAX may use; of the machine on a CPU, shared by devices."""
+    """Return JAX's memory limit on the first device; on CPU, host memory per device."""
     stats = jax.local_devices()[0].memory_stats()
     if stats and "bytes_limit" in stats:
         return float(stats["bytes_limit"])

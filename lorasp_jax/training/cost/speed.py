@@ -1,6 +1,6 @@
-"""How fast a run trains, what it waits for and what memory it holds, by log interval.
+"""Throughput, data wait and memory use per log interval.
 
-Nothing here waits for the device: an interval ends where its metrics were read anyway.
+Nothing here blocks on the device: an interval ends when its metrics have been read anyway.
 """
 
 import contextlib
@@ -15,62 +15,62 @@ from lorasp_jax.training.cost.preflight import GIB
 
 
 class Speed:
-    """The clock of a run; it stands still between two intervals, and while a program compiles."""
+    """Meter of training speed; it is paused between intervals and during compilation."""
 
-    def __init__(self, batch_size: int, operations: float | None) -> None:
-        """Not yet begun.
+    def __init__(self, batch_size: int, step_flops: float | None) -> None:
+        """Create a meter that has not started.
 
         Args:
-            batch_size: windows a step, over all devices.
-            operations: floating-point operations a step, over all devices; None: not counted.
+            batch_size: windows per step, over all devices.
+            step_flops: FLOPs per step, over all devices; None: not counted.
         """
-        self._batch_size, self._operations = batch_size, operations
-        self._began: float | None = None
-        self._waited: float | None = None
+        self._batch_size, self._step_flops = batch_size, step_flops
+        self._start: float | None = None
+        self._wait: float | None = None
 
     def begin(self) -> None:
-        """Start the clock, unless it runs."""
-        if self._began is None:
-            self._began = time.perf_counter()
+        """Start the clock unless it is running."""
+        if self._start is None:
+            self._start = time.perf_counter()
 
     @contextlib.contextmanager
     def waiting(self, results: Any) -> Iterator[None]:
-        """In this block the host waits for the next batch.
+        """Measure the time in this block, in which the host waits for the next batch.
 
-        The time counts if the device has nothing left to do at the end of it: until then it still
-        works on what the host gave it ahead.
+        It counts only if the device is idle at its end, having finished all steps dispatched so
+        far.
 
         Args:
-            results: any tree of arrays of the last step that the device was given.
+            results: pytree of arrays computed by the last dispatched step.
         """
-        began = time.perf_counter()
+        start = time.perf_counter()
         yield
         idle = all(array.is_ready() for array in jax.tree.leaves(results))
-        self._waited = (self._waited or 0.0) + idle * (time.perf_counter() - began)
+        self._wait = (self._wait or 0.0) + idle * (time.perf_counter() - start)
 
     def end(self, steps: int) -> dict[str, float]:
-        """Stop the clock after so many steps, and give what is known of them.
+        """Stop the clock after `steps` steps and return the metrics of the interval.
 
         Returns:
-            `speed/samples_per_second`; `speed/flop_utilisation`, where operations are counted and
-            the device's peak is known; `speed/data_wait`, share of the time in which the device
-            waited for data, of runs that stream or replace them; `memory/in_use_gib` and
-            `memory/peak_gib` of the first device of this process, where it reports them.
+            `speed/samples_per_second`; `speed/flop_utilisation`, if FLOPs are counted and the
+            device's peak is known; `speed/data_wait`, the fraction of the time that the device
+            waited for data, for runs that stream or replace it; `memory/in_use_gib` and
+            `memory/peak_gib` of this process's first device, if it reports them.
         """
-        assert self._began is not None
-        seconds = time.perf_counter() - self._began
-        found = {"speed/samples_per_second": steps * self._batch_size / seconds}
-        if self._operations is not None:
-            share = flops.utilisation(steps * self._operations / jax.device_count(), seconds)
-            found |= {} if share is None else {"speed/flop_utilisation": share}
-        if self._waited is not None:
-            found["speed/data_wait"] = self._waited / seconds
-        self._began = self._waited = None
-        return found | memory()
+        assert self._start is not None
+        seconds = time.perf_counter() - self._start
+        metrics = {"speed/samples_per_second": steps * self._batch_size / seconds}
+        if self._step_flops is not None:
+            share = flops.utilization(steps * self._step_flops / jax.device_count(), seconds)
+            metrics |= {} if share is None else {"speed/flop_utilisation": share}
+        if self._wait is not None:
+            metrics["speed/data_wait"] = self._wait / seconds
+        self._start = self._wait = None
+        return metrics | memory()
 
 
 def memory() -> dict[str, float]:
-    """Memory in use and its highest so far [GiB]; nothing where the device does not report it."""
+    """Return current and peak memory use [GiB]; {} if the device does not report them."""
     stats = jax.local_devices()[0].memory_stats() or {}
     names = {"memory/in_use_gib": "bytes_in_use", "memory/peak_gib": "peak_bytes_in_use"}
     return {name: stats[key] / GIB for name, key in names.items() if key in stats}

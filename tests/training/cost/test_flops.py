@@ -1,4 +1,4 @@
-"""Operations counted by hand, and against XLA's own count."""
+"""FLOPs compared with counts by hand and with XLA's own count."""
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ def layers(x, w):
         (jnp.matmul, (X, W), PRODUCT),
         (jax.jit(lambda x, w: jnp.tanh(x @ w)), (X, W), PRODUCT),
         (layers, (X, jnp.ones((4, 8, 8))), 4 * 2 * 6 * 8 * 8),
-        (jax.grad(lambda w: (X @ w).sum()), (W,), PRODUCT),  # the sum itself is not used
+        (jax.grad(lambda w: (X @ w).sum()), (W,), PRODUCT),  # the sum itself is unused
         (jax.grad(lambda w: jnp.square(X @ w).sum()), (W,), 2 * PRODUCT),
         (lambda x, w: jax.lax.cond(x.sum() > 0, lambda: x @ w, lambda: x[:, :5]), (X, W), PRODUCT),
         (lambda x: jnp.einsum("bij,bkj->bik", x, x), (jnp.ones((3, 4, 5)),), 2 * 3 * 4 * 4 * 5),
@@ -35,11 +35,11 @@ def test_counted_by_hand(function, arguments, expected):
     assert flops.count(function, *arguments) == expected
 
 
-def test_shapes_are_enough():
+def test_shapes_suffice():
     assert flops.count(jnp.matmul, jax.ShapeDtypeStruct((6, 8), "bfloat16"), W) == PRODUCT
 
 
-def test_a_backbone_needs_what_xla_says():
+def test_a_backbone_agrees_with_xla():
     config = Pi0Config.nano()
     model, obs = random_backbone(config), observation(config, 2)
     actions = jnp.zeros((2, config.chunk, config.action_dim))
@@ -48,8 +48,10 @@ def test_a_backbone_needs_what_xla_says():
         return model.loss(jax.random.key(0), obs, actions)[0].mean()
 
     xla = jax.jit(loss).lower(model, obs).cost_analysis()["flops"]
-    assert 0.75 * xla < flops.count(loss, model, obs) < xla  # XLA counts elementwise work too
+    assert (
+        0.75 * xla < flops.count(loss, model, obs) < xla
+    )  # XLA also counts elementwise operations
 
 
-def test_utilisation_needs_a_known_device():
-    assert flops.utilisation(1e12, 1.0) is None  # a CPU
+def test_utilization_needs_a_known_device():
+    assert flops.utilization(1e12, 1.0) is None  # a CPU

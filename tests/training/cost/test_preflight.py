@@ -1,4 +1,4 @@
-"""What a step needs of memory: exact where it can be; one sentence where it cannot fit."""
+"""Estimated memory of a step: exact for parameters, and a one-line error if it cannot fit."""
 
 import dataclasses
 import functools
@@ -16,27 +16,27 @@ TINY = dataclasses.replace(Pi0Config.dummy(), vision=Pi0Config.nano().vision, im
 
 
 @pytest.fixture(scope="module", autouse=True)
-def once():
-    """The same question is traced once for all tests."""
+def cached_estimates():
+    """Trace each config only once for all tests."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(preflight, "expected", functools.cache(preflight.expected))
+        patch.setattr(preflight, "estimate_memory", functools.cache(preflight.estimate_memory))
         yield
 
 
 @pytest.fixture(scope="module")
-def memory(once):
+def memory(cached_estimates):
     return {
-        remat: preflight.expected(CONFIG, dataclasses.replace(TINY, remat=remat))
+        remat: preflight.estimate_memory(CONFIG, dataclasses.replace(TINY, remat=remat))
         for remat in preflight.REMATS
     }
 
 
-def test_what_is_stored_is_exact(memory):
+def test_parameter_memory_is_exact(memory):
     found = memory["none"]
     assert found.gradients == found.adapters
     assert 2 * found.adapters < found.optimizer < 2 * found.adapters + 100  # moments, counters
-    full = preflight.expected(dataclasses.replace(CONFIG, peft=FullFineTuning()), TINY)
-    half = preflight.expected(CONFIG, dataclasses.replace(TINY, param_dtype="bfloat16"))
+    full = preflight.estimate_memory(dataclasses.replace(CONFIG, peft=FullFineTuning()), TINY)
+    half = preflight.estimate_memory(CONFIG, dataclasses.replace(TINY, param_dtype="bfloat16"))
     assert full.base == 0
     assert full.adapters == found.base == 2 * half.base
 
@@ -45,41 +45,41 @@ def test_activations_grow_with_the_batch_and_shrink_with_remat(memory):
     none, products, full = (memory[remat].activations for remat in preflight.REMATS)
     assert none > 1.5 * products > 2 * full > 0
     optim = dataclasses.replace(CONFIG.optim, batch_size=128)
-    twice = preflight.expected(dataclasses.replace(CONFIG, optim=optim), TINY)
+    twice = preflight.estimate_memory(dataclasses.replace(CONFIG, optim=optim), TINY)
     assert twice.activations == pytest.approx(2 * none, rel=0.1)
 
 
-def test_parts_of_a_batch_and_an_average(memory):
+def test_gradient_accumulation_and_ema(memory):
     none = memory["none"]
     optim = dataclasses.replace(CONFIG.optim, accumulate=4, ema=0.5)
-    found = preflight.expected(dataclasses.replace(CONFIG, optim=optim), TINY)
-    assert found.gradients == 2 * none.gradients  # of a part, and their sum
+    found = preflight.estimate_memory(dataclasses.replace(CONFIG, optim=optim), TINY)
+    assert found.gradients == 2 * none.gradients  # of a micro-batch, and the sum
     assert found.optimizer == none.optimizer + none.adapters
     assert found.activations < 0.5 * none.activations
 
 
-def test_the_first_that_fits_is_chosen(memory):
+def test_the_least_rematerialization_that_fits_is_chosen(memory):
     for remat in preflight.REMATS:
         assert preflight.choose_remat(CONFIG, TINY, memory[remat].peak)[0] == remat
-    asked = dataclasses.replace(CONFIG, model=ModelConfig(remat="full"))
-    assert preflight.choose_remat(asked, TINY, memory["none"].peak)[0] == "full"
+    full = dataclasses.replace(CONFIG, model=ModelConfig(remat="full"))
+    assert preflight.choose_remat(full, TINY, memory["none"].peak)[0] == "full"
 
 
-def test_what_cannot_fit_is_refused_with_a_batch_that_does(memory):
-    room = (memory["full"].peak + preflight.HEADROOM * memory["full"].base) / 2
+def test_a_run_that_cannot_fit_suggests_a_batch_that_does(memory):
+    available = (memory["full"].peak + preflight.HEADROOM * memory["full"].base) / 2
     with pytest.raises(ValueError, match=r"needs about .* try --optim.batch-size") as caught:
-        preflight.choose_remat(CONFIG, TINY, room)
+        preflight.choose_remat(CONFIG, TINY, available)
     assert "--optim.accumulate 2, " in str(caught.value)
     assert "--fsdp 2" in str(caught.value)
     assert "\n" not in str(caught.value)
     size = int(str(caught.value).partition("--optim.batch-size ")[2].partition(",")[0])
     assert size % jax.device_count() == 0
     smaller = dataclasses.replace(CONFIG, optim=OptimConfig(batch_size=size))
-    assert preflight.choose_remat(smaller, TINY, room)[0] == "full"
+    assert preflight.choose_remat(smaller, TINY, available)[0] == "full"
 
 
-def test_a_batch_is_proposed_that_its_parts_can_share(memory, monkeypatch):
-    monkeypatch.setattr(preflight, "expected", lambda *_: memory["full"])
+def test_the_suggested_batch_is_a_multiple_of_the_micro_batches(memory, monkeypatch):
+    monkeypatch.setattr(preflight, "estimate_memory", lambda *_: memory["full"])
     optim = OptimConfig(batch_size=64, accumulate=4)
     config = dataclasses.replace(CONFIG, optim=optim, model=ModelConfig(remat="full"))
     fixed = memory["full"].peak - preflight.HEADROOM * memory["full"].activations

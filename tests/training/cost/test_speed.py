@@ -1,4 +1,4 @@
-"""Throughput, waiting, memory: what is logged beside the losses."""
+"""Logged throughput, data wait and memory use."""
 
 import re
 from types import SimpleNamespace
@@ -14,7 +14,7 @@ from lorasp_jax.training.stepper import Stepper
 
 @pytest.fixture
 def clock(monkeypatch):
-    """A clock that is set by hand."""
+    """A clock that the test advances."""
     now = SimpleNamespace(seconds=100.0)
     monkeypatch.setattr(speed.time, "perf_counter", lambda: now.seconds)
     return now
@@ -28,7 +28,7 @@ def test_log_intervals(clock, monkeypatch):
     monkeypatch.setattr(jax, "devices", device)
     monkeypatch.setattr(jax, "device_count", lambda: 2)
     peak = flops.PEAK["NVIDIA H100"]
-    timer = Speed(batch_size=8, operations=0.5 * peak)
+    timer = Speed(batch_size=8, step_flops=0.5 * peak)
     for interval in range(2):
         clock.seconds += 7 * interval  # between two intervals
         timer.begin()
@@ -41,8 +41,8 @@ def test_log_intervals(clock, monkeypatch):
         assert "speed/data_wait" not in found
 
 
-def test_waiting_counts_where_the_device_had_nothing_to_do(clock):
-    timer = Speed(batch_size=8, operations=None)
+def test_waiting_counts_only_if_the_device_is_idle(clock):
+    timer = Speed(batch_size=8, step_flops=None)
     for times in range(2):
         timer.begin()
         for ready in (False, True, False):
@@ -53,7 +53,7 @@ def test_waiting_counts_where_the_device_had_nothing_to_do(clock):
         assert "speed/flop_utilisation" not in found
 
 
-def test_memory_where_it_is_reported(monkeypatch):
+def test_memory_if_the_device_reports_it(monkeypatch):
     assert speed.memory() == {}  # a CPU
     memory = device(bytes_in_use=2**30, peak_bytes_in_use=3 * 2**29, num_allocs=4)
     monkeypatch.setattr(jax, "local_devices", lambda: memory)
@@ -62,13 +62,12 @@ def test_memory_where_it_is_reported(monkeypatch):
     assert speed.memory() == {}
 
 
-def test_the_terminal_tells_what_compiles(capsys, monkeypatch):
-    """In words, for how long, and that it is the first time only."""
+def test_compilation_is_announced_once(capsys, monkeypatch):
     monkeypatch.setattr(messages, "PATIENCE", 0.0)
     steps = jax.jit(lambda frozen, data, state, key, count: state + count, static_argnums=4)
     run = Stepper(steps, jax.numpy.ones(2), jax.numpy.ones(2), Speed(1, None))
     for _ in range(2):
         run(jax.numpy.ones(2), jax.random.key(0), 3)
-    told = capsys.readouterr().err
-    assert len(re.findall(r"compiling the training step .*\.\.\.", told)) == 1
-    assert re.search(r"compiled the training step in \d+ s", told)
+    printed = capsys.readouterr().err
+    assert len(re.findall(r"compiling the training step .*\.\.\.", printed)) == 1
+    assert re.search(r"compiled the training step in \d+ s", printed)
