@@ -75,7 +75,7 @@ def test_targets_on_the_command_line_can_be_presets(config, tmp_path):
     run = prepare(kaiming, tmp_path, file=printed)
     found = adaptation.methods(run.policy.model)
     assert {path.rpartition("/")[0] for path in found} == {"language/blocks", "vision"}
-    assert "; the others are frozen, all of action, action_in_proj," in printed.getvalue()
+    assert "; entirely frozen: action, action_in_proj," in printed.getvalue()
 
 
 def test_an_incompatible_tokenizer_is_rejected_before_collection(config, tmp_path):
