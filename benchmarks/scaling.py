@@ -5,8 +5,8 @@
 
 The batch per device ("batch") is constant. "data" replicates all weights on each device; "fsdp"
 shards base, adapters and optimizer state over the devices and gathers each layer's weights when
-needed. "of linear" is the rate relative to that of one device times their number; GiB is the memory
-of the program on each device.
+needed. "efficiency" is the rate divided by the number of devices and by the rate of one device;
+GiB is the memory of the program on each device.
 """
 
 import argparse
@@ -62,7 +62,7 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
             "layout": name,
             "batch": each,
             "samples/s": rate,
-            "of linear": rate / number / single_rate,
+            "efficiency": rate / number / single_rate,
             "GiB": step.bytes / GIB,
         }
 

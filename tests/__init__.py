@@ -1,4 +1,4 @@
-"""Tests, in the folders of what they test."""
+"""Tests; the folders mirror the packages."""
 
 from pathlib import Path
 

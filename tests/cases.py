@@ -1,4 +1,4 @@
-"""Parametrized tests whose every case is run only with the slow ones."""
+"""Parametrized tests that run most of their cases only with the slow tests."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -7,6 +7,6 @@ import pytest
 
 
 def mostly_slow(cases: Iterable[Any], quick: Iterable[Any]) -> list[Any]:
-    """The cases, all but some of them marked as slow."""
-    chosen = list(quick)
-    return [c if c in chosen else pytest.param(c, marks=pytest.mark.slow) for c in cases]
+    """Mark all cases as slow, except those in `quick`."""
+    fast = list(quick)
+    return [c if c in fast else pytest.param(c, marks=pytest.mark.slow) for c in cases]

@@ -1,4 +1,4 @@
-"""Every test runs on CPU with eight simulated devices and keeps what it compiles."""
+"""Run every test on CPU with eight simulated devices and a persistent compilation cache."""
 
 import gc
 import os
@@ -15,14 +15,14 @@ jax.config.update("jax_default_matmul_precision", "highest")
 
 
 def pytest_configure(config):
-    """Fast tests run most programs once; long ones run what users run."""
+    """Set XLA flags; fast tests skip XLA's optimizations, as they run most programs once."""
     os.environ["XLA_FLAGS"] = xla.flags(devices=8)
     if config.option.markexpr == "not slow":
-        os.environ["XLA_FLAGS"] += f" {xla.UNOPTIMISED}"
-    xla.compile_steps_as_all_else()
+        os.environ["XLA_FLAGS"] += f" {xla.UNOPTIMIZED}"
+    xla.drop_training_step_options()
 
 
 def pytest_collection_finish():
-    """What was imported stays, and tracing makes many objects: collect garbage less often."""
+    """Collect garbage less often: imports are permanent and tracing creates many objects."""
     gc.freeze()
     gc.set_threshold(20_000, 20, 20)

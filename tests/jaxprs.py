@@ -1,10 +1,10 @@
-"""What a program does, whatever its functions are cut into."""
+"""Inspect traced programs, independently of how they are split into functions."""
 
 import jax
 
 
 def primitives(function, *arguments):
-    """Names of all equations of a traced function, those of inner functions at every call."""
+    """Return the primitives of a traced function, including those of inner functions per call."""
     return list(_names(jax.make_jaxpr(function)(*arguments).jaxpr))
 
 

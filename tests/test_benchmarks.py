@@ -1,4 +1,4 @@
-"""Arithmetic of the benchmarks; the measurements themselves are not tested."""
+"""Test the arithmetic of the benchmarks, not the measured values."""
 
 import argparse
 import functools
@@ -15,25 +15,25 @@ from lorasp_jax.models.pi0 import Pi0Config
 from lorasp_jax.training.distributed import mesh as meshes
 
 
-def part(broken=0, **memory):
+def report(broken=0, **memory):
     return long_run.Report(1, 1.0, broken, memory, 1.0)
 
 
 @pytest.mark.parametrize(
-    ("parts", "good"),
+    ("reports", "passes"),
     [
-        ([part(host=100.0), part(host=101.9)], True),
-        ([part(host=100.0), part(host=102.1)], False),
-        ([part(host=100.0, JAX=5.0), part(host=90.0, JAX=6.0)], False),
-        ([part(host=100.0), part(1, host=100.0)], False),
+        ([report(host=100.0), report(host=101.9)], True),
+        ([report(host=100.0), report(host=102.1)], False),
+        ([report(host=100.0, JAX=5.0), report(host=90.0, JAX=6.0)], False),
+        ([report(host=100.0), report(1, host=100.0)], False),
     ],
 )
-def test_a_long_run_passes_if_nothing_grows_or_breaks(parts, good):
-    assert long_run.passed(parts) == good
+def test_long_run_passes_if_no_memory_grows_and_no_world_breaks(reports, passes):
+    assert long_run.passed(reports) == passes
 
 
 @pytest.mark.parametrize("episodes", [1, 3, 5, 7, 200])
-def test_a_long_run_reports_at_its_end(episodes, monkeypatch):
+def test_long_run_reports_at_its_end(episodes, monkeypatch):
     class Worlds:
         num_envs = 2
 
@@ -43,14 +43,14 @@ def test_a_long_run_reports_at_its_end(episodes, monkeypatch):
     info = {"success": 1, "broken": 0}
     monkeypatch.setattr(long_run.jax, "jit", lambda _: lambda state, key: (state, info))
     monkeypatch.setattr(long_run, "memory", lambda env: {"host": 1.0})
-    parts = list(long_run.run(Worlds(), episodes))
-    assert len(parts) == min(episodes, 5)
-    assert parts[-1].episodes == episodes
-    assert parts[-1].success == 0.5
+    reports = list(long_run.run(Worlds(), episodes))
+    assert len(reports) == min(episodes, 5)
+    assert reports[-1].episodes == episodes
+    assert reports[-1].success == 0.5
 
 
 @pytest.mark.slow
-def test_a_long_run(capsys):
+def test_long_run(capsys):
     arguments = ["--tasks", "press", "--backend", "jax", "--episodes", "5", "--num-envs", "2"]
     assert long_run.main(arguments) == 0
     assert "5 episodes" in capsys.readouterr().out
@@ -75,17 +75,17 @@ def test_tables_fit_a_terminal():
     assert "pick_place jax 8192 123 13.9 M 694 k 337 k 12.3 k 0.0123" in " ".join(text.split())
 
 
-def test_what_data_measures(tmp_path):
+def test_data_reading(tmp_path):
     row = data.reading(tmp_path, 500, (4, 6), batch=8, batches=3)
     assert (row["images"], row["batch"]) == ("6x4", 8)
     assert row["windows/s"] > 0
-    found = Cache(tmp_path / "4x6")
-    assert (len(found), found.num_steps, found.cameras["wrist"]) == (2, 500, [4, 6])
+    cache = Cache(tmp_path / "4x6")
+    assert (len(cache), cache.num_steps, cache.cameras["wrist"]) == (2, 500, [4, 6])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("codec", "size"), [("AV1", 13), ("H.264", 5)])
-def test_what_data_imports(tmp_path, codec, size, capfd):
+def test_data_import(tmp_path, codec, size, capfd):
     data.record(tmp_path / codec, 2, codec)
     assert not capfd.readouterr().err
     row = data.importing(tmp_path, codec, 64)
@@ -96,7 +96,7 @@ def test_what_data_imports(tmp_path, codec, size, capfd):
 
 @pytest.mark.slow
 def test_scaling(monkeypatch):
-    """One device, then two that hold everything or half of the base; with a share each."""
+    """One device, then two, with the base replicated and sharded."""
     tiny = Pi0Config.dummy()
     monkeypatch.setattr(scaling.backbones, "sized", lambda *_: tiny)
     monkeypatch.setattr(meshes, "shardings", functools.partial(meshes.shardings, minimum=1024))
@@ -110,16 +110,16 @@ def test_scaling(monkeypatch):
         ("data", 2),
         ("fsdp", 2),
     ]
-    assert rows[0]["of linear"] == 1
+    assert rows[0]["efficiency"] == 1
     assert all(row["samples/s"] > 0 for row in rows)
     assert rows[2]["GiB"] < rows[1]["GiB"]
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # qwix uses what Flax gives up
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # qwix uses deprecated Flax APIs
 def test_compile_time(tmp_path, capsys):
     sizes = ["--depth", "2", "--width", "16", "--tokens", "8", "--rank", "4", "--repeats", "1"]
-    compile_time.main([*sizes, "--json", str(tmp_path / "found.json")])
-    rows = json.loads((tmp_path / "found.json").read_text())["rows"]
+    compile_time.main([*sizes, "--json", str(tmp_path / "results.json")])
+    rows = json.loads((tmp_path / "results.json").read_text())["rows"]
     assert {"bare", *peft.names()} <= {row["model"] for row in rows}
     assert rows[0]["ratio"] == 1
     assert "lora_sp" in capsys.readouterr().out

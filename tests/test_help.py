@@ -1,4 +1,4 @@
-"""What `--help` prints needs nothing that is slow to import or to start."""
+"""Test that `--help` does not import slow packages or start a JAX backend."""
 
 import os
 import re
@@ -31,12 +31,12 @@ COMMANDS = {
 PROGRAM = """
 import atexit, runpy, sys
 
-def tell():
+def report():
     from jax._src import xla_bridge
     started = ["a JAX backend"] if xla_bridge.backends_are_initialized() else []
     print("slow:", *[name for name in {slow} if name in sys.modules], *started)
 
-atexit.register(tell)
+atexit.register(report)
 sys.argv = {arguments}
 if sys.argv[0] == "-m":
     del sys.argv[0]
@@ -46,8 +46,8 @@ else:
 """
 
 
-def assert_light(found):
-    assert re.search(r"^slow:$", found.stdout, re.MULTILINE), found.stdout.splitlines()[-1]
+def assert_nothing_slow(process):
+    assert re.search(r"^slow:$", process.stdout, re.MULTILINE), process.stdout.splitlines()[-1]
 
 
 def run(arguments):
@@ -58,44 +58,44 @@ def run(arguments):
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_help_is_light(name):
+def test_help_is_fast(name):
     arguments, option = COMMANDS[name]
-    found = run(arguments)
-    assert found.returncode == 0, found.stderr
-    assert option in found.stdout
-    assert_light(found)
+    process = run(arguments)
+    assert process.returncode == 0, process.stderr
+    assert option in process.stdout
+    assert_nothing_slow(process)
 
 
 @pytest.mark.parametrize("option", ["--tasks", "--robot"])
-def test_an_unknown_name_is_refused_before_slow_imports(option):
+def test_unknown_name_fails_before_slow_imports(option):
     parse = "from lorasp_jax.training.overrides import parse; parse"
-    named = f"['--config', 'configs/multitask.py', '--scale', 'smoke', '{option}', 'juggle']"
+    arguments = f"['--config', 'configs/multitask.py', '--scale', 'smoke', '{option}', 'juggle']"
     program = PROGRAM.partition("sys.argv")[0].format(slow=SLOW)
-    found = subprocess.run(
-        [sys.executable, "-c", f"{program}\n{parse}({named})"],
+    process = subprocess.run(
+        [sys.executable, "-c", f"{program}\n{parse}({arguments})"],
         cwd=ROOT,
         capture_output=True,
         text=True,
         check=False,
     )
-    assert "'juggle': choose from" in found.stderr
-    assert_light(found)
+    assert "'juggle': choose from" in process.stderr
+    assert_nothing_slow(process)
 
 
 @pytest.mark.parametrize(
     "arguments", [["train.py"], ["-m", "envs"], ["-m", "lorasp_jax.data"]], ids=str
 )
-def test_a_reader_that_leaves_is_told_nothing(arguments):
-    reading, writing = os.pipe()
-    os.close(reading)
-    found = subprocess.run(
+def test_closed_pipe_prints_no_error(arguments):
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    process = subprocess.run(
         [sys.executable, *arguments, "--help"],
         cwd=ROOT,
         env={name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"},
-        stdout=writing,
+        stdout=write_end,
         stderr=subprocess.PIPE,
         text=True,
         check=False,
     )
-    os.close(writing)
-    assert (found.returncode, found.stderr) == (141, "")
+    os.close(write_end)
+    assert (process.returncode, process.stderr) == (141, "")

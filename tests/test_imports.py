@@ -1,4 +1,4 @@
-"""Data flows one way: a room imports only rooms above it."""
+"""Test that imports go one way: a package imports only packages above it in `PACKAGES`."""
 
 import ast
 import re
@@ -8,7 +8,7 @@ import pytest
 
 from tests import ROOT
 
-ROOMS = [
+PACKAGES = [
     "envs",
     "lorasp_jax._compat",
     "lorasp_jax.storage",
@@ -26,7 +26,7 @@ ROOMS = [
     "lorasp_jax.cli",
 ]
 PRIVATE = re.compile(r"(jax|flax|optax|orbax)(\..*)?\._|jaxlib\b|jax\.interpreters\b")
-"""Names that a package may change without notice."""
+"""Private modules, which a dependency may change without notice."""
 SOURCES = [
     path
     for top in ("envs", "lorasp_jax")
@@ -35,10 +35,10 @@ SOURCES = [
 ]
 
 
-def room(module: str) -> int | None:
-    """Index of the room that `module` lies in; None for a third party's module."""
-    found = [i for i, name in enumerate(ROOMS) if f"{module}.".startswith(f"{name}.")]
-    return found[0] if found else None
+def package(module: str) -> int | None:
+    """Return the index of the package that contains `module`, or None for third-party modules."""
+    matches = [i for i, name in enumerate(PACKAGES) if f"{module}.".startswith(f"{name}.")]
+    return matches[0] if matches else None
 
 
 def imported(path: Path) -> set[str]:
@@ -55,10 +55,10 @@ def imported(path: Path) -> set[str]:
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_imports_point_up(path: Path):
     module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-    own = room(module)
-    assert own is not None, f"{module} lies in no room"
+    own = package(module)
+    assert own is not None, f"{module} is in no package"
     for name in imported(path):
-        other = room(name)
+        other = package(name)
         assert other is None or other <= own, f"{module} imports {name}"
         assert not name.startswith("configs"), f"{module} imports {name}"
         if path.name != "_compat.py":
@@ -67,8 +67,8 @@ def test_imports_point_up(path: Path):
             assert not name.startswith("lorasp_jax"), f"{module} imports {name}"
 
 
-def test_a_wrong_import_would_be_seen():
-    assert room("lorasp_jax.report.html") > room("lorasp_jax.training.step")
-    assert room("jax.numpy") is None
+def test_wrong_imports_are_detected():
+    assert package("lorasp_jax.report.html") > package("lorasp_jax.training.step")
+    assert package("jax.numpy") is None
     assert PRIVATE.match("jax._src.core")
     assert not PRIVATE.match("jax.numpy")

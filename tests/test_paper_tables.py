@@ -1,4 +1,4 @@
-"""The paper's parameter columns, digit by digit, as they are printed in arXiv 2603.07404v1."""
+"""Test that the paper's parameter columns (arXiv 2603.07404v1) are reproduced to every digit."""
 
 import math
 
@@ -27,32 +27,32 @@ TABLE_II = {
 
 
 @pytest.mark.parametrize(("name", "printed"), [("I", TABLE_I), ("II", TABLE_II)])
-def test_every_printed_digit(name, printed):
-    wanted = {
+def test_parameter_column_matches_the_paper(name, printed):
+    expected = {
         (backbone, strategy): values[i]
         for i, backbone in enumerate(("π0", "SmolVLA"))
         for strategy, values in printed.items()
     }
-    assert paper_tables.parameter_column(name) == wanted
+    assert paper_tables.parameter_column(name) == expected
 
 
 @pytest.mark.parametrize(
-    ("backbone", "layers", "both", "inputs", "total"),
+    ("backbone", "layers", "sum_in_out", "sum_in", "total"),
     [
         ("π0", 422, 2_731_200, 998_960, 3_501_372_176),
         ("SmolVLA", 303, 720_336, 331_584, 450_046_176),
     ],
 )
-def test_linear_layers(backbone, layers, both, inputs, total):
-    """How many there are, their sums of I + O and of I, and the models' own parameters."""
+def test_linear_layers(backbone, layers, sum_in_out, sum_in, total):
+    """Check the number of layers, their sums of I + O and of I, and the backbone's parameters."""
     config = paper_tables.BACKBONES[backbone]
-    shapes, found = paper_tables.linear_layers(config)
+    shapes, backbone_total = paper_tables.linear_layers(config)
     stacks = [(math.prod(stack), d_in, d_out) for *stack, d_in, d_out in shapes.values()]
-    assert found == total
+    assert backbone_total == total
     assert sum(n for n, _, _ in stacks) == layers
-    assert sum(n * (d_in + d_out) for n, d_in, d_out in stacks) == both
-    assert sum(n * d_in for n, d_in, _ in stacks) == inputs
-    assert paper_tables.count(config, LoRA(rank=16)) == (16 * both, total + 16 * both)
+    assert sum(n * (d_in + d_out) for n, d_in, d_out in stacks) == sum_in_out
+    assert sum(n * d_in for n, d_in, _ in stacks) == sum_in
+    assert paper_tables.count(config, LoRA(rank=16)) == (16 * sum_in_out, total + 16 * sum_in_out)
 
 
 MORE_DIGITS = [
@@ -68,7 +68,7 @@ MORE_DIGITS = [
 
 
 @pytest.mark.parametrize(("method", "pi0", "smolvla"), MORE_DIGITS)
-def test_to_more_digits(method, pi0, smolvla):
+def test_counts_to_three_decimals(method, pi0, smolvla):
     for config, percent in zip(paper_tables.BACKBONES.values(), (pi0, smolvla), strict=True):
         trainable, total = paper_tables.count(config, method)
         assert 100 * trainable / total == pytest.approx(percent, abs=6e-4)
@@ -83,7 +83,7 @@ def test_to_more_digits(method, pi0, smolvla):
     ],
     ids=["4", "8", "release"],
 )
-def test_what_does_not_give_the_17_1_of_lora_sp(router, printed):
+def test_other_routers_do_not_give_the_published_17_1(router, printed):
     shapes, total = paper_tables.linear_layers(paper_tables.BACKBONES["SmolVLA"])
     adapters = sum(
         math.prod(stack) * (128 * (d_in + d_out) + router(d_in))

@@ -1,4 +1,4 @@
-"""The names users build on: losing one, or making another public unasked, fails here."""
+"""Test the public API: removing a name, or exposing another one unintentionally, fails here."""
 
 import importlib
 import importlib.metadata
@@ -34,7 +34,7 @@ PUBLIC = {
         Env Episodes Randomization State Trajectory collect expert_success make rlds
     """,
 }
-"""All that `__all__` lists."""
+"""Contents of `__all__` by module."""
 SHOWN = {
     "lorasp_jax.dense": "AdapterParam Dense LinenDense dense",
     "lorasp_jax.models.pi0": "Pi0Config",
@@ -49,16 +49,16 @@ SHOWN = {
     "envs.rlds": "read",
     "envs.robots.piper": "forward_kinematics",
 }
-"""What README, pages and experiments show besides."""
+"""Other names that the README, the documentation and the configs use."""
 
 
 @pytest.mark.parametrize("module", PUBLIC)
-def test_all_is_what_is_public(module):
+def test_all_lists_the_public_names(module):
     assert sorted(importlib.import_module(module).__all__) == sorted(PUBLIC[module].split())
 
 
 @pytest.mark.parametrize(("module", "names"), [*PUBLIC.items(), *SHOWN.items()])
-def test_every_public_name_is_there(module, names):
+def test_every_public_name_exists(module, names):
     for name in names.split():
         assert pkgutil.resolve_name(f"{module}.{name}") is not None
 
@@ -68,17 +68,17 @@ def test_every_method_is_public():
     assert methods <= set(lorasp_jax.__all__)
 
 
-def test_what_one_makes_one_can_save_and_load():
+def test_saving_and_loading_are_documented():
     for name in ("split", "save_adapters", "load_adapters", "save_peft", "load_peft"):
         assert inspect.getdoc(getattr(lorasp_jax, name))
 
 
-def test_the_version_is_that_of_the_installed_package():
+def test_version_matches_the_installed_package():
     assert lorasp_jax.__version__ == importlib.metadata.version("lorasp_jax")
 
 
-def test_a_folder_of_the_same_name_does_not_hide_the_package(tmp_path):
-    """As a checkout does for whoever starts Python beside it."""
+def test_folder_of_the_same_name_does_not_shadow_the_package(tmp_path):
+    """This happens if Python starts next to a checkout."""
     (tmp_path / "lorasp_jax" / "data").mkdir(parents=True)
-    use = "import lorasp_jax.data.keys; lorasp_jax.adapt"
-    subprocess.run([sys.executable, "-c", use], cwd=tmp_path, check=True)
+    code = "import lorasp_jax.data.keys; lorasp_jax.adapt"
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True)

@@ -31,7 +31,7 @@ def main(args: argparse.Namespace) -> None:
     from envs.compilation import cache
 
     cache.enable()
-    xla.compile_steps_as_all_else()
+    xla.drop_training_step_options()
     jax.config.update("jax_default_matmul_precision", "highest")
     from lorasp_jax.training.distributed import processes
 
