@@ -205,7 +205,7 @@ def test_linen_scan_that_hands_no_rngs_on():
     adapter = lorasp_jax.LinenAdapter(Linen(streams=("params",)), [("blocks", WIDE)])
     variables = adapter.init(jax.random.key(0), LINEN_IDS)
     adapter.apply(variables, LINEN_IDS)
-    with pytest.raises(ValueError, match=r"blocks/dense gets no rngs .* 'dropout' in split_rngs"):
+    with pytest.raises(ValueError, match=r"blocks/dense has no rngs .* 'dropout' to split_rngs"):
         adapter.apply(variables, LINEN_IDS, rngs={"dropout": KEY})
 
 

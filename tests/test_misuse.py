@@ -65,7 +65,7 @@ def test_models_of_another_library():
         lorasp_jax.adapt(nn.Dense(3), [("inp", METHOD)], rngs=nnx.Rngs(0))
     with pytest.raises(ValueError, match="must be an NNX module, got dict"):
         lorasp_jax.adapt({"inp": NET.inp}, [("inp", METHOD)], rngs=nnx.Rngs(0))
-    with pytest.raises(ValueError, match="must be a Linen module, got Dict; `adapt` takes NNX"):
+    with pytest.raises(ValueError, match="must be a Linen module, got Dict; for NNX modules use"):
         lorasp_jax.LinenAdapter(NET, [("inp", METHOD)])
 
 
