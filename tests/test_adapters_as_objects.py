@@ -11,7 +11,7 @@ from flax import nnx
 
 import lorasp_jax
 from lorasp_jax.adapters import adaptation
-from lorasp_jax.adapters.combine.named import bare
+from lorasp_jax.adapters.combine.named import strip_adapters
 from lorasp_jax.adapters.io.native import load_adapters, save_adapters
 from lorasp_jax.peft import LoRA, LoRAMoE, LoRASP, LoRASPRelease
 from tests import nets
@@ -46,13 +46,13 @@ def test_off_is_the_base(method, model):
             lorasp_jax.combine({"own": model})
         return
     if method.splits_kernel:
-        for take_away in (bare, lambda model: lorasp_jax.combine({"own": model})):
+        for take_away in (strip_adapters, lambda model: lorasp_jax.combine({"own": model})):
             with pytest.raises(ValueError, match="split the kernel"):
                 take_away(model)
         return
     assert np.abs(call(model, X) - call(NET, X)).max() > 1e-3
     pair = lorasp_jax.combine({"other": trained(("out", LoRA(rank=2)), seed=1), "own": model})
-    for base in (bare(model), lorasp_jax.extract(pair, None)):
+    for base in (strip_adapters(model), lorasp_jax.extract(pair, None)):
         np.testing.assert_array_equal(call(base, X), call(NET, X))
         for ours, theirs in zip(parameters(base), parameters(NET), strict=True):
             np.testing.assert_array_equal(ours, theirs)

@@ -143,15 +143,15 @@ def test_methods_are_found_by_name():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda m: lorasp_jax.combine([m]), "are a mapping by name"),
+        (lambda m: lorasp_jax.combine([m]), "must be a non-empty mapping from name"),
         (lambda m: lorasp_jax.combine({"a": m}, rank=2.5), "rank must be a whole number up to"),
         (lambda m: lorasp_jax.combine({"a": m}, rank=-1), "or None, got -1"),
-        (lambda m: lorasp_jax.choose(lorasp_jax.combine({"a": m}), 3), "a choice is a name"),
+        (lambda m: lorasp_jax.choose(lorasp_jax.combine({"a": m}), 3), "choice must be a name"),
         (
             lambda m: lorasp_jax.choose(lorasp_jax.combine({"a": m}), {"a": float("nan")}),
             "the weight of 'a' must be a finite number, got nan",
         ),
-        (lambda m: lorasp_jax.extract(lorasp_jax.combine({"a": m}), 3), "there is no adapter 3"),
+        (lambda m: lorasp_jax.extract(lorasp_jax.combine({"a": m}), 3), "unknown adapter 3"),
         (lambda m: lorasp_jax.prune(m, [], "x"), "tolerance must lie in [0, 1), got 'x'"),
         (lambda m: lorasp_jax.distill(m, [], 2.5), "must be a whole number, at least 1, or None"),
     ],
@@ -370,12 +370,15 @@ def test_models_without_values(tmp_path):
             "names gives 'one' for ('head', ()) and for ('inp', ())",
         ),
         (lambda f: lorasp_jax.save_peft(f, adapted(), base=5), "base must be a text"),
-        (lambda _: lorasp_jax.fuse(lorasp_jax.combine({"a": adapted()}), 5), "needs weights by"),
+        (
+            lambda _: lorasp_jax.fuse(lorasp_jax.combine({"a": adapted()}), 5),
+            "weights must be a non-empty",
+        ),
         (
             lambda _: lorasp_jax.fuse(lorasp_jax.combine({"a": adapted()}), {"a": 1.0}, rank="x"),
             "rank must be an integer from 1",
         ),
-        (lambda _: lorasp_jax.combine({5: adapted()}), "are a mapping by name, a text"),
+        (lambda _: lorasp_jax.combine({5: adapted()}), "must be a non-empty mapping from name"),
     ],
 )
 def test_what_functions_take_beside_a_model(call, message, tmp_path):

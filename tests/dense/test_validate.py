@@ -97,8 +97,11 @@ def with_kernel(value):
         (lambda: calibration.input_moments(NET, [X], b"a"), "rules must be a list of (pattern"),
         (lambda: calibration.input_moments(SHAPES, [X]), "the model holds shapes without values"),
         (lambda: lorasp_jax.swap(named(), "a", SHAPES), "the model holds shapes without values"),
-        (lambda: lorasp_jax.choose(named(), np.ones((0, 2))), "weights of 2 adapters are floats"),
-        (lambda: lorasp_jax.choose(named(), ["a", "b"])(X), "for 2 examples, but a layer sees 3"),
+        (
+            lambda: lorasp_jax.choose(named(), np.ones((0, 2))),
+            "weights must be floating point of shape [2]",
+        ),
+        (lambda: lorasp_jax.choose(named(), ["a", "b"])(X), "for 2 examples, but a layer got 3"),
     ],
 )
 def test_one_sentence(call, message):

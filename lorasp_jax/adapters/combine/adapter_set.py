@@ -1,11 +1,11 @@
-"""Several adapters of one layer as one method: a sum whose weights are data.
+"""Several adapters of one layer as one method: a weighted sum.
 
     y = x W + Σ_i w_i Δ_i(x)
 
-The weights w belong to the arrays and not to the structure: another choice of adapters is another
-array, and nothing is compiled again. Of a method that is not additive (DoRA), Δ_i is what it makes
-of x W less x W. All LoRAs share one bank, padded to one rank, and cost one matrix product on either
-side; other methods are computed one after the other, also where their weight is 0.
+The weights w are an array, not static structure, so selecting other adapters does not recompile.
+For a method that is not additive (DoRA), Δ_i is its output minus x W. All LoRAs share one bank,
+padded to one rank, and cost one matmul each for A and B; other methods are computed one by one,
+even with weight 0.
 """
 
 import dataclasses
@@ -21,25 +21,25 @@ from lorasp_jax.peft._method import Params
 
 
 class AdapterChoice(nnx.Variable[Any]):
-    """The weights of a layer's adapters, f32 [..., A] or, for each example, [..., B, A]."""
+    """Weights of a layer's adapters, f32 [..., A], or [..., B, A] per example."""
 
 
-class SetParam(nnx.Param[Any]):
-    """The parameters of a layer's adapters. They are frozen: adapters train before or after."""
+class AdapterSetParam(nnx.Param[Any]):
+    """Parameters of a layer's adapters, frozen while they are combined."""
 
 
 class NamedAdapters(nnx.Module):
-    """What a layer of a combined model holds in the place of one adapter.
+    """The adapter of a layer in a combined model: parameters of an `AdapterSet`.
 
     Attributes:
-      choice: `AdapterChoice`, and params: `SetParam`, all else of an `AdapterSet`'s parameters. In
-        a stack of layers both carry its leading axes.
+      choice: `AdapterChoice` with the weights.
+      params: `AdapterSetParam` with all other parameters. Both have the leading axes of a stack.
     """
 
     def __init__(self, params: Params, choice: jax.Array) -> None:
-        """Wraps the arrays."""
+        """Wrap the arrays in variables."""
         self.choice: AdapterChoice = AdapterChoice(choice)
-        self.params: SetParam = SetParam(params)
+        self.params: AdapterSetParam = AdapterSetParam(params)
 
     def get_value(self) -> Params:
         """The parameters of the `AdapterSet`."""
@@ -48,64 +48,71 @@ class NamedAdapters(nnx.Module):
 
 @dataclasses.dataclass(frozen=True)
 class AdapterSet(Method):
-    """The weighted sum of A adapters.
+    """Weighted sum of A adapters.
 
     Parameters:
-      choice: w, f32 [A], or [B, A] where each example of a batch has its own: inputs then have
-        B rows, or k B, of which k in turn belong to an example.
-      bank: K LoRAs padded to one rank R, lora_a [I, K, R], lora_b [K, R, O], scale f32 [K] and rank
+      choice: w, f32 [A], or [B, A] per example of a batch. In that case inputs have B rows, or k B
+        with k contiguous rows per example.
+      bank: K LoRAs padded to one rank R: lora_a [I, K, R], lora_b [K, R, O], scale f32 [K] and rank
         int32 [K], which is 0 for an adapter that the layer does not have.
-      others: the parameters of the other adapters by name.
+      others: parameters of the other adapters, by name.
     """
 
     names: tuple[str, ...]
-    """A names."""
+    """Names of the A adapters."""
     methods: tuple[Method | None, ...]
-    """The methods; None is a place in the bank."""
+    """Their methods; None for adapters in the bank."""
 
     @property
-    def banked(self) -> list[str]:
+    def bank_names(self) -> list[str]:
         """Names of the K adapters in the bank."""
         return [name for name, method in zip(self.names, self.methods, strict=True) if not method]
 
     @property
     def others(self) -> dict[str, Method]:
-        """The methods of the adapters outside of the bank, by name."""
+        """Methods of the adapters that are not in the bank, by name."""
         return {n: m for n, m in zip(self.names, self.methods, strict=True) if m is not None}
 
     @property
     def down_in_fp32(self) -> bool:
-        """True if one of the adapters does."""
+        """True if it is for any of the adapters."""
         return any(method.down_in_fp32 for method in self.others.values())
 
     def down(self, params: Params) -> jax.Array:
-        """[I, ...], of the bank and of all that add to x W, side by side."""
+        """Down-projections [I, ...] of the bank and the other additive adapters, concatenated."""
         bank = params["bank"]["lora_a"]
-        return jnp.concatenate([bank.reshape(len(bank), -1), *self._sides(params, "down")], axis=1)
+        return jnp.concatenate(
+            [bank.reshape(len(bank), -1), *self._other_matrices(params, "down")], axis=1
+        )
 
     def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
-        """Each adapter's own z times its weight. There are no losses: a set does not train."""
+        """Multiply each adapter's z by its weight. There are no losses: a set is not trainable."""
         weights, bank = self._weights(params["choice"], rows), params["bank"]
-        own = _stack([weights[name] for name in self.banked])
-        columns = jnp.repeat(own * bank["scale"], bank["lora_a"].shape[-1], axis=-1)
-        widths = [columns.shape[-1], *(side.shape[1] for side in self._sides(params, "down"))]
+        bank_weights = _stack([weights[name] for name in self.bank_names])
+        columns = jnp.repeat(bank_weights * bank["scale"], bank["lora_a"].shape[-1], axis=-1)
+        widths = [
+            columns.shape[-1],
+            *(matrix.shape[1] for matrix in self._other_matrices(params, "down")),
+        ]
         first, *parts = jnp.split(rows, list(itertools.accumulate(widths))[:-1], axis=-1)
         z = [first * columns.astype(rows.dtype)]
-        rank = jnp.sum((own != 0) * bank["rank"], axis=-1).astype(jnp.float32)
-        for (name, method), part in zip(self._adding(), parts, strict=True):
+        rank = jnp.sum((bank_weights != 0) * bank["rank"], axis=-1).astype(jnp.float32)
+        for (name, method), part in zip(self._additive_others(), parts, strict=True):
             own_params = params["others"][name]
-            run = method.fused_kernel(own_params) or method
-            more, aux = run.bottleneck(method.bottleneck_params(own_params), part, token_mask)
-            z.append(weights[name][..., None] * more)
+            kernel = method.fused_kernel(own_params) or method
+            own_z, aux = kernel.bottleneck(method.bottleneck_params(own_params), part, token_mask)
+            z.append(weights[name][..., None] * own_z)
             rank += _active_rank(weights[name], aux)
         return jnp.concatenate(z, axis=-1), Aux(jnp.broadcast_to(rank, rows.shape[:-1]))
 
     def up(self, params: Params) -> jax.Array:
-        """[..., O], of the bank and of all that add to x W, one below the other."""
+        """Up-projections [..., O] of the bank and the other additive adapters, concatenated."""
         bank = params["bank"]["lora_b"]
-        return jnp.concatenate([bank.reshape(-1, bank.shape[-1]), *self._sides(params, "up")])
+        return jnp.concatenate(
+            [bank.reshape(-1, bank.shape[-1]), *self._other_matrices(params, "up")]
+        )
 
     def apply(
         self,
@@ -115,53 +122,58 @@ class AdapterSet(Method):
         *,
         token_mask: jax.Array | None = None,
     ) -> tuple[jax.Array, Aux]:
-        """x @ kernel + Σ_i w_i Δ_i(x), [...tokens, O]; arguments as for `Method.apply`.
+        """Compute x @ kernel + Σ_i w_i Δ_i(x), [...tokens, O]; arguments as for `Method.apply`.
 
-        The active rank is that of the adapters whose weight is not 0.
+        The active rank is the sum over adapters with non-zero weight.
         """
         y, aux = super().apply(params, x, kernel, token_mask=token_mask)
         rank, weights = aux.active_rank, self._weights(params["choice"], x)
         assert rank is not None
         for name, method in self.others.items():
             if not method.additive:
-                own = params["others"][name]
-                adapted, other = method.apply(own, x, kernel, token_mask=token_mask)
-                change = adapted - x @ jax.lax.stop_gradient(kernel.astype(x.dtype))
-                y += weights[name].astype(x.dtype)[..., None] * change
-                rank += _active_rank(weights[name], other)
+                own_params = params["others"][name]
+                adapted, own_aux = method.apply(own_params, x, kernel, token_mask=token_mask)
+                delta = adapted - x @ jax.lax.stop_gradient(kernel.astype(x.dtype))
+                y += weights[name].astype(x.dtype)[..., None] * delta
+                rank += _active_rank(weights[name], own_aux)
         return y, dataclasses.replace(aux, active_rank=rank)
 
-    def _adding(self) -> list[tuple[str, Method]]:
-        """Name and method of the adapters outside of the bank that add to x W."""
+    def _additive_others(self) -> list[tuple[str, Method]]:
+        """Names and methods of the additive adapters that are not in the bank."""
         return [(name, method) for name, method in self.others.items() if method.additive]
 
-    def _sides(self, params: Params, side: Literal["down", "up"]) -> list[jax.Array]:
-        """One side of each of those adapters."""
-        return [getattr(method, side)(params["others"][name]) for name, method in self._adding()]
+    def _other_matrices(self, params: Params, side: Literal["down", "up"]) -> list[jax.Array]:
+        """The down- or up-projection of each of `_additive_others`."""
+        return [
+            getattr(method, side)(params["others"][name])
+            for name, method in self._additive_others()
+        ]
 
     def merge(self, params: Params, kernel: jax.Array) -> jax.Array:
-        """W + Σ_i w_i ΔW_i, summed in fp32.
+        """Compute W + Σ_i w_i ΔW_i in fp32.
 
         Raises:
-          ValueError: each example has its own weights, or one of the deltas depends on the input.
+          ValueError: the weights differ per example, or a delta depends on the input.
         """
         if params["choice"].ndim > 1:
-            raise ValueError("each example of a batch has its own adapters: choose for all first.")
+            raise ValueError(
+                "cannot merge adapters chosen per example: choose one for the whole batch first."
+            )
         base, bank = kernel.astype(jnp.float32), params["bank"]
         weights = dict(zip(self.names, params["choice"], strict=True))
-        scale = bank["scale"] * _stack([weights[name] for name in self.banked])
+        scale = bank["scale"] * _stack([weights[name] for name in self.bank_names])
         merged = base + jnp.einsum("ikr,k,kro->io", bank["lora_a"], scale, bank["lora_b"])
         for name, method in self.others.items():
             merged += weights[name] * (method.merge(params["others"][name], base) - base)
         return merged.astype(kernel.dtype)
 
     def _weights(self, choice: jax.Array, x: jax.Array) -> dict[str, jax.Array]:
-        """Each adapter's weight by name, a scalar or [rows, 1, ...] for the tokens of x."""
+        """Weights by name, each a scalar, or [rows, 1, ...] to broadcast over the tokens of x."""
         if choice.ndim > 1:
             examples, rows = len(choice), x.shape[0] if x.ndim > 1 else 1
             if rows % examples:
                 raise ValueError(
-                    f"adapters were chosen for {examples} examples, but a layer sees {rows} rows."
+                    f"adapters were chosen for {examples} examples, but a layer got {rows} rows."
                 )
             choice = jnp.repeat(choice, rows // examples, axis=0)
             choice = choice.reshape(rows, *(1 for _ in x.shape[1:-1]), -1)
@@ -169,7 +181,7 @@ class AdapterSet(Method):
 
 
 def empty_bank(size: int, rank: int, shape: tuple[int, ...]) -> Params:
-    """A bank of K places for LoRAs up to a rank, for kernels [..., I, O]."""
+    """Create a bank with K empty slots for LoRAs up to a rank, for kernels [..., I, O]."""
     *leading, d_in, d_out = shape
     return {
         "lora_a": jnp.zeros((*leading, d_in, size, rank)),
@@ -180,7 +192,7 @@ def empty_bank(size: int, rank: int, shape: tuple[int, ...]) -> Params:
 
 
 def set_slot(bank: Params, slot: int, method: LoRA | None, params: Params) -> Params:
-    """The bank with another LoRA in a place, or with none.
+    """Store a LoRA in a slot of the bank, or clear the slot if method is None.
 
     Raises:
       ValueError: the LoRA's rank exceeds the bank's.
@@ -188,7 +200,7 @@ def set_slot(bank: Params, slot: int, method: LoRA | None, params: Params) -> Pa
     bank, rank = dict(bank), 0 if method is None else method.rank
     capacity = bank["lora_a"].shape[-1]
     if rank > capacity:
-        raise ValueError(f"a LoRA of rank {rank} needs more than the room for rank {capacity}.")
+        raise ValueError(f"LoRA rank {rank} exceeds the maximum rank {capacity} of combine.")
     a, b = bank["lora_a"].at[..., slot, :].set(0), bank["lora_b"].at[..., slot, :, :].set(0)
     if method is not None:
         a = a.at[..., slot, :rank].set(params["lora_a"])
@@ -199,7 +211,7 @@ def set_slot(bank: Params, slot: int, method: LoRA | None, params: Params) -> Pa
 
 
 def get_slot(bank: Params, slot: int) -> tuple[LoRA | None, Params]:
-    """The LoRA in a place with its own rank and scale, or None and None; inverse of `put`."""
+    """The LoRA in a slot and its parameters, or (None, None) if empty; inverse of `set_slot`."""
     rank = int(bank["rank"][..., slot].max())
     if not rank:
         return None, None
@@ -212,10 +224,10 @@ def get_slot(bank: Params, slot: int) -> tuple[LoRA | None, Params]:
 
 
 def _active_rank(weight: jax.Array, aux: Aux) -> jax.Array:
-    """The active rank of an adapter, 0 where it has no weight."""
+    """Active rank of an adapter, 0 where its weight is 0."""
     return jnp.where(weight != 0, 0.0 if aux.active_rank is None else aux.active_rank, 0.0)
 
 
 def _stack(values: list[jax.Array]) -> jax.Array:
-    """Weights side by side, [..., K], also where K is 0."""
+    """Stack weights [..., K]; K may be 0."""
     return jnp.stack(values, axis=-1) if values else jnp.zeros(0)

@@ -1,7 +1,7 @@
-"""Named LoRAs made into one, and merged kernels taken apart again.
+"""Fuse named LoRAs into one, and unmerge adapters from merged kernels.
 
-`fuse` gives one LoRA that is the weighted sum of several: exact, of all their ranks together, or
-the best one of a smaller rank, with the error that this makes. `unmerge` is the inverse of `merge`.
+`fuse` replaces several LoRAs by their weighted sum: one LoRA that is exact, with the sum of their
+ranks, or the best approximation of a smaller rank, with its error. `unmerge` inverts `merge`.
 """
 
 import re
@@ -22,103 +22,107 @@ from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import Params
 
 
-class Fused(NamedTuple):
-    """A model with one LoRA a layer, and what it costs to have only one.
+class FusedAdapters(NamedTuple):
+    """A model with one LoRA per layer, and the approximation errors.
 
     Attributes:
-      model: adapted by plain LoRA of scale 1, fit to train, save and merge.
-      errors: ‖ΔW − ΔW'‖ / ‖ΔW‖ by path, Frobenius, of a whole stack at once: what the layer's delta
-        is off by, relative to itself, for inputs that are as long in every direction.
+      model: adapted by plain LoRA of scale 1; can be trained, saved and merged.
+      errors: ‖ΔW − ΔW'‖ / ‖ΔW‖ by path, in the Frobenius norm over a whole stack: the relative
+        error of the layer's delta for isotropic inputs.
     """
 
     model: nnx.Module
     errors: dict[str, float]
 
 
-def fuse(model: nnx.Module, weights: Mapping[str, float], *, rank: int | None = None) -> Fused:
-    """The weighted sum of some of a combined model's LoRAs as one LoRA.
+def fuse(
+    model: nnx.Module, weights: Mapping[str, float], *, rank: int | None = None
+) -> FusedAdapters:
+    """Fuse LoRAs of a combined model into one LoRA, their weighted sum.
 
     Args:
       model: from `combine`; not modified.
-      weights: w_i by name, of any sign.
-      rank: None: their ranks together, which is exact. Else at most that, by singular values.
+      weights: w_i by name; may be negative.
+      rank: maximum rank, reached by truncated SVD. None uses the sum of the ranks, which is exact.
 
     Raises:
-      ValueError: as for `choose`; no weight, a rank below 1, or a method that is no LoRA.
+      ValueError: as for `choose`; no weights, a rank below 1, or a method other than LoRA.
     """
     if rank is not None:
         validate.size("rank", rank)
     if not isinstance(weights, Mapping) or not weights:
-        raise ValueError(f"fuse needs weights by name, at least one, got {short(weights)}.")
-    named.weights(model, weights)  # raises for an unknown name or a weight that is no number
+        raise ValueError(
+            f"weights must be a non-empty mapping from name to weight, got {short(weights)}."
+        )
+    named.weights(model, weights)  # raises for an unknown name or an invalid weight
     fused, errors = {}, {}
-    for path, _, _, layer in named.sets(model):
-        found = []
+    for path, _, _, layer in named.adapter_sets(model):
+        factors = []
         for name, weight in weights.items():
-            method, params = named.member(layer, name)
+            method, params = named.get_adapter(layer, name)
             if method is not None and type(method) is not LoRA:
-                raise ValueError(f"cannot fuse {name} at {path}: {method} is no LoRA.")
+                raise ValueError(f"cannot fuse {name} at {path}: {method} is not plain LoRA.")
             if method is not None:
-                found.append((params["lora_a"], weight * method.scale * params["lora_b"]))
-        if found:
-            method, params, errors[path] = _one(found, rank)
+                factors.append((params["lora_a"], weight * method.scale * params["lora_b"]))
+        if factors:
+            method, params, errors[path] = _fused_lora(factors, rank)
             fused[path] = layer, method, params
-    return Fused(named.with_adapters(named.bare(model), fused), errors)
+    return FusedAdapters(named.with_adapters(named.strip_adapters(model), fused), errors)
 
 
 def unmerge(merged: Model, adapted: nnx.Module) -> Model:
-    """The adapted model that `merge` made the merged one of, from the adapters alone.
+    """Invert `merge`: restore the adapted model from the merged one and the adapters.
 
-    What they added is subtracted in fp32 and rounded to the kernel's type, so that a kernel comes
-    back up to eps/2 (|W + ΔW| + |W|), entry by entry (eps 1.2e-7 in fp32, 7.8e-3 in bf16). Weights
-    that train in full, biases for instance, are those of the adapted model and train again.
+    The delta is subtracted in fp32 and the result rounded to the kernel's dtype, so each entry is
+    restored to within eps/2 (|W + ΔW| + |W|) (eps 1.2e-7 in fp32, 7.8e-3 in bf16). Fully
+    fine-tuned weights, for example biases, are taken from the adapted model and are trainable.
 
     Args:
       merged: from `merge`; not modified.
-      adapted: a model with the adapters, of which nothing else is read: for a saved adapter,
-        `load_adapters(folder, merged, any_base=True)`, unless it holds a part of its kernel.
+      adapted: model with the adapters; its base is not used. For a saved adapter that did not split
+        its kernel, use `load_adapters(folder, merged, any_base=True)`.
 
     Raises:
-      ValueError: the merged model has adapters, lacks a layer or has one of another class, or an
-        adapter that did not just add a constant: DoRA rescaled the kernel, and what it was before
-        is not in the result.
+      ValueError: the merged model has adapters, lacks a layer or has one of a different class, or
+        an adapter did not just add a constant delta: DoRA also rescales the kernel, which
+        cannot be undone from the result.
     """
     validate.with_values(merged)
-    if named.sets(validate.with_values(adapted)):
-        raise ValueError("the model to unmerge by has named adapters: extract one of them.")
-    adapters = named.own_adapters(adapted)
-    own = {p.path: p.child.get_value() for p in paths.locate(nnx.List([adapted]), AdapterParam)}
-    freed = [path for path in adaptation.methods(adapted) if path not in adapters]
+    if named.adapter_sets(validate.with_values(adapted)):
+        raise ValueError("the adapted model is a combined model: extract one adapter first.")
+    adapters = named.single_adapters(adapted)
+    values = {p.path: p.child.get_value() for p in paths.locate(nnx.List([adapted]), AdapterParam)}
+    full_paths = [path for path in adaptation.methods(adapted) if path not in adapters]
     if has := adaptation.methods(merged):
-        raise ValueError(f"{min(has)} of the merged model has an adapter.")
+        raise ValueError(f"the merged model must have no adapters, but {min(has)} has one.")
     root = nnx.List([nnx.merge(*adaptation.split(merged))])
 
-    def taken_apart(location: paths.Location) -> AdaptedLayer | None:
+    def unmerge_layer(location: paths.Location) -> AdaptedLayer | None:
         if location.path not in adapters:
             return None
         try:
-            return _unmerged(location.child, adapters[location.path])
+            return _unmerged_layer(location.child, adapters[location.path])
         except (ValueError, TypeError) as error:
             raise ValueError(f"cannot unmerge {location.path}: {error}") from error
 
-    found = paths.locate(root, nnx.Module)
-    paths.replace(found, taken_apart)
-    if beyond := adapters.keys() - {location.path for location in found}:
-        raise ValueError(f"the merged model has no layer {min(beyond)}.")
-    full = [(f"^{re.escape(path)}$", FullFineTuning()) for path in freed]
-    for i in set(range(len(full))) - adaptation.unfreeze(root, full):
-        raise ValueError(f"the merged model has no parameter {freed[i]}.")
+    modules = paths.locate(root, nnx.Module)
+    paths.replace(modules, unmerge_layer)
+    if missing := adapters.keys() - {location.path for location in modules}:
+        raise ValueError(f"the merged model has no layer {min(missing)}.")
+    rules = [(f"^{re.escape(path)}$", FullFineTuning()) for path in full_paths]
+    for i in set(range(len(rules))) - adaptation.unfreeze(root, rules):
+        raise ValueError(f"the merged model has no parameter {full_paths[i]}.")
     for location in paths.locate(root, AdapterParam):
-        if location.path in freed:
-            location.child.set_value(own[location.path])
+        if location.path in full_paths:
+            location.child.set_value(values[location.path])
     return root[0]
 
 
-def _unmerged(layer: nnx.Module, adapted: AdaptedLayer) -> AdaptedLayer:
-    """The layer with the adapter of the adapted one, less what it had added."""
+def _unmerged_layer(layer: nnx.Module, adapted: AdaptedLayer) -> AdaptedLayer:
+    """Subtract the adapted layer's delta from the kernel and attach its adapter."""
     method, params = adapted.method_and_params()
     if not method.additive:
-        raise ValueError(f"{method} did not just add to its base.")
+        raise ValueError(f"{method} does not just add to its base.")
     layer = nnx_layers.make_adaptable_like(layer, adapted)
     kernel = layer.kernel_matrices()
     delta = adaptation.over_stack(method.merge, kernel)(params, jnp.zeros(kernel.shape))
@@ -128,10 +132,12 @@ def _unmerged(layer: nnx.Module, adapted: AdaptedLayer) -> AdaptedLayer:
     return layer
 
 
-def _one(found: list[tuple[jax.Array, jax.Array]], rank: int | None) -> tuple[LoRA, Params, float]:
-    """One LoRA of scale 1 with Σ A_i B_i, and its relative error."""
-    a = jnp.concatenate([a for a, _ in found], axis=-1)
-    b = jnp.concatenate([b for _, b in found], axis=-2)
+def _fused_lora(
+    factors: list[tuple[jax.Array, jax.Array]], rank: int | None
+) -> tuple[LoRA, Params, float]:
+    """LoRA of scale 1 equal to Σ A_i B_i, its parameters, and its relative error."""
+    a = jnp.concatenate([a for a, _ in factors], axis=-1)
+    b = jnp.concatenate([b for _, b in factors], axis=-2)
     error = 0.0
     if rank is not None and rank < a.shape[-1]:
         a, b, error = truncated(a, b, rank)
@@ -140,10 +146,11 @@ def _one(found: list[tuple[jax.Array, jax.Array]], rank: int | None) -> tuple[Lo
 
 
 def truncated(a: jax.Array, b: jax.Array, rank: int) -> tuple[jax.Array, jax.Array, float]:
-    """The best A', B' of a smaller rank for A [..., I, R] and B [..., R, O], with ‖A‖ = ‖B‖.
+    """Best low-rank approximation A' B' of A [..., I, R] B [..., R, O], and its relative error.
 
-    A B = Q_a (R_a R_bᵀ) Q_bᵀ by QR of A and Bᵀ, so only a matrix of R x R is decomposed. The
-    singular values go to both sides in halves; the error is sqrt(Σ left out² / Σ all²).
+    A B = Q_a (R_a R_bᵀ) Q_bᵀ by QR of A and Bᵀ, so the SVD is only of an R x R matrix. A' and B'
+    each get the square root of the singular values, so that ‖A'‖ = ‖B'‖; the error is
+    sqrt(Σ discarded² / Σ all²).
     """
     (qa, ra), (qb, rb) = jnp.linalg.qr(a), jnp.linalg.qr(jnp.swapaxes(b, -1, -2))
     left, values, right = jnp.linalg.svd(ra @ jnp.swapaxes(rb, -1, -2), full_matrices=False)

@@ -22,7 +22,7 @@ from flax import nnx
 
 from envs.datasets.files import check_local, read_text
 from envs.datasets.writing import write_bytes
-from lorasp_jax.adapters.combine.adapter_set import SetParam
+from lorasp_jax.adapters.combine.adapter_set import AdapterSetParam
 from lorasp_jax.adapters.compress.quantization import is_quantized
 from lorasp_jax.dense import AdapterParam
 from lorasp_jax.models import backbone
@@ -76,7 +76,7 @@ def base_arrays(model: nnx.Module) -> dict[str, np.ndarray]:
     Raises:
         ValueError: the model has adapters or quantized kernels, or does not match its config.
     """
-    if jax.tree.leaves(nnx.state(model, (AdapterParam, SetParam))):
+    if jax.tree.leaves(nnx.state(model, (AdapterParam, AdapterSetParam))):
         raise ValueError(
             "models.save needs a model without adapters: merge them or save them separately."
         )

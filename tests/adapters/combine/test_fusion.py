@@ -1,4 +1,4 @@
-"""Fused LoRAs against the sum that they stand for; kernels back from merged ones."""
+"""Compare fused LoRAs with the weighted sum, and unmerged kernels with the original ones."""
 
 import functools
 
@@ -84,14 +84,14 @@ def test_deltas_of_zero():
     np.testing.assert_array_equal(a @ b, 0)
 
 
-def test_what_does_not_fuse():
-    with pytest.raises(ValueError, match=r"cannot fuse sp at inp: LoRASP.* is no LoRA"):
+def test_fuse_errors():
+    with pytest.raises(ValueError, match=r"cannot fuse sp at inp: LoRASP.* is not plain LoRA"):
         lorasp_jax.fuse(pair(), {"pour": 1.0, "sp": 0.5})
-    with pytest.raises(ValueError, match="no adapter 'pure'; the model has pour"):
+    with pytest.raises(ValueError, match="unknown adapter 'pure'; the model has pour"):
         lorasp_jax.fuse(pair(), {"pure": 1.0})
     with pytest.raises(ValueError, match="rank must be an integer from 1 to 1048576, got 0"):
         lorasp_jax.fuse(pair(), WEIGHTS, rank=0)
-    with pytest.raises(ValueError, match="needs weights by name, at least one"):
+    with pytest.raises(ValueError, match="weights must be a non-empty mapping from name"):
         lorasp_jax.fuse(pair(), {})
 
 
@@ -103,7 +103,7 @@ METHODS = [peft.create(n, rank=2) for n in peft.names() if n not in UNMERGEABLE]
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
 @pytest.mark.parametrize("method", [*METHODS, LoRA(rank=3, rank_stabilized=True), *SPLITS], ids=str)
 def test_unmerge(method, dtype):
-    """The kernels that the adapters are over, to the stated rounding, and the same adapters."""
+    """The base kernels are restored up to the documented rounding, with the same adapters."""
     graphdef, state = nnx.split(NET)
     net = nnx.merge(graphdef, jax.tree.map(lambda leaf: leaf.astype(dtype), state))
     model = trained(("inp|blocks", method), seed=4, net=net)
@@ -131,8 +131,8 @@ def test_unmerge_by_a_file(tmp_path):
     assert_close(back.blocks.kernel.get_value(), NET.blocks.kernel.get_value())
 
 
-def test_unmerge_what_also_trains_in_full():
-    """Biases come back as what they are: trained, and training."""
+def test_unmerge_with_fully_fine_tuned_weights():
+    """Biases keep their trained values and are trainable again."""
     rules = [("bias|out", FullFineTuning()), ("blocks", LoRA(rank=2))]
     model = trained(*rules, seed=4)
     back = lorasp_jax.unmerge(lorasp_jax.merge(model), model)
@@ -143,11 +143,11 @@ def test_unmerge_what_also_trains_in_full():
         lorasp_jax.unmerge(nnx.Dict(blocks=lorasp_jax.merge(model).blocks), model)
 
 
-def test_what_does_not_unmerge():
+def test_unmerge_errors():
     model = trained(("blocks", LoRA(rank=2)), seed=4)
     merged = lorasp_jax.merge(model)
     for method, message in (
-        (DoRA(rank=2), r"cannot unmerge blocks: DoRA.* did not just add"),
+        (DoRA(rank=2), r"cannot unmerge blocks: DoRA.* does not just add"),
         (SP, "cannot unmerge blocks: LoRA-SP chooses its directions per input"),
         (LoRAMoE(experts=2, rank=2), "cannot unmerge blocks: LoRA-MoE's delta depends"),
     ):

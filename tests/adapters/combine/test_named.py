@@ -1,4 +1,4 @@
-"""Named adapters in one model: against each adapted model alone, and against Hugging Face PEFT."""
+"""Compare combined models with each adapted model, and with Hugging Face PEFT."""
 
 import functools
 
@@ -35,29 +35,29 @@ def models():
 
 
 @functools.cache
-def together():
+def combined():
     return lorasp_jax.combine(models())
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_one_alone(name):
-    assert_close(call(lorasp_jax.choose(together(), name), X), call(models()[name], X))
+def test_each_adapter(name):
+    assert_close(call(lorasp_jax.choose(combined(), name), X), call(models()[name], X))
 
 
 def test_the_base_and_the_first():
-    assert_close(call(lorasp_jax.choose(together(), None), X), call(NET, X))
-    assert_close(call(together(), X), call(models()["pour"], X))
-    assert named.names(together()) == NAMES
+    assert_close(call(lorasp_jax.choose(combined(), None), X), call(NET, X))
+    assert_close(call(combined(), X), call(models()["pour"], X))
+    assert named.names(combined()) == NAMES
 
 
-def test_each_example_its_own():
+def test_choice_per_example():
     chosen = ["press", "open", None, "pour"]
-    y = call(lorasp_jax.choose(together(), chosen), X)
+    y = call(lorasp_jax.choose(combined(), chosen), X)
     alone = [call(models()[n] if n else NET, X)[i] for i, n in enumerate(chosen)]
     assert_close(y, jnp.stack(alone))
 
 
-def test_a_choice_compiles_nothing():
+def test_choices_do_not_recompile():
     """Neither another name nor another sum, by a new model or by an array inside jit."""
     traces = []
 
@@ -72,12 +72,12 @@ def test_a_choice_compiles_nothing():
         return lorasp_jax.choose(model, weights)(x)
 
     for choice in ("pour", "open", None, WEIGHTS):
-        y = run(lorasp_jax.choose(together(), choice), X)
-        assert_close(run_weights(together(), named.weights(together(), choice), X), y)
+        y = run(lorasp_jax.choose(combined(), choice), X)
+        assert_close(run_weights(combined(), named.weights(combined(), choice), X), y)
     assert traces == ["model", "array"]
     for choices in (["pour", None, "open", WEIGHTS], ["press"] * 4):
-        y = run(lorasp_jax.choose(together(), choices), X)
-        assert_close(run_weights(together(), named.weights(together(), choices), X), y)
+        y = run(lorasp_jax.choose(combined(), choices), X)
+        assert_close(run_weights(combined(), named.weights(combined(), choices), X), y)
     assert traces == ["model", "array"] * 2
 
 
@@ -118,71 +118,73 @@ def test_weighted_sum_is_one_merged_model():
 @pytest.mark.parametrize("name", NAMES)
 def test_extracting_one(tmp_path, name):
     """As it was before, ready to train, and through a file."""
-    alone = lorasp_jax.extract(together(), name)
+    alone = lorasp_jax.extract(combined(), name)
     assert_close(call(alone, X), call(models()[name], X))
     assert adaptation.count(alone).trainable == adaptation.count(models()[name]).trainable
     save_adapters(tmp_path, alone)
-    model = lorasp_jax.swap(together(), name, load_adapters(tmp_path, NET))
+    model = lorasp_jax.swap(combined(), name, load_adapters(tmp_path, NET))
     assert_close(call(lorasp_jax.choose(model, name), X), call(models()[name], X))
 
 
 def test_extracting_the_base():
-    base = lorasp_jax.extract(together(), None)
+    base = lorasp_jax.extract(combined(), None)
     assert not adaptation.methods(base)
     np.testing.assert_array_equal(call(base, X), call(NET, X))
 
 
-def test_nothing_trains_and_the_base_is_shared():
-    assert not jax.tree.leaves(nnx.state(together(), AdapterParam))
-    assert together().blocks.kernel.get_value() is NET.blocks.kernel.get_value()
+def test_nothing_is_trainable_and_the_base_is_shared():
+    assert not jax.tree.leaves(nnx.state(combined(), AdapterParam))
+    assert combined().blocks.kernel.get_value() is NET.blocks.kernel.get_value()
     assert models()["pour"].blocks.method == LoRA(rank=3)
     chosen = named.AdapterChoice
     assert not np.array_equal(
         *(
-            jax.tree.leaves(nnx.state(lorasp_jax.choose(together(), n), chosen))
+            jax.tree.leaves(nnx.state(lorasp_jax.choose(combined(), n), chosen))
             for n in ("pour", "open")
         )
     )
 
 
 def test_unknown_names():
-    with pytest.raises(ValueError, match=r"no adapter 'puor'; the model has pour"):
-        lorasp_jax.choose(together(), "puor")
-    with pytest.raises(ValueError, match="no adapter 'press2'"):
-        lorasp_jax.choose(together(), ["pour", {"press2": 0.5}])
-    with pytest.raises(ValueError, match="no adapter 'prss'"):
-        lorasp_jax.extract(together(), "prss")
+    with pytest.raises(ValueError, match=r"unknown adapter 'puor'; the model has pour"):
+        lorasp_jax.choose(combined(), "puor")
+    with pytest.raises(ValueError, match="unknown adapter 'press2'"):
+        lorasp_jax.choose(combined(), ["pour", {"press2": 0.5}])
+    with pytest.raises(ValueError, match="unknown adapter 'prss'"):
+        lorasp_jax.extract(combined(), "prss")
     with pytest.raises(ValueError, match="no named adapters: combine models first"):
         lorasp_jax.choose(NET, "pour")
     for bad in (jnp.ones(3), [], np.array([0, 1, 2, 3]), np.ones((2, 2, 4))):
-        with pytest.raises(ValueError, match=r"are floats of shape \[4\] or \[B, 4\], got "):
-            lorasp_jax.choose(together(), bad)
+        with pytest.raises(
+            ValueError, match=r"must be floating point of shape \[4\] or \[B, 4\], got "
+        ):
+            lorasp_jax.choose(combined(), bad)
 
 
-def test_models_that_do_not_combine():
-    other = with_random_parameters(Net)
+def test_combine_errors():
+    other = filled(Net)
     other.inp.kernel.set_value(other.inp.kernel.get_value() + 1)
     with pytest.raises(ValueError, match="pour and b have different bases, first at 'inp/kernel'"):
         lorasp_jax.combine({"pour": models()["pour"], "b": other})
-    with pytest.raises(ValueError, match=r"full trains out/(kernel|bias)"):
+    with pytest.raises(ValueError, match=r"full also trains the base weight out/(kernel|bias)"):
         lorasp_jax.combine({"full": trained(("out", FullFineTuning()), seed=0)})
     with pytest.raises(ValueError, match="inp split the kernel"):
         lorasp_jax.combine({"a": trained(("inp", LoRA(2, initialization="pissa")), seed=0)})
-    with pytest.raises(ValueError, match="has named adapters already"):
-        lorasp_jax.combine({"a": together()})
-    with pytest.raises(ValueError, match="rank 4 needs more than the room for rank 3"):
+    with pytest.raises(ValueError, match="is already a combined model"):
+        lorasp_jax.combine({"a": combined()})
+    with pytest.raises(ValueError, match="rank 4 exceeds the maximum rank 3"):
         lorasp_jax.combine(models(), rank=3)
-    with pytest.raises(ValueError, match="a mapping by name, a text, and at least one"):
+    with pytest.raises(ValueError, match="must be a non-empty mapping from name"):
         lorasp_jax.combine({})
 
 
-def test_adapters_that_do_not_fit_a_place():
-    with pytest.raises(ValueError, match=r"open at blocks needs DoRA\(rank=2"):
-        lorasp_jax.swap(together(), "open", trained(("inp", SP), seed=0))
-    with pytest.raises(ValueError, match="pour at blocks needs a LoRA"):
-        lorasp_jax.swap(together(), "pour", models()["open"])
+def test_swap_errors():
+    with pytest.raises(ValueError, match=r"open at blocks requires the method DoRA\(rank=2"):
+        lorasp_jax.swap(combined(), "open", trained(("inp", SP), seed=0))
+    with pytest.raises(ValueError, match="pour at blocks requires the method LoRA"):
+        lorasp_jax.swap(combined(), "pour", models()["open"])
     few = lorasp_jax.combine({"open": models()["open"], "pour": models()["pour"]})
-    with pytest.raises(ValueError, match="pour adapts out, where the combined model has no"):
+    with pytest.raises(ValueError, match="pour adapts out, but the combined model has no"):
         lorasp_jax.swap(few, "pour", models()["press"])
 
 
@@ -208,7 +210,7 @@ def test_hugging_face(case, choice):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", mostly_slow([n for n in METHODS if n != "full"], ["lora_sp"]))
-def test_half_of_an_adapter_is_half_of_what_it_changes(name):
+def test_half_weight_is_half_the_delta(name):
     model = trained(("inp", METHODS[name]), seed=6)
     pair = lorasp_jax.combine({"lora": models()["pour"], "own": model})
     half = lorasp_jax.choose(pair, {"own": 0.5}).inp(X)
