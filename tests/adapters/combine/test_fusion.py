@@ -153,7 +153,7 @@ def test_unmerge_errors():
     ):
         with pytest.raises(ValueError, match=message):
             lorasp_jax.unmerge(merged, trained(("blocks", method), seed=4))
-    with pytest.raises(ValueError, match="blocks of the merged model has an adapter"):
+    with pytest.raises(ValueError, match="must have no adapters, but blocks has one"):
         lorasp_jax.unmerge(model, model)
     with pytest.raises(ValueError, match="has no layer blocks"):
         lorasp_jax.unmerge(merged.inp, model)
