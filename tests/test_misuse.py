@@ -144,7 +144,7 @@ def test_methods_are_found_by_name():
     ("call", "message"),
     [
         (lambda m: lorasp_jax.combine([m]), "must be a non-empty mapping from name"),
-        (lambda m: lorasp_jax.combine({"a": m}, rank=2.5), "rank must be a whole number up to"),
+        (lambda m: lorasp_jax.combine({"a": m}, rank=2.5), "rank must be an integer up to"),
         (lambda m: lorasp_jax.combine({"a": m}, rank=-1), "or None, got -1"),
         (lambda m: lorasp_jax.choose(lorasp_jax.combine({"a": m}), 3), "choice must be a name"),
         (

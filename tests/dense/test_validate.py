@@ -73,7 +73,10 @@ def with_kernel(value):
         ),
         # Linen
         (lambda: LINEN.init(0, X), "key must be a key such as jax.random.key(0), got 0"),
-        (lambda: LINEN.init({"dropout": KEY}, X), "need a key for \"params\", got ['dropout']"),
+        (
+            lambda: LINEN.init({"dropout": KEY}, X),
+            "must have a key for \"params\", got ['dropout']",
+        ),
         (lambda: LINEN.attach(None, VARIABLES["params"], X), 'a dict whose "params" is a dict'),
         (lambda: LINEN.attach(None, {"params": {}}, X), "key must be a key such as"),
         (

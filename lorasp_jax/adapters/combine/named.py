@@ -65,9 +65,7 @@ def combine(models: Mapping[str, Model], *, rank: int | None = None) -> Model:
     for model in models.values():
         validate.with_values(model)
     if rank is not None and not (type(rank) is int and 0 <= rank <= MAX_SIZE):
-        raise ValueError(
-            f"rank must be a whole number up to {MAX_SIZE} or None, got {short(rank)}."
-        )
+        raise ValueError(f"rank must be an integer up to {MAX_SIZE} or None, got {short(rank)}.")
     adapter_names = tuple(models)
     bases = {name: strip_adapters(model) for name, model in models.items()}
     adapters = {name: adapters_by_path(name, model) for name, model in models.items()}

@@ -162,7 +162,7 @@ def test_unknown_names():
 
 
 def test_combine_errors():
-    other = filled(Net)
+    other = with_random_parameters(Net)
     other.inp.kernel.set_value(other.inp.kernel.get_value() + 1)
     with pytest.raises(ValueError, match="pour and b have different bases, first at 'inp/kernel'"):
         lorasp_jax.combine({"pour": models()["pour"], "b": other})
