@@ -112,7 +112,7 @@ def time_images(env: Env, state: State, size: int) -> float:
 def mujoco_c(env: Env, state: State) -> float:
     """Measure physics steps/s of MuJoCo's C engine from the same start, one thread per core."""
     cores = os.cpu_count() or 1
-    model = placing.placed(env.model, state.info["layout"], 0)
+    model = placing.world_model(env.model, state.info["layout"], 0)
     data = [mujoco.MjData(model) for _ in range(cores)]
     data[0].qpos[:] = np.asarray(state.data.qpos[0])
     spec = mujoco.mjtState.mjSTATE_FULLPHYSICS

@@ -65,7 +65,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     option("--actions", default="joint", help=f"{', '.join(actions.MODES)} {_DEFAULT}")
     text = f"standard deviation of noise on joint targets [rad] {_DEFAULT}"
     option("--action-noise", type=finite, default=0.0, help=text)
-    text = f"unrelated objects on the table, up to {distractors.MOST} {_DEFAULT}"
+    text = f"unrelated objects on the table, up to {distractors.MAX_COUNT} {_DEFAULT}"
     option("--distractors", type=int, default=0, help=text)
     text = "randomize masses, cameras, light and more between worlds"
     option("--randomize", action="store_true", help=text)

@@ -9,25 +9,25 @@ import jax.numpy as jnp
 import numpy as np
 
 
-def count(name: str, value: Any, most: int, least: int = 1) -> int:
-    """Check that a value is an integer between `least` and `most`, and return it as an int.
+def count(name: str, value: Any, maximum: int, minimum: int = 1) -> int:
+    """Check that a value is an integer from `minimum` to `maximum`, and return it as an int.
 
     Raises:
         TypeError: it is not an integer.
         ValueError: it is out of range.
     """
     if isinstance(value, bool | np.bool_) or not isinstance(value, numbers.Integral):
-        raise TypeError(f"{name} must be a whole number, got {value!r}")
-    whole = int(value)
-    if whole < least:
-        raise ValueError(f"{name} must be at least {least}, got {whole}")
-    if whole > most:
-        raise ValueError(f"{name} must be at most {most:,}, got {whole:,}")
-    return whole
+        raise TypeError(f"{name} must be an integer, got {value!r}")
+    number = int(value)
+    if number < minimum:
+        raise ValueError(f"{name} must be at least {minimum}, got {number}")
+    if number > maximum:
+        raise ValueError(f"{name} must be at most {maximum:,}, got {number:,}")
+    return number
 
 
 def number(name: str, value: Any) -> float:
-    """Check that a value is a finite real number or such a scalar array; return it as a float.
+    """Check that a value is a finite real number or scalar array, and return it as a float.
 
     Raises:
         TypeError: it is not a real number.
@@ -51,8 +51,8 @@ def key(value: Any) -> Any:
     if dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key):
         if shape != ():
             raise TypeError(f"key must be one key, got an array of keys of shape {shape}")
-    elif dtype != jnp.uint32 or shape not in ((2,), (4,)):  # raw, threefry's or rbg's
-        raise TypeError(f"key must be a key such as jax.random.key(0), got {short(value)}")
+    elif dtype != jnp.uint32 or shape not in ((2,), (4,)):  # raw keys of threefry and of rbg
+        raise TypeError(f"key must be a JAX key such as jax.random.key(0), got {short(value)}")
     return value
 
 
@@ -70,10 +70,10 @@ def action(value: Any, shape: tuple[int, ...]) -> Any:
     return value
 
 
-def instance(name: str, value: Any, kind: type, where: str) -> None:
-    """Raise a TypeError if a value is not an instance of `kind`; `where` says how to get one."""
+def instance(name: str, value: Any, kind: type, expected: str) -> None:
+    """Raise a TypeError if a value is not an instance of `kind`, described by `expected`."""
     if not isinstance(value, kind):
-        raise TypeError(f"{name} must be {where}, got {short(value)}")
+        raise TypeError(f"{name} must be {expected}, got {short(value)}")
 
 
 def is_numeric(value: Any) -> bool:

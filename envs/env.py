@@ -118,7 +118,7 @@ class Env:
         Raises:
             TypeError, ValueError: the key or a range is invalid.
         """
-        ranges = randomization.prepared(ranges, self.control_dt)
+        ranges = randomization.prepare(ranges, self.control_dt)
         with self._calls.first("reset", ranges is None):
             return self._resets(checks.key(key), ranges)
 
@@ -197,7 +197,7 @@ class Env:
 
         keys = jax.random.split(policy_key, self.max_steps)
         start = self.reset(reset_key, ranges)
-        with self._calls.announced("rollout"):  # every time: JAX retraces for each policy
+        with self._calls.announce("rollout"):  # every time: JAX retraces for each policy
             return jax.lax.scan(body, start, keys)
 
     def reset_done(
@@ -262,8 +262,8 @@ class Env:
     def _check_worlds(self, state: Any) -> None:
         checks.instance("state", state, State, "a state from reset or step")
         if state.done.shape != (self.num_envs,):
-            number = state.done.shape[0] if state.done.shape else "no axis of"
-            raise ValueError(f"state has {number} worlds, this environment {self.num_envs}")
+            got = f"{state.done.shape[0]} worlds" if state.done.shape else "no axis of worlds"
+            raise ValueError(f"state must have {self.num_envs} worlds, got {got}")
 
     @functools.cached_property
     def _calls(self) -> messages.Calls:

@@ -24,12 +24,12 @@ from envs.scene import scene
 AnyRobot = str | os.PathLike[str] | Robot
 RendererName = Literal["rays", "warp"]
 RENDERERS: tuple[str, ...] = get_args(RendererName)
-# Upper bounds, beyond any device's memory, against typos; and lower bounds that are not 1.
+# Upper bounds against typos, beyond any device's memory; and lower bounds other than 1.
 _RANGES: dict[str, tuple[int, ...]] = {
     "num_envs": (2**20,),
     "image_size": (2**12,),
     "antialias": (16,),
-    "distractors": (envs.scene.distractors.MOST, 0),
+    "distractors": (envs.scene.distractors.MAX_COUNT, 0),
 }
 
 
@@ -56,7 +56,7 @@ def make(
             `envs.mjcf.load`.
         num_envs: number of parallel worlds W.
         image_size: height and width of images [px].
-        antialias: n, for smooth edges with n x n rays per pixel at n² times the cost.
+        antialias: n, for n x n rays per pixel: smoother edges at n² times the cost.
         control_dt: time between actions [s], a multiple of 0.02.
         actions: action mode: joint, delta_joint or end_effector, see `envs.actions`.
         reward: sparse, 1 on success, or dense, with shaping by progress, see `envs.rewards`.
@@ -76,7 +76,7 @@ def make(
     num_envs, image_size, antialias, distractors = _counts(
         num_envs=num_envs, image_size=image_size, antialias=antialias, distractors=distractors
     )
-    control_dt = _checked_dt(control_dt, task_definition.time_limit)
+    control_dt = _check_dt(control_dt, task_definition.time_limit)
     _check_learning(actions, reward, discount)
     objects = task_definition.scene + envs.scene.distractors.mjcf(distractors)
     model = scene.build(objects, robot_model)
@@ -103,19 +103,20 @@ def _renderer(
     rays = render.RayRenderer(render.build(model, scene.CAMERAS), image_size, antialias)
     if name == "rays":
         return rays
-    physics.need_warp("renderer")
+    physics.require_warp("renderer")
     from envs.rendering.warp import WarpRenderer
 
     return WarpRenderer(model, rays, num_envs)
 
 
-def _checked_dt(value: float, time_limit: float) -> float:
+def _check_dt(value: float, time_limit: float) -> float:
+    """Check the control period [s], and return it as a float."""
     control_dt = checks.number("control_dt", value)
     if control_dt > time_limit:
         limit = f"the time limit of the task, {time_limit} s"
         raise ValueError(f"control_dt must be at most {limit}, got {control_dt}")
-    moves = control_dt / TARGET_DT
-    if round(moves) < 1 or abs(moves - round(moves)) > 1e-6:
+    targets = control_dt / TARGET_DT
+    if round(targets) < 1 or abs(targets - round(targets)) > 1e-6:
         raise ValueError(
             f"control_dt must be a positive multiple of {TARGET_DT} s, got {control_dt}"
         )
@@ -143,12 +144,13 @@ def _check_learning(actions: Mode, reward: Reward, discount: float) -> None:
 
 
 def _find_robot(robot: AnyRobot) -> Robot:
+    """Return a robot, given itself, its name or its MJCF file."""
     if isinstance(robot, Robot):
         return robot
     path = os.fspath(robot) if isinstance(robot, str | os.PathLike) else None
     if not isinstance(path, str):
-        what = f"one of {', '.join(names('robot'))}, the path of an MJCF file or a Robot"
-        raise TypeError(f"robot must be {what}, got {checks.short(robot)}")
+        valid = f"one of {', '.join(names('robot'))}, the path of an MJCF file or a Robot"
+        raise TypeError(f"robot must be {valid}, got {checks.short(robot)}")
     return mjcf.load(path) if path.endswith(".xml") else _find("robot", path)
 
 

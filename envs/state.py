@@ -42,7 +42,7 @@ class Data:
 
 
 class Poses(NamedTuple):
-    """Where all geoms and cameras of a scene are, in the world frame; leading axes may precede.
+    """Poses of all geoms and cameras of a scene, in the world frame; leading axes may precede.
 
     Attributes:
         geom_xpos: `[G, 3]` positions of the geoms [m].
@@ -58,12 +58,12 @@ class Poses(NamedTuple):
 
     @classmethod
     def of(cls, data: Data) -> Self:
-        """The poses in the data of a state."""
+        """Take the poses from the data of a state."""
         return cls(data.geom_xpos, data.geom_xmat, data.cam_xpos, data.cam_xmat)
 
 
 MOVING = ("qpos", "qvel", "qacc_warmstart")
-"""The fields of `Data` that physics steps update; all others are computed from them."""
+"""Fields of `Data` that physics steps update; all others are computed from them."""
 Changes = dict[str, jax.Array]
 """Fields of the MuJoCo model that differ between worlds, by MuJoCo's names."""
 

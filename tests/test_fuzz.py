@@ -119,7 +119,7 @@ def _offline(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.timeout(120)
-@pytest.mark.filterwarnings("ignore:robot .* misses parts of the table", "ignore:MuJoCo says")
+@pytest.mark.filterwarnings("ignore:robot .* misses parts of the table", "ignore:MuJoCo:")
 @pytest.mark.parametrize("kind", KINDS)
 def test_read_or_refused(kind: str, good: dict[str, Path], tmp_path: Path) -> None:
     check(kind, range(SEEDS // DEAR.get(kind, 1)), good, tmp_path)
@@ -127,7 +127,7 @@ def test_read_or_refused(kind: str, good: dict[str, Path], tmp_path: Path) -> No
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-@pytest.mark.filterwarnings("ignore:robot .* misses parts of the table", "ignore:MuJoCo says")
+@pytest.mark.filterwarnings("ignore:robot .* misses parts of the table", "ignore:MuJoCo:")
 @pytest.mark.parametrize("kind", KINDS)
 def test_many(kind: str, good: dict[str, Path], tmp_path: Path) -> None:
     check(kind, range(SEEDS, SLOW_SEEDS // DEAR.get(kind, 1)), good, tmp_path)

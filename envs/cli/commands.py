@@ -168,7 +168,7 @@ def _collect(options: argparse.Namespace, env: envs.Env, out: Path, report: Repo
         jax.random.key(options.seed),
         options.action_noise,
         recipes.ranges(options),
-        kept=writer.num_episodes,
+        collected=writer.num_episodes,
         attempted=writer.attempted,
         record=options.record,
     ):

@@ -64,7 +64,9 @@ def episode(
             world = wins[0]
             steps = int(states[-1].info["steps"][world])
             positions = [np.asarray(state.data.qpos[world]) for state in states[: steps + 1]]
-            return placing.placed(env.model, states[0].info["layout"], world), np.stack(positions)
+            return placing.world_model(env.model, states[0].info["layout"], world), np.stack(
+                positions
+            )
     raise ValueError(f"the expert failed in all {tries * env.num_envs} layouts")
 
 

@@ -18,7 +18,7 @@ _FATAL, _JAX_DEFAULT = 3, 1  # levels of TF_CPP_MIN_LOG_LEVEL
 
 
 def silence(
-    set_level: Callable[[int], None] = _compat.set_least_logged_level,
+    set_level: Callable[[int], None] = _compat.set_min_log_level,
 ) -> "Compilations | None":
     """Log nothing below fatal from JAX's C++ code while this process compiles. Call it once.
 

@@ -17,7 +17,7 @@ PATIENCE = 2.0
 
 
 @contextlib.contextmanager
-def announced(what: str) -> Iterator[None]:
+def announce(what: str) -> Iterator[None]:
     """Print a line to stderr if the enclosed compilation takes long, and another when it is done.
 
     Of several processes only the first prints.
@@ -28,7 +28,7 @@ def announced(what: str) -> Iterator[None]:
     config = jax.config
     cached = config.jax_enable_compilation_cache and config.jax_compilation_cache_dir is not None
     start = time.monotonic()
-    once = " (long the first time only)" if cached else ""
+    once = " (slow only the first time)" if cached else ""
     timer = threading.Timer(PATIENCE, _print, [f"compiling {what}{once} ..."])
     timer.daemon = True
     timer.start()
@@ -38,7 +38,7 @@ def announced(what: str) -> Iterator[None]:
         timer.cancel()
     seconds = time.monotonic() - start
     if seconds > PATIENCE:
-        hint = "" if cached else "; envs.compilation.cache.enable() keeps it for the next start"
+        hint = "" if cached else "; envs.compilation.cache.enable() caches it for the next start"
         _print(f"compiled {what} in {seconds:.0f} s{hint}")
 
 
@@ -60,10 +60,10 @@ class Calls:
         if call in self._called or not _compat.is_untraced():
             return contextlib.nullcontext()
         self._called.add(call)
-        return self.announced(call[0])
+        return self.announce(call[0])
 
-    def announced(self, what: str) -> AbstractContextManager[None]:
+    def announce(self, what: str) -> AbstractContextManager[None]:
         """Announce a compilation, unless it is part of an outer trace."""
         if not _compat.is_untraced():
             return contextlib.nullcontext()
-        return announced(f"{what} of {self._name}")
+        return announce(f"{what} of {self._name}")

@@ -17,7 +17,7 @@ from envs.datasets.episodes import Episodes, concatenate
 from envs.env import Env
 from envs.experts import expert, traced
 from envs.making import AnyRobot, make
-from envs.scene.randomization import Draw, Randomization, prepared
+from envs.scene.randomization import Draw, Randomization, prepare
 from envs.state import Poses
 
 # Default number of worlds per call; own choice: fills the device and fits its memory.
@@ -30,7 +30,7 @@ _MAX_EPISODES = 10**9  # own choice, a bound against typos
 Record = Callable[
     [Env, jax.Array, float | jax.Array, Randomization | None], tuple[dict[str, Any], jax.Array]
 ]
-"""Attempts an episode in every world: the arrays of `Episodes`, and which succeeded."""
+"""Attempt an episode in every world; return the arrays of `Episodes`, and which succeeded."""
 
 
 @jax.tree_util.register_dataclass
@@ -79,8 +79,8 @@ def rollout(
     def body(state: Any, key: jax.Array) -> tuple[Any, tuple]:
         action = expert.act(env, plan, state)
         noise = action_noise * jax.random.normal(key, action.shape).at[:, -1].set(0.0)
-        seen = (env.proprio(state), action, Poses.of(state.data), ~state.done)
-        return env.step(state, action + noise), seen
+        record = (env.proprio(state), action, Poses.of(state.data), ~state.done)
+        return env.step(state, action + noise), record
 
     keys = jax.random.split(noise_key, env.expert_steps)
     last, (state, action, poses, alive) = jax.lax.scan(body, first, keys)
@@ -121,7 +121,7 @@ def collect(
         action_noise: see `rollout`.
         ranges: see `rollout`.
         progress: called with (episodes so far, num_episodes), first with 0 before compilation.
-        record: attempts an episode in every world; default: the expert in simulation.
+        record: function that attempts an episode in every world; default: the expert in simulation.
         **options: further options of `envs.make`; the backend defaults to jax.
 
     Raises:
@@ -146,11 +146,11 @@ def expert_success(
 ) -> jax.Array:
     """Return whether the expert solves each of `num_episodes` random layouts, bool [num_episodes].
 
-    Arguments are as in `collect`; `attempt` returns the success of every world, by default of the
+    Arguments are as in `collect`; `attempt` returns which worlds succeed, by default with the
     expert in simulation.
     """
     env = make_repeatable(task, robot, num_envs=worlds(num_episodes, num_envs), **options)
-    ranges = prepared(ranges, env.control_dt)
+    ranges = prepare(ranges, env.control_dt)
     checks.key(key)
     calls = -(-num_episodes // env.num_envs)
     attempt = attempt or attempt_expert
@@ -171,39 +171,39 @@ def gather(
     action_noise: float = 0.0,
     ranges: Randomization | None = None,
     *,
-    kept: int = 0,
+    collected: int = 0,
     attempted: int = 0,
     record: Record | None = None,
 ) -> Iterator[Episodes]:
-    """Yield the successful episodes of one call after the other, `num_episodes` in total.
+    """Yield successful episodes call by call, `num_episodes` in total.
 
     Args:
         env: W worlds, one attempt each per call.
         num_episodes, key, action_noise, ranges: as in `collect`.
-        kept, attempted: episodes yielded and attempts made before an interruption, to resume with
-            the same episodes as without it.
+        collected, attempted: episodes yielded and attempts made before an interruption; resuming
+            with them gives the same episodes as without it.
         record: as in `collect`.
 
     Raises:
         ValueError: the expert fails too often.
     """
     record = record or record_expert
-    ranges = prepared(ranges, env.control_dt)
+    ranges = prepare(ranges, env.control_dt)
     checks.key(key)
     if checks.number("action_noise", action_noise) < 0:
         raise ValueError(f"action_noise must be at least 0, got {action_noise}")
     for _ in range(attempted // env.num_envs):
         key, _ = jax.random.split(key)
     tried = 0  # since the last success
-    while kept < num_episodes:
-        _check_success(env, kept, attempted)
+    while collected < num_episodes:
+        _check_success(env, collected, attempted)
         key, chunk_key = jax.random.split(key)
         # Wait here, outside Python's lock, so that other threads can write their episodes.
         chunk, success = jax.block_until_ready(record(env, chunk_key, action_noise, ranges))
-        wins = np.flatnonzero(success)[: num_episodes - kept]
-        kept += len(wins)
+        wins = np.flatnonzero(success)[: num_episodes - collected]
+        collected += len(wins)
         # Do not count attempts after the last one needed.
-        tries = env.num_envs if kept < num_episodes else int(wins[-1]) + 1
+        tries = env.num_envs if collected < num_episodes else int(wins[-1]) + 1
         attempted, tried = attempted + tries, tried + tries
         if len(wins):
             won = jax.tree.map(lambda x, wins=wins: x[wins], chunk)
@@ -240,10 +240,10 @@ def _silent(done: int, total: int) -> None:
     """Report no progress."""
 
 
-def _check_success(env: Env, kept: int, attempted: int) -> None:
-    if attempted >= _MIN_ATTEMPTS and kept < _MIN_SUCCESS * attempted:
+def _check_success(env: Env, collected: int, attempted: int) -> None:
+    if attempted >= _MIN_ATTEMPTS and collected < _MIN_SUCCESS * attempted:
         raise ValueError(
-            f"the expert solved only {kept} of {attempted} layouts of {env.task.name!r} with "
+            f"the expert solved only {collected} of {attempted} layouts of {env.task.name!r} with "
             f"{env.robot.name!r}, but should solve {_MIN_SUCCESS:.0%}: check the scene or lower "
             "action_noise"
         )
@@ -253,7 +253,7 @@ def _check_success(env: Env, kept: int, attempted: int) -> None:
 def record_expert(
     env: Env, key: jax.Array, action_noise: float | jax.Array, ranges: Randomization | None
 ) -> tuple[dict[str, Any], jax.Array]:
-    """The expert's attempts at random layouts, with pictures: a `Record`."""
+    """Attempt random layouts with the expert and render images, as a `Record`."""
     tries = rollout(env, key, action_noise, ranges)
     steps, worlds = tries.action.shape[:2]
     # World-major order, so that the images of an episode are contiguous.

@@ -48,7 +48,7 @@ def act(env: Env, plan: Plan, state: State) -> jax.Array:
     return jax.vmap(convert)(state.info["command"], targets)
 
 
-def leaning(robot: Robot, waypoints: Waypoints) -> jax.Array:
+def tool_rotations(robot: Robot, waypoints: Waypoints) -> jax.Array:
     """Compute tool rotations [P, 3, 3]: the waypoints' plus the robot's lean and tilt."""
     # The tcp's x axis points back to the base; y, along which the fingers open, stays level.
     angle = -(waypoints.lean * robot.lean + waypoints.tilt * robot.tilt_side)
@@ -64,7 +64,7 @@ def _plan(env: Env, info: dict, key: jax.Array) -> Plan:
     waypoints = env.task.waypoints({k: v.at[2].divide(size) for k, v in info["layout"].items()})
     noise = jax.random.normal(position_key, waypoints.position.shape) * waypoints.spread[:, None]
     start = info["command"]
-    rotations = leaning(env.robot, waypoints)
+    rotations = tool_rotations(env.robot, waypoints)
     heights = waypoints.position[:, 2] - waypoints.reach
     scaled = waypoints.position.at[:, 2].add((size - 1) * heights)
     positions = scaled + noise + waypoints.reach[:, None] * rotations[:, :, 2]

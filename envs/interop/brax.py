@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from envs import checks
 from envs.compilation import fast_cpu
 from envs.env import Env
-from envs.scene.randomization import Randomization, prepared
+from envs.scene.randomization import Randomization, prepare
 from envs.state import State
 
 try:
@@ -61,7 +61,7 @@ class BraxEnv(base.Env):
         """
         checks.instance("env", env, Env, "an environment from envs.make")
         self.env: Env = dataclasses.replace(env, num_envs=1)
-        prepared(ranges, env.control_dt)
+        prepare(ranges, env.control_dt)
         self.ranges = ranges
 
     def reset(self, rng: jax.Array) -> base.State:
@@ -70,7 +70,7 @@ class BraxEnv(base.Env):
         Raises:
             TypeError: `rng` is not a key.
         """
-        ranges = prepared(self.ranges, self.env.control_dt)
+        ranges = prepare(self.ranges, self.env.control_dt)
         with self.env._calls.first("reset", ranges is None):
             world = _reset(self.env, ranges, checks.key(rng))
         return base.State(reward=world.reward, metrics=world.metrics, **self._fields(world))

@@ -17,7 +17,7 @@ import numpy as np
 from envs import checks
 from envs.env import Env
 from envs.making import make as make_env
-from envs.scene.randomization import Randomization, prepared
+from envs.scene.randomization import Randomization, prepare
 from envs.state import State
 
 try:
@@ -42,7 +42,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     """W worlds of a task behind Gymnasium's interface.
 
     Observations are one of `OBSERVATIONS`, with leading axis W. Actions are those of `Env.step`,
-    float32 [W, A]. Info: `success`, bool [W], and `instruction`, text [W].
+    float32 [W, A]. Info: `success`, bool [W], and `instruction`, string [W].
 
     Worlds restart automatically in Gymnasium's next-step mode: the step after a world ended ignores
     its action and returns the first observation of its next episode, with reward 0 and neither
@@ -67,7 +67,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
         Args:
             env: from `envs.make`.
-            observation: one of `OBSERVATIONS`; pictures cost more than the physics.
+            observation: one of `OBSERVATIONS`; rendering pictures costs more than the physics.
             ranges: for every episode, as in `Env.reset`.
 
         Raises:
@@ -77,7 +77,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         checks.instance("env", env, Env, "an environment from envs.make")
         self.env = env
         self.observation = observation
-        prepared(ranges, env.control_dt)
+        prepare(ranges, env.control_dt)
         self.ranges = ranges
         self.state: State | None = None
         self.num_envs: int = env.num_envs
@@ -160,7 +160,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 class SingleEnv(gymnasium.Env):
     """One world of a task as a Gymnasium environment; `VectorEnv` is far faster.
 
-    Works like `VectorEnv`, without the axis of worlds and without automatic restarts.
+    Like `VectorEnv`, but without the axis of worlds and without automatic restarts.
 
     Attributes:
         vector: the wrapped environment, with one world.

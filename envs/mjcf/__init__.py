@@ -23,7 +23,7 @@ from envs.mjcf import attaching, hands, posing, reading
 from envs.robots import Robot
 from envs.scene import scene
 
-# Own choices, rad/s and m/s: between Panda (2.175 to 2.61) and PiPER (3); the gripper's is both's.
+# Own choices, rad/s and m/s: between Panda (2.175 to 2.61) and PiPER (3); both grippers' speed.
 _SPEED, _GRIPPER_SPEED = 2.5, 0.1
 
 
@@ -45,7 +45,7 @@ def load(
             they open. By default the site "tcp" if there is one, else the last joint's axis is z.
             The tcp of the robot is on that z axis, `robots.TIP_LENGTH` before the fingers' ends.
         speed: joint speed limits, one for all or one each [rad/s]; MJCF has none.
-        gripper_speed: largest speed of the opening [m/s].
+        gripper_speed: maximum speed of the opening [m/s].
         folder: folder that must contain all referenced files, such as meshes, after following
             links; by default the folder of the file.
 
@@ -56,7 +56,7 @@ def load(
     try:
         robot = _read(path, tcp, speed, gripper_speed, folder)
         scene.build("", robot)  # report MuJoCo's errors now, not when a task is made
-        return posing.posed(robot)
+        return posing.complete(robot)
     except ValueError as error:
         raise ValueError(f"robot {path}: {' '.join(str(error).split())}") from None
 
@@ -97,9 +97,9 @@ def _positive(name: str, value: float | Sequence[float], count: int) -> np.ndarr
     return np.broadcast_to(numbers, count).copy()
 
 
-def _guess_home(model: mujoco.MjModel, arm: reading.Arm, middle: np.ndarray) -> np.ndarray:
+def _guess_home(model: mujoco.MjModel, arm: reading.Arm, mid_range: np.ndarray) -> np.ndarray:
     """Return initial joint angles [J] for the start pose: the keyframe "home", else mid-range."""
     for i in range(model.nkey):
         if model.key(i).name == "home":
             return model.key_qpos[i, model.jnt_qposadr[arm.joints]]
-    return middle
+    return mid_range

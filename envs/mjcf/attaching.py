@@ -15,7 +15,7 @@ from envs.robots import Robot
 
 _BASE = "base"
 _PREFIX = "robot/"  # for all names in the user's file, to avoid clashes with the scene and tasks
-_LEFT_OUT = ("keys", "sensors", "actuators", "tendons", "equalities", "pairs", "excludes", "lights")
+_DROPPED = ("keys", "sensors", "actuators", "tendons", "equalities", "pairs", "excludes", "lights")
 _UNSET = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default color; such a geom takes its material's
 _SMALL = 0.01  # m, half-extent below which a mesh is not drawn; own choice
 _HIDDEN_GROUP = 3
@@ -90,7 +90,7 @@ def prepare(
         {element.id: element for element in elements}
         for elements in (spec.bodies, spec.joints, spec.geoms)
     )
-    for kind in _LEFT_OUT:
+    for kind in _DROPPED:
         for element in list(getattr(spec, kind)):
             spec.delete(element)
     root = bodies[arm.root]

@@ -12,12 +12,14 @@ import numpy as np
 # Own choices.
 _POINTS = 500  # samples of a surface
 _CUTS = np.arange(1, 6) / 6  # candidate cuts, as fractions of a part's extent
-_WORTH = 0.85  # cut only if the volume shrinks to less than this share
-_LONG = 0.06  # m, extent above which a part may be cut; a pixel of a 64 px side camera is 6 mm wide
-_DEPTH = 3  # largest number of successive cuts
-_FEWEST = 10  # points in a part
+_MAX_VOLUME_RATIO = 0.85  # cut only if the total volume shrinks below this share
+_MIN_EXTENT = (
+    0.06  # m, extent above which a part may be cut; a pixel of a 64 px side camera is 6 mm wide
+)
+_MAX_DEPTH = 3  # of successive cuts
+_MIN_POINTS = 10  # points in a part
 _OUTLIERS = 0.01  # share of the points on each side that a shape may leave out
-_THIN = 0.0005  # m, smallest half-extent
+_MIN_HALF_EXTENT = 0.0005  # m, smallest half-extent
 _BOX, _CYLINDER, _CAPSULE = (
     mujoco.mjtGeom.mjGEOM_BOX,
     mujoco.mjtGeom.mjGEOM_CYLINDER,
@@ -51,7 +53,7 @@ def fit(model: mujoco.MjModel, geom: int) -> list[Shape]:
     frames = [np.eye(3), file_axes.reshape(3, 3).T]
     orders = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
     rotations = [frame[:, order] for frame in frames for order in orders]
-    return _fit(_sample_surface(model, mesh), rotations, _DEPTH)
+    return _fit(_sample_surface(model, mesh), rotations, _MAX_DEPTH)
 
 
 def _sample_surface(model: mujoco.MjModel, mesh: int) -> np.ndarray:
@@ -69,16 +71,16 @@ def _sample_surface(model: mujoco.MjModel, mesh: int) -> np.ndarray:
 
 def _fit(points: np.ndarray, rotations: list[np.ndarray], depth: int) -> list[Shape]:
     whole, volume = _closest(points, rotations)
-    best, parts = _WORTH * volume, None
+    best, parts = _MAX_VOLUME_RATIO * volume, None
     for axis in whole.rotation.T:
         along = points @ axis
         low, high = along.min(), along.max()
-        if depth == 0 or high - low < _LONG:
+        if depth == 0 or high - low < _MIN_EXTENT:
             continue
         for fraction in _CUTS:
             below = along < low + fraction * (high - low)
             halves = points[below], points[~below]
-            if min(map(len, halves)) < _FEWEST:
+            if min(map(len, halves)) < _MIN_POINTS:
                 continue
             volume = sum(_closest(half, rotations)[1] for half in halves)
             if volume < best:
@@ -95,10 +97,10 @@ def _closest(points: np.ndarray, rotations: list[np.ndarray]) -> tuple[Shape, fl
         local = points @ rotation
         low, high = np.quantile(local, (_OUTLIERS, 1 - _OUTLIERS), axis=0)
         middle = (low + high) / 2
-        local, half = local - middle, np.maximum((high - low) / 2, _THIN)
+        local, half = local - middle, np.maximum((high - low) / 2, _MIN_HALF_EXTENT)
         across, height = np.linalg.norm(local[:, :2], axis=1), np.abs(local[:, 2])
         radius = half[:2].mean()
-        straight = max(half[2] - radius, _THIN)
+        straight = max(half[2] - radius, _MIN_HALF_EXTENT)
         past_ends = np.stack([across - radius, height - half[2]], axis=1)
         round_ends = np.hypot(across, np.maximum(height - straight, 0)) - radius
         for kind, size, distance in (

@@ -31,7 +31,7 @@ _ROWS = 32  # poses solved at once
 _TRIES, _SPREAD = 8, 0.4  # random starts around the first guess, their standard deviation [rad]
 
 
-def posed(robot: Robot) -> Robot:
+def complete(robot: Robot) -> Robot:
     """Set home, lean and tilt side; rotate the tcp by 180 degrees about z if that fits better.
 
     Args:

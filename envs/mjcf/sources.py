@@ -17,7 +17,7 @@ from envs.datasets.files import check_memory, read_text, regular
 
 _FOLDERS = ("assetdir", "meshdir", "texturedir")  # attributes of compiler
 _DESCRIPTIONS = ("include", "model")  # elements that refer to another MJCF file
-_HOLDING = ("include", "attach")  # elements that are replaced by those of another MJCF file
+_EXPANDED = ("include", "attach")  # elements that are replaced by those of another MJCF file
 # Limits are own choices, far above any robot; MuJoCo 3.17 takes seconds at _MAX_COPIES and
 # _MAX_ELEMENTS (measured).
 _MAX_DEPTH, _MAX_TEXT = 20, 2**25
@@ -95,7 +95,7 @@ def _check_growth(descriptions: dict[Path, ElementTree.Element], main: Path) -> 
 
 def _elements(element: ElementTree.Element, copies: float, inner: float) -> float:
     """Bound the elements that one expands to, if each included file has at most `inner`."""
-    more = inner if element.tag in _HOLDING else 0.0
+    more = inner if element.tag in _EXPANDED else 0.0
     below = copies * _copies(element)
     return copies * (1 + more) + sum(_elements(child, below, inner) for child in element)
 

@@ -25,8 +25,8 @@ Backend = Literal["jax", "warp"]
 BACKENDS: tuple[str, ...] = get_args(Backend)
 """jax runs everywhere; warp is much faster on NVIDIA GPUs, and runs on CPU, slowly, for tests."""
 
-MOST_GROWTH = 1.25
-"""Largest factor on a geom's size in a world; own choice, Warp's bounding volumes allow for it."""
+MAX_GROWTH = 1.25
+"""Maximum factor on a geom's size in a world; own choice, Warp's bounding volumes allow for it."""
 
 
 @functools.cache
@@ -67,7 +67,7 @@ def default_backend() -> str:
 
 
 class Physics:
-    """Simulates one MuJoCo model; methods are pure and take one world each.
+    """Simulator of one MuJoCo model; methods are pure and take one world each.
 
     Poses always come from MJX-JAX: they are cheap, and so `reset` gives the same on every engine.
     """
@@ -93,7 +93,7 @@ class Physics:
 
             # MJX-JAX sizes its arrays for the most contacts and constraints a world can have.
             most = {"contacts": max(data._impl.ncon, 1), "rows": data._impl.nefc}
-            self._simulate = WarpSteps(model, growth=MOST_GROWTH, **most)
+            self._simulate = WarpSteps(model, growth=MAX_GROWTH, **most)
 
     def start(self, changes: Changes, qpos: jax.Array) -> Data:
         """Return a world at rest at these joint positions."""
@@ -151,10 +151,10 @@ def _check_backend(backend: str) -> None:
     if backend not in BACKENDS:
         raise ValueError(f"unknown backend {backend!r}: choose from {', '.join(BACKENDS)}")
     if backend == "warp":
-        need_warp("backend")
+        require_warp("backend")
 
 
-def need_warp(option: str) -> None:
+def require_warp(option: str) -> None:
     """Check that warp-lang, which `option` asks for, is installed and can run here.
 
     Raises:

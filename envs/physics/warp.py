@@ -24,7 +24,7 @@ _FIXED = ("geom_xpos", "geom_xmat")
 
 
 class WarpSteps:
-    """Simulates batches of worlds of one MuJoCo model.
+    """Simulator of batches of worlds with one MuJoCo model.
 
     Device memory for each number of worlds is allocated when its first call is traced, and never
     freed. Not thread-safe: what one thread traces while another captures a graph would become part
@@ -36,8 +36,8 @@ class WarpSteps:
 
         Args:
             model: shared by all worlds.
-            contacts, rows: largest number of contacts and constraint rows per world.
-            growth: largest factor on geom sizes in one world.
+            contacts, rows: maximum number of contacts and constraint rows per world.
+            growth: maximum factor on geom sizes in one world.
         """
         self._mujoco = _with_larger_bounds(model, growth)
         self._sizes = {"nconmax": int(contacts), "njmax": int(rows)}

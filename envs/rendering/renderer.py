@@ -4,7 +4,7 @@ Geoms are sorted by kind when the model is built. Rendering an image takes three
 
 1. For each kind, loop over its geoms: how far along every pixel's ray is the geom? Depth and geom
    index share one int32 (the bits of a positive float sort like an integer; the lowest few hold the
-   index), so the loop carries a single array and XLA compiles each iteration to one vectorised
+   index), so the loop carries a single array and XLA compiles each iteration to one vectorized
    kernel. On two CPU cores a [geoms, pixels] table with argmin was 3 to 5 times slower.
 2. Gather pose, size and color of the nearest geom per pixel, and compute one normal.
 3. Loop once more for hard shadows: does another geom block the way to the light?
@@ -106,7 +106,7 @@ def render_batch(
 
 
 class Renderer(Protocol):
-    """Renders the images of an environment; see `RayRenderer`."""
+    """Renderer of an environment; see `RayRenderer`."""
 
     @property
     def model(self) -> RenderModel: ...  # noqa: D102
@@ -124,7 +124,7 @@ class Renderer(Protocol):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RayRenderer:
-    """The ray caster as an environment uses it: square images of N worlds per call.
+    """Ray caster of an environment, which renders square images of N worlds per call.
 
     Attributes:
         model: from `build`.
@@ -173,13 +173,13 @@ def cast(
     size = model.size if size is None else size
     raster = Raster(height, width, samples=1)
 
-    def seen(geoms: Geom, view: View) -> tuple[jax.Array, jax.Array]:
+    def first_hit(geoms: Geom, view: View) -> tuple[jax.Array, jax.Array]:
         x, y = shading.slopes(view, raster, jnp.arange(height * width, dtype=jnp.int32))
         number, depth = intersections.nearest(_table(geoms), model.kinds, x, y)
         geom = jnp.where(jnp.isfinite(depth), jnp.array(model.geoms, jnp.int32)[number], -1)
         return geom.reshape(height, width), depth.reshape(height, width)
 
-    return jax.vmap(seen)(*in_camera_frames(model, model.appearance, size, poses, height))
+    return jax.vmap(first_hit)(*in_camera_frames(model, model.appearance, size, poses, height))
 
 
 def _table(geoms: Geom) -> Geoms:

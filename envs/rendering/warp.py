@@ -37,13 +37,13 @@ class WarpRenderer:
         # of view for all worlds.
         self.image_size, self.samples = rays.image_size, rays.samples
         self._num_worlds = num_worlds
-        lamplit = _lamplit(model)
+        with_lamp = _with_lamp(model)
         with wp.ScopedDevice(warp_call.device()):
-            self._model = mujoco_warp.put_model(lamplit)
+            self._model = mujoco_warp.put_model(with_lamp)
             self._data = mujoco_warp.make_data(model, nworld=num_worlds)
             self._contexts = [
                 mujoco_warp.create_render_context(
-                    lamplit,
+                    with_lamp,
                     nworld=num_worlds,
                     cam_res=(rays.samples * rays.image_size,) * 2,  # pyright: ignore
                     render_rgb=True,
@@ -151,7 +151,7 @@ class WarpRenderer:
         )
 
 
-def _lamplit(model: mujoco.MjModel) -> mujoco.MjModel:
+def _with_lamp(model: mujoco.MjModel) -> mujoco.MjModel:
     """Copy the model, with the lamp on and the headlight, which shines along the camera, off."""
     model = copy.copy(model)
     model.vis.headlight.diffuse[:] = 0.0

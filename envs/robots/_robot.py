@@ -38,7 +38,7 @@ class Robot:
     """One arm with a two-finger gripper; J joints. Positions in m, angles in rad.
 
     Attributes:
-        name: file name of the robot.
+        name: name of the robot's module, or path of a user's MJCF file.
         chain: [J, 4, 4] fixed transform from link i-1 (base first) to joint i, a hinge about z.
         tool: [4, 4] pose of the tcp in the last link.
         lower, upper: [J] joint limits [rad].
@@ -49,7 +49,7 @@ class Robot:
         tilt_side: side to which the hand can tilt by 90 degrees from pointing down: 1 outwards, -1
             back towards the base.
         stroke: largest gripper opening, both fingers together [m].
-        gripper_speed: largest speed of the opening [m/s].
+        gripper_speed: maximum speed of the opening [m/s].
         body: the simulated part.
     """
 

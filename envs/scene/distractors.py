@@ -12,7 +12,7 @@ _SHAPES = (  # own choices, in colors that no task uses
     f'type="box" size="{_SIZE / 2} {1.5 * _SIZE} {_SIZE}" rgba=".90 .90 .86 1"',
     f'type="sphere" size="{_SIZE}" rgba=".20 .70 .75 1"',
 )
-MOST = len(_SHAPES)
+MAX_COUNT = len(_SHAPES)
 
 _LOW, _HIGH = (0.27, -0.21), (0.45, 0.21)  # m, part of the table that the side camera sees
 _CLEARANCE = 0.10  # m between centers, where there is room; own choice

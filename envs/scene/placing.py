@@ -37,7 +37,7 @@ def fixed_bodies(model: mujoco.MjModel, layout: Layout, changes: Changes) -> Cha
     return {"body_pos": position, "body_quat": rotation}
 
 
-def placed(model: mujoco.MjModel, layout: Layout, world: int) -> mujoco.MjModel:
+def world_model(model: mujoco.MjModel, layout: Layout, world: int) -> mujoco.MjModel:
     """Copy the model with its fixed bodies placed as in one world of a batch."""
     model = copy.copy(model)
     own = {name: poses[world] for name, poses in layout.items()}

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from envs import checks
-from envs.physics.physics import MOST_GROWTH
+from envs.physics.physics import MAX_GROWTH
 from envs.rendering.renderer import Appearance
 from envs.robots import multiply, turn
 from envs.state import Changes, Data
@@ -90,8 +90,8 @@ class Randomization:
                 raise ValueError(f"{name} must be two finite numbers (low, high), got {value}")
             if name in _POSITIVE and value[0] <= 0:
                 raise ValueError(f"{name} is a factor and must be above 0, got {value}")
-        if self.size[0] < 1 / MOST_GROWTH or self.size[1] > MOST_GROWTH:
-            limits = f"{1 / MOST_GROWTH} to {MOST_GROWTH}"
+        if self.size[0] < 1 / MAX_GROWTH or self.size[1] > MAX_GROWTH:
+            limits = f"{1 / MAX_GROWTH} to {MAX_GROWTH}"
             raise ValueError(f"size must lie in {limits}, got {self.size}")
         if max(map(abs, self.field_of_view)) > _MAX_FOV_CHANGE:
             limit = f"-{_MAX_FOV_CHANGE} to {_MAX_FOV_CHANGE} degrees"
@@ -128,8 +128,8 @@ class Draw:
     latency: jax.Array
 
 
-def prepared(ranges: Randomization | None, control_dt: float) -> Randomization | None:
-    """Check the ranges, unless they are traced, and convert them to strongly typed arrays."""
+def prepare(ranges: Randomization | None, control_dt: float) -> Randomization | None:
+    """Check ranges, unless they are traced, and convert them to strongly typed arrays."""
     leaves = jax.tree.leaves(ranges)
     if ranges is not None:
         checks.instance("ranges", ranges, Randomization, "an envs.Randomization or None")

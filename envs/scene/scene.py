@@ -90,7 +90,7 @@ def as_python_warnings() -> Iterator[None]:
     finally:
         mujoco.set_mju_user_warning(before)
     for text in messages:
-        warnings.warn(f"MuJoCo says: {' '.join(text.split())}", stacklevel=3)
+        warnings.warn(f"MuJoCo: {' '.join(text.split())}", stacklevel=3)
 
 
 def mjcf(objects: str, robot: Robot) -> str:

@@ -1,6 +1,6 @@
-"""Manipulation tasks: one file per task, found by its name.
+"""Manipulation tasks: one module per task, found by the `TASK` that it defines.
 
-Modules that begin with `_` hold what all tasks share.
+All tasks share `_task`, the definition of a task and helpers.
 """
 
 from envs.tasks._task import (

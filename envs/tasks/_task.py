@@ -1,7 +1,7 @@
 """Definition of a manipulation task, and helpers for all tasks.
 
-A task defines the objects on the table (`scene`, `place`), success (`check`), the requests
-(`instructions`), a solution as poses of the hand (`waypoints`) and the progress along it
+A task defines the objects on the table (`scene`, `place`), success (`check`), phrasings of the
+request (`instructions`), a solution as poses of the hand (`waypoints`) and the progress along it
 (`stages`). It does not depend on the robot.
 
 Contact masks: each role has a bit of contype, 1 for carried objects, 2 for finger tips, 4 for
@@ -19,7 +19,7 @@ import mujoco
 
 from envs.robots import TIP_LENGTH, multiply
 
-_ALMOST = 0.99  # largest share of a stage that is not passed yet; own choice
+_ALMOST = 0.99  # upper bound on the progress of a stage before it is passed; own choice
 
 Layout = dict[str, jax.Array]
 """Body name -> pose at reset: [4], x, y, z in m and yaw in rad."""
@@ -71,7 +71,7 @@ class View:
         return jnp.all(jnp.abs(offset[:2]) < half_width) & (offset[2] < height)
 
     def apart(self, body: str, other: str) -> jax.Array:
-        """Return the horizontal distance of two bodies [m]."""
+        """Return the horizontal distance between two bodies [m]."""
         return jnp.linalg.norm((self.position(body) - self.position(other))[:2])
 
     def released(self, grip: jax.Array, width: float, away: float = 0.06) -> jax.Array:
@@ -151,7 +151,7 @@ class Task:
     """A task; all functions are pure and take one world.
 
     Attributes:
-        name: file name of the task.
+        name: name of the task's module.
         scene: MJCF of the bodies on the table; `place` positions fixed and free bodies.
         instructions: phrasings of the request, at most 8 words each.
         time_limit: time after which an episode ends [s].

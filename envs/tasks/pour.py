@@ -38,7 +38,7 @@ _BASKET, _BASKET_RANGE = (0.37, 0.12), (0.03, 0.03)  # m
 
 _BLUE, _BASKET_GEOM = 'rgba=".16 .38 .72 1"', 'conaffinity="1" rgba=".85 .65 .30 1"'
 _RISE = (_HEIGHT - 2 * _FOOT) / 2  # m, half the height of the walls
-_CENTRE = 2 * _FOOT + _RISE
+_CENTER = 2 * _FOOT + _RISE
 _OUT = _BOTTOM + _THICK + math.tan(_FLARE) * _RISE
 _TOP = _BOTTOM + math.tan(_FLARE) * 2 * _RISE
 
@@ -53,11 +53,11 @@ def _cup() -> str:
     wall = f'type="box" conaffinity="1" mass=".005" {_BLUE}'
     flared = "".join(
         f'<geom {wall} size="{_THICK} {_SIDE} {_RISE / math.cos(_FLARE)}" '
-        f'pos="{sign * _OUT} 0 {_CENTRE}" euler="0 {sign * _FLARE} 0"/>'
+        f'pos="{sign * _OUT} 0 {_CENTER}" euler="0 {sign * _FLARE} 0"/>'
         for sign in (-1, 1)
     )
     sides = "".join(
-        f'<geom {wall} size="{_TOP} {_THICK} {_RISE}" pos="0 {sign * _SIDE} {_CENTRE}" contype="4" '
+        f'<geom {wall} size="{_TOP} {_THICK} {_RISE}" pos="0 {sign * _SIDE} {_CENTER}" contype="4" '
         'condim="4" friction="1 .02 .001" solref=".01 1"/>'
         for sign in (-1, 1)
     )
@@ -104,7 +104,7 @@ def _stages(view: View) -> dict[str, jax.Array]:
     grip, cup = view.on("cup", _GRIP), view.position("cup")
     grasped = view.grasping(grip, _WIDTH)
     mouth = view.on("cup", _GRIP + _REACH)
-    loaded = jnp.linalg.norm(view.position("block") - view.on("cup", _CENTRE)) < _HEIGHT
+    loaded = jnp.linalg.norm(view.position("block") - view.on("cup", _CENTER)) < _HEIGHT
     carried = gate(
         loaded, near(jnp.linalg.norm(mouth[:2] - view.position("basket")[:2]), within=0.04)
     )

@@ -13,7 +13,7 @@ _STROKE = 0.012  # m
 _TOP = 0.040  # m, height of the cap at rest
 _RADIUS = 0.024  # m, of the cap
 _DEEP = 0.75 * _STROKE  # m, depth that counts as pressed
-_CENTRE, _RANGE = (0.36, 0.0), (0.04, 0.04)  # m, of the random position
+_CENTER, _RANGE = (0.36, 0.0), (0.04, 0.04)  # m, of the random position
 
 # A spring of 150 N/m gives 1.8 N at full stroke, far more than the cap's (compensated) weight.
 _SCENE = f"""
@@ -32,7 +32,7 @@ _SCENE = f"""
 
 
 def _place(key: jax.Array) -> Layout:
-    return {"button": scatter(key, _CENTRE, _RANGE)}
+    return {"button": scatter(key, _CENTER, _RANGE)}
 
 
 def _check(view: View) -> tuple[jax.Array, dict[str, jax.Array]]:

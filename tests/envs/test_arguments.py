@@ -41,8 +41,8 @@ def worlds():
         ({"antialias": 1000}, "antialias must be at most 16, got 1,000"),
         ({"distractors": -1}, "distractors must be at least 0, got -1"),
         ({"distractors": 5}, "distractors must be at most 4, got 5"),
-        *[({n: v}, f"{n} must be a whole number, got {v!r}") for n in NUMBER for v in (2.5, True)],
-        *[({"num_envs": v}, "num_envs must be a whole number") for v in (np.nan, "3", None, [4])],
+        *[({n: v}, f"{n} must be an integer, got {v!r}") for n in NUMBER for v in (2.5, True)],
+        *[({"num_envs": v}, "num_envs must be an integer") for v in (np.nan, "3", None, [4])],
         ({"control_dt": 0.03}, "control_dt must be a positive multiple of 0.02 s, got 0.03"),
         ({"control_dt": 0.0}, "control_dt must be a positive multiple of 0.02 s, got 0.0"),
         ({"control_dt": 1e12}, "control_dt must be at most the time limit of the task, 8.0 s, got"),
@@ -121,7 +121,7 @@ def test_states(worlds):
     ):
         with pytest.raises(TypeError, match=r"^state must be a state from reset or step, got None"):
             call(None)
-    with pytest.raises(ValueError, match=r"^state has 2 worlds, this environment 3"):
+    with pytest.raises(ValueError, match=r"^state must have 3 worlds, got 2 worlds"):
         other.observe(state)
 
 
@@ -154,9 +154,9 @@ def test_ranges_of_a_wrong_type(worlds):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"num_episodes": 2.5}, "num_episodes must be a whole number, got 2.5"),
+        ({"num_episodes": 2.5}, "num_episodes must be an integer, got 2.5"),
         ({"num_episodes": 10**12}, "num_episodes must be at most"),
-        ({"num_envs": 2.5}, "num_envs must be a whole number, got 2.5"),
+        ({"num_envs": 2.5}, "num_envs must be an integer, got 2.5"),
         ({"action_noise": "a"}, "action_noise must be a number, got 'a'"),
         ({"action_noise": -1.0}, "action_noise must be at least 0, got -1.0"),
         ({"ranges": 3}, "ranges must be an envs.Randomization or None, got 3"),

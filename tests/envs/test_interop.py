@@ -208,7 +208,7 @@ def test_brax_compiles_little_more_than_the_bare_environment(env):
 @pytest.mark.slow
 def test_brax_misuse(env):
     world = BraxEnv(env)
-    with pytest.raises(TypeError, match="key must be a key such as"):
+    with pytest.raises(TypeError, match="key must be a JAX key such as"):
         world.reset(5)
     state = world.reset(jax.random.key(0))
     with pytest.raises(ValueError, match=r"action must have shape \(7,\), got \(6,\)"):

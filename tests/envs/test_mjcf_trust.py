@@ -198,7 +198,7 @@ def test_mujocos_warnings_become_pythons(robots, monkeypatch):
     monkeypatch.chdir(robots)
     before = sorted(robots.rglob("*"))
     path = model(robots, "", body='<geom size="1" pos="nan 0 0"/>')
-    with pytest.warns(UserWarning, match="MuJoCo says: XML contains a 'NaN'"):
+    with pytest.warns(UserWarning, match="MuJoCo: XML contains a 'NaN'"):
         reading.read(path)
     assert sorted(robots.rglob("*")) == sorted([*before, path])
 

@@ -24,7 +24,7 @@ def reach(scene, data, position, opening: float) -> None:
     goal = jnp.asarray(position, jnp.float32)
     start = jnp.asarray(scene.robot.home, jnp.float32)
     solve = jax.jit(functools.partial(robots.inverse_kinematics, scene.robot))
-    (rotation,) = expert.leaning(scene.robot, route((goal, (0.0, 0.0, 0.0), 0.0, 1.0, 0.0)))
+    (rotation,) = expert.tool_rotations(scene.robot, route((goal, (0.0, 0.0, 0.0), 0.0, 1.0, 0.0)))
     data.qpos[: scene.num_joints] = solve(goal, rotation, start)
     data.qpos[scene.num_joints : scene.num_joints + 2] = opening / 2
 

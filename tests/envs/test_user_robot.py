@@ -85,7 +85,7 @@ def test_start_pose_is_the_common_one(robot, model):
 def test_lean_and_tilt_of_our_robots_are_recovered(name):
     known = getattr(robots, name).ROBOT
     turned = known.tool @ robots.rotation("z", np.pi)
-    found = mjcf.posing.posed(dataclasses.replace(known, tool=turned, lean=0.5, tilt_side=0))
+    found = mjcf.posing.complete(dataclasses.replace(known, tool=turned, lean=0.5, tilt_side=0))
     assert found.lean == pytest.approx(known.lean, abs=0.1)
     assert found.tilt_side == known.tilt_side
     np.testing.assert_allclose(found.tool, known.tool, atol=1e-6)

@@ -20,7 +20,7 @@ def impatient(monkeypatch):
 
 
 def test_long_compilation_is_announced(impatient, capsys):
-    with messages.announced("the world"):
+    with messages.announce("the world"):
         time.sleep(0.3)
         assert capsys.readouterr() == ("", "compiling the world ...\n")
     assert capsys.readouterr().err.startswith("compiled the world in 0 s")
@@ -28,21 +28,21 @@ def test_long_compilation_is_announced(impatient, capsys):
 
 def test_with_a_cache_the_message_says_the_first_time_only(impatient, capsys):
     jax.config.update("jax_enable_compilation_cache", True)
-    with messages.announced("the world"):
+    with messages.announce("the world"):
         time.sleep(0.3)
-    told = "compiling the world (long the first time only) ...\ncompiled the world in 0 s\n"
+    told = "compiling the world (slow only the first time) ...\ncompiled the world in 0 s\n"
     assert capsys.readouterr().err == told
 
 
 def test_short_compilation_is_silent(capsys):
-    with messages.announced("the world"):
+    with messages.announce("the world"):
         pass
     assert capsys.readouterr() == ("", "")
 
 
 def test_an_error_is_not_reported_as_done(impatient, capsys):
     def fail():
-        with messages.announced("the world"):
+        with messages.announce("the world"):
             time.sleep(0.3)
             raise KeyError
 
@@ -53,7 +53,7 @@ def test_an_error_is_not_reported_as_done(impatient, capsys):
 
 def test_only_the_first_process_prints(impatient, capsys, monkeypatch):
     monkeypatch.setattr(jax, "process_index", lambda: 1)
-    with messages.announced("the world"):
+    with messages.announce("the world"):
         time.sleep(0.2)
     assert capsys.readouterr() == ("", "")
 

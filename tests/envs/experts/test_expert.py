@@ -88,7 +88,7 @@ def test_inverse_kinematics_reaches(scene):
     rng = np.random.default_rng(0)
     goals = jnp.array(rng.uniform([0.30, -0.18, 0.01], [0.42, 0.18, 0.12], (64, 3)), jnp.float32)
     way = route(*((goal, (0.0, 0.0, 0.0), 0.0, 1.0, 0.0) for goal in goals))
-    rotations = expert.leaning(robot, way)
+    rotations = expert.tool_rotations(robot, way)
     start = jnp.asarray(robot.home, jnp.float32)
 
     @jax.jit

@@ -76,7 +76,7 @@ def test_a_control_step_matches_mujoco(env):
     while after.metrics["button_depth"][0] < rest + 0.002:  # until the button is touched
         assert not after.done[0]
         state, after = after, env.step(after, act(after))
-    model = placing.placed(env.model, start.info["layout"], 0)
+    model = placing.world_model(env.model, start.info["layout"], 0)
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = state.data.qpos[0], state.data.qvel[0]
     data.qacc_warmstart[:] = state.data.qacc_warmstart[0]
