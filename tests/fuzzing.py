@@ -1,4 +1,4 @@
-"""Random changes of a folder's files; each is a function of a generator and of the files."""
+"""Random changes to a folder's files; each takes a random generator and the files."""
 
 import contextlib
 import copy
@@ -38,7 +38,7 @@ TYPES = [pa.string(), pa.int8(), pa.float64(), pa.list_(pa.float64()), pa.bool_(
 
 
 def described(r: random.Random, files: list[Path]) -> None:
-    """A value in a JSON file is another one, or gone; of lines, in one of them."""
+    """Change or delete a value in a JSON file, or in one line of a JSONL file."""
     file = r.choice([file for file in files if file.suffix in (".json", ".jsonl")])
     lines = file.read_text().splitlines() if file.suffix == ".jsonl" else [file.read_text()]
     number = r.randrange(len(lines))
@@ -53,7 +53,7 @@ def described(r: random.Random, files: list[Path]) -> None:
 
 
 def _sealed(value: Any) -> Any:
-    """With a right digest, where it had one: what is wrong shows behind it, too."""
+    """Update the digest if there is one, so that it does not hide the error."""
     if not isinstance(value, dict) or DIGEST not in value:
         return value
     with contextlib.suppress(TypeError, RecursionError):
@@ -62,7 +62,7 @@ def _sealed(value: Any) -> Any:
 
 
 def _places(value: Any) -> Iterator[tuple[Any, Any]]:
-    """All that a JSON value holds, as owner and key."""
+    """Yield all values inside a JSON value as (container, key)."""
     keys = value if isinstance(value, dict) else range(min(len(value), 6))
     for key in keys:
         yield value, key
@@ -71,7 +71,7 @@ def _places(value: Any) -> Iterator[tuple[Any, Any]]:
 
 
 def damaged(r: random.Random, files: list[Path]) -> None:
-    """A file is cut, or has other bits, more or fewer bytes."""
+    """Truncate a file, change its bits, or insert or remove bytes."""
     file = r.choice(files)
     data = bytearray(file.read_bytes())
     place, size = r.randrange(len(data) + 1), r.choice([1, 8, 100])
@@ -92,7 +92,7 @@ def damaged(r: random.Random, files: list[Path]) -> None:
 
 
 def replaced(r: random.Random, files: list[Path]) -> None:
-    """A file is another one, or something else of that name."""
+    """Replace a file by another one, or by something that is not a regular file."""
     file, other = r.choice(files), r.choice(files)
     mine = file.read_bytes()
     file.unlink()
@@ -116,7 +116,7 @@ def replaced(r: random.Random, files: list[Path]) -> None:
 
 
 def tabled(r: random.Random, files: list[Path]) -> None:
-    """A parquet file has another value or type in a column, or lacks it."""
+    """Change a value or the type of a column in a parquet file, or drop the column."""
     file = r.choice([file for file in files if file.suffix == ".parquet"])
     table = pq.read_table(file)
     name = r.choice(table.column_names)
@@ -131,12 +131,12 @@ def tabled(r: random.Random, files: list[Path]) -> None:
         lambda: table.set_column(place, name, pa.array([value] * len(rows))),
     ]
     with contextlib.suppress(pa.ArrowException, OverflowError, ValueError, TypeError):
-        pq.write_table(r.choice(changes)(), file)  # what pyarrow cannot write nobody reads
+        pq.write_table(r.choice(changes)(), file)  # values that pyarrow cannot write need no test
 
 
 def array(r: random.Random, found: np.ndarray) -> np.ndarray:
-    """Another one."""
-    minus = np.array(-1).astype(found.dtype)  # of unsigned integers the largest
+    """Change the dtype, shape or values of an array."""
+    minus = np.array(-1).astype(found.dtype)  # the largest value for unsigned integers
     with np.errstate(all="ignore"):
         changes = [
             lambda: found.astype(r.choice(["f2", "f8", ">f4", "i8", "?", "U5", "S3"])),
@@ -153,7 +153,7 @@ def array(r: random.Random, found: np.ndarray) -> np.ndarray:
 
 
 def mapped(r: random.Random, files: list[Path]) -> None:
-    """An array of a cache is another one; mostly its checksum is, too."""
+    """Change an array of a cache, usually together with its checksum."""
     file = r.choice([file for file in files if file.suffix == ".npy"])
     found = array(r, np.load(file))
     np.save(file, found)
@@ -165,7 +165,7 @@ def mapped(r: random.Random, files: list[Path]) -> None:
 
 
 def zipped(r: random.Random, files: list[Path]) -> None:
-    """An array in an .npz file is another one; or a value in its header."""
+    """Change an array in an .npz file, or a value in its header."""
     (file,) = files
     with np.load(file) as archive:
         arrays: dict[str, Any] = dict(archive)
@@ -182,7 +182,7 @@ def zipped(r: random.Random, files: list[Path]) -> None:
 
 
 def drawn(r: random.Random, files: list[Path]) -> None:
-    """An MJCF file has another value of an attribute, or one element more or less."""
+    """Change an attribute in an MJCF file, or add or remove an element."""
     (file,) = files
     text = file.read_text()
     if r.random() < 0.5:

@@ -1,6 +1,6 @@
-"""Small Gemma models: Flax's own example where it is on the path, and one of the same layers.
+"""Small Gemma models: Flax's example if it is importable, and a copy with the same layers.
 
-Flax's example is no package. With its repository at F, `PYTHONPATH=F/examples/gemma` finds it.
+Flax's example is not a package: add examples/gemma of the Flax repository to `PYTHONPATH`.
 """
 
 import jax
@@ -11,7 +11,7 @@ VOCABULARY, WIDTH, HEADS, KV_HEADS, HEAD, MLP = 40, 16, 4, 2, 8, 24
 
 
 class Attention(nnx.Module):
-    """As Flax's example: einsums over heads, a fused key and value, sizes read off the kernels."""
+    """Like Flax's example: einsums over heads, fused keys and values, sizes read from kernels."""
 
     def __init__(self, rngs):
         self.q_einsum = nnx.Einsum("BTD,NDH->BTNH", (HEADS, WIDTH, HEAD), rngs=rngs)
@@ -24,8 +24,8 @@ class Attention(nnx.Module):
         groups = self.q_einsum.kernel.shape[0] // self.kv_einsum.kernel.shape[1]
         key, value = (jnp.repeat(v, groups, axis=2) for v in (key, value))
         logits = jnp.einsum("BTNH,BSNH->BNTS", query, key) * HEAD**-0.5
-        shares = jax.nn.softmax(jnp.where(mask[:, None], logits, -1e9))
-        return self.attn_vec_einsum(jnp.einsum("BNTS,BSNH->BTNH", shares, value))
+        weights = jax.nn.softmax(jnp.where(mask[:, None], logits, -1e9))
+        return self.attn_vec_einsum(jnp.einsum("BNTS,BSNH->BTNH", weights, value))
 
 
 class Block(nnx.Module):
@@ -60,7 +60,7 @@ class Gemma(nnx.Module):
 
 
 def of_flax(rngs):
-    """Flax's example in the same size."""
+    """Return Flax's example at the same size."""
     from modules import AttentionType  # pyright: ignore[reportMissingImports]
     from transformer import Transformer  # pyright: ignore[reportMissingImports]
     from transformer_cfg import (  # pyright: ignore[reportMissingImports]

@@ -1,4 +1,4 @@
-"""Ways to spoil a good input, each a name and a function of its folder; and what a refusal is."""
+"""Ways to corrupt a valid input, each a name and a function of its folder; check of the error."""
 
 import json
 import random
@@ -19,7 +19,7 @@ from tests import ROOT
 Damage = Callable[[Path], None]
 Cases = Iterator[tuple[str, Damage]]
 ABSENT = object()
-HUGE = 1e999  # infinity, as JSON spells it
+HUGE = 1e999  # infinity in JSON
 
 
 def first(folder: Path, pattern: str) -> Path:
@@ -34,7 +34,7 @@ _BYTES = {"empty": lambda data: b"", "half": lambda data: data[: len(data) // 2]
 
 
 def files(*patterns: str) -> Cases:
-    """A file that is missing, empty, cut in half, or noise."""
+    """Remove a file, empty it, cut it in half, or replace it by noise."""
     for pattern in patterns:
         yield f"{pattern} missing", lambda folder, p=pattern: first(folder, p).unlink()
         for name, change in _BYTES.items():
@@ -47,7 +47,7 @@ def files(*patterns: str) -> Cases:
 
 
 def flips(pattern: str, places: tuple[int, ...]) -> Cases:
-    """A file with one byte changed."""
+    """Change one byte of a file."""
     for place in places:
 
         def spoil(folder: Path, place: int = place) -> None:
@@ -60,7 +60,7 @@ def flips(pattern: str, places: tuple[int, ...]) -> Cases:
 
 
 def fields(pattern: str, values: dict[str, list[Any]], line: int | None = None) -> Cases:
-    """A JSON file, or a line of one, with a field of another value; a field is a/b/c."""
+    """Change a field, such as a/b/c, of a JSON file or of a line in a JSONL file."""
     for place, bad in values.items():
         for value in bad:
 
@@ -77,7 +77,7 @@ def fields(pattern: str, values: dict[str, list[Any]], line: int | None = None) 
                 else:
                     owner[key] = value
                 if isinstance(content, dict) and content.pop(DIGEST, None):
-                    content = with_digest(content)  # what is wrong shows behind the digest, too
+                    content = with_digest(content)  # a valid digest must not hide the error
                 lines[line or 0] = json.dumps(content)
                 path.write_text("\n".join(lines))
 
@@ -86,7 +86,7 @@ def fields(pattern: str, values: dict[str, list[Any]], line: int | None = None) 
 
 
 def columns(pattern: str, values: dict[str, list[Any]], row: int = 3) -> Cases:
-    """A parquet file with a column left out, or with another value in a row; `all` means in all."""
+    """Drop a column of a parquet file, or change its value in one row or in all rows."""
     for column, bad in values.items():
         for value in bad:
 
@@ -97,7 +97,7 @@ def columns(pattern: str, values: dict[str, list[Any]], row: int = 3) -> Cases:
                     pq.write_table(table.drop_columns(column), path)
                     return
                 rows = table[column].to_pylist()
-                if isinstance(value, str | list):  # of another type: all rows
+                if isinstance(value, str | list):  # another type: change all rows
                     rows = pa.array([value] * len(rows))
                 else:
                     rows[row] = value(rows[row]) if callable(value) else value
@@ -112,7 +112,7 @@ def columns(pattern: str, values: dict[str, list[Any]], row: int = 3) -> Cases:
 
 
 def tensors(pattern: str, changes: dict[str, Callable[[dict[str, np.ndarray]], Any]]) -> Cases:
-    """A safetensors file with other tensors."""
+    """Change the tensors of a safetensors file."""
     for name, change in changes.items():
 
         def spoil(folder: Path, change: Any = change) -> None:
@@ -123,7 +123,7 @@ def tensors(pattern: str, changes: dict[str, Callable[[dict[str, np.ndarray]], A
 
 
 def _on_first(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[dict[str, Any]], Any]:
-    """A change of the first tensor alone."""
+    """Apply a change to the first tensor only."""
 
     def changed(found: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         name = min(found)
@@ -168,7 +168,7 @@ def with_infinity(values: list[float]) -> list[float]:
 
 
 def check_refusal(error: BaseException, *names: str) -> None:
-    """It is ours, one sentence, and says what it is about."""
+    """Check that the error is this project's, has one line and names one of `names`."""
     assert type(error) in (ValueError, FileNotFoundError, RefusedError), repr(error)
     raised = Path(traceback.extract_tb(error.__traceback__)[-1].filename)
     assert raised.is_relative_to(ROOT), f"{error!r} was raised in {raised}"

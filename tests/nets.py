@@ -1,4 +1,4 @@
-"""Small models with adapters that have moved off their start, shared by several tests."""
+"""Small adapted models with non-initial adapter parameters, shared by several tests."""
 
 import dataclasses
 import itertools
@@ -20,7 +20,7 @@ SIZES = {"rank": 8, "hidden_width": 4}
 
 
 def small(name):
-    """A method by its file's name, small where it has sizes."""
+    """Create a method by module name, with small sizes."""
     fields = {field.name for field in dataclasses.fields(peft.find(name))}
     return peft.create(name, **{key: size for key, size in SIZES.items() if key in fields})
 
@@ -29,7 +29,7 @@ METHODS = {name: small(name) for name in peft.names()}
 
 
 class Net(nnx.Module):
-    """A stranger's nnx.Linear, and a stack that is scanned over."""
+    """Two third-party `nnx.Linear` layers around a scanned stack."""
 
     def __init__(self):
         self.inp = nnx.Linear(5, 4, rngs=nnx.Rngs(0))
@@ -48,7 +48,7 @@ class Net(nnx.Module):
 
 
 class Kinds(nnx.Module):
-    """All kinds of layers: ids [B, T] in, [B, T, 4] out."""
+    """Every supported layer type; maps ids [B, T] to [B, T, 4]."""
 
     def __init__(self):
         rngs, init = nnx.Rngs(0), nnx.initializers.normal()
@@ -77,7 +77,7 @@ def call(model, x):
 
 
 def trained(*rules, seed, net=NET, size=0.5):
-    """An adapted model whose adapters have moved off their start, this far."""
+    """Adapt a model and add noise of this size to its adapters."""
     model = adaptation.adapt(net, rules, rngs=nnx.Rngs(seed))
     graphdef, adapters, frozen = adaptation.split(model)
     return nnx.merge(graphdef, with_noise(adapters, size, seed), frozen)
@@ -88,7 +88,7 @@ def assert_close(actual, expected):
 
 
 class Tiny(nnx.Module):
-    """The golden file's net."""
+    """Network of the golden file."""
 
     def __init__(self, golden):
         sizes = itertools.pairwise((24, 40, 24, 16))
@@ -113,7 +113,7 @@ def golden_model(golden, name, method):
 
 
 def golden_models():
-    """PEFT's several adapters over one base (lora_multi.npz), by name, and the file."""
+    """Return the golden file lora_multi.npz, and PEFT's adapters on one base by name."""
     with np.load(GOLDEN / "lora_multi.npz") as file:
         golden = dict(file)
     methods = {

@@ -1,4 +1,4 @@
-"""A run that needs no simulation: random episodes and a backbone of no size."""
+"""Runs that need no simulation: random episodes and a tiny backbone."""
 
 import io
 import os
@@ -57,11 +57,11 @@ RESULTS = {
     "trainable_parameters": 10,
     "total_parameters": 1000,
 }
-"""What results.json holds."""
+"""Contents of results.json."""
 
 
 class Miniature(nnx.Module):
-    """What a run needs of a backbone, in two layers: a process that trains it starts at once."""
+    """Two-layer stand-in for a backbone, so that a training process starts immediately."""
 
     def __init__(self):
         self.config = Pi0Config.dummy()
@@ -71,12 +71,12 @@ class Miniature(nnx.Module):
     def loss(self, key, observation, actions, **_):
         noise = jax.random.normal(key, actions.shape)
         hidden, first = self.inp(noise + observation.state[:, None], return_aux=True)
-        found, second = self.out(jnp.tanh(hidden), return_aux=True)
-        return (found - actions) ** 2, {"action": {"inp": first, "out": second}}
+        predicted, second = self.out(jnp.tanh(hidden), return_aux=True)
+        return (predicted - actions) ** 2, {"action": {"inp": first, "out": second}}
 
 
 class Terminate(Callback):
-    """Sends this process a SIGTERM after step 2, as a scheduler would."""
+    """Send SIGTERM to this process after step 2, as a scheduler would."""
 
     def __init__(self):
         self.started = 0
@@ -112,7 +112,7 @@ def random_episodes(task: str, seed: int) -> Episodes:
 def make_run(
     folder: Path, config: Config = CONFIG, model: Any = None, devices: int | None = 1
 ) -> Run:
-    """By default of the dummy backbone, on one device: that compiles in a quarter of the time."""
+    """Make a run; the default, the dummy backbone on one device, compiles four times faster."""
     folder.mkdir(exist_ok=True)
     model = model or random_backbone(Pi0Config.dummy())
     model = adaptation.adapt(
@@ -129,18 +129,18 @@ def make_run(
 
 
 def repeatable(folder: Path) -> list[dict[str, float]]:
-    """The logged metrics but those that depend on the clock."""
+    """Return the logged metrics without those that depend on timing."""
     rows = read_metrics(folder)
     return [{k: v for k, v in row.items() if not k.startswith(TIMED)} for row in rows]
 
 
 def leaves(tree) -> dict[str, np.ndarray]:
-    found = jax.tree_util.tree_leaves_with_path(tree)
-    return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in found}
+    pairs = jax.tree_util.tree_leaves_with_path(tree)
+    return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in pairs}
 
 
 def finish(folder: Path) -> Path:
-    """A folder as a run of two logged steps leaves it, but for its weights."""
+    """Write the files of a finished run with two logged steps, without weights."""
     write_json(folder / "config.json", {**to_json(CONFIG), "name": "<b>run</b>"})
     write_json(folder / "results.json", RESULTS)
     log = MetricsLog(folder)

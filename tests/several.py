@@ -1,4 +1,4 @@
-"""Several processes of one run, on this machine."""
+"""Start several processes of one run on this machine."""
 
 import os
 import socket
@@ -14,19 +14,19 @@ NAMES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 
 
 def free_address() -> str:
-    """An address on this machine where nobody listens."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return f"127.0.0.1:{free.getsockname()[1]}"
+    """Return an unused address on this machine."""
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        return f"127.0.0.1:{unused.getsockname()[1]}"
 
 
 def environments(count: int, devices: int = 1) -> Iterator[dict[str, str]]:
-    """Of each of `count` processes that are to find one another, with so many CPU devices each."""
-    everyone = {**os.environ, "XLA_FLAGS": xla.flags(devices), "JAX_PLATFORMS": "cpu"}
+    """Yield the environment of each of `count` processes, with `devices` CPU devices each."""
+    common = {**os.environ, "XLA_FLAGS": xla.flags(devices), "JAX_PLATFORMS": "cpu"}
     address = free_address()
     for number in range(count):
         own = zip(NAMES, (address, str(count), str(number)), strict=True) if count > 1 else ()
-        yield everyone | dict(own)
+        yield common | dict(own)
 
 
 def start(
@@ -36,13 +36,14 @@ def start(
     devices: int = 1,
     **options: Any,
 ) -> list[subprocess.Popen]:
-    """`count` processes `python ARGUMENTS`, which find one another.
+    """Start `count` processes `python ARGUMENTS` of one run.
 
     Args:
-        arguments: of all.
-        own: further ones, by a process's number.
-        devices: of each.
-        options: of `Popen`.
+        count: number of processes.
+        arguments: arguments of every process.
+        own: additional arguments by process number.
+        devices: CPU devices per process.
+        options: options of `Popen`.
     """
     return [
         subprocess.Popen(

@@ -1,4 +1,4 @@
-"""One flipped bit in a file that a run, a policy or a cache is made of: harmless, or refused."""
+"""Test that a flipped bit in any file of a run, policy or cache is harmless or raises an error."""
 
 import json
 from collections.abc import Callable
@@ -26,7 +26,7 @@ from tests.models.random_models import random_backbone
 from tests.runs import leaves, random_episodes
 
 HEADERS = 200
-"""Bytes at the beginning of a large file, where it says what it is."""
+"""Size of the header of a large file [bytes]."""
 
 
 def net() -> nnx.Module:
@@ -36,14 +36,18 @@ def net() -> nnx.Module:
 def adapter(folder: Path) -> None:
     rules = [(".*", LoRASP(rank=4, hidden_width=2, energy_target=0.9))]
     model = adaptation.adapt(net(), rules, rngs=nnx.Rngs(1))
-    told = {"instructions": ["press the button"], "statistics": {"state_mean": [0.25]}}
-    save_adapters(folder, model, base="abc", metadata=told)
+    metadata = {"instructions": ["press the button"], "statistics": {"state_mean": [0.25]}}
+    save_adapters(folder, model, base="abc", metadata=metadata)
 
 
 def read_adapter(folder: Path) -> Any:
-    told = read_description(folder)
+    description = read_description(folder)
     model = load_adapters(folder, net(), base="abc")
-    return told, {path: str(m) for path, m in adaptation.methods(model).items()}, leaves(model)
+    return (
+        description,
+        {path: str(m) for path, m in adaptation.methods(model).items()},
+        leaves(model),
+    )
 
 
 def run(folder: Path) -> None:
@@ -54,7 +58,7 @@ def run(folder: Path) -> None:
     for step in (2, 4):
         log.write(step, {"loss": 1 / step, "task": 0.125})
     log.close()
-    for path in (folder / "tensorboard").iterdir():  # for the eye alone
+    for path in (folder / "tensorboard").iterdir():  # not covered by digests
         path.unlink()
 
 
@@ -65,15 +69,20 @@ def read_run(folder: Path) -> Any:
 def base(folder: Path) -> None:
     models.save(folder, random_backbone(Pi0Config.dummy()))
     state = np.random.default_rng(0).normal(size=(9, 7))
-    known = Statistics.measure(state, state, np.ones(9, bool), slots=range(7), dim=8)
-    (folder / "statistics.json").write_text(known.to_json() + "\n")
+    statistics = Statistics.measure(state, state, np.ones(9, bool), slots=range(7), dim=8)
+    (folder / "statistics.json").write_text(statistics.to_json() + "\n")
     write_json(folder / TRAINING, {"control_dt": 0.1, "tasks": ["press"]})
 
 
 def read_base(folder: Path) -> Any:
-    known = statistics_files.read(folder)
+    statistics = statistics_files.read(folder)
     model = models.load_config(folder), models.load(folder)
-    return str(model[0]), leaves(nnx.state(model[1])), leaves(known), read_json(folder / TRAINING)
+    return (
+        str(model[0]),
+        leaves(nnx.state(model[1])),
+        leaves(statistics),
+        read_json(folder / TRAINING),
+    )
 
 
 def dataset(folder: Path) -> None:
@@ -109,16 +118,16 @@ KINDS: dict[str, tuple[Callable[[Path], None], Callable[[Path], Any], int]] = {
     "cache": (dataset, read_dataset, 17),
     "demonstrations": (demonstrations, read_demonstrations, 5),
 }
-"""What is written, how it is read, and how many bytes lie between two that are flipped."""
+"""Writer, reader, and the distance between flipped bytes."""
 
 
 def same(one: Any, other: Any) -> bool:
-    found, wanted = (jax.tree.flatten(value) for value in (one, other))
-    return found[1] == wanted[1] and all(map(np.array_equal, found[0], wanted[0]))
+    first, second = (jax.tree.flatten(value) for value in (one, other))
+    return first[1] == second[1] and all(map(np.array_equal, first[0], second[0]))
 
 
-def places(content: bytes, step: int) -> list[int]:
-    """Of a large file the header, its end and a few in between."""
+def positions(content: bytes, step: int) -> list[int]:
+    """Return the bytes to flip; for a large file: its header, its end and a few in between."""
     if len(content) < 20_000:
         return list(range(0, len(content), step))
     middle = range(HEADERS, len(content), max(1, len(content) // 20))
@@ -126,42 +135,46 @@ def places(content: bytes, step: int) -> list[int]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_flipped_bit_is_harmless_or_refused(kind, tmp_path):
+def test_flipped_bit_is_harmless_or_raises(kind, tmp_path):
     write, read, step = KINDS[kind]
     folder = tmp_path / kind
     folder.mkdir()
     write(folder)
-    expected, refused = read(folder), []
+    expected, messages = read(folder), []
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         content = path.read_bytes()
-        for place in places(content, step):
+        for position in positions(content, step):
             flipped = bytearray(content)
-            flipped[place] ^= 1 << (place // step % 8)
+            flipped[position] ^= 1 << (position // step % 8)
             path.write_bytes(flipped)
             try:
                 found = read(folder)
             except ValueError as error:
-                refused.append(str(error))
+                messages.append(str(error))
             else:
-                assert same(found, expected), (path.name, place, bytes(flipped[place - 20 :][:40]))
+                assert same(found, expected), (
+                    path.name,
+                    position,
+                    bytes(flipped[position - 20 :][:40]),
+                )
         path.write_bytes(content)
-    assert len(refused) > 20
-    assert not [sentence for sentence in refused if "\n" in sentence]
+    assert len(messages) > 20
+    assert not [message for message in messages if "\n" in message]
     assert same(read(folder), expected)
 
 
-def test_a_digest_that_is_gone_is_missed(tmp_path):
+def test_missing_digest_raises(tmp_path):
     adapter(tmp_path / "adapter")
     path = tmp_path / "adapter" / "adapter.json"
-    facts = json.loads(path.read_text())
-    del facts["digest"]
-    path.write_text(json.dumps(facts))
+    description = json.loads(path.read_text())
+    del description["digest"]
+    path.write_text(json.dumps(description))
     with pytest.raises(ValueError, match="the digest is missing"):
         read_description(path.parent)
 
 
 @pytest.mark.parametrize("reading", ["episode", "steps", "device"])
-def test_a_pixel_is_looked_at_when_it_is_first_read(tmp_path, reading):
+def test_image_is_verified_when_first_read(tmp_path, reading):
     (tmp_path / "cache").mkdir()
     dataset(tmp_path / "cache")
     path = tmp_path / "cache" / "image_side.npy"
@@ -170,14 +183,14 @@ def test_a_pixel_is_looked_at_when_it_is_first_read(tmp_path, reading):
     path.write_bytes(content)
     found = cache.Cache(tmp_path / "cache")
     assert found.episode(0).num_steps == 5
-    pictures = found.steps.image["side"]
-    assert pictures[np.arange(20)].shape == (20, 32, 32, 3)
+    images = found.steps.image["side"]
+    assert images[np.arange(20)].shape == (20, 32, 32, 3)
     last = found.num_steps - 1
     with pytest.raises(
         ValueError, match=rf"side\.npy is damaged \(wrong checksum of image {last}\)"
     ):
         {
             "episode": lambda: found.episode(2),
-            "steps": lambda: pictures[np.array([3, last])],
-            "device": lambda: np.asarray(pictures),
+            "steps": lambda: images[np.array([3, last])],
+            "device": lambda: np.asarray(images),
         }[reading]()

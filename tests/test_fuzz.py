@@ -1,4 +1,4 @@
-"""Random changes of data: each is read or refused in one sentence, soon and without a trace."""
+"""Test randomly changed data: reading works or raises a one-line error, and leaves no files."""
 
 import contextlib
 import io
@@ -31,7 +31,7 @@ TOKENIZERS = {
     "tokenizer.json": "smolvlm_like_tokenizer.json",
     "tokenizer.model": "paligemma_like.model",
 }
-DEAR = {"mjcf": 4}  # how many times as much time a kind takes
+COST = {"mjcf": 4}  # relative run time of a kind
 
 
 def read(folder: Path) -> None:
@@ -41,41 +41,41 @@ def read(folder: Path) -> None:
     inspection.report(source, Console(file=io.StringIO()))
 
 
-def go_on(folder: Path) -> None:
-    """As a collection does that was interrupted."""
+def resume(folder: Path) -> None:
+    """Read the dataset as a resumed collection does."""
     rlds.ShardWriter(folder, {}).complete()
 
 
-def seen(folder: Path) -> None:
-    """As a finished run is."""
+def show(folder: Path) -> None:
+    """Write the report and the table of a finished run."""
     write_report(folder)
     final_table(folder)
 
 
-def spell(folder: Path) -> None:
-    """As the prompts of a policy are."""
+def tokenize(folder: Path) -> None:
+    """Tokenize a prompt as a policy does."""
     tokenizer.load_tokenizer(folder).encode(["push the button"], 16)
 
 
 FILES: list[fuzzing.Change] = [fuzzing.damaged, fuzzing.replaced]
 KINDS: dict[str, tuple[Callable[[Path], Any], list[fuzzing.Change]]] = {
     "rlds": (read, [*FILES, *[fuzzing.described] * 4]),
-    "rlds, gone on with": (go_on, [fuzzing.damaged, *[fuzzing.described] * 4]),
+    "rlds, resumed": (resume, [fuzzing.damaged, *[fuzzing.described] * 4]),
     "cache": (read, [*FILES, fuzzing.described, *[fuzzing.mapped] * 2]),
     "npz": (lambda folder: read(folder / "episodes.npz"), [*FILES, *[fuzzing.zipped] * 3]),
     "lerobot v21": (read, [*FILES, *[fuzzing.described] * 2, *[fuzzing.tabled] * 2]),
     "lerobot v3": (read, [*FILES, *[fuzzing.described] * 2, *[fuzzing.tabled] * 2]),
     "statistics": (statistics_files.read, [*FILES, fuzzing.described]),
-    "tokenizer.json": (spell, [*FILES, *[fuzzing.described] * 2]),
-    "tokenizer.model": (spell, [fuzzing.replaced, *[fuzzing.damaged] * 4]),
-    "run": (seen, [*FILES, *[fuzzing.described] * 6]),
+    "tokenizer.json": (tokenize, [*FILES, *[fuzzing.described] * 2]),
+    "tokenizer.model": (tokenize, [fuzzing.replaced, *[fuzzing.damaged] * 4]),
+    "run": (show, [*FILES, *[fuzzing.described] * 6]),
     "mjcf": (lambda folder: mjcf.load(folder / "arm.xml"), [*FILES, *[fuzzing.drawn] * 4]),
 }
 
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A folder of each kind."""
+    """Write a valid folder of each kind."""
     at = tmp_path_factory.mktemp("good")
     rlds.write(make(), at / "rlds")
     cache.write([open_source(at / "rlds")], at / "cache", lambda done, total: None)
@@ -87,7 +87,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     for name, file in TOKENIZERS.items():
         (at / name).mkdir()
         found[name] = shutil.copy(GOLDEN / "tokenizers" / file, at / name / name).parent
-    found |= {"rlds, gone on with": at / "rlds", "statistics": golden("v21") / "meta"}
+    found |= {"rlds, resumed": at / "rlds", "statistics": golden("v21") / "meta"}
     return found | {f"lerobot {version}": golden(version) for version in ("v21", "v3")}
 
 
@@ -98,7 +98,7 @@ def check(kind: str, seeds: range, good: dict[str, Path], tmp_path: Path) -> Non
         r = random.Random(f"{kind} {seed}")
         r.choice(changes)(r, sorted(path for path in folder.rglob("*") if path.is_file()))
         error = None
-        with contextlib.suppress(IsADirectoryError):  # where a file is to be written
+        with contextlib.suppress(IsADirectoryError):  # where a file should be written
             try:
                 reader(folder)
             except Exception as found:
@@ -113,7 +113,7 @@ def check(kind: str, seeds: range, good: dict[str, Path], tmp_path: Path) -> Non
 @pytest.fixture(autouse=True)
 def _offline(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*arguments: Any) -> None:
-        raise AssertionError("a request")
+        raise AssertionError("network access")
 
     monkeypatch.setattr(socket.socket, "connect", refuse)
 
@@ -121,13 +121,15 @@ def _offline(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.timeout(120)
 @pytest.mark.filterwarnings("ignore:robot .* misses parts of the table", "ignore:MuJoCo:")
 @pytest.mark.parametrize("kind", KINDS)
-def test_read_or_refused(kind: str, good: dict[str, Path], tmp_path: Path) -> None:
-    check(kind, range(SEEDS // DEAR.get(kind, 1)), good, tmp_path)
+def test_changed_input_is_read_or_rejected(
+    kind: str, good: dict[str, Path], tmp_path: Path
+) -> None:
+    check(kind, range(SEEDS // COST.get(kind, 1)), good, tmp_path)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 @pytest.mark.filterwarnings("ignore:robot .* misses parts of the table", "ignore:MuJoCo:")
 @pytest.mark.parametrize("kind", KINDS)
-def test_many(kind: str, good: dict[str, Path], tmp_path: Path) -> None:
-    check(kind, range(SEEDS, SLOW_SEEDS // DEAR.get(kind, 1)), good, tmp_path)
+def test_changed_input_with_many_seeds(kind: str, good: dict[str, Path], tmp_path: Path) -> None:
+    check(kind, range(SEEDS, SLOW_SEEDS // COST.get(kind, 1)), good, tmp_path)

@@ -1,4 +1,4 @@
-"""The router's nonlinearities, written for few instructions, are those that they stand for."""
+"""Test that the router's fast nonlinearities equal the standard ones."""
 
 import jax
 import numpy as np

@@ -1,5 +1,5 @@
-"""The documented training loop on models with nnx.remat and nnx.scan inside, as language models are
-written in NNX (tunix' Llama: einsums of its own, remat around methods)."""
+"""Test the documented training loop on models that use nnx.remat and nnx.scan internally, like NNX
+language models (tunix's Llama: custom einsum layers, remat around methods)."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ SP = LoRASP(rank=4, hidden_width=2)
 
 
 class Einsum(nnx.Module):
-    """A layer class that adapters do not know."""
+    """A custom einsum layer class."""
 
     def __init__(self, einsum_str, shape, *, rngs):
         self.einsum_str, self.shape = einsum_str, shape
@@ -28,7 +28,7 @@ class Einsum(nnx.Module):
 
 
 class Layer(nnx.Module):
-    """Attention without its softmax, and an MLP, both within remat if asked."""
+    """Attention without softmax and an MLP, optionally rematerialized."""
 
     def __init__(self, remat, *, rngs):
         self.norm = nnx.RMSNorm(WIDTH, rngs=rngs)
@@ -46,7 +46,7 @@ class Layer(nnx.Module):
 
 
 class Llama(nnx.Module):
-    """Token ids [B, T] in, logits out; `scanned`: its layers are one stack."""
+    """Map token ids [B, T] to logits; `scanned` stacks the layers."""
 
     def __init__(self, *, remat, scanned):
         rngs = nnx.Rngs(0)
@@ -78,7 +78,7 @@ def adapted(base):
 
 
 def loss_of(model):
-    """The documented loss of a model, and what is trained."""
+    """Return the documented loss of a model, and its adapters."""
     graphdef, adapters, frozen = lorasp_jax.split(model)
 
     def loss(adapters):
@@ -96,7 +96,7 @@ def loss_of(model):
     [(True, True), pytest.param(True, False, marks=pytest.mark.slow)],
     ids=["remat and scan", "remat"],
 )
-def test_the_documented_loop(remat, scanned, tmp_path):
+def test_documented_training_loop(remat, scanned, tmp_path):
     base = Llama(remat=remat, scanned=scanned)
     model = adapted(base)
     loss, adapters = loss_of(model)
@@ -126,8 +126,8 @@ def test_the_documented_loop(remat, scanned, tmp_path):
 
 
 @pytest.mark.slow
-def test_remat_and_scan_change_no_number():
-    """Loss and gradients of the stack are those of its layers one by one."""
+def test_remat_and_scan_do_not_change_results():
+    """Loss and gradients of the stack equal those of separate layers."""
     model = adapted(Llama(remat=True, scanned=True))
     plain = adapted(Llama(remat=False, scanned=False))
     for place in ("embedder", "head"):

@@ -1,4 +1,4 @@
-"""Gemma as others wrote it, adapted as it is: Flax's example (NNX), Hugging Face's (Linen)."""
+"""Adapt third-party Gemma models unchanged: Flax's example (NNX) and Hugging Face's (Linen)."""
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ MASK = jnp.broadcast_to(jnp.tril(jnp.ones((5, 5), bool)), (2, 5, 5))
 
 @pytest.fixture(scope="module", params=["own", "of_flax"])
 def gemma(request):
-    """With weights at random: Flax's example starts some at zero."""
+    """Return a Gemma with random weights; Flax's example initializes some to zero."""
     if request.param == "of_flax":
         pytest.importorskip("transformer", reason="flax/examples/gemma is not on the path")
     model = (gemmas.Gemma if request.param == "own" else gemmas.of_flax)(nnx.Rngs(0))
@@ -52,7 +52,7 @@ def adapted(gemma, *rules):
 
 
 def trained(model, steps=5):
-    """A few steps, and the loss before and after."""
+    """Train a few steps; return the model and the loss before and after."""
     graphdef, adapters, frozen = adaptation.split(model)
     optimizer = optax.adam(1e-2)
 
@@ -73,7 +73,7 @@ def trained(model, steps=5):
     return nnx.merge(graphdef, adapters, frozen), losses
 
 
-def test_nnx_gemma_trains_and_travels(gemma, tmp_path):
+def test_nnx_gemma_trains_saves_and_loads(gemma, tmp_path):
     model = adapted(gemma, ("0/attn", SP), ("attn|mlp", LoRA(rank=2)))
     before = logits(model)
     np.testing.assert_allclose(before, logits(gemma), rtol=1e-3, atol=1e-4)
@@ -90,7 +90,7 @@ def test_nnx_gemma_trains_and_travels(gemma, tmp_path):
 
 def test_nnx_gemma_merges_into_its_own_parameters(gemma):
     model = adapted(gemma, ("attn|mlp", LoRA(rank=2)))
-    # One adapter for all heads, as of Hugging Face's q_proj, k_proj and v_proj, those two as one.
+    # One adapter for all heads, like Hugging Face's q_proj, k_proj and v_proj, with k and v fused.
     sizes = [(16, 32), (16, 32), (32, 16), (16, 24), (16, 24), (24, 16)]
     assert adaptation.count(model).trainable == 2 * sum(2 * (i + o) for i, o in sizes)
     graphdef, adapters, frozen = adaptation.split(model)
@@ -102,8 +102,8 @@ def test_nnx_gemma_merges_into_its_own_parameters(gemma):
     np.testing.assert_allclose(logits(loaded), logits(model), rtol=1e-3, atol=1e-3)
 
 
-def test_nnx_gemma_with_names_and_in_fewer_bits(gemma):
-    """It reads sizes off its kernels, which must not show how they are kept."""
+def test_nnx_gemma_with_named_adapters_and_quantization(gemma):
+    """The model reads sizes from its kernels, so quantized kernels must keep their shapes."""
     pour, press = (adapted(gemma, (".*", LoRA(rank=rank))) for rank in (2, 3))
     graphdef, adapters, frozen = adaptation.split(pour)
     pour = nnx.merge(graphdef, perturbed(adapters, 0.3), frozen)
@@ -119,7 +119,7 @@ def test_nnx_gemma_with_names_and_in_fewer_bits(gemma):
 
 @pytest.fixture(scope="module")
 def linen():
-    """Gemma of Hugging Face's transformers, and its parameters."""
+    """Return the Gemma of Hugging Face transformers, and its parameters."""
     gemma = pytest.importorskip(
         "transformers.models.gemma.modeling_flax_gemma", exc_type=ImportError
     )
@@ -174,7 +174,7 @@ def test_linen_gemma(linen):
 
 def test_linen_gemma_merges(linen):
     module, published, arguments = linen
-    # The head reads the embedding's table on its own: a merged one would change it too.
+    # The head shares the embedding table, so merging into it would change the head too.
     adapter = LinenAdapter(module, [("embed_tokens", None), (".*", LoRA(rank=2))])
     variables = jax.jit(adapter.attach)(jax.random.key(1), published, *arguments)
     variables = perturbed(variables, 0.1)

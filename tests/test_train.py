@@ -1,4 +1,5 @@
-"""The command: every kind of bad input is one sentence and exit code 2, and changes nothing."""
+"""Test the command: every kind of bad input gives a one-line error and exit code 2, and changes
+nothing."""
 
 import errno
 import json
@@ -24,7 +25,7 @@ def elsewhere(tmp_path, monkeypatch):
 
 
 def files():
-    """What there is, but for locks, which lie beside the folders of runs."""
+    """List all files except locks, which are next to the run folders."""
     found = {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()}
     return {path: content for path, content in found.items() if path.suffix != ".lock"}
 
@@ -74,11 +75,11 @@ def test_bad_input(arguments, message, capsys):
     assert message in printed
     assert printed.count("\n") == 1
     assert "Traceback" not in printed
-    # At most the record of what was asked: the corrected command can take the same name.
+    # At most the config is written, so a corrected command can reuse the name.
     assert {path.name for path in files()} <= {"config.json"}
 
 
-def test_folder_of_another_run_is_left_alone(capsys):
+def test_folder_of_another_run_is_not_changed(capsys):
     folder = Path("runs/multitask")
     folder.mkdir(parents=True)
     (folder / "metrics.jsonl").write_text("precious\n")
@@ -140,7 +141,7 @@ def test_base_without_its_control_period(content, capsys):
     assert re.search(message, capsys.readouterr().err)
 
 
-def test_finished_run_is_not_run_again(capsys):
+def test_finished_run_is_not_repeated(capsys):
     assert train.main([*MULTITASK, "--model.checkpoint", "nowhere"]) == 2
     record = json.loads(Path("runs/multitask/config.json").read_text())
     assert record["peft"]["method"] == "LoRASP"

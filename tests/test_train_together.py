@@ -1,4 +1,4 @@
-"""`train.py` in two processes: they do what one does, or say in one sentence why not."""
+"""Test `train.py` in two processes: same results as in one, or a one-line error."""
 
 import subprocess
 
@@ -23,23 +23,23 @@ SPLIT = (
 )
 
 
-def ended(children):
-    """Exit codes and what was printed, together and as errors."""
-    said = [child.communicate() for child in children]
-    return [child.returncode for child in children], said
+def wait(children):
+    """Wait for the processes; return their exit codes and their (stdout, stderr)."""
+    outputs = [child.communicate() for child in children]
+    return [child.returncode for child in children], outputs
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_two_processes_with_simulated_tasks_train_as_one(tmp_path):
-    """With a base, and what trains of it, that are really split over both."""
+    """Base and trainable parameters are large enough to be sharded over both processes."""
     shapes = nnx.state(nnx.eval_shape(lambda: Pi0Config.small().create(nnx.Rngs(0))))
     assert meshes.bytes_on_device(shapes, fsdp=2) < meshes.bytes_on_device(shapes, fsdp=1)
     folders = []
     for count in (1, 2):
         options = (*COMMAND, *SPLIT, "--name", f"of{count}")
         joint = ("--distributed",) if count > 1 else ()
-        codes, _ = ended(start(count, *options, *joint, devices=2 // count, cwd=tmp_path))
+        codes, _ = wait(start(count, *options, *joint, devices=2 // count, cwd=tmp_path))
         assert codes == [0] * count
         folders.append(tmp_path / "runs" / f"of{count}")
     for expected, found in zip(*map(repeatable, folders), strict=True):
@@ -63,14 +63,14 @@ def test_two_processes_with_simulated_tasks_train_as_one(tmp_path):
         ({}, "error: runs/multitask already holds a run: add --resume"),
     ],
 )
-def test_a_refusal_is_one_sentence_of_the_first_process(own, reason, tmp_path):
+def test_first_process_prints_a_one_line_error(own, reason, tmp_path):
     (tmp_path / "runs/multitask").mkdir(parents=True)
     (tmp_path / "runs/multitask/metrics.jsonl").write_text("precious\n")
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    codes, said = ended(start(2, *COMMAND, "--distributed", own=own, cwd=tmp_path, **pipes))
+    codes, outputs = wait(start(2, *COMMAND, "--distributed", own=own, cwd=tmp_path, **pipes))
     assert codes == [2, 2]
-    (out, sentence), other = said
+    (out, error), other = outputs
     assert out.startswith("waiting for 2 processes at 127.0.0.1:")
-    assert reason in sentence
-    assert sentence.count("\n") == 1
+    assert reason in error
+    assert error.count("\n") == 1
     assert other == ("", "")
