@@ -1,4 +1,4 @@
-"""Laws of every backbone that need no recorded numbers: who sees whom, adapters, remat, types."""
+"""Properties of every backbone, without recorded values: masks, adapters, remat, dtypes."""
 
 import dataclasses
 import functools
@@ -50,7 +50,7 @@ def actions(config):
 
 @pytest.fixture(scope="module")
 def velocity(model):
-    """Compiled once: (obs, x_t) -> v_t at time 0.4."""
+    """(obs, x_t) -> v_t at time 0.4, compiled once."""
     return jax.jit(lambda obs, x_t: model.velocity(obs, x_t, jnp.full(BATCH, 0.4)))
 
 
@@ -64,25 +64,25 @@ def test_missing_camera_and_wrong_size_raise(model, obs):
         model.embed_prefix(dataclasses.replace(obs, images=large))
 
 
-def test_padding_and_missing_cameras_are_not_seen(velocity, obs, actions):
-    wanted = velocity(obs, actions)
+def test_padding_and_missing_cameras_do_not_affect_the_velocity(velocity, obs, actions):
+    expected = velocity(obs, actions)
     wrist = obs.images["wrist"].at[1].set(0.7)
     tokens = jnp.where(obs.token_mask, obs.tokens, 9)
-    hidden = dataclasses.replace(obs, images={**obs.images, "wrist": wrist}, tokens=tokens)
-    np.testing.assert_array_equal(velocity(hidden, actions), wanted)
-    seen = dataclasses.replace(obs, images={**obs.images, "wrist": wrist.at[0].set(0.7)})
-    assert np.abs(velocity(seen, actions) - wanted)[0].max() > 1e-4
+    masked_change = dataclasses.replace(obs, images={**obs.images, "wrist": wrist}, tokens=tokens)
+    np.testing.assert_array_equal(velocity(masked_change, actions), expected)
+    valid_change = dataclasses.replace(obs, images={**obs.images, "wrist": wrist.at[0].set(0.7)})
+    assert np.abs(velocity(valid_change, actions) - expected)[0].max() > 1e-4
 
 
-def test_every_action_sees_the_state(velocity, obs, actions):
+def test_every_action_depends_on_the_state(velocity, obs, actions):
     other = velocity(dataclasses.replace(obs, state=obs.state + 1), actions)
     assert (np.abs(other - velocity(obs, actions)).max(axis=-1) > 1e-6).all()
 
 
 @pytest.fixture(scope="module")
 def adapted(model):
-    """LoRA-SP in every tower and kind of layer, LoRA, which compiles sooner, on what is left."""
-    # The gate has its own tests; without a search (η = 1) this compiles in a third of the time.
+    """LoRA-SP in every tower and kind of layer; LoRA, which compiles faster, elsewhere."""
+    # The gate has its own tests; without its search (η = 1) this compiles in a third of the time.
     sparse = LoRASP(rank=RANK, hidden_width=4, energy_target=1.0)
     rules = [("vision/head|o_proj|state_proj|cross_layer/k_proj", sparse), (".*", LoRA(rank=2))]
     return lorasp_jax.adapt(model, rules, rngs=nnx.Rngs(1))
@@ -108,7 +108,7 @@ def trained(adapted, obs, actions, mask):
     return per_element, aux, nnx.to_pure_dict(grads)
 
 
-def test_every_dense_layer_is_reached(trained, backbone, actions):
+def test_every_dense_layer_has_aux(trained, backbone, actions):
     per_element, aux, _ = trained
     assert per_element.shape == actions.shape
     assert per_element.dtype == jnp.float32
@@ -119,35 +119,35 @@ def test_every_dense_layer_is_reached(trained, backbone, actions):
     }
 
 
-def test_adapters_change_nothing_at_the_start(trained, model, obs, actions, mask):
-    plain = jax.jit(lambda model: model.loss(jax.random.key(2), obs, actions, action_mask=mask)[0])
-    np.testing.assert_allclose(trained[0], plain(model), rtol=1e-4, atol=1e-5)
+def test_adapters_initially_do_not_change_the_loss(trained, model, obs, actions, mask):
+    base = jax.jit(lambda model: model.loss(jax.random.key(2), obs, actions, action_mask=mask)[0])
+    np.testing.assert_allclose(trained[0], base(model), rtol=1e-4, atol=1e-5)
 
 
-def test_reports_are_masked(trained, config, obs):
+def test_aux_is_masked(trained, config, obs):
     _, aux, _ = trained
-    image = config.patches
-    seen = 3 * config.image_tokens + 3 + 5  # three of four pictures, the valid words
-    counted = {
+    patches = config.patches
+    prefix = 3 * config.image_tokens + 3 + 5  # three of four images, the valid language tokens
+    counts = {
         tower: {name: int(a.token_mask.sum(axis=(-2, -1)).max()) for name, a in layers.items()}
         for tower, layers in aux.items()
     }
-    assert counted["vision"] == {
-        name: 3 * (config.image_tokens if name == "head" else image) for name in counted["vision"]
+    assert counts["vision"] == {
+        name: 3 * (config.image_tokens if name == "head" else patches) for name in counts["vision"]
     }
     state = BATCH if isinstance(config, smolvla.SmolVLAConfig) else 0
-    assert set(counted["language"].values()) == {seen + state}
+    assert set(counts["language"].values()) == {prefix + state}
     valid = BATCH * (config.chunk - 1)
-    assert counted["action"]["action_out_proj"] == counted["action"]["action_in_proj"] == valid
-    assert counted["action"]["state_proj"] == BATCH
-    cross = {n: c for n, c in counted["action"].items() if n.startswith("cross_layer/")}
-    assert all(c == (seen + state if n[-6] in "kv" else valid) for n, c in cross.items())
+    assert counts["action"]["action_out_proj"] == counts["action"]["action_in_proj"] == valid
+    assert counts["action"]["state_proj"] == BATCH
+    cross = {n: c for n, c in counts["action"].items() if n.startswith("cross_layer/")}
+    assert all(c == (prefix + state if n[-6] in "kv" else valid) for n, c in cross.items())
     assert aux["vision"]["head"].losses["balance"].shape == ()
     assert aux["language"]["o_proj"].losses["spectral"].shape == (config.language.depth,)
 
 
-def test_adapters_train(trained, backbone):
-    """U and B start at zero, so at first they alone have a gradient, in every layer."""
+def test_adapters_have_gradients(trained, backbone):
+    """U and B are initialized to zero, so initially only they have a gradient, in every layer."""
     _, _, grads = trained
     ups = []
     for path, leaf in jax.tree_util.tree_leaves_with_path(grads):
@@ -157,23 +157,23 @@ def test_adapters_train(trained, backbone):
     assert sum(ups) == 8 + 7 + len(ACTION[backbone]) + 5
 
 
-def test_unused_slots_do_not_matter(adapted, config, obs, actions):
-    """x_t is held at zero there, in sampling as in training."""
+def test_unused_slots_do_not_affect_the_sample(adapted, config, obs, actions):
+    """x_t is zero there, in sampling as in training."""
     slots = np.arange(config.action_dim) < 5
 
     @jax.jit
     def sample(noise: jax.Array):
-        fixed = {"noise": noise, "slots": slots, "num_steps": STEPS}
-        return adapted.sample_actions(jax.random.key(0), obs, **fixed, return_aux=True)
+        options = {"noise": noise, "slots": slots, "num_steps": STEPS}
+        return adapted.sample_actions(jax.random.key(0), obs, **options, return_aux=True)
 
-    found, aux = sample(actions)
+    sampled, aux = sample(actions)
     other, _ = sample(jnp.where(slots, actions, 7.0))
-    np.testing.assert_array_equal(found, other)
-    assert not np.any(found[..., 5:])
-    assert {report.active_rank.shape[0] for report in aux["action"].values()} == {STEPS}
-    # What ran once per observation has no axis of steps of its own: all steps read the same.
-    once = aux["action"]["state_proj"].active_rank
-    np.testing.assert_array_equal(once[0], once[-1])
+    np.testing.assert_array_equal(sampled, other)
+    assert not np.any(sampled[..., 5:])
+    assert {layer.active_rank.shape[0] for layer in aux["action"].values()} == {STEPS}
+    # SmolVLA projects the state once per observation, so its aux is the same in all steps.
+    state_rank = aux["action"]["state_proj"].active_rank
+    np.testing.assert_array_equal(state_rank[0], state_rank[-1])
 
 
 @pytest.fixture(scope="module")
@@ -195,31 +195,31 @@ def loss_of(config, obs, actions):
 
 
 @pytest.fixture(scope="module")
-def plain(model, loss_of):
-    """Loss and gradients as the configuration has them."""
+def reference(model, loss_of):
+    """Loss and gradients without remat."""
     return jax.jit(jax.value_and_grad(loss_of(remat="none")))(nnx.split(model)[1])
 
 
-def test_remat_changes_nothing(model, loss_of, plain):
+def test_remat_does_not_change_gradients(model, loss_of, reference):
     close = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5)
     for remat in ("products", "full"):
-        found = jax.jit(jax.value_and_grad(loss_of(remat=remat)))(nnx.split(model)[1])
-        jax.tree.map(close, found, plain)
+        result = jax.jit(jax.value_and_grad(loss_of(remat=remat)))(nnx.split(model)[1])
+        jax.tree.map(close, result, reference)
 
 
-def test_remat_stores_less(model, loss_of):
+def test_remat_saves_fewer_residuals(model, loss_of):
     parameters = nnx.split(model)[1]
 
-    def stored(remat):
+    def residual_size(remat):
         arrays = jax.eval_shape(lambda p: jax.vjp(loss_of(remat=remat), p)[1], parameters)
         return sum(a.size for a in jax.tree.leaves(arrays))
 
-    none, products, full = map(stored, ("none", "products", "full"))
+    none, products, full = map(residual_size, ("none", "products", "full"))
     assert none > 1.5 * products > 1.5 * full
 
 
-def test_unroll_and_bfloat16_hardly_change_the_loss(model, loss_of, plain):
-    parameters, loss = nnx.split(model)[1], plain[0]
+def test_unroll_and_bfloat16_hardly_change_the_loss(model, loss_of, reference):
+    parameters, loss = nnx.split(model)[1], reference[0]
     np.testing.assert_allclose(jax.jit(loss_of(unroll=True))(parameters), loss, rtol=1e-5)
     half = jax.jit(loss_of(dtype="bfloat16"))(parameters)
     assert half != loss
@@ -227,10 +227,10 @@ def test_unroll_and_bfloat16_hardly_change_the_loss(model, loss_of, plain):
 
 
 def test_works_without_graph_mode(config, obs, actions):
-    """NNX as it will be: trees only."""
+    """The future default of NNX: trees only."""
     with nnx.set_graph_mode(False), nnx.set_graph_updates(False):
         graphdef, state = nnx.split(nnx.eval_shape(lambda: config.create(nnx.Rngs(0))))
-        found = jax.eval_shape(
+        sampled = jax.eval_shape(
             lambda state: nnx.merge(graphdef, state).sample_actions(jax.random.key(0), obs), state
         )
-    assert found.shape == actions.shape
+    assert sampled.shape == actions.shape

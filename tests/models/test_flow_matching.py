@@ -18,7 +18,7 @@ def test_time_one_is_noise_and_zero_is_data():
 
 
 def test_time_distribution():
-    """Beta(1.5, 1) has mean 0.6 and distribution function t^1.5."""
+    """Beta(1.5, 1) has mean 0.6 and CDF t^1.5."""
     time = flow_matching.sample_time(jax.random.key(2), 20_000)
     assert time.min() >= 0.001
     assert time.max() <= 1
@@ -26,7 +26,7 @@ def test_time_distribution():
     np.testing.assert_allclose((time < 0.5).mean(), 0.5**1.5, atol=0.015)
 
 
-def test_loss_is_zero_for_the_right_velocity_only():
+def test_loss_is_zero_only_for_the_true_velocity():
     right = lambda x_t, time: (NOISE - DATA, "aux")  # noqa: E731
     per_element, aux = flow_matching.loss(right, jax.random.key(3), DATA, noise=NOISE)
     assert aux == "aux"
@@ -38,20 +38,20 @@ def test_loss_is_zero_for_the_right_velocity_only():
     )
 
 
-def test_euler_takes_the_steps_it_should():
-    """The straight field leads back to the data; times are 1 - k / n."""
+def test_euler_steps():
+    """A constant velocity leads back to the data; times are 1 - k / n."""
     sampled, times = flow_matching.sample(lambda x, t: (NOISE - DATA, t), NOISE, num_steps=10)
     np.testing.assert_allclose(sampled, DATA, atol=1e-5)
     np.testing.assert_allclose(times[:, 0], 1 - np.arange(10) / 10, rtol=1e-6)
 
 
-def test_slots_out_of_use_are_held_at_zero():
+def test_unused_slots_stay_zero():
     slots = jnp.array([True, True, False, True])
-    seen = []
+    inputs = []
     flow_matching.loss(
-        lambda x_t, t: (seen.append(x_t) or x_t, None), jax.random.key(4), DATA, slots=slots
+        lambda x_t, t: (inputs.append(x_t) or x_t, None), jax.random.key(4), DATA, slots=slots
     )
-    assert not seen[0][..., 2].any()
-    assert seen[0][..., 3].all()
+    assert not inputs[0][..., 2].any()
+    assert inputs[0][..., 3].all()
     sampled, _ = flow_matching.sample(lambda x, t: (x + 5, None), NOISE, num_steps=3, slots=slots)
     assert not sampled[..., 2].any()

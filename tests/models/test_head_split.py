@@ -1,4 +1,4 @@
-"""As many values in other heads are another model: each layout refuses them, in and out."""
+"""Kernels of equal size with different heads are different models: every layout rejects them."""
 
 import dataclasses
 import functools
@@ -19,7 +19,7 @@ CONFIG = Pi0Config.dummy()
 
 
 def with_heads(tower, **heads):
-    """The dummy with other heads of the same matrices; the experts' must agree."""
+    """The dummy config with other heads but equal kernel sizes; both experts change together."""
     towers = ("vision",) if tower == "vision" else ("language", "action")
     sizes = {name: dataclasses.replace(getattr(CONFIG, name), **heads) for name in towers}
     return dataclasses.replace(CONFIG, **sizes)
@@ -36,22 +36,22 @@ def model():
     return random_backbone(CONFIG)
 
 
-@pytest.mark.parametrize("part", OTHERS)
-def test_openpi(part, model, tmp_path):
+@pytest.mark.parametrize("tower", OTHERS)
+def test_openpi(tower, model, tmp_path):
     published.save(tmp_path, model, "openpi")
     with pytest.raises(ValueError, match=r"must have shape \(2, .*, got \(2, "):
-        models.load(tmp_path, OTHERS[part])
+        models.load(tmp_path, OTHERS[tower])
 
 
 def test_openpi_patches(model, tmp_path):
-    """A picture of 2 x 2 patches of 16 pixels, not of 4 x 4 of 8 with four times the positions."""
+    """The image has 2 x 2 patches of 16 pixels; 4 x 4 patches of 8 would need more positions."""
     published.save(tmp_path, model, "openpi")
     vision = dataclasses.replace(CONFIG.vision, patch=8)
     with pytest.raises(ValueError, match=r"img/embedding/kernel of .*, got \(16, 16, 3, 32\)"):
         models.load(tmp_path, dataclasses.replace(CONFIG, vision=vision))
 
 
-def test_openpi_says_that_it_took_the_published_sizes(model, tmp_path):
+def test_openpi_error_mentions_the_default_sizes(model, tmp_path):
     published.save(tmp_path, model, "openpi")
     with pytest.raises(
         ValueError, match=r"must have shape \(14, .*published pi0 were used: pass a config"
@@ -59,8 +59,8 @@ def test_openpi_says_that_it_took_the_published_sizes(model, tmp_path):
         models.load(tmp_path)
 
 
-def test_lora_of_openpi(model):
-    """Its pairs have head axes, too."""
+def test_openpi_lora(model):
+    """LoRA pairs have head axes, too."""
     size, rank, leaves = CONFIG.language, 2, {}
     for name, kernel in {
         "attn/q_einsum/": (size.heads, size.width, size.head_dim),
@@ -80,7 +80,7 @@ def test_lora_of_openpi(model):
         openpi_lora.attach(other, leaves)
 
 
-def test_patches_of_lerobot(model, tmp_path):
+def test_lerobot_patches(model, tmp_path):
     published.save(tmp_path, model, "lerobot")
     file = tmp_path / "model.safetensors"
     tensors = safetensors.numpy.load_file(file)
@@ -93,43 +93,43 @@ def test_patches_of_lerobot(model, tmp_path):
         models.load(tmp_path, CONFIG)
 
 
-@pytest.mark.parametrize("part", OTHERS)
-def test_heads_of_lerobot_are_those_of_its_config(part, model, tmp_path, monkeypatch):
-    """Its matrices have no head axes."""
+@pytest.mark.parametrize("tower", OTHERS)
+def test_lerobot_heads_must_match_config_json(tower, model, tmp_path, monkeypatch):
+    """LeRobot's matrices have no head axes."""
     monkeypatch.setattr(Pi0Config, "base", lambda: CONFIG)
     published.save(tmp_path, model, "lerobot")
-    assert models.load(tmp_path, OTHERS[part]).config == OTHERS[part]
+    assert models.load(tmp_path, OTHERS[tower]).config == OTHERS[tower]
     variants = {"paligemma_variant": "gemma_2b", "action_expert_variant": "gemma_300m"}
     (tmp_path / "config.json").write_text(json.dumps({"type": "pi0", **variants}))
     assert models.load(tmp_path, CONFIG).config == CONFIG
     with pytest.raises(ValueError, match="does not match the config: heads of "):
-        models.load(tmp_path, OTHERS[part])
+        models.load(tmp_path, OTHERS[tower])
 
 
-@pytest.mark.parametrize("part", OTHERS)
-def test_own_config_is_under_the_hash(part, model, tmp_path):
+@pytest.mark.parametrize("tower", OTHERS)
+def test_native_hash_covers_the_config(tower, model, tmp_path):
     models.save(tmp_path, model)
     with pytest.raises(ValueError, match="does not match the config: "):
-        models.load(tmp_path, OTHERS[part])
+        models.load(tmp_path, OTHERS[tower])
     path = tmp_path / "config.json"
     fields = json.loads(path.read_text())
-    fields["config"] |= json.loads(json.dumps(dataclasses.asdict(OTHERS[part])))
+    fields["config"] |= json.loads(json.dumps(dataclasses.asdict(OTHERS[tower])))
     path.write_text(json.dumps(fields))
     with pytest.raises(ValueError, match="weights and config do not match the hash"):
         models.load(tmp_path)
 
 
-@pytest.mark.parametrize("layout", ["openpi", "lerobot", "own"])
-def test_nothing_is_saved_under_sizes_of_another_model(layout, tmp_path):
+@pytest.mark.parametrize("layout", ["openpi", "lerobot", "ours"])
+def test_saving_requires_a_matching_config(layout, tmp_path):
     model = random_backbone(CONFIG)
     model.config = dataclasses.replace(CONFIG, vocabulary=CONFIG.vocabulary + 1)
-    save = models.save if layout == "own" else functools.partial(published.save, layout=layout)
+    save = models.save if layout == "ours" else functools.partial(published.save, layout=layout)
     with pytest.raises(ValueError, match="does not match its config: see language/embedding"):
         save(tmp_path, model)
     assert not list(tmp_path.iterdir())
 
 
-UNRELATED = [
+UNRELATED_CONFIGS = [
     ({"architectures": ["SmolVLMForConditionalGeneration"]}, "must have 'backbone'"),
     ({"type": "pi0"}, r"lacks .* The sizes come from .*config\.json, which has type 'pi0'"),
     ({"type": "smolvla", "num_vlm_layers": "x"}, "depth must be an integer from 1 to 1000"),
@@ -140,8 +140,8 @@ UNRELATED = [
 ]
 
 
-@pytest.mark.parametrize(("fields", "message"), UNRELATED)
-def test_an_unrelated_config_beside_smolvla(fields, message, tmp_path):
+@pytest.mark.parametrize(("fields", "message"), UNRELATED_CONFIGS)
+def test_smolvla_with_an_unrelated_config(fields, message, tmp_path):
     config = SmolVLAConfig.dummy()
     published.save(tmp_path, random_backbone(config), "lerobot")
     with pytest.raises(ValueError, match="contains weights, but no config"):

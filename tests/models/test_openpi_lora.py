@@ -1,6 +1,7 @@
-"""openpi's LoRA against the einsums that its models/lora.py writes down."""
+"""Compare openpi's LoRA with the einsums in its models/lora.py."""
 
 import flax.traverse_util
+import jax
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
@@ -14,7 +15,7 @@ from tests.models.random_models import random_backbone
 
 CONFIG = Pi0Config.dummy()
 SCALE = 0.5
-"""alpha / rank, which the MLP ignores."""
+"""alpha / rank; the MLP ignores it."""
 LAYERS = "PaliGemma/llm/layers"
 RANK = {"": 3, "_1": 2}
 BATCH, TOKENS = 2, 3
@@ -28,7 +29,7 @@ def model():
 @pytest.fixture(scope="module")
 def leaves():
     """LoRA of both experts, in openpi's shapes."""
-    rng, found = np.random.default_rng(1), {}
+    rng, leaves = np.random.default_rng(1), {}
     for size, suffix in ((CONFIG.language, ""), (CONFIG.action, "_1")):
         kernels = {
             f"attn/q_einsum{suffix}/": (size.heads, size.width, size.head_dim),
@@ -39,9 +40,9 @@ def leaves():
         }
         for name, (*outer, d_in, d_out) in kernels.items():
             for side, shape in (("a", (d_in, RANK[suffix])), ("b", (RANK[suffix], d_out))):
-                drawn = rng.normal(size=(size.depth, *outer, *shape)).astype(np.float32)
-                found[f"{LAYERS}/{name}lora_{side}"] = drawn
-    return found
+                leaf = rng.normal(size=(size.depth, *outer, *shape)).astype(np.float32)
+                leaves[f"{LAYERS}/{name}lora_{side}"] = leaf
+    return leaves
 
 
 @pytest.mark.parametrize(("tower", "suffix"), [("language", ""), ("action", "_1")])
@@ -54,13 +55,13 @@ def test_the_layers_compute_openpis_einsums(model, leaves, tower, suffix):
         return (leaves[f"{LAYERS}/{name}lora_{side}"][layer] for side in "ab")
 
     def delta(name, x):
-        """What our layer adds to x W."""
+        """The adapter's contribution to our layer's output."""
         dense = getattr(getattr(adapted, tower).blocks, name)
-        one = {key: leaf[layer] for key, leaf in dense.adapter.get_value().items()}
-        return dense.method.delta(one, jnp.asarray(x, jnp.float32))[0]
+        params = {key: leaf[layer] for key, leaf in dense.adapter.get_value().items()}
+        return dense.method.delta(params, jnp.asarray(x, jnp.float32))[0]
 
-    def close(found, wanted):
-        np.testing.assert_allclose(found, wanted.reshape(found.shape), rtol=1e-4, atol=1e-4)
+    def close(actual, expected):
+        np.testing.assert_allclose(actual, expected.reshape(actual.shape), rtol=1e-4, atol=1e-4)
 
     x = rng.normal(size=(BATCH, TOKENS, size.width))
     a, b = pair(f"attn/q_einsum{suffix}/")
@@ -87,28 +88,26 @@ def test_the_layers_compute_openpis_einsums(model, leaves, tower, suffix):
 
 
 def test_a_checkpoint_with_lora_is_loaded(model, leaves, tmp_path):
-    """As openpi saves one: base and LoRA in one tree. One expert may have none."""
-    one = {name: leaf for name, leaf in leaves.items() if "_1" not in name}
+    """openpi saves base and LoRA in one tree; here only the language expert has LoRA."""
+    language = {name: leaf for name, leaf in leaves.items() if "_1" not in name}
     base = layouts.to_theirs(published_names.openpi_layout(CONFIG), base_arrays(model))
-    tree = flax.traverse_util.unflatten_dict({**base, **one}, sep="/")
+    tree = flax.traverse_util.unflatten_dict({**base, **language}, sep="/")
     ocp.PyTreeCheckpointer().save(tmp_path / "params", {"params": tree})
-    found, unused = published.load_published(tmp_path, CONFIG)
+    loaded, unused = published.load_published(tmp_path, CONFIG)
     assert unused == []
-    wanted = openpi_lora.attach(model, one)
-    assert wanted.action.blocks.q_proj.adapter is None
-    found, wanted = (nnx.to_flat_state(nnx.state(m, nnx.Param)) for m in (found, wanted))
-    for (path, leaf), (other, expected) in zip(found, wanted, strict=True):
-        assert path == other
-        for key, array in leaf.get_value().items() if path[-1] == "adapter" else [("", leaf[...])]:
-            whole = expected.get_value()
-            np.testing.assert_array_equal(array, whole[key] if key else whole)
+    expected = openpi_lora.attach(model, language)
+    assert expected.action.blocks.q_proj.adapter is None
+    loaded, expected = (nnx.to_flat_state(nnx.state(m, nnx.Param)) for m in (loaded, expected))
+    for (path, leaf), (expected_path, expected_leaf) in zip(loaded, expected, strict=True):
+        assert path == expected_path
+        jax.tree.map(np.testing.assert_array_equal, leaf.get_value(), expected_leaf.get_value())
 
 
-def test_what_does_not_fit_is_named(model, leaves):
+def test_mismatched_leaves_are_named(model, leaves):
     missing = f"{LAYERS}/mlp_1/linear_lora_b"
-    less = {name: leaf for name, leaf in leaves.items() if name != missing}
+    incomplete = {name: leaf for name, leaf in leaves.items() if name != missing}
     with pytest.raises(ValueError, match=f"lacks {missing}"):
-        openpi_lora.attach(model, less)
+        openpi_lora.attach(model, incomplete)
     with pytest.raises(ValueError, match="unexpected state_proj/lora_a"):
         openpi_lora.attach(model, {**leaves, "state_proj/lora_a": np.zeros(1)})
     wide = {**leaves, f"{LAYERS}/mlp/linear_lora_a": np.zeros((2, 7, 3), np.float32)}

@@ -1,4 +1,4 @@
-"""Laws of pi0 alone that need no recorded numbers: sizes, who sees whom."""
+"""Properties of pi0, without recorded values: sizes and attention masks."""
 
 import dataclasses
 
@@ -44,21 +44,21 @@ def test_parameter_counts(name, low, high):
 
 
 def test_base_towers():
-    """SigLIP with its head, both experts, the projections (openpi, shape evaluation)."""
+    """Counts from shape evaluation in openpi: SigLIP with its head, both experts, one expert."""
     model = nnx.eval_shape(lambda: Pi0Config.base().create(nnx.Rngs(0)))
     assert size(model.vision) == 414_803_696
     assert size(model.language) + size(model.action) == 2_819_996_672
     assert size(model.action) == 311_464_960
 
 
-def test_config_says_what_is_wrong():
+def test_inconsistent_sizes_raise():
     with pytest.raises(ValueError, match=r"depth of both experts must be equal, .* got 2 and 3"):
         dataclasses.replace(CONFIG, action=dataclasses.replace(CONFIG.action, depth=3))
     with pytest.raises(ValueError, match=r"image_size must be a multiple of .* = 16, got 40"):
         dataclasses.replace(CONFIG, image_size=40)
 
 
-def test_every_action_sees_every_action(model, obs):
+def test_every_action_attends_to_every_action(model, obs):
     time = jnp.full(BATCH, 0.4)
     velocity = jax.jit(lambda x_t: model.velocity(obs, x_t, time))
     x_t = actions()
@@ -66,17 +66,17 @@ def test_every_action_sees_every_action(model, obs):
     assert (last.max(axis=-1) > 1e-6).all()
 
 
-def test_state_does_not_see_actions(model, obs):
-    """The state's keys and values, and with them its whole row, are the same for any x_t."""
+def test_state_does_not_attend_to_actions(model, obs):
+    """The action expert's output at the state token is the same for any x_t."""
 
     def state_row(x_t: jax.Array) -> jax.Array:
         prefix, _ = model.run_prefix(obs)
         tokens, _ = model.embed_suffix(obs, x_t, jnp.full(BATCH, 0.4))
         block = np.array([1] + [2] * CONFIG.chunk)
-        seen = np.concatenate([np.zeros(prefix.valid.shape[1], int), block])
+        key_block = np.concatenate([np.zeros(prefix.valid.shape[1], int), block])
         valid = jnp.ones(tokens.shape[:2], bool)
         key_valid = jnp.concatenate([prefix.valid, valid], axis=1)
-        mask = block_mask(block, seen, valid, key_valid)
+        mask = block_mask(block, key_block, valid, key_valid)
         position = jnp.broadcast_to(jnp.arange(tokens.shape[1]), tokens.shape[:2])
         return model.action(tokens, position, mask, prefix.cache, token_mask=valid)[0][:, 0]
 

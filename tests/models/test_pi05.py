@@ -1,4 +1,4 @@
-"""pi0.5: sizes, its two published layouts, and its velocity against one pass written out."""
+"""pi0.5: sizes, its two published layouts, and its velocity against a NumPy implementation."""
 
 import dataclasses
 import re
@@ -19,7 +19,7 @@ from tests.models.random_models import observation, random_backbone
 CONFIG = dataclasses.replace(Pi0Config.dummy(), pi05=True)
 BATCH = 2
 NORMS = {"input_layernorm/dense", "post_attention_layernorm/dense", "norm/dense"}
-AROUND = {"action_in_proj", "action_out_proj", "time_mlp_in", "time_mlp_out"}
+PROJECTIONS = {"action_in_proj", "action_out_proj", "time_mlp_in", "time_mlp_out"}
 
 
 @pytest.fixture(scope="module")
@@ -43,34 +43,34 @@ def sizes(config):
 
 
 def test_parameter_count():
-    found = sizes(Pi0Config.base_pi05())
-    assert sum(int(np.prod(shape)) for shape in found.values()) == 3_353_433_872
-    assert found["action/blocks/input_layernorm/dense/kernel"] == (18, 1024, 3072)
-    assert not any("state_proj" in name or "action/norm/scale" in name for name in found)
+    shapes = sizes(Pi0Config.base_pi05())
+    assert sum(int(np.prod(shape)) for shape in shapes.values()) == 3_353_433_872
+    assert shapes["action/blocks/input_layernorm/dense/kernel"] == (18, 1024, 3072)
+    assert not any("state_proj" in name or "action/norm/scale" in name for name in shapes)
     assert Pi0Config.base_pi05().max_tokens == 200
 
 
 def test_published_names_and_shapes():
-    """openpi's 51 leaves; LeRobot's tensors, a weight and a bias for each norm of 18 layers."""
+    """openpi has 51 leaves; LeRobot has a weight and a bias for each norm of 18 layers."""
     config = Pi0Config.base_pi05()
     ours = sizes(config)
     rules = {layout: make(config) for layout, make in published_names.LAYOUTS.items()}
-    names = {layout: [n for r in found for n in r.theirs] for layout, found in rules.items()}
+    names = {layout: [n for r in rs for n in r.theirs] for layout, rs in rules.items()}
     assert len(names["openpi"]) == 51
     assert len(names["lerobot"]) + len(published_names.UNUSED) == 778 + 37 - 2
     assert all(published_names.lerobot_name(name) == name for name in names["lerobot"])
 
-    def saved(rule):
+    def their_shapes(rule):
         zeros = [np.broadcast_to(np.zeros((), np.int8), ours[name]) for name in rule.ours]
         return zip(rule.theirs, (array.shape for array in rule.to_theirs(*zeros)), strict=True)
 
-    new = re.compile("norm|time_mlp")  # the others are pi0's, and too large to be stacked here
+    new = re.compile("norm|time_mlp")  # the others are as in pi0, and too large to stack here
     shapes = dict(
         pair
-        for found in rules.values()
-        for rule in found
+        for layout_rules in rules.values()
+        for rule in layout_rules
         if new.search(rule.ours[0])
-        for pair in saved(rule)
+        for pair in their_shapes(rule)
     )
     layers, expert = "PaliGemma/llm/layers", "paligemma_with_expert.gemma_expert.model"
     for name, shape in {
@@ -88,44 +88,44 @@ def test_published_names_and_shapes():
 
 
 @pytest.mark.parametrize("layout", ["openpi", "lerobot"])
-def test_there_and_back(layout, model, tmp_path):
+def test_round_trip(layout, model, tmp_path):
     published.save(tmp_path / "new", model, layout)
-    found, _ = published.load_published(tmp_path / "new", CONFIG)
-    found, wanted = native.named_arrays(found), native.named_arrays(model)
-    assert found.keys() == wanted.keys()
-    for name, array in wanted.items():
-        np.testing.assert_array_equal(found[name], array, err_msg=name)
+    loaded, _ = published.load_published(tmp_path / "new", CONFIG)
+    loaded, expected = native.named_arrays(loaded), native.named_arrays(model)
+    assert loaded.keys() == expected.keys()
+    for name, array in expected.items():
+        np.testing.assert_array_equal(loaded[name], array, err_msg=name)
     with pytest.raises(ValueError, match=r"lacks .*state_proj"):
         published.load_published(tmp_path / "new", Pi0Config.dummy())
 
 
-def test_dense_of_a_norm_is_transposed_for_lerobot(model):
+def test_adaptive_norm_kernels_are_transposed_for_lerobot(model):
     arrays = {name: np.asarray(leaf) for name, leaf in native.named_arrays(model).items()}
     theirs = layouts.to_theirs(published_names.lerobot_layout(CONFIG), arrays)
     name = "paligemma_with_expert.gemma_expert.model.layers.1.input_layernorm.dense.weight"
-    wanted = arrays["action/blocks/input_layernorm/dense/kernel"][1].T
-    np.testing.assert_array_equal(theirs[name], wanted)
+    expected = arrays["action/blocks/input_layernorm/dense/kernel"][1].T
+    np.testing.assert_array_equal(theirs[name], expected)
 
 
-def test_cached_path_is_one_pass_over_the_whole_sequence(model, obs, actions):
-    """Against both experts in joint attention, layer by layer, in fp64 (facts of openpi's code)."""
+def test_cached_path_equals_one_pass_over_the_whole_sequence(model, obs, actions):
+    """Compare with joint attention of both experts, layer by layer, in fp64 (as in openpi)."""
     time = jnp.array([0.3, 0.9])
-    found, (tokens, valid) = jax.jit(
+    v_t, (tokens, valid) = jax.jit(
         lambda obs, x_t: (model.velocity(obs, x_t, time), model.embed_prefix(obs)[:2])
     )(obs, actions)
     p = {n: np.asarray(a, np.float64) for n, a in native.named_arrays(model).items()}
-    wanted = joint_pass(
+    expected = joint_pass(
         p, np.float64(tokens), np.asarray(valid), np.float64(actions), np.float64(time)
     )
-    np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-4)
-    drawn_actions = jax.eval_shape(lambda: model.sample_actions(jax.random.key(0), obs))
-    assert drawn_actions.shape == actions.shape
-    blind = dataclasses.replace(obs, state=obs.state + 1)
-    np.testing.assert_array_equal(jax.jit(model.velocity)(blind, actions, time), found)
+    np.testing.assert_allclose(v_t, expected, rtol=1e-4, atol=1e-4)
+    sampled = jax.eval_shape(lambda: model.sample_actions(jax.random.key(0), obs))
+    assert sampled.shape == actions.shape
+    other_state = dataclasses.replace(obs, state=obs.state + 1)
+    np.testing.assert_array_equal(jax.jit(model.velocity)(other_state, actions, time), v_t)
 
 
 def joint_pass(p, prefix, valid, x_t, time):
-    """v_t `[B, C, A]`: prefix and actions in one sequence, two blocks, adaptive norms."""
+    """Compute v_t `[B, C, A]` with prefix and actions as two blocks of one sequence."""
     size, width = CONFIG.action, CONFIG.action.width
 
     def linear(name, x):
@@ -152,12 +152,12 @@ def joint_pass(p, prefix, valid, x_t, time):
 
     chunk = x_t.shape[1]
     block = np.array([0] * prefix.shape[1] + [1] * chunk)
-    real = np.concatenate([valid, np.ones((len(valid), chunk), bool)], axis=1)
-    mask = (block[None, :] <= block[:, None]) & real[:, None] & real[:, :, None]
-    position = np.cumsum(real, axis=1) - 1
+    valid = np.concatenate([valid, np.ones((len(valid), chunk), bool)], axis=1)
+    mask = (block[None, :] <= block[:, None]) & valid[:, None] & valid[:, :, None]
+    position = np.cumsum(valid, axis=1) - 1
     rate = position[:, :, None, None] / 10_000 ** (np.arange(0, size.head_dim, 2) / size.head_dim)
 
-    def turned(x):
+    def rotate(x):
         first, second = np.split(x, 2, axis=-1)
         sin, cos = np.sin(rate), np.cos(rate)
         return np.concatenate([first * cos - second * sin, second * cos + first * sin], axis=-1)
@@ -185,7 +185,7 @@ def joint_pass(p, prefix, valid, x_t, time):
             for n in "qkv"
         ]
         q, keys, values = (a.reshape(*a.shape[:2], -1, size.head_dim) for a in heads)
-        q, keys = turned(q) / size.head_dim**0.5, turned(keys)
+        q, keys = rotate(q) / size.head_dim**0.5, rotate(keys)
         keys, values = (a.repeat(size.heads // size.kv_heads, axis=2) for a in (keys, values))
         logits = np.where(mask[:, None], np.einsum("btnh,bsnh->bnts", q, keys), -1e30)
         weight = np.exp(logits - logits.max(-1, keepdims=True))
@@ -195,17 +195,17 @@ def joint_pass(p, prefix, valid, x_t, time):
         y = y + gate * (attended[:, -chunk:] @ action["o_proj/kernel"])
         h, k, gate = norms("post_attention_layernorm", x, y)
 
-        def mlp(x, part):
-            inner = gelu(x @ part["gate_proj/kernel"]) * (x @ part["up_proj/kernel"])
-            return inner @ part["down_proj/kernel"]
+        def mlp(x, expert):
+            inner = gelu(x @ expert["gate_proj/kernel"]) * (x @ expert["up_proj/kernel"])
+            return inner @ expert["down_proj/kernel"]
 
         x, y = x + mlp(h, language), y + gate * mlp(k, action)
     y, _ = adaptive(y, p["action/norm/dense/kernel"], p["action/norm/dense/bias"])
     return linear("action_out_proj", y)
 
 
-def test_a_step_trains_adapters_on_every_dense_layer(model, obs, actions):
-    """Those of the norms too; their reports say how many conditions they saw."""
+def test_a_step_updates_adapters_of_every_dense_layer(model, obs, actions):
+    """Including those of the norms, whose aux counts one condition per sample."""
     rules = presets.rules("expert-only", LoRA(rank=2))
     adapted = lorasp_jax.adapt(model, rules, rngs=nnx.Rngs(1))
     graphdef, adapters, frozen = lorasp_jax.split(adapted)
@@ -213,8 +213,9 @@ def test_a_step_trains_adapters_on_every_dense_layer(model, obs, actions):
     @jax.jit
     def step(adapters):
         def loss(adapters):
-            found = nnx.merge(graphdef, adapters, frozen).loss(jax.random.key(2), obs, actions)
-            return found[0].mean(), found[1]
+            model = nnx.merge(graphdef, adapters, frozen)
+            per_element, aux = model.loss(jax.random.key(2), obs, actions)
+            return per_element.mean(), aux
 
         (value, aux), grads = jax.value_and_grad(loss, has_aux=True)(adapters)
         return value, aux, jax.tree.map(lambda a, g: a - 0.03 * g, adapters, grads)
@@ -222,9 +223,9 @@ def test_a_step_trains_adapters_on_every_dense_layer(model, obs, actions):
     first, aux, stepped = step(adapters)
     assert step(stepped)[0] < first
     experts = {f"{name}_proj" for name in ("q", "k", "v", "o", "gate", "up", "down")}
-    assert aux["action"].keys() == NORMS | AROUND | experts
-    report = aux["action"]["input_layernorm/dense"]
-    assert report.token_mask.shape == (CONFIG.action.depth, BATCH, 1)
-    assert report.token_mask.all()
-    moved = jax.tree.map(lambda a, b: bool((a != b).any()), adapters, stepped)
-    assert all(leaf.get_value()["lora_b"] for _, leaf in nnx.to_flat_state(moved))
+    assert aux["action"].keys() == NORMS | PROJECTIONS | experts
+    norm_aux = aux["action"]["input_layernorm/dense"]
+    assert norm_aux.token_mask.shape == (CONFIG.action.depth, BATCH, 1)
+    assert norm_aux.token_mask.all()
+    changed = jax.tree.map(lambda a, b: bool((a != b).any()), adapters, stepped)
+    assert all(leaf.get_value()["lora_b"] for _, leaf in nnx.to_flat_state(changed))

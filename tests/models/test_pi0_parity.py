@@ -1,4 +1,4 @@
-"""pi0 against numbers recorded from openpi (tests/golden/pi0_tiny, fp32)."""
+"""Compare pi0 with values recorded from openpi (tests/golden/pi0_tiny, fp32)."""
 
 import jax
 import jax.numpy as jnp
@@ -49,25 +49,25 @@ def expected():
 
 @pytest.fixture(scope="module")
 def obs(inputs):
-    def cameras(kind: str) -> dict[str, jax.Array]:
-        return {name: jnp.asarray(inputs[f"{kind}/{name}"]) for name in CONFIG.cameras}
+    def per_camera(prefix: str) -> dict[str, jax.Array]:
+        return {name: jnp.asarray(inputs[f"{prefix}/{name}"]) for name in CONFIG.cameras}
 
     return Observation(
-        images=cameras("image"),
-        image_masks=cameras("image_mask"),
+        images=per_camera("image"),
+        image_masks=per_camera("image_mask"),
         tokens=jnp.asarray(inputs["tokens"]),
         token_mask=jnp.asarray(inputs["token_mask"]),
         state=jnp.asarray(inputs["state"]),
     )
 
 
-def close(found, wanted, atol):
-    np.testing.assert_allclose(np.asarray(found), wanted, rtol=0, atol=atol)
+def assert_close(actual, expected, atol):
+    np.testing.assert_allclose(np.asarray(actual), expected, rtol=0, atol=atol)
 
 
 @pytest.fixture(scope="module")
 def loss_and_grad(model, obs, inputs):
-    """Compiled once: (noise, time) -> ((mean, loss `[B, C]`), gradients)."""
+    """(noise, time) -> ((mean, loss `[B, C]`), gradients), compiled once."""
     graphdef, parameters = nnx.split(model)
 
     def mean_loss(parameters, noise, time):
@@ -84,9 +84,9 @@ def test_prefix(model, obs, expected):
     both = jax.jit(lambda model, obs: (model.embed_prefix(obs)[:2], model.run_prefix(obs)[0]))
     (tokens, valid), prefix = both(model, obs)
     assert np.array_equal(valid, expected["prefix_mask"])
-    close(tokens, expected["prefix_tokens"], 1e-5 * np.abs(expected["prefix_tokens"]).max())
-    rows = expected["prefix_mask"]
-    close(np.asarray(prefix.out)[rows], expected["prefix_out"][rows], 1e-4)
+    assert_close(tokens, expected["prefix_tokens"], 1e-5 * np.abs(expected["prefix_tokens"]).max())
+    valid = expected["prefix_mask"]
+    assert_close(np.asarray(prefix.out)[valid], expected["prefix_out"][valid], 1e-4)
 
 
 def test_suffix_and_velocity(model, obs, inputs, expected):
@@ -94,12 +94,12 @@ def test_suffix_and_velocity(model, obs, inputs, expected):
     tokens, v_t = jax.jit(
         lambda model: (model.embed_suffix(obs, x_t, time)[0], model.velocity(obs, x_t, time))
     )(model)
-    close(tokens, expected["suffix_tokens"], 5e-5)
-    close(v_t, expected["v_t"], 1e-4)
+    assert_close(tokens, expected["suffix_tokens"], 5e-5)
+    assert_close(v_t, expected["v_t"], 1e-4)
 
 
 def test_masks_and_positions(expected):
-    """Prefix and suffix in one sequence give openpi's mask and positions."""
+    """Prefix and suffix as one sequence have openpi's mask and positions."""
     valid = np.concatenate([expected["prefix_mask"], expected["suffix_mask"]], axis=1)
     block = np.array([0] * expected["prefix_mask"].shape[1] + [1] + [2] * CONFIG.chunk)
     assert np.array_equal(block_mask(block, block, valid, valid), expected["attn_mask"])
@@ -108,32 +108,32 @@ def test_masks_and_positions(expected):
 
 def test_loss_and_gradients(loss_and_grad, inputs, expected):
     (mean, loss), grads = loss_and_grad(inputs["noise"], inputs["time"])
-    close(loss, expected["loss"], 1e-4)
-    close(mean, expected["mean_loss"], 1e-4)
+    assert_close(loss, expected["loss"], 1e-4)
+    assert_close(mean, expected["mean_loss"], 1e-4)
     grads = nnx.to_pure_dict(grads)
     norm = np.sqrt(sum(np.sum(np.square(g)) for g in jax.tree.leaves(grads)))
-    close(norm, expected["grad_norm_all"], 1e-3 * expected["grad_norm_all"])
+    assert_close(norm, expected["grad_norm_all"], 1e-3 * expected["grad_norm_all"])
     assert not np.any(grads["language"]["norm"]["scale"])
 
     vision, language = grads["vision"]["blocks"], grads["language"]["blocks"]
     keys_values = [language[name]["kernel"] for name in ("k_proj", "v_proj")]
-    found = {
+    actual = {
         "PaliGemma/img/Transformer/encoderblock/MlpBlock_0/Dense_0/kernel": vision["fc1"]["kernel"],
         "action_time_mlp_in/kernel": grads["action_time_mlp_in"]["kernel"],
         "PaliGemma/llm/layers/attn/kv_einsum/w": np.stack(keys_values, axis=1)[:, :, None],
     }
-    for name, grad in found.items():
-        wanted = expected[f"grad/{name}"]
-        close(grad, wanted, 1e-3 * np.abs(wanted).max())
+    for name, grad in actual.items():
+        recorded = expected[f"grad/{name}"]
+        assert_close(grad, recorded, 1e-3 * np.abs(recorded).max())
 
 
 def test_sampling(model, obs, inputs, expected):
     noise = jnp.asarray(inputs["noise"])
     sample = jax.jit(lambda m, o: m.sample_actions(jax.random.key(0), o, noise=noise))(model, obs)
-    close(sample, expected["sample"], 1e-4)
+    assert_close(sample, expected["sample"], 1e-4)
 
 
-def test_loss_drawn_by_openpi(loss_and_grad, expected):
-    check = {name: expected[f"compute_loss_check/{name}"] for name in ("noise", "time", "loss")}
-    (_, loss), _ = loss_and_grad(check["noise"], check["time"])
-    close(loss, check["loss"], 3e-4)
+def test_loss_with_noise_drawn_by_openpi(loss_and_grad, expected):
+    recorded = {name: expected[f"compute_loss_check/{name}"] for name in ("noise", "time", "loss")}
+    (_, loss), _ = loss_and_grad(recorded["noise"], recorded["time"])
+    assert_close(loss, recorded["loss"], 3e-4)

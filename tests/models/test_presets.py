@@ -1,4 +1,4 @@
-"""Presets: which layers of both backbones they name, and what trains then."""
+"""Presets: the layers of both backbones that they match, and the resulting parameter counts."""
 
 import dataclasses
 import re
@@ -13,7 +13,7 @@ from lorasp_jax.peft import FullFineTuning, LoRA, LoRASP
 
 EXPERT = {f"{name}_proj" for name in ("q", "k", "v", "o", "gate", "up", "down")}
 BLOCK = {"q_proj", "k_proj", "v_proj", "out_proj", "fc1", "fc2"}
-AROUND = {
+PROJECTIONS = {
     *(f"{name}_proj" for name in ("state", "action_in", "action_out")),
     *(f"action_time_mlp_{name}" for name in ("in", "out")),
 }
@@ -35,21 +35,21 @@ def adapted(config, targets, method):
 
 @pytest.mark.parametrize("backbone", [pi0, smolvla], ids=["pi0", "smolvla"])
 def test_layers_of_each_preset(backbone):
-    """Scanned layers included; every preset is in the table."""
+    """Including stacked layers; the table covers every preset."""
     action = ACTION[backbone]
-    wanted = {
-        "paper": VISION | LANGUAGE | action | AROUND,
-        "all-linear": PATCH | VISION | LANGUAGE | action | AROUND,
+    expected = {
+        "paper": VISION | LANGUAGE | action | PROJECTIONS,
+        "all-linear": PATCH | VISION | LANGUAGE | action | PROJECTIONS,
         "openpi": LANGUAGE | action,
-        "expert-only": action | AROUND,
+        "expert-only": action | PROJECTIONS,
         "vision": PATCH | VISION,
         "language": LANGUAGE,
         "action": action,
     }
-    assert wanted.keys() == presets.PRESETS.keys()
+    assert expected.keys() == presets.PRESETS.keys()
     root = nnx.List([nnx.eval_shape(lambda: backbone.Config.dummy().create(nnx.Rngs(0)))])
     layers = {location.path for location in paths.locate_layers(root)}
-    for name, layer_paths in wanted.items():
+    for name, layer_paths in expected.items():
         rules = presets.patterns(name)
         assert {p for p in layers if any(re.search(rule, p) for rule in rules)} == layer_paths, name
     model = adapted(backbone.Config.dummy(), ["vision", "k_proj$"], LoRASP(rank=4))
@@ -57,15 +57,15 @@ def test_layers_of_each_preset(backbone):
     assert adaptation.methods(model).keys() == PATCH | VISION | keys
 
 
-def test_adaptive_norms_are_of_the_expert_and_not_openpis():
+def test_adaptive_norms_are_in_action_but_not_in_openpi():
     config = dataclasses.replace(pi0.Config.dummy(), pi05=True)
-    found = {
+    matched = {
         name: adaptation.methods(adapted(config, name, LoRA(rank=2))).keys()
         for name in ("openpi", "action")
     }
-    assert found["openpi"] == LANGUAGE | ACTION[pi0]
+    assert matched["openpi"] == LANGUAGE | ACTION[pi0]
     norms = ("blocks/input_layernorm", "blocks/post_attention_layernorm", "norm")
-    assert found["action"] == ACTION[pi0] | {f"action/{name}/dense" for name in norms}
+    assert matched["action"] == ACTION[pi0] | {f"action/{name}/dense" for name in norms}
 
 
 @pytest.mark.parametrize(
@@ -76,15 +76,15 @@ def test_adaptive_norms_are_of_the_expert_and_not_openpis():
     ],
     ids=["pi0", "smolvla"],
 )
-def test_share_of_the_published_sizes(config, adapters, base, share):
-    """Sum of I + O over all linear layers but the lm_heads, times the rank."""
+def test_trained_share_of_the_published_sizes(config, adapters, base, share):
+    """Adapter parameters: the sum of I + O over linear layers except the lm_heads, times rank."""
     model = adapted(config, "paper", LoRA(rank=128))
     line = summary.trained_share(model)
     assert line.startswith(f"{share} of parameters trainable ({adapters:,} of {adapters + base:,})")
 
 
 def test_trained_share_lists_frozen_modules():
-    """LeRobot's `train_expert_only` trains as many parameters; a bare model has none."""
+    """LeRobot's `train_expert_only` trains the same number; without adapters it is 0."""
     config = smolvla.Config.base()
     model = adapted(config, "expert-only", FullFineTuning())
     assert adaptation.count(model).trainable == 99_880_992
@@ -104,12 +104,12 @@ def test_trained_share_lists_frozen_modules():
     ("wrong", "meant"),
     [("expert-onyl", "expert-only"), ("expert_only", "expert-only"), ("Vision", "vision")],
 )
-def test_a_wrong_name(wrong, meant):
+def test_an_unknown_preset_gets_a_suggestion(wrong, meant):
     message = f"unknown preset {wrong!r} (did you mean {meant!r}?): choose one of paper, all-linear"
     with pytest.raises(ValueError, match=re.escape(message)):
         presets.rules(["q_proj", wrong], LoRA())
 
 
 @pytest.mark.parametrize("pattern", ["visio", "action_out", "action_in_proj", "q_proj", "head"])
-def test_parts_of_paths_are_patterns(pattern):
+def test_substrings_of_paths_are_patterns(pattern):
     assert presets.patterns(pattern) == [pattern]

@@ -1,4 +1,4 @@
-"""Laws of SmolVLA alone that need no recorded numbers: sizes, who sees whom, layers by kind."""
+"""Properties of SmolVLA, without recorded values: sizes, attention masks, layers."""
 
 import dataclasses
 
@@ -49,17 +49,17 @@ def test_parameter_counts(name, low, high):
 
 
 def test_base_towers(base):
-    """lerobot/smolvla_base: language and vision, expert, projections."""
+    """Counts of lerobot/smolvla_base: in total, language and vision, action expert."""
     assert size(base) == 450_046_176
     assert size(base.vision) + size(base.language) == 350_165_184
     assert size(base.action) == 98_245_840
 
 
 def test_base_has_the_published_tensors(base):
-    """Names and shapes of 500 tensors, through arrays that take no memory."""
-    one = np.zeros((), np.int8)
+    """Check names and shapes of 500 tensors with broadcast arrays, which take no memory."""
+    zero = np.zeros((), np.int8)
     ours = {
-        jax.tree_util.keystr(path, simple=True, separator="/"): np.broadcast_to(one, leaf.shape)
+        jax.tree_util.keystr(path, simple=True, separator="/"): np.broadcast_to(zero, leaf.shape)
         for path, leaf in jax.tree_util.tree_leaves_with_path(parameters(base))
     }
     theirs = {
@@ -89,10 +89,10 @@ def test_base_has_the_published_tensors(base):
         assert theirs[name] == shape, name
 
 
-def test_config_says_what_is_wrong():
-    odd = [dataclasses.replace(part, depth=3) for part in (CONFIG.language, CONFIG.action)]
+def test_inconsistent_sizes_raise():
+    language, action = (dataclasses.replace(e, depth=3) for e in (CONFIG.language, CONFIG.action))
     with pytest.raises(ValueError, match=r"depth must be even, .* got 3"):
-        dataclasses.replace(CONFIG, language=odd[0], action=odd[1])
+        dataclasses.replace(CONFIG, language=language, action=action)
     with pytest.raises(ValueError, match=r"image_size must be a multiple of .* = 16, got"):
         dataclasses.replace(CONFIG, image_size=40)
 

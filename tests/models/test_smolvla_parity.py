@@ -1,7 +1,7 @@
-"""SmolVLA against numbers recorded from LeRobot (tests/golden/smolvla_tiny, fp32).
+"""Compare SmolVLA with values recorded from LeRobot (tests/golden/smolvla_tiny, fp32).
 
-LeRobot computed velocity, loss and gradients on the whole sequence and the sample with its cache;
-here all of them go through the cache.
+LeRobot computed velocity, loss and gradients on the whole sequence and sampled with its cache; here
+everything uses the cache.
 """
 
 import dataclasses
@@ -74,36 +74,36 @@ def obs(inputs):
     )
 
 
-def close(found, wanted, atol):
-    np.testing.assert_allclose(np.asarray(found), wanted, rtol=0, atol=atol)
+def assert_close(actual, expected, atol):
+    np.testing.assert_allclose(np.asarray(actual), expected, rtol=0, atol=atol)
 
 
 def test_prefix(model, obs, expected):
     both = jax.jit(lambda model: (model.encode_images(obs)[0], model.embed_prefix(obs)[:2]))
-    seen, (tokens, valid) = both(model)
-    wanted = [expected[f"image_tokens_unscaled/{name}"] for name in CONFIG.cameras]
-    close(seen, np.concatenate(wanted, axis=1), 1e-5)
+    image_tokens, (tokens, valid) = both(model)
+    recorded = [expected[f"image_tokens_unscaled/{name}"] for name in CONFIG.cameras]
+    assert_close(image_tokens, np.concatenate(recorded, axis=1), 1e-5)
     assert np.array_equal(valid, expected["prefix_pad_mask"])
-    close(tokens, expected["prefix_embs"], 2e-5)
+    assert_close(tokens, expected["prefix_embs"], 2e-5)
 
 
 def test_suffix_and_velocity(model, obs, inputs, expected):
-    """At the recorded time, and at the first and the last step of the sampler."""
+    """At the recorded time, and at the sampler's first and last step."""
     compiled = jax.jit(
         lambda x_t, t: (model.embed_suffix(obs, x_t, t)[0], model.velocity(obs, x_t, t))
     )
     tokens, v_t = compiled(jnp.asarray(expected["x_t"]), inputs["time"])
-    close(tokens, expected["suffix_embs"], 5e-5)
-    close(v_t, expected["v_t"], 1e-4)
+    assert_close(tokens, expected["suffix_embs"], 5e-5)
+    assert_close(v_t, expected["v_t"], 1e-4)
     _, first = compiled(inputs["noise"], jnp.ones(2))
-    close(first, expected["sample_v_first_step"], 1e-4)
+    assert_close(first, expected["sample_v_first_step"], 1e-4)
     before_last = expected["sample"] + 0.1 * expected["sample_v_last_step"]
     _, last = compiled(jnp.asarray(before_last), jnp.full(2, 0.1))
-    close(last, expected["sample_v_last_step"], 1e-4)
+    assert_close(last, expected["sample_v_last_step"], 1e-4)
 
 
 def test_masks_and_positions(expected):
-    """Prefix and suffix in one sequence give LeRobot's mask and positions."""
+    """Prefix and suffix as one sequence have LeRobot's mask and positions."""
     valid = np.concatenate([expected["prefix_pad_mask"], expected["suffix_pad_mask"]], axis=1)
     marks = np.concatenate([expected["prefix_att_mask"], expected["suffix_att_mask"]], axis=1)
     block = np.array([0] * (expected["prefix_pad_mask"].shape[1] - 1) + [1, 2, 3, 4, 5, 6])
@@ -126,16 +126,16 @@ def test_loss_and_gradients(model, obs, inputs, expected):
         return per_element.mean(), per_element
 
     (mean, loss), grads = jax.jit(jax.value_and_grad(mean_loss, has_aux=True))(parameters)
-    close(loss, expected["loss"], 3e-4)
-    close(mean, expected["mean_loss"], 3e-4)
+    assert_close(loss, expected["loss"], 3e-4)
+    assert_close(mean, expected["mean_loss"], 3e-4)
     grads = native.base_arrays(nnx.merge(graphdef, grads))
     theirs = layouts.to_theirs(published_names.lerobot_layout(CONFIG), grads)
     grads = {f"model.{name}": grad for name, grad in theirs.items()}
-    recorded = [name.removeprefix("grad/") for name in expected if name.startswith("grad/")]
-    assert len(recorded) == 3
-    for name in recorded:
-        wanted = expected[f"grad/{name}"]
-        close(grads[name], wanted, 1e-3 * np.abs(wanted).max())
+    names = [name.removeprefix("grad/") for name in expected if name.startswith("grad/")]
+    assert len(names) == 3
+    for name in names:
+        recorded = expected[f"grad/{name}"]
+        assert_close(grads[name], recorded, 1e-3 * np.abs(recorded).max())
     last = "model.vlm_with_expert.vlm.model.text_model.layers.3."
     unused = {f"{last}self_attn.{linear}_proj.weight" for linear in "qo"}
     unused |= {f"{last}mlp.{linear}_proj.weight" for linear in ("gate", "up", "down")}
@@ -148,22 +148,22 @@ def test_sampling(model, obs, inputs, expected):
     sample = jax.jit(lambda m: m.sample_actions(jax.random.key(0), obs, noise=inputs["noise"]))(
         model
     )
-    close(sample, expected["sample"], 1e-4)
+    assert_close(sample, expected["sample"], 1e-4)
 
 
-def test_saving_gives_back_every_tensor(model, tensors, tmp_path):
+def test_saving_restores_every_tensor(model, tensors, tmp_path):
     published.save(tmp_path, model, "lerobot")
-    found = safetensors.numpy.load_file(tmp_path / "model.safetensors")
-    assert found.keys() == tensors.keys()
+    saved = safetensors.numpy.load_file(tmp_path / "model.safetensors")
+    assert saved.keys() == tensors.keys()
     for name, tensor in tensors.items():
-        assert found[name].dtype == tensor.dtype, name
-        np.testing.assert_array_equal(found[name], tensor)
+        assert saved[name].dtype == tensor.dtype, name
+        np.testing.assert_array_equal(saved[name], tensor)
     adapted = lorasp_jax.adapt(model, [("state_proj", LoRA(rank=2))], rngs=nnx.Rngs(0))
     with pytest.raises(ValueError, match="without adapters"):
         published.save(tmp_path / "adapted", adapted, "lerobot")
 
 
-def test_stored_types_are_kept(tensors, tmp_path):
+def test_saving_can_restore_the_stored_dtypes(tensors, tmp_path):
     """As in the published file: the projections in fp32, the rest in bf16."""
     mixed = {
         name: tensor if "_proj.bias" in name or name == HEAD else tensor.astype(ml_dtypes.bfloat16)
@@ -173,15 +173,15 @@ def test_stored_types_are_kept(tensors, tmp_path):
     safetensors.numpy.save_file(mixed, tmp_path / "from" / "model.safetensors")
     loaded, unused = published.load_published(tmp_path / "from", CONFIG)
     assert unused == []
-    types = published.stored_dtypes(tmp_path / "from", CONFIG)
-    published.save(tmp_path / "to", loaded, "lerobot", types)
-    found = safetensors.numpy.load_file(tmp_path / "to" / "model.safetensors")
-    assert {name: t.dtype for name, t in found.items()} == {n: t.dtype for n, t in mixed.items()}
+    dtypes = published.stored_dtypes(tmp_path / "from", CONFIG)
+    published.save(tmp_path / "to", loaded, "lerobot", dtypes)
+    saved = safetensors.numpy.load_file(tmp_path / "to" / "model.safetensors")
+    assert {name: t.dtype for name, t in saved.items()} == {n: t.dtype for n, t in mixed.items()}
     for name, tensor in mixed.items():
-        assert found[name].tobytes() == tensor.tobytes(), name
+        assert saved[name].tobytes() == tensor.tobytes(), name
 
 
-def test_other_sizes_raise():
+def test_wrong_sizes_raise():
     with pytest.raises(
         ValueError, match=r"embed_tokens.weight of .* must have shape \(100, 64\), got \(101, 64\)"
     ):
@@ -189,9 +189,9 @@ def test_other_sizes_raise():
 
 
 def test_names_without_prefix(model, tensors, tmp_path):
-    bare = {name.removeprefix("model."): tensor for name, tensor in tensors.items()}
-    safetensors.numpy.save_file(bare, tmp_path / "model.safetensors")
-    found, _ = published.load_published(tmp_path, CONFIG)
-    pairs = zip(jax.tree.leaves(nnx.state(found)), jax.tree.leaves(nnx.state(model)), strict=True)
-    for ours, theirs in pairs:
-        np.testing.assert_array_equal(ours, theirs)
+    unprefixed = {name.removeprefix("model."): tensor for name, tensor in tensors.items()}
+    safetensors.numpy.save_file(unprefixed, tmp_path / "model.safetensors")
+    loaded, _ = published.load_published(tmp_path, CONFIG)
+    pairs = zip(jax.tree.leaves(nnx.state(loaded)), jax.tree.leaves(nnx.state(model)), strict=True)
+    for actual, expected in pairs:
+        np.testing.assert_array_equal(actual, expected)

@@ -32,7 +32,7 @@ SMOLVLA = {
 }
 
 
-def test_published_fields_are_the_published_sizes():
+def test_published_fields_give_the_published_config():
     assert parse(SMOLVLA) == SmolVLAConfig.base()
     assert parse({"type": "smolvla"}) == SmolVLAConfig.base()
     expected = dataclasses.replace(Pi0Config.base(), inputs=LEROBOT_PI0)
@@ -42,12 +42,12 @@ def test_published_fields_are_the_published_sizes():
     assert (expected.inputs.state, expected.inputs.action) == ("quantiles", "quantiles")
 
 
-def test_what_differs_is_read():
+def test_other_fields_override_the_published_config():
     features = {
         "observation.images.top": {"type": "VISUAL"},
         "observation.image": {"type": "VISUAL"},
     }
-    found = parse(
+    config = parse(
         SMOLVLA
         | {
             "chunk_size": 10,
@@ -62,12 +62,17 @@ def test_what_differs_is_read():
             "normalization_mapping": {"STATE": "QUANTILE10", "ACTION": "MIN_MAX"},
         }
     )
-    assert (found.chunk, found.action_dim, found.max_tokens, found.image_size) == (10, 24, 20, 256)
-    assert (found.language.depth, found.action.depth) == (8, 8)
-    # Two thirds of 4 * 480, in whole 256s: 1280.
-    assert (found.language.width, found.action.width, found.action.mlp) == (960, 480, 1280)
-    assert found.cameras == ("top", "image", "empty_camera_0")
-    assert found.inputs == dataclasses.replace(
+    assert (config.chunk, config.action_dim, config.max_tokens, config.image_size) == (
+        10,
+        24,
+        20,
+        256,
+    )
+    assert (config.language.depth, config.action.depth) == (8, 8)
+    # 2/3 of 4 * 480 = 1280, a multiple of 256.
+    assert (config.language.width, config.action.width, config.action.mlp) == (960, 480, 1280)
+    assert config.cameras == ("top", "image", "empty_camera_0")
+    assert config.inputs == dataclasses.replace(
         LEROBOT_SMOLVLA, state="quantile10", action="min_max"
     )
     large = parse({"type": "pi0", "action_expert_variant": "gemma_2b"})
@@ -75,7 +80,7 @@ def test_what_differs_is_read():
 
 
 @pytest.mark.parametrize(
-    ("names", "kept", "relative"),
+    ("names", "exclusion", "relative"),
     [
         (["j1.pos", "Gripper.pos", "j2.pos"], {}, (True, False, True)),
         (["j1.pos", "Gripper.pos", "j2.pos"], {"relative_exclude_joints": []}, (True,) * 3),
@@ -83,10 +88,10 @@ def test_what_differs_is_read():
         (None, {}, (True,) * 3),
     ],
 )
-def test_relative_actions(names, kept, relative):
-    """Names that hold an excluded word are absolute; without names nothing is."""
+def test_relative_actions(names, exclusion, relative):
+    """Actions whose name contains an excluded word are absolute; unnamed actions are relative."""
     fields = {"type": "pi0", "output_features": {"action": {"type": "ACTION", "shape": [3]}}}
-    fields |= {"use_relative_actions": True, "action_feature_names": names, **kept}
+    fields |= {"use_relative_actions": True, "action_feature_names": names, **exclusion}
     config = parse(fields)
     assert config.inputs.delta == relative
     assert parse(fields | {"use_relative_actions": False}).inputs.delta == ()
@@ -115,6 +120,6 @@ def test_relative_actions(names, kept, relative):
         ({"input_features": [1]}, "not a LeRobot policy config"),
     ],
 )
-def test_what_no_config_says_raises(change, message):
+def test_unsupported_fields_raise(change, message):
     with pytest.raises(ValueError, match=message):
         parse(SMOLVLA | change)

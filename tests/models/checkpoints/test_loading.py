@@ -1,4 +1,4 @@
-"""One function for every layout and place; the published sizes are replaced by the goldens'."""
+"""`load` for every layout; the published sizes are replaced by those of the golden models."""
 
 import json
 import logging
@@ -28,14 +28,14 @@ FIELDS = {
 
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch):
-    """The goldens' towers stand for the published ones, which no config.json describes."""
+    """Use the golden models' towers as the published ones, which config.json does not specify."""
     monkeypatch.setattr(Pi0Config, "base", lambda: pi0.CONFIG)
     monkeypatch.setattr(SmolVLAConfig, "base", lambda: smolvla.CONFIG)
 
 
 @pytest.fixture
 def lerobot(tmp_path):
-    """A policy's folder as `lerobot/smolvla_base` was: statistics among the weights."""
+    """A policy folder in the old format of `lerobot/smolvla_base`: statistics among the weights."""
     folder = tmp_path / "policy"
     folder.mkdir()
     tensors = safetensors.numpy.load_file(smolvla.GOLDEN / "model.safetensors")
@@ -47,11 +47,11 @@ def lerobot(tmp_path):
     return folder
 
 
-def assert_same(one, other):
-    one, other = named_arrays(one), named_arrays(other)
-    assert one.keys() == other.keys()
-    for name, array in one.items():
-        np.testing.assert_array_equal(array, other[name], err_msg=name)
+def assert_same(actual, expected):
+    actual, expected = named_arrays(actual), named_arrays(expected)
+    assert actual.keys() == expected.keys()
+    for name, array in actual.items():
+        np.testing.assert_array_equal(array, expected[name], err_msg=name)
 
 
 def test_lerobot(lerobot, caplog):
@@ -66,20 +66,20 @@ def test_lerobot(lerobot, caplog):
         models.load(lerobot)
 
 
-def test_what_was_found_is_not_read_again(lerobot):
-    found = loading.find(lerobot)
-    assert (found.layout, found.config) == ("lerobot", smolvla.CONFIG)
+def test_config_json_is_read_once(lerobot):
+    folder = loading.find(lerobot)
+    assert (folder.layout, folder.config) == ("lerobot", smolvla.CONFIG)
     (lerobot / "config.json").unlink()
-    assert found.inputs == smolvla.CONFIG.inputs
-    assert found.load().config == smolvla.CONFIG
+    assert folder.inputs == smolvla.CONFIG.inputs
+    assert folder.load().config == smolvla.CONFIG
 
 
-def test_what_no_file_says_is_none_or_an_error(lerobot):
+def test_lerobot_without_config_json(lerobot):
     (lerobot / "config.json").unlink()
-    found = loading.find(lerobot)
-    assert (found.layout, found.inputs) == ("lerobot", None)
+    folder = loading.find(lerobot)
+    assert (folder.layout, folder.inputs) == ("lerobot", None)
     with pytest.raises(ValueError, match="pass a config"):
-        _ = found.config
+        _ = folder.config
 
 
 def test_openpi(tmp_path):
@@ -99,7 +99,7 @@ def test_ours_and_the_hub(tmp_path, monkeypatch):
     assert models.weights_hash(models.load("hf://me/pi0")) == models.weights_hash(tmp_path)
 
 
-def test_bad_folders_are_one_sentence(lerobot, tmp_path):
+def test_invalid_folders_raise(lerobot, tmp_path):
     with pytest.raises(ValueError, match="contains no model"):
         models.load(tmp_path)
     with pytest.raises(ValueError, match="no_such does not exist"):

@@ -33,25 +33,25 @@ def parameters(model: nnx.Module) -> dict:
 
 
 def test_round_trip_is_exact_in_bfloat16(folder, model):
-    loaded, kept = models.load(folder), dataclasses.replace(CONFIG, unroll=None)
-    assert loaded.config == kept
+    loaded, expected = models.load(folder), dataclasses.replace(CONFIG, unroll=None)
+    assert loaded.config == expected
     jax.tree.map(
         lambda a, b: np.testing.assert_array_equal(a, b.astype(jnp.bfloat16).astype(jnp.float32)),
         parameters(loaded),
         parameters(model),
     )
-    assert models.load_config(folder) == kept
+    assert models.load_config(folder) == expected
 
 
-def test_types_are_as_asked(folder):
-    wanted = dataclasses.replace(CONFIG, dtype="bfloat16", param_dtype="bfloat16", remat="full")
-    loaded = models.load(folder, wanted)
-    assert loaded.config == wanted
+def test_config_sets_the_runtime_fields(folder):
+    config = dataclasses.replace(CONFIG, dtype="bfloat16", param_dtype="bfloat16", remat="full")
+    loaded = models.load(folder, config)
+    assert loaded.config == config
     assert {leaf.dtype for leaf in jax.tree.leaves(parameters(loaded))} == {jnp.dtype("bfloat16")}
     assert models.weights_hash(loaded) == models.weights_hash(folder)
 
 
-def test_hash_knows_the_base_and_not_its_adapters(folder, model):
+def test_hash_covers_the_base_without_adapters(folder, model):
     loaded = models.load(folder)
     assert models.weights_hash(loaded) == models.weights_hash(folder)
     adapted = lorasp_jax.adapt(loaded, [("^action", LoRA(rank=2))], rngs=nnx.Rngs(0))
@@ -62,11 +62,11 @@ def test_hash_knows_the_base_and_not_its_adapters(folder, model):
             models.save(folder, has_adapters)
     with pytest.raises(ValueError, match="save the base before quantizing"):
         models.save(folder, lorasp_jax.quantize(loaded, [("state_proj", "int8")]).model)
-    with pytest.raises(ValueError, match="gs:/bucket/base is a URL"):
+    with pytest.raises(ValueError, match="cannot write to the URL gs:/bucket/base"):
         models.save("gs://bucket/base", loaded)
 
 
-def test_shards_stay_under_their_limit(tmp_path, model, monkeypatch):
+def test_shards_respect_the_maximum_size(tmp_path, model, monkeypatch):
     monkeypatch.setattr(native, "SHARD_BYTES", 80_000)
     models.save(tmp_path, model)
     shards = sorted(tmp_path.glob("model-*.safetensors"))
@@ -83,13 +83,13 @@ def test_shards_stay_under_their_limit(tmp_path, model, monkeypatch):
     assert models.weights_hash(tmp_path) == sharded
 
 
-def test_other_sizes_raise(folder):
+def test_wrong_sizes_raise(folder):
     other = dataclasses.replace(CONFIG, image_size=64)
     with pytest.raises(ValueError, match=r"does not match the config: image_size is 32, not 64\.$"):
         models.load(folder, other)
 
 
-def edit(folder, **change):
+def edit_config(folder, **change):
     path = folder / "config.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
 
@@ -98,14 +98,14 @@ def test_damaged_and_foreign_folders_raise(folder):
     with pytest.raises(ValueError, match=r"contains no model: config\.json is missing"):
         native.load_native(folder / "nothing")
     sizes = json.loads((folder / "config.json").read_text())["config"]
-    edit(folder, config={**sizes, "vocabulary": 7})
+    edit_config(folder, config={**sizes, "vocabulary": 7})
     with pytest.raises(ValueError, match="weights and config do not match the hash"):
         models.load(folder)
-    edit(folder, config=sizes, sha256="0" * 64)
+    edit_config(folder, config=sizes, sha256="0" * 64)
     with pytest.raises(ValueError, match="weights and config do not match the hash"):
         models.load(folder)
     for change in ({"backbone": "no_such"}, {"config": {"vision": {}}}):
-        edit(folder, **{"config": sizes, "backbone": "pi0", **change})
+        edit_config(folder, **{"config": sizes, "backbone": "pi0", **change})
         with pytest.raises(ValueError, match="does not describe a supported backbone"):
             models.load(folder)
     (folder / "config.json").write_text('{"architectures": []}')
@@ -113,14 +113,14 @@ def test_damaged_and_foreign_folders_raise(folder):
         native.load_native(folder)
 
 
-def test_a_file_cut_short_raises(folder):
+def test_a_truncated_file_raises(folder):
     path = folder / "model.safetensors"
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(ValueError, match=r"model\.safetensors is damaged or truncated"):
         models.load(folder)
 
 
-def test_set_arrays_lists_what_does_not_fit(model):
+def test_set_arrays_lists_missing_and_unexpected_arrays(model):
     with pytest.raises(ValueError, match="missing arrays: action/blocks/down_proj/kernel, "):
         models.set_arrays(model, {})
     arrays = native.named_arrays(model)

@@ -1,4 +1,4 @@
-"""Published layouts: what others wrote is read, and what is written is what they would read."""
+"""Loading and saving checkpoints in openpi's and LeRobot's layouts."""
 
 import dataclasses
 import json
@@ -30,22 +30,22 @@ def model():
 
 @pytest.fixture(scope="module")
 def leaves():
-    """openpi's own arrays."""
+    """openpi's original arrays."""
     return orbax_leaves(OPENPI / "params")
 
 
 def orbax_leaves(folder):
     checkpointer, folder = ocp.PyTreeCheckpointer(), folder.absolute()
     tree = checkpointer.metadata(folder).item_metadata.tree
-    kinds = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), tree)
-    found = checkpointer.restore(folder, restore_args=kinds)
-    assert set(found) == {"params"}
-    return flax.traverse_util.flatten_dict(found["params"], sep="/")
+    as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), tree)
+    restored = checkpointer.restore(folder, restore_args=as_numpy)
+    assert set(restored) == {"params"}
+    return flax.traverse_util.flatten_dict(restored["params"], sep="/")
 
 
 @pytest.fixture
 def tensors(model, tmp_path):
-    """What LeRobot would find."""
+    """The same model in LeRobot's layout."""
     published.save(tmp_path / "lerobot", model, "lerobot")
     return safetensors.numpy.load_file(tmp_path / "lerobot" / "model.safetensors")
 
@@ -56,25 +56,25 @@ def write(folder, tensors):
     return folder
 
 
-def assert_same(one, other):
-    one, other = named_arrays(one), named_arrays(other)
-    assert one.keys() == other.keys()
-    for name, array in one.items():
-        assert array.dtype == other[name].dtype
-        np.testing.assert_array_equal(array, other[name], err_msg=name)
+def assert_same(actual, expected):
+    actual, expected = named_arrays(actual), named_arrays(expected)
+    assert actual.keys() == expected.keys()
+    for name, array in actual.items():
+        assert array.dtype == expected[name].dtype
+        np.testing.assert_array_equal(array, expected[name], err_msg=name)
 
 
-def test_openpi_there_and_back(model, leaves, tmp_path):
+def test_openpi_round_trip(model, leaves, tmp_path):
     published.save(tmp_path / "new", model, "openpi")
-    back = orbax_leaves(tmp_path / "new" / "params")
-    assert back.keys() == leaves.keys()
+    saved = orbax_leaves(tmp_path / "new" / "params")
+    assert saved.keys() == leaves.keys()
     for name, array in leaves.items():
-        np.testing.assert_array_equal(array, back[name], err_msg=name)
+        np.testing.assert_array_equal(array, saved[name], err_msg=name)
     assert published.load_published(tmp_path / "new" / "params", CONFIG)[1] == []
 
 
-def test_openpi_saved_from_a_state(model, leaves, tmp_path):
-    """Then every path ends in "value"."""
+def test_openpi_saved_from_an_nnx_state(model, leaves, tmp_path):
+    """Every path then ends in "value"."""
     tree = flax.traverse_util.unflatten_dict(
         {(*k.split("/"), "value"): jnp.asarray(a) for k, a in leaves.items()}
     )
@@ -83,7 +83,7 @@ def test_openpi_saved_from_a_state(model, leaves, tmp_path):
 
 
 def test_lerobot_has_the_documented_tensors(tensors, leaves):
-    """The key table of openpi's converter (examples/convert_jax_model_to_pytorch.py), by hand."""
+    """Check rows of the table in openpi's converter (examples/convert_jax_model_to_pytorch.py)."""
     q = leaves["PaliGemma/llm/layers/attn/q_einsum/w"][1]  # [N, D, H]
     kv = leaves["PaliGemma/llm/layers/attn/kv_einsum_1/w"][2]  # [2, K, D, H]
     out = leaves["PaliGemma/llm/layers/attn/attn_vec_einsum/w"][0]  # [N, H, D]
@@ -108,46 +108,46 @@ def test_lerobot_has_the_documented_tensors(tensors, leaves):
         np.testing.assert_array_equal(tensors[name], array, err_msg=name)
 
 
-def test_lerobot_of_the_published_size():
+def test_lerobot_names_of_the_published_model():
     rules = published_names.lerobot_layout(Pi0Config.base())
     names = {name for rule in rules for name in rule.theirs} | set(published_names.UNUSED)
     assert len(names) == 778
     assert all(published_names.lerobot_name(name) == name for name in names)
 
 
-def test_lerobot_there_and_back(model, tensors, tmp_path):
-    found, unused = published.load_published(write(tmp_path / "again", tensors), CONFIG)
-    assert_same(found, model)
+def test_lerobot_round_trip(model, tensors, tmp_path):
+    loaded, unused = published.load_published(write(tmp_path / "again", tensors), CONFIG)
+    assert_same(loaded, model)
     assert unused == [HEAD.removeprefix("model.")]
 
 
 def test_lerobot_in_bf16_and_in_shards(model, tensors, tmp_path):
-    """Types are kept, whatever the model computes in between."""
-    narrow = {name: a.astype(ml_dtypes.bfloat16) for name, a in tensors.items()}
-    narrow["model.state_proj.bias"] = tensors["model.state_proj.bias"]
-    names = sorted(narrow)
-    parts = {"a.safetensors": names[:50], "b.safetensors": names[50:]}
+    """Stored dtypes can be restored, whatever the model's dtype."""
+    mixed = {name: a.astype(ml_dtypes.bfloat16) for name, a in tensors.items()}
+    mixed["model.state_proj.bias"] = tensors["model.state_proj.bias"]
+    names = sorted(mixed)
+    shards = {"a.safetensors": names[:50], "b.safetensors": names[50:]}
     (tmp_path / "shards").mkdir()
-    for file, part in parts.items():
-        safetensors.numpy.save_file({n: narrow[n] for n in part}, tmp_path / "shards" / file)
-    index = {"weight_map": {name: file for file, part in parts.items() for name in part}}
+    for file, shard in shards.items():
+        safetensors.numpy.save_file({n: mixed[n] for n in shard}, tmp_path / "shards" / file)
+    index = {"weight_map": {name: file for file, shard in shards.items() for name in shard}}
     (tmp_path / "shards" / "model.safetensors.index.json").write_text(json.dumps(index))
-    wide, _ = published.load_published(tmp_path / "shards", CONFIG)
-    assert {a.dtype for a in named_arrays(wide).values()} == {np.dtype("float32")}
+    loaded, _ = published.load_published(tmp_path / "shards", CONFIG)
+    assert {a.dtype for a in named_arrays(loaded).values()} == {np.dtype("float32")}
     dtypes = published.stored_dtypes(tmp_path / "shards", CONFIG)
-    published.save(tmp_path / "new", wide, "lerobot", dtypes)
-    back = safetensors.numpy.load_file(tmp_path / "new" / "model.safetensors")
-    assert back.keys() == narrow.keys()
-    for name, array in narrow.items():
-        assert back[name].dtype == array.dtype
-        np.testing.assert_array_equal(back[name], array, err_msg=name)
+    published.save(tmp_path / "new", loaded, "lerobot", dtypes)
+    saved = safetensors.numpy.load_file(tmp_path / "new" / "model.safetensors")
+    assert saved.keys() == mixed.keys()
+    for name, array in mixed.items():
+        assert saved[name].dtype == array.dtype
+        np.testing.assert_array_equal(saved[name], array, err_msg=name)
     half = dataclasses.replace(CONFIG, param_dtype="bfloat16")
-    stored, _ = published.load_published(tmp_path / "shards", half)
-    assert {a.dtype for a in named_arrays(stored).values()} == {np.dtype("bfloat16")}
+    loaded, _ = published.load_published(tmp_path / "shards", half)
+    assert {a.dtype for a in named_arrays(loaded).values()} == {np.dtype("bfloat16")}
 
 
-def test_lerobot_of_older_versions(model, tensors, tmp_path):
-    """Other places of the towers, no prefix, and the embedding only as the head."""
+def test_older_lerobot_versions(model, tensors, tmp_path):
+    """Towers in other modules, no prefix, and the embedding stored only as the head."""
     old = {}
     for name, array in tensors.items():
         name = name.removeprefix("model.").replace(
@@ -155,18 +155,18 @@ def test_lerobot_of_older_versions(model, tensors, tmp_path):
         )
         old[name.replace("paligemma.model.vision_tower", "paligemma.vision_tower")] = array
     del old["paligemma_with_expert.paligemma.language_model.model.embed_tokens.weight"]
-    found, unused = published.load_published(write(tmp_path / "old", old), CONFIG)
-    assert_same(found, model)
+    loaded, unused = published.load_published(write(tmp_path / "old", old), CONFIG)
+    assert_same(loaded, model)
     assert unused == []
 
 
-def test_what_does_not_fit_is_named(model, tensors, tmp_path):
+def test_mismatched_checkpoints_raise(model, tensors, tmp_path):
     lora = {**tensors, "model.extra.lora_A.weight": np.zeros((2, 2), np.float32)}
     with pytest.raises(ValueError, match=r"has unexpected extra\.lora_A\.weight"):
         published.load_published(write(tmp_path / "more", lora), CONFIG)
-    less = {name: a for name, a in tensors.items() if "layers.1.mlp.up_proj" not in name}
+    incomplete = {name: a for name, a in tensors.items() if "layers.1.mlp.up_proj" not in name}
     with pytest.raises(ValueError, match=r"lacks .*layers\.1\.mlp\.up_proj\.weight"):
-        published.load_published(write(tmp_path / "less", less), CONFIG)
+        published.load_published(write(tmp_path / "incomplete", incomplete), CONFIG)
     other = dataclasses.replace(CONFIG, action_dim=7)
     with pytest.raises(
         ValueError, match=r"state_proj/kernel of .* must have shape \(7, 64\), got \(32, 64\)"
@@ -181,12 +181,12 @@ def test_what_does_not_fit_is_named(model, tensors, tmp_path):
         published.save(tmp_path / "more", model, "lerobot")
     with pytest.raises(ValueError, match="layout must be one of openpi, lerobot, got 'torch'"):
         published.save(tmp_path / "new", model, "torch")
-    with pytest.raises(ValueError, match="gs:/bucket/base is a URL"):
+    with pytest.raises(ValueError, match="cannot write to the URL gs:/bucket/base"):
         published.save(Path("gs://bucket/base"), model, "openpi")
 
 
 @pytest.mark.parametrize("layout", ["lerobot", "openpi"])
-def test_damage_is_one_sentence(layout, model, tmp_path):
+def test_damaged_files_raise(layout, model, tmp_path):
     published.save(tmp_path / "new", model, layout)
     if layout == "lerobot":
         file = tmp_path / "new" / "model.safetensors"

@@ -1,4 +1,4 @@
-"""Straight-line code over a stack of layers against the loop: values, gradients, what is stored."""
+"""Compare unrolled layers with the scan: values, gradients and residuals."""
 
 import jax
 import jax.numpy as jnp
@@ -42,40 +42,40 @@ def loss_of(graphdef, frozen, **options):
 
     def loss(adapters):
         blocks = nnx.merge(graphdef, adapters, frozen).blocks
-        y, kept = scan_depth(blocks, lambda block, x, _: (block(x), x.sum()), x, **options)
-        return (y**2).sum() + (kept * jnp.arange(DEPTH)).sum()
+        y, sums = scan_depth(blocks, lambda block, x, _: (block(x), x.sum()), x, **options)
+        return (y**2).sum() + (sums * jnp.arange(DEPTH)).sum()
 
     return loss
 
 
-def close(found, expected):
-    assert np.linalg.norm(found - expected) <= 1e-3 * np.linalg.norm(expected)
+def assert_close(actual, expected):
+    assert np.linalg.norm(actual - expected) <= 1e-3 * np.linalg.norm(expected)
 
 
 @pytest.mark.parametrize("remat", ["none", "products"])
-def test_dropout_is_the_same_in_straight_line_code_and_in_the_loop(remat):
-    """Each layer of the stack by a key of its own."""
+def test_dropout_is_the_same_unrolled_and_scanned(remat):
+    """Each layer of the stack has its own key."""
     model = trained((".*", LoRA(rank=4, dropout=0.5)), seed=1, net=Net())
-    dropping = adaptation.with_dropout(model, jax.random.key(5))
-    found = []
-    for net, unroll in ((model, False), (dropping, False), (dropping, True)):
+    with_dropout = adaptation.with_dropout(model, jax.random.key(5))
+    losses = []
+    for net, unroll in ((model, False), (with_dropout, False), (with_dropout, True)):
         graphdef, adapters, frozen = nnx.split(net, AdapterParam, ...)
-        found.append(jax.jit(loss_of(graphdef, frozen, remat=remat, unroll=unroll))(adapters))
-    np.testing.assert_allclose(found[1], found[2], rtol=1e-5)
-    assert abs(found[1] - found[0]) > 1e-2 * found[0]
+        losses.append(jax.jit(loss_of(graphdef, frozen, remat=remat, unroll=unroll))(adapters))
+    np.testing.assert_allclose(losses[1], losses[2], rtol=1e-5)
+    assert abs(losses[1] - losses[0]) > 1e-2 * losses[0]
 
 
 @pytest.mark.parametrize("remat", ["none", "products"])
-def test_straight_line_code_has_the_loops_gradients(split, remat):
+def test_unrolled_gradients_equal_scanned_gradients(split, remat):
     graphdef, adapters, frozen = split
-    expected, found = (
+    scanned, unrolled = (
         jax.jit(jax.value_and_grad(loss_of(graphdef, frozen, remat=remat, unroll=unroll)))(adapters)
         for unroll in (False, True)
     )
-    jax.tree.map(close, found, expected)
+    jax.tree.map(assert_close, unrolled, scanned)
 
 
-def test_straight_line_code_stores_no_layers_weights_and_stacks_gradients(split):
+def test_unrolled_layers_save_no_weight_slices_and_concatenate_gradients(split):
     graphdef, adapters, frozen = split
 
     def residuals(adapters, frozen):
@@ -90,26 +90,26 @@ def test_straight_line_code_stores_no_layers_weights_and_stacks_gradients(split)
     assert "dynamic_update_slice" not in str(gradient)
 
 
-def test_what_has_a_name_is_stored_in_place_of_its_products():
+def test_marked_values_are_saved_instead_of_their_matmuls():
     class Sum(nnx.Module):
         def __init__(self, *, rngs):
             self.first, self.second = Dense(WIDTH, INNER, rngs=rngs), Dense(WIDTH, INNER, rngs=rngs)
 
-        def __call__(self, x, keep):
-            return x + jnp.cos(keep(self.first(x) + self.second(x))).sum(-1, keepdims=True)
+        def __call__(self, x, mark):
+            return x + jnp.cos(mark(self.first(x) + self.second(x))).sum(-1, keepdims=True)
 
     blocks = stack(lambda rngs: Sum(rngs=rngs), DEPTH, nnx.Rngs(0))
 
-    def inner(keep):
-        run = lambda x: scan_depth(blocks, lambda b, x, _: (b(x, keep), None), x, remat="products")  # noqa: E731
-        pull_back = jax.eval_shape(lambda x: jax.vjp(run, x)[1], jnp.ones((1, TOKENS, WIDTH)))
-        return sum(leaf.shape[-2:] == (TOKENS, INNER) for leaf in jax.tree.leaves(pull_back))
+    def saved_count(mark):
+        run = lambda x: scan_depth(blocks, lambda b, x, _: (b(x, mark), None), x, remat="products")  # noqa: E731
+        residuals = jax.eval_shape(lambda x: jax.vjp(run, x)[1], jnp.ones((1, TOKENS, WIDTH)))
+        return sum(leaf.shape[-2:] == (TOKENS, INNER) for leaf in jax.tree.leaves(residuals))
 
-    assert (inner(lambda x: x), inner(save_for_backward)) == (2, 1)
+    assert (saved_count(lambda x: x), saved_count(save_for_backward)) == (2, 1)
 
 
 @pytest.mark.parametrize("unroll", [False, True])
-def test_a_stack_in_which_nothing_trains(unroll):
+def test_a_stack_without_trainable_parameters(unroll):
     blocks, x = Net().blocks, jnp.ones((1, TOKENS, WIDTH))
     run = lambda x: scan_depth(blocks, lambda block, x, _: (block(x), None), x, unroll=unroll)[0]  # noqa: E731
     expected = x
@@ -119,7 +119,7 @@ def test_a_stack_in_which_nothing_trains(unroll):
     np.testing.assert_allclose(run(x), expected, rtol=1e-5)
 
 
-def test_the_adapters_kernel_runs_once_each_way():
+def test_the_fused_kernel_runs_once_forward_and_once_backward():
     method = OnGPU(rank=16, hidden_width=16)
     blocks = stack(lambda rngs: Dense(WIDTH, WIDTH, method=method, rngs=rngs), DEPTH, nnx.Rngs(0))
     graphdef, adapters, frozen = adaptation.split(blocks)
