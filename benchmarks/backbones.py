@@ -1,14 +1,14 @@
-"""Speed of training and sampling of whole backbones at published sizes, with random weights.
+"""Speed of training and sampling for full backbones of published sizes, with random weights.
 
     python -m benchmarks.backbones --json backbones.json
     python -m benchmarks.backbones --size nano --batch 4 --rank 8 --dtype float32    # on a CPU
 
-A training step is this project's own, with AdamW and the auxiliary losses, on a batch already on
-the device; its state is donated. GiB is the memory of the compiled program including its arguments.
-MFU is the rate of the matrix products of loss and gradients (`lorasp_jax.training.cost.flops`,
-without recomputation) relative to the device's bf16 peak. Sampling runs ten denoising steps in one
-program, from images to action chunk, with the model's prepared `sampler`. "largest" is the largest
-batch whose step is expected to fit in 24 GiB.
+The training step is that of `lorasp_jax.training`, with AdamW and the auxiliary losses, on a batch
+already on the device, with donated state. GiB is the memory of the compiled program including its
+arguments. MFU is the matmul FLOP/s of loss and gradients (`lorasp_jax.training.cost.flops`, without
+recomputation) relative to the device's bf16 peak. Sampling runs ten denoising steps in one program,
+from images to action chunk, with the model's `sampler`. "largest" is the largest batch with a step
+expected to fit in 24 GiB.
 """
 
 import argparse
@@ -44,7 +44,7 @@ STEPS = 10
 
 
 def sized(name: str, options: argparse.Namespace, remat: Remat = "none") -> BackboneConfig:
-    """Return the backbone's config at the chosen size, its base stored in the compute dtype."""
+    """Return the backbone's config of the chosen size, with parameters in the compute dtype."""
     config = getattr(backbone.find(name), options.size)()
     return dataclasses.replace(
         config,
@@ -57,13 +57,13 @@ def sized(name: str, options: argparse.Namespace, remat: Remat = "none") -> Back
 
 
 def run_config(method: peft.Method, targets: tuple[str, ...], batch: int) -> Config:
-    """Return the config of a run with this method."""
+    """Return a run config with this method."""
     optim = OptimConfig(batch_size=batch)
     return Config(name="benchmark", scale="", peft=method, targets=targets, optim=optim)
 
 
 def arrays(config: BackboneConfig, run: Config | None) -> tuple[Any, Any, Any]:
-    """Initialize graph, adapters and frozen arrays on a device; no adapters without a run."""
+    """Initialize graph, adapters and frozen arrays on the device; no adapters without a run."""
 
     def model(key: jax.Array) -> Backbone:
         return preflight.adapted_model(run, config, key) if run else config.create(nnx.Rngs(key))
@@ -85,12 +85,12 @@ def noise(shapes: Any) -> Any:
 
 
 class Step:
-    """A compiled training step; `load` gives it its arrays.
+    """A compiled training step; `load` supplies its arrays.
 
     Args:
         config: the backbone's config.
-        run: the run's config; its batch size is that of all devices together.
-        mesh: mesh of devices; by default only the first device.
+        run: the run's config; its batch size is global.
+        mesh: device mesh; by default only the first device.
     """
 
     def __init__(self, config: BackboneConfig, run: Config, mesh: Mesh | None = None) -> None:
@@ -115,33 +115,33 @@ class Step:
         self.compiled = jitted.lower(*shapes).compile()
 
     def load(self, adapters: Any, frozen: Any) -> "Step":
-        """Copy these arrays to their devices; return self."""
+        """Place the arrays on the devices and return self."""
         arrays = self._initial(adapters), frozen, noise(self._batch), jax.random.key(1)
         self.state, *self.others = jax.device_put(arrays, self._shardings)
         return self
 
     def __call__(self) -> Any:
-        """Run the next step; return its metrics."""
+        """Run the next step and return its metrics."""
         self.state, metrics = self.compiled(self.state, *self.others)
         return metrics
 
     @property
     def bytes(self) -> float:
         """Memory of the program on each device, including its arguments."""
-        needed: Any = self.compiled.memory_analysis()
-        return needed.argument_size_in_bytes + needed.temp_size_in_bytes
+        memory: Any = self.compiled.memory_analysis()
+        return memory.argument_size_in_bytes + memory.temp_size_in_bytes
 
 
 def training(name: str, label: str, run: Config, options: argparse.Namespace, remat: Remat) -> Any:
-    """Measure one training row."""
+    """Measure one row of the training table."""
     config = sized(name, options, remat)
     step, size = Step(config, run).load(*arrays(config, run)[1:]), run.optim.batch_size
     seconds = best(step, calls=options.calls)
     operations = preflight.step_flops(run, sized(name, options))
-    share = flops.utilization(operations, seconds)
+    utilization = flops.utilization(operations, seconds)
     return {
         "backbone": name,
-        "trains": label,
+        "trainable": label,
         "batch": size,
         "remat": remat,
         "ms": 1e3 * seconds,
@@ -149,7 +149,7 @@ def training(name: str, label: str, run: Config, options: argparse.Namespace, re
         "GiB": step.bytes / GIB,
         "expected": estimate_memory(run, config).peak / GIB,
         "TFLOP": operations / 1e12,
-        "MFU": "" if share is None else share,
+        "MFU": "" if utilization is None else utilization,
     }
 
 
@@ -162,12 +162,12 @@ def largest(name: str, run: Config, options: argparse.Namespace) -> int:
         return estimate_memory(dataclasses.replace(run, optim=optim), config).peak
 
     one, nine = bytes_of(1), bytes_of(9)
-    each = (nine - one) / 8
-    return max(1, int((options.gib * GIB - one + each) / each))
+    per_sample = (nine - one) / 8
+    return max(1, int((options.gib * GIB - one + per_sample) / per_sample))
 
 
 def sampling(name: str, label: str, run: Config | None, options: argparse.Namespace) -> Iterator:
-    """Yield the rows of sampling action chunks."""
+    """Yield the rows of the sampling table."""
     config = sized(name, options)
     sampler = nnx.merge(*arrays(config, run)).sampler()
     observation = noise(abstract_batch(config, 1).observation)
@@ -202,19 +202,21 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that define a step and its measurement."""
     parser.add_argument("--rank", type=int, default=128)
     parser.add_argument("--remat", choices=REMATS, default="products")
-    parser.add_argument("--unroll", choices=["yes", "no"], help="default: as the size's preset")
+    parser.add_argument("--unroll", choices=["yes", "no"], help="default: that of the size")
     parser.add_argument("--dtype", default="bfloat16")
-    parser.add_argument("--calls", type=int, default=5, help="steps queued together")
-    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--calls", type=int, default=5, help="steps queued at once")
+    parser.add_argument("--json", type=Path, help="file for the results")
 
 
 def main() -> None:
-    """Measure, print, write."""
+    """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--backbones", nargs="+", default=list(CAMERAS))
     parser.add_argument("--size", default="base", help="nano, small or base")
     parser.add_argument("--batch", type=int, default=32)
-    parser.add_argument("--sampled", type=int, nargs="+", default=[1, 8], help="batches")
+    parser.add_argument(
+        "--sampled", type=int, nargs="+", default=[1, 8], help="batch sizes for sampling"
+    )
     parser.add_argument("--gib", type=float, default=24, help="memory for the largest batch")
     parser.add_argument("--only", choices=["training", "largest", "sampling"])
     add_options(parser)

@@ -3,8 +3,8 @@
     JAX_PLATFORMS=cpu python -m benchmarks.compile_time
 
 The program is the gradient of a training loss with respect to the adapters, auxiliary losses
-included. Times are CPU seconds of this process on all cores, which other programs hardly affect;
-the best of several repeats counts. Ratios are relative to qwix's LoRA in the same run
+included. Times are CPU seconds of this process on all cores, which other programs hardly affect,
+the best of several repeats. Ratios are relative to qwix's LoRA in the same run
 (`pip install qwix`), or to the bare model if qwix is not installed.
 """
 
@@ -27,7 +27,7 @@ from lorasp_jax import peft
 from lorasp_jax.adapters.adaptation import adapt
 
 LOSS_WEIGHT = 1e-2
-PARTS = ("trace s", "lower s", "compile s", "total s")
+PHASES = ("trace s", "lower s", "compile s", "total s")
 
 
 class Stack(nnx.Module):
@@ -46,7 +46,7 @@ class Stack(nnx.Module):
 
 
 def models(base: Stack, x: jax.Array, rank: int) -> Iterator[tuple[str, Any, Any]]:
-    """Yield name, model and the variable type that trains; the reference comes first."""
+    """Yield name, model and type of the trainable variables; the reference comes first."""
     if importlib.util.find_spec("qwix"):
         import qwix  # pyright: ignore[reportMissingImports]
 
@@ -65,21 +65,21 @@ def models(base: Stack, x: jax.Array, rank: int) -> Iterator[tuple[str, Any, Any
 
 def gradient(model: nnx.Module, kind: Any) -> tuple[Callable[..., Any], tuple[Any, Any]]:
     """Return the function to compile, and its first two arguments."""
-    graphdef, trained, frozen = nnx.split(nnx.clone(model), kind, ...)
+    graphdef, trainable, frozen = nnx.split(nnx.clone(model), kind, ...)
 
-    def loss(trained: Any, frozen: Any, x: jax.Array) -> jax.Array:
-        model: Any = nnx.merge(graphdef, trained, frozen)
+    def loss(trainable: Any, frozen: Any, x: jax.Array) -> jax.Array:
+        model: Any = nnx.merge(graphdef, trainable, frozen)
         total = jnp.square(model(x)).mean()
         if nnx.state(model, lorasp_jax.dense.AdapterAux):
             for aux in lorasp_jax.collect_aux(model).values():
                 total += LOSS_WEIGHT * sum(aux.losses.values())
         return total
 
-    return jax.value_and_grad(loss), (trained, frozen)
+    return jax.value_and_grad(loss), (trainable, frozen)
 
 
 def seconds(function: Callable[..., Any], *arguments: Any) -> tuple[float, ...]:
-    """Measure the CPU seconds of each of `PARTS`."""
+    """Measure the CPU seconds of each of `PHASES`."""
     jax.clear_caches()
     times = [time.process_time()]
     traced = jax.jit(function).trace(*arguments)
@@ -92,7 +92,7 @@ def seconds(function: Callable[..., Any], *arguments: Any) -> tuple[float, ...]:
 
 
 def measure(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Yield one row per model; models take turns, so that load on the machine affects all alike."""
+    """Yield one row per model, interleaving the models so that machine load affects all alike."""
     x = jnp.ones((options.tokens, options.width), options.dtype)
     base = Stack(options.depth, options.width, options.dtype)
     times: dict[str, list[tuple[float, ...]]] = {}
@@ -103,11 +103,11 @@ def measure(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     fastest = {name: min(rows, key=lambda row: row[-1]) for name, rows in times.items()}
     reference = next(iter(fastest.values()))[-1]
     for name, row in fastest.items():
-        yield {"model": name, **dict(zip(PARTS, row, strict=True)), "ratio": row[-1] / reference}
+        yield {"model": name, **dict(zip(PHASES, row, strict=True)), "ratio": row[-1] / reference}
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Measure, print, write."""
+    """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--depth", type=int, default=12)
     parser.add_argument("--width", type=int, default=512)
@@ -115,7 +115,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--rank", type=int, default=16)
     parser.add_argument("--dtype", default="float32")
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--json", type=Path, help="file for the results")
     options = parser.parse_args(arguments)
     jax.config.update("jax_enable_compilation_cache", False)
     console, name = Console(soft_wrap=True), machine("jax")

@@ -1,12 +1,12 @@
-"""Speed of the data pipeline: windows/s from the cache, time to first batch, import from LeRobot.
+"""Speed of the data pipeline: windows/s from the cache, time to first batch, LeRobot import.
 
     python -m benchmarks.data --json data.json
-    python -m benchmarks.data --steps 50000 --batches 500     # more than fits in the page cache
+    python -m benchmarks.data --steps 50000 --batches 500     # larger than the page cache
 
-Windows have two cameras and 50 actions, in shuffled order. The import reads synthetic recordings of
-two cameras as LeRobot writes them (AV1 or H.264, a key frame every 2 frames), once at full size and
-once resized to 224 pixels as for published models. For comparison, the decoder alone runs with one
-video per core. Everything runs on the host; the accelerator is idle.
+Windows have two cameras and 50 actions and are shuffled. The import reads synthetic two-camera
+recordings in LeRobot's encoding (AV1 or H.264, a key frame every 2 frames), at full size and
+resized to 224 pixels as for published models. For comparison, the decoder alone runs with one video
+per core. Everything runs on the host; the accelerator is idle.
 """
 
 import argparse
@@ -39,13 +39,13 @@ CAMERAS, CHUNK, FPS = ("side", "wrist"), 50, 30
 EPISODE = 250  # steps
 HEIGHT, WIDTH = 480, 640
 CODECS = {"AV1": "libsvtav1", "H.264": "libx264"}
-"""Codec -> PyAV's encoder."""
+"""Codec -> name of its encoder in PyAV."""
 
 
-class Drawn:
-    """Episodes of noise, drawn when they are read."""
+class Noise:
+    """A source of random episodes, generated when they are read."""
 
-    kind, cameras, control_dt = "drawn", CAMERAS, 1 / FPS
+    kind, cameras, control_dt = "noise", CAMERAS, 1 / FPS
 
     def __init__(self, steps: int, height: int, width: int) -> None:
         self.num_steps, self._rng = steps, np.random.default_rng(0)
@@ -55,9 +55,9 @@ class Drawn:
         return self.num_steps // EPISODE
 
     def episode(self, number: int, cameras: Any = None) -> Episodes:  # noqa: ARG002
-        """Draw an episode."""
-        draw = self._rng.standard_normal
-        state, action = (draw((1, EPISODE, 7), np.float32) for _ in range(2))
+        """Generate an episode."""
+        normal = self._rng.standard_normal
+        state, action = (normal((1, EPISODE, 7), np.float32) for _ in range(2))
         return Episodes(
             image={name: self._rng.integers(0, 255, self._size, np.uint8) for name in CAMERAS},
             state=state,
@@ -65,7 +65,7 @@ class Drawn:
             length=np.array([EPISODE], np.int32),
             instruction=np.zeros(1, np.int32),
             instructions=("do it",),
-            task="drawn",
+            task="noise",
             robot="piper",
             control_dt=self.control_dt,
             physics_dt=0.0,
@@ -74,24 +74,24 @@ class Drawn:
 
 
 def seconds(call: Callable[[], Any]) -> float:
-    """Time one call, without repeats: a second one would find its files in memory."""
+    """Time a single call: for a second one the files would be in the page cache."""
     start = time.perf_counter()
     call()
     return time.perf_counter() - start
 
 
-def reading(folder: Path, steps: int, size: tuple[int, int], batch: int, batches: int) -> Any:
+def read_cache(folder: Path, steps: int, size: tuple[int, int], batch: int, batches: int) -> Any:
     """Measure windows/s, and the time from opening the folder to the first batch."""
     path = folder / f"{size[0]}x{size[1]}"
     if not path.exists():
-        cache.write([Drawn(steps, *size)], path, lambda *_: None)
+        cache.write([Noise(steps, *size)], path, lambda *_: None)
     start = time.perf_counter()
     stream = Stream(cache.Cache(path).steps, batch_size=batch, chunk=CHUNK, seed=0)
     next(stream)
     first = time.perf_counter() - start
-    taken = seconds(lambda: collections.deque(itertools.islice(stream, batches), maxlen=1))
+    duration = seconds(lambda: collections.deque(itertools.islice(stream, batches), maxlen=1))
     pixels = f"{size[1]}x{size[0]}"
-    rate = batch * batches / taken
+    rate = batch * batches / duration
     return {"images": pixels, "batch": batch, "windows/s": rate, "first batch s": first}
 
 
@@ -129,7 +129,7 @@ def record(folder: Path, episodes: int, codec: str) -> None:
 
 
 def encode(path: Path, rng: np.random.Generator, codec: str) -> None:
-    """Encode an object moving over a background, with LeRobot's settings: yuv420p, g 2, crf 30."""
+    """Encode a moving object on a background with LeRobot's settings: yuv420p, g 2, crf 30."""
     os.environ.setdefault("SVT_LOG", "1")  # errors only: the AV1 encoder prints a banner
     scene, patch = texture(rng, HEIGHT, WIDTH), texture(rng, HEIGHT // 2, WIDTH // 4)
     with av.open(str(path), "w") as container:
@@ -147,7 +147,7 @@ def encode(path: Path, rng: np.random.Generator, codec: str) -> None:
 
 
 def texture(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
-    """Draw an image, f32 `[H, W, 3]`, with detail at all scales; AV1 needs 13 kB at 640 x 480."""
+    """Generate an image, f32 `[H, W, 3]`, with detail at all scales; 13 kB as AV1 at 640 x 480."""
     frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width))
     frequency[0, 0] = np.inf
     noise = np.fft.fft2(rng.standard_normal((4, height, width))) / frequency**1.6
@@ -155,8 +155,8 @@ def texture(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
     return (128 + 45 * (gray[..., None] + 0.3 * np.stack(colors, -1))).astype(np.float32)
 
 
-def importing(folder: Path, codec: str, image_size: int) -> dict[str, Any]:
-    """Measure the import of a LeRobot dataset to a cache, with statistics: steps/s and images/s."""
+def import_dataset(folder: Path, codec: str, image_size: int) -> dict[str, Any]:
+    """Measure steps/s and images/s of importing a LeRobot dataset into a cache, with statistics."""
     source = LeRobot(folder / codec, Keys(image_size=image_size))
     target = folder / f"imported_{codec}_{image_size}"
     rate = source.num_steps / seconds(lambda: cache.write([source], target, lambda *_: None))
@@ -165,7 +165,7 @@ def importing(folder: Path, codec: str, image_size: int) -> dict[str, Any]:
     return {"codec": codec, "stored as": size, "steps/s": rate, "images/s": images}
 
 
-def decoding(folder: Path, codec: str) -> dict[str, Any]:
+def decode(folder: Path, codec: str) -> dict[str, Any]:
     """Measure images/s of the decoder alone, an upper bound for the import."""
     videos = sorted((folder / codec).rglob("*.mp4"))
 
@@ -182,7 +182,7 @@ def decoding(folder: Path, codec: str) -> dict[str, Any]:
 
 
 def statistics(steps: int) -> dict[str, Any]:
-    """Time the computation of normalization statistics over this many steps."""
+    """Time the normalization statistics of `steps` steps."""
     rows = np.random.default_rng(0).standard_normal((steps, 7), np.float32)
     valid = np.ones(steps, bool)
     call = lambda: Statistics.measure(rows, rows, valid, slots=range(7), dim=7)  # noqa: E731
@@ -190,24 +190,24 @@ def statistics(steps: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Measure, print, write."""
+    """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--steps", type=int, default=5000, help="in the cache (%(default)s)")
     parser.add_argument("--batches", type=int, default=200, help="to time (%(default)s)")
     parser.add_argument("--episodes", type=int, default=4, help="to import (%(default)s)")
-    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--json", type=Path, help="file for the results")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         read = [
-            reading(folder, options.steps, size, batch, options.batches)
+            read_cache(folder, options.steps, size, batch, options.batches)
             for size in ((128, 128), (168, 224))
             for batch in (32, 256)
         ]
         for codec in CODECS:
             record(folder / codec, options.episodes, codec)
-        imported = [importing(folder, codec, size) for codec in CODECS for size in (0, 224)]
-        decoded = [decoding(folder, codec) for codec in CODECS]
+        imported = [import_dataset(folder, codec, size) for codec in CODECS for size in (0, 224)]
+        decoded = [decode(folder, codec) for codec in CODECS]
     tables = {"cache": read, f"LeRobot {WIDTH}x{HEIGHT}": imported, "decoder": decoded}
     tables["statistics"] = [statistics(1_000_000)]
     name = machine("numpy", "grain", "av")

@@ -1,12 +1,12 @@
-"""Latency of LoRA-SP layers for one token: the whole bank, or only gathered active directions.
+"""Latency of LoRA-SP layers for one token: full bank compared with gathered active directions.
 
     python -m benchmarks.decoding --json decoding.json
     python -m benchmarks.decoding --dtype float32 --shapes 1024x1024 --ranks 128 512   # on a CPU
 
 Several layers with separate arrays run in one program, so that neither launch overhead nor cache
 hits dominate. Capacities are fractions of R. The initial router keeps about 0.9 R, so the gather
-drops directions beyond its capacity, which does not change the time. "gain" is dense / gathered
-time.
+drops directions beyond its capacity, which does not affect the time. "gain" is dense time divided
+by gathered time.
 """
 
 import argparse
@@ -22,7 +22,7 @@ from lorasp_jax.peft import LoRASP
 from lorasp_jax.peft.lora_sp import decoding
 
 QUEUED = 10
-SHARES = (2, 4, 8)
+DIVISORS = (2, 4, 8)
 
 
 def measure(shape: tuple[int, int], rank: int, dtype: str, num_layers: int) -> dict[str, Any]:
@@ -42,26 +42,26 @@ def measure(shape: tuple[int, int], rank: int, dtype: str, num_layers: int) -> d
     dense = jax.jit(lambda layers, x: [method.delta(p, x)[0] for p in layers])
     base = best(lambda: dense(dense_params, x), calls=QUEUED) / num_layers
     row: dict[str, Any] = {"layer": "x".join(map(str, shape)), "R": rank, "dense us": base * 1e6}
-    for share in SHARES:
-        capacity = max(rank // share, 1)
+    for divisor in DIVISORS:
+        capacity = max(rank // divisor, 1)
         gathered = jax.jit(
             lambda layers, x, capacity=capacity: [
                 decoding.decode(method, p, x, capacity=capacity)[0] for p in layers
             ]
         )
         seconds = best(lambda run=gathered: run(prepared, x), calls=QUEUED) / num_layers
-        row |= {f"R/{share} us": seconds * 1e6, f"R/{share} gain": base / seconds}
+        row |= {f"R/{divisor} us": seconds * 1e6, f"R/{divisor} gain": base / seconds}
     return row
 
 
 def main() -> None:
-    """Measure, print, write."""
+    """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--shapes", nargs="+", default=["2048x2048", "2048x16384", "16384x2048"])
     parser.add_argument("--ranks", nargs="+", type=int, default=[128, 512, 2048])
     parser.add_argument("--dtype", default="bfloat16", choices=["bfloat16", "float32"])
     parser.add_argument("--layers", type=int, default=8)
-    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--json", type=Path, help="file for the results")
     options = parser.parse_args()
     shapes = [tuple(map(int, shape.split("x"))) for shape in options.shapes]
     rows = [

@@ -6,7 +6,7 @@ For each task, backend and batch size: compile time (`--jobs` programs at once),
 control steps/s without and with rendering both cameras ("control+images/s"), images/s of the ray
 caster alone (hard shadows, two cameras), memory, and the speed relative to MuJoCo's C engine on the
 same scene with one thread per core ("over C"). Actions are noise around the start pose. Inputs are
-built under jit; everything is warmed up twice; the best of three calls counts.
+created under jit; times are the best of three calls after two warm-ups.
 """
 
 import argparse
@@ -44,7 +44,7 @@ PLAYGROUND, PLAYGROUND_CONTACTS = "PandaPickCube", 24  # contacts per world: Pla
 
 @dataclasses.dataclass
 class Case:
-    """One row of the table: an environment, and the compiled program that steps it."""
+    """One row of the table: an environment and the compiled program that steps it."""
 
     env: Env
     state: State
@@ -53,16 +53,17 @@ class Case:
 
     @classmethod
     def prepare(cls, options: argparse.Namespace, task: str, backend: Any, batch: int) -> Self:
-        """Make the environment and compile its program."""
+        """Create the environment and compile its program."""
         env = envs.make(
             task, options.robot, num_envs=batch, image_size=options.image_size, backend=backend
         )
         state = env.reset(jax.random.key(0))
-        middle = state.info["command"]
+        start_command = state.info["command"]
 
         def run(state: State, key: jax.Array) -> State:
             def body(state: State, key: jax.Array) -> tuple[State, None]:
-                return env.step(state, middle + 0.1 * jax.random.normal(key, middle.shape)), None
+                noise = jax.random.normal(key, start_command.shape)
+                return env.step(state, start_command + 0.1 * noise), None
 
             return jax.lax.scan(body, state, jax.random.split(key, CONTROL_STEPS))[0]
 
@@ -94,8 +95,8 @@ class Case:
 
     def memory(self) -> float:
         """Return the program's temporary memory plus Warp's allocations, in MiB."""
-        needed: int = self.steps.memory_analysis().temp_size_in_bytes
-        return needed / 2**20 + measuring.warp_mib(self.env.physics.backend)
+        temporary: int = self.steps.memory_analysis().temp_size_in_bytes
+        return temporary / 2**20 + measuring.warp_mib(self.env.physics.backend)
 
 
 def time_images(env: Env, state: State, size: int) -> float:
@@ -110,7 +111,7 @@ def time_images(env: Env, state: State, size: int) -> float:
 
 
 def mujoco_c(env: Env, state: State) -> float:
-    """Measure physics steps/s of MuJoCo's C engine from the same start, one thread per core."""
+    """Measure physics steps/s of MuJoCo's C engine from the same state, one thread per core."""
     cores = os.cpu_count() or 1
     model = placing.world_model(env.model, state.info["layout"], 0)
     data = [mujoco.MjData(model) for _ in range(cores)]
@@ -129,7 +130,7 @@ def playground(backend: Any, batch: Any) -> tuple[Callable[[], Any], int]:
     """Compile MuJoCo Playground's environment, with enough memory for each world's contacts.
 
     Returns:
-        A compiled call, and the number of physics steps it makes in all worlds.
+        A compiled call, and its number of physics steps over all worlds.
     """
     from mujoco_playground import registry  # pyright: ignore[reportMissingImports]
 
@@ -152,19 +153,19 @@ def playground(backend: Any, batch: Any) -> tuple[Callable[[], Any], int]:
 
 def measure_playground(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Yield the rows of MuJoCo Playground, one per backend and batch size."""
-    wanted = list(itertools.product(options.backends, options.batches))
+    cases = list(itertools.product(options.backends, options.batches))
     with ThreadPoolExecutor(options.jobs) as pool:
-        prepared = list(pool.map(lambda names: playground(*names), wanted))
-    for (backend, batch), (call, steps) in zip(wanted, prepared, strict=True):
+        prepared = list(pool.map(lambda names: playground(*names), cases))
+    for (backend, batch), (call, steps) in zip(cases, prepared, strict=True):
         yield {"backend": backend, "batch": batch, "physics/s": steps / best(call)}
 
 
 def measure(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Yield the rows, one per task, backend and batch size."""
-    wanted = itertools.product(options.tasks, options.backends, options.batches)
+    cases = itertools.product(options.tasks, options.backends, options.batches)
     references: dict[str, float] = {}
     with ThreadPoolExecutor(options.jobs) as pool:
-        for case in list(pool.map(lambda names: Case.prepare(options, *names), wanted)):
+        for case in list(pool.map(lambda names: Case.prepare(options, *names), cases)):
             task = case.env.task.name
             if task not in references:
                 references[task] = mujoco_c(case.env, case.state)
@@ -172,7 +173,7 @@ def measure(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def main() -> None:
-    """Measure, print, write."""
+    """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--tasks", nargs="+", default=["open_pot", "pour", "press", "pick_place"])
     parser.add_argument("--robot", default="piper")
@@ -180,7 +181,7 @@ def main() -> None:
     parser.add_argument("--batches", nargs="+", type=int, default=[16])
     parser.add_argument("--image-size", type=int, default=64)
     parser.add_argument("--jobs", type=int, default=1, help="programs to compile at once")
-    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--json", type=Path, help="file for the results")
     options = parser.parse_args()
     options.backends = options.backends or sorted({"jax", physics.default_backend()})
     console = Console()
@@ -200,7 +201,7 @@ def main() -> None:
         results[PLAYGROUND] = list(measure_playground(options))
         print_table(console, results[PLAYGROUND], f"MuJoCo Playground's {PLAYGROUND}")
     else:
-        console.print(f"mujoco_playground is not installed: no figures for its {PLAYGROUND}")
+        console.print(f"mujoco_playground is not installed: skipping its {PLAYGROUND}")
     if options.json:
         options.json.write_text(json.dumps(results, indent=1))
 

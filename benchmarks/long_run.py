@@ -2,9 +2,9 @@
 
     python -m benchmarks.long_run --tasks pour --backend warp --episodes 200 --num-envs 256
 
-For each task, after each fifth of the episodes: the share of episodes solved, the number of broken
-worlds (ended because a position or velocity was not finite), and the memory of host and device. The
-exit code is 1 if a world broke, or if memory grew by more than 2 % after the first fifth.
+After each fifth of the episodes of a task: the success rate, the number of broken worlds (ended
+because a position or velocity was not finite), and host and device memory. The exit code is 1 if a
+world broke, or if memory grew by more than 2 % after the first fifth.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from envs.physics import physics
 from envs.state import State
 
 PARTS = 5
-MAX_GROWTH = 1.02  # of memory after the first part; own choice, above the noise of allocators
+MAX_GROWTH = 1.02  # of memory after the first part; chosen above the noise of allocators
 
 
 @dataclasses.dataclass
@@ -38,9 +38,9 @@ class Report:
 
     Attributes:
         episodes: episodes per world.
-        success: share of episodes that the expert solved.
+        success: fraction of episodes that the expert solved.
         broken: number of worlds that broke.
-        memory: memory by owner [MiB].
+        memory: memory by allocator [MiB].
         seconds: time since the first episode.
     """
 
@@ -82,18 +82,18 @@ def run(env: Env, episodes: int) -> Iterator[Report]:
         images = {name: image.mean() for name, image in env.observe(state)["image"].items()}
         return state, images | {k: state.info[k].sum() for k in ("success", "broken")}
 
-    state, begun = env.reset(jax.random.key(0), ranges), time.perf_counter()
+    state, start = env.reset(jax.random.key(0), ranges), time.perf_counter()
     success = broken = 0
     for number in range(1, episodes + 1):
         state, sums = episode(state, jax.random.key(number))
         success, broken = success + int(sums["success"]), broken + int(sums["broken"])
         if number * PARTS // episodes > (number - 1) * PARTS // episodes:
-            share, seconds = success / (env.num_envs * number), time.perf_counter() - begun
-            yield Report(number, share, broken, memory(env), seconds)
+            rate, seconds = success / (env.num_envs * number), time.perf_counter() - start
+            yield Report(number, rate, broken, memory(env), seconds)
 
 
 def memory(env: Env) -> dict[str, float]:
-    """Return the memory in use by owner [MiB]."""
+    """Return the memory in use by allocator [MiB]."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     used: dict[str, float] = {"host": pages * 4096 / 2**20}
     if stats := jax.devices()[0].memory_stats():  # None on CPU
@@ -104,7 +104,7 @@ def memory(env: Env) -> dict[str, float]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run and print; return the exit code."""
+    """Run the test from the command line and return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--tasks", nargs="+", default=["open_pot", "pour", "press", "pick_place"])
     parser.add_argument("--robot", default="piper")
@@ -113,10 +113,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--num-envs", type=int, default=256)
     options = parser.parse_args(arguments)
     if options.episodes < PARTS:
-        parser.error(f"--episodes must be at least {PARTS} to measure the growth of memory")
+        parser.error(f"--episodes must be at least {PARTS} to measure memory growth")
     cache.enable()
     backend: Any = options.backend or physics.default_backend()
-    console, good = Console(soft_wrap=True), True
+    console, all_passed = Console(soft_wrap=True), True
     for task in options.tasks:
         env = envs.make(
             task, options.robot, num_envs=options.num_envs, backend=backend, distractors=2
@@ -125,8 +125,8 @@ def main(arguments: list[str] | None = None) -> int:
         for part in run(env, options.episodes):
             console.print(f"{task}, {options.robot}, {backend}, {env.num_envs} worlds: {part}")
             parts.append(part)
-        good &= passed(parts)
-    return 0 if good else 1
+        all_passed &= passed(parts)
+    return 0 if all_passed else 1
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Shared by all benchmarks: timing, machine description, compact tables."""
+"""Utilities of all benchmarks: timing, machine description, compact tables."""
 
 import importlib.metadata
 import os
@@ -14,10 +14,7 @@ from rich.table import Table
 
 
 def best(call: Callable[[], Any], *, calls: int = 1, repeats: int = 3) -> float:
-    """Time `calls` queued together; return seconds per call, the best of `repeats`.
-
-    Two repeats to warm up are not counted.
-    """
+    """Queue `calls` calls; return seconds per call, the best of `repeats` after two warm-ups."""
     seconds = []
     for _ in range(2 + repeats):
         start = time.perf_counter()

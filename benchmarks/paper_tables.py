@@ -3,18 +3,18 @@
 The paper does not say how it counts. These rules reproduce its percentages to the last digit:
 
 - Every linear layer of the PyTorch models has an adapter (422 in pi0, 303 in SmolVLA), including
-  the unused lm_heads. The patch embedding is a convolution there and has none.
-- The totals are 3,501,372,176 for pi0, including its expert's lm_head, which is in no checkpoint
-  published by openpi, and 450,046,176 for SmolVLA. "Trainable/Total" is
+  the unused lm_heads. The patch embedding is a convolution there and has no adapter.
+- The totals are 3,501,372,176 for pi0, including its expert's lm_head, which openpi's checkpoints
+  do not contain, and 450,046,176 for SmolVLA. "Trainable/Total" is
   adapters / (total + adapters).
-- LoRA-MoE has 4 experts of rank 32. AdaLoRA starts at rank 128, with one diagonal more than LoRA.
-- LoRA-SP is `LoRASP.paper()`, with a router of width 4, and leaves out the five linear maps around
-  the towers. 4 is the only constant width that fits both backbones; with those five maps 17.1 would
-  be 17.2. The released code, with a router as wide as the bank, gives 12.0 and 23.0 instead of 9.2
-  and 17.1.
+- LoRA-MoE has 4 experts of rank 32. AdaLoRA starts at rank 128 and has a diagonal that LoRA lacks.
+- LoRA-SP is `LoRASP.paper()`, with a router of width 4, and omits the five linear layers outside
+  the towers. 4 is the only constant width that fits both backbones; with those five layers 17.1
+  would be 17.2. The released code, with a router as wide as the bank, gives 12.0 and 23.0 instead
+  of 9.2 and 17.1.
 
-Both columns are complete. The tables also report active ranks and success rates, which are measured
-and cannot be counted; the success of LoRA-SP on pi0 differs between the tables (80 and 60 % for
+Both columns are complete. The tables also report active ranks and success rates, which are
+measured, not counted; the success of LoRA-SP on pi0 differs between the tables (80 and 60 % for
 opening the pot).
 """
 
@@ -33,7 +33,7 @@ from lorasp_jax.models.smolvla import SmolVLAConfig
 from lorasp_jax.peft import AdaLoRA, FullFineTuning, LoRA, LoRAMoE, LoRASP, Method
 
 Shapes = dict[str, tuple[int, ...]]
-"""Path -> [I, O], or [L, I, O] for a stack."""
+"""Path -> [I, O], or [L, I, O] for stacked layers."""
 
 STRATEGIES: dict[str, dict[str, Method]] = {
     "I": {
@@ -56,10 +56,10 @@ BACKBONES: dict[str, BackboneConfig] = {"π0": Pi0Config.base(), "SmolVLA": Smol
 
 
 def count(config: BackboneConfig, method: Method) -> Counts:
-    """Count trainable and total parameters as the paper does, from shapes, without allocating.
+    """Count trainable and total parameters as the paper does, from shapes alone.
 
     Args:
-        config: a backbone's sizes.
+        config: config of a backbone.
         method: an adapter method, or full fine-tuning.
     """
     shapes, total = linear_layers(config)
@@ -93,7 +93,7 @@ def linear_layers(config: BackboneConfig) -> tuple[Shapes, int]:
         if location.path != "vision/patch_embed"
     }
     shapes["language/lm_head"] = (config.language.width, config.vocabulary)
-    if isinstance(config, Pi0Config):  # tied to the embedding; the expert has its own
+    if isinstance(config, Pi0Config):  # tied to the embedding; the expert has one of its own
         shapes["action/lm_head"] = (config.action.width, config.vocabulary)
         total += config.action.width * config.vocabulary
     return shapes, total

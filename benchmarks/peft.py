@@ -1,15 +1,15 @@
-"""Cost of adapters: one dense layer, bare and with every method, forward and with gradients.
+"""Cost of adapters: a dense layer without and with every method, forward and with gradients.
 
     python -m benchmarks.peft --json peft.json
     python -m benchmarks.peft --tokens 1024 --shapes 256x2048 2048x256 --dtype float32   # on a CPU
 
 For each shape [I, O]: the frozen layer alone ("bare"), LoRA as usually written (`usual_lora`,
-automatic differentiation of x W + scale (x A) B), and this project's methods at rank R, with their
-losses. Gradients are those of training, with respect to the input and the adapter. Ratios are
-relative to the usual LoRA in the same run. Memory is that of the compiled program without its
-arguments. Then layers that share an input, "I:O,O,O", called one by one and together; finally the
-energy gate, compared with a copy of its scores. Inputs are made under jit, everything is warmed up
-twice, and ten calls are queued together.
+autodiff of x W + scale (x A) B), and this project's methods at rank R, with their losses. Gradients
+are with respect to the input and the adapter, as in training. Ratios are relative to the usual LoRA
+in the same run. Memory is that of the compiled program without its arguments. Then layers that
+share an input, "I:O,O,O", called one by one and grouped; finally the energy gate, compared with a
+copy of its scores. Inputs are created under jit, everything is warmed up twice, and ten calls are
+queued at once.
 """
 
 import argparse
@@ -30,9 +30,9 @@ from lorasp_jax.peft._shared_input import apply_shared_input
 
 SHAPES = ((2048, 16384), (16384, 2048), (2048, 2048), (1152, 4304))
 # Query, key and value of pi0's language model and vision tower; gate and up of a smaller MLP.
-TOGETHER = ((2048, (2048, 256, 256)), (1152, (1152, 1152, 1152)), (1024, (4096, 4096)))
+SHARED_INPUT = ((2048, (2048, 256, 256)), (1152, (1152, 1152, 1152)), (1024, (4096, 4096)))
 QUEUED = 10
-COPIES = 20  # of the gate per program: a single one is dominated by its launch
+COPIES = 20  # gates per program: a single one is dominated by its launch
 LOSS_WEIGHT = 1e-2
 
 Layer = Callable[[Any, jax.Array, Any], tuple[Any, Any]]
@@ -51,7 +51,7 @@ def usual_lora(params: Any, x: jax.Array, kernel: jax.Array) -> tuple[jax.Array,
 
 
 def layers(rank: int) -> Iterator[tuple[str, Layer, Any]]:
-    """Name, function and the method that makes its parameters."""
+    """Yield name, function and the method that creates its parameters."""
     yield "bare", bare, peft.LoRA(rank=1)
     yield "usual LoRA", usual_lora, peft.LoRA(rank=rank)
     for name in peft.names():
@@ -74,7 +74,7 @@ def make(name: str, rank: int) -> peft.Method:
 
 
 def inputs(method: peft.Method, shape: tuple[int, int], tokens: int, dtype: str) -> Any:
-    """Draw parameters, x [tokens, I], kernel [I, O] and the gradient of y, on the device."""
+    """Sample parameters, x [tokens, I], kernel [I, O] and the gradient of y, on the device."""
 
     @jax.jit
     def draw(key: jax.Array) -> Any:
@@ -88,33 +88,35 @@ def inputs(method: peft.Method, shape: tuple[int, int], tokens: int, dtype: str)
 
 
 def with_gradients(layer: Layer, params: Any, x: jax.Array, kernel: Any, g: Any) -> Any:
-    """Compute y and the gradients of x and the adapter, auxiliary losses included."""
+    """Compute y and the gradients with respect to x and the adapter, including auxiliary losses."""
 
     def run(params: Any, x: jax.Array) -> tuple[jax.Array, jax.Array]:
         y, losses = layer(params, x, kernel)
         return y, sum(losses.values(), jnp.zeros(()))
 
-    (y, loss), pull = jax.vjp(run, params, x)
-    return y, pull((g, jnp.full_like(loss, LOSS_WEIGHT)))
+    (y, loss), vjp = jax.vjp(run, params, x)
+    return y, vjp((g, jnp.full_like(loss, LOSS_WEIGHT)))
 
 
-def measure_together(
+def measure_shared_input(
     options: argparse.Namespace, d_in: int, d_outs: tuple[int, ...]
 ) -> Iterator[dict[str, Any]]:
-    """Measure layers that share an input, one by one and together."""
+    """Measure layers that share an input, one by one and grouped."""
     for name in ("lora", "lora_sp"):
         method = make(name, options.rank)
         drawn = [inputs(method, (d_in, d_out), options.tokens, options.dtype) for d_out in d_outs]
         params, xs, kernels, gradients = map(list, zip(*drawn, strict=True))
 
-        def apart(params: Any, x: jax.Array, kernels: Any, method: Any = method) -> Any:
+        def separate(params: Any, x: jax.Array, kernels: Any, method: Any = method) -> Any:
             return [method.apply(p, x, k) for p, k in zip(params, kernels, strict=True)]
 
-        def together(params: Any, x: jax.Array, kernels: Any, method: Any = method) -> Any:
-            return apply_shared_input([(method, *a) for a in zip(params, kernels, strict=True)], x)
+        def grouped(params: Any, x: jax.Array, kernels: Any, method: Any = method) -> Any:
+            return apply_shared_input(
+                [(method, *arrays) for arrays in zip(params, kernels, strict=True)], x
+            )
 
         seconds = []
-        for layers in (apart, together):
+        for layers in (separate, grouped):
             run = jax.jit(functools.partial(with_gradients, functools.partial(_summed, layers)))
             arguments = (params, xs[0], kernels, gradients)
             run = run.lower(*arguments).compile()
@@ -122,8 +124,8 @@ def measure_together(
         yield {
             "layers": f"{d_in}:{','.join(map(str, d_outs))}",
             "method": name,
-            "apart ms": 1e3 * seconds[0],
-            "together ms": 1e3 * seconds[1],
+            "separate ms": 1e3 * seconds[0],
+            "grouped ms": 1e3 * seconds[1],
             "ratio": seconds[1] / seconds[0],
         }
 
@@ -150,7 +152,7 @@ def measure(options: argparse.Namespace, shape: tuple[int, int]) -> Iterator[dic
         }
         if name == "usual LoRA":
             base = seconds
-        needed: Any = backward.memory_analysis()
+        memory: Any = backward.memory_analysis()
         yield {
             "shape": "x".join(map(str, shape)),
             "layer": name,
@@ -158,7 +160,7 @@ def measure(options: argparse.Namespace, shape: tuple[int, int]) -> Iterator[dic
             "fwd+bwd ms": 1e3 * seconds["both"],
             "fwd ratio": seconds["forward"] / base["forward"] if base else "",
             "ratio": seconds["both"] / base["both"] if base else "",
-            "MiB": (needed.temp_size_in_bytes + needed.output_size_in_bytes) / 2**20,
+            "MiB": (memory.temp_size_in_bytes + memory.output_size_in_bytes) / 2**20,
         }
 
 
@@ -167,8 +169,8 @@ def measure_gate(options: argparse.Namespace) -> dict[str, Any]:
     keys = jax.random.split(jax.random.key(0), COPIES)
     draw = jax.jit(jax.vmap(lambda key: jax.random.normal(key, (options.tokens, options.rank))))
     scores = [*jax.nn.softplus(draw(keys))]
-    gate = jax.jit(lambda many: [energy_gate(s, 0.9)[0] for s in many])
-    copy = jax.jit(lambda many: [-s for s in many])
+    gate = jax.jit(lambda scores: [energy_gate(s, 0.9)[0] for s in scores])
+    copy = jax.jit(lambda scores: [-s for s in scores])
     gated, copied = (best(lambda f=f: f(scores)) / COPIES for f in (gate, copy))
     return {
         "gate": f"{options.tokens}x{options.rank}",
@@ -183,20 +185,22 @@ def _shape(text: str) -> tuple[int, int]:
     return d_in, d_out
 
 
-def _several(text: str) -> tuple[int, tuple[int, ...]]:
+def _shared_input(text: str) -> tuple[int, tuple[int, ...]]:
     d_in, _, d_outs = text.partition(":")
     return int(d_in), tuple(map(int, d_outs.split(",")))
 
 
 def main() -> None:
-    """Measure, print, write."""
+    """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--shapes", nargs="+", type=_shape, default=SHAPES, metavar="IxO")
-    parser.add_argument("--together", nargs="+", type=_several, default=TOGETHER, metavar="I:O,O")
+    parser.add_argument(
+        "--together", nargs="+", type=_shared_input, default=SHARED_INPUT, metavar="I:O,O"
+    )
     parser.add_argument("--tokens", type=int, default=26112)
     parser.add_argument("--rank", type=int, default=128)
     parser.add_argument("--dtype", default="bfloat16")
-    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--json", type=Path, help="file for the results")
     options = parser.parse_args()
     console = Console(soft_wrap=True)
     results: dict[str, Any] = {"machine": machine("jax"), "rows": []}
@@ -208,7 +212,7 @@ def main() -> None:
         print_table(console, rows)
         results["rows"] += rows
     results["together"] = [
-        row for case in options.together for row in measure_together(options, *case)
+        row for case in options.together for row in measure_shared_input(options, *case)
     ]
     print_table(console, results["together"])
     results["gate"] = measure_gate(options)

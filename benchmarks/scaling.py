@@ -1,4 +1,4 @@
-"""Scaling of training to several devices of one host: LoRA-SP on all linear layers, random weights.
+"""Scaling of training over the devices of a host: LoRA-SP on all linear layers, random weights.
 
     python -m benchmarks.scaling --devices 1 2 4 --json scaling.json
     python -m benchmarks.scaling --devices 1 2 --sizes nano --batch 4 --rank 8 --dtype float32
@@ -36,31 +36,31 @@ def layouts(devices: list[int]) -> list[tuple[str, int]]:
 
 def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Yield one row per layout; all programs are compiled in parallel."""
-    each = options.batch or BATCH[options.size]
+    batch = options.batch or BATCH[options.size]
     config = backbones.sized(options.backbone, options, options.remat)
-    single = backbones.run_config(peft.LoRASP(rank=options.rank), ("all-linear",), each)
+    single = backbones.run_config(peft.LoRASP(rank=options.rank), ("all-linear",), batch)
 
     def compiled(layout: tuple[str, int]) -> backbones.Step:
         name, number = layout
         fsdp = number if name == "fsdp" else 1
         mesh = meshes.make_mesh(fsdp, jax.devices()[:number])
-        optim = dataclasses.replace(single.optim, batch_size=number * each)
+        optim = dataclasses.replace(single.optim, batch_size=number * batch)
         return backbones.Step(config, dataclasses.replace(single, optim=optim, fsdp=fsdp), mesh)
 
-    wanted, single_rate = layouts(options.devices), None
+    cases, single_rate = layouts(options.devices), None
     with ThreadPoolExecutor(options.threads) as pool:
-        drawn = pool.submit(backbones.arrays, config, single)
-        steps = dict(zip(wanted, pool.map(compiled, wanted), strict=True))
-    for name, number in wanted:
-        step = steps.pop((name, number)).load(*drawn.result()[1:])
-        rate = number * each / best(step, calls=options.calls)
+        arrays = pool.submit(backbones.arrays, config, single)
+        steps = dict(zip(cases, pool.map(compiled, cases), strict=True))
+    for name, number in cases:
+        step = steps.pop((name, number)).load(*arrays.result()[1:])
+        rate = number * batch / best(step, calls=options.calls)
         single_rate = single_rate or rate
         yield {
             "backbone": options.backbone,
             "size": options.size,
             "devices": number,
             "layout": name,
-            "batch": each,
+            "batch": batch,
             "samples/s": rate,
             "efficiency": rate / number / single_rate,
             "GiB": step.bytes / GIB,
@@ -68,7 +68,7 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def main() -> None:
-    """Measure, print, write."""
+    """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--backbone", default="pi0")
     parser.add_argument("--sizes", nargs="+", default=["small", "base"])

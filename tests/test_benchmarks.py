@@ -76,7 +76,7 @@ def test_tables_fit_a_terminal():
 
 
 def test_data_reading(tmp_path):
-    row = data.reading(tmp_path, 500, (4, 6), batch=8, batches=3)
+    row = data.read_cache(tmp_path, 500, (4, 6), batch=8, batches=3)
     assert (row["images"], row["batch"]) == ("6x4", 8)
     assert row["windows/s"] > 0
     cache = Cache(tmp_path / "4x6")
@@ -88,10 +88,10 @@ def test_data_reading(tmp_path):
 def test_data_import(tmp_path, codec, size, capfd):
     data.record(tmp_path / codec, 2, codec)
     assert not capfd.readouterr().err
-    row = data.importing(tmp_path, codec, 64)
+    row = data.import_dataset(tmp_path, codec, 64)
     assert row["stored as"] == "64x48"
     assert row["images/s"] == 2 * row["steps/s"]
-    assert data.decoding(tmp_path, codec)["kB/image"] == pytest.approx(size, rel=0.3)
+    assert data.decode(tmp_path, codec)["kB/image"] == pytest.approx(size, rel=0.3)
 
 
 @pytest.mark.slow
