@@ -1,4 +1,4 @@
-"""The two shells: drop-ins for nnx.Linear and nn.Dense, and what they report."""
+"""`Dense` and `LinenDense`, drop-ins for nnx.Linear and nn.Dense, and their aux."""
 
 import sys
 
@@ -18,7 +18,7 @@ METHOD = LoRASP(rank=8, hidden_width=4)
 
 
 class Net(nnx.Module):
-    """A stranger's model: it knows nothing of adapters and wants one result a layer."""
+    """A model written without adapters in mind, which expects one result per layer."""
 
     def __init__(self, method, rngs):
         self.first = Dense(5, 6, method=method, rngs=rngs)
@@ -48,8 +48,8 @@ def test_equals_nnx_linear(x):
     )
 
 
-def test_layers_of_one_input(x):
-    """Whatever the methods, and also where some have none: each as if it were called alone."""
+def test_layers_with_a_shared_input(x):
+    """Each layer gives the same result as alone, for any mix of methods and with no adapter."""
     methods = [LoRA(rank=2), None, METHOD, DoRA(rank=2), LoRA(rank=3)]
     mask = jnp.arange(4) != 1
     layers = [Dense(5, 6 + i, method=m, rngs=nnx.Rngs(i)) for i, m in enumerate(methods)]
@@ -61,8 +61,8 @@ def test_layers_of_one_input(x):
             layer.adapter.set_value(
                 jax.tree.map(lambda p, d=draw: p + d[: p.size].reshape(p.shape), params)
             )
-    found = dense_shared_input(x, [layer.arrays() for layer in layers], token_mask=mask)
-    for layer, (y, aux) in zip(layers, found, strict=True):
+    results = dense_shared_input(x, [layer.arrays() for layer in layers], token_mask=mask)
+    for layer, (y, aux) in zip(layers, results, strict=True):
         alone, expected = layer(x, token_mask=mask, return_aux=True)
         np.testing.assert_allclose(y, alone, rtol=1e-5, atol=1e-5)
         assert jax.tree.structure(aux) == jax.tree.structure(expected)
@@ -81,12 +81,12 @@ def test_linen_equals_nnx(x):
     layer = Dense(5, 6, method=METHOD, rngs=nnx.Rngs(0))
     layer.kernel.set_value(variables["params"]["kernel"])
     layer.adapter.set_value(adapter)
-    y, kept = jax.jit(lambda v, x: linen.apply(v, x, mutable=["intermediates"]))(variables, x)
+    y, state = jax.jit(lambda v, x: linen.apply(v, x, mutable=["intermediates"]))(variables, x)
     np.testing.assert_allclose(y, layer(x), rtol=1e-6)
-    ours, theirs = lorasp_jax.collect_aux(layer)[""], lorasp_jax.collect_aux(kept)[""]
+    ours, theirs = lorasp_jax.collect_aux(layer)[""], lorasp_jax.collect_aux(state)[""]
     np.testing.assert_array_equal(ours.active_rank, theirs.active_rank)
-    bare = nn.Dense(6).apply({"params": variables["params"]}, x)
-    assert jnp.abs(y - bare).max() > 0.1
+    base = nn.Dense(6).apply({"params": variables["params"]}, x)
+    assert jnp.abs(y - base).max() > 0.1
 
 
 def test_linen_adapts_inside_a_model(x):
@@ -97,13 +97,13 @@ def test_linen_adapts_inside_a_model(x):
 
     model = Outer()
     variables = jax.jit(model.init)(jax.random.key(0), x)
-    _, kept = jax.jit(lambda v: model.apply(v, x, mutable=["intermediates"]))(variables)
-    assert set(lorasp_jax.collect_aux(kept)) == {"LinenDense_0"}
+    _, state = jax.jit(lambda v: model.apply(v, x, mutable=["intermediates"]))(variables)
+    assert set(lorasp_jax.collect_aux(state)) == {"LinenDense_0"}
     with pytest.raises(ValueError, match="no adapted layer stored any aux"):
         lorasp_jax.collect_aux({"params": variables["params"]})
 
 
-def test_collect_aux_eagerly_and_once(net, x):
+def test_collect_aux_eagerly_only_once(net, x):
     net(x)
     aux = lorasp_jax.collect_aux(net)
     assert set(aux) == {"first", "last"}
@@ -128,7 +128,7 @@ def test_collect_aux_under_jit_and_grad(net, x):
     assert jnp.abs(first["router"]["w2"]).max() > 0
 
 
-def test_a_closed_over_model_stays_callable(net, x):
+def test_model_in_a_closure_is_callable(net, x):
     np.testing.assert_allclose(jax.jit(net.__call__)(x), net(x), rtol=1e-5)
     np.testing.assert_allclose(jax.jit(lambda net, x: net(x))(net, x), net(x), rtol=1e-5)
 
@@ -153,7 +153,7 @@ def test_full_fine_tuning_trains_the_layer_itself(x):
 
 
 def test_kernels_with_several_output_axes(x):
-    """An einsum kernel [I, N, H] is one map onto N·H outputs."""
+    """An einsum kernel [I, N, H] is a matrix with N·H outputs."""
     kernel = jax.random.normal(jax.random.key(1), (5, 2, 3))
     params, _ = METHOD.init(jax.random.key(2), kernel.reshape(5, 6))
     y, aux = jax.jit(dense, static_argnums=4)(x, kernel, jnp.ones((2, 3)), params, METHOD)
@@ -162,15 +162,15 @@ def test_kernels_with_several_output_axes(x):
 
 
 @pytest.mark.parametrize(
-    ("dtype", "kind", "expected"),
+    ("dtype", "param_dtype", "expected"),
     [(None, jnp.bfloat16, jnp.float32), (jnp.bfloat16, jnp.float32, jnp.bfloat16)],
 )
-def test_compute_type(x, dtype, kind, expected):
-    layer = Dense(5, 6, method=METHOD, dtype=dtype, param_dtype=kind, rngs=nnx.Rngs(0))
+def test_compute_dtype(x, dtype, param_dtype, expected):
+    layer = Dense(5, 6, method=METHOD, dtype=dtype, param_dtype=param_dtype, rngs=nnx.Rngs(0))
     assert jax.eval_shape(layer, x).dtype == expected
-    assert layer.kernel.get_value().dtype == kind
-    types = {leaf.dtype for leaf in jax.tree.leaves(layer.adapter.get_value())}
-    assert types == {jnp.dtype("float32")}
+    assert layer.kernel.get_value().dtype == param_dtype
+    dtypes = {leaf.dtype for leaf in jax.tree.leaves(layer.adapter.get_value())}
+    assert dtypes == {jnp.dtype("float32")}
 
 
 def test_wrong_input_width(net):
@@ -178,11 +178,11 @@ def test_wrong_input_width(net):
         net(jnp.ones((2, 7)))
 
 
-@pytest.mark.parametrize(("method", "most"), [(LoRA(rank=4), 50), (LoRASP(rank=4), 160)])
-def test_what_one_more_layer_adds_to_a_program(method, most):
-    """Lines of the lowered gradient: equal layers share what they are made of."""
+@pytest.mark.parametrize(("method", "limit"), [(LoRA(rank=4), 50), (LoRASP(rank=4), 160)])
+def test_program_size_per_layer(method, limit):
+    """Operations that each further layer adds to the lowered gradient: equal layers share code."""
 
-    def lines(depth):
+    def count_operations(depth):
         rngs = nnx.Rngs(0)
         model = nnx.List([Dense(8, 8, method=method, rngs=rngs) for _ in range(depth)])
         graphdef, adapters, frozen = nnx.split(model, AdapterParam, ...)
@@ -196,7 +196,7 @@ def test_what_one_more_layer_adds_to_a_program(method, most):
 
         return jax.jit(jax.grad(loss)).lower(adapters, jnp.ones((5, 8))).as_text().count(" = ")
 
-    assert (lines(6) - lines(3)) / 3 <= most
+    assert (count_operations(6) - count_operations(3)) / 3 <= limit
 
 
 @pytest.mark.parametrize("method", [LoRA(rank=2), LoRASP(rank=2, hidden_width=2)])
@@ -210,28 +210,28 @@ def test_what_one_more_layer_adds_to_a_program(method, most):
         (jnp.ones((2, 4)), jnp.ones(2), r"bool \[2\], got float32 \[2\]"),
     ],
 )
-def test_odd_inputs(method, x, mask, message):
+def test_invalid_inputs(method, x, mask, message):
     kernel = jnp.ones((4, 3))
     params, kernel = method.init(jax.random.key(0), kernel)
     with pytest.raises(ValueError, match=message):
         dense(x, kernel, None, params, method, token_mask=mask)
 
 
-def test_five_jumps_lead_from_a_layer_to_the_first_equation():
-    """A reader who follows the calls meets eq. (10) after four other functions."""
+def test_call_depth_from_a_layer_to_the_router():
+    """A reader who follows the calls from a layer reaches eq. (10) after five functions."""
     layer = Dense(3, 5, method=LoRASP(rank=7, hidden_width=3), rngs=nnx.Rngs(0))
-    passed = []
+    callers = []
 
     def profile(frame, event, _):
-        if event == "call" and frame.f_code is router_scores.__code__ and not passed:
+        if event == "call" and frame.f_code is router_scores.__code__ and not callers:
             while frame := frame.f_back:
                 own = frame.f_globals.get("__name__", "").startswith("lorasp_jax.")
                 if own and not frame.f_code.co_name.startswith("<"):
-                    passed.append(frame.f_code.co_name)
+                    callers.append(frame.f_code.co_name)
 
     sys.setprofile(profile)
     try:
         layer(jnp.ones((2, 3)))
     finally:
         sys.setprofile(None)
-    assert passed == ["bottleneck", "low_rank_matmul", "apply", "dense", "__call__"]
+    assert callers == ["bottleneck", "low_rank_matmul", "apply", "dense", "__call__"]

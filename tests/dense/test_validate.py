@@ -1,4 +1,4 @@
-"""Arguments of the adapters' deeper entries: what cannot be meant is one sentence."""
+"""Invalid arguments of lower-level functions raise one-sentence errors."""
 
 import re
 
@@ -38,7 +38,7 @@ def with_kernel(value):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        # methods alone
+        # methods
         (lambda: METHOD.init(0, KERNEL), "key must be a key such as jax.random.key(0), got 0"),
         (lambda: METHOD.init(nnx.Rngs(0), KERNEL), "key must be a key such as"),
         (
@@ -47,14 +47,14 @@ def with_kernel(value):
         ),
         (lambda: METHOD.apply(KERNEL, X, PARAMS), "a floating-point kernel [I, O], got dict"),
         (lambda: METHOD.apply({}, X, KERNEL), "lora for a kernel [5, 4] needs lora_a [5, 2]"),
-        # α/R of another rank would be the scale.
+        # The scale α/R would be that of a different rank.
         (
             lambda: LoRA(rank=3, alpha=2.0).apply(PARAMS, X, KERNEL),
             "lora for a kernel [5, 4] needs lora_a [5, 3], got (5, 2)",
         ),
         (lambda: LoRA(rank=3).delta(PARAMS, X), "needs lora_a [5, 3], got (5, 2)"),
         (lambda: METHOD.delta(PARAMS, [1.0]), "a floating-point array [...tokens, I], got list"),
-        # One number for three tokens would count three times.
+        # A mask of length 1 would broadcast to three tokens.
         (
             lambda: MOE.delta(MOE_PARAMS, X, token_mask=jnp.ones(1, bool)),
             "token_mask must be bool [3], got bool [1]",

@@ -1,4 +1,4 @@
-"""AdaLoRA against Hugging Face PEFT, and what its allocation promises."""
+"""AdaLoRA against Hugging Face PEFT, and properties of its rank allocation."""
 
 import dataclasses
 import json
@@ -16,13 +16,13 @@ LAYERS = ("lin.0", "lin.1", "lin.2")
 
 
 def layer(arrays, prefix, suffix=""):
-    """Parameters of a layer in our layout."""
+    """A layer's parameters in our layout."""
     a, b, e = (arrays[f"{prefix}.lora_{name}{suffix}"] for name in "ABE")
     return {"lora_a": jnp.array(a.T), "lora_b": jnp.array(b.T), "lora_e": jnp.array(e[:, 0])}
 
 
 def model(arrays, prefix):
-    """Parameters of the oracle's three layers."""
+    """Parameters of the three layers that PEFT trained."""
     return {name: {"adapter": layer(arrays, f"{prefix}/{name}")} for name in LAYERS}
 
 
@@ -32,19 +32,19 @@ def trace():
 
 
 @pytest.fixture(scope="module")
-def oracle(trace):
-    """The method with the oracle's schedule, and the number of steps."""
+def configured(trace):
+    """The method with PEFT's schedule, and the number of steps."""
     cfg = json.loads(str(trace["cfg"]))
     total = cfg["total_step"]
-    shares = {"warmup": cfg["tinit"] / total, "final": cfg["tfinal"] / total}
+    fractions = {"warmup": cfg["tinit"] / total, "final": cfg["tfinal"] / total}
     ranks = {"rank": cfg["init_r"], "target_rank": cfg["target_r"]}
-    return AdaLoRA(**ranks, **shares, alpha=cfg["lora_alpha"], interval=cfg["deltaT"]), total
+    return AdaLoRA(**ranks, **fractions, alpha=cfg["lora_alpha"], interval=cfg["deltaT"]), total
 
 
 @pytest.fixture(scope="module")
-def replay(trace, oracle):
-    """Parameters and allocation after each step on the oracle's gradients."""
-    method, total = oracle
+def replay(trace, configured):
+    """Parameters and optimizer state after each step on PEFT's recorded gradients."""
+    method, total = configured
     optimizer = method.transform(optax.sgd(0.05), total)
 
     @jax.jit
@@ -53,14 +53,14 @@ def replay(trace, oracle):
         return optax.apply_updates(params, updates), state
 
     params = model(trace, "init")
-    state, found = optimizer.init(params), []
+    state, history = optimizer.init(params), []
     for t in range(total):
         params, state = step(params, state, model(trace, f"grad/{t}"))
-        found.append((params, state))
-    return found
+        history.append((params, state))
+    return history
 
 
-def test_masks_and_values_of_every_step(trace, replay):
+def test_masks_and_values_at_every_step(trace, replay):
     checked = 0
     for t, (params, state) in enumerate(replay):
         for name, kept in zip(LAYERS, state.kept, strict=True):
@@ -74,7 +74,7 @@ def test_masks_and_values_of_every_step(trace, replay):
     assert checked == 156
 
 
-def test_end_of_training(trace, replay):
+def test_final_parameters(trace, replay):
     expected = model(trace, "final")
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6),
@@ -84,24 +84,24 @@ def test_end_of_training(trace, replay):
 
 
 @pytest.mark.parametrize("t", [0, 1, 30])
-def test_moving_means(trace, replay, t):
+def test_moving_averages(trace, replay, t):
     state = replay[t][1]
     for ours, name in ((state.importance, "ema_ipt"), (state.uncertainty, "ema_unc")):
-        for found, key in zip(ours, LAYERS, strict=True):
+        for actual, key in zip(ours, LAYERS, strict=True):
             expected = layer(trace, f"{name}/{t}/{key}")
             for leaf in expected:
-                np.testing.assert_allclose(found[leaf], expected[leaf], rtol=1e-4, atol=1e-9)
+                np.testing.assert_allclose(actual[leaf], expected[leaf], rtol=1e-4, atol=1e-9)
 
 
-def test_budgets(trace, oracle):
-    method, total = oracle
+def test_budgets(trace, configured):
+    method, total = configured
     begin, end = round(method.warmup * total), total - round(method.final * total)
-    found = ada_lora.budgets(24, 12, begin, end)
-    np.testing.assert_array_equal(found, trace["budget"][: end + 1])
+    actual = ada_lora.budgets(24, 12, begin, end)
+    np.testing.assert_array_equal(actual, trace["budget"][: end + 1])
     long = ada_lora.budgets(128 * 400, 60 * 400, 1000, 10_000)
     t = np.arange(1000, 10_001)
-    left = [1 - (int(step) - 1000) / 9000 for step in t]
-    assert long[t].tolist() == [int((128 - 60) * 400 * x**3 + 60 * 400) for x in left]
+    remaining = [1 - (int(step) - 1000) / 9000 for step in t]
+    assert long[t].tolist() == [int((128 - 60) * 400 * x**3 + 60 * 400) for x in remaining]
 
 
 def test_forward_and_orthogonality():
@@ -121,7 +121,7 @@ def test_forward_and_orthogonality():
     np.testing.assert_allclose(np.mean(penalties), arrays["orth_reg_mean"], rtol=1e-6)
 
 
-def test_unmasked_equals_lora():
+def test_equals_lora_without_pruning():
     key, x, kernel = jax.random.key(0), jnp.ones((3, 5)), jnp.ones((5, 7))
     method = AdaLoRA(rank=4, target_rank=2, alpha=6.0)
     params = method.init(key, kernel)[0] | {"lora_e": jnp.ones(4)}
@@ -131,7 +131,7 @@ def test_unmasked_equals_lora():
 
 
 def run(method, params, total, seed=0):
-    """Entries of e that are not 0 after each step, all layers together, on random gradients."""
+    """Train on random gradients; return the mask of nonzero e of all layers after each step."""
     optimizer = method.transform(optax.adam(1e-2), total)
 
     def step(carry, key):
@@ -152,10 +152,10 @@ def small(**fields):
     return AdaLoRA(**{"rank": 6, "target_rank": 2, "interval": 3} | fields)
 
 
-def test_rank_shrinks_to_the_target_and_stays():
+def test_rank_falls_to_the_target_and_stays():
     method = small()
-    params = {"one": method.init(jax.random.key(0), jnp.zeros((4, 5)))[0], "other": jnp.ones(3)}
-    params["two"] = method.init(jax.random.key(1), jnp.zeros((8, 3)))[0]
+    params = {"first": method.init(jax.random.key(0), jnp.zeros((4, 5)))[0], "weight": jnp.ones(3)}
+    params["second"] = method.init(jax.random.key(1), jnp.zeros((8, 3)))[0]
     (after, state), kept = run(method, params, 40)
     ranks = kept.sum(1)
     assert np.all(ranks[:4] == 12)
@@ -164,39 +164,39 @@ def test_rank_shrinks_to_the_target_and_stays():
     pruned = np.flatnonzero(ranks[:-1] > ranks[1:]) + 1
     assert len(pruned) > 3
     assert not np.any(pruned % 3 * (pruned != 28))
-    assert np.any(kept[1:] & ~kept[:-1])  # a pruned triplet trains on and can come back
-    assert not np.array_equal(after["other"], params["other"])  # the optimizer trains all else
+    assert np.any(kept[1:] & ~kept[:-1])  # pruned triplets keep training and can return
+    assert not np.array_equal(after["weight"], params["weight"])  # trained as usual
     assert int(state.step) == 40
 
 
-def test_stacked_layers_are_layers():
+def test_stacked_layers_share_the_budget():
     method = small()
-    one = method.init(jax.random.key(0), jnp.zeros((4, 5)))[0]
-    stacked = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), one)
+    layer = method.init(jax.random.key(0), jnp.zeros((4, 5)))[0]
+    stacked = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), layer)
     _, kept = run(method, {"stack": stacked}, 40)
     assert kept[-1].sum() == 2 * method.target_rank
     shaped = kept[-1].reshape(2, 6).sum(1)
     assert shaped.sum() == 4
 
 
-def test_no_pruning_where_nothing_is_to_prune():
+def test_target_equal_to_rank_prunes_nothing():
     _, kept = run(
         small(target_rank=6), {"a": small().init(jax.random.key(0), jnp.zeros((4, 5)))[0]}, 20
     )
     assert kept.all()
 
 
-def test_ties_at_the_threshold_go_too():
+def test_ties_at_the_threshold_are_pruned():
     scores = [jnp.array([3.0, 1.0]), jnp.array([1.0, 2.0])]
     kept = ada_lora._keep(scores, jnp.array(1))
     assert [k.tolist() for k in kept] == [[True, False], [False, True]]
 
 
-def test_half_the_rank_is_the_target_if_nothing_is_said():
+def test_default_target_is_half_the_rank():
     assert [AdaLoRA(rank=rank).final_rank for rank in (1, 2, 16)] == [1, 1, 8]
 
 
-def test_the_budget_that_lora_sp_used():
+def test_match_budget():
     assert AdaLoRA(rank=128).match_budget(75.6) == AdaLoRA(rank=128, target_rank=76)
 
 
@@ -211,18 +211,18 @@ def test_the_budget_that_lora_sp_used():
     ],
     ids=str,
 )
-def test_bad_fields(fields):
+def test_invalid_fields(fields):
     with pytest.raises(ValueError, match="got"):
         small(**fields)
 
 
-def test_orthogonal_parameters_have_a_gradient_of_zero():
+def test_orthogonal_parameters_have_zero_gradient():
     params = {"lora_a": jnp.eye(4, 2), "lora_b": jnp.eye(2, 3), "lora_e": jnp.ones(2)}
     gradient = jax.grad(lambda p: small(rank=2).penalty(p)["orthogonality"])(params)
     assert not any(np.any(leaf) for leaf in jax.tree.leaves(gradient))
 
 
-def test_an_optimizer_without_adalora():
+def test_optimizer_without_adalora_parameters():
     with pytest.raises(ValueError, match="contain no AdaLoRA adapter"):
         small().transform(optax.sgd(1.0), 40).init({"kernel": jnp.ones(3)})
 
@@ -232,7 +232,7 @@ def test_too_few_steps():
         small(warmup=0.2, final=0.6).transform(optax.sgd(1.0), 1)
 
 
-def test_gradients_and_parameters_agree():
+def test_initial_gradients_and_parameter_count():
     method = small()
     params, kernel = method.init(jax.random.key(0), jnp.ones((4, 5)))
     assert sum(leaf.size for leaf in jax.tree.leaves(params)) == (4 + 5 + 1) * 6

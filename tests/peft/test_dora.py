@@ -1,4 +1,4 @@
-"""DoRA against Hugging Face PEFT and against its formula written out."""
+"""DoRA against Hugging Face PEFT and against its formula."""
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +7,7 @@ import pytest
 
 from lorasp_jax import peft
 from lorasp_jax.peft.dora import DoRA
-from tests.peft.test_lora import SIDES, assert_close, assert_equals_hugging_face, load
+from tests.peft.test_lora import HF_NAMES, assert_close, assert_equals_hugging_face, load
 
 D_IN, D_OUT, RANK = 6, 10, 3
 METHOD = DoRA(rank=RANK, alpha=5.0)
@@ -16,7 +16,7 @@ X = jax.random.normal(jax.random.key(2), (2, 5, D_IN))
 
 
 def trained(method=METHOD, kernel=KERNEL):
-    """Parameters moved off their start: B and the magnitude too."""
+    """Parameters away from their initial values, including B and the magnitude."""
     params, _ = method.init(jax.random.key(3), kernel)
     keys = dict(zip(params, jax.random.split(jax.random.key(4), 3), strict=True))
     return {
@@ -26,23 +26,23 @@ def trained(method=METHOD, kernel=KERNEL):
 
 
 def test_equals_hugging_face():
-    names = SIDES | {"magnitude": "lora_magnitude_vector"}
+    names = HF_NAMES | {"magnitude": "lora_magnitude_vector"}
     golden, kernels, params, gradients = load("lora_dora", names)
     methods = [DoRA(rank=8, alpha=16)] * 3
     assert_equals_hugging_face(golden, methods, kernels, params, gradients)
-    for kernel, one in zip(kernels, params, strict=True):  # the recorded magnitudes are fresh ones
-        fresh = methods[0].init(jax.random.key(0), kernel)[0]
-        assert_close(fresh["magnitude"], one["magnitude"], 1e-6)
+    for kernel, recorded in zip(kernels, params, strict=True):  # with initial magnitudes
+        initial = methods[0].init(jax.random.key(0), kernel)[0]
+        assert_close(initial["magnitude"], recorded["magnitude"], 1e-6)
 
 
-def test_is_found_by_its_name():
+def test_find_and_create_by_name():
     assert peft.find("dora") is DoRA
     assert peft.create("dora", rank=4, rank_stabilized=True) == DoRA(4, rank_stabilized=True)
     assert METHOD.name == "dora"
 
 
-def test_starts_as_the_base():
-    """Equal to x @ kernel, with (I + O) R + O fp32 parameters."""
+def test_initially_equals_the_base():
+    """Initially x @ kernel, with (I + O) R + O fp32 parameters."""
     params, kernel = METHOD.init(jax.random.key(0), KERNEL)
     assert kernel is KERNEL
     assert sum(leaf.size for leaf in params.values()) == (D_IN + D_OUT) * RANK + D_OUT
@@ -53,7 +53,7 @@ def test_starts_as_the_base():
     np.testing.assert_allclose(METHOD.merge(params, KERNEL), KERNEL, rtol=1e-6)
 
 
-def test_starts_from_the_norms_over_the_input():
+def test_initial_magnitude_is_the_column_norm():
     kernel = jnp.array([[3.0, 0.0], [4.0, 2.0], [0.0, 0.0]], jnp.bfloat16)
     magnitude = METHOD.init(jax.random.key(0), kernel)[0]["magnitude"]
     np.testing.assert_array_equal(magnitude, [5, 2])
@@ -61,8 +61,8 @@ def test_starts_from_the_norms_over_the_input():
 
 
 @pytest.mark.parametrize("stabilized", [False, True])
-def test_equals_the_formula_with_a_constant_norm(stabilized):
-    """Forward and gradients of x (W + s A B) m / n, where n is a number and no function."""
+def test_formula_with_a_constant_norm(stabilized):
+    """Output and gradients of x (W + s A B) m / n with n a constant."""
     method = DoRA(rank=RANK, alpha=5.0, rank_stabilized=stabilized)
     params = trained(method)
     scale = 5 / RANK ** (0.5 if stabilized else 1)
@@ -86,18 +86,18 @@ def test_equals_the_formula_with_a_constant_norm(stabilized):
     jax.tree.map(lambda a, b: assert_close(a, b, 1e-5), actual, (expected, y))
 
 
-def test_the_norm_carries_no_gradient():
-    """With it, stretching a column would change nothing and have no gradient; without, it has."""
+def test_norm_has_no_gradient():
+    """Scaling a column of V does not change the output, but has a gradient if the norm has none."""
     params = trained() | {"lora_a": jnp.eye(D_IN, RANK)}
 
     def loss(params, kernel):
         return METHOD.apply(params, X, kernel)[0].sum()
 
-    kernel = jnp.zeros_like(KERNEL)  # V is scale A B alone: scaling B scales V
+    kernel = jnp.zeros_like(KERNEL)  # V = scale A B, so that scaling B scales V
     gradient = jax.grad(loss)(params, kernel)["lora_b"]
     assert np.abs((gradient * params["lora_b"]).sum(0)).min() > 1e-3
-    stretched = params | {"lora_b": 2 * params["lora_b"]}
-    np.testing.assert_allclose(loss(stretched, kernel), loss(params, kernel), rtol=1e-5)
+    scaled = params | {"lora_b": 2 * params["lora_b"]}
+    np.testing.assert_allclose(loss(scaled, kernel), loss(params, kernel), rtol=1e-5)
 
 
 def test_merge_equals_apply():
@@ -110,14 +110,14 @@ def test_merge_equals_apply():
     assert METHOD.merge(params, KERNEL.astype(jnp.bfloat16)).dtype == jnp.bfloat16
 
 
-def test_no_gradient_reaches_the_kernel():
+def test_kernel_has_no_gradient():
     params = trained()
     gradient = jax.grad(lambda kernel: METHOD.apply(params, X, kernel)[0].sum())(KERNEL)
     np.testing.assert_array_equal(gradient, 0)
 
 
-def test_keeps_low_precision():
-    """bf16 in, bf16 out over a bf16 base, fp32 gradients; close to the same in fp32."""
+def test_bfloat16():
+    """bf16 input and kernel give a bf16 output and fp32 gradients, close to those in fp32."""
     params = trained()
     x, kernel = X.astype(jnp.bfloat16), KERNEL.astype(jnp.bfloat16)
 
@@ -134,8 +134,8 @@ def test_keeps_low_precision():
     jax.tree.map(lambda a, b: assert_close(a, b, 0.03), gradients, expected_gradients)
 
 
-def test_the_factor_is_not_rounded_to_low_precision():
-    """In bf16 a factor of 1.003 would be 1 and every output stay as it was."""
+def test_factor_is_not_rounded_to_bfloat16():
+    """Rounded to bf16, a factor of 1.003 would become 1 and change no output."""
     method, kernel = DoRA(rank=1), jnp.ones((1, 1), jnp.bfloat16)
     params, _ = method.init(jax.random.key(0), kernel)
     x = jnp.linspace(1, 2, 129)[:, None].astype(jnp.bfloat16)
@@ -144,8 +144,8 @@ def test_the_factor_is_not_rounded_to_low_precision():
     assert (y > x).mean() > 0.5
 
 
-def test_a_zero_kernel_starts_at_zero_and_learns():
-    """Its columns have no direction, 0 / 0: the output is 0, and B then the magnitude move."""
+def test_zero_kernel_can_learn():
+    """Columns without direction (0 / 0) give 0. B learns first, then the magnitude."""
     kernel = jnp.zeros((D_IN, D_OUT))
     params, _ = METHOD.init(jax.random.key(0), kernel)
 
@@ -161,11 +161,11 @@ def test_a_zero_kernel_starts_at_zero_and_learns():
     assert jax.grad(loss, has_aux=True)(params)[0]["magnitude"].all()
 
 
-def test_needs_the_kernels_values():
+def test_requires_kernel_values():
     shape = jax.ShapeDtypeStruct((D_IN, D_OUT), jnp.float32)
     with pytest.raises(ValueError, match=r"from the kernel's values, got only the shape \(6, 10\)"):
         METHOD.init(jax.random.key(0), shape)
-    shapes, _ = jax.eval_shape(METHOD.init, jax.random.key(0), shape)  # there it is a tracer
+    shapes, _ = jax.eval_shape(METHOD.init, jax.random.key(0), shape)  # the kernel is a tracer here
     assert {name: leaf.shape for name, leaf in shapes.items()} == {
         "lora_a": (D_IN, RANK),
         "lora_b": (RANK, D_OUT),
@@ -178,6 +178,6 @@ def test_has_no_delta():
         METHOD.delta(trained(), X)
 
 
-def test_bad_rank():
+def test_invalid_rank():
     with pytest.raises(ValueError, match="rank must be at least 1, got 0"):
         DoRA(rank=0)

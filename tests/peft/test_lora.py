@@ -8,7 +8,7 @@ import pytest
 from lorasp_jax.peft import LoRA
 from tests import GOLDEN
 
-SIDES = {"lora_a": "lora_A", "lora_b": "lora_B"}
+HF_NAMES = {"lora_a": "lora_A", "lora_b": "lora_B"}
 CASES = [
     ("lora_r8", [LoRA(rank=8, alpha=16)] * 3),
     ("lora_rslora", [LoRA(rank=8, alpha=16, rank_stabilized=True)] * 3),
@@ -20,12 +20,12 @@ CASES = [
 
 
 def assert_close(actual, expected, relative):
-    """To the golden files' tolerance, which is relative to the largest value."""
+    """Compare with a tolerance relative to the largest expected value."""
     np.testing.assert_allclose(actual, expected, rtol=0, atol=relative * np.abs(expected).max())
 
 
 def load(case, names):
-    """A golden file; its kernels [I, O]; the adapters' parameters and gradients, by our names."""
+    """A golden file, its kernels [I, O], and the adapters' params and gradients in our layout."""
     with np.load(GOLDEN / f"{case}.npz") as file:
         golden = dict(file)
 
@@ -43,7 +43,7 @@ def load(case, names):
 
 
 def forward(x, golden, layer):
-    """The net with `layer(i, x)` in the place of x @ kernel i."""
+    """Apply the three-layer net with `layer(i, x)` instead of x @ kernels[i]."""
     for i in range(3):
         x = layer(i, x) + golden[f"base/lin.{i}.bias"]
         x = jnp.tanh(x) if i < 2 else x
@@ -51,7 +51,7 @@ def forward(x, golden, layer):
 
 
 def assert_equals_hugging_face(golden, methods, kernels, params, gradients):
-    """Output, loss, every gradient, scales and merged weights of one golden file."""
+    """Compare output, loss, gradients, scales and merged weights with a golden file."""
 
     def loss(params):
         y = forward(golden["x"], golden, lambda i, x: methods[i].apply(params[i], x, kernels[i])[0])
@@ -70,15 +70,15 @@ def assert_equals_hugging_face(golden, methods, kernels, params, gradients):
 
 @pytest.mark.parametrize(("case", "methods"), CASES)
 def test_equals_hugging_face(case, methods):
-    golden, kernels, params, gradients = load(case, SIDES)
+    golden, kernels, params, gradients = load(case, HF_NAMES)
     assert_equals_hugging_face(golden, methods, kernels, params, gradients)
     for i in range(3):
         delta, _ = methods[i].delta(params[i], jnp.eye(len(kernels[i])))
         assert_close(delta, golden[f"delta_weight/{i}"].T, 1e-5)
 
 
-def test_initialisation_and_count():
-    """A is uniform in ±1/√I, B zero: (I + O) R parameters."""
+def test_initialization_and_parameter_count():
+    """A is uniform in ±1/√I and B zero, with (I + O) R parameters."""
     params, _ = LoRA(rank=4).init(jax.random.key(0), jax.ShapeDtypeStruct((900, 50), jnp.float32))
     assert sum(leaf.size for leaf in jax.tree.leaves(params)) == (900 + 50) * 4
     bound = 1 / 30
@@ -87,6 +87,6 @@ def test_initialisation_and_count():
     assert not params["lora_b"].any()
 
 
-def test_bad_rank():
+def test_invalid_rank():
     with pytest.raises(ValueError, match="rank must be at least 1, got 0"):
         LoRA(rank=0)

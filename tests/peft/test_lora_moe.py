@@ -1,4 +1,4 @@
-"""LoRA-MoE: router losses against Hugging Face, routing against plain loops, identities."""
+"""LoRA-MoE: losses against Hugging Face, routing against loops, special cases."""
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ def x():
 
 
 def arrays(experts=EXPERTS, rank=RANK):
-    """Parameters that are nowhere zero, with a router that makes up its mind."""
+    """Nonzero parameters, with a router whose probabilities differ clearly."""
     keys = jax.random.split(jax.random.key(1), 3)
     shapes = {
         "lora_a": (D_IN, experts * rank),
@@ -38,9 +38,9 @@ def arrays(experts=EXPERTS, rank=RANK):
 
 
 def probabilities_of(x, router):
-    """Softmax of x @ router in float64, by hand."""
-    powers = np.exp(np.asarray(x, np.float64) @ np.asarray(router, np.float64))
-    return powers / powers.sum(-1, keepdims=True)
+    """Softmax of x @ router in float64."""
+    exponentials = np.exp(np.asarray(x, np.float64) @ np.asarray(router, np.float64))
+    return exponentials / exponentials.sum(-1, keepdims=True)
 
 
 def expert_deltas(params, x, rank=RANK):
@@ -51,7 +51,7 @@ def expert_deltas(params, x, rank=RANK):
 
 
 def test_losses_equal_hugging_face():
-    """Theirs averages the balance of single sequences, ours pools: 1.0865 against 1.0253."""
+    """Hugging Face averages the balance loss over sequences; ours pools (1.0865 and 1.0253)."""
     with np.load(GOLDEN) as file:
         logits, balance, z = jnp.asarray(file["logits"]), file["lb"], file["z"]
     probabilities = jax.nn.softmax(logits)
@@ -61,8 +61,8 @@ def test_losses_equal_hugging_face():
     np.testing.assert_allclose(z_loss(logits, None), z, rtol=1e-6)
 
 
-def test_balance_is_between_one_and_the_experts():
-    """Tokens spread evenly give 1, all on one expert E; f has no gradient, P's is E f / n."""
+def test_balance_loss_range_and_gradient():
+    """1 for evenly spread tokens, E if all use one expert; f has no gradient, P's is E f / n."""
     spread = jnp.eye(EXPERTS) * 0.9 + 0.1 / EXPERTS
     assert balance_loss(spread, None) == pytest.approx(1)
     assert balance_loss(jnp.eye(EXPERTS)[jnp.zeros(9, int)], None) == pytest.approx(EXPERTS)
@@ -102,17 +102,17 @@ def test_top1_uses_one_expert(method, x):
 
 
 @pytest.mark.parametrize("method", ALL, ids=lambda m: f"{m.routing}-{m.gate_gradient}")
-def test_the_task_teaches_the_router_unless_top1_is_hard(method, x):
+def test_router_gets_a_task_gradient_unless_top1_is_hard(method, x):
     def task(params):
         return jnp.sum(method.delta(params, x)[0] ** 2)
 
     def router_losses(params):
         return sum(method.delta(params, x)[1].losses.values())
 
-    taught = jnp.abs(jax.grad(task)(arrays())["router"]).max() > 1e-3
-    assert taught == (method is not TOP1[0])
+    has_task_gradient = jnp.abs(jax.grad(task)(arrays())["router"]).max() > 1e-3
+    assert has_task_gradient == (method is not TOP1[0])
     assert jnp.abs(jax.grad(router_losses)(arrays())["router"]).max() > 1e-3
-    if not taught:
+    if not has_task_gradient:
         np.testing.assert_array_equal(jax.grad(task)(arrays())["router"], 0)
 
 
@@ -128,20 +128,20 @@ def test_one_expert_equals_lora(fields, x):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_lora_sp_of_the_paper_starts_as_a_weighted_mixture(seed, x):
-    """At η = 1 and W2 = its 0/1 start they are one map, whatever the bank and the router hold."""
+def test_initial_paper_lora_sp_equals_weighted_moe(seed, x):
+    """They are equal for η = 1 and the initial 0/1 matrix W2, for any bank and W1."""
     sp = LoRASP.paper(rank=EXPERTS * RANK, energy_target=1.0)
-    start, _ = sp.init(jax.random.key(seed), jax.ShapeDtypeStruct((D_IN, D_OUT), jnp.float32))
-    bank = start["bank"] | {"u": jax.random.normal(jax.random.key(seed), (sp.rank, D_OUT))}
-    w1 = start["router"]["w1"] * 3.0**seed
-    theirs, _ = sp.delta({"bank": bank, "router": start["router"] | {"w1": w1}}, x)
+    initial, _ = sp.init(jax.random.key(seed), jax.ShapeDtypeStruct((D_IN, D_OUT), jnp.float32))
+    bank = initial["bank"] | {"u": jax.random.normal(jax.random.key(seed), (sp.rank, D_OUT))}
+    w1 = initial["router"]["w1"] * 3.0**seed
+    theirs, _ = sp.delta({"bank": bank, "router": initial["router"] | {"w1": w1}}, x)
     params = {"lora_a": bank["v"], "lora_b": bank["u"], "router": w1}
     moe = LoRAMoE(EXPERTS, RANK)
     assert moe.scale == sp.scale
     np.testing.assert_allclose(moe.delta(params, x)[0], theirs, rtol=1e-5, atol=1e-6)
 
 
-def test_initialisation_and_count():
+def test_initialization_and_parameter_count():
     """(I + O) E R + I E parameters; A and the router uniform in ±1/√I, B zero."""
     kernel = jax.ShapeDtypeStruct((400, 30), jnp.float32)
     params, _ = LoRAMoE(EXPERTS, 8).init(jax.random.key(0), kernel)
@@ -154,24 +154,24 @@ def test_initialisation_and_count():
 
 
 @pytest.mark.parametrize("method", ALL, ids=lambda m: f"{m.routing}-{m.gate_gradient}")
-def test_padding_has_no_influence(method, x):
-    """Losses and their gradients are those of the valid tokens by themselves."""
+def test_padding_is_ignored(method, x):
+    """Losses and their gradients equal those of the valid tokens alone."""
     mask = jnp.arange(7)[None] < jnp.array([[3], [7], [0]])
 
     def losses(params, x, mask):
         aux = method.delta(params, x, token_mask=mask)[1]
         return sum(aux.losses.values()), aux.losses
 
-    both = jax.value_and_grad(losses, has_aux=True)
-    alone = both(arrays(), x[mask], None)
+    losses_and_grads = jax.value_and_grad(losses, has_aux=True)
+    alone = losses_and_grads(arrays(), x[mask], None)
     for garbage in (1e3, -1e3, 1e8):
-        padded = both(arrays(), jnp.where(mask[..., None], x, garbage), mask)
+        padded = losses_and_grads(arrays(), jnp.where(mask[..., None], x, garbage), mask)
         for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(padded), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
 
 
-def test_nothing_but_padding(x):
-    """Losses and their gradients are zero, not NaN."""
+def test_padding_only(x):
+    """Losses and their gradients are 0, not NaN."""
     mask = jnp.zeros(x.shape[:-1], bool)
 
     def losses(params):
@@ -182,8 +182,8 @@ def test_nothing_but_padding(x):
     assert all(not leaf.any() for leaf in jax.tree.leaves(gradients))
 
 
-def test_logits_keep_fp32_sums_in_low_precision(x):
-    """A bf16 input gives a bf16 delta, and losses as near as the rounding of its inputs allows."""
+def test_logits_are_fp32_for_bfloat16_inputs(x):
+    """The delta is bf16, and the losses are exact for the rounded inputs."""
     low = x.astype(jnp.bfloat16)
     delta, aux = ALL[0].delta(arrays(), low)
     assert delta.dtype == jnp.bfloat16
@@ -194,12 +194,12 @@ def test_logits_keep_fp32_sums_in_low_precision(x):
     expected = balance_loss(jax.nn.softmax(logits), None)
     np.testing.assert_allclose(aux.losses["balance"], expected, rtol=1e-5)
     task = jax.grad(lambda params, x: TOP1[1].delta(params, x)[0].sum(), argnums=(0, 1))
-    of_params, of_x = task(arrays(), low)
-    assert {leaf.dtype for leaf in jax.tree.leaves(of_params)} == {jnp.dtype("float32")}
-    assert of_x.dtype == jnp.bfloat16
+    param_grads, x_grad = task(arrays(), low)
+    assert {leaf.dtype for leaf in jax.tree.leaves(param_grads)} == {jnp.dtype("float32")}
+    assert x_grad.dtype == jnp.bfloat16
 
 
-def test_merge_says_what_to_do_instead():
+def test_merge_suggests_an_alternative():
     with pytest.raises(ValueError, match=r"depends on the input .* keep the adapter"):
         ALL[0].merge(arrays(), jnp.zeros((D_IN, D_OUT)))
 
@@ -214,6 +214,6 @@ def test_merge_says_what_to_do_instead():
         ({"gate_gradient": "switch"}, "'switch' needs routing 'top1', got 'weighted'"),
     ],
 )
-def test_bad_fields(fields, message):
+def test_invalid_fields(fields, message):
     with pytest.raises(ValueError, match=message):
         LoRAMoE(**fields)

@@ -1,4 +1,4 @@
-"""The public code's rule: its gate against recorded ranks, its losses against plain NumPy."""
+"""The public code's variant: gate against recorded ranks, losses against NumPy."""
 
 import fractions
 
@@ -24,7 +24,7 @@ def x():
 
 
 def arrays(method):
-    """Parameters with U and the projection off their starts, which makes scores negative."""
+    """Parameters with U and W2 away from their initial values, so that some scores are negative."""
     kernel = jax.ShapeDtypeStruct((D_IN, D_OUT), jnp.float32)
     params, _ = method.init(jax.random.key(1), kernel)
     params["bank"]["u"] = jax.random.normal(jax.random.key(2), (RANK, D_OUT))
@@ -33,7 +33,7 @@ def arrays(method):
     return params
 
 
-def by_hand(params, x, scale, target=0.9):
+def numpy_layer(params, x, scale, target=0.9):
     """y, scores, k and losses in NumPy float64, token by token."""
     w = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), params)
     y, scores, masks = [], [], []
@@ -41,10 +41,10 @@ def by_hand(params, x, scale, target=0.9):
         s = token @ w["router"]["w1"]
         if "w2" in w["router"]:
             s = np.exp(s) / np.exp(s).sum() @ w["router"]["w2"]
-        total, run, mask = (s**2).sum(), 0.0, np.zeros(RANK, bool)
+        total, energy, mask = (s**2).sum(), 0.0, np.zeros(RANK, bool)
         for n, i in enumerate(np.argsort(-s, kind="stable")):
-            run += s[i] ** 2
-            if n and run > target * total:
+            energy += s[i] ** 2
+            if n and energy > target * total:
                 break
             mask[i] = True
         y.append(scale * (token @ w["bank"]["v"] * s * mask) @ w["bank"]["u"])
@@ -53,35 +53,35 @@ def by_hand(params, x, scale, target=0.9):
     s, mask = np.array(scores), np.array(masks)
     gates = np.exp(np.where(mask, s, 0))
     gates /= gates.sum(1, keepdims=True)
-    first = np.bincount(gates.argmax(1), minlength=RANK) / len(s)
+    top_fraction = np.bincount(gates.argmax(1), minlength=RANK) / len(s)
     lse = np.clip(np.log(np.exp(s).sum(1)), -1, 10)
     losses = {
         "spectral": 1 - (s**2 * mask).sum() / (s**2).sum(),
-        "balance": RANK * (first * gates.mean(0)).sum(),
+        "balance": RANK * (top_fraction * gates.mean(0)).sum(),
         "z": np.log1p(lse).mean(),
     }
     return np.array(y), s, mask, losses
 
 
-def test_ranks_of_the_recorded_rule():
+def test_recorded_ranks():
     golden = np.load(GOLDEN / "energy_gate_exact.npz")
     gate = jax.jit(release.release_gate)
     for eta, expected in zip(golden["etas"], golden["k_authors_rule"], strict=True):
         eta = float(fractions.Fraction(eta))
         if eta == 1:
-            continue  # everything, up to the rounding of a running sum
-        found = np.asarray(gate(golden["scores"], eta).sum(-1))
+            continue  # keeps all, up to the rounding of a running sum
+        actual = np.asarray(gate(golden["scores"], eta).sum(-1))
         energy = np.square(golden["scores"].astype(np.float64))
         ordered = np.cumsum(-np.sort(-energy, axis=-1), axis=-1)
-        # Exact where squares exist in fp32 and no share of the energy is within rounding of η.
+        # Exact if the squares are in fp32 range and no energy share is within rounding of η.
         gap = np.abs(ordered / np.maximum(ordered[:, -1:], 1e-300) - eta).min(-1)
-        plain = (gap > 1e-5) & (ordered[:, -1] > 1e-20) & (ordered[:, -1] < 1e30)
-        assert plain.sum() > 400
-        np.testing.assert_array_equal(found[plain], expected[plain])
+        exact = (gap > 1e-5) & (ordered[:, -1] > 1e-20) & (ordered[:, -1] < 1e30)
+        assert exact.sum() > 400
+        np.testing.assert_array_equal(actual[exact], expected[exact])
 
 
-def test_falls_short_of_the_target_as_published():
-    """No token reaches η with signed random scores, so the spectral loss exceeds 1 - η."""
+def test_kept_energy_stays_below_the_target():
+    """With random signed scores no token exceeds η, so that the spectral loss exceeds 1 - η."""
     scores = jax.random.normal(jax.random.key(0), (4000, 128))
     mask = release.release_gate(scores, 0.9)
     energy = (scores**2 * mask).sum(-1) / (scores**2).sum(-1)
@@ -90,10 +90,10 @@ def test_falls_short_of_the_target_as_published():
 
 
 @pytest.mark.parametrize("method", METHODS, ids=["linear", "projection"])
-def test_equals_the_rule_by_hand(method, x):
+def test_equals_numpy(method, x):
     params = arrays(method)
     delta, aux = jax.jit(method.delta)(params, x)
-    y, scores, mask, losses = by_hand(params, x, method.scale)
+    y, scores, mask, losses = numpy_layer(params, x, method.scale)
     assert (scores < 0).any()
     np.testing.assert_allclose(delta.reshape(-1, D_OUT), y, rtol=1e-4, atol=1e-4)
     np.testing.assert_array_equal(aux.active_rank.ravel(), mask.sum(1))
@@ -105,32 +105,34 @@ def test_equals_the_rule_by_hand(method, x):
 
 
 @pytest.mark.parametrize("method", METHODS, ids=["linear", "projection"])
-def test_gradients_are_those_of_the_rule(method, x):
-    """Central differences of the hand-made losses, whose masks do not change on the way."""
+def test_gradients_equal_numpy_differences(method, x):
+    """Against central differences of the NumPy losses, over which the masks do not change."""
     params = arrays(method)
 
     def total(params):
         y, aux = method.delta(params, x)
         return jnp.sum(y**2) / 100 + sum(aux.losses.values())
 
-    def by_difference(params):
-        y, _, mask, losses = by_hand(params, x, method.scale)
+    def numpy_total(params):
+        y, _, mask, losses = numpy_layer(params, x, method.scale)
         return (y**2).sum() / 100 + sum(losses.values()), mask
 
     gradient = jax.jit(jax.grad(total))(params)
-    step = jax.tree.map(lambda leaf: np.random.default_rng(0).normal(size=leaf.shape), params)
+    direction = jax.tree.map(lambda leaf: np.random.default_rng(0).normal(size=leaf.shape), params)
     ends = [
-        jax.tree.map(lambda p, d: np.float64(p) + d, params, jax.tree.map(sign, step))
-        for sign in (lambda d: 1e-4 * d, lambda d: -1e-4 * d)
+        jax.tree.map(lambda p, d: np.float64(p) + d, params, jax.tree.map(scale, direction))
+        for scale in (lambda d: 1e-4 * d, lambda d: -1e-4 * d)
     ]
-    (plus, mask), (minus, other) = map(by_difference, ends)
-    np.testing.assert_array_equal(mask, other)
-    slope = sum(jax.tree.leaves(jax.tree.map(lambda g, d: float((g * d).sum()), gradient, step)))
+    (plus, mask), (minus, minus_mask) = map(numpy_total, ends)
+    np.testing.assert_array_equal(mask, minus_mask)
+    slope = sum(
+        jax.tree.leaves(jax.tree.map(lambda g, d: float((g * d).sum()), gradient, direction))
+    )
     assert slope == pytest.approx((plus - minus) / 2e-4, rel=2e-2)
 
 
 @pytest.mark.parametrize("method", mostly_slow(METHODS, METHODS[:1]), ids=["linear", "projection"])
-def test_padding_stays_out(method, x):
+def test_padding_is_ignored(method, x):
     mask = jnp.arange(6)[None] < jnp.array([[4], [1]])
     params = arrays(method)
     _, padded = method.delta(params, jnp.where(mask[..., None], x, 1e3), token_mask=mask)
@@ -143,8 +145,8 @@ def test_padding_stays_out(method, x):
         np.testing.assert_allclose(a, b, rtol=1e-5)
 
 
-def test_the_z_loss_is_minus_infinity_at_its_end():
-    """A flaw of the rule that parity keeps."""
+def test_z_loss_is_minus_infinity_at_the_clip():
+    """A flaw of the public code, kept for parity."""
     scores = jnp.full((1, 4), -9.0)
     losses = release.release_losses(scores, scores < 0, jnp.ones(1, bool))
     assert losses["z"] == -jnp.inf
@@ -159,6 +161,6 @@ def test_the_z_loss_is_minus_infinity_at_its_end():
         ({"granularity": "layer"}, "lora_sp_release has no field 'granularity'"),
     ],
 )
-def test_bad_fields(fields, message):
+def test_invalid_fields(fields, message):
     with pytest.raises(ValueError, match=message):
         LoRASPRelease(**fields)

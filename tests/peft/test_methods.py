@@ -1,4 +1,4 @@
-"""Laws that hold for every adapter method; a new file in `peft/` is found and tested by itself."""
+"""Properties of every adapter method. New files in `peft/` are tested automatically."""
 
 import dataclasses
 import functools
@@ -10,19 +10,19 @@ import pytest
 
 from lorasp_jax import peft
 
-D_IN, D_OUT, RANK = 6, 10, 12  # a rank above both sides
+D_IN, D_OUT, RANK = 6, 10, 12  # the rank exceeds both widths
 INPUT_DEPENDENT = (
     peft.LoRASP,
     peft.LoRASPRelease,
     peft.LoRAMoE,
-)  # cannot be merged; every other method must be
+)  # cannot be merged, unlike every other method
 SMALL = {
     "rank": RANK,
     "target_rank": 6,
     "hidden_width": 4,
     "alpha": 5.0,
     "experts": 2,
-}  # alpha unlike the rank
+}  # alpha differs from the rank
 
 
 def small(name):
@@ -62,7 +62,7 @@ def initial(method, key, kernel):
 
 @functools.partial(jax.jit, static_argnums=0)
 def trained(method, kernel):
-    """Parameters moved off their start, so that nothing is zero any more."""
+    """Parameters away from their initial values, so that none is zero."""
     params, _ = method.init(jax.random.key(3), kernel)
     leaves, structure = jax.tree.flatten(params)
     keys = jax.random.split(jax.random.key(4), len(leaves))
@@ -70,7 +70,7 @@ def trained(method, kernel):
     return jax.tree.map(jnp.add, params, jax.tree.unflatten(structure, noise))
 
 
-def test_starts_as_the_base(method, kernel, x):
+def test_initially_equals_the_base(method, kernel, x):
     params = initial(method, jax.random.key(0), kernel)
     y, _ = apply(method, params, x, kernel)
     np.testing.assert_allclose(y, x @ kernel, rtol=1e-5, atol=1e-5)
@@ -79,8 +79,8 @@ def test_starts_as_the_base(method, kernel, x):
 
 
 @pytest.mark.parametrize("size", [1e15, 1e25, 1e35])
-def test_huge_inputs_leave_the_base_as_it_is(method, kernel, x, size):
-    """Where the bare layer is finite, so are the adapted one, its losses and its gradients."""
+def test_huge_inputs(method, kernel, x, size):
+    """If the base layer's output is finite, so are the adapted output, losses and gradients."""
     params = initial(method, jax.random.key(0), kernel)
 
     @jax.jit
@@ -95,9 +95,9 @@ def test_huge_inputs_leave_the_base_as_it_is(method, kernel, x, size):
     assert jnp.isfinite(y).all()
 
 
-def test_init_depends_on_key_and_shape_alone(method, kernel):
+def test_init_depends_only_on_key_and_shape(method, kernel):
     if not method.additive:
-        pytest.skip("starts from the kernel's values")
+        pytest.skip("initialized from the kernel's values")
     params = initial(method, jax.random.key(0), kernel)
     shape = jax.ShapeDtypeStruct(kernel.shape, jnp.bfloat16)
     again = jax.jit(lambda key: method.init(key, shape)[0])(jax.random.key(0))
@@ -123,7 +123,7 @@ def test_apply_is_base_plus_delta(method, kernel, x):
     assert all(v.shape == () and v.dtype == jnp.float32 for v in aux.losses.values())
 
 
-def test_merge_equals_forward_or_names_the_ways_out(method, kernel, x):
+def test_merge_equals_apply_or_suggests_an_alternative(method, kernel, x):
     params = trained(method, kernel)
     if isinstance(method, INPUT_DEPENDENT):
         with pytest.raises(ValueError, match=r"cannot be merged .* (distill it|keep the adapter)"):
@@ -134,8 +134,8 @@ def test_merge_equals_forward_or_names_the_ways_out(method, kernel, x):
     assert method.merge(params, kernel.astype(jnp.bfloat16)).dtype == jnp.bfloat16
 
 
-def test_keeps_low_precision(method, kernel, x):
-    """bf16 in, bf16 out, over a bf16 base; adapters, statistics and gradients stay fp32."""
+def test_bfloat16(method, kernel, x):
+    """bf16 input and kernel give a bf16 output; parameters, aux and gradients stay fp32."""
     params = initial(method, jax.random.key(0), kernel)
 
     def loss(params, x, kernel):
@@ -144,27 +144,27 @@ def test_keeps_low_precision(method, kernel, x):
         assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(aux))
         return y.sum()
 
-    low = (x.astype(jnp.bfloat16), kernel.astype(jnp.bfloat16))
-    gradients = jax.eval_shape(jax.grad(loss), params, *low)
+    half = (x.astype(jnp.bfloat16), kernel.astype(jnp.bfloat16))
+    gradients = jax.eval_shape(jax.grad(loss), params, *half)
     assert {leaf.dtype for leaf in jax.tree.leaves(gradients)} == {jnp.dtype("float32")}
 
 
 def test_transformations_agree(method, kernel, x):
     params = trained(method, kernel)
 
-    def one(params, x):
+    def loss(params, x):
         y, aux = method.apply(params, x, kernel)
         return jnp.sum(y**2) + sum(aux.losses.values()), y
 
     @jax.jit
-    def all_ways(params, x):
-        gradient = jax.grad(one, has_aux=True)
+    def all_transformations(params, x):
+        gradient = jax.grad(loss, has_aux=True)
         scanned = jax.lax.scan(lambda _, row: (None, gradient(params, row)), None, x)[1]
         mapped = jax.vmap(gradient, in_axes=(None, 0))(params, x)
-        remade = jax.vmap(jax.grad(jax.checkpoint(one), has_aux=True), (None, 0))(params, x)
-        return scanned, mapped, remade
+        remat = jax.vmap(jax.grad(jax.checkpoint(loss), has_aux=True), (None, 0))(params, x)
+        return scanned, mapped, remat
 
-    scanned, *others = all_ways(params, x)
+    scanned, *others = all_transformations(params, x)
     for other in others:
         for a, b in zip(jax.tree.leaves(scanned), jax.tree.leaves(other), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4 * float(jnp.abs(a).max()))
@@ -172,8 +172,8 @@ def test_transformations_agree(method, kernel, x):
     np.testing.assert_allclose(scanned[1], eager, rtol=1e-4, atol=1e-4)
 
 
-def test_padding_has_no_influence(method, kernel, x):
-    """Losses, gradients and statistics over valid tokens do not see what padding holds."""
+def test_padding_is_ignored(method, kernel, x):
+    """Losses, gradients and statistics over valid tokens do not depend on padding."""
     params = trained(method, kernel)
     mask = jnp.arange(5)[None] < jnp.array([[3], [4]])
 
@@ -191,7 +191,7 @@ def test_padding_has_no_influence(method, kernel, x):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
 
 
-def test_needs_a_matrix(method):
+def test_requires_a_matrix(method):
     if not method.trains_base:
         with pytest.raises(
             ValueError, match=r"needs a floating-point kernel \[I, O\], got float32 \[2, 3, 4\]"
@@ -199,7 +199,7 @@ def test_needs_a_matrix(method):
             method.init(jax.random.key(0), jnp.zeros((2, 3, 4)))
 
 
-def test_methods_are_found_by_file_name(method):
+def test_create_by_file_name(method):
     assert peft.create(method.name) == type(method)()
     assert hash(method) == hash(dataclasses.replace(method))
 

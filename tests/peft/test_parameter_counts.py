@@ -1,4 +1,4 @@
-"""Parameters of one adapted layer against the formulas, for every method and preset."""
+"""Parameter count of an adapted layer against its formula, for every method and preset."""
 
 import jax
 import jax.numpy as jnp
@@ -20,19 +20,19 @@ I, O = 24, 40
 """d_in, d_out."""
 
 TABLE = [
-    # LoRA and what it is initialised with: A and B.
+    # LoRA with each initialization: A and B.
     (LoRA(), 128 * (I + O)),
     (LoRA(rank=7, rank_stabilized=True), 7 * (I + O)),
     *((LoRA(rank=7, initialization=name), 7 * (I + O)) for name in ("gaussian", "pissa", "olora")),
     (LoRA(rank=7, initialization="eva"), 7 * (I + O)),
-    # A magnitude by output.
+    # Plus a magnitude per output.
     (DoRA(), 128 * (I + O) + O),
-    # A diagonal between A and B.
+    # Plus a diagonal between A and B.
     (AdaLoRA(), 128 * (I + O) + 128),
-    # Four experts of 32 and a linear router, weighted or top-1.
+    # Four experts of rank 32 and a linear router, weighted or top-1.
     (LoRAMoE(), 4 * 32 * (I + O) + 4 * I),
     (LoRAMoE(routing="top1"), 4 * 32 * (I + O) + 4 * I),
-    # A bank of R, h hidden units: R (I + O) + h (I + R), and h + R biases.
+    # Bank of R directions, h hidden units: R (I + O) + h (I + R), plus h + R biases.
     (LoRASP(), 128 * (I + O) + 32 * (I + 128) + 32 + 128),
     *(
         (LoRASP(rank=8, hidden_width=4, router=name), 8 * (I + O) + 4 * (I + 8) + 4 + 8)

@@ -1,4 +1,4 @@
-"""Initialisations that take a part of the kernel: PiSSA and OLoRA."""
+"""Initializations that split the kernel: PiSSA and OLoRA."""
 
 import flax.linen as nn
 import jax
@@ -23,7 +23,7 @@ def lora(name, cls=LoRA, **fields):
 
 
 def model(depth=None):
-    """A model of one layer, or of a stack of them."""
+    """A model with one layer, or with a stack of `depth` layers."""
 
     class Net(nnx.Module):
         def __init__(self):
@@ -37,79 +37,79 @@ def model(depth=None):
 
 @SPLIT
 @CLASSES
-def test_starts_as_the_base(name, cls):
+def test_initially_equals_the_base(name, cls):
     method = lora(name, cls)
-    params, rest = method.init(jax.random.key(3), KERNEL)
-    np.testing.assert_allclose(method.apply(params, X, rest)[0], X @ KERNEL, atol=1e-5)
-    np.testing.assert_allclose(method.merge(params, rest), KERNEL, atol=1e-5)
-    assert np.abs(rest - KERNEL).max() > 0.1
+    params, residual = method.init(jax.random.key(3), KERNEL)
+    np.testing.assert_allclose(method.apply(params, X, residual)[0], X @ KERNEL, atol=1e-5)
+    np.testing.assert_allclose(method.merge(params, residual), KERNEL, atol=1e-5)
+    assert np.abs(residual - KERNEL).max() > 0.1
 
 
 def test_pissa_is_the_best_approximation():
     method = lora("pissa")
-    params, rest = method.init(jax.random.key(3), KERNEL)
+    params, residual = method.init(jax.random.key(3), KERNEL)
     values = np.linalg.svd(np.asarray(KERNEL), compute_uv=False)
-    np.testing.assert_allclose(np.linalg.norm(rest), np.linalg.norm(values[3:]), rtol=1e-5)
-    left = np.linalg.svd(np.asarray(rest), compute_uv=False)
-    np.testing.assert_allclose(left[:6], values[3:], rtol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(residual), np.linalg.norm(values[3:]), rtol=1e-5)
+    residual_values = np.linalg.svd(np.asarray(residual), compute_uv=False)
+    np.testing.assert_allclose(residual_values[:6], values[3:], rtol=1e-4)
     a, b = params["lora_a"], params["lora_b"]
     np.testing.assert_allclose(jnp.linalg.norm(a, axis=0), jnp.linalg.norm(b, axis=1), rtol=1e-5)
 
 
 def test_olora_is_orthonormal():
     method = lora("olora")
-    params, rest = method.init(jax.random.key(3), KERNEL)
+    params, residual = method.init(jax.random.key(3), KERNEL)
     a, b = map(np.asarray, (params["lora_a"], params["lora_b"]))
     np.testing.assert_allclose(b @ b.T, np.eye(3), atol=1e-5)
     orthonormal, triangular = np.linalg.qr(np.asarray(KERNEL).T)
     np.testing.assert_allclose(np.abs(b), np.abs(orthonormal[:, :3].T), atol=1e-5)
     np.testing.assert_allclose(a @ b, (orthonormal[:, :3] @ triangular[:3]).T, atol=1e-5)
-    np.testing.assert_allclose(rest, KERNEL - 5 / 3 * a @ b, atol=1e-5)
+    np.testing.assert_allclose(residual, KERNEL - 5 / 3 * a @ b, atol=1e-5)
 
 
 @SPLIT
-def test_low_precision_bases_keep_their_type(name):
+def test_bfloat16_base_keeps_its_dtype(name):
     low = KERNEL.astype(jnp.bfloat16)
     method = lora(name)
-    params, rest = method.init(jax.random.key(3), low)
-    assert rest.dtype == jnp.bfloat16
+    params, residual = method.init(jax.random.key(3), low)
+    assert residual.dtype == jnp.bfloat16
     assert {leaf.dtype for leaf in params.values()} == {jnp.dtype("float32")}
-    np.testing.assert_allclose(method.merge(params, rest), low, atol=0.05)
+    np.testing.assert_allclose(method.merge(params, residual), low, atol=0.05)
 
 
 @SPLIT
 @pytest.mark.parametrize("depth", [None, 2])
-def test_a_model_is_the_same_before_training_and_after_merging(name, depth):
+def test_adapting_and_merging_restores_the_kernel(name, depth):
     base = model(depth)
     kernel = np.asarray(base.layer.kernel.get_value())
     adapted = adaptation.adapt(base, [("layer", lora(name))], rngs=nnx.Rngs(0))
-    rest = adapted.layer.kernel.get_value()
-    assert np.abs(rest - kernel).max() > 0.1
+    residual = adapted.layer.kernel.get_value()
+    assert np.abs(residual - kernel).max() > 0.1
     np.testing.assert_array_equal(base.layer.kernel.get_value(), kernel)
     merged = adaptation.merge(adapted)
     np.testing.assert_allclose(merged.layer.kernel.get_value(), kernel, atol=1e-5)
 
 
 @pytest.mark.parametrize("method", [LoRA(rank=3), lora("pissa"), lora("olora")], ids=str)
-def test_layers_that_share_a_kernel_stay_right(method):
+def test_layers_with_a_shared_kernel(method):
     class Tied(nnx.Module):
         def __init__(self):
-            self.one, self.two = (Dense(9, 14, rngs=nnx.Rngs(i)) for i in range(2))
-            self.two.kernel = self.one.kernel
+            self.first, self.second = (Dense(9, 14, rngs=nnx.Rngs(i)) for i in range(2))
+            self.second.kernel = self.first.kernel
 
     base = Tied()
     adapted = adaptation.adapt(base, [(".*", method)], rngs=nnx.Rngs(0))
-    np.testing.assert_allclose(adapted.two(X), base.two(X), atol=1e-5)
-    for layer in (adapted.one, adapted.two):
+    np.testing.assert_allclose(adapted.second(X), base.second(X), atol=1e-5)
+    for layer in (adapted.first, adapted.second):
         params = layer.adapter.get_value()
         layer.adapter.set_value(jax.tree.map(lambda leaf: leaf + 0.2, params))
     merged = adaptation.merge(adapted)
-    np.testing.assert_allclose(merged.one(X), adapted.one(X), atol=1e-4)
-    np.testing.assert_allclose(merged.two(X), adapted.two(X), atol=1e-4)
+    np.testing.assert_allclose(merged.first(X), adapted.first(X), atol=1e-4)
+    np.testing.assert_allclose(merged.second(X), adapted.second(X), atol=1e-4)
 
 
 @SPLIT
-def test_saved_adapters_fit_the_base_they_were_made_from(name, tmp_path):
+def test_save_and_load_with_the_original_base(name, tmp_path):
     adapted = adaptation.adapt(model(), [("layer", lora(name))], rngs=nnx.Rngs(0))
     trained = adapted.layer.adapter.get_value()
     adapted.layer.adapter.set_value(jax.tree.map(lambda leaf: leaf + 0.1, trained))
@@ -119,7 +119,7 @@ def test_saved_adapters_fit_the_base_they_were_made_from(name, tmp_path):
 
 
 @SPLIT
-def test_an_adapter_that_holds_a_part_is_not_thrown_away(name):
+def test_replacing_a_split_adapter_requires_merging(name):
     adapted = adaptation.adapt(model(), [("layer", lora(name))], rngs=nnx.Rngs(0))
     with pytest.raises(ValueError, match=r"the layer already has a lora adapter: .* merge"):
         adaptation.adapt(adapted, [("layer", LoRA(rank=2))], rngs=nnx.Rngs(0))
@@ -127,7 +127,7 @@ def test_an_adapter_that_holds_a_part_is_not_thrown_away(name):
 
 
 @SPLIT
-def test_linen_says_that_it_cannot(name):
+def test_linen_does_not_support_splitting(name):
     with pytest.raises(ValueError, match="changes the kernel, which Linen does not allow"):
         LinenDense(14, method=lora(name)).init(jax.random.key(0), X)
     assert isinstance(LinenDense(14, method=LoRA(rank=2)), nn.Module)
@@ -135,7 +135,7 @@ def test_linen_says_that_it_cannot(name):
 
 @SPLIT
 @CLASSES
-def test_values_and_a_fitting_rank_are_needed(name, cls):
+def test_requires_values_and_a_valid_rank(name, cls):
     shape = jax.ShapeDtypeStruct((9, 14), jnp.float32)
     with pytest.raises(ValueError, match="values"):
         lora(name, cls).init(jax.random.key(0), shape)
@@ -144,7 +144,7 @@ def test_values_and_a_fitting_rank_are_needed(name, cls):
 
 
 @SPLIT
-def test_a_matrix_is_needed(name):
+def test_requires_a_matrix(name):
     with pytest.raises(
         ValueError, match=r"needs a floating-point kernel \[I, O\], got float32 \[2, 9, 14\]"
     ):

@@ -1,4 +1,4 @@
-"""Gathered decoding against the dense path."""
+"""Single-token decoding with gathered directions against the dense path."""
 
 import dataclasses
 
@@ -31,9 +31,9 @@ def arrays(method, dtype):
     keys = jax.random.split(jax.random.key(2), len(leaves))
     moved = [p + jax.random.normal(k, p.shape) for k, p in zip(keys, leaves, strict=True)]
     params = jax.tree.unflatten(structure, moved)
-    if method.rank == 12:  # of 16 that the router scores
-        whole, _ = arrays(METHOD, dtype)
-        params |= {"router": whole["router"]}
+    if method.rank == 12:  # pruned: the router scores 16
+        unpruned, _ = arrays(METHOD, dtype)
+        params |= {"router": unpruned["router"]}
     return params, decoding.prepare(method, params, dtype)
 
 
@@ -45,45 +45,45 @@ def test_equals_the_dense_path(method):
     run = jax.jit(
         jax.vmap(lambda x: decoding.decode(method, prepared, x, capacity=method.rank - 1))
     )
-    found, missed = run(tokens)
-    room = aux.active_rank < method.rank
-    assert room.sum() > 10
-    np.testing.assert_array_equal(missed[room], 0)
-    np.testing.assert_allclose(found[room], expected[room], rtol=1e-4, atol=1e-4)
+    actual, dropped = run(tokens)
+    fits = aux.active_rank < method.rank
+    assert fits.sum() > 10
+    np.testing.assert_array_equal(dropped[fits], 0)
+    np.testing.assert_allclose(actual[fits], expected[fits], rtol=1e-4, atol=1e-4)
 
 
-def test_says_what_found_no_room():
-    """Left out are the lowest scores: a target that keeps only the others gives the same."""
+def test_directions_beyond_the_capacity():
+    """The lowest scores are left out: a lower target that keeps the others gives the same."""
     params, prepared = arrays(METHOD, jnp.float32)
     x = jax.random.normal(jax.random.key(4), (D_IN,))
     _, aux = METHOD.delta(params, x)
     active = int(aux.active_rank)
     assert active > 3
-    found, missed = decoding.decode(METHOD, prepared, x, capacity=2)
-    assert missed == active - 2
+    actual, dropped = decoding.decode(METHOD, prepared, x, capacity=2)
+    assert dropped == active - 2
     for target in np.linspace(0.01, 0.7, 100):
-        fewer = dataclasses.replace(METHOD, energy_target=round(float(target), 3))
-        expected, aux = fewer.delta(params, x)
+        lower = dataclasses.replace(METHOD, energy_target=round(float(target), 3))
+        expected, aux = lower.delta(params, x)
         if aux.active_rank == 2:
-            np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
+            np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-4)
             return
     pytest.fail("no target keeps two directions")
 
 
-def test_low_precision():
+def test_bfloat16():
     _, prepared = arrays(METHOD, jnp.bfloat16)
-    found, _ = decoding.decode(METHOD, prepared, jnp.ones(D_IN, jnp.bfloat16), capacity=4)
-    assert found.dtype == jnp.bfloat16
+    delta, _ = decoding.decode(METHOD, prepared, jnp.ones(D_IN, jnp.bfloat16), capacity=4)
+    assert delta.dtype == jnp.bfloat16
 
 
 @pytest.mark.parametrize("capacity", [0, 17])
-def test_bad_capacity(capacity):
+def test_invalid_capacity(capacity):
     _, prepared = arrays(METHOD, jnp.float32)
     with pytest.raises(ValueError, match=f"a capacity of 1 to 16, got .*24.* and {capacity}"):
         decoding.decode(METHOD, prepared, jnp.ones(D_IN), capacity=capacity)
 
 
-def test_needs_masks_by_token():
+def test_requires_one_mask_per_token():
     method = dataclasses.replace(METHOD, granularity="sample")
     params, _ = method.init(jax.random.key(1), jnp.zeros((D_IN, D_OUT)))
     with pytest.raises(ValueError, match="needs granularity 'token' and no schedule"):

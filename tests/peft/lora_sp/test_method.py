@@ -1,4 +1,4 @@
-"""LoRA-SP's equations, losses, parameter counts and its identity with LoRA."""
+"""LoRA-SP's equations, losses, parameter counts, GPU kernel and equivalence with LoRA."""
 
 import dataclasses
 import re
@@ -34,11 +34,11 @@ def scores_of(router, x, kind="gelu"):
     return router_scores(router, x @ router["w1"], kind)
 
 
-def losses_of(scores, kept_energy=1.0, rows=None):
-    """The three losses of rows of scores that are all kept; logits are the scores."""
-    counts = jnp.ones((len(scores), 1), bool) if rows is None else rows
+def losses_of(scores, kept_energy=1.0, valid=None):
+    """The three losses for scores that are also the logits; every positive score is active."""
+    valid = jnp.ones((len(scores), 1), bool) if valid is None else valid
     energy = jnp.broadcast_to(jnp.asarray(kept_energy).reshape(-1, 1), (len(scores), 1))
-    sums = losses.loss_sums(scores, scores, scores > 0, energy, counts)
+    sums = losses.loss_sums(scores, scores, scores > 0, energy, valid)
     return losses.spectral_loss(sums), losses.balance_loss(sums), losses.z_loss(sums)
 
 
@@ -56,24 +56,24 @@ def test_parameter_count(method, router):
     assert count == method.rank * (D_IN + D_OUT) + router
 
 
-def test_scores_start_at_one(x):
+def test_initial_scores_are_one(x):
     scores, logits = scores_of(initial(LoRASP())["router"], x)
     assert (scores.shape, logits.shape) == ((3, 7, 128), (3, 7, 128))
     np.testing.assert_allclose(scores, 1, atol=0.15)
-    assert np.std(scores) > 1e-3  # never all equal, or the same last directions would go
+    assert np.std(scores) > 1e-3  # not equal, or ties would always prune the same directions
 
 
-def test_paper_router_spreads_a_softmax(x):
-    """Four softmax values, each the score of a block of 32; non-negative whatever W2 becomes."""
+def test_paper_router_repeats_a_softmax(x):
+    """Each of four softmax values scores 32 directions. Scores are non-negative for any W2."""
     router = initial(LoRASP.paper())["router"]
     scores, logits = scores_of(router, x, "softmax")
     np.testing.assert_allclose(scores, np.repeat(jax.nn.softmax(logits), 32, -1), rtol=1e-6)
-    pushed, _ = scores_of(router | {"w2": router["w2"] - 0.3}, x, "softmax")
-    assert pushed.min() == 0
+    shifted, _ = scores_of(router | {"w2": router["w2"] - 0.3}, x, "softmax")
+    assert shifted.min() == 0
 
 
 def test_unit_scores_and_full_target_equal_lora(x):
-    """s = 1 (router weights zero) and η = 1 leave plain LoRA of the same rank and alpha."""
+    """With s = 1 (zero router weights) and η = 1 it is LoRA of the same rank and alpha."""
     method = LoRASP(rank=16, energy_target=1.0, alpha=8.0)
     params = initial(method)
     router = params["router"] | {"w2": jnp.zeros((32, 16))}
@@ -86,8 +86,8 @@ def test_unit_scores_and_full_target_equal_lora(x):
     np.testing.assert_array_equal(aux.active_rank, 16)
 
 
-def test_update_is_u_sigma_v(x):
-    """Eqs. (9) and (11) literally, token by token."""
+def test_update_equals_u_sigma_v(x):
+    """Eqs. (9) and (11) for a single token."""
     method = LoRASP(rank=16, energy_target=0.7, alpha=4.0)
     params = initial(method)
     params["bank"]["u"] = jax.random.normal(jax.random.key(2), (16, D_OUT))
@@ -118,21 +118,21 @@ def test_pruned_directions_get_no_task_gradient(x):
     np.testing.assert_array_equal(gradient != 0, mask)
 
 
-def test_losses_of_uniform_and_concentrated_routing():
-    """Balance is 1 where all directions are used alike and R where one takes all; z is 0 at 0."""
-    even, one = jnp.ones((5, 8)), jnp.eye(8)[jnp.zeros(5, int)]
-    assert losses_of(even)[1] == pytest.approx(1)
-    assert losses_of(one)[1] == pytest.approx(8)
+def test_losses_of_uniform_and_concentrated_scores():
+    """Balance is 1 for uniform use and R for a single direction; z is 0 for zero logits."""
+    uniform, single = jnp.ones((5, 8)), jnp.eye(8)[jnp.zeros(5, int)]
+    assert losses_of(uniform)[1] == pytest.approx(1)
+    assert losses_of(single)[1] == pytest.approx(8)
     assert losses_of(jnp.eye(8)[:5])[1] == pytest.approx(8 / 5)  # balanced over tokens
     assert losses_of(jnp.full((5, 8), 3.0))[2] == pytest.approx(9, rel=1e-5)
     assert losses_of(jnp.full((5, 8), 1e-9))[2] == pytest.approx(0, abs=1e-6)
     kept = jnp.array([0.9, 1.0, 0.95, 0.2, 0.1])
-    spectral, _, _ = losses_of(even, kept, rows=jnp.arange(5)[:, None] < 3)
+    spectral, _, _ = losses_of(uniform, kept, valid=jnp.arange(5)[:, None] < 3)
     assert spectral == pytest.approx(0.05)
 
 
-class OnGPU(LoRASP):
-    """One whose kernel is there on every machine: Triton's on a GPU, its interpreter elsewhere."""
+class WithFusedKernel(LoRASP):
+    """Always use the fused kernel: Triton's on a GPU, interpreted elsewhere."""
 
     def fused_kernel(self, params):
         del params
@@ -146,7 +146,7 @@ class OnGPU(LoRASP):
     ("masked", "few"),
     [pytest.param(False, 0, marks=pytest.mark.slow), (True, 0), (True, rowwise_kernel.FEW_ROWS)],
 )
-def test_one_kernel_equals_the_equations(x, monkeypatch, masked, few):
+def test_fused_kernel_equals_the_method(x, monkeypatch, masked, few):
     monkeypatch.setattr(rowwise_kernel, "FEW_ROWS", few)
     fields = {"rank": 32, "hidden_width": 16, "energy_target": 0.7}
     params = initial(LoRASP(**fields))
@@ -160,15 +160,15 @@ def test_one_kernel_equals_the_equations(x, monkeypatch, masked, few):
 
     run = jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True), static_argnums=2)
     with jax.default_matmul_precision("highest"):
-        expected, found = (run(params, x, kind(**fields)) for kind in (LoRASP, OnGPU))
-    assert 1 < found[0][1][1].mean_active_rank() < 31
-    for f, e in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        error = np.asarray(f, float) - np.asarray(e, float)
+        expected, actual = (run(params, x, kind(**fields)) for kind in (LoRASP, WithFusedKernel))
+    assert 1 < actual[0][1][1].mean_active_rank() < 31
+    for a, e in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
+        error = np.asarray(a, float) - np.asarray(e, float)
         assert np.linalg.norm(error) <= 1e-5 * np.linalg.norm(e)
 
 
-def test_layers_of_one_input_are_one_kernel(x):
-    method = OnGPU(rank=32, hidden_width=16, energy_target=0.7)
+def test_layers_with_a_shared_input_share_a_kernel(x):
+    method = WithFusedKernel(rank=32, hidden_width=16, energy_target=0.7)
     params = [initial(method, key) for key in (1, 2)]
     for i, p in enumerate(params):
         p["bank"]["u"] = jax.random.normal(jax.random.key(i), (32, D_OUT))
@@ -176,27 +176,27 @@ def test_layers_of_one_input_are_one_kernel(x):
     weights = jax.random.normal(jax.random.key(9), (2, D_IN, D_OUT))
     mask = jax.random.bernoulli(jax.random.key(4), 0.6, x.shape[:2])
 
-    def together(params, x):
+    def shared(params, x):
         layers = [(method, p, w) for p, w in zip(params, weights, strict=True)]
         return apply_shared_input(layers, x, token_mask=mask)
 
-    def alone(params, x):
+    def separate(params, x):
         pairs = zip(params, weights, strict=True)
         return [method.apply(p, x, w, token_mask=mask) for p, w in pairs]
 
-    def everything(layers):
+    def values_and_grads(layers):
         def loss(params, x):
-            found = layers(params, x)
-            losses = sum(i * v for _, aux in found for i, v in enumerate(aux.losses.values()))
-            return sum(jnp.sin(y).sum() for y, _ in found) + losses, found
+            results = layers(params, x)
+            losses = sum(i * v for _, aux in results for i, v in enumerate(aux.losses.values()))
+            return sum(jnp.sin(y).sum() for y, _ in results) + losses, results
 
         return jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
 
-    found, expected = (jax.jit(everything(f))(params, x) for f in (together, alone))
+    actual, expected = (jax.jit(values_and_grads(f))(params, x) for f in (shared, separate))
     jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3), found, expected
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3), actual, expected
     )
-    programs = [primitives(everything(f), params, x) for f in (together, alone)]
+    programs = [primitives(values_and_grads(f), params, x) for f in (shared, separate)]
     assert [names.count("pallas_call") for names in programs] == [2, 4]
 
 
@@ -204,14 +204,14 @@ def test_layers_of_one_input_are_one_kernel(x):
     ("method", "kernels"),
     [
         (LoRASP(rank=64), ["rowwise_kernel"]),
-        (LoRASP(rank=48), ["energy_gate"]),  # sides that Triton does not take
+        (LoRASP(rank=48), ["energy_gate"]),  # sizes that Triton does not support
         (LoRASP(hidden_width=8), ["energy_gate"]),
         (LoRASP.paper(rank=64), ["energy_gate"]),
         (LoRASP(rank=64, router="gelu_relu"), ["energy_gate"]),
         (LoRASP(rank=64, schedule=EnergySchedule()), []),
     ],
 )
-def test_kernels_of_an_nvidia_gpu(x, method, kernels):
+def test_kernels_on_an_nvidia_gpu(x, method, kernels):
     params, kernel = jax.eval_shape(lambda: initial(method)), jnp.ones((D_IN, D_OUT))
     run = jax.jit(lambda params, x: method.apply(params, x, kernel)[0])
     for platform, expected in (("cuda", kernels), ("cpu", [])):
@@ -222,28 +222,28 @@ def test_kernels_of_an_nvidia_gpu(x, method, kernels):
         assert sorted(set(re.findall(r"name=(rowwise_kernel|energy_gate)", text))) == expected
 
 
-def test_pruned_directions_are_scored_and_never_kept(x):
-    """What a router scores behind the bank's R has no part in z, but in E_k."""
-    method, whole = LoRASP(rank=8, energy_target=1.0), LoRASP(rank=12, energy_target=1.0)
-    params = initial(whole)
+def test_pruned_directions_are_scored_but_inactive(x):
+    """Scores beyond the bank's R directions do not contribute to z, but to E_k."""
+    method, unpruned = LoRASP(rank=8, energy_target=1.0), LoRASP(rank=12, energy_target=1.0)
+    params = initial(unpruned)
     bank = {"u": params["bank"]["u"][:8], "v": params["bank"]["v"][:, :8]}
-    found = method.apply(params | {"bank": bank}, x, jnp.ones((D_IN, D_OUT)))[1]
-    np.testing.assert_array_equal(found.active_rank, 8)
-    assert found.usage.shape == (12,)
-    np.testing.assert_allclose(found.kept_energy, 8 / 12, atol=0.05)
+    aux = method.apply(params | {"bank": bank}, x, jnp.ones((D_IN, D_OUT)))[1]
+    np.testing.assert_array_equal(aux.active_rank, 8)
+    assert aux.usage.shape == (12,)
+    np.testing.assert_allclose(aux.kept_energy, 8 / 12, atol=0.05)
     router = params["router"] | {"b2": params["router"]["b2"][:10]}
     with pytest.raises(ValueError, match=r"needs router/b2 \[12\], got \(10,\)"):
         method.apply({"bank": bank, "router": router}, x, jnp.ones((D_IN, D_OUT)))
 
 
-def test_a_softmax_router_spreads_its_values_over_any_rank():
+def test_softmax_router_covers_any_rank():
     w2 = LoRASP(rank=7, router="softmax", hidden_width=3).init_params(jax.random.key(0), 4, 4)
     np.testing.assert_array_equal(w2["router"]["w2"].sum(0), 1)
     np.testing.assert_array_equal(w2["router"]["w2"].sum(1), [3, 2, 2])
 
 
-def test_rows_without_scores_stay_out(x):
-    """A ReLU router can go silent: nothing is kept, nothing is lost, no loss is counted."""
+def test_tokens_with_zero_scores_are_ignored(x):
+    """Scores after a ReLU may all be 0: nothing is active, kept energy is 1, the losses are 0."""
     method = LoRASP.paper()
     params = initial(method)
     params["router"]["w2"] = -params["router"]["w2"]
@@ -259,16 +259,16 @@ def test_rows_without_scores_stay_out(x):
     assert all(value == 0 for value in aux.losses.values())
 
 
-@pytest.mark.parametrize("place", [("router", "b2"), ("router", "w1"), ("bank", "v")])
-def test_broken_parameters_are_not_hidden(x, monkeypatch, place):
-    """Nor where a clip loses NaN, as one of minimum and maximum does in a GPU's kernel."""
+@pytest.mark.parametrize("path", [("router", "b2"), ("router", "w1"), ("bank", "v")])
+def test_nan_parameters_propagate(x, monkeypatch, path):
+    """Even where clipping drops NaN, as minimum and maximum do in a GPU kernel."""
     monkeypatch.setattr(jnp, "clip", lambda a, low, high: jnp.fmin(jnp.fmax(a, low), high))
     params = initial(LoRASP())
-    room, name = place
-    params[room][name] = params[room][name].at[0].set(jnp.nan)
+    part, name = path
+    params[part][name] = params[part][name].at[0].set(jnp.nan)
     y, aux = jax.jit(LoRASP().delta)(params, x)
     assert jnp.isnan(y).all()
-    if room == "router":
+    if part == "router":
         assert all(jnp.isnan(value) for value in aux.losses.values())
 
 
@@ -284,7 +284,7 @@ def test_broken_parameters_are_not_hidden(x, monkeypatch, place):
         ({"schedule": 0.5}, "schedule must be EnergySchedule or None, got 0.5"),
     ],
 )
-def test_bad_fields(fields, message):
+def test_invalid_fields(fields, message):
     with pytest.raises(ValueError, match=message):
         LoRASP(**fields)
 
@@ -294,7 +294,7 @@ def test_scale_follows_alpha():
     assert dataclasses.replace(LoRASP(), alpha=64.0).scale == 0.5
 
 
-def test_losses_of_stacked_layers_are_those_of_each():
+def test_losses_of_stacked_layers():
     def sums(key):
         one = lambda key, size: jax.random.uniform(key, (size,), minval=1, maxval=3)  # noqa: E731
         return losses.LossSums(*map(one, jax.random.split(key, 5), (1, 1, 1, 8, 8)))

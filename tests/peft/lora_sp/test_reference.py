@@ -1,4 +1,4 @@
-"""The fast path computes what the equations say, and so do its gradients."""
+"""Values and gradients of the fast path against the reference implementation."""
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +14,8 @@ def normal(seed, *shape):
     return jax.random.normal(jax.random.key(seed), shape)
 
 
-def drawn(method, d_in, d_out, spread=1.0):
-    """Parameters with U and W2 far from their start, so that scores differ."""
+def random_params(method, d_in, d_out, spread=1.0):
+    """Parameters with U and W2 far from their initial values, so that the scores differ."""
     params = method.init_params(jax.random.key(0), d_in, d_out)
     params["bank"]["u"] = normal(1, method.rank, d_out) / 8
     params["router"]["w2"] = spread * normal(2, method.hidden_width, method.rank)
@@ -23,7 +23,7 @@ def drawn(method, d_in, d_out, spread=1.0):
 
 
 def results(layer, *arguments):
-    """y, the losses, and the gradients of a scalar made of them."""
+    """y, the losses, and the gradients of a scalar function of both."""
 
     def loss(*arguments):
         y, losses = layer(*arguments)
@@ -41,18 +41,18 @@ def fast(method):
     return layer
 
 
-def plain(method):
+def paper(method):
     def layer(params, x, kernel):
         return reference.lora_sp(params, x, kernel, method.energy_target, method.scale)
 
     return layer
 
 
-def assert_close(found, expected, tolerance):
-    assert jax.tree.structure(found) == jax.tree.structure(expected)
-    for one, other in zip(*map(jax.tree.leaves, (found, expected)), strict=True):
-        error = np.linalg.norm(np.asarray(one, np.float64) - np.asarray(other, np.float64))
-        assert error <= tolerance * max(np.linalg.norm(np.asarray(other, np.float64)), 1e-3)
+def assert_close(actual, expected, tolerance):
+    assert jax.tree.structure(actual) == jax.tree.structure(expected)
+    for a, b in zip(*map(jax.tree.leaves, (actual, expected)), strict=True):
+        error = np.linalg.norm(np.asarray(a, np.float64) - np.asarray(b, np.float64))
+        assert error <= tolerance * max(np.linalg.norm(np.asarray(b, np.float64)), 1e-3)
 
 
 @pytest.mark.parametrize(
@@ -64,35 +64,44 @@ def assert_close(found, expected, tolerance):
         (7, 8, 8, {"rank": 1, "hidden_width": 1}),
     ],
 )
-def test_the_fast_path_is_the_paper(tokens, d_in, d_out, fields):
-    """Values, and gradients of all parameters, x and the kernel (none)."""
+def test_fast_path_equals_the_reference(tokens, d_in, d_out, fields):
+    """Values, and gradients of all parameters, x and the kernel (zero)."""
     method = LoRASP(**fields)
-    arguments = (drawn(method, d_in, d_out), normal(3, tokens, d_in), normal(4, d_in, d_out))
-    found, expected = (results(layer(method), *arguments) for layer in (fast, plain))
-    assert_close(found, expected, 1e-4)
+    arguments = (
+        random_params(method, d_in, d_out),
+        normal(3, tokens, d_in),
+        normal(4, d_in, d_out),
+    )
+    actual, expected = (results(layer(method), *arguments) for layer in (fast, paper))
+    assert_close(actual, expected, 1e-4)
 
 
-def test_half_precision_is_the_paper_up_to_its_rounding():
+def test_bfloat16_equals_the_reference_up_to_rounding():
     method = LoRASP(rank=32, hidden_width=16)
     half = [(a / 4).astype(jnp.bfloat16) for a in (normal(3, 96, 24), normal(4, 24, 20))]
-    params = drawn(method, 24, 20, spread=0.3)
-    found = results(fast(method), params, *half)
-    expected = results(plain(method), params, *(a.astype(jnp.float32) for a in half))
-    assert found[0][1][0].dtype == jnp.bfloat16
-    assert_close(found, expected, 0.05)
+    params = random_params(method, 24, 20, spread=0.3)
+    actual = results(fast(method), params, *half)
+    expected = results(paper(method), params, *(a.astype(jnp.float32) for a in half))
+    assert actual[0][1][0].dtype == jnp.bfloat16
+    assert_close(actual, expected, 0.05)
 
 
-def test_a_layer_is_the_paper():
-    """From the front door, with token axes and a bias."""
+def test_dense_equals_the_reference():
+    """Through the public `dense`, with token axes and a bias."""
     method = LoRASP(rank=16, hidden_width=8, energy_target=0.7)
-    params, x, kernel, bias = drawn(method, 6, 5), normal(3, 2, 9, 6), normal(4, 6, 5), normal(5, 5)
+    params, x, kernel, bias = (
+        random_params(method, 6, 5),
+        normal(3, 2, 9, 6),
+        normal(4, 6, 5),
+        normal(5, 5),
+    )
     y, aux = dense(x, kernel, bias, params, method)
-    expected, losses = plain(method)(params, x.reshape(18, 6), kernel)
+    expected, losses = paper(method)(params, x.reshape(18, 6), kernel)
     assert_close(y, (expected + bias).reshape(2, 9, 5), 1e-5)
     assert_close(dict(aux.losses), losses, 1e-5)
 
 
-def test_the_gate_keeps_the_fewest():
+def test_gate_keeps_the_smallest_set():
     scores = jnp.array([[3.0, 1.0, 2.0, 0.0]])  # energy 9, 1, 4, 0 of 14
     for target, kept in ((0.6, [1, 0, 0, 0]), (0.9, [1, 0, 1, 0]), (0.93, [1, 1, 1, 0])):
         mask, kept_energy = reference.energy_gate(scores, target)

@@ -1,4 +1,4 @@
-"""Score functions, and masks that several tokens share."""
+"""Score functions and shared masks."""
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +35,7 @@ def scores_of(method, params, x):
 
 @pytest.mark.parametrize("name", ["gelu", "gelu_relu", "gelu_softmax"])
 def test_score_functions(name, x):
-    """1 at the start for each; then the function of one and the same logits."""
+    """Initial scores of 1 for each router; then its function of the same logits."""
     method = LoRASP(rank=RANK, router=name)
     scores, _ = scores_of(method, arrays(method, 0), x)
     np.testing.assert_allclose(scores, 1, atol=0.1)
@@ -48,16 +48,16 @@ def test_score_functions(name, x):
     }[name]
     np.testing.assert_allclose(scores, expected, rtol=1e-5, atol=1e-6)
     delta, aux = jax.jit(method.delta)(params, x)
-    kept = scores * np.asarray(jnp.stack([_smallest(s, 0.9) for s in scores.reshape(-1, RANK)]))[
-        :
-    ].reshape(scores.shape)
+    kept = scores * np.asarray(
+        jnp.stack([_smallest_set(s, 0.9) for s in scores.reshape(-1, RANK)])
+    ).reshape(scores.shape)
     expected = method.scale * (np.asarray(x @ params["bank"]["v"]) * kept) @ params["bank"]["u"]
     np.testing.assert_allclose(delta, expected, rtol=1e-4, atol=1e-4)
     assert 0 < aux.mean_active_rank() < RANK
 
 
-def _smallest(scores, target):
-    """Eq. (12) by hand: the mask of the fewest scores that hold `target` of the squares."""
+def _smallest_set(scores, target):
+    """Eq. (12) in NumPy: mask of the smallest set that holds a fraction `target` of the energy."""
     order = np.argsort(-scores, kind="stable")
     energy = np.cumsum(np.float64(scores[order]) ** 2)
     k = int(np.searchsorted(energy, target * energy[-1])) + 1
@@ -66,15 +66,15 @@ def _smallest(scores, target):
 
 @pytest.mark.parametrize("granularity", ["sample", "layer"])
 def test_shared_masks(granularity, x):
-    """One mask for the tokens of a sample, or of all: the fewest that hold η of their energy."""
+    """One mask per sample or per layer: the smallest set that holds η of the pooled energy."""
     method = LoRASP(rank=RANK, energy_target=0.7, granularity=granularity)
     params = arrays(method)
     delta, aux = jax.jit(method.delta)(params, x, token_mask=MASK)
     scores = np.asarray(scores_of(method, params, x)[0])
     energy = np.where(MASK[..., None], scores**2, 0)
     groups = energy.sum(1) if granularity == "sample" else np.tile(energy.sum((0, 1)), (3, 1))
-    for sample in range(2):  # the third is all padding
-        mask = _smallest(np.sqrt(groups[sample]), 0.7)
+    for sample in range(2):  # the third is padding only
+        mask = _smallest_set(np.sqrt(groups[sample]), 0.7)
         np.testing.assert_array_equal(aux.active_rank[sample], mask.sum())
         share = (scores[sample] ** 2 * mask).sum(-1) / (scores[sample] ** 2).sum(-1)
         np.testing.assert_allclose(aux.kept_energy[sample], share, rtol=1e-5)
@@ -85,8 +85,8 @@ def test_shared_masks(granularity, x):
 
 @pytest.mark.parametrize("granularity", ["token", "sample", "layer"])
 @pytest.mark.parametrize("name", ["gelu", "gelu_relu", "gelu_softmax"])
-def test_padding_stays_out(granularity, name, x):
-    """Losses, usage, outputs of valid tokens and gradients do not see what padding holds."""
+def test_padding_is_ignored(granularity, name, x):
+    """Losses, usage, outputs of valid tokens and gradients do not depend on padding."""
     method = LoRASP(rank=RANK, granularity=granularity, router=name)
     params = arrays(method)
 
@@ -104,11 +104,11 @@ def test_padding_stays_out(granularity, name, x):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
 
 
-def test_one_token_needs_no_pool(x):
+def test_single_token_needs_no_pooling(x):
     params = arrays(LoRASP(rank=RANK))
-    one = [LoRASP(rank=RANK, granularity=g).delta(params, x[0, 0]) for g in ("token", "sample")]
-    for a, b in zip(jax.tree.leaves(one[0]), jax.tree.leaves(one[1]), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)  # a GPU rounds the two differently
+    results = [LoRASP(rank=RANK, granularity=g).delta(params, x[0, 0]) for g in ("token", "sample")]
+    for a, b in zip(jax.tree.leaves(results[0]), jax.tree.leaves(results[1]), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)  # rounded differently on a GPU
 
 
 def test_usage_counts_valid_tokens(x):
@@ -116,5 +116,5 @@ def test_usage_counts_valid_tokens(x):
     params = arrays(method)
     _, aux = method.delta(params, x, token_mask=MASK)
     scores = np.asarray(scores_of(method, params, x)[0])[np.asarray(MASK)]
-    expected = sum(_smallest(s, 0.7).astype(int) for s in scores)
+    expected = sum(_smallest_set(s, 0.7).astype(int) for s in scores)
     np.testing.assert_array_equal(aux.usage, expected)

@@ -1,4 +1,4 @@
-"""A moving energy target: its values, its gate, and that the optimizer moves it."""
+"""Scheduled energy targets: values, gate, and updates by the optimizer."""
 
 import dataclasses
 import math
@@ -31,40 +31,40 @@ def test_values():
 
 
 @pytest.mark.parametrize("target", [0.3, 0.5, 0.77, 1.0])
-def test_the_traced_gate_is_the_gate(target):
+def test_scheduled_gate_equals_the_gate(target):
     scores = jax.nn.softplus(3 * jax.random.normal(jax.random.key(0), (200, 24)))
     scores = scores.at[:3].set(0).at[3:9].set(2.0)
-    found = jax.jit(schedule.scheduled_gate)(scores, jnp.float32(target))
-    np.testing.assert_array_equal(found, energy_gate(scores, target, implementation="sort")[0])
+    actual = jax.jit(schedule.scheduled_gate)(scores, jnp.float32(target))
+    np.testing.assert_array_equal(actual, energy_gate(scores, target, implementation="sort")[0])
 
 
 @pytest.mark.parametrize("granularity", ["token", "sample"])
-def test_a_layer_follows_its_progress_without_compiling_again(granularity):
-    moving = dataclasses.replace(METHOD, granularity=granularity)
-    params, _ = moving.init(jax.random.key(0), KERNEL)
+def test_progress_needs_no_recompilation(granularity):
+    scheduled = dataclasses.replace(METHOD, granularity=granularity)
+    params, _ = scheduled.init(jax.random.key(0), KERNEL)
     params["router"]["w2"] = jax.random.normal(jax.random.key(1), (4, 8))
     x = jax.random.normal(jax.random.key(2), (3, 4, 6))
-    run = jax.jit(moving.delta)
+    run = jax.jit(scheduled.delta)
     for progress, target in ((0.0, 0.5), (0.25, 0.7), (1.0, 0.9)):
         _, aux = run(params | {"progress": jnp.float32(progress)}, x)
-        still = LoRASP(rank=8, hidden_width=4, energy_target=target, granularity=granularity)
-        _, expected = still.delta({k: params[k] for k in ("bank", "router")}, x)
+        constant = LoRASP(rank=8, hidden_width=4, energy_target=target, granularity=granularity)
+        _, expected = constant.delta({k: params[k] for k in ("bank", "router")}, x)
         np.testing.assert_array_equal(aux.active_rank, expected.active_rank)
         np.testing.assert_allclose(aux.losses["spectral"], expected.losses["spectral"], rtol=1e-5)
     assert run._cache_size() == 1
 
 
-def test_the_optimizer_moves_it_past_decay_and_in_stacks():
-    """Layers alone and stacked, two schedules and a budget of another method in one tree."""
+def test_optimizer_updates_progress_despite_weight_decay():
+    """Single and stacked layers with different schedules, and AdaLoRA, in one tree."""
     other = dataclasses.replace(METHOD, schedule=EnergySchedule(0.95, "cosine"))
     key = jax.random.key(0)
     stacked = jax.vmap(lambda key: other.init_params(key, 6, 5))(jax.random.split(key, 3))
     ada = AdaLoRA(rank=4, target_rank=2, interval=1)
     params = {
-        "one": METHOD.init_params(key, 6, 5),
+        "single": METHOD.init_params(key, 6, 5),
         "stack": stacked,
         "ada": ada.init_params(key, 6, 5),
-        "plain": LoRASP(rank=4, hidden_width=4).init_params(key, 6, 5),
+        "constant": LoRASP(rank=4, hidden_width=4).init_params(key, 6, 5),
     }
     optimizer = make_optimizer(OptimConfig(steps=4, weight_decay=0.9), [METHOD, ada, other])
     state = optimizer.init(params)
@@ -74,15 +74,15 @@ def test_the_optimizer_moves_it_past_decay_and_in_stacks():
         updates, state = optimizer.update(jax.tree.map(jnp.ones_like, params), state, params)
         return optax.apply_updates(params, updates), state
 
-    for done in (0.25, 0.5, 0.75, 1.0):
+    for progress in (0.25, 0.5, 0.75, 1.0):
         params, state = step(params, state)
-        np.testing.assert_allclose(params["one"]["progress"], done, rtol=1e-6)
-        np.testing.assert_allclose(params["stack"]["progress"], [done] * 3, rtol=1e-6)
+        np.testing.assert_allclose(params["single"]["progress"], progress, rtol=1e-6)
+        np.testing.assert_allclose(params["stack"]["progress"], [progress] * 3, rtol=1e-6)
     assert (params["ada"]["lora_e"] == 0).any()
     assert step._cache_size() == 1
 
 
-def test_progress_has_no_gradient_and_only_a_moving_target_has_it():
+def test_progress_has_no_gradient_and_exists_only_with_a_schedule():
     params, _ = METHOD.init(jax.random.key(0), KERNEL)
     x = jax.random.normal(jax.random.key(2), (4, 6))
 
@@ -92,8 +92,8 @@ def test_progress_has_no_gradient_and_only_a_moving_target_has_it():
 
     assert jax.grad(loss)(params)["progress"] == 0
     assert "progress" not in LoRASP(rank=8).init(jax.random.key(0), KERNEL)[0]
-    plain = optax.sgd(1.0)
-    assert LoRASP().transform(plain, 4) is plain
+    optimizer = optax.sgd(1.0)
+    assert LoRASP().transform(optimizer, 4) is optimizer
 
 
 @pytest.mark.parametrize(
@@ -104,6 +104,6 @@ def test_progress_has_no_gradient_and_only_a_moving_target_has_it():
         ({"curve": "square"}, "schedule.curve must be one of 'linear', 'cosine', got 'square'"),
     ],
 )
-def test_bad_fields(fields, message):
+def test_invalid_fields(fields, message):
     with pytest.raises(ValueError, match=message):
         EnergySchedule(**fields)
