@@ -97,26 +97,16 @@ def low_rank_matmul(
       token_mask: bool [...tokens] or None, passed to each f.
     """
     projected = jnp.matmul(x, _concat_downs(layers, x), preferred_element_type=rows_dtype)
-    params = [layer.params for layer in layers]
-    z_aux = _bottlenecks(methods, params, projected, _widths(layers), token_mask)
+    params, widths = [layer.params for layer in layers], _widths(layers)
+    if isinstance(methods, tuple):
+        calls = zip(methods, params, _split(widths, projected), strict=True)
+        z_aux = [method.bottleneck(p, rows, token_mask) for method, p, rows in calls]
+    else:
+        z_aux = methods.bottleneck_each(params, projected, widths, token_mask)
     return [
         (base_plus_low_rank(x, z, layer.kernel, layer.up), aux)
         for layer, (z, aux) in zip(layers, z_aux, strict=True)
     ]
-
-
-def _bottlenecks(
-    methods: Methods,
-    params: Sequence[Any],
-    projected: jax.Array,
-    widths: Sequence[int],
-    token_mask: jax.Array | None,
-) -> list[tuple[jax.Array, Any]]:
-    """Apply f of every layer to its columns of the projected rows."""
-    if not isinstance(methods, tuple):
-        return methods.bottleneck_each(params, projected, widths, token_mask)
-    calls = zip(methods, params, _split(widths, projected), strict=True)
-    return [method.bottleneck(p, rows, token_mask) for method, p, rows in calls]
 
 
 def _forward(
@@ -131,7 +121,11 @@ def _forward(
     projected = jnp.matmul(x, _concat_downs(layers, x), preferred_element_type=rows_dtype)
 
     def inner(params: list[Any], projected: jax.Array) -> list[tuple[jax.Array, Any]]:
-        z_aux = _bottlenecks(methods, params, projected, widths, token_mask)
+        if isinstance(methods, tuple):
+            calls = zip(methods, params, _split(widths, projected), strict=True)
+            z_aux = [method.bottleneck(p, rows, token_mask) for method, p, rows in calls]
+        else:
+            z_aux = methods.bottleneck_each(params, projected, widths, token_mask)
         return [(z.astype(x.dtype), aux) for z, aux in z_aux]
 
     z_aux, vjp = jax.vjp(inner, [layer.params for layer in layers], projected)
