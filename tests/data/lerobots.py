@@ -1,4 +1,4 @@
-"""LeRobot datasets of the tests: copies of the golden ones, whole or broken."""
+"""LeRobot datasets for tests: copies of the golden ones, intact or damaged."""
 
 import hashlib
 import json
@@ -36,7 +36,7 @@ def edit_info(folder: Path, change: Callable[[dict[str, Any]], Any]) -> None:
 
 
 def edit_rows(folder: Path, change: Callable[[pa.Table], pa.Table], of: str = "data") -> None:
-    """Changes the first parquet file below a folder of the dataset."""
+    """Change the first parquet file in a folder of the dataset."""
     path = next(iter(sorted((folder / of).rglob("*.parquet"))))
     pq.write_table(change(pq.read_table(path)), path)
 
@@ -46,7 +46,7 @@ def replaced(table: pa.Table, name: str, values: Any) -> pa.Table:
 
 
 def set_value(name: str, row: int, value: Any) -> Callable[[pa.Table], pa.Table]:
-    """A change for `edit_rows`: one row of a column is another."""
+    """Make a change for `edit_rows` that replaces one value of a column."""
 
     def change(table: pa.Table) -> pa.Table:
         column = table[name]
@@ -60,7 +60,7 @@ def set_value(name: str, row: int, value: Any) -> Callable[[pa.Table], pa.Table]
 
 
 def cut(folder: Path, pattern: str, share: float) -> None:
-    """Keeps only the beginning of a file."""
+    """Truncate a file."""
     path = next(iter(sorted(folder.rglob(pattern))))
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])

@@ -1,4 +1,4 @@
-"""Windows: inside one episode, padded and masked past its end."""
+"""Windows stay in one episode, padded and masked past its end."""
 
 import dataclasses
 
@@ -23,7 +23,7 @@ def test_flatten_keeps_valid_steps_in_order():
 
 
 def test_windows_repeat_the_last_step_of_their_episode():
-    """By hand: episodes of 5, 9 and 7 steps; in NumPy and in JAX."""
+    """Computed by hand for episodes of 5, 9 and 7 steps, in NumPy and in JAX."""
     steps = flatten([random_episodes("a", 0)])
     start = np.array([0, 3, 4, 19])
     for begin in (start, jax.numpy.asarray(start)):
@@ -57,7 +57,7 @@ def test_chunks_stay_in_their_episode(tmp_path):
 
 
 @pytest.mark.slow
-def test_noise_touches_the_robots_slots_only(tmp_path):
+def test_noise_is_added_to_the_robots_slots_only(tmp_path):
     run = make_run(tmp_path / "run", CONFIG)
     steps = flatten(list(run.episodes.values()))
     batch = sample_batch(
@@ -67,8 +67,8 @@ def test_noise_touches_the_robots_slots_only(tmp_path):
     assert batch.observation.state[:, :6].any()
 
 
-def test_published_weights_learn_the_slots_that_the_robot_lacks(tmp_path):
-    """And relative actions count from the window's first state."""
+def test_published_weights_train_unused_slots(tmp_path):
+    """And relative actions are relative to the window's first state."""
     run = make_run(tmp_path / "run", CONFIG)
     steps, own = flatten(list(run.episodes.values())), run.policy.processor
     inputs = dataclasses.replace(own.inputs, quiet_slots=False, delta=(True, False))

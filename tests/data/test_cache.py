@@ -1,4 +1,4 @@
-"""The cache: what goes in comes out, whole or not at all."""
+"""The cache: data round-trip, and writes are atomic."""
 
 import contextlib
 import dataclasses
@@ -31,7 +31,7 @@ def written(folder, *sources):
 
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory):
-    """Two tasks' episodes, and a cache of them."""
+    """Episodes of two tasks, and a cache of them."""
     folder, parts = tmp_path_factory.mktemp("simulated"), []
     for number, task in enumerate(("press", "pour")):
         parts.append(random_episodes(task, number))
@@ -40,14 +40,14 @@ def simulated(tmp_path_factory):
     return parts, written(folder / "cache", *sources)
 
 
-def test_two_tasks_are_no_rlds_folder(simulated, tmp_path):
+def test_two_tasks_are_refused_as_rlds(simulated, tmp_path):
     with pytest.raises(ValueError, match="one task, got pour, press"):
         rlds_export.to_rlds(simulated[1], tmp_path / "rlds", pytest.fail)
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-def test_windows_are_those_of_lerobot(version, tmp_path):
-    """Padded where LeRobot pads, and statistics as LeRobot has them."""
+def test_windows_match_lerobot(version, tmp_path):
+    """With the same padding and statistics."""
     found = written(tmp_path / "cache", LeRobot(golden(version)))
     with np.load(GOLDEN / f"lerobot_{version}" / "truth.npz") as truth:
         windows = gather(found.steps, truth["window_index"], 6)
@@ -69,8 +69,8 @@ def test_windows_are_those_of_lerobot(version, tmp_path):
                 np.testing.assert_allclose(known[name], wanted, rtol=1e-6, atol=1e-6)
 
 
-def test_steps_are_those_of_the_device(simulated):
-    """What training reads from files is what it has on the device where it fits."""
+def test_steps_match_those_on_the_device(simulated):
+    """Training reads the same from files as from the device."""
     parts, found = simulated
     expected = flatten(parts)
     table = np.array([text for part in parts for text in part.instructions])
@@ -85,7 +85,7 @@ def test_steps_are_those_of_the_device(simulated):
         np.testing.assert_array_equal(found.steps.image[name], picture)
 
 
-def test_episodes_come_back(simulated):
+def test_episodes_round_trip(simulated):
     parts, found = simulated
     assert (len(found), found.num_steps, found.control_dt) == (6, 42, 0.1)
     source, number = parts[1], 4 - 3
@@ -100,7 +100,7 @@ def test_episodes_come_back(simulated):
 
 
 def test_files_are_plain(simulated):
-    """Anybody reads them with NumPy."""
+    """NumPy alone can read them."""
     parts, found = simulated
     state = np.load(found.path / "state.npy")
     np.testing.assert_array_equal(state, flatten(parts).state)
@@ -108,7 +108,7 @@ def test_files_are_plain(simulated):
 
 
 class Broken:
-    """Episodes, the last of which cannot be read."""
+    """A source whose last episode cannot be read."""
 
     kind, cameras, control_dt, num_steps = "broken", ("side", "wrist"), 0.1, 10
 
@@ -120,7 +120,7 @@ class Broken:
 
     def episode(self, number, cameras=None):
         if number == len(self.episodes):
-            raise ValueError("the film ends")
+            raise ValueError("the video ends")
         return self.episodes[number]
 
 
@@ -128,8 +128,8 @@ def one(**changes):
     return dataclasses.replace(random_episodes("press", 0).select([0]), **changes)
 
 
-def test_all_or_nothing(tmp_path, simulated):
-    with pytest.raises(ValueError, match="the film ends"):
+def test_a_failed_write_leaves_nothing(tmp_path, simulated):
+    with pytest.raises(ValueError, match="the video ends"):
         written(tmp_path / "cache", Broken(one()))
     assert not list(tmp_path.iterdir())
     before = digest(simulated[1].path)
@@ -140,7 +140,7 @@ def test_all_or_nothing(tmp_path, simulated):
         written(tmp_path / "cache")
 
 
-def test_no_room(tmp_path, monkeypatch):
+def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
     class Full(cache.Column):
         def append(self, rows):
             raise OSError(28, "No space left on device")
@@ -161,13 +161,13 @@ def test_no_room(tmp_path, monkeypatch):
         ({"action": np.full((1, 9, 7), np.nan, np.float32)}, "action is not finite"),
     ],
 )
-def test_episodes_of_another_kind(changes, sentence, tmp_path):
+def test_incompatible_episodes_are_refused(changes, sentence, tmp_path):
     with pytest.raises(ValueError, match=sentence):
         written(tmp_path / "cache", Broken(one(), one(**changes)))
     assert not list(tmp_path.iterdir())
 
 
-def test_datasets_of_another_kind_are_refused_before_the_first_is_read(tmp_path):
+def test_incompatible_datasets_are_refused_before_reading(tmp_path):
     sources, told = [Broken(one(), one()), Broken(one(robot="panda"))], []
     with pytest.raises(
         ValueError, match="same robot, but it is 'piper' in the first one and 'panda'"
@@ -189,7 +189,7 @@ def test_a_broken_dataset_leaves_no_cache(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["dataset"]
 
 
-def test_every_damage_is_one_sentence(simulated, tmp_path):
+def test_damage_is_reported_in_one_sentence(simulated, tmp_path):
     for number, file in enumerate(sorted(simulated[1].path.iterdir())):
         for share in (0, 0.5, None):
             folder = tmp_path / f"{number} {share}"
@@ -205,8 +205,8 @@ def test_every_damage_is_one_sentence(simulated, tmp_path):
 
 @pytest.mark.parametrize("place", [20, 40, 75, -3])
 @pytest.mark.parametrize("name", cache.ROWS)
-def test_flipped_bits_are_noticed(name, place, simulated, tmp_path):
-    """In the header and in the numbers."""
+def test_flipped_bits_are_detected(name, place, simulated, tmp_path):
+    """In the headers and in the data."""
     folder = shutil.copytree(simulated[1].path, tmp_path / "cache")
     path = folder / f"{name}.npy"
     content = bytearray(path.read_bytes())
@@ -217,7 +217,7 @@ def test_flipped_bits_are_noticed(name, place, simulated, tmp_path):
     assert "\n" not in str(caught.value)
 
 
-def test_any_change_of_the_header_is_read_or_refused(simulated, tmp_path):
+def test_a_changed_header_is_harmless_or_refused(simulated, tmp_path):
     folder = shutil.copytree(simulated[1].path, tmp_path / "cache")
     path = folder / "cache.json"
     good = json.loads(path.read_text())
@@ -266,8 +266,8 @@ def test_opening(tmp_path, simulated):
         ("instruction", lambda x: x - np.int32(9), "instruction has indices -"),
     ],
 )
-def test_arrays_of_others(name, change, sentence, simulated, tmp_path):
-    """Also where their checksum is right."""
+def test_invalid_columns_are_refused(name, change, sentence, simulated, tmp_path):
+    """Even if their checksums are correct."""
     folder = shutil.copytree(simulated[1].path, tmp_path / "cache")
     path = folder / f"{name}.npy"
     array = change(np.load(path))

@@ -1,4 +1,4 @@
-"""`python -m lorasp_jax.data`, without the interpreter around it."""
+"""`python -m lorasp_jax.data`, called in this process."""
 
 import json
 import os
@@ -46,15 +46,15 @@ def test_inspect(capsys, tmp_path, monkeypatch):
         assert picture.size[1] > 100
     sheet.write_bytes(b"")
     for folder in (golden("v3"), golden("v21"), Path(os.path.relpath(golden("v3")))):
-        assert run(capsys, "inspect", folder)[0] == 0  # again, and another one of this name
+        assert run(capsys, "inspect", folder)[0] == 0  # again, and a dataset of the same name
     assert len(list(tmp_path.rglob("*.png"))) == 2
     assert sheet.stat().st_size > 1000
     assert [path.name for path in tmp_path.iterdir()] == ["cache"]
     assert digest(golden("v3")) == before
 
 
-def test_where_pictures_go(capsys, tmp_path):
-    """A file of the user's is not replaced unless they say so."""
+def test_output_of_the_contact_sheet(capsys, tmp_path):
+    """A user's file is replaced only with --overwrite."""
     out = tmp_path / "new" / "sheet.png"
     assert run(capsys, "inspect", golden("v3"), "--out", out)[0] == 0
     code, text, err = run(capsys, "inspect", golden("v3"), "--out", out)
@@ -62,7 +62,7 @@ def test_where_pictures_go(capsys, tmp_path):
     assert run(capsys, "inspect", golden("v3"), "--out", out, "--overwrite")[0] == 0
 
 
-def test_convert_to_all_kinds_and_back(capsys, tmp_path):
+def test_convert_between_all_formats(capsys, tmp_path):
     made, again, third = tmp_path / "cache", tmp_path / "rlds", tmp_path / "third"
     assert run(capsys, "convert", golden("v3"), "--out", made)[0] == 0
     code, _, err = run(capsys, "convert", made, "--to", "rlds", "--out", again)
@@ -101,7 +101,7 @@ def test_two_datasets_in_one_cache(capsys, tmp_path):
 
 
 @pytest.mark.parametrize("to", ["cache", "rlds"])
-def test_a_film_that_ends_too_early(to, capsys, tmp_path):
+def test_a_truncated_video(to, capsys, tmp_path):
     folder = copied("v21", tmp_path)
     cut(folder / "videos", "*3.mp4", 0.5)
     before = digest(folder)
@@ -130,7 +130,7 @@ def test_bad_input(arguments, sentence, capsys, tmp_path):
 
 
 @pytest.mark.parametrize("command", ["inspect", "convert"])
-def test_output_goes_to_this_machine(command, capsys, tmp_path, monkeypatch):
+def test_output_must_be_local(command, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     code, _, err = run(capsys, command, golden("v3"), "--out", "gs://bucket/folder")
     assert code == 2
@@ -139,8 +139,8 @@ def test_output_goes_to_this_machine(command, capsys, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("to", ["cache", "rlds"])
-def test_a_refused_conversion_begins_nothing(to, capsys, tmp_path, monkeypatch):
-    """No folder above the output is left, and no bar is shown."""
+def test_a_refused_conversion_leaves_nothing(to, capsys, tmp_path, monkeypatch):
+    """No parent folder of the output is created, and no progress bar is shown."""
 
     def refuse(self, number, cameras=None):
         raise ValueError("no")

@@ -1,4 +1,4 @@
-"""A run's dataset: what does not fit is said before anything long begins."""
+"""Datasets of a run: incompatible ones are refused early."""
 
 import dataclasses
 
@@ -40,7 +40,7 @@ def test_a_dataset_becomes_a_cache_once(tmp_path):
     chosen = config(golden("v3"))
     source = dataset.opened(chosen, MODEL, tmp_path)
     found = dataset.cached(source, tmp_path, quietly)
-    size = MODEL.image_size  # what the model sees, the longer side
+    size = MODEL.image_size  # longer image side of the model input
     assert found.cameras["side"] == [size * 96 // 128, size]
     again = dataset.opened(chosen, MODEL, tmp_path)
     assert isinstance(again, Cache)
@@ -60,7 +60,7 @@ def test_a_dataset_becomes_a_cache_once(tmp_path):
         ({}, {"cameras": ("side",)}, "has the cameras side, wrist, the backbone places for 1"),
     ],
 )
-def test_what_does_not_fit_is_said_at_once(changes, model, sentence, tmp_path):
+def test_incompatible_datasets_are_refused_early(changes, model, sentence, tmp_path):
     with pytest.raises(ValueError, match=sentence):
         dataset.opened(
             config(golden("v3"), **changes),
@@ -80,7 +80,7 @@ def test_what_does_not_fit_is_said_at_once(changes, model, sentence, tmp_path):
         ),
     ],
 )
-def test_numbers_that_no_policy_learns(changes, sentence, tmp_path):
+def test_unsupported_dimensions_are_refused(changes, sentence, tmp_path):
     path = tmp_path / "recorded.npz"
     dataclasses.replace(random_episodes("press", 0), **changes).save(path)
     with pytest.raises(ValueError, match=sentence):
@@ -88,7 +88,7 @@ def test_numbers_that_no_policy_learns(changes, sentence, tmp_path):
 
 
 def test_outline(simulated):
-    """The numbers are those of the episodes; one picture stands for all."""
+    """States and actions are those of the episodes; images are only outlined."""
     found = dataset.outline(simulated)
     assert list(found) == ["press", "pour"]
     for number, (task, group) in enumerate(found.items()):
@@ -107,10 +107,10 @@ def test_outline(simulated):
             )
         first = wanted.image["wrist"][0, 0]
         assert (group.image["wrist"] == first).all()
-        assert group.image["wrist"].base is not None  # it takes no memory
+        assert group.image["wrist"].base is not None  # takes no memory
 
 
-def test_what_can_be_simulated(simulated):
+def test_which_datasets_can_be_simulated(simulated):
     assert dataset.is_simulated(simulated)
     facts = dict(simulated.metadata)
     # The last: recordings of a real robot.

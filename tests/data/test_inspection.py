@@ -1,4 +1,4 @@
-"""What is said of a dataset is what is in it."""
+"""Summaries and contact sheets match the dataset."""
 
 import dataclasses
 
@@ -30,7 +30,7 @@ def test_summary(source):
 
 
 @pytest.mark.parametrize("actions", ["joint", "end_effector"])
-def test_numbers_have_names(actions, source):
+def test_dimensions_have_names(actions, source):
     episode = dataclasses.replace(source.episode(0, ()), actions=actions)
     joints = [f"joint_{number}" for number in range(1, 7)]
     found = inspection._names(episode)
@@ -44,7 +44,7 @@ def test_numbers_have_names(actions, source):
     assert chosen.names == {"state": ["gripper", "joint_1"], "action": ["gripper", "joint_2"]}
 
 
-def test_units_are_doubted(source):
+def test_wrong_units_give_hints(source):
     found = inspection.summarize(source)
     scale = np.array([57.3] * 6 + [1000], np.float32)
     degrees, millimetres = inspection.hints(dataclasses.replace(found, state=found.state * scale))
@@ -53,7 +53,7 @@ def test_units_are_doubted(source):
 
 
 def test_contact_sheet(source, tmp_path):
-    """A row for each episode; the bar at the bottom of each picture tells which it is."""
+    """One row per episode; the bar at the bottom of each image identifies the frame."""
     path = tmp_path / "sheet.png"
     inspection.write_contact_sheet(source, path)
     with Image.open(path) as picture:
@@ -65,12 +65,12 @@ def test_contact_sheet(source, tmp_path):
     assert np.allclose(np.diff(widths), widths[0], atol=2)
     assert widths[0] > 10
     white = (sheet[inspection.LINE + 4] > 200).all(-1).reshape(inspection.FRAMES, -1)
-    assert (np.diff(white[:, :128].sum(-1)) > 10).all()  # time goes on from left to right
+    assert (np.diff(white[:, :128].sum(-1)) > 10).all()  # in time order from left to right
     assert [file.name for file in tmp_path.iterdir()] == ["sheet.png"]
 
 
-def test_pictures_are_reduced_and_of_any_shape(tmp_path):
-    """And an instruction in any script is no error."""
+def test_images_of_any_shape_are_downscaled(tmp_path):
+    """Instructions in any script are accepted."""
     folder = copied("v21", tmp_path)
     tasks = folder / "meta" / "tasks.jsonl"
     tasks.write_text(tasks.read_text().replace("green button", "绿色按钮"))
@@ -80,7 +80,7 @@ def test_pictures_are_reduced_and_of_any_shape(tmp_path):
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 6, 7, 100])
-def test_chosen_ones_are_spread_over_all(count):
+def test_indices_are_evenly_spread(count):
     found = inspection._spread(count, 6)
     assert found[0] == 0
     assert found[-1] == count - 1

@@ -1,4 +1,4 @@
-"""LeRobot datasets, against what LeRobot's own readers give of them."""
+"""LeRobot datasets, compared with LeRobot's own readers."""
 
 import contextlib
 import io
@@ -31,7 +31,7 @@ def read_all(folder, keys=None, cameras=None):
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-def test_reads_what_lerobot_reads(version):
+def test_data_match_lerobot(version):
     dataset = LeRobot(golden(version))
     episodes = [dataset.episode(number) for number in range(len(dataset))]
     with np.load(GOLDEN / f"lerobot_{version}" / "truth.npz") as truth:
@@ -47,7 +47,7 @@ def test_reads_what_lerobot_reads(version):
             for camera in ("side", "wrist"):
                 found = episodes[episode].image[camera][0, frame].astype(int)
                 wanted = truth[f"{camera}_uint8_hwc"][row]
-                # Another release of the decoder may round colours otherwise; a wrong frame
+                # Other releases of the decoder may round colors differently; a wrong frame
                 # differs by 200.
                 assert np.abs(found - wanted).max() <= 3
     assert len(dataset) == 4
@@ -57,8 +57,8 @@ def test_reads_what_lerobot_reads(version):
         episode.validate()
 
 
-def test_order_of_reading_does_not_matter():
-    """Going back or ahead in a film seeks."""
+def test_reading_order_does_not_matter():
+    """Jumping back or ahead in a video seeks."""
     dataset = LeRobot(golden("v3"))
     forwards = [dataset.episode(number, ["side"]).image["side"] for number in range(4)]
     for number in (2, 0, 3, 1, 1):
@@ -66,8 +66,8 @@ def test_order_of_reading_does_not_matter():
         np.testing.assert_array_equal(found, forwards[number])
 
 
-def test_numbers_are_chosen_and_converted(tmp_path):
-    """A state with more numbers, in degrees and millimetres, is the golden one again."""
+def test_dimensions_are_selected_and_converted(tmp_path):
+    """Selecting and converting a larger state in degrees and mm restores the golden one."""
     folder = copied("v3", tmp_path)
 
     def widen(table):
@@ -100,7 +100,7 @@ def test_numbers_are_chosen_and_converted(tmp_path):
             np.testing.assert_allclose(found.action, wanted.action, atol=1e-6)
 
 
-def test_every_third_frame_goes_with_the_command_before_the_next():
+def test_kept_frames_get_the_last_action_before_the_next():
     (whole, *_), (found, *_) = read_all(golden("v21")), read_all(golden("v21"), Keys(every=3))
     assert found.num_steps == 9  # of 25
     np.testing.assert_array_equal(found.state[0], whole.state[0, ::3])
@@ -110,7 +110,7 @@ def test_every_third_frame_goes_with_the_command_before_the_next():
     assert found.control_dt == pytest.approx(0.3)
 
 
-def test_cameras_are_chosen_and_pictures_reduced():
+def test_cameras_are_selected_and_images_downscaled():
     keys = Keys(cameras={"main": "observation.images.wrist"}, image_size=64)
     (found, *_), (whole, *_) = read_all(golden("v3"), keys), read_all(golden("v3"))
     assert list(found.image) == ["main"]
@@ -119,8 +119,8 @@ def test_cameras_are_chosen_and_pictures_reduced():
     assert np.abs(found.image["main"] - blocks).mean() < 4
 
 
-def test_pictures_in_columns(tmp_path):
-    """Datasets without videos hold PNG files among their numbers."""
+def test_images_in_columns(tmp_path):
+    """Datasets without videos store PNG files in parquet columns."""
     folder, key = copied("v21", tmp_path), "observation.images.side"
     (wanted, *_) = read_all(golden("v21"), cameras=["side"])
 
@@ -232,8 +232,8 @@ def test_empty_episode(tmp_path):
         LeRobot(folder)
 
 
-def test_film_of_another_rate(tmp_path):
-    """In 3.0, an episode begins where the index says, between no two frames."""
+def test_a_video_of_another_frame_rate(tmp_path):
+    """The metadata say where an episode of version 3.0 starts: at a frame, not between two."""
     folder = copied("v3", tmp_path)
     name = "videos/observation.images.side/from_timestamp"
     edit_rows(folder, set_value(name, 1, lambda time: time + 0.05), of="meta/episodes")
@@ -244,8 +244,8 @@ def test_film_of_another_rate(tmp_path):
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-def test_any_change_of_the_description_is_read_or_refused(version, tmp_path):
-    """Every field of info.json, left out and of other kinds: never another exception."""
+def test_changed_metadata_are_harmless_or_refused(version, tmp_path):
+    """Remove or retype every field of info.json: only ValueErrors are raised."""
     folder = copied(version, tmp_path)
     path = folder / "meta" / "info.json"
     good = json.loads(path.read_text())
@@ -277,7 +277,7 @@ def test_any_change_of_the_description_is_read_or_refused(version, tmp_path):
         {"state_numbers": ("joint_1", "joint_9")},
     ],
 )
-def test_wrong_keys_name_what_there_is(keys):
+def test_wrong_keys_list_the_available_ones(keys):
     with pytest.raises(ValueError, match=r"its cameras are|lacks|no joint_9 .* joint_6, gripper"):
         LeRobot(golden("v3"), Keys(**keys))
     with pytest.raises(ValueError, match="every must be at least 1"):
@@ -300,7 +300,7 @@ def test_wrong_keys_name_what_there_is(keys):
         ("image_size", 10**30),
     ],
 )
-def test_kinds_of_keys(name, value):
-    """A unit that is not known would be taken for radians or metres."""
+def test_types_of_keys(name, value):
+    """An unknown unit must not be taken for radians or meters."""
     with pytest.raises(ValueError, match=f"^{name} must be"):
         Keys(**{name: value})

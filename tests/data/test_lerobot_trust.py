@@ -1,4 +1,4 @@
-"""A LeRobot dataset asks nobody, leaves its folder nowhere, and takes no more than it holds."""
+"""A LeRobot dataset opens no URLs, stays in its folder, and takes bounded memory."""
 
 import json
 import os
@@ -55,7 +55,7 @@ def test_paths(version, of, path, sentence, tmp_path):
 
 
 def test_the_name_of_a_camera(tmp_path):
-    """It is part of the path of its films."""
+    """It becomes part of the paths of its videos."""
     folder = copied("v21", tmp_path)
     edit_info(folder, lambda i: i["features"].update({"../../x": {"dtype": "video"}}))
     with pytest.raises(ValueError, match="names must be relative and stay"):
@@ -94,8 +94,8 @@ def test_a_snapshot_of_the_hub(version, tmp_path):
     np.testing.assert_array_equal(found.episode(1).image["side"], wanted.episode(1).image["side"])
 
 
-def test_a_playlist_is_no_film(tmp_path):
-    """FFmpeg would read what it names, wherever that is."""
+def test_playlists_are_refused(tmp_path):
+    """FFmpeg would open the files and URLs that they list."""
     for number, text in enumerate(
         (
             "#EXTM3U\n#EXTINF:1,\nhttp://localhost:9/x.ts\n#EXT-X-ENDLIST\n",
@@ -108,14 +108,14 @@ def test_a_playlist_is_no_film(tmp_path):
             VideoReader(path)
 
 
-def test_kinds_of_pictures():
-    """The library would run a program for PostScript."""
+def test_image_formats():
+    """Pillow would run a program for PostScript."""
     with pytest.raises(ValueError, match="an image is damaged"):
         decode_image(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n")
 
 
 def test_many_equal_rows(tmp_path):
-    """Few bytes in a file, many in memory."""
+    """A small file that takes much memory."""
     column = pa.DictionaryArray.from_arrays(pa.array([0] * 10**6, pa.int8()), pa.array([1.5]))
     path = tmp_path / "many.parquet"
     table = pa.table({"action": column})
@@ -132,7 +132,7 @@ def test_many_equal_rows(tmp_path):
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-def test_a_width(version, tmp_path):
+def test_a_dimension_out_of_range(version, tmp_path):
     folder = copied(version, tmp_path)
     edit_info(folder, lambda i: i["features"]["action"].update(shape=[10**12]))
     with pytest.raises(
@@ -150,7 +150,7 @@ def test_a_width(version, tmp_path):
         ("videos/observation.images.side/from_timestamp", -1.0),
     ],
 )
-def test_numbers_of_the_index(name, value, tmp_path):
+def test_invalid_values_in_parquet_metadata(name, value, tmp_path):
     folder = copied("v3", tmp_path)
     before = digest(folder / "data")
 
@@ -166,7 +166,7 @@ def test_numbers_of_the_index(name, value, tmp_path):
     assert digest(folder / "data") == before
 
 
-def test_lines_of_the_index(tmp_path):
+def test_invalid_values_in_json_metadata(tmp_path):
     folder = copied("v21", tmp_path)
     path = folder / "meta" / "episodes.jsonl"
     lines = [json.loads(line) for line in path.read_text().splitlines()]

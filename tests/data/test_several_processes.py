@@ -1,4 +1,4 @@
-"""`convert` in several processes, and killed: there is no cache or a whole one."""
+"""`convert` in concurrent and killed processes: a cache is complete or absent."""
 
 import os
 import random
@@ -22,7 +22,7 @@ KILLS = 12
 
 
 def convert(out):
-    """A process that is on its way."""
+    """Start a conversion in a new process."""
     command = [sys.executable, "-m", "lorasp_jax.data", "convert", golden("v3"), "--out", out]
     return subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
 
@@ -33,7 +33,7 @@ def files(folder):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """What a conversion that nothing disturbs writes."""
+    """Files that an undisturbed conversion writes."""
     path = tmp_path_factory.mktemp("whole") / "cache"
     cache.write([LeRobot(golden("v3"), Keys(image_size=224))], path, lambda *_: None)
     return files(path)
@@ -55,12 +55,12 @@ def test_one_writes_and_the_others_wait(whole, tmp_path):
 
 @pytest.mark.parametrize("seed", mostly_slow(range(KILLS), [6]))
 def test_killed_at_any_moment(whole, tmp_path, seed):
-    """From the first file to a little after the last one."""
+    """Between the first file and a little after the last one."""
     out, part = tmp_path / "cache", (seed + random.random()) / KILLS
     child = convert(out)
     while not list(tmp_path.iterdir()):
         time.sleep(0.001)
-    time.sleep(0.2 * part)  # s; about half of them come to an end
+    time.sleep(0.2 * part)  # s; about half of the conversions finish
     child.kill()
     child.communicate()
     if not out.exists():
@@ -80,7 +80,7 @@ def test_killed_at_any_moment(whole, tmp_path, seed):
         ({"action": "observation.state"}, False),
     ],
 )
-def test_what_another_one_wrote_must_be_the_same(tmp_path, keys, fits):
+def test_a_cache_of_another_process_must_match(tmp_path, keys, fits):
     out, asked = tmp_path / "cache", threading.Event()
     cache.write([LeRobot(golden("v3"))], tmp_path / "other", lambda *_: None)
     with ThreadPoolExecutor() as pool:
@@ -95,7 +95,7 @@ def test_what_another_one_wrote_must_be_the_same(tmp_path, keys, fits):
     assert len(Cache(out)) == 4
 
 
-def test_who_does_not_wait_is_refused(tmp_path):
+def test_without_waiting_a_second_writer_is_refused(tmp_path):
     out = tmp_path / "cache"
     with locked(out), pytest.raises(ValueError, match=r"another process is writing .*cache$"):
         cache.write([LeRobot(golden("v3"))], out, lambda *_: None)

@@ -1,4 +1,4 @@
-"""The order of training: every step once an epoch, the same for any number of processes."""
+"""The order of training data: every step once per epoch, for any number of processes."""
 
 import jax
 import numpy as np
@@ -15,7 +15,7 @@ from tests.runs import random_episodes
 
 @pytest.fixture(scope="module")
 def steps():
-    """42 steps in NumPy, whose first state number is the step's index."""
+    """42 steps in NumPy; the first state dimension is the index of the step."""
     found = jax.tree.map(np.asarray, flatten([random_episodes("a", 0), random_episodes("b", 1)]))
     state = np.array(found.state)
     state[:, 0] = np.arange(42)
@@ -30,7 +30,7 @@ def drawn(stream, batches):
     return np.stack([next(stream).state[:, 0] for _ in range(batches)])
 
 
-def test_every_step_once_an_epoch(steps):
+def test_every_step_once_per_epoch(steps):
     found = drawn(make(steps), 14).reshape(2, 42)
     for epoch in found:
         np.testing.assert_array_equal(np.sort(epoch), np.arange(42))
@@ -39,7 +39,7 @@ def test_every_step_once_an_epoch(steps):
     assert (found != drawn(make(steps, seed=4), 14).reshape(2, 42)).any()
 
 
-def test_going_on_at_any_position(steps):
+def test_resuming_at_any_position(steps):
     whole = drawn(make(steps), 17)
     for start in (1, 6, 7, 13):  # within an epoch, at its end and in the next one
         stream = make(steps, start=start)
@@ -48,7 +48,7 @@ def test_going_on_at_any_position(steps):
 
 
 def test_processes_share_the_same_batches(steps):
-    """So a run goes on with another number of them."""
+    """So a run can resume with another number of processes."""
     whole = drawn(make(steps), 10)
     for count in (2, 3):
         parts = [drawn(make(steps, process=(index, count)), 10) for index in range(count)]
@@ -57,7 +57,7 @@ def test_processes_share_the_same_batches(steps):
     np.testing.assert_array_equal(np.concatenate(later, -1), whole[4:])
 
 
-def test_windows_end_with_their_episode(steps):
+def test_windows_stay_in_their_episode(steps):
     windows = next(make(steps))
     for row, start in enumerate(windows.state[:, 0].astype(int)):
         end = steps.end[start]
@@ -84,6 +84,6 @@ def test_a_streamed_window_trains_as_one_on_the_device():
 
 
 @pytest.mark.parametrize("process", [(0, 4), (1, 5)])
-def test_processes_that_cannot_share(steps, process):
+def test_an_uneven_batch_is_refused(steps, process):
     with pytest.raises(ValueError, match=f"multiple of the {process[1]} processes"):
         make(steps, process=process)

@@ -1,4 +1,4 @@
-"""Films: every picture is the frame that PyAV itself gives, however it is read."""
+"""Videos: frames match PyAV's own, in any reading order."""
 
 import av
 import numpy as np
@@ -12,7 +12,7 @@ FPS, LENGTH, HEIGHT, WIDTH = 10, 23, 66, 90
 
 @pytest.fixture(scope="module", params=["libsvtav1", "libx264"])
 def film(request, tmp_path_factory):
-    """A path: noise, in which no frame is as another, as wide as no row of a decoder."""
+    """Path of a video of noise: all frames differ, and the width needs padding in the decoder."""
     path, rng = tmp_path_factory.mktemp("film") / "film.mp4", np.random.default_rng(0)
     with av.open(str(path), "w") as container:
         stream = container.add_stream(request.param, rate=FPS)
@@ -32,20 +32,20 @@ def frames(film):
         return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
 
 
-def test_pictures_are_the_frames(film, frames):
+def test_all_frames(film, frames):
     found = VideoReader(film).read(0.0, LENGTH, FPS)
     np.testing.assert_array_equal(found, frames)
     assert np.abs(np.diff(found.astype(int), axis=0)).mean((1, 2, 3)).min() > 20
 
 
-def test_reduced_pictures_are_pillows(film, frames):
+def test_downscaling_matches_pillow(film, frames):
     found = VideoReader(film).read(0.0, LENGTH, FPS, every=3, image_size=32)
     size = 32, 32 * HEIGHT // WIDTH
     reduced = [Image.fromarray(f).resize(size, Image.Resampling.BILINEAR) for f in frames[::3]]
     np.testing.assert_array_equal(found, reduced)
 
 
-def test_stretches_in_any_order(film, frames):
+def test_ranges_in_any_order(film, frames):
     reader = VideoReader(film)
     for first, length in ((5, 4), (9, 6), (0, 3), (20, 3), (1, 20)):
         found = reader.read(first / FPS, length, FPS)

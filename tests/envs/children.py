@@ -1,4 +1,4 @@
-"""What child processes of test_commands.py run: collections that come to a sudden end."""
+"""Code of the child processes of test_commands.py: collections that end abruptly."""
 
 import itertools
 import os
@@ -16,25 +16,25 @@ from envs.datasets import rlds, rlds_schema
 from tests import ROOT
 
 COLLECT = "collect --task press --robot piper --num-episodes 20 --num-envs 6 --image-size 16"
-# Where a process is killed: a function, and which call of it the process does not survive.
+# Where a process is killed: a function, and the number of the fatal call.
 MOMENTS = {
-    "in the middle of a part": (rlds_schema, "record", 9),
-    "before the second part counts": (os, "replace", 3),
-    "before a further part": (sys.modules[__name__], "fake_record", 4),
-    "when all parts are there": (rlds.ShardWriter, "complete", 1),
+    "in the middle of a shard": (rlds_schema, "record", 9),
+    "before the second shard is listed": (os, "replace", 3),
+    "before the next shard": (sys.modules[__name__], "fake_record", 4),
+    "when all shards are complete": (rlds.ShardWriter, "complete", 1),
     "before the dataset is in place": (os, "rename", 1),
 }
 
-# Further moments, with what is made meanwhile.
+# More moments, with the name of the output.
 REPLACING = {
     "between two datasets": (os, "rename", 2, "press"),
     "before the old dataset is deleted": (shutil, "rmtree", 1, "press"),
-    "before the parts of a file are deleted": (shutil, "rmtree", 1, "press.npz"),
+    "before the shards of a file are deleted": (shutil, "rmtree", 1, "press.npz"),
 }
 
 
 def fake_record(env, key, action_noise, ranges):
-    """Stands in for the simulation: noise instead of pictures, some attempts fail."""
+    """Replace the simulation: images are noise, and some attempts fail."""
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     size, width = (env.num_envs, 5), env.num_joints + 1
     episodes = {
@@ -50,7 +50,7 @@ def fake_record(env, key, action_noise, ranges):
 
 
 def die_at(owner, name, call):
-    """The process is killed, as by kill -9, instead of that call of a function."""
+    """Kill the process, as by kill -9, in place of a function's call with this number."""
     survived, count = getattr(owner, name), itertools.count(1)
 
     def deadly(*arguments, **options):
@@ -62,20 +62,20 @@ def die_at(owner, name, call):
 
 
 def run_child(call):
-    """What the tests call: a process that runs one of the functions below to its end."""
+    """Run one of the functions below in a child process, and wait for it."""
     code = f"from tests.envs import children; children.{call}"
     root = ROOT
     return subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, check=False)
 
 
 def collect_and_die(moment, out, options=""):
-    """What a child process runs."""
+    """In a child process: collect until killed."""
     die_at(*(MOMENTS | REPLACING)[moment][:3])
     command_line.main([*COLLECT.split(), "--out", out, *options.split()], record=fake_record)
 
 
 def collect_and_interrupt(out):
-    """What another child process runs: Ctrl-C while the second part is made."""
+    """In a child process: collect, with Ctrl-C during the second shard."""
     calls, noticed = itertools.count(), threading.Event()
 
     def notice(*_):
@@ -85,7 +85,7 @@ def collect_and_interrupt(out):
     def record(*arguments):
         if next(calls) == 1:
             os.kill(os.getpid(), signal.SIGINT)
-            assert noticed.wait(60)  # the main thread of a busy machine may take its time
+            assert noticed.wait(60)  # the main thread may be slow on a busy machine
         return fake_record(*arguments)
 
     signal.signal(signal.SIGINT, notice)

@@ -1,4 +1,4 @@
-"""Scenes and expert episodes that several tests look at; each is compiled once a session."""
+"""Scenes and expert episodes shared by tests; each is compiled once per session."""
 
 import functools
 
@@ -12,15 +12,15 @@ from envs.names import names
 TASKS = names("task")
 ROBOTS = names("robot")
 EPISODES = 32
-SHORT = ("press", "piper")  # whose episodes every run of the tests looks at
+SHORT = ("press", "piper")  # episodes of these are tested in every run
 
 
 def pytest_generate_tests(metafunc):
-    """Every test that asks for a task or a robot sees all there are, unless it says which."""
+    """Parametrize tests with a task or robot over all of them, unless they choose themselves."""
     chosen = {mark.args[0] for mark in metafunc.definition.iter_markers("parametrize")}
     for name, values in (("task_name", TASKS), ("robot_name", ROBOTS)):
         if name in metafunc.fixturenames and name not in chosen:
-            # Episodes take a minute a scene to compile: most are long tests.
+            # Compiling episodes takes a minute per scene, so most of these tests are slow.
             long = values if "episodes" in metafunc.fixturenames else []
             marks = {v: [] if v in SHORT else [pytest.mark.slow] for v in long}
             metafunc.parametrize(name, [pytest.param(v, marks=marks.get(v, [])) for v in values])
@@ -42,17 +42,17 @@ def _collect(task: str, robot: str) -> envs.Episodes:
 
 @pytest.fixture
 def scene(task_name, robot_name) -> envs.Env:
-    """An environment to look at, not to step: it is never compiled."""
+    """An environment that is inspected, never stepped or compiled."""
     return _make(task_name, robot_name, 1)
 
 
 @pytest.fixture
 def episodes(task_name, robot_name) -> envs.Episodes:
-    """Successful expert episodes, as numpy arrays."""
+    """Successful expert episodes, as NumPy arrays."""
     return _collect(task_name, robot_name)
 
 
 @pytest.fixture(scope="session")
 def env() -> envs.Env:
-    """Four worlds of one task to step."""
+    """An environment with four worlds of one task."""
     return _make("press", "piper", 4)

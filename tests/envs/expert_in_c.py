@@ -1,4 +1,4 @@
-"""What an expert does, in MuJoCo's own engine: no scene has to be compiled for it."""
+"""Run experts in MuJoCo's own engine, without compiling a scene."""
 
 import functools
 from collections.abc import Iterator
@@ -14,12 +14,12 @@ from envs.tasks import View
 
 
 def world(scene, key: int = 0) -> mujoco.MjData:
-    """MuJoCo data of a random layout, robot at home; moves the model's fixed bodies."""
+    """Return MuJoCo data of a random layout, robot at home; moves fixed bodies of the model."""
     return _placed(scene, scene.task.place(jax.random.key(key)))
 
 
 def episode(scene, key: int = 0) -> Iterator[mujoco.MjData]:
-    """The same world, at first and after each control step of the expert's, until success."""
+    """Yield the same data at the start and after each control step of the expert, until success."""
     layout = scene.task.place(jax.random.key(key))
     data = _placed(scene, layout)
     command = jnp.append(jnp.asarray(scene.robot.home, jnp.float32), 0.04)  # m, gripper

@@ -18,7 +18,7 @@ def robot(robot_name):
 
 
 def command(robot, key):
-    """Return targets near home, and others a little further."""
+    """Return targets near home, and others a little farther away."""
     draw = jax.random.normal(jax.random.key(key), (2, robot.num_joints))
     joints = jnp.asarray(robot.home, jnp.float32) + jnp.array([0.05, 0.1])[:, None] * draw
     return jnp.concatenate([joints, jnp.array([[0.02], [0.04]])], axis=1)

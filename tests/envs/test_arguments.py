@@ -1,4 +1,4 @@
-"""Invalid arguments raise one sentence before anything is compiled."""
+"""Invalid arguments raise errors of one sentence before anything is compiled."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ NUMBER = ("num_envs", "image_size", "antialias", "distractors")
 
 @pytest.fixture(scope="module")
 def worlds():
-    """An environment that is never compiled, and the shapes of its state."""
+    """Return an environment that is never compiled, and the shapes of its state."""
     env = envs.make("press", num_envs=2, image_size=8)
     shapes = jax.eval_shape(env.reset, KEY)
     return env, jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)

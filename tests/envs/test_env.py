@@ -178,7 +178,7 @@ def test_lowers_for_every_accelerator(env):
         assert "f64" not in text
 
 
-def test_import_is_light():
+def test_import_is_fast():
     code = (
         "import envs, envs.__main__, jax, sys\n"
         "from jax._src import xla_bridge\n"

@@ -15,7 +15,7 @@ _MESH = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\
 
 @pytest.fixture
 def robots(tmp_path):
-    """Make a folder with meshes, and another one beside it."""
+    """Make a folder with meshes, and a second folder beside it."""
     for folder in ("robot/meshes", "robot/parts", "other"):
         (tmp_path / folder).mkdir(parents=True)
         (tmp_path / folder / "a.obj").write_text(_MESH)
@@ -149,8 +149,8 @@ def test_sizes(asset, body, sentence, robots):
 
 
 @pytest.mark.parametrize("kind", ["attach", "include"])
-def test_descriptions_in_descriptions(kind, robots):
-    """Ten in each of five: more than MuJoCo could ever make."""
+def test_nested_descriptions(kind, robots):
+    """Ten includes in each of five levels: more elements than MuJoCo could build."""
     for i in range(5):
         model = f'<asset><model name="m" file="x{i + 1}.xml"/></asset>'
         ten = "".join(f'<attach model="m" body="b" prefix="{j}"/>' for j in range(10))
@@ -193,7 +193,7 @@ def test_each_file_is_read_once(robots, monkeypatch):
     assert len(count) == 3
 
 
-def test_mujocos_warnings_become_pythons(robots, monkeypatch):
+def test_mujocos_warnings_become_python_warnings(robots, monkeypatch):
     """MuJoCo would write them to a file in the working folder."""
     monkeypatch.chdir(robots)
     before = sorted(robots.rglob("*"))

@@ -1,4 +1,4 @@
-"""What the command line takes, and what it says of its options."""
+"""Validation and help of command-line options."""
 
 import pytest
 
@@ -16,14 +16,14 @@ from tests.envs.children import COLLECT
         ("--action-noise nan", "argument --action-noise: must be a finite number, got nan"),
     ],
 )
-def test_numbers_that_are_none(tmp_path, capsys, text, message):
+def test_invalid_numbers(tmp_path, capsys, text, message):
     with pytest.raises(SystemExit, match="2"):
         command_line.main([*COLLECT.split(), "--out", str(tmp_path / "new"), *text.split()])
     assert message in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
-def test_help_says_what_options_are_for(capsys):
+def test_help_describes_options(capsys):
     for command, texts in (
         ("play", ("with --out: height", "with --out: replace", "or the path of an MJCF file")),
         ("collect", ("replace existing output", "or the path of an MJCF file")),

@@ -37,9 +37,9 @@ def potentials(scene, key) -> np.ndarray:
     [
         ([0.0, 0.0, 0.0], 0.0),
         ([0.6, 0.0, 0.0], 0.2),
-        ([0.6, 0.9, 0.9], 0.2),  # later stages have not begun
+        ([0.6, 0.9, 0.9], 0.2),  # later stages have not started
         ([1.0, 0.5, 0.0], 0.5),
-        ([0.1, 1.0, 0.5], 2.5 / 3),  # a passed stage stands for those before it
+        ([0.1, 1.0, 0.5], 2.5 / 3),  # a passed stage counts for those before it
         ([0.0, 0.0, 1.0], 1.0),
         ([1.0, 1.0, 1.0], 1.0),
     ],
@@ -115,7 +115,7 @@ def test_rewards_telescope(discount):
     won = episode(discount=discount, success=True)
     sparse = discount ** (length - 1)
     assert discounted(won, discount) == pytest.approx(sparse - start)
-    # Time that is up leaves a state that the learner bootstraps from: its potential stays.
+    # After a time limit the learner bootstraps from the last state, so its potential stays.
     late = episode(discount=discount, done=True)
     assert discounted(late, discount) == pytest.approx(discount**length * 0.95 - start)
 
@@ -165,7 +165,7 @@ def test_bad_arguments(options, message):
 
 @pytest.mark.slow
 def test_an_environment_with_dense_rewards(task_name):
-    """The expert's rewards in randomised worlds are finite, and telescope."""
+    """The expert's rewards in randomized worlds are finite, and telescope."""
     env = envs.make(task_name, num_envs=4, image_size=16, reward="dense", discount=0.95)
     ranges = envs.Randomization.typical()
     state = env.reset(jax.random.key(0), ranges)

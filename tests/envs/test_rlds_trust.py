@@ -1,4 +1,4 @@
-"""An RLDS dataset runs no code, leaves its folder nowhere, and takes no more than it holds."""
+"""An RLDS dataset runs no code, stays in its folder, and takes bounded memory."""
 
 import dataclasses
 import json
@@ -18,7 +18,7 @@ TEXT = "tensorflow_datasets.core.features.text_feature.Text"
 
 @pytest.fixture
 def path(tmp_path, monkeypatch):
-    """A dataset whose folder is where Python looks for modules, as the working folder is."""
+    """A dataset in a folder from which Python imports modules, like the working folder."""
     rlds.write(make(), tmp_path / "press")
     (tmp_path / "press" / "evil_of_a_dataset.py").write_text("open('harm', 'w')\n")
     monkeypatch.chdir(tmp_path)
@@ -98,7 +98,7 @@ def test_names_and_numbers_of_files(where, value, sentence, path):
         rlds.Reader(path)
 
 
-def test_a_name_that_leaves_the_folder(path, tmp_path):
+def test_a_name_outside_the_folder(path, tmp_path):
     (file,) = path.glob("*array_record*")
     shutil.copy(file, tmp_path / "x-train.array_record-00000")
     edit(path / "dataset_info.json", lambda found: found.update(name="../x"))
@@ -106,7 +106,7 @@ def test_a_name_that_leaves_the_folder(path, tmp_path):
         rlds.Reader(path)
 
 
-def test_more_episodes_than_there_are(path):
+def test_more_episodes_than_records(path):
     edit(path / "metadata.json", lambda found: found.update(parts=[10**12]))
     edit(path / "dataset_info.json", lambda i: i["splits"][0].update(shardLengths=[str(10**12)]))
     with pytest.raises(ValueError, match="has 3 episodes, expected 1000000000000"):
@@ -128,7 +128,7 @@ def test_links_and_pipes(name, path, tmp_path):
         rlds.Reader(path)
 
 
-def test_pictures_of_another_size(path):
+def test_images_of_another_size(path):
     """They are refused before they are decoded."""
     edit(path / "metadata.json", lambda found: found["cameras"].update(side=[60, 80]))
     with pytest.raises(ValueError, match=r"an image has 6 x 8 pixels, expected \[60, 80\]"):
@@ -136,7 +136,7 @@ def test_pictures_of_another_size(path):
 
 
 @pytest.mark.parametrize("name", ["../../harm", "/tmp/harm", "a/b", "é" * 300, "x" * 300, ""])
-def test_names_of_tasks_and_robots_are_no_paths(name, path, tmp_path):
+def test_names_of_tasks_and_robots_are_not_paths(name, path, tmp_path):
     before = sorted(tmp_path.iterdir())
     rlds.write(make(task=name, robot=name), tmp_path / "other")
     assert sorted(tmp_path.iterdir()) == sorted([*before, tmp_path / "other"])
@@ -145,7 +145,7 @@ def test_names_of_tasks_and_robots_are_no_paths(name, path, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["../x", "a/b", "", ".x", "x" * 101, "a\\b"])
-def test_names_of_cameras_are_no_paths(name, tmp_path):
+def test_names_of_cameras_are_not_paths(name, tmp_path):
     episodes = make()
     images = {name: episodes.image["side"]}
     with pytest.raises(ValueError, match="invalid camera name"):

@@ -31,7 +31,7 @@ def test_only_modules_that_define_a_robot_are_robots():
 
 
 @pytest.mark.parametrize("offset", [0, 1])
-def test_piper_kinematics_are_the_sdks(offset):
+def test_piper_kinematics_match_the_sdk(offset):
     q = jnp.asarray(GOLDEN["q"], jnp.float32)
     position, rotation = jax.jit(piper.forward_kinematics, static_argnames="sdk_offset")(
         q, sdk_offset=bool(offset)
@@ -101,7 +101,9 @@ def test_fingers_follow_the_opening(scene, robot_name):
     data.ctrl[:] = np.append(scene.robot.home, scene.robot.stroke / 2)
     for _ in range(300):
         mujoco.mj_step(model, data)
-    np.testing.assert_allclose(data.qpos[:joints], scene.robot.home, atol=2e-3)  # gravity held
+    np.testing.assert_allclose(
+        data.qpos[:joints], scene.robot.home, atol=2e-3
+    )  # gravity compensated
     np.testing.assert_allclose(data.qpos[joints : joints + 2], scene.robot.stroke / 2, atol=1e-3)
     gap = data.geom_xpos[pads(model)[0]] - data.geom_xpos[pads(model)[1]]
     thickness = 2 * model.geom_size[pads(model)[0], 1]

@@ -1,4 +1,4 @@
-"""A process that is not the first has environments of its own."""
+"""Processes other than the first can make environments, too."""
 
 from tests.several import start
 

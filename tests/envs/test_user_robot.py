@@ -164,7 +164,7 @@ def built(folder: Path, *edits: tuple[str, str]) -> mujoco.MjModel:
     return scene.build(press.TASK.scene, mjcf.load(write(folder, *edits)))
 
 
-def test_names_may_clash_with_the_scene(tmp_path):
+def test_names_of_the_scene_may_be_used(tmp_path):
     edits = [(f'"{old}"', f'"{new}"') for old, new in zip("ab", ("right", "left"), strict=True)]
     edits += [('"upper"', '"base"'), ('"lower"', '"button"'), ('"yaw"', '"gripper"')]
     edits += [('"column"', '"hand"'), ('"blue"', '"table"'), ('"shell"', '"squares"')]
@@ -215,7 +215,7 @@ def test_a_tendon_may_drive_a_hinge(tmp_path):
     np.testing.assert_allclose(model.actuator("robot/yaw").biasprm[:3], [0, -50, -4])
 
 
-def test_colours_move_to_the_geoms(tmp_path):
+def test_colors_move_to_the_geoms(tmp_path):
     geoms = '<default class="robot"><geom contype="1"'
     model = built(tmp_path, (geoms, f'{geoms} material="blue"'))
     arm = model.body_rootid[model.geom_bodyid] == model.body("base").id

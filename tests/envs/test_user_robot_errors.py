@@ -1,4 +1,4 @@
-"""What is said of a user's MJCF that lacks something."""
+"""Errors about a user's MJCF that lacks something."""
 
 import re
 

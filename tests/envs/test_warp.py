@@ -97,14 +97,14 @@ def test_images_match_the_ray_caster(ranges, antialias):
         difference = np.abs(np.asarray(picture, int) - np.asarray(other, int))
         assert difference.mean(axis=(1, 2, 3)).max() < 1.5
         assert np.mean(difference.max(axis=-1) > 16) < 0.03
-    # Chunks of the context's size, the last one filled up.
+    # Chunks of the context's size, the last one padded.
     poses = Poses.of(state.data)
     many = jax.tree.map(lambda x: jnp.concatenate([x, x[:1]]), (poses, state.info["draw"]))
     pictures = theirs.render(many[0], draw=many[1])
     seen = theirs.observe(state)["image"]
     for name, picture in pictures.items():
         np.testing.assert_array_equal(picture, jnp.concatenate([seen[name], seen[name][:1]]))
-    # A further vmap makes more worlds of it.
+    # Another vmap multiplies the number of worlds.
     twice = jax.vmap(theirs.observe)(jax.tree.map(lambda x: jnp.stack([x, x]), state))["image"]
     for name, picture in twice.items():
         np.testing.assert_array_equal(picture[1], seen[name])

@@ -92,7 +92,7 @@ JOINTS = ("yaw", "shoulder", "elbow", "roll", "pitch", "turn")
 
 
 def write(folder: Path, *edits: tuple[str, str]) -> Path:
-    """The arm's file, with texts replaced by others."""
+    """Write the arm's file, with some strings replaced."""
     text = _ARM
     for old, new in edits:
         assert old in text

@@ -1,4 +1,4 @@
-"""What progress bars say."""
+"""Text of progress bars."""
 
 import io
 import threading
@@ -16,8 +16,8 @@ from envs.cli.bars import bars, collecting
         (64, 2.0, None, "128 samples/s"),
         (512, 40.0, None, "20,480 samples/s"),
         (1, 0.025, None, "0.025 samples/s"),
-        (1, None, None, ""),  # nothing done yet, or all at once
-        (2, 3.0, 5.0, "10 samples/s"),  # over the whole time, once it is over
+        (1, None, None, ""),  # nothing done yet, or everything at once
+        (2, 3.0, 5.0, "10 samples/s"),  # mean over the whole time, once it is over
     ],
 )
 def test_rate_counts_units_not_steps(per_step, speed, finished, text):
@@ -36,7 +36,7 @@ def test_slow_steps_have_a_rate_too():
 
 @pytest.mark.parametrize("kept", [0, 8])
 def test_compiling_is_not_in_the_rate(kept):
-    """It ends with the first episodes, also of a collection that continues."""
+    """Compilation ends with the first episodes, also in a resumed collection."""
     progress, now = bars(Console(file=io.StringIO()), "episodes"), [0.0]
     progress.get_time = lambda: now[0]
     report = collecting(progress, "press, piper", threading.Event())
@@ -47,7 +47,7 @@ def test_compiling_is_not_in_the_rate(kept):
         assert task.description.endswith("compiling ..." if now[0] == 1 else "collecting")
 
 
-def test_what_is_refused_has_no_bar_and_what_is_stopped_ends():
+def test_no_bar_before_the_first_report_and_none_after_a_stop():
     progress, stop = bars(Console(file=io.StringIO()), "episodes"), threading.Event()
     collecting(progress, "dance, piper", stop)
     report = collecting(progress, "press, piper", stop)

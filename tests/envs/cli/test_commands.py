@@ -1,4 +1,4 @@
-"""The command line's manners: nothing is overwritten, half written or lost."""
+"""The command line never overwrites, truncates or loses a file."""
 
 import itertools
 import os
@@ -22,7 +22,7 @@ from tests.envs.datasets.test_rlds import trimmed
 
 
 def stopping(function, calls):
-    """The function, which Ctrl-C meets after so many calls."""
+    """Wrap a function to raise KeyboardInterrupt after a number of calls."""
     count = itertools.count()
 
     def stopped(*arguments, **options):
@@ -35,8 +35,8 @@ def stopping(function, calls):
 
 @pytest.fixture
 def run(capsys, monkeypatch):
-    """Runs a command, by default without simulation; returns its exit code and what it said."""
-    # These act on the process.
+    """Return a function that runs a command, by default without simulation: exit code, output."""
+    # These change the process.
     monkeypatch.setattr(command_line.cache, "enable", lambda: None)
 
     def run(text, *more, record=fake_record):
@@ -80,7 +80,7 @@ def test_bad_input_is_one_sentence(tmp_path, run, monkeypatch):
 
 def test_play_and_gallery_write_files(tmp_path, run, monkeypatch):
     def collect(task, robot, *, num_episodes, progress, **options):
-        assert options["num_envs"] == 1  # no picture is drawn that nobody sees
+        assert options["num_envs"] == 1  # only shown images are rendered
         progress(0, num_episodes)
         progress(num_episodes, num_episodes)
         length = np.full(num_episodes, 4, np.int32)
@@ -99,7 +99,7 @@ def test_play_and_gallery_write_files(tmp_path, run, monkeypatch):
         assert picture.info["duration"] == 200  # ms
 
 
-def test_collect_writes_what_the_library_gives(tmp_path, run):
+def test_collect_writes_the_episodes_of_the_library(tmp_path, run):
     code, said = run(COLLECT, "--out", tmp_path / "press", "--actions", "delta_joint")
     assert code == 0, said
     assert "20/20" in said
@@ -121,7 +121,7 @@ def test_collect_writes_what_the_library_gives(tmp_path, run):
     )
 
 
-def test_collect_writes_a_file_or_many_datasets(tmp_path, run):
+def test_collect_writes_a_file_or_several_datasets(tmp_path, run):
     assert run(COLLECT, "--out", tmp_path / "press.npz")[0] == 0
     code, said = run(COLLECT.replace("press", "pour press"), "--out", tmp_path / "many")
     assert code == 0, said
@@ -132,7 +132,7 @@ def test_collect_writes_a_file_or_many_datasets(tmp_path, run):
 
 
 @pytest.mark.parametrize("moment", mostly_slow(MOMENTS, [*MOMENTS][:1]))
-def test_killed_and_continued(tmp_path, run, moment):
+def test_killed_and_resumed(tmp_path, run, moment):
     run(COLLECT, "--out", tmp_path / "whole")
     out, unfinished = tmp_path / "killed", tmp_path / "killed.partial"
     child = run_child(f"collect_and_die({moment!r}, {str(out)!r})")
@@ -154,12 +154,12 @@ def test_killed_and_continued(tmp_path, run, moment):
     assert rlds.metadata(out) == rlds.metadata(tmp_path / "whole")
     assert sorted(os.listdir(out)) == sorted(os.listdir(tmp_path / "whole"))
     assert not unfinished.exists()
-    for file in sorted(before)[: len(parts)]:  # what was finished was not made again
+    for file in sorted(before)[: len(parts)]:  # complete shards were not collected again
         assert (out / file.name).stat().st_mtime_ns == before[file]
 
 
 @pytest.mark.slow
-def test_interrupted_simulation_goes_on_bit_for_bit(tmp_path, run, env, monkeypatch):
+def test_an_interrupted_simulation_resumes_bit_for_bit(tmp_path, run, env, monkeypatch):
     for module in (envs, collection):
         monkeypatch.setattr(module, "make", lambda *arguments, **options: env)
     text, out = "collect --task press --robot piper --num-episodes 10", tmp_path / "press"
@@ -172,7 +172,7 @@ def test_interrupted_simulation_goes_on_bit_for_bit(tmp_path, run, env, monkeypa
     assert_equal(rlds.read(out), trimmed(whole))
 
 
-def test_interrupted_before_anything(tmp_path, run, monkeypatch):
+def test_interrupted_before_the_first_shard(tmp_path, run, monkeypatch):
     monkeypatch.setattr(rlds, "ShardWriter", stopping(rlds.ShardWriter, 0))
     code, said = run(COLLECT, "--out", tmp_path / "press")
     assert code == 130
@@ -180,7 +180,7 @@ def test_interrupted_before_anything(tmp_path, run, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_several_tasks_go_on_where_they_were(tmp_path, run, monkeypatch):
+def test_several_tasks_resume(tmp_path, run, monkeypatch):
     text, out = COLLECT.replace("press", "all"), tmp_path / "many"
     with monkeypatch.context() as patch:
         patch.setattr(writing, "replace_folder", stopping(writing.replace_folder, 2))
@@ -214,7 +214,7 @@ def test_one_bad_task_stops_the_others(tmp_path, run):
     assert "error: the expert solved only 0 of 18 layouts of 'pour'" in said
 
 
-def test_ctrl_c_keeps_the_part_under_way(tmp_path):
+def test_ctrl_c_keeps_the_current_shard(tmp_path):
     out = tmp_path / "press"
     child = run_child(f"collect_and_interrupt({str(out)!r})")
     assert child.returncode == 130, child.stderr
@@ -223,7 +223,7 @@ def test_ctrl_c_keeps_the_part_under_way(tmp_path):
     assert b"Traceback" not in child.stderr
 
 
-def test_overwriting_keeps_the_old_until_the_new_is_whole(tmp_path, run, monkeypatch):
+def test_overwriting_keeps_the_old_until_the_new_is_complete(tmp_path, run, monkeypatch):
     out = tmp_path / "press"
     run(COLLECT, "--out", out)
     before = rlds.read(out)
@@ -237,7 +237,7 @@ def test_overwriting_keeps_the_old_until_the_new_is_whole(tmp_path, run, monkeyp
     assert rlds.metadata(out)["options"]["seed"] == 1
 
 
-def test_a_damaged_part_is_refused(tmp_path, run, monkeypatch):
+def test_a_damaged_shard_is_refused(tmp_path, run, monkeypatch):
     out = tmp_path / "press"
     with monkeypatch.context() as patch:
         patch.setattr(rlds.ShardWriter, "complete", stopping(rlds.ShardWriter.complete, 0))
@@ -251,7 +251,7 @@ def test_a_damaged_part_is_refused(tmp_path, run, monkeypatch):
 
 
 @pytest.mark.slow
-def test_an_edited_robot_is_another(tmp_path, run):
+def test_an_edited_robot_is_a_different_one(tmp_path, run):
     text = COLLECT.replace("piper", str(user_arm.write(tmp_path)))
     assert run(text, "--out", tmp_path / "done")[0] == 0
     with pytest.MonkeyPatch.context() as patch:
@@ -293,7 +293,7 @@ def test_killed_while_the_old_is_replaced(tmp_path, run, moment):
     assert found.num_episodes == 20
 
 
-def test_a_file_of_others_survives_parts_that_are_whole(tmp_path, run, monkeypatch):
+def test_an_unrelated_file_survives_complete_shards(tmp_path, run, monkeypatch):
     out = tmp_path / "press.npz"
     with monkeypatch.context() as patch:
         patch.setattr(rlds.ShardWriter, "complete", stopping(rlds.ShardWriter.complete, 0))

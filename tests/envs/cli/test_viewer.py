@@ -1,4 +1,4 @@
-"""Replaying an episode in a window; the window itself is a stand-in."""
+"""Replay an episode in a window, replaced by a fake."""
 
 import argparse
 import contextlib
@@ -15,7 +15,7 @@ PLAY = argparse.Namespace(task="press", robot="piper", out=None, seed=0)
 
 
 class Window:
-    """Stands in for MuJoCo's window: closes after some pictures."""
+    """Fake of MuJoCo's window that closes after some frames."""
 
     def __init__(self, model, data, pictures):
         self.model, self.data, self.left = model, data, pictures
@@ -59,7 +59,7 @@ def test_play_repeats_an_episode_until_the_window_closes(env, monkeypatch):
     seen = np.array(window.seen)
     assert len(seen) == len(slept) == 60
     assert 0 < np.median(slept) < env.control_dt  # in real time
-    # The button stands where this world has it, and goes down; then all begins anew.
+    # The button is where this world has it, and goes down; then the replay restarts.
     assert not np.allclose(window.model.body("button").pos, env.model.body("button").pos)
     length = int(np.flatnonzero((seen == seen[0]).all(axis=1))[1])
     (button,) = env.model.joint("button").qposadr
@@ -68,13 +68,13 @@ def test_play_repeats_an_episode_until_the_window_closes(env, monkeypatch):
     np.testing.assert_array_equal(seen[length:], seen[: 60 - length])
 
 
-def test_without_a_display_it_says_what_to_do(monkeypatch):
+def test_without_a_display_the_error_suggests_a_file(monkeypatch):
     monkeypatch.setattr(viewer.glfw, "init", lambda: False)
     with pytest.raises(ValueError, match=r"without a display: add --out FILE\.mp4"):
         commands.play(PLAY, Console())
 
 
-def test_where_windows_need_another_interpreter(env, monkeypatch):
+def test_windows_that_need_another_interpreter(env, monkeypatch):
     def launch(model, data, **panels):
         raise RuntimeError("`launch_passive` requires mjpython on macOS")
 
@@ -85,7 +85,7 @@ def test_where_windows_need_another_interpreter(env, monkeypatch):
 
 def test_an_expert_that_never_succeeds_is_an_error(env):
     def act(env, plan, state):
-        return state.info["command"]  # stands still
+        return state.info["command"]  # does not move
 
     with pytest.raises(ValueError, match="the expert failed in all 4 layouts"):
         viewer.episode(env, jax.random.key(0), tries=1, plan=lambda *_: None, act=act)

@@ -1,4 +1,4 @@
-"""Processes that share a compilation cache only read whole programs."""
+"""Processes that share a compilation cache read only complete programs."""
 
 import threading
 

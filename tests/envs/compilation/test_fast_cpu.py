@@ -66,7 +66,7 @@ def test_too_late_warns_once_and_our_programs_are_fast():
         "for _ in range(10):\n"
         "    state = env.step(state, state.info['command'])\n"
         "jax.block_until_ready(state)\n"
-        "assert time.process_time() - start < 1.5",  # else 10 s
+        "assert time.process_time() - start < 1.5",  # otherwise 10 s
         xla.UNOPTIMIZED,
     )
 

@@ -26,7 +26,7 @@ def test_long_compilation_is_announced(impatient, capsys):
     assert capsys.readouterr().err.startswith("compiled the world in 0 s")
 
 
-def test_with_a_cache_the_message_says_the_first_time_only(impatient, capsys):
+def test_with_a_cache_only_the_first_time_is_slow(impatient, capsys):
     jax.config.update("jax_enable_compilation_cache", True)
     with messages.announce("the world"):
         time.sleep(0.3)

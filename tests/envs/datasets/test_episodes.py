@@ -43,7 +43,7 @@ def assert_equal(a, b):
 
 
 def rewritten(path, **changes):
-    """The .npz file with some arrays replaced, None removing one."""
+    """Rewrite an .npz file with some arrays replaced; None removes one."""
     with np.load(path) as archive:
         arrays = {name: archive[name] for name in archive.files} | changes
     np.savez(path, **{name: x for name, x in arrays.items() if x is not None})
@@ -59,7 +59,7 @@ def test_round_trip(tmp_path):
     assert episodes.num_steps == 1 + 2 + 3
 
 
-def test_printed_they_are_a_line():
+def test_repr_is_one_line():
     text = repr(make(3, 4))
     assert "image/side=uint8[3, 4, 6, 8, 3]" in text
     assert "task='press', robot='piper'" in text
@@ -68,7 +68,7 @@ def test_printed_they_are_a_line():
     assert "state=0" in repr(jax.tree.map(lambda _: 0, make(3, 4)))
 
 
-def test_every_truncation_is_one_sentence(tmp_path):
+def test_truncated_files_are_refused_in_one_sentence(tmp_path):
     path = tmp_path / "episodes.npz"
     make().save(path)
     whole = path.read_bytes()
@@ -79,7 +79,7 @@ def test_every_truncation_is_one_sentence(tmp_path):
         assert "\n" not in str(caught.value)
 
 
-def test_flipped_bytes_are_noticed(tmp_path):
+def test_flipped_bytes_are_detected(tmp_path):
     path = tmp_path / "episodes.npz"
     make().save(path)
     whole = bytearray(path.read_bytes())
@@ -130,7 +130,7 @@ def test_bad_contents(tmp_path, changes, message):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_numbers_that_are_none(value):
+def test_values_that_are_not_finite(value):
     episodes = make()
     action = np.array(episodes.action)
     action[1, 2, 3] = value
@@ -140,7 +140,7 @@ def test_numbers_that_are_none(value):
         dataclasses.replace(episodes, action=action).validate()
 
 
-def test_every_action_convention(tmp_path):
+def test_every_action_mode(tmp_path):
     panda = {"robot": "panda", "state": np.zeros((3, 4, 8), np.float32)}
     tool = make(**panda, actions="end_effector", action=np.ones((3, 4, 7), np.float32))
     tool.save(tmp_path / "e.npz")
@@ -151,7 +151,7 @@ def test_every_action_convention(tmp_path):
         make(actions="voltage").validate()
 
 
-def test_files_from_before_actions_were_told_apart(tmp_path):
+def test_files_without_an_action_mode(tmp_path):
     make().save(tmp_path / "e.npz")
     with np.load(tmp_path / "e.npz") as archive:
         facts = json.loads(archive["header"].tobytes())
@@ -209,7 +209,7 @@ def test_concatenate_pads_to_the_longest():
     "changes",
     [{"robot": "panda"}, {"control_dt": 0.2}, {"task": "pour"}, {"actions": "delta_joint"}],
 )
-def test_concatenate_refuses_mixtures(changes):
+def test_concatenate_refuses_mixed_metadata(changes):
     with pytest.raises(ValueError, match=f"episodes of different {next(iter(changes))}:"):
         concatenate([make(), make(**changes)])
     with pytest.raises(ValueError, match="empty"):
@@ -235,8 +235,8 @@ def _npy(shape: tuple, data: bytes) -> bytes:
         b"",
     ],
 )
-def test_an_array_that_is_not_what_its_header_says(member, tmp_path):
-    """Least of all is memory taken for it."""
+def test_an_array_that_does_not_match_its_header(member, tmp_path):
+    """No memory is allocated for it."""
     path = tmp_path / "x.npz"
     make().save(path)
     with zipfile.ZipFile(path, "a") as archive:

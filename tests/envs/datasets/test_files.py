@@ -1,4 +1,4 @@
-"""What is not trusted is refused before it is opened; what is right is read."""
+"""Untrusted files are refused before they are opened; valid ones are read."""
 
 import json
 import os
@@ -20,7 +20,7 @@ def folder(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["data/a.json", "a b", "...", "a..b/c", "ä"])
-def test_names_that_stay(name, tmp_path):
+def test_names_inside_the_folder(name, tmp_path):
     assert files.inside(tmp_path, name) == tmp_path / name
 
 
@@ -31,13 +31,13 @@ def test_names_that_stay(name, tmp_path):
         *("", None, 3, "a\0b", ["x"]),
     ],
 )
-def test_names_that_leave(name, tmp_path):
+def test_names_outside_the_folder(name, tmp_path):
     with pytest.raises(files.RefusedError, match=re.escape(f"{tmp_path} refers to {name!r}")):
         files.inside(tmp_path, name)
 
 
 def test_links(folder, tmp_path):
-    """Inside, and a folder that is itself a link: as any file. Out of it: not."""
+    """Links within the folder, and a folder that is a link itself, are fine; others are not."""
     (folder / "b.json").symlink_to("data/a.json")
     (tmp_path / "link").symlink_to(folder)
     for place in (folder, tmp_path / "link"):
@@ -58,7 +58,7 @@ def test_links(folder, tmp_path):
 
 @pytest.mark.parametrize("shared", [False, True])
 def test_a_snapshot_of_the_hub(shared, tmp_path):
-    """As huggingface_hub lays it out, also in a cache that is reached through a link."""
+    """In the layout of huggingface_hub, also if the cache is behind a link."""
     snapshot = tmp_path / "hub" / "datasets--owner--name" / "snapshots" / "0123"
     blobs = snapshot.parent.parent / "blobs"
     for folder in (snapshot / "meta", blobs, tmp_path / "hub" / "blobs" / "ab"):
@@ -78,11 +78,11 @@ def test_a_snapshot_of_the_hub(shared, tmp_path):
         files.regular(snapshot / "other" / "refs", snapshot)
 
 
-def test_what_is_no_file(folder, monkeypatch):
-    """It is not opened: that would wait for ever."""
+def test_special_files_are_refused(folder, monkeypatch):
+    """They are never opened: that would block forever."""
     os.mkfifo(folder / "pipe")
     with socket.socket(socket.AF_UNIX) as server:
-        monkeypatch.chdir(folder)  # the names of sockets are short
+        monkeypatch.chdir(folder)  # names of sockets must be short
         server.bind("socket")
     for path, kind in (("pipe", "a pipe"), ("data", "a folder"), ("socket", "a socket")):
         with pytest.raises(files.RefusedError, match=f"{path} must be a file, but is {kind}"):
@@ -94,7 +94,7 @@ def test_what_is_no_file(folder, monkeypatch):
 def test_sizes(folder):
     large = folder / "large.json"
     with large.open("wb") as file:
-        file.truncate(files.TEXT_BYTES + 1)  # a hole: takes no place
+        file.truncate(files.TEXT_BYTES + 1)  # sparse, takes no disk space
     with pytest.raises(files.RefusedError, match=r"large.json has 1073741825 bytes"):
         files.read_json(large)
     (folder / "deep.json").write_text("[" * 100_000)
@@ -105,7 +105,7 @@ def test_sizes(folder):
         files.check_memory(10**20, "the film")
 
 
-def test_whole_numbers():
+def test_integers():
     assert [files.whole(n) for n in (3, 3.0, -1, 2**62)] == [3, 3, -1, 2**62]
     for bad in (2.5, float("nan"), float("inf"), -1e300, 10**30, True, None, "3", [3]):
         with pytest.raises(ValueError, match="is not an integer"):
@@ -146,4 +146,4 @@ def test_damage_is_one_sentence(error, sentence):
     ):
         raise error
     with pytest.raises(AssertionError), files.damage(files.Path("x")):
-        raise AssertionError  # ours
+        raise AssertionError  # a bug

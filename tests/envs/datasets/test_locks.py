@@ -1,4 +1,4 @@
-"""Locks between processes, which end with them."""
+"""Locks between processes, released when a process ends."""
 
 import fcntl
 import os
@@ -41,16 +41,16 @@ def test_one_process_at_a_time(path):
         ):
             pass
         kill = threading.Thread(target=child.send_signal, args=(signal.SIGKILL,))
-        with locks.locked(path, kill.start):  # waits for it
+        with locks.locked(path, kill.start):  # waits for the lock
             assert kill.ident
             assert child.wait(60) == -signal.SIGKILL
-    with locks.locked(path):  # what a killed process leaves is in nobody's way
+    with locks.locked(path):  # the lock file of a killed process does not block
         assert path.parent.exists()
     assert not list(path.parent.iterdir())
 
 
 def test_never_two_at_a_time(path):
-    """Some wait at a lock file that is deleted meanwhile, others come anew."""
+    """Some wait for a lock file that is deleted meanwhile, others create a new one."""
     inside, turns, told = [], [], []
 
     def work(number):
@@ -66,12 +66,12 @@ def test_never_two_at_a_time(path):
         for one in [pool.submit(work, number) for number in range(8)]:
             one.result()
     assert len(turns) == 8 * 20
-    assert len(told) == len(set(told)) > 0  # each once, however often it must wait
+    assert len(told) == len(set(told)) > 0  # called once each, however often it must wait
     assert not os.listdir(path.parent)
 
 
 @pytest.mark.parametrize("anew", [False, True])
-def test_a_lock_that_was_deleted_meanwhile_is_none(path, monkeypatch, anew):
+def test_a_lock_on_a_deleted_file_does_not_count(path, monkeypatch, anew):
     lock, flock, calls = path.with_name(".press.lock"), fcntl.flock, []
 
     def late(file, how):
@@ -91,8 +91,8 @@ def test_a_lock_that_was_deleted_meanwhile_is_none(path, monkeypatch, anew):
 
 @pytest.mark.timeout(20)
 @pytest.mark.parametrize("kind", ["link", "folder", "pipe"])
-def test_a_lock_that_is_no_file_is_refused(path, kind):
-    """A link's file would be made or written; nobody reads a pipe."""
+def test_a_lock_file_must_be_regular(path, kind):
+    """Following a link would create or write its target, and opening a pipe would block."""
     path.parent.mkdir()
     lock = path.with_name(".press.lock")
     {

@@ -1,4 +1,4 @@
-"""Datasets on disk: what goes in comes out, for us and for plain tfds, whole or not at all."""
+"""RLDS datasets: data round-trip, here and in plain tfds, and writes are atomic."""
 
 import json
 import os
@@ -41,7 +41,7 @@ print(json.dumps({
 
 
 def trimmed(episodes: Episodes) -> Episodes:
-    """As they come back: padding is zeros, up to the longest episode."""
+    """Return episodes as they are read: padded with zeros to the longest one."""
     longest = int(np.max(episodes.length))
 
     def blank(array):
@@ -109,7 +109,7 @@ def test_plain_tfds_reads_it_without_tensorflow(path):
         np.testing.assert_array_equal(np.array(seen[key], expected.dtype), expected[1, :4])
 
 
-def test_what_stands_there_is_not_touched(path):
+def test_existing_files_are_not_touched(path):
     rlds.write(make(), path)
     with pytest.raises(ValueError, match="already exists"):
         rlds.write(make(2), path)
@@ -142,7 +142,7 @@ def damage(file, how):
 
 
 @pytest.mark.parametrize("name", ["dataset_info.json", "features.json", "metadata.json"])
-def test_a_damaged_description_is_one_sentence(path, name):
+def test_a_damaged_description_is_reported_in_one_sentence(path, name):
     rlds.write(make(), path)
     (path / name).write_bytes((path / name).read_bytes()[:40])
     with pytest.raises(ValueError, match=r"is damaged|is not a folder of") as caught:
@@ -151,7 +151,7 @@ def test_a_damaged_description_is_one_sentence(path, name):
 
 
 @pytest.mark.parametrize("how", ["flipped", "cut", "empty"])
-def test_damage_is_one_sentence(path, how):
+def test_damage_is_reported_in_one_sentence(path, how):
     rlds.write(make(), path)
     (file,) = path.glob("*array_record*")
     damage(file, how)
@@ -175,7 +175,7 @@ def test_foreign_folders(tmp_path, path):
         rlds.read(tmp_path)
 
 
-def test_parts_add_up(tmp_path):
+def test_shards_add_up(tmp_path):
     folder, options = tmp_path / "parts", {"seed": 0}
     first, second = make(2, 3), make(3, 5)
     parts = rlds.ShardWriter(folder, options)
@@ -183,7 +183,7 @@ def test_parts_add_up(tmp_path):
     shutil.copytree(folder, tmp_path / "copy")
     parts.append(second)
 
-    # As if it had been killed while the second part was written, then continued.
+    # As after a kill while the second shard was written, and resumed.
     again = rlds.ShardWriter(tmp_path / "copy", options)
     assert (again.num_episodes, again.attempted) == (2, 3)
     (torn,) = {file.name for file in folder.iterdir()} - {p.name for p in again.folder.iterdir()}
@@ -194,7 +194,7 @@ def test_parts_add_up(tmp_path):
         assert_equal(rlds.read(each.folder), trimmed(concatenate([first, second])))
 
 
-def test_parts_belong_together(tmp_path):
+def test_shards_must_match(tmp_path):
     parts = rlds.ShardWriter(tmp_path / "parts", {"seed": 0})
     parts.append(make())
     with pytest.raises(
@@ -212,7 +212,7 @@ def test_parts_belong_together(tmp_path):
 
 
 @pytest.mark.parametrize("how", ["flipped", "cut", "empty", "missing"])
-def test_a_damaged_part_is_refused(tmp_path, how):
+def test_a_damaged_shard_is_refused(tmp_path, how):
     parts = rlds.ShardWriter(tmp_path / "parts", {})
     parts.append(make(2))
     (file,) = parts.folder.glob("*array_record*")
@@ -221,7 +221,7 @@ def test_a_damaged_part_is_refused(tmp_path, how):
         rlds.ShardWriter(parts.folder, {})
 
 
-def test_parts_of_another_dataset_are_noticed(tmp_path):
+def test_shards_of_another_dataset_are_detected(tmp_path):
     one, two = (rlds.ShardWriter(tmp_path / name, {}) for name in ("one", "two"))
     one.append(make(2))
     two.append(make(3))
@@ -237,7 +237,7 @@ def test_a_robot_by_path(path, tmp_path):
     assert_equal(rlds.read(path), trimmed(episodes))
 
 
-def test_no_room_for_a_part(tmp_path):
+def test_a_full_disk_keeps_earlier_shards(tmp_path):
     folder = tmp_path / "parts"
     parts = rlds.ShardWriter(folder, {})
     parts.append(make(2))

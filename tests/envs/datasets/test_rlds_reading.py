@@ -1,4 +1,4 @@
-"""Datasets in RLDS form that are not what they should be, and reading only what is wanted."""
+"""Read invalid RLDS datasets, and only parts of valid ones."""
 
 import contextlib
 import dataclasses
@@ -20,7 +20,7 @@ def path(tmp_path):
 
 
 def rewrite(path, episodes):
-    """Puts records in a dataset that `rlds.write` would refuse to."""
+    """Replace a dataset's records by ones that `rlds.write` would refuse."""
     to = rlds_schema.serializer(rlds_schema.features(make()))
     (file,) = path.glob("*array_record*")
     writer = array_record_module.ArrayRecordWriter(str(file), "group_size:1,uncompressed")
@@ -52,7 +52,7 @@ def test_one_episode_at_a_time(path):
         assert camera == "wrist"
 
 
-def test_numbers_that_are_none(path):
+def test_values_that_are_not_finite(path):
     episodes = make()
     episodes.state[1, 0, 2] = np.nan
     rewrite(path, episodes)
@@ -71,7 +71,7 @@ def test_an_empty_episode(path):
 
 
 def changes(node):
-    """All the ways to break one thing in a JSON value, each done and undone."""
+    """Yield after each way to break one thing in a JSON value, then undo it."""
     keys = list(node) if isinstance(node, dict) else range(len(node))
     for key in keys:
         kept = node[key]
@@ -90,8 +90,8 @@ def changes(node):
 @pytest.mark.parametrize(
     ("name", "every"), [("metadata.json", 2), ("features.json", 8), ("dataset_info.json", 1)]
 )
-def test_any_change_of_a_description_is_read_or_refused(name, every, path):
-    """Columns that are missing, shapes and kinds that are wrong: never another exception."""
+def test_a_changed_description_is_harmless_or_refused(name, every, path):
+    """Missing columns, wrong shapes and wrong types: only ValueErrors are raised."""
     good = json.loads((path / name).read_text())
     refused = tried = 0
     for _ in itertools.islice(changes(good), 0, None, every):

@@ -1,4 +1,4 @@
-"""Files and folders that are written aside: nothing is lost by a kill or a full disk."""
+"""Atomic writes of files and folders survive a kill and a full disk."""
 
 import os
 import shutil
@@ -57,7 +57,7 @@ def test_killed_before_a_folder_is_renamed(tmp_path):
     assert run(KILLED, path).returncode == -signal.SIGKILL
     assert not path.exists()
     with writing.atomic_folder(path) as folder:
-        assert not os.listdir(folder)  # what the killed one left is gone
+        assert not os.listdir(folder)  # leftovers of the killed process are gone
     assert os.listdir(tmp_path) == ["folder"]
 
 
@@ -72,7 +72,7 @@ def test_a_full_disk_leaves_nothing(tmp_path, kind):
     assert kind == "folder" or path.read_text() == "old"
 
 
-def test_all_is_on_disk_before_it_is_renamed(tmp_path, monkeypatch):
+def test_contents_are_synced_before_the_rename(tmp_path, monkeypatch):
     fsync, synced = os.fsync, []
 
     def noted(descriptor):
@@ -107,7 +107,7 @@ def test_a_write_that_fails_keeps_the_old_file(tmp_path):
     assert [path.read_text() for path in tmp_path.iterdir()] == ["old"]
 
 
-def test_what_exists_is_not_created_again(tmp_path):
+def test_existing_folders_are_refused(tmp_path):
     refused = pytest.raises(ValueError, match="already exists: choose another path")
     with refused, writing.atomic_folder(tmp_path):
         pass

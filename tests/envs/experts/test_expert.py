@@ -127,7 +127,7 @@ def test_hurried_experts_slow_down_to_half_the_speed_limits(env):
     share = fastest / env.robot.action_speed
     assert np.all(share[..., :-1] <= 0.5 + 1e-4)
     assert np.all(share[..., -1] <= 1 + 1e-4)
-    assert np.all(share[:, 0].max(axis=-1) > 0.49)  # no slower than it must
+    assert np.all(share[:, 0].max(axis=-1) > 0.49)  # no slower than necessary
 
 
 def fake_record(success):
@@ -169,7 +169,7 @@ def test_collect_gives_up_on_a_broken_expert():
         envs.collect("press", num_episodes=50, num_envs=4, key=jax.random.key(0), record=record)
 
 
-def test_expert_success_counts_whole_and_part_batches():
+def test_expert_success_counts_full_and_partial_batches():
     seen = []
 
     def attempt(env, key, ranges):

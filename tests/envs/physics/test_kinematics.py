@@ -7,7 +7,7 @@ import numpy as np
 
 from envs.physics import physics
 
-# What no scene of ours has, but a user's arm may: several joints on a body, away from its middle,
+# Features that only users' arms have: several joints on a body, away from its center,
 # a ball, and bodies that hang on a free one.
 ODD = """
 <mujoco>

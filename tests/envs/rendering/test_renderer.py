@@ -1,4 +1,4 @@
-"""Compare the ray caster with MuJoCo's rays; light and colours change nothing else."""
+"""Compare the ray caster with MuJoCo's rays; light and colors change nothing else."""
 
 import copy
 import dataclasses
@@ -42,7 +42,7 @@ GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)  # drawn
 
 
 def poses_of(data):
-    """Arguments of `render.render`: poses of all geoms and cameras."""
+    """Return the poses of all geoms and cameras, for `render.render`."""
     arrays = Poses.of(data)
     ends = ((-1, 3), (-1, 3, 3)) * 2
     return Poses(
@@ -74,7 +74,7 @@ def image(built, poses):
 
 
 def camera_rays(model, data, name, height, width):
-    """Unit vectors [P, 3] in world axes, and the ray length per metre along the camera's axis."""
+    """Unit vectors [P, 3] in world axes, and the ray length per meter along the camera's axis."""
     camera = model.camera(name).id
     x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, height / 2 - np.arange(height) - 0.5)
     edge = 2 * np.tan(np.deg2rad(model.cam_fovy[camera]) / 2) / height
@@ -119,7 +119,7 @@ def test_rays_agree_with_mujoco(shapes, built, poses):
     seen = set()
     for i, name in enumerate(CAMERAS):
         seen |= assert_agrees_with_mujoco(*shapes, name, geom[i], depth[i])
-    assert seen == set(range(10)) | {-1}  # every visible geom, and the sky: all are covered
+    assert seen == set(range(10)) | {-1}  # every visible geom and the sky are covered
 
 
 def test_rays_agree_with_mujoco_in_every_task(scene):
@@ -141,7 +141,7 @@ def pixel(shapes, name, point):
 
 def test_shadow_falls_opposite_the_light(shapes, built, poses):
     flat = dataclasses.replace(built.appearance, checker=jnp.array([0.1, 0.0]))
-    # The ball's centre is 0.1 m above the table, so its shadow is centred 0.15 m to one side.
+    # The ball's center is 0.1 m above the table, so its shadow is centered 0.15 m to one side.
     left, right = (pixel(shapes, "top", (x, 0.0, 0.0)) for x in (-0.15, 0.15))
     for slope, dark, bright in ((1.5, left, right), (-1.5, right, left)):
         light = np.array([slope, 0.0, 1.0], np.float32)
@@ -165,7 +165,7 @@ def test_headlight_and_ambient_cast_no_shadow(built, poses):
     assert pixels[0, 0] == round(0.6 * 0.35 * 255)
 
 
-def test_colour_changes_only_its_geom(built, poses, image):
+def test_color_changes_only_its_geom(built, poses, image):
     geom = np.asarray(renderer.cast(built, poses, **SIZE)[0])
     green = built.appearance.rgba.copy()
     green[2] = (0, 1, 0, 1)

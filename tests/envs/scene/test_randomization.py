@@ -1,4 +1,4 @@
-"""Domain randomisation: every range changes the outcome it should, and nothing else."""
+"""Domain randomization: every range changes the outcome it should, and nothing else."""
 
 import dataclasses
 
