@@ -1,4 +1,4 @@
-"""Dropout of what adapters read: PEFT's formula, off in evaluation, in every kind of layer."""
+"""Test dropout on adapter inputs: PEFT's formula, off in evaluation, for every layer type."""
 
 import dataclasses
 
@@ -24,8 +24,8 @@ X = jax.random.normal(jax.random.key(0), (6, 5))
 WIDE = LoRA(rank=2, dropout=RATE)
 
 
-def away(params, seed=3):
-    """Parameters with nothing left at its start."""
+def perturbed(params, seed=3):
+    """Add noise to all parameters, so that none keeps its initial value."""
     noise = lambda p: p + 0.3 * jax.random.normal(jax.random.key(seed), p.shape)  # noqa: E731
     return jax.tree.map(noise, params)
 
@@ -34,7 +34,7 @@ def same(a, b):
     return bool(jnp.array_equal(a, b))
 
 
-def test_a_share_is_zero_and_the_rest_makes_up_for_it():
+def test_dropped_fraction_is_zero_and_the_rest_is_rescaled():
     seen = dropout(jnp.ones((200, 100), jnp.bfloat16), 0.25, KEY)
     assert seen.dtype == jnp.bfloat16
     np.testing.assert_allclose(jnp.unique(seen), [0, 4 / 3], rtol=4e-3)
@@ -42,10 +42,10 @@ def test_a_share_is_zero_and_the_rest_makes_up_for_it():
 
 
 @pytest.mark.parametrize("method", [WIDE, DoRA(rank=2, dropout=RATE), AdaLoRA(2, dropout=RATE)])
-def test_formula_of_peft(method):
+def test_formula_matches_peft(method):
     """PEFT 0.21.2: lora_B(lora_A(dropout(x))); DoRA's magnitude rescales W dropout(x) (dora.py)."""
     kernel = jax.random.normal(jax.random.key(1), (5, 4))
-    params = away(method.init(jax.random.key(2), kernel)[0])
+    params = perturbed(method.init(jax.random.key(2), kernel)[0])
     seen = dropout(X, RATE, KEY)
     a, b = params["lora_a"], params["lora_b"]
     if isinstance(method, AdaLoRA):
@@ -60,18 +60,18 @@ def test_formula_of_peft(method):
     slope = jax.grad(lambda kernel: method.apply_with_dropout(params, X, kernel, KEY)[0].sum())(
         kernel
     )
-    assert not slope.any()  # as without dropout: the base is frozen
+    assert not slope.any()  # the base is frozen, as without dropout
 
 
 def trained(base, rules, **options):
     model = lorasp_jax.adapt(base, rules, rngs=nnx.Rngs(1), **options)
     graphdef, adapters, frozen = lorasp_jax.split(model)
-    return nnx.merge(graphdef, away(adapters), frozen, copy=True)
+    return nnx.merge(graphdef, perturbed(adapters), frozen, copy=True)
 
 
 @pytest.mark.parametrize("path", ["conv", "split", "experts", "join", "blocks", "out"])
-def test_every_kind_of_layer(path):
-    """In training another function at each key, with a gradient; in evaluation always one."""
+def test_every_layer_type(path):
+    """Outputs depend on the key in training and are deterministic in evaluation."""
     model = trained(nets.Kinds(), [(path, WIDE)])
     ids = jnp.array([[1, 2, 3], [4, 5, 6]])
 
@@ -87,13 +87,13 @@ def test_every_kind_of_layer(path):
     assert same(model(ids), nnx.merge(graphdef, lorasp_jax.split(model)[1], frozen)(ids))
 
 
-def test_ids_of_an_embedding_are_never_dropped():
+def test_embedding_ids_are_never_dropped():
     model = trained(nets.Kinds(), [("embed", WIDE)])
     ids = jnp.array([[1, 2, 3]])
     assert same(lorasp_jax.with_dropout(model, KEY)(ids), model(ids))
 
 
-def test_layers_experts_and_stacks_draw_apart():
+def test_layers_experts_and_stacks_use_independent_masks():
     model = lorasp_jax.with_dropout(trained(nets.Kinds(), [("out|join|blocks", WIDE)]), KEY)
     keys = [model.out.dropout_key, model.join.dropout_key, *model.blocks.dropout_key]
     assert len({tuple(jax.random.key_data(key).tolist()) for key in keys}) == 5
@@ -108,7 +108,7 @@ def test_layers_experts_and_stacks_draw_apart():
     assert not np.allclose(y[:, 0], y[:, 1])
 
 
-def test_off_again_in_whatever_is_made_of_the_model(tmp_path):
+def test_dropout_is_off_in_derived_models(tmp_path):
     base = nnx.Linear(5, 4, rngs=nnx.Rngs(0))
     model = trained(base, [("", WIDE)])
     dropping = lorasp_jax.with_dropout(model, KEY)
@@ -123,8 +123,8 @@ def test_off_again_in_whatever_is_made_of_the_model(tmp_path):
     assert same(loaded(X), model(X))
 
 
-def test_without_dropout_the_program_is_the_same():
-    """Of a method that has none, in a model "for training" too; and of one that has, outside it."""
+def test_program_without_dropout_is_unchanged():
+    """Covers methods without dropout in training, and methods with dropout in evaluation."""
 
     def program(model, rate):
         model = lorasp_jax.adapt(model, [("", LoRA(rank=2, dropout=rate))], rngs=nnx.Rngs(1))
@@ -148,7 +148,7 @@ def test_without_dropout_the_program_is_the_same():
 
 @pytest.mark.parametrize("scanned", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_models_with_remat_and_scan(scanned):
-    """The documented loss, with a key."""
+    """Test the documented loss, which takes a key."""
     rules = [("layers|head", WIDE)]
     model = trained(Llama(remat=True, scanned=scanned), rules, einsums=EINSUMS)
     graphdef, adapters, frozen = lorasp_jax.split(model)
@@ -191,7 +191,7 @@ LINEN_IDS = jnp.array([[1, 2, 3], [4, 5, 6]])
 def test_linen(path):
     adapter = lorasp_jax.LinenAdapter(Linen(), [(path, WIDE)])
     variables = adapter.init(jax.random.key(0), LINEN_IDS)
-    variables |= {"adapters": away(variables["adapters"])}
+    variables |= {"adapters": perturbed(variables["adapters"])}
     run = jax.jit(lambda key: adapter.apply(variables, LINEN_IDS, rngs={"dropout": key}))
     assert not np.allclose(run(KEY), run(jax.random.key(8)))
     assert same(run(KEY), run(KEY))
@@ -201,7 +201,7 @@ def test_linen(path):
     assert same(off.apply(variables, LINEN_IDS, rngs={"dropout": KEY}), expected)
 
 
-def test_linen_scan_that_hands_no_rngs_on():
+def test_linen_scan_without_split_rngs():
     adapter = lorasp_jax.LinenAdapter(Linen(streams=("params",)), [("blocks", WIDE)])
     variables = adapter.init(jax.random.key(0), LINEN_IDS)
     adapter.apply(variables, LINEN_IDS)
@@ -212,7 +212,7 @@ def test_linen_scan_that_hands_no_rngs_on():
 def test_linen_dense():
     layer = LinenDense(4, method=WIDE)
     variables = layer.init(jax.random.key(0), X)
-    variables |= {"adapters": away(variables["adapters"])}
+    variables |= {"adapters": perturbed(variables["adapters"])}
     first, second = (layer.apply(variables, X, rngs={"dropout": k}) for k in jax.random.split(KEY))
     assert not np.allclose(first, second)
     expected = LinenDense(4, method=LoRA(rank=2)).apply(variables, X)

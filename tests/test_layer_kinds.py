@@ -1,6 +1,6 @@
-"""Tools on adapters over every kind of layer: general, einsum, scanned, lookup, convolution.
+"""Test adapter tools on every layer type: general, einsum, scanned, embedding, convolution.
 
-Dense layers have their own tests, file by file; here einsums must do what dense twins do.
+Dense layers have their own tests; here einsums must match equivalent dense layers.
 """
 
 import operator
@@ -31,7 +31,7 @@ IDS = list(jnp.asarray(np.random.default_rng(0).integers(0, 7, (3, 4, 5))))
 
 
 def kernels(model):
-    """Kernels by path, as arrays."""
+    """Return the kernels as arrays, by path."""
     layers = {path: getattr(model, path) for path in KINDS}
     return {
         p: np.asarray(v.embedding[...] if p == "embed" else v.kernel[...])
@@ -41,7 +41,7 @@ def kernels(model):
 
 @pytest.fixture(scope="module")
 def models():
-    """Two models over one base whose LoRAs differ in rank, scale and layers."""
+    """Return two models on the same base whose LoRAs differ in rank, scale and layers."""
     return {
         "a": trained((".*", LoRA(rank=2)), seed=1, net=NET),
         "b": trained(("embed|conv|experts|blocks", LoRA(rank=3, alpha=1)), seed=2, net=NET),
@@ -53,24 +53,24 @@ def combined(models):
     return lorasp_jax.combine(models)
 
 
-def experts_and_twins(method):
-    """An einsum of two experts, and as many dense layers with its weights and adapters."""
+def experts_and_dense_layers(method):
+    """Return an einsum with two experts, and the equivalent dense layers."""
     init = nnx.initializers.normal(0.5)
     layer = nnx.Einsum("nbh,nhk->bnk", (2, 5, 4), rngs=nnx.Rngs(0), kernel_init=init)
     layer = trained((".*", method), seed=3, net=layer)
-    twins = [Dense(5, 4, use_bias=False, method=method, rngs=nnx.Rngs(0)) for _ in range(2)]
+    dense_layers = [Dense(5, 4, use_bias=False, method=method, rngs=nnx.Rngs(0)) for _ in range(2)]
     params = layer.adapter.get_value()
-    for i, twin in enumerate(twins):
-        twin.kernel.set_value(layer.kernel[...][i])
-        twin.adapter = AdapterParam(jax.tree.map(operator.itemgetter(i), params))
-    return layer, nnx.List(twins)
+    for i, dense_layer in enumerate(dense_layers):
+        dense_layer.kernel.set_value(layer.kernel[...][i])
+        dense_layer.adapter = AdapterParam(jax.tree.map(operator.itemgetter(i), params))
+    return layer, nnx.List(dense_layers)
 
 
-def by_twins(twins, x):
-    return jnp.stack([twin(one) for twin, one in zip(twins, x, strict=True)], axis=1)
+def apply_dense_layers(dense_layers, x):
+    return jnp.stack([layer(inputs) for layer, inputs in zip(dense_layers, x, strict=True)], axis=1)
 
 
-def test_moments_are_those_of_the_inputs_by_hand():
+def test_moments_equal_a_direct_computation():
     found = calibration.input_moments(NET, IDS)
     assert sorted(found) == ["blocks", "experts", "join", "out", "split"]
     x = np.concatenate([NET.conv(NET.embed(ids)) for ids in IDS])
@@ -94,33 +94,33 @@ def test_moments_are_those_of_the_inputs_by_hand():
     np.testing.assert_allclose(np.abs(right @ a), np.eye(2), atol=1e-3)
 
 
-def test_moments_of_lookups_are_refused():
+def test_moments_of_embeddings_raise():
     with pytest.raises(ValueError, match="'embed' matches no dense layer or einsum; those here: "):
         calibration.input_moments(NET, IDS, "embed")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("tool", [lorasp_jax.prune, lorasp_jax.distill])
-def test_experts_get_smaller_like_dense_twins(tool):
-    layer, twins = experts_and_twins(SP)
+def test_experts_shrink_like_equivalent_dense_layers(tool):
+    layer, dense_layers = experts_and_dense_layers(SP)
     x = jax.random.normal(jax.random.key(0), (2, 40, 5))
-    assert_close(layer(x), by_twins(twins, x))
+    assert_close(layer(x), apply_dense_layers(dense_layers, x))
     amount = 0.3 if tool is lorasp_jax.prune else 2
     smaller, report = tool(layer, [x], amount)
-    expected, each = tool(twins, [x], amount, forward=by_twins)
+    expected, each = tool(dense_layers, [x], amount, forward=apply_dense_layers)
     np.testing.assert_array_equal(report.ranks[""], [each.ranks[str(i)] for i in range(2)])
-    if tool is lorasp_jax.prune:  # a stack has one rank: the largest
+    if tool is lorasp_jax.prune:  # a stack has a single rank, the largest
         assert smaller.method.rank == max(report.ranks[""]) < SP.rank
     else:
         own = [each.layer_errors[str(i)] for i in range(2)]
         np.testing.assert_allclose(report.layer_errors[""], own, rtol=1e-3)
-        assert_close(call(smaller, x), by_twins(expected, x))
+        assert_close(call(smaller, x), apply_dense_layers(expected, x))
     error = np.linalg.norm(smaller(x) - layer(x)) / np.linalg.norm(layer(x))
     np.testing.assert_allclose(report.output_error, error, rtol=1e-4)
 
 
 @pytest.mark.slow
-def test_distilled_kinds_merge_save_and_load(tmp_path):
+def test_distilled_layers_merge_save_and_load(tmp_path):
     model = trained(("split|experts|join|blocks", SP), seed=4, net=NET, size=0.2)
     smaller, report = lorasp_jax.distill(model, IDS)
     assert sorted(report.layer_errors) == EINSUMS
@@ -136,8 +136,8 @@ def test_distilled_kinds_merge_save_and_load(tmp_path):
 
 
 @pytest.mark.slow
-def test_pruned_kinds_answer_as_before():
-    """η = 0.6 never needs them all, so something goes, and nothing that was used."""
+def test_pruned_layers_give_the_same_outputs():
+    """η = 0.6 never needs all directions, so pruning drops some, but none that was used."""
     model = trained(("split|experts|join|blocks", SP), seed=4, net=NET, size=0.2)
     smaller, report = lorasp_jax.prune(model, IDS)
     assert report.output_error < 1e-5
@@ -147,7 +147,7 @@ def test_pruned_kinds_answer_as_before():
     assert_close(call(smaller, IDS[0]), call(model, IDS[0]))
 
 
-def test_each_name_answers_as_its_model(models, combined):
+def test_each_name_gives_the_outputs_of_its_model(models, combined):
     for name, model in models.items():
         assert_close(call(lorasp_jax.choose(combined, name), IDS[0]), call(model, IDS[0]))
         alone = lorasp_jax.extract(combined, name)
@@ -157,14 +157,14 @@ def test_each_name_answers_as_its_model(models, combined):
     assert_close(call(lorasp_jax.choose(combined, None), IDS[0]), call(NET, IDS[0]))
 
 
-def test_each_example_has_its_own(models, combined):
+def test_adapters_per_example(models, combined):
     found = call(lorasp_jax.choose(combined, ["b", None, "a", "b"]), IDS[0])
     expected = [(models["b"], 0), (NET, 1), (models["a"], 2), (models["b"], 3)]
     for model, row in expected:
         assert_close(found[row], call(model, IDS[0])[row])
 
 
-def test_a_table_adapted_twice_attends_with_both(models, combined):
+def test_attend_of_an_embedding_with_two_adapters(models, combined):
     query = jax.random.normal(jax.random.key(0), (4, 6))
     attend = [lorasp_jax.choose(combined, one).embed.attend(query) for one in ("a", "b", None)]
     for found, model in zip(attend, [*models.values(), NET], strict=True):
@@ -173,7 +173,7 @@ def test_a_table_adapted_twice_attends_with_both(models, combined):
     assert_close(both, attend[2] + 0.6 * (attend[0] - attend[2]) - 0.3 * (attend[1] - attend[2]))
 
 
-def test_weighted_sums_add_up_in_the_kernels(models, combined):
+def test_weighted_sums_match_merged_kernels(models, combined):
     chosen = lorasp_jax.choose(combined, WEIGHTS)
     fused, errors = lorasp_jax.fuse(combined, WEIGHTS)
     base, merged = kernels(NET), kernels(lorasp_jax.merge(chosen))
@@ -189,7 +189,7 @@ def test_weighted_sums_add_up_in_the_kernels(models, combined):
     assert 0 < errors["blocks"] < 1
 
 
-def test_swapping_compiles_nothing(models, combined):
+def test_swapping_does_not_recompile(models, combined):
     other = trained(("conv|join|blocks", LoRA(rank=1, alpha=5)), seed=7, net=NET)
     run = jax.jit(lambda model, x: model(x))
     run(lorasp_jax.choose(combined, "b"), IDS[0])
@@ -200,7 +200,7 @@ def test_swapping_compiles_nothing(models, combined):
 
 
 @pytest.mark.slow
-def test_other_methods_have_names_too(models):
+def test_named_adapters_of_other_methods(models):
     others = {
         "sp": trained(("split|experts|blocks", SP), seed=5, net=NET),
         "dora": trained(("split|experts|blocks", DoRA(rank=2)), seed=6, net=NET),
@@ -210,7 +210,7 @@ def test_other_methods_have_names_too(models):
         assert_close(call(lorasp_jax.choose(model, name), IDS[0]), call(expected, IDS[0]))
 
 
-def test_merged_kinds_come_apart(models):
+def test_unmerging_restores_the_kernels(models):
     merged = lorasp_jax.merge(models["a"])
     apart = lorasp_jax.unmerge(merged, models["a"])
     assert adaptation.methods(apart) == adaptation.methods(models["a"])
@@ -219,7 +219,7 @@ def test_merged_kinds_come_apart(models):
     assert_close(call(apart, IDS[0]), call(models["a"], IDS[0]))
 
 
-def test_unmerging_needs_layers_of_the_same_kind(models):
+def test_unmerging_needs_the_same_layer_types(models):
     merged = lorasp_jax.merge(models["a"])
     merged.split = nnx.Linear(6, 6, rngs=nnx.Rngs(0))
     message = "cannot unmerge split: a Linear is there instead of a LinearGeneral"
@@ -228,7 +228,7 @@ def test_unmerging_needs_layers_of_the_same_kind(models):
 
 
 class Shared(nnx.Module):
-    """One layer in two places."""
+    """One layer used under two names."""
 
     def __init__(self):
         self.first = nnx.Einsum("...d,df->...f", (4, 4), rngs=nnx.Rngs(0))
@@ -238,7 +238,7 @@ class Shared(nnx.Module):
         return self.second(self.first(x))
 
 
-def test_a_shared_layer_changes_once():
+def test_shared_layer_is_changed_once():
     net, x = Shared(), jax.random.normal(jax.random.key(0), (5, 4))
     model = trained((".*", LoRA(rank=2)), seed=1, net=net)
     merged = lorasp_jax.merge(model)

@@ -1,4 +1,4 @@
-"""Quantised kernels of general, einsum, expert and scanned layers: no matrices at first."""
+"""Test quantized kernels of general, einsum, expert and scanned layers, which are not matrices."""
 
 import jax
 import jax.numpy as jnp
@@ -28,12 +28,12 @@ MATRICES = {
 
 
 @pytest.fixture(scope="module", params=mostly_slow(KINDS, ["int8"]))
-def quantised(request):
+def quantized(request):
     return lorasp_jax.quantize(NET, [(".*", request.param)])
 
 
-def widened(model):
-    """A copy of NET with the kernels that the codes stand for, put into shape by hand."""
+def dequantized(model):
+    """Return a copy of NET with the dequantized kernels in their original shapes."""
     wide = nnx.clone(NET)
     for path in MATRICES:
         kernel = np.asarray(getattr(model, path).kernel.get_value().astype(jnp.float32))
@@ -45,33 +45,33 @@ def widened(model):
 
 
 def with_adapters(net, model):
-    """NET's copy with the adapters of another model."""
+    """Return a copy of the network with the adapters of another model."""
     graphdef, _, frozen = adaptation.split(adaptation.adapt(net, [LORA], rngs=nnx.Rngs(0)))
     return nnx.merge(graphdef, adaptation.split(model)[1], frozen)
 
 
-def test_codes_lie_in_matrices_and_answer_for_the_kernel(quantised):
-    model, errors = quantised
+def test_quantized_matrices_represent_the_kernel(quantized):
+    model, errors = quantized
     assert errors.keys() == MATRICES.keys()
     for path, shape in MATRICES.items():
         kernel = getattr(model, path).kernel.get_value()
         assert isinstance(kernel, QuantizedKernel)
         assert getattr(model, path).kernel_matrices().shape == shape
         old = getattr(NET, path).kernel[...]
-        assert kernel.shape == old.shape  # a model may read sizes off its kernels
-        wide = getattr(widened(model), path).kernel[...]
+        assert kernel.shape == old.shape  # models may read sizes from their kernels
+        wide = getattr(dequantized(model), path).kernel[...]
         off = np.linalg.norm(wide - old) / np.linalg.norm(old)
         assert 0 < errors[path] < 0.2
         np.testing.assert_allclose(off, errors[path], rtol=1e-4)
-    assert_close(call(model, IDS), call(widened(model), IDS))
+    assert_close(call(model, IDS), call(dequantized(model), IDS))
     with pytest.raises(ValueError, match="no adapted layer stored any aux"):
         lorasp_jax.collect_aux(model)
 
 
-def test_adapters_before_and_after(quantised):
-    kind = "int8" if quantised.errors["out"] < 0.02 else "nf4"
-    model = trained(LORA, seed=1, net=quantised.model)
-    expected = with_adapters(widened(quantised.model), model)
+def test_adapting_before_and_after_quantization(quantized):
+    kind = "int8" if quantized.errors["out"] < 0.02 else "nf4"
+    model = trained(LORA, seed=1, net=quantized.model)
+    expected = with_adapters(dequantized(quantized.model), model)
     assert_close(call(model, IDS), call(expected, IDS))
     later, _ = lorasp_jax.quantize(trained(LORA, seed=1, net=NET), [(".*", kind)])
     assert_close(call(later, IDS), call(expected, IDS))
@@ -79,7 +79,7 @@ def test_adapters_before_and_after(quantised):
     def gradients(model):
         graphdef, adapters, frozen = adaptation.split(model)
 
-        def loss(adapters):  # nnx.scan wants variables of this very trace
+        def loss(adapters):  # nnx.scan needs variables created in this trace
             model = nnx.clone(nnx.merge(graphdef, adapters, frozen))
             return jnp.square(model(IDS)).sum()
 
@@ -89,8 +89,8 @@ def test_adapters_before_and_after(quantised):
         np.testing.assert_allclose(found, wanted, rtol=1e-3, atol=1e-3)
 
 
-def test_merging_makes_whole_kernels_and_leaves_the_others(quantised):
-    model = trained(("split|blocks|out", LoRA(rank=2)), seed=1, net=quantised.model)
+def test_merging_dequantizes_only_merged_kernels(quantized):
+    model = trained(("split|blocks|out", LoRA(rank=2)), seed=1, net=quantized.model)
     merged = lorasp_jax.merge(model)
     assert type(merged.split) is nnx.LinearGeneral
     assert merged.split.kernel.shape == (6, 2, 3)
@@ -100,23 +100,23 @@ def test_merging_makes_whole_kernels_and_leaves_the_others(quantised):
 
 
 @pytest.mark.slow
-def test_saved_adapters_and_names_over_codes(quantised, tmp_path):
+def test_saved_and_named_adapters_on_quantized_kernels(quantized, tmp_path):
     model = trained(
-        ("split|experts|blocks", LoRASP(rank=4, hidden_width=2)), seed=1, net=quantised.model
+        ("split|experts|blocks", LoRASP(rank=4, hidden_width=2)), seed=1, net=quantized.model
     )
     save_adapters(tmp_path, model)
-    loaded = load_adapters(tmp_path, quantised.model)
+    loaded = load_adapters(tmp_path, quantized.model)
     np.testing.assert_array_equal(call(loaded, IDS), call(model, IDS))
-    other = trained(LORA, seed=2, net=quantised.model)
+    other = trained(LORA, seed=2, net=quantized.model)
     both = lorasp_jax.combine({"a": model, "b": other})
-    for name, expected in {"a": model, "b": other, None: quantised.model}.items():
+    for name, expected in {"a": model, "b": other, None: quantized.model}.items():
         assert_close(call(lorasp_jax.choose(both, name), IDS), call(expected, IDS))
     alone = lorasp_jax.extract(both, "b")
     assert_close(call(lorasp_jax.merge(alone), IDS), call(other, IDS))
 
 
 class Tied(nnx.Module):
-    """One kernel read in three ways."""
+    """One kernel used by three layers in different ways."""
 
     def __init__(self):
         self.there = nnx.Einsum("...i,io->...o", (6, 4), rngs=nnx.Rngs(0))
@@ -128,7 +128,7 @@ class Tied(nnx.Module):
         return self.again(self.back(self.there(x)))
 
 
-def test_a_shared_kernel_has_codes_for_each_way_to_read_it():
+def test_shared_kernel_is_quantized_once_per_layout():
     net = Tied()
     model, errors = lorasp_jax.quantize(net, [(".*", "int8")])
     assert model.there.kernel is model.again.kernel
@@ -138,7 +138,7 @@ def test_a_shared_kernel_has_codes_for_each_way_to_read_it():
     assert 0 < lost < 2 * sum(errors.values())
 
 
-def test_lookups_and_convolutions_stay():
+def test_embeddings_and_convolutions_are_not_quantized():
     with pytest.raises(
         ValueError, match=r"rule 'embed' governs nothing; dense layers and einsums here"
     ):
