@@ -24,7 +24,7 @@ class InputConfig:
     """Mask of action dimensions relative to the state at the start of the chunk, see
     `policies.processor.to_delta`. The action statistics are then those of relative actions."""
     convention: Convention = "ours"
-    """Project whose guard against division by zero normalization uses."""
+    """Guard against division by zero in normalization: that of the named project."""
     gripper_slot: int | None = 7
     """Slot of the gripper in state and action vectors; None is the first slot after the joints."""
     quiet_slots: bool = True

@@ -38,7 +38,8 @@ _MAX_COMPRESSION = 20  # bytes of arrays per byte of files
 _UNCHECKED_BYTES = 2**30  # arrays below this size may have any compression ratio
 _CONCURRENT_READS = 1  # GB that Orbax may hold in addition to the result
 _PREFIX = "model."  # prefix of every tensor in a LeRobot policy
-_STATISTIC = re.compile(r"(?:un)?normalize_(?:inputs|targets|outputs)\.")  # in older policies
+# Normalization statistics, which older LeRobot versions stored among the weights.
+_STATISTIC = re.compile(r"(?:un)?normalize_(?:inputs|targets|outputs)\.")
 _COMPILED = "_orig_mod."  # prefix that torch.compile adds
 
 
@@ -55,7 +56,7 @@ def load_published(folder: Path, config: Any) -> tuple[Any, list[str]]:
 
     Raises:
         ValueError: unknown layout or damaged files.
-        ModelMismatchError: missing, unexpected or wrongly shaped leaves; a ValueError.
+        ModelMismatchError: missing, unexpected or wrongly shaped leaves (a ValueError subclass).
     """
     published_names = _published_names(config)
     layout, theirs = _open(folder, published_names.lerobot_name)

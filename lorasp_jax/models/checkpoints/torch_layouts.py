@@ -46,9 +46,13 @@ def siglip(theirs: str, size: VisionConfig) -> list[Rule]:
 
 
 def decoder(ours: str, theirs: str, layers: Iterable[int], *, adaptive: bool = False) -> list[Rule]:
-    """Rules that stack some layers of a Llama or Gemma as `ours`.
+    """Rules that stack some layers of a Llama or Gemma model.
 
-    adaptive: the norms are pi0.5's adaptive ones.
+    Args:
+        ours: path of our stack.
+        theirs: prefix of their module.
+        layers: numbers of their layers.
+        adaptive: whether the norms are pi0.5's adaptive norms.
     """
     paths = [f"{theirs}.layers.{i}" for i in layers]
     attention = (f"self_attn.{name}_proj" for name in "qkvo")

@@ -204,7 +204,7 @@ class Pi0(Backbone):
         return v_t, {**expert_aux, **aux, **time_aux, "action_out_proj": out_aux}
 
     def norm_condition(self, flow_time: jax.Array) -> tuple[jax.Array | None, LayerAux]:
-        """Compute the condition of adaptive norms; None and no aux here. See `Pi05`."""
+        """Return the condition for adaptive norms and the adapters' aux; pi0 has neither."""
         del flow_time
         return None, {}
 
@@ -248,7 +248,11 @@ class Pi05(Pi0):
         return h, {"action_in_proj": aux}
 
     def norm_condition(self, flow_time: jax.Array) -> tuple[jax.Array, LayerAux]:
-        """Embed times `[B]` as the condition `[B, 1, D]` f32 of the adaptive norms; also aux."""
+        """Embed flow times `[B]` as the condition for adaptive norms.
+
+        Returns:
+            `[B, 1, D]` f32, and the adapters' aux.
+        """
         aux: LayerAux = {}
         valid = jnp.ones((flow_time.shape[0], 1), bool)
         h = time_embedding(flow_time, self.config.action.width)[:, None]

@@ -151,7 +151,10 @@ def _heads_first(kernel: np.ndarray, heads: int) -> np.ndarray:
 
 
 def lerobot_name(name: str) -> str:
-    """The current LeRobot name of a tensor; older versions keep the towers in other modules."""
+    """Map a tensor name of any LeRobot version to the current name.
+
+    Older versions keep the towers in other modules.
+    """
     if name.endswith("lm_head.weight"):
         return UNUSED["gemma_expert." in name]
     for marker, inner, tower in (

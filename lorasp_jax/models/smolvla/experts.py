@@ -44,7 +44,7 @@ class CrossBlock(SelfBlock):
         self.q_proj = fuse_layer(self.q_proj, copy_kernels=copy_kernels)
         self.k_proj = fuse_layer(self.k_proj, copy_kernels=copy_kernels)
         self.v_proj = fuse_layer(self.v_proj, copy_kernels=copy_kernels)
-        self.join_output_and_mlp(copy_kernels=copy_kernels)
+        self.fuse_output_and_mlp(copy_kernels=copy_kernels)
 
     def project_cache(self, cache: KeysValues, valid: jax.Array) -> tuple[KeysValues, LayerAux]:
         """Compute this layer's keys and values `[B, P, K, H]` from the language model's.

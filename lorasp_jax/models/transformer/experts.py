@@ -50,7 +50,14 @@ class ExpertBlock(nnx.Module):
         context: int | None = None,
         rngs: nnx.Rngs,
     ) -> None:
-        """Initialize the weights. `context` is the input width of k_proj and v_proj."""
+        """Initialize the weights.
+
+        Args:
+            size: sizes of this expert.
+            config: the backbone's config.
+            context: input width of k_proj and v_proj; None is `size.width`.
+            rngs: source of the random weights.
+        """
         options: dict[str, Any] = {
             "use_bias": False,
             "dtype": config.dtype,
@@ -73,10 +80,10 @@ class ExpertBlock(nnx.Module):
         """See `prepared.FusableModule`."""
         qkv = self.q_proj, self.k_proj, self.v_proj
         self.q_proj, self.k_proj, self.v_proj = fuse_layers(qkv, copy_kernels=copy_kernels)
-        self.join_output_and_mlp(copy_kernels=copy_kernels)
+        self.fuse_output_and_mlp(copy_kernels=copy_kernels)
 
-    def join_output_and_mlp(self, *, copy_kernels: bool) -> None:
-        """Join the layers that `output_and_mlp` calls."""
+    def fuse_output_and_mlp(self, *, copy_kernels: bool) -> None:
+        """Fuse the layers that `output_and_mlp` calls."""
         self.o_proj = fuse_layer(self.o_proj, copy_kernels=copy_kernels)
         gate_up = self.gate_proj, self.up_proj
         self.gate_proj, self.up_proj = fuse_layers(gate_up, copy_kernels=copy_kernels)

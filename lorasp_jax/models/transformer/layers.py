@@ -122,7 +122,7 @@ def apply_to_shared_input(
     Args:
         x: `[B, T, I]`.
         token_mask: `[B, T]` bool, False for tokens to exclude from the adapters' aux.
-        layers: by name. Prepared layers must be in the order in which they were joined.
+        layers: by name. Fused layers must be in the order in which they were fused.
 
     Returns:
         y `[B, T, O]` of each layer, and the adapters' aux by layer name.
@@ -141,8 +141,8 @@ def apply_to_shared_input(
             results.append(next(fused_results))
         else:
             results.append(layer(x, token_mask=token_mask, return_aux=True))
-    ys, auxes = zip(*results, strict=True)
-    return list(ys), dict(zip(layers, auxes, strict=True))
+    ys, aux = zip(*results, strict=True)
+    return list(ys), dict(zip(layers, aux, strict=True))
 
 
 def nest_aux(module: str, aux: LayerAux) -> LayerAux:

@@ -54,7 +54,8 @@ class SigLIP(nnx.Module):
     """Encodes images as language tokens.
 
     The patch embedding is a dense layer over flattened patches, equal to the usual strided
-    convolution. The head merges squares of `config.vision.shuffle`^2 tokens (pixel shuffle).
+    convolution. The head merges each `shuffle` x `shuffle` square of tokens into one (pixel
+    shuffle).
     """
 
     def __init__(self, config: BackboneConfig, *, head_bias: bool = True, rngs: nnx.Rngs) -> None:
