@@ -1,8 +1,7 @@
-"""What this package needs of JAX and Flax beyond their public names; no other module here imports
-such names.
+"""Private JAX and Flax APIs that this package needs; no other module imports any.
 
-Each is there in JAX 0.10.2, 0.11.2 and 0.12.0.1 with Flax 0.12.8 and 0.12.12; where a later version
-moves one, this file follows.
+All exist in JAX 0.10.2, 0.11.2 and 0.12.0.1 with Flax 0.12.8 and 0.12.12. If a later version moves
+one, only this file changes.
 """
 
 from flax.core import scope
@@ -11,19 +10,19 @@ from jax._src import clusters
 from jax.interpreters import partial_eval
 
 find_processes = clusters.ClusterEnv.auto_detect_unset_distributed_params
-"""Where the processes of a run meet, how many they are and this one's number, from Slurm, Open MPI,
-Kubernetes or a TPU pod. `jax.distributed.initialize` asks it too, but does not tell: without it the
-processes could not compare versions before JAX connects them."""
+"""Detect coordinator address, number of processes and process index from Slurm, Open MPI,
+Kubernetes or a TPU pod. `jax.distributed.initialize` calls it but does not expose the result, which
+the processes need to compare versions before JAX connects them."""
 
-without_unused = partial_eval.dce_jaxpr
-"""A jaxpr without equations that no result needs; `jax.jit` removes them only while compiling.
-Without it operations whose result is dropped would count as work."""
+eliminate_dead_code = partial_eval.dce_jaxpr
+"""Remove equations with unused results from a jaxpr; `jax.jit` does so only during compilation.
+Without it, operations with unused results would count as work."""
 
 nnx_promote_dtype = dtypes.promote_dtype
-"""The default of the argument `promote_dtype` of NNX's layers, which `flax.nnx` does not export.
-Without it a layer with a promotion of its own would be adapted as if it had none."""
+"""Default of the `promote_dtype` argument of NNX layers, which `flax.nnx` does not export. Without
+it, a layer with a custom function would be adapted as if it had the default."""
 
 is_mutable = scope.in_filter
-"""Whether a name is among the collections that Linen's `apply` was told are mutable; the ways to
-say that (a bool, a name, a list, a DenyList) have no public reader. Without it a call could change
-the collection that holds the adapters."""
+"""Return whether the `mutable` argument of Linen's `apply` (bool, name, list or DenyList) includes
+a collection; there is no public function for it. Without it, a call could modify the collection
+that holds the adapters."""

@@ -25,7 +25,7 @@ def resize_with_pad(
     The rest is padded with black (-1).
 
     Args:
-        images: in [-1, 1]; images of the right size are returned unchanged.
+        images: values in [-1, 1]; images of the right size are returned unchanged.
         size: height and width [pixels].
         centred: center the image, as in openpi (shared/image_tools.py) and LeRobot's pi0; False:
             align it right and bottom, as in LeRobot's SmolVLA.
@@ -34,7 +34,7 @@ def resize_with_pad(
     batch, height, width, channels = images.shape
     if height == width == size:
         return images
-    # Floats, as in both projects, where rounding makes 116 pixels 223 instead of 224.
+    # Float arithmetic, as in both projects: 116 pixels become 223, not 224.
     ratio = max(width / size, height / size)
     inner = (max(1, int(height / ratio)), max(1, int(width / ratio)))
     shape = (batch, *inner, channels)

@@ -1,15 +1,15 @@
 """Normalize robot states and actions to order one, and back.
 
 Every mode is an affine map: y = (x - shift) / divisor + offset and x = (y - offset) factor + shift.
-Divisor and factor are both the spread, guarded against division by zero in constant dimensions; the
-guard is a convention of each project:
+Divisor and factor are both the spread, guarded against division by zero in constant dimensions.
+Each project has its own guard:
 
     mean_std             shift mean, spread std, offset 0
     min_max, quantiles   shift low, spread (high - low) / 2, offset -1: [low, high] becomes [-1, 1];
                          quantiles: 1st and 99th percentile, quantile10: 10th and 90th
     identity             y = x
 
-    ours      at least SMALLEST_SPREAD, both ways
+    ours      at least MIN_SPREAD, both ways
     openpi    adds 1e-6, both ways (transforms.py, Normalize and Unnormalize, at 15a9616a)
     lerobot   std: adds 1e-8 when normalizing only; ranges: 1e-8 in place of 0, both ways
               (processor/normalize_processor.py, 0.6)
@@ -23,7 +23,7 @@ import jax.numpy as jnp
 
 from lorasp_jax.models.inputs import Convention, Mode
 
-SMALLEST_SPREAD = 1e-3
+MIN_SPREAD = 1e-3
 """Lower bound on the spread [rad, m], so that noise in a constant dimension (such as a gripper that
 stays open) is not amplified."""
 BOUNDS = {"min_max": ("min", "max"), "quantiles": ("q01", "q99"), "quantile10": ("q10", "q90")}
@@ -83,7 +83,7 @@ def _affine_map(stats: Mapping[str, jax.Array], mode: Mode, convention: Conventi
     if convention == "openpi":
         divisor = factor = spread + _OPENPI
     elif convention == "ours":
-        divisor = factor = jnp.maximum(spread, SMALLEST_SPREAD)
+        divisor = factor = jnp.maximum(spread, MIN_SPREAD)
     elif mode == "mean_std":
         divisor, factor = spread + _LEROBOT, spread
     else:

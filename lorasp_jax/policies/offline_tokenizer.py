@@ -1,4 +1,4 @@
-"""Tokenizer of the project's own base weights: a tiny WordPiece over manipulation words, offline.
+"""Offline tokenizer of the project's own base weights: a tiny WordPiece of manipulation words.
 
 Other words are split into characters, so every printable ASCII text encodes. The position of an
 entry is its id, and the shipped weights depend on it: entries are never moved or removed, and a new

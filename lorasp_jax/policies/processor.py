@@ -131,7 +131,7 @@ class Processor:
 
         Args:
             config: the backbone's sizes and input conventions.
-            statistics: of the robot's states and actions, in the robot's order or already in slots.
+            statistics: the robot's statistics, in the order of its joints or already in slots.
             prompts: tokenized prompts of the instructions.
             num_joints: J.
             cameras: backbone camera -> robot camera, see `camera_slots`; None: the same names.
@@ -222,9 +222,9 @@ class Processor:
         slots, inputs = np.array(self.robot_slots), self.inputs
         stats = {name: array[slots] for name, array in self.statistics.action.items()}
         actions = unnormalize(actions[..., slots], stats, inputs.action, inputs.convention)
-        return (
-            to_absolute(actions, _require_state(state), inputs.delta) if inputs.delta else actions
-        )
+        if inputs.delta:
+            actions = to_absolute(actions, _require_state(state), inputs.delta)
+        return actions
 
     def _to_slots(self, kind: str, values: jax.Array) -> jax.Array:
         """Normalize states or actions `[..., J+1]` and return them in slots, `[..., A]`."""

@@ -1,4 +1,4 @@
-"""Token ids of a robot's prompts, tokenized once, since no tokenizer runs inside `jax.jit`.
+"""Prompts of a robot, tokenized in advance, since no tokenizer runs inside `jax.jit`.
 
 pi0.5's prompt contains the state, "Task: press the button, State: 12 130 7;\\nAction: ". Its ids
 are assembled from those of the text before the numbers, of each number with its leading space, and
@@ -26,7 +26,7 @@ class Ids(NamedTuple):
     ids: jax.Array
     mask: jax.Array
 
-    def of(self, rows: jax.Array) -> "Ids":
+    def gather(self, rows: jax.Array) -> "Ids":
         """Gather rows `[B, n]` or `[B]` and flatten each to `[B, n K]`."""
         return Ids(*(jnp.asarray(a)[rows].reshape(len(rows), -1) for a in self))
 
@@ -34,7 +34,7 @@ class Ids(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class PromptTable:
-    """Prompts by instruction. A pytree.
+    """Tokenized prompts by instruction. A pytree.
 
     Attributes:
         start: `[P, T]`, one row per instruction: the prompt, or the part of it before the state.
@@ -74,10 +74,10 @@ class PromptTable:
             table = _with_state(words, instructions, config.max_tokens, num_joints + 1)
         else:
             table = cls(_ids(*words.encode(instructions, config.max_tokens)))
-        highest = max(int(leaf.max()) for leaf in jax.tree.leaves(table))
-        if highest >= config.vocabulary:
+        max_id = max(int(leaf.max()) for leaf in jax.tree.leaves(table))
+        if max_id >= config.vocabulary:
             raise ValueError(
-                f"Token {highest} is beyond the backbone's vocabulary of {config.vocabulary}: "
+                f"Token {max_id} is beyond the backbone's vocabulary of {config.vocabulary}: "
                 "the tokenizer belongs to a different model."
             )
         return dataclasses.replace(table, instructions=tuple(instructions))
@@ -101,15 +101,14 @@ class PromptTable:
             instruction: `[B]` int32 rows of the table.
             state: `[B, J+1]`, normalized; used only if prompts contain the state.
         """
-        start = self.start.of(instruction)
+        start = self.start.gather(instruction)
         if self.numbers is None or self.last is None:
             return start
         rows = jnp.digitize(state, prompts.EDGES)  # bin -1 is row 0
-        parts = start, self.numbers.of(rows[:, :-1]), self.last.of(rows[:, -1])
+        parts = start, self.numbers.gather(rows[:, :-1]), self.last.gather(rows[:, -1])
         ids, mask = (jnp.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
-        order = jnp.argsort(~mask, axis=1, stable=True)[
-            :, : start.ids.shape[1]
-        ]  # stable: padding last
+        order = jnp.argsort(~mask, axis=1, stable=True)  # moves the padding to the end
+        order = order[:, : start.ids.shape[1]]
         return Ids(*(jnp.take_along_axis(a, order, axis=1) for a in (ids, mask)))
 
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lorasp_jax.policies.normalization import SMALLEST_SPREAD
+from lorasp_jax.policies.normalization import MIN_SPREAD
 from lorasp_jax.storage.digest import DIGEST, verify_digest, with_digest
 
 NAMES = ("mean", "std", "min", "max", "q01", "q99", "q10", "q90")
@@ -45,7 +45,7 @@ class Statistics:
         slots: Sequence[int],
         dim: int,
     ) -> "Statistics":
-        """Compute the statistics of demonstrations; std is at least `SMALLEST_SPREAD`.
+        """Compute the statistics of demonstrations; std is at least `MIN_SPREAD`.
 
         Args:
             state: `[..., J+1]` joints [rad] and gripper [m].
@@ -131,8 +131,8 @@ def validate(both: Mapping[str, Mapping[str, np.ndarray]], source: str) -> Stati
     """
     arrays = [array for stats in both.values() for array in stats.values()]
     unknown = sorted({name for stats in both.values() for name in stats} - set(NAMES))
-    wrong = any(array.ndim != 1 or array.shape != arrays[0].shape for array in arrays)
-    if unknown or wrong or not all(both.values()):
+    inconsistent = any(array.ndim != 1 or array.shape != arrays[0].shape for array in arrays)
+    if unknown or inconsistent or not all(both.values()):
         problem = f"has {unknown[0]!r}" if unknown else "lacks one of them or differs in length"
         raise ValueError(
             f"Statistics must be lists of equal length for state and for action, named "
@@ -162,7 +162,7 @@ def _measure(rows: np.ndarray) -> dict[str, jax.Array]:
     q01, q10, q90, q99 = np.quantile(rows, [0.01, 0.1, 0.9, 0.99], axis=0)
     stats = {
         "mean": rows.mean(axis=0),
-        "std": np.maximum(rows.std(axis=0), SMALLEST_SPREAD),
+        "std": np.maximum(rows.std(axis=0), MIN_SPREAD),
         "min": rows.min(axis=0),
         "max": rows.max(axis=0),
         "q01": q01,

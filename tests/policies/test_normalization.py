@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lorasp_jax.policies.normalization import SMALLEST_SPREAD, normalize, unnormalize
+from lorasp_jax.policies.normalization import MIN_SPREAD, normalize, unnormalize
 
 STATS = {
     "mean": [0.5, -1.0, 2.0, 0.1],
@@ -46,8 +46,8 @@ EXPECTED = {
         (Y + 1) * np.where(INNER == 0, 1e-8, INNER) / 2 + K["q10"],
     ),
     ("mean_std", "ours"): (
-        (X - K["mean"]) / np.maximum(K["std"], SMALLEST_SPREAD),
-        Y * np.maximum(K["std"], SMALLEST_SPREAD) + K["mean"],
+        (X - K["mean"]) / np.maximum(K["std"], MIN_SPREAD),
+        Y * np.maximum(K["std"], MIN_SPREAD) + K["mean"],
     ),
     ("identity", "openpi"): (X, Y),
 }

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from lorasp_jax.policies.normalization import SMALLEST_SPREAD
+from lorasp_jax.policies.normalization import MIN_SPREAD
 from lorasp_jax.policies.statistics import NAMES, Statistics
 
 DIM = 8
@@ -24,7 +24,7 @@ def test_measure_ignores_padding(slots):
     rows, used = state[valid], np.array(slots)
     expected = {
         "mean": rows.mean(0),
-        "std": np.maximum(rows.std(0), SMALLEST_SPREAD),
+        "std": np.maximum(rows.std(0), MIN_SPREAD),
         "min": rows.min(0),
         "max": rows.max(0),
         "q01": np.percentile(rows, 1, axis=0),

@@ -30,7 +30,7 @@ def count(function: Callable, *arguments: Any) -> float:
       arguments: arrays or `jax.ShapeDtypeStruct`s; only shapes and dtypes matter.
     """
     jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
-    return _of_jaxpr(_compat.without_unused(jaxpr, [True] * len(jaxpr.outvars))[0])
+    return _of_jaxpr(_compat.eliminate_dead_code(jaxpr, [True] * len(jaxpr.outvars))[0])
 
 
 def utilization(flop_count: float, seconds: float) -> float | None:
