@@ -122,7 +122,7 @@ class Evaluation(Callback):
         with contextlib.ExitStack() as compiles:
             if task not in self._rollouts:
                 what = f"the evaluation of {task} and running its first episodes"
-                compiles.enter_context(messages.announced(what))
+                compiles.enter_context(messages.announce(what))
 
             def report(done: int, _: int) -> None:
                 compiles.close()

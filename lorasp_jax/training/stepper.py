@@ -46,7 +46,7 @@ class Stepper:
 
     def _compile(self, state: TrainState, count: int) -> Any:
         key = jax.random.key(0)
-        with messages.announced("the training step"):
+        with messages.announce("the training step"):
             lowered = self._jitted.lower(self._frozen, self._data, state, key, count)
             return lowered.compile(compiler_options=fast_cpu.without_simulation())
 

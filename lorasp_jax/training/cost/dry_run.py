@@ -52,7 +52,7 @@ def dry_run(
     console.print(_parameter_table(built.model))
     run = Run(config, folder, console, built.base_hash)
     data = _abstract_data(run, built)
-    with messages.announced("the training step"):
+    with messages.announce("the training step"):
         options = fast_cpu.without_simulation()
         compiled = _lower(run, data).compile(compiler_options=options)
     local_bytes = _bytes(data) / _shards(data)
