@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.actions import MODES
-from envs.datasets.files import check_local, check_memory, damage, regular
+from envs.datasets.files import as_value_error, check_local, check_memory, check_regular
 from envs.datasets.writing import atomic_file
 
 Array = jax.Array | np.ndarray
@@ -264,8 +264,8 @@ def _pad(xp: Any, array: Array, steps: int) -> Array:
 
 def _read(path: Path) -> dict[str, np.ndarray]:
     """Read all arrays of an .npz file."""
-    regular(path)
-    with damage(path), zipfile.ZipFile(path) as archive:
+    check_regular(path)
+    with as_value_error(path), zipfile.ZipFile(path) as archive:
         members = archive.infolist()
         check_memory(sum(member.file_size for member in members), path)
         return {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}

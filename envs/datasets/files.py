@@ -32,7 +32,7 @@ class RefusedError(ValueError):
     """A file or a name that is not trusted; the message is a complete sentence."""
 
 
-def inside(folder: Path, name: object) -> Path:
+def join_inside(folder: Path, name: object) -> Path:
     """Join a folder and an untrusted name, checking the name alone.
 
     Raises:
@@ -53,7 +53,7 @@ def check_local(path: Path) -> None:
         raise ValueError(f"cannot write to the URL {path}: give a path on this machine")
 
 
-def regular(path: Path, folder: Path | None = None) -> Path:
+def check_regular(path: Path, folder: Path | None = None) -> Path:
     """Check that a path is a readable regular file, and return it.
 
     Args:
@@ -76,7 +76,7 @@ def regular(path: Path, folder: Path | None = None) -> Path:
     return path
 
 
-def beside(file: Path, name: object) -> Path:
+def path_beside(file: Path, name: object) -> Path:
     """Return the path of a file beside another one that refers to it; it may be missing.
 
     Raises:
@@ -86,7 +86,7 @@ def beside(file: Path, name: object) -> Path:
     if not isinstance(name, str) or Path(name).name != name or name in ("", "..") or "\0" in name:
         raise RefusedError(f"{file} refers to {name!r}, which is not a file beside it")
     path = file.parent / name
-    return regular(path) if path.exists() else path
+    return check_regular(path) if path.exists() else path
 
 
 def check_only_files(folder: Path, home: Path | None = None) -> None:
@@ -104,17 +104,17 @@ def check_only_files(folder: Path, home: Path | None = None) -> None:
         if path.is_dir():
             _check_contained(path, home)
         else:
-            regular(path, home)
+            check_regular(path, home)
 
 
 def read_bytes(path: Path, folder: Path | None = None) -> bytes:
-    """Read a file after the checks of `regular`.
+    """Read a file after the checks of `check_regular`.
 
     Raises:
-        RefusedError: as in `regular`; or it is larger than `TEXT_BYTES`.
-        OSError: as in `regular`.
+        RefusedError: as in `check_regular`; or it is larger than `TEXT_BYTES`.
+        OSError: as in `check_regular`.
     """
-    if (size := regular(path, folder).stat().st_size) > TEXT_BYTES:
+    if (size := check_regular(path, folder).stat().st_size) > TEXT_BYTES:
         raise RefusedError(f"{path} has {size} bytes; at most {TEXT_BYTES} are allowed")
     return path.read_bytes()
 
@@ -124,7 +124,7 @@ def read_text(path: Path, folder: Path | None = None) -> str:
 
     Raises:
         RefusedError: as in `read_bytes`.
-        OSError: as in `regular`.
+        OSError: as in `check_regular`.
         ValueError: it is not UTF-8.
     """
     return read_bytes(path, folder).decode()
@@ -135,7 +135,7 @@ def read_json(path: Path, folder: Path | None = None) -> Any:
 
     Raises:
         RefusedError: as in `read_text`.
-        OSError: as in `regular`.
+        OSError: as in `check_regular`.
         ValueError: it is not JSON, is nested too deeply, or has a string with a lone surrogate.
     """
     try:
@@ -147,7 +147,7 @@ def read_json(path: Path, folder: Path | None = None) -> Any:
 
 
 @contextlib.contextmanager
-def damage(path: Path, *also: type[Exception], remedy: str = "") -> Iterator[None]:
+def as_value_error(path: Path, *also: type[Exception], remedy: str = "") -> Iterator[None]:
     """Convert errors of reading a path to a ValueError that names it; refusals pass unchanged.
 
     Args:
@@ -162,11 +162,12 @@ def damage(path: Path, *also: type[Exception], remedy: str = "") -> Iterator[Non
     except (*_FAILURES, *also) as error:
         if isinstance(error, FileNotFoundError) and error.filename:
             raise ValueError(f"{os.fsdecode(error.filename)} is missing{remedy}") from error
-        what = f"lacks {error}" if isinstance(error, KeyError) else f"is damaged ({reason(error)})"
-        raise ValueError(f"{path} {what}{remedy}") from error
+        cause = first_line(error)
+        problem = f"lacks {error}" if isinstance(error, KeyError) else f"is damaged ({cause})"
+        raise ValueError(f"{path} {problem}{remedy}") from error
 
 
-def reason(error: BaseException) -> str:
+def first_line(error: BaseException) -> str:
     """Return the first line of an error message, at most 200 characters."""
     text = str(getattr(error, "strerror", None) or error) or type(error).__name__
     return text.partition("\n")[0].rstrip(".")[:200]
@@ -182,7 +183,7 @@ def check_memory(size: int, what: object) -> None:
         )
 
 
-def whole(number: Any) -> int:
+def as_int(number: Any) -> int:
     """Convert a number from a table to an int: tables with gaps store integers as floats.
 
     Raises:

@@ -24,7 +24,7 @@ from array_record.python import array_record_module
 
 from envs.datasets import rlds_schema
 from envs.datasets.episodes import SHARED, Episodes
-from envs.datasets.files import reason, regular
+from envs.datasets.files import check_regular, first_line
 from envs.datasets.locks import locked
 from envs.datasets.rlds_reading import (
     FORMAT,
@@ -32,7 +32,7 @@ from envs.datasets.rlds_reading import (
     SPLIT,
     THREADS,
     Reader,
-    damage,
+    as_value_error,
     metadata,
     read,
 )
@@ -149,7 +149,7 @@ class ShardWriter:
             data_dir=str(self.folder),
             module_name="",
         )
-        with damage(self.folder, ": delete it to start over"):
+        with as_value_error(self.folder, ": delete it to start over"):
             features = rlds_schema.stored(self.folder)
         info = tfds.core.DatasetInfo(
             builder=identity,
@@ -213,8 +213,8 @@ def _write_records(file: Path, records: Iterable[bytes]) -> None:
 
 def _check_shard(file: Path, episodes: int) -> None:
     """Raise a ValueError if a shard is damaged; reading verifies each record's checksum."""
-    with damage(file, f": delete {file.parent} to start over"):
-        reader = array_record_module.ArrayRecordReader(str(regular(file, file.parent)))
+    with as_value_error(file, f": delete {file.parent} to start over"):
+        reader = array_record_module.ArrayRecordReader(str(check_regular(file, file.parent)))
         if reader.num_records() != episodes or len(reader.read_all()) != episodes:
             raise ValueError(f"expected {episodes} episodes, found {reader.num_records()}")
         reader.close()
@@ -225,5 +225,5 @@ def _as_os_error(file: Path) -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        cause = reason(error).partition("; ")[0]  # the rest is a position in the file
+        cause = first_line(error).partition("; ")[0]  # the rest is a position in the file
         raise OSError(f"cannot write {file} ({cause})") from error

@@ -14,7 +14,7 @@ from google.protobuf.json_format import ParseError
 
 from envs.datasets import files, rlds_schema
 from envs.datasets.episodes import SHARED, Episodes, concatenate
-from envs.datasets.files import RefusedError, read_json, regular, whole
+from envs.datasets.files import RefusedError, as_int, check_regular, read_json
 
 FORMAT, SPLIT = "envs-rlds-1", "train"
 METADATA = "metadata.json"
@@ -38,7 +38,7 @@ def read(path: str | os.PathLike[str]) -> Episodes:
     """
     reader = Reader(path)
     parts = list(THREADS.map(reader.episode, range(len(reader))))
-    with damage(reader.path):
+    with as_value_error(reader.path):
         return replace(concatenate(parts), attempted=reader.metadata["attempted"])
 
 
@@ -90,11 +90,11 @@ class Reader:
         """
         self.path: Path = Path(path)
         self.metadata: dict[str, Any] = metadata(self.path)
-        with damage(self.path):
+        with as_value_error(self.path):
             cameras = self.metadata["cameras"]
             self.cameras: dict[str, str] = {n: rlds_schema.image_feature(n) for n in cameras}
             self.control_dt: float = float(self.metadata["control_dt"])
-            self.num_steps: int = whole(self.metadata["steps"])
+            self.num_steps: int = as_int(self.metadata["steps"])
             self._shared: dict[str, Any] = {name: self.metadata[name] for name in SHARED}
             self._shared |= {"instructions": tuple(self.metadata["instructions"]), "attempted": 1}
             builder = _builder(self.path, self.metadata["parts"])
@@ -117,7 +117,7 @@ class Reader:
         Raises:
             ValueError: it is damaged or incomplete.
         """
-        with damage(self.path):
+        with as_value_error(self.path):
             names = self.cameras if cameras is None else cameras
             wanted = {name: self.cameras[name] for name in names}
             sizes = self.metadata["cameras"]
@@ -136,7 +136,7 @@ def _builder(folder: Path, parts: Sequence[int]) -> Any:
     if list(split.shard_lengths) != list(parts):
         raise ValueError(f"it lists {sum(split.shard_lengths)} episodes, expected {sum(parts)}")
     for file, episodes in zip(split.filepaths, parts, strict=True):
-        path = regular(files.inside(folder, os.path.relpath(file, folder)), folder)
+        path = check_regular(files.join_inside(folder, os.path.relpath(file, folder)), folder)
         reader = array_record_module.ArrayRecordReader(str(path))
         if reader.num_records() != episodes:
             raise ValueError(f"{file} has {reader.num_records()} episodes, expected {episodes}")
@@ -144,6 +144,6 @@ def _builder(folder: Path, parts: Sequence[int]) -> Any:
     return builder
 
 
-def damage(path: Path, remedy: str = "") -> contextlib.AbstractContextManager[None]:
-    """Convert errors as `files.damage` does, protobuf's included."""
-    return files.damage(path, ParseError, remedy=remedy)
+def as_value_error(path: Path, remedy: str = "") -> contextlib.AbstractContextManager[None]:
+    """Convert errors as `files.as_value_error` does, protobuf's included."""
+    return files.as_value_error(path, ParseError, remedy=remedy)

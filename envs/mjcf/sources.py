@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
-from envs.datasets.files import check_memory, read_text, regular
+from envs.datasets.files import check_memory, check_regular, read_text
 
 _FOLDERS = ("assetdir", "meshdir", "texturedir")  # attributes of compiler
 _DESCRIPTIONS = ("include", "model")  # elements that refer to another MJCF file
@@ -45,12 +45,12 @@ def check(path: Path, folder: Path) -> None:
         _check_sizes(root, 1)
     _check_growth(descriptions, path.parent)
     for file in _referenced(descriptions, path.parent, ()):
-        _check_image(regular(file, folder))
+        _check_image(check_regular(file, folder))
 
 
 def _all_descriptions(path: Path, folder: Path) -> dict[Path, ElementTree.Element]:
     """Parse a file and all MJCF files that it includes, directly or not."""
-    regular(path)
+    check_regular(path)
     main, known, new, size = path.parent, {}, [path], 0
     for _ in range(_MAX_DEPTH):
         for file in new:

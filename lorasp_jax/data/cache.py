@@ -22,7 +22,7 @@ from typing import Any, Self
 import numpy as np
 
 from envs.datasets.episodes import SHARED, Episodes, check_camera
-from envs.datasets.files import damage, read_json, read_text
+from envs.datasets.files import as_value_error, read_json, read_text
 from envs.datasets.locks import locked
 from envs.datasets.writing import atomic_folder
 from lorasp_jax.data.batches import Steps
@@ -227,7 +227,7 @@ class Cache:
         header = self.path / HEADER
         if not header.is_file():
             raise ValueError(f"{path} is not a cache: it has no {HEADER}")
-        with damage(header):
+        with as_value_error(header):
             self.metadata: dict[str, Any] = _read_header(header)
         self.cameras: dict[str, list[int]] = self.metadata["cameras"]
         self.control_dt: float = self.metadata["control_dt"]
@@ -239,7 +239,7 @@ class Cache:
         self._columns = self._map_columns()
         self._end = np.cumsum(self._columns["length"], dtype=np.int64)
         self._check_columns()
-        with damage(header):
+        with as_value_error(header):
             self.episode(0, ()).validate_numbers()
             for name in ("state", "action"):
                 if not np.isfinite(self._columns[name]).all():
@@ -320,7 +320,7 @@ class Cache:
         path = self.path / STATISTICS
         if self.metadata["actions"] != "joint":
             return None
-        with damage(path):
+        with as_value_error(path):
             return Statistics.from_json(read_text(path, self.path))
 
 

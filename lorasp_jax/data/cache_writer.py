@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from envs.datasets.files import damage, regular
+from envs.datasets.files import as_value_error, check_regular
 
 
 class Column:
@@ -51,8 +51,8 @@ def map_column(
     Raises:
         ValueError: the file is missing or damaged.
     """
-    with damage(path):
-        array: Any = np.load(regular(path, path.parent), mmap_mode="r")
+    with as_value_error(path):
+        array: Any = np.load(check_regular(path, path.parent), mmap_mode="r")
         wanted = tuple(n if n else m for n, m in zip(shape, array.shape, strict=True))
         if array.shape != wanted or array.dtype != np.dtype(dtype) or not array.flags.c_contiguous:
             order = "" if array.flags.c_contiguous else " in Fortran order"

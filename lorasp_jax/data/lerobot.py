@@ -18,9 +18,15 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from envs.datasets.episodes import Episodes
-from envs.datasets.files import check_memory, regular, whole
+from envs.datasets.files import as_int, check_memory, check_regular
 from lorasp_jax.data.keys import Keys
-from lorasp_jax.data.lerobot_files import EpisodeEntry, Index, damage, read_index, read_table
+from lorasp_jax.data.lerobot_files import (
+    EpisodeEntry,
+    Index,
+    as_value_error,
+    read_index,
+    read_table,
+)
 from lorasp_jax.data.video import VideoReader, decode_image
 from lorasp_jax.storage import hub
 
@@ -151,9 +157,9 @@ class LeRobot:
     def _names(self, kind: str) -> list[str]:
         """Return the names of a feature's dimensions, or their indices if they have no names."""
         key = getattr(self.keys, kind)
-        with damage(self.path / "meta" / "info.json"):
+        with as_value_error(self.path / "meta" / "info.json"):
             feature = self.index.features[key]
-            (dim,) = map(whole, feature["shape"])
+            (dim,) = map(as_int, feature["shape"])
             if not 0 < dim <= _MAX_DIM:
                 raise ValueError(f"{key} must have 1 to {_MAX_DIM} dimensions, got {dim}")
             names = feature.get("names")
@@ -179,7 +185,7 @@ class LeRobot:
     def _frames(self, entry: EpisodeEntry) -> Any:
         """Read the episode's rows from its parquet file, and check that none is missing."""
         path, number = entry.table, entry.number
-        with damage(path):
+        with as_value_error(path):
             if self._table[0] != path:
                 self._table = path, read_table(path, self.path, self._needed)
             table = self._table[1]
@@ -203,7 +209,7 @@ class LeRobot:
     def _values(self, table: Any, entry: EpisodeEntry, kind: str) -> np.ndarray:
         """Return joints [rad] and gripper [m], f32 `[T, J+1]`."""
         key, path = getattr(self.keys, kind), entry.table
-        with damage(path):
+        with as_value_error(path):
             column = table[key].combine_chunks()
             dim = len(self._names(kind))
             dims = set(pc.list_value_length(column).to_pylist())
@@ -226,7 +232,7 @@ class LeRobot:
 
     def _instruction(self, table: Any, entry: EpisodeEntry) -> int:
         """Return the position of the episode's instruction in order of task indices."""
-        with damage(entry.table):
+        with as_value_error(entry.table):
             tasks = pc.unique(table["task_index"]).to_pylist()
         if len(tasks) != 1 or tasks[0] not in self.index.tasks:
             raise ValueError(
@@ -243,7 +249,7 @@ class LeRobot:
             video = self._video(camera, path)
             fps, length = self.index.fps, entry.length
             return video.read(start, length, fps, every=every, image_size=size)
-        with damage(entry.table):
+        with as_value_error(entry.table):
             files = [row["bytes"] for row in table[key].to_pylist()[::every]]
             first = decode_image(files[0], size)
             check_memory(len(files) * first.nbytes, f"an episode in {entry.table}")
@@ -255,7 +261,7 @@ class LeRobot:
         if video is None or video.path != path:
             if video is not None:
                 video.close()
-            with damage(path):
-                regular(path, self.path)
+            with as_value_error(path):
+                check_regular(path, self.path)
             video = self._videos[camera] = VideoReader(path)
         return video

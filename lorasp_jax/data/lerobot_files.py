@@ -20,7 +20,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from envs.datasets import files
-from envs.datasets.files import check_memory, inside, read_json, read_text, regular, whole
+from envs.datasets.files import (
+    as_int,
+    check_memory,
+    check_regular,
+    join_inside,
+    read_json,
+    read_text,
+)
 
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 _FIELD = re.compile(r"\{(\w+)(?::(\d{0,2}d?))?\}")
@@ -80,7 +87,7 @@ def read_index(folder: Path) -> Index:
     path = folder / "meta" / "info.json"
     if not path.is_file():
         raise ValueError(f"{folder} is not a LeRobot dataset: it has no meta/info.json")
-    with damage(path):
+    with as_value_error(path):
         info = read_json(path, folder)
         version, fps, features = info["codebase_version"], float(info["fps"]), info["features"]
         videos = [name for name, feature in features.items() if feature["dtype"] == "video"]
@@ -102,21 +109,24 @@ def _read_2(
 ) -> tuple[dict[int, str], list[EpisodeEntry]]:
     """Read tasks and episodes of versions 2.0 and 2.1."""
     path = folder / "meta" / "tasks.jsonl"
-    with damage(path):
-        tasks = {whole(row["task_index"]): str(row["task"]) for row in _json_lines(path, folder)}
+    with as_value_error(path):
+        tasks = {as_int(row["task_index"]): str(row["task"]) for row in _json_lines(path, folder)}
     path = folder / "meta" / "episodes.jsonl"
     episodes = []
-    with damage(path):
+    with as_value_error(path):
         for row in _json_lines(path, folder):
-            number = whole(row["episode_index"])
-            chunk = number // whole(info["chunks_size"])
+            number = as_int(row["episode_index"])
+            chunk = number // as_int(info["chunks_size"])
             fields = {"episode_index": number, "episode_chunk": chunk}
             files = {
-                key: (inside(folder, _format(info["video_path"], video_key=key, **fields)), 0.0)
+                key: (
+                    join_inside(folder, _format(info["video_path"], video_key=key, **fields)),
+                    0.0,
+                )
                 for key in videos
             }
-            table = inside(folder, _format(info["data_path"], **fields))
-            episodes.append(EpisodeEntry(number, whole(row["length"]), table, files))
+            table = join_inside(folder, _format(info["data_path"], **fields))
+            episodes.append(EpisodeEntry(number, as_int(row["length"]), table, files))
     return tasks, episodes
 
 
@@ -125,21 +135,21 @@ def _read_3(
 ) -> tuple[dict[int, str], list[EpisodeEntry]]:
     """Read tasks and episodes of version 3.0."""
     path = folder / "meta" / "tasks.parquet"
-    with damage(path):
+    with as_value_error(path):
         # The tasks are the index of a pandas table, which may have lost its name "task".
         rows = [
             {"task": row.pop("__index_level_0__", None), **row}
             for row in read_table(path, folder).to_pylist()
         ]
-        tasks = {whole(row["task_index"]): str(row["task"]) for row in rows}
+        tasks = {as_int(row["task_index"]): str(row["task"]) for row in rows}
     episodes = []
     for path in sorted((folder / "meta" / "episodes").rglob("*.parquet")):
-        with damage(path):
+        with as_value_error(path):
             for row in read_table(path, folder, without="stats/").to_pylist():
-                at = {name: whole(row[f"data/{name}"]) for name in ("chunk_index", "file_index")}
+                at = {name: as_int(row[f"data/{name}"]) for name in ("chunk_index", "file_index")}
                 files = {key: _video_3(folder, info, key, row) for key in videos}
-                table = inside(folder, _format(info["data_path"], **at))
-                number, length = whole(row["episode_index"]), whole(row["length"])
+                table = join_inside(folder, _format(info["data_path"], **at))
+                number, length = as_int(row["episode_index"]), as_int(row["length"])
                 episodes.append(EpisodeEntry(number, length, table, files))
     return tasks, episodes
 
@@ -148,11 +158,11 @@ def _video_3(
     folder: Path, info: Mapping[str, Any], key: str, row: Mapping[str, Any]
 ) -> tuple[Path, float]:
     """Return an episode's video and its start in that file [s], in version 3.0."""
-    at = {name: whole(row[f"videos/{key}/{name}"]) for name in ("chunk_index", "file_index")}
+    at = {name: as_int(row[f"videos/{key}/{name}"]) for name in ("chunk_index", "file_index")}
     start = float(row[f"videos/{key}/from_timestamp"])
     if not 0 <= start < math.inf:
         raise ValueError(f"episode {row['episode_index']} starts at {start} s in its {key} video")
-    return inside(folder, _format(info["video_path"], video_key=key, **at)), start
+    return join_inside(folder, _format(info["video_path"], video_key=key, **at)), start
 
 
 def _format(template: Any, **values: Any) -> str:
@@ -175,9 +185,9 @@ def read_table(
 
     Raises:
         KeyError: a column is missing.
-        Exception: an error of `files.regular` or pyarrow, see `damage`.
+        Exception: an error of `files.check_regular` or pyarrow, see `as_value_error`.
     """
-    with pq.ParquetFile(regular(path, folder)) as file:
+    with pq.ParquetFile(check_regular(path, folder)) as file:
         available = file.schema_arrow.names
         for name in columns or ():
             if name not in available:
@@ -221,6 +231,6 @@ def _json_lines(path: Path, folder: Path) -> Iterator[dict[str, Any]]:
     return (json.loads(line) for line in read_text(path, folder).splitlines() if line.strip())
 
 
-def damage(path: Path) -> contextlib.AbstractContextManager[None]:
-    """Convert errors as `files.damage` does, pyarrow's included."""
-    return files.damage(path, pa.ArrowException)
+def as_value_error(path: Path) -> contextlib.AbstractContextManager[None]:
+    """Convert errors as `files.as_value_error` does, pyarrow's included."""
+    return files.as_value_error(path, pa.ArrowException)

@@ -12,7 +12,7 @@ import numpy as np
 from av.video.reformatter import VideoReformatter
 from PIL import Image
 
-from envs.datasets.files import check_memory, reason
+from envs.datasets.files import check_memory, first_line
 
 # Allowed containers: FFmpeg would also read playlists, which refer to other files and URLs.
 _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
@@ -41,7 +41,7 @@ class VideoReader:
             self._container: Any = av.open(f"file:{path}", container_options=_OPTIONS)
             self._stream = self._container.streams.video[0]
         except (av.error.FFmpegError, OSError, ValueError, IndexError) as error:
-            raise ValueError(f"{path} cannot be read as a video ({reason(error)})") from error
+            raise ValueError(f"{path} cannot be read as a video ({first_line(error)})") from error
         self._stream.thread_type = "AUTO"
         self._frames: Iterator[Any] = self._container.decode(self._stream)
         # One for all frames and without threads: setting one up takes as long as a conversion.
@@ -94,7 +94,7 @@ class VideoReader:
             self._container.seek(round(start / self._stream.time_base), stream=self._stream)
         except (av.error.FFmpegError, OSError, OverflowError) as error:
             raise ValueError(
-                f"{self.path} has no frame at {start:g} s ({reason(error)})"
+                f"{self.path} has no frame at {start:g} s ({first_line(error)})"
             ) from error
         self._frames = self._container.decode(self._stream)
 
@@ -106,7 +106,7 @@ class VideoReader:
         except StopIteration:
             cause = "end of file"
         except (av.error.FFmpegError, OSError) as error:
-            cause = reason(error)
+            cause = first_line(error)
         raise ValueError(
             f"{self.path} has only {number} of {length} frames of an episode ({cause})"
         )
@@ -128,7 +128,7 @@ def decode_image(file: bytes, image_size: int = 0) -> np.ndarray:
                 raise ValueError(f"{image.width} x {image.height} pixels are too many")
             return downscale(np.asarray(image.convert("RGB")), image_size)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise ValueError(f"an image is damaged ({reason(error)})") from error
+        raise ValueError(f"an image is damaged ({first_line(error)})") from error
 
 
 def downscale(image: np.ndarray, image_size: int) -> np.ndarray:

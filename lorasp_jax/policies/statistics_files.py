@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import safetensors
 
-from envs.datasets.files import beside, read_text
+from envs.datasets.files import path_beside, read_text
 from lorasp_jax.policies.statistics import NAMES, Statistics, validate
 from lorasp_jax.storage import hub
 
@@ -127,7 +127,7 @@ def _policy(files: list[Path]) -> dict[str, Stats]:
     for pipeline in (files[0].with_name(name) for name in PIPELINES):
         for step in json.loads(read_text(pipeline))["steps"]:
             if "normalizer" in step.get("registry_name", "") and "state_file" in step:
-                tensors += _tensors(beside(pipeline, step["state_file"]))
+                tensors += _tensors(path_beside(pipeline, step["state_file"]))
     return _group(tensors)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from envs.datasets.files import inside, read_bytes
+from envs.datasets.files import join_inside, read_bytes
 from envs.datasets.writing import write_text
 from lorasp_jax.report import figures
 from lorasp_jax.training import records
@@ -240,7 +240,7 @@ def _image(figure: Figure) -> str:
 
 def _video(folder: Path, task: str) -> Path:
     """Path of a task's video."""
-    return inside(folder, f"rollout_{task}.mp4")
+    return join_inside(folder, f"rollout_{task}.mp4")
 
 
 def _media(folder: Path, tasks: Collection[str]) -> Iterable[str]:
@@ -248,7 +248,7 @@ def _media(folder: Path, tasks: Collection[str]) -> Iterable[str]:
     if tasks:
         yield "<h2>Observations and rollouts</h2>"
     for task in tasks:
-        image, video = inside(folder, f"cameras_{task}.png"), _video(folder, task)
+        image, video = join_inside(folder, f"cameras_{task}.png"), _video(folder, task)
         if missing := [path.name for path in (image, video) if not path.exists()]:
             names = html.escape(", ".join(missing))
             yield f"<h3>{html.escape(task)}</h3><p>Missing: {names}.</p>"

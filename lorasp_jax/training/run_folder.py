@@ -19,7 +19,7 @@ from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.proto.summary_pb2 import Summary
 
-from envs.datasets.files import check_only_files, damage, read_bytes
+from envs.datasets.files import as_value_error, check_only_files, read_bytes
 from envs.datasets.locks import acquire
 from envs.datasets.writing import TEMPORARY_SUFFIX, write_text
 from lorasp_jax.config import Config
@@ -60,7 +60,7 @@ def read_json(path: Path, kind: Mapping[Any, Any] = MappingProxyType({})) -> dic
     """
     if not path.exists():
         return {}
-    with damage(path, remedy=": put back a whole one"):
+    with as_value_error(path, remedy=": put back a whole one"):
         found = verify_digest(json.loads(read_bytes(path)))
         check(found, kind)
         return found

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import safetensors
 
-from envs.datasets.files import beside, check_memory, read_text
+from envs.datasets.files import check_memory, path_beside, read_text
 
 SINGLE, INDEX = "model.safetensors", "model.safetensors.index.json"
 
@@ -29,7 +29,7 @@ def weight_files(folder: Path) -> list[Path]:
         names = sorted(set(weight_map.values()))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{index} is damaged.") from error
-    return [beside(index, name) for name in names]
+    return [path_beside(index, name) for name in names]
 
 
 class TensorFiles(MutableMapping[str, np.ndarray]):

@@ -21,7 +21,7 @@ def folder(tmp_path):
 
 @pytest.mark.parametrize("name", ["data/a.json", "a b", "...", "a..b/c", "ä"])
 def test_names_inside_the_folder(name, tmp_path):
-    assert files.inside(tmp_path, name) == tmp_path / name
+    assert files.join_inside(tmp_path, name) == tmp_path / name
 
 
 @pytest.mark.parametrize(
@@ -33,7 +33,7 @@ def test_names_inside_the_folder(name, tmp_path):
 )
 def test_names_outside_the_folder(name, tmp_path):
     with pytest.raises(files.RefusedError, match=re.escape(f"{tmp_path} refers to {name!r}")):
-        files.inside(tmp_path, name)
+        files.join_inside(tmp_path, name)
 
 
 def test_links(folder, tmp_path):
@@ -48,12 +48,12 @@ def test_links(folder, tmp_path):
         with pytest.raises(
             files.RefusedError, match=r"links to .*secret.json, outside of .*dataset"
         ):
-            files.regular(path, folder)
-        assert files.regular(path) == path
+            files.check_regular(path, folder)
+        assert files.check_regular(path) == path
     (folder / "loop").symlink_to("loop")
     for name in ("loop", "nothing"):
         with pytest.raises(OSError, match=name):
-            files.regular(folder / name, folder)
+            files.check_regular(folder / name, folder)
 
 
 @pytest.mark.parametrize("shared", [False, True])
@@ -75,7 +75,7 @@ def test_a_snapshot_of_the_hub(shared, tmp_path):
     (snapshot / "other").symlink_to(tmp_path / "hub" / "datasets--owner--name")
     (snapshot.parent.parent / "refs").write_text("x")
     with pytest.raises(files.RefusedError, match="outside of"):
-        files.regular(snapshot / "other" / "refs", snapshot)
+        files.check_regular(snapshot / "other" / "refs", snapshot)
 
 
 def test_special_files_are_refused(folder, monkeypatch):
@@ -106,10 +106,10 @@ def test_sizes(folder):
 
 
 def test_integers():
-    assert [files.whole(n) for n in (3, 3.0, -1, 2**62)] == [3, 3, -1, 2**62]
+    assert [files.as_int(n) for n in (3, 3.0, -1, 2**62)] == [3, 3, -1, 2**62]
     for bad in (2.5, float("nan"), float("inf"), -1e300, 10**30, True, None, "3", [3]):
         with pytest.raises(ValueError, match="is not an integer"):
-            files.whole(bad)
+            files.as_int(bad)
     assert json.loads("1e999") == float("inf")
 
 
@@ -142,8 +142,8 @@ def test_damage_is_one_sentence(error, sentence):
     remedy = "" if isinstance(error, files.RefusedError) else ": mend it"
     with (
         pytest.raises(ValueError, match=f"^{re.escape(sentence + remedy)}$"),
-        files.damage(files.Path("x"), UserWarning, remedy=": mend it"),
+        files.as_value_error(files.Path("x"), UserWarning, remedy=": mend it"),
     ):
         raise error
-    with pytest.raises(AssertionError), files.damage(files.Path("x")):
+    with pytest.raises(AssertionError), files.as_value_error(files.Path("x")):
         raise AssertionError  # a bug
