@@ -24,7 +24,7 @@ from lorasp_jax.models.config import ExpertConfig
 from lorasp_jax.peft import LoRA
 
 _LAYERS = "PaliGemma/llm/layers"
-_TOWERS = {"language": "", "action": "_1"}
+_TOWERS = {"language": "", "action": "_1"}  # our tower -> openpi's suffix
 _ATTENTION = ("q_proj", "k_proj", "v_proj", "o_proj")
 Pair = tuple[np.ndarray, np.ndarray]
 """A [L, I, R] and B [L, R, O]."""
