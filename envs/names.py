@@ -12,6 +12,6 @@ def names(kind: str) -> list[str]:
 
 
 def check(kind: str, name: str) -> None:
-    """Raise a ValueError that lists the known names if there is no task or robot of this name."""
+    """Raise a ValueError that lists the known names if this is not one of them."""
     if name not in names(kind):
         raise ValueError(f"unknown {kind} {name!r}: choose from {', '.join(names(kind))}")

@@ -40,7 +40,7 @@ def silence(
 
 
 class Compilations:
-    """Counts the compilations running in all threads, and sets the log level accordingly."""
+    """Counter of the compilations running in all threads, which sets the log level."""
 
     def __init__(self, set_level: Callable[[int], None]) -> None:
         self._set_level = set_level

@@ -48,7 +48,7 @@ def _print(line: str) -> None:
 
 
 class Calls:
-    """Tracks the calls of one object: the first of each kind compiles."""
+    """Record of the calls of one object: the first of each kind compiles."""
 
     def __init__(self, name: str) -> None:
         """Set the object's name in messages."""

@@ -1,1 +1,1 @@
-"""Simulate with MuJoCo MJX; the only folder that knows its implementations, JAX and Warp."""
+"""Simulate with MuJoCo MJX; only this folder depends on its implementations, JAX and Warp."""

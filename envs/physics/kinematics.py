@@ -1,4 +1,4 @@
-"""Forward kinematics of a MuJoCo model, compiling in a sixth of the time of MJX's own.
+"""Forward kinematics of a MuJoCo model, which compiles in a sixth of the time of MJX's own.
 
 MJX walks down the body tree and unrolls every level, which was half of the compiled code of a step.
 Here all frames, one per body and one per joint, are handled at once by pointer jumping: each starts

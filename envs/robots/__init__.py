@@ -1,6 +1,6 @@
 """Robot arms: one module per robot, found by the `ROBOT` that it defines.
 
-All robots share `arm_kinematics`, forward and inverse, and `_robot`, the definition of a robot.
+Shared modules: `arm_kinematics`, forward and inverse kinematics; `_robot`, what defines a robot.
 """
 
 import importlib

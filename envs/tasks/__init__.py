@@ -1,6 +1,6 @@
 """Manipulation tasks: one module per task, found by the `TASK` that it defines.
 
-All tasks share `_task`, the definition of a task and helpers.
+Shared module: `_task`, what defines a task, and helpers.
 """
 
 from envs.tasks._task import (

@@ -185,7 +185,7 @@ def read_table(
 
     Raises:
         KeyError: a column is missing.
-        Exception: an error of `files.check_regular` or pyarrow, see `as_value_error`.
+        Exception: raised by `files.check_regular` or pyarrow, see `as_value_error`.
     """
     with pq.ParquetFile(check_regular(path, folder)) as file:
         available = file.schema_arrow.names

@@ -1,4 +1,4 @@
-"""Endless, shuffled batches of windows from a cache, loaded by Grain; the position is one integer.
+"""Stream endless, shuffled batches of windows from a cache with Grain; the position is an integer.
 
     for raw in Stream(Cache("my_cache").steps, batch_size=32, chunk=50, seed=0, start=1000):
 
