@@ -72,7 +72,7 @@ def test_models_of_another_library():
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"r": 8}, "lora has no field 'r' (did you mean 'rank'?); valid are rank, alpha"),
+        ({"r": 8}, "lora has no field 'r' (did you mean 'rank'?); valid fields are rank, alpha"),
         ({"lora_alpha": 8}, "did you mean 'alpha'?"),
         ({"rank": "8"}, "rank must be int, got '8'"),
         ({"rank": True}, "rank must be int, got True"),
@@ -95,7 +95,7 @@ def test_fields_of_lora(fields, message):
 
 
 def test_more_values_than_fields():
-    with pytest.raises(ValueError, match="lora has 5 fields, not 6: rank, alpha"):
+    with pytest.raises(ValueError, match="lora has fields rank, alpha, .* dropout, got 6 values"):
         LoRA(1, 2.0, False, "kaiming", 0.1, 3)  # pyright: ignore[reportCallIssue]
 
 

@@ -54,7 +54,8 @@ def find(name: str) -> type[Method]:
     if name not in names():
         close = difflib.get_close_matches(str(name), names(), n=1)
         hint = f" (did you mean {close[0]!r}?)" if close else ""
-        raise ValueError(f"unknown method {short(name)}{hint}; valid are {', '.join(names())}.")
+        valid = ", ".join(names())
+        raise ValueError(f"unknown method {short(name)}{hint}; valid methods are {valid}.")
     module = importlib.import_module(f"{__name__}.{name}")
     classes = [c for c in vars(module).values() if isinstance(c, type) and issubclass(c, Method)]
     (cls,) = [c for c in classes if f"{c.__module__}.".startswith(f"{module.__name__}.")]

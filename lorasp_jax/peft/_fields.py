@@ -43,13 +43,13 @@ def check_names(cls: type, name: str, values: Sequence[Any], fields: Iterable[st
     """Raise ValueError for too many positional values, or for an unknown field name."""
     valid = [field.name for field in dataclasses.fields(cls)]
     if len(values) > len(valid):
-        raise ValueError(f"{name} has {len(valid)} fields, not {len(values)}: {', '.join(valid)}.")
+        raise ValueError(f"{name} has fields {', '.join(valid)}, got {len(values)} values.")
     for field in fields:
         if field not in valid:
             close = difflib.get_close_matches(field, valid, n=1, cutoff=0.4)
             hint = f" (did you mean {close[0]!r}?)" if close else ""
             raise ValueError(
-                f"{name} has no field {short(field)}{hint}; valid are {', '.join(valid)}."
+                f"{name} has no field {short(field)}{hint}; valid fields are {', '.join(valid)}."
             )
 
 
@@ -61,7 +61,7 @@ def positive_int(name: str, value: Any, maximum: int = MAX_INT) -> int:
 
 
 def short(value: Any) -> str:
-    """A short representation of a value for an error message, on one line."""
+    """Abbreviate a value for an error message, on one line."""
     if is_array(value):
         return f"{value.dtype} {list(value.shape)}"
     text = " ".join(repr(value).split())

@@ -169,8 +169,8 @@ def orthogonal_part(kernel: jax.Array, rank: int, scale: float) -> tuple[jax.Arr
 def principal_inputs(moment: jax.Array | None, d_in: int, rank: int) -> jax.Array:
     """A [I, R]: the R leading right singular vectors of the stacked inputs x [T, I].
 
-    EVA (Paischer et al., arXiv 2410.07170, section 3.1), without its redistribution of ranks. They
-    are computed as eigenvectors of Σ x xᵀ, which can be summed over batches.
+    EVA (Paischer et al., arXiv 2410.07170, section 3.1), without its redistribution of ranks. The
+    vectors are computed as eigenvectors of Σ x xᵀ, which can be summed over batches.
 
     Args:
       moment: Σ x xᵀ, [I, I], not centered.

@@ -49,7 +49,7 @@ def test_equals_nnx_linear(x):
 
 
 def test_layers_with_a_shared_input(x):
-    """Each layer gives the same result as alone, for any mix of methods and with no adapter."""
+    """Each layer gives the same result as alone, for any mix of methods, including none."""
     methods = [LoRA(rank=2), None, METHOD, DoRA(rank=2), LoRA(rank=3)]
     mask = jnp.arange(4) != 1
     layers = [Dense(5, 6 + i, method=m, rngs=nnx.Rngs(i)) for i, m in enumerate(methods)]

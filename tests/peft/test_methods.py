@@ -207,11 +207,11 @@ def test_create_by_file_name(method):
 def test_unknown_names():
     with pytest.raises(
         ValueError,
-        match=r"did you mean 'lora_sp'.*valid are ada_lora, dora, full, lora, lora_moe, lora_sp",
+        match=r"did you mean 'lora_sp'.*valid methods are ada_lora, dora, full, lora, lora_moe, lora_sp",
     ):
         peft.create("lora_ps")
     with pytest.raises(
         ValueError,
-        match=r"lora has no field 'rnk' \(did you mean 'rank'\?\); valid are rank, alpha",
+        match=r"lora has no field 'rnk' \(did you mean 'rank'\?\); valid fields are rank, alpha",
     ):
         peft.create("lora", rnk=4)

@@ -32,12 +32,12 @@ def init_bank(key: jax.Array, v: jax.Array, d_out: int, *, normalized: bool) -> 
 
 
 def normalized_bank(bank: Bank) -> Bank:
-    """Normalize a bank so that eq. (4) holds: ‖ΔW‖² is the score energy times c², c² Σ_i s_i².
+    """Normalize a bank so that ‖ΔW(x)‖² = c² Σ_i s_i(x)², from which eq. (4) follows.
 
     The rank-one terms u_i v_i must be orthonormal under the Frobenius inner product, which factors
     into (u_i u_j)(v_i v_j). It suffices to orthonormalize the factor on the wider side of the
-    kernel and to scale the other's vectors to unit norm. All terms share c = gain √O, which makes
-    the entries of U change at first as fast as in a bank that is not normalized.
+    kernel and to scale the other's vectors to unit norm. All terms share c = gain √O, so that the
+    entries of U initially change as fast as in a bank that is not normalized.
 
     Args:
       bank: u [R, O] and v [I, R], both of full rank, and gain [].
@@ -79,8 +79,8 @@ class BankMethod(Method):
     """Base of methods whose router scores the directions of a bank for each token.
 
     Parameters: bank.u [R, O], bank.v [I, R], bank.gain [] if the bank is normalized; router.w1
-    [I, H] and the router's other arrays. Pruning removes directions from the bank only. The router
-    still scores them, after the R remaining ones, because their energy is part of E_k.
+    [I, H] and the router's other arrays. `lorasp_jax.prune` removes directions from the bank only.
+    The router still scores them, after the R remaining ones: their energy is part of E_k.
     """
 
     rank: int

@@ -1,4 +1,4 @@
-"""LoRA-SP for a single token, which loads only the active directions.
+"""LoRA-SP for a single token, loading only the active directions.
 
 A dense matmul with the bank costs the same for any mask. A single token is bound by the memory
 traffic of the bank, most of which is saved by gathering k of R rows of U and Vᵀ. Several tokens
@@ -55,7 +55,7 @@ def decode(
     Args:
       method: static.
       params: from `prepare`.
-      x: [I], in the compute dtype.
+      x: [I], in the dtype passed to `prepare`.
       capacity: maximum number of directions to gather, 1 to R, static.
 
     Returns:

@@ -29,7 +29,7 @@ class FusedBottleneck(BatchedBottleneck):
     energy_target: float
     scale: float
     interpret: bool = False
-    """Interpret the kernels, which is slow but needs no GPU."""
+    """Run the kernels in interpret mode, which is slow but needs no GPU."""
 
     @property
     def is_supported(self) -> bool:

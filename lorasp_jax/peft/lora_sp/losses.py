@@ -1,6 +1,6 @@
 """LoRA-SP's auxiliary losses, eqs. (13) and (14) of the paper (arXiv 2603.07404), in fp32.
 
-Each layer sums the quantities they need over its valid tokens, excluding padding.
+Each layer sums the required quantities over its valid tokens, excluding padding.
 """
 
 import dataclasses
@@ -15,10 +15,10 @@ from lorasp_jax.kernels.energy_gate import energy_share
 
 
 class LossSums(NamedTuple):
-    """Sums over the valid rows, from which the losses are computed. f32 [1], kept and share [R]."""
+    """Sums over valid rows, for computing the losses: f32 [1], except `kept` and `share` [R]."""
 
     rows: jax.Array
-    """1 for each valid row."""
+    """Number of valid rows."""
     spectral: jax.Array
     """1 - E_k."""
     z: jax.Array
@@ -37,7 +37,7 @@ def loss_sums(
     Rows with all-zero scores are excluded: they carry no signal for the router. NaN propagates.
     """
     valid = (scores.max(-1, keepdims=True) != 0) & valid
-    mean_logit = jax.nn.logsumexp(logits, axis=-1, keepdims=True) - math.log(logits.shape[-1])
+    log_mean_exp = jax.nn.logsumexp(logits, axis=-1, keepdims=True) - math.log(logits.shape[-1])
 
     def total(values: jax.Array) -> jax.Array:
         return jnp.where(valid, values, 0).sum(0)
@@ -45,7 +45,7 @@ def loss_sums(
     return LossSums(
         rows=total(jnp.ones_like(energy)),
         spectral=total(1 - energy),
-        z=total(jnp.square(mean_logit)),
+        z=total(jnp.square(log_mean_exp)),
         kept=total(mask.astype(jnp.float32)),
         share=total(energy_share(scores)),
     )

@@ -47,9 +47,10 @@ def losses(scores: Any, logits: Any, mask: Any, kept_energy: Any) -> dict[str, j
     frequency = mask.mean(0) / mask.mean(0).sum()  # share of active directions
     share = jnp.mean(scores**2 / (scores**2).sum(-1, keepdims=True), axis=0)  # share of the energy
     num_directions = scores.shape[-1]
-    mean_logit = jax.nn.logsumexp(logits, axis=-1) - math.log(num_directions)
+    log_mean_exp = jax.nn.logsumexp(logits, axis=-1) - math.log(num_directions)
     balance = num_directions * jnp.sum(frequency * share)
-    return {"spectral": jnp.mean(1 - kept_energy), "balance": balance, "z": jnp.mean(mean_logit**2)}
+    z = jnp.mean(log_mean_exp**2)
+    return {"spectral": jnp.mean(1 - kept_energy), "balance": balance, "z": z}
 
 
 def lora_sp(

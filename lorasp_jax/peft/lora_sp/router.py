@@ -20,8 +20,8 @@ INITIAL_LOGIT = {"gelu": INVERSE_SOFTPLUS_OF_ONE, "gelu_relu": 1.0, "gelu_softma
 """Initial logit of every direction, by router; it yields scores of 1."""
 
 MAX_HIDDEN = 2.0**40
-"""Bound to which |x W1| is clipped. Scores grow linearly with x and the delta quadratically: beyond
-1e19 it would overflow fp32, and U = 0 would turn that into NaN."""
+"""Bound to which |x W1| is clipped. Scores grow linearly with x and the delta quadratically;
+beyond 1e19 it would overflow fp32, and U = 0 would turn the infinity into NaN."""
 
 _RATIO = np.polynomial.Chebyshev.interpolate(lambda e: np.log1p(e) / e, 8, domain=[0, 1])
 _LOG1P = _RATIO.convert(kind=np.polynomial.Polynomial).coef[::-1].tolist()
@@ -132,7 +132,7 @@ def pooled_scores(scores: jax.Array, valid: jax.Array, granularity: Granularity)
     """
     if granularity == "token" or scores.ndim == 1:
         return scores
-    # The mask needs no gradient, and that of the root is infinite at 0.
+    # The mask needs no gradient, and the square root has an infinite one at 0.
     scores = jax.lax.stop_gradient(scores)
     axes = (scores.ndim - 2,) if granularity == "sample" else tuple(range(scores.ndim - 1))
     valid = valid[..., None]

@@ -296,8 +296,8 @@ def test_scale_follows_alpha():
 
 def test_losses_of_stacked_layers():
     def sums(key):
-        one = lambda key, size: jax.random.uniform(key, (size,), minval=1, maxval=3)  # noqa: E731
-        return losses.LossSums(*map(one, jax.random.split(key, 5), (1, 1, 1, 8, 8)))
+        draw = lambda key, size: jax.random.uniform(key, (size,), minval=1, maxval=3)  # noqa: E731
+        return losses.LossSums(*map(draw, jax.random.split(key, 5), (1, 1, 1, 8, 8)))
 
     each = [sums(key) for key in jax.random.split(jax.random.key(0), 3)]
     stacked = losses.Losses(jax.tree.map(lambda *leaves: jnp.stack(leaves), *each))
