@@ -95,7 +95,7 @@ def test_fields_of_lora(fields, message):
 
 
 def test_more_values_than_fields():
-    with pytest.raises(ValueError, match="lora has fields rank, alpha, .* dropout, got 6 values"):
+    with pytest.raises(ValueError, match=r"lora has fields rank, alpha, .* dropout, got 6 values"):
         LoRA(1, 2.0, False, "kaiming", 0.1, 3)  # pyright: ignore[reportCallIssue]
 
 
