@@ -1,4 +1,4 @@
-"""What a finished run hands on, adapters or with full fine-tuning a new base, and its way back."""
+"""Export the trained policy of a run, as adapters or as a full base, and load it again."""
 
 import dataclasses
 import json
@@ -26,11 +26,11 @@ from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import read_json, write_json
 
 BASE = "base"
-"""Folder of a base that was trained itself."""
+"""Folder of a fully fine-tuned base."""
 
 
 class Export(Callback):
-    """`write` after the last step."""
+    """Exports the trained policy after the last step, see `write`."""
 
     def on_end(self, run: Run) -> None:
         """Write the trained policy."""
@@ -38,21 +38,21 @@ class Export(Callback):
 
 
 def write(run: Run) -> None:
-    """Write adapter.safetensors and adapter.json, or `base` if the base itself was trained."""
-    config, facts = run.config, _facts(run)
+    """Write adapter.safetensors and adapter.json, or folder `base` after full fine-tuning."""
+    config, metadata = run.config, _metadata(run)
     if config.peft.trains_base:
         folder = run.folder / BASE
         models.save(folder, adaptation.merge(run.policy.model))
         statistics = run.policy.processor.statistics.to_json()
         (folder / "statistics.json").write_text(statistics + "\n")
-        write_json(folder / TRAINING, facts)
+        write_json(folder / TRAINING, metadata)
         return
-    metadata = {"base": hub.portable_path(config.model.source), **facts}
+    metadata = {"base": hub.portable_path(config.model.source), **metadata}
     native.save_adapters(run.folder, run.policy.model, base=run.base_hash, metadata=metadata)
 
 
-def _facts(run: Run) -> dict[str, Any]:
-    """What the weights were trained on, and what their policy needs beside them."""
+def _metadata(run: Run) -> dict[str, Any]:
+    """Return the training data's properties and everything but weights that the policy needs."""
     config, first = run.config, next(iter(run.episodes.values()))
     processor = run.policy.processor
     return {
@@ -67,7 +67,7 @@ def _facts(run: Run) -> dict[str, Any]:
             "prompts": _prompts_digest(processor.prompts),
             "instructions": list(processor.prompts.instructions),
             "num_joints": len(processor.robot_slots) - 1,
-            "cameras": {place: name for place, name in processor.cameras if name},
+            "cameras": {slot: name for slot, name in processor.cameras if name},
             "relative": list(processor.inputs.delta),
             "statistics": json.loads(processor.statistics.to_json()),
         },
@@ -77,70 +77,72 @@ def _facts(run: Run) -> dict[str, Any]:
 def load_policy(
     folder: str | os.PathLike[str], *, base: str = "", words: str = "", any_base: bool = False
 ) -> Policy:
-    """The policy that a finished run left.
+    """Load the policy of a finished run.
 
     Args:
-        folder: of the run.
-        base: where the frozen base is now, see `models.load`; by default where it was.
-        words: likewise the tokenizer.
-        any_base: whether other weights than those trained on will do, see `load_adapters`.
+        folder: folder of the run.
+        base: location of the frozen base, see `models.load`; default: the one recorded.
+        words: location of the tokenizer; default: the one recorded.
+        any_base: accept a base with other weights than the one trained on, see `load_adapters`.
 
     Returns:
-        The policy; `Policy.sample` takes the rows of `processor.prompts.instructions`.
+        The policy; `Policy.sample` takes indices into `processor.prompts.instructions`.
 
     Raises:
-        ValueError: no finished run, or damaged files; a base that is not there or not the run's.
+        ValueError: the run is not finished, its files are corrupt, or the base is missing or is a
+            different one.
     """
     folder = Path(folder)
-    trained = (folder / BASE).is_dir()
-    path = folder / BASE / TRAINING if trained else folder / native.DESCRIPTION
+    is_full = (folder / BASE).is_dir()
+    path = folder / BASE / TRAINING if is_full else folder / native.DESCRIPTION
     if not path.is_file():
-        raise ValueError(f"{folder} has no policy: no run finished there")
-    told = read_json(path) if trained else native.read_description(folder)["metadata"]
+        raise ValueError(f"{folder} holds no policy: no run has finished there")
+    metadata = read_json(path) if is_full else native.read_description(folder)["metadata"]
     try:
-        config = backbone.find(told["policy"]["backbone"]).from_dict(told["policy"]["config"])
-        source = folder / BASE if trained else base or hub.resolve_portable(told["base"])
+        policy = metadata["policy"]
+        config = backbone.find(policy["backbone"]).from_dict(policy["config"])
+        source = folder / BASE if is_full else base or hub.resolve_portable(metadata["base"])
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} does not say what its policy needs") from error
+        raise ValueError(f"{path} does not describe a policy") from error
     if not source:
-        raise ValueError(f"the base of {folder} was random, and nothing keeps it")
+        raise ValueError(f"the base of {folder} was randomly initialized and not saved")
     try:
         model = models.load(source, config)
     except ValueError as error:
-        hint = "" if trained else f" (base= says where the base of {folder} is now)"
+        hint = "" if is_full else f" (pass base= if the base of {folder} has moved)"
         raise ValueError(f"{error}{hint}") from error
-    if not trained:
+    if not is_full:
         model = native.load_adapters(folder, model, any_base=any_base)
     try:
-        return Policy(model, _processor(told["policy"], config, words))
+        return Policy(model, _processor(policy, config, words))
     except (KeyError, TypeError) as error:
-        raise ValueError(f"{path} does not say what its policy needs") from error
+        raise ValueError(f"{path} does not describe a policy") from error
 
 
-def _processor(told: Mapping[str, Any], config: Any, words: str) -> Processor:
-    """The processor of an exported policy."""
-    joints = told["num_joints"]
+def _processor(policy: Mapping[str, Any], config: Any, words: str) -> Processor:
+    """Create the processor of an exported policy."""
+    joints = policy["num_joints"]
     try:
-        found = tokenizer.load_tokenizer(words or hub.resolve_portable(told["tokenizer"]))
+        loaded = tokenizer.load_tokenizer(words or hub.resolve_portable(policy["tokenizer"]))
     except ValueError as error:
-        raise ValueError(f"{error} (words= says where the policy's tokenizer is now)") from error
-    prompts = PromptTable.of(found, told["instructions"], config, num_joints=joints)
-    if _prompts_digest(prompts) != told["prompts"]:
+        raise ValueError(f"{error} (pass words= if the policy's tokenizer has moved)") from error
+    prompts = PromptTable.of(loaded, policy["instructions"], config, num_joints=joints)
+    if _prompts_digest(prompts) != policy["prompts"]:
         raise ValueError(
-            f"the tokenizer {words or told['tokenizer'] or 'of this version'} gives other tokens "
-            "than the policy was trained on: words= says where its own is now"
+            f"the tokenizer {words or policy['tokenizer'] or 'of this version'} produces other "
+            "tokens than the one used in training: pass words= with the location of the original"
         )
     return Processor.of(
         config,
-        Statistics.from_json(json.dumps(told["statistics"])),
+        Statistics.from_json(json.dumps(policy["statistics"])),
         prompts,
         num_joints=joints,
-        cameras=told["cameras"],
-        delta=told["relative"],
+        cameras=policy["cameras"],
+        delta=policy["relative"],
     )
 
 
 def _prompts_digest(prompts: PromptTable) -> str:
-    """The identity of a tokenizer, as far as a policy sees it: the tokens of its prompts."""
+    """Identify a tokenizer by its effect on the policy: the tokens of the prompts."""
     leaves = jax.tree_util.tree_leaves_with_path(prompts)
     return digest({jax.tree_util.keystr(path): jnp.asarray(leaf) for path, leaf in leaves})

@@ -1,14 +1,14 @@
-"""Steps that would spoil the state are skipped: not finite, or a spike of loss or gradient.
+"""Skip training steps whose loss or gradient is non-finite or spikes.
 
-A skipped step leaves parameters, their average and optimizer state as they were; the step count,
-and with it the data position and every random stream, goes on. Whether a step counts is decided by
-its loss and the norm of its gradient alone, before any update exists. `select` then fuses leaf by
-leaf into the update, which overwrites the donated state where it lies; decided by the updates, all
-of them would have to be kept beside the whole old state until the last one is known.
+A skipped step leaves parameters, their average and the optimizer state unchanged; the step count
+still advances, and with it the data position and the random streams. A step is accepted by its loss
+and gradient norm alone, before the updates are computed. `select` can then fuse, leaf by leaf, into
+the in-place update of the donated state; a decision that depended on the updates would keep all of
+them in memory together with the whole old state.
 
-Looking at the gradient is enough: clipped to a finite norm it gives AdamW an update of at most a
-few learning rates an element, so an update that is not finite comes from a learning rate that no
-run can have. The loop stops at it before it saves.
+Checking the gradient suffices: clipped to a finite norm, it changes each parameter by at most a few
+learning rates under AdamW. A non-finite update therefore means an absurdly high learning rate; the
+loop then stops before saving.
 """
 
 from collections.abc import Mapping
@@ -20,19 +20,19 @@ import jax.numpy as jnp
 import numpy as np
 
 WINDOW = 100
-"""Steps that the running means look back on; no step is a spike before so many have counted."""
+"""Window of the running means [steps]; spikes are detected only after this many accepted steps."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Guard:
-    """What is known of the steps so far; part of the state, so that a resumed run judges alike.
+    """Statistics of the accepted steps; part of the training state, so a resumed run decides alike.
 
     Attributes:
-        counted: `[]` int32, steps that counted.
-        in_a_row: `[]` int32, steps skipped since the last one that counted.
-        loss: `[]` running mean of the loss over steps that counted.
-        grad_norm: `[]` running mean of the gradient's global norm.
+        counted: `[]` int32, number of accepted steps.
+        in_a_row: `[]` int32, number of steps skipped since the last accepted one.
+        loss: `[]` running mean of the loss over accepted steps.
+        grad_norm: `[]` running mean of the global gradient norm over accepted steps.
     """
 
     counted: jax.Array
@@ -42,52 +42,54 @@ class Guard:
 
     @staticmethod
     def initial() -> "Guard":
-        """Before the first step."""
-        # Arrays of their own: each one's memory is given away.
-        return Guard(*(jnp.zeros((), kind) for kind in ("int32", "int32", "float32", "float32")))
+        """Return the statistics before the first step."""
+        # Four separate arrays, because each buffer is donated.
+        return Guard(*(jnp.zeros((), dtype) for dtype in ("int32", "int32", "float32", "float32")))
 
 
-def judge(
+def check_step(
     guard: Guard, loss: jax.Array, grad_norm: jax.Array, spike: float
 ) -> tuple[jax.Array, Guard]:
-    """Whether a step counts, `[]` bool, and what is known after it.
+    """Return whether to accept a step, `[]` bool, and the updated statistics.
 
     Args:
-        guard: what is known before it.
+        guard: statistics before the step.
         loss: `[]`.
         grad_norm: `[]`.
-        spike: factor on either running mean beyond which a step is skipped; 0: none is.
+        spike: skip the step if loss or gradient norm exceeds this multiple of its running mean; 0:
+            never.
     """
-    counts = jnp.isfinite(loss) & jnp.isfinite(grad_norm)
+    accept = jnp.isfinite(loss) & jnp.isfinite(grad_norm)
     if spike:
-        usual = (loss <= spike * guard.loss) & (grad_norm <= spike * guard.grad_norm)
-        counts &= usual | (guard.counted < WINDOW)
-    share = 1 / jnp.minimum(guard.counted + 1, WINDOW)
-    after = Guard(
+        within_range = (loss <= spike * guard.loss) & (grad_norm <= spike * guard.grad_norm)
+        accept &= within_range | (guard.counted < WINDOW)
+    weight = 1 / jnp.minimum(guard.counted + 1, WINDOW)
+    accepted = Guard(
         guard.counted + 1,
         jnp.zeros_like(guard.in_a_row),
-        guard.loss + share * (loss - guard.loss),
-        guard.grad_norm + share * (grad_norm - guard.grad_norm),
+        guard.loss + weight * (loss - guard.loss),
+        guard.grad_norm + weight * (grad_norm - guard.grad_norm),
     )
     skipped = Guard(guard.counted, guard.in_a_row + 1, guard.loss, guard.grad_norm)
-    return counts, select(counts, after, skipped)
+    return accept, select(accept, accepted, skipped)
 
 
-def select(counts: jax.Array, after: Any, before: Any) -> Any:
-    """Leaf by leaf the state after a step that counts, else the one before it."""
-    return jax.tree.map(lambda new, old: jnp.where(counts, new, old), after, before)
+def select(accept: jax.Array, after: Any, before: Any) -> Any:
+    """Select `after` if the step is accepted, else `before`, leaf by leaf."""
+    return jax.tree.map(lambda new, old: jnp.where(accept, new, old), after, before)
 
 
-def summarise(rows: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """What is logged of several steps.
+def summarize(steps: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Summarize the metrics of several steps for the log.
 
     Args:
-        rows: metrics by name, `[steps, ...]`, with `in_a_row` as `Guard` has it after each step.
+        steps: metrics by name, `[steps, ...]`, including `in_a_row` of `Guard` after each step.
 
     Returns:
-        `[...]` means over the steps that counted, none where none did; "skipped": how many did not.
+        Means over the accepted steps, `[...]`, absent if all were skipped; "skipped": the number
+        of skipped steps.
     """
-    counted = rows["in_a_row"] == 0
-    names = [name for name in rows if name != "in_a_row"] if counted.any() else []
-    means = {name: rows[name][counted].mean(0) for name in names}
-    return {**means, "skipped": np.asarray(np.sum(~counted))}
+    accepted = steps["in_a_row"] == 0
+    names = [name for name in steps if name != "in_a_row"] if accepted.any() else []
+    means = {name: steps[name][accepted].mean(0) for name in names}
+    return {**means, "skipped": np.asarray(np.sum(~accepted))}

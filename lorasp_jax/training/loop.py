@@ -1,4 +1,4 @@
-"""The training run: build, resume, train, save. Knows neither evaluation nor report."""
+"""The training loop: resume, train, log, save. Evaluation and reports are callbacks."""
 
 import contextlib
 import functools
@@ -18,7 +18,7 @@ from lorasp_jax.training.checkpoint import Checkpoints
 from lorasp_jax.training.demonstrations import fresh_demonstrations
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.distributed import processes
-from lorasp_jax.training.guard import summarise
+from lorasp_jax.training.guard import summarize
 from lorasp_jax.training.interrupt import deferred
 from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
 from lorasp_jax.training.random_streams import RandomStream
@@ -29,7 +29,7 @@ from lorasp_jax.training.stepper import Collect, Stepper, make_stepper
 
 
 class RunError(ValueError):
-    """The run cannot go on; the message says why and what to do, in one sentence."""
+    """The run cannot continue; the message gives the reason and a remedy in one sentence."""
 
 
 def train(
@@ -39,17 +39,17 @@ def train(
     resume: bool = False,
     collect: Collect = fresh_demonstrations,
 ) -> None:
-    """Train the adapters of `run.policy` and leave the trained policy there.
+    """Train the adapters of `run.policy`, then set `run.policy` to the trained policy.
 
     Args:
         run: the run.
-        callbacks: called in this order.
+        callbacks: callbacks, called in order.
         resume: continue from the newest checkpoint, if there is one.
-        collect: gives other demonstrations where the config wants them replaced.
+        collect: collects new demonstrations if `data.fresh_every` is set.
 
     Raises:
-        RunError: too many steps in a row were skipped; the last checkpoint before stays.
-        KeyboardInterrupt: a signal asked to stop; the state is saved.
+        RunError: too many consecutive steps were skipped; the last checkpoint is kept.
+        KeyboardInterrupt: stopped by a signal; the state is saved.
     """
     graphdef, adapters, frozen = adaptation.split(run.policy.model)
     methods = adaptation.methods(run.policy.model).values()
@@ -60,7 +60,10 @@ def train(
     state = processes.device_put(state, shardings)
     frozen = processes.device_put(frozen, meshes.shardings(frozen, mesh))
     processor = run.policy.processor
-    policy = lambda state: Policy(nnx.merge(graphdef, state.best, frozen), processor)  # noqa: E731
+
+    def policy(state: TrainState) -> Policy:
+        return Policy(nnx.merge(graphdef, state.eval_adapters, frozen), processor)
+
     run.policy = policy(state)
     checkpoints = Checkpoints(run.folder, run.base_hash, run.console)
     restored = checkpoints.restore(state) if resume else None
@@ -68,7 +71,7 @@ def train(
     jitted = jit_steps(run, graphdef, optimizer, shardings)
     stepper = make_stepper(run, jitted, frozen, mesh, int(state.step), collect)
     if restored is None:
-        stepper.compile(state, _log_interval(run.config, int(state.step)))  # during the callbacks
+        stepper.compile(state, _log_interval(run.config, int(state.step)))  # in the background
         _call(callbacks, run, "on_start")
     try:
         with run.timed("train"):
@@ -76,7 +79,8 @@ def train(
     except RunError as error:
         for callback in callbacks:
             callback.on_stop(run, str(error))
-        processes.barrier("stopped")  # or the first one might be ended before it has said why
+        # Otherwise another process could end the first one before it has written the reason.
+        processes.barrier("stopped")
         raise
     finally:
         checkpoints.close()
@@ -85,7 +89,7 @@ def train(
 
 
 def _call(callbacks: Sequence[Callback], run: Run, hook: str) -> None:
-    """Call one hook of all callbacks."""
+    """Call a hook of all callbacks."""
     with _local_policy(run, hook):
         for callback in callbacks:
             getattr(callback, hook)(run)
@@ -94,9 +98,9 @@ def _call(callbacks: Sequence[Callback], run: Run, hook: str) -> None:
 def _call_on_log(
     callbacks: Sequence[Callback], run: Run, done: int, values: dict[str, float]
 ) -> dict[str, float]:
-    """Scalars to log at a step, with those that the callbacks add, which may evaluate."""
-    evaluated = _local_policy(run, f"evaluated at step {done}")
-    with evaluated if run.config.evaluates(done) else contextlib.nullcontext():
+    """Return the scalars to log, merged with those of the callbacks, which may evaluate."""
+    local_policy = _local_policy(run, f"evaluated at step {done}")
+    with local_policy if run.config.evaluates(done) else contextlib.nullcontext():
         for callback in callbacks:
             values = values | (callback.on_log(run, done, values) or {})
     return values
@@ -104,17 +108,18 @@ def _call_on_log(
 
 @contextlib.contextmanager
 def _local_policy(run: Run, name: str) -> Iterator[None]:
-    """In this block the run's policy is on this process's own device; at its end all wait."""
-    everywhere, run.policy = run.policy, processes.to_local(run.policy)
+    """Hold the run's policy on this process's device inside the block; wait for all at its end."""
+    sharded, run.policy = run.policy, processes.to_local(run.policy)
     yield
-    run.policy = everywhere
+    run.policy = sharded
     processes.barrier(name)
 
 
 def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) -> Callable:
-    """The jitted scan over steps: (frozen, data, state, key, count) -> state, metrics of each.
+    """Return the jitted scan over steps: (frozen, data, state, key, count) -> state, metrics.
 
-    Data are all steps, or one raw batch. `shardings` are `meshes.shardings` of the state.
+    `data` is the whole dataset or one raw batch; metrics have a leading axis over steps.
+    `shardings` are `meshes.shardings` of the state.
     """
     optim, processor = run.config.optim, run.policy.processor
     mesh = shardings.step.mesh
@@ -128,16 +133,16 @@ def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) ->
         spike=optim.spike,
     )
     chunk = run.policy.model.config.chunk
-    draw = functools.partial(sample_batch, batch_size=optim.batch_size, chunk=chunk)
+    sample = functools.partial(sample_batch, batch_size=optim.batch_size, chunk=chunk)
 
-    def one(state: TrainState, frozen: Any, data: Steps | Raw, key: jax.Array) -> Any:
+    def body(state: TrainState, frozen: Any, data: Steps | Raw, key: jax.Array) -> Any:
         batch_key, loss_key = jax.random.split(jax.random.fold_in(key, state.step))
-        make: Any = encode if isinstance(data, Raw) else draw
-        batch = make(batch_key, data, processor, state_noise=optim.state_noise)
+        make_batch: Any = encode if isinstance(data, Raw) else sample
+        batch = make_batch(batch_key, data, processor, state_noise=optim.state_noise)
         batch = jax.lax.with_sharding_constraint(batch, meshes.batch_sharding(mesh))
         return step(state, frozen, batch, loss_key)
 
-    # The state comes back placed as it went in, so that nothing compiles a second time.
+    # Keep the sharding of the state; another one would recompile the next call.
     @functools.partial(
         jax.jit,
         static_argnames="count",
@@ -145,13 +150,13 @@ def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) ->
         out_shardings=(shardings, meshes.replicated(mesh)),
     )
     def scan(frozen: Any, data: Steps | Raw, state: TrainState, key: jax.Array, count: int) -> Any:
-        return jax.lax.scan(lambda state, _: one(state, frozen, data, key), state, length=count)
+        return jax.lax.scan(lambda state, _: body(state, frozen, data, key), state, length=count)
 
     return scan
 
 
 def _log_interval(config: Config, done: int) -> int:
-    """Steps until the next log line or the end."""
+    """Return the number of steps until the next log entry or the end of training."""
     return min(config.log_every, config.optim.steps - done)
 
 
@@ -163,7 +168,7 @@ def _loop(
     callbacks: Sequence[Callback],
     policy: Callable[[TrainState], Policy],
 ) -> TrainState:
-    """One log interval after the other, until the last step or a signal."""
+    """Run log intervals until the last step or a signal to stop."""
     config, key = run.config, RandomStream.TRAINING.key(run.config.seed)
     total, saved = config.optim.steps, int(state.step)
     with (
@@ -177,15 +182,12 @@ def _loop(
             count = _log_interval(config, done)
             state, metrics = stepper(state, key, count)
             rows, done = jax.device_get(metrics), done + count
-            means = summarise(rows)
+            means = summarize(rows)
             values = {name: float(mean.mean()) for name, mean in means.items()}
             values |= stepper.speed.end(count)
-            if reason := _failure(config.optim, rows, values, done):
+            if error := _failure(config.optim, rows, values, done, saved):
                 log.write(done, values)
-                raise RunError(
-                    f"{reason}: nothing after step {saved} was saved; try a lower "
-                    "--optim.learning-rate"
-                )
+                raise error
             loss = values.get("task", math.nan)
             progress.update(bar, completed=done, description=f"training, loss {loss:.4f}")
             run.policy = policy(state)
@@ -202,24 +204,28 @@ def _loop(
 
 
 def _failure(
-    optim: OptimConfig, rows: dict[str, Any], values: dict[str, float], done: int
-) -> str | None:
-    """Why training cannot go on after a log interval: too many skipped steps, or a spoilt state.
+    optim: OptimConfig, rows: dict[str, Any], values: dict[str, float], done: int, saved: int
+) -> RunError | None:
+    """Return an error if too many steps were skipped or an update was non-finite.
 
     Args:
-        optim: what is allowed.
-        rows: metrics of each step, `[count, ...]`.
-        values: their means, as they are logged.
-        done: steps up to the end of the interval.
+        optim: limits.
+        rows: metrics of each step of the log interval, `[count, ...]`.
+        values: their logged means.
+        done: step at the end of the interval.
+        saved: step of the last checkpoint.
     """
+    remedy = f"nothing after step {saved} was saved: try a lower --optim.learning-rate"
     if (skipped := rows["in_a_row"].max()) >= optim.max_skipped:
         last = int(rows["in_a_row"].argmax())
-        usual = f", or beyond {optim.spike:g} times its mean," if optim.spike else ""
-        return (
-            f"loss or gradient was not finite{usual} in {skipped} steps in a row (at step "
-            f"{done - len(rows['loss']) + last + 1} the loss was {rows['loss'][last]:.3g}, the "
-            f"gradient's norm {rows['grad_norm'][last]:.3g})"
+        spike = f" or above {optim.spike:g} times its running mean" if optim.spike else ""
+        return RunError(
+            f"{skipped} consecutive steps were skipped because loss or gradient was non-finite"
+            f"{spike} (step {done - len(rows['loss']) + last + 1}: loss {rows['loss'][last]:.3g}, "
+            f"gradient norm {rows['grad_norm'][last]:.3g}); {remedy}"
         )
     if not math.isfinite(values.get("update_norm", 0.0)):
-        return f"an update was not finite up to step {done} though its gradient was"
+        return RunError(
+            f"an update was non-finite by step {done} although all gradients were finite; {remedy}"
+        )
     return None

@@ -9,7 +9,7 @@ from lorasp_jax.peft import AdaLoRA, Method
 
 
 def learning_rate(config: OptimConfig) -> optax.Schedule:
-    """Linear warm-up from zero, then cosine decay to `final_learning_rate`."""
+    """Return a schedule of linear warm-up from zero and cosine decay to `final_learning_rate`."""
     return optax.warmup_cosine_decay_schedule(
         init_value=0.0,
         peak_value=config.learning_rate,
@@ -22,17 +22,17 @@ def learning_rate(config: OptimConfig) -> optax.Schedule:
 def make_optimizer(
     config: OptimConfig, methods: Collection[Method] = ()
 ) -> optax.GradientTransformation:
-    """AdamW on gradients clipped to a global norm, with what the adapters' methods add to it.
+    """Create AdamW on clipped gradients, with the transformations of the adapter methods.
 
     Raises:
-        ValueError: several settings of a method that has one budget for all layers.
+        ValueError: AdaLoRA, whose layers share one rank budget, is used with different settings.
     """
     optimizer = optax.adamw(learning_rate(config), b2=config.b2, weight_decay=config.weight_decay)
     budgets = {method for method in methods if isinstance(method, AdaLoRA)}
     if len(budgets) > 1:
         raise ValueError(
-            "all layers that share a budget need the same settings, but AdaLoRA is used with "
-            f"{len(budgets)} different ones."
+            "all AdaLoRA layers share one rank budget and need the same settings, got "
+            f"{len(budgets)} different ones"
         )
     for method in dict.fromkeys(methods):
         optimizer = method.transform(optimizer, config.steps)
@@ -40,10 +40,10 @@ def make_optimizer(
 
 
 def auxiliary_weights(config: AuxiliaryConfig, steps: int) -> dict[str, optax.Schedule]:
-    """Weight of each auxiliary loss by step: a linear rise over the first `warmup` share."""
-    rise = max(round(config.warmup * steps), 1)
+    """Return a schedule per auxiliary loss: linear warm-up to its weight."""
+    warmup_steps = max(round(config.warmup * steps), 1)
     return {
-        name: optax.linear_schedule(0.0, weight, rise)
+        name: optax.linear_schedule(0.0, weight, warmup_steps)
         for name, weight in (
             ("spectral", config.spectral),
             ("balance", config.balance),

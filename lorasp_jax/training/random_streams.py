@@ -1,4 +1,4 @@
-"""The random streams of a run: each is a key of its own, derived from the run's one seed."""
+"""Random streams of a run, with independent keys derived from the run's seed."""
 
 import enum
 
@@ -7,7 +7,7 @@ import jax
 
 @enum.unique
 class RandomStream(enum.IntEnum):
-    """What a run draws at random. A changed number changes the results of every run."""
+    """Purposes of random numbers. Changing a value changes the results of every run."""
 
     DEMONSTRATIONS = 1
     TRAINING = 2
@@ -15,8 +15,8 @@ class RandomStream(enum.IntEnum):
     BASE = 4
     STATISTICS = 5
     EVALUATION = 10
-    """The last one: number n of `key` has 10 + n."""
+    """Must stay the largest value: evaluation n uses 10 + n."""
 
     def key(self, seed: int, number: int = 0) -> jax.Array:
-        """The stream's key, or the key of one of several evaluations."""
+        """Return the key of the stream; `number` distinguishes several evaluations."""
         return jax.random.fold_in(jax.random.key(seed), self + number)

@@ -1,12 +1,12 @@
-"""What the JSON files of a run hold, for `storage.json_values.check`.
+"""Schemas of a run's JSON files.
 
-A digest says that a file is as it was written, not that this version wrote it.
+A digest verifies that a file is intact, but not that this version wrote it.
 """
 
 from typing import Any, TypeAlias
 
 Kind: TypeAlias = dict[Any, Any]
-"""What a JSON object must hold, see `storage.json_values.check`."""
+"""Schema of a JSON object, see `storage.json_values.check`."""
 TIMES: Kind = {str: float}
 RATE: Kind = {"success": float, "episodes": int, "ci95": (float, float)}
 BEFORE: Kind = {str: RATE}

@@ -1,4 +1,4 @@
-"""A run as its parts see it, and the hooks into it."""
+"""State of a run that all parts of training share, and callbacks."""
 
 import contextlib
 import time
@@ -15,27 +15,26 @@ from lorasp_jax.data.batches import Steps, flatten
 from lorasp_jax.policies.policy import Policy
 from lorasp_jax.training import records
 from lorasp_jax.training.distributed import processes
-from lorasp_jax.training.run_folder import CLOCK, read_json, write_json
+from lorasp_jax.training.run_folder import TIMES_FILE, read_json, write_json
 
 
 @dataclass
 class Run:
-    """A run as its callbacks see it.
+    """A run, as passed to callbacks.
 
     Attributes:
-        config: what was asked for.
-        folder: where everything is written.
-        console: where to print.
+        config: configuration of the run.
+        folder: folder for all files of the run.
+        console: console for status messages.
         base_hash: hash of the frozen base.
-        episodes: demonstrations by task; of a dataset, without all its pictures.
-        dataset: the steps of a dataset, in files; None: those of `episodes`.
-        streams: whether the steps of a dataset are read from there step by step, because the device
-            has no room for them.
-        devices: those that train; None: all.
+        episodes: demonstrations per task; for a dataset, with only the first images of each task.
+        dataset: all steps of a dataset, stored on disk; None: those of `episodes`.
+        streams: read batches of the dataset from disk, because it does not fit on the device.
+        devices: devices to train on; None: all.
         simulated: whether the tasks can be evaluated in simulation.
-        policy: the policy as it is while a callback runs; in between, training owns its memory.
-        started: `time.perf_counter()` when this process began.
-        seconds: time spent by phase, and "total", over all processes that worked on this run.
+        policy: the current policy, valid inside callbacks; training donates its buffers in between.
+        started: `time.perf_counter()` when this process started.
+        seconds: time per phase, and "total", over all processes that worked on this run [s].
     """
 
     config: Config
@@ -52,20 +51,20 @@ class Run:
     seconds: dict[str, float] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Takes over the time that earlier processes spent."""
-        self.seconds = {"total": 0.0, **read_json(self.folder / CLOCK, records.TIMES)}
+        """Continue from the times of earlier processes."""
+        self.seconds = {"total": 0.0, **read_json(self.folder / TIMES_FILE, records.TIMES)}
         self._before = self.seconds["total"]
 
     @property
     def steps(self) -> Steps:
-        """All steps that are trained on."""
+        """All steps to train on."""
         return self.dataset or flatten(list(self.episodes.values()))
 
     @contextlib.contextmanager
     def timed(self, phase: str) -> Iterator[None]:
-        """Add the time spent in this block to `seconds[phase]`, also if it is interrupted.
+        """Add the time spent in this block to `seconds[phase]`, even if it is interrupted.
 
-        Time of another phase inside this block is that phase's.
+        Nested phases are not counted twice: their time belongs to the inner phase.
         """
         others = lambda: sum(self.seconds.values()) - self.seconds["total"]  # noqa: E731
         start, before = time.perf_counter(), others()
@@ -77,24 +76,24 @@ class Run:
             self.seconds[phase] = self.seconds.get(phase, 0.0) + spent
             self.seconds["total"] = self._before + now - self.started
             if processes.is_first():
-                write_json(self.folder / CLOCK, self.seconds)
+                write_json(self.folder / TIMES_FILE, self.seconds)
 
 
 class Callback:
-    """Hooks into a run; override what is needed."""
+    """Hooks called during a run; override any of them."""
 
     def on_start(self, run: Run) -> None:
-        """Before the first step, with the policy as it comes; not called again on resume."""
+        """Called before the first step, with the untrained policy; not called on resume."""
 
     def on_log(self, run: Run, step: int, metrics: dict[str, float]) -> dict[str, float] | None:
-        """At every log line, with the policy as it is then.
+        """Called at every log step, with the current policy.
 
         Returns:
-            Further scalars to log at this step.
+            Additional scalars to log at this step.
         """
 
     def on_end(self, run: Run) -> None:
-        """After the last step, with the trained policy."""
+        """Called after the last step, with the trained policy."""
 
     def on_stop(self, run: Run, reason: str) -> None:
-        """When training cannot go on, in place of `on_end`; there is no policy then."""
+        """Called instead of `on_end` when training cannot continue; the policy is not available."""

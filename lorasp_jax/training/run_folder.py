@@ -1,4 +1,4 @@
-"""The folder of one run: its config, its logs, and the rule that nothing is overwritten."""
+"""The folder of a run: config, logs and lock; existing runs are never overwritten."""
 
 import contextlib
 import dataclasses
@@ -29,69 +29,72 @@ from lorasp_jax.storage.json_values import check
 from lorasp_jax.training import records
 from lorasp_jax.training.distributed import processes
 
-RECORD, CLOCK, DATASET = "config.json", "seconds.json", "dataset.json"
-"""All files that a run leaves which failed before it had anything."""
+CONFIG_FILE, TIMES_FILE, DATASET_FILE = "config.json", "seconds.json", "dataset.json"
+"""Files of a run that failed before it produced any results."""
 WILDCARDS = frozenset("*?[\\")
-"""Orbax takes paths for patterns: below a folder with one of these it finds no checkpoint again."""
+"""Orbax globs its paths, so checkpoints below a folder with one of these cannot be found."""
 STOPPED = "stopped.json"
-"""Why training could not go on, until it does."""
+"""File with the reason why training stopped; removed when it continues."""
 
 
 def to_json(config: Config) -> dict[str, Any]:
-    """The config as plain JSON values, the adapter method with its name."""
-    plain = json.loads(json.dumps(dataclasses.asdict(config)))
-    return {**plain, "peft": {"method": type(config.peft).__name__, **plain["peft"]}}
+    """Convert a config to JSON values, including the name of the adapter method."""
+    fields = json.loads(json.dumps(dataclasses.asdict(config)))
+    return {**fields, "peft": {"method": type(config.peft).__name__, **fields["peft"]}}
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
-    """Write a JSON object with its digest so that readers never see half of it."""
+    """Write a JSON object with its digest, atomically."""
     write_text(path, json.dumps(with_digest(value), indent=2) + "\n")
 
 
-def read_json(path: Path, kind: Mapping[Any, Any] = MappingProxyType({})) -> dict[str, Any]:
-    """What `write_json` wrote; nothing without a file.
+def read_json(path: Path, schema: Mapping[Any, Any] = MappingProxyType({})) -> dict[str, Any]:
+    """Read a file of `write_json`; {} if it does not exist.
 
     Args:
         path: the file.
-        kind: what must be in it, see `json_values.check`.
+        schema: required fields, see `json_values.check`.
 
     Raises:
-        ValueError: the file is damaged, or another version wrote other values.
+        ValueError: the file is corrupt, or another version wrote it.
     """
     if not path.exists():
         return {}
-    with as_value_error(path, remedy=": put back a whole one"):
+    with as_value_error(path, remedy=": restore it from a backup"):
         found = verify_digest(json.loads(read_bytes(path)))
-        check(found, kind)
+        check(found, schema)
         return found
 
 
 @contextlib.contextmanager
 def open_run(config: Config, root: Path, *, resume: bool | Literal["auto"]) -> Iterator[Path]:
-    """The run's folder, for this process alone as long as it is open.
+    """Open the run's folder under an exclusive lock.
 
-    It is created, or with `resume` checked to hold this very run; "auto" is that of the two which
-    fits.
+    Args:
+        config: configuration of the run.
+        root: folder that holds the runs' folders.
+        resume: True: require a run with the same config; False: create the folder; "auto": resume
+            if the run exists, otherwise create it.
 
     Raises:
-        ValueError: the folder cannot be made or has a wildcard in its path; another process works
-            on it; it holds a run and `resume` is off, holds none and `resume` is on, or holds a run
-            with another config, a pipe, or a link to elsewhere.
+        ValueError: the folder cannot be created, has a wildcard in its path or is in use by another
+            process; there is a run and `resume` is False, or no run and it is True; the run has
+            another config; or the folder contains a pipe or a link to the outside.
     """
     folder = root / config.name
-    if found := WILDCARDS & set(str(folder.absolute())):
+    if wildcards := WILDCARDS & set(str(folder.absolute())):
         raise ValueError(
-            f"checkpoints cannot be read again from {folder.absolute()}, because of the "
-            f"{' '.join(sorted(found))} in it: choose another --name or place"
+            f"checkpoints cannot be restored from {folder.absolute()} because its path contains "
+            f"{' '.join(sorted(wildcards))}: choose another --name or working directory"
         )
     with _locked(folder):
-        if (folder / RECORD).exists() if resume == "auto" else resume:
+        if (folder / CONFIG_FILE).exists() if resume == "auto" else resume:
             check_only_files(folder, folder)
             changed = _differences(_recorded(folder), to_json(config))
             if changed:
                 raise ValueError(
-                    f"{folder} holds a run with other settings ({', '.join(changed)}): resume with "
-                    "the settings it was started with, or give this run another --name"
+                    f"{folder} holds a run with different settings ({', '.join(changed)}): resume "
+                    "with the original settings or use another --name"
                 )
         else:
             _begin(config, folder)
@@ -99,60 +102,60 @@ def open_run(config: Config, root: Path, *, resume: bool | Literal["auto"]) -> I
 
 
 def _begin(config: Config, folder: Path) -> None:
-    """Record a new run in a folder that holds none."""
+    """Create the folder of a new run and write its config."""
     if folder.exists() and not folder.is_dir():
-        raise ValueError(f"{folder} is a file: remove it, or give this run another --name")
-    names = (RECORD, CLOCK, DATASET)
+        raise ValueError(f"{folder} is a file: remove it or use another --name")
+    names = (CONFIG_FILE, TIMES_FILE, DATASET_FILE)
     allowed = {folder / name for name in names}
     for name in names:
-        allowed |= {*folder.glob(f".{name}.*{TEMPORARY_SUFFIX}")}  # of a process that was killed
+        allowed |= {*folder.glob(f".{name}.*{TEMPORARY_SUFFIX}")}  # left by a killed process
     if any(path not in allowed for path in folder.rglob("*") if not path.is_dir()):
         raise ValueError(
-            f"{folder} already holds a run: add --resume to continue it, "
-            "or give this one another --name"
+            f"{folder} already holds a run: add --resume to continue it or use another --name"
         )
     folder.mkdir(exist_ok=True)
-    for path in allowed - {folder / RECORD}:
+    for path in allowed - {folder / CONFIG_FILE}:
         path.unlink(missing_ok=True)
-    write_json(folder / RECORD, to_json(config))
+    write_json(folder / CONFIG_FILE, to_json(config))
 
 
 def record_dataset(folder: Path, facts: Mapping[str, Any], *, streams: bool) -> bool:
-    """Whether a run's dataset streams: where it did when the run began, it goes on to.
+    """Record the run's dataset and return whether to stream it.
 
-    Streamed batches are others than those that are drawn on the device.
+    A run that started streaming keeps streaming, because streamed batches differ from those
+    sampled on the device.
 
     Args:
-        folder: the run's, which keeps all this.
-        facts: JSON values by which the dataset is known again.
-        streams: whether it has to, now.
+        folder: folder of the run.
+        facts: JSON values that identify the dataset.
+        streams: whether the dataset is too large for this device.
 
     Raises:
-        ValueError: the run began with another dataset.
+        ValueError: the run started with a different dataset.
     """
-    path, now = folder / DATASET, {"facts": dict(facts), "streams": streams}
-    before = read_json(path, records.DATASET) or now
-    if before is now:
-        write_json(path, now)
-    if before["facts"] != now["facts"]:
+    path, current = folder / DATASET_FILE, {"facts": dict(facts), "streams": streams}
+    recorded = read_json(path, records.DATASET)
+    if not recorded:
+        write_json(path, current)
+        return streams
+    if recorded["facts"] != current["facts"]:
         raise ValueError(
-            f"the dataset is not the one that {folder} began with: put that back where it was, or "
-            "give this run another --name"
+            f"the dataset differs from the one {folder} was started with: restore the original or "
+            "use another --name"
         )
-    return streams or before["streams"]
+    return streams or recorded["streams"]
 
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Keep other processes out of a folder, by a lock file beside it that names its last user."""
+    """Hold the folder's lock, a file next to it that names the last process to hold it."""
     file = folder.parent / f".{folder.name}.lock"
     try:
         lock = acquire(file)
     except filelock.Timeout as error:
         user = file.read_text().strip() or "another process"
         raise ValueError(
-            f"{folder} is in use by {user}: wait for that run or stop it, or give this one another "
-            "--name"
+            f"{folder} is in use by {user}: wait for that run, stop it or use another --name"
         ) from error
     with lock:
         file.write_text(f"process {os.getpid()} on {platform.node()}\n")
@@ -160,15 +163,15 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _recorded(folder: Path) -> dict[str, Any]:
-    """The config of the run in `folder`."""
-    if not (folder / RECORD).exists():
-        raise ValueError(f"{folder} holds no run to resume: start it without --resume")
-    found = read_json(folder / RECORD, records.CONFIG)
+    """Return the config recorded in `folder` as JSON values."""
+    if not (folder / CONFIG_FILE).exists():
+        raise ValueError(f"{folder} holds no run to resume: omit --resume to start one")
+    found = read_json(folder / CONFIG_FILE, records.CONFIG)
     return {**found, "peft": upgrade(found["peft"])}
 
 
 def _differences(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> list[str]:
-    """Dotted names of the values in which two nested mappings differ."""
+    """Return the dotted names of values that differ between two nested mappings."""
     names: list[str] = []
     for key in sorted({*a, *b}):
         x, y = a.get(key), b.get(key)
@@ -182,24 +185,24 @@ def _differences(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -
 class MetricsLog:
     """Appends scalars to `metrics.jsonl` and to TensorBoard event files.
 
-    A resumed run drops the lines past the step it continues from, so that the file reads like that
-    of an uninterrupted run. Of several processes the first one alone writes.
+    A resumed run drops rows after its start step, so that the log equals that of an uninterrupted
+    run. Only the first process writes.
     """
 
     def __init__(self, folder: Path, start_step: int = 0) -> None:
-        """Open the log of the run in `folder`, which continues at `start_step`."""
+        """Open the log of the run in `folder`, which resumes at `start_step`."""
         self.path: Path = folder / "metrics.jsonl"
         self._writes = processes.is_first()
         if not self._writes:
             return
-        kept = [row for row in read_metrics(folder) if row["step"] <= start_step]
-        write_text(self.path, "".join(map(_line, kept)))
+        rows = [row for row in read_metrics(folder) if row["step"] <= start_step]
+        write_text(self.path, "".join(map(_line, rows)))
         board = folder / "tensorboard"
         board.mkdir(exist_ok=True)
-        # Not SummaryWriter: when its thread cannot write, whoever adds to its queue waits for ever.
-        # The name has whole seconds: with the step, no other log is written over.
+        # Not SummaryWriter: if its writer thread fails, callers block forever. File names have a
+        # resolution of one second; the step as suffix keeps them unique.
         self._board = EventsWriter(str(board / "events"), f".{start_step:09}")
-        start = SessionLog(status=SessionLog.START)  # drop what was drawn from this step on
+        start = SessionLog(status=SessionLog.START)  # discards earlier events from this step on
         self._add(start_step + 1, session_log=start)
 
     def write(
@@ -208,22 +211,24 @@ class MetricsLog:
         values: Mapping[str, float],
         histograms: Mapping[str, np.ndarray] = MappingProxyType({}),
     ) -> None:
-        """Record scalars at `step`, and for TensorBoard alone histograms of arrays over layers.
+        """Log scalars at `step`, and histograms of arrays over layers to TensorBoard only.
 
-        JSON has no numbers that are not finite: they are left out.
+        Non-finite values are omitted, because JSON cannot represent them.
         """
         if not self._writes:
             return
         values = {name: value for name, value in values.items() if math.isfinite(value)}
         with self.path.open("a") as file:
             file.write(_line({"step": step, **values}))
-        drawn = [summary.scalar(name, value) for name, value in values.items()]
-        # TensorBoard drops all but the first kind of a tag.
-        drawn += [summary.histogram(f"{name}/layers", a, "auto") for name, a in histograms.items()]
-        self._add(step, summary=Summary(value=[value for one in drawn for value in one.value]))
+        summaries = [summary.scalar(name, value) for name, value in values.items()]
+        # TensorBoard keeps only one kind of summary per tag, hence "/layers".
+        summaries += [
+            summary.histogram(f"{name}/layers", array, "auto") for name, array in histograms.items()
+        ]
+        self._add(step, summary=Summary(value=[value for s in summaries for value in s.value]))
 
     def _add(self, step: int, **content: Any) -> None:
-        """Put an event where TensorBoard finds it."""
+        """Write an event and flush it."""
         self._board.write_event(Event(wall_time=time.time(), step=step, **content))
         self._board.flush()
 
@@ -234,10 +239,10 @@ class MetricsLog:
 
 
 def read_metrics(folder: Path) -> list[dict[str, float]]:
-    """The rows of `metrics.jsonl`; a last line cut off by a crash is dropped.
+    """Read the rows of `metrics.jsonl`; a last line truncated by a crash is dropped.
 
     Raises:
-        ValueError: a row is not as it was written.
+        ValueError: a row is corrupt.
     """
     path = folder / "metrics.jsonl"
     lines = read_bytes(path).split(b"\n")[:-1] if path.exists() else []
@@ -248,7 +253,7 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
             check(rows[-1], records.ROW)
         except (ValueError, RecursionError) as error:
             raise ValueError(
-                f"line {number} of {path} is damaged ({error}): put back a whole one, or remove it"
+                f"line {number} of {path} is damaged ({error}): restore the file or delete the line"
             ) from error
     return rows
 

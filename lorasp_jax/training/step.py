@@ -22,14 +22,14 @@ Metrics = dict[str, jax.Array]
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class TrainState:
-    """What changes from step to step; the frozen base is not part of it.
+    """State of training, without the frozen base.
 
     Attributes:
-        step: `[]` int32, steps taken, skipped ones included.
-        adapters: trainable part of the model, an `nnx.State` of `AdapterParam`.
+        step: `[]` int32, number of steps taken, including skipped ones.
+        adapters: trainable parameters, an `nnx.State` of `AdapterParam`.
         opt_state: state of the optimizer.
-        guard: what decides whether a step is skipped.
-        average: moving average of the adapters, or None.
+        guard: statistics for skipping bad steps.
+        average: exponential moving average of the adapters, or None.
     """
 
     step: jax.Array
@@ -39,15 +39,15 @@ class TrainState:
     average: Any = None
 
     @property
-    def best(self) -> Any:
-        """The adapters to use: their average, where there is one."""
+    def eval_adapters(self) -> Any:
+        """The adapters to evaluate and export: their average if there is one."""
         return self.adapters if self.average is None else self.average
 
 
 def init_state(
     adapters: Any, optimizer: optax.GradientTransformation, *, ema: bool = False
 ) -> TrainState:
-    """The state before the first step, of copies: a step takes its state's memory over."""
+    """Return the initial state, with copies because a step donates the buffers of its state."""
     adapters = jax.tree.map(jnp.copy, adapters)
     average = jax.tree.map(jnp.copy, adapters) if ema else None
     step = jnp.zeros((), jnp.int32)
@@ -55,8 +55,8 @@ def init_state(
 
 
 def active_ranks(aux: dict[str, dict[str, Aux]]) -> Metrics:
-    """Active rank averaged over valid tokens, as a mean by tower and as `[L]` by linear map."""
-    found: Metrics = {}
+    """Return active ranks averaged over valid tokens, per tower (scalar) and linear layer `[L]`."""
+    metrics: Metrics = {}
     for tower, linears in aux.items():
         ranks = {
             f"active_rank/{tower}/{name}": _layer_ranks(a.active_rank, a.token_mask)
@@ -64,13 +64,13 @@ def active_ranks(aux: dict[str, dict[str, Aux]]) -> Metrics:
             if a.active_rank is not None
         }
         if ranks:
-            found |= {f"active_rank/{tower}": jnp.stack([r.mean() for r in ranks.values()]).mean()}
-            found |= ranks
-    return found
+            mean = jnp.stack([rank.mean() for rank in ranks.values()]).mean()
+            metrics |= {f"active_rank/{tower}": mean, **ranks}
+    return metrics
 
 
 def _layer_ranks(rank: jax.Array, mask: jax.Array | None) -> jax.Array:
-    """`[L]` means over the valid tokens of `[..., B, T]`; L is 1 without leading axes."""
+    """Average `[..., B, T]` over the valid tokens, giving `[L]`; L is 1 without leading axes."""
     mask = jnp.ones((), bool) if mask is None else mask
     tokens = (x.reshape(-1, *rank.shape[-2:]) for x in (rank, jnp.broadcast_to(mask, rank.shape)))
     return jax.vmap(masked_mean)(*tokens)
@@ -88,11 +88,11 @@ def loss_fn(
     noise: jax.Array | None = None,
     flow_time: jax.Array | None = None,
 ) -> tuple[jax.Array, Metrics]:
-    """Eq. 14 of arXiv 2603.07404: flow-matching loss plus weighted auxiliary losses.
+    """Flow-matching loss plus weighted auxiliary losses, eq. 14 of arXiv 2603.07404.
 
-    The task loss is the mean over the elements that `batch.action_mask` marks as valid; `valid`
-    takes the place of their number, `noise` and `flow_time` of what is drawn. `key` is the
-    adapters' dropout's too.
+    The task loss is the mean over the elements that `batch.action_mask` marks as valid. `valid`
+    overrides their number, `noise` and `flow_time` override the sampled ones. `key` also drives
+    the adapters' dropout.
     """
     model = adaptation.with_dropout(nnx.merge(graphdef, adapters, frozen), key)
     mask = batch.action_mask
@@ -120,27 +120,27 @@ def gradients(
     weights: Metrics,
     parts: int = 1,
 ) -> tuple[Any, Metrics]:
-    """Gradient of `loss_fn` and its metrics, from equal parts of the batch one after the other.
+    """Return the gradient of `loss_fn` and its metrics, accumulated over `parts` micro-batches.
 
     The task loss is that of the whole batch, up to rounding; auxiliary losses and active ranks are
-    means over the parts.
+    averaged over the micro-batches.
     """
     gradient = jax.grad(loss_fn, has_aux=True)
     if parts == 1:
         return gradient(adapters, frozen, graphdef, batch, key, weights)
-    # Every part has rows of all devices, so that none moves: rows 0, n, 2n, ... are the first part.
+    # Every n-th row goes into the same micro-batch, so that no row changes its device.
     split = lambda x: jnp.swapaxes(x.reshape(-1, parts, *x.shape[1:]), 0, 1)  # noqa: E731
     valid = jnp.sum(batch.action_mask) / parts
 
     def add(total: Any, part: Any) -> tuple[Any, Metrics]:
-        rows, (noise, flow_time), own_key = part
-        given = {"valid": valid, "noise": noise, "flow_time": flow_time}
-        grads, metrics = gradient(adapters, frozen, graphdef, rows, own_key, weights, **given)
+        rows, (noise, flow_time), part_key = part
+        overrides = {"valid": valid, "noise": noise, "flow_time": flow_time}
+        grads, metrics = gradient(adapters, frozen, graphdef, rows, part_key, weights, **overrides)
         return jax.tree.map(jnp.add, total, grads), metrics
 
     zeros = jax.tree.map(jnp.zeros_like, adapters)
-    each = jax.tree.map(split, (batch, flow_matching.draw(key, batch.actions)))
-    total, metrics = jax.lax.scan(add, zeros, (*each, jax.random.split(key, parts)))
+    micro_batches = jax.tree.map(split, (batch, flow_matching.draw(key, batch.actions)))
+    total, metrics = jax.lax.scan(add, zeros, (*micro_batches, jax.random.split(key, parts)))
     mean = lambda tree: jax.tree.map(lambda x: x.mean(0), tree)  # noqa: E731
     return jax.tree.map(lambda x: x / parts, total), mean(metrics)
 
@@ -158,15 +158,15 @@ def train_step(
     ema: float = 0.0,
     spike: float = 0.0,
 ) -> tuple[TrainState, Metrics]:
-    """One step on the global batch, taken in `parts`; `key` is consumed.
+    """Take one step on the global batch, accumulated over `parts`; `key` is consumed.
 
-    Where the state has an average, it decays by `ema`. A step that `guard.judge` does not let count
-    changes only the step number and the guard.
+    The average, if there is one, decays by `ema`. A step that `guard.check_step` does not accept
+    changes only the step count and the guard.
     """
     now = {name: jnp.asarray(schedule(state.step)) for name, schedule in weights.items()}
     grads, metrics = gradients(state.adapters, frozen, graphdef, batch, key, now, parts)
     grad_norm = optax.tree.norm(grads)
-    counts, guard = guards.judge(state.guard, metrics["loss"], grad_norm, spike)
+    accept, guard = guards.check_step(state.guard, metrics["loss"], grad_norm, spike)
     updates, opt_state = optimizer.update(grads, state.opt_state, state.adapters)
     adapters = optax.apply_updates(state.adapters, updates)
     average = state.average
@@ -179,4 +179,4 @@ def train_step(
     }
     after = TrainState(state.step + 1, adapters, opt_state, guard, average)
     before = dataclasses.replace(state, step=after.step, guard=guard)
-    return guards.select(counts, after, before), metrics
+    return guards.select(accept, after, before), metrics

@@ -1,4 +1,4 @@
-"""Run training steps, several in one call, on data from wherever the run has them."""
+"""Run several training steps per call, on data that is on the device, streamed or re-collected."""
 
 import functools
 from collections.abc import Callable, Iterator
@@ -22,24 +22,31 @@ from lorasp_jax.training.run import Run
 from lorasp_jax.training.step import TrainState
 
 Collect = Callable[[Config, int], dict[str, Episodes]]
-"""Gives demonstrations by task for a generation, 1 and on, as `fresh_demonstrations` does."""
+"""Collects demonstrations per task for generation 1, 2, ..., see `fresh_demonstrations`."""
 
 
 class Stepper:
-    """Runs steps, (state, key, count) -> state, metrics; each count is compiled once.
+    """Runs steps, (state, key, count) -> state, metrics; compiles once per count.
 
     Attributes:
-        speed: the clock of the steps.
+        speed: meter of training speed.
     """
 
     def __init__(self, jitted: Callable, frozen: Any, data: Steps | Raw, speed: Speed) -> None:
-        """Take what `loop.jit_steps` gives, the frozen parameters and the data on the device."""
+        """Store the arguments; nothing is compiled yet.
+
+        Args:
+            jitted: compiled function of `loop.jit_steps`.
+            frozen: frozen parameters, on the mesh.
+            data: the whole dataset or one raw batch, on the mesh.
+            speed: meter of training speed.
+        """
         self._jitted, self._frozen, self._data = jitted, frozen, data
         self.speed: Speed = speed
         self._compiled: dict[int, Future[Any]] = {}
 
     def compile(self, state: TrainState, count: int) -> Future[Any]:
-        """Begin to compile `count` steps in a thread, unless that was begun before."""
+        """Start compiling `count` steps in a background thread, unless started before."""
         if count not in self._compiled:
             self._compiled[count] = _in_thread(self._compile, state, count)
         return self._compiled[count]
@@ -51,41 +58,40 @@ class Stepper:
             return lowered.compile(compiler_options=fast_cpu.without_simulation())
 
     def __call__(self, state: TrainState, key: jax.Array, count: int) -> tuple[TrainState, Any]:
-        """Run `count` steps; the metrics have a leading axis over them."""
+        """Run `count` steps; metrics have a leading axis over steps."""
         compiled = self.compile(state, count).result()
         self.speed.begin()
         return compiled(self._frozen, self._data, state, key)
 
 
 class StreamingStepper(Stepper):
-    """Runs steps on batches read from files; the next batch is always on its way to the device."""
+    """Runs steps on batches read from disk; the next batch is prefetched to the device."""
 
     def __init__(self, jitted: Callable, frozen: Any, batches: Iterator[Raw], speed: Speed) -> None:
-        """Read the first batch."""
+        """Read the first batch; the other arguments are those of `Stepper`."""
         super().__init__(jitted, frozen, next(batches), speed)
         self._batches = batches
 
     def compile(self, state: TrainState, count: int) -> Future[Any]:  # noqa: ARG002
-        """Begin to compile a single step: each has a batch of its own."""
+        """Start compiling a single step: every step has its own batch."""
         return super().compile(state, 1)
 
     def __call__(self, state: TrainState, key: jax.Array, count: int) -> tuple[TrainState, Any]:
-        """Run `count` steps, reading the next batch during each."""
-        found = []
+        """Run `count` steps, reading the next batch during each one."""
+        rows = []
         for _ in range(count):
             state, metrics = super().__call__(state, key, 1)
             with self.speed.waiting(metrics):
                 self._data = next(self._batches)
-            found.append(metrics)
-        return state, jax.tree.map(lambda *values: jnp.concatenate(values), *found)
+            rows.append(metrics)
+        return state, jax.tree.map(lambda *values: jnp.concatenate(values), *rows)
 
 
 class RefreshingStepper(Stepper):
     """Runs steps on demonstrations that are replaced every `data.fresh_every` steps.
 
-    Generation 0, 1, ... trains for that many steps each; the next one is collected on the device
-    meanwhile. A generation is a function of the run's seed and its number alone, so a run resumed
-    within one collects it again.
+    Each generation, 0, 1, ..., is used for that many steps while the device collects the next one.
+    A generation depends only on the run's seed and its own number, so a resumed run reproduces it.
     """
 
     def __init__(
@@ -97,25 +103,26 @@ class RefreshingStepper(Stepper):
         collect: Callable[[int], Steps],
         start: int,
     ) -> None:
-        """Collect the generation of the first step, and begin to collect the next.
+        """Collect the generation of the first step and start collecting the next one.
 
         Args:
-            jitted: as in `Stepper`.
-            frozen: as in `Stepper`.
-            speed: as in `Stepper`.
-            config: the run's.
-            collect: gives a generation on the device, all of equal shapes.
-            start: the first step's number.
+            jitted: see `Stepper`.
+            frozen: see `Stepper`.
+            speed: see `Stepper`.
+            config: configuration of the run.
+            collect: returns a generation on the device; all have equal shapes.
+            start: index of the first step.
         """
         self._every, self._last = config.data.fresh_every, config.optim.steps - 1
         self._collect = collect
         self._generation = self._generation_of(min(start, self._last))
-        first = self._generation if start <= self._last else 0  # at hand, if nothing trains
+        # After the last step nothing trains: take generation 0, which is already collected.
+        first = self._generation if start <= self._last else 0
         super().__init__(jitted, frozen, collect(first), speed)
         self._collect_next()
 
     def __call__(self, state: TrainState, key: jax.Array, count: int) -> tuple[TrainState, Any]:
-        """Run `count` steps, all on the generation of the first."""
+        """Run `count` steps, all on the generation of the first one."""
         if self._generation_of(int(state.step)) > self._generation:
             self.speed.begin()
             with self.speed.waiting(state):
@@ -128,7 +135,7 @@ class RefreshingStepper(Stepper):
         return step // self._every
 
     def _collect_next(self) -> None:
-        """Begin to collect the next generation in a thread, if any step will train on it."""
+        """Start collecting the next generation in a thread, if any step will train on it."""
         if self._generation_of(self._last) > self._generation:
             self._next = _in_thread(self._collect, self._generation + 1)
 
@@ -141,15 +148,15 @@ def make_stepper(
     start: int,
     collect: Collect,
 ) -> Stepper:
-    """The stepper for where the run has its data.
+    """Create the stepper for the run's kind of data.
 
     Args:
         run: the run.
-        jitted: what `loop.jit_steps` gives.
+        jitted: compiled function of `loop.jit_steps`.
         frozen: frozen parameters, on the mesh.
-        mesh: the devices that train.
-        start: the first step's number.
-        collect: gives demonstrations where the config wants them replaced.
+        mesh: mesh of the devices that train.
+        start: index of the first step.
+        collect: collects new demonstrations if `data.fresh_every` is set.
     """
     speed = _speed(run)
     if run.streams:
@@ -168,7 +175,7 @@ def make_stepper(
 
 
 def _in_thread(function: Callable, *arguments: Any) -> Future[Any]:
-    """The result to come of a call in a thread of its own."""
+    """Call `function` in a new thread and return its future."""
     pool = ThreadPoolExecutor(1)
     future = pool.submit(function, *arguments)
     pool.shutdown(wait=False)
@@ -176,7 +183,7 @@ def _in_thread(function: Callable, *arguments: Any) -> Future[Any]:
 
 
 def _batches(run: Run, mesh: jax.sharding.Mesh, start: int) -> Iterator[Raw]:
-    """Batches of a dataset from a step on, split over the devices."""
+    """Return the dataset's batches from step `start` on, sharded over the devices."""
     stream = Stream(
         run.steps,
         batch_size=run.config.optim.batch_size,
@@ -190,7 +197,7 @@ def _batches(run: Run, mesh: jax.sharding.Mesh, start: int) -> Iterator[Raw]:
 
 
 def _speed(run: Run) -> Speed:
-    """The run's clock; operations are counted where it is known how many there could be."""
+    """Create the speed meter; FLOPs are counted only if the device's peak is known."""
     size = run.config.optim.batch_size
     if flops.peak() is None:
         return Speed(size, None)

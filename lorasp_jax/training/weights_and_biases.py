@@ -1,4 +1,4 @@
-"""Weights & Biases, if it is installed and asked for: `--wandb PROJECT`."""
+"""Logging to Weights & Biases: `--wandb PROJECT`."""
 
 from pathlib import Path
 from types import TracebackType
@@ -10,43 +10,44 @@ from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import read_json, to_json, write_json
 
 RECORD = "wandb.json"
-"""File of a run's folder with its id there, under which it goes on."""
+"""File in a run's folder with the W&B run id, which a resumed run continues."""
 
 
 class WeightsAndBiases(Callback):
-    """Sends config, metrics, success and videos of a run; a context that tells how it ended.
+    """Logs config, metrics, success rates and videos; a context manager that reports the exit code.
 
-    What W&B writes while it sends lies in the folder that holds the runs' folders. Its own settings
-    are those of its environment variables, such as WANDB_MODE=offline.
+    W&B keeps its own files in the folder of all runs. Configure it with its environment variables,
+    such as WANDB_MODE=offline.
     """
 
     def __init__(self, project: str, config: Config, folder: Path) -> None:
-        """Begin a run there, or go on with the one of this folder.
+        """Start a W&B run, or continue that of this folder.
 
         Raises:
-            ValueError: wandb is not installed, or refuses.
+            ValueError: wandb is not installed, or reports an error.
         """
         try:
             import wandb  # pyright: ignore[reportMissingImports]
         except ImportError as error:
             raise ValueError("--wandb needs a package: pip install wandb") from error
         self._wandb, record = wandb, folder / RECORD
-        known = read_json(record, {"id": str}).get("id")
+        run_id = read_json(record, {"id": str}).get("id")
         try:
             self._run = wandb.init(
                 project=project,
                 name=config.name,
-                id=known,
+                id=run_id,
                 resume="allow",
                 dir=str(folder.parent.absolute()),
                 config=to_json(config),
             )
         except wandb.Error as error:
             raise ValueError(f"Weights & Biases: {' '.join(str(error).split())}") from error
-        self._run.define_metric("*", step_metric="step")  # its own counter cannot go back
+        # W&B's own step counter cannot go back to the step that a run resumes from.
+        self._run.define_metric("*", step_metric="step")
 
     def __enter__(self) -> Self:
-        """Itself."""
+        """Return self."""
         return self
 
     def __exit__(
@@ -55,31 +56,31 @@ class WeightsAndBiases(Callback):
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Wait until everything is sent."""
+        """Finish the W&B run, waiting for all uploads."""
         self._run.finish(exit_code=int(kind is not None))
 
     def on_start(self, run: Run) -> None:
-        """Remember the id, and send success before the first step."""
+        """Record the run id and log the success rates before training."""
         write_json(run.folder / RECORD, {"id": self._run.id})
         before = run.folder / "before.json"
         if before.exists():
-            self._success(0, read_json(before, records.BEFORE))
+            self._log_success(0, read_json(before, records.BEFORE))
 
     def on_log(self, run: Run, step: int, metrics: dict[str, float]) -> None:  # noqa: ARG002
-        """Send the metrics."""
+        """Log the metrics."""
         self._run.log({"step": step, **metrics})
 
     def on_end(self, run: Run) -> None:
-        """Send success after the last step and the videos."""
+        """Log the success rates after training and the videos."""
         results = read_json(run.folder / "results.json", records.RESULTS)
         after = {task: result["after"] for task, result in results["tasks"].items()}
-        self._success(run.config.optim.steps, after)
+        self._log_success(run.config.optim.steps, after)
         videos = {
             f"rollout/{task}": self._wandb.Video(str(run.folder / f"rollout_{task}.mp4"))
             for task in after
         }
         self._run.log({"step": run.config.optim.steps, **videos})
 
-    def _success(self, step: int, tasks: dict[str, dict[str, float]]) -> None:
+    def _log_success(self, step: int, tasks: dict[str, dict[str, float]]) -> None:
         rates = {f"success/{task}": result["success"] for task, result in tasks.items()}
         self._run.log({"step": step, **rates})

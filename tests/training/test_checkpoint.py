@@ -1,4 +1,4 @@
-"""Checkpoints that were damaged, half written or had no room: used as saved, or refused aloud."""
+"""Corrupt and incomplete checkpoints and full disks: restored exactly or rejected with a warning."""
 
 import errno
 import gc
@@ -13,15 +13,15 @@ import pytest
 from rich.console import Console
 
 from lorasp_jax.storage.digest import digest
-from lorasp_jax.training.checkpoint import WRITTEN, Checkpoints
+from lorasp_jax.training.checkpoint import COMMIT_MARKER, Checkpoints
 from lorasp_jax.training.distributed import mesh as meshes
 from lorasp_jax.training.guard import Guard
 from lorasp_jax.training.step import TrainState
 from tests.runs import leaves
 
-# Orbax leaves reads behind that nobody awaits when one of them fails.
+# If a read fails, Orbax leaves others behind that are never awaited.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-LARGE = (100, 80)  # more than what Orbax keeps among its own records
+LARGE = (100, 80)  # too large for Orbax to store inline with its metadata
 
 
 def state(step):
@@ -31,15 +31,15 @@ def state(step):
 
 
 @pytest.fixture(autouse=True)
-def forgotten_reads():
-    """They are complained about when their memory is collected: here."""
+def collect_unawaited_reads():
+    """Trigger their warnings here, when they are garbage-collected."""
     yield
     gc.collect()
 
 
 @pytest.fixture(scope="module")
 def master(tmp_path_factory):
-    """A folder with checkpoints of the steps 1 and 2."""
+    """A folder with checkpoints of steps 1 and 2."""
     folder = tmp_path_factory.mktemp("master")
     checkpoints = Checkpoints(folder, "base", Console(file=io.StringIO()))
     for step in (1, 2):
@@ -50,23 +50,23 @@ def master(tmp_path_factory):
 
 @pytest.fixture
 def folder(master, tmp_path):
-    """A copy, which may be damaged."""
+    """A copy that a test may corrupt."""
     return shutil.copytree(master, tmp_path / "run")
 
 
 def restore(folder, base_hash="base"):
-    """The step that is restored, whose state is what was saved then, and what is said."""
+    """Restore and check the state; return its step and the printed warnings."""
     console = Console(file=io.StringIO(), width=1000)
     checkpoints = Checkpoints(folder, base_hash, console)
     try:
-        found = checkpoints.restore(state(0))
+        restored = checkpoints.restore(state(0))
     finally:
         checkpoints.close()
-    if found is None:
+    if restored is None:
         return None, console.file.getvalue()
-    for name, value in leaves(state(int(found.step))).items():
-        np.testing.assert_array_equal(leaves(found)[name], value, err_msg=name)
-    return int(found.step), console.file.getvalue()
+    for name, value in leaves(state(int(restored.step))).items():
+        np.testing.assert_array_equal(leaves(restored)[name], value, err_msg=name)
+    return int(restored.step), console.file.getvalue()
 
 
 def names(folder):
@@ -83,36 +83,36 @@ def flipped(content, position):
 
 
 def sweep(master, tmp_path, damages):
-    """How often the damaged checkpoint itself was restored, and how often the one before."""
-    steps = {1: 0, 2: 0}
+    """Count by step how often the corrupted checkpoint and the previous one were restored."""
+    counts = {1: 0, 2: 0}
     for file in files(master):
         content = (master / file).read_bytes()
         for damaged in damages(content):
             folder = shutil.copytree(master, tmp_path / "run")
             (folder / file).write_bytes(damaged)
-            step, said = restore(folder)
-            steps[step] += 1
+            step, printed = restore(folder)
+            counts[step] += 1
             if step == 2:
-                assert (said, names(folder)) == ("", ["1", "2"]), file
+                assert (printed, names(folder)) == ("", ["1", "2"]), file
             else:
-                assert "the checkpoint at step 2 is damaged, " in said, file
-                assert said.endswith("2.damaged, and the run goes on from step 1\n"), file
+                assert "the checkpoint at step 2 is corrupt (" in printed, file
+                assert printed.endswith("2.damaged, resuming from step 1\n"), file
                 assert names(folder) == ["1", "2.damaged"], file
             shutil.rmtree(folder)
-    return steps
+    return counts
 
 
-def test_a_damaged_file_is_never_restored_as_something_else(master, tmp_path):
+def test_a_corrupt_file_is_never_restored_with_other_values(master, tmp_path):
     def damages(content):
         return flipped(content, len(content) // 2), content[: len(content) // 2]
 
     steps = sweep(master, tmp_path, damages)
     assert steps[1] >= 10
-    assert steps[2] >= 10  # what Orbax does not need is not missed
+    assert steps[2] >= 10  # Orbax does not need every file
 
 
 @pytest.mark.slow
-def test_damage_anywhere(master, tmp_path):
+def test_corruption_at_many_positions(master, tmp_path):
     def damages(content):
         size, every = len(content), max(len(content) // 25, 1)
         yield from (flipped(content, position) for position in range(0, size, every))
@@ -123,46 +123,46 @@ def test_damage_anywhere(master, tmp_path):
     assert min(steps.values()) > 100
 
 
-def test_what_is_damaged_twice_is_kept_twice(folder):
+def test_repeatedly_corrupt_checkpoints_are_all_kept(folder):
     for expected in (["1", "2.damaged"], ["1", "2.damaged", "2.damaged.1"]):
         (folder / "checkpoints/2/meta/metadata").write_text("{}")
         assert restore(folder)[0] == 1
         assert names(folder) == expected
         checkpoints = Checkpoints(folder, "base", Console(file=io.StringIO()))
-        checkpoints.save(state(2))  # as the run does that goes on
+        checkpoints.save(state(2))  # as the resumed run does
         checkpoints.close()
         assert restore(folder) == (2, "")
 
 
-def test_nothing_is_touched_where_all_are_damaged(folder):
+def test_nothing_changes_if_all_checkpoints_are_corrupt(folder):
     for step in (1, 2):
         (folder / f"checkpoints/{step}/meta/metadata").write_text("{}")
-    with pytest.raises(ValueError, match=r"no checkpoint in .* can be used \(step 2: it cannot be"):
+    with pytest.raises(ValueError, match=r"all checkpoints in .* are corrupt \(step 2: unreadable"):
         restore(folder)
     assert names(folder) == ["1", "2"]
 
 
-def test_another_base_is_no_damage(folder):
-    with pytest.raises(ValueError, match="trained on another base: its hash is base"):
+def test_another_base_is_not_corruption(folder):
+    with pytest.raises(ValueError, match=r"trained on a different base \(hash base"):
         restore(folder, "other")
     assert names(folder) == ["1", "2"]
 
 
-def test_half_written_and_empty_folders_are_removed(folder):
-    (folder / "checkpoints/2" / WRITTEN).unlink()
+def test_incomplete_checkpoints_are_removed(folder):
+    (folder / "checkpoints/2" / COMMIT_MARKER).unlink()
     (folder / "checkpoints/7").mkdir()
-    step, said = restore(folder)
+    step, printed = restore(folder)
     assert (step, names(folder)) == (1, ["1"])
-    for gone in (2, 7):
-        assert f"the writer of the checkpoint at step {gone} was killed: it is removed" in said
+    for removed in (2, 7):
+        assert f"removed the incomplete checkpoint at step {removed}: its process" in printed
     shutil.rmtree(folder / "checkpoints/1")
     assert restore(folder) == (None, "")
 
 
-def test_a_full_disk_leaves_the_checkpoint_before(folder, caplog):
-    """Files may not be as large as one of the state's."""
+def test_a_full_disk_leaves_the_previous_checkpoint(folder, caplog):
+    """The file size limit is below the size of an array."""
     checkpoints = Checkpoints(folder, "base", Console(file=io.StringIO()))
-    message = r"could not be written \(File too large\), the one at step 2 stays: make room for"
+    message = r"could not be written \(File too large\), the one at step 2 is intact: free some"
     _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))
     try:
@@ -177,14 +177,14 @@ def test_a_full_disk_leaves_the_checkpoint_before(folder, caplog):
     assert restore(folder) == (2, "")
 
 
-def test_threads_that_still_write_are_outlasted(folder, monkeypatch):
-    """Of a failed write: a file more in a folder that is being removed."""
+def test_removal_retries_while_other_threads_still_write(folder, monkeypatch):
+    """After a failed write they may add a file to a folder that is being removed."""
     (folder / "3" / "left").mkdir(parents=True)
     remove, failures = shutil.rmtree, [errno.ENOTEMPTY, errno.ENOENT]
 
     def rmtree(path):
         if failures:
-            raise OSError(failures.pop(), "somebody else was there")
+            raise OSError(failures.pop(), "another thread wrote here")
         remove(path)
 
     monkeypatch.setattr(shutil, "rmtree", rmtree)
@@ -193,20 +193,20 @@ def test_threads_that_still_write_are_outlasted(folder, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", ["float32", "bfloat16", "bool", "int8"])
-def test_digest_sees_every_bit(kind):
+def test_the_digest_depends_on_every_bit(kind):
     array = np.asarray(jax.random.normal(jax.random.key(0), (3, 5)) > 0.3).astype(jnp.dtype(kind))
-    seen = {digest({"a": jnp.asarray(array)})}
+    digests = {digest({"a": jnp.asarray(array)})}
     bits = 1 if kind == "bool" else 8 * array.dtype.itemsize
     for byte in range(0, array.nbytes, 7):
         for bit in range(min(bits, 8)):
             changed = bytearray(array.tobytes())
             changed[byte] ^= 1 << bit
             other = np.frombuffer(bytes(changed), array.dtype).reshape(array.shape)
-            seen.add(digest({"a": jnp.asarray(other)}))
-    assert len(seen) == 1 + len(range(0, array.nbytes, 7)) * min(bits, 8)
+            digests.add(digest({"a": jnp.asarray(other)}))
+    assert len(digests) == 1 + len(range(0, array.nbytes, 7)) * min(bits, 8)
 
 
-def test_digest_is_of_names_shapes_places_and_notes_too():
+def test_the_digest_depends_on_names_shapes_order_dtypes_and_notes():
     a = jnp.arange(6.0)
     others = [
         digest({"a": a}),
@@ -220,7 +220,7 @@ def test_digest_is_of_names_shapes_places_and_notes_too():
     assert len(set(others)) == len(others)
 
 
-def test_digest_does_not_depend_on_where_the_arrays_lie():
+def test_the_digest_does_not_depend_on_sharding():
     array = jax.random.normal(jax.random.key(0), (16, 4, 6))
     expected = digest({"a": array})
     for mesh in (meshes.make_mesh(2), meshes.make_mesh(1, jax.devices()[:1])):
@@ -229,10 +229,10 @@ def test_digest_does_not_depend_on_where_the_arrays_lie():
 
 
 @pytest.mark.timeout(60)
-def test_a_link_to_what_has_no_end_hangs_nobody(folder):
+def test_a_link_to_an_endless_device_does_not_hang(folder):
     file = next(path for path in (folder / "checkpoints" / "2").rglob("d/*") if path.is_file())
     file.unlink()
     file.symlink_to("/dev/zero")
-    step, said = restore(folder)
+    step, printed = restore(folder)
     assert step == 1
-    assert "the checkpoint at step 2 is damaged" in said
+    assert "the checkpoint at step 2 is corrupt" in printed

@@ -70,7 +70,7 @@ def test_a_policy_comes_back(tmp_path, method):
     run = make_run(tmp_path / "run", config, models.load(tmp_path / "base"))
     run.policy = changed(run.policy)
     run.base_hash = models.weights_hash(tmp_path / "base")
-    with pytest.raises(ValueError, match="has no policy: no run finished there"):
+    with pytest.raises(ValueError, match="holds no policy: no run has finished there"):
         export.load_policy(run.folder)
     export.write(run)
     loaded = export.load_policy(run.folder)
@@ -125,7 +125,7 @@ def test_a_base_that_is_gone_is_named_with_the_way_out(tmp_path, monkeypatch):
     export.write(run)
     (tmp_path / "base").rename("moved")
     message = (
-        rf"^{tmp_path / 'base'} does not exist.* \(base= says where the base of .*run is now\)"
+        rf"^{tmp_path / 'base'} does not exist.* \(pass base= if the base of .*run has moved\)"
     )
     with pytest.raises(ValueError, match=message):
         export.load_policy("run")
@@ -149,7 +149,7 @@ def test_another_tokenizer_is_refused(tmp_path, monkeypatch):
         return np.where(valid, (ids + 1) % 300, 0), valid
 
     monkeypatch.setattr(tokenizer.Offline, "encode", other)
-    with pytest.raises(ValueError, match=r"gives other tokens than .*: words= says"):
+    with pytest.raises(ValueError, match=r"produces other tokens than .*: pass words="):
         export.load_policy(run.folder)
 
 
@@ -163,7 +163,7 @@ def test_a_policy_that_cannot_come_back(tmp_path, changes):
     facts = {"format": native.FORMAT, "version": native.VERSION, "metadata": told | changes}
     facts |= {"base": "", "weights": {}, "methods": {}, "sha256": ""}
     (tmp_path / "adapter.json").write_text(json.dumps(with_digest(facts)))
-    with pytest.raises(ValueError, match=r"does not say what its policy needs|was random"):
+    with pytest.raises(ValueError, match=r"does not describe a policy|was random"):
         export.load_policy(tmp_path)
 
 

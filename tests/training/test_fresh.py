@@ -1,4 +1,4 @@
-"""Demonstrations that are replaced while a run goes on."""
+"""Demonstrations that are replaced during training."""
 
 import dataclasses
 
@@ -16,13 +16,13 @@ FRESH = dataclasses.replace(SAME, data=dataclasses.replace(SAME.data, fresh_ever
 
 
 class Collect:
-    """Notes which generations were asked for, without simulation."""
+    """Records the requested generations, without simulation."""
 
     def __init__(self):
-        self.asked = []
+        self.generations = []
 
     def __call__(self, config, generation):
-        self.asked.append(generation)
+        self.generations.append(generation)
         return {task: random_episodes(task, 10 * generation) for task in config.tasks}
 
 
@@ -30,35 +30,34 @@ def run(folder, config=FRESH):
     return make_run(folder, config, Miniature())
 
 
-def test_generations_train_one_after_the_other(tmp_path):
-    """The first as without, the next on others; a run that goes on repeats them to the bit."""
+def test_generations_replace_each_other(tmp_path):
+    """The first one is as without replacement; a resumed run reproduces all of them exactly."""
     collect = Collect()
     same, whole = run(tmp_path / "same", SAME), run(tmp_path / "whole")
     train(same, collect=collect)
-    assert collect.asked == []
+    assert collect.generations == []
     train(whole, collect=collect)
-    assert collect.asked == [*range(1, CONFIG.optim.steps // 2)]
+    assert collect.generations == [*range(1, CONFIG.optim.steps // 2)]
     first, *others = zip(repeatable(same.folder), repeatable(whole.folder), strict=True)
     assert first[0] == first[1]
     assert all(without != fresh for without, fresh in others)
     halved = run(tmp_path / "halved")
     with pytest.raises(KeyboardInterrupt):
         train(halved, [Terminate()], collect=collect)
-    collect.asked.clear()
+    collect.generations.clear()
     halved = run(tmp_path / "halved")
     train(halved, [Terminate()], resume=True, collect=collect)
-    assert collect.asked == [*range(1, CONFIG.optim.steps // 2)]
+    assert collect.generations == [*range(1, CONFIG.optim.steps // 2)]
     assert repeatable(halved.folder) == repeatable(whole.folder)
-    collect.asked.clear()
-    train(
-        run(tmp_path / "whole"), resume=True, collect=collect
-    )  # as one that was stopped in the last evaluation
-    assert collect.asked == []
+    collect.generations.clear()
+    # As after a stop during the final evaluation.
+    train(run(tmp_path / "whole"), resume=True, collect=collect)
+    assert collect.generations == []
 
 
 @pytest.mark.parametrize("size", [13, 21, 50])
 def test_of_size(size):
-    """Windows stay within their episode, also where one is cut off or comes again."""
+    """Windows stay within their episode, even if it is truncated or repeated."""
     steps = flatten([random_episodes("press", 0)])  # 5, 9 and 7 steps
     found = fit_to_size(steps, size)
     start = np.arange(size)
@@ -71,7 +70,7 @@ def test_of_size(size):
         np.testing.assert_array_equal(found.end, steps.end)
 
 
-def test_each_generation_has_its_own_layouts(monkeypatch):
+def test_each_generation_has_its_own_keys(monkeypatch):
     monkeypatch.setattr(demonstrations.envs, "collect", lambda _, key, **others: key)
     keys = [demonstrations.fresh_demonstrations(CONFIG, number) for number in (1, 1, 2)]
     data = [jax.random.key_data(found[CONFIG.tasks[0]]).tolist() for found in keys]

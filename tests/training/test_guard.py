@@ -1,4 +1,4 @@
-"""Steps that are skipped: what they leave alone, how they are counted, when a run stops."""
+"""Skipped steps: what they leave unchanged, how they are counted, when a run stops."""
 
 import dataclasses
 import functools
@@ -24,14 +24,14 @@ GOOD, TINY = 1.0, 1e-6
 
 
 def loss(adapters, frozen, graphdef, batch, key, weights, **_):
-    """w² b, whose gradient's norm overflows before it does."""
+    """Return w² b: the norm of its gradient overflows before the loss does."""
     value = sum((w**2).sum() for w in jax.tree.leaves(adapters)) * batch
     return value, {"loss": value}
 
 
 @pytest.fixture
 def step(monkeypatch):
-    """A jitted training step of `loss`, (state, batch) -> state, metrics."""
+    """Returns a jitted training step of `loss`, (state, batch) -> state, metrics."""
     monkeypatch.setattr(steps, "loss_fn", loss)
 
     def make(spike=0.0):
@@ -43,12 +43,12 @@ def step(monkeypatch):
     return make
 
 
-def begin():
+def initial_state():
     return steps.init_state({"w": jnp.arange(1.0, 4.0)}, OPTIMIZER, ema=True)
 
 
-def kept(state):
-    """All that a skipped step leaves alone."""
+def unchanged(state):
+    """Everything that a skipped step leaves unchanged."""
     return leaves((state.adapters, state.opt_state, state.average))
 
 
@@ -59,57 +59,57 @@ def after(step, state, *batches):
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 1e30])
-def test_a_skipped_step_changes_nothing_but_the_count(step, bad):
+def test_a_skipped_step_changes_only_the_count(step, bad):
     step = step()
-    before = after(step, begin(), GOOD)
+    before = after(step, initial_state(), GOOD)
     skipped, metrics = step(before, bad)
     assert math.isfinite(metrics["loss"]) == (bad == 1e30)
     assert not math.isfinite(metrics["grad_norm"])
-    for name, value in kept(skipped).items():
-        np.testing.assert_array_equal(value, kept(before)[name], err_msg=name)
+    for name, value in unchanged(skipped).items():
+        np.testing.assert_array_equal(value, unchanged(before)[name], err_msg=name)
     assert (int(skipped.step), int(skipped.guard.in_a_row), int(metrics["in_a_row"])) == (2, 1, 1)
     assert int(skipped.guard.counted) == 1
-    good = after(step, skipped, GOOD)  # as if it had never been
+    good = after(step, skipped, GOOD)  # as if it had not happened
     assert int(good.guard.in_a_row) == 0
-    for name, value in kept(good).items():
-        np.testing.assert_array_equal(value, kept(after(step, before, GOOD))[name])
-        assert (value != kept(before)[name]).any(), name
+    for name, value in unchanged(good).items():
+        np.testing.assert_array_equal(value, unchanged(after(step, before, GOOD))[name])
+        assert (value != unchanged(before)[name]).any(), name
 
 
-def test_running_means_are_those_of_the_steps_that_counted(step, monkeypatch):
+def test_running_means_are_over_accepted_steps(step, monkeypatch):
     monkeypatch.setattr(guards, "WINDOW", 2)
-    guard, seen = guards.Guard.initial(), []
+    guard, accepted = guards.Guard.initial(), []
     for value in (3.0, math.nan, 5.0, 8.0):
-        counts, guard = guards.judge(guard, jnp.float32(value), jnp.float32(10 * value), 0.0)
-        seen.append(bool(counts))
-    assert seen == [True, False, True, True]
+        accept, guard = guards.check_step(guard, jnp.float32(value), jnp.float32(10 * value), 0.0)
+        accepted.append(bool(accept))
+    assert accepted == [True, False, True, True]
     assert int(guard.counted) == 3
     assert float(guard.loss) == ((3 + 5) / 2 + 8) / 2
     assert float(guard.grad_norm) == 10 * float(guard.loss)
 
 
 @pytest.mark.parametrize(
-    ("loss", "norm", "counts"), [(1.0, 1.0, True), (3.1, 1.0, False), (1.0, 3.1, False)]
+    ("loss", "norm", "accepted"), [(1.0, 1.0, True), (3.1, 1.0, False), (1.0, 3.1, False)]
 )
-def test_a_spike_is_skipped_once_enough_is_known(loss, norm, counts, monkeypatch):
+def test_a_spike_is_skipped_after_enough_accepted_steps(loss, norm, accepted, monkeypatch):
     monkeypatch.setattr(guards, "WINDOW", 2)
-    known = guards.Guard(jnp.int32(2), jnp.int32(0), jnp.float32(1), jnp.float32(1))
-    asked = jnp.float32(loss), jnp.float32(norm)
-    assert bool(guards.judge(known, *asked, 3.0)[0]) == counts
-    assert bool(guards.judge(known, *asked, 0.0)[0])
-    early = dataclasses.replace(known, counted=jnp.int32(1))
-    assert bool(guards.judge(early, *asked, 3.0)[0])
+    guard = guards.Guard(jnp.int32(2), jnp.int32(0), jnp.float32(1), jnp.float32(1))
+    values = jnp.float32(loss), jnp.float32(norm)
+    assert bool(guards.check_step(guard, *values, 3.0)[0]) == accepted
+    assert bool(guards.check_step(guard, *values, 0.0)[0])
+    early = dataclasses.replace(guard, counted=jnp.int32(1))
+    assert bool(guards.check_step(early, *values, 3.0)[0])
 
 
-def test_the_loop_s_step_looks_for_spikes_where_asked(step, monkeypatch):
+def test_train_step_detects_spikes_if_enabled(step, monkeypatch):
     monkeypatch.setattr(guards, "WINDOW", 2)
     for spike, skipped in ((0.0, 0), (50.0, 1)):
-        state = after(step(spike), begin(), TINY, TINY, GOOD)
+        state = after(step(spike), initial_state(), TINY, TINY, GOOD)
         assert int(state.guard.in_a_row) == skipped
 
 
 def test_no_second_copy_of_the_state_is_needed(step, monkeypatch):
-    """Deciding by the updates, which is what the loss and the norm are taken for, needs one."""
+    """A decision by the updates, in place of loss and gradient norm, would need one."""
     leaf = 1 << 16
     state = jax.eval_shape(
         lambda: steps.init_state({str(i): jnp.ones(leaf) for i in range(16)}, OPTIMIZER, ema=True)
@@ -136,19 +136,19 @@ def test_no_second_copy_of_the_state_is_needed(step, monkeypatch):
 def test_summary():
     loss, in_a_row = np.array([1.0, np.nan, np.inf, 3.0]), np.array([0, 1, 2, 0])
     rows = {"loss": loss, "ranks": np.stack([loss, 2 * loss], -1), "in_a_row": in_a_row}
-    found = {name: value.tolist() for name, value in guards.summarise(rows).items()}
+    found = {name: value.tolist() for name, value in guards.summarize(rows).items()}
     assert found == {"loss": 2.0, "ranks": [2.0, 4.0], "skipped": 2}
-    assert guards.summarise({name: v[1:3] for name, v in rows.items()}) == {"skipped": 2}
+    assert guards.summarize({name: v[1:3] for name, v in rows.items()}) == {"skipped": 2}
 
 
 @pytest.mark.parametrize("bad", [{"max_skipped": 0}, {"spike": 1.0}, {"spike": math.nan}])
-def test_numbers_that_make_no_sense(bad):
+def test_invalid_limits_are_rejected(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         OptimConfig(**bad)
 
 
 def spoiled(folder, episodes, at, **optim):
-    """A run whose demonstrations of a task have NaN for the state somewhere."""
+    """A run with NaN in some states of the demonstrations of one task."""
     optim = dataclasses.replace(CONFIG.optim, **optim)
     config = dataclasses.replace(CONFIG, optim=optim, targets=("inp", "out"))
     run = make_run(folder, config, Miniature())
@@ -156,30 +156,33 @@ def spoiled(folder, episodes, at, **optim):
     return run
 
 
-def test_a_run_of_skipped_steps_stops_and_says_so(tmp_path):
-    class Note(Callback):
+def test_too_many_skipped_steps_stop_the_run(tmp_path):
+    class RecordReason(Callback):
         def on_stop(self, run, reason):
             self.reason = reason
 
-    note, run = Note(), spoiled(tmp_path / "run", slice(None), slice(None), max_skipped=3)
+    callback, run = (
+        RecordReason(),
+        spoiled(tmp_path / "run", slice(None), slice(None), max_skipped=3),
+    )
     before = leaves(adaptation.split(run.policy.model)[1])
     message = (
-        r"not finite in 4 steps in a row \(at step 4 the loss was nan, the gradient's norm nan\): "
-        "nothing after step 2 was saved; try a lower --optim.learning-rate"
+        r"4 consecutive steps were skipped because .* non-finite \(step 4: loss nan, gradient norm nan"
+        r"\); nothing after step 2 was saved: try a lower --optim.learning-rate"
     )
     with pytest.raises(RunError, match=message) as caught:
-        train(run, [note])
-    assert note.reason == str(caught.value)
+        train(run, [callback])
+    assert callback.reason == str(caught.value)
     assert [(row["step"], row["skipped"]) for row in read_metrics(run.folder)] == [(2, 2), (4, 2)]
     assert "task" not in read_metrics(run.folder)[0]
     assert [path.name for path in (run.folder / "checkpoints").glob("*")] == ["2"]
     again = spoiled(tmp_path / "run", slice(None), slice(None), steps=2)
-    train(again, resume=True)  # leaves what was saved
+    train(again, resume=True)  # keeps the saved state
     for name, value in leaves(adaptation.split(again.policy.model)[1]).items():
         np.testing.assert_array_equal(value, before[name], err_msg=name)
 
 
-def test_some_skipped_steps_are_counted_and_the_others_train(tmp_path):
+def test_other_steps_still_train(tmp_path):
     run = spoiled(tmp_path / "run", 0, 0)
     run.config = dataclasses.replace(run.config, seed=1)
     train(run)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from lorasp_jax.adapters import adaptation
-from lorasp_jax.training.checkpoint import WRITTEN
+from lorasp_jax.training.checkpoint import COMMIT_MARKER
 from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.run_folder import read_metrics
 from tests import ROOT
@@ -74,7 +74,7 @@ def test_a_killed_run_resumes_to_the_bit(times, whole, tmp_path, capsys):
     killed = tmp_path / "killed"
     for _ in range(times):
         kill(killed, steps, chance)
-    newest = max(int(path.parent.name) for path in killed.glob(f"checkpoints/*/{WRITTEN}"))
+    newest = max(int(path.parent.name) for path in killed.glob(f"checkpoints/*/{COMMIT_MARKER}"))
     assert newest < steps  # else nothing is left to do
     capsys.readouterr()
     work(killed, steps, devices=1)

@@ -1,4 +1,4 @@
-"""Runs: frozen stays frozen, resume is exact, an update that is not finite stops."""
+"""Runs: frozen stays frozen, resume is exact, a non-finite update stops the run."""
 
 import dataclasses
 import os
@@ -19,7 +19,7 @@ from tests.runs import CONFIG, Miniature, Terminate, leaves, make_run, repeatabl
 
 
 def quick_run(folder):
-    """Of no size: a whole backbone resumes in test_dataset."""
+    """A run of a tiny model; test_dataset resumes a whole backbone."""
     return make_run(folder, dataclasses.replace(CONFIG, targets=("inp", "out")), Miniature())
 
 
@@ -32,7 +32,7 @@ def test_resume_is_bit_exact_and_frozen_stays_frozen(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         train(halved, [callback])
     assert [row["step"] for row in read_metrics(halved.folder)] == [2]
-    halved = quick_run(tmp_path / "halved")  # as a new process would
+    halved = quick_run(tmp_path / "halved")  # as in a new process
     train(halved, [callback], resume=True)
     assert callback.started == 1
 
@@ -44,54 +44,54 @@ def test_resume_is_bit_exact_and_frozen_stays_frozen(tmp_path):
     assert read_metrics(whole.folder)[-1]["speed/samples_per_second"] > 0
     for name, value in leaves(frozen).items():
         np.testing.assert_array_equal(value, leaves(frozen_before)[name], err_msg=name)
-    moved = [
+    changed = [
         name for name, v in leaves(adapters).items() if (v != leaves(adapters_before)[name]).any()
     ]
-    assert len(moved) == len(leaves(adapters))
+    assert len(changed) == len(leaves(adapters))
 
 
-def test_other_base_is_refused(tmp_path):
+def test_another_base_is_rejected(tmp_path):
     run = quick_run(tmp_path / "run")
     train(run)
     other = quick_run(tmp_path / "run")
     other.base_hash = "hash of another base"
-    with pytest.raises(ValueError, match="trained on another base"):
+    with pytest.raises(ValueError, match="trained on a different base"):
         train(other, resume=True)
 
 
 @pytest.mark.slow
-def test_an_update_that_is_not_finite_stops_and_keeps_the_last_checkpoint(tmp_path):
+def test_a_non_finite_update_stops_the_run_and_keeps_the_last_checkpoint(tmp_path):
     # The warm-up's first step has learning rate zero; the second overflows.
     optim = dataclasses.replace(CONFIG.optim, learning_rate=1e38, warmup_steps=2)
     config = dataclasses.replace(CONFIG, optim=optim, log_every=1, checkpoint_every=1)
     run = make_run(tmp_path / "run", config)
-    with pytest.raises(RunError, match=r"was not finite up to step 2 .*: nothing after step 1 was"):
+    with pytest.raises(RunError, match=r"non-finite by step 2 .*; nothing after step 1 was"):
         train(run)
     assert sorted(os.listdir(tmp_path / "run" / "checkpoints")) == ["1"]
     again = make_run(tmp_path / "run", config)
     with pytest.raises(RunError) as caught:
-        train(again, resume=True)  # from a state that is finite
+        train(again, resume=True)  # from a finite state
     assert "\n" not in str(caught.value)
 
 
-def test_signal_handlers_are_put_back(tmp_path):
-    """And callbacks see the policy as it is at each log line, and add to it."""
+def test_signal_handlers_are_restored(tmp_path):
+    """Also: callbacks get the current policy at each log step and add metrics."""
 
-    class Look(Callback):
+    class LogSize(Callback):
         def on_log(self, run, step, metrics):
             adapters = leaves(adaptation.split(run.policy.model)[1]).values()
             return {"size": float(sum(np.abs(x).sum() for x in adapters))}
 
     before, run = signal.getsignal(signal.SIGTERM), quick_run(tmp_path / "run")
-    train(run, [Look()])
-    last = {"size": Look().on_log(run, 4, {})["size"]}
+    train(run, [LogSize()])
+    last = {"size": LogSize().on_log(run, 4, {})["size"]}
     first, second = read_metrics(run.folder)
     assert second["size"] == last["size"] != first["size"] > 0
     assert signal.getsignal(signal.SIGTERM) == before
     assert jax.device_count() == 8
 
 
-def test_steps_are_compiled_without_what_simulation_needs(monkeypatch):
+def test_steps_are_compiled_without_options_for_simulation(monkeypatch):
     jitted, options = Mock(), Mock()
     monkeypatch.setattr(fast_cpu, "without_simulation", options)
     Stepper(jitted, None, None, Mock()).compile(Mock(), 3).result()
@@ -100,22 +100,22 @@ def test_steps_are_compiled_without_what_simulation_needs(monkeypatch):
 
 
 @pytest.mark.slow
-def test_each_number_of_steps_compiles_once_and_beside_the_callbacks(tmp_path, monkeypatch):
+def test_each_step_count_compiles_once_and_during_the_callbacks(tmp_path, monkeypatch):
     compiled = []
-    begin = Stepper.compile
+    original = Stepper.compile
 
-    def compile_and_note(self, state, count):
+    def compile_and_record(self, state, count):
         compiled.append((count, count in self._compiled))
-        return begin(self, state, count)
+        return original(self, state, count)
 
-    monkeypatch.setattr(Stepper, "compile", compile_and_note)
+    monkeypatch.setattr(Stepper, "compile", compile_and_record)
 
-    class Look(Callback):
+    class LogSize(Callback):
         def on_start(self, run):
             assert compiled == [(2, False)]
 
     optim = dataclasses.replace(CONFIG.optim, steps=5)
     run = make_run(tmp_path / "run", dataclasses.replace(CONFIG, optim=optim))
-    train(run, [Look()])
+    train(run, [LogSize()])
     assert compiled == [(2, False), (2, True), (2, True), (1, False)]
     assert [row["step"] for row in read_metrics(run.folder)] == [2, 4, 5]

@@ -5,7 +5,7 @@ import re
 import pytest
 
 from lorasp_jax.report.html import write_report
-from lorasp_jax.training.run_folder import RECORD, read_json, write_json
+from lorasp_jax.training.run_folder import CONFIG_FILE, read_json, write_json
 from tests.runs import RESULTS, finish
 
 
@@ -32,7 +32,7 @@ def test_results_of_another_version(name, value, sentence, tmp_path):
 )
 def test_settings_of_another_version(peft, sentence, tmp_path):
     finish(tmp_path)
-    config = read_json(tmp_path / RECORD)
-    write_json(tmp_path / RECORD, config | {"peft": {"method": "LoRASP"} | peft})
+    config = read_json(tmp_path / CONFIG_FILE)
+    write_json(tmp_path / CONFIG_FILE, config | {"peft": {"method": "LoRASP"} | peft})
     with pytest.raises(ValueError, match=rf"config\.json is damaged \({re.escape(sentence)}"):
         write_report(tmp_path)

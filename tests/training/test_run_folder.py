@@ -1,4 +1,4 @@
-"""Run folders: nothing is overwritten, two runs are kept apart, logs continue."""
+"""Run folders: nothing is overwritten, runs are locked, logs continue."""
 
 import dataclasses
 import json
@@ -24,30 +24,30 @@ CONFIG = Config(name="a", scale="cpu", peft=LoRASP(rank=8))
 
 
 def open_run(*arguments, **options):
-    """The folder of a run that is opened and closed."""
+    """Open and close a run; return its folder."""
     with run_folder.open_run(*arguments, **options) as folder:
         return folder
 
 
-def test_second_run_in_one_folder_is_refused(tmp_path):
+def test_a_second_run_in_the_same_folder_is_rejected(tmp_path):
     folder = open_run(CONFIG, tmp_path, resume=False)
-    (folder / "metrics.jsonl").write_text("kept")
+    (folder / "metrics.jsonl").write_text("precious")
     with pytest.raises(ValueError, match="already holds a run"):
         open_run(CONFIG, tmp_path, resume=False)
-    assert (folder / "metrics.jsonl").read_text() == "kept"
+    assert (folder / "metrics.jsonl").read_text() == "precious"
 
 
 @pytest.mark.parametrize("character", "[*?\\")
-def test_a_place_where_no_checkpoint_would_be_found_again_is_refused(tmp_path, character):
-    with pytest.raises(ValueError, match=r"cannot be read again from .*choose another --name"):
+def test_paths_in_which_orbax_finds_no_checkpoints_are_rejected(tmp_path, character):
+    with pytest.raises(ValueError, match=r"cannot be restored from .*choose another --name"):
         open_run(dataclasses.replace(CONFIG, name=f"a{character}"), tmp_path, resume=False)
-    with pytest.raises(ValueError, match="cannot be read again"):
+    with pytest.raises(ValueError, match="cannot be restored"):
         open_run(CONFIG, tmp_path / f"b{character}", resume=False)
     assert not list(tmp_path.iterdir())
 
 
 def test_two_runs_do_not_share_a_folder(tmp_path):
-    """And who has it is said; the other's name is free, as this one is again later."""
+    """The error names the holder; other names are free, and so is this one afterwards."""
     with run_folder.open_run(CONFIG, tmp_path, resume=False) as folder:
         before = (folder / "config.json").read_bytes()
         for resume in (False, True):
@@ -60,14 +60,14 @@ def test_two_runs_do_not_share_a_folder(tmp_path):
     open_run(CONFIG, tmp_path, resume=True)
 
 
-def test_a_killed_run_blocks_nobody(tmp_path):
-    hold = (
+def test_the_lock_of_a_killed_run_is_released(tmp_path):
+    program = (
         "import os, sys; from pathlib import Path; from tests.training.test_run_folder import *\n"
         "with run_folder.open_run(CONFIG, Path(sys.argv[1]), resume=False):\n"
         "    print('held', flush=True)\n"
         "    sys.stdin.read()\n"
     )
-    command = [sys.executable, "-c", hold, str(tmp_path)]
+    command = [sys.executable, "-c", program, str(tmp_path)]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with subprocess.Popen(command, cwd=ROOT, **pipes) as other:
         assert other.stdout.readline() == b"held\n"
@@ -83,44 +83,46 @@ def test_resume_needs_the_same_settings(tmp_path):
     folder = open_run(CONFIG, tmp_path, resume=False)
     assert open_run(CONFIG, tmp_path, resume=True) == folder
     other = dataclasses.replace(CONFIG, peft=LoRASP(rank=4), seed=3)
-    with pytest.raises(ValueError, match=r"other settings \(peft\.alpha.*seed|peft\.rank, seed"):
+    with pytest.raises(
+        ValueError, match=r"different settings \(peft\.alpha.*seed|peft\.rank, seed"
+    ):
         open_run(other, tmp_path, resume=True)
     assert json.loads((folder / "config.json").read_text())["peft"]["rank"] == 8
 
 
-def test_resume_auto_starts_or_goes_on(tmp_path):
+def test_resume_auto_starts_or_continues(tmp_path):
     folder = open_run(CONFIG, tmp_path, resume="auto")
     (folder / "metrics.jsonl").write_text("precious\n")
     assert open_run(CONFIG, tmp_path, resume="auto") == folder
     assert (folder / "metrics.jsonl").read_text() == "precious\n"
-    with pytest.raises(ValueError, match=r"other settings \(seed"):
+    with pytest.raises(ValueError, match=r"different settings \(seed"):
         open_run(dataclasses.replace(CONFIG, seed=3), tmp_path, resume="auto")
     (folder / "config.json").unlink()
     with pytest.raises(ValueError, match="already holds a run"):
         open_run(CONFIG, tmp_path, resume="auto")
 
 
-@pytest.mark.parametrize("place", ["", "a", ".a.lock/"])
-def test_something_else_is_where_the_folder_should_be(tmp_path, place):
+@pytest.mark.parametrize("name", ["", "a", ".a.lock/"])
+def test_a_path_of_another_kind_in_place_of_the_folder_or_lock(tmp_path, name):
     root = tmp_path / "runs"
-    if place.endswith("/"):
-        (root / place).mkdir(parents=True)
+    if name.endswith("/"):
+        (root / name).mkdir(parents=True)
     else:
-        (root / place).parent.mkdir(exist_ok=True)
-        (root / place).write_text("a file")
+        (root / name).parent.mkdir(exist_ok=True)
+        (root / name).write_text("a file")
     with pytest.raises(ValueError, match=r"is a file|cannot open"):
         open_run(CONFIG, root, resume=False)
 
 
 @pytest.mark.parametrize("content", [b"{", b"[3]", b"3", b"\xff"])
-def test_damaged_record(tmp_path, content):
+def test_corrupt_config(tmp_path, content):
     folder = open_run(CONFIG, tmp_path, resume=False)
     (folder / "config.json").write_bytes(content)
     with pytest.raises(ValueError, match="is damaged"):
         open_run(CONFIG, tmp_path, resume=True)
 
 
-def test_log_continues_like_an_uninterrupted_one(tmp_path):
+def test_a_resumed_log_equals_an_uninterrupted_one(tmp_path):
     log = MetricsLog(tmp_path)
     for step in (2, 4, 6):
         log.write(step, {"loss": float(step)})
@@ -135,7 +137,7 @@ def test_log_continues_like_an_uninterrupted_one(tmp_path):
 
 
 @pytest.mark.timeout(60)
-def test_a_full_disk_stops_the_log_at_once(tmp_path):
+def test_a_full_disk_stops_the_log_immediately(tmp_path):
     log = MetricsLog(tmp_path)
 
     def fill():
@@ -154,8 +156,8 @@ def test_a_full_disk_stops_the_log_at_once(tmp_path):
     assert len(read_metrics(tmp_path)) > 10
 
 
-def test_tensorboards_own_reader_finds_every_number(tmp_path):
-    """A scalar and a histogram of one name, of a run that went on from step 2."""
+def test_tensorboard_reads_every_value(tmp_path):
+    """A scalar and a histogram of the same name, from a run resumed at step 2."""
     name = "active_rank/vision/fc1"
     for start, steps in ((0, (2, 4)), (2, (4, 6))):
         log = MetricsLog(tmp_path, start)
@@ -178,33 +180,33 @@ def test_tensorboards_own_reader_finds_every_number(tmp_path):
     ]
 
 
-def test_json_has_no_numbers_that_are_not_finite(tmp_path):
+def test_non_finite_values_are_omitted(tmp_path):
     log = MetricsLog(tmp_path)
     log.write(2, {"loss": float("nan"), "grad_norm": float("inf"), "skipped": 2.0})
     log.close()
     assert read_metrics(tmp_path) == [{"step": 2, "skipped": 2.0}]
 
 
-def test_name_is_free_after_a_run_that_failed_before_it_had_anything(tmp_path):
-    """As with an expert that fails under too much noise."""
+def test_a_name_is_free_after_a_run_that_failed_without_results(tmp_path):
+    """For example if too much noise makes the expert fail."""
     noisy = dataclasses.replace(CONFIG, data=DataConfig(action_noise=0.1))
     folder = open_run(noisy, tmp_path, resume=False)
     (folder / "seconds.json").write_text('{"collect": 9.0, "total": 9.0}')
     record_dataset(folder, {"crc32": 1}, streams=True)
-    (folder / "cache").mkdir()  # of a dataset that turned out to be damaged
+    (folder / "cache").mkdir()  # of a corrupt dataset
     assert open_run(CONFIG, tmp_path, resume=False) == folder
     files = [path.name for path in folder.iterdir() if path.is_file()]
-    assert files == ["config.json"]  # the clock starts anew
+    assert files == ["config.json"]  # times start from zero
     assert json.loads((folder / "config.json").read_text())["data"]["action_noise"] == 0.005
 
 
-def test_a_damaged_clock_is_named(tmp_path):
+def test_corrupt_times_are_reported(tmp_path):
     (tmp_path / "seconds.json").write_text("")
     with pytest.raises(ValueError, match=r"seconds\.json is damaged"):
         Run(CONFIG, tmp_path, Console(), "hash")
 
 
-def test_a_dataset_stays_what_and_where_it_was(tmp_path):
+def test_a_run_keeps_its_dataset_and_whether_it_streams(tmp_path):
     facts = {"crc32": {"state": 1}, "instructions": ["press"]}
     assert not record_dataset(tmp_path, facts, streams=False)
     assert not record_dataset(tmp_path, facts, streams=False)
@@ -212,12 +214,12 @@ def test_a_dataset_stays_what_and_where_it_was(tmp_path):
     (tmp_path / "dataset.json").unlink()
     assert record_dataset(tmp_path, facts, streams=True)
     assert record_dataset(tmp_path, facts, streams=False)
-    with pytest.raises(ValueError, match=r"the dataset is not the one that .* began with"):
+    with pytest.raises(ValueError, match=r"the dataset differs from the one .* was started with"):
         record_dataset(tmp_path, facts | {"crc32": {"state": 2}}, streams=True)
 
 
 @pytest.mark.parametrize("more", ["cache/pick_place.npz", "before.json"])
-def test_a_run_that_has_something_is_kept(tmp_path, more):
+def test_a_run_with_results_is_not_overwritten(tmp_path, more):
     folder = open_run(CONFIG, tmp_path, resume=False)
     (folder / more).parent.mkdir(exist_ok=True)
     (folder / more).write_text("more")
@@ -227,7 +229,7 @@ def test_a_run_that_has_something_is_kept(tmp_path, more):
     assert json.loads((folder / "config.json").read_text())["seed"] == 0
 
 
-def test_a_lock_that_is_a_link_leaves_what_it_leads_to(tmp_path):
+def test_a_lock_that_is_a_link_does_not_change_its_target(tmp_path):
     precious = tmp_path / "precious"
     precious.write_text("precious")
     (tmp_path / "runs").mkdir()
@@ -240,7 +242,7 @@ def test_a_lock_that_is_a_link_leaves_what_it_leads_to(tmp_path):
     assert precious.read_text() == "precious"
 
 
-def test_a_run_that_leads_elsewhere_is_not_gone_on_with(tmp_path):
+def test_a_run_with_a_link_to_the_outside_is_not_resumed(tmp_path):
     folder = open_run(CONFIG, tmp_path / "runs", resume=False)
     (tmp_path / "precious.mp4").write_text("precious")
     (folder / "unfinished_press.mp4").symlink_to("../../precious.mp4")
@@ -250,7 +252,7 @@ def test_a_run_that_leads_elsewhere_is_not_gone_on_with(tmp_path):
         open_run(CONFIG, tmp_path / "runs", resume=True)
 
 
-def test_killed_before_its_first_file_had_its_name(tmp_path):
+def test_temporary_files_of_a_killed_process_are_removed(tmp_path):
     folder = tmp_path / CONFIG.name
     folder.mkdir()
     (folder / ".config.json.0123abcd.tmp").write_text("{")
@@ -259,7 +261,7 @@ def test_killed_before_its_first_file_had_its_name(tmp_path):
 
 
 @pytest.mark.timeout(20)
-def test_a_pipe_among_the_records_hangs_nobody(tmp_path):
+def test_pipes_in_place_of_files_do_not_block(tmp_path):
     for name in ("config.json", "metrics.jsonl"):
         os.mkfifo(tmp_path / name)
     with pytest.raises(ValueError, match=r"config\.json must be a file, but is a pipe"):

@@ -1,4 +1,4 @@
-"""A training step: what it reports, and that its parts are the whole."""
+"""A training step: its metrics, gradient accumulation, dropout and moving average."""
 
 import dataclasses
 
@@ -43,7 +43,7 @@ def test_active_ranks_by_tower_and_by_layer():
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
-    """A run with few adapters, their values as after some training, and a batch."""
+    """A model with few adapters, moved away from their initialization, and a batch."""
     config = dataclasses.replace(CONFIG, targets=("fc1", "action_out_proj"))
     run = make_run(tmp_path_factory.mktemp("run") / "run", config)
     graphdef, adapters, frozen = adaptation.split(run.policy.model)
@@ -53,8 +53,8 @@ def small(tmp_path_factory):
     return graphdef, with_noise(adapters, 0.1), frozen, batch
 
 
-def test_a_batch_in_parts_is_the_whole_batch(small):
-    """Also where parts have unequal numbers of valid elements; auxiliary losses where not."""
+def test_accumulated_gradients_equal_those_of_the_whole_batch(small):
+    """Even for unequal numbers of valid elements; auxiliary losses only for equal ones."""
     graphdef, adapters, frozen, ragged = small
     counts = ragged.action_mask.sum((1, 2)).reshape(-1, 4).sum(0)
     assert counts.min() < counts.max()
@@ -62,8 +62,8 @@ def test_a_batch_in_parts_is_the_whole_batch(small):
     gradient, key = jax.jit(gradients, static_argnums=(2, 6)), jax.random.key(1)
     for batch, auxiliary in ((ragged, 0.0), (even, 1e-2)):
         weights = {"spectral": auxiliary, "balance": 0.0, "z": auxiliary}
-        given = adapters, frozen, graphdef, batch, key, weights
-        (whole, expected), (parts, found) = gradient(*given, 1), gradient(*given, 4)
+        arguments = adapters, frozen, graphdef, batch, key, weights
+        (whole, expected), (parts, found) = gradient(*arguments, 1), gradient(*arguments, 4)
         for name in ("task", "loss", *(("spectral", "z") if auxiliary else ())):
             np.testing.assert_allclose(found[name], expected[name], rtol=1e-5, err_msg=name)
         for name, value in leaves(whole).items():
@@ -73,7 +73,7 @@ def test_a_batch_in_parts_is_the_whole_batch(small):
 
 
 class Linear(nnx.Module):
-    """What a step needs of a backbone; nothing is random but dropout."""
+    """A minimal backbone; only dropout is random."""
 
     def __init__(self):
         self.out = nnx.Linear(8, 2, rngs=nnx.Rngs(0))
@@ -83,7 +83,7 @@ class Linear(nnx.Module):
         return (self.out(observation) - actions) ** 2, {}
 
 
-def test_dropout_takes_the_steps_key_and_another_one_for_each_part():
+def test_dropout_uses_the_key_of_the_step_and_one_per_micro_batch():
     method = LoRA(rank=2, dropout=0.5, initialization="pissa")
     model = adaptation.adapt(Linear(), [("out", method)], rngs=nnx.Rngs(0))
     graphdef, adapters, frozen = adaptation.split(model)
@@ -103,25 +103,25 @@ def test_dropout_takes_the_steps_key_and_another_one_for_each_part():
     )
 
 
-def test_the_average_follows_and_is_what_is_used(small):
+def test_the_moving_average_is_updated_and_evaluated(small):
     graphdef, adapters, frozen, batch = small
     optimizer = optax.sgd(0.1)
     state = init_state(adapters, optimizer, ema=True)
     weights = dict.fromkeys(("spectral", "balance", "z"), optax.constant_schedule(0.0))
     options = {"graphdef": graphdef, "optimizer": optimizer, "weights": weights}
-    step = jax.jit(lambda *given: train_step(*given, **options, ema=0.75)[0])
+    step = jax.jit(lambda *arguments: train_step(*arguments, **options, ema=0.75)[0])
     after = step(state, frozen, batch, jax.random.key(0))
-    moved = leaves(after.adapters)
+    updated = leaves(after.adapters)
     for name, old in leaves(adapters).items():
-        expected = 0.75 * old + 0.25 * moved[name]
+        expected = 0.75 * old + 0.25 * updated[name]
         np.testing.assert_allclose(leaves(after.average)[name], expected, atol=1e-6)
-        assert (moved[name] != old).any()
-    assert after.best is after.average
-    assert init_state(adapters, optimizer).best is not None
+        assert (updated[name] != old).any()
+    assert after.eval_adapters is after.average
+    assert init_state(adapters, optimizer).eval_adapters is not None
 
 
 @pytest.mark.slow
-def test_a_run_in_parts_with_an_average_resumes_to_the_bit(tmp_path):
+def test_a_run_with_accumulation_and_average_resumes_exactly(tmp_path):
     optim = dataclasses.replace(CONFIG.optim, accumulate=2, ema=0.5)
     config = dataclasses.replace(CONFIG, optim=optim, targets=("action_out_proj",))
     whole, plain = make_run(tmp_path / "whole", config), make_run(tmp_path / "plain", config)

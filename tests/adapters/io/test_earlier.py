@@ -82,7 +82,7 @@ def test_a_run_goes_on(tmp_path, file, method):
         assert folder == tmp_path / "a"
     other = dataclasses.replace(config, peft=dataclasses.replace(method, rank=4))
     with (
-        pytest.raises(ValueError, match=r"other settings \(peft.rank\)"),
+        pytest.raises(ValueError, match=r"different settings \(peft.rank\)"),
         run_folder.open_run(other, tmp_path, resume=True),
     ):
         pass
