@@ -15,9 +15,9 @@ from envs.datasets.writing import write_text
 from lorasp_jax.report import figures
 from lorasp_jax.training import records
 from lorasp_jax.training.run_folder import (
-    CLOCK,
-    RECORD,
+    CONFIG_FILE,
     STOPPED,
+    TIMES_FILE,
     read_json,
     read_metrics,
 )
@@ -56,9 +56,11 @@ def write_report(folder: Path) -> Path:
         ValueError: the folder has no run, or damaged files.
     """
     rows = read_metrics(folder)
-    config = read_json(folder / RECORD, records.WITH_RANK if _has_rank(rows) else records.CONFIG)
+    config = read_json(
+        folder / CONFIG_FILE, records.WITH_RANK if _has_rank(rows) else records.CONFIG
+    )
     if not config:
-        raise ValueError(f"no run in {folder}: {RECORD} is missing")
+        raise ValueError(f"no run in {folder}: {CONFIG_FILE} is missing")
     finished = read_json(folder / "results.json", records.RESULTS)
     results = finished or _unfinished(folder)
     parts = [
@@ -94,7 +96,7 @@ def _unfinished(folder: Path) -> dict[str, Any]:
     """Return the available part of results.json."""
     before = read_json(folder / "before.json", records.BEFORE).items()
     return {
-        "seconds": read_json(folder / CLOCK, records.TIMES),
+        "seconds": read_json(folder / TIMES_FILE, records.TIMES),
         "tasks": {task: {"before": value} for task, value in before},
         "layer_active_rank": {},
     }

@@ -1,4 +1,4 @@
-"""Corrupt and incomplete checkpoints and full disks: restored exactly or rejected with a warning."""
+"""Corrupt checkpoints, incomplete ones and full disks: restored exactly or rejected."""
 
 import errno
 import gc

@@ -167,8 +167,8 @@ def test_too_many_skipped_steps_stop_the_run(tmp_path):
     )
     before = leaves(adaptation.split(run.policy.model)[1])
     message = (
-        r"4 consecutive steps were skipped because .* non-finite \(step 4: loss nan, gradient norm nan"
-        r"\); nothing after step 2 was saved: try a lower --optim.learning-rate"
+        r"4 consecutive steps were skipped because .* non-finite \(step 4: loss nan, gradient norm "
+        r"nan\); nothing after step 2 was saved: try a lower --optim.learning-rate"
     )
     with pytest.raises(RunError, match=message) as caught:
         train(run, [callback])

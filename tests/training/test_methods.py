@@ -59,9 +59,9 @@ def test_a_budget_is_kept_by_the_loop_and_over_an_interruption(tmp_path):
     assert read_metrics(whole.folder)[-1]["orthogonality"] > 0
 
 
-def test_one_budget_needs_one_setting():
+def test_ada_lora_layers_need_the_same_settings():
     one, other = peft.AdaLoRA(target_rank=8), peft.AdaLoRA(target_rank=4)
-    with pytest.raises(ValueError, match="need the same settings, but AdaLoRA is used with 2"):
+    with pytest.raises(ValueError, match="need the same settings, got 2 different"):
         make_optimizer(OptimConfig(), [one, peft.LoRA(), other])
     make_optimizer(OptimConfig(), [one, one, peft.LoRA()])
     assert isinstance(make_optimizer(OptimConfig()), optax.GradientTransformation)
