@@ -34,7 +34,7 @@ class Evaluation(Callback):
     """Evaluates every task of a run before, during and after training.
 
     Adapters start at exactly zero, so the policy before the first step is the unadapted base. All
-    evaluations share one compilation; the final one has layouts of its own. Videos are rendered in
+    evaluations share one compilation; the final one uses different layouts. Videos are rendered in
     the background while training continues.
     """
 
@@ -89,8 +89,8 @@ class Evaluation(Callback):
     def _write_media(self, run: Run, results: dict[str, Result]) -> None:
         """Write a video and the first camera images of each task."""
         for task, result in results.items():
-            first = {name: np.asarray(i[0, 0]) for name, i in run.episodes[task].image.items()}
-            video.write_image(run.folder / f"cameras_{task}.png", video.side_by_side(first))
+            images = {name: np.asarray(i[0, 0]) for name, i in run.episodes[task].image.items()}
+            video.write_image(run.folder / f"cameras_{task}.png", video.side_by_side(images))
             with atomic_file(run.folder / f"rollout_{task}.mp4") as unfinished:
                 self._write_video(self._rollouts[task][0], result.poses, unfinished)
 

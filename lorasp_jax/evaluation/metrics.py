@@ -8,13 +8,13 @@ import jax.numpy as jnp
 from lorasp_jax.peft import Aux
 
 Reports = dict[str, dict[str, Aux]]
-"""Tower -> linear layer -> `Aux` of its adapters, `[..., W, T]`.
+"""Tower -> name of a linear layer -> `Aux` of its adapters, `[..., W, T]`.
 
 The images of a world are folded into W. The leading axis is layers, in the action expert preceded
 by denoising steps."""
 
 LayerRanks = dict[str, dict[str, jax.Array]]
-"""Tower -> linear layer -> active rank `[L]`."""
+"""Tower -> name of a linear layer -> active rank `[L]`."""
 
 
 def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
@@ -46,7 +46,7 @@ def layer_ranks(reports: Reports, running: jax.Array) -> LayerRanks:
     """Average each layer's active rank over valid tokens, running worlds and denoising steps.
 
     Args:
-        reports: reports of one policy call; linear layers without a rank are omitted.
+        reports: from one policy call; linear layers without a rank are omitted.
         running: `[W]` bool, unfinished worlds.
     """
 
@@ -67,7 +67,7 @@ def rank_histogram(reports: Reports, running: jax.Array, rank: int) -> dict[str,
     """Count the tokens of a tower with each active rank, over all its layers.
 
     Args:
-        reports: reports of one policy call; towers without a rank are omitted.
+        reports: from one policy call; towers without a rank are omitted.
         running: `[W]` bool, unfinished worlds.
         rank: R, the maximum active rank.
 

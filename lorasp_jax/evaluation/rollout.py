@@ -137,8 +137,8 @@ def evaluate(
     """Measure the success rate of `policy` on the task of `env`.
 
     Args:
-        policy: for the robot of `env`; its processor has prompts for `env.instructions`.
-        env: the environment, which runs `num_envs` episodes in parallel.
+        policy: policy for the robot of `env`, with prompts for `env.instructions`.
+        env: environment; `num_envs` episodes run in parallel.
         key: PRNG key, which determines the layouts; consumed.
         num_episodes: a multiple of `env.num_envs`.
         rollout: jitted `make_rollout(env)`; reuse it to compile only once.

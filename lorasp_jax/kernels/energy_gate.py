@@ -48,8 +48,8 @@ from lorasp_jax.kernels.threshold_search import (
 Implementation = Literal["pairwise", "sort", "bisection", "block", "pallas"]
 
 MIN_TARGET = 2.0**-64
-"""Smaller η are raised to this value: they would underflow in fp32, and both keep one direction,
-since no bank has 2^64 directions."""
+"""Smaller η are raised to this value, since they would underflow in fp32. The mask is the same: one
+direction, since no bank has 2^64 directions."""
 
 PAIRWISE_RANK = 32
 """Largest R with "pairwise" as the default on CPU; above it bisection is faster (on two cores)."""

@@ -121,7 +121,7 @@ def _forward(static: tuple, packed: PackedTree, rows: jax.Array, valid: jax.Arra
 def _run(
     static: tuple, packed: PackedTree, rows: jax.Array, valid: jax.Array, *, keep_mask: bool
 ) -> tuple[tuple, Sequence[jax.Array]]:
-    """Return the results of `rowwise_kernel` and [the mask as bits, for the gradient] or []."""
+    """Return the results of `rowwise_kernel`, and [bit-packed mask], or [] without `keep_mask`."""
     function, widths, start, (launch, _), interpret = static
 
     def block(shared: Any, columns: Columns, valid: Columns) -> tuple[list[Columns], Any]:

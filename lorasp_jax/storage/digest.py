@@ -31,9 +31,7 @@ def digest(arrays: Mapping[str, jax.Array], *extra: str) -> str:
 
 
 def fingerprints(weights: Mapping[str, Any]) -> dict[str, str]:
-    """Return eight hexadecimal digits per array, computed from its values in bf16, so that fp32 and
-    bf16 copies match.
-    """
+    """Hash each array's values in bf16, so that fp32 and bf16 copies match; eight hex digits."""
     sums = jax.device_get({name: _sum(array, rounded=True) for name, array in weights.items()})
     return {name: f"{int(value):08x}" for name, value in sums.items()}
 

@@ -56,7 +56,9 @@ def local(
         return _from_hub(name.removeprefix(HUB), only, repository)
     if "://" in name:
         if not BUCKET.fullmatch(name) or ".." in name.split("/"):
-            raise ValueError(f"{name} is not a bucket URL, gs://bucket/folder.")
+            raise ValueError(
+                f"A bucket URL must be gs://bucket/folder or s3://bucket/folder, got {name}."
+            )
         return _from_bucket(name)
     for candidate in (path, shipped.ROOT / path) if _is_shipped(path) else (path,):
         if os.path.exists(candidate):  # Path.exists raises if a name is too long
@@ -65,7 +67,7 @@ def local(
 
 
 def portable_path(where: str) -> str:
-    """Return the form of a path to record, which resolves from any folder; "" stays ""."""
+    """Return a path to record, which `resolve_portable` resolves from any folder; "" stays ""."""
     if not where or "://" in where:
         return where
     path = Path(where)
@@ -96,13 +98,13 @@ def _not_found_message(name: str, path: Path) -> str:
 
 
 def is_remote(where: str | os.PathLike[str]) -> bool:
-    """Return whether `local` downloads from here: the Hub or a bucket."""
+    """Return whether `where` is a Hub or bucket URL, from which `local` downloads."""
     return "://" in os.fspath(where)
 
 
 def _from_hub(name: str, only: list[str] | None, repository: str) -> Path:
     if not REPOSITORY.fullmatch(name):
-        raise ValueError(f"{HUB}{name} is not a Hub repository, {HUB}owner/name.")
+        raise ValueError(f"A Hub repository must be {HUB}owner/name, got {HUB}{name}.")
     import huggingface_hub
     from huggingface_hub.errors import HfHubHTTPError
 

@@ -1,4 +1,4 @@
-"""Files shipped with the project, configs/ and assets/, available under these paths in any folder.
+"""Files shipped with the project, configs/ and assets/, whose paths resolve from any folder.
 
 A checkout has both beside the package; a wheel has them inside it, with only the nano bases.
 """
@@ -17,7 +17,7 @@ def is_under(path: Path, folder: str) -> bool:
 
 
 def missing_base_message(name: str) -> str:
-    """Explain which bases exist if there is none at a path below assets/."""
+    """Return the error message for a missing base in assets/, with the bases that exist."""
     bases = ", ".join(sorted(file.parent.name for file in ROOT.glob(f"{BASES}/*/config.json")))
     message = f"{name} does not exist; the bases in {ROOT / BASES} are {bases or 'none'}"
     if ROOT != PACKAGE:

@@ -56,7 +56,7 @@ def test_missing_folders_never_resolve_to_the_hub(name, tmp_path, monkeypatch, n
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match=f"{name} does not exist; .* is written hf://{name}$"):
         hub.local(name)
-    with pytest.raises(ValueError, match=r"is not a Hub repository, hf://owner/name"):
+    with pytest.raises(ValueError, match="A Hub repository must be hf://owner/name, got"):
         hub.local("hf://too/many/parts")
 
 
@@ -150,7 +150,7 @@ def test_unreadable_bucket(bucket, tmp_path, monkeypatch):
 )
 def test_other_urls_are_rejected(where, monkeypatch):
     monkeypatch.delattr("fsspec.core.url_to_fs")
-    with pytest.raises(ValueError, match="is not a bucket URL, gs://bucket/folder"):
+    with pytest.raises(ValueError, match="A bucket URL must be gs://bucket/folder or s3"):
         hub.local(where)
 
 
