@@ -80,7 +80,7 @@ class Backbone(nnx.Module):
         self.action_time_mlp_out = fuse_layer(self.action_time_mlp_out, copy_kernels=copy_kernels)
         self.action_out_proj = fuse_layer(self.action_out_proj, copy_kernels=copy_kernels)
 
-    def action_tokens(
+    def embed_actions(
         self, x_t: jax.Array, flow_time: jax.Array, action_valid: jax.Array | None
     ) -> tuple[jax.Array, LayerAux]:
         """Embed noisy actions and flow time as action tokens.

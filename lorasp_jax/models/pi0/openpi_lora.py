@@ -73,7 +73,7 @@ def attach(model: Any, leaves: Mapping[str, np.ndarray], *, scale: float = 1.0) 
 def _expert_pairs(
     leaves: dict[str, np.ndarray], size: ExpertConfig, ours: str, suffix: str
 ) -> dict[str, Pair]:
-    """Convert one expert's leaves, popping them: (A, B) by path of our layer."""
+    """Pop one expert's leaves and convert them to (A, B) by path of our layer."""
     layers, width, mlp = size.depth, size.width, size.mlp
     heads, kv_heads, head_dim = size.heads, size.kv_heads, size.head_dim
 

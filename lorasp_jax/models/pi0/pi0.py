@@ -166,7 +166,7 @@ class Pi0(Backbone):
         """
         valid, state = jnp.ones((x_t.shape[0], 1), bool), obs.state[:, None].astype(jnp.float32)
         state_token, state_aux = self.state_proj(state, token_mask=valid, return_aux=True)
-        h, aux = self.action_tokens(x_t, flow_time, action_valid)
+        h, aux = self.embed_actions(x_t, flow_time, action_valid)
         return jnp.concatenate([state_token, h], axis=1), {"state_proj": state_aux, **aux}
 
     def run_prefix(self, obs: Observation) -> tuple[Prefix, ModelAux]:

@@ -31,7 +31,7 @@ def smolvla_config(fields: Mapping[str, Any]) -> SmolVLAConfig:
     action = config.action
     if "expert_width_multiplier" in fields:
         width = int(config.language.width * fields["expert_width_multiplier"])
-        # 2/3 of 4 width, rounded up to a multiple of 256 (smolvlm_with_expert.py).
+        # 2/3 of 4 * width, rounded up to a multiple of 256 (smolvlm_with_expert.py).
         mlp = 256 * math.ceil(4 * int(2 * width / 3) / 256)
         action = dataclasses.replace(action, width=width, mlp=mlp)
     return dataclasses.replace(

@@ -171,7 +171,7 @@ class SmolVLA(Backbone):
             `[B, C, D]` f32, and the adapters' aux.
         """
         del obs
-        return self.action_tokens(x_t, flow_time, action_valid)
+        return self.embed_actions(x_t, flow_time, action_valid)
 
     def run_prefix(self, obs: Observation) -> tuple[Prefix, ModelAux]:
         """Encode images, instruction and state, independent of the actions."""
