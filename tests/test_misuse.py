@@ -336,7 +336,10 @@ def test_models_without_values(tmp_path):
             ),
             "statistics of inp must be finite, of shape [..., I, I], got float32 [5, 5]",
         ),
-        (lambda _: lorasp_jax.with_dropout(NET, 5), "key must be a key such as jax.random.key(0)"),
+        (
+            lambda _: lorasp_jax.with_dropout(NET, 5),
+            "key must be a PRNG key such as jax.random.key(0)",
+        ),
         (lambda _: lorasp_jax.save_adapters(5, adapted()), "folder must be a str or path, got 5"),
         (
             lambda _: lorasp_jax.save_adapters("gs://x/y", adapted()),

@@ -29,7 +29,7 @@ from lorasp_jax.adapters.layers.linen_layers import layer_call, supported_class,
 from lorasp_jax.adapters.layers.nnx_layers import Einsums
 from lorasp_jax.adapters.paths import Rules, check_method_rules, find_rule, no_match_message
 from lorasp_jax.dense import AUX_NAME, validate
-from lorasp_jax.peft import Method, _arguments
+from lorasp_jax.peft import Method, _validate
 from lorasp_jax.peft._method import dropout_rate
 
 ADAPTER = "lorasp_adapter"  # parameter name of an adapter in its layer
@@ -326,7 +326,7 @@ def _rngs(key: Any) -> dict[str, jax.Array]:
     rngs = dict(key) if isinstance(key, Mapping) else {"params": key}
     if "params" not in rngs:
         raise ValueError(f'rngs must have a key for "params", got {sorted(map(str, rngs))}.')
-    return {name: _arguments.key(value) for name, value in rngs.items()}
+    return {name: _validate.key(value) for name, value in rngs.items()}
 
 
 def _is_model_module(module: nn.Module) -> bool:

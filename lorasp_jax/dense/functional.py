@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax.typing import Dtype
 
 from lorasp_jax.dense import validate
-from lorasp_jax.peft import Aux, Method, _arguments
+from lorasp_jax.peft import Aux, Method, _validate
 from lorasp_jax.peft._method import Params
 from lorasp_jax.peft._shared_input import AdaptedKernel, apply_shared_input
 
@@ -95,7 +95,7 @@ def dense_shared_input(
 
 def _checked_matrix(layer: DenseLayer, x: jax.Array, token_mask: jax.Array | None) -> jax.Array:
     """The layer's kernel as a matrix [I, O], after validating layer, input and mask."""
-    _arguments.tokens(x, token_mask)
+    _validate.tokens(x, token_mask)
     validate.layer(layer, x.shape[-1])
     return layer.kernel.reshape(layer.kernel.shape[0], math.prod(layer.kernel.shape[1:]))
 

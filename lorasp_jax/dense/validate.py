@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import linen, nnx
 
-from lorasp_jax.peft import Method, _arguments, _fields
+from lorasp_jax.peft import Method, _fields, _validate
 from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import MAX_SIZE
 
@@ -80,7 +80,7 @@ def layer(arrays: Any, width: int) -> None:
     if (arrays.params is None) != (adapter_method is None or adapter_method.trains_base):
         raise ValueError("params and method must be given together.")
     if arrays.dropout_key is not None:
-        _arguments.key(arrays.dropout_key)
+        _validate.key(arrays.dropout_key)
 
 
 def module(model: Any) -> Any:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import optax
 
 from lorasp_jax.kernels.low_rank_matmul import LowRankLayer, low_rank_matmul
-from lorasp_jax.peft import _arguments, _fields
+from lorasp_jax.peft import _fields, _validate
 from lorasp_jax.peft._aux import Aux
 from lorasp_jax.peft._batched_bottleneck import BatchedBottleneck
 
@@ -30,7 +30,7 @@ class ShapeLike(Protocol):
 Kernel: TypeAlias = jax.Array | ShapeLike
 
 MAX_SIZE = 2**20
-"""Upper bound for ranks and widths. Larger values are mistakes and would exhaust memory."""
+"""Upper bound for ranks and widths. Larger values are likely mistakes and would exhaust memory."""
 MAX_ALPHA = 1e30
 """Upper bound for |α| and 1/|α|, so that α/R neither overflows nor underflows in fp32."""
 
@@ -76,7 +76,7 @@ class Method:
 
     @property
     def down_in_fp32(self) -> bool:
-        """True if x P must stay in fp32."""
+        """True if x P must be in fp32, whatever the dtype of x."""
         return False
 
     @property
@@ -116,8 +116,8 @@ class Method:
           ValueError: the kernel is not a matrix, or `key` is not a random key.
         """
         del statistics
-        _arguments.matrix(kernel)
-        return self.init_params(_arguments.key(key), *kernel.shape), kernel
+        _validate.matrix(kernel)
+        return self.init_params(_validate.key(key), *kernel.shape), kernel
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
         """Initialize parameters for a kernel [d_in, d_out]; a pure function of key and shape."""
@@ -168,7 +168,7 @@ class Method:
           ValueError: the method is not additive, x or the mask has the wrong shape or dtype, or
             the parameters belong to another method.
         """
-        _arguments.tokens(x, token_mask)
+        _validate.tokens(x, token_mask)
         if not self.additive:
             raise ValueError(f"{type(self).__name__} is not additive and has no delta; use apply.")
         z, aux = self.bottleneck_from_input(params, x, token_mask)
@@ -202,7 +202,7 @@ class Method:
           ValueError: x, the mask or the kernel has the wrong shape or dtype, or the parameters
             belong to another method.
         """
-        _arguments.tokens(x, token_mask)
+        _validate.tokens(x, token_mask)
         self.check(params, x, kernel)
         implementation = self.fused_kernel(params) or self
         layer = self.low_rank_layer(params, kernel)
@@ -249,7 +249,7 @@ class Method:
 
     def check(self, params: Params, x: jax.Array, kernel: jax.Array) -> None:
         """Raise ValueError unless the shapes of x, kernel and parameters match."""
-        _arguments.matrix(kernel)
+        _validate.matrix(kernel)
         if x.shape[-1] != kernel.shape[0]:
             raise ValueError(
                 f"input width {x.shape[-1]} does not match kernel shape {list(kernel.shape)}."
@@ -258,9 +258,9 @@ class Method:
 
     def _check_params(self, params: Params, shape: tuple[int, ...]) -> None:
         if type(self).init_params is not Method.init_params:
-            _arguments.check_params(self, params, shape)
+            _validate.params(self, params, shape)
 
-    def shapes(self, initial: _arguments.Shapes, actual: _arguments.Shapes) -> _arguments.Shapes:
+    def shapes(self, initial: _validate.Shapes, actual: _validate.Shapes) -> _validate.Shapes:
         """The shapes that parameters must have.
 
         Args:

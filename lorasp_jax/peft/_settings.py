@@ -18,7 +18,7 @@ _EARLIER_FIELDS = {
 """Fields of LoRA-SP in earlier versions."""
 _RELEASE_NAMES = {"lora_sp": "lora_sp_release", "LoRASP": "LoRASPRelease"}
 _GELU_ROUTERS = {"softplus": "gelu", "relu": "gelu_relu", "softmax": "gelu_softmax"}
-"""Current router names by the score function that earlier versions stored beside "gelu"."""
+"""Current router names by the score function that earlier versions stored with "gelu"."""
 
 
 def to_settings(method: Any) -> Settings:

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
-from lorasp_jax.peft import _arguments
+from lorasp_jax.peft import _validate
 from lorasp_jax.peft._aux import Aux
 from lorasp_jax.peft._method import Kernel, Method, Params, kaiming_uniform
 
@@ -81,12 +81,12 @@ class LoRA(Method):
             fewer than R rows or columns; or statistics are missing or of the wrong shape.
         """
         if self.needs_statistics:
-            _arguments.matrix(kernel)
+            _validate.matrix(kernel)
             a = principal_inputs(statistics, kernel.shape[0], self.rank)
             return {"lora_a": a, "lora_b": jnp.zeros((self.rank, kernel.shape[1]))}, kernel
         if not self.splits_kernel:
             return super().init(key, kernel, statistics=statistics)
-        _arguments.matrix(kernel)
+        _validate.matrix(kernel)
         if isinstance(kernel, jax.ShapeDtypeStruct) or self.rank > min(kernel.shape):
             given = "a shape" if isinstance(kernel, jax.ShapeDtypeStruct) else "a kernel"
             raise ValueError(

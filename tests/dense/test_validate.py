@@ -39,8 +39,8 @@ def with_kernel(value):
     ("call", "message"),
     [
         # methods
-        (lambda: METHOD.init(0, KERNEL), "key must be a key such as jax.random.key(0), got 0"),
-        (lambda: METHOD.init(nnx.Rngs(0), KERNEL), "key must be a key such as"),
+        (lambda: METHOD.init(0, KERNEL), "key must be a PRNG key such as jax.random.key(0), got 0"),
+        (lambda: METHOD.init(nnx.Rngs(0), KERNEL), "key must be a PRNG key such as"),
         (
             lambda: METHOD.apply(PARAMS, X[:, 1:], KERNEL),
             "width 4 does not match kernel shape [5, 4]",
@@ -72,13 +72,13 @@ def with_kernel(value):
             "total_steps must be an integer from 1",
         ),
         # Linen
-        (lambda: LINEN.init(0, X), "key must be a key such as jax.random.key(0), got 0"),
+        (lambda: LINEN.init(0, X), "key must be a PRNG key such as jax.random.key(0), got 0"),
         (
             lambda: LINEN.init({"dropout": KEY}, X),
             "must have a key for \"params\", got ['dropout']",
         ),
         (lambda: LINEN.attach(None, VARIABLES["params"], X), 'a dict whose "params" is a dict'),
-        (lambda: LINEN.attach(None, {"params": {}}, X), "key must be a key such as"),
+        (lambda: LINEN.attach(None, {"params": {}}, X), "key must be a PRNG key such as"),
         (
             lambda: LINEN.apply(with_kernel(None), X),
             '"params" must hold arrays, got None at kernel',

@@ -19,7 +19,7 @@ def key(value: Any) -> jax.Array:
     typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key) and shape == ()
     # Raw keys: threefry has 2 words, rbg 4.
     if not typed and (dtype != jnp.uint32 or shape not in ((2,), (4,))):
-        raise ValueError(f"key must be a key such as jax.random.key(0), got {short(value)}.")
+        raise ValueError(f"key must be a PRNG key such as jax.random.key(0), got {short(value)}.")
     return value
 
 
@@ -35,12 +35,12 @@ def tokens(x: Any, token_mask: Any) -> None:
             raise ValueError(f"{expected}, got {actual[0]} {list(actual[1])}.")
 
 
-def check_params(method: Any, params: Any, shape: tuple[int, ...]) -> None:
+def params(method: Any, values: Any, shape: tuple[int, ...]) -> None:
     """Raise ValueError if the parameters do not fit the method and a kernel [I, O].
 
     Some would otherwise run without an error, but with the scale of a different rank.
     """
-    actual = _shapes(params)
+    actual = _shapes(values)
     for name, expected in method.shapes(_initial_shapes(method, shape), actual).items():
         if actual.get(name) != expected:
             raise ValueError(
