@@ -125,7 +125,7 @@ def test_several_layers_share_the_down_projection():
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_no_gradient_of_the_kernel(shape):
-    """No matmul in the gradient's jaxpr has the shape of W, so it is never allocated."""
+    """No matmul in the gradient's jaxpr has the shape of W, so its gradient is never computed."""
     arguments = inputs(*shape)
 
     def gradient(function):

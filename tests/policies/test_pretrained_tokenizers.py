@@ -36,7 +36,7 @@ def test_ids_equal_the_reference(name, length, suffix):
     assert loaded.vocabulary == expected["vocab_size"]
 
 
-def test_padding_beyond_the_longest_prompt_is_mrequests():
+def test_padding_beyond_the_longest_prompt_is_masked():
     expected = np.load(GOLDEN / "smolvlm_like_ids.npz")
     ids, mask = tokenizer.load_tokenizer(GOLDEN / FILES["smolvlm"]).encode(PROMPTS[:4], 48)
     length = expected["tokens_longest"].shape[1]

@@ -43,42 +43,42 @@ def test_slots(robot):
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_decode_inverts_normalize(robot):
-    own = processor(ROBOTS[robot][1])
-    actions = RNG.normal(size=(3, 4, len(own.robot_slots))).astype(np.float32)
-    normalized = own.normalize_actions(jnp.asarray(actions))
+    proc = processor(ROBOTS[robot][1])
+    actions = RNG.normal(size=(3, 4, len(proc.robot_slots))).astype(np.float32)
+    normalized = proc.normalize_actions(jnp.asarray(actions))
     assert normalized.shape == (3, 4, DIM)
-    assert not normalized[..., ~own.slot_mask].any()
-    np.testing.assert_allclose(own.decode(normalized), actions, atol=1e-5)
+    assert not normalized[..., ~proc.slot_mask].any()
+    np.testing.assert_allclose(proc.decode(normalized), actions, atol=1e-5)
 
 
 def test_encode():
-    own = processor(6)
+    proc = processor(6)
     image = RNG.integers(0, 256, (2, 16, 16, 3), np.uint8)
     state = RNG.normal(size=(2, 7)).astype(np.float32)
     raw = {"image": {"side": jnp.asarray(image)}, "state": jnp.asarray(state)}
-    obs = jax.jit(lambda own, raw, ids: own.encode(raw, ids))(own, raw, jnp.array([1, 0]))
+    obs = jax.jit(lambda proc, raw, ids: proc.encode(raw, ids))(proc, raw, jnp.array([1, 0]))
     np.testing.assert_allclose(obs.images["side"], image / 127.5 - 1, atol=1e-6)
     assert obs.tokens.tolist() == [[5, 0, 0], [3, 4, 0]]
     assert obs.token_mask.sum(axis=1).tolist() == [1, 2]
     assert obs.image_masks["side"].all()
     assert not obs.state[:, 6].any()
-    gripper = (state[:, -1] - own.statistics.state["mean"][7]) / own.statistics.state["std"][7]
+    gripper = (state[:, -1] - proc.statistics.state["mean"][7]) / proc.statistics.state["std"][7]
     np.testing.assert_allclose(obs.state[:, 7], gripper, rtol=1e-5)
 
 
 def test_invalid_observations_raise():
-    own = processor(6)
+    proc = processor(6)
     state = jnp.zeros((2, 7))
     with pytest.raises(ValueError, match=r"'side' needs uint8 \[B, H, W, 3\], got float32"):
-        own.encode(
+        proc.encode(
             {"image": {"side": jnp.zeros((2, 16, 16, 3))}, "state": state}, jnp.zeros(2, int)
         )
     with pytest.raises(ValueError, match="slots must be 6 distinct integers from 0 to 7"):
-        own.encode({"image": {}, "state": state[:, :6]}, jnp.zeros(2, int))
+        proc.encode({"image": {}, "state": state[:, :6]}, jnp.zeros(2, int))
 
 
 def test_images_are_resized_under_their_names():
-    own = processor(6)
+    proc = processor(6)
     shades = {"wrist": ((2, 32, 32, 3), 255), "side": ((2, 8, 16, 3), 0)}
     raw = {
         "image": {
@@ -86,7 +86,7 @@ def test_images_are_resized_under_their_names():
         },
         "state": jnp.zeros((2, 7)),
     }
-    images = own.encode(raw, jnp.zeros(2, int)).images
+    images = proc.encode(raw, jnp.zeros(2, int)).images
     assert {name: image.shape for name, image in images.items()} == dict.fromkeys(
         shades, (2, 16, 16, 3)
     )
@@ -94,20 +94,20 @@ def test_images_are_resized_under_their_names():
     np.testing.assert_allclose(images["side"], -1, atol=1e-6)
     gray = {**raw, "image": {"side": raw["image"]["side"][..., 0]}}
     with pytest.raises(ValueError, match=r"got uint8 \(2, 8, 16\)"):
-        own.encode(gray, jnp.zeros(2, int))
+        proc.encode(gray, jnp.zeros(2, int))
 
 
 def test_unused_slots_do_not_affect_actions():
-    own = processor(6)
+    proc = processor(6)
     chunk = jnp.asarray(RNG.normal(size=(2, 4, DIM)), jnp.float32)
-    np.testing.assert_array_equal(own.decode(chunk), own.decode(chunk.at[..., 6].set(99.0)))
-    moved = own.decode(chunk.at[..., 7].add(1.0)) - own.decode(chunk)
+    np.testing.assert_array_equal(proc.decode(chunk), proc.decode(chunk.at[..., 6].set(99.0)))
+    moved = proc.decode(chunk.at[..., 7].add(1.0)) - proc.decode(chunk)
     assert not moved[..., :6].any()
-    np.testing.assert_allclose(moved[..., 6], own.statistics.action["std"][7], rtol=1e-4)
+    np.testing.assert_allclose(moved[..., 6], proc.statistics.action["std"][7], rtol=1e-4)
 
 
 def published(num_joints: int = 6, relative: tuple[bool, ...] = (), **choices) -> Processor:
-    """Processor with openpi's inputs: contiguous dimensions, noise in all 32 slots."""
+    """Processor with openpi's inputs: contiguous slots, noise in all 32 slots."""
     inputs = dataclasses.replace(OPENPI, delta=relative)
     config = dataclasses.replace(Pi0Config.base(), image_size=28, inputs=inputs)
     state, action = RNG.normal(2.0, 3.0, (2, 20, num_joints + 1))
@@ -121,22 +121,22 @@ def published(num_joints: int = 6, relative: tuple[bool, ...] = (), **choices) -
 
 
 def test_published_weights_use_contiguous_slots():
-    own = published()
-    assert own.robot_slots == (0, 1, 2, 3, 4, 5, 6)
-    assert (own.slot_mask.sum(), own.flow_slots.sum()) == (7, 32)
+    proc = published()
+    assert proc.robot_slots == (0, 1, 2, 3, 4, 5, 6)
+    assert (proc.slot_mask.sum(), proc.flow_slots.sum()) == (7, 32)
     assert processor(6).flow_slots.tolist() == processor(6).slot_mask.tolist()
     state = RNG.normal(size=(2, 7)).astype(np.float32)
-    obs = own.encode({"image": {}, "state": jnp.asarray(state)}, jnp.zeros(2, int))
-    mean, std = own.statistics.state["mean"][:7], own.statistics.state["std"][:7]
+    obs = proc.encode({"image": {}, "state": jnp.asarray(state)}, jnp.zeros(2, int))
+    mean, std = proc.statistics.state["mean"][:7], proc.statistics.state["std"][:7]
     np.testing.assert_allclose(obs.state[:, :7], (state - mean) / (std + 1e-6), rtol=1e-5)
     assert not obs.state[:, 7:].any()
     actions = RNG.normal(size=(2, 4, 7)).astype(np.float32)
-    np.testing.assert_allclose(own.decode(own.normalize_actions(actions)), actions, atol=1e-5)
+    np.testing.assert_allclose(proc.decode(proc.normalize_actions(actions)), actions, atol=1e-5)
 
 
 def test_missing_cameras_are_black_and_masked():
     """The robot has two cameras for pi0's three."""
-    own = published(cameras={"base_0_rgb": "side", "left_wrist_0_rgb": "wrist"})
+    proc = published(cameras={"base_0_rgb": "side", "left_wrist_0_rgb": "wrist"})
     raw = {
         "image": {
             "wrist": jnp.full((2, 14, 28, 3), 255, jnp.uint8),
@@ -144,7 +144,7 @@ def test_missing_cameras_are_black_and_masked():
         },
         "state": jnp.zeros((2, 7)),
     }
-    obs = jax.jit(lambda own, raw: own.encode(raw, jnp.zeros(2, int)))(own, raw)
+    obs = jax.jit(lambda proc, raw: proc.encode(raw, jnp.zeros(2, int)))(proc, raw)
     assert list(obs.images) == list(Pi0Config.base().cameras)
     assert {name: mask.tolist() for name, mask in obs.image_masks.items()} == {
         "base_0_rgb": [True, True],
@@ -157,18 +157,18 @@ def test_missing_cameras_are_black_and_masked():
     assert obs.images["right_wrist_0_rgb"].shape == (2, 28, 28, 3)
     assert (obs.images["right_wrist_0_rgb"] == -1).all()
     with pytest.raises(ValueError, match="lacks camera wrist; it has side"):
-        own.encode({**raw, "image": {"side": raw["image"]["side"]}}, jnp.zeros(2, int))
+        proc.encode({**raw, "image": {"side": raw["image"]["side"]}}, jnp.zeros(2, int))
     with pytest.raises(ValueError, match=r"backbone's cameras \(base_0_rgb, .* got top"):
         published(cameras={"top": "side"})
 
 
 def test_smolvla_is_padded_at_the_top():
     config = dataclasses.replace(SmolVLAConfig.base(), image_size=64)
-    own = processor(6)
-    own = dataclasses.replace(own, image_size=64, inputs=config.inputs)
-    own = dataclasses.replace(own, robot_slots=robot_slots(6, config.inputs))
+    proc = processor(6)
+    proc = dataclasses.replace(proc, image_size=64, inputs=config.inputs)
+    proc = dataclasses.replace(proc, robot_slots=robot_slots(6, config.inputs))
     raw = {"image": {"side": jnp.full((1, 32, 64, 3), 255, jnp.uint8)}, "state": jnp.zeros((1, 7))}
-    image = own.encode(raw, jnp.zeros(1, int)).images["side"][0]
+    image = proc.encode(raw, jnp.zeros(1, int)).images["side"][0]
     np.testing.assert_allclose(image[32:], 1, atol=1e-6)
     assert (image[:32] == -1).all()
 
@@ -186,17 +186,17 @@ def test_delta_actions():
 @pytest.mark.parametrize("set_by", ["caller", "backbone"])
 def test_delta_actions_are_decoded_as_absolute(set_by):
     mask = (*[True] * 6, False)
-    own = published(delta=mask) if set_by == "caller" else published(relative=mask)
+    proc = published(delta=mask) if set_by == "caller" else published(relative=mask)
     absolute = published(relative=mask, delta=())
-    own = dataclasses.replace(own, statistics=absolute.statistics)
+    proc = dataclasses.replace(proc, statistics=absolute.statistics)
     state = jnp.asarray(RNG.normal(size=(2, 7)), jnp.float32)
     actions = jnp.asarray(RNG.normal(size=(2, 4, 7)), jnp.float32)
     relative = actions - state[:, None].at[..., 6].set(0)
-    normalized = own.normalize_actions(actions, state)
+    normalized = proc.normalize_actions(actions, state)
     np.testing.assert_allclose(normalized, absolute.normalize_actions(relative), atol=1e-5)
-    np.testing.assert_allclose(own.decode(normalized, state), actions, atol=1e-5)
+    np.testing.assert_allclose(proc.decode(normalized, state), actions, atol=1e-5)
     with pytest.raises(ValueError, match="pass the raw state"):
-        own.decode(normalized)
+        proc.decode(normalized)
     with pytest.raises(ValueError, match="has 14 entries, but the robot's actions have 7"):
         published(relative=(True,) * 14)
 
@@ -208,11 +208,11 @@ def test_prompts_contain_the_normalized_state():
     valid = np.ones(50, bool)
     statistics = Statistics.measure(state, action, valid, slots=range(7), dim=7)
     table = PromptTable.of(Offline(), texts, config, num_joints=6)
-    own = Processor.of(config, statistics, table, num_joints=6)
+    proc = Processor.of(config, statistics, table, num_joints=6)
     raw = {"image": {}, "state": jnp.asarray(state, jnp.float32)}
     noise = jnp.asarray(RNG.normal(size=(50, DIM)), jnp.float32)
     rows = RNG.integers(0, 2, 50)
-    obs = jax.jit(Processor.encode)(own, raw, jnp.asarray(rows), state_noise=noise)
+    obs = jax.jit(Processor.encode)(proc, raw, jnp.asarray(rows), state_noise=noise)
     low, high = np.quantile(state, [0.01, 0.99], axis=0)
     normalized = 2 * (state - low) / (high - low) - 1 + noise[:, [0, 1, 2, 3, 4, 5, 7]]
     np.testing.assert_allclose(obs.state[:, [0, 1, 2, 3, 4, 5, 7]], normalized, atol=1e-5)
@@ -234,16 +234,16 @@ class EchoBackbone:
 
 
 def test_policy_encodes_and_decodes():
-    own = processor(6)
+    proc = processor(6)
     raw = {
         "image": {},
-        "state": jnp.asarray(own.statistics.state["mean"][jnp.array(own.robot_slots)]),
+        "state": jnp.asarray(proc.statistics.state["mean"][jnp.array(proc.robot_slots)]),
     }
     raw["state"] = jnp.broadcast_to(raw["state"], (2, 7))
-    policy = Policy(EchoBackbone(), own)
+    policy = Policy(EchoBackbone(), proc)
     actions, aux = policy.sample(
         jax.random.key(0), raw, jnp.zeros(2, int), num_steps=4, return_aux=True
     )
-    mean = own.statistics.action["mean"][jnp.array(own.robot_slots)]
+    mean = proc.statistics.action["mean"][jnp.array(proc.robot_slots)]
     np.testing.assert_allclose(actions, jnp.broadcast_to(mean, (2, 4, 7)), atol=1e-5)
     assert aux == {"steps": 4}
