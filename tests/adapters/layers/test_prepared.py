@@ -17,7 +17,7 @@ from lorasp_jax.models.transformer.layers import apply_to_shared_input
 from tests.cases import mostly_slow
 from tests.models.random_models import observation, random_backbone
 from tests.nets import METHODS, trained
-from tests.peft.lora_sp.test_method import OnGPU
+from tests.peft.lora_sp.test_method import WithFusedKernel
 
 FUSABLE = [name for name in METHODS if name not in ("full", "dora", "lora_moe")]
 
@@ -110,7 +110,7 @@ def test_a_stacks_adapters_are_cast_before_the_loop():
 
 
 def test_a_kernel_gets_the_packed_router_parameters():
-    model = adapted(OnGPU(rank=32, hidden_width=16), "float32")
+    model = adapted(WithFusedKernel(rank=32, hidden_width=16), "float32")
     x = jnp.sin(jnp.arange(96.0)).reshape(2, 6, 8)
     fused = prepare(model)
     params = fused.first.fused.get_value().params

@@ -11,7 +11,7 @@ from lorasp_jax.dense import AdapterParam, Dense
 from lorasp_jax.models.transformer.depth import save_for_backward, scan_depth, stack
 from lorasp_jax.peft import LoRA
 from tests.nets import METHODS, trained
-from tests.peft.lora_sp.test_method import OnGPU
+from tests.peft.lora_sp.test_method import WithFusedKernel
 
 DEPTH, TOKENS, WIDTH, INNER = 3, 5, 8, 12
 
@@ -120,7 +120,7 @@ def test_a_stack_without_trainable_parameters(unroll):
 
 
 def test_the_fused_kernel_runs_once_forward_and_once_backward():
-    method = OnGPU(rank=16, hidden_width=16)
+    method = WithFusedKernel(rank=16, hidden_width=16)
     blocks = stack(lambda rngs: Dense(WIDTH, WIDTH, method=method, rngs=rngs), DEPTH, nnx.Rngs(0))
     graphdef, adapters, frozen = adaptation.split(blocks)
 
