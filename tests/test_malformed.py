@@ -1,4 +1,4 @@
-"""Malformed inputs: each is refused in one sentence of the project's own, and left as it is."""
+"""Test that malformed inputs raise a one-line error of this project and are not modified."""
 
 import dataclasses
 import hashlib
@@ -31,7 +31,7 @@ DATA = "data/**/*.parquet"
 
 
 class Net(nnx.Module):
-    """Of the golden PEFT adapter's size."""
+    """Network with the sizes of the golden PEFT adapter."""
 
     def __init__(self) -> None:
         sizes = ((24, 40), (40, 24), (24, 16))
@@ -73,13 +73,13 @@ def _lerobot(version: str) -> Cases:
     else:
         index = "meta/episodes/**/*.parquet"
         yield from malformed.files(index, "tasks.parquet")
-        film = "videos/observation.images.side/"
+        video = "videos/observation.images.side/"
         lines = {
             "length": [ABSENT, 0, -1, None, "x"],
             "episode_index": [ABSENT, 0, 7, None],
             "data/file_index": [ABSENT, 5, None],
-            film + "file_index": [ABSENT, 5, None],
-            film + "from_timestamp": [ABSENT, NAN, HUGE, -5.0, 1e300, 1e6, None],
+            video + "file_index": [ABSENT, 5, None],
+            video + "from_timestamp": [ABSENT, NAN, HUGE, -5.0, 1e300, 1e6, None],
         }
         yield from malformed.columns(index, lines, row=2)
 
@@ -87,7 +87,7 @@ def _lerobot(version: str) -> Cases:
 def _rlds() -> Cases:
     yield from malformed.files("metadata.json", "features.json", "dataset_info.json")
     yield from malformed.files("*array_record*")
-    facts: dict[str, list[Any]] = {
+    metadata: dict[str, list[Any]] = {
         "format": [ABSENT, "x", None],
         "cameras": [ABSENT, 3, ["front"], [[]]],
         "control_dt": [ABSENT, "x", None, 0, -1, NAN, HUGE],
@@ -96,7 +96,7 @@ def _rlds() -> Cases:
         "task": [ABSENT],
         "actions": [ABSENT, "x", 3],
     }
-    yield from malformed.fields("metadata.json", facts)
+    yield from malformed.fields("metadata.json", metadata)
     step = "featuresDict/features/steps/sequence/feature/featuresDict/features/"
     shape = step + "action/tensor/shape/dimensions"
     yield from malformed.fields(
@@ -108,7 +108,7 @@ def _cache() -> Cases:
     names = [f"{name}.npy" for name in (*cache.ROWS, "image_side")]
     yield from malformed.files(cache.HEADER, cache.STATISTICS, *names)
     yield from malformed.flips("state.npy", (0, 8, 40, -3))
-    facts: dict[str, list[Any]] = {
+    metadata: dict[str, list[Any]] = {
         "format": [ABSENT, "x", [1]],
         "cameras": [ABSENT, [], {"side": 3}, {"front": [8, 8]}, {"side": [8]}, {"side": "xy"}],
         "control_dt": [ABSENT, "x", 0.0, -1.0, NAN, HUGE],
@@ -119,7 +119,7 @@ def _cache() -> Cases:
         "tasks": [[], "x", [3]],
         "instructions": [[], [None]],
     }
-    yield from malformed.fields(cache.HEADER, facts)
+    yield from malformed.fields(cache.HEADER, metadata)
 
 
 def _npz() -> Cases:
@@ -147,7 +147,7 @@ def _npz() -> Cases:
 
 
 def _rehashed(damage: Damage) -> Damage:
-    """A foreign file that states its tensors' checksum."""
+    """Update the checksums after the damage, so that they do not hide the error."""
 
     def spoil(folder: Path) -> None:
         damage(folder)
@@ -187,7 +187,7 @@ def _adapter() -> Cases:
 
 
 def _escaped(values: dict[str, list[Any]]) -> Cases:
-    """`fields` of the description, where ~ is a slash within a name."""
+    """Like `malformed.fields` for adapter.json, where ~ stands for a slash within a name."""
     for place, bad in values.items():
         for value in bad:
 
@@ -235,7 +235,7 @@ def _episodes() -> Episodes:
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A folder of each kind."""
+    """Write a valid folder of each kind."""
     at = tmp_path_factory.mktemp("good")
     rlds.write(_episodes(), at / "rlds")
     cache.write([open_source(at / "rlds")], at / "cache", lambda done, total: None)
@@ -264,8 +264,8 @@ KINDS = {
     "peft": (_peft, lambda folder: load_peft(folder, Net())),
 }
 CASES = [(kind, name, damage) for kind, (make, _) in KINDS.items() for name, damage in make()]
-QUICK = 12
-"""Every so many-th case runs in the plain test."""
+FAST_EVERY = 12
+"""Every n-th case runs with the fast tests, the others with the slow ones."""
 
 
 def _marked(cases: list[Any], every: int) -> list[Any]:
@@ -275,14 +275,14 @@ def _marked(cases: list[Any], every: int) -> list[Any]:
     ]
 
 
-@pytest.mark.parametrize(("kind", "name", "damage"), _marked(CASES, QUICK))
-def test_refused_in_one_sentence(
+@pytest.mark.parametrize(("kind", "name", "damage"), _marked(CASES, FAST_EVERY))
+def test_malformed_input_raises_a_one_line_error(
     kind: str, name: str, damage: Damage, good: dict[str, Path], tmp_path: Path
 ) -> None:
     folder = Path(shutil.copytree(good[kind], tmp_path / "input"))
     damage(folder)
     before = digest(folder)
-    with pytest.raises(Exception) as caught:  # noqa: PT011 (which one is checked)
+    with pytest.raises(Exception) as caught:  # noqa: PT011 (check_refusal checks the type)
         KINDS[kind][1](folder)
     check_refusal(caught.value, str(folder))
     assert digest(folder) == before

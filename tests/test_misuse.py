@@ -1,4 +1,4 @@
-"""What a first-time user writes by mistake: one sentence that says what is valid."""
+"""Test that common mistakes of new users raise a one-sentence error that says what is valid."""
 
 import re
 from pathlib import Path
@@ -36,7 +36,7 @@ NET = nnx.Dict(inp=nnx.Linear(5, 4, rngs=nnx.Rngs(0)), head=nnx.Linear(4, 2, rng
     ],
 )
 def test_rules(rules, message):
-    """Of NNX, Linen and quantisation alike."""
+    """NNX, Linen and quantization check rules in the same way."""
     with pytest.raises(ValueError, match=re.escape(message)):
         lorasp_jax.adapt(NET, rules, rngs=nnx.Rngs(0))
     with pytest.raises(ValueError, match=re.escape(message)):
@@ -60,7 +60,7 @@ def test_rngs(rngs, given):
         lorasp_jax.adapt(NET, [("inp", METHOD)], rngs=rngs)
 
 
-def test_models_of_another_library():
+def test_models_of_other_libraries():
     with pytest.raises(ValueError, match="got Dense; for a Linen module use LinenAdapter"):
         lorasp_jax.adapt(nn.Dense(3), [("inp", METHOD)], rngs=nnx.Rngs(0))
     with pytest.raises(ValueError, match="must be an NNX module, got dict"):
@@ -94,7 +94,7 @@ def test_fields_of_lora(fields, message):
         LoRA(**fields)
 
 
-def test_more_values_than_fields():
+def test_too_many_values():
     with pytest.raises(ValueError, match=r"lora has fields rank, alpha, .* dropout, got 6 values"):
         LoRA(1, 2.0, False, "kaiming", 0.1, 3)  # pyright: ignore[reportCallIssue]
 
@@ -107,7 +107,7 @@ FIELDS = [
 
 @pytest.mark.parametrize(("cls", "field"), FIELDS)
 def test_every_field_of_every_method(cls, field):
-    """One sentence that names the field, or a method that makes its parameters."""
+    """A wrong value raises an error that names the field, or the method works."""
     for value in BAD:
         if (refusal := refused(cls, field, value)) is None:
             assert value in (None, True, -1)
@@ -117,7 +117,7 @@ def test_every_field_of_every_method(cls, field):
 
 
 def refused(cls, field, value):
-    """The sentence, or None where the method can make its parameters."""
+    """Return the error message, or None if the method can create its parameters."""
     try:
         method = cls(**{field: value})
     except ValueError as error:
@@ -127,7 +127,7 @@ def refused(cls, field, value):
 
 
 @pytest.mark.parametrize("initialization", ["pissa", "olora"])
-def test_a_rank_beyond_the_kernel_that_is_split(initialization):
+def test_rank_larger_than_a_split_kernel(initialization):
     method = LoRA(rank=128, initialization=initialization)
     with pytest.raises(
         ValueError, match=r"cannot adapt inp: .* got rank 128 and a kernel \[5, 4\]"
@@ -135,7 +135,7 @@ def test_a_rank_beyond_the_kernel_that_is_split(initialization):
         lorasp_jax.adapt(NET, [("inp", method)], rngs=nnx.Rngs(0))
 
 
-def test_methods_are_found_by_name():
+def test_unknown_field_of_a_method_gets_a_suggestion():
     with pytest.raises(ValueError, match=r"lora_sp has no field 'energy_targt' \(did you mean"):
         peft.create("lora_sp", energy_targt=0.9)
 
@@ -156,7 +156,7 @@ def test_methods_are_found_by_name():
         (lambda m: lorasp_jax.distill(m, [], 2.5), "must be a whole number, at least 1, or None"),
     ],
 )
-def test_several_adapters_and_smaller_ones(call, message):
+def test_combining_and_compressing(call, message):
     model = lorasp_jax.adapt(NET, [("inp", METHOD)], rngs=nnx.Rngs(0))
     with pytest.raises(ValueError, match=re.escape(message)):
         call(model)
@@ -172,7 +172,7 @@ def adapted(method=METHOD, net=NET):
 
 
 def refuses(call, message):
-    """In one sentence, of no more letters than somebody reads."""
+    """Check that the call raises a short one-sentence error."""
     with pytest.raises(ValueError, match=re.escape(message)) as caught:
         call()
     assert "\n" not in str(caught.value)
@@ -218,7 +218,7 @@ def test_layers(call, message):
 
 
 def test_kernels_that_cannot_be_adapted():
-    """Each by its path: without numbers, of one axis, of none at all."""
+    """Errors name the path: an empty kernel, one axis, not an array, no kernel."""
     zeros = nnx.initializers.zeros
     for d_in, d_out in ((0, 3), (3, 0)):
         net = nnx.Dict(inp=nnx.Linear(d_in, d_out, kernel_init=zeros, rngs=nnx.Rngs(0)))
@@ -233,7 +233,7 @@ def test_kernels_that_cannot_be_adapted():
     )
 
 
-def test_kernels_of_8_bits_need_a_type_to_compute_in():
+def test_8_bit_kernels_need_a_compute_dtype():
     kind = {"param_dtype": jnp.float8_e4m3fn, "rngs": nnx.Rngs(0)}
     net = nnx.Dict(inp=nnx.Linear(5, 4, **kind))
     refuses(
@@ -245,7 +245,7 @@ def test_kernels_of_8_bits_need_a_type_to_compute_in():
 
 @pytest.mark.parametrize("method", [METHOD, LoRAMoE(2, 2), LoRASP(4, hidden_width=4)])
 def test_no_tokens(method):
-    """Losses and ranks are 0; a Linen model's output has no rows."""
+    """Losses and ranks are 0; the output of a Linen model has no rows."""
     params, _ = method.init(KEY, KERNEL)
     y, aux = method.apply(params, jnp.zeros((0, 5)), KERNEL)
     assert y.shape == (0, 4)
@@ -259,14 +259,14 @@ LINEN = lorasp_jax.LinenAdapter(nn.Dense(3), [("", METHOD)])
 
 
 @pytest.mark.parametrize("variables", [{}, None, 5, {"params": 5}, {"adapters": {}}])
-def test_variables_of_linen(variables):
+def test_linen_variables(variables):
     message = 'variables must be a dict whose "params" is a dict'
     refuses(lambda: LINEN.apply(variables, X), message)
     refuses(lambda: LINEN.merge(variables, X), message)
     refuses(lambda: LINEN.attach(KEY, variables, X), message)
 
 
-def test_adapters_of_another_width_in_linen():
+def test_linen_adapters_of_another_width():
     variables = LINEN.init(KEY, X)
     narrow = jax.tree.map(lambda a: a[:1], variables["adapters"])
     refuses(lambda: LINEN.apply(variables | {"adapters": narrow}, X), "needs lora_a [5, 2]")
@@ -276,7 +276,7 @@ SHAPES = "holds shapes without values"
 
 
 @pytest.mark.parametrize("model", [5, None, nn.Dense(3), {}])
-def test_what_is_no_model(model, tmp_path):
+def test_not_a_model(model, tmp_path):
     message = "must be an NNX module" if model != {} else "must be an NNX module, got dict"
     for call in (
         lambda: lorasp_jax.summary(model),
@@ -297,8 +297,8 @@ def test_what_is_no_model(model, tmp_path):
         refuses(call, message)
 
 
-def test_models_without_values(tmp_path):
-    """Shapes can be adapted and counted, but not computed with."""
+def test_abstract_models(tmp_path):
+    """Abstract models can be adapted and counted, but not called."""
     model = nnx.eval_shape(adapted)
     assert lorasp_jax.summary(model)
     for call in (
@@ -384,7 +384,7 @@ def test_models_without_values(tmp_path):
         (lambda _: lorasp_jax.combine({5: adapted()}), "must be a non-empty mapping from name"),
     ],
 )
-def test_what_functions_take_beside_a_model(call, message, tmp_path):
+def test_other_arguments(call, message, tmp_path):
     refuses(lambda: call(tmp_path / "new"), message)
     assert not (tmp_path / "new").exists()
 
@@ -404,5 +404,5 @@ def test_what_functions_take_beside_a_model(call, message, tmp_path):
         lambda: lorasp_jax.summary(adapted(), {LONG: 5}),
     ],
 )
-def test_long_texts_are_cut(call):
+def test_long_values_are_truncated(call):
     refuses(call, "qqq")
