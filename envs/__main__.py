@@ -58,11 +58,12 @@ def parser(program: str) -> argparse.ArgumentParser:
     option = _add_command(subparsers, commands.collect, image_size=64)
     option("--task", required=True, nargs="+", help=f"{tasks}; or all")
     option("--robot", required=True, help=robots)
-    option("--out", required=True, type=Path, help="dataset or .npz file; folder of several tasks")
+    text = "dataset folder or .npz file; for several tasks, folder of the datasets"
+    option("--out", required=True, type=Path, help=text)
     option("--num-episodes", type=int, default=64, help=f"episodes per task {_DEFAULT}")
     option("--num-envs", type=int, help="parallel worlds (default: depends on the device)")
     option("--control-dt", type=finite, default=0.1, help=f"time between actions [s] {_DEFAULT}")
-    option("--actions", default="joint", help=f"{', '.join(actions.MODES)} {_DEFAULT}")
+    option("--actions", default="joint", help=f"mode: {', '.join(actions.MODES)} {_DEFAULT}")
     text = f"standard deviation of noise on joint targets [rad] {_DEFAULT}"
     option("--action-noise", type=finite, default=0.0, help=text)
     text = f"unrelated objects on the table, up to {distractors.MAX_COUNT} {_DEFAULT}"

@@ -107,7 +107,7 @@ def _add_keys(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("LeRobot datasets").add_argument
     default = "(default: %(default)s)"
     add("--state", default=Keys.state, help=f"feature with measured joints and gripper {default}")
-    add("--action", default=Keys.action, help=f"feature with their targets {default}")
+    add("--action", default=Keys.action, help=f"feature with commanded joints, gripper {default}")
     text = "dimensions to use, by name or index: joints first, gripper last (default: all)"
     add("--state-numbers", nargs="+", default=(), metavar="NAME", help=text)
     add("--action-numbers", nargs="+", default=(), metavar="NAME", help=text)
