@@ -5,9 +5,9 @@
     python train.py --config configs/multitask.py --method lora --peft.rank 16 --name lora
 
 Loads the base pretrained on a simulated Franka Panda (assets/), collects PiPER demonstrations with
-the scripted expert, measures the base, trains adapters on the paper's four tasks together, measures
-again and writes runs/multitask/report.html. The README has the expected result and time. On a CPU
-two of the tasks are taken unless `--tasks open_pot pour press pick_place` asks for all.
+the scripted expert, evaluates the base, trains adapters jointly on the paper's four tasks,
+evaluates again and writes runs/multitask/report.html. Expected results and times are in the README.
+On a CPU only two tasks are trained; pass `--tasks open_pot pour press pick_place` for all four.
 """
 
 from lorasp_jax.config import Config, DataConfig, EvaluationConfig, ModelConfig, OptimConfig
@@ -15,12 +15,12 @@ from lorasp_jax.peft import LoRASP
 
 
 def get_config(scale: str) -> Config:
-    """The experiment at `scale`: smoke (two minutes for press), cpu or accelerator."""
+    """Return the config at `scale`: smoke (two minutes for press), cpu or accelerator."""
     return {"smoke": _smoke, "cpu": _cpu, "accelerator": _accelerator}[scale]()
 
 
 def _smoke() -> Config:
-    # Nearly all of it is compilation, so few layers are adapted: those that press needs.
+    # Compilation dominates, so only the layers that the task press needs are adapted.
     return Config(
         name="multitask",
         scale="smoke",

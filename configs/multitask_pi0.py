@@ -1,4 +1,4 @@
-"""Adapt the published pi0 (3.2 B parameters) to the PiPER arm: four tasks, LoRA-SP of rank 128.
+"""Adapt the published pi0 (3.2 B parameters) to the PiPER arm: four tasks, LoRA-SP, rank 128.
 
     python train.py --config configs/multitask_pi0.py
     python train.py --config configs/multitask_pi0.py --model.checkpoint FOLDER \\
@@ -6,10 +6,10 @@
     python train.py --config configs/multitask_pi0.py --model.size base_pi05 \\
         --model.checkpoint gs://openpi-assets/checkpoints/pi05_base
 
-Weights and tokenizer come from openpi's buckets unless places of your own are named; both of
-openpi's and LeRobot's layouts are read. Needs a GPU of 80 GB or, with `--model.remat full`, of 24;
-`--fsdp N` splits the base over N devices. pi0 has places for three cameras; the third is masked.
-The last command adapts pi0.5.
+Downloads weights and tokenizer from openpi's buckets unless you pass your own; weights may be in
+openpi's or LeRobot's layout. Needs a GPU with 80 GB or, with `--model.remat full`, 24 GB;
+`--fsdp N` shards the base over N devices. pi0 has three camera slots; the third is masked. The last
+command adapts pi0.5.
 """
 
 from lorasp_jax.config import Config, DataConfig, EvaluationConfig, ModelConfig, OptimConfig
@@ -17,7 +17,7 @@ from lorasp_jax.peft import LoRASP
 
 
 def get_config(scale: str) -> Config:
-    """The experiment; smoke is a few steps of it, at full size."""
+    """Return the config; smoke runs a few steps at full model size."""
     smoke = scale == "smoke"
     return Config(
         name="multitask_pi0",

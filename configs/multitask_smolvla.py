@@ -4,7 +4,7 @@
     python train.py --config configs/multitask_smolvla.py --model.checkpoint FOLDER \\
         --model.tokenizer FILE
 
-Weights and tokenizer come from Hugging Face's hub unless places of your own are named.
+Downloads weights and tokenizer from the Hugging Face Hub unless you pass your own.
 """
 
 import dataclasses
@@ -15,7 +15,7 @@ from lorasp_jax.training.overrides import load
 
 
 def get_config(scale: str) -> Config:
-    """The experiment, as configs/multitask_pi0.py has it; smoke is a few steps of it."""
+    """Return the config, based on configs/multitask_pi0.py; smoke runs a few steps."""
     config = load(Path(__file__).with_name("multitask_pi0.py"), scale)
     model = dataclasses.replace(
         config.model,

@@ -1,13 +1,13 @@
-"""Pretrain the base policies that ship in assets/, from scratch, on Panda demonstrations.
+"""Pretrain the bundled base policies in assets/ from scratch on Panda demonstrations.
 
     python train.py --config configs/pretrain.py --name pi0_small
     python train.py --config configs/pretrain.py --name smolvla_small --model.backbone smolvla
     python train.py --config configs/pretrain.py --name pi0_nano --model.size nano \\
         --optim.steps 24000 --optim.learning-rate 2e-3
 
-All parameters train (FullFineTuning on every path), on the paper's four tasks. The run leaves
-runs/<name>/base, which is what assets/<name> holds; the model cards there state hardware, time and
-measured success.
+Trains all parameters (FullFineTuning on every layer) on the paper's four tasks and writes
+runs/<name>/base, the contents of assets/<name>. The model cards in assets/ state hardware, training
+time and success rates.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from lorasp_jax.peft import FullFineTuning
 
 
 def get_config(scale: str) -> Config:
-    """The experiment at `scale`; accelerator is the one that makes the shipped bases."""
+    """Return the config at `scale`; the bundled bases were trained with accelerator."""
     config = Config(
         name="pretrain",
         scale=scale,

@@ -1,8 +1,8 @@
-"""Adapt a pretrained miniature policy to one task of the PiPER arm, the one that is named.
+"""Adapt a pretrained miniature policy to a single task on the PiPER arm.
 
     python train.py --config configs/single_task.py --tasks pour --name pour
 
-Everything but the tasks is as in configs/multitask.py.
+Everything but the tasks comes from configs/multitask.py; the default task is press.
 """
 
 import dataclasses
@@ -13,6 +13,6 @@ from lorasp_jax.training.overrides import load
 
 
 def get_config(scale: str) -> Config:
-    """The experiment at `scale`: smoke, cpu or accelerator."""
+    """Return the config at `scale`: smoke, cpu or accelerator."""
     config = load(Path(__file__).with_name("multitask.py"), scale)
     return dataclasses.replace(config, name="single_task", tasks=("press",))

@@ -32,17 +32,17 @@ BASES = sorted(path.parent for path in Path("assets").glob("*/config.json"))
 
 
 def perturbed(run):
-    """The run with every trainable number changed, as training would."""
-    run.policy = changed(run.policy)
+    """Change every trainable parameter, as training would."""
+    run.policy = with_random_adapters(run.policy)
     return run
 
 
-def changed(policy):
-    """Other adapters, of numbers that bf16 has."""
+def with_random_adapters(policy):
+    """Return the policy with random adapters, whose values bf16 represents exactly."""
     graphdef, adapters, frozen = adaptation.split(policy.model)
-    draws = np.random.default_rng(0)
-    other = lambda x: jnp.asarray(draws.integers(-8, 8, x.shape) / 16, x.dtype)  # noqa: E731
-    return Policy(nnx.merge(graphdef, jax.tree.map(other, adapters), frozen), policy.processor)
+    rng = np.random.default_rng(0)
+    randomize = lambda x: jnp.asarray(rng.integers(-8, 8, x.shape) / 16, x.dtype)  # noqa: E731
+    return Policy(nnx.merge(graphdef, jax.tree.map(randomize, adapters), frozen), policy.processor)
 
 
 @pytest.mark.slow
@@ -53,22 +53,22 @@ def test_adapters(tmp_path):
     metadata = json.loads((run.folder / "adapter.json").read_text())["metadata"]
     assert (metadata["robot"], metadata["control_dt"]) == ("piper", 0.1)
     assert Statistics.from_json(json.dumps(metadata["policy"]["statistics"]))
-    bare = random_backbone(Pi0Config.dummy())
-    loaded = native.load_adapters(run.folder, bare, base=run.base_hash)
+    base_model = random_backbone(Pi0Config.dummy())
+    loaded = native.load_adapters(run.folder, base_model, base=run.base_hash)
     expected = leaves(adaptation.split(run.policy.model)[1])
     for name, value in leaves(adaptation.split(loaded)[1]).items():
         np.testing.assert_array_equal(value, expected[name], err_msg=name)
     with pytest.raises(ValueError, match="was trained on base"):
-        native.load_adapters(run.folder, bare, base="another")
+        native.load_adapters(run.folder, base_model, base="another")
 
 
 @pytest.mark.parametrize("method", [CONFIG.peft, FullFineTuning()], ids=["adapters", "base"])
-def test_a_policy_comes_back(tmp_path, method):
+def test_a_policy_loads(tmp_path, method):
     models.save(tmp_path / "base", random_backbone(Pi0Config.dummy()))
-    chosen = dataclasses.replace(CONFIG.model, checkpoint=str(tmp_path / "base"))
-    config = dataclasses.replace(CONFIG, model=chosen, peft=method)
+    model_config = dataclasses.replace(CONFIG.model, checkpoint=str(tmp_path / "base"))
+    config = dataclasses.replace(CONFIG, model=model_config, peft=method)
     run = make_run(tmp_path / "run", config, models.load(tmp_path / "base"))
-    run.policy = changed(run.policy)
+    run.policy = with_random_adapters(run.policy)
     run.base_hash = models.weights_hash(tmp_path / "base")
     with pytest.raises(ValueError, match="holds no policy: no run has finished there"):
         export.load_policy(run.folder)
@@ -86,7 +86,7 @@ def test_a_policy_comes_back(tmp_path, method):
 
 ELSEWHERE = """
 import sys, huggingface_hub
-huggingface_hub.snapshot_download = lambda *_, **__: sys.exit("the hub was asked")
+huggingface_hub.snapshot_download = lambda *_, **__: sys.exit("the Hub was contacted")
 from lorasp_jax import models
 from lorasp_jax.training.export import load_policy
 print(models.weights_hash(load_policy(sys.argv[1]).model))
@@ -94,20 +94,20 @@ print(models.weights_hash(load_policy(sys.argv[1]).model))
 
 
 @pytest.mark.parametrize("kind", ["shipped", "folder"])
-def test_a_policy_comes_back_in_another_folder(tmp_path, monkeypatch, kind):
-    """In a process of its own, which finds there something else of the base's name."""
+def test_a_policy_loads_from_another_working_directory(tmp_path, monkeypatch, kind):
+    """In a new process, where the base's relative path leads to another model."""
     if kind == "shipped":
-        chosen = ModelConfig()
+        model_config = ModelConfig()
     else:
         monkeypatch.chdir(tmp_path)
         models.save("base", random_backbone(Pi0Config.dummy()))
-        chosen = dataclasses.replace(CONFIG.model, checkpoint="base")
-    model = models.load(chosen.source)
-    run = make_run(tmp_path / "run", dataclasses.replace(CONFIG, model=chosen), model)
+        model_config = dataclasses.replace(CONFIG.model, checkpoint="base")
+    model = models.load(model_config.source)
+    run = make_run(tmp_path / "run", dataclasses.replace(CONFIG, model=model_config), model)
     run.base_hash = models.weights_hash(model)
     export.write(run)
     elsewhere = tmp_path / "elsewhere"
-    models.save(elsewhere / chosen.source, random_backbone(Pi0Config.dummy(), seed=1))
+    models.save(elsewhere / model_config.source, random_backbone(Pi0Config.dummy(), seed=1))
     command = [sys.executable, "-c", ELSEWHERE, str(run.folder)]
     env = os.environ | {"PYTHONPATH": str(ROOT)}
     found = subprocess.run(
@@ -116,11 +116,13 @@ def test_a_policy_comes_back_in_another_folder(tmp_path, monkeypatch, kind):
     assert found.stdout.split() == [run.base_hash], found.stderr
 
 
-def test_a_base_that_is_gone_is_named_with_the_way_out(tmp_path, monkeypatch):
+def test_the_error_for_a_missing_base_suggests_a_remedy(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     models.save("base", random_backbone(Pi0Config.dummy()))
-    chosen = dataclasses.replace(CONFIG.model, checkpoint="base")
-    run = make_run(tmp_path / "run", dataclasses.replace(CONFIG, model=chosen), models.load("base"))
+    model_config = dataclasses.replace(CONFIG.model, checkpoint="base")
+    run = make_run(
+        tmp_path / "run", dataclasses.replace(CONFIG, model=model_config), models.load("base")
+    )
     run.base_hash = models.weights_hash("base")
     export.write(run)
     (tmp_path / "base").rename("moved")
@@ -136,10 +138,10 @@ def test_a_base_that_is_gone_is_named_with_the_way_out(tmp_path, monkeypatch):
     assert export.load_policy("run", base="moved", any_base=True).model
 
 
-def test_another_tokenizer_is_refused(tmp_path, monkeypatch):
+def test_another_tokenizer_is_rejected(tmp_path, monkeypatch):
     models.save(tmp_path / "base", random_backbone(Pi0Config.dummy()))
-    chosen = dataclasses.replace(CONFIG.model, checkpoint=str(tmp_path / "base"))
-    config = dataclasses.replace(CONFIG, model=chosen)
+    model_config = dataclasses.replace(CONFIG.model, checkpoint=str(tmp_path / "base"))
+    config = dataclasses.replace(CONFIG, model=model_config)
     run = make_run(tmp_path / "run", config, models.load(tmp_path / "base"))
     export.write(run)
     encode = tokenizer.Offline.encode
@@ -154,13 +156,13 @@ def test_another_tokenizer_is_refused(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("changes", [{"policy": {}}, {"policy": {"backbone": "pi9"}}, {"base": ""}])
-def test_a_policy_that_cannot_come_back(tmp_path, changes):
+def test_an_incomplete_policy_is_rejected(tmp_path, changes):
     config = Pi0Config.dummy()
-    told = {
+    metadata = {
         "base": "somewhere",
         "policy": {"backbone": "pi0", "config": dataclasses.asdict(config)},
     }
-    facts = {"format": native.FORMAT, "version": native.VERSION, "metadata": told | changes}
+    facts = {"format": native.FORMAT, "version": native.VERSION, "metadata": metadata | changes}
     facts |= {"base": "", "weights": {}, "methods": {}, "sha256": ""}
     (tmp_path / "adapter.json").write_text(json.dumps(with_digest(facts)))
     with pytest.raises(ValueError, match=r"does not describe a policy|was random"):
@@ -179,21 +181,21 @@ def test_base(tmp_path):
     expected = leaves(nnx.state(adaptation.merge(run.policy.model), nnx.Param))
     for name, value in leaves(nnx.state(loaded, nnx.Param)).items():
         np.testing.assert_array_equal(value, expected[name].astype(jnp.bfloat16).astype(np.float32))
-    told = json.loads((folder / base.TRAINING).read_text())
-    assert (told["robot"], told["tasks"]) == ("piper", ["press", "pick_place"])
-    assert (told["control_dt"], told["physics_dt"]) == (0.1, 0.005)
+    training = json.loads((folder / base.TRAINING).read_text())
+    assert (training["robot"], training["tasks"]) == ("piper", ["press", "pick_place"])
+    assert (training["control_dt"], training["physics_dt"]) == (0.1, 0.005)
 
 
 @pytest.mark.parametrize("path", BASES, ids=lambda path: path.name)
-def test_shipped_bases_load_and_say_what_they_are(path):
+def test_bundled_bases_load_and_match_their_model_cards(path):
     backbone, size = path.name.split("_")
-    chosen = ModelConfig(backbone=backbone, size=size, dtype="bfloat16")
-    model, base_hash = base.base_model(dataclasses.replace(CONFIG, model=chosen))
+    model_config = ModelConfig(backbone=backbone, size=size, dtype="bfloat16")
+    model, base_hash = base.base_model(dataclasses.replace(CONFIG, model=model_config))
     assert base_hash == models.weights_hash(path)
     assert f"{adaptation.count(model).total:,} parameters" in (path / "README.md").read_text()
     assert model.config.dtype == "bfloat16"
 
 
-def test_all_assets_are_small_enough_to_ship():
+def test_assets_are_small():
     assert len(BASES) == 4
     assert sum(f.stat().st_size for f in Path("assets").rglob("*") if f.is_file()) < 48e6

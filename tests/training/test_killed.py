@@ -1,4 +1,4 @@
-"""Processes that are really stopped, and runs that go on elsewhere."""
+"""Killed and stopped processes; runs resumed on other devices."""
 
 import contextlib
 import json
@@ -25,13 +25,13 @@ STEPS = 8
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """A run on one device that nobody stopped."""
+    """An uninterrupted run on one device."""
     return work(tmp_path_factory.mktemp("runs") / "whole", STEPS, devices=1)
 
 
 @contextlib.contextmanager
-def started(folder, environment=None, **options):
-    """A worker, which does not outlive this block."""
+def start_worker(folder, environment=None, **options):
+    """Start a worker; kill it at the end of the block."""
     command = [sys.executable, "-u", "-m", "tests.training.worker", str(folder)]
     for name, value in options.items():
         command += [f"--{name}", str(value)]
@@ -44,48 +44,48 @@ def started(folder, environment=None, **options):
             process.kill()
 
 
-def wait_for(process, beginning):
-    """The first line that begins so."""
+def wait_for(process, prefix):
+    """Return the first printed line that starts with `prefix`."""
     for line in process.stdout:
-        if line.startswith(beginning):
+        if line.startswith(prefix):
             return line
-    pytest.fail(f"the process ended with {process.wait()} and never said {beginning!r}")
+    pytest.fail(f"the process ended with {process.wait()} and never printed {prefix!r}")
 
 
-def saved(folder, step):
-    """What identifies every bit of the state at a step."""
+def saved_digest(folder, step):
+    """Return the digest of the state saved at a step."""
     return json.loads((folder / f"checkpoints/{step}/meta/metadata").read_text())["digest"]
 
 
-def kill(folder, steps, chance):
-    """Begin or go on, and kill -9 while it begins, restores, trains or saves."""
-    with started(folder, steps=steps, mesh=1) as process:
+def kill(folder, steps, rng):
+    """Start or resume, then kill -9 during startup, restoring, training or saving."""
+    with start_worker(folder, steps=steps, mesh=1) as process:
         wait_for(process, "started")
-        for _ in range(chance.choice((0, 3, 4, 5))):
+        for _ in range(rng.choice((0, 3, 4, 5))):
             wait_for(process, "step")
-        time.sleep(chance.uniform(0, 0.1))
+        time.sleep(rng.uniform(0, 0.1))
 
 
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("times", [1, pytest.param(20, marks=pytest.mark.slow)])
-def test_a_killed_run_resumes_to_the_bit(times, whole, tmp_path, capsys):
-    steps, chance = STEPS * times, random.Random(times)
+def test_a_killed_run_resumes_exactly(times, whole, tmp_path, capsys):
+    steps, rng = STEPS * times, random.Random(times)
     expected = whole.folder if times == 1 else work(tmp_path / "whole", steps, devices=1).folder
     killed = tmp_path / "killed"
     for _ in range(times):
-        kill(killed, steps, chance)
+        kill(killed, steps, rng)
     newest = max(int(path.parent.name) for path in killed.glob(f"checkpoints/*/{COMMIT_MARKER}"))
-    assert newest < steps  # else nothing is left to do
+    assert newest < steps  # otherwise nothing is left to train
     capsys.readouterr()
     work(killed, steps, devices=1)
     assert f"started\nstep {newest + 1}\n" in capsys.readouterr().out
-    assert saved(killed, steps) == saved(expected, steps)
+    assert saved_digest(killed, steps) == saved_digest(expected, steps)
     assert repeatable(killed) == repeatable(expected)
 
 
-def test_a_signal_to_another_process_stops_this_one_too(tmp_path, monkeypatch):
-    asked = iter([False, True])  # at steps 1 and 2
-    monkeypatch.setattr(processes, "any_process", lambda _: next(asked))
+def test_a_signal_to_another_process_also_stops_this_one(tmp_path, monkeypatch):
+    answers = iter([False, True])  # at steps 1 and 2
+    monkeypatch.setattr(processes, "any_process", lambda _: next(answers))
     assert work(tmp_path / "run", 6, devices=1) is None
     assert sorted(os.listdir(tmp_path / "run/checkpoints")) == ["1", "2"]
 
@@ -95,14 +95,14 @@ def adapters(run):
 
 
 def assert_same(found, expected):
-    """To rounding: sums over a batch on other devices are in another order."""
+    """Compare up to rounding: other devices sum over a batch in another order."""
     for name, value in expected.items():
         np.testing.assert_allclose(
             found[name], value, atol=1e-5 * np.abs(value).max(), err_msg=name
         )
 
 
-def test_a_run_goes_on_with_another_number_of_devices(whole, tmp_path):
+def test_a_run_resumes_on_another_number_of_devices(whole, tmp_path):
     moved = tmp_path / "moved"
     for count, until in ((4, 2), (1, 4), (8, None)):
         run = work(moved, STEPS, until, devices=count)
@@ -110,11 +110,11 @@ def test_a_run_goes_on_with_another_number_of_devices(whole, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_run_goes_on_in_processes_with_other_devices(tmp_path):
-    """4 -> 1 -> 8, each all that its process has."""
+def test_a_run_resumes_in_processes_with_other_devices(tmp_path):
+    """4 -> 1 -> 8 devices, all devices of each process."""
     moved = tmp_path / "moved"
     for count, until, end in ((4, 4, "stopped"), (1, 8, "stopped"), (8, 99, "finished")):
-        with started(moved, devices=count, until=until) as process:
+        with start_worker(moved, devices=count, until=until) as process:
             wait_for(process, end)
             assert process.wait(60) == 0
     assert (moved / "checkpoints/12").exists()
@@ -123,9 +123,9 @@ def test_a_run_goes_on_in_processes_with_other_devices(tmp_path):
 
 @pytest.mark.slow
 def test_a_signal_to_one_of_two_processes_saves_on_both(tmp_path):
-    """2 processes of 2 devices; then one process of 8 goes on."""
+    """Two processes with 2 devices each; then one process with 8 resumes."""
     folder = tmp_path / "run"
-    one, other = (started(folder, own, steps=40, devices=2) for own in environments(2))
+    one, other = (start_worker(folder, own, steps=40, devices=2) for own in environments(2))
     with one as first, other as second:
         for process in (first, second):
             wait_for(process, "step 3")

@@ -1,4 +1,4 @@
-"""Options and experiment files that are wrong: one sentence each, see `tests.test_malformed`."""
+"""Invalid options and experiment files: one-line errors, see `tests.test_malformed`."""
 
 from pathlib import Path
 
@@ -68,10 +68,10 @@ CHOICES = [(f"--{name}", value) for name, values in OPTIONS.items() for value in
 
 
 @pytest.mark.parametrize(("option", "value"), CHOICES)
-def test_options_are_refused_in_one_sentence(
+def test_invalid_options_are_rejected_in_one_sentence(
     option: str, value: str | None, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(Exception) as caught:  # noqa: PT011 (which one is checked)
+    with pytest.raises(Exception) as caught:  # noqa: PT011 (the type is checked below)
         parse([*MULTITASK, option] if value is None else [*MULTITASK, f"{option}={value}"])
     field = option.rpartition(".")[2].removeprefix("--")
     check_refusal(caught.value, field, field.replace("-", "_"))
@@ -116,11 +116,11 @@ FIELDS |= {"text for a number": "learning_rate must be a finite number"}
 
 
 @pytest.mark.parametrize("name", PROGRAMS)
-def test_config_files_are_refused_in_one_sentence(name: str, tmp_path: Path) -> None:
+def test_invalid_config_files_are_rejected_in_one_sentence(name: str, tmp_path: Path) -> None:
     path = tmp_path / "experiment.py"
     path.write_text(PROGRAMS[name])
     before = path.read_bytes()
-    with pytest.raises(Exception) as caught:  # noqa: PT011 (which one is checked)
+    with pytest.raises(Exception) as caught:  # noqa: PT011 (the type is checked below)
         parse(["--config", str(path), "--scale", "smoke"])
     check_refusal(caught.value, str(path))
     assert FIELDS.get(name, "") in str(caught.value)

@@ -1,4 +1,4 @@
-"""Every method trains in the same loop; what one adds to the step is not forgotten."""
+"""Every method trains in the same loop, including its own additions to the step."""
 
 import dataclasses
 
@@ -15,7 +15,7 @@ from lorasp_jax.training.run_folder import read_metrics
 from tests.runs import CONFIG, Terminate, leaves, make_run
 
 SMALL = {"rank": 8, "target_rank": 3, "interval": 1, "hidden_width": 8, "experts": 2}
-ELSEWHERE = ("lora_sp",)  # what the other tests of the loop train
+COVERED = ("lora_sp",)  # by the other tests of the loop
 
 
 def configure(name, **changes):
@@ -26,7 +26,7 @@ def configure(name, **changes):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in peft.names() if name not in ELSEWHERE])
+@pytest.mark.parametrize("name", [name for name in peft.names() if name not in COVERED])
 def test_trains(name, tmp_path):
     run = make_run(tmp_path / "run", configure(name))
     _, before, frozen_before = adaptation.split(run.policy.model)
@@ -39,13 +39,13 @@ def test_trains(name, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_budget_is_kept_by_the_loop_and_over_an_interruption(tmp_path):
+def test_the_rank_budget_holds_in_the_loop_and_after_a_resume(tmp_path):
     config = configure("ada_lora", steps=6)
     whole, halved = make_run(tmp_path / "whole", config), make_run(tmp_path / "halved", config)
     train(whole)
     with pytest.raises(KeyboardInterrupt):
         train(halved, [Terminate()])
-    halved = make_run(tmp_path / "halved", config)  # as a new process would
+    halved = make_run(tmp_path / "halved", config)  # as in a new process
     train(halved, resume=True)
 
     _, adapters, _ = adaptation.split(whole.policy.model)
@@ -54,8 +54,8 @@ def test_a_budget_is_kept_by_the_loop_and_over_an_interruption(tmp_path):
         np.testing.assert_array_equal(value, leaves(adapters)[key], err_msg=key)
     entries = [value for key, value in leaves(adapters).items() if "lora_e" in key]
     assert len(entries) == len(adaptation.methods(whole.policy.model)) > 1
-    kept, budget = sum((e != 0).sum() for e in entries), sum(e.size for e in entries) * 3 / 8
-    assert budget - 4 < kept <= budget  # ties at the threshold go too
+    nonzero, budget = sum((e != 0).sum() for e in entries), sum(e.size for e in entries) * 3 / 8
+    assert budget - 4 < nonzero <= budget  # ties at the threshold are pruned
     assert read_metrics(whole.folder)[-1]["orthogonality"] > 0
 
 

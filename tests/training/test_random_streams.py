@@ -1,4 +1,4 @@
-"""A run's random streams: apart from one another, and the same as ever."""
+"""Random streams of a run: distinct, and unchanged between versions."""
 
 import itertools
 
@@ -13,7 +13,7 @@ def test_no_two_streams_share_a_key():
     keys += [RandomStream.EVALUATION.key(3, number) for number in range(1, 8)]
     for one, other in itertools.combinations(keys, 2):
         assert one != other
-    assert max(RandomStream) == RandomStream.EVALUATION  # what is added to it meets no other
+    assert max(RandomStream) == RandomStream.EVALUATION  # so that sums with it are no other stream
 
 
 @pytest.mark.parametrize(
@@ -24,5 +24,5 @@ def test_no_two_streams_share_a_key():
     ],
 )
 def test_runs_stay_reproducible(stream, number, folded):
-    """Numbers as they were when the bases in assets/ were trained."""
+    """The values with which the bases in assets/ were trained."""
     assert RandomStream[stream].key(7, number) == jax.random.fold_in(jax.random.key(7), folded)

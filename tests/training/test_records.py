@@ -1,4 +1,4 @@
-"""Fields of a run's files are checked where they are read."""
+"""Fields of a run's files are validated when they are read."""
 
 import re
 

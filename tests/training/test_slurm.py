@@ -1,6 +1,6 @@
-"""The commands of docs/launch.md on a real Slurm of one node, which this test starts.
+"""The commands of docs/launch.md on a one-node Slurm cluster that this test starts.
 
-Debian has it in the packages slurmctld, slurmd, slurm-client and munge.
+Install the Debian packages slurmctld, slurmd, slurm-client and munge.
 """
 
 import contextlib
@@ -66,9 +66,9 @@ def free_ports(count):
 
 @contextlib.contextmanager
 def running(*command, environment):
-    """A daemon in the foreground, as long as this block lasts."""
-    nowhere = subprocess.DEVNULL
-    with subprocess.Popen(command, env=environment, stdout=nowhere, stderr=nowhere) as process:
+    """Run a daemon for the duration of the block."""
+    null = subprocess.DEVNULL
+    with subprocess.Popen(command, env=environment, stdout=null, stderr=null) as process:
         try:
             yield
         finally:
@@ -77,17 +77,17 @@ def running(*command, environment):
 
 @pytest.fixture
 def slurm(tmp_path):
-    """Runs a command of Slurm's in a working copy; gives what it prints."""
+    """Return a function that runs a Slurm command in a working copy and returns its output."""
     folder = tmp_path / "slurm"
     for name in ("state", "spool"):
         (folder / name).mkdir(parents=True)
-    folder.chmod(0o755)  # munged's socket has to be reachable
+    folder.chmod(0o755)  # so that munged's socket is reachable
     key = folder / "munge.key"
     key.write_bytes(os.urandom(64))
     key.chmod(0o400)
     host = socket.gethostname().partition(".")[0]
-    known = {"host": host, "user": getpass.getuser(), "folder": folder, "ports": free_ports(2)}
-    (folder / "slurm.conf").write_text(CONFIG.format(**known))
+    values = {"host": host, "user": getpass.getuser(), "folder": folder, "ports": free_ports(2)}
+    (folder / "slurm.conf").write_text(CONFIG.format(**values))
     (folder / "gres.conf").write_text("Name=gpu File=/dev/null\nName=gpu File=/dev/zero\n")
     environment = {
         **os.environ,
@@ -95,7 +95,7 @@ def slurm(tmp_path):
         "SLURM_CONF": str(folder / "slurm.conf"),
         "JAX_PLATFORMS": "cpu",
         "XLA_FLAGS": "--xla_force_host_platform_device_count=1",
-        "JAX_COORDINATOR_PORT": str(free_ports(1)[0]),  # the job's number would give it else
+        "JAX_COORDINATOR_PORT": str(free_ports(1)[0]),  # otherwise derived from the job id
     }
     for name in ("train.py", "configs"):
         (tmp_path / name).symlink_to(ROOT / name)
@@ -119,7 +119,7 @@ def slurm(tmp_path):
 
 
 def page():
-    """`job.sh` of the page and its commands, by name."""
+    """Return the page's `job.sh` and its commands by name."""
     text = (ROOT / "docs/launch.md").read_text()
     blocks = re.findall(r"^```\w*\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     job = next(block for block in blocks if "srun" in block and "--distributed" in block)
@@ -127,54 +127,54 @@ def page():
     return job, {line.split()[0]: line.partition("#")[0].split() for line in lines}
 
 
-def wait_for(what, seconds=1500):
-    """Poll until it gives something."""
+def wait_for(condition, seconds=1500):
+    """Poll until the condition is true; return its value."""
     end = time.monotonic() + seconds
-    while not (found := what()):
-        assert time.monotonic() < end, what
+    while not (value := condition()):
+        assert time.monotonic() < end, condition
         time.sleep(0.2)
-    return found
+    return value
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 @pytest.mark.skipif(bool(MISSING), reason=f"not installed: {', '.join(MISSING)}")
-def test_a_run_under_slurm_stops_goes_on_and_equals_one_process(slurm, tmp_path):
+def test_a_run_under_slurm_resumes_and_equals_one_process(slurm, tmp_path):
     job, commands = page()
     (tmp_path / "job.sh").write_text(job)
     whole, folder = (tmp_path / "runs" / name for name in ("whole", "slurm"))
     two = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
     slurm("python", "train.py", *OPTIONS, "--name", "whole", **two)
 
-    def number(name):
+    def job_field(name):
         return lambda: re.search(rf"{name}=(\S+)", slurm("scontrol", "show", "job", job_id))[1]
 
     submit = commands["sbatch"][:2]
     wait_for(lambda: "idle" in slurm("sinfo", "--noheader"))
     sbatch = [submit[0], *SIZES, f"--output={tmp_path}/log", *submit[1:]]
     job_id = slurm(*sbatch, *OPTIONS, "--name", "slurm").split()[-1]
-    told = lambda name: [word.replace("JOBID", job_id) for word in commands[name]]  # noqa: E731
-    ended = lambda: number("JobState")() not in UNFINISHED  # noqa: E731
+    command = lambda name: [word.replace("JOBID", job_id) for word in commands[name]]  # noqa: E731
+    ended = lambda: job_field("JobState")() not in UNFINISHED  # noqa: E731
     wait_for(lambda: read_metrics(folder) or ended())
-    slurm(*told("scancel"))
-    wait_for(lambda: number("JobState")() == "FAILED")
-    assert number("ExitCode")() == "130:0"
+    slurm(*command("scancel"))
+    wait_for(lambda: job_field("JobState")() == "FAILED")
+    assert job_field("ExitCode")() == "130:0"
     log = (tmp_path / "log").read_text()
     assert "waiting for 2 processes at localhost:" in log
     assert log.count("stopped; to resume: python train.py --distributed --resume auto") == 1
     assert 0 < len(read_metrics(folder)) < STEPS
-    slurm(*told("scontrol"))
-    # slurmd does not launch again what it killed in the same second
+    slurm(*command("scontrol"))
+    # slurmd does not restart a job within the second in which it was killed
     slurm("scontrol", "update", f"jobid={job_id}", "StartTime=now+5")
     wait_for(ended)
-    assert number("JobState")() == "COMPLETED", (tmp_path / "log").read_text()
-    assert number("Restarts")() == "1"
+    assert job_field("JobState")() == "COMPLETED", (tmp_path / "log").read_text()
+    assert job_field("Restarts")() == "1"
     assert not re.search("Traceback|disconnected unexpectedly", (tmp_path / "log").read_text())
     assert_same(folder, whole)
 
 
 def assert_same(found, expected):
-    """To rounding, as sums over a batch are in another order."""
+    """Compare up to rounding: sums over a batch are in another order."""
     rows = [[row["task"] for row in read_metrics(folder)] for folder in (found, expected)]
     assert len(rows[0]) == STEPS
     np.testing.assert_allclose(*rows, rtol=1e-3)

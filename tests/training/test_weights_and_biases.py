@@ -1,4 +1,4 @@
-"""What Weights & Biases is sent, by a module in its place."""
+"""Calls to Weights & Biases, recorded by a fake module."""
 
 import contextlib
 import sys
@@ -14,20 +14,20 @@ from tests.test_train import MULTITASK
 
 
 class Fake:
-    """The part of the package that is used; it keeps what it is given."""
+    """Fake of the used part of the package, which records all calls."""
 
     class Error(Exception):
         pass
 
     def __init__(self):
-        self.begun, self.rows, self.codes, self.metrics = [], [], [], []
+        self.inits, self.rows, self.codes, self.metrics = [], [], [], []
 
     def init(self, **options):
         if options["project"] == "refused":
             raise self.Error("not\nlogged in")
-        self.begun.append(options)
+        self.inits.append(options)
         return SimpleNamespace(
-            id=options["id"] or f"id {len(self.begun)}",
+            id=options["id"] or f"id {len(self.inits)}",
             log=self.rows.append,
             finish=lambda *, exit_code: self.codes.append(exit_code),
             define_metric=lambda name, step_metric: self.metrics.append((name, step_metric)),
@@ -44,14 +44,16 @@ def fake(monkeypatch):
     return module
 
 
-def test_a_run_and_its_continuation(fake, tmp_path):
+def test_a_run_and_its_resume(fake, tmp_path):
     folder = tmp_path / "test"
     folder.mkdir()
     run = SimpleNamespace(folder=folder, config=CONFIG)
     before = RESULTS["tasks"]["press"]["before"]
     write_json(folder / "before.json", {"press": before | {"success": 0.25}})
     with contextlib.suppress(KeyboardInterrupt), WeightsAndBiases("arms", CONFIG, folder) as first:
-        assert list(folder.iterdir()) == [folder / "before.json"]  # nothing to lose yet
+        assert list(folder.iterdir()) == [
+            folder / "before.json"
+        ]  # no id is recorded before the start
         first.on_start(run)
         first.on_log(run, 2, {"loss": 0.5})
         raise KeyboardInterrupt
@@ -59,12 +61,12 @@ def test_a_run_and_its_continuation(fake, tmp_path):
         callback.on_log(run, 2, {"loss": 0.4})
         write_json(folder / "results.json", RESULTS)
         callback.on_end(run)
-    assert [(b["project"], b["id"], b["name"]) for b in fake.begun] == [
+    assert [(options["project"], options["id"], options["name"]) for options in fake.inits] == [
         ("arms", None, "test"),
         ("arms", "id 1", "test"),
     ]
-    assert fake.begun[0]["config"]["peft"]["method"] == "LoRASP"
-    assert fake.begun[0]["dir"] == str(tmp_path)
+    assert fake.inits[0]["config"]["peft"]["method"] == "LoRASP"
+    assert fake.inits[0]["dir"] == str(tmp_path)
     assert fake.codes == [1, 0]
     assert fake.metrics == 2 * [("*", "step")]
     assert fake.rows == [
@@ -77,7 +79,7 @@ def test_a_run_and_its_continuation(fake, tmp_path):
 
 
 @pytest.mark.parametrize("project", ["arms", "refused"])
-def test_what_is_missing_is_one_sentence(project, tmp_path, monkeypatch, capsys):
+def test_errors_are_one_sentence(project, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "wandb", None if project == "arms" else Fake())
     assert train.main([*MULTITASK, "--wandb", project]) == 2

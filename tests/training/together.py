@@ -1,4 +1,4 @@
-"""One of several processes that train together; see test_processes.py.
+"""One of several processes of a run, see test_processes.py.
 
 python -m tests.training.together FOLDER STREAMS
 """
@@ -23,8 +23,8 @@ from lorasp_jax.training.run import Callback, Run
 from tests.runs import CONFIG, Terminate, make_run
 
 
-class Look(Callback):
-    """Evaluation needs the whole policy on devices of its own process."""
+class CheckPolicy(Callback):
+    """Checks that the policy is on devices of its own process, as evaluation needs it."""
 
     def on_start(self, run):
         assert all(x.is_fully_addressable for x in jax.tree.leaves(run.policy))
@@ -41,7 +41,7 @@ class Look(Callback):
 
 
 def main(folder: str, streams: str) -> None:
-    """A run in two parts; large arrays are those over 1 KiB."""
+    """Run until a signal, then resume; arrays over 1 KiB are sharded."""
     if "JAX_PROCESS_ID" in os.environ:
         processes.initialize(Console(), "add --resume")
     mesh.shardings = functools.partial(mesh.shardings, minimum=1024)
@@ -54,17 +54,17 @@ def main(folder: str, streams: str) -> None:
     )
     first = processes.is_first()
 
-    def run() -> Run:
-        made = make_run(Path(folder), config, devices=None)
+    def new_run() -> Run:
+        run = make_run(Path(folder), config, devices=None)
         if streams == "True":
-            steps = flatten([*made.episodes.values()])
-            made.dataset, made.streams = jax.tree.map(np.asarray, steps), True
-        return made
+            steps = flatten([*run.episodes.values()])
+            run.dataset, run.streams = jax.tree.map(np.asarray, steps), True
+        return run
 
     with contextlib.suppress(KeyboardInterrupt):
-        train(run(), [Look(), Terminate()] if first else [])  # a signal to one of them
-        raise AssertionError("it went on")
-    train(run(), [Look()] if first else [], resume=True)
+        train(new_run(), [CheckPolicy(), Terminate()] if first else [])  # signals only one process
+        raise AssertionError("not stopped")
+    train(new_run(), [CheckPolicy()] if first else [], resume=True)
 
 
 if __name__ == "__main__":

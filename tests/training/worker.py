@@ -1,4 +1,4 @@
-"""A process that works on a run, to be stopped: python -m tests.training.worker FOLDER."""
+"""A process that trains until it is stopped: python -m tests.training.worker FOLDER."""
 
 import argparse
 import dataclasses
@@ -13,12 +13,10 @@ def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
     parser.add_argument("--steps", type=int, default=12)
-    parser.add_argument("--until", type=int, help="step at which a signal comes")
-    parser.add_argument(
-        "--fails", type=int, help="step at which an error comes that nobody catches"
-    )
-    parser.add_argument("--devices", type=int, default=8, help="of this process")
-    parser.add_argument("--mesh", type=int, help="how many of them are used; all unless said")
+    parser.add_argument("--until", type=int, help="step at which to raise a signal")
+    parser.add_argument("--fails", type=int, help="step at which to raise an uncaught error")
+    parser.add_argument("--devices", type=int, default=8, help="number of devices")
+    parser.add_argument("--mesh", type=int, help="number of devices to use; default: all")
     return parser.parse_args()
 
 
@@ -42,7 +40,7 @@ def main(args: argparse.Namespace) -> None:
 
 
 def prepare(folder: Path, steps: int, devices: int | None = None):
-    """A run that logs and saves at every step."""
+    """Return a run that logs and saves at every step."""
     from tests.runs import CONFIG, Miniature, make_run
 
     config = dataclasses.replace(
@@ -62,12 +60,12 @@ def work(
     fails: int | None = None,
     devices: int | None = None,
 ):
-    """Begin the run or go on with it; it is returned if it is finished."""
+    """Start or resume the run; return it if it finishes."""
     from lorasp_jax.training.interrupt import sigterm_as_interrupt
     from lorasp_jax.training.loop import train
     from lorasp_jax.training.run import Callback
 
-    class Tell(Callback):
+    class PrintStep(Callback):
         def on_log(self, run, step, metrics):
             print("step", step, flush=True)
             if step == fails:
@@ -79,7 +77,7 @@ def work(
         run = prepare(folder, steps, devices)
         print("started", flush=True)
         try:
-            train(run, [Tell()], resume=True)
+            train(run, [PrintStep()], resume=True)
         except KeyboardInterrupt:
             print("stopped", flush=True)
             return None
