@@ -181,5 +181,6 @@ def _require_same_heads(config: Any, folder: Path, fields: dict[str, Any]) -> No
         expected, actual = getattr(stored, name), getattr(config, name)
         if expected.kernel_sizes == actual.kernel_sizes and expected != actual:
             raise ValueError(
-                f"{folder} does not match the config: heads of {name} are {expected}, not {actual}."
+                f"{folder} does not match the config: heads of {name} must be {expected}, "
+                f"got {actual}."
             )

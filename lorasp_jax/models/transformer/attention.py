@@ -13,7 +13,7 @@ CUDNN_MIN_QUERIES, CUDNN_MIN_HEAD_DIM = 128, 64
 so their results are bitwise reproducible."""
 
 KEY_MULTIPLE, MIN_PADDED_KEYS = 128, 512
-"""Without cuDNN, at least `MIN_PADDED_KEYS` keys are padded to a multiple of `KEY_MULTIPLE`."""
+"""Without cuDNN, keys are padded to a multiple of `KEY_MULTIPLE` from `MIN_PADDED_KEYS` on."""
 
 CUDNN_MULTIPLE = 8
 """cuDNN needs query and key counts divisible by 8 (16 bytes of the mask)."""

@@ -130,8 +130,8 @@ def test_the_fused_kernel_runs_once_forward_and_once_backward():
         return scan_depth(blocks, layer, jnp.ones((1, 16, WIDTH)), remat="products")[0].sum()
 
     def calls(jaxpr):
-        inner = (getattr(value, "jaxpr", value) for e in jaxpr.eqns for value in e.params.values())
-        own = sum(e.primitive.name == "custom_vmap_call" for e in jaxpr.eqns)
-        return own + sum(calls(j) for j in inner if hasattr(j, "eqns"))
+        nested = (getattr(value, "jaxpr", value) for e in jaxpr.eqns for value in e.params.values())
+        count = sum(e.primitive.name == "custom_vmap_call" for e in jaxpr.eqns)
+        return count + sum(calls(j) for j in nested if hasattr(j, "eqns"))
 
     assert calls(jax.make_jaxpr(jax.grad(loss))(adapters).jaxpr) == 2
