@@ -119,9 +119,9 @@ class Reader:
         """
         with as_value_error(self.path):
             names = self.cameras if cameras is None else cameras
-            wanted = {name: self.cameras[name] for name in names}
+            selected = {name: self.cameras[name] for name in names}
             sizes = self.metadata["cameras"]
-            episode = rlds_schema.episode(self._source[number], wanted, sizes, self._shared)
+            episode = rlds_schema.episode(self._source[number], selected, sizes, self._shared)
             episode.validate_numbers()
             return episode
 

@@ -95,11 +95,11 @@ def write(
 
 def _check_same(cache: "Cache", sources: Sequence[Source], steps: int) -> None:
     """Raise ValueError unless a cache's size and first episode match these datasets."""
-    first, wanted = cache.episode(0), sources[0].episode(0)
-    length = int(wanted.length[0])
-    same = cache.num_steps == steps and _metadata(first) == _metadata(wanted)
+    first, expected = cache.episode(0), sources[0].episode(0)
+    length = int(expected.length[0])
+    same = cache.num_steps == steps and _metadata(first) == _metadata(expected)
     for name in ("state", "action"):
-        same = same and np.array_equal(getattr(first, name), getattr(wanted, name)[:, :length])
+        same = same and np.array_equal(getattr(first, name), getattr(expected, name)[:, :length])
     if not same:
         raise ValueError(f"{cache.path} was written by another process from different datasets")
 
@@ -266,9 +266,9 @@ class Cache:
         """Load one episode with the images of these cameras; None: all."""
         rows = slice(self._end[number] - self._columns["length"][number], self._end[number])
         row = slice(number, number + 1)
-        wanted = self.cameras if cameras is None else cameras
+        selected = self.cameras if cameras is None else cameras
         return Episodes(
-            image={name: self._images[name][rows][None] for name in wanted},
+            image={name: self._images[name][rows][None] for name in selected},
             state=self._columns["state"][None, rows],
             action=self._columns["action"][None, rows],
             length=self._columns["length"][row],

@@ -53,15 +53,19 @@ def map_column(
     """
     with as_value_error(path):
         array: Any = np.load(check_regular(path, path.parent), mmap_mode="r")
-        wanted = tuple(n if n else m for n, m in zip(shape, array.shape, strict=True))
-        if array.shape != wanted or array.dtype != np.dtype(dtype) or not array.flags.c_contiguous:
+        expected = tuple(n if n else m for n, m in zip(shape, array.shape, strict=True))
+        if (
+            array.shape != expected
+            or array.dtype != np.dtype(dtype)
+            or not array.flags.c_contiguous
+        ):
             order = "" if array.flags.c_contiguous else " in Fortran order"
             raise ValueError(
-                f"expected {np.dtype(dtype).str} {wanted}, got {array.dtype.str} {array.shape}"
+                f"expected {np.dtype(dtype).str} {expected}, got {array.dtype.str} {array.shape}"
                 f"{order}"
             )
         if path.stat().st_size != array.offset + array.nbytes:
-            raise ValueError(f"its size does not match the shape {wanted}")
+            raise ValueError(f"its size does not match the shape {expected}")
         if crc32 is not None and zlib.crc32(array.data) != crc32:
             raise ValueError("its checksum does not match")
         return array.view(np.ndarray)

@@ -191,6 +191,6 @@ def _row(source: Source, number: int) -> np.ndarray:
     return np.concatenate([np.asarray(caption), images])
 
 
-def _spread(count: int, wanted: int) -> list[int]:
-    """Return up to `wanted` evenly spaced integers from 0 to count - 1, both ends included."""
-    return sorted({round(x) for x in np.linspace(0, count - 1, min(count, wanted))})
+def _spread(count: int, number: int) -> list[int]:
+    """Return up to `number` evenly spaced integers from 0 to count - 1, both ends included."""
+    return sorted({round(x) for x in np.linspace(0, count - 1, min(count, number))})

@@ -112,11 +112,11 @@ class LeRobot:
         entry = self.index.episodes[number]
         table = self._frames(entry)
         state, action = (self._values(table, entry, kind) for kind in ("state", "action"))
-        wanted = self.cameras if cameras is None else cameras
+        selected = self.cameras if cameras is None else cameras
         with ThreadPoolExecutor() as pool:
-            images = list(pool.map(lambda name: self._images(table, entry, name), wanted))
+            images = list(pool.map(lambda name: self._images(table, entry, name), selected))
         episode = Episodes(
-            image={name: x[None] for name, x in zip(wanted, images, strict=True)},
+            image={name: x[None] for name, x in zip(selected, images, strict=True)},
             state=state[None],
             action=action[None],
             length=np.array([len(state)], np.int32),
@@ -172,15 +172,15 @@ class LeRobot:
     def _selection(self, kind: str) -> list[int]:
         """Return the indices of the selected dimensions of a feature."""
         names = self._names(kind)
-        wanted = getattr(self.keys, f"{kind}_numbers") or [str(i) for i in range(len(names))]
+        selected = getattr(self.keys, f"{kind}_numbers") or [str(i) for i in range(len(names))]
         by_name = {str(i): i for i in range(len(names))} | {n: i for i, n in enumerate(names)}
-        unknown = [name for name in wanted if name not in by_name]
+        unknown = [name for name in selected if name not in by_name]
         if unknown:
             raise ValueError(
                 f"{self.path} has no {', '.join(unknown)} in its {kind}: choose from "
                 f"{', '.join(names)}, or indices 0 to {len(names) - 1}"
             )
-        return [by_name[name] for name in wanted]
+        return [by_name[name] for name in selected]
 
     def _frames(self, entry: EpisodeEntry) -> Any:
         """Read the episode's rows from its parquet file, and check that none is missing."""

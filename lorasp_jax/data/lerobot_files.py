@@ -192,9 +192,9 @@ def read_table(
         for name in columns or ():
             if name not in available:
                 raise KeyError(name)
-        wanted = [name for name in columns or available if not name.startswith(without)]
-        check_memory(_size(file.metadata, set(wanted)), path)
-        return file.read(columns=wanted)
+        selected = [name for name in columns or available if not name.startswith(without)]
+        check_memory(_size(file.metadata, set(selected)), path)
+        return file.read(columns=selected)
 
 
 def _size(metadata: pq.FileMetaData, columns: set[str]) -> int:

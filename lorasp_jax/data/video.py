@@ -71,10 +71,10 @@ class VideoReader:
             self._seek(start)
         for number in range(length):
             frame = self._next(start - tolerance, number, length)
-            wanted = start + number / fps
-            if abs(frame.time - wanted) > tolerance:
+            expected = start + number / fps
+            if abs(frame.time - expected) > tolerance:
                 raise ValueError(
-                    f"{self.path} has a frame at {frame.time:.3f} s instead of {wanted:.3f} s, "
+                    f"{self.path} has a frame at {frame.time:.3f} s instead of {expected:.3f} s, "
                     f"which does not match the dataset's {fps:g} fps"
                 )
             if number % every == 0:
