@@ -257,7 +257,7 @@ def _sensitivity(
 
 
 def _importance(importance: list[Triplets], uncertainty: list[Triplets]) -> list[jax.Array]:
-    """Eqs. (7), (11): S of each triplet, Ī Ū of its entry of e plus the means over A and B."""
+    """Eqs. (7), (11): S of each triplet, Ī Ū of its e plus the means over its A and B vectors."""
     scores = jax.tree.map(jnp.multiply, importance, uncertainty)
     return [s["lora_e"] + s["lora_a"].mean(-2) + s["lora_b"].mean(-1) for s in scores]
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from lorasp_jax.peft._aux import Aux, masked_mean
 from lorasp_jax.peft._method import Method, Params, kaiming_uniform
-from lorasp_jax.peft.lora_sp.router import clip_hidden
+from lorasp_jax.peft.lora_sp.router import cast_and_clip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +83,7 @@ class LoRAMoE(Method):
         """Eq. (2) of the LoRA-SP paper: z = scale w(x) x A, one weight per expert's R columns."""
         del params
         expert_inputs, logits = jnp.split(rows, [self.experts * self.rank], axis=-1)
-        logits = clip_hidden(logits)
+        logits = cast_and_clip(logits)
         probabilities = jax.nn.softmax(logits)
         columns = jnp.repeat(self.scale * self._weights(probabilities), self.rank, axis=-1)
         z = expert_inputs * columns

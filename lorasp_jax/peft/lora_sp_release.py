@@ -25,7 +25,7 @@ from lorasp_jax.kernels.energy_gate import kept_energy
 from lorasp_jax.peft._aux import Aux, masked_mean
 from lorasp_jax.peft._method import Params, kaiming_uniform
 from lorasp_jax.peft.lora_sp.bank import BankMethod, apply_masked_scores, init_bank
-from lorasp_jax.peft.lora_sp.router import clip_hidden, init_scores
+from lorasp_jax.peft.lora_sp.router import cast_and_clip, init_output_layer
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,10 +69,10 @@ class LoRASPRelease(BankMethod):
         v, w1 = jnp.split(inputs, [self.rank], axis=1)
         bank_key = jax.random.fold_in(key, 1)
         bank = init_bank(bank_key, v, d_out, normalized=self.normalized_bank)
-        scores = {}
+        output_layer = {}
         if self.hidden_width is not None:
-            scores = init_scores(score_key, "softmax", self.hidden_width, self.rank)
-        return {"bank": bank, "router": {"w1": w1, **scores}}
+            output_layer = init_output_layer(score_key, "softmax", self.hidden_width, self.rank)
+        return {"bank": bank, "router": {"w1": w1, **output_layer}}
 
     def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
@@ -82,9 +82,8 @@ class LoRASPRelease(BankMethod):
         v_x, hidden = jnp.split(rows, [self.rank], axis=-1)
         scores = release_scores(params["router"], hidden)
         mask = release_gate(scores, self.energy_target)
-        mask &= (
-            jnp.arange(mask.shape[-1]) < self.rank
-        )  # trailing scores belong to pruned directions
+        # Trailing scores belong to pruned directions.
+        mask &= jnp.arange(mask.shape[-1]) < self.rank
         usage = (mask & valid[..., None]).reshape(-1, mask.shape[-1]).astype(jnp.float32).sum(0)
         energy = kept_energy(scores, mask)
         z = apply_masked_scores(v_x, self.scale * scores, mask, energy[..., None])
@@ -94,7 +93,7 @@ class LoRASPRelease(BankMethod):
 
 def release_scores(router: dict[str, jax.Array], hidden: jax.Array) -> jax.Array:
     """Signed scores f32 [..., R]: x W1, or softmax(x W1) W2 if the router has a w2 [H, R]."""
-    hidden = clip_hidden(hidden)
+    hidden = cast_and_clip(hidden)
     return jax.nn.softmax(hidden) @ router["w2"] if "w2" in router else hidden
 
 

@@ -29,7 +29,7 @@ from lorasp_jax.peft.lora_sp.losses import Losses, loss_sums
 from lorasp_jax.peft.lora_sp.router import (
     Granularity,
     Router,
-    init_scores,
+    init_output_layer,
     pooled_scores,
     router_scores,
 )
@@ -96,8 +96,8 @@ class LoRASP(BankMethod):
         v, w1 = jnp.split(inputs, [self.rank], axis=1)
         bank_key = jax.random.fold_in(key, 1)
         bank = init_bank(bank_key, v, d_out, normalized=self.normalized_bank)
-        scores = init_scores(score_key, self.router, self.hidden_width, self.rank)
-        params = {"bank": bank, "router": {"w1": w1, **scores}}
+        output_layer = init_output_layer(score_key, self.router, self.hidden_width, self.rank)
+        params = {"bank": bank, "router": {"w1": w1, **output_layer}}
         return params | ({PROGRESS: jnp.zeros(())} if self.schedule else {})
 
     def bottleneck(

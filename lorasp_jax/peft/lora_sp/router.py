@@ -19,7 +19,7 @@ INVERSE_SOFTPLUS_OF_ONE = math.log(math.e - 1)
 INITIAL_LOGIT = {"gelu": INVERSE_SOFTPLUS_OF_ONE, "gelu_relu": 1.0, "gelu_softmax": 0.0}
 """Initial logit of every direction, by router; it yields scores of 1."""
 
-MAX_HIDDEN = 2.0**40
+MAX_PROJECTED = 2.0**40
 """Bound to which |x W1| is clipped. Scores grow linearly with x and the delta quadratically;
 beyond 1e19 it would overflow fp32, and U = 0 would turn the infinity into NaN."""
 
@@ -28,7 +28,7 @@ _LOG1P = _RATIO.convert(kind=np.polynomial.Polynomial).coef[::-1].tolist()
 """log(1 + e) / e for e in [0, 1] as a polynomial, highest power first; maximum error 4e-8."""
 
 
-def init_scores(
+def init_output_layer(
     key: jax.Array, router: Router, hidden_width: int, rank: int
 ) -> dict[str, jax.Array]:
     """Initialize the router's second layer w2 [H, R], and its biases b1 [H], b2 [R] if it has any.
@@ -64,7 +64,7 @@ def router_scores(
       scores f32 [..., R], and the logits for the z-loss: the input of ψ [..., R], or of the softmax
       [..., H] if `kind` is "softmax".
     """
-    hidden = clip_hidden(hidden)
+    hidden = cast_and_clip(hidden)
     if kind == "softmax":
         return jax.nn.relu(jax.nn.softmax(hidden) @ router["w2"]), hidden
     logits = _matmul(gelu(hidden + router["b1"]), router["w2"]) + router["b2"]
@@ -73,9 +73,9 @@ def router_scores(
     return (softplus if kind == "gelu" else jax.nn.relu)(logits), logits
 
 
-def clip_hidden(hidden: jax.Array) -> jax.Array:
-    """x W1 in fp32, clipped so that scores, losses and gradients are finite for any finite x."""
-    return clip(hidden.astype(jnp.float32), MAX_HIDDEN)
+def cast_and_clip(hidden: jax.Array) -> jax.Array:
+    """Cast x W1 to fp32 and clip it: scores, losses and gradients are finite for any finite x."""
+    return clip(hidden.astype(jnp.float32), MAX_PROJECTED)
 
 
 def clip(x: jax.Array, limit: float) -> jax.Array:
