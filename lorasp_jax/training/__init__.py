@@ -1,4 +1,4 @@
-"""Training: the step, the loop around it, checkpoints and what a run leaves."""
+"""Training: setup, step, loop, checkpoints and export of a run."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +9,7 @@ __all__ = ["load_policy"]
 
 
 def __getattr__(name: str) -> Any:
-    """Public names, imported when asked for: `train.py --help` needs none of them."""
+    """Import public names lazily, because `train.py --help` does not need them."""
     if name == "load_policy":
         from lorasp_jax.training.export import load_policy
 

@@ -65,7 +65,7 @@ def _check_state_and_actions(first: Episodes, model: BackboneConfig, path: objec
 
 
 def as_cache(source: Source, folder: Path, progress: Progress) -> Cache:
-    """Convert a dataset to a cache in the run's folder, unless that is done or it is a cache."""
+    """Return the dataset as a cache, converted into the run's folder if necessary."""
     if isinstance(source, Cache):
         return source
     if not (folder / _CACHE).exists():
@@ -74,7 +74,7 @@ def as_cache(source: Source, folder: Path, progress: Progress) -> Cache:
 
 
 def outline(dataset: Cache) -> dict[str, Episodes]:
-    """Return states and actions per task, with the task's first images in place of all others."""
+    """Return the episodes of each task; every image is replaced by the task's first one."""
     every = [dataset.episode(index, ()) for index in range(len(dataset))]
     groups: dict[str, Episodes] = {}
     for task in dataset.metadata["tasks"]:

@@ -73,11 +73,11 @@ def parse(arguments: Sequence[str], program: str = "python train.py") -> Command
     else:
         _check_names(rest, Config(name="NAME", scale=known.scale, peft=LoRASP()))
         parser.print_help()
-        raise ValueError("--config is required, such as --config configs/multitask.py")
+        raise ValueError("--config is required, for example --config configs/multitask.py")
     if wants_help:
         _option_parser(program, config.peft.name).print_help()
         print(f"\n{_scale_note(known.config, known.scale)}")
-        rest = ["--help"]  # alone, as it may stand in place of an option's value
+        rest = ["--help"]  # only this: it may stand where an option expects a value
     if known.method is not None:
         config = dataclasses.replace(config, peft=_with_rank_of(config.peft, known.method))
     if known.resume and known.dry_run:

@@ -68,8 +68,8 @@ def dry_run(
 def _abstract_data(run: Run, built: setup.RunSetup) -> Any:
     """Return the shapes of a step's data, `Steps` or `Raw`; also set the policy of the run.
 
-    The statistics are those of the dataset's first episode. Without a dataset they are those of a
-    blank step, and every demonstration is assumed to last as long as its task allows.
+    Statistics come from the dataset's first episode. Without a dataset they come from a blank step,
+    and every demonstration is assumed to last as long as its task allows.
     """
     config, source = run.config, built.source
     first = source.episode(0) if source else _blank_episode(config, built)
