@@ -22,7 +22,7 @@ class BatchedBottleneck:
     """
 
     def pack(self, params: Any) -> Any:
-        """Convert one layer's `bottleneck_params` to what `bottleneck_all` takes."""
+        """Convert a layer's `bottleneck_params` for `bottleneck_all`, once instead of per call."""
         return params
 
     def bottleneck_all(

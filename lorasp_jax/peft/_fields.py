@@ -69,7 +69,7 @@ def short(value: Any) -> str:
 
 
 def is_array(value: Any) -> bool:
-    """Whether a value has a dtype and a shape. (`nnx.Rngs` answers to any attribute name.)"""
+    """Whether a value has a dtype and a shape. (`nnx.Rngs` has any attribute.)"""
     return hasattr(value, "dtype") and isinstance(getattr(value, "shape", None), tuple)
 
 

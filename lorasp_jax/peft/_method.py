@@ -96,7 +96,7 @@ class Method:
 
     @property
     def as_saved(self) -> "Method":
-        """The method to store with the parameters, from which they can be loaded."""
+        """The method to store with the parameters and to load them with."""
         return self
 
     def init(
@@ -147,7 +147,7 @@ class Method:
         raise NotImplementedError
 
     def fused_kernel(self, params: Params) -> BatchedBottleneck | None:
-        """A fused GPU kernel for `bottleneck` at these shapes, or None."""
+        """A fused GPU kernel for `bottleneck` with parameters of these shapes, or None."""
         del params
 
     def up(self, params: Params) -> jax.Array:

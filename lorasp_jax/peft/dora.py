@@ -60,7 +60,7 @@ class DoRA(LoRA):
     ) -> tuple[jax.Array, Aux]:
         """Eq. (5): (x W + scale x A B) · m / ‖V‖, [...tokens, O]. The kernel receives no gradient.
 
-        The factor is applied in fp32; in bf16 it would scale a whole column wrongly by up to 0.4 %.
+        The factor is applied in fp32: bf16 would round it by up to 0.4 % for a whole column.
         """
         y, aux = super().apply(params, x, kernel, token_mask=token_mask)
         factor = column_factor(params["magnitude"], self._adapted(params, kernel))

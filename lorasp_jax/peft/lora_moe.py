@@ -28,8 +28,8 @@ class LoRAMoE(Method):
     router [I, E]: (I + O) E R + I E in total.
 
     Raises:
-      ValueError: a count or rank below 1, an unknown routing or gate gradient, or "switch" without
-        "top1".
+      ValueError: `experts` or `rank` below 1, an unknown routing or gate gradient, or "switch"
+        without "top1".
     """
 
     experts: int = 4
