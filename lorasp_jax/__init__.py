@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from lorasp_jax.adapters.combine.fusion import fuse, unmerge
     from lorasp_jax.adapters.combine.named import choose, combine, extract, swap
     from lorasp_jax.adapters.compress.calibration import input_moments
-    from lorasp_jax.adapters.compress.compaction import distill, prune
+    from lorasp_jax.adapters.compress.distillation import distill
+    from lorasp_jax.adapters.compress.pruning import prune
     from lorasp_jax.adapters.compress.quantization import quantize
     from lorasp_jax.adapters.io import hugging_face
     from lorasp_jax.adapters.io.hugging_face import load_peft, save_peft
@@ -83,7 +84,8 @@ _MODULES = {
     "adapters.combine.fusion": "fuse unmerge",
     "adapters.combine.named": "choose combine extract swap",
     "adapters.compress.calibration": "input_moments",
-    "adapters.compress.compaction": "distill prune",
+    "adapters.compress.distillation": "distill",
+    "adapters.compress.pruning": "prune",
     "adapters.compress.quantization": "quantize",
     "adapters.io.hugging_face": "load_peft save_peft",
     "adapters.io.native": "load_adapters save_adapters",

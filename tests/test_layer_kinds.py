@@ -95,7 +95,7 @@ def test_moments_equal_a_direct_computation():
 
 
 def test_moments_of_embeddings_raise():
-    with pytest.raises(ValueError, match="'embed' matches no dense layer or einsum; those here: "):
+    with pytest.raises(ValueError, match="'embed' matches no dense layer or einsum; available: "):
         calibration.input_moments(NET, IDS, "embed")
 
 

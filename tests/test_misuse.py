@@ -152,8 +152,8 @@ def test_unknown_field_of_a_method_gets_a_suggestion():
             "the weight of 'a' must be a finite number, got nan",
         ),
         (lambda m: lorasp_jax.extract(lorasp_jax.combine({"a": m}), 3), "unknown adapter 3"),
-        (lambda m: lorasp_jax.prune(m, [], "x"), "tolerance must lie in [0, 1), got 'x'"),
-        (lambda m: lorasp_jax.distill(m, [], 2.5), "must be a whole number, at least 1, or None"),
+        (lambda m: lorasp_jax.prune(m, [], "x"), "tolerance must be in [0, 1), got 'x'"),
+        (lambda m: lorasp_jax.distill(m, [], 2.5), "must be an integer of at least 1, or None"),
     ],
 )
 def test_combining_and_compressing(call, message):

@@ -140,6 +140,6 @@ def test_shared_kernel_is_quantized_once_per_layout():
 
 def test_embeddings_and_convolutions_are_not_quantized():
     with pytest.raises(
-        ValueError, match=r"rule 'embed' governs nothing; dense layers and einsums here"
+        ValueError, match=r"rule 'embed' applies to nothing; available dense layers and einsums"
     ):
         lorasp_jax.quantize(NET, [("embed", "nf4")])

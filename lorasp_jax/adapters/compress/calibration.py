@@ -1,11 +1,10 @@
-"""What passes through a model's layers on a calibration set, summed over its valid tokens.
+"""Collect activation statistics of a model's layers, summed over a calibration set's valid tokens.
 
-That is dense layers and einsums, which multiply their input, as rows [...tokens, I], by a matrix.
-Embeddings and convolutions do not and are left out.
+Covers dense layers and einsums; embeddings and convolutions are skipped.
 
-Each layer's method is wrapped in one that leaves the output alone and reports sums in `Aux`, under
-the layer's path. So they come out of any model that adapters work in: a stranger's, whose layers
-keep them, and one that scans over its depth and returns them, stacked.
+Each layer's method is wrapped in one that does not change the output, but reports sums in `Aux`
+under the layer's path. This works for any adaptable model: third-party models store the sums in
+their layers, and scanned models return them stacked.
 """
 
 import dataclasses
@@ -27,28 +26,28 @@ from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import Aux, Method, Params
 
 Forward = Callable[[Any, Any], Any]
-"""(model, batch) -> its output, any tree. A model whose layers return their aux must return it with
-its output; every other array counts as output."""
+"""(model, batch) -> output pytree. If the model's layers return their aux, it must be part of the
+output; all other arrays are treated as output."""
 Sums = dict[str, jax.Array]
 Report = Callable[["Layer"], Sums]
 
 
 def call(model: Any, batch: Any) -> Any:
-    """The forward pass of a model of one argument."""
+    """Default forward pass: `model(batch)`."""
     return model(batch)
 
 
 @dataclasses.dataclass(frozen=True)
 class Layer:
-    """One call of one matrix of a layer, as a report of `layers.einsum` sees it.
+    """Inputs and outputs of one layer call, for one matrix [I, O]; passed to a report function.
 
     Attributes:
-      method: the layer's own, or None.
-      params: the adapter's, or {}.
+      method: the layer's method, or None.
+      params: the adapter's parameters, or {}.
       x: [...tokens, I].
       kernel: [I, O].
-      y: [...tokens, O], without the bias.
-      other: [...tokens, O], what another adapter would give, or None.
+      y: [...tokens, O], without bias.
+      reference_y: [...tokens, O], output with the adapter to compare with, or None.
       aux: of the method.
       valid: bool [...tokens].
     """
@@ -58,27 +57,30 @@ class Layer:
     x: jax.Array
     kernel: jax.Array
     y: jax.Array
-    other: jax.Array | None
+    reference_y: jax.Array | None
     aux: Aux
     valid: jax.Array
 
     def rows(self, array: jax.Array) -> jax.Array:
-        """[...tokens, n] as f32 [T, n], zero where a token does not count."""
+        """Reshape [...tokens, n] to f32 [T, n], with invalid tokens zeroed."""
         array = jnp.where(self.valid[..., None], array, 0).astype(jnp.float32)
         return array.reshape(-1, array.shape[-1])
 
 
 @dataclasses.dataclass(frozen=True)
 class Observed(Method):
-    """A layer's own method, with a report. Parameters: its own, or a pair with another method's."""
+    """Wrap a layer's method to report sums.
+
+    Parameters: the method's, or a pair with the reference method's.
+    """
 
     path: str
     inner: Method | None
     report: Report
-    another: Method | None = None
+    reference: Method | None = None
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
-        """None of its own."""
+        """Observed has no parameters of its own."""
         del key, d_in, d_out
         return {}
 
@@ -90,17 +92,19 @@ class Observed(Method):
         *,
         token_mask: jax.Array | None = None,
     ) -> tuple[jax.Array, Aux]:
-        """What the layer gives without it, and the report."""
-        other = None
-        if self.another is not None:
-            params, others = params
-            other, _ = self.another.apply(others, x, kernel, token_mask=token_mask)
+        """Return the wrapped layer's output, with the report in aux."""
+        reference_y = None
+        if self.reference is not None:
+            params, reference_params = params
+            reference_y, _ = self.reference.apply(
+                reference_params, x, kernel, token_mask=token_mask
+            )
         if self.inner is None:
             y, aux = x @ kernel.astype(x.dtype), Aux()
         else:
             y, aux = self.inner.apply(params, x, kernel, token_mask=token_mask)
         valid = jnp.ones(x.shape[:-1], bool) if token_mask is None else token_mask
-        sums = self.report(Layer(self.inner, params, x, kernel, y, other, aux, valid))
+        sums = self.report(Layer(self.inner, params, x, kernel, y, reference_y, aux, valid))
         sums["tokens"] = valid.sum().astype(jnp.float32)
         return y, dataclasses.replace(aux, statistics={self.path: sums})
 
@@ -110,78 +114,77 @@ def observe(
     batches: Iterable[Any],
     reports: dict[str, Report],
     forward: Forward = call,
-    others: Mapping[str, tuple[Method, Params]] = MappingProxyType({}),
+    references: Mapping[str, tuple[Method, Params]] = MappingProxyType({}),
 ) -> dict[str, Sums]:
-    """The reports of some layers, summed over batches.
+    """Sum reports of some layers over batches.
 
     Args:
       model: not modified.
-      batches: of one shape each, or it compiles for each.
-      reports: by path of a layer, of those of `paths.multiplying`.
+      batches: inputs of `forward`; use one shape to avoid recompilation.
+      reports: report functions by layer path, see `paths.locate_matmul_layers`.
       forward: how to call the model.
-      others: adapters by path that some layers' output is to be compared with.
+      references: adapters to compare some layers' outputs with, by path.
 
     Returns:
-      Sums by path, with "tokens", the number of valid ones, all with the leading axes of the
+      Sums by path, including "tokens", the valid-token count. All have the leading axes of the
       layer's kernel matrices: those of a scanned stack and the batch axes of an einsum.
 
     Raises:
-      ValueError: no batches, no token in them, or numbers that are not finite; a layer that was not
-        called or whose aux `forward` did not return, or one with its own matrix product, precision
-        or the like.
+      ValueError: there are no batches or no valid tokens, values are not finite, a layer was not
+        called or its aux not returned by `forward`, or it has a custom matmul or precision.
     """
     if not isinstance(batches, Iterable) or isinstance(batches, str | Mapping):
-        raise ValueError(f"batches are a list or the like of inputs, got {short(batches)}.")
+        raise ValueError(f"batches must be an iterable of inputs, got {short(batches)}.")
     if not callable(forward):
-        raise ValueError(f"forward is a function of model and batch, got {short(forward)}.")
-    step = _stepping(_observed(model, reports, others), forward)
+        raise ValueError(f"forward must be callable (model, batch), got {short(forward)}.")
+    step = _make_step(_make_observed(model, reports, references), forward)
     total: dict[str, Sums] = {}
     for batch in batches:
         for leaf in jax.tree.leaves(batch):
             if not isinstance(leaf, jax.Array | np.ndarray | np.generic | float | int):
-                raise ValueError(f"a batch holds arrays and numbers, got {short(leaf)}.")
+                raise ValueError(f"batch leaves must be arrays or numbers, got {short(leaf)}.")
         _add(total, step(batch))
     if missing := sorted(reports.keys() - total.keys()):
         raise ValueError(
-            f"nothing was seen of {paths.near_misses(missing[0], missing)}: the batches must "
-            "reach every layer, and `forward` must return the aux of a model that returns it."
+            f"no statistics for {paths.near_misses(missing[0], missing)}: every layer must be "
+            "called, and `forward` must return the aux of models that return it."
         )
     for path, sums in total.items():
         if not np.any(sums["tokens"]):
-            raise ValueError(f"the batches hold no token that counts for {path or 'the model'}.")
+            raise ValueError(f"the batches have no valid tokens for {path or 'the model'}.")
         if not all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(sums)):
-            raise ValueError(f"numbers that are not finite reach {path or 'the model'}.")
+            raise ValueError(f"activations of {path or 'the model'} are not finite.")
     return total
 
 
 def outputs(model: nnx.Module, forward: Forward = call) -> Callable[[Any], list[jax.Array]]:
-    """The jitted function from a batch to the floating-point arrays beside aux."""
+    """Jitted function from a batch to the model's floating-point outputs, without aux."""
     graphdef, state = nnx.split(model)
     run = jax.jit(lambda state, batch: _arrays(forward(nnx.merge(graphdef, state), batch)))
     return functools.partial(run, state)
 
 
-def _stepping(model: nnx.Module, forward: Forward) -> Callable[[Any], dict[str, Sums]]:
-    """The jitted function from a batch to the reports of a model that reports."""
+def _make_step(model: nnx.Module, forward: Forward) -> Callable[[Any], dict[str, Sums]]:
+    """Jitted function from a batch to the reports of an observed model."""
     graphdef, state = nnx.split(model)
 
     @jax.jit
     def step(state: Any, batch: Any) -> dict[str, Sums]:
         model = nnx.merge(graphdef, state)
-        found = [aux for aux in _nodes(forward(model, batch)) if isinstance(aux, Aux)]
-        kept = nnx.to_flat_state(nnx.pop(model, AdapterAux))
+        returned = [aux for aux in _nodes(forward(model, batch)) if isinstance(aux, Aux)]
+        stored = nnx.to_flat_state(nnx.pop(model, AdapterAux))
         total: dict[str, Sums] = {}
-        for aux in [*found, *(variable.get_value() for _, variable in kept)]:
+        for aux in [*returned, *(variable.get_value() for _, variable in stored)]:
             _add(total, aux.statistics)
         return total
 
     return functools.partial(step, state)
 
 
-def _observed(
-    model: nnx.Module, reports: dict[str, Report], others: Mapping[str, tuple[Method, Params]]
+def _make_observed(
+    model: nnx.Module, reports: dict[str, Report], references: Mapping[str, tuple[Method, Params]]
 ) -> nnx.Module:
-    """A copy of the model that reports."""
+    """Copy the model, with the methods of some layers wrapped in `Observed`."""
     root = nnx.List([nnx.clone(model)])
     nnx.pop(root, AdapterAux)
     for location in paths.locate_matmul_layers(root):
@@ -196,12 +199,12 @@ def _observed(
         if layer.adapter is None:
             adaptation.attach(layer, Observed(path, None, reports[path]), jax.random.key(0))
         else:
-            own, params = layer.method_and_params()
-            method = Observed(path, own, reports[path])
-            if path in others:
-                another, its_params = others[path]
-                method = dataclasses.replace(method, another=another)
-                params = (params, its_params)
+            inner, params = layer.method_and_params()
+            method = Observed(path, inner, reports[path])
+            if path in references:
+                reference, reference_params = references[path]
+                method = dataclasses.replace(method, reference=reference)
+                params = (params, reference_params)
             layer.method = method
             layer.adapter = AdapterParam(params)
     return root[0]
@@ -224,28 +227,28 @@ def _add(total: dict[str, Sums], more: Any) -> None:
 def input_moments(
     model: nnx.Module, batches: Iterable[Any], pattern: str = ".*", forward: Forward = call
 ) -> dict[str, jax.Array]:
-    """Σ x xᵀ of the inputs of the layers whose path matches, f32 [..., I, I] by path.
+    """Uncentered second moments Σ x xᵀ of layer inputs, f32 [..., I, I] by path.
 
-    It is what `adapt(..., statistics=...)` needs for LoRA's initialization "eva". Not centred. Of
-    dense layers and einsums; other people's einsum classes are known once they are adapted.
+    Required by `adapt(..., statistics=...)` for LoRA's initialization "eva". Covers dense layers
+    and einsums whose path matches; third-party einsum classes only after adaptation.
 
     Raises:
       ValueError: as for `observe`, or no such layer matches.
     """
     paths.check_rules([(pattern, None)], lambda _: True, "None")
-    known = [
+    layer_paths = [
         location.path
         for location in paths.locate_matmul_layers(nnx.List([validate.with_values(model)]))
     ]
-    reports = {path: second_moment for path in known if re.search(pattern, path)}
+    reports = {path: second_moment for path in layer_paths if re.search(pattern, path)}
     if not reports:
-        close = paths.near_misses(pattern, known) or "none"
-        raise ValueError(f"{short(pattern)} matches no dense layer or einsum; those here: {close}.")
-    found = observe(model, batches, reports, forward)
-    return {path: sums["moment"] for path, sums in found.items()}
+        close = paths.near_misses(pattern, layer_paths) or "none"
+        raise ValueError(f"{short(pattern)} matches no dense layer or einsum; available: {close}.")
+    sums_by_path = observe(model, batches, reports, forward)
+    return {path: sums["moment"] for path, sums in sums_by_path.items()}
 
 
 def second_moment(layer: Layer) -> Sums:
-    """Σ x xᵀ over the valid tokens."""
+    """Second moment Σ x xᵀ over the valid tokens."""
     x = layer.rows(layer.x)
     return {"moment": x.T @ x}

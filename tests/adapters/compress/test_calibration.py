@@ -1,4 +1,4 @@
-"""Sums over a calibration set, and what EVA starts from."""
+"""Activation statistics over a calibration set, and EVA initialization from them."""
 
 import jax
 import jax.numpy as jnp
@@ -31,24 +31,24 @@ def moments(net, batches):
 
 
 def inputs(net, x):
-    """What each layer of the net sees, by hand: the net's own formula, layer after layer."""
+    """Inputs of each layer, by evaluating the net's formula by hand."""
     h = net.norm(net.inp(x))
-    seen = []
+    block_inputs = []
     for kernel, bias in zip(net.blocks.kernel[...], net.blocks.bias[...], strict=True):
-        seen.append(h)
+        block_inputs.append(h)
         h = h + jnp.tanh(h @ kernel + bias)
-    return {"inp": x, "blocks": np.stack(seen), "heads/0": h, "heads/1": h}
+    return {"inp": x, "blocks": np.stack(block_inputs), "heads/0": h, "heads/1": h}
 
 
 def test_moments_are_those_of_the_inputs_by_hand(net, batches, moments):
-    seen = [inputs(net, x) for x in batches]
+    layer_inputs = [inputs(net, x) for x in batches]
     assert set(moments) == {"inp", "blocks", "heads/0", "heads/1"}
     for path, moment in moments.items():
-        rows = np.concatenate([np.asarray(s[path], np.float64) for s in seen], axis=-2)
+        rows = np.concatenate([np.asarray(s[path], np.float64) for s in layer_inputs], axis=-2)
         np.testing.assert_allclose(moment, np.swapaxes(rows, -1, -2) @ rows, rtol=1e-4, atol=1e-4)
 
 
-def test_the_model_is_left_alone(net, batches, moments):
+def test_the_model_is_not_modified(net, batches, moments):
     del moments
     assert not adaptation.methods(net)
     assert isinstance(net.inp, nnx.Linear)
@@ -56,7 +56,7 @@ def test_the_model_is_left_alone(net, batches, moments):
     assert set(some) == {"heads/1"}
 
 
-def test_padding_stays_out():
+def test_padding_is_excluded():
     layer = nnx.List([Dense(5, 3, rngs=nnx.Rngs(0))])
     x = jax.random.normal(jax.random.key(0), (2, 7, 5))
     mask = jnp.arange(7)[None] < jnp.array([[3], [6]])
@@ -68,10 +68,10 @@ def test_padding_stays_out():
     np.testing.assert_allclose(found["0"], rows.T @ rows, rtol=1e-5)
 
 
-def test_what_was_not_seen_is_an_error(net, batches):
-    with pytest.raises(ValueError, match=r"nothing was seen of blocks.*must return the aux"):
+def test_missing_statistics_are_an_error(net, batches):
+    with pytest.raises(ValueError, match=r"no statistics for blocks.*must return the aux"):
         calibration.input_moments(net, batches, forward=lambda model, x: model(x)[0])
-    with pytest.raises(ValueError, match="nothing was seen of blocks"):
+    with pytest.raises(ValueError, match="no statistics for blocks"):
         calibration.input_moments(net, [])
 
 
@@ -88,7 +88,7 @@ def test_eva_starts_with_the_right_singular_vectors(path, net, batches, moments)
     np.testing.assert_array_equal(params["lora_b"], 0)
 
 
-def test_eva_in_a_stack_saves_as_a_lora(net, batches, moments, tmp_path):
+def test_eva_in_a_stack_is_saved_as_lora(net, batches, moments, tmp_path):
     rules = [("blocks", LoRA(rank=2, initialization="eva"))]
     model = lorasp_jax.adapt(net, rules, rngs=nnx.Rngs(1), statistics=moments)
     stacked = np.concatenate([np.asarray(inputs(net, x)["blocks"]) for x in batches], axis=1)

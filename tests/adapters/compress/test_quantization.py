@@ -1,4 +1,4 @@
-"""Quantised bases under adapters: what shrinks, what stays, what still works."""
+"""Quantized bases: memory, errors, and every operation on adapted models."""
 
 import functools
 
@@ -24,8 +24,8 @@ def quantized(kind):
     return lorasp_jax.quantize(NET, [("", kind)]).model
 
 
-def widened(model):
-    """The model with every quantised kernel as an array again."""
+def dequantized(model):
+    """Copy of the model with dequantized kernels."""
     root = nnx.List([nnx.clone(model)])
     for location in paths.locate(root, Dense):
         kernel = location.child.kernel.get_value()
@@ -40,7 +40,7 @@ def size(model):
 
 @pytest.mark.parametrize(("kind", "bits", "error"), [("int8", 8.125, 0.0051), ("nf4", 4.5, 0.092)])
 def test_memory_and_error(kind, bits, error):
-    """In all, and of the output: as far off as is reported, for an input without a direction."""
+    """Bytes of all parameters; the reported error is that of the output for isotropic inputs."""
     wide = nnx.Linear(256, 512, rngs=nnx.Rngs(0))
     smaller, errors = lorasp_jax.quantize(wide, [("", kind)])
     assert size(smaller) == 256 * 512 * bits / 8 + 512 * 4
@@ -52,28 +52,28 @@ def test_memory_and_error(kind, bits, error):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_quantised_equals_widened(kind):
+def test_quantized_equals_dequantized(kind):
     model = quantized(kind)
     assert isinstance(model.blocks.kernel.get_value(), QuantizedKernel)
-    assert_close(call(model, X), call(widened(model), X))
-    assert np.abs(call(model, X) - call(NET, X)).max() > 1e-4  # and something was quantised
+    assert_close(call(model, X), call(dequantized(model), X))
+    assert np.abs(call(model, X) - call(NET, X)).max() > 1e-4  # the kernels did change
     assert isinstance(NET.inp, nnx.Linear)
     graphdef, state = nnx.split(model)
     assert_close(jax.jit(lambda s: nnx.merge(graphdef, s)(X))(state), call(model, X))
 
 
 @pytest.mark.parametrize("name", mostly_slow(METHODS, ["lora", "lora_sp"]))
-def test_methods_over_a_quantised_base(name):
+def test_methods_over_a_quantized_base(name):
     """By discovery: attached after or before, the same as over the widened kernels."""
     method = METHODS[name]
     if method.trains_base:
         with pytest.raises(ValueError, match="inp/kernel is quantized and cannot be fully"):
             adaptation.adapt(quantized("nf4"), [("inp", method)], rngs=nnx.Rngs(0))
-        with pytest.raises(ValueError, match="cannot quantise inp: its kernel trains"):
+        with pytest.raises(ValueError, match="cannot quantize inp: its kernel is trainable"):
             lorasp_jax.quantize(trained(("inp", method), seed=0), [("", "nf4")])
         return
     model = trained(("inp|blocks", method), seed=1, net=quantized("nf4"))
-    assert_close(call(model, X), call(widened(model), X))
+    assert_close(call(model, X), call(dequantized(model), X))
     later, _ = lorasp_jax.quantize(trained(("inp|blocks", method), seed=1), [("", "nf4")])
     if method.additive:  # what DoRA starts from is of the kernel that it found
         assert_close(call(later, X), call(model, X))
@@ -90,7 +90,7 @@ def test_gradients_and_training(kind):
         return jnp.mean((nnx.merge(graphdef, adapters, frozen)(x) - 1) ** 2)
 
     found = []
-    for one in (model, widened(model)):
+    for one in (model, dequantized(model)):
         graphdef, adapters, frozen = adaptation.split(one)
         gradient = jax.jit(jax.grad(loss, (0, 1)), static_argnums=2)
         found.append(gradient(adapters, X, graphdef, frozen))
@@ -119,12 +119,12 @@ def test_merge_widens_what_it_merges():
     assert_close(call(merged, X), call(model, X))
     back = lorasp_jax.unmerge(merged, model)
     assert_close(
-        back.blocks.kernel.get_value(), widened(quantized("nf4")).blocks.kernel.get_value()
+        back.blocks.kernel.get_value(), dequantized(quantized("nf4")).blocks.kernel.get_value()
     )
 
 
 @pytest.mark.slow
-def test_named_adapters_over_one_quantised_base():
+def test_named_adapters_over_one_quantized_base():
     models = {
         n: trained(("", LoRA(rank=i)), seed=i, net=quantized("nf4"))
         for i, n in ((1, "a"), (2, "b"))
@@ -139,7 +139,7 @@ def test_split_kernels_come_first():
     with pytest.raises(ValueError, match="adapt first, then quantize"):
         adaptation.adapt(quantized("int8"), [("inp", pissa)], rngs=nnx.Rngs(0))
     model, errors = lorasp_jax.quantize(trained(("inp", pissa), seed=1), [("inp", "nf4")])
-    assert_close(call(model, X), call(widened(model), X))
+    assert_close(call(model, X), call(dequantized(model), X))
     assert 0 < errors["inp"] < 0.12
 
 
@@ -165,19 +165,19 @@ def test_rules():
     for rules, message in (
         (
             [("blcks", "nf4")],
-            r"rule 'blcks' governs nothing; dense layers and einsums here: blocks",
+            r"rule 'blcks' applies to nothing; available dense layers and einsums: blocks",
         ),
-        ([("", "nf4"), ("out", "int8")], "rule 'out' governs nothing"),
+        ([("", "nf4"), ("out", "int8")], "rule 'out' applies to nothing"),
         ([("out", "fp4")], "rule 'out' must have 'int8' or 'nf4' or None, got 'fp4'"),
         ([("(", "nf4")], r"rule '\(' is not a valid regular expression"),
     ):
         with pytest.raises(ValueError, match=message):
             lorasp_jax.quantize(NET, rules)
-    with pytest.raises(ValueError, match="quantised already"):
+    with pytest.raises(ValueError, match="already quantized"):
         lorasp_jax.quantize(model, [("out", "nf4")])
     broken = Net()
     broken.out.kernel.set_value(broken.out.kernel.get_value().at[0].set(jnp.inf))
-    with pytest.raises(ValueError, match="cannot quantise out: the kernel has NaN"):
+    with pytest.raises(ValueError, match="cannot quantize out: the kernel has NaN"):
         lorasp_jax.quantize(broken, [("", "nf4")])
     with pytest.raises(ValueError, match="out/kernel is quantized"):
         adaptation.adapt(model, [("out", FullFineTuning())], rngs=nnx.Rngs(0))
@@ -193,10 +193,10 @@ def test_shared_kernels_stay_shared():
 
 
 def test_tables_and_reports():
-    """A summary counts weights, not bytes; adapters report as ever."""
+    """A summary counts weights, not bytes; adapters still report aux."""
     model = trained(("", LoRA(rank=2)), seed=1, net=quantized("nf4"))
     assert "inp" in lorasp_jax.summary(model)
-    assert lorasp_jax.summary(model) == lorasp_jax.summary(widened(model))
+    assert lorasp_jax.summary(model) == lorasp_jax.summary(dequantized(model))
     named = lorasp_jax.choose(lorasp_jax.combine({"a": model}), None)
     named(X)
     assert not lorasp_jax.collect_aux(named)["inp"].active_rank.any()

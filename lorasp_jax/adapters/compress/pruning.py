@@ -1,0 +1,93 @@
+"""Prune LoRA-SP directions that are rarely active on a calibration set."""
+
+import dataclasses
+import functools
+import numbers
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lorasp_jax.adapters import adaptation
+from lorasp_jax.adapters.compress import calibration
+from lorasp_jax.adapters.compress.calibration import Forward, Layer, Sums
+from lorasp_jax.adapters.compress.compaction import (
+    Compaction,
+    Replacements,
+    lora_sp_layers,
+    replace_adapters,
+)
+from lorasp_jax.peft import Method
+from lorasp_jax.peft._fields import short
+from lorasp_jax.peft._method import Params
+from lorasp_jax.peft.lora_sp.bank import BankMethod, normalized_bank
+
+
+def prune(
+    model: adaptation.Model,
+    batches: Sequence[Any],
+    tolerance: float = 0.0,
+    *,
+    forward: Forward = calibration.call,
+) -> tuple[adaptation.Model, Compaction]:
+    """Prune LoRA-SP directions that are rarely active.
+
+    Drops each direction that is active for at most a fraction `tolerance` of the valid calibration
+    tokens. The bank's arrays shrink, but the router still scores dropped directions, since E_k is
+    relative to the energy of all. So dropping a direction that was never active leaves every output
+    unchanged, ties included, and dropping another one removes exactly its contribution. All layers
+    of a stack have the same rank, the largest that one of them needs; the others keep additional
+    directions.
+
+    Args:
+      model: not modified; the result shares its frozen arrays and can be trained further.
+      batches: calibration set.
+      tolerance: maximum fraction of tokens, in [0, 1), for which a dropped direction is active.
+      forward: how to call the model on a batch; see `lorasp_jax.adapters.compress.calibration`.
+
+    Raises:
+      ValueError: tolerance is outside [0, 1), or the model has no LoRA-SP layers.
+    """
+    if not (isinstance(tolerance, numbers.Real) and 0 <= tolerance < 1):
+        raise ValueError(f"tolerance must be in [0, 1), got {short(tolerance)}.")
+    layers = lora_sp_layers(model)
+    sums = calibration.observe(model, batches, dict.fromkeys(layers, _usage), forward)
+    replacements: Replacements = {}
+    ranks = {}
+    for path, layer in layers.items():
+        usage = np.asarray(sums[path]["usage"] / jnp.maximum(sums[path]["tokens"][..., None], 1))
+        ranks[path] = np.asarray((usage > tolerance).sum(-1))
+        replacements[path] = _pruned(layer, usage, max(int(ranks[path].max()), 1))
+    return replace_adapters(model, batches, replacements, ranks, forward)
+
+
+def _usage(layer: Layer) -> Sums:
+    assert layer.aux.usage is not None  # LoRA-SP always reports it
+    return {"usage": layer.aux.usage}
+
+
+def _pruned(layer: Any, usage: np.ndarray, rank: int) -> tuple[Method, Params]:
+    """Method and parameters with the `rank` most used directions, in their original order."""
+    method = layer.method
+    in_bank = np.arange(usage.shape[-1]) < method.rank  # directions dropped earlier stay dropped
+    by_usage = np.argsort(np.where(in_bank, -usage, 1), axis=-1, kind="stable")
+    order = np.concatenate([np.sort(by_usage[..., :rank]), np.sort(by_usage[..., rank:])], axis=-1)
+    params = layer.adapter.get_value()
+    reorder = functools.partial(_reordered, method=method, rank=rank)
+    reorder_stack = adaptation.over_stack(reorder, layer.kernel_matrices())
+    params = reorder_stack(params, jnp.asarray(order))
+    smaller = dataclasses.replace(method, rank=rank, alpha=method.scale * rank)
+    return smaller, params
+
+
+def _reordered(params: Params, order: jax.Array, *, method: BankMethod, rank: int) -> Params:
+    """Reorder one layer's directions; keep the first `rank` in the bank, and all scores."""
+    bank, router = dict(params["bank"]), dict(params["router"])
+    if method.normalized_bank:  # a subset of orthonormal directions is orthonormal
+        gain = jnp.asarray(bank["u"].shape[1] ** -0.5)
+        bank |= normalized_bank(bank | {"gain": gain})
+    bank["u"], bank["v"] = bank["u"][order[:rank]], bank["v"][:, order[:rank]]
+    router |= {name: router[name][..., order] for name in method.score_arrays if name in router}
+    return {**params, "bank": bank, "router": router}

@@ -1,0 +1,59 @@
+"""Models with LoRA-SP adapters and a calibration set, for the tests of pruning and distillation."""
+
+import jax
+from flax import nnx
+
+from lorasp_jax.adapters import adaptation, paths
+from lorasp_jax.dense import AdapterParam, Dense
+from lorasp_jax.peft import EnergySchedule, LoRASP, LoRASPRelease
+from tests.adapters.test_adaptation import Net
+
+RANK = 12
+TOKENS = 40
+VARIANTS = [
+    LoRASP(rank=RANK, hidden_width=4, energy_target=0.6),
+    LoRASP(RANK, 0.6, hidden_width=4, granularity="sample", schedule=EnergySchedule(0.7)),
+    LoRASP(rank=4, hidden_width=2, energy_target=0.6, router="softmax"),
+    LoRASP(rank=4, hidden_width=4, energy_target=0.6, normalized_bank=True),
+    LoRASPRelease(rank=RANK, energy_target=0.5),
+]
+IDS = ["default", "sample", "softmax", "normalized", "release"]
+
+
+def perturbed(model, seed=0, size=1.0):
+    """Add noise to all adapters, so that scores differ; `size` scales their deltas."""
+    for i, location in enumerate(paths.locate(nnx.List([model]), Dense)):
+        if location.child.adapter is not None:
+            params = location.child.adapter.get_value()
+            leaves, structure = jax.tree.flatten(params)
+            keys = jax.random.split(jax.random.key(seed + i), len(leaves))
+            pairs = zip(keys, leaves, strict=True)
+            noisy = [p if p.ndim < 1 else p + jax.random.normal(k, p.shape) for k, p in pairs]
+            params = jax.tree.unflatten(structure, noisy)
+            params["bank"]["u"] *= size
+            if "gain" in params["bank"]:
+                params["bank"]["gain"] += 0.3
+            location.child.adapter = AdapterParam(params)
+    return model
+
+
+def lora_sp_model(method, seed=0):
+    """Deltas are about as large as the base outputs: with far larger ones, three blocks and heads
+    amplify rounding errors of the first block a thousandfold."""
+    net = Net(nnx.Rngs(0))
+    model = adaptation.adapt(net, [("blocks|heads", method)], rngs=nnx.Rngs(1))
+    return perturbed(model, seed, size=0.1)
+
+
+def calibration_batches():
+    return [jax.random.normal(jax.random.key(i), (TOKENS, 5)) for i in range(2)]
+
+
+def forward(model, batch):
+    y, aux = model(batch)
+    return y, aux  # the stack's aux; the heads store theirs
+
+
+@jax.jit
+def call(model, x):
+    return model(x)[0]

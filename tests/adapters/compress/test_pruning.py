@@ -1,0 +1,165 @@
+"""Pruning: unused directions are dropped without error, others with the reported error."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+import lorasp_jax
+from lorasp_jax.adapters import adaptation, paths
+from lorasp_jax.adapters.io import native
+from lorasp_jax.dense import AdapterParam, Dense
+from lorasp_jax.peft import LoRA
+from tests.adapters.compress.lora_sp_models import (
+    IDS,
+    RANK,
+    TOKENS,
+    VARIANTS,
+    calibration_batches,
+    call,
+    forward,
+    lora_sp_model,
+    perturbed,
+)
+from tests.adapters.test_adaptation import Net, trained
+from tests.cases import mostly_slow
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def batches():
+    return calibration_batches()
+
+
+def deactivate(model, path, layer, directions):
+    """Prevent directions of one layer of a stack from being active, by very low logits."""
+    (location,) = (p for p in paths.locate(nnx.List([model]), Dense) if p.path == path)
+    params = location.child.adapter.get_value()
+    b2 = params["router"]["b2"].at[layer, jnp.array(directions)].set(-30.0)
+    w2 = params["router"]["w2"].at[layer, :, jnp.array(directions)].set(0.0)
+    location.child.adapter = AdapterParam(
+        params | {"router": params["router"] | {"b2": b2, "w2": w2}}
+    )
+    return model
+
+
+@pytest.mark.parametrize("method", mostly_slow(VARIANTS, VARIANTS[:1]), ids=IDS)
+def test_pruning_inactive_directions_preserves_outputs(method, batches):
+    """Directions that are never active are dropped without changing outputs on these batches."""
+    model = lora_sp_model(method)
+    smaller, report = lorasp_jax.prune(model, batches, forward=forward)
+    for x in batches:
+        before, after = call(model, x), call(smaller, x)
+        np.testing.assert_allclose(after, before, rtol=1e-4, atol=1e-4)
+    assert report.output_error < 1e-5
+    assert all((error < 1e-5).all() for error in report.layer_errors.values())
+
+
+@pytest.mark.slow
+def test_a_stack_gets_the_largest_rank_that_a_layer_needs(batches):
+    """Three layers need ranks 7, 9 and 8: all get rank 9 and keep the directions they use."""
+    model = lora_sp_model(dataclasses.replace(VARIANTS[0], energy_target=1.0))
+    inactive = [[0, 1, 2, 5, 11], [3, 4, 10], [0, 6, 7, 8]]
+    for layer, directions in enumerate(inactive):
+        model = deactivate(model, "blocks", layer, directions)
+    smaller, report = lorasp_jax.prune(model, batches, 0.0, forward=forward)
+    # With η = 1 every positive score is active, even softplus(-30), so nothing is dropped.
+    np.testing.assert_array_equal(report.ranks["blocks"], 12)
+
+    method = dataclasses.replace(VARIANTS[0], energy_target=0.99)
+    model = lora_sp_model(method)
+    for layer, directions in enumerate(inactive):
+        model = deactivate(model, "blocks", layer, directions)
+    smaller, report = lorasp_jax.prune(model, batches, 0.0, forward=forward)
+    np.testing.assert_array_equal(report.ranks["blocks"], [7, 9, 8])
+    params = smaller.blocks.adapter.get_value()
+    assert params["bank"]["u"].shape == (3, 9, 4)
+    assert params["bank"]["v"].shape == (3, 4, 9)
+    assert params["router"]["w2"].shape == (3, 4, 12)
+    assert smaller.blocks.method.rank == 9
+    assert smaller.blocks.method.scale == method.scale
+    assert report.output_error < 1e-6
+    for x in batches:
+        np.testing.assert_allclose(call(smaller, x), call(model, x), rtol=1e-5, atol=1e-5)
+
+
+def active_fractions(model, batches):
+    """Fraction of tokens by head and direction, from the aux of the heads."""
+    fractions = []
+    for i in range(2):
+        usage = []
+        for x in batches:
+            model(x)
+            usage.append(lorasp_jax.collect_aux(model)[f"heads/{i}"].usage)
+        fractions.append(np.mean(usage, axis=0) / TOKENS)
+    return np.array(fractions)
+
+
+@pytest.mark.slow
+def test_a_tolerance_drops_rarely_active_directions_and_reports_the_error(batches):
+    model = lora_sp_model(VARIANTS[0])
+    fractions = active_fractions(model, batches)
+    smaller, report = lorasp_jax.prune(model, batches, 0.3, forward=forward)
+    for i in range(2):
+        assert (
+            report.ranks[f"heads/{i}"] == (fractions[i] > 0.3).sum() == smaller.heads[i].method.rank
+        )
+    assert 0 < report.ranks["heads/0"] < RANK
+    before = np.concatenate([call(model, x) for x in batches])
+    after = np.concatenate([call(smaller, x) for x in batches])
+    error = np.linalg.norm(after - before) / np.linalg.norm(before)
+    assert report.output_error == pytest.approx(error, rel=1e-3)
+    assert error > 1e-3
+    again, second = lorasp_jax.prune(smaller, batches, 0.3, forward=forward)
+    assert adaptation.methods(again) == adaptation.methods(smaller)  # nothing else is dropped
+    assert second.output_error < 1e-6
+
+
+@pytest.mark.slow
+def test_layer_errors_ignore_padding():
+    """For a single layer, the layer error equals the output error, over valid tokens only."""
+    layer = Dense(5, 4, use_bias=False, method=VARIANTS[0], rngs=nnx.Rngs(0))
+    model = perturbed(nnx.List([layer]))
+    x = jax.random.normal(jax.random.key(3), (2, 20, 5))
+    mask = jnp.arange(20)[None] < jnp.array([[7], [20]])
+
+    def valid(model, x):
+        y = model[0](x, token_mask=mask)
+        return jnp.where(mask[..., None], y, 0)
+
+    _, clean = lorasp_jax.prune(model, [x], 0.4, forward=valid)
+    garbage = jnp.where(mask[..., None], x, 1e3)
+    _, padded = lorasp_jax.prune(model, [garbage], 0.4, forward=valid)
+    assert clean.layer_errors["0"] == pytest.approx(clean.output_error, rel=1e-5)
+    assert clean.output_error > 1e-3
+    assert padded.output_error == pytest.approx(clean.output_error, rel=1e-4)
+    np.testing.assert_array_equal(clean.ranks["0"], padded.ranks["0"])
+
+
+@pytest.mark.slow
+def test_a_pruned_model_trains_saves_and_loads(batches, tmp_path):
+    model = lora_sp_model(VARIANTS[0])
+    smaller, _ = lorasp_jax.prune(model, batches, 0.3, forward=forward)
+    assert f"{smaller.heads[0].method.rank}" in lorasp_jax.summary(smaller)
+    native.save_adapters(tmp_path, smaller)
+    loaded = native.load_adapters(tmp_path, Net(nnx.Rngs(0)))
+    np.testing.assert_array_equal(call(loaded, batches[0]), call(smaller, batches[0]))
+    after = trained(loaded, batches[0])
+    assert jnp.isfinite(call(after, batches[0])).all()
+    assert (call(after, batches[0]) != call(loaded, batches[0])).any()
+    assert adaptation.count(smaller).trainable < adaptation.count(model).trainable
+
+
+def test_bad_tolerance(batches):
+    with pytest.raises(ValueError, match=r"tolerance must be in \[0, 1\)"):
+        lorasp_jax.prune(lora_sp_model(VARIANTS[0]), batches, 1.0)
+
+
+def test_needs_lora_sp(batches):
+    net = adaptation.adapt(Net(nnx.Rngs(0)), [("heads", LoRA(rank=2))], rngs=nnx.Rngs(1))
+    with pytest.raises(ValueError, match="the model has no LoRA-SP layers"):
+        lorasp_jax.prune(net, batches)
