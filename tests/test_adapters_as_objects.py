@@ -92,7 +92,7 @@ def test_what_was_saved_comes_back(tmp_path, method, model):
     again = load_adapters(tmp_path / "out", NET)
     for ours, theirs in zip(parameters(again), parameters(model), strict=True):
         np.testing.assert_array_equal(ours, theirs)
-    with pytest.raises(ValueError, match="of a combined one, extract one first"):
+    with pytest.raises(ValueError, match="for a combined model, extract one first"):
         save_adapters(tmp_path / "none", pair)
 
 

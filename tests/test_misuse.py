@@ -352,27 +352,30 @@ def test_abstract_models(tmp_path):
         (lambda _: lorasp_jax.load_adapters("gs://x/y", NET), "gs://x/y is a URL; adapters must"),
         (lambda f: lorasp_jax.load_adapters(f / LONG, NET), "must have at most 255 bytes, got '"),
         (lambda f: lorasp_jax.load_peft(f / LONG, NET), "must have at most 255 bytes"),
-        (lambda f: lorasp_jax.save_adapters(f, adapted(), base=5), "base must be a text"),
+        (lambda f: lorasp_jax.save_adapters(f, adapted(), base=5), "base must be a str"),
         (
             lambda f: lorasp_jax.save_adapters(f, adapted(), metadata={"a": float("nan")}),
-            "metadata is for JSON, which cannot hold it: Out of range",
+            "metadata is not JSON-serializable: Out of range",
         ),
         (
             lambda f: lorasp_jax.save_adapters(f, adapted(), metadata={1: 2}),
-            "metadata is a dictionary whose keys are texts, got {1: 2}",
+            "metadata must be a dict with str keys, got {1: 2}",
         ),
-        (lambda f: lorasp_jax.save_peft(f, adapted(), names=5), "names is a function of a path"),
+        (
+            lambda f: lorasp_jax.save_peft(f, adapted(), names=5),
+            "names must be callable (path, index) -> str",
+        ),
         (
             lambda f: lorasp_jax.save_peft(f, adapted(), names=lambda *_: None),
-            "names must give a text for 'inp', (), got None",
+            "names('inp', ()) must return a non-empty str, got None",
         ),
         (
             lambda f: lorasp_jax.save_peft(
                 f, lorasp_jax.adapt(NET, [(".*", METHOD)], **RNGS), names=lambda *_: "one"
             ),
-            "names gives 'one' for ('head', ()) and for ('inp', ())",
+            "names returns 'one' for both ('head', ()) and ('inp', ())",
         ),
-        (lambda f: lorasp_jax.save_peft(f, adapted(), base=5), "base must be a text"),
+        (lambda f: lorasp_jax.save_peft(f, adapted(), base=5), "base must be a str"),
         (
             lambda _: lorasp_jax.fuse(lorasp_jax.combine({"a": adapted()}), 5),
             "weights must be a non-empty",

@@ -1,9 +1,9 @@
-"""Adapter folders of Hugging Face PEFT, in and out: LoRA, rsLoRA, DoRA, and AdaLoRA once pruned.
+"""Load and save Hugging Face PEFT adapter folders: LoRA, rsLoRA, DoRA, pruned AdaLoRA.
 
-Such a folder holds adapter_config.json and adapter_model.safetensors, whose tensors are named
-base_model.model.<module>.lora_A.weight and so on, with torch's layout [out, in]. Which module is
-which layer of a model says a function of the layer's path and its index in a scanned stack; without
-one, "a/0/b" is "a.0.b". (Format as PEFT 0.21.2 writes it.)
+A folder has adapter_config.json and adapter_model.safetensors, with tensors named
+base_model.model.<module>.lora_A.weight etc., in torch's layout [out, in]. A function
+`names(path, index)` maps each layer, and its index in a scanned stack, to its module name; by
+default "a/0/b" becomes "a.0.b". (Format of PEFT 0.21.2.)
 """
 
 import collections
@@ -22,9 +22,14 @@ import safetensors.numpy
 from flax import nnx
 
 from lorasp_jax.adapters import adaptation, paths
-from lorasp_jax.adapters.io.native import write_whole
-from lorasp_jax.adapters.io.peft_folders import CONFIG, PREFIX, TENSORS, Adapter, read
-from lorasp_jax.adapters.io.peft_whole import Names, check_biases, exported_whole, whole_parameters
+from lorasp_jax.adapters.io.native import write_atomic
+from lorasp_jax.adapters.io.peft_folders import CONFIG, PREFIX, TENSORS, Adapter, read_folder
+from lorasp_jax.adapters.io.peft_full import (
+    Names,
+    check_biases,
+    export_full_parameters,
+    full_parameters,
+)
 from lorasp_jax.adapters.layers import nnx_layers
 from lorasp_jax.dense import AdaptedLayer, AdapterParam, validate
 from lorasp_jax.peft import AdaLoRA, DoRA, FullFineTuning, LoRA
@@ -33,29 +38,32 @@ from lorasp_jax.peft._method import dropout_rate
 
 
 def dotted(path: str, index: tuple[int, ...]) -> str:
-    """The module's name where a model's attributes are called as in torch.
+    """Default module name, for models whose attribute names match torch's.
 
     Raises:
-      ValueError: for a layer of a stack, whose name cannot be guessed.
+      ValueError: the layer is in a stack, so its name cannot be guessed.
     """
     if index:
-        raise ValueError(f"{path} is a stack of layers: give names(path, index) for its modules.")
+        raise ValueError(
+            f"{path} is a stack of layers: pass names=, a function (path, index) -> module name."
+        )
     return path.replace("/", ".")
 
 
-def distinct(names: Names) -> Names:
-    """The same function, which now raises a ValueError for what it gives that is no name, and for
-    one name of two layers."""
+def checked_names(names: Names) -> Names:
+    """Wrap `names` to raise ValueError for invalid and duplicate names."""
     if not callable(names):
-        raise ValueError(f"names is a function of a path and an index, got {short(names)}.")
+        raise ValueError(f"names must be callable (path, index) -> str, got {short(names)}.")
     layer_of: dict[str, tuple[str, tuple[int, ...]]] = {}
 
     def checked(path: str, index: tuple[int, ...]) -> str:
         name = names(path, index)
         if not isinstance(name, str) or not name:
-            raise ValueError(f"names must give a text for {path!r}, {index}, got {short(name)}.")
+            raise ValueError(
+                f"names{(path, index)} must return a non-empty str, got {short(name)}."
+            )
         if (first := layer_of.setdefault(name, (path, index))) != (path, index):
-            raise ValueError(f"names gives {short(name)} for {first} and for {(path, index)}.")
+            raise ValueError(f"names returns {short(name)} for both {first} and {(path, index)}.")
         return name
 
     return checked
@@ -68,24 +76,24 @@ def load_peft(
     names: Names = dotted,
     einsums: nnx_layers.Einsums = MappingProxyType({}),
 ) -> adaptation.Model:
-    """The model with the adapters of a folder of Hugging Face PEFT.
+    """Load the adapters of a Hugging Face PEFT folder into a model.
 
-    Biases and modules that the folder trained in full (`bias`, `modules_to_save`) train in full
-    here, too. Adapters go to dense layers and einsums, `nnx.MultiHeadAttention`'s among them, whose
-    kernels stand for torch's with all heads side by side. AdaLoRA comes as the LoRA that it has
-    become. Zeros make up for different ranks in a stack. `lora_dropout` is the methods' `dropout`,
-    which is off but for `with_dropout`.
+    Biases and modules that the folder trained in full (`bias`, `modules_to_save`) are fully
+    fine-tuned here too. Adapters apply to dense layers and einsums, including those of
+    `nnx.MultiHeadAttention`, whose kernels match torch's with concatenated heads. AdaLoRA is loaded
+    as the equivalent LoRA. Smaller ranks in a stack are zero-padded. `lora_dropout` becomes the
+    methods' `dropout`, which is active only under `with_dropout`.
 
     Args:
       folder: with adapter_config.json and adapter_model.safetensors; or a repository on the hub,
-        hf://owner/name, of which only these two files are fetched.
-      model: not modified; adapters that it has elsewhere than the folder stay.
-      names: module of the layer at a path and an index in its stack, () outside of stacks.
+        hf://owner/name, from which only these two files are downloaded.
+      model: not modified; its adapters on other layers are kept.
+      names: module name of the layer at a path and an index in its stack, () outside of stacks.
       einsums: as for `adapt`.
 
     Raises:
-      ValueError: missing or damaged files, an adapter of another kind, modules that the model does
-        not have, or adapters that do not fit their layers.
+      ValueError: files are missing or damaged, the adapter type is not supported, the model lacks a
+        module, or an adapter does not fit its layer.
     """
     nnx_layers.check_einsums(einsums)
     root = nnx.List([validate.module(model)])
@@ -95,63 +103,66 @@ def load_peft(
     }
     parameters = [p for p in paths.locate(root, nnx.Param) if p.name != "adapter"]
     sizes = {location.path: location.child.get_value().shape for location in parameters}
-    rules, values, whole = matched(folder, shapes, sizes, names)
+    rules, values, full_values = match_folder(folder, shapes, sizes, names)
     adapted = adaptation.adapt(model, rules, rngs=nnx.Rngs(0), einsums=einsums)
     for location in paths.locate(nnx.List([adapted]), AdapterParam):
-        if location.path in whole:
-            location.child.set_value(jnp.asarray(whole[location.path]))
+        if location.path in full_values:
+            location.child.set_value(jnp.asarray(full_values[location.path]))
     for location in paths.locate(nnx.List([adapted]), AdaptedLayer):
         if location.path in values:
             location.child.adapter.set_value(jax.tree.map(jnp.asarray, values[location.path]))
     return adapted
 
 
-def matched(
+def match_folder(
     folder: str | os.PathLike[str],
     shapes: Mapping[str, Sequence[int]],
     sizes: Mapping[str, Sequence[int]],
     names: Names,
 ) -> tuple[paths.Rules, dict[str, Adapter], Adapter]:
-    """The rules that give a model what is in a folder, and by path the parameters of its adapters
-    and those that it trained in full.
+    """Match a PEFT folder against a model's layers and parameters.
 
     Args:
       folder: as for `load_peft`.
-      shapes: by path of a layer, [..., I, O] of its kernel matrices.
-      sizes: by path of a parameter, its shape.
+      shapes: shape [..., I, O] of the kernel matrices of each layer, by path.
+      sizes: shape of each parameter, by path.
       names: as for `load_peft`.
+
+    Returns:
+      Rules for `adapt` that reproduce the folder's adapters, the adapters' parameters by path, and
+      the fully trained parameters by path.
 
     Raises:
       ValueError: as for `load_peft`.
     """
-    folder, names = _at_hand(folder), distinct(names)
-    config, modules, full = read(folder)
+    folder, names = _local_folder(folder), checked_names(names)
+    config, modules, full = read_folder(folder)
     kind = DoRA if config.get("use_dora") else LoRA
     dropout = config.get("lora_dropout") or 0.0
-    left, known, rules, values = dict(modules), [], [], {}
+    unused, candidates, rules, values = dict(modules), [], [], {}
     for path, (*leading, d_in, d_out) in shapes.items():
-        wanted = [names(path, index) for index in np.ndindex(*leading)]
-        known += wanted
-        found = [left.pop(name) for name in wanted if name in left]
-        if not found:
+        module_names = [names(path, index) for index in np.ndindex(*leading)]
+        candidates += module_names
+        adapters = [unused.pop(name) for name in module_names if name in unused]
+        if not adapters:
             continue
-        if len(found) < len(wanted):
-            raise ValueError(f"{folder} adapts only some of the layers of the stack {path}.")
-        for name, adapter in zip(wanted, found, strict=True):
+        if len(adapters) < len(module_names):
+            raise ValueError(f"{folder} adapts only some layers of the stack {path}.")
+        for name, adapter in zip(module_names, adapters, strict=True):
             _check_fits(folder, name, adapter, d_in, d_out)
-        scale, values[path] = _stacked(found, leading)
+        scale, values[path] = _stacked(adapters, leading)
         rank = values[path]["lora_a"].shape[-1]
         rules.append((f"^{re.escape(path)}$", kind(rank, scale * rank, dropout=dropout)))
-    _check_used(folder, modules, left, known)
+    _check_used(folder, modules, unused, candidates)
     check_biases(folder, config.get("bias", "none"), full, sizes, values)
-    whole = whole_parameters(folder, full, shapes, sizes, names)
-    # Of a layer with an adapter the bias may train in full: such rules go first.
-    free = [(f"^{re.escape(path)}$", FullFineTuning()) for path in whole]
-    return [*free, *rules], values, whole
+    full_values = full_parameters(folder, full, shapes, sizes, names)
+    # These rules come first, since the bias of an adapted layer may be fully fine-tuned.
+    full_rules = [(f"^{re.escape(path)}$", FullFineTuning()) for path in full_values]
+    return [*full_rules, *rules], values, full_values
 
 
-def _at_hand(folder: str | os.PathLike[str]) -> pathlib.Path:
-    """The folder on this machine; only what begins with hf:// is asked of the hub."""
+def _local_folder(folder: str | os.PathLike[str]) -> pathlib.Path:
+    """Return a local folder; download hf:// paths from the hub."""
     if not isinstance(folder, str) or "://" not in folder:
         return validate.folder(folder)
     from lorasp_jax.storage import hub
@@ -166,106 +177,121 @@ def save_peft(
     names: Names = dotted,
     base: str | None = None,
 ) -> None:
-    """Writes the adapters of a model as a folder of Hugging Face PEFT.
+    """Save the adapters of a model as a Hugging Face PEFT folder.
 
-    AdaLoRA is written as the LoRA that it has become, pruned directions left out.
+    AdaLoRA is saved as the equivalent LoRA, without pruned directions.
 
     Args:
-      folder: made if absent; an adapter in it is replaced.
-      model: adapted by LoRA and AdaLoRA, or by DoRA; what trains in full, too, becomes PEFT's
+      folder: created if absent; an adapter in it is replaced.
+      model: adapted by LoRA and AdaLoRA, or by DoRA; fully fine-tuned parameters become PEFT's
         `bias` and `modules_to_save`.
       names: as for `load_peft`.
-      base: what the folder says of its base model.
+      base: value of base_model_name_or_path.
 
     Raises:
-      ValueError: adapters that PEFT has no counterpart for, LoRA and DoRA together, or several
-        rates of dropout.
+      ValueError: PEFT does not support an adapter, both LoRA and DoRA are used, or the dropout
+        rates differ.
     """
-    folder, names = validate.folder(folder), distinct(names)
+    folder, names = validate.folder(folder), checked_names(names)
     validate.with_values(model)
     if not isinstance(base, str | None):
-        raise ValueError(f"base must be a text, the name of the base, got {short(base)}.")
-    modules: dict[str, tuple[float, Adapter]] = {}
-    kinds, rates = set(), set()
-    methods = adaptation.methods(model).items()
-    known = {p for p, method in methods if not method.trains_base and _is_known(p, method)}
-    for location in paths.locate(nnx.List([model]), AdaptedLayer):
-        if location.path in known:
-            if isinstance(location.child, nnx_layers.LoRALayer):
-                raise ValueError(
-                    f"{location.path} is neither dense nor an einsum, so PEFT cannot store it."
-                )
-            kinds.add(isinstance(location.child.method, DoRA))
-            rates.add(dropout_rate(location.child.method))
-            shape = location.child.kernel_matrices().shape[:-2]
-            for index in np.ndindex(*shape):
-                modules[names(location.path, index)] = _exported(location.child, index)
-    if len(kinds) != 1:
-        raise ValueError("a PEFT folder holds either LoRA or DoRA, and at least one adapter.")
-    if len(rates) != 1:
-        raise ValueError(
-            f"a PEFT folder has one lora_dropout, the adapters have {sorted(rates)}: give their "
-            "layers one, as in layer.method = dataclasses.replace(layer.method, dropout=0.1)."
-        )
+        raise ValueError(f"base must be a str, the base model's name, got {short(base)}.")
+    layers = _supported_layers(model)
+    use_dora, lora_dropout = _common_settings([layer.method for layer in layers.values()])
+    modules = {
+        names(path, index): _to_peft(layer, index)
+        for path, layer in layers.items()
+        for index in np.ndindex(*layer.kernel_matrices().shape[:-2])
+    }
     tensors = {
         f"{PREFIX}{module}.{name}": value
         for module, (_, adapter) in modules.items()
         for name, value in adapter.items()
     }
-    whole, said = exported_whole(model, known, names)
-    data = safetensors.numpy.save(tensors | whole, {"format": "pt"})
+    full_values, config = export_full_parameters(model, layers, names)
+    config = _config(modules, base) | config
+    config |= {"use_dora": use_dora, "lora_dropout": lora_dropout}
     folder.mkdir(parents=True, exist_ok=True)
-    write_whole(folder / TENSORS, data)
-    said |= {"use_dora": kinds.pop(), "lora_dropout": rates.pop()}
-    text = json.dumps(_config(modules, base) | said, indent=2)
-    write_whole(folder / CONFIG, text.encode())
+    data = safetensors.numpy.save(tensors | full_values, {"format": "pt"})
+    write_atomic(folder / TENSORS, data)
+    write_atomic(folder / CONFIG, json.dumps(config, indent=2).encode())
+
+
+def _supported_layers(model: nnx.Module) -> dict[str, AdaptedLayer]:
+    """Adapted layers by path; raise ValueError for one that PEFT does not support."""
+    methods = adaptation.methods(model).items()
+    adapted = {p for p, method in methods if not method.trains_base and _is_supported(p, method)}
+    layers = {}
+    for location in paths.locate(nnx.List([model]), AdaptedLayer):
+        if location.path in adapted:
+            if isinstance(location.child, nnx_layers.LoRALayer):
+                raise ValueError(
+                    f"{location.path} is neither dense nor an einsum, so PEFT cannot store it."
+                )
+            layers[location.path] = location.child
+    return layers
+
+
+def _common_settings(methods: Collection[Any]) -> tuple[bool, float]:
+    """`use_dora` and `lora_dropout`; raise ValueError if they differ, or there are no methods."""
+    use_dora = {isinstance(method, DoRA) for method in methods}
+    rates = {dropout_rate(method) for method in methods}
+    if len(use_dora) != 1:
+        raise ValueError("a PEFT folder needs at least one adapter, and either LoRA or DoRA only.")
+    if len(rates) != 1:
+        raise ValueError(
+            f"PEFT stores a single lora_dropout, but the adapters have {sorted(rates)}: set a "
+            "common rate with layer.method = dataclasses.replace(layer.method, dropout=0.1)."
+        )
+    return use_dora.pop(), rates.pop()
 
 
 def _check_fits(folder: pathlib.Path, module: str, adapter: Adapter, d_in: int, d_out: int) -> None:
-    """Raises a ValueError unless a kernel [I, O] can carry the adapter."""
+    """Raise ValueError unless the adapter's shapes match a kernel [I, O]."""
     a, b = adapter["lora_a"].shape, adapter["lora_b"].shape
     rank = a[-1]
     magnitude = adapter.get("magnitude", np.empty(d_out)).shape
     if (a, b, magnitude) != ((d_in, rank), (rank, d_out), (d_out,)):
         raise ValueError(
-            f"{folder} adapts {module} by arrays {a} and {b}, the model's kernel is {d_in}x{d_out}."
+            f"{folder}: adapter shapes {a} and {b} of {module} do not match the {d_in}x{d_out} "
+            "kernel of the model."
         )
 
 
 def _check_used(
-    folder: pathlib.Path, modules: Collection[str], left: Collection[str], known: list[str]
+    folder: pathlib.Path, modules: Collection[str], unused: Collection[str], candidates: list[str]
 ) -> None:
-    """Raises a ValueError unless there are modules and none is left that the model lacks."""
+    """Raise ValueError if the folder has no modules, or some are missing from the model."""
     if not modules:
-        raise ValueError(f"{folder} adapts nothing.")
-    if left:
-        close = paths.near_misses(min(left), known)
+        raise ValueError(f"{folder} contains no adapters.")
+    if unused:
+        close = paths.near_misses(min(unused), candidates)
         raise ValueError(
-            f"{folder} adapts {short(min(left))}, which the model lacks; it has {close}."
+            f"{folder} adapts {short(min(unused))}, which the model lacks; it has {close}."
         )
 
 
-def _stacked(found: list[Adapter], leading: list[int]) -> tuple[float, Adapter]:
-    """One scale, and parameters of one rank with the stack's leading axes."""
-    rank, scale = max(1, *(a["lora_a"].shape[1] for a in found)), float(found[0]["scale"])
+def _stacked(adapters: list[Adapter], leading: list[int]) -> tuple[float, Adapter]:
+    """Stack adapters with a common scale and zero-padded to a common rank."""
+    rank, scale = max(1, *(a["lora_a"].shape[1] for a in adapters)), float(adapters[0]["scale"])
 
     def padded(adapter: Adapter) -> Adapter:
-        room = rank - adapter["lora_a"].shape[1]
+        padding = rank - adapter["lora_a"].shape[1]
         ratio = float(adapter["scale"]) / scale
         return {
-            "lora_a": np.pad(adapter["lora_a"], ((0, 0), (0, room))),
-            "lora_b": np.pad(adapter["lora_b"] * np.float32(ratio), ((0, room), (0, 0))),
+            "lora_a": np.pad(adapter["lora_a"], ((0, 0), (0, padding))),
+            "lora_b": np.pad(adapter["lora_b"] * np.float32(ratio), ((0, padding), (0, 0))),
         } | {name: adapter[name] for name in ("magnitude",) if name in adapter}
 
-    same = [padded(adapter) for adapter in found]
-    stacked = {name: np.stack([a[name] for a in same]) for name in same[0]}
+    padded_adapters = [padded(adapter) for adapter in adapters]
+    stacked = {name: np.stack([a[name] for a in padded_adapters]) for name in padded_adapters[0]}
     return scale, {name: x.reshape(*leading, *x.shape[1:]) for name, x in stacked.items()}
 
 
-def _is_known(path: str, method: Any) -> bool:
-    """Raises a ValueError for a method that PEFT does not have."""
+def _is_supported(path: str, method: Any) -> bool:
+    """Return True, or raise ValueError if PEFT does not support the method."""
     if not isinstance(method, LoRA | AdaLoRA):
-        raise ValueError(f"{path} has {method.name}, which Hugging Face PEFT does not know.")
+        raise ValueError(f"{path} uses {method.name}, which Hugging Face PEFT does not support.")
     if method.splits_kernel:
         raise ValueError(
             f"the adapter of {path} split the kernel, so it cannot be used with another base: "
@@ -274,15 +300,15 @@ def _is_known(path: str, method: Any) -> bool:
     return True
 
 
-def _exported(layer: AdaptedLayer, index: tuple[int, ...]) -> tuple[float, Adapter]:
+def _to_peft(layer: AdaptedLayer, index: tuple[int, ...]) -> tuple[float, Adapter]:
     """Scale and tensors of one module, in PEFT's names and layout."""
     assert layer.adapter is not None
     params = {k: np.asarray(v[index], np.float32) for k, v in layer.adapter.get_value().items()}
     a, b = params["lora_a"], params["lora_b"]
     if isinstance(layer.method, AdaLoRA):
-        kept = np.flatnonzero(params["lora_e"])
-        kept = kept if len(kept) else np.array([0])  # PEFT needs a rank of at least 1
-        a, b = (a * params["lora_e"])[:, kept], b[kept]
+        active = np.flatnonzero(params["lora_e"])
+        active = active if len(active) else np.array([0])  # PEFT needs a rank of at least 1
+        a, b = (a * params["lora_e"])[:, active], b[active]
     tensors = {
         "lora_A.weight": np.ascontiguousarray(a.T),
         "lora_B.weight": np.ascontiguousarray(b.T),
@@ -293,8 +319,8 @@ def _exported(layer: AdaptedLayer, index: tuple[int, ...]) -> tuple[float, Adapt
 
 
 def _config(modules: Mapping[str, tuple[float, Adapter]], base: str | None) -> dict[str, Any]:
-    """Most of adapter_config.json: one rank and α for most, patterns for the others."""
-    ranks = {name: len(found["lora_A.weight"]) for name, (_, found) in modules.items()}
+    """Most of adapter_config.json: most common rank and α as defaults, patterns for the rest."""
+    ranks = {name: len(adapter["lora_A.weight"]) for name, (_, adapter) in modules.items()}
     alphas = {name: scale * ranks[name] for name, (scale, _) in modules.items()}
     rank, alpha = (collections.Counter(x.values()).most_common(1)[0][0] for x in (ranks, alphas))
     return {

@@ -1,4 +1,4 @@
-"""Adapter folders of Hugging Face PEFT for Linen models; `hugging_face` has NNX."""
+"""Load Hugging Face PEFT adapter folders into Linen models; `hugging_face` is for NNX."""
 
 import os
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from lorasp_jax.adapters.io.hugging_face import Names, dotted, matched
+from lorasp_jax.adapters.io.hugging_face import Names, dotted, match_folder
 from lorasp_jax.adapters.layers.nnx_layers import Einsums
 from lorasp_jax.adapters.linen import ADAPTER, LinenAdapter
 
@@ -24,19 +24,19 @@ def load_peft_linen(
     einsums: Einsums = MappingProxyType({}),
     **kwargs: Any,
 ) -> tuple[LinenAdapter, dict[str, Any]]:
-    """The adapter of a Linen model that a folder of Hugging Face PEFT describes, and its variables.
+    """Load the adapters of a Hugging Face PEFT folder into a Linen model.
 
     Args:
       folder: as for `hugging_face.load_peft`.
       model: any Linen module.
-      variables: of the bare model, with "params"; not modified.
-      *args: as for a call of the model, which tells what its layers do.
+      variables: of the model without adapters, with "params"; not modified.
+      *args: the model's call arguments, for a call that determines what its layers compute.
       names: as for `hugging_face.load_peft`.
       einsums: as for `LinenAdapter`.
-      **kwargs: as for a call of the model.
+      **kwargs: the model's call arguments.
 
     Returns:
-      `adapter, variables` for `adapter.apply(variables, ...)`.
+      (adapter, variables) for `adapter.apply(variables, ...)`.
 
     Raises:
       ValueError: as for `hugging_face.load_peft`.
@@ -45,13 +45,13 @@ def load_peft_linen(
     shapes = bare.kernel_shapes(variables, *args, **kwargs)
     flat: dict[Any, Any] = {**flatten_dict(variables["params"])}
     sizes = {"/".join(path): jnp.shape(parameter) for path, parameter in flat.items()}
-    rules, values, whole = matched(folder, shapes, sizes, names)
+    rules, values, full_values = match_folder(folder, shapes, sizes, names)
     adapter = LinenAdapter(model, rules, einsums)
     attached = adapter.attach(jax.random.key(0), variables, *args, **kwargs)
     trained: dict[Any, Any] = {**flatten_dict(attached["adapters"])}
     for path, params in values.items():
         for name, value in params.items():
             trained[(*filter(None, path.split("/")), ADAPTER, name)] = jnp.asarray(value)
-    for path, value in whole.items():
+    for path, value in full_values.items():
         trained[tuple(path.split("/"))] = jnp.asarray(value)
     return adapter, attached | {"adapters": unflatten_dict(trained)}

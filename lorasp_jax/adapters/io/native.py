@@ -1,9 +1,8 @@
-"""Adapters on disk: a folder with adapter.safetensors (what trains) and adapter.json (what it is).
+"""Save and load adapters: a folder with adapter.safetensors (tensors) and adapter.json (metadata).
 
-The JSON holds the method of every adapted path, the identity of the base (fingerprints of its
-weights, and its name if the caller gives one), free metadata, the checksum that binds it to its
-tensors, and its own digest. Tensor names are "/"-joined paths; a stacked layer's tensors keep their
-leading layer axes.
+The JSON has the method of every adapted path, the identity of the base (fingerprints of its weights
+and an optional name), user metadata, a checksum of the tensor file, and a digest of the JSON
+itself. Tensor names are "/"-joined paths; tensors of stacked layers keep their leading layer axes.
 """
 
 import hashlib
@@ -47,25 +46,28 @@ def save_adapters(
     base: str = "",
     metadata: Mapping[str, Any] | None = None,
 ) -> None:
-    """Writes everything in a model that trains, and nothing of its frozen base.
+    """Save a model's trainable parameters, without the frozen base.
 
-    Each file is complete before it takes its name; an adapter already in the folder is replaced.
+    Files are written atomically; an existing adapter in the folder is replaced.
 
     Args:
-      folder: made if absent.
+      folder: created if absent.
       model: an adapted model.
-      base: name of the frozen base, if it has one; its weights are known by themselves.
-      metadata: anything JSON can hold.
+      base: optional name of the base; its weights are identified by fingerprints regardless.
+      metadata: any JSON-serializable dict.
 
     Raises:
-      ValueError: the model has nothing that trains, or metadata that JSON would not give back.
+      ValueError: the model has no trainable parameters, or metadata does not round-trip through
+        JSON.
     """
     folder, adapters = validate.folder(folder), nnx.state(validate.with_values(model), AdapterParam)
     if not isinstance(base, str):
-        raise ValueError(f"base must be a text, the name of the base, got {short(base)}.")
-    tensors = {name: np.asarray(leaf) for name, leaf in _named(adapters).items()}
+        raise ValueError(f"base must be a str, the base model's name, got {short(base)}.")
+    tensors = {name: np.asarray(leaf) for name, leaf in _leaves_by_name(adapters).items()}
     if not tensors:
-        raise ValueError("the model has no adapters to save; of a combined one, extract one first.")
+        raise ValueError(
+            "the model has no adapters to save; for a combined model, extract one first."
+        )
     data = safetensors.numpy.save(tensors)
     description = {
         "format": FORMAT,
@@ -78,8 +80,8 @@ def save_adapters(
     }
     text = json.dumps(digest.with_digest(description), indent=2)
     folder.mkdir(parents=True, exist_ok=True)
-    write_whole(folder / TENSORS, data)
-    write_whole(folder / DESCRIPTION, text.encode())
+    write_atomic(folder / TENSORS, data)
+    write_atomic(folder / DESCRIPTION, text.encode())
 
 
 def load_adapters(
@@ -90,21 +92,23 @@ def load_adapters(
     any_base: bool = False,
     einsums: nnx_layers.Einsums = MappingProxyType({}),
 ) -> adaptation.Model:
-    """The model with the adapters of a folder.
+    """Load the adapters of a folder into a model.
 
-    A model without adapters is adapted as the file says; one that has adapters must have the same.
+    A model without adapters is adapted as described in the file; an adapted model must have the
+    same adapters.
 
     Args:
       folder: written by `save_adapters`.
       model: not modified.
       base: if given, must equal the name of the base that the adapters were saved for.
-      any_base: take the adapters onto other weights, too. Otherwise each array of the base must be
-        the one they were trained on, up to rounding to bf16; what is quantised on one side only, or
-        lacks the part that an adapter holds, is not compared.
-      einsums: those that `adapt` was given.
+      any_base: skip the base check. By default every base array must match the one used in
+        training, up to bf16 rounding; arrays quantized on one side only, or split by an adapter,
+        are not compared.
+      einsums: as passed to `adapt`.
 
     Raises:
-      ValueError: missing, damaged or foreign files, another base, or adapters that do not fit.
+      ValueError: files are missing, damaged or unrelated, the base differs, or the adapters do not
+        fit the model.
     """
     folder = validate.folder(folder)
     description, tensors = _read(folder)
@@ -112,48 +116,53 @@ def load_adapters(
         raise ValueError(
             f"{folder} was trained on base {description['base']!r}, not on {short(base)}."
         )
-    wanted = _methods(description["methods"], folder)
-    present = {path: method.as_saved for path, method in adaptation.methods(model).items()}
-    if not present:
-        model = _adapted(model, wanted, tensors, folder, einsums)
-    elif present != wanted:
-        differing = sorted(p for p in present | wanted if present.get(p) != wanted.get(p))
-        raise ValueError(f"{folder} has other adapters than the model, first at {differing[0]!r}.")
+    saved_methods = _methods(description["methods"], folder)
+    model_methods = {path: method.as_saved for path, method in adaptation.methods(model).items()}
+    if not model_methods:
+        model = _adapt_as_saved(model, saved_methods, tensors, folder, einsums)
+    elif model_methods != saved_methods:
+        different = sorted(
+            p for p in model_methods | saved_methods if model_methods.get(p) != saved_methods.get(p)
+        )
+        raise ValueError(
+            f"{folder} and the model have different adapters, first at {different[0]!r}."
+        )
     if not any_base:
         _check_weights(model, description["weights"], folder)
     graphdef, adapters, frozen = adaptation.split(model)
-    expected = _fitting(adapters, tensors, adaptation.methods(model), folder)
+    expected = _matched_leaves(adapters, tensors, adaptation.methods(model), folder)
     values = [jnp.asarray(tensors[name], leaf.dtype) for name, leaf in expected.items()]
     return nnx.merge(graphdef, jax.tree.unflatten(jax.tree.structure(adapters), values), frozen)
 
 
-def _adapted(
+def _adapt_as_saved(
     model: adaptation.Model,
     methods: Mapping[str, Method],
     tensors: Mapping[str, np.ndarray],
     folder: pathlib.Path,
     einsums: nnx_layers.Einsums,
 ) -> adaptation.Model:
-    """The bare model with the adapters that a file lists, by exact paths.
+    """Adapt the bare model with the methods of a file, by exact paths.
 
-    They are made as shapes first: what is asked for may be larger than any memory.
+    Shapes are built and checked first: a damaged or malicious file could request more memory than
+    exists.
     """
     try:
-        # A parameter trained in full may sit in a layer with an adapter: such rules go first.
+        # FullFineTuning first: an adapted layer may have fully fine-tuned parameters.
         paths = sorted(methods, key=lambda path: not methods[path].trains_base)
         rules = [(f"^{re.escape(path)}$", methods[path]) for path in paths]
         adapt = lambda: adaptation.adapt(model, rules, rngs=nnx.Rngs(0), einsums=einsums)  # noqa: E731
         adapters = adaptation.split(nnx.eval_shape(adapt))[1]
     except (ValueError, TypeError, OverflowError) as error:
         raise ValueError(f"{folder} does not fit the model: {error}") from error
-    _fitting(adapters, tensors, methods, folder)
+    _matched_leaves(adapters, tensors, methods, folder)
     return adapt()
 
 
 def _frozen_weights(model: nnx.Module) -> dict[str, jax.Array]:
-    """By path, the base's parameters that adapters leave as they are and that have values."""
+    """Base parameters with values, by path, except those split by an adapter."""
     split = [path for path, method in adaptation.methods(model).items() if method.splits_kernel]
-    found = _named(nnx.state(model, nnx.All(nnx.Param, nnx.Not(AdapterParam))))
+    found = _leaves_by_name(nnx.state(model, nnx.All(nnx.Param, nnx.Not(AdapterParam))))
     return {
         name: leaf
         for name, leaf in found.items()
@@ -164,47 +173,52 @@ def _frozen_weights(model: nnx.Module) -> dict[str, jax.Array]:
 
 
 def _check_weights(model: nnx.Module, saved: Mapping[str, str], folder: pathlib.Path) -> None:
-    """Raises a ValueError if the base has other weights than those saved."""
+    """Raise ValueError if a base weight differs from the saved fingerprint."""
     common = {n: leaf for n, leaf in _frozen_weights(model).items() if n in saved}
     found = digest.fingerprints(common)
-    if others := [name for name in found if found[name] != saved[name]]:
+    if changed := [name for name in found if found[name] != saved[name]]:
         raise ValueError(
-            f"{folder} was trained on another base: of {len(found)} arrays {len(others)} differ, "
-            f"first {others[0]!r}; any_base=True takes the adapters all the same."
+            f"{folder} was trained on another base: {len(changed)} of {len(found)} arrays differ, "
+            f"first {changed[0]!r}; pass any_base=True to load anyway."
         )
 
 
-def _fitting(
+def _matched_leaves(
     adapters: nnx.State,
     tensors: Mapping[str, np.ndarray],
     methods: Mapping[str, Method],
     folder: pathlib.Path,
 ) -> dict[str, Any]:
-    """The leaves of a state by name, of which each has a tensor that fits its method."""
-    expected = _named(adapters)
-    if differing := sorted(expected.keys() ^ tensors.keys()):
-        raise ValueError(f"{folder} and the model differ in tensors, first {differing[0]!r}.")
-    made, held = ({name: a.shape for name, a in of.items()} for of in (expected, tensors))
+    """Leaves of the adapters by name, after checking that each has a tensor of matching shape."""
+    leaves = _leaves_by_name(adapters)
+    if different := sorted(leaves.keys() ^ tensors.keys()):
+        raise ValueError(f"{folder} and the model have different tensors, first {different[0]!r}.")
+    expected = {name: leaf.shape for name, leaf in leaves.items()}
+    saved = {name: tensor.shape for name, tensor in tensors.items()}
     for path, method in methods.items():
-        begin = f"{path}/adapter/".lstrip("/")
-        own = [name for name in made if name.startswith(begin)]
-        of_made, of_held = ({n.removeprefix(begin): s[n] for n in own} for s in (made, held))
-        made |= {begin + name: shape for name, shape in method.shapes(of_made, of_held).items()}
-    for name, shape in made.items():
-        if held[name] != shape:
-            shapes = f"{held[name]} in {folder}, {shape} in the model"
-            raise ValueError(f"tensor {name!r} has shape {shapes}.")
-    return expected
+        prefix = f"{path}/adapter/".lstrip("/")
+        names = [name for name in expected if name.startswith(prefix)]
+        shapes = method.shapes(
+            {name.removeprefix(prefix): expected[name] for name in names},
+            {name.removeprefix(prefix): saved[name] for name in names},
+        )
+        expected |= {prefix + name: shape for name, shape in shapes.items()}
+    for name, shape in expected.items():
+        if saved[name] != shape:
+            raise ValueError(
+                f"tensor {name!r} has shape {saved[name]} in {folder}, {shape} in the model."
+            )
+    return leaves
 
 
-def _named(adapters: nnx.State) -> dict[str, jax.Array]:
-    """Leaves in tree order, by attribute path and place in the parameters."""
+def _leaves_by_name(adapters: nnx.State) -> dict[str, jax.Array]:
+    """Leaves by path, in tree order."""
     leaves = jax.tree_util.tree_flatten_with_path(nnx.to_pure_dict(adapters))[0]
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
 
 
 def _methods(found: Mapping[str, Any], folder: pathlib.Path) -> dict[str, Method]:
-    """The methods of a description, by path."""
+    """Methods of a description, by path."""
     try:
         return {path: peft.from_settings(settings) for path, settings in found.items()}
     except (ValueError, TypeError, OverflowError) as error:
@@ -212,82 +226,92 @@ def _methods(found: Mapping[str, Any], folder: pathlib.Path) -> dict[str, Method
 
 
 def _checked_metadata(metadata: Any) -> dict[str, Any]:
-    """It as a dictionary; raises a ValueError for what would be another one once it is read."""
+    """Return metadata as a dict; raise ValueError if it does not round-trip through JSON."""
     try:
-        again = json.loads(json.dumps(metadata, allow_nan=False))
+        restored = json.loads(json.dumps(metadata, allow_nan=False))
     except (TypeError, ValueError, RecursionError) as error:
-        raise ValueError(f"metadata is for JSON, which cannot hold it: {error}.") from error
-    if not isinstance(metadata, Mapping) or again.keys() != metadata.keys():
-        raise ValueError(f"metadata is a dictionary whose keys are texts, got {short(metadata)}.")
-    return again
+        raise ValueError(f"metadata is not JSON-serializable: {error}.") from error
+    if not isinstance(metadata, Mapping) or restored.keys() != metadata.keys():
+        raise ValueError(f"metadata must be a dict with str keys, got {short(metadata)}.")
+    return restored
 
 
-def write_whole(path: pathlib.Path, data: bytes) -> None:
-    """Replaces a file when all is written."""
-    from envs.datasets.writing import write_bytes  # here alone: envs sets a flag of XLA
+def write_atomic(path: pathlib.Path, data: bytes) -> None:
+    """Write a file atomically, replacing an existing one."""
+    from envs.datasets.writing import write_bytes  # imported here because envs sets an XLA flag
 
     write_bytes(path, data)
 
 
-def read_whole(path: pathlib.Path) -> bytes:
-    """The bytes of a file.
+def read_bytes(path: pathlib.Path) -> bytes:
+    """Read a file.
 
     Raises:
-      ValueError: it has more than this machine's memory.
+      ValueError: the file is larger than this machine's memory.
     """
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if (size := path.stat().st_size) > memory:
-        raise ValueError(f"{path} has {size} bytes, more than this machine's memory")
+        raise ValueError(f"{path} has {size} bytes, more than this machine's memory.")
     return path.read_bytes()
 
 
 def read_tensors(path: pathlib.Path, data: bytes) -> dict[str, np.ndarray]:
-    """The tensors in a safetensors file's bytes, by name.
+    """Decode the tensors of a safetensors file by name.
+
+    Args:
+      path: of the file, for error messages.
+      data: the file's content.
 
     Raises:
-      ValueError: they are damaged, or one is not of finite floating point numbers.
+      ValueError: the file is damaged, or a tensor is not finite floating point.
     """
     try:
         tensors = dict(sorted(safetensors.numpy.load(data).items()))
     except (ValueError, KeyError, TypeError, safetensors.SafetensorError) as error:
-        raise ValueError(f"{path} is damaged or no safetensors file: {error}") from error
+        raise ValueError(f"{path} is damaged or not a safetensors file: {error}") from error
     for name, tensor in tensors.items():
         if not jnp.issubdtype(tensor.dtype, jnp.floating):
-            raise ValueError(f"{path} holds {name!r} as {tensor.dtype}, not as real numbers.")
+            raise ValueError(f"tensor {name!r} in {path} is {tensor.dtype}, not floating point.")
         if not np.isfinite(tensor.astype(np.float32)).all():
-            raise ValueError(f"{path} holds numbers that are not finite in {name!r}.")
+            raise ValueError(f"tensor {name!r} in {path} has non-finite values.")
     return tensors
 
 
 def _read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The description and the tensors, checked against each other."""
+    """Read the description and the tensors, and verify the tensors' checksum."""
     for name in (DESCRIPTION, TENSORS):
         if not (folder / name).is_file():
-            raise ValueError(f"{folder} holds no {name}; an adapter is a folder with both files.")
-    data = read_whole(folder / TENSORS)
+            raise ValueError(
+                f"{folder} has no {name}; an adapter folder needs {DESCRIPTION} and {TENSORS}."
+            )
+    data = read_bytes(folder / TENSORS)
     description = read_description(folder)
     if description["sha256"] != hashlib.sha256(data).hexdigest():
-        raise ValueError(f"{folder / TENSORS} is damaged or belongs to another {DESCRIPTION}.")
+        raise ValueError(f"{folder / TENSORS} is damaged, or does not belong to {DESCRIPTION}.")
     return description, read_tensors(folder / TENSORS, data)
 
 
 def read_description(folder: pathlib.Path) -> dict[str, Any]:
-    """adapter.json of a folder, as it was written.
+    """Read adapter.json of a folder.
 
     Raises:
-      ValueError: it is missing, damaged, or of another format.
+      ValueError: it is missing, damaged, or of an unsupported format or version.
     """
     path = folder / DESCRIPTION
     try:
-        found = json.loads(read_whole(path))
-        known = (found["format"], found["version"]) == (FORMAT, VERSION)
-        if known:
-            found = digest.verify_digest(found)
-            wrong = [name for name, kind in FIELDS.items() if not isinstance(found[name], kind)]
+        description = json.loads(read_bytes(path))
+        supported = (description["format"], description["version"]) == (FORMAT, VERSION)
+        if supported:
+            description = digest.verify_digest(description)
+            wrong = [
+                name for name, kind in FIELDS.items() if not isinstance(description[name], kind)
+            ]
             if wrong:
-                raise ValueError(f"its {wrong[0]} is {short(found[wrong[0]])}")
+                field = wrong[0]
+                kind = FIELDS[field].__name__
+                raise ValueError(f"{field} must be a {kind}, got {short(description[field])}")
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ValueError(f"{path} is damaged or no adapter description ({error}).") from error
-    if not known:
+        raise ValueError(f"{path} is damaged or not an adapter description: {error}") from error
+    if not supported:
         raise ValueError(f"{path} is not a {FORMAT} of version {VERSION}.")
-    return found
+    return description

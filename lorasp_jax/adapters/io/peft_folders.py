@@ -1,9 +1,8 @@
-"""A folder of Hugging Face PEFT as arrays by module, once everything in it has been checked.
+"""Read and validate a Hugging Face PEFT folder, as arrays by module.
 
-The fields that are checked by type are those of `LoraConfig` and `AdaLoraConfig` of PEFT 0.21.2
-that JSON holds as one plain type. All may be null or left out, but for what scales an adapter. A
-field of another type would mean something else to each reader: "use_rslora": "false" is true to
-Python.
+Type checks cover the fields of `LoraConfig` and `AdaLoraConfig` of PEFT 0.21.2 that have a simple
+JSON type. All may be null or absent, except those that determine an adapter's scale. Wrong types
+are rejected because they are ambiguous: "use_rslora": "false" is truthy in Python.
 """
 
 import collections
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from lorasp_jax.adapters.io.name_patterns import values_of
-from lorasp_jax.adapters.io.native import read_tensors, read_whole
+from lorasp_jax.adapters.io.native import read_bytes, read_tensors
 from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import MAX_ALPHA, MAX_SIZE
 
@@ -27,95 +26,105 @@ PREFIX = "base_model.model."
 _TENSOR = re.compile(
     rf"{re.escape(PREFIX)}(.+)\.(lora_A|lora_B|lora_E|lora_magnitude_vector)(\.weight)?"
 )
-_WHOLE = re.compile(rf"{re.escape(PREFIX)}(.+?)(\.base_layer)?\.(weight|bias)")
+_FULL_TENSOR = re.compile(rf"{re.escape(PREFIX)}(.+?)(\.base_layer)?\.(weight|bias)")
 _ADA_CONSTANT = 1e-5  # AdaLoRA's scale is α/(r + this)
-# What a folder may ask for beyond its tensors, and the values that ask for nothing.
-_NOTHING = (None, False, [], {}, "none")
-# Initialisations that leave the base as it is. After the others (PiSSA, OLoRA, CorDA, LoRA-GA,
-# LoftQ) A and B belong to what was left of the base.
-_WHOLE_BASE = (None, True, False, "gaussian", "orthogonal", "eva", "mica")
-_UNKNOWN = (
+# Initializations that do not change the base. With the others (PiSSA, OLoRA, CorDA, LoRA-GA, LoftQ)
+# A and B fit only the residual base.
+_BASE_PRESERVING = (None, True, False, "gaussian", "orthogonal", "eva", "mica")
+# Fields that are not supported, and the values that disable them.
+_DISABLED = (None, False, [], {}, "none")
+_UNSUPPORTED = (
     "lora_bias", "fan_in_fan_out", "layer_replication", "use_qalora", "target_parameters",
     "trainable_token_indices", "use_bdlora", "alora_invocation_tokens",
 )  # fmt: skip
 
 Adapter = dict[str, np.ndarray]
-Whole = dict[tuple[str, str], np.ndarray]
-"""What trains in full, by module and "weight" or "bias", in torch's layout."""
+FullTensors = dict[tuple[str, str], np.ndarray]
+"""Fully trained parameters by (module, "weight" or "bias"), in torch's layout."""
 
 
-def read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter], Whole]:
-    """The configuration, by module lora_A, lora_B in our layout, the scale among them, and biases
-    and modules that were trained in full."""
+def read_folder(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter], FullTensors]:
+    """Read the config, the adapters by module in this project's layout, and full parameters.
+
+    Raises:
+      ValueError: files are missing or damaged, or the adapter is not supported.
+    """
     for name in (CONFIG, TENSORS):
         if not (folder / name).is_file():
-            raise ValueError(f"{folder} holds no {name}; a PEFT adapter is a folder with both.")
+            raise ValueError(
+                f"{folder} has no {name}; a PEFT adapter needs {CONFIG} and {TENSORS}."
+            )
     try:
-        config = json.loads(read_whole(folder / CONFIG))
+        config = json.loads(read_bytes(folder / CONFIG))
         kind = config["peft_type"]
-        _check(config)
+        _check_fields(config)
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ValueError(f"{folder / CONFIG} is damaged or no PEFT adapter: {error}") from error
-    tensors = read_tensors(folder / TENSORS, read_whole(folder / TENSORS))
+        raise ValueError(f"{folder / CONFIG} is damaged or not a PEFT config: {error}") from error
+    tensors = read_tensors(folder / TENSORS, read_bytes(folder / TENSORS))
     if kind not in ("LORA", "ADALORA"):
-        raise ValueError(f"{folder} holds {str(kind)[:40]}; LORA and ADALORA can be loaded.")
-    if asked := [name for name in _UNKNOWN if config.get(name) not in _NOTHING]:
         raise ValueError(
-            f"{folder} sets {asked[0]} to {reprlib.repr(config[asked[0]])}, which is not "
-            "supported: merge it into its base in PEFT (merge_and_unload), and load the result."
+            f"{folder} has peft_type {str(kind)[:40]}; only LORA and ADALORA are supported."
         )
-    if (start := config.get("init_lora_weights")) not in _WHOLE_BASE:
+    if enabled := [name for name in _UNSUPPORTED if config.get(name) not in _DISABLED]:
         raise ValueError(
-            f"{folder} was trained on what {reprlib.repr(start)} left of its base: save it in PEFT "
-            "with path_initial_model_for_weight_conversion, which makes a plain LoRA of it."
+            f"{folder} sets {enabled[0]} to {reprlib.repr(config[enabled[0]])}, which is not "
+            "supported: merge the adapter in PEFT (merge_and_unload), and load the result."
         )
-    modules, whole = collections.defaultdict(dict), {}
+    if (initialization := config.get("init_lora_weights")) not in _BASE_PRESERVING:
+        raise ValueError(
+            f"{folder} was trained on the residual base of {reprlib.repr(initialization)}: convert "
+            "it to plain LoRA with PEFT's path_initial_model_for_weight_conversion."
+        )
+    modules, full_values = collections.defaultdict(dict), {}
     for name, tensor in tensors.items():
         if match := _TENSOR.fullmatch(name):
             modules[match[1]][match[2]] = tensor.astype(np.float32)
-        elif (match := _WHOLE.fullmatch(name)) and _trains(config, match[1], match[3]):
-            whole[match[1], match[3]] = tensor.astype(np.float32)
+        elif (match := _FULL_TENSOR.fullmatch(name)) and _is_fully_trained(
+            config, match[1], match[3]
+        ):
+            full_values[match[1], match[3]] = tensor.astype(np.float32)
         else:
-            raise ValueError(f"{folder} holds {short(name)}, which belongs to no LoRA.")
+            raise ValueError(f"{folder} has the unexpected tensor {short(name)}.")
     try:
         alphas = values_of(config.get("alpha_pattern") or {}, modules, config.get("lora_alpha"))
         imported = {
-            name: _imported(config, name, found, alphas[name]) for name, found in modules.items()
+            name: _from_peft(config, name, tensors, alphas[name])
+            for name, tensors in modules.items()
         }
-        return config, imported, whole
+        return config, imported, full_values
     except (ValueError, TypeError, LookupError, ArithmeticError, RecursionError) as error:
-        raise ValueError(f"{folder} is no PEFT adapter that can be read: {error}") from error
+        raise ValueError(f"{folder} is not a valid PEFT adapter: {error}") from error
 
 
-def _trains(config: Mapping[str, Any], module: str, kind: str) -> bool:
-    """Whether a folder may hold a whole weight or bias."""
+def _is_fully_trained(config: Mapping[str, Any], module: str, kind: str) -> bool:
+    """Whether the config allows a fully trained weight or bias of the module."""
     saved = any(f".{name}." in f".{module}." for name in config.get("modules_to_save") or ())
     return saved or (kind == "bias" and config.get("bias") in ("all", "lora_only"))
 
 
-def _imported(config: Mapping[str, Any], module: str, found: Adapter, alpha: Any) -> Adapter:
-    """lora_a, lora_b, perhaps magnitude, and scale, in our layout."""
+def _from_peft(config: Mapping[str, Any], module: str, tensors: Adapter, alpha: Any) -> Adapter:
+    """Convert a module's tensors to lora_a, lora_b, scale and, for DoRA, magnitude."""
     ada = config["peft_type"] == "ADALORA"
-    needed = {"lora_A", "lora_B"} | ({"lora_E"} if ada else set())
-    needed |= {"lora_magnitude_vector"} if config.get("use_dora") else set()
-    if missing := needed - found.keys():
+    expected = {"lora_A", "lora_B"} | ({"lora_E"} if ada else set())
+    expected |= {"lora_magnitude_vector"} if config.get("use_dora") else set()
+    if missing := expected - tensors.keys():
         raise ValueError(f"the adapter of {module} lacks {min(missing)}.")
-    if beyond := found.keys() - needed:
-        raise ValueError(f"the adapter of {module} has {min(beyond)}, which its kind does not.")
-    a, b = found["lora_A"].T, found["lora_B"].T
+    if unexpected := tensors.keys() - expected:
+        raise ValueError(f"the adapter of {module} has an unexpected {min(unexpected)}.")
+    a, b = tensors["lora_A"].T, tensors["lora_B"].T
     if not alpha or (ada and not config.get("init_r")):
-        raise ValueError(f"the adapter of {module} lacks lora_alpha or init_r, which scale it.")
+        raise ValueError(f"the adapter of {module} lacks lora_alpha or init_r for its scale.")
     if ada:
         scale = alpha / (config["init_r"] + _ADA_CONSTANT)
-        a = a * found["lora_E"][:, 0]
+        a = a * tensors["lora_E"][:, 0]
     else:
         rank = a.shape[1]
         scale = alpha / (math.sqrt(rank) if config.get("use_rslora") else rank)
     if not math.isfinite(scale):
-        raise ValueError(f"the adapter of {module} has the scale {scale}.")
+        raise ValueError(f"the scale of the adapter of {module} must be finite, got {scale}.")
     adapter = {"lora_a": a, "lora_b": b, "scale": np.float32(scale)}
-    if "lora_magnitude_vector" in found:
-        adapter["magnitude"] = found["lora_magnitude_vector"].reshape(-1)
+    if "lora_magnitude_vector" in tensors:
+        adapter["magnitude"] = tensors["lora_magnitude_vector"].reshape(-1)
     return adapter
 
 
@@ -131,26 +140,26 @@ def _is_size(value: Any) -> bool:
     return type(value) is int and 1 <= value <= MAX_SIZE
 
 
-def _are_texts(value: Any) -> bool:
+def _is_string_list(value: Any) -> bool:
     return isinstance(value, list) and all(isinstance(item, str) for item in value)
 
 
-_KINDS: dict[str, tuple[Callable[[Any], bool], tuple[str, ...]]] = {
+_FIELD_TYPES: dict[str, tuple[Callable[[Any], bool], tuple[str, ...]]] = {
     "true or false": (
         lambda value: type(value) is bool,
         ("use_dora", "use_rslora", "use_qalora", "fan_in_fan_out", "inference_mode", "lora_bias"),
     ),
     f"a number other than 0, up to {MAX_ALPHA:g}": (_is_alpha, ("lora_alpha",)),
-    "an object of such numbers": (
+    "an object of non-zero numbers": (
         lambda value: isinstance(value, dict) and all(map(_is_alpha, value.values())),
         ("alpha_pattern",),
     ),
-    f"a whole number from 1 to {MAX_SIZE}": (_is_size, ("r", "init_r", "target_r")),
-    "a number from 0 on, less than 1": (
+    f"an integer from 1 to {MAX_SIZE}": (_is_size, ("r", "init_r", "target_r")),
+    "a number in [0, 1)": (
         lambda value: _is_number(value) and 0 <= value < 1,
         ("lora_dropout",),
     ),
-    "a text": (
+    "a string": (
         lambda value: isinstance(value, str),
         ("peft_type", "base_model_name_or_path", "revision", "task_type"),
     ),
@@ -158,12 +167,12 @@ _KINDS: dict[str, tuple[Callable[[Any], bool], tuple[str, ...]]] = {
         lambda value: value in ("none", "all", "lora_only"),
         ("bias",),
     ),
-    "a text or a list of texts": (
-        lambda value: isinstance(value, str) or _are_texts(value),
+    "a string or a list of strings": (
+        lambda value: isinstance(value, str) or _is_string_list(value),
         ("target_modules", "exclude_modules", "layers_pattern"),
     ),
-    "a list of texts": (_are_texts, ("modules_to_save", "target_parameters")),
-    "true, false or a text": (
+    "a list of strings": (_is_string_list, ("modules_to_save", "target_parameters")),
+    "true, false or a string": (
         lambda value: type(value) is bool or isinstance(value, str),
         ("init_lora_weights",),
     ),
@@ -171,10 +180,10 @@ _KINDS: dict[str, tuple[Callable[[Any], bool], tuple[str, ...]]] = {
 }
 
 
-def _check(config: Mapping[str, Any]) -> None:
-    """Raises a ValueError that names a field of another type, or beyond all sense."""
-    for words, (fits, names) in _KINDS.items():
+def _check_fields(config: Mapping[str, Any]) -> None:
+    """Raise ValueError for a field of the wrong type or out of range."""
+    for description, (is_valid, names) in _FIELD_TYPES.items():
         for name in names:
             value = config.get(name)
-            if value is not None and not fits(value):
-                raise ValueError(f"{name} must be {words}, got {reprlib.repr(value)}")
+            if value is not None and not is_valid(value):
+                raise ValueError(f"{name} must be {description}, got {reprlib.repr(value)}")

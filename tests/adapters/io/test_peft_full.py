@@ -17,7 +17,8 @@ from lorasp_jax.adapters import adaptation
 from lorasp_jax.adapters.io import hugging_face
 from lorasp_jax.adapters.io.hugging_face_linen import load_peft_linen
 from lorasp_jax.peft import FullFineTuning, LoRA
-from tests.adapters.io.test_hugging_face import FOLDER, GOLDEN, Net, edit, retensor
+from tests import GOLDEN
+from tests.adapters.io.peft_folder import FOLDER, Net, edit, retensor
 
 
 @pytest.mark.parametrize(
@@ -57,7 +58,7 @@ def test_what_trains_in_full_is_written_again(name, tmp_path):
 def test_biases_that_are_not_there(bias, tmp_path):
     folder = shutil.copytree(FOLDER, tmp_path / "copy")
     edit(folder, bias=bias)
-    with pytest.raises(ValueError, match=f"was trained with bias '{bias}', but holds no bias"):
+    with pytest.raises(ValueError, match=f"was trained with bias '{bias}', but has no bias"):
         hugging_face.load_peft(folder, Net())
     bare = Net()
     for layer in bare.lin:
@@ -120,7 +121,7 @@ def test_stacks_there_and_back(name, tmp_path):
     again = hugging_face.load_peft(tmp_path, Stack(), names=numbered)
     np.testing.assert_allclose(again(IDS), model(IDS), rtol=1e-5, atol=1e-5)
     assert adaptation.methods(again).keys() == adaptation.methods(model).keys()
-    with pytest.raises(ValueError, match="is a stack of layers: give names"):
+    with pytest.raises(ValueError, match="is a stack of layers: pass names"):
         hugging_face.load_peft(tmp_path, Stack())
 
 
@@ -176,7 +177,9 @@ def test_a_convolution_that_was_trained_in_full(tmp_path):
 def test_dropout_of_all_adapters_or_none(tmp_path):
     rules = [("lin/0", LoRA(rank=2, dropout=0.1)), ("lin/1", LoRA(rank=2))]
     model = adaptation.adapt(Net(), rules, rngs=nnx.Rngs(0))
-    with pytest.raises(ValueError, match=r"one lora_dropout, the adapters have \[0.0, 0.1\]: give"):
+    with pytest.raises(
+        ValueError, match=r"single lora_dropout, but the adapters have \[0.0, 0.1\]: set"
+    ):
         hugging_face.save_peft(tmp_path / "new", model)
     model.lin[1].method = dataclasses.replace(model.lin[1].method, dropout=0.1)
     hugging_face.save_peft(tmp_path / "new", model)
@@ -192,7 +195,7 @@ def test_a_module_that_peft_cannot_hold(tmp_path):
 
     rules = [("conv", FullFineTuning()), ("head", LoRA(rank=2))]
     model = adaptation.adapt(Picture(), rules, rngs=nnx.Rngs(0))
-    with pytest.raises(ValueError, match="conv/kernel trains in full, which a PEFT folder cannot"):
+    with pytest.raises(ValueError, match="conv/kernel is fully trained, but PEFT cannot"):
         hugging_face.save_peft(tmp_path / "new", model)
 
 
@@ -207,6 +210,6 @@ def test_only_what_is_said_to_be_on_the_hub_is_asked_of_it(monkeypatch):
     model = hugging_face.load_peft("hf://somebody/adapter", Net())
     assert set(adaptation.methods(model)) == {"lin/0", "lin/2"}
     assert asked == [("somebody/adapter", [hugging_face.CONFIG, hugging_face.TENSORS])]
-    with pytest.raises(ValueError, match=r"somebody/adapter holds no adapter_config.json"):
+    with pytest.raises(ValueError, match=r"somebody/adapter has no adapter_config.json"):
         hugging_face.load_peft("somebody/adapter", Net())
     assert len(asked) == 1

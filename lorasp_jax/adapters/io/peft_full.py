@@ -1,0 +1,154 @@
+"""Fully trained biases and modules in Hugging Face PEFT folders.
+
+`bias` "all" and "lora_only" make biases trainable, stored as <module>.base_layer.bias for adapted
+layers and <module>.bias for others. `modules_to_save` makes whole modules trainable; weights are
+stored in torch's layout, [out, in] for a dense layer.
+"""
+
+import math
+import pathlib
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from flax import nnx
+
+from lorasp_jax.adapters import paths
+from lorasp_jax.adapters.io.peft_folders import PREFIX, Adapter, FullTensors
+from lorasp_jax.adapters.layers import nnx_layers
+from lorasp_jax.dense import AdapterParam, Dense
+from lorasp_jax.peft._fields import short
+
+Names = Callable[[str, tuple[int, ...]], str]
+_TORCH_NAMES = {"kernel": "weight", "embedding": "weight", "scale": "weight", "bias": "bias"}
+# Axes of one layer's parameter, except in dense layers and einsums; leading ones are stacks.
+_AXES = {"embedding": 2, "scale": 1, "bias": 1}
+
+
+def full_parameters(
+    folder: pathlib.Path,
+    full: FullTensors,
+    shapes: Mapping[str, Sequence[int]],
+    sizes: Mapping[str, Sequence[int]],
+    names: Names,
+) -> Adapter:
+    """A folder's fully trained parameters, by path, in the model's layout.
+
+    Raises:
+      ValueError: the model lacks one, or has it in a different shape.
+    """
+    values, unused = {}, dict(full)
+    for path, size in sizes.items() if full else ():
+        module, _, name = path.rpartition("/")
+        kind = _TORCH_NAMES.get(name, "")
+        leading = _stack(name, size, shapes.get(module))
+        keys = [(names(module, index), kind) for index in np.ndindex(*leading)]
+        parts = [unused.pop(key) for key in keys if key in unused]
+        if not parts:
+            continue
+        if len(parts) < len(keys):
+            raise ValueError(f"{folder} has {kind} of only some layers of the stack {module}.")
+        value = np.stack([_from_torch(part) if name == "kernel" else part for part in parts])
+        rows = value.shape[1:] if name == "kernel" else (value[0].size,)
+        shape = tuple(size[len(leading) :])
+        if rows != (shape if name == "kernel" else (math.prod(shape),)):
+            raise ValueError(f"{path} has shape {rows} in {folder}, but {shape} in the model.")
+        values[path] = value.reshape(tuple(size))
+    if unused:
+        module, kind = min(unused)
+        raise ValueError(f"{folder} has the {kind} of {short(module)}, which the model lacks.")
+    return values
+
+
+def check_biases(
+    folder: pathlib.Path,
+    bias: str,
+    full: FullTensors,
+    sizes: Collection[str],
+    adapted: Collection[str],
+) -> None:
+    """Check that a folder with trained biases has them.
+
+    Args:
+      folder: PEFT folder.
+      bias: "none", "all" or "lora_only".
+      full: the folder's fully trained parameters.
+      sizes: paths of the model's parameters.
+      adapted: paths of layers that the folder adapts.
+
+    Raises:
+      ValueError: the folder has no biases, although its config says that it trained biases that the
+        model has.
+    """
+    modules = [path.rpartition("/")[0] for path in sizes if path.rpartition("/")[2] == "bias"]
+    trained = modules if bias == "all" else set(modules) & set(adapted)
+    if bias != "none" and trained and not any(kind == "bias" for _, kind in full):
+        raise ValueError(f"{folder} was trained with bias {bias!r}, but has no bias tensors.")
+
+
+def export_full_parameters(
+    model: nnx.Module, adapted: Collection[str], names: Names
+) -> tuple[Adapter, dict[str, Any]]:
+    """A model's fully trained parameters by PEFT name, and the config fields that describe them.
+
+    Raises:
+      ValueError: PEFT cannot store a parameter.
+    """
+    locations = [p for p in paths.locate(nnx.List([model]), nnx.Param) if p.name != "adapter"]
+    trainable = [location for location in locations if isinstance(location.child, AdapterParam)]
+    saved = {_module(location) for location in trainable if location.name != "bias"}
+    biases = {_module(location) for location in trainable} - saved
+    matmul_layers = paths.locate_matmul_layers(nnx.List([model]))
+    shapes = {
+        location.path: nnx_layers.matrices_shape(location.child, {}) for location in matmul_layers
+    }
+    tensors: Adapter = {}
+    for location in locations:
+        module = _module(location)
+        if module in saved or location in trainable:
+            infix = ".base_layer" if module in adapted else ""
+            for index, value in _parts(location, shapes.get(module)):
+                name = f"{names(module, index)}{infix}.{_TORCH_NAMES[location.name]}"
+                tensors[PREFIX + name] = value
+    stems = {name.removeprefix(PREFIX).rpartition(".")[0] for name in tensors}
+    saved_modules = sorted(stem for stem in stems if f"{PREFIX}{stem}.weight" in tensors)
+    bias = "none" if not biases else "lora_only" if biases <= set(adapted) else "all"
+    return tensors, {"bias": bias, "modules_to_save": saved_modules or None}
+
+
+def _module(location: paths.Location) -> str:
+    return location.path.rpartition("/")[0]
+
+
+def _stack(name: str, size: Sequence[int], matrices: Sequence[int] | None) -> tuple[int, ...]:
+    """Leading stack axes of a parameter.
+
+    Args:
+      name: of the parameter.
+      size: its shape.
+      matrices: shape [..., I, O] of its layer's kernel, for dense layers and einsums.
+    """
+    if matrices is not None:
+        return tuple(matrices[:-2])
+    return tuple(size[: -_AXES[name]]) if name in _AXES else ()
+
+
+def _from_torch(kernel: np.ndarray) -> np.ndarray:
+    """Convert torch's [out, in, *sizes] to [*sizes, I, O]; sizes are those of a convolution."""
+    return kernel.transpose(*range(2, kernel.ndim), 1, 0)
+
+
+def _parts(
+    location: paths.Location, matrices: Sequence[int] | None
+) -> list[tuple[tuple[int, ...], np.ndarray]]:
+    """Stack index and value in torch's layout of each layer in a stacked parameter."""
+    value, name = np.asarray(location.child.get_value(), np.float32), location.name
+    dense = isinstance(location.parent, nnx.Linear | Dense)
+    if name not in _TORCH_NAMES or (name == "kernel" and not dense):
+        raise ValueError(f"{location.path} is fully trained, but PEFT cannot store it.")
+    parts = []
+    for index in np.ndindex(*_stack(name, value.shape, matrices)):
+        part = value[index]
+        part = part.T if name == "kernel" else part if name == "embedding" else part.ravel()
+        parts.append((index, np.ascontiguousarray(part)))
+    return parts
