@@ -249,7 +249,7 @@ def test_linen_attention_takes_the_same_folder(tmp_path):
         flat[(*path, "kernel")] = kernel + updates[name].reshape(kernel.shape)
     expected = Linen().apply({"params": unflatten_dict(flat)}, x)
     np.testing.assert_allclose(adapter.apply(loaded, x), expected, rtol=1e-4, atol=1e-4)
-    with pytest.raises(ValueError, match="must be an NNX module, got Linen; see LinenAdapter"):
+    with pytest.raises(ValueError, match="must be an NNX module, got Linen; for a Linen module"):
         hugging_face.load_peft(tmp_path, Linen())
 
 
