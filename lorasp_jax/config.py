@@ -87,8 +87,8 @@ class DataConfig:
     """Standard deviation of the noise added to executed joint targets [rad]; recorded actions are
     noise-free."""
     fresh_every: int = 0
-    """Replace all demonstrations every this many steps with newly collected ones, which the device
-    collects while it trains; a multiple of log_every. 0: never."""
+    """Replace all demonstrations every N steps with new ones, which the device collects while it
+    trains; a multiple of log_every. 0: never."""
 
     def __post_init__(self) -> None:
         """Validate the fields."""
@@ -227,7 +227,7 @@ class Config:
     image_size: int = 64
     """Height and width of simulated camera images [pixels]; the backbone resizes them."""
     data: DataConfig = field(default_factory=DataConfig)
-    """Demonstrations."""
+    """Training data."""
     optim: OptimConfig = field(default_factory=OptimConfig)
     """Optimizer and schedule."""
     auxiliary: AuxiliaryConfig = field(default_factory=AuxiliaryConfig)

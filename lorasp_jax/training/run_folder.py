@@ -61,9 +61,9 @@ def read_json(path: Path, schema: Mapping[Any, Any] = MappingProxyType({})) -> d
     if not path.exists():
         return {}
     with as_value_error(path, remedy=": restore it from a backup"):
-        found = verify_digest(json.loads(read_bytes(path)))
-        check(found, schema)
-        return found
+        value = verify_digest(json.loads(read_bytes(path)))
+        check(value, schema)
+        return value
 
 
 @contextlib.contextmanager
@@ -153,9 +153,9 @@ def _locked(folder: Path) -> Iterator[None]:
     try:
         lock = acquire(file)
     except filelock.Timeout as error:
-        user = file.read_text().strip() or "another process"
+        holder = file.read_text().strip() or "another process"
         raise ValueError(
-            f"{folder} is in use by {user}: wait for that run, stop it or use another --name"
+            f"{folder} is in use by {holder}: wait for that run, stop it or use another --name"
         ) from error
     with lock:
         file.write_text(f"process {os.getpid()} on {platform.node()}\n")
@@ -166,8 +166,8 @@ def _recorded(folder: Path) -> dict[str, Any]:
     """Return the config recorded in `folder` as JSON values."""
     if not (folder / CONFIG_FILE).exists():
         raise ValueError(f"{folder} holds no run to resume: omit --resume to start one")
-    found = read_json(folder / CONFIG_FILE, records.CONFIG)
-    return {**found, "peft": upgrade(found["peft"])}
+    config = read_json(folder / CONFIG_FILE, records.CONFIG)
+    return {**config, "peft": upgrade(config["peft"])}
 
 
 def _differences(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> list[str]:

@@ -26,7 +26,7 @@ JOIN_TIMEOUT = 180.0
 """Seconds to wait for missing processes, counted from the last one that joined."""
 EXIT_GRACE = 5.0
 """Seconds the other processes have to exit by themselves after one has exited."""
-_FIRST_PROCESS_DELAY = 3.0  # s that the first process, and JAX's service in it, outlives the others
+_LAST_EXIT_GRACE = 3.0  # s that the first process, which hosts JAX's service, waits for the others
 _MAX_DIFFERENCES = 5  # listed in a message
 # A crashed machine closes no connection: after 30 s of silence, send 3 probes within 30 s.
 _KEEPALIVE = {"TCP_KEEPIDLE": 30, "TCP_KEEPINTVL": 10, "TCP_KEEPCNT": 3}
@@ -197,7 +197,7 @@ class Rendezvous:
         others = [member for member in self._members if member.number]
         for member in others:
             member.send({"leave": code, "say": ""})
-        await self._until(lambda: all(member.closed for member in others), _FIRST_PROCESS_DELAY)
+        await self._until(lambda: all(member.closed for member in others), _LAST_EXIT_GRACE)
         for member in self._members:
             if member.number == 0:  # one that fails itself has already printed why
                 failed = member.exit is not None and member.exit[0] != 0

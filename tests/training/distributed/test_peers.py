@@ -15,7 +15,7 @@ from lorasp_jax.training.distributed import peers, rendezvous
 from lorasp_jax.training.distributed.rendezvous import Rendezvous
 from tests.several import free_address
 
-HINT = "to go on: add --resume"
+HINT = "to resume: add --resume"
 
 
 class Process(peers.Peers):
