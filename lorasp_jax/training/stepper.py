@@ -36,7 +36,7 @@ class Stepper:
         """Store the arguments; nothing is compiled yet.
 
         Args:
-            jitted: compiled function of `loop.jit_steps`.
+            jitted: jitted step function, see `loop.jit_steps`.
             frozen: frozen parameters, on the mesh.
             data: the whole dataset or one raw batch, on the mesh.
             speed: meter of training speed.
@@ -152,7 +152,7 @@ def make_stepper(
 
     Args:
         run: the run.
-        jitted: compiled function of `loop.jit_steps`.
+        jitted: jitted step function, see `loop.jit_steps`.
         frozen: frozen parameters, on the mesh.
         mesh: mesh of the devices that train.
         start: index of the first step.
