@@ -38,14 +38,14 @@ def simulated(tmp_path_factory):
 
 def test_a_dataset_becomes_a_cache_once(tmp_path):
     chosen = config(golden("v3"))
-    source = dataset.opened(chosen, MODEL, tmp_path)
-    found = dataset.cached(source, tmp_path, quietly)
+    source = dataset.open_dataset(chosen, MODEL, tmp_path)
+    found = dataset.as_cache(source, tmp_path, quietly)
     size = MODEL.image_size  # longer image side of the model input
     assert found.cameras["side"] == [size * 96 // 128, size]
-    again = dataset.opened(chosen, MODEL, tmp_path)
+    again = dataset.open_dataset(chosen, MODEL, tmp_path)
     assert isinstance(again, Cache)
     assert again.path == found.path == tmp_path / "cache" / "steps"
-    assert dataset.cached(again, tmp_path, quietly) is again
+    assert dataset.as_cache(again, tmp_path, quietly) is again
     assert not dataset.is_simulated(found)
 
 
@@ -55,14 +55,14 @@ def test_a_dataset_becomes_a_cache_once(tmp_path):
         (
             {"control_dt": 0.05},
             {},
-            r"has 0\.1 s between two steps, this run has --control-dt 0\.05",
+            r"has a control period of 0\.1 s, this run has --control-dt 0\.05",
         ),
-        ({}, {"cameras": ("side",)}, "has the cameras side, wrist, the backbone places for 1"),
+        ({}, {"cameras": ("side",)}, "has cameras side, wrist, but the backbone takes at most 1"),
     ],
 )
 def test_incompatible_datasets_are_refused_early(changes, model, sentence, tmp_path):
     with pytest.raises(ValueError, match=sentence):
-        dataset.opened(
+        dataset.open_dataset(
             config(golden("v3"), **changes),
             dataclasses.replace(MODEL, **model),
             tmp_path,
@@ -73,7 +73,7 @@ def test_incompatible_datasets_are_refused_early(changes, model, sentence, tmp_p
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"actions": "delta_joint"}, "has actions of the kind delta_joint, policies learn joint"),
+        ({"actions": "delta_joint"}, "has delta_joint actions, policies learn joint"),
         (
             dict.fromkeys(("state", "action"), np.zeros((3, 9, 14), np.float32)),
             "1 to 7 for this backbone, got 13. Choose with .* --state-numbers",
@@ -84,7 +84,7 @@ def test_unsupported_dimensions_are_refused(changes, sentence, tmp_path):
     path = tmp_path / "recorded.npz"
     dataclasses.replace(random_episodes("press", 0), **changes).save(path)
     with pytest.raises(ValueError, match=sentence):
-        dataset.opened(config(path), MODEL, tmp_path / "run")
+        dataset.open_dataset(config(path), MODEL, tmp_path / "run")
 
 
 def test_outline(simulated):
