@@ -61,7 +61,7 @@ class TokenizersFile:
     def __init__(self, file: Path) -> None:
         try:
             self._model = tokenizers.Tokenizer.from_file(str(file))
-        except Exception as error:  # the library raises plain Exception
+        except Exception as error:  # the library raises Exception itself
             raise ValueError(f"{file} is not a file of Hugging Face tokenizers.") from error
         self._model.no_truncation()
         self._model.no_padding()

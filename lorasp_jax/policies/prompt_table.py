@@ -40,7 +40,7 @@ class PromptTable:
         start: `[P, T]`, one row per instruction: the prompt, or the part of it before the state.
         numbers: one row per bin, -1 first: a state value with its leading space. None if prompts do
             not contain the state.
-        last: likewise, the last state value with the end of the prompt.
+        last: the same for the last state value, with the end of the prompt.
         instructions: P strings.
     """
 

@@ -24,7 +24,7 @@ class Statistics:
 
     Attributes:
         state: some of `NAMES`; mean and std are 0 and 1 in unused slots.
-        action: likewise.
+        action: the same for actions.
     """
 
     state: Mapping[str, jax.Array]
@@ -49,7 +49,7 @@ class Statistics:
 
         Args:
             state: `[..., J+1]` joints [rad] and gripper [m].
-            action: `[..., J+1]` likewise, as the policy predicts them (absolute or relative).
+            action: `[..., J+1]` as the policy predicts them, absolute or relative to the state.
             valid: `[...]` bool, False at padding.
             slots: slots of the J+1 dimensions.
             dim: number of slots, A.
