@@ -5,6 +5,7 @@
 
 The file must describe an arm: up to 16 hinges from its base to a hand with two sliding fingers, and
 a position actuator for each hinge and for the fingers. Parts are recognized by type, not by name.
+Angles are in degrees unless the file has `<compiler angle="radian"/>`, as always in MJCF.
 Joints, masses, gains, meshes, names (prefixed with "robot/") and the pose of the base are kept; a
 hinge's limits are the intersection of its range and its actuator's ctrlrange. Everything that
 belongs to a scene is dropped: floor, lights, options, keyframes, sensors, tendons, equalities. A

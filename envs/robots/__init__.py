@@ -1,6 +1,6 @@
 """Robot arms: one module per robot, found by the `ROBOT` that it defines.
 
-Shared modules: `arm_kinematics`, forward and inverse kinematics; `_robot`, what defines a robot.
+Shared modules: `arm_kinematics`, forward and inverse kinematics; `_robot`, the class of robots.
 """
 
 import importlib

@@ -1,6 +1,6 @@
 """Manipulation tasks: one module per task, found by the `TASK` that it defines.
 
-Shared module: `_task`, what defines a task, and helpers.
+Shared module: `_task`, the class of tasks, and helpers.
 """
 
 from envs.tasks._task import (

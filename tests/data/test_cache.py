@@ -168,12 +168,12 @@ def test_incompatible_episodes_are_refused(changes, sentence, tmp_path):
 
 
 def test_incompatible_datasets_are_refused_before_reading(tmp_path):
-    sources, told = [Broken(one(), one()), Broken(one(robot="panda"))], []
+    sources, reports = [Broken(one(), one()), Broken(one(robot="panda"))], []
     with pytest.raises(
         ValueError, match="same robot, but it is 'piper' in the first one and 'panda'"
     ):
-        cache.write(sources, tmp_path / "cache", lambda *steps: told.append(steps))
-    assert not told
+        cache.write(sources, tmp_path / "cache", lambda *steps: reports.append(steps))
+    assert not reports
     assert not list(tmp_path.iterdir())
 
 

@@ -45,10 +45,10 @@ def test_one_writes_and_the_others_wait(whole, tmp_path):
     with locked(out):
         children = [convert(out), convert(out)]
         assert [child.stderr.readline() for child in children] == [sentence, sentence]
-    said = [child.communicate()[1] for child in children]
+    output = [child.communicate()[1] for child in children]
     assert [child.returncode for child in children] == [0, 0]
-    assert sorted("126/126" in text for text in said) == [False, True]
-    assert not any("another" in text for text in said)
+    assert sorted("126/126" in text for text in output) == [False, True]
+    assert not any("another" in text for text in output)
     assert os.listdir(tmp_path) == ["cache"]
     assert files(out) == whole
 

@@ -30,5 +30,5 @@ def test_help_describes_options(capsys):
     ):
         with pytest.raises(SystemExit, match="0"):
             command_line.main([command, "--help"])
-        said = " ".join(capsys.readouterr().out.split())
-        assert all(text in said for text in texts)
+        help_text = " ".join(capsys.readouterr().out.split())
+        assert all(text in help_text for text in texts)

@@ -70,10 +70,10 @@ def test_bad_input_is_one_sentence(tmp_path, run, monkeypatch):
         (f"play {press}", "gs://bucket/press.mp4", "cannot write to the URL gs:/bucket/press.mp4"),
         ("gallery --task press --robot piper --out", "gs://bucket", "press_piper.gif: give a path"),
     ):
-        code, said = run(text, out)
+        code, output = run(text, out)
         assert code == 2
-        assert message in said
-        assert "Traceback" not in said
+        assert message in output
+        assert "Traceback" not in output
     assert existing.read_text() == "precious"
     assert sorted(os.listdir(tmp_path)) == ["episodes.npz", "photos"]
 
@@ -88,8 +88,8 @@ def test_play_and_gallery_write_files(tmp_path, run, monkeypatch):
 
     monkeypatch.setattr(envs, "collect", collect)
     for command, out in (("play", "v.mp4"), ("gallery", "g")):
-        code, said = run(f"{command} --task press --robot piper --out", tmp_path / out)
-        assert code == 0, said
+        code, output = run(f"{command} --task press --robot piper --out", tmp_path / out)
+        assert code == 0, output
     assert (tmp_path / "v.mp4").read_bytes()[4:8] == b"ftyp"
     (file,) = (tmp_path / "g").iterdir()
     assert file.name == "press_piper.gif"
@@ -100,9 +100,9 @@ def test_play_and_gallery_write_files(tmp_path, run, monkeypatch):
 
 
 def test_collect_writes_the_episodes_of_the_library(tmp_path, run):
-    code, said = run(COLLECT, "--out", tmp_path / "press", "--actions", "delta_joint")
-    assert code == 0, said
-    assert "20/20" in said
+    code, output = run(COLLECT, "--out", tmp_path / "press", "--actions", "delta_joint")
+    assert code == 0, output
+    assert "20/20" in output
     expected = envs.collect(
         "press",
         num_episodes=20,
@@ -114,7 +114,7 @@ def test_collect_writes_the_episodes_of_the_library(tmp_path, run):
     assert expected.attempted > 20
     found = rlds.read(tmp_path / "press")
     assert_equal(found, trimmed(expected))
-    assert f"20 of {found.attempted} attempted episodes, {found.num_steps} steps" in said
+    assert f"20 of {found.attempted} attempted episodes, {found.num_steps} steps" in output
     assert os.listdir(tmp_path) == ["press"]
     assert (
         rlds.metadata(tmp_path / "press")["options"].items() >= {"seed": 0, "num_envs": 6}.items()
@@ -123,8 +123,8 @@ def test_collect_writes_the_episodes_of_the_library(tmp_path, run):
 
 def test_collect_writes_a_file_or_several_datasets(tmp_path, run):
     assert run(COLLECT, "--out", tmp_path / "press.npz")[0] == 0
-    code, said = run(COLLECT.replace("press", "pour press"), "--out", tmp_path / "many")
-    assert code == 0, said
+    code, output = run(COLLECT.replace("press", "pour press"), "--out", tmp_path / "many")
+    assert code == 0, output
     assert sorted(os.listdir(tmp_path)) == ["many", "press.npz"]
     assert sorted(os.listdir(tmp_path / "many")) == ["pour", "press"]
     assert_equal(Episodes.load(tmp_path / "press.npz"), rlds.read(tmp_path / "many" / "press"))
@@ -141,15 +141,15 @@ def test_killed_and_resumed(tmp_path, run, moment):
     before = {file: file.stat().st_mtime_ns for file in unfinished.glob("*array_record*")}
     parts = rlds.metadata(unfinished)["parts"]
 
-    code, said = run(COLLECT, "--out", out, "--seed", 1)
+    code, output = run(COLLECT, "--out", out, "--seed", 1)
     assert code == 2
     assert (
         "killed.partial was started with seed 0, not 1: continue with the same value, or delete"
-        in said
+        in output
     )
 
-    code, said = run(COLLECT, "--out", out)
-    assert code == 0, said
+    code, output = run(COLLECT, "--out", out)
+    assert code == 0, output
     assert_equal(rlds.read(out), rlds.read(tmp_path / "whole"))
     assert rlds.metadata(out) == rlds.metadata(tmp_path / "whole")
     assert sorted(os.listdir(out)) == sorted(os.listdir(tmp_path / "whole"))
@@ -164,9 +164,9 @@ def test_an_interrupted_simulation_resumes_bit_for_bit(tmp_path, run, env, monke
         monkeypatch.setattr(module, "make", lambda *arguments, **options: env)
     text, out = "collect --task press --robot piper --num-episodes 10", tmp_path / "press"
     expert = collection.record_expert
-    code, said = run(text, "--out", out, record=stopping(expert, 2))
+    code, output = run(text, "--out", out, record=stopping(expert, 2))
     assert code == 130
-    assert f"interrupted; 8 of 10 episodes are in {out}.partial; run the same command" in said
+    assert f"interrupted; 8 of 10 episodes are in {out}.partial; run the same command" in output
     assert run(text, "--out", out, record=expert)[0] == 0
     whole = envs.collect("press", num_episodes=10, key=jax.random.key(0))
     assert_equal(rlds.read(out), trimmed(whole))
@@ -174,9 +174,9 @@ def test_an_interrupted_simulation_resumes_bit_for_bit(tmp_path, run, env, monke
 
 def test_interrupted_before_the_first_shard(tmp_path, run, monkeypatch):
     monkeypatch.setattr(rlds, "ShardWriter", stopping(rlds.ShardWriter, 0))
-    code, said = run(COLLECT, "--out", tmp_path / "press")
+    code, output = run(COLLECT, "--out", tmp_path / "press")
     assert code == 130
-    assert said.endswith("interrupted; temporary files were removed")
+    assert output.endswith("interrupted; temporary files were removed")
     assert not list(tmp_path.iterdir())
 
 
@@ -184,23 +184,23 @@ def test_several_tasks_resume(tmp_path, run, monkeypatch):
     text, out = COLLECT.replace("press", "all"), tmp_path / "many"
     with monkeypatch.context() as patch:
         patch.setattr(writing, "replace_folder", stopping(writing.replace_folder, 2))
-        code, said = run(text, "--out", out)
+        code, output = run(text, "--out", out)
     assert code == 130
     done, rest = ([f for f in out.iterdir() if (f.suffix == ".partial") == p] for p in (0, 1))
     assert len(done) >= 2
-    assert all(f"of 20 episodes are in {folder}; run the same" in said for folder in rest)
+    assert all(f"of 20 episodes are in {folder}; run the same" in output for folder in rest)
     before = {folder: folder.stat() for folder in done}
-    code, said = run(text, "--out", out)
-    assert code == 0, said
+    code, output = run(text, "--out", out)
+    assert code == 0, output
     for folder in done:
-        assert f"{folder} is already complete" in said
+        assert f"{folder} is already complete" in output
         assert folder.stat() == before[folder]
     assert sorted(os.listdir(out)) == ["open_pot", "pick_place", "pour", "press"]
     run(COLLECT, "--out", tmp_path / "press")
     assert_equal(rlds.read(tmp_path / "press"), rlds.read(out / "press"))
-    code, said = run(text, "--out", out, "--seed", 1)
+    code, output = run(text, "--out", out, "--seed", 1)
     assert code == 2
-    assert "open_pot already exists: choose another --out or add --overwrite" in said
+    assert "open_pot already exists: choose another --out or add --overwrite" in output
 
 
 def test_one_bad_task_stops_the_others(tmp_path, run):
@@ -209,9 +209,9 @@ def test_one_bad_task_stops_the_others(tmp_path, run):
         return episodes, success & (env.task.name != "pour")
 
     text = COLLECT.replace("press", "press pour")
-    code, said = run(text, "--out", tmp_path, record=record)
+    code, output = run(text, "--out", tmp_path, record=record)
     assert code == 2
-    assert "error: the expert solved only 0 of 18 layouts of 'pour'" in said
+    assert "error: the expert solved only 0 of 18 layouts of 'pour'" in output
 
 
 def test_ctrl_c_keeps_the_current_shard(tmp_path):
@@ -229,8 +229,8 @@ def test_overwriting_keeps_the_old_until_the_new_is_complete(tmp_path, run, monk
     before = rlds.read(out)
     with monkeypatch.context() as patch:
         patch.setattr(rlds.ShardWriter, "complete", stopping(rlds.ShardWriter.complete, 0))
-        code, said = run(COLLECT, "--out", out, "--seed", 1, "--overwrite")
-    assert (code, "20 of 20 episodes are in" in said) == (130, True)
+        code, output = run(COLLECT, "--out", out, "--seed", 1, "--overwrite")
+    assert (code, "20 of 20 episodes are in" in output) == (130, True)
     assert_equal(rlds.read(out), before)
     assert run(COLLECT, "--out", out, "--seed", 1, "--overwrite")[0] == 0
     assert os.listdir(tmp_path) == ["press"]
@@ -244,10 +244,10 @@ def test_a_damaged_shard_is_refused(tmp_path, run, monkeypatch):
         run(COLLECT, "--out", out)
     file = sorted((tmp_path / "press.partial").glob("*array_record*"))[1]
     file.write_bytes(file.read_bytes()[:-9])
-    code, said = run(COLLECT, "--out", out)
+    code, output = run(COLLECT, "--out", out)
     assert code == 2
-    assert f"{file} is damaged" in said
-    assert said.endswith(f"delete {file.parent} to start over")
+    assert f"{file} is damaged" in output
+    assert output.endswith(f"delete {file.parent} to start over")
 
 
 @pytest.mark.slow
@@ -257,21 +257,21 @@ def test_an_edited_robot_is_a_different_one(tmp_path, run):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rlds.ShardWriter, "complete", stopping(rlds.ShardWriter.complete, 0))
         assert run(text, "--out", tmp_path / "begun")[0] == 130
-    code, said = run(text, "--out", tmp_path / "done")
-    assert (code, "is already complete" in said) == (0, True)
+    code, output = run(text, "--out", tmp_path / "done")
+    assert (code, "is already complete" in output) == (0, True)
     user_arm.write(tmp_path, ('kp="150"', 'kp="140"'))
-    code, said = run(text, "--out", tmp_path / "done")
-    assert (code, "already exists" in said) == (2, True)
-    code, said = run(text, "--out", tmp_path / "begun")
-    assert (code, "was started with model" in said) == (2, True)
+    code, output = run(text, "--out", tmp_path / "done")
+    assert (code, "already exists" in output) == (2, True)
+    code, output = run(text, "--out", tmp_path / "begun")
+    assert (code, "was started with model" in output) == (2, True)
 
 
 def test_a_second_process_is_refused(tmp_path, run):
     out = tmp_path / "press"
     with locks.locked(out):
-        code, said = run(COLLECT, "--out", out)
+        code, output = run(COLLECT, "--out", out)
         assert code == 2
-        assert said.endswith(f"another process is writing {out}")
+        assert output.endswith(f"another process is writing {out}")
         assert not out.with_name("press.partial").exists()
     assert run(COLLECT, "--out", out)[0] == 0
     assert os.listdir(tmp_path) == ["press"]
@@ -286,8 +286,8 @@ def test_killed_while_the_old_is_replaced(tmp_path, run, moment):
     child = run_child(f"collect_and_die({moment!r}, {str(out)!r}, {text!r})")
     assert child.returncode == -signal.SIGKILL, child.stderr
     assert len(os.listdir(tmp_path)) > 1
-    code, said = run(f"{COLLECT} {text}", "--out", out)
-    assert code == 0, said
+    code, output = run(f"{COLLECT} {text}", "--out", out)
+    assert code == 0, output
     assert os.listdir(tmp_path) == [out.name]
     found = Episodes.load(out) if out.suffix == ".npz" else rlds.read(out)
     assert found.num_episodes == 20
@@ -299,8 +299,8 @@ def test_an_unrelated_file_survives_complete_shards(tmp_path, run, monkeypatch):
         patch.setattr(rlds.ShardWriter, "complete", stopping(rlds.ShardWriter.complete, 0))
         run(COLLECT, "--out", out)
     make().save(out)
-    code, said = run(COLLECT, "--out", out)
-    assert (code, "already exists" in said) == (2, True)
+    code, output = run(COLLECT, "--out", out)
+    assert (code, "already exists" in output) == (2, True)
     assert_equal(Episodes.load(out), make())
     assert run(f"{COLLECT} --overwrite", "--out", out)[0] == 0
     assert os.listdir(tmp_path) == ["press.npz"]

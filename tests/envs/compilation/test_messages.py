@@ -30,8 +30,8 @@ def test_with_a_cache_only_the_first_time_is_slow(impatient, capsys):
     jax.config.update("jax_enable_compilation_cache", True)
     with messages.announce("the world"):
         time.sleep(0.3)
-    told = "compiling the world (slow only the first time) ...\ncompiled the world in 0 s\n"
-    assert capsys.readouterr().err == told
+    lines = "compiling the world (slow only the first time) ...\ncompiled the world in 0 s\n"
+    assert capsys.readouterr().err == lines
 
 
 def test_short_compilation_is_silent(capsys):
@@ -63,7 +63,7 @@ def test_an_environment_announces_once(impatient, capsys):
     jax.eval_shape(env.reset, jax.random.key(0))  # nothing is compiled
     assert capsys.readouterr().err == ""
     env.reset(jax.random.key(0))
-    said = capsys.readouterr().err
-    assert said.startswith("compiling reset of press, 2 worlds ...\ncompiled reset of press")
+    output = capsys.readouterr().err
+    assert output.startswith("compiling reset of press, 2 worlds ...\ncompiled reset of press")
     env.reset(jax.random.key(1))
     assert capsys.readouterr().err == ""

@@ -51,11 +51,11 @@ def test_one_process_at_a_time(path):
 
 def test_never_two_at_a_time(path):
     """Some wait for a lock file that is deleted meanwhile, others create a new one."""
-    inside, turns, told = [], [], []
+    inside, turns, calls = [], [], []
 
     def work(number):
         for turn in range(20):
-            with locks.locked(path, lambda: told.append((number, turn))):  # noqa: B023
+            with locks.locked(path, lambda: calls.append((number, turn))):  # noqa: B023
                 inside.append(number)
                 time.sleep(0.0005)
                 assert inside == [number]
@@ -66,7 +66,7 @@ def test_never_two_at_a_time(path):
         for one in [pool.submit(work, number) for number in range(8)]:
             one.result()
     assert len(turns) == 8 * 20
-    assert len(told) == len(set(told)) > 0  # called once each, however often it must wait
+    assert len(calls) == len(set(calls)) > 0  # called once each, however often it must wait
     assert not os.listdir(path.parent)
 
 
