@@ -1,4 +1,4 @@
-"""Adapting whole models: rules, stacked layers, splitting, counting, merging."""
+"""Adapt whole models: rules, stacked layers, splitting, counting, merging."""
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ SP = LoRASP(rank=8, hidden_width=4)
 
 
 class Net(nnx.Module):
-    """A stranger's nnx.Linear, a norm, a stack that is scanned over, and a list of layers."""
+    """An nnx.Linear, a norm, a scanned stack and a list of layers."""
 
     def __init__(self, rngs, param_dtype=jnp.float32):
         kinds = {"param_dtype": param_dtype, "rngs": rngs}
@@ -59,7 +59,7 @@ def call(model, x):
 
 
 def trained(model, x, steps=2):
-    """A few Adam steps as the train loop takes them: split once, merge inside."""
+    """Run a few Adam steps as the training loop does: split once, merge inside the loss."""
     graphdef, adapters, frozen = adaptation.split(model)
     optimizer = optax.adam(1e-2)
 
@@ -84,7 +84,7 @@ def leaves(model, kind):
 
 @pytest.mark.parametrize("name", peft.names())
 def test_only_adapters_train(net, x, name):
-    """Every method: same output at first, a base that stays bit-identical, a trained part."""
+    """The initial output equals the base's, and training does not change the base."""
     method = SP if name == "lora_sp" else peft.create(name)
     model = adapted(net, (".*", method))
     np.testing.assert_allclose(call(model, x)[0], call(net, x)[0], rtol=1e-4, atol=1e-5)
@@ -112,7 +112,7 @@ def test_adapts_linear_and_stacked_layers(net, x):
     assert aux.losses["spectral"].shape == (LAYERS,)
 
 
-def test_the_input_stays_as_it_was(net):
+def test_the_model_is_not_modified(net):
     before = nnx.graphdef(net), jax.tree.leaves(nnx.state(net))
     model = adapted(net, (".*", LoRA(rank=2)))
     assert nnx.graphdef(net) == before[0]
@@ -124,7 +124,7 @@ def test_the_input_stays_as_it_was(net):
     assert not shared & {leaf.unsafe_buffer_pointer() for leaf in free}  # may be donated
 
 
-def test_first_match_wins_and_none_leaves_alone(net):
+def test_first_match_wins_and_none_skips(net):
     model = adapted(net, ("heads/1", None), ("inp|heads", LoRA(rank=2)), ("", FullFineTuning()))
     assert set(adaptation.methods(model)) == {
         "inp", "heads/0", "norm/scale", "blocks/kernel", "blocks/bias",
@@ -132,7 +132,7 @@ def test_first_match_wins_and_none_leaves_alone(net):
     assert isinstance(model.heads[1], nnx.Linear)
 
 
-def test_adapters_depend_on_their_path_alone(net):
+def test_initial_adapters_depend_only_on_key_and_path(net):
     one, two = adapted(net, ("heads/1", SP)), adapted(net, ("inp", None), (".*", SP))
 
     def v(layer):
@@ -142,7 +142,7 @@ def test_adapters_depend_on_their_path_alone(net):
     assert not np.array_equal(v(two.heads[0]), v(two.heads[1]))
 
 
-def test_full_fine_tuning_frees_everything_under_a_path(x):
+def test_full_fine_tuning_unfreezes_everything_under_a_path(x):
     net = Net(nnx.Rngs(0), param_dtype=jnp.bfloat16)
     model = adapted(net, ("norm|blocks", FullFineTuning()))
     assert set(adaptation.methods(model)) == {"norm/scale", "blocks/kernel", "blocks/bias"}
@@ -152,7 +152,7 @@ def test_full_fine_tuning_frees_everything_under_a_path(x):
     assert set(adaptation.methods(with_bias)) == {"inp/bias", "blocks/bias", "blocks"}
 
 
-def test_adapting_what_trained_in_full_freezes_it(net):
+def test_adapting_a_fully_fine_tuned_layer_freezes_it(net):
     full = adapted(net, (".*", FullFineTuning()))
     model = adapted(full, ("inp", LoRA(rank=2)), (".*", None))
     assert isinstance(model.inp, nnx.Linear) or model.inp.method == LoRA(rank=2)
@@ -162,7 +162,7 @@ def test_adapting_what_trained_in_full_freezes_it(net):
 
 
 def test_an_adapter_is_never_replaced(net, x):
-    """It may have been trained; what stays beside a new one is untouched."""
+    """It may be trained already; existing adapters on other layers are unchanged."""
     model = trained(adapted(net, ("inp", LoRA(rank=2))), x)
     with pytest.raises(ValueError, match="cannot adapt inp: the layer already has a lora adapter"):
         adapted(model, (".*", LoRA(rank=3)))
@@ -197,7 +197,7 @@ def test_a_single_layer_is_a_model(x):
     np.testing.assert_allclose(model(x), layer(x), rtol=1e-5, atol=1e-6)
 
 
-def test_shapes_suffice():
+def test_models_of_shapes():
     """A model too large to build is adapted and counted under eval_shape."""
     model = nnx.eval_shape(lambda: adapted(Net(nnx.Rngs(0)), ("blocks", SP)))
     per_layer = 8 * (WIDTH + WIDTH) + 4 * (WIDTH + 8) + 4 + 8
@@ -228,7 +228,7 @@ def test_merge_equals_forward(net, x):
 
 
 def test_tree_mode(net, x):
-    """The split, the step and the merge also run with NNX's coming defaults."""
+    """Splitting, training and merging also run with NNX's upcoming defaults."""
     model = adapted(net, (".*", SP))
     graphdef, adapters, frozen = adaptation.split(model)
     with nnx.set_graph_mode(False):

@@ -1,4 +1,4 @@
-"""An unmodified Linen model under path rules: every kind of layer, scan, remat, merging."""
+"""Adapt an unmodified Linen model by path rules: every layer type, scan, remat, merging."""
 
 import flax.linen as nn
 import jax
@@ -25,7 +25,7 @@ class Block(nn.Module):
 
 
 class Net(nn.Module):
-    """A stranger's model: a scanned and a rematerialised block, all kinds of layers."""
+    """A third-party model: a scanned and a rematerialized block, all layer types."""
 
     @nn.compact
     def __call__(self, ids):
@@ -46,7 +46,7 @@ def ids():
 
 @pytest.fixture(scope="module")
 def published(ids):
-    """Parameters that somebody else trained: biases are not zero."""
+    """Published parameters, with non-zero biases."""
     shapes = jax.eval_shape(Net().init, jax.random.key(0), ids)
     return with_noise(jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes), 0.4)
 
@@ -76,7 +76,7 @@ def test_every_method_starts_at_the_base(published, ids, name):
 
 
 @pytest.mark.slow
-def test_init_is_the_models_own(ids):
+def test_init_matches_the_model(ids):
     adapter = LinenAdapter(Net(), [(".*", LoRA(rank=2))])
     variables = jax.jit(adapter.init)(jax.random.key(0), ids)
     own = jax.jit(Net().init)(jax.random.key(0), ids)
@@ -109,7 +109,7 @@ def test_stacks_have_stacked_adapters(published, ids):
     ],
 )
 def test_merged_equals_adapted(published, ids, rules):
-    """The bare model with merged parameters, which have the published ones' names and shapes."""
+    """Merged parameters have the published names and shapes, so the bare model can use them."""
     adapter, variables = attached(published, ids, *rules)
     expected = call(Net(), published, ids)
     np.testing.assert_allclose(call(adapter, variables, ids), expected, rtol=1e-3, atol=1e-3)
@@ -120,7 +120,7 @@ def test_merged_equals_adapted(published, ids, rules):
     np.testing.assert_allclose(call(Net(), merged, ids), y, rtol=1e-3, atol=1e-3)
 
 
-def test_against_a_kernel_made_by_hand(published, ids):
+def test_against_a_manually_merged_kernel(published, ids):
     adapter, variables = attached(published, ids, ("embed|blocks/split", LoRA(rank=2, alpha=6)))
     variables = variables | {"adapters": with_noise(variables["adapters"], 0.3)}
     trained = variables["adapters"]
@@ -151,7 +151,7 @@ def test_gradients_and_aux(published, ids):
 
 
 @pytest.mark.slow
-def test_freed_parameters_train_in_fp32(ids):
+def test_fully_fine_tuned_parameters_are_fp32(ids):
     half = jax.tree.map(lambda v: v.astype(jnp.bfloat16), Net().init(jax.random.key(0), ids))
     adapter, variables = attached(half, ids, ("bias$|norm", FullFineTuning()), ("dense", SP))
     flat = flatten_dict(variables["adapters"], sep="/")
@@ -162,7 +162,7 @@ def test_freed_parameters_train_in_fp32(ids):
 
 
 class Product(nn.Module):
-    """An einsum whose equation comes with the call."""
+    """An einsum that takes its equation as a call argument."""
 
     shape: tuple
 
@@ -171,7 +171,7 @@ class Product(nn.Module):
         return jnp.einsum(equation, x, self.param("w", nn.initializers.normal(), self.shape))
 
 
-def test_layers_described_by_the_user():
+def test_user_defined_einsums():
     class Outer(nn.Module):
         @nn.compact
         def __call__(self, x):

@@ -1,4 +1,4 @@
-"""Children are replaced at their places, and nothing else of a model is touched."""
+"""Locate and replace modules, without changing anything else in the model."""
 
 import re
 
@@ -12,7 +12,7 @@ from tests import ROOT
 
 
 class Net(nnx.Module):
-    """A layer in two places, one in a list, and one that is an `nnx.Linear` in two."""
+    """A shared einsum, a layer in a list, and a shared `nnx.Linear`."""
 
     def __init__(self):
         rngs = nnx.Rngs(0)
@@ -28,31 +28,31 @@ def net():
     return Net()
 
 
-def found(net):
+def modules(net):
     return paths.locate(nnx.List([net]), nnx.Module)
 
 
-def test_what_hangs_in_two_places_is_replaced_once(net):
-    asked = []
+def test_shared_children_are_replaced_once(net):
+    calls = []
 
     def make(location):
-        asked.append(location.path)
+        calls.append(location.path)
         return nnx.Dropout(0.5) if location.path in ("second", "linear", "again") else None
 
-    paths.replace([location for location in found(net) if "several" not in location.path], make)
-    assert sorted(asked) == ["", "again", "first", "linear", "second"]
-    assert net.first is net.second  # no answer for the first place, one for the second
+    paths.replace([location for location in modules(net) if "several" not in location.path], make)
+    assert sorted(calls) == ["", "again", "first", "linear", "second"]
+    assert net.first is net.second  # `make` returns None for "first"
     assert type(net.linear) is nnx.Dropout
-    assert net.linear is not net.again  # each place of an `nnx.Linear` has its own
+    assert net.linear is not net.again  # replaced separately
 
 
-def test_a_child_is_put_into_a_list(net):
-    (location,) = (location for location in found(net) if location.path == "several/0")
+def test_set_child_in_a_list(net):
+    (location,) = (location for location in modules(net) if location.path == "several/0")
     paths.set_child(location, nnx.Dropout(0.5))
     assert type(net.several[0]) is nnx.Dropout
 
 
-def test_adapting_leaves_classes_and_merging_gives_them_back(net):
+def test_merging_restores_classes(net):
     structure = nnx.graphdef(net)
     model = lorasp_jax.adapt(net, [("first|several", LoRA(rank=2))], rngs=nnx.Rngs(1))
     assert nnx.graphdef(net) == structure
@@ -63,8 +63,8 @@ def test_adapting_leaves_classes_and_merging_gives_them_back(net):
     assert nnx.graphdef(lorasp_jax.merge(model)) == structure
 
 
-def test_attributes_are_set_by_name_in_two_modules():
-    """In `paths.put`, and where a layer's own class names its kernel."""
+def test_only_two_modules_use_setattr():
+    """`paths.set_child`, and layers whose class names its kernel."""
     by_name = re.compile(r"\b(setattr|delattr)\(|\.__class__ =")
     sources = (ROOT / "lorasp_jax").rglob("*.py")
     having = {path.name for path in sources if by_name.search(path.read_text())}

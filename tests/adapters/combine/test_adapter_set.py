@@ -1,4 +1,4 @@
-"""A sum of adapters as one method: against each adapter's own `apply`, one by one."""
+"""Compare a weighted sum of adapters with each adapter's own `apply`."""
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +33,7 @@ def x():
 
 @pytest.fixture(scope="module")
 def members(kernel):
-    """Parameters of each adapter, moved off their start."""
+    """Parameters of each adapter, with noise added."""
     found = {}
     for i, (name, method) in enumerate(METHODS.items()):
         leaves, structure = jax.tree.flatten(method.init(jax.random.key(i), kernel)[0])
@@ -58,7 +58,7 @@ def apply(params, choice, x, kernel):
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_one_alone(params, members, x, kernel, name):
+def test_each_adapter(params, members, x, kernel, name):
     choice = jnp.array([float(other == name) for other in METHODS])
     y, aux = apply(params, choice, x, kernel)
     expected, report = METHODS[name].apply(members[name], x, kernel)
@@ -84,7 +84,7 @@ def test_weighted_sum(params, members, x, kernel):
     np.testing.assert_allclose(y, expected, rtol=1e-4, atol=1e-4)
 
 
-def test_each_example_its_own(params, members, x, kernel):
+def test_choice_per_example(params, members, x, kernel):
     weights = jax.random.normal(jax.random.key(5), (4, len(METHODS)))
     y, aux = apply(params, weights, x, kernel)
     expected = x @ kernel + jnp.einsum("ba,abto->bto", weights, deltas(members, x, kernel))
@@ -92,7 +92,7 @@ def test_each_example_its_own(params, members, x, kernel):
     assert aux.active_rank.shape == (4, 3)
 
 
-def test_rows_of_an_example_are_in_turn(params, x, kernel):
+def test_rows_of_an_example_are_contiguous(params, x, kernel):
     """[B, T, I] folded into [B T, I], as a vision tower folds its cameras."""
     weights = jax.random.normal(jax.random.key(5), (4, len(METHODS)))
     y, _ = apply(params, weights, x, kernel)
@@ -112,7 +112,7 @@ def test_without_a_bank(members, x, kernel):
 
 
 def test_merge(params, members, x, kernel):
-    """The sum of the deltas as one kernel, where none depends on the input."""
+    """Merge the deltas into one kernel; none depends on the input."""
     mergeable = [name for name in METHODS if name not in ("sp", "moe")]
     method = AdapterSet(tuple(mergeable), tuple(OTHERS.get(name) for name in mergeable))
     own = {"bank": params["bank"], "others": {name: members[name] for name in ("dora", "ada")}}
@@ -137,7 +137,7 @@ def test_low_precision(params, x, kernel):
 
 @pytest.mark.slow
 def test_gradients(params, x, kernel):
-    """They reach x, the weights and the parameters of the adapters that count, not the kernel."""
+    """x, the weights and adapters with non-zero weight get gradients, the kernel does not."""
     choice = jnp.zeros(len(METHODS)).at[1].set(1.0)
 
     def loss(params, choice, x, kernel):
@@ -159,7 +159,7 @@ def test_gradients(params, x, kernel):
     assert not base.any()
 
 
-def test_bank_gives_back_what_it_took(members):
+def test_bank_slots_round_trip(members):
     bank = empty_bank(2, 7, (D_IN, D_OUT))
     bank = set_slot(set_slot(bank, 0, LORAS["b"], members["b"]), 0, LORAS["a"], members["a"])
     method, params = get_slot(bank, 0)

@@ -29,7 +29,7 @@ def pair():
     return lorasp_jax.combine(models)
 
 
-def test_together_is_exact():
+def test_the_full_rank_is_exact():
     fused, errors = lorasp_jax.fuse(pair(), WEIGHTS)
     assert_close(call(fused, X), call(lorasp_jax.choose(pair(), WEIGHTS), X))
     assert {path: method.rank for path, method in adaptation.methods(fused).items()} == {
@@ -40,15 +40,15 @@ def test_together_is_exact():
 
 
 def deltas(fused, path):
-    """What was added to a layer's kernels, one by one."""
+    """Deltas of a layer's kernels, one by one."""
     layer, base = getattr(lorasp_jax.merge(fused), path), getattr(NET, path)
     delta = np.asarray(layer.kernel.get_value() - base.kernel.get_value())
     return delta.reshape(-1, *delta.shape[-2:])
 
 
 @pytest.mark.parametrize("rank", [1, 2, 3])
-def test_smaller_is_the_best_of_its_rank(rank):
-    """Against the singular value decomposition of the whole delta, layer by layer of the stack."""
+def test_truncation_is_the_best_of_its_rank(rank):
+    """Compare with the SVD of the full delta, for each layer of the stack."""
     fused, errors = lorasp_jax.fuse(pair(), WEIGHTS, rank=rank)
     exact = lorasp_jax.fuse(pair(), WEIGHTS).model
     for path in ("inp", "blocks"):
@@ -122,7 +122,7 @@ def test_unmerge(method, dtype):
     assert not adaptation.methods(merged)
 
 
-def test_unmerge_by_a_file(tmp_path):
+def test_unmerge_with_a_saved_adapter(tmp_path):
     model = trained(("", LoRA(rank=2)), seed=4)
     save_adapters(tmp_path, model)
     merged = lorasp_jax.merge(model)

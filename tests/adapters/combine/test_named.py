@@ -58,7 +58,7 @@ def test_choice_per_example():
 
 
 def test_choices_do_not_recompile():
-    """Neither another name nor another sum, by a new model or by an array inside jit."""
+    """Other names and weights, as a new model or as an array inside jit."""
     traces = []
 
     @jax.jit
@@ -81,7 +81,7 @@ def test_choices_do_not_recompile():
     assert traces == ["model", "array"] * 2
 
 
-def test_another_adapter_in_the_same_place_compiles_nothing():
+def test_swap_does_not_recompile():
     model = lorasp_jax.combine({"a": models()["pour"], "spare": NET}, rank=6)
     other = trained(("inp|blocks", LoRA(rank=6, alpha=2.5)), seed=8)
     traces = []
@@ -102,7 +102,7 @@ def test_another_adapter_in_the_same_place_compiles_nothing():
 
 
 def test_weighted_sum_is_one_merged_model():
-    """In each kernel, the sum of what each adapter merges into it."""
+    """Each merged kernel has the weighted sum of the adapters' deltas."""
     pair = lorasp_jax.combine({name: models()[name] for name in WEIGHTS})
     model = lorasp_jax.choose(pair, WEIGHTS)
     merged = lorasp_jax.merge(model)
@@ -117,7 +117,7 @@ def test_weighted_sum_is_one_merged_model():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_extracting_one(tmp_path, name):
-    """As it was before, ready to train, and through a file."""
+    """The extracted adapter is unchanged, trainable, and can be saved."""
     alone = lorasp_jax.extract(combined(), name)
     assert_close(call(alone, X), call(models()[name], X))
     assert adaptation.count(alone).trainable == adaptation.count(models()[name]).trainable

@@ -1,4 +1,4 @@
-"""What earlier versions wrote still loads and computes the same.
+"""Files of earlier versions still load and compute the same.
 
 `tests/golden/adapter_sp_earlier` is of commit 9fd9abf, whose LoRA-SP had 14 fields: an adapter of
 nine layers with their outputs, and the config.json of two runs.
@@ -74,7 +74,7 @@ def test_an_adapter_computes_the_same(tmp_path, again):
         ("run_config_release.json", LoRASPRelease(rank=8)),
     ],
 )
-def test_a_run_goes_on(tmp_path, file, method):
+def test_a_run_resumes(tmp_path, file, method):
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "config.json").write_bytes((FOLDER / file).read_bytes())
     config = Config(name="a", scale="cpu", peft=method)

@@ -34,7 +34,7 @@ def module(path, index):
 X = jax.random.normal(jax.random.key(9), (4, 24))
 
 
-def test_a_folder_that_peft_wrote_gives_its_outputs():
+def test_outputs_match_peft():
     arrays = dict(np.load(GOLDEN / "adapter_lora_io.npz"))
     model = hugging_face.load_peft(FOLDER, Net(arrays))
     np.testing.assert_allclose(model(arrays["x"]), arrays["y"], rtol=0, atol=1e-5)
@@ -43,14 +43,14 @@ def test_a_folder_that_peft_wrote_gives_its_outputs():
 
 
 @pytest.mark.parametrize("name", ["dora", "rs", "ada"])
-def test_folders_that_peft_trained_give_its_outputs(name):
+def test_outputs_of_trained_folders_match_peft(name):
     """DoRA, rsLoRA and AdaLoRA, 20 steps of SGD in PEFT 0.21.2, ranks and α by pattern."""
     arrays = dict(np.load(GOLDEN / "adapter_trained_io.npz"))
     model = hugging_face.load_peft(GOLDEN / f"adapter_{name}", Net(arrays))
     np.testing.assert_allclose(model(arrays["x"]), arrays[f"y/{name}"], rtol=0, atol=1e-5)
 
 
-def test_what_peft_wrote_is_written_again(tmp_path):
+def test_saving_a_loaded_folder(tmp_path):
     hugging_face.save_peft(tmp_path, hugging_face.load_peft(FOLDER, Net()))
     ours, theirs = (
         safetensors.numpy.load_file(folder / hugging_face.TENSORS) for folder in (tmp_path, FOLDER)
@@ -102,13 +102,13 @@ def test_adalora_as_peft_saves_it(tmp_path):
     np.testing.assert_allclose(kernel, expected, atol=1e-4)
 
 
-def test_patterns_follow_the_end_of_a_name(copy):
+def test_patterns_match_name_suffixes(copy):
     edit(copy, alpha_pattern={r"lin\.2": 16}, rank_pattern={"2": 4})
     model = hugging_face.load_peft(copy, Net())
     assert [model.lin[i].method.scale for i in (0, 2)] == [2, 4]
 
 
-def test_names_that_end_in_another_name(tmp_path):
+def test_names_that_are_suffixes_of_others(tmp_path):
     class Twins(nnx.Module):
         def __init__(self):
             self.proj = nnx.Linear(4, 3, rngs=nnx.Rngs(0))
@@ -163,7 +163,7 @@ def test_stacks(tmp_path):
 
 
 class Attention(nnx.Module):
-    """Flax's own attention, whose kernels have axes of heads, and a layer of another class."""
+    """Flax's attention, whose kernels have head axes, and a layer of a user-defined class."""
 
     def __init__(self):
         self.attn = nnx.MultiHeadAttention(2, 6, decode=False, rngs=nnx.Rngs(0))
@@ -174,7 +174,7 @@ class Attention(nnx.Module):
 
 
 class Own(nnx.Module):
-    """An einsum of somebody's own."""
+    """A user-defined einsum."""
 
     def __init__(self):
         self.w = nnx.Param(jax.random.normal(jax.random.key(3), (6, 4)))
@@ -190,7 +190,7 @@ def torch_names(path, index):
 
 
 def attention_folder(folder):
-    """As PEFT writes it for torch's [out, in] weights; and the updates [in, out] by module."""
+    """Write a folder as PEFT does, from weights [out, in]; return updates [in, out] by module."""
     rng, tensors, updates = np.random.default_rng(0), {}, {}
     for name, d_out in (("q_proj", 6), ("out_proj", 6), ("head", 4)):
         a, b = (rng.normal(size=s).astype(np.float32) for s in ((2, 6), (d_out, 2)))
@@ -205,7 +205,7 @@ def attention_folder(folder):
 
 
 def test_attention_with_axes_of_heads_and_own_classes(tmp_path):
-    """Kernels [D, N, H] and [N, H, D] are torch's with all heads side by side."""
+    """Kernels [D, N, H] and [N, H, D] match torch's with concatenated heads."""
     updates, base = attention_folder(tmp_path), Attention()
     einsums = {Own: lambda layer: ("w", "...i,io->...o")}
     model = hugging_face.load_peft(tmp_path, base, names=torch_names, einsums=einsums)
@@ -231,7 +231,7 @@ def test_attention_with_axes_of_heads_and_own_classes(tmp_path):
 
 
 def test_linen_attention_takes_the_same_folder(tmp_path):
-    """Its layers are known from a call; outputs are those of merged parameters."""
+    """Layers are determined from a call; outputs match those of merged parameters."""
 
     class Linen(nn.Module):
         @nn.compact
@@ -253,7 +253,7 @@ def test_linen_attention_takes_the_same_folder(tmp_path):
         hugging_face.load_peft(tmp_path, Linen())
 
 
-def test_adapters_elsewhere_stay():
+def test_adapters_on_other_layers_are_kept():
     fresh = hugging_face.load_peft(FOLDER, Net())
     (other,) = {"lin/0", "lin/1", "lin/2"} - adaptation.methods(fresh).keys()
     model = adaptation.adapt(Net(), [(other, LoRA(rank=3))], rngs=nnx.Rngs(1))

@@ -1,4 +1,4 @@
-"""Patterns over names of modules: what PEFT's own matching gives, in bounded time."""
+"""Patterns match module names as in PEFT, in bounded time."""
 
 import re
 import time
@@ -40,7 +40,7 @@ def test_as_peft_matches(pattern):
     assert found == {n: bool(re.match(rf"(.*\.)?({pattern})$", n)) for n in NAMES}
 
 
-def test_the_first_that_matches():
+def test_the_first_match_wins():
     found = values_of({"0.q": 1, "q": 2}, ["x.0.q", "x.1.q", "k"], default=3)
     assert found == {"x.0.q": 1, "x.1.q": 2, "k": 3}
 
@@ -48,14 +48,14 @@ def test_the_first_that_matches():
 @pytest.mark.parametrize(
     "pattern", ["(a+)+b", "(a|a)*b", "(.*)*b", "a?" * 60 + "a" * 60, "(((a*)*)*)*b", ".*.*.*.*.*b"]
 )
-def test_patterns_that_take_python_for_ever(pattern):
+def test_catastrophic_patterns_are_rejected(pattern):
     names = [f"{'a' * 250}{i}" for i in range(20)]
     with pytest.raises(ValueError, match=r"^the pattern '.* could take too long for 20 names\.$"):
         values_of({pattern: True}, names, default=False)
 
 
-def test_what_is_let_through_takes_seconds():
-    """The slowest kind, close to the limit, by this process's clock."""
+def test_accepted_patterns_take_seconds():
+    """The slowest accepted pattern, close to the limit, in process time."""
     names = [f"{'a' * 170}{i}" for i in range(50)]
     began = time.process_time()
     assert not any(values_of({".*a.*b": True}, names, default=False).values())
@@ -63,12 +63,12 @@ def test_what_is_let_through_takes_seconds():
 
 
 @pytest.mark.parametrize("pattern", ["a)", "(a", "[a", "*a", "a**", "[z-a]", "a\\"])
-def test_no_regular_expressions(pattern):
+def test_invalid_regular_expressions(pattern):
     with pytest.raises(ValueError, match="is not a valid regular expression: "):
         values_of({pattern: 1}, ["a"], default=2)
 
 
 @pytest.mark.parametrize("pattern", [r"(?=a)", r"(a)\1", "a++"])
-def test_what_is_not_supported(pattern):
+def test_unsupported_constructs(pattern):
     with pytest.raises(ValueError, match=r"a pattern with [A-Z_]+ is not supported"):
         values_of({pattern: 1}, ["a"], default=2)

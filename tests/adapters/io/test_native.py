@@ -1,4 +1,4 @@
-"""Adapters on disk: round trips for every method, and files that do not fit."""
+"""Save and load adapters: round trips for every method, and invalid files."""
 
 import json
 import os
@@ -46,7 +46,7 @@ def saved(tmp_path):
 
 @pytest.mark.parametrize("name", peft.names())
 def test_round_trip(tmp_path, name):
-    """Onto the bare base, which the file adapts, and onto a model adapted alike."""
+    """Load into the bare base and into a model with the same adapters."""
     rule = (".*", peft.create(name))
     model = adapted(rule)
     save_adapters(tmp_path, model)
@@ -60,7 +60,7 @@ def test_mixed_methods(tmp_path):
     assert_same(load_adapters(tmp_path, Net(nnx.Rngs(0))), model)
 
 
-def test_what_the_file_says(saved):
+def test_description(saved):
     description = json.loads((saved / "adapter.json").read_text())
     assert (description["base"], description["metadata"]) == ("abc", {"step": 3})
     assert description["methods"]["blocks"]["method"] == "lora_sp"
@@ -75,7 +75,7 @@ def test_another_base(saved):
 
 
 def with_other(model, change):
-    """The model with another number in the kernel that is first by path."""
+    """Copy of the model with the first kernel by path modified."""
     graphdef, adapters, frozen = adaptation.split(model)
     first, *others = jax.tree.leaves(frozen)
     frozen = jax.tree.unflatten(jax.tree.structure(frozen), [change(first), *others])
@@ -94,7 +94,7 @@ def test_other_weights_of_the_same_shapes(saved, bare):
     assert_same(kept, with_other(load_adapters(saved, model), lambda k: k.at[0, 0].add(0.5)))
 
 
-def test_the_same_weights_in_another_type(saved):
+def test_the_same_weights_in_another_dtype(saved):
     half = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), Net(nnx.Rngs(0)))
     load_adapters(saved, half)
     mesh = jax.make_mesh((2,), ("data",), devices=jax.devices()[:2])
@@ -115,8 +115,8 @@ def test_models_that_do_not_fit(saved):
 
 @pytest.mark.parametrize("field", ["rank", "hidden_width"])
 @pytest.mark.parametrize("size", [10**12, 10**30])
-def test_sizes_beyond_any_memory(saved, field, size):
-    """Are compared with the tensors before anything is made."""
+def test_sizes_larger_than_memory(saved, field, size):
+    """Sizes are compared with the tensors before anything is allocated."""
     path = saved / "adapter.json"
     description = json.loads(path.read_text())
     del description["digest"]
@@ -129,7 +129,7 @@ def test_sizes_beyond_any_memory(saved, field, size):
 
 
 def resealed(old, new):
-    """A change by somebody who knows of the digest."""
+    """A change with an updated digest."""
 
     def damage(data):
         description = json.loads(data.replace(old, new))
@@ -178,7 +178,7 @@ def test_a_failed_save_keeps_the_old_adapter(saved):
 
 
 @pytest.mark.parametrize("name", ["adapter.json", "adapter.safetensors"])
-def test_a_file_beyond_any_memory(saved, name):
+def test_files_larger_than_memory(saved, name):
     os.truncate(saved / name, 2**43)
     with pytest.raises(ValueError, match=f"{name} has 8796093022208 bytes, more than"):
         load_adapters(saved, Net(nnx.Rngs(0)))

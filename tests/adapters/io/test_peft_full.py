@@ -1,4 +1,4 @@
-"""What PEFT folders hold beside adapters, biases and whole modules, and folders on the hub."""
+"""Fully trained biases and modules in PEFT folders, and folders on the hub."""
 
 import dataclasses
 import json
@@ -29,7 +29,7 @@ from tests.adapters.io.peft_folder import FOLDER, Net, edit, retensor
         ("head", {"lin/2/bias", "lin/2/kernel"}),
     ],
 )
-def test_what_peft_trained_in_full(name, trained):
+def test_fully_trained_parameters_of_peft(name, trained):
     """bias "all" and "lora_only", modules_to_save; PEFT 0.21.2, dropout 0.1, 20 steps of SGD."""
     arrays = dict(np.load(GOLDEN / "adapter_more_io.npz"))
     model = hugging_face.load_peft(GOLDEN / f"adapter_{name}", Net(arrays))
@@ -40,7 +40,7 @@ def test_what_peft_trained_in_full(name, trained):
 
 
 @pytest.mark.parametrize("name", ["bias_all", "bias_lora", "head"])
-def test_what_trains_in_full_is_written_again(name, tmp_path):
+def test_fully_trained_parameters_are_saved(name, tmp_path):
     folder = GOLDEN / f"adapter_{name}"
     arrays = dict(np.load(GOLDEN / "adapter_more_io.npz"))
     hugging_face.save_peft(tmp_path, hugging_face.load_peft(folder, Net(arrays)))
@@ -55,7 +55,7 @@ def test_what_trains_in_full_is_written_again(name, tmp_path):
 
 
 @pytest.mark.parametrize("bias", ["all", "lora_only"])
-def test_biases_that_are_not_there(bias, tmp_path):
+def test_missing_biases(bias, tmp_path):
     folder = shutil.copytree(FOLDER, tmp_path / "copy")
     edit(folder, bias=bias)
     with pytest.raises(ValueError, match=f"was trained with bias '{bias}', but has no bias"):
@@ -67,7 +67,7 @@ def test_biases_that_are_not_there(bias, tmp_path):
 
 
 class Stack(nnx.Module):
-    """Two layers in a stack, each with a norm, behind an embedding; axes of heads; a head."""
+    """An embedding, a stack of two layers with norms, a layer with head axes, and a head."""
 
     def __init__(self, seed=0):
         rngs = nnx.Rngs(seed)
@@ -91,7 +91,7 @@ def numbered(path, index):
 
 
 def moved(model):
-    """The model with other numbers in all that trains."""
+    """Add noise to all trainable parameters."""
     graphdef, adapters, frozen = adaptation.split(model)
     adapters = jax.tree.map(
         lambda x: x + 0.1 * jnp.cos(jnp.arange(x.size)).reshape(x.shape), adapters
@@ -108,8 +108,8 @@ RULES = {
 
 
 @pytest.mark.parametrize("name", RULES)
-def test_stacks_there_and_back(name, tmp_path):
-    """Each layer of a stack is a module, norms too; a bias with axes of heads is flat."""
+def test_round_trip_of_stacks(name, tmp_path):
+    """Each layer of a stack is a module, including norms; biases with head axes are flattened."""
     model = moved(adaptation.adapt(Stack(), RULES[name], rngs=nnx.Rngs(1)))
     hugging_face.save_peft(tmp_path, model, names=numbered)
     tensors = safetensors.numpy.load_file(tmp_path / hugging_face.TENSORS)
@@ -144,7 +144,7 @@ class LinenStack(nn.Module):
 
 @pytest.mark.parametrize("name", RULES)
 def test_linen_takes_the_same_folder(name, tmp_path):
-    """From one base in two libraries, the outputs of the model that was saved."""
+    """The same base in Linen gives the outputs of the saved NNX model."""
     base = Stack()
     model = moved(adaptation.adapt(base, RULES[name], rngs=nnx.Rngs(1)))
     hugging_face.save_peft(tmp_path, model, names=numbered)
@@ -158,8 +158,8 @@ def test_linen_takes_the_same_folder(name, tmp_path):
     )
 
 
-def test_a_convolution_that_was_trained_in_full(tmp_path):
-    """torch's [out, in, height, width] with sides that differ in value but not in size."""
+def test_fully_trained_convolution(tmp_path):
+    """torch's [out, in, height, width], with equal sizes but distinct values."""
     base = nnx.Dict(
         conv=nnx.Conv(2, 3, (2, 2), rngs=nnx.Rngs(0)), head=nnx.Linear(3, 4, rngs=nnx.Rngs(1))
     )
@@ -174,7 +174,7 @@ def test_a_convolution_that_was_trained_in_full(tmp_path):
         assert found[h, w, i, o] == kernel[o, i, h, w]
 
 
-def test_dropout_of_all_adapters_or_none(tmp_path):
+def test_dropout_rates_must_agree(tmp_path):
     rules = [("lin/0", LoRA(rank=2, dropout=0.1)), ("lin/1", LoRA(rank=2))]
     model = adaptation.adapt(Net(), rules, rngs=nnx.Rngs(0))
     with pytest.raises(
@@ -187,7 +187,7 @@ def test_dropout_of_all_adapters_or_none(tmp_path):
     assert again.lin[1].method == LoRA(rank=2, alpha=4.0, dropout=0.1)
 
 
-def test_a_module_that_peft_cannot_hold(tmp_path):
+def test_unsupported_module(tmp_path):
     class Picture(nnx.Module):
         def __init__(self):
             self.conv = nnx.Conv(2, 3, (3,), rngs=nnx.Rngs(0))
@@ -199,7 +199,7 @@ def test_a_module_that_peft_cannot_hold(tmp_path):
         hugging_face.save_peft(tmp_path / "new", model)
 
 
-def test_only_what_is_said_to_be_on_the_hub_is_asked_of_it(monkeypatch):
+def test_only_hf_paths_are_downloaded(monkeypatch):
     asked = []
 
     def download(name, *, allow_patterns, **options):

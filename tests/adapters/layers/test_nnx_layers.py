@@ -1,4 +1,4 @@
-"""Layers of strangers' NNX models: einsums, embeddings, convolutions, and what keeps working."""
+"""Adapted layers of third-party NNX models: einsums, embeddings, convolutions."""
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ SP = LoRASP(rank=8, hidden_width=4)
 
 
 class Heads(nnx.Module):
-    """General, einsum and expert layers, and a stack of einsums that is scanned over."""
+    """General, einsum and expert layers, and a scanned stack of einsums."""
 
     def __init__(self, rngs):
         init = nnx.initializers.normal()
@@ -50,7 +50,7 @@ def adapted(model, *rules, **settings):
 
 
 def perturbed(model):
-    """The model with adapters that do something."""
+    """Add noise to the adapters, so that their deltas are not zero."""
     graphdef, adapters, frozen = adaptation.split(model)
     return nnx.merge(graphdef, with_noise(adapters, 0.3), frozen)
 
@@ -90,8 +90,8 @@ def test_every_method_starts_at_the_base(heads, x, name):
 @pytest.mark.parametrize(
     "method", [LoRA(rank=2), DoRA(rank=2), LoRA(rank=2, initialization="pissa")]
 )
-def test_merged_layers_are_what_they_were(heads, x, method):
-    """The same computation and structure: a state that the model's own code can load."""
+def test_merging_restores_the_original_classes(heads, x, method):
+    """Outputs and graph structure are the same, so the model's own code can load the state."""
     model = perturbed(adapted(heads, (".*", method)))
     merged = lorasp_jax.merge(model)
     np.testing.assert_allclose(call(merged, x), call(model, x), rtol=1e-4, atol=1e-5)
@@ -167,7 +167,7 @@ def test_attention_of_flax(x):
 
 @pytest.mark.slow
 def test_embedding_and_convolution(vision, ids):
-    """Against the base model with W + scale A B in place of its kernels, and PEFT's start."""
+    """Compare with a base model with kernels W + scale A B, and with PEFT's initialization."""
     method = LoRA(rank=3, alpha=6.0)
     model = adapted(vision, (".*", method))
     start = model.embed.adapter.get_value()
@@ -201,7 +201,7 @@ def test_convolutions_of_two_dimensions():
 
 
 @pytest.mark.slow
-def test_gradients_reach_the_adapters_alone(vision, ids):
+def test_only_adapters_get_gradients(vision, ids):
     graphdef, adapters, frozen = adaptation.split(perturbed(adapted(vision, (".*", LoRA(rank=2)))))
     loss = jax.jit(lambda a: sum(y.sum() for y in nnx.merge(graphdef, a, frozen)(ids)))
     gradients = jax.tree.leaves(jax.grad(loss)(adapters))
@@ -210,7 +210,7 @@ def test_gradients_reach_the_adapters_alone(vision, ids):
 
 
 class Product(nnx.Module):
-    """An einsum under other names, whose model reads its shape."""
+    """A third-party einsum with other attribute names, whose shape the model reads."""
 
     def __init__(self, einsum_str, shape, rngs):
         self.einsum_str = einsum_str
@@ -284,7 +284,7 @@ def test_unsupported_layers(heads, vision, tmp_path):
         adapted(heads, ("split", SP)).split(jnp.ones((1, 6)), out_sharding=object())
 
 
-def test_rules_stand_for_the_options_of_peft(heads):
+def test_rules_cover_the_options_of_peft(heads):
     """rank_pattern, alpha_pattern, exclude_modules, modules_to_save, bias."""
     rules = [
         ("join", FullFineTuning()),  # modules_to_save
