@@ -264,7 +264,7 @@ def main(config: Config) -> float:
     draw(config, curve)
     key = jax.random.key(config.seed + 1_000_000)
     env = make(config, config.episodes)
-    with messages.announced(f"the evaluation of {config.task} (including its episodes)"):
+    with messages.announce(f"the evaluation of {config.task} (including its episodes)"):
         success = float(np.mean(evaluate(env, learner.params, learner.moments, key)))
     print(
         f"{success:.1%} of {config.episodes} unseen layouts, {time.process_time():.0f} CPU seconds"
