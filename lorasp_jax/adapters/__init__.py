@@ -1,1 +1,1 @@
-"""Adapting whole models."""
+"""Adapt whole models, and save, combine and compress their adapters."""

@@ -1,4 +1,4 @@
-"""Adapting a whole model: attach methods by path rules, split, count, merge.
+"""Adapt a whole model: attach methods by path rules, split, count, merge.
 
 A rule is (pattern, method). Patterns are searched (`re.search`) in "/"-joined paths. The first
 match wins, even if its method cannot apply to that path: with [("vision", LoRA()),
@@ -121,10 +121,10 @@ def with_dropout(model: Model, key: jax.Array) -> Model:
     for location in paths.unique(paths.locate(root, AdaptedLayer)):
         layer = location.child
         if isinstance(layer.adapter, AdapterParam) and dropout_rate(layer.method):
-            own = jax.random.fold_in(key, zlib.crc32(location.path.encode()))
+            layer_key = jax.random.fold_in(key, zlib.crc32(location.path.encode()))
             leading = layer.stack_shape()
             layer.stored_dropout_key = DropoutKey(
-                jax.random.split(own, leading) if leading else own
+                jax.random.split(layer_key, leading) if leading else layer_key
             )
     return root[0]
 
@@ -333,7 +333,7 @@ def init_stack(
     if statistics is not None:
         statistics = statistics.reshape(-1, d_in, d_in)
     keys = jax.random.split(key, math.prod(leading))
-    each = jax.vmap(lambda key, kernel, own: init(key, kernel, statistics=own))
+    each = jax.vmap(lambda key, kernel, moment: init(key, kernel, statistics=moment))
     stacked = each(keys, kernel.reshape(-1, d_in, d_out), statistics)
     return jax.tree.map(lambda leaf: leaf.reshape(*leading, *leaf.shape[1:]), stacked)
 

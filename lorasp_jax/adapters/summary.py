@@ -88,8 +88,8 @@ def _rows(model: nnx.Module) -> list[Row]:
 
 def _others(model: nnx.Module) -> list[str]:
     """List with one line on the unsupported classes that have matrices, if there are any."""
-    found = locate_other_matrices(nnx.List([model]))
-    classes = dict.fromkeys(type(location.parent).__name__ for location in found)
+    matrices = locate_other_matrices(nnx.List([model]))
+    classes = dict.fromkeys(type(location.parent).__name__ for location in matrices)
     if not classes:
         return []
     return [f"no built-in adapter support for {', '.join(classes)}. {EINSUMS_HINT}."]

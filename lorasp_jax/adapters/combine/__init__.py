@@ -1,1 +1,1 @@
-"""Several adapters on one model."""
+"""Combine several adapters in one model."""

@@ -1,1 +1,1 @@
-"""Smaller adapters and bases, by calibration."""
+"""Compress adapters and bases: pruning, distillation, quantization, calibration statistics."""

@@ -80,7 +80,7 @@ class Observed(Method):
     reference: Method | None = None
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
-        """Observed has no parameters of its own."""
+        """Return {}: `Observed` has no parameters of its own."""
         del key, d_in, d_out
         return {}
 

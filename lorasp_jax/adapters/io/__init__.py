@@ -1,1 +1,1 @@
-"""Adapters in files: this project's own and Hugging Face PEFT's."""
+"""Adapter files in this project's format and in Hugging Face PEFT's."""

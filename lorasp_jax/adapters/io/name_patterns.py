@@ -46,11 +46,11 @@ def values_of(patterns: Mapping[str, Any], names: Collection[str], default: Any)
                 f"the pattern {pattern_text!r} could take too long for {len(names)} names."
             )
     compiled = [(re.compile(pattern), value) for pattern, value in full_values.items()]
-    found = {}
+    values = {}
     for name in names:
         hits = (value for pattern, value in compiled if pattern.match(name))
-        found[name] = next(hits, default)
-    return found
+        values[name] = next(hits, default)
+    return values
 
 
 def _ways(tree: Iterable[tuple[Any, Any]], length: int) -> int:

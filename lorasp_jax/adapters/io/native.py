@@ -162,10 +162,10 @@ def _adapt_as_saved(
 def _frozen_weights(model: nnx.Module) -> dict[str, jax.Array]:
     """Base parameters with values, by path, except those split by an adapter."""
     split = [path for path, method in adaptation.methods(model).items() if method.splits_kernel]
-    found = _leaves_by_name(nnx.state(model, nnx.All(nnx.Param, nnx.Not(AdapterParam))))
+    leaves = _leaves_by_name(nnx.state(model, nnx.All(nnx.Param, nnx.Not(AdapterParam))))
     return {
         name: leaf
-        for name, leaf in found.items()
+        for name, leaf in leaves.items()
         if not any(name.startswith(f"{path}/") for path in split)
         and isinstance(leaf, (jax.Array, np.ndarray))
         and not isinstance(leaf, jax.core.Tracer)
@@ -175,11 +175,11 @@ def _frozen_weights(model: nnx.Module) -> dict[str, jax.Array]:
 def _check_weights(model: nnx.Module, saved: Mapping[str, str], folder: pathlib.Path) -> None:
     """Raise ValueError if a base weight differs from the saved fingerprint."""
     common = {n: leaf for n, leaf in _frozen_weights(model).items() if n in saved}
-    found = digest.fingerprints(common)
-    if changed := [name for name in found if found[name] != saved[name]]:
+    fingerprints = digest.fingerprints(common)
+    if changed := [name for name in fingerprints if fingerprints[name] != saved[name]]:
         raise ValueError(
-            f"{folder} was trained on another base: {len(changed)} of {len(found)} arrays differ, "
-            f"first {changed[0]!r}; pass any_base=True to load anyway."
+            f"{folder} was trained on a different base: {len(changed)} of {len(fingerprints)} "
+            f"arrays differ, first {changed[0]!r}; pass any_base=True to load anyway."
         )
 
 
@@ -217,10 +217,10 @@ def _leaves_by_name(adapters: nnx.State) -> dict[str, jax.Array]:
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
 
 
-def _methods(found: Mapping[str, Any], folder: pathlib.Path) -> dict[str, Method]:
+def _methods(saved: Mapping[str, Any], folder: pathlib.Path) -> dict[str, Method]:
     """Methods of a description, by path."""
     try:
-        return {path: peft.from_settings(settings) for path, settings in found.items()}
+        return {path: peft.from_settings(settings) for path, settings in saved.items()}
     except (ValueError, TypeError, OverflowError) as error:
         raise ValueError(f"{folder} does not fit the model: {error}") from error
 

@@ -1,1 +1,1 @@
-"""Adapted layers of each kind."""
+"""Adapted layers: einsums, embeddings and convolutions, and layers prepared for inference."""

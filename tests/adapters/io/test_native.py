@@ -87,7 +87,7 @@ def test_other_weights_of_the_same_shapes(saved, bare):
     model = Net(nnx.Rngs(0)) if bare else adapted((".*", SP))
     other = with_other(model, lambda kernel: kernel.at[0, 0].add(0.5))
     with pytest.raises(
-        ValueError, match=r"another base: 1 of .* differ, first 'blocks.*any_base=True"
+        ValueError, match=r"different base: 1 of .* differ, first 'blocks.*any_base=True"
     ):
         load_adapters(saved, other)
     kept = load_adapters(saved, other, any_base=True)
