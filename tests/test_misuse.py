@@ -82,7 +82,10 @@ def test_models_of_other_libraries():
         ({"alpha": 1e308}, "alpha must be a finite number or None, got 1e+308"),
         ({"alpha": 1e35}, "|alpha| must be between 1e-30 and 1e+30, got 1e+35"),
         ({"alpha": 0}, "|alpha| must be between 1e-30 and 1e+30, got 0"),
-        ({"alpha": -1.0, "initialization": "pissa"}, "needs a positive alpha, got -1.0"),
+        (
+            {"alpha": -1.0, "initialization": "pissa"},
+            "alpha must be positive for 'pissa', got -1.0",
+        ),
         ({"dropout": 1.0}, "dropout must be in [0, 1), got 1.0"),
         ({"dropout": -0.1}, "dropout must be in [0, 1), got -0.1"),
         ({"dropout": "0.1"}, "dropout must be a finite number, got '0.1'"),
@@ -95,7 +98,9 @@ def test_fields_of_lora(fields, message):
 
 
 def test_too_many_values():
-    with pytest.raises(ValueError, match=r"lora has fields rank, alpha, .* dropout, got 6 values"):
+    with pytest.raises(
+        ValueError, match=r"lora takes at most 5 values \(rank, .* dropout\), got 6"
+    ):
         LoRA(1, 2.0, False, "kaiming", 0.1, 3)  # pyright: ignore[reportCallIssue]
 
 

@@ -77,7 +77,7 @@ def dense_shared_input(
       y and aux of each layer.
 
     Raises:
-      ValueError: as for `dense`.
+      ValueError: see `dense`.
     """
     layers = [DenseLayer(*layer) for layer in layers]
     results: dict[int, tuple[jax.Array, Aux]] = {}
@@ -112,7 +112,7 @@ def cast_input(dtype: Dtype | None, x: Any, kernel: Any) -> jax.Array:
     """Cast x to the compute dtype; None promotes the dtypes of x and kernel.
 
     Raises:
-      ValueError: x is not an array, or the dtypes do not promote, as for 8-bit kernels.
+      ValueError: x is not an array, or the dtypes cannot be promoted, such as for 8-bit kernels.
     """
     try:
         return validate.array(x).astype(dtype or jnp.promote_types(x.dtype, kernel.dtype))

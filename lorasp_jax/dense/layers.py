@@ -42,7 +42,7 @@ class DropoutKey(nnx.Variable[Any]):
 
 
 def with_value(variable: Any, value: Any) -> Any:
-    """A new variable with the same metadata; the old one may be shared with other layers."""
+    """Return a new variable with the same metadata, since other layers may share the old one."""
     return type(variable)(value, **variable.get_metadata())
 
 
@@ -53,9 +53,9 @@ class AdaptedLayer(nnx.Module):
       kernel_name: attribute name of the layer's kernel.
       adapter: `AdapterParam` holding the method's parameters, or None.
       method: the adapter's method, static.
-      stored_aux: aux of the last call. Absent if there is none, so that the graph structure of the
-        layer does not change.
-      stored_dropout_key: the key set by `with_dropout`, absent otherwise.
+      stored_aux: aux of the last call. Absent rather than None before that, so that it does not
+        change the layer's graph structure.
+      stored_dropout_key: the key set by `with_dropout`; absent otherwise.
     """
 
     kernel_name: str = "kernel"

@@ -29,7 +29,7 @@ def method(value: Any) -> Method | None:
         hint = f": write {value.__name__}()" if isinstance(value, type) else ""
         raise ValueError(
             f"method must be None or a Method such as LoRA(rank=8), got {short(value)}{hint}; "
-            "`peft.create` makes one by name."
+            "`peft.create` creates one by name."
         )
     return value
 

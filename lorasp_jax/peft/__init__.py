@@ -1,6 +1,6 @@
 """Framework-agnostic adapter methods, one frozen dataclass per file or folder.
 
-`create("lora_sp", rank=64)` finds a method by its file name, so adding a method takes one new file.
+`create("lora_sp", rank=64)` finds a method by its module name; adding a method takes one new file.
 Modules that begin with `_` are shared by the methods.
 """
 
@@ -63,7 +63,7 @@ def find(name: str) -> type[Method]:
 
 
 def create(name: str, **fields: Any) -> Method:
-    """Create the method `name` (a file name such as lora, lora_sp or full) with the given fields.
+    """Create the method `name` (a module name such as lora, lora_sp or full) with the given fields.
 
     Raises:
       ValueError: unknown method, unknown field or invalid value.
@@ -75,7 +75,7 @@ def from_settings(settings: Any) -> Method:
     """Create a method from the settings that `to_settings` wrote, in this or an earlier version.
 
     Raises:
-      ValueError: `settings` does not name a method, or as for `create`.
+      ValueError: `settings` does not name a method, or `create` rejects it.
     """
     if not isinstance(settings, dict) or not isinstance(settings.get("method"), str):
         raise ValueError(f"adapter settings must name a method, got {short(settings)}.")

@@ -21,7 +21,7 @@ class Aux:
       losses: fp32 scalars by name, averaged over the valid tokens.
       token_mask: bool [...tokens], True for valid tokens; None if all are valid.
       usage: f32 [R], number of valid tokens that use each direction; None without a gate.
-      statistics: sums over valid tokens by layer path, during calibration
+      statistics: sums over valid tokens, by layer path; empty except during calibration
         (`lorasp_jax.adapters.compress.calibration`).
     """
 
@@ -59,7 +59,7 @@ def auxiliary_losses(aux: Any) -> dict[str, jax.Array]:
     layers = jax.tree.leaves(aux, is_leaf=lambda node: isinstance(node, Aux))
     if invalid := [layer for layer in layers if not isinstance(layer, Aux)]:
         raise ValueError(
-            f"aux must be a tree of Aux, as from collect_aux, got {short(invalid[0])}."
+            f"aux must be a tree of Aux, such as from collect_aux, got {short(invalid[0])}."
         )
     names = sorted({name for layer in layers for name in layer.losses})
     return {

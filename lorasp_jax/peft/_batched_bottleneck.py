@@ -33,8 +33,8 @@ class BatchedBottleneck:
         Args:
           params: from `pack`, stacked [n, ...].
           projected: [...tokens, C], which includes x P of all layers.
-          columns: start column of each layer; its step is the width Q.
-          token_mask: as for `Method.delta`.
+          columns: range of the layers' start columns; its step is the width Q.
+          token_mask: see `Method.delta`.
 
         Returns:
           z of all layers, concatenated [...tokens, n R], and aux [n, ...] with token_mask unset.

@@ -16,16 +16,16 @@ MAX_INT = 2**31 - 1
 
 
 def check_fields(owner: Any, prefix: str = "") -> None:
-    """Check field values against their annotations. Ints are valid floats, bools are not numbers.
+    """Check field values against their annotations. Ints are valid floats; bools are not numbers.
 
     Args:
-        owner: a dataclass instance. Only annotations that are classes, unions, `Literal` or
-            homogeneous tuples are checked.
-        prefix: prefix of field names in messages, such as "optim.".
+      owner: a dataclass instance. Only annotations that are classes, unions, `Literal` or
+        homogeneous tuples are checked.
+      prefix: prefix of field names in messages, such as "optim.".
 
     Raises:
-        ValueError: a value of the wrong type, a number that is not finite, or an integer above
-            `MAX_INT` or the "max" in its field's metadata.
+      ValueError: a value of the wrong type, a number that is not finite, or an integer above
+        `MAX_INT` or the "max" in its field's metadata.
     """
     fields = dataclasses.fields(owner) if dataclasses.is_dataclass(owner) else ()
     maximum = {field.name: field.metadata.get("max", MAX_INT) for field in fields}
@@ -43,7 +43,8 @@ def check_names(cls: type, name: str, values: Sequence[Any], fields: Iterable[st
     """Raise ValueError for too many positional values, or for an unknown field name."""
     valid = [field.name for field in dataclasses.fields(cls)]
     if len(values) > len(valid):
-        raise ValueError(f"{name} has fields {', '.join(valid)}, got {len(values)} values.")
+        names = ", ".join(valid)
+        raise ValueError(f"{name} takes at most {len(valid)} values ({names}), got {len(values)}.")
     for field in fields:
         if field not in valid:
             close = difflib.get_close_matches(field, valid, n=1, cutoff=0.4)
@@ -69,7 +70,7 @@ def short(value: Any) -> str:
 
 
 def is_array(value: Any) -> bool:
-    """Whether a value has a dtype and a shape. (`nnx.Rngs` has any attribute.)"""
+    """Whether a value has a dtype and a shape. (`hasattr` is always True for `nnx.Rngs`.)"""
     return hasattr(value, "dtype") and isinstance(getattr(value, "shape", None), tuple)
 
 

@@ -96,7 +96,7 @@ class Method:
 
     @property
     def as_saved(self) -> "Method":
-        """The method to store with the parameters and to load them with."""
+        """The method to save with the parameters, used to load them again."""
         return self
 
     def init(
@@ -139,7 +139,7 @@ class Method:
         Args:
           params: from `bottleneck_params`.
           rows: x P, [...tokens, Q] in the dtype of x, or in fp32 if `down_in_fp32`.
-          token_mask: as for `delta`.
+          token_mask: see `delta`.
 
         Returns:
           z [...tokens, R], to be multiplied by U, and aux with token_mask unset.
@@ -147,7 +147,7 @@ class Method:
         raise NotImplementedError
 
     def fused_kernel(self, params: Params) -> BatchedBottleneck | None:
-        """A fused GPU kernel for `bottleneck` with parameters of these shapes, or None."""
+        """A fused GPU kernel for `bottleneck` if the parameters' shapes allow one, else None."""
         del params
 
     def up(self, params: Params) -> jax.Array:
@@ -196,7 +196,7 @@ class Method:
     ) -> tuple[jax.Array, Aux]:
         """The adapted linear layer without bias, [...tokens, O]: x @ kernel + delta, fused.
 
-        `kernel` receives no gradient. Arguments as for `delta`.
+        `kernel` receives no gradient. See `delta` for the arguments.
 
         Raises:
           ValueError: x, the mask or the kernel has the wrong shape or dtype, or the parameters
@@ -228,7 +228,7 @@ class Method:
           x: [...tokens, I].
           kernel: [I, O]; receives no gradient.
           key: typed random key.
-          token_mask: as for `delta`.
+          token_mask: see `delta`.
         """
         x_dropped = dropout(x, dropout_rate(self), key)
         kernel = jax.lax.stop_gradient(kernel.astype(x.dtype))
@@ -283,7 +283,7 @@ class Method:
         return optimizer
 
     def merge(self, params: Params, kernel: jax.Array) -> jax.Array:
-        """The kernel [I, O] with the adapter folded in, in the kernel's dtype.
+        """The kernel [I, O] merged with the adapter, in the kernel's dtype.
 
         Raises:
           ValueError: the delta depends on the input, so it cannot be merged.
@@ -292,7 +292,7 @@ class Method:
 
 
 def name_of(cls: type[Method]) -> str:
-    """The name of the file that defines a method, or of the folder around its `method.py`."""
+    """The name of the file that defines a method, or of the folder containing its `method.py`."""
     folder, _, file = cls.__module__.rpartition(".")
     return folder.rpartition(".")[2] if file == "method" else file
 

@@ -1,4 +1,4 @@
-"""Convert methods to and from JSON settings, including the settings of earlier versions."""
+"""Convert methods to JSON settings, and upgrade the settings of earlier versions."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -15,10 +15,10 @@ _EARLIER_FIELDS = {
     "pruned",
     "gate",
 }
-"""Fields of LoRA-SP in earlier versions."""
+"""Fields of LoRA-SP that only earlier versions had."""
 _RELEASE_NAMES = {"lora_sp": "lora_sp_release", "LoRASP": "LoRASPRelease"}
 _GELU_ROUTERS = {"softplus": "gelu", "relu": "gelu_relu", "softmax": "gelu_softmax"}
-"""Current router names by the score function that earlier versions stored with "gelu"."""
+"""Current name of router "gelu" for each score function that earlier versions stored."""
 
 
 def to_settings(method: Any) -> Settings:

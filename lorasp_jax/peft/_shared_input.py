@@ -16,7 +16,7 @@ AdaptedKernel = tuple[Method, Params, jax.Array]
 def apply_shared_input(
     layers: Sequence[AdaptedKernel], x: jax.Array, *, token_mask: jax.Array | None = None
 ) -> list[tuple[jax.Array, Aux]]:
-    """Apply `Method.apply` of several layers to the same input.
+    """Compute `Method.apply` of several layers for the same input.
 
     Layers whose methods are low-rank sums (`Method.is_low_rank_sum`) and agree on `down_in_fp32`
     share one matmul for their down-projections. Kernels receive no gradient.

@@ -24,7 +24,7 @@ def key(value: Any) -> jax.Array:
 
 
 def tokens(x: Any, token_mask: Any) -> None:
-    """Raise ValueError unless x is inexact [...tokens, I] and the mask bool [...tokens] or None."""
+    """Raise ValueError unless x is inexact [...tokens, I] and mask is None or bool [...tokens]."""
     if not (is_array(x) and x.shape and jnp.issubdtype(x.dtype, jnp.inexact)):
         actual = f"{x.dtype} {list(x.shape)}" if is_array(x) else type(x).__name__
         raise ValueError(f"x must be a floating-point array [...tokens, I], got {actual}.")
@@ -38,7 +38,7 @@ def tokens(x: Any, token_mask: Any) -> None:
 def params(method: Any, values: Any, shape: tuple[int, ...]) -> None:
     """Raise ValueError if the parameters do not fit the method and a kernel [I, O].
 
-    Some would otherwise run without an error, but with the scale of a different rank.
+    Otherwise, some mismatches would raise no error but use the scale of a different rank.
     """
     actual = _shapes(values)
     for name, expected in method.shapes(_initial_shapes(method, shape), actual).items():

@@ -51,9 +51,9 @@ class AdaLoRA(Method):
     warmup: float = 0.1
     """Fraction of the training steps before pruning starts."""
     final: float = 0.3
-    """Fraction of the training steps, at the end, with a fixed set of pruned triplets."""
+    """Fraction of the training steps, at the end, that keep the set of pruned triplets fixed."""
     interval: int = 10
-    """Steps between prunings."""
+    """Steps from one pruning to the next."""
     importance_decay: float = 0.85
     """β1, EMA decay of the importance."""
     uncertainty_decay: float = 0.85
@@ -67,7 +67,7 @@ class AdaLoRA(Method):
         super().__post_init__()
         if self.rank < 1 or not 1 <= self.final_rank <= self.rank or self.interval < 1:
             raise ValueError(
-                "rank and interval must be at least 1 and target_rank 1 to rank, got "
+                "rank and interval must be at least 1 and target_rank from 1 to rank, got "
                 f"rank={self.rank}, target_rank={self.target_rank}, interval={self.interval}."
             )
         if self.warmup < 0 or self.final < 0 or self.warmup + self.final >= 1:
@@ -88,11 +88,11 @@ class AdaLoRA(Method):
 
     @property
     def scale(self) -> float:
-        """α/(R + 1e-5); the 1e-5 is that of PEFT and the authors' code."""
+        """α/(R + 1e-5); the 1e-5 matches PEFT and the authors' code."""
         return (2 * self.rank if self.alpha is None else self.alpha) / (self.rank + 1e-5)
 
     def match_budget(self, mean_active_rank: float) -> "AdaLoRA":
-        """Copy with LoRA-SP's measured mean active rank as `target_rank` (paper, Table I)."""
+        """Return a copy whose `target_rank` is LoRA-SP's mean active rank (paper, Table I)."""
         return dataclasses.replace(self, target_rank=round(mean_active_rank))
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
@@ -208,7 +208,7 @@ def _allocate(
 ) -> tuple[list[jax.Array], list[jax.Array]]:
     """Masks shaped like lora_e: entries kept by the last allocation, and entries to zero now.
 
-    Between allocations pruned entries may train and return; after the last one they stay 0.
+    Between allocations, pruned entries train and can become nonzero; after the last, they stay 0.
     """
     step, total = state.step, sum(s.size for s in scores)
     table = budgets(total, total // method.rank * method.final_rank, begin, end)

@@ -1,4 +1,4 @@
-"""DoRA: LoRA adapts the direction of each kernel column, a trained magnitude its length.
+"""DoRA: LoRA adapts the direction of each kernel column; a trained magnitude sets its length.
 
 Liu et al., arXiv 2402.09353. With V = W + scale A B and a trained magnitude m per output,
 
@@ -22,12 +22,12 @@ from lorasp_jax.peft.lora import LoRA
 
 @dataclasses.dataclass(frozen=True)
 class DoRA(LoRA):
-    """Fixed-rank adapter with a magnitude per output. Fields, scale and initialization as in LoRA.
+    """Fixed-rank adapter with a magnitude per output. Fields, scale and initialization are LoRA's.
 
     Parameters: lora_a [I, R], lora_b [R, O], magnitude [O]: (I + O) R + O in total.
 
     Raises:
-      ValueError: a rank below 1.
+      ValueError: a rank below 1, an unknown initialization, or a dropout outside [0, 1).
     """
 
     additive: ClassVar[bool] = False
@@ -37,14 +37,14 @@ class DoRA(LoRA):
     ) -> tuple[Params, Kernel]:
         """Initialize LoRA's parameters, and the magnitude to the norms of the kernel's columns.
 
-        Arguments and results as for `Method.init`, except that the kernel must have values.
+        See `Method.init` for the arguments and results; here the kernel must have values.
 
         Raises:
           ValueError: the kernel is not a matrix, or only a shape.
         """
         if isinstance(kernel, jax.ShapeDtypeStruct):
             raise ValueError(
-                "DoRA's magnitude is initialized from the kernel's values, got only "
+                "DoRA's magnitude must be initialized from the kernel's values, got only "
                 f"the shape {kernel.shape}."
             )
         params, residual = super().init(key, kernel, statistics=statistics)
@@ -60,7 +60,7 @@ class DoRA(LoRA):
     ) -> tuple[jax.Array, Aux]:
         """Eq. (5): (x W + scale x A B) · m / ‖V‖, [...tokens, O]. The kernel receives no gradient.
 
-        The factor is applied in fp32: bf16 would round it by up to 0.4 % for a whole column.
+        The factor is applied in fp32: bf16 rounding would rescale a whole column by up to 0.4 %.
         """
         y, aux = super().apply(params, x, kernel, token_mask=token_mask)
         factor = column_factor(params["magnitude"], self._adapted(params, kernel))
@@ -80,8 +80,8 @@ def column_factor(magnitude: jax.Array, adapted: jax.Array) -> jax.Array:
     """m / ‖V‖, f32 [O], for magnitude [O] and V [I, O]. V receives no gradient.
 
     V is formed explicitly to compute its norms. Expanding them per column w + s A b as
-    ‖w‖² + 2 s (wᵀA) b + s² bᵀ(AᵀA) b would avoid that, but costs as much (I O R for WᵀA) and
-    suffers from cancellation where V is much shorter than W.
+    ‖w‖² + 2 s (wᵀA) b + s² bᵀ(AᵀA) b would avoid that, but cost as much (I O R for WᵀA) and
+    suffer from cancellation where V is much shorter than W.
 
     A zero column has no direction to rescale. Its factor is m + 1, that is 1 for the initial m = 0,
     so that B can learn even from a zero kernel.

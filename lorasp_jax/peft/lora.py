@@ -1,7 +1,8 @@
 """LoRA: ΔW = (α/R) A B of fixed rank (Hu et al., arXiv 2106.09685), optionally with rsLoRA scaling.
 
-Conventions and initializations follow Hugging Face PEFT. Either B = 0 and A is Kaiming-uniform with
-a = √5, which is U(±1/√I), or Gaussian; or A B is split off the kernel and the residual is frozen.
+Conventions and initializations follow Hugging Face PEFT. Initially, B = 0 and A is Kaiming-uniform
+(a = √5, so U(±1/√I)), Gaussian or computed from inputs; alternatively, A B is split off the kernel
+and the residual is frozen.
 The scale is α/R, or α/√R for rsLoRA (Kalajdzievski, arXiv 2312.03732).
 """
 
@@ -29,10 +30,10 @@ class LoRA(Method):
     """
 
     rank: int = 128
-    """R. It may exceed I and O unless A B is split off the kernel. 128 is the main baseline of the
-    LoRA-SP paper."""
+    """R. It must be at most min(I, O) for "pissa" and "olora", and at most I for "eva". The LoRA-SP
+    paper's main baseline has rank 128."""
     alpha: float | None = None
-    """α. Defaults to 2 R, a scale of 2 as in LoRA-SP."""
+    """α. Defaults to 2 R, so that α/R is 2 as in LoRA-SP."""
     rank_stabilized: bool = False
     """Scale by α/√R (rsLoRA) instead of α/R."""
     initialization: Literal["kaiming", "gaussian", "pissa", "olora", "eva"] = "kaiming"
@@ -51,7 +52,7 @@ class LoRA(Method):
         if self.rank < 1:
             raise ValueError(f"rank must be at least 1, got {self.rank}.")
         if self.initialization == "pissa" and self.scale < 0:
-            raise ValueError(f"'pissa' needs a positive alpha, got {self.alpha}.")
+            raise ValueError(f"alpha must be positive for 'pissa', got {self.alpha}.")
 
     @property
     def splits_kernel(self) -> bool:
@@ -74,11 +75,11 @@ class LoRA(Method):
     ) -> tuple[Params, Kernel]:
         """Initialize A and B; if they are split off the kernel, return the residual W - scale A B.
 
-        Arguments and results as for `Method.init`.
+        See `Method.init` for the arguments and results.
 
         Raises:
-          ValueError: the kernel is not a matrix; or it must be split, but is only a shape or has
-            fewer than R rows or columns; or statistics are missing or of the wrong shape.
+          ValueError: the kernel is not a matrix; a kernel to be split is only a shape or has fewer
+            than R rows or columns; or statistics are missing or have the wrong shape.
         """
         if self.needs_statistics:
             _validate.matrix(kernel)
@@ -110,7 +111,8 @@ class LoRA(Method):
     ) -> tuple[Params, Kernel]:
         """Initialize parameters for an embedding [V, D]: A zero, B from N(0, 1), as in PEFT.
 
-        Only the rows of A that were looked up receive a gradient, so A must be the zero factor.
+        Rows of A that are not looked up receive no gradient and stay zero, so that their entries do
+        not change.
         """
         del statistics
         entries, width = table.shape
@@ -134,7 +136,7 @@ class LoRA(Method):
 
     @property
     def as_saved(self) -> "LoRA":
-        """This method, with "eva" replaced: its statistics are only needed to initialize."""
+        """This method, with "eva" replaced: only `init` needs the statistics."""
         if self.needs_statistics:
             return dataclasses.replace(self, initialization="kaiming")
         return self
@@ -157,7 +159,7 @@ def principal_part(kernel: jax.Array, rank: int, scale: float) -> tuple[jax.Arra
 
 
 def orthogonal_part(kernel: jax.Array, rank: int, scale: float) -> tuple[jax.Array, jax.Array]:
-    """A [I, R] and B [R, O] with orthonormal rows of B: QR of the kernel's transpose, rank R.
+    """A [I, R] and B [R, O] from the kernel's rank-R QR decomposition; B's rows are orthonormal.
 
     OLoRA (Büyükakyüz, arXiv 2406.01775, algorithm 1), which does not divide by the scale.
     """

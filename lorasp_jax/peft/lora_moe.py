@@ -41,9 +41,9 @@ class LoRAMoE(Method):
     routing: Literal["weighted", "top1"] = "weighted"
     """"weighted": all experts, weighted by probability. "top1": the most likely one per token."""
     gate_gradient: Literal["hard", "switch"] = "hard"
-    """For "top1" only. "hard": the chosen expert has weight 1, so that the router learns from its
-    losses alone, as in LoRA-SP's code. "switch": its weight is p, which passes the task gradient on
-    to the router."""
+    """For "top1" only. "hard": the chosen expert has weight 1, so that the router learns only from
+    its own losses, as in LoRA-SP's code. "switch": its weight is p, which passes the task gradient
+    on to the router."""
 
     def __post_init__(self) -> None:
         """Validate the fields."""
@@ -80,7 +80,7 @@ class LoRAMoE(Method):
     def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
-        """Eq. (2) of the LoRA-SP paper: z = scale w(x) x A, one weight per expert's R columns."""
+        """Eq. (2) of the LoRA-SP paper: z = scale w(x) x A; each w_i scales R columns."""
         del params
         expert_inputs, logits = jnp.split(rows, [self.experts * self.rank], axis=-1)
         logits = cast_and_clip(logits)

@@ -1,6 +1,6 @@
 """LoRA-SP as in its public code, which differs from the paper's equations.
 
-For comparison with results of that code, github.com/dhkim-furiosa/LoRA-SP at dfbf57d (PyTorch).
+Use it to compare with results of that code, github.com/dhkim-furiosa/LoRA-SP at dfbf57d (PyTorch).
 This is an independent implementation that uses only facts about it. Differences from the paper
 (`lora_sp`):
 
@@ -46,8 +46,8 @@ class LoRASPRelease(BankMethod):
     alpha: float | None = None
     """α of the scale α/R. Defaults to 2 R."""
     hidden_width: int | None = None
-    """None: scores x W1, the public code's default. H: its option `router_projection`, the softmax
-    of H values (4 there) times a matrix that is initially 0/1."""
+    """None: the scores are x W1, as in the public code by default. H: they are the softmax of H
+    values times a matrix, initially 0/1, as in its option `router_projection` (H = 4)."""
     normalized_bank: bool = False
     """Keep the bank's directions orthonormal; see `LoRASP.normalized_bank`."""
 
@@ -100,7 +100,7 @@ def release_scores(router: dict[str, jax.Array], hidden: jax.Array) -> jax.Array
 def release_gate(scores: jax.Array, energy_target: float) -> jax.Array:
     """Mask, bool [..., R]: the k largest scores for the largest k with E_k <= η, but at least one.
 
-    Ties by lowest index. No gradient.
+    Ties go to the lowest index. No gradient.
     """
     constant = jax.lax.stop_gradient(scores)
     order = jnp.argsort(-constant, axis=-1, stable=True)

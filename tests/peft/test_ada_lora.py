@@ -1,4 +1,4 @@
-"""AdaLoRA against Hugging Face PEFT, and properties of its rank allocation."""
+"""Test AdaLoRA against Hugging Face PEFT, and properties of its rank allocation."""
 
 import dataclasses
 import json
@@ -164,7 +164,7 @@ def test_rank_falls_to_the_target_and_stays():
     pruned = np.flatnonzero(ranks[:-1] > ranks[1:]) + 1
     assert len(pruned) > 3
     assert not np.any(pruned % 3 * (pruned != 28))
-    assert np.any(kept[1:] & ~kept[:-1])  # pruned triplets keep training and can return
+    assert np.any(kept[1:] & ~kept[:-1])  # pruned triplets still train and can become nonzero
     assert not np.array_equal(after["weight"], params["weight"])  # trained as usual
     assert int(state.step) == 40
 

@@ -1,4 +1,4 @@
-"""DoRA against Hugging Face PEFT and against its formula."""
+"""Test DoRA against Hugging Face PEFT and its formula."""
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ def test_equals_hugging_face():
     golden, kernels, params, gradients = load("lora_dora", names)
     methods = [DoRA(rank=8, alpha=16)] * 3
     assert_equals_hugging_face(golden, methods, kernels, params, gradients)
-    for kernel, recorded in zip(kernels, params, strict=True):  # with initial magnitudes
+    for kernel, recorded in zip(kernels, params, strict=True):  # PEFT's magnitudes are initial
         initial = methods[0].init(jax.random.key(0), kernel)[0]
         assert_close(initial["magnitude"], recorded["magnitude"], 1e-6)
 
@@ -42,7 +42,7 @@ def test_find_and_create_by_name():
 
 
 def test_initially_equals_the_base():
-    """Initially x @ kernel, with (I + O) R + O fp32 parameters."""
+    """The output is x @ kernel; there are (I + O) R + O fp32 parameters."""
     params, kernel = METHOD.init(jax.random.key(0), KERNEL)
     assert kernel is KERNEL
     assert sum(leaf.size for leaf in params.values()) == (D_IN + D_OUT) * RANK + D_OUT
@@ -62,7 +62,7 @@ def test_initial_magnitude_is_the_column_norm():
 
 @pytest.mark.parametrize("stabilized", [False, True])
 def test_formula_with_a_constant_norm(stabilized):
-    """Output and gradients of x (W + s A B) m / n with n a constant."""
+    """Output and gradients equal those of x (W + s A B) m / n with constant n."""
     method = DoRA(rank=RANK, alpha=5.0, rank_stabilized=stabilized)
     params = trained(method)
     scale = 5 / RANK ** (0.5 if stabilized else 1)

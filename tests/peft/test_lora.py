@@ -1,4 +1,4 @@
-"""LoRA against Hugging Face PEFT: forward, gradients and merged weights of a three-layer net."""
+"""Test LoRA against Hugging Face PEFT: output, gradients and merged weights of a small net."""
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ def assert_close(actual, expected, relative):
 
 
 def load(case, names):
-    """A golden file, its kernels [I, O], and the adapters' params and gradients in our layout."""
+    """Load a golden file, its kernels [I, O], and adapter params and gradients in our layout."""
     with np.load(GOLDEN / f"{case}.npz") as file:
         golden = dict(file)
 

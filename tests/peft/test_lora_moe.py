@@ -1,4 +1,4 @@
-"""LoRA-MoE: losses against Hugging Face, routing against loops, special cases."""
+"""Test LoRA-MoE losses against Hugging Face, routing against loops, and special cases."""
 
 import jax
 import jax.numpy as jnp
@@ -51,7 +51,7 @@ def expert_deltas(params, x, rank=RANK):
 
 
 def test_losses_equal_hugging_face():
-    """Hugging Face averages the balance loss over sequences; ours pools (1.0865 and 1.0253)."""
+    """Hugging Face averages the balance loss over sequences (1.0865); we pool tokens (1.0253)."""
     with np.load(GOLDEN) as file:
         logits, balance, z = jnp.asarray(file["logits"]), file["lb"], file["z"]
     probabilities = jax.nn.softmax(logits)
@@ -62,7 +62,7 @@ def test_losses_equal_hugging_face():
 
 
 def test_balance_loss_range_and_gradient():
-    """1 for evenly spread tokens, E if all use one expert; f has no gradient, P's is E f / n."""
+    """1 for evenly spread tokens, E if all use one expert; only P has a gradient, E f / n."""
     spread = jnp.eye(EXPERTS) * 0.9 + 0.1 / EXPERTS
     assert balance_loss(spread, None) == pytest.approx(1)
     assert balance_loss(jnp.eye(EXPERTS)[jnp.zeros(9, int)], None) == pytest.approx(EXPERTS)

@@ -1,4 +1,4 @@
-"""The public code's variant: gate against recorded ranks, losses against NumPy."""
+"""Test the public code's gate against recorded ranks, and its losses against NumPy."""
 
 import fractions
 
@@ -69,7 +69,7 @@ def test_recorded_ranks():
     for eta, expected in zip(golden["etas"], golden["k_authors_rule"], strict=True):
         eta = float(fractions.Fraction(eta))
         if eta == 1:
-            continue  # keeps all, up to the rounding of a running sum
+            continue  # η = 1 keeps all, up to the rounding of a running sum
         actual = np.asarray(gate(golden["scores"], eta).sum(-1))
         energy = np.square(golden["scores"].astype(np.float64))
         ordered = np.cumsum(-np.sort(-energy, axis=-1), axis=-1)
@@ -106,7 +106,7 @@ def test_equals_numpy(method, x):
 
 @pytest.mark.parametrize("method", METHODS, ids=["linear", "projection"])
 def test_gradients_equal_numpy_differences(method, x):
-    """Against central differences of the NumPy losses, over which the masks do not change."""
+    """The slope equals the central difference of the NumPy losses, with the same masks."""
     params = arrays(method)
 
     def total(params):
@@ -146,7 +146,7 @@ def test_padding_is_ignored(method, x):
 
 
 def test_z_loss_is_minus_infinity_at_the_clip():
-    """A flaw of the public code, kept for parity."""
+    """This flaw of the public code is kept for parity."""
     scores = jnp.full((1, 4), -9.0)
     losses = release.release_losses(scores, scores < 0, jnp.ones(1, bool))
     assert losses["z"] == -jnp.inf

@@ -62,7 +62,7 @@ def initial(method, key, kernel):
 
 @functools.partial(jax.jit, static_argnums=0)
 def trained(method, kernel):
-    """Parameters away from their initial values, so that none is zero."""
+    """Parameters away from their initial values, so that all are nonzero."""
     params, _ = method.init(jax.random.key(3), kernel)
     leaves, structure = jax.tree.flatten(params)
     keys = jax.random.split(jax.random.key(4), len(leaves))

@@ -1,4 +1,4 @@
-"""Parameter count of an adapted layer against its formula, for every method and preset."""
+"""Test the parameter count of an adapted layer against its formula, for every method and preset."""
 
 import jax
 import jax.numpy as jnp

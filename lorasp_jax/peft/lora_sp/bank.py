@@ -54,7 +54,7 @@ def normalized_bank(bank: Bank) -> Bank:
 
 
 def _orthonormal(columns: jax.Array) -> jax.Array:
-    """Orthonormalize columns [n, R], R <= n. Fixed signs make it smooth; LAPACK's may flip."""
+    """Orthonormalize columns [n, R], R <= n, smoothly: LAPACK's signs may flip, so fix them."""
     orthonormal, triangular = jnp.linalg.qr(columns)
     return orthonormal * jnp.where(jnp.diagonal(triangular) < 0, -1.0, 1.0)
 
@@ -62,10 +62,10 @@ def _orthonormal(columns: jax.Array) -> jax.Array:
 def apply_masked_scores(
     v_x: jax.Array, scores: jax.Array, mask: jax.Array, energy: jax.Array
 ) -> jax.Array:
-    """Eq. (11): Σ(x) V x with masked scores at zero, in the dtype of v_x = V x [..., n].
+    """Eq. (11): Σ(x) V x, zero outside the mask, in the dtype of v_x = V x [..., n].
 
     Scores and mask may be wider than n: the trailing ones belong to pruned directions. NaN scores
-    are masked, but still propagate: a row whose energy [..., 1] is NaN becomes NaN.
+    are not in the mask, but propagate: a row whose energy [..., 1] is NaN becomes NaN.
     """
     n, dtype = v_x.shape[-1], v_x.dtype
     if n < scores.shape[-1]:

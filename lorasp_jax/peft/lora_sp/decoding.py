@@ -2,8 +2,8 @@
 
 A dense matmul with the bank costs the same for any mask. A single token is bound by the memory
 traffic of the bank, most of which is saved by gathering k of R rows of U and Vᵀ. Several tokens
-have different directions, and then the dense matmul is faster; hence a single token only.
-`python -m benchmarks.decoding` measures where it pays off.
+differ in their active directions, so that the dense matmul is faster for them.
+`python -m benchmarks.decoding` measures when gathering pays off.
 """
 
 from typing import NamedTuple
@@ -60,11 +60,11 @@ def decode(
 
     Returns:
       delta [O], equal to `method.delta` up to rounding if at most `capacity` directions are active;
-      and the number of active directions beyond `capacity`, int32 []. Those with the lowest scores
-      are left out.
+      and the number of active directions beyond `capacity`, int32 []; of all active directions,
+      the lowest-scoring ones are left out.
 
     Raises:
-      ValueError: `capacity` is not in 1 to R, or x has more than one token.
+      ValueError: `capacity` is not between 1 and R, or x has more than one token.
     """
     if not 1 <= capacity <= method.rank or x.ndim != 1:
         raise ValueError(

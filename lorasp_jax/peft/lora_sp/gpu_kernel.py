@@ -74,7 +74,7 @@ def bottleneck_block(
 
     Args:
       router: b1 [H], w2 [H, R], b2 [R].
-      columns: V x [n, R] and W1 x [n, H], of the same dtype.
+      columns: V x [n, R] and x W1 [n, H], of the same dtype.
       valid: bool [n, 1], False for padding.
       mask: bool [n, R], the gate's mask if already known, else None; it has no gradient.
       energy_target: η.

@@ -66,8 +66,8 @@ class LoRASP(BankMethod):
     schedule: EnergySchedule | None = None
     """Training schedule of η, ending at `energy_target`; None keeps η constant."""
     normalized_bank: bool = False
-    """Keep the bank's directions orthonormal, so that score energy equals ΔW energy and eq. (4),
-    ‖ΔW - ΔW_k‖ = √(1 - E_k) ‖ΔW‖, holds (see `bank`). Requires R <= max(I, O)."""
+    """Keep the bank's directions orthonormal, so that eq. (4), ‖ΔW - ΔW_k‖ = √(1 - E_k) ‖ΔW‖, holds
+    and score energy is proportional to ΔW energy (see `bank`). Requires R <= max(I, O)."""
 
     def __post_init__(self) -> None:
         """Validate the fields."""
@@ -79,7 +79,7 @@ class LoRASP(BankMethod):
     def paper(cls, *, rank: int = 128, energy_target: float = 0.9) -> "LoRASP":
         """Configuration with the parameter count of Table I: router "softmax" of hidden width 4.
 
-        The paper does not state the width; only 4 reproduces both of its percentages.
+        The paper does not state the width; only 4 reproduces both percentages of the table.
         """
         return cls(rank=rank, energy_target=energy_target, hidden_width=4, router="softmax")
 
@@ -131,7 +131,7 @@ class LoRASP(BankMethod):
         return jnp.broadcast_to(mask, by_token.shape).reshape(scores.shape)
 
     def fused_kernel(self, params: Params) -> FusedBottleneck | None:
-        """A fused kernel for NVIDIA GPUs, for the default router and gate."""
+        """A fused NVIDIA GPU kernel for the default router and gate; None for others."""
         num_scores = params["router"]["w2"].shape[-1]
         default = (self.router, self.granularity, self.schedule) == ("gelu", "token", None)
         if not default or num_scores > self.rank or default_implementation(num_scores) != "pallas":

@@ -2,9 +2,9 @@
 
     y = x W + ΔW(x) x,    ΔW(x) = U Σ(x) V                                        (9)
 
-W is frozen. V projects the input onto R directions, U maps these to the output. For each token a
+W is frozen. V projects the input onto R directions; U maps them to the output. For each token a
 small router scores the directions; only the smallest set that holds a fraction η of the energy
-stays active. `lorasp_jax.peft.lora_sp.method` computes the same faster; a test compares the two.
+stays active. `lorasp_jax.peft.lora_sp.method` computes the same result faster, as a test checks.
 
 T: tokens, I: input width, O: output width, R: directions, H: the router's hidden width.
 """
@@ -29,9 +29,9 @@ def update(bank: dict[str, jax.Array], x: jax.Array, scores: jax.Array) -> jax.A
 
 
 def energy_gate(scores: jax.Array, energy_target: float) -> tuple[jax.Array, jax.Array]:
-    """Eq. (12): keep the k largest scores for the smallest k with E_k(x) >= η, ties by index.
+    """Eq. (12): keep the k largest scores for the smallest k with E_k(x) >= η.
 
-    Returns the mask, bool [T, R], without a gradient, and E_k(x), [T].
+    Ties go to the lowest index. Returns the mask, bool [T, R], without a gradient, and E_k(x), [T].
     """
     energy = scores**2
     order = jnp.argsort(-jax.lax.stop_gradient(energy), axis=-1)
@@ -43,7 +43,7 @@ def energy_gate(scores: jax.Array, energy_target: float) -> tuple[jax.Array, jax
 
 
 def losses(scores: Any, logits: Any, mask: Any, kept_energy: Any) -> dict[str, jax.Array]:
-    """Eq. (13), L_spec = 1 - E_k(x), and the balance and z terms of eq. (14), means over tokens."""
+    """Eq. (13), L_spec = 1 - E_k(x), and the balance and z terms of eq. (14), as token means."""
     frequency = mask.mean(0) / mask.mean(0).sum()  # share of active directions
     share = jnp.mean(scores**2 / (scores**2).sum(-1, keepdims=True), axis=0)  # share of the energy
     num_directions = scores.shape[-1]

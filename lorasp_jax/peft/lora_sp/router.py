@@ -21,7 +21,7 @@ INITIAL_LOGIT = {"gelu": INVERSE_SOFTPLUS_OF_ONE, "gelu_relu": 1.0, "gelu_softma
 
 MAX_PROJECTED = 2.0**40
 """Bound to which |x W1| is clipped. Scores grow linearly with x and the delta quadratically;
-beyond 1e19 it would overflow fp32, and U = 0 would turn the infinity into NaN."""
+for x beyond 1e19, z would overflow fp32 to infinity, and U = 0 would turn that into NaN."""
 
 _RATIO = np.polynomial.Chebyshev.interpolate(lambda e: np.log1p(e) / e, 8, domain=[0, 1])
 _LOG1P = _RATIO.convert(kind=np.polynomial.Polynomial).coef[::-1].tolist()
@@ -92,7 +92,8 @@ def gelu(x: jax.Array) -> jax.Array:
 def softplus(x: jax.Array) -> jax.Array:
     """log(1 + e^x), relative error 3e-7, for a GPU kernel limited by its number of instructions.
 
-    With `jax.nn.softplus` and `jax.nn.gelu`, its gradient has 25 % more PTX instructions (H200).
+    With `jax.nn.softplus` and `jax.nn.gelu`, the kernel's gradient has 25 % more PTX instructions
+    (H200).
     """
     e = jnp.exp(-jnp.abs(x))
     first, *others = _LOG1P

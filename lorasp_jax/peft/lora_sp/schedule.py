@@ -1,8 +1,8 @@
 """Schedule of the energy target η during training.
 
 The training progress is stored among the adapter's parameters, as `progress`. It thus reaches the
-layers of any model, scanned, rematerialized or sharded, is saved and resumed with it, and never
-triggers recompilation. Only the optimizer (`with_schedule`) updates it; it has no gradient.
+layers of any model (scanned, rematerialized or sharded), is saved and loaded with the adapter, and
+never triggers recompilation. Only the optimizer (`with_schedule`) updates it; it has no gradient.
 """
 
 import dataclasses

@@ -73,7 +73,7 @@ def test_initially_zero_and_every_array_gets_a_gradient():
 
 
 def test_continuous_where_qr_flips_signs():
-    """A sign change of the entry from which LAPACK takes a sign has only a small effect."""
+    """Flipping the sign of the entry that sets LAPACK's sign has only a small effect."""
     bank = arrays(24, 10)["bank"]
     ends = [
         normalized_bank(bank | {"v": bank["v"].at[0, 0].set(entry)})["v"] for entry in (-1e-4, 1e-4)

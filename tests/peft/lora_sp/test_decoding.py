@@ -1,4 +1,4 @@
-"""Single-token decoding with gathered directions against the dense path."""
+"""Test single-token decoding with gathered directions against the dense path."""
 
 import dataclasses
 
@@ -31,7 +31,7 @@ def arrays(method, dtype):
     keys = jax.random.split(jax.random.key(2), len(leaves))
     moved = [p + jax.random.normal(k, p.shape) for k, p in zip(keys, leaves, strict=True)]
     params = jax.tree.unflatten(structure, moved)
-    if method.rank == 12:  # pruned: the router scores 16
+    if method.rank == 12:  # pruned: the router still scores 16 directions
         unpruned, _ = arrays(METHOD, dtype)
         params |= {"router": unpruned["router"]}
     return params, decoding.prepare(method, params, dtype)
@@ -53,7 +53,7 @@ def test_equals_the_dense_path(method):
 
 
 def test_directions_beyond_the_capacity():
-    """The lowest scores are left out: a lower target that keeps the others gives the same."""
+    """The lowest scores are left out: a lower target that keeps only the others agrees."""
     params, prepared = arrays(METHOD, jnp.float32)
     x = jax.random.normal(jax.random.key(4), (D_IN,))
     _, aux = METHOD.delta(params, x)

@@ -73,7 +73,7 @@ def test_paper_router_repeats_a_softmax(x):
 
 
 def test_unit_scores_and_full_target_equal_lora(x):
-    """With s = 1 (zero router weights) and η = 1 it is LoRA of the same rank and alpha."""
+    """With s = 1 (zero router weights) and η = 1, LoRA-SP is LoRA of the same rank and alpha."""
     method = LoRASP(rank=16, energy_target=1.0, alpha=8.0)
     params = initial(method)
     router = params["router"] | {"w2": jnp.zeros((32, 16))}
@@ -223,7 +223,7 @@ def test_kernels_on_an_nvidia_gpu(x, method, kernels):
 
 
 def test_pruned_directions_are_scored_but_inactive(x):
-    """Scores beyond the bank's R directions do not contribute to z, but to E_k."""
+    """Scores beyond the bank's R directions contribute to E_k, but not to z."""
     method, unpruned = LoRASP(rank=8, energy_target=1.0), LoRASP(rank=12, energy_target=1.0)
     params = initial(unpruned)
     bank = {"u": params["bank"]["u"][:8], "v": params["bank"]["v"][:, :8]}
@@ -261,7 +261,7 @@ def test_tokens_with_zero_scores_are_ignored(x):
 
 @pytest.mark.parametrize("path", [("router", "b2"), ("router", "w1"), ("bank", "v")])
 def test_nan_parameters_propagate(x, monkeypatch, path):
-    """Even where clipping drops NaN, as minimum and maximum do in a GPU kernel."""
+    """NaN propagates even if clipping drops it, as minimum and maximum do in a GPU kernel."""
     monkeypatch.setattr(jnp, "clip", lambda a, low, high: jnp.fmin(jnp.fmax(a, low), high))
     params = initial(LoRASP())
     part, name = path

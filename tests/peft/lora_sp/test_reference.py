@@ -1,4 +1,4 @@
-"""Values and gradients of the fast path against the reference implementation."""
+"""Test values and gradients of the fast path against the reference implementation."""
 
 import jax
 import jax.numpy as jnp
@@ -65,7 +65,7 @@ def assert_close(actual, expected, tolerance):
     ],
 )
 def test_fast_path_equals_the_reference(tokens, d_in, d_out, fields):
-    """Values, and gradients of all parameters, x and the kernel (zero)."""
+    """Compare values and the gradients of all parameters, x and the kernel."""
     method = LoRASP(**fields)
     arguments = (
         random_params(method, d_in, d_out),
@@ -87,7 +87,7 @@ def test_bfloat16_equals_the_reference_up_to_rounding():
 
 
 def test_dense_equals_the_reference():
-    """Through the public `dense`, with token axes and a bias."""
+    """The public `dense` agrees, with token axes and a bias."""
     method = LoRASP(rank=16, hidden_width=8, energy_target=0.7)
     params, x, kernel, bias = (
         random_params(method, 6, 5),

@@ -35,7 +35,7 @@ def scores_of(method, params, x):
 
 @pytest.mark.parametrize("name", ["gelu", "gelu_relu", "gelu_softmax"])
 def test_score_functions(name, x):
-    """Initial scores of 1 for each router; then its function of the same logits."""
+    """Initial scores are 1; scores are the router's function of the logits."""
     method = LoRASP(rank=RANK, router=name)
     scores, _ = scores_of(method, arrays(method, 0), x)
     np.testing.assert_allclose(scores, 1, atol=0.1)
