@@ -10,11 +10,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Stream", "cache", "open_source"]
 
-_HOMES = {"Stream": "stream", "open_source": "opening"}
+_MODULES = {"Stream": "stream", "open_source": "opening"}
 
 
 def __getattr__(name: str) -> Any:
-    """Import public names on access: `--help` needs neither Grain nor PyArrow."""
-    if name in _HOMES:
-        return getattr(importlib.import_module(f"lorasp_jax.data.{_HOMES[name]}"), name)
+    """Import public names lazily, so that `--help` loads neither Grain nor PyArrow."""
+    if name in _MODULES:
+        return getattr(importlib.import_module(f"lorasp_jax.data.{_MODULES[name]}"), name)
     raise AttributeError(f"module 'lorasp_jax.data' has no attribute {name!r}")

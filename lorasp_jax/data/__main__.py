@@ -23,10 +23,10 @@ def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.data") -
     """Run a command and return its exit code: 0 success, 2 invalid input, 130 interrupted."""
     options = parse_arguments(
         parser(program), arguments
-    )  # before slow imports, which help does not need
+    )  # before the slow imports, so that --help is fast
     import jax
 
-    jax.config.update("jax_platforms", "cpu")  # leave accelerators to others
+    jax.config.update("jax_platforms", "cpu")  # leave accelerators to other processes
     errors = Console(stderr=True)
     try:
         options.command(options, Console())
@@ -107,7 +107,8 @@ def _add_keys(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("LeRobot datasets").add_argument
     default = "(default: %(default)s)"
     add("--state", default=Keys.state, help=f"feature with measured joints and gripper {default}")
-    add("--action", default=Keys.action, help=f"feature with commanded joints, gripper {default}")
+    text = f"feature with commanded joints and gripper {default}"
+    add("--action", default=Keys.action, help=text)
     text = "dimensions to use, by name or index: joints first, gripper last (default: all)"
     add("--state-numbers", nargs="+", default=(), metavar="NAME", help=text)
     add("--action-numbers", nargs="+", default=(), metavar="NAME", help=text)
@@ -118,9 +119,7 @@ def _add_keys(parser: argparse.ArgumentParser) -> None:
     text = f"unit of the gripper opening {default}"
     add("--gripper", choices=("metres", "millimetres"), default=Keys.gripper, help=text)
     add("--every", type=int, default=1, help=f"keep every N-th frame {default}")
-    text = (
-        f"maximum longer side of an image [px], larger ones are downscaled; 0: no limit {default}"
-    )
+    text = f"downscale larger images to this length of the longer side [px]; 0: never {default}"
     add("--image-size", type=int, default=224, help=text)
 
 
@@ -148,7 +147,7 @@ def _camera(text: str) -> tuple[str, str]:
 
 @contextmanager
 def _progress_bar(title: str) -> Iterator[tuple["Report", Callable[[str], None]]]:
-    """Yield two functions: one moves a bar, which appears at its first call; one prints a line."""
+    """Yield a progress callback, whose first call shows the bar, and a function to print a line."""
     progress = bars(Console(stderr=True), "steps")
     bar = progress.add_task(title, total=None)
     print_line = functools.partial(

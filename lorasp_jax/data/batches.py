@@ -2,7 +2,7 @@
 
 Episodes are stored as flat per-step arrays, on the device if they fit, else in files; a batch is a
 gather. The batch of a training step depends only on the run's key or seed and the step number, so
-the data position of a run is one integer.
+one integer is enough to resume the data of a run.
 """
 
 import dataclasses
@@ -77,9 +77,9 @@ class Raw:
 
 
 def flatten(episodes: Sequence[Episodes]) -> Steps:
-    """Concatenate the valid steps of all episodes; indices of instructions are offset."""
+    """Concatenate the valid steps of all episodes; instruction indices are offset."""
     parts: list[Steps] = []
-    offset = phrase = 0
+    step_offset = instruction_offset = 0
     for group in episodes:
         length = np.asarray(group.length)
         valid = np.flatnonzero(np.arange(group.state.shape[1]) < length[:, None])
@@ -92,17 +92,19 @@ def flatten(episodes: Sequence[Episodes]) -> Steps:
                 image={name: keep(image) for name, image in group.image.items()},
                 state=keep(group.state),
                 action=keep(group.action),
-                end=jnp.asarray(np.repeat(np.cumsum(length), length) + offset, jnp.int32),
-                instruction=jnp.asarray(np.repeat(group.instruction, length) + phrase, jnp.int32),
+                end=jnp.asarray(np.repeat(np.cumsum(length), length) + step_offset, jnp.int32),
+                instruction=jnp.asarray(
+                    np.repeat(group.instruction, length) + instruction_offset, jnp.int32
+                ),
             )
         )
-        offset += int(length.sum())
-        phrase += len(group.instructions)
+        step_offset += int(length.sum())
+        instruction_offset += len(group.instructions)
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
 def fit_to_size(steps: Steps, size: int) -> Steps:
-    """Truncate to `size` steps, or repeat from the start until there are that many."""
+    """Truncate to `size` steps, or repeat the steps cyclically up to `size`."""
     number = len(steps.end)
     rows = np.arange(size) % number
     fitted = jax.tree.map(lambda array: array[rows], steps)
@@ -140,7 +142,7 @@ def gather(steps: Steps, start: Array, chunk: int) -> Raw:
 
 
 def encode(key: jax.Array, raw: Raw, processor: Processor, *, state_noise: float) -> Batch:
-    """Normalize a batch for the model; `key` is consumed, for noise on the normalized state.
+    """Normalize a batch for the model; `key` draws the noise added to the normalized state.
 
     The action mask is False where a chunk repeats the last action of its episode.
     """

@@ -15,8 +15,8 @@ class Column:
     def __init__(self, path: Path, like: np.ndarray) -> None:
         """Create an empty file for rows with the dtype and shape of those in `like`."""
         self._file = path.open("wb")
-        self._dtype = {"descr": np.lib.format.dtype_to_descr(like.dtype), "fortran_order": False}
-        self._row, self._length = like.shape[1:], 0
+        self._header = {"descr": np.lib.format.dtype_to_descr(like.dtype), "fortran_order": False}
+        self._row_shape, self._length = like.shape[1:], 0
         self._write_header()
 
     def append(self, rows: np.ndarray) -> None:
@@ -33,14 +33,14 @@ class Column:
 
     def _write_header(self) -> None:
         # NumPy pads the header, so that the first dimension can grow in place.
-        header = self._dtype | {"shape": (self._length, *self._row)}
+        header = self._header | {"shape": (self._length, *self._row_shape)}
         np.lib.format.write_array_header_1_0(self._file, header)
 
 
 def map_column(
     path: Path, dtype: Any, shape: tuple[int | None, ...], crc32: int | None = None
 ) -> np.ndarray:
-    """Memory-map an array; without a checksum to verify, no data is read.
+    """Memory-map an array; its data is read only to verify a checksum.
 
     Args:
         path: the .npy file.

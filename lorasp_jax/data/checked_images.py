@@ -36,7 +36,7 @@ class CheckedImages:
         self.nbytes: int = array.nbytes
 
     def __len__(self) -> int:
-        """N."""
+        """Number of images, N."""
         return len(self._array)
 
     def __getitem__(self, index: Any) -> np.ndarray:

@@ -102,7 +102,7 @@ def report(source: Source, console: Console) -> None:
 
 
 def hints(summary: Summary) -> list[str]:
-    """Return hints at probable unit errors; simulated episodes give none."""
+    """Return hints about probable unit errors; simulated episodes have no such errors."""
     joints, gripper = np.abs(summary.state[:, :-1]).max(), np.abs(summary.state[:, -1]).max()
     texts = []
     if joints > 2 * math.pi:
@@ -139,7 +139,7 @@ def _value_table(summary: Summary) -> Table:
 
 
 def contact_sheet(source: Source) -> np.ndarray:
-    """Draw one row per episode, for some episodes: frames over time, cameras side by side.
+    """Draw up to `EPISODES` episodes, one per row: frames over time, cameras side by side.
 
     Returns:
         uint8 `[H, W, 3]`.
@@ -186,7 +186,7 @@ def _row(source: Source, number: int) -> np.ndarray:
     caption = Image.new("RGB", (images.shape[1], LINE))
     phrase = episode.instructions[int(episode.instruction[0])]
     text = f"{number}: {phrase} ({episode.num_steps} steps)"
-    printable = text.encode("latin-1", "replace").decode("latin-1")  # all that the font covers
+    printable = text.encode("latin-1", "replace").decode("latin-1")  # the font's characters
     ImageDraw.Draw(caption).text((2, 1), printable, fill="white")
     return np.concatenate([np.asarray(caption), images])
 

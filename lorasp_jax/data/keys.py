@@ -1,4 +1,4 @@
-"""Feature mapping of a LeRobot dataset; a module of its own, since the reader imports slowly."""
+"""Feature mapping of a LeRobot dataset, apart from the reader, which is slow to import."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ class Keys:
         action: feature with the commanded joints and gripper.
         state_numbers: names or indices of the state dimensions to use, in order; empty: all.
         action_numbers: the same for the action.
-        cameras: camera -> feature; empty: all image features, without the prefix
+        cameras: camera -> feature; empty: all image features, named without the prefix
             observation.images.
         angles: unit of the joints.
         gripper: unit of the gripper opening.
@@ -45,7 +45,7 @@ class Keys:
             raise ValueError(f"cameras must be a mapping, name -> feature, got {self.cameras!r}")
         for name, feature in self.cameras.items():
             if not isinstance(name, str) or not isinstance(feature, str):
-                raise ValueError(f"cameras must be names and features, got {name!r} -> {feature!r}")
+                raise ValueError(f"cameras must map str to str, got {name!r} -> {feature!r}")
         if self.every < 1 or self.image_size < 0:
             raise ValueError(
                 f"every must be at least 1 and image_size at least 0, "

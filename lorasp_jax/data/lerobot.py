@@ -3,8 +3,9 @@
     dataset = LeRobot("hf://lerobot/some_dataset", Keys(angles="degrees", gripper="millimetres"))
     episodes = dataset.episode(0)
 
-States and actions are columns of parquet files; images are video frames, or PNG files in such
-columns. Each episode is returned as `Episodes` with E = 1, in this project's order and units.
+States and actions are columns of parquet files; images are video frames, or PNG or JPEG files in
+further columns. Each episode is returned as `Episodes` with E = 1, in this project's order and
+units.
 """
 
 import os
@@ -79,8 +80,8 @@ class LeRobot:
         if len(set(map(len, self._columns.values()))) > 1:
             dims = " and ".join(f"{len(c)} {kind}" for kind, c in self._columns.items())
             raise ValueError(
-                f"state and action must have the same dimensions, joints and gripper, but "
-                f"{self.path} has {dims} dimensions: choose --state-numbers from "
+                f"state and action must have the same dimensions (joints and gripper), got {dims} "
+                f"dimensions in {self.path}: choose --state-numbers from "
                 f"{', '.join(self._names('state'))} and --action-numbers from "
                 f"{', '.join(self._names('action'))}"
             )
@@ -183,7 +184,7 @@ class LeRobot:
         return [by_name[name] for name in selected]
 
     def _frames(self, entry: EpisodeEntry) -> Any:
-        """Read the episode's rows from its parquet file, and check that none is missing."""
+        """Read the episode's rows from its parquet file, and check that they are complete."""
         path, number = entry.table, entry.number
         with as_value_error(path):
             if self._table[0] != path:
@@ -225,13 +226,13 @@ class LeRobot:
         if self.keys.gripper == "millimetres":
             values = np.concatenate([values[:, :-1], values[:, -1:] / 1000], axis=1)
         every = self.keys.every
-        # Of the skipped frames' actions, use the last one before the next frame that is kept.
+        # Each selected state is paired with the last action before the next selected state.
         first = 0 if kind == "state" else every - 1
         steps = np.minimum(np.arange(0, len(values), every) + first, len(values) - 1)
         return values[steps].astype(np.float32)
 
     def _instruction(self, table: Any, entry: EpisodeEntry) -> int:
-        """Return the position of the episode's instruction in order of task indices."""
+        """Return the index of the episode's instruction in `Episodes.instructions`."""
         with as_value_error(entry.table):
             tasks = pc.unique(table["task_index"]).to_pylist()
         if len(tasks) != 1 or tasks[0] not in self.index.tasks:
@@ -242,7 +243,7 @@ class LeRobot:
         return sorted(self.index.tasks).index(tasks[0])
 
     def _images(self, table: Any, entry: EpisodeEntry, camera: str) -> np.ndarray:
-        """Load the images of every kept frame, uint8 `[T, H, W, 3]`."""
+        """Load the images of the selected frames, uint8 `[T, H, W, 3]`."""
         key, every, size = self.cameras[camera], self.keys.every, self.keys.image_size
         if self._is_video(key):
             path, start = entry.videos[key]

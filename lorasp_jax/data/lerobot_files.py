@@ -1,4 +1,4 @@
-"""Metadata and file layout of LeRobot datasets; versions 2.0, 2.1 and 3.0 differ only here.
+"""Metadata and file layout of LeRobot datasets: the only code that depends on their version.
 
     2.x   one parquet file per episode, one video per episode and camera; meta/*.jsonl
     3.0   many episodes per parquet file and per video; meta/**/*.parquet
@@ -43,7 +43,7 @@ class EpisodeEntry:
         number: its index in the dataset.
         length: number of frames.
         table: parquet file with its states and actions, and possibly those of other episodes.
-        videos: feature -> video file, and the time in it at which the episode begins [s].
+        videos: feature -> video file, and start time of the episode in it [s].
     """
 
     number: int
@@ -198,7 +198,7 @@ def read_table(
 
 
 def _size(metadata: pq.FileMetaData, columns: set[str]) -> int:
-    """Bound the bytes of columns in memory: a million equal values are a few bytes in the file."""
+    """Estimate the bytes of columns in memory; equal values take almost no space in the file."""
     groups = (metadata.row_group(i) for i in range(metadata.num_row_groups))
     chunks = (group.column(j) for group in groups for j in range(group.num_columns))
     return sum(
@@ -232,5 +232,5 @@ def _json_lines(path: Path, folder: Path) -> Iterator[dict[str, Any]]:
 
 
 def as_value_error(path: Path) -> contextlib.AbstractContextManager[None]:
-    """Convert errors as `files.as_value_error` does, pyarrow's included."""
+    """Convert errors like `files.as_value_error`, including those of pyarrow."""
     return files.as_value_error(path, pa.ArrowException)

@@ -23,7 +23,7 @@ def open_source(where: str | os.PathLike[str], keys: Keys | None = None) -> Sour
 
     Raises:
         ValueError: the dataset is missing, damaged or of unknown format; or `keys` select features
-            of a dataset that is not LeRobot's.
+            of a dataset in another format.
     """
     path = hub.local(where, repository="dataset")
     if is_lerobot(path):

@@ -20,10 +20,10 @@ def to_rlds(
     """Write an RLDS folder, which appears only once it is complete; see `envs.datasets.rlds`.
 
     Args:
-        source: a dataset of one task; only read.
+        source: a dataset of one task; not modified.
         path: folder to create.
         progress: called with the steps done and the total.
-        episodes_per_file: episodes per file, which are in memory at the same time.
+        episodes_per_file: episodes per file, all held in memory at once.
 
     Raises:
         ValueError: the path already exists, another process is writing it, there are several tasks,
@@ -31,8 +31,8 @@ def to_rlds(
         OSError: the disk is full.
     """
     tasks = sorted({source.episode(number, ()).task for number in (0, len(source) - 1)})
-    if len(tasks) > 1:  # fail now, not after hours of writing the first one's images
-        raise ValueError(f"an RLDS dataset holds one task, got {', '.join(tasks)}")
+    if len(tasks) > 1:  # fail now, not after hours of writing images
+        raise ValueError(f"an RLDS dataset can hold only one task, got {', '.join(tasks)}")
     with locked(Path(path)), atomic_folder(path) as folder:
         writer, done = rlds.ShardWriter(folder, {}), 0
         for first in range(0, len(source), episodes_per_file):

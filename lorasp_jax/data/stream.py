@@ -1,8 +1,8 @@
-"""Stream endless, shuffled batches of windows from a cache with Grain; the position is an integer.
+"""Stream endless, shuffled batches of windows from a cache with Grain, resumable by position.
 
     for raw in Stream(Cache("my_cache").steps, batch_size=32, chunk=50, seed=0, start=1000):
 
-A batch depends on seed and position alone. The global batch is the same, row for row, for any
+A batch depends only on seed and position. The global batch is the same, row for row, for any
 number of processes, so a run may resume with a different number.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from lorasp_jax.data.batches import Raw, Steps, gather
 
-_THREADS = 1  # a second one would only wait for Python's lock
+_THREADS = 1  # a second thread would only wait for the GIL
 _PREFETCH = 4  # batches
 
 
@@ -34,7 +34,7 @@ class Stream:
         start: int = 0,
         process: tuple[int, int] = (0, 1),
     ) -> None:
-        """Start to prefetch in threads.
+        """Prefetch in a background thread.
 
         Args:
             steps: steps to sample from, see `Cache.steps`.

@@ -24,7 +24,7 @@ next one, and that a wrong frame rate is noticed within the first frames."""
 
 
 class VideoReader:
-    """A video file, decoded sequentially; continuing after the last read decodes nothing twice.
+    """A video file, decoded sequentially; consecutive reads decode each frame only once.
 
     Attributes:
         path: the file.
@@ -44,7 +44,7 @@ class VideoReader:
             raise ValueError(f"{path} cannot be read as a video ({first_line(error)})") from error
         self._stream.thread_type = "AUTO"
         self._frames: Iterator[Any] = self._container.decode(self._stream)
-        # One for all frames and without threads: setting one up takes as long as a conversion.
+        # Shared by all frames, without threads: creating one takes as long as a conversion.
         self._reformatter = VideoReformatter()
         self._end = 0.0  # s, where the last read ended
 
@@ -117,7 +117,7 @@ class VideoReader:
 
 
 def decode_image(file: bytes, image_size: int = 0) -> np.ndarray:
-    """Decode a PNG or JPEG image to uint8 `[H, W, 3]`, downscaled as in `downscale`.
+    """Decode a PNG or JPEG image to uint8 `[H, W, 3]`, downscaled by `downscale`.
 
     Raises:
         ValueError: the image is damaged, or larger than Pillow's limit.
@@ -125,7 +125,8 @@ def decode_image(file: bytes, image_size: int = 0) -> np.ndarray:
     try:
         with Image.open(io.BytesIO(file), formats=_FORMATS) as image:
             if image.width * image.height > (Image.MAX_IMAGE_PIXELS or math.inf):
-                raise ValueError(f"{image.width} x {image.height} pixels are too many")
+                size = f"{image.width} x {image.height}"
+                raise ValueError(f"must have at most {Image.MAX_IMAGE_PIXELS} pixels, got {size}")
             return downscale(np.asarray(image.convert("RGB")), image_size)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise ValueError(f"an image is damaged ({first_line(error)})") from error

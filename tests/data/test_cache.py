@@ -154,9 +154,9 @@ def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"robot": "panda"}, "same robot, but it is 'piper' in the first one and 'panda'"),
-        ({"control_dt": 0.05}, r"same control_dt, but it is 0\.1"),
-        ({"image": {"side": np.zeros((1, 9, 16, 32, 3), np.uint8)}}, "same cameras, but"),
+        ({"robot": "panda"}, "same robot, got 'piper' in the first episode and 'panda'"),
+        ({"control_dt": 0.05}, r"same control_dt, got 0\.1"),
+        ({"image": {"side": np.zeros((1, 9, 16, 32, 3), np.uint8)}}, "same cameras, got"),
         ({"state": np.zeros((1, 9, 8), np.float32)}, "action must have shape"),
         ({"action": np.full((1, 9, 7), np.nan, np.float32)}, "action is not finite"),
     ],
@@ -170,7 +170,7 @@ def test_incompatible_episodes_are_refused(changes, sentence, tmp_path):
 def test_incompatible_datasets_are_refused_before_reading(tmp_path):
     sources, reports = [Broken(one(), one()), Broken(one(robot="panda"))], []
     with pytest.raises(
-        ValueError, match="same robot, but it is 'piper' in the first one and 'panda'"
+        ValueError, match="same robot, got 'piper' in the first episode and 'panda'"
     ):
         cache.write(sources, tmp_path / "cache", lambda *steps: reports.append(steps))
     assert not reports
@@ -256,14 +256,14 @@ def test_opening(tmp_path, simulated):
         ("state", lambda x: x.astype(">f4"), "got >f4"),
         ("state", np.asfortranarray, "Fortran order"),
         ("action", lambda x: x * np.float32(np.nan), "not finite"),
-        ("length", lambda x: x[:0], "and no empty episode"),
+        ("length", lambda x: x[:0], "and no empty episodes"),
         (
             "length",
             lambda x: x * np.where(np.arange(len(x)), 1, -1).astype(np.int32),
-            "and no empty episode",
+            "and no empty episodes",
         ),
         ("task", lambda x: x[:-1], "expected <i4"),
-        ("instruction", lambda x: x - np.int32(9), "instruction has indices -"),
+        ("instruction", lambda x: x - np.int32(9), "instruction indices must be"),
     ],
 )
 def test_invalid_columns_are_refused(name, change, sentence, simulated, tmp_path):
