@@ -32,12 +32,12 @@ class Rule(NamedTuple):
 
 
 def copied(ours: str, theirs: str) -> Rule:
-    """The same array under another name."""
+    """Rule for the same array under another name."""
     return Rule((ours,), (theirs,), lambda shape: [shape], list, lambda a: [a])
 
 
 def reshaped(ours: str, theirs: str, ours_shape: Shape, theirs_shape: Shape) -> Rule:
-    """The same values in the same order, in another shape."""
+    """Rule for the same values, in the same order, in another shape."""
     return Rule(
         (ours,),
         (theirs,),
@@ -48,7 +48,7 @@ def reshaped(ours: str, theirs: str, ours_shape: Shape, theirs_shape: Shape) -> 
 
 
 def transposed(ours: str, theirs: str) -> Rule:
-    """Our matrix [I, O] stored as [O, I], as in PyTorch's linear layers."""
+    """Rule for our matrix [I, O] stored as [O, I], as in PyTorch's linear layers."""
     return Rule(
         (ours,),
         (theirs,),
@@ -59,7 +59,7 @@ def transposed(ours: str, theirs: str) -> Rule:
 
 
 def stacked(ours: str, theirs: Iterable[str], *, transpose: bool = False) -> Rule:
-    """Our array [L, ...] stored as one array per layer, optionally transposed."""
+    """Rule for our array [L, ...] stored as one array per layer, optionally transposed."""
     names = tuple(theirs)
 
     def stack_layers(layers: Iterator[np.ndarray]) -> list[np.ndarray]:
@@ -108,7 +108,7 @@ def to_ours(
     """
     missing = [name for rule in rules for name in rule.theirs if name not in theirs]
     unexpected = theirs.keys() - {name for rule in rules for name in rule.theirs}
-    for problem, names in (("lacks", missing), ("has unexpected", sorted(unexpected))):
+    for problem, names in (("lacks", missing), ("has unexpected leaves", sorted(unexpected))):
         if names:
             raise ModelMismatchError(f"{source} {problem} {_abbreviate(names)}.")
 

@@ -17,7 +17,7 @@ Fields = Mapping[str, Any]
 _IMAGE_PREFIXES = ("observation.images.", "observation.")
 _WRONG_STRUCTURE = (AttributeError, KeyError, OverflowError, TypeError)
 _MODES = {mode.upper(): mode for mode in get_args(Mode)}
-# Options of LeRobot for which this project's backbones support a single value.
+# LeRobot options for which this project's backbones support only one value.
 _FIXED: Fields = {"min_period": 4e-3, "max_period": 4.0, "adapt_to_pi_aloha": False}
 
 
@@ -25,7 +25,7 @@ def parse(fields: Fields) -> BackboneConfig:
     """Convert a LeRobot policy's config; missing fields default to the published values.
 
     Args:
-        fields: content of config.json.
+        fields: contents of config.json.
 
     Raises:
         ValueError: an unknown policy type or an unsupported option.
@@ -75,14 +75,17 @@ def _shared_fields(config: BackboneConfig, fields: Fields) -> dict[str, Any]:
     dims = {fields.get(f"max_{name}_dim", dim) for name in ("state", "action")}
     if len(dims) > 1 or not size or size[0] != size[1]:
         raise ValueError(
-            "max_state_dim and max_action_dim must be equal and images square, "
+            "max_state_dim and max_action_dim must be equal, and images must be square, "
             f"got {dims} and {size}"
         )
     inputs = config.inputs
     modes = {"VISUAL": "IDENTITY", "STATE": inputs.state.upper(), "ACTION": inputs.action.upper()}
     modes |= fields.get("normalization_mapping", {})
     if modes["VISUAL"] != "IDENTITY" or not modes.keys() <= {"VISUAL", "STATE", "ACTION"}:
-        raise ValueError(f"VISUAL must be 'IDENTITY' in normalization_mapping, got {modes}")
+        raise ValueError(
+            "normalization_mapping must map VISUAL to 'IDENTITY' and may otherwise contain only "
+            f"STATE and ACTION, got {modes}"
+        )
     if unknown := sorted(set(modes.values()) - _MODES.keys()):
         raise ValueError(f"normalization must be one of {', '.join(_MODES)}, got {unknown[0]!r}")
     return {

@@ -1,4 +1,4 @@
-"""Load a model from a local folder, Hugging Face's Hub or a bucket, in any supported layout."""
+"""Load a model from a local folder, the Hugging Face Hub or a bucket, in any known layout."""
 
 import dataclasses
 import functools
@@ -31,7 +31,7 @@ class ModelFolder:
         folder: its path.
         layout: "ours" (this project's config.json), "openpi" (Orbax folder `params`) or "lerobot"
             (safetensors and a config.json with the policy type).
-        fields: content of config.json, empty if there is none.
+        fields: contents of config.json, empty if there is no such file.
     """
 
     folder: Path
@@ -43,7 +43,7 @@ class ModelFolder:
         """The config that `load` uses by default; no weights are read.
 
         Raises:
-            ValueError: the folder specifies no sizes, or those of an unsupported model.
+            ValueError: the folder does not specify sizes, or its model is not supported.
         """
         if self.layout == "ours":
             return native.load_config(self.folder)
@@ -61,7 +61,7 @@ class ModelFolder:
         return self.config.inputs if self.layout == "lerobot" and "type" in self.fields else None
 
     def load(self, config: BackboneConfig | None = None) -> Any:
-        """Load the model; arguments and errors as for the function `load`."""
+        """Load the model; see the function `load` for the argument and errors."""
         if self.layout == "ours":
             return native.load_native(self.folder, config)
         if config is not None and self.layout == "lerobot" and "type" in self.fields:
@@ -104,7 +104,7 @@ def find(where: str | os.PathLike[str]) -> ModelFolder:
 
 
 def load(where: str | os.PathLike[str], config: Any = None) -> Any:
-    """Load a model from a folder, a repository on Hugging Face's Hub or a bucket.
+    """Load a model from a folder, a Hugging Face Hub repository or a bucket.
 
     The layout is detected from the files: this project's config.json, LeRobot's config.json with
     the policy type, or openpi's Orbax folder `params`.
@@ -125,7 +125,7 @@ def load_config(where: str | os.PathLike[str]) -> Any:
     """Return the config that `load` uses by default; no weights are read.
 
     Raises:
-        ValueError: as `load`.
+        ValueError: under the same conditions as `load`.
     """
     return find(where).config
 
@@ -181,6 +181,6 @@ def _require_same_heads(config: Any, folder: Path, fields: dict[str, Any]) -> No
         expected, actual = getattr(stored, name), getattr(config, name)
         if expected.kernel_sizes == actual.kernel_sizes and expected != actual:
             raise ValueError(
-                f"{folder} does not match the config: heads of {name} must be {expected}, "
+                f"{folder} does not match the config: {name} must have the heads of {expected}, "
                 f"got {actual}."
             )

@@ -2,8 +2,8 @@
 
 Large models are split into shards with Hugging Face's index. Tensor names are "/"-joined paths;
 tensors of stacked layers keep their leading layer axis. config.json names the backbone and its
-sizes and holds a hash over config and weights, so that loading refuses a folder that is damaged,
-half written or has edited head counts.
+sizes and holds a hash of config and weights, so that loading rejects a folder that is damaged or
+half-written, or whose head counts were edited.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ CONFIG = "config.json"
 SHARD_BYTES = 15 * 2**20
 """Maximum shard size, including its header; a larger tensor gets its own shard."""
 HEADER_BYTES = 2**16
-"""Reserved for a shard's header: names, shapes and offsets of a few hundred tensors."""
+"""Bytes reserved for a shard's header: names, shapes and offsets of a few hundred tensors."""
 RUNTIME_FIELDS = ("dtype", "param_dtype", "remat", "unroll")
 """Config fields that affect how the model runs, not its architecture."""
 
@@ -175,8 +175,8 @@ def set_arrays(model: Model, arrays: Mapping[str, Any]) -> Model:
 def weights_hash(source: Folder | nnx.Module) -> str:
     """SHA-256 of a model's base weights: names, shapes and values in fp32.
 
-    It identifies the frozen base: adapters are excluded, and a model in any param_dtype has the
-    same hash as the folder it was loaded from.
+    It identifies the frozen base: adapters are excluded, and a model with bf16 or fp32 parameters
+    has the same hash as the folder it was loaded from.
 
     Args:
         source: a folder that `save` wrote, or a model.

@@ -1,4 +1,4 @@
-"""Checks of a folder before Orbax opens it, and filters for the errors that Orbax repeats."""
+"""Check a folder before Orbax opens it, and filter the errors that Orbax repeats."""
 
 import asyncio
 import functools
@@ -12,11 +12,11 @@ from typing import Any
 from envs.datasets.files import TEXT_BYTES, RefusedError, check_memory, check_only_files
 
 MANIFEST = "manifest.ocdbt"
-"""Root of a TensorStore database, in one or more folders; it is read into memory whole."""
+"""Root file of a TensorStore database, in one or more folders; read whole into memory."""
 
 
 def check(folder: Path) -> None:
-    """Raise if Orbax cannot open a folder safely; its C++ code could hang or end this process.
+    """Raise if Orbax cannot open a folder safely; its C++ code could hang or crash this process.
 
     Raises:
         RefusedError: an entry is not a regular file or is too large.
@@ -33,8 +33,8 @@ def check(folder: Path) -> None:
 def suppress_repeated_errors() -> None:
     """When Orbax reads or writes fail, report only the exception that Orbax raises.
 
-    Otherwise Orbax logs a traceback for every other failed operation, asyncio logs one for every
-    task that is never awaited, and Python prints the errors of their threads and coroutines.
+    Otherwise Orbax logs a traceback for each further failed operation, asyncio logs one for each
+    task that is never awaited, and Python prints errors from their threads and coroutines.
     """
     for name in ("absl", "asyncio"):
         logging.getLogger(name).addFilter(_is_not_from_orbax)

@@ -7,8 +7,8 @@ Each backbone package provides a module `published_names`:
     UNUSED               LeRobot tensors that the model does not use
     TIED                 unused tensor -> the tensor it is tied to
 
-Arrays are read one at a time and released once copied, so loading takes little more host memory
-than the model itself.
+Arrays are converted one at a time and released once copied, so loading takes little more host
+memory than the model itself.
 """
 
 import importlib
@@ -36,7 +36,7 @@ from lorasp_jax.models.pi0 import openpi_lora
 
 _MAX_COMPRESSION = 20  # bytes of arrays per byte of files
 _UNCHECKED_BYTES = 2**30  # arrays below this size may have any compression ratio
-_CONCURRENT_READS = 1  # GB that Orbax may hold in addition to the result
+_CONCURRENT_GB = 1  # host memory that Orbax may use in addition to the result
 _PREFIX = "model."  # prefix of every tensor in a LeRobot policy
 # Normalization statistics, which older LeRobot versions stored among the weights.
 _STATISTIC = re.compile(r"(?:un)?normalize_(?:inputs|targets|outputs)\.")
@@ -51,8 +51,8 @@ def load_published(folder: Path, config: Any) -> tuple[Any, list[str]]:
         config: model sizes and parameter dtype.
 
     Returns:
-        The model, with adapters if openpi trained LoRA; and the names of unused tensors: heads, and
-        the normalization statistics of older LeRobot versions (read by `statistics_files`).
+        The model, with adapters if the checkpoint has openpi's LoRA, and names of unused tensors:
+        heads, and the normalization statistics of older LeRobot versions (see `statistics_files`).
 
     Raises:
         ValueError: unknown layout or damaged files.
@@ -123,7 +123,7 @@ def stored_dtypes(folder: Path, config: Any) -> dict[str, np.dtype]:
     """The dtype of each leaf in a published checkpoint, for `save`.
 
     Raises:
-        ValueError: as `load_published`.
+        ValueError: unknown layout or damaged files.
     """
     _, theirs = _open(folder, _published_names(config).lerobot_name)
     return {name: theirs[name].dtype for name in theirs}
@@ -158,8 +158,8 @@ def orbax_folder(folder: Path) -> Path | None:
 
 
 def _restore(folder: Path) -> dict[str, np.ndarray]:
-    """Read an Orbax checkpoint: leaves by path below `params`, without a trailing "/value"."""
-    handler = ocp.PyTreeCheckpointHandler(restore_concurrent_gb=_CONCURRENT_READS)
+    """Read an Orbax checkpoint's leaves by path below `params`, without a trailing "/value"."""
+    handler = ocp.PyTreeCheckpointHandler(restore_concurrent_gb=_CONCURRENT_GB)
     checkpointer = ocp.Checkpointer(handler)
     orbax_folders.suppress_repeated_errors()
     try:
@@ -178,7 +178,7 @@ def _restore(folder: Path) -> dict[str, np.ndarray]:
 
 
 def _check_size(folder: Path, tree: Any) -> None:
-    """Raise ValueError if the arrays are implausibly larger than the files.
+    """Raise ValueError if the arrays are implausibly large for the files.
 
     Orbax reads missing chunks as zeros, so a small folder can declare arrays of any size.
     """

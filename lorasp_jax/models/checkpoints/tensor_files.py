@@ -33,7 +33,7 @@ def weight_files(folder: Path) -> list[Path]:
 
 
 class TensorFiles(MutableMapping[str, np.ndarray]):
-    """Mapping from names to tensors. Each access reads the tensor from its file; none are cached.
+    """Mapping from names to tensors. Each access reads the tensor from its file, without a cache.
 
     Args:
         files: from `weight_files`.

@@ -51,7 +51,7 @@ def decoder(ours: str, theirs: str, layers: Iterable[int], *, adaptive: bool = F
     Args:
         ours: path of our stack.
         theirs: prefix of their module.
-        layers: numbers of their layers.
+        layers: indices of their layers.
         adaptive: whether the norms are pi0.5's adaptive norms.
     """
     paths = [f"{theirs}.layers.{i}" for i in layers]
@@ -68,7 +68,7 @@ def decoder(ours: str, theirs: str, layers: Iterable[int], *, adaptive: bool = F
 
 
 def _patches(ours: str, theirs: str, size: VisionConfig) -> Rule:
-    """The patch embedding: their convolution `[O, rgb, y, x]`, our matrix `[y x rgb, O]`."""
+    """Rule for the patch embedding: their kernel `[O, rgb, y, x]`, our matrix `[y x rgb, O]`."""
     patch = size.patch
     return Rule(
         (ours,),

@@ -1,14 +1,14 @@
 """Convert openpi's LoRA weights to equivalent adapters of our layers.
 
-openpi has two matrices for each einsum kernel, with the kernel's head axes (its models/lora.py).
+openpi has two matrices for each einsum kernel, with the kernel's head axes (models/lora.py).
 W is a kernel, A and B its `lora_a` and `lora_b`, n a head, s = alpha / rank, or alpha / √rank:
 
     q_einsum, kv_einsum    [N, D, H]    ΔW[n] = s A[n] B[n], one pair for each head
-    attn_vec_einsum        [N, H, D]    ΔW[n] = s A[n] Σ_m B[m]: summed over heads before B
+    attn_vec_einsum        [N, H, D]    ΔW[n] = s A[n] Σ_m B[m]: A's outputs summed over heads
     gating_einsum, linear               ΔW = A B, independent of alpha
 
-With a pair of rank r, the first is one LoRA of rank N r with a block-diagonal B, the second one of
-rank r. Both are exact. Further training also updates the zeros outside the blocks.
+For pairs of rank r, the first row becomes a LoRA of rank N r with a block-diagonal B, the second a
+LoRA of rank r. Both conversions are exact. Training also updates the zeros outside the blocks.
 """
 
 from collections.abc import Mapping, MutableMapping
@@ -27,7 +27,7 @@ _LAYERS = "PaliGemma/llm/layers"
 _TOWERS = {"language": "", "action": "_1"}  # our tower -> openpi's suffix
 _ATTENTION = ("q_proj", "k_proj", "v_proj", "o_proj")
 Pair = tuple[np.ndarray, np.ndarray]
-"""A [L, I, R] and B [L, R, O]."""
+"""A [L, ..., I, R] and B [L, ..., R, O]."""
 
 
 def pop_lora(leaves: MutableMapping[str, Any]) -> dict[str, Any]:
@@ -58,7 +58,7 @@ def attach(model: Any, leaves: Mapping[str, np.ndarray], *, scale: float = 1.0) 
                 remaining, getattr(model.config, tower), f"{tower}/blocks", suffix
             )
     if remaining:
-        raise ValueError(f"openpi's LoRA has unexpected {', '.join(sorted(remaining)[:8])}.")
+        raise ValueError(f"openpi's LoRA has unexpected leaves {', '.join(sorted(remaining)[:8])}.")
     model = nnx.clone(model)
     for path, (a, b) in pairs.items():
         tower, _, name = path.split("/")
@@ -108,8 +108,8 @@ def _pop_pair(leaves: dict[str, np.ndarray], prefix: str, kernel: tuple[int, ...
     rank = a.shape[-1] if a.ndim else 0
     if (a.shape, b.shape) != ((*outer, d_in, rank), (*outer, rank, d_out)):
         raise ModelMismatchError(
-            f"{names[0]} and lora_b have shapes {a.shape} and {b.shape}, "
-            f"which do not match the model's kernel {kernel}."
+            f"{names[0]} and lora_b must fit the model's kernel shape {kernel}, "
+            f"got shapes {a.shape} and {b.shape}."
         )
     return a, b
 

@@ -104,8 +104,8 @@ def test_relative_actions(names, exclusion, relative):
         ({"type": "act"}, "type must be one of pi0, pi05, smolvla, got 'act'"),
         ({"attention_mode": "self_attn"}, "attention_mode must be 'cross_attn', got"),
         ({"max_state_dim": 7}, "max_state_dim and max_action_dim must be equal"),
-        ({"resize_imgs_with_padding": [512, 256]}, "images square, got"),
-        ({"resize_imgs_with_padding": None}, "images square, got"),
+        ({"resize_imgs_with_padding": [512, 256]}, "images must be square, got"),
+        ({"resize_imgs_with_padding": None}, "images must be square, got"),
         (
             {"normalization_mapping": {"STATE": "QUANTILE5"}},
             "normalization must be one of MEAN_STD, .*, got 'QUANTILE5'",
@@ -113,7 +113,7 @@ def test_relative_actions(names, exclusion, relative):
         ({"use_relative_actions": True}, "not a LeRobot policy config"),
         (
             {"normalization_mapping": {"VISUAL": "MEAN_STD"}},
-            "VISUAL must be 'IDENTITY' in normalization_mapping",
+            "normalization_mapping must map VISUAL to 'IDENTITY'",
         ),
         ({"type": "pi05", "use_visual_memory": True}, "use_visual_memory must be False, got True"),
         ({"num_expert_layers": 8}, "num_expert_layers must equal num_vlm_layers = 16, got 8"),

@@ -162,7 +162,7 @@ def test_older_lerobot_versions(model, tensors, tmp_path):
 
 def test_mismatched_checkpoints_raise(model, tensors, tmp_path):
     lora = {**tensors, "model.extra.lora_A.weight": np.zeros((2, 2), np.float32)}
-    with pytest.raises(ValueError, match=r"has unexpected extra\.lora_A\.weight"):
+    with pytest.raises(ValueError, match=r"has unexpected leaves extra\.lora_A\.weight"):
         published.load_published(write(tmp_path / "more", lora), CONFIG)
     incomplete = {name: a for name, a in tensors.items() if "layers.1.mlp.up_proj" not in name}
     with pytest.raises(ValueError, match=r"lacks .*layers\.1\.mlp\.up_proj\.weight"):
