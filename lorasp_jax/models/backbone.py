@@ -104,7 +104,7 @@ class Backbone(nnx.Module):
         return h, aux | {"action_time_mlp_in": in_aux, "action_time_mlp_out": out_aux}
 
     def run_prefix(self, obs: Observation) -> tuple[Any, ModelAux]:
-        """Encode the observation, independent of the actions."""
+        """Encode the observation independently of the actions."""
         raise NotImplementedError
 
     def run_suffix(
@@ -150,7 +150,7 @@ class Backbone(nnx.Module):
         return tokens, valid, {"vision": aux}
 
     def velocity(self, obs: Observation, x_t: jax.Array, flow_time: jax.Array) -> jax.Array:
-        """Velocity v_t `[B, C, A]` at x_t `[B, C, A]` and flow_time `[B]` (1 noise, 0 data)."""
+        """Compute v_t `[B, C, A]` at x_t `[B, C, A]` and flow_time `[B]` (1 = noise, 0 = data)."""
         prefix, _ = self.run_prefix(obs)
         return self.run_suffix(prefix, obs, x_t, flow_time)[0]
 
@@ -164,10 +164,10 @@ class Backbone(nnx.Module):
         noise: jax.Array | None = None,
         flow_time: jax.Array | None = None,
     ) -> tuple[jax.Array, ModelAux]:
-        """Flow-matching loss. Do not reuse the key.
+        """Compute the flow-matching loss. Do not reuse the key.
 
         Args:
-            key: typed PRNG key; draws `noise` and `flow_time` if they are not given.
+            key: typed PRNG key to sample `noise` and `flow_time` if they are not given.
             obs: the observation.
             actions: `[B, C, A]` normalized.
             action_mask: `[B, C, A]` bool. Slots with no valid step are zero in x_t; steps with no
@@ -211,7 +211,7 @@ def suffix_mask_and_positions(
         block: `[T]` int, block number of each suffix token.
 
     Returns:
-        mask `[B, T, P + T]` bool, and positions `[B, T]` int32 that continue the prefix's.
+        mask `[B, T, P + T]` bool, and positions `[B, T]` int32 that continue those of the prefix.
     """
     valid = jnp.ones((len(prefix_valid), len(block)), bool)
     key_block = np.concatenate([prefix_block, block])

@@ -12,7 +12,7 @@ from lorasp_jax.models.inputs import OURS, InputConfig
 from lorasp_jax.peft import _fields
 
 VOCABULARY_SIZE = 320
-"""Rows of the embedding table of this project's own bases, reserved tokens included."""
+"""Rows of the embedding table in this project's own base models, including reserved tokens."""
 
 Remat = Literal["none", "products", "full"]
 _MAX_SIZE = 2**24
@@ -69,7 +69,7 @@ class ExpertConfig:
 
     @property
     def kernel_sizes(self) -> tuple[int, ...]:
-        """The sizes that determine kernel shapes; heads and head_dim enter only as a product."""
+        """Sizes that determine kernel shapes; head counts and head_dim enter only as products."""
         inner, context = self.heads * self.head_dim, self.kv_heads * self.head_dim
         return self.width, self.depth, self.mlp, inner, context
 
@@ -96,7 +96,7 @@ class BackboneConfig:
     chunk: int
     """Actions per chunk, C."""
     action_dim: int
-    """Slots of state and action vectors, A."""
+    """Number of slots in state and action vectors, A."""
     inputs: InputConfig = OURS
     """How images, states and actions are preprocessed."""
     dtype: str = "float32"
@@ -104,13 +104,14 @@ class BackboneConfig:
     param_dtype: str = "float32"
     """Dtype of the stored parameters."""
     remat: Remat = "none"
-    """What the backward pass recomputes: nothing ("none"); everything except matmul results
-    ("products": half the memory, a few percent more work); whole layers ("full": the least memory,
-    a third more work)."""
+    """What the backward pass recomputes. "none": nothing; "products": everything except matmul
+    results, with half the memory and a few percent more compute; "full": whole layers, with the
+    least memory and a third more compute."""
     unroll: bool | None = None
-    """Unroll the loop over layers: faster, especially for small layers, but two to three times as
-    long to compile. (A loop copies the backward pass's residuals into stacks and out again.)
-    None unrolls unless `remat` is "full": XLA preserves remat order only inside a loop."""
+    """Unroll the loop over layers. This runs faster, especially for small layers, because a loop
+    copies the backward pass's residuals into and out of stacks, but takes two to three times as
+    long to compile. None unrolls unless `remat` is "full": XLA preserves remat order only inside a
+    loop."""
 
     def __post_init__(self) -> None:
         """Validate the sizes."""

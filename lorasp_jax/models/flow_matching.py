@@ -55,11 +55,11 @@ def loss(
     noise: jax.Array | None = None,
     flow_time: jax.Array | None = None,
 ) -> tuple[jax.Array, Any]:
-    """Per-element squared error (v_t - u_t)^2 in fp32, neither masked nor reduced.
+    """Compute the squared error (v_t - u_t)^2 per element in fp32, without masks or reduction.
 
     Args:
         velocity: the model.
-        key: draws `noise` and `flow_time` if they are not given; do not reuse it.
+        key: PRNG key to sample `noise` and `flow_time` if they are not given; do not reuse it.
         actions: `[B, C, A]` normalized.
         slots: bool broadcastable to `[B, C, A]`; x_t is zero where False, so that unused slots do
             not affect the model. None uses all slots.

@@ -13,7 +13,7 @@ class InputConfig:
     """Preprocessing of raw observations and actions; a field of the backbone config."""
 
     centred: bool = True
-    """Pad images of another aspect ratio on both sides; False pads only the left or the top."""
+    """Pad non-square images on both sides; False pads only the left or the top."""
     antialias: bool = True
     """Antialias when downscaling images."""
     state: Mode = "mean_std"
@@ -24,12 +24,12 @@ class InputConfig:
     """Mask of action dimensions relative to the state at the start of the chunk, see
     `policies.processor.to_delta`. The action statistics are then those of relative actions."""
     convention: Convention = "ours"
-    """Guard against division by zero in normalization: that of the named project."""
+    """Project whose guard against division by zero is used in normalization."""
     gripper_slot: int | None = 7
-    """Slot of the gripper in state and action vectors; None is the first slot after the joints."""
+    """Gripper slot in state and action vectors; None means the first slot after the joints."""
     quiet_slots: bool = True
-    """Keep slots that the robot does not use at zero in the flow. False treats them like the
-    others: noise in the flow, zero as data, included in the loss."""
+    """Keep the robot's unused slots at zero in the flow. False treats them like the others:
+    they contain noise in the flow and zeros in the data, and count in the loss."""
     prompt_state: bool = False
     """Put the normalized state into the prompt, see `policies.prompts.pi05`."""
     masks_missing: bool = True
@@ -42,7 +42,7 @@ OPENPI = InputConfig(convention="openpi", gripper_slot=None, quiet_slots=False)
 """pi0 in openpi (shared/image_tools.py, transforms.py at 15a9616a)."""
 _PI05 = {"state": "quantiles", "action": "quantiles", "prompt_state": True}
 OURS_PI05, OPENPI_PI05 = (dataclasses.replace(inputs, **_PI05) for inputs in (OURS, OPENPI))
-"""pi0.5, ours and in openpi (training/config.py, use_quantile_norm, ModelTransformFactory)."""
+"""pi0.5 here and in openpi (training/config.py, use_quantile_norm, ModelTransformFactory)."""
 LEROBOT_PI0 = dataclasses.replace(OPENPI, antialias=False, convention="lerobot")
 """pi0 in LeRobot 0.6 (policies/common/vla_utils.py, processor/normalize_processor.py)."""
 LEROBOT_PI05 = dataclasses.replace(LEROBOT_PI0, **_PI05)

@@ -29,7 +29,7 @@ class Observation:
 
 
 def abstract_observation(config: BackboneConfig, batch: int) -> Observation:
-    """An observation of a backbone's input shapes, with ShapeDtypeStructs instead of arrays."""
+    """Create an observation of ShapeDtypeStructs with a backbone's input shapes."""
 
     def abstract(dtype: str, *shape: int) -> Any:
         return jax.ShapeDtypeStruct((batch, *shape), dtype)

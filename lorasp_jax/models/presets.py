@@ -18,12 +18,12 @@ _PROJECTIONS = r"^(state_proj|action_in_proj|action_out_proj|(action_)?time_mlp_
 """Projections outside the towers."""
 
 PRESETS: dict[str, tuple[str, ...]] = {
-    # The linear layers of Table I of arXiv 2603.07404 that affect the actions: its code adapts
-    # every `nn.Linear`, and its patch embedding is a convolution.
+    # The linear layers in Table I of arXiv 2603.07404 that affect the actions. The paper's code
+    # adapts every `nn.Linear`, which excludes the patch embedding, a convolution there.
     "paper": ("^(?!vision/patch_embed)",),
     # Includes the patch embedding, a linear layer here.
     "all-linear": (".*",),
-    # The layers that openpi's "gemma_2b_lora" and "gemma_300m_lora" adapt (its models/gemma.py).
+    # The layers that openpi's "gemma_2b_lora" and "gemma_300m_lora" adapt (models/gemma.py).
     "openpi": (r"^(language|action)/blocks/(.*/)?[a-z]+_proj$",),
     # The layers that LeRobot trains with `train_expert_only`.
     "expert-only": ("^action/", _PROJECTIONS),
@@ -58,7 +58,7 @@ def patterns(targets: str | Sequence[str]) -> list[str]:
 
 
 def _suggestion(target: str) -> str | None:
-    """Find the preset that a target misspells; substrings of presets are valid patterns."""
+    """Find the preset that a target misspells; substrings of preset names or patterns are valid."""
     texts = (text for name, patterns in PRESETS.items() for text in (name, *patterns))
     if not _WORD.fullmatch(target) or any(target in text for text in texts):
         return None

@@ -1,4 +1,4 @@
-"""Sample action chunks by integrating the flow, with weight-only computation done up front."""
+"""Sample action chunks by integrating the flow, with input-independent results precomputed."""
 
 import dataclasses
 import functools
@@ -44,9 +44,9 @@ class FlowModel(prepared.FusableModule, Protocol):
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sampler:
-    """Samples action chunks from a backbone, with weight-only computation done once, up front.
+    """Samples action chunks from a backbone, with input-independent results precomputed once.
 
-    It holds a second copy of the weights, unless the caller drops its reference to the backbone.
+    It copies the weights; drop the reference to the backbone to free the originals.
     The weights are a flat list, because passing a module with about a thousand arrays to a jitted
     function adds too much dispatch latency for some control loops.
     """
@@ -125,7 +125,7 @@ def _prefix_model(model: FlowModel) -> FlowModel:
 
 
 def _suffix_model(model: FlowModel) -> FlowModel:
-    """Inference copy for the flow steps, with weight-only products precomputed."""
+    """Inference copy for the flow steps, with input-independent results precomputed."""
     model = nnx.merge(*nnx.split(model))
     del model.vision, model.language
     model.action.blocks = unstack(model.action.blocks)

@@ -1,4 +1,4 @@
-"""Convert config.json of a LeRobot 0.6 pi0 or pi0.5 (policies/pi0, policies/pi05)."""
+"""Convert the config.json of a LeRobot 0.6 pi0 or pi0.5 policy (policies/pi0, policies/pi05)."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ def pi0_config(fields: Mapping[str, Any]) -> Pi0Config:
 
 
 def pi05_config(fields: Mapping[str, Any]) -> Pi0Config:
-    """As `pi0_config`, for pi0.5.
+    """Like `pi0_config`, but for pi0.5.
 
     Raises:
         ValueError: the policy uses memory of past observations.

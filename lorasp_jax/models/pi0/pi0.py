@@ -37,7 +37,7 @@ from lorasp_jax.models.transformer.siglip import SigLIP
 
 @dataclasses.dataclass(frozen=True)
 class Pi0Config(BackboneConfig):
-    """Sizes and runtime options of a pi0 or pi0.5."""
+    """Sizes and runtime options of a pi0 or pi0.5 model."""
 
     pi05: bool = False
     """Build pi0.5: the flow time conditions the action expert's norms, and the state is part of the
@@ -89,7 +89,7 @@ class Pi0Config(BackboneConfig):
 
     @classmethod
     def nano_pi05(cls) -> Pi0Config:
-        """pi0.5 for a CPU, with room for the offline tokenizer's prompts including the state."""
+        """pi0.5 for a CPU; `max_tokens` fits the offline tokenizer's prompts with the state."""
         return dataclasses.replace(cls.nano(), pi05=True, max_tokens=64, inputs=OURS_PI05)
 
     @classmethod
@@ -170,7 +170,7 @@ class Pi0(Backbone):
         return jnp.concatenate([state_token, h], axis=1), {"state_proj": state_aux, **aux}
 
     def run_prefix(self, obs: Observation) -> tuple[Prefix, ModelAux]:
-        """Encode images and instruction, independent of the actions."""
+        """Encode images and instruction independently of the actions."""
         tokens, valid, vision_aux = self.embed_prefix(obs)
         block = np.zeros(valid.shape[1], int)
         mask = block_mask(block, block, valid, valid)
@@ -240,7 +240,7 @@ class Pi05(Pi0):
     ) -> tuple[jax.Array, LayerAux]:
         """Embed noisy actions as tokens `[B, C, D]` f32; also return the adapters' aux.
 
-        `obs` and `flow_time` are unused: the state is in the prompt, the time in the norms.
+        `obs` and `flow_time` are unused: the prompt contains the state, and the norms use the time.
         """
         del obs, flow_time
         x_t = x_t.astype(jnp.float32)

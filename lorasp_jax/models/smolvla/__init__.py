@@ -1,4 +1,4 @@
-"""SmolVLA: SigLIP, SmolLM2 and an action expert that attends to its keys and values."""
+"""SmolVLA: SigLIP, SmolLM2 and an action expert that attends to SmolLM2's keys and values."""
 
 from lorasp_jax.models.smolvla.smolvla import SmolVLA, SmolVLAConfig
 

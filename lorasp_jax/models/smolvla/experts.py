@@ -1,4 +1,4 @@
-"""SmolVLA's experts: SmolLM2 (arXiv 2502.02737), and an action expert that attends to its cache.
+"""SmolVLA's experts: SmolLM2 (arXiv 2502.02737), and an action expert that uses SmolLM2's cache.
 
 Even layers of the action expert attend to the language model's keys and values and to their own, as
 in pi0. Odd layers are cross-attention: they attend only to projections of the keys and values of
@@ -149,7 +149,7 @@ class ActionExpert(nnx.Module):
 
         Args:
             x: `[B, T, D]`.
-            position: `[B, T]` int32, continuing the prefix's; cross-attention starts from zero.
+            position: `[B, T]` int32, continuing the prefix's; cross-attention restarts at zero.
             mask: `[B, T, P + T]` bool.
             cache: prefix keys and values for self-attention, from `project_cache`.
             cross: prefix keys and values for cross-attention, from `project_cache`.

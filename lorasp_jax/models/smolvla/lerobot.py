@@ -1,4 +1,4 @@
-"""Convert config.json of a LeRobot 0.6 SmolVLA (policies/smolvla/configuration_smolvla.py)."""
+"""Convert the config.json of a LeRobot 0.6 SmolVLA (policies/smolvla/configuration_smolvla.py)."""
 
 import dataclasses
 import math
@@ -8,7 +8,7 @@ from typing import Any
 from lorasp_jax.models.checkpoints.lerobot_config import require
 from lorasp_jax.models.smolvla.smolvla import SmolVLAConfig
 
-# Options of LeRobot for which this backbone supports a single value.
+# LeRobot options for which this backbone supports only one value.
 _FIXED = {
     "attention_mode": "cross_attn",
     "self_attn_every_n_layers": 2,

@@ -1,4 +1,4 @@
-"""Names and shapes of SmolVLA's parameters as LeRobot publishes them (its policies/smolvla)."""
+"""Names and shapes of SmolVLA's parameters as LeRobot publishes them (policies/smolvla)."""
 
 import re
 

@@ -34,7 +34,7 @@ from lorasp_jax.models.transformer.siglip import SigLIP
 
 @dataclasses.dataclass(frozen=True)
 class SmolVLAConfig(BackboneConfig):
-    """Sizes and runtime options of a SmolVLA.
+    """Sizes and runtime options of a SmolVLA model.
 
     Raises:
         ValueError: inconsistent sizes.
@@ -57,8 +57,8 @@ class SmolVLAConfig(BackboneConfig):
     def base(cls) -> SmolVLAConfig:
         """The published SmolVLA, 450,046,176 parameters (LeRobot, policies/smolvla).
 
-        The action expert has 3/4 of the language model's width, 720, and an MLP of
-        256 ceil(int(4 int(2 * 720 / 3)) / 256) = 2048 (its smolvlm_with_expert.py).
+        The action expert has 3/4 of the language model's width, 720, and an MLP of width
+        256 ceil(int(4 int(2 * 720 / 3)) / 256) = 2048 (smolvlm_with_expert.py).
         """
         return cls(
             vision=VisionConfig(width=768, depth=12, mlp=3072, heads=12, patch=16, shuffle=4),
@@ -174,7 +174,7 @@ class SmolVLA(Backbone):
         return self.embed_actions(x_t, flow_time, action_valid)
 
     def run_prefix(self, obs: Observation) -> tuple[Prefix, ModelAux]:
-        """Encode images, instruction and state, independent of the actions."""
+        """Encode images, instruction and state independently of the actions."""
         tokens, valid, aux = self.embed_prefix(obs)
         block = _prefix_block(valid.shape[1])
         mask = block_mask(block, block, valid, valid)

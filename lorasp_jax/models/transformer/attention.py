@@ -13,14 +13,14 @@ CUDNN_MIN_QUERIES, CUDNN_MIN_HEAD_DIM = 128, 64
 so their results are bitwise reproducible."""
 
 KEY_MULTIPLE, MIN_PADDED_KEYS = 128, 512
-"""Without cuDNN, keys are padded to a multiple of `KEY_MULTIPLE` from `MIN_PADDED_KEYS` on."""
+"""Without cuDNN, `MIN_PADDED_KEYS` or more keys are padded to a multiple of `KEY_MULTIPLE`."""
 
 CUDNN_MULTIPLE = 8
-"""cuDNN needs query and key counts divisible by 8 (16 bytes of the mask)."""
+"""cuDNN needs query and key counts divisible by 8 (16-byte alignment of the mask)."""
 
 
 def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) -> jax.Array:
-    """Grouped-query attention with fp32 softmax; uses cuDNN for long bf16 sequences on NVIDIA GPUs.
+    """Grouped-query attention with fp32 softmax; uses cuDNN for long 16-bit sequences on GPUs.
 
     cuDNN accumulates gradients in nondeterministic order, so two runs differ in the last bits;
     `CUDNN_MIN_HEAD_DIM` keeps small models on the deterministic path.

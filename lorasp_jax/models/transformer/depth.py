@@ -23,7 +23,7 @@ def save_for_backward(x: jax.Array) -> jax.Array:
 
 
 def _save_products(primitive: Any, *shapes: Any, **params: Any) -> Any:
-    """Save matmul results, expensive primitives and values marked by `save_for_backward`."""
+    """Save results of matmuls and expensive primitives, and `save_for_backward` values."""
     if primitive.name in _EXPENSIVE_TO_RECOMPUTE or params.get("name") == _SAVED:
         return True
     return jax.checkpoint_policies.dots_with_no_batch_dims_saveable(primitive, *shapes, **params)
@@ -53,7 +53,7 @@ def scan_depth(
 
     Args:
         blocks: from `stack` or `unstack`.
-        call: (block, x, its slice of `per_layer`) -> (x, per-layer output).
+        call: (block, x, the layer's slice of `per_layer`) -> (x, per-layer output).
         x: `[B, T, D]`.
         per_layer: pytree with a leading axis L, or None.
         remat: what the backward pass recomputes, see `BackboneConfig.remat`.

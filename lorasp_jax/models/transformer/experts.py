@@ -55,7 +55,7 @@ class ExpertBlock(nnx.Module):
         Args:
             size: sizes of this expert.
             config: the backbone's config.
-            context: input width of k_proj and v_proj; None is `size.width`.
+            context: input width of k_proj and v_proj; None means `size.width`.
             rngs: source of the random weights.
         """
         options: dict[str, Any] = {

@@ -27,7 +27,7 @@ def rms_normalize(x: jax.Array, eps: float) -> jax.Array:
 class RMSNorm(nnx.Module):
     """x / sqrt(mean(x^2) + eps) * (offset + scale), computed in fp32, returned in the dtype of x.
 
-    Gemma stores the factor minus one (offset 1), other models store the factor itself (offset 0).
+    Gemma stores the factor minus one (offset 1); other models store the factor itself (offset 0).
     """
 
     def __init__(
@@ -43,14 +43,14 @@ class RMSNorm(nnx.Module):
         self.offset = offset
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        """x `[..., D]`."""
+        """Normalize x `[..., D]`."""
         factor = self.offset + self.scale.get_value().astype(jnp.float32)
         return (rms_normalize(x, self.eps) * factor).astype(x.dtype)
 
     def normalize(
         self, x: jax.Array, condition: jax.Array | None
     ) -> tuple[jax.Array, int, LayerAux]:
-        """As `AdaptiveRMSNorm.normalize`, but ignore the condition: gate 1, empty aux."""
+        """Like `AdaptiveRMSNorm.normalize`, but without a condition: gate 1, empty aux."""
         del condition
         return self(x), 1, {}
 
@@ -106,7 +106,7 @@ class LayerNorm(nnx.Module):
         self.eps = eps
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        """x `[..., D]`."""
+        """Normalize x `[..., D]`."""
         h = x.astype(jnp.float32)
         h = h - jnp.mean(h, axis=-1, keepdims=True)
         h = h * jax.lax.rsqrt(jnp.mean(jnp.square(h), axis=-1, keepdims=True) + self.eps)
@@ -207,8 +207,8 @@ def rope(x: jax.Array, table: tuple[jax.Array, jax.Array], scale: float = 1.0) -
 def time_embedding(flow_time: jax.Array, width: int) -> jax.Array:
     """Sinusoidal embedding `[B, width]` f32 of times `[B]`, with periods from 4e-3 to 4.
 
-    Sines come first, then cosines; periods as in openpi, src/openpi/models/pi0.py,
-    `create_sinusoidal_pos_embedding`.
+    Sines come first, then cosines. The periods match openpi's `create_sinusoidal_pos_embedding`
+    (models/pi0.py).
     """
     period = 4e-3 * (4.0 / 4e-3) ** np.linspace(0, 1, width // 2)
     angle = flow_time[:, None].astype(jnp.float32) * (2 * math.pi / period).astype(np.float32)

@@ -53,7 +53,7 @@ class VisionBlock(nnx.Module):
 class SigLIP(nnx.Module):
     """Encodes images as language tokens.
 
-    The patch embedding is a dense layer over flattened patches, equal to the usual strided
+    The patch embedding is a dense layer over flattened patches, equivalent to the usual strided
     convolution. The head merges each `shuffle` x `shuffle` square of tokens into one (pixel
     shuffle).
     """
