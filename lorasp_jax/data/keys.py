@@ -45,7 +45,7 @@ class Keys:
             raise ValueError(f"cameras must be a mapping, name -> feature, got {self.cameras!r}")
         for name, feature in self.cameras.items():
             if not isinstance(name, str) or not isinstance(feature, str):
-                raise ValueError(f"cameras must map str to str, got {name!r} -> {feature!r}")
+                raise ValueError(f"cameras must be str -> str, got {name!r} -> {feature!r}")
         if self.every < 1 or self.image_size < 0:
             raise ValueError(
                 f"every must be at least 1 and image_size at least 0, "

@@ -87,7 +87,7 @@ def test_dimensions_are_selected_and_converted(tmp_path):
     edit_rows(folder, widen)
     edit_info(folder, describe)
     with pytest.raises(
-        ValueError, match=r"8 state and 7 action dimensions: choose .*3\.pos, torque, j"
+        ValueError, match=r"8 state and 7 action dimensions in .*: choose .*3\.pos, torque, j"
     ):
         LeRobot(folder)
     joints = tuple(f"joint_{i + 1}.pos" for i in range(6))
