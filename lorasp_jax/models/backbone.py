@@ -192,7 +192,7 @@ class Backbone(nnx.Module):
         return per_element, merge_action_aux(aux, action_aux)
 
     def sample_actions(self, key: jax.Array, obs: Observation, **options: Any) -> Any:
-        """Sample action chunks; arguments as for `Sampler.sample_actions`."""
+        """Sample action chunks; see `Sampler.sample_actions` for arguments."""
         return self.sampler().sample_actions(key, obs, **options)
 
     def sampler(self) -> Sampler:
@@ -207,7 +207,7 @@ def suffix_mask_and_positions(
 
     Args:
         prefix_valid: `[B, P]` bool.
-        prefix_block: `[P]` int, block number of each prefix token, see `block_mask`.
+        prefix_block: `[P]` int, block number of each prefix token; see `block_mask`.
         block: `[T]` int, block number of each suffix token.
 
     Returns:

@@ -175,7 +175,7 @@ class BackboneConfig:
 
     @property
     def unroll_layers(self) -> bool:
-        """Whether the loop over layers is unrolled; resolves `unroll` = None."""
+        """Whether to unroll the loop over layers; resolves `unroll=None`."""
         return self.remat != "full" if self.unroll is None else self.unroll
 
     @property

@@ -88,7 +88,7 @@ def sample(
         velocity: the model.
         noise: `[B, C, A]` x at time 1.
         num_steps: number of Euler steps; step k is at time 1 - k / num_steps.
-        slots: as in `loss`.
+        slots: see `loss`.
 
     Returns:
         `[B, C, A]` f32, and the model's aux with a leading step axis.

@@ -17,7 +17,7 @@ class InputConfig:
     antialias: bool = True
     """Antialias when downscaling images."""
     state: Mode = "mean_std"
-    """Normalization of states, see `policies.normalization`."""
+    """Normalization of states; see `policies.normalization`."""
     action: Mode = "mean_std"
     """Normalization of actions."""
     delta: tuple[bool, ...] = ()
@@ -31,7 +31,7 @@ class InputConfig:
     """Keep the robot's unused slots at zero in the flow. False treats them like the others:
     they contain noise in the flow and zeros in the data, and count in the loss."""
     prompt_state: bool = False
-    """Put the normalized state into the prompt, see `policies.prompts.pi05`."""
+    """Put the normalized state into the prompt; see `policies.prompts.pi05`."""
     masks_missing: bool = True
     """Replace a missing camera's image with a black, masked one; False omits the camera."""
 

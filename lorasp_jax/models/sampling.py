@@ -19,7 +19,7 @@ from lorasp_jax.peft import Method
 
 
 class FlowModel(prepared.FusableModule, Protocol):
-    """Backbone interface that a sampler requires, see `backbone.Backbone`."""
+    """Backbone interface that a sampler requires; see `backbone.Backbone`."""
 
     config: BackboneConfig
     vision: Any

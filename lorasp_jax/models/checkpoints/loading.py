@@ -91,7 +91,7 @@ def find(where: str | os.PathLike[str]) -> ModelFolder:
     """Find a model folder, downloading it if it is remote, and detect its layout.
 
     Args:
-        where: a folder, "hf://owner/name" or "gs://bucket/folder", see `hub.local`.
+        where: a folder, "hf://owner/name" or "gs://bucket/folder"; see `hub.local`.
 
     Raises:
         ValueError: `where` cannot be reached, or its config.json is damaged.
@@ -110,7 +110,7 @@ def load(where: str | os.PathLike[str], config: Any = None) -> Any:
     the policy type, or openpi's Orbax folder `params`.
 
     Args:
-        where: a folder, "hf://owner/name" or "gs://bucket/folder", see `hub.local`.
+        where: a folder, "hf://owner/name" or "gs://bucket/folder"; see `hub.local`.
         config: model sizes, dtype and param_dtype. None uses the sizes in this project's or
             LeRobot's config.json; for openpi, those of the published pi0.
 

@@ -185,7 +185,7 @@ class Pi0(Backbone):
         flow_time: jax.Array,
         action_valid: jax.Array | None = None,
     ) -> tuple[jax.Array, LayerAux]:
-        """Predict the velocity `[B, C, A]` f32 given the prefix; arguments as in `embed_suffix`."""
+        """Predict velocities `[B, C, A]` f32 given the prefix; see `embed_suffix` for arguments."""
         batch, chunk = x_t.shape[:2]
         if action_valid is None:
             action_valid = jnp.ones((batch, chunk), bool)

@@ -191,7 +191,7 @@ class SmolVLA(Backbone):
         flow_time: jax.Array,
         action_valid: jax.Array | None = None,
     ) -> tuple[jax.Array, LayerAux]:
-        """Predict the velocity `[B, C, A]` f32 given the prefix; arguments as in `embed_suffix`."""
+        """Predict velocities `[B, C, A]` f32 given the prefix; see `embed_suffix` for arguments."""
         if action_valid is None:
             action_valid = jnp.ones(x_t.shape[:2], bool)
         tokens, aux = self.embed_suffix(obs, x_t, flow_time, action_valid)

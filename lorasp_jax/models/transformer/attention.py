@@ -66,7 +66,7 @@ def _use_cudnn(q: jax.Array, k: jax.Array, mask: jax.Array | None) -> bool:
     """Whether cuDNN supports these arrays and is worth its launch overhead."""
     queries, head_dim, keys = q.shape[1], q.shape[3], k.shape[1]
     half_precision = q.dtype in (jnp.bfloat16, jnp.float16)
-    even = mask is not None or (queries % 2 == 0 and keys % 2 == 0)
+    even = mask is not None or (queries % 2 == 0 and keys % 2 == 0)  # masked inputs are padded
     supported = CUDNN_MIN_HEAD_DIM <= head_dim <= 256 and head_dim % 8 == 0 and even
     large = queries >= CUDNN_MIN_QUERIES
     return jax.default_backend() == "gpu" and half_precision and supported and large

@@ -56,7 +56,7 @@ def scan_depth(
         call: (block, x, the layer's slice of `per_layer`) -> (x, per-layer output).
         x: `[B, T, D]`.
         per_layer: pytree with a leading axis L, or None.
-        remat: what the backward pass recomputes, see `BackboneConfig.remat`.
+        remat: what the backward pass recomputes; see `BackboneConfig.remat`.
         unroll: unroll the loop over layers instead of using `lax.scan`.
 
     Returns:

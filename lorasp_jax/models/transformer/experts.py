@@ -134,7 +134,7 @@ class ExpertBlock(nnx.Module):
     ) -> tuple[jax.Array, LayerAux]:
         """Add the output projection of attention `[B, T, N H]` and the gated MLP to x `[B, T, D]`.
 
-        `gate` multiplies the attention branch, see `AdaptiveRMSNorm`.
+        `gate` multiplies the attention branch; see `AdaptiveRMSNorm`.
         """
         y, o_aux = self.o_proj(attended, token_mask=token_mask, return_aux=True)
         x = x + gate * y
