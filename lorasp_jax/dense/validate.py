@@ -46,7 +46,7 @@ def rngs(value: Any) -> nnx.Rngs:
 
 
 def array(x: Any) -> Any:
-    """Return x; raise ValueError unless it is a numeric array with at least one axis."""
+    """Return x; raise ValueError unless it is a numeric or bool array with at least one axis."""
     has_axes = isinstance(x, jax.Array | np.ndarray) and x.ndim
     if not has_axes or not (x.dtype == bool or jnp.issubdtype(x.dtype, jnp.number)):
         raise ValueError(f"x must be an array [...tokens, I], got {short(x)}.")

@@ -45,7 +45,7 @@ class Method:
     """
 
     def __new__(cls, *values: Any, **fields: Any) -> "Method":
-        """Raise ValueError for an unknown field, before Python raises TypeError."""
+        """Raise ValueError for an unknown field, where Python would raise TypeError."""
         _fields.check_names(cls, name_of(cls), values, fields)
         return super().__new__(cls)
 
@@ -81,7 +81,7 @@ class Method:
 
     @property
     def is_low_rank_sum(self) -> bool:
-        """True if the method does not override `apply`, so that it computes exactly x W + z U."""
+        """True if the method does not override `apply`, so it computes exactly x W + z U."""
         return type(self).apply is Method.apply
 
     @property

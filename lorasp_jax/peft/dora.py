@@ -83,8 +83,8 @@ def column_factor(magnitude: jax.Array, adapted: jax.Array) -> jax.Array:
     ‖w‖² + 2 s (wᵀA) b + s² bᵀ(AᵀA) b would avoid that, but cost as much (I O R for WᵀA) and
     suffer from cancellation where V is much shorter than W.
 
-    A zero column has no direction to rescale. Its factor is m + 1, that is 1 for the initial m = 0,
-    so that B can learn even from a zero kernel.
+    A zero column has no direction to rescale. Its factor is m + 1, or 1 for the initial m = 0,
+    so B can learn even from a zero kernel.
     """
     norm = column_norms(jax.lax.stop_gradient(adapted))
     is_zero = norm == 0

@@ -2,8 +2,7 @@
 
 Conventions and initializations follow Hugging Face PEFT. Initially, B = 0 and A is Kaiming-uniform
 (a = √5, so U(±1/√I)), Gaussian or computed from inputs; alternatively, A B is split off the kernel
-and the residual is frozen.
-The scale is α/R, or α/√R for rsLoRA (Kalajdzievski, arXiv 2312.03732).
+and the residual is frozen. The scale is α/R, or α/√R for rsLoRA (Kalajdzievski, arXiv 2312.03732).
 """
 
 import dataclasses
@@ -33,7 +32,7 @@ class LoRA(Method):
     """R. It must be at most min(I, O) for "pissa" and "olora", and at most I for "eva". The LoRA-SP
     paper's main baseline has rank 128."""
     alpha: float | None = None
-    """α. Defaults to 2 R, so that α/R is 2 as in LoRA-SP."""
+    """α. Defaults to 2 R, so α/R is 2, as in LoRA-SP."""
     rank_stabilized: bool = False
     """Scale by α/√R (rsLoRA) instead of α/R."""
     initialization: Literal["kaiming", "gaussian", "pissa", "olora", "eva"] = "kaiming"
@@ -111,8 +110,8 @@ class LoRA(Method):
     ) -> tuple[Params, Kernel]:
         """Initialize parameters for an embedding [V, D]: A zero, B from N(0, 1), as in PEFT.
 
-        Rows of A that are not looked up receive no gradient and stay zero, so that their entries do
-        not change.
+        Rows of A that are not looked up receive no gradient and stay zero, so their entries do not
+        change.
         """
         del statistics
         entries, width = table.shape

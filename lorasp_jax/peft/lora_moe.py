@@ -41,8 +41,8 @@ class LoRAMoE(Method):
     routing: Literal["weighted", "top1"] = "weighted"
     """"weighted": all experts, weighted by probability. "top1": the most likely one per token."""
     gate_gradient: Literal["hard", "switch"] = "hard"
-    """For "top1" only. "hard": the chosen expert has weight 1, so that the router learns only from
-    its own losses, as in LoRA-SP's code. "switch": its weight is p, which passes the task gradient
+    """For "top1" only. "hard": the chosen expert has weight 1, so the router learns only from its
+    own losses, as in LoRA-SP's code. "switch": its weight is p, which passes the task gradient
     on to the router."""
 
     def __post_init__(self) -> None:

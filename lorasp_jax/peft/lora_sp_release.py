@@ -6,7 +6,7 @@ This is an independent implementation that uses only facts about it. Differences
 
 - Scores may be negative and are ranked by signed value.
 - The gate keeps the largest set whose energy does *not exceed* η, and at least one direction, so
-  that E_k is usually below η.
+  E_k is usually below η.
 - The spectral loss is a ratio of sums over tokens.
 - The balance loss is Switch's, on a softmax over all scores with the pruned ones set to 0.
 - The z-loss is ln(1 + lse) with lse clipped to [-1, 10], and thus -inf at the lower end.

@@ -93,7 +93,7 @@ def test_norm_has_no_gradient():
     def loss(params, kernel):
         return METHOD.apply(params, X, kernel)[0].sum()
 
-    kernel = jnp.zeros_like(KERNEL)  # V = scale A B, so that scaling B scales V
+    kernel = jnp.zeros_like(KERNEL)  # V = scale A B, so scaling B scales V
     gradient = jax.grad(loss)(params, kernel)["lora_b"]
     assert np.abs((gradient * params["lora_b"]).sum(0)).min() > 1e-3
     scaled = params | {"lora_b": 2 * params["lora_b"]}

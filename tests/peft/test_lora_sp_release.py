@@ -81,7 +81,7 @@ def test_recorded_ranks():
 
 
 def test_kept_energy_stays_below_the_target():
-    """With random signed scores no token exceeds η, so that the spectral loss exceeds 1 - η."""
+    """With random signed scores, no token exceeds η, so the spectral loss exceeds 1 - η."""
     scores = jax.random.normal(jax.random.key(0), (4000, 128))
     mask = release.release_gate(scores, 0.9)
     energy = (scores**2 * mask).sum(-1) / (scores**2).sum(-1)

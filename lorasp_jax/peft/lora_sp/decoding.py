@@ -2,7 +2,7 @@
 
 A dense matmul with the bank costs the same for any mask. A single token is bound by the memory
 traffic of the bank, most of which is saved by gathering k of R rows of U and Vᵀ. Several tokens
-differ in their active directions, so that the dense matmul is faster for them.
+differ in their active directions, so the dense matmul is faster for them.
 `python -m benchmarks.decoding` measures when gathering pays off.
 """
 

@@ -1,6 +1,6 @@
 """LoRA-SP's router: eq. (10) of the paper (arXiv 2603.07404), and score pooling.
 
-Everything is in fp32. `method` combines it with the gate, bank and losses.
+Everything is in fp32. `method` combines the router with the gate, bank and losses.
 """
 
 import functools
@@ -57,7 +57,7 @@ def router_scores(
 
     Args:
       router: w2 [H, R], and b1 [H], b2 [R] unless `kind` is "softmax".
-      hidden: x W1, [..., H] in any dtype; computed in fp32 from here on.
+      hidden: x W1, [..., H] in any dtype; cast to fp32 here.
       kind: the router variant.
 
     Returns:
@@ -125,7 +125,7 @@ def pooled_scores(scores: jax.Array, valid: jax.Array, granularity: Granularity)
       scores: f32 [...tokens, R].
       valid: bool [...tokens], False for padding.
       granularity: "token": no pooling. "sample": over the last token axis. "layer": over all token
-        axes, that is over the whole batch.
+        axes, i.e. over the whole batch.
 
     Returns:
       f32 [...tokens, R], pooled axes reduced to size 1. Scores without token axes are returned
