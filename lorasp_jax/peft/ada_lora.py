@@ -92,7 +92,7 @@ class AdaLoRA(Method):
         return (2 * self.rank if self.alpha is None else self.alpha) / (self.rank + 1e-5)
 
     def match_budget(self, mean_active_rank: float) -> "AdaLoRA":
-        """Return a copy whose `target_rank` is LoRA-SP's mean active rank (paper, Table I)."""
+        """Return a copy with LoRA-SP's measured mean active rank as `target_rank` (Table I)."""
         return dataclasses.replace(self, target_rank=round(mean_active_rank))
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:

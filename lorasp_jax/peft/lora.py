@@ -158,7 +158,7 @@ def principal_part(kernel: jax.Array, rank: int, scale: float) -> tuple[jax.Arra
 
 
 def orthogonal_part(kernel: jax.Array, rank: int, scale: float) -> tuple[jax.Array, jax.Array]:
-    """A [I, R] and B [R, O] from the kernel's rank-R QR decomposition; B's rows are orthonormal.
+    """A [I, R] and B [R, O] from a rank-R QR of the kernel's transpose; B's rows are orthonormal.
 
     OLoRA (Büyükakyüz, arXiv 2406.01775, algorithm 1), which does not divide by the scale.
     """

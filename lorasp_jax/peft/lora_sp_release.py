@@ -47,7 +47,7 @@ class LoRASPRelease(BankMethod):
     """α of the scale α/R. Defaults to 2 R."""
     hidden_width: int | None = None
     """None: the scores are x W1, as in the public code by default. H: they are the softmax of H
-    values times a matrix, initially 0/1, as in its option `router_projection` (H = 4)."""
+    values times a matrix, initially 0/1, as in that code's `router_projection` (H = 4)."""
     normalized_bank: bool = False
     """Keep the bank's directions orthonormal; see `LoRASP.normalized_bank`."""
 
