@@ -34,7 +34,7 @@ __all__ = [
     "rlds",
 ]
 
-_HOMES = {
+_MODULES = {
     "Env": "env",
     "Episodes": "datasets.episodes",
     "Randomization": "scene.randomization",
@@ -49,9 +49,9 @@ envs.interop.ids.register()
 
 
 def __getattr__(name: str) -> Any:
-    """Import public names and modules on access: MJX takes seconds, too long for `--help`."""
-    if name in _HOMES:
-        return getattr(importlib.import_module(f"envs.{_HOMES[name]}"), name)
+    """Import public names and modules lazily: MJX takes seconds, too long for `--help`."""
+    if name in _MODULES:
+        return getattr(importlib.import_module(f"envs.{_MODULES[name]}"), name)
     if name == "rlds":
         return importlib.import_module("envs.datasets.rlds")
     if importlib.util.find_spec(f"envs.{name}") is None:

@@ -34,7 +34,7 @@ def main(
     options = parse_arguments(parser(program), arguments)
     options.record = record
     console = Console(stderr=True)
-    # Reserving most of a GPU at startup takes a second (measured) of a command's half minute.
+    # Preallocating GPU memory takes a second (measured) of a command's half minute.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     cache.enable()
     try:
@@ -50,7 +50,7 @@ def main(
 
 def parser(program: str) -> argparse.ArgumentParser:
     """Define the commands and their options."""
-    parser = argparse.ArgumentParser(prog=program, description="Episodes of scripted experts.")
+    parser = argparse.ArgumentParser(prog=program, description="Collect or show expert episodes.")
     subparsers = parser.add_subparsers(required=True, metavar="command")
     tasks = ", ".join(names("task"))
     robots = f"{', '.join(names('robot'))}, or the path of an MJCF file"
@@ -70,7 +70,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     option("--distractors", type=int, default=0, help=text)
     text = "randomize masses, cameras, light and more between worlds"
     option("--randomize", action="store_true", help=text)
-    option("--antialias", type=int, default=1, help=f"n, for n x n rays per pixel {_DEFAULT}")
+    option("--antialias", type=int, default=1, help=f"cast n x n rays per pixel {_DEFAULT}")
 
     option = _add_command(subparsers, commands.gallery, image_size=128)
     option("--task", help=f"{tasks} (default: all)")
@@ -87,7 +87,7 @@ def parser(program: str) -> argparse.ArgumentParser:
 def _add_command(
     subparsers: Any, command: Callable[..., None], image_size: int, prefix: str = ""
 ) -> Callable[..., Any]:
-    """Add a command with the options that all commands have; return its `add_argument`."""
+    """Add a command with the options that all commands share; return its `add_argument`."""
     text = command.__doc__
     sub = subparsers.add_parser(command.__name__, help=text, description=text)
     sub.set_defaults(command=command)
@@ -99,7 +99,7 @@ def _add_command(
 
 
 def seed(text: str) -> int:
-    """Parse a seed; JAX uses only 32 bits of one."""
+    """Parse a seed; JAX uses only its low 32 bits."""
     if not 0 <= (value := int(text)) < 2**32:
         raise argparse.ArgumentTypeError(f"must be 0 to {2**32 - 1}, got {value}")
     return value

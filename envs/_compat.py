@@ -1,4 +1,4 @@
-"""Private names of JAX that this package needs; no other module of it imports any.
+"""JAX's private names that this package needs; no other module of `envs` imports them.
 
 All exist in JAX 0.10.2, 0.11.2 and 0.12.0.1.
 """
@@ -8,11 +8,11 @@ from jaxlib import utils
 
 FileCache = lru_cache.LRUCache
 """JAX's file cache of compiled programs. Public settings cover only its folder, not how it writes,
-and a process could read an entry that another one is still writing."""
+and a process could read an entry that another process is still writing."""
 
 
 def use_file_cache(kind: type[FileCache]) -> None:
-    """Make JAX use this class for its cache; no public setting does."""
+    """Make JAX use this class for its cache; no public setting can."""
     compilation_cache.LRUCache = kind  # pyright: ignore[reportPrivateImportUsage]
 
 

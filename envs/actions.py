@@ -5,8 +5,8 @@
     end_effector  [7] translation [m] and rotation vector [rad] of the tcp, both in the base frame,
                   gripper opening [m]
 
-Changes are relative to the last targets, not to measured positions, so that lag of the servos does
-not make an arm creep.
+Changes are relative to the last targets, not to measured positions, so that servo lag does not make
+an arm creep.
 """
 
 from typing import Literal, get_args
@@ -23,13 +23,13 @@ Mode = Literal["joint", "delta_joint", "end_effector"]
 MODES: tuple[str, ...] = get_args(Mode)
 
 TARGET_DT = 0.02
-"""Period at which joint targets are interpolated between two actions [s]; own choice (50 Hz)."""
+"""Period at which joint targets are interpolated between two actions [s]; our choice (50 Hz)."""
 
-_TOOL_SPEED = np.array([0.5] * 3 + [2.0] * 3, np.float32)  # limits, own choice [m/s, rad/s]
+_TOOL_SPEED = np.array([0.5] * 3 + [2.0] * 3, np.float32)  # limits, our choice [m/s, rad/s]
 
 
 def bounds(mode: Mode, robot: Robot, control_dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and the highest action, float32 [A], for one action per `control_dt` s."""
+    """Return the lowest and highest actions, float32 [A], for a control period in seconds."""
     if mode == "joint":
         return robot.action_low, robot.action_high
     speed = _TOOL_SPEED if mode == "end_effector" else robot.action_speed[:-1]
@@ -40,7 +40,7 @@ def bounds(mode: Mode, robot: Robot, control_dt: float) -> tuple[np.ndarray, np.
 def to_targets(mode: Mode, robot: Robot, command: jax.Array, action: jax.Array) -> jax.Array:
     """Convert one world's action [A] to targets [J + 1], given its last targets [J + 1].
 
-    An end-effector pose out of reach gives the closest one that inverse kinematics finds.
+    If an end-effector pose is out of reach, use the closest one that inverse kinematics finds.
     """
     if mode == "joint":
         return action
@@ -53,7 +53,7 @@ def to_targets(mode: Mode, robot: Robot, command: jax.Array, action: jax.Array) 
 
 
 def from_targets(mode: Mode, robot: Robot, command: jax.Array, targets: jax.Array) -> jax.Array:
-    """Invert `to_targets`: return the action [A] that leads from the last targets to these.
+    """Invert `to_targets`: return the action [A] that leads from `command` to `targets`.
 
     An end-effector action does not determine the joints of an arm with more than six.
     """
@@ -72,7 +72,7 @@ def interpolate(commands: jax.Array, control_dt: float, latency: float | jax.Arr
     """Interpolate actuator targets [S, J + 1] for the S physics steps of one control step.
 
     Args:
-        commands: [3, J + 1] targets of the last but one, the last and the new action.
+        commands: [3, J + 1] targets of the last two actions and the new one, oldest first.
         control_dt: control period [s], a multiple of `TARGET_DT`.
         latency: delay of the targets [s], at most `control_dt`.
     """

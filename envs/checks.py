@@ -1,4 +1,4 @@
-"""Check arguments: one sentence for invalid ones, before anything is computed."""
+"""Check arguments before anything is computed; errors are one sentence."""
 
 import math
 import numbers
@@ -42,16 +42,16 @@ def number(name: str, value: Any) -> float:
 
 
 def key(value: Any) -> Any:
-    """Check that a value is one key, of `jax.random.key` or `jax.random.PRNGKey`, and return it.
+    """Check that a value is a key from `jax.random.key` or `jax.random.PRNGKey`, and return it.
 
     Raises:
-        TypeError: it is not a key, or an array of several.
+        TypeError: it is not a key, or is an array of keys.
     """
     dtype, shape = getattr(value, "dtype", None), getattr(value, "shape", None)
     if dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key):
         if shape != ():
-            raise TypeError(f"key must be one key, got an array of keys of shape {shape}")
-    elif dtype != jnp.uint32 or shape not in ((2,), (4,)):  # raw keys of threefry and of rbg
+            raise TypeError(f"key must be a single key, got an array of keys of shape {shape}")
+    elif dtype != jnp.uint32 or shape not in ((2,), (4,)):  # raw keys of threefry and rbg
         raise TypeError(f"key must be a JAX key such as jax.random.key(0), got {short(value)}")
     return value
 
@@ -64,7 +64,7 @@ def action(value: Any, shape: tuple[int, ...]) -> Any:
         ValueError: its shape is different.
     """
     if not is_numeric(value):
-        raise TypeError(f"action must be an array of numbers, {list(shape)}, got {short(value)}")
+        raise TypeError(f"action must be a numeric array {list(shape)}, got {short(value)}")
     if value.shape != shape:
         raise ValueError(f"action must have shape {shape}, got {value.shape}")
     return value

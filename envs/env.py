@@ -5,7 +5,7 @@
     state = env.step(state, action)
     images = env.observe(state)["image"]
 
-Only `observe` renders, and only `reset_done` restarts worlds.
+`step` neither renders nor restarts worlds: see `observe` and `reset_done`.
 """
 
 import dataclasses
@@ -29,8 +29,8 @@ from envs.scene.randomization import Draw, Randomization
 from envs.state import Changes, Data, Poses, State, Trajectory, where
 from envs.tasks import Layout, Task, View
 
-_HOME_NOISE = 0.03  # rad, half the range of random start poses around home; own choice
-_START_OPENING = 0.04  # m, gripper opening at reset; own choice
+_HOME_NOISE = 0.03  # rad, half the range of random start poses around home; our choice
+_START_OPENING = 0.04  # m, gripper opening at reset; our choice
 
 
 @enum.unique
@@ -70,7 +70,7 @@ class Env:
 
     @property
     def num_joints(self) -> int:
-        """J, without the gripper."""
+        """Number of joints J, without the gripper."""
         return self.robot.num_joints
 
     @property
@@ -80,7 +80,7 @@ class Env:
 
     @property
     def antialias(self) -> int:
-        """n, for n x n rays per pixel."""
+        """n, where each pixel takes n x n rays."""
         return self.renderer.samples
 
     @property
@@ -113,14 +113,14 @@ class Env:
 
         Args:
             key: source of all randomness.
-            ranges: domain randomization; None for none.
+            ranges: domain randomization; None: disabled.
 
         Raises:
             TypeError, ValueError: the key or a range is invalid.
         """
         ranges = randomization.prepare(ranges, self.control_dt)
         with self._calls.first("reset", ranges is None):
-            return self._resets(checks.key(key), ranges)
+            return self._batched_reset(checks.key(key), ranges)
 
     def step(self, state: State, action: jax.Array) -> State:
         """Simulate one control step.
@@ -132,7 +132,7 @@ class Env:
                 robot's speed limits.
 
         Returns:
-            The worlds `control_dt` later. Worlds that were done stay as they were.
+            The worlds `control_dt` later. Worlds that were done are unchanged.
 
         Raises:
             TypeError: the action is not a numeric array, or the state not a `State`.
@@ -143,7 +143,7 @@ class Env:
         # A weakly typed action, such as jnp.full(shape, 0.0), would recompile the step.
         action = jax.lax.convert_element_type(action, jnp.float32)
         with self._calls.first("step", state.info["draw"] is None):
-            return self._steps(state, action)
+            return self._batched_step(state, action)
 
     def observe(self, state: State) -> dict[str, Any]:
         """Render and measure what a policy observes.
@@ -157,10 +157,10 @@ class Env:
         """
         self._check_worlds(state)
         with self._calls.first("images", state.info["draw"] is None):
-            return self._observes(state)
+            return self._batched_observe(state)
 
     @functools.partial(fast_cpu.jit, static_argnums=0)
-    def _observes(self, state: State) -> dict[str, Any]:
+    def _batched_observe(self, state: State) -> dict[str, Any]:
         return {
             "image": self.render(Poses.of(state.data), draw=state.info["draw"]),
             "state": self.proprio(state),
@@ -211,7 +211,7 @@ class Env:
         """
         self._check_worlds(state)
         if (ranges is None) != (state.info["draw"] is None):
-            raise ValueError("pass ranges to reset_done if, and only if, reset had ranges")
+            raise ValueError("pass ranges to reset_done if and only if reset had ranges")
         return jax.jit(where)(state.done, self.reset(key, ranges), state)
 
     def proprio(self, state: State) -> jax.Array:
@@ -232,27 +232,27 @@ class Env:
             TypeError: `state` is not a `State`.
         """
         checks.instance("state", state, State, "a state from reset or step")
-        return self._full_states(state)
+        return self._batched_full_state(state)
 
     @functools.partial(jax.jit, static_argnums=0)
-    def _full_states(self, state: State) -> jax.Array:
+    def _batched_full_state(self, state: State) -> jax.Array:
         return jax.vmap(self._full_state)(state)
 
     def _full_state(self, state: State) -> jax.Array:
         """Return the privileged state of one world, f32 [D]."""
-        parts = observations.parts(self.model, state.data, state.info["command"], self._placed)
+        parts = observations.parts(self.model, state.data, state.info["command"], self._task_bodies)
         return jnp.concatenate([*parts.values()])
 
     @functools.cached_property
     def full_state_layout(self) -> dict[str, slice]:
         """Name of each part -> its slice of the last axis of `full_state`."""
-        return observations.layout(self.model, self.num_joints, self._placed)
+        return observations.layout(self.model, self.num_joints, self._task_bodies)
 
     def render(self, poses: Poses, *, draw: Draw | None = None) -> dict[str, jax.Array]:
         """Render N recorded scenes: camera name -> uint8 [N, image_size, image_size, 3].
 
         Args:
-            poses: of all geoms and cameras, leading axis N.
+            poses: poses of all geoms and cameras, leading axis N.
             draw: randomized values of these worlds, leading axis N, from `State.info`.
         """
         appearance, size = jax.vmap(self._appearance)(draw) if draw else (None, None)
@@ -262,7 +262,7 @@ class Env:
     def _check_worlds(self, state: Any) -> None:
         checks.instance("state", state, State, "a state from reset or step")
         if state.done.shape != (self.num_envs,):
-            got = f"{state.done.shape[0]} worlds" if state.done.shape else "no axis of worlds"
+            got = f"{state.done.shape[0]} worlds" if state.done.shape else "no world axis"
             raise ValueError(f"state must have {self.num_envs} worlds, got {got}")
 
     @functools.cached_property
@@ -271,11 +271,11 @@ class Env:
         return messages.Calls(f"{self.task.name}, {worlds}")
 
     @functools.partial(fast_cpu.jit, static_argnums=0)
-    def _steps(self, state: State, action: jax.Array) -> State:
+    def _batched_step(self, state: State, action: jax.Array) -> State:
         return jax.vmap(self._step)(state, action)
 
     @functools.partial(fast_cpu.jit, static_argnums=0)
-    def _resets(self, key: jax.Array, ranges: Randomization | None) -> State:
+    def _batched_reset(self, key: jax.Array, ranges: Randomization | None) -> State:
         keys = jax.random.split(key, self.num_envs)
         return jax.vmap(functools.partial(self._reset, ranges))(keys)
 
@@ -318,11 +318,11 @@ class Env:
 
     def _move(self, state: State, action: jax.Array) -> State:
         info = state.info
-        reach = jnp.asarray(self.robot.action_speed) * self.control_dt
+        max_change = jnp.asarray(self.robot.action_speed) * self.control_dt
         action = jnp.clip(action, self.action_low, self.action_high)
         target = actions.to_targets(self.actions, self.robot, info["command"], action)
         target = jnp.clip(target, self.robot.action_low, self.robot.action_high)
-        target = jnp.clip(target, info["command"] - reach, info["command"] + reach)
+        target = jnp.clip(target, info["command"] - max_change, info["command"] + max_change)
         draw = info["draw"]
         commands = jnp.stack([info["earlier"], info["command"], target])
         latency = draw.latency if draw else 0.0
@@ -348,24 +348,24 @@ class Env:
         return where(state.done, state, where(finite, after, broken))
 
     def _start(self, draw: Draw | None, layout: Layout, command: jax.Array) -> Data:
-        """Start one world at rest, its robot at the command [J + 1]."""
+        """Start one world at rest, with the robot at `command` [J + 1]."""
         joints = jnp.concatenate([command[:-1], jnp.full(2, command[-1] / 2)])
         qpos = placing.positions(self.model, layout, joints)
         return self._with_cameras(draw, self.physics.start(self._changes(draw, layout), qpos))
 
     def _changes(self, draw: Draw | None, layout: Layout) -> Changes:
-        """Return the fields of one world's model: randomized values, poses of fixed bodies."""
+        """Return one world's changes to the model: randomized values, poses of fixed bodies."""
         changes = randomization.changes(draw, self.model, self._objects) if draw else {}
         return changes | placing.fixed_bodies(self.model, layout, changes)
 
     @functools.cached_property
     def _objects(self) -> np.ndarray:
         """Mask of the bodies of the task's objects and distractors, bool [bodies]."""
-        names = [*self._placed, *distractors.names(self.distractors)]
+        names = [*self._task_bodies, *distractors.names(self.distractors)]
         return randomization.in_subtrees(self.model, names)
 
     @functools.cached_property
-    def _placed(self) -> list[str]:
+    def _task_bodies(self) -> list[str]:
         """Names of the bodies that the task places."""
         return sorted(jax.eval_shape(self.task.place, jax.random.key(0)))
 

@@ -24,7 +24,7 @@ from envs.scene import scene
 AnyRobot = str | os.PathLike[str] | Robot
 RendererName = Literal["rays", "warp"]
 RENDERERS: tuple[str, ...] = get_args(RendererName)
-# Upper bounds against typos, beyond any device's memory; and lower bounds other than 1.
+# Upper bounds, which only catch typos: they exceed any device; and lower bounds other than 1.
 _RANGES: dict[str, tuple[int, ...]] = {
     "num_envs": (2**20,),
     "image_size": (2**12,),
@@ -56,15 +56,15 @@ def make(
             `envs.mjcf.load`.
         num_envs: number of parallel worlds W.
         image_size: height and width of images [px].
-        antialias: n, for n x n rays per pixel: smoother edges at n² times the cost.
+        antialias: n, to cast n x n rays per pixel: smoother edges at n² times the cost.
         control_dt: time between actions [s], a multiple of 0.02.
         actions: action mode: joint, delta_joint or end_effector, see `envs.actions`.
-        reward: sparse, 1 on success, or dense, with shaping by progress, see `envs.rewards`.
+        reward: sparse (1 on success) or dense (shaped by progress), see `envs.rewards`.
         discount: the learner's discount in (0, 1], for the dense reward.
         distractors: number of unrelated objects on the table, up to 4.
-        backend: physics engine, jax or warp; None for the fastest available.
-        renderer: rays, the ray caster that runs everywhere, or warp, MuJoCo Warp's renderer, which
-            also draws meshes and textures.
+        backend: physics engine, jax or warp; None: the fastest available.
+        renderer: rays (the ray caster, which runs everywhere) or warp (MuJoCo Warp's renderer,
+            which also draws meshes and textures).
 
     Raises:
         TypeError: an argument that should be a number or a robot is not.
@@ -144,7 +144,7 @@ def _check_learning(actions: Mode, reward: Reward, discount: float) -> None:
 
 
 def _find_robot(robot: AnyRobot) -> Robot:
-    """Return a robot, given itself, its name or its MJCF file."""
+    """Return the robot given by a `Robot`, a name or an MJCF file."""
     if isinstance(robot, Robot):
         return robot
     path = os.fspath(robot) if isinstance(robot, str | os.PathLike) else None

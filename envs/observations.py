@@ -26,7 +26,7 @@ def parts(
     - `joints` [J + 1]: joint angles [rad] and gripper opening [m]; `joint_speeds` [J + 1]: their
       derivatives per second; `command` [J + 1]: the last targets.
     - `tool` [9]: position [m], x axis and y axis of the tcp.
-    - `<body>` [9]: position relative to the tcp [m], x axis and y axis; of free bodies also
+    - `<body>` [9]: position relative to the tcp [m], x axis and y axis; for free bodies also
       `<body>_speed` [6]: linear [m/s] and angular [rad/s] velocity.
     - `<body>/<joint>` [2]: position and speed of each hinge or slide of a body.
 

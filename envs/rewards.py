@@ -9,7 +9,7 @@ that
 - the discount is the learner's own, passed to `envs.make`;
 - the potential of terminal states is 0. Only success is terminal; after a time limit or broken
   physics the learner bootstraps from the last state, whose potential therefore counts;
-- nothing crosses episodes: a done world gets 0 until it restarts, and a restart gets 0.
+- no shaping spans two episodes: a done world gets 0 until it restarts, and a restart gets 0.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ REWARDS: tuple[str, ...] = get_args(Reward)
 
 
 def potential(stages: dict[str, jax.Array]) -> jax.Array:
-    """Compute the progress of a task in [0, 1]: stages passed plus the share of the next one.
+    """Compute the progress of a task: the share of stages passed, plus part of the next, in [0, 1].
 
     Args:
         stages: completed share of each stage, f32 [...] in [0, 1], first to last. A stage with

@@ -42,7 +42,7 @@ class Data:
 
 
 class Poses(NamedTuple):
-    """Poses of all geoms and cameras of a scene, in the world frame; leading axes may precede.
+    """Poses of all geoms and cameras of a scene, in the world frame; with any leading axes.
 
     Attributes:
         geom_xpos: `[G, 3]` positions of the geoms [m].

@@ -24,7 +24,7 @@ Array = jax.Array | np.ndarray
 
 _FORMAT = "envs-episodes-1"
 SHARED = ("task", "robot", "control_dt", "physics_dt", "actions", "instructions")
-"""Fields that must match in episodes to concatenate."""
+"""Fields that must be equal in order to concatenate episodes."""
 _ARRAYS = ("state", "action", "length", "instruction")
 _METADATA = (*SHARED, "attempted")
 _IMAGE = "image/"
@@ -55,7 +55,7 @@ class Episodes:
         robot: name of the robot.
         control_dt: time between two actions [s].
         physics_dt: time step of the simulation [s]; 0 for recordings of real robots.
-        attempted: number of attempts that these episodes are the successes of.
+        attempted: number of attempts; these episodes are the successful ones.
         actions: action mode, see `envs.actions`.
     """
 
@@ -82,7 +82,7 @@ class Episodes:
 
     @property
     def num_episodes(self) -> int:
-        """E."""
+        """Number of episodes, E."""
         return self.state.shape[0]
 
     @property
@@ -124,7 +124,7 @@ class Episodes:
         """
         arrays = _read(Path(path))
         try:
-            metadata = {"actions": "joint"}  # for files from before this field existed
+            metadata = {"actions": "joint"}  # for files older than this field
             metadata |= json.loads(arrays.pop("header").tobytes())
             if metadata.pop("format") != _FORMAT:
                 raise KeyError("format")
@@ -251,7 +251,7 @@ def concatenate(parts: Sequence[Episodes]) -> Episodes:
 
 
 def _dtype_and_shape(array: Any) -> str:
-    """Describe an array or tracer; other leaves, which a tree map may have put there, as `repr`."""
+    """Describe an array or tracer; return the `repr` of other leaves, as from a tree map."""
     return f"{array.dtype}{list(array.shape)}" if hasattr(array, "dtype") else repr(array)
 
 
@@ -278,6 +278,6 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
             raise ValueError(f"{member.filename} has unsupported .npy version {version}")
         shape, _, dtype = _HEADERS[version](file)
         if math.prod(shape) * dtype.itemsize != member.file_size - file.tell():
-            raise ValueError(f"the size of {member.filename} is not that of {dtype} {list(shape)}")
+            raise ValueError(f"the size of {member.filename} does not match {dtype} {list(shape)}")
     with archive.open(member) as file:
         return np.lib.format.read_array(file, allow_pickle=False)

@@ -21,7 +21,7 @@ TEXT_BYTES = 2**30
 """Size limit of files that are read whole; the text for a million episodes takes a tenth of it."""
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
 _FAILURES = (OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, ArithmeticError)
-_FAILURES += (RuntimeError,)  # among them RecursionError
+_FAILURES += (RuntimeError,)  # includes RecursionError
 _FAILURES += (ImportError,)  # raised by tfds without TensorFlow
 _FAILURES += (SyntaxError, tokenize.TokenError)  # raised by NumPy when it parses a header
 _FAILURES += (zipfile.BadZipFile, zlib.error, struct.error)
@@ -33,7 +33,7 @@ class RefusedError(ValueError):
 
 
 def join_inside(folder: Path, name: object) -> Path:
-    """Join a folder and an untrusted name, checking the name alone.
+    """Join a folder and an untrusted name, checking only the name.
 
     Raises:
         RefusedError: the name is not a relative path that stays in the folder.
@@ -77,7 +77,7 @@ def check_regular(path: Path, folder: Path | None = None) -> Path:
 
 
 def path_beside(file: Path, name: object) -> Path:
-    """Return the path of a file beside another one that refers to it; it may be missing.
+    """Return the path of a file that `file` refers to, in the same folder; it may be missing.
 
     Raises:
         RefusedError: the name leads elsewhere, or to something that is not a regular file.
@@ -153,7 +153,7 @@ def as_value_error(path: Path, *also: type[Exception], remedy: str = "") -> Iter
     Args:
         path: the file or folder read in the block.
         also: exceptions that a library raises for damaged files, besides Python's own.
-        remedy: end of the sentence that says what to do.
+        remedy: what to do, as the end of the message.
     """
     try:
         yield
@@ -184,7 +184,7 @@ def check_memory(size: int, what: object) -> None:
 
 
 def as_int(number: Any) -> int:
-    """Convert a number from a table to an int: tables with gaps store integers as floats.
+    """Convert a number from a table to an int: tables with missing values have floats.
 
     Raises:
         ValueError: it is not an integer, or its magnitude is 2^63 or more.
@@ -198,23 +198,23 @@ def as_int(number: Any) -> int:
 def _check_contained(path: Path, folder: Path | None) -> None:
     """Raise RefusedError if a path, after following links, is outside of a folder."""
     real = Path(os.path.realpath(path))
-    if folder is not None and not any(real.is_relative_to(home) for home in _homes(folder)):
+    if folder is not None and not any(real.is_relative_to(f) for f in _allowed_folders(folder)):
         raise RefusedError(
             f"{path} links to {real}, outside of {folder}: copy the file into the folder instead"
         )
 
 
-def _homes(folder: Path) -> list[Path]:
-    """Return the folders that may hold the files of a folder.
+def _allowed_folders(folder: Path) -> list[Path]:
+    """Return the folders in which the files of a folder may be stored.
 
-    The hub's cache is cache/datasets--OWNER--NAME/snapshots/REVISION/, whose files are links into
-    the blobs/ of the dataset, which may link into the blobs/ of the cache (huggingface_hub 2.4.0,
+    A snapshot is cache/datasets--OWNER--NAME/snapshots/REVISION/, whose files are links into the
+    blobs/ of the dataset, which may link into the blobs/ of the cache (huggingface_hub 2.4.0,
     file_download.py and utils/_shared_blobs.py).
     """
     folder = Path(os.path.realpath(folder))
-    homes = [folder]
+    allowed = [folder]
     for path in (folder, *folder.parents):
         repository = path.parent.parent
         if path.parent.name == "snapshots" and "--" in repository.name:
-            homes += [repository / "blobs", repository.parent / "blobs"]
-    return homes
+            allowed += [repository / "blobs", repository.parent / "blobs"]
+    return allowed

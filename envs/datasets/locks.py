@@ -17,7 +17,7 @@ _RETRY = 0.2  # s, time for a second attempt, in case the last holder deletes th
 def locked(path: Path, waiting: Callable[[], None] | None = None) -> Iterator[None]:
     """Keep other processes and threads from writing the same file or folder.
 
-    The lock is a file beside it, which is deleted at the end. If the block raises, empty folders
+    The lock is a file next to the path, deleted at the end. If the block raises, empty folders
     created for the lock file are deleted, too.
 
     Args:

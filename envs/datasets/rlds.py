@@ -4,9 +4,9 @@
     episodes = rlds.read("data/press")
     source = tfds.builder_from_directory("data/press").as_data_source("train")  # with tfds alone
 
-Images are lossless PNG. Metadata that all episodes share are those of the dataset
-(`builder.info.metadata`, the file metadata.json), and are repeated in every episode, where floats
-are rounded to float32.
+Images are lossless PNG. Metadata that all episodes share are stored once for the
+dataset (`builder.info.metadata`, from metadata.json) and again in every episode, where floats are
+rounded to float32.
 """
 
 import contextlib
@@ -70,14 +70,14 @@ def write(episodes: Episodes, path: str | os.PathLike[str]) -> None:
 class ShardWriter:
     """Write a dataset shard by shard, resuming if its folder exists.
 
-    The metadata list the complete shards and are replaced atomically after each one, so the process
-    may be killed at any time: an incomplete shard does not count.
+    The metadata file lists the complete shards and is replaced atomically after each one, so the
+    process may be killed at any time: an incomplete shard is ignored.
 
     Attributes:
         folder: folder of the shards.
         metadata: content of metadata.json: fields of `Episodes`; `options`, how the episodes were
-            made; `parts`, the number of episodes in each shard; `steps`, the total of control
-            steps; `cameras`, height and width of each camera's images.
+            made; `parts`, the number of episodes in each shard; `steps`, the total number of
+            control steps; `cameras`, height and width of each camera's images.
     """
 
     def __init__(self, folder: Path, options: Mapping[str, Any]):
@@ -95,7 +95,7 @@ class ShardWriter:
         self.metadata |= {"steps": 0, "attempted": 0}
         if (folder / METADATA).exists():
             self.metadata = metadata(folder)
-            for leftover in folder.glob(f".{METADATA}.*"):  # of a killed process
+            for leftover in folder.glob(f".{METADATA}.*"):  # left by a killed process
                 leftover.unlink()
             _check_same(folder, self.metadata["options"], options)
             for number, episodes in enumerate(self.metadata["parts"]):
@@ -111,14 +111,14 @@ class ShardWriter:
 
     @property
     def attempted(self) -> int:
-        """Number of attempts that these episodes are the successes of."""
+        """Number of attempts; the episodes are the successful ones."""
         return self.metadata["attempted"]
 
     def append(self, episodes: Episodes) -> None:
         """Append a shard, and add its attempts to `attempted`.
 
         Raises:
-            ValueError: the arrays are inconsistent, or the metadata differ from earlier shards'.
+            ValueError: the arrays are inconsistent, or the metadata differ from those before.
             OSError: the disk is full; earlier shards are unaffected.
         """
         episodes.validate()
@@ -164,7 +164,7 @@ class ShardWriter:
             filename_template=self._template,
         )
         info.set_splits(tfds.core.SplitDict([split]))
-        (self.folder / rlds_schema.INFO).unlink(missing_ok=True)  # of a killed process
+        (self.folder / rlds_schema.INFO).unlink(missing_ok=True)  # left by a killed process
         info.write_to_directory(self.folder)
 
     def _save(self) -> None:

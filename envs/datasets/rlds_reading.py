@@ -18,17 +18,17 @@ from envs.datasets.files import RefusedError, as_int, check_regular, read_json
 
 FORMAT, SPLIT = "envs-rlds-1", "train"
 METADATA = "metadata.json"
-"""File of metadata in a dataset's folder, with the name that tfds looks for."""
+"""Metadata file in a dataset's folder; tfds reads a file of this name."""
 THREADS = ThreadPoolExecutor(8)
-"""Shared by all datasets in progress: more threads would only wait for Python's lock."""
-# Types of metadata: of every dataset, and of one with at least one shard.
+"""Shared by all open datasets: more threads would only wait for the GIL."""
+# Types of metadata fields: in every dataset, and only in those with at least one shard.
 _TYPES: dict[str, Any] = {"options": dict, "parts": list, "steps": int, "attempted": int}
 _SHARD_TYPES: dict[str, Any] = {"task": str, "robot": str, "actions": str, "instructions": list}
 _SHARD_TYPES |= {"cameras": dict, "control_dt": int | float, "physics_dt": int | float}
 
 
 def read(path: str | os.PathLike[str]) -> Episodes:
-    """Read a dataset of `write` or `python -m envs collect` into host memory.
+    """Read a dataset from `write` or `python -m envs collect` into host memory.
 
     Episodes are padded with zeros to the longest one.
 
@@ -63,12 +63,12 @@ def metadata(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path} is not a folder of {FORMAT} episodes") from error
     if wrong:
         value = repr(content.get(wrong[0]))[:80]
-        raise ValueError(f"{path} is damaged ({METADATA} has {wrong[0]} {value})")
+        raise ValueError(f"{path} is damaged ({METADATA} has an invalid {wrong[0]}, {value})")
     return content
 
 
 class Reader:
-    """A dataset of `write` or `python -m envs collect`, read one episode at a time.
+    """A dataset from `write` or `python -m envs collect`, read one episode at a time.
 
     Attributes:
         kind: name of the format.
@@ -98,7 +98,7 @@ class Reader:
             self._shared: dict[str, Any] = {name: self.metadata[name] for name in SHARED}
             self._shared |= {"instructions": tuple(self.metadata["instructions"]), "attempted": 1}
             builder = _builder(self.path, self.metadata["parts"])
-            # The schema decodes images: tfds would decode one after the other.
+            # The schema decodes images: tfds would decode them one by one.
             encoded = {name: tfds.decode.SkipDecoding() for name in self.cameras.values()}
             decoders = {"steps": {"observation": encoded}}
             self._source = builder.as_data_source(SPLIT, decoders=decoders)
@@ -145,5 +145,5 @@ def _builder(folder: Path, parts: Sequence[int]) -> Any:
 
 
 def as_value_error(path: Path, remedy: str = "") -> contextlib.AbstractContextManager[None]:
-    """Convert errors as `files.as_value_error` does, protobuf's included."""
+    """Convert errors like `files.as_value_error`, including those of protobuf."""
     return files.as_value_error(path, ParseError, remedy=remedy)

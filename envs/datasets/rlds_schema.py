@@ -1,6 +1,6 @@
 """The schema of RLDS datasets: an episode as one record of tensorflow-datasets (tfds).
 
-Features have the names of Open X-Embodiment.
+Features are named as in Open X-Embodiment.
 """
 
 import io
@@ -19,7 +19,7 @@ from envs.datasets.episodes import Episodes
 from envs.datasets.files import RefusedError, read_json
 
 FEATURES, INFO = "features.json", "dataset_info.json"
-"""Files in a dataset's folder in which tfds describes it."""
+"""Files in a dataset's folder with tfds's description of the dataset."""
 FILES = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_INDEX}"
 """Template of shard names, as used by tfds.core.SequentialWriter."""
 _MAIN = {"side": "image"}  # feature of the main camera; the others are <name>_image
@@ -43,7 +43,7 @@ _CLASSES = [
         tfds.features.Scalar,
     )
 ]
-_NAMES = {
+_ALLOWED = {
     "pythonClassName": _CLASSES,
     "python_class_name": _CLASSES,
     "filepathTemplate": [FILES],
@@ -55,9 +55,9 @@ _NAMES = {
     "jsonFeature": [],
     "json_feature": [],
 }
-"""Fields of a description that tfds interprets, in the spelling of tfds and protobuf -> allowed
-values. The last two, and a "type" at the top level, hold features in older formats, which name
-classes too."""
+"""Fields of a description that tfds interprets, as spelled by tfds and by protobuf -> allowed
+values. The last two, and "type" at the top level, hold features in older formats, which also name
+classes."""
 
 
 def features(episodes: Episodes) -> tfds.features.FeaturesDict:
@@ -108,7 +108,7 @@ def _metadata() -> tfds.features.FeaturesDict:
 
 
 def stored(folder: Path) -> tfds.features.FeaturesDict:
-    """Read the features that a folder describes.
+    """Read the features of a dataset in a folder.
 
     Raises:
         ValueError: they are damaged, or refused by `check_description`.
@@ -119,7 +119,7 @@ def stored(folder: Path) -> tfds.features.FeaturesDict:
 
 
 def check_description(folder: Path, *names: str) -> None:
-    """Raise unless these files are safe for tfds, which imports classes and formats names in them.
+    """Raise unless files are safe for tfds, which imports classes and expands templates in them.
 
     Raises:
         RefusedError: a file names classes other than those of `features`, or shards other than
@@ -129,7 +129,9 @@ def check_description(folder: Path, *names: str) -> None:
     """
     for path in (folder / name for name in names):
         description = read_json(path, folder)
-        fields = _NAMES | ({"type": ()} if path.name == FEATURES and "type" in description else {})
+        fields = _ALLOWED | (
+            {"type": ()} if path.name == FEATURES and "type" in description else {}
+        )
         for field, value in _values(description, fields):
             if value not in fields[field]:
                 allowed = " or ".join(fields[field])
@@ -151,7 +153,7 @@ def _values(value: Any, fields: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 def serializer(features: tfds.features.FeaturesDict) -> ExampleSerializer:
     """Make the serializer for `record`.
 
-    It takes whole columns; `features.serialize_example` goes step by step and takes twice as long.
+    It takes whole columns; `features.serialize_example` works step by step and takes twice as long.
     """
     columns: Any = features.get_serialized_info()
     return ExampleSerializer(columns)
@@ -195,7 +197,7 @@ def episode(
     sizes: Mapping[str, Any],
     metadata: Mapping[str, Any],
 ) -> Episodes:
-    """Convert an example of tfds to an episode in host memory.
+    """Convert an example from tfds to an episode in host memory.
 
     Args:
         example: an example from tfds, with encoded images.
@@ -226,9 +228,9 @@ def image_feature(camera: str) -> str:
 def _encode(images: Any) -> list[bytes]:
     """Encode uint8 `[T, H, W, 3]` images in host memory as PNG files (ISO/IEC 15948).
 
-    No library is as fast: zlib releases Python's lock, and rendered images compress best without a
+    No library is as fast: zlib releases the GIL, and rendered images compress best without a
     filter. Measured for images of 128 px on 16 cores: 8 threads take 56 us per image; ffmpeg's
-    encoder takes 88 at best, OpenCV's 141 and PIL's 177, with files larger by 15 %.
+    encoder takes 88 at best, OpenCV's 141 and PIL's 177, for files 15 % larger.
     """
     count, height, width, _ = images.shape
     rows = np.zeros((count, height, 1 + 3 * width), np.uint8)  # each begins with 0: no filter

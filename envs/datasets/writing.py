@@ -1,8 +1,8 @@
 """Atomic writes of files and folders: write under a temporary name, then rename.
 
 Contents are synced to disk before the rename and the rename before the call returns, so a crash or
-a power failure never leaves a partial file under the final name. If anything raises, a full disk
-for example, the temporary file is deleted and the old one stays.
+a power failure never leaves a partial file under the final name. If anything fails, for
+example on a full disk, the temporary file is deleted and the old file is kept.
 """
 
 import contextlib
@@ -49,8 +49,8 @@ def write_text(file: Path, text: str) -> None:
 def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a new folder to fill, which is renamed to `path` if the block succeeds.
 
-    Only one process at a time may create a path, see `envs.datasets.locks.locked`: what a killed
-    process left is deleted first.
+    Only one process at a time may create a path, see `envs.datasets.locks.locked`: leftovers of a
+    killed process are deleted first.
 
     Raises:
         ValueError: the path already exists.
@@ -89,7 +89,7 @@ def replace_folder(new: Path, path: Path, check: Callable[[Path], object]) -> No
 
 
 def recover_folder(path: Path) -> None:
-    """Complete a killed `replace_folder`: keep the new folder if in place, else the old one."""
+    """Finish an interrupted `replace_folder`: keep the new folder if in place, else the old one."""
     if not path.exists() and _old(path).exists():
         rename(_old(path), path)
     elif _old(path).exists():

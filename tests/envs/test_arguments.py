@@ -95,11 +95,11 @@ def test_raw_keys_are_accepted(worlds, raw):
 @pytest.mark.parametrize(
     ("action", "message"),
     [
-        ([[0.0] * 7] * 2, r"action must be an array of numbers, \[2, 7\], got a list"),
-        (None, "action must be an array of numbers"),
-        (np.full((2, 7), "a"), "action must be an array of numbers"),
-        (np.zeros((2, 7), bool), "action must be an array of numbers, .* got an array of bool"),
-        (np.zeros((2, 7), complex), "action must be an array of numbers"),
+        ([[0.0] * 7] * 2, r"action must be a numeric array \[2, 7\], got a list"),
+        (None, "action must be a numeric array"),
+        (np.full((2, 7), "a"), "action must be a numeric array"),
+        (np.zeros((2, 7), bool), "action must be a numeric array .* got an array of bool"),
+        (np.zeros((2, 7), complex), "action must be a numeric array"),
         (np.zeros((2, 6)), r"action must have shape \(2, 7\), got \(2, 6\)"),
     ],
 )

@@ -77,7 +77,7 @@ def test_nested_vmap(pair):
     action = state.info["command"] + 0.02
     batch = env.step(state, action)
     nested = jax.tree.map(lambda x: jnp.stack([x, x]), (state, action))
-    twice = jax.vmap(env._steps)(*nested)
+    twice = jax.vmap(env._batched_step)(*nested)
     np.testing.assert_allclose(twice.data.qpos[1], batch.data.qpos, atol=1e-5)
 
 

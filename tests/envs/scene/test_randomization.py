@@ -212,5 +212,5 @@ def test_invalid_ranges_raise(env, ranges, message):
 def test_reset_done_needs_the_ranges_of_reset(env):
     key, ranges = jax.random.key(0), Randomization()
     for first, second in ((None, ranges), (ranges, None)):
-        with pytest.raises(ValueError, match="pass ranges to reset_done if, and only if"):
+        with pytest.raises(ValueError, match="pass ranges to reset_done if and only if"):
             env.reset_done(env.reset(key, first), key, second)
