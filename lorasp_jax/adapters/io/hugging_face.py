@@ -78,7 +78,7 @@ def load_peft(
 ) -> adaptation.Model:
     """Load the adapters of a Hugging Face PEFT folder into a model.
 
-    Biases and modules that the folder trained in full (`bias`, `modules_to_save`) are fully
+    Biases and modules that were trained in full (`bias`, `modules_to_save`) are fully
     fine-tuned here too. Adapters apply to dense layers and einsums, including those of
     `nnx.MultiHeadAttention`, whose kernels match torch's with concatenated heads. AdaLoRA is loaded
     as the equivalent LoRA. Smaller ranks in a stack are zero-padded. `lora_dropout` becomes the
@@ -88,7 +88,7 @@ def load_peft(
       folder: with adapter_config.json and adapter_model.safetensors; or a repository on the hub,
         hf://owner/name, from which only these two files are downloaded.
       model: not modified; its adapters on other layers are kept.
-      names: module name of the layer at a path and an index in its stack, () outside of stacks.
+      names: function (path, index) -> module name; index is the position in a stack, or ().
       einsums: as for `adapt`.
 
     Raises:
@@ -267,7 +267,7 @@ def _check_used(
     if unused:
         close = paths.near_misses(min(unused), candidates)
         raise ValueError(
-            f"{folder} adapts {short(min(unused))}, which the model lacks; it has {close}."
+            f"{folder} adapts {short(min(unused))}, which the model lacks; the model has {close}."
         )
 
 
@@ -301,7 +301,7 @@ def _is_supported(path: str, method: Any) -> bool:
 
 
 def _to_peft(layer: AdaptedLayer, index: tuple[int, ...]) -> tuple[float, Adapter]:
-    """Scale and tensors of one module, in PEFT's names and layout."""
+    """Scale and tensors of one module, with PEFT's names and layout."""
     assert layer.adapter is not None
     params = {k: np.asarray(v[index], np.float32) for k, v in layer.adapter.get_value().items()}
     a, b = params["lora_a"], params["lora_b"]
@@ -319,7 +319,7 @@ def _to_peft(layer: AdaptedLayer, index: tuple[int, ...]) -> tuple[float, Adapte
 
 
 def _config(modules: Mapping[str, tuple[float, Adapter]], base: str | None) -> dict[str, Any]:
-    """Most of adapter_config.json: most common rank and α as defaults, patterns for the rest."""
+    """Fields of adapter_config.json: the most common rank and α, and patterns for the others."""
     ranks = {name: len(adapter["lora_A.weight"]) for name, (_, adapter) in modules.items()}
     alphas = {name: scale * ranks[name] for name, (scale, _) in modules.items()}
     rank, alpha = (collections.Counter(x.values()).most_common(1)[0][0] for x in (ranks, alphas))

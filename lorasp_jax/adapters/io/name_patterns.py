@@ -1,7 +1,7 @@
 """Match untrusted regular expressions against module names, rejecting catastrophic backtracking.
 
-Python's `re` tries every way in which a pattern may match: (a+)+b has 2**30 of them for thirty
-times "a". An upper bound follows from the parsed pattern.
+Python's `re` tries every way in which a pattern may match, for instance 2**30 ways for (a+)+b and
+thirty "a"s. `_ways` derives an upper bound from the parsed pattern.
 """
 
 import importlib
@@ -9,11 +9,11 @@ import re
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
-# The parser of re itself; public until Python 3.11, as sre_parse.
+# The parser that re uses; before Python 3.11 it was public, as sre_parse.
 _parse = importlib.import_module("re._parser").parse
 _ONE_WAY = {"LITERAL", "NOT_LITERAL", "ANY", "IN", "AT"}
 MAX_WAYS = 3 * 10**8
-"""For all patterns on all names; takes about ten seconds."""
+"""Limit for all patterns and names together, which take about ten seconds."""
 
 
 def values_of(patterns: Mapping[str, Any], names: Collection[str], default: Any) -> dict[str, Any]:
@@ -32,9 +32,9 @@ def values_of(patterns: Mapping[str, Any], names: Collection[str], default: Any)
     Raises:
       ValueError: a pattern is invalid or not supported, or matching could take too long.
     """
-    full_values = {rf"(.*\.)?({pattern})$": value for pattern, value in patterns.items()}
+    anchored = {rf"(.*\.)?({pattern})$": value for pattern, value in patterns.items()}
     longest, ways = max(map(len, names), default=0), 0
-    for pattern, pattern_text in zip(full_values, patterns, strict=True):
+    for pattern, pattern_text in zip(anchored, patterns, strict=True):
         try:
             ways += len(names) * _ways(_parse(pattern), longest)
         except re.error as error:
@@ -43,9 +43,9 @@ def values_of(patterns: Mapping[str, Any], names: Collection[str], default: Any)
             ) from error
         if ways > MAX_WAYS:
             raise ValueError(
-                f"the pattern {pattern_text!r} could take too long for {len(names)} names."
+                f"the pattern {pattern_text!r} could take too long to match {len(names)} names."
             )
-    compiled = [(re.compile(pattern), value) for pattern, value in full_values.items()]
+    compiled = [(re.compile(pattern), value) for pattern, value in anchored.items()]
     values = {}
     for name in names:
         hits = (value for pattern, value in compiled if pattern.match(name))

@@ -1,8 +1,9 @@
 """Save and load adapters: a folder with adapter.safetensors (tensors) and adapter.json (metadata).
 
-The JSON has the method of every adapted path, the identity of the base (fingerprints of its weights
-and an optional name), user metadata, a checksum of the tensor file, and a digest of the JSON
-itself. Tensor names are "/"-joined paths; tensors of stacked layers keep their leading layer axes.
+The JSON contains the method of every adapted path, the identity of the base (fingerprints of its
+weights and an optional name), user metadata, a checksum of the tensor file, and a digest of the
+JSON itself. Tensor names are "/"-joined paths; tensors of stacked layers keep their leading layer
+axes.
 """
 
 import hashlib
@@ -107,14 +108,15 @@ def load_adapters(
       einsums: as passed to `adapt`.
 
     Raises:
-      ValueError: files are missing, damaged or unrelated, the base differs, or the adapters do not
-        fit the model.
+      ValueError: files are missing, damaged or do not belong together, the base differs, or the
+        adapters do not fit the model.
     """
     folder = validate.folder(folder)
     description, tensors = _read(folder)
     if base is not None and description["base"] != base:
         raise ValueError(
-            f"{folder} was trained on base {description['base']!r}, not on {short(base)}."
+            f"the adapter in {folder} was trained on base {description['base']!r}, not on "
+            f"{short(base)}."
         )
     saved_methods = _methods(description["methods"], folder)
     model_methods = {path: method.as_saved for path, method in adaptation.methods(model).items()}
@@ -178,8 +180,9 @@ def _check_weights(model: nnx.Module, saved: Mapping[str, str], folder: pathlib.
     fingerprints = digest.fingerprints(common)
     if changed := [name for name in fingerprints if fingerprints[name] != saved[name]]:
         raise ValueError(
-            f"{folder} was trained on a different base: {len(changed)} of {len(fingerprints)} "
-            f"arrays differ, first {changed[0]!r}; pass any_base=True to load anyway."
+            f"the adapter in {folder} was trained on a different base: {len(changed)} of "
+            f"{len(fingerprints)} arrays differ, first {changed[0]!r}; pass any_base=True to load "
+            "it anyway."
         )
 
 
@@ -206,7 +209,7 @@ def _matched_leaves(
     for name, shape in expected.items():
         if saved[name] != shape:
             raise ValueError(
-                f"tensor {name!r} has shape {saved[name]} in {folder}, {shape} in the model."
+                f"tensor {name!r} has shape {saved[name]} in {folder}, but {shape} in the model."
             )
     return leaves
 

@@ -72,8 +72,9 @@ def read_folder(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter
         )
     if (initialization := config.get("init_lora_weights")) not in _BASE_PRESERVING:
         raise ValueError(
-            f"{folder} was trained on the residual base of {reprlib.repr(initialization)}: convert "
-            "it to plain LoRA with PEFT's path_initial_model_for_weight_conversion."
+            f"the adapter in {folder} was trained on the residual base of "
+            f"{reprlib.repr(initialization)}: convert it to plain LoRA with PEFT's "
+            "path_initial_model_for_weight_conversion."
         )
     modules, full_values = collections.defaultdict(dict), {}
     for name, tensor in tensors.items():

@@ -21,7 +21,7 @@ from lorasp_jax.peft._fields import short
 
 Names = Callable[[str, tuple[int, ...]], str]
 _TORCH_NAMES = {"kernel": "weight", "embedding": "weight", "scale": "weight", "bias": "bias"}
-# Axes of one layer's parameter, except in dense layers and einsums; leading ones are stacks.
+# Number of axes of a parameter outside dense layers and einsums; additional ones are stack axes.
 _AXES = {"embedding": 2, "scale": 1, "bias": 1}
 
 
@@ -35,7 +35,7 @@ def full_parameters(
     """A folder's fully trained parameters, by path, in the model's layout.
 
     Raises:
-      ValueError: the model lacks one, or has it in a different shape.
+      ValueError: the model lacks a parameter, or its shape differs.
     """
     values, unused = {}, dict(full)
     for path, size in sizes.items() if full else ():
@@ -47,7 +47,7 @@ def full_parameters(
         if not parts:
             continue
         if len(parts) < len(keys):
-            raise ValueError(f"{folder} has {kind} of only some layers of the stack {module}.")
+            raise ValueError(f"{folder} has the {kind} of only some layers of the stack {module}.")
         value = np.stack([_from_torch(part) if name == "kernel" else part for part in parts])
         rows = value.shape[1:] if name == "kernel" else (value[0].size,)
         shape = tuple(size[len(leading) :])
@@ -64,26 +64,30 @@ def check_biases(
     folder: pathlib.Path,
     bias: str,
     full: FullTensors,
-    sizes: Collection[str],
+    parameter_paths: Collection[str],
     adapted: Collection[str],
 ) -> None:
-    """Check that a folder with trained biases has them.
+    """Check that a folder whose biases were trained contains them.
 
     Args:
       folder: PEFT folder.
       bias: "none", "all" or "lora_only".
       full: the folder's fully trained parameters.
-      sizes: paths of the model's parameters.
+      parameter_paths: paths of the model's parameters.
       adapted: paths of layers that the folder adapts.
 
     Raises:
-      ValueError: the folder has no biases, although its config says that it trained biases that the
-        model has.
+      ValueError: the folder has no biases, although according to its config biases of the model
+        were trained.
     """
-    modules = [path.rpartition("/")[0] for path in sizes if path.rpartition("/")[2] == "bias"]
+    modules = [
+        path.rpartition("/")[0] for path in parameter_paths if path.rpartition("/")[2] == "bias"
+    ]
     trained = modules if bias == "all" else set(modules) & set(adapted)
     if bias != "none" and trained and not any(kind == "bias" for _, kind in full):
-        raise ValueError(f"{folder} was trained with bias {bias!r}, but has no bias tensors.")
+        raise ValueError(
+            f"the adapter in {folder} was trained with bias {bias!r}, but has no bias tensors."
+        )
 
 
 def export_full_parameters(
@@ -121,7 +125,7 @@ def _module(location: paths.Location) -> str:
 
 
 def _stack(name: str, size: Sequence[int], matrices: Sequence[int] | None) -> tuple[int, ...]:
-    """Leading stack axes of a parameter.
+    """Sizes of the leading stack axes of a parameter.
 
     Args:
       name: of the parameter.
@@ -141,7 +145,7 @@ def _from_torch(kernel: np.ndarray) -> np.ndarray:
 def _parts(
     location: paths.Location, matrices: Sequence[int] | None
 ) -> list[tuple[tuple[int, ...], np.ndarray]]:
-    """Stack index and value in torch's layout of each layer in a stacked parameter."""
+    """Index and value, in torch's layout, of each layer of a stacked parameter."""
     value, name = np.asarray(location.child.get_value(), np.float32), location.name
     dense = isinstance(location.parent, nnx.Linear | Dense)
     if name not in _TORCH_NAMES or (name == "kernel" and not dense):

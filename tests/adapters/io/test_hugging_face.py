@@ -226,7 +226,9 @@ def test_attention_with_axes_of_heads_and_own_classes(tmp_path):
     assert ours.keys() == theirs.keys()
     for name, value in theirs.items():
         np.testing.assert_array_equal(ours[name], value)
-    with pytest.raises(ValueError, match=r"'model.head', which the model lacks; it has model\."):
+    with pytest.raises(
+        ValueError, match=r"'model.head', which the model lacks; the model has model\."
+    ):
         hugging_face.load_peft(tmp_path, base, names=torch_names)
 
 

@@ -65,7 +65,7 @@ def extended(tensors):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (renamed, r"adapts 'lin.7', which the model lacks; it has lin"),
+        (renamed, r"adapts 'lin.7', which the model lacks; the model has lin"),
         (halved, "adapter of lin.2 lacks lora_B"),
         (narrowed, r"shapes \(23, 4\) and \(4, 40\) of lin.0 do not match the 24x40 kernel"),
         (extended, "has the unexpected tensor .*head.weight'"),
