@@ -136,7 +136,7 @@ def count(model: nnx.Module) -> Counts:
 
 
 def methods(model: nnx.Module) -> dict[str, Method]:
-    """Methods by path: of adapters by layer, `FullFineTuning` by parameter."""
+    """Return methods by path: of the layer for adapters, of the parameter for full fine-tuning."""
     methods_by_path = {}
     validate.module(model)
     for path, parent, name, _ in paths.locate(nnx.List([model]), AdapterParam):
@@ -154,7 +154,7 @@ def merge(model: Model) -> Model:
     does not, yet merging changes the table. An adapted quantized kernel is dequantized.
 
     Raises:
-      ValueError: a method's delta depends on the input, or the model holds shapes only.
+      ValueError: a method's delta depends on the input, or the model has shapes without values.
     """
     root = _wrapped_copy(validate.with_values(model))
     paths.replace(paths.locate(root, AdaptedLayer), _merged)
@@ -237,7 +237,7 @@ def _check_statistics(statistics: Any) -> None:
 def _wrapped_copy(model: nnx.Module) -> nnx.List[Any]:
     """Copy the model, sharing its arrays, without stored aux and dropout keys.
 
-    The copy is wrapped in a List, so that a model that is itself one layer can be replaced in it.
+    The copy is wrapped in a List so that a model that is itself a layer can be replaced.
     """
     model = nnx.clone(validate.module(model))
     nnx.pop(model, nnx.Any(AdapterAux, DropoutKey))
@@ -298,7 +298,9 @@ def unfreeze(root: nnx.List[Any], rules: paths.Rules) -> set[int]:
             if jnp.issubdtype(location.child.get_value().dtype, jnp.floating):
                 unfrozen.append(location)
     if shapes := [p for p in unfrozen if isinstance(p.child.get_value(), jax.ShapeDtypeStruct)]:
-        raise ValueError(f"{shapes[0].path} holds a shape only: call this inside nnx.eval_shape.")
+        raise ValueError(
+            f"{shapes[0].path} has a shape but no value: call this inside nnx.eval_shape."
+        )
     _convert_variables(unfrozen, AdapterParam)
     return used
 
@@ -323,7 +325,7 @@ def init_stack(
 ) -> tuple[Params, Any]:
     """Apply a method's `init` to a kernel [..., I, O], with an independent key per matrix.
 
-    Not jitted as a whole, so that random draws compile once per I, not once per shape.
+    This is not jitted as a whole, so random draws compile once per I, not once per shape.
     """
     if len(getattr(kernel, "shape", ())) < 2:
         raise ValueError(f"an adapter needs a kernel [..., I, O], got {short(kernel)}.")

@@ -6,7 +6,7 @@
 
 The collection "adapters" is trainable; "params" keeps the structure of the model's own `init`, so
 published parameters fit. During a call, each adapter is one of its layer's parameters, so the
-model's transformations of those (scan, remat, vmap) also apply to the adapter.
+model's own transformations (scan, remat, vmap) also apply to it.
 """
 
 import dataclasses
@@ -124,8 +124,8 @@ class LinenAdapter:
         Args:
           variables: from `init` or `attach`, possibly trained.
           *args: as for the model's `apply`.
-          mutable: as for the model's `apply`, except "params"; include "intermediates" for
-            `collect_aux`.
+          mutable: as for the model's `apply`, but must not include "params"; include
+            "intermediates" for `collect_aux`.
           **kwargs: as for the model's `apply`; the adapters' dropout is on if rngs has "dropout".
 
         Raises:
@@ -133,7 +133,9 @@ class LinenAdapter:
             a scan does not pass on the rngs for dropout.
         """
         if _compat.is_mutable(mutable, "params"):
-            raise ValueError("'params' cannot be mutable: it has the adapters during the call.")
+            raise ValueError(
+                "'params' cannot be mutable: it contains the adapters during the call."
+            )
         with nn.intercept_methods(self._call):
             return _apply(
                 self.model, _with_adapters_in_params(variables), *args, mutable=mutable, **kwargs
@@ -163,7 +165,7 @@ class LinenAdapter:
     def _visit_layers(
         self, visit: Function, variables: Mapping[str, Any], *args: Any, **kwargs: Any
     ) -> Any:
-        """Parameters after a call of the model, with `visit` called on each of its modules."""
+        """Call the model, calling `visit` on each of its modules; return the new parameters."""
 
         def interceptor(
             next_fun: Function, args: Any, kwargs: Any, context: nn.module.InterceptorContext
@@ -209,7 +211,7 @@ class LinenAdapter:
         return supported_class(module, self.einsums) if _is_model_module(module) else None
 
     def _rule(self, module: nn.Module) -> tuple[int, Method] | None:
-        """Index of the rule that gives the layer an adapter, and the rule's method."""
+        """Index and method of the rule that adapts the layer, or None."""
         i = find_rule(self.rules, "/".join(module.path))
         method = None if i is None else self.rules[i][1]
         return None if i is None or method is None or method.trains_base else (i, method)
@@ -284,7 +286,7 @@ class LinenAdapter:
             has = "no adapter" if params is None else "an adapter"
             raise ValueError(
                 f"{'/'.join(module.path)} has {has}, which does not match the rules: create the "
-                "variables by `init` or `attach` with the same rules."
+                "variables using `init` or `attach` with the same rules."
             )
         if rule is None:
             return next_fun(*args, **kwargs)

@@ -144,8 +144,8 @@ def einsum(
     """Einsum of x and kernel plus bias, with an adapter if `method` and `params` are given.
 
     Args:
-      equation: "x,kernel->y", see the module.
-      x, kernel: of the shapes in the equation.
+      equation: "x,kernel->y", see the module docstring.
+      x, kernel: arrays with the axes in the equation.
       bias: with the kernel axes that are also in y, in the order of y; or None.
       params: the adapter's parameters for `to_matrices(equation, kernel)`, or None.
       method: the adapter's method; required with `params`.

@@ -1,4 +1,4 @@
-"""How Linen layers use their kernels, determined from one call of a layer."""
+"""Determine from one call of a Linen layer how it uses its kernel."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -157,7 +157,7 @@ def lookup(table: jax.Array, ids: jax.Array) -> jax.Array:
 
 
 def attend_delta(method: Method, params: Any, query: jax.Array) -> jax.Array:
-    """Delta of scale A B to the inner products of queries [..., D] with a table's rows."""
+    """Inner products of queries [..., D] with the rows that scale A B adds to a table."""
     down, up = (matrix.astype(query.dtype) for matrix in (method.down(params), method.up(params)))
     return method.bottleneck(params, query @ up.T, None)[0].astype(query.dtype) @ down.T
 
@@ -265,7 +265,9 @@ def kernel_and_equation(layer: Any, known: type | None, einsums: Einsums) -> tup
     assert known is not None
     name, equation = describe_einsum({**EINSUMS, **einsums}[known], layer)
     if equation is None:
-        raise ValueError(f"einsums must return the equation of a {type(layer).__name__}, got None.")
+        raise ValueError(
+            f"the einsums function of {type(layer).__name__} must return an equation, got None."
+        )
     if not isinstance(getattr(layer, name, None), nnx.Param):
         raise ValueError(f"a {type(layer).__name__} has no parameter {name!r}.")
     einsum.parse(equation)
@@ -283,13 +285,17 @@ def check_einsums(einsums: Any) -> None:
 
 
 def describe_einsum(describe: Callable[[Any], Any], layer: Any) -> tuple[str, str | None]:
-    """Call a function of `Einsums`; raise ValueError if it fails or returns another type."""
+    """Call a function of `Einsums`; raise ValueError if it fails or returns a wrong type."""
     try:
         name, equation = describe(layer)
     except (TypeError, ValueError, AttributeError) as error:
-        raise ValueError(f"einsums cannot describe a {type(layer).__name__}: {error}") from error
+        raise ValueError(
+            f"the einsums function of {type(layer).__name__} failed: {error}"
+        ) from error
     if not isinstance(name, str) or not isinstance(equation, str | None):
-        raise ValueError(f"einsums must return (name, equation), got {short((name, equation))}.")
+        raise ValueError(
+            f"einsums functions must return (name, equation), got {short((name, equation))}."
+        )
     return name, equation
 
 
@@ -373,7 +379,7 @@ def _with_mixin(
 
 
 def _restore_class(layer: AdaptedLayer) -> Any:
-    """Undo `_with_mixin`, with the layer's current variables."""
+    """Undo `_with_mixin`, keeping the layer's current variables."""
     original = _with_class(layer, type(layer).__bases__[1])
     del original.adapter, original.method, original.kernel_name
     return original

@@ -46,7 +46,7 @@ MIN_SPLIT_INPUTS, MIN_SPLIT_SIZE = 2048, 512
 
 
 class BottleneckSpec(NamedTuple):
-    """f of n layers."""
+    """The function f of n layers."""
 
     kernel: BatchedBottleneck
     width: int
@@ -77,7 +77,7 @@ class FusedLayers:
 @functools.partial(_pytree, data_fields=["params", "down", "ups", "kernels", "biases"])
 @dataclasses.dataclass(frozen=True)
 class SharedProjection:
-    """As `FusedLayers`, but W is not copied."""
+    """Like `FusedLayers`, but W is not copied."""
 
     bottleneck: BottleneckSpec
     params: Any
@@ -145,7 +145,7 @@ def fuse_layers(layers: Sequence[Layer], *, copy_kernels: bool = True) -> list[L
     unchanged.
 
     Args:
-        layers: in the order in which they are called together.
+        layers: in the order in which they are called.
         copy_kernels: whether to fuse W too; use it for layers called repeatedly.
     """
     fusable = [layer for layer in layers if _is_fusable(layer)]
@@ -185,7 +185,7 @@ def _call_fused(
 def _call_shared(
     shared: SharedProjection, x: jax.Array, token_mask: jax.Array | None
 ) -> tuple[Sequence[jax.Array], Aux]:
-    """As `_call_fused`."""
+    """Like `_call_fused`."""
     # Without the barrier XLA fuses x W and x P into one matmul and copies W.
     projected = matmul(jax.lax.optimization_barrier(x), shared.down)
     z, aux = _bottleneck(shared, projected, 0, token_mask)

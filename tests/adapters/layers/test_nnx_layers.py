@@ -225,13 +225,13 @@ class Product(nnx.Module):
 
 
 WRONG_EINSUMS = [
-    ({Product: lambda layer, x: ("w", x)}, "einsums cannot describe a Product: .* missing 1"),
+    ({Product: lambda layer, x: ("w", x)}, "the einsums function of Product failed: .* missing 1"),
     ({Product: lambda layer: ("kernel", "ab,bc->ac")}, "a Product has no parameter 'kernel'"),
     (
         {Product: lambda layer: ("w", None)},
-        "einsums must return the equation of a Product, got None",
+        "the einsums function of Product must return an equation, got None",
     ),
-    ({Product: lambda layer: "w"}, "einsums cannot describe a Product: not enough values"),
+    ({Product: lambda layer: "w"}, "the einsums function of Product failed: not enough values"),
     ([Product], "einsums must map layer classes to functions"),
 ]
 
