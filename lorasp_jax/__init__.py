@@ -99,8 +99,9 @@ _SUBMODULES = {"named": "adapters.combine.named", "hugging_face": "adapters.io.h
 if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:
-        """Import public names and submodules on access: JAX and Flax take a second, too long for
-        `lorasp-jax --help` and Ctrl-C.
+        """Import public names and submodules on first access.
+
+        Importing JAX and Flax takes a second, which would delay `lorasp-jax --help` and Ctrl-C.
         """
         for module, names in _MODULES.items():
             if name in names.split():

@@ -143,7 +143,7 @@ def find_rule(rules: Rules, *paths: str) -> int | None:
 def locate_other_matrices(
     root: nnx.List[Any], einsums: nnx_layers.Einsums = MappingProxyType({})
 ) -> list[Location]:
-    """List parameters of two or more axes in modules that adapters do not support.
+    """List parameters with two or more axes in modules that adapters do not support.
 
     Scales and biases are skipped: those of stacked norms have a second axis, but are not matrices.
     """
@@ -181,5 +181,5 @@ EINSUMS_HINT = (
 
 
 def near_misses(query: str, names: Sequence[str]) -> str:
-    """Up to five names, comma-separated: the ones most similar to the query, else the first."""
+    """Join up to five names: those most similar to the query, or the first if none is similar."""
     return ", ".join(difflib.get_close_matches(query, names, n=5, cutoff=0.3) or names[:5])

@@ -1,4 +1,4 @@
-"""Summary table of an adapted model, and collection of the aux that its layers stored."""
+"""Summarize an adapted model in a table, and collect the aux that its layers stored."""
 
 import math
 from collections.abc import Mapping
@@ -87,7 +87,7 @@ def _rows(model: nnx.Module) -> list[Row]:
 
 
 def _others(model: nnx.Module) -> list[str]:
-    """List with one line on the unsupported classes that have matrices, if there are any."""
+    """Lines about unsupported classes that have matrices; empty if there are none."""
     matrices = locate_other_matrices(nnx.List([model]))
     classes = dict.fromkeys(type(location.parent).__name__ for location in matrices)
     if not classes:

@@ -1,11 +1,11 @@
-"""Several adapters of one layer as one method: a weighted sum.
+"""Combine several adapters of one layer into a single method, their weighted sum.
 
     y = x W + Σ_i w_i Δ_i(x)
 
 The weights w are an array, not static structure, so selecting other adapters does not recompile.
 For a method that is not additive (DoRA), Δ_i is its output minus x W. All LoRAs share one bank,
-padded to one rank, and cost one matmul each for A and B; other methods are computed one by one,
-even with weight 0.
+padded to one rank, and together cost one matmul for A and one for B; other methods are computed
+one by one, even with weight 0.
 """
 
 import dataclasses
@@ -75,7 +75,7 @@ class AdapterSet(Method):
 
     @property
     def down_in_fp32(self) -> bool:
-        """True if it is for any of the adapters."""
+        """Whether any of the adapters needs its down-projection in fp32."""
         return any(method.down_in_fp32 for method in self.others.values())
 
     def down(self, params: Params) -> jax.Array:

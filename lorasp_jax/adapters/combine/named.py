@@ -152,13 +152,15 @@ def names(model: nnx.Module) -> tuple[str, ...]:
 
 
 def extract(model: Model, name: str | None) -> Model:
-    """Extract one adapter as a model of its own, as before `combine`: to train, save or merge it.
+    """Extract one adapter as a separate model, as it was before `combine`.
+
+    The result can be trained, saved and merged.
 
     A LoRA's rank and scale are restored, with the scale expressed as alpha = scale · rank.
 
     Args:
       model: from `combine`; not modified.
-      name: of the adapter; None returns the base without adapters.
+      name: name of the adapter; None returns the base without adapters.
 
     Raises:
       ValueError: the model has no named adapters, or the name is unknown (the message lists near
@@ -209,7 +211,7 @@ def swap(model: Model, name: str, other: nnx.Module) -> Model:
 
     Args:
       model: from `combine`; not modified.
-      name: of the slot, which is kept.
+      name: name of the adapter to replace; the new adapter takes this name.
       other: model adapted from the same base.
 
     Raises:
@@ -360,7 +362,7 @@ def _weight_row(adapter_names: tuple[str, ...], selection: Selection) -> list[fl
 
 
 def index_of(adapter_names: tuple[str, ...], name: str) -> int:
-    """Index of a name; raise ValueError that lists near misses if it is unknown."""
+    """Index of a name; raise ValueError with near misses if it is unknown."""
     if name not in adapter_names:
         close = paths.near_misses(str(name), adapter_names)
         raise ValueError(f"unknown adapter {short(name)}; the model has {close}.")

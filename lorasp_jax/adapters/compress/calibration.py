@@ -47,8 +47,8 @@ class Layer:
       x: [...tokens, I].
       kernel: [I, O].
       y: [...tokens, O], without bias.
-      reference_y: [...tokens, O], output with the adapter to compare with, or None.
-      aux: of the method.
+      reference_y: [...tokens, O], output of the adapter to compare with, or None.
+      aux: the method's aux.
       valid: bool [...tokens].
     """
 
@@ -71,7 +71,7 @@ class Layer:
 class Observed(Method):
     """Wrap a layer's method to report sums.
 
-    Parameters: the method's, or a pair with the reference method's.
+    Parameters: those of the wrapped method, or a pair of these and the reference method's.
     """
 
     path: str
@@ -233,7 +233,7 @@ def input_moments(
     and einsums whose path matches; third-party einsum classes only after adaptation.
 
     Raises:
-      ValueError: as for `observe`, or no such layer matches.
+      ValueError: as for `observe`, or the pattern matches no dense layer or einsum.
     """
     paths.check_rules([(pattern, None)], lambda _: True, "None")
     layer_paths = [

@@ -42,7 +42,7 @@ def lora_sp_layers(model: nnx.Module) -> dict[str, Any]:
     """Layers with a LoRA-SP adapter, by path.
 
     Raises:
-      ValueError: there are none, or the model holds shapes only.
+      ValueError: the model has no such layers, or has shapes without values.
     """
     locations = paths.locate(nnx.List([validate.with_values(model)]), AdaptedLayer)
     layers = {p.path: p.child for p in locations if isinstance(p.child.method, BankMethod)}
@@ -64,7 +64,7 @@ def replace_adapters(
       model: not modified.
       batches: calibration set.
       replacements: new adapters by path.
-      ranks: for the report.
+      ranks: required ranks, for the returned `Compaction`.
       forward: how to call the model on a batch.
     """
     root = nnx.List([nnx.clone(model)])

@@ -33,13 +33,13 @@ def distill(
 
     Each layer gets the rank-r update with the least squared output error on the calibration set
     (reduced-rank regression of the delta on the input). The mean update E[ΔW(x)] would ignore that
-    the scores depend on the very x that they multiply.
+    the scores depend on the same x that they multiply.
 
     Args:
       model: not modified.
       batches: calibration set. With fewer tokens than a layer has inputs, the update is
         undetermined in directions without energy, and set to zero there.
-      rank: of the LoRA. None or a rank above the bank's uses the bank's, which suffices for the
+      rank: LoRA rank, limited to the bank's. None uses the bank's rank, which suffices for the
         optimum over all ranks.
       forward: how to call the model on a batch; see `lorasp_jax.adapters.compress.calibration`.
 

@@ -36,10 +36,10 @@ def prune(
 
     Drops each direction that is active for at most a fraction `tolerance` of the valid calibration
     tokens. The bank's arrays shrink, but the router still scores dropped directions, since E_k is
-    relative to the energy of all. So dropping a direction that was never active leaves every output
-    unchanged, ties included, and dropping another one removes exactly its contribution. All layers
-    of a stack have the same rank, the largest that one of them needs; the others keep additional
-    directions.
+    relative to the energy of all directions. So dropping a direction that was never active leaves
+    every output unchanged, ties included, and dropping any other removes exactly its contribution.
+    All layers of a stack have the same rank, the largest that any of them needs; the others keep
+    additional directions.
 
     Args:
       model: not modified; the result shares its frozen arrays and can be trained further.

@@ -2,7 +2,7 @@
 
     model, errors = quantize(model, [("vision", None), (".*", "nf4")])
 
-Kernels of dense layers and einsums (with flattened inputs) are quantized to 8 or 4.5 bits per
+Kernels of dense layers and einsums (flattened to matrices) are quantized to 8 or 4.5 bits per
 weight. Adapters, biases, norms, embeddings and convolutions are unchanged, and everything else
 works as before: gradients flow to x and the adapters, and adapters can be saved separately,
 attached and combined. `merge` dequantizes the kernels of the layers it merges and adds the delta.
