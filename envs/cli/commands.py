@@ -25,7 +25,7 @@ from envs.names import names
 from envs.rendering import video
 
 WORLDS = 4
-"""Parallel attempts of `play`, which shows one success: the expert may fail."""
+"""Parallel attempts of `play`, since the expert may fail; one success is shown."""
 _EVERY = 2  # control steps per frame of a GIF
 
 
@@ -34,7 +34,9 @@ def collect(options: argparse.Namespace, console: Console) -> None:
     tasks = names("task") if options.task == ["all"] else list(dict.fromkeys(options.task))
     out: Path = options.out
     if len(tasks) > 1 and out.suffix == ".npz":
-        raise ValueError(f"an .npz file holds one task, got {len(tasks)}: give a folder as --out")
+        raise ValueError(
+            f"an .npz file can hold only one task, got {len(tasks)}: give a folder as --out"
+        )
     files = [out / task for task in tasks] if len(tasks) > 1 else [out]
     scenes = [_env(options, task) for task in tasks]  # fail early on bad input
     with contextlib.ExitStack() as locks:
@@ -122,7 +124,7 @@ def _is_done(options: argparse.Namespace, env: envs.Env, file: Path) -> bool:
         if existing == recipe and not options.overwrite:
             return True
     elif partial.exists() and _is_complete(rlds.metadata(partial), recipe):
-        return False  # possibly killed before deleting the shards: `_save` compares both
+        return False  # perhaps killed before it deleted the shards: `_save` compares both
     _refuse_existing(options, file)
     return False
 
@@ -144,7 +146,7 @@ def _collect_concurrently(
     running: dict[Path, Future[str]] = {}
     with bars(console, "episodes") as progress, ThreadPoolExecutor() as pool:
         try:
-            # Longest first, so that it runs while the others are still being traced.
+            # Start the longest task first: it runs while the others are still being traced.
             for file, env in sorted(scenes.items(), key=lambda item: -item[1].expert_steps):
                 report = collecting(progress, f"{env.task.name}, {env.robot.name}", stop)
                 running[file] = pool.submit(_collect, options, env, file, report)
@@ -188,7 +190,7 @@ def _collect(options: argparse.Namespace, env: envs.Env, out: Path, report: Repo
 
 
 def _save(options: argparse.Namespace, folder: Path, out: Path) -> None:
-    """Convert a dataset to an .npz file and delete the dataset; safe to repeat after a kill.
+    """Convert a dataset to an .npz file and delete the dataset; safe to repeat if killed.
 
     Raises:
         ValueError: another file exists and must not be replaced.

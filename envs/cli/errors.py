@@ -1,7 +1,7 @@
-"""Report errors of a command in one sentence; only bugs keep their traceback.
+"""Report errors of a command in one sentence; only bugs show a traceback.
 
 Bad input raises ValueError everywhere in the project. Inaccessible files and exhausted memory are
-problems of the machine. If the reader of a pipe has left, nothing is reported.
+not bugs, either. If the reader of a pipe has closed it, nothing is reported.
 """
 
 import argparse
@@ -16,11 +16,11 @@ from rich.console import Console
 REFUSED = 2
 """Exit code after bad input."""
 BROKEN_PIPE = 141
-"""Exit code if the reader of the output has left, as shells report SIGPIPE."""
+"""Exit code if the reader of the output has closed it, as shells report SIGPIPE."""
 MAX_LENGTH = 1000
 """Maximum characters of a message."""
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Error numbers of writes that found no space."""
+"""Error numbers of writes that ran out of space."""
 _STDOUT = 1
 
 
@@ -31,7 +31,7 @@ def parse_arguments(
 
     Raises:
         SystemExit: after help or bad options, as in argparse; with `BROKEN_PIPE` if the reader of
-            the help has left.
+            the help has closed the pipe.
     """
     try:
         return parser.parse_args(arguments)
@@ -39,7 +39,7 @@ def parse_arguments(
         try:
             sys.stdout.flush()  # otherwise Python flushes at exit and reports an error
         except BrokenPipeError as error:
-            if _reader_left():
+            if _stdout_is_closed():
                 raise SystemExit(BROKEN_PIPE) from error
             raise
         raise
@@ -51,12 +51,12 @@ def report_error(error: Exception, errors: Console, remedy: str = "") -> int:
     Args:
         error: the exception; raised again if it is a bug.
         errors: console to print to.
-        remedy: end of the sentence that says what to do if disk or memory is full.
+        remedy: what to do if disk or memory is full, as the end of the message.
 
     Returns:
         The exit code.
     """
-    if isinstance(error, BrokenPipeError) and _reader_left():
+    if isinstance(error, BrokenPipeError) and _stdout_is_closed():
         return BROKEN_PIPE
     if (reason := describe(error, remedy)) is None:
         raise error
@@ -75,14 +75,14 @@ def describe(error: Exception, remedy: str = "") -> str | None:
         return _one_line(error)
     if not isinstance(error, OSError):
         return None
-    if error.strerror is None:  # raised with a message of its own
+    if error.strerror is None:  # raised with only a message
         return _one_line(error)
     prefix = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
     return f"{prefix}{error.strerror}{remedy if error.errno in DISK_FULL else ''}"
 
 
-def _reader_left() -> bool:
-    """Return whether the reader of stdout has left; if so, discard further output."""
+def _stdout_is_closed() -> bool:
+    """Return whether the reader of stdout has closed it; if so, discard further output."""
     poll = select.poll()
     poll.register(_STDOUT, select.POLLOUT)
     if not any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0)):
@@ -94,11 +94,11 @@ def _reader_left() -> bool:
 
 
 def _is_out_of_memory(error: Exception) -> bool:
-    """Return whether a JAX device ran out of memory; by name, so that JAX need not be imported."""
+    """Return whether a JAX device ran out of memory, by type name, to avoid importing JAX."""
     return type(error).__name__ == "JaxRuntimeError" and "RESOURCE_EXHAUSTED" in str(error)
 
 
 def _one_line(error: Exception) -> str:
-    """Return the message on one line, keeping both ends of a long one, which may quote a file."""
+    """Return the message on one line; keep both ends of a long message, which may quote a file."""
     text, half = " ".join(str(error).split()), MAX_LENGTH // 2
     return text if len(text) <= MAX_LENGTH else f"{text[:half]} ... {text[-half:]}"

@@ -35,5 +35,5 @@ def recipe(options: argparse.Namespace, env: envs.Env) -> dict[str, Any]:
 
 
 def ranges(options: argparse.Namespace) -> envs.Randomization | None:
-    """Return what is randomized between worlds, if anything."""
+    """Return the ranges of domain randomization, if any."""
     return envs.Randomization.typical() if options.randomize else None

@@ -41,8 +41,8 @@ def episode(
         env: environment with W parallel attempts.
         key: source of all randomness.
         tries: maximum number of resets.
-        plan: replacement for `expert.plan`; by default that, compiled.
-        act: replacement for `expert.act`; by default that, compiled.
+        plan: replacement for the compiled `expert.plan`.
+        act: replacement for the compiled `expert.act`.
 
     Returns:
         Model of the successful world, and the joint positions `[T, nq]` over time.

@@ -1,4 +1,4 @@
-"""A robot arm as numbers, and as MJCF of primitive shapes.
+"""A robot arm's parameters, and its MJCF with primitive shapes.
 
 A robot's joint chain is defined once; its MuJoCo bodies and its analytic kinematics both derive
 from it and cannot disagree. All hands share one tool frame, `tcp`: z points out of the hand, y is
@@ -12,11 +12,11 @@ from typing import Protocol
 import mujoco
 import numpy as np
 
-TIP_LENGTH = 0.012  # m from the tcp to the end of the finger tips on every hand; own choice
-TIP_RADIUS = 0.005  # m, sphere at each finger tip to touch tables, walls, buttons; own choice
+TIP_LENGTH = 0.012  # m from the tcp to the end of the finger tips on every hand; our choice
+TIP_RADIUS = 0.005  # m, sphere at each finger tip to touch tables, walls, buttons; our choice
 
 # The wrist camera sits on the outer side of the hand and looks along it, tilted 22 degrees towards
-# the tips. Own choice: the tips are in the lower half of the image, the object above them.
+# the tips. Our choice: the tips are in the lower half of the image, the object above them.
 WRIST_POSITION, WRIST_FOVY = (-0.08, 0.0, -0.093), 75.0  # m, deg
 WRIST_AXES = (0.0, -1.0, 0.0, -0.9272, 0.0, 0.3746)  # x and y axes of the camera in the tcp frame
 
@@ -71,7 +71,7 @@ class Robot:
 
     @property
     def num_joints(self) -> int:
-        """J, without the gripper."""
+        """Number of joints J, without the gripper."""
         return len(self.chain)
 
     @property
@@ -140,13 +140,13 @@ class Primitives:
         xml = ""
         for i, (kp, kv) in enumerate(zip(self.stiffness, self.damping, strict=True)):
             xml += f'<position name="joint{i + 1}" joint="joint{i + 1}" kp="{kp}" kv="{kv}"/>'
-        # The target is half the opening. kp, kv: own choice; they hold a 12 g grape without slip
+        # The target is half the opening. kp, kv: our choice; they hold a 12 g grape without slip
         # and stay below 20 N at full stroke.
         return xml + '<position name="gripper" joint="left" kp="400" kv="20"/>'
 
 
 def pose(transform: np.ndarray) -> str:
     """Format a [4, 4] transform as the MJCF attributes `pos` and `xyaxes`."""
-    numbers = np.round(transform, 12) + 0.0
-    position, x, y = (" ".join(map(str, numbers[:3, i])) for i in (3, 0, 1))
+    rounded = np.round(transform, 12) + 0.0
+    position, x, y = (" ".join(map(str, rounded[:3, i])) for i in (3, 0, 1))
     return f'pos="{position}" xyaxes="{x} {y}"'

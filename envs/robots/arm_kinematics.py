@@ -8,11 +8,11 @@ import numpy as np
 
 from envs.robots._robot import Robot
 
-# Damped least squares: damping, weight of rotation [m/rad], largest step [rad]. Own choices: with
-# them an expert placed the grape in 64 of 64 worlds.
+# Damped least squares: damping, weight of rotation [m/rad], largest step [rad]. Our choices: with
+# them, an expert placed the grape in 64 of 64 worlds.
 _DAMPING, _ROTATION_WEIGHT, _MAX_STEP = 0.03, 0.3, 0.3
-_ITERATIONS = 60  # own choice
-_POSTURE_GAIN = 0.1  # own choice: share of the way home that redundant joints move per iteration
+_ITERATIONS = 60  # our choice
+_POSTURE_GAIN = 0.1  # our choice: share of the way home that redundant joints move per iteration
 
 
 class Geometry(NamedTuple):
@@ -26,7 +26,7 @@ class Geometry(NamedTuple):
 
     @property
     def num_joints(self) -> int:
-        """J, without the gripper."""
+        """Number of joints J, without the gripper."""
         return len(self.chain)
 
 
@@ -96,8 +96,8 @@ def inverse_kinematics(
 
     Args:
         robot: the arm.
-        position: [3] of the tcp [m].
-        rotation: [3, 3] of the tcp.
+        position: [3] desired tcp position [m].
+        rotation: [3, 3] desired tcp rotation.
         start: [J] initial joint angles [rad].
     """
     lower, upper, home = (

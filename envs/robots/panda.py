@@ -21,7 +21,7 @@ _FRAMES = (
 )
 _CHAIN = np.stack([robots.translation(*p) @ robots.rotation("x", a) for p, a in _FRAMES])
 
-# Shapes and colors are own choices; masses [kg] are Menagerie's.
+# Shapes and colors are our choices; masses [kg] are Menagerie's.
 _WHITE, _LIGHT = 'rgba=".93 .93 .93 1"', 'rgba=".70 .72 .75 1"'
 _DARK = 'rgba=".25 .25 .27 1"'
 _LINKS = (

@@ -1,8 +1,8 @@
 """AgileX PiPER: six joints and a parallel gripper with 70 mm stroke.
 
 Kinematics, limits and speeds are from the vendor's `piper_sdk` 0.6.2. Masses and servo gains are
-from MuJoCo Menagerie's `agilex_piper` (commit cd165455), whose link masses leave out the motors, so
-joints are gravity-compensated and no dynamic fidelity is claimed. Shapes are primitives along the
+from MuJoCo Menagerie's `agilex_piper` (commit cd165455), whose link masses exclude the motors, so
+joints are gravity-compensated and the dynamics are not realistic. Shapes are primitives along the
 links.
 """
 
@@ -13,7 +13,7 @@ from envs import robots
 
 # Modified (Craig) Denavit-Hartenberg table of piper_sdk's C_PiperForwardKinematics, rows of
 # (a [m], alpha [rad], d [m], theta0 [rad]); T_i = Rx(alpha) Tx(a) Rz(q + theta0) Tz(d).
-# Zeros of joints 2 and 3 as with dh_is_offset=0, the convention of the URDF and of Menagerie.
+# Joints 2 and 3 have the zeros of dh_is_offset=0, the convention of the URDF and of Menagerie.
 _DH = np.array(
     [
         [0.0, 0.0, 0.123, 0.0],
@@ -75,7 +75,7 @@ def to_sdk_zeros(q: jax.Array) -> jax.Array:
     return q - jax.numpy.asarray(_SDK_OFFSET, q.dtype)
 
 
-# Shapes and colors are own choices; masses [kg] are Menagerie's; link 6 with gripper weighs .45.
+# Shapes and colors are our choices; masses [kg] are Menagerie's; link 6 with gripper weighs .45.
 _DARK, _GRAY = 'rgba=".13 .14 .16 1"', 'rgba=".30 .32 .35 1"'
 _LINKS = (
     f'<geom type="capsule" size=".042" fromto="0 0 -.035 0 0 .01" mass=".098" {_GRAY}/>',
@@ -96,10 +96,10 @@ ROBOT = robots.Robot(
     upper=np.array([2.6179, 3.14, 0.0, 1.745, 1.22, 2.09439]),
     speed=np.full(6, 3.0),  # piper_sdk, [rad/s]
     home=np.array([0.0, 1.528, -1.248, 0.0, 1.029, 0.0]),
-    lean=np.deg2rad(20.0),  # own choice
+    lean=np.deg2rad(20.0),  # our choice
     tilt_side=1,  # inwards, joint 5 reaches its limit soon after the tool points down
     stroke=0.07,  # piper_sdk, GripperCtrl [m]
-    gripper_speed=0.1,  # own choice, same as the Panda's [m/s]
+    gripper_speed=0.1,  # our choice, same as the Panda's [m/s]
     body=robots.Primitives(
         stiffness=np.array([80.0, 80.0, 80.0, 40.0, 10.0, 10.0]),
         damping=np.array([5.0, 5.0, 5.0, 5.0, 1.5, 1.5]),

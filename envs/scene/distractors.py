@@ -5,8 +5,8 @@ import jax.numpy as jnp
 
 from envs.tasks import Layout
 
-_SIZE = 0.016  # m, half the width of each, and the height of its center; own choice
-_SHAPES = (  # own choices, in colors that no task uses
+_SIZE = 0.016  # m, half the width of each, and the height of its center; our choice
+_SHAPES = (  # our choices, in colors that no task uses
     f'type="box" size="{_SIZE} {_SIZE} {_SIZE}" rgba=".15 .55 .30 1"',
     f'type="sphere" size="{_SIZE}" rgba=".95 .75 .15 1"',
     f'type="box" size="{_SIZE / 2} {1.5 * _SIZE} {_SIZE}" rgba=".90 .90 .86 1"',
@@ -15,8 +15,8 @@ _SHAPES = (  # own choices, in colors that no task uses
 MAX_COUNT = len(_SHAPES)
 
 _LOW, _HIGH = (0.27, -0.21), (0.45, 0.21)  # m, part of the table that the side camera sees
-_CLEARANCE = 0.10  # m between centers, where there is room; own choice
-_TRIES = 64  # random positions per distractor; own choice
+_CLEARANCE = 0.10  # m between centers, where possible; our choice
+_TRIES = 64  # random positions per distractor; our choice
 
 
 def names(count: int) -> list[str]:
@@ -45,7 +45,7 @@ def place(key: jax.Array, layout: Layout, count: int) -> Layout:
             position_key, (_TRIES, 2), minval=jnp.array(_LOW), maxval=jnp.array(_HIGH)
         )
         gap = jnp.linalg.norm(candidates[:, None] - occupied, axis=-1).min(axis=1)
-        best = candidates[jnp.argmax(jnp.minimum(gap, _CLEARANCE))]  # argmax: the first of equals
+        best = candidates[jnp.argmax(jnp.minimum(gap, _CLEARANCE))]  # the first maximum
         yaw = jax.random.uniform(yaw_key, (), maxval=jnp.pi)
         placed[name] = jnp.stack([*best, jnp.float32(_SIZE), yaw])
         occupied = jnp.concatenate([occupied, best[None]])

@@ -23,7 +23,7 @@ def positions(model: mujoco.MjModel, layout: Layout, joints: jax.Array) -> jax.A
 
 
 def fixed_bodies(model: mujoco.MjModel, layout: Layout, changes: Changes) -> Changes:
-    """Return the poses of all bodies in their parents, with fixed bodies placed by the layout.
+    """Return all bodies' poses relative to their parents, with fixed bodies placed by the layout.
 
     Mocap bodies would be the usual way, but MJX does not move their children.
     """

@@ -4,7 +4,7 @@
     state = env.reset(key, ranges)
 
 Every world draws its values at reset and keeps them until its next reset. Ranges and draws are
-traced, so other numbers do not recompile.
+traced, so changing them does not recompile.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ from envs.tasks import Layout
 
 Range = tuple[float, float]
 _POSITIVE = ("size", "mass", "friction", "gains", "brightness")
-_MAX_FOV_CHANGE = 20.0  # deg; own choice, the narrowest camera has 32
+_MAX_FOV_CHANGE = 20.0  # deg; our choice: the narrowest camera has 32
 _ZERO, _ONE = (0.0, 0.0), (1.0, 1.0)
 
 
@@ -66,7 +66,7 @@ class Randomization:
 
     @classmethod
     def typical(cls) -> Self:
-        """Return moderate ranges for small arms and cameras; own choices that experts solve."""
+        """Return moderate ranges for small arms and cameras, chosen so that experts succeed."""
         return cls(
             position=(-0.01, 0.01),
             turn=(-0.1, 0.1),
@@ -91,13 +91,13 @@ class Randomization:
             if name in _POSITIVE and value[0] <= 0:
                 raise ValueError(f"{name} is a factor and must be above 0, got {value}")
         if self.size[0] < 1 / MAX_GROWTH or self.size[1] > MAX_GROWTH:
-            limits = f"{1 / MAX_GROWTH} to {MAX_GROWTH}"
+            limits = f"[{1 / MAX_GROWTH}, {MAX_GROWTH}]"
             raise ValueError(f"size must lie in {limits}, got {self.size}")
         if max(map(abs, self.field_of_view)) > _MAX_FOV_CHANGE:
-            limit = f"-{_MAX_FOV_CHANGE} to {_MAX_FOV_CHANGE} degrees"
+            limit = f"[-{_MAX_FOV_CHANGE}, {_MAX_FOV_CHANGE}] degrees"
             raise ValueError(f"field_of_view must lie in {limit}, got {self.field_of_view}")
         if self.latency[0] < 0 or self.latency[1] > control_dt:
-            raise ValueError(f"latency must lie in 0 to {control_dt} s, got {self.latency}")
+            raise ValueError(f"latency must lie in [0, {control_dt}] s, got {self.latency}")
 
 
 @jax.tree_util.register_dataclass
@@ -176,12 +176,12 @@ def draw(
         latency=uniform("latency"),
     )
     move = jnp.stack([*uniform("position", 2), jnp.float32(0.0), uniform("turn")])
-    scale = jnp.ones(4).at[2].set(drawn.size)  # heights add up the sizes of all objects below
+    scale = jnp.ones(4).at[2].set(drawn.size)  # heights are sums of object sizes
     return drawn, {name: pose * scale + move for name, pose in layout.items()}
 
 
 def in_subtrees(model: mujoco.MjModel, names: Iterable[str]) -> np.ndarray:
-    """Return whether each body is one of these or a descendant of one, bool [bodies]."""
+    """Return a mask of the named bodies and their descendants, bool [bodies]."""
     included = np.isin(np.arange(model.nbody), [model.body(name).id for name in names])
     for body in range(1, model.nbody):  # parents come first
         included[body] |= included[model.body_parentid[body]]

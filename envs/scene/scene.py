@@ -12,10 +12,10 @@ from envs.rendering.model import AMBIENT, CONTRAST, DIFFUSE, HEADLIGHT, SKY, SQU
 from envs.robots import Robot
 
 CAMERAS = ("side", "wrist")
-PHYSICS_DT = 0.005  # s; own choice: the largest that is stable with solref .01 (at least 2 steps)
+PHYSICS_DT = 0.005  # s; our choice: the largest that is stable with solref .01 (at least 2 steps)
 
-# Solver settings are own choices from grasping experiments: with fewer than 2 iterations nothing is
-# grasped, and elliptic cones cost six times as much. Only spheres, boxes and the table plane touch.
+# Solver settings are our choices from grasping experiments: with fewer than 2 iterations nothing is
+# grasped; elliptic cones take six times as long. Only spheres, boxes and the table plane collide.
 _SCENE = """
 <mujoco>
   <compiler angle="radian"/>
@@ -53,7 +53,7 @@ _SCENE = """
 </mujoco>
 """
 # Make MuJoCo's other renderers resemble the ray caster. Their headlight shines along the camera's
-# axis; the lamp replaces it where a renderer can place one at the camera, as the ray caster does.
+# axis; the lamp replaces it in renderers that can place a light at the camera, like the ray caster.
 _VISUALS = """
   <visual>
     <headlight ambient="{ambient} {ambient} {ambient}" specular="0 0 0"
@@ -69,11 +69,11 @@ _VISUALS = """
   </asset>
 """
 _TABLE, _TABLE_SIZE = ".62 .66 .68 1", 2.0  # color; half the edge [m]
-_SIDE_EYE, _SIDE_TARGET = (0.76, -0.49, 0.42), (0.34, 0.0, 0.065)  # m; own choices
+_SIDE_EYE, _SIDE_TARGET = (0.76, -0.49, 0.42), (0.34, 0.0, 0.065)  # m; our choices
 
 
 def build(objects: str, robot: Robot) -> mujoco.MjModel:
-    """Compile the model of a robot, base at the origin, at a table z = 0 with a task's objects."""
+    """Compile a model of a task's objects on a table (z = 0) and a robot, base at the origin."""
     with as_python_warnings():
         spec = mujoco.MjSpec.from_string(mjcf(objects, robot))
         robot.body.attach(robot, spec)
@@ -82,7 +82,7 @@ def build(objects: str, robot: Robot) -> mujoco.MjModel:
 
 @contextlib.contextmanager
 def as_python_warnings() -> Iterator[None]:
-    """Turn MuJoCo's warnings, which go to a file in the working folder, into Python warnings."""
+    """Turn MuJoCo's warnings, usually written to a file in the working folder, into Python's."""
     before, messages = mujoco.get_mju_user_warning(), []
     mujoco.set_mju_user_warning(messages.append)
     try:
@@ -94,7 +94,7 @@ def as_python_warnings() -> Iterator[None]:
 
 
 def mjcf(objects: str, robot: Robot) -> str:
-    """Return the scene's MJCF, without what only `Robot.body.attach` can add."""
+    """Return the scene's MJCF, except for elements that only `Robot.body.attach` can add."""
     bodies, actuators = robot.body.mjcf(robot)
     return _SCENE.format(
         timestep=PHYSICS_DT,

@@ -6,7 +6,7 @@ request (`instructions`), a solution as poses of the hand (`waypoints`) and the 
 
 Contact masks: each role has a bit of contype, 1 for carried objects, 2 for finger tips, 4 for
 surfaces that only finger pads hold, 8 for feet. A geom that may touch a role has its bit in
-conaffinity; no other pairs are ever computed.
+conaffinity; no other pairs collide.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ import mujoco
 
 from envs.robots import TIP_LENGTH, multiply
 
-_ALMOST = 0.99  # upper bound on the progress of a stage before it is passed; own choice
+_ALMOST = 0.99  # upper bound on the progress of a stage before it is passed; our choice
 
 Layout = dict[str, jax.Array]
 """Body name -> pose at reset: [4], x, y, z in m and yaw in rad."""
@@ -127,11 +127,11 @@ class Waypoints:
 
     Attributes:
         position: [P, 3] of a point on the hand's axis, `reach` behind the tcp [m].
-        reach: [P], 0 for the tcp itself; the hand rotates about that point [m].
+        reach: [P] distance of that point, about which the hand rotates, from the tcp [m].
         rotation: [P, 3, 3] of the tcp before leaning and tilting.
         lean: [P] share of the robot's own lean.
-        tilt: [P] in rad.
-        opening: [P] of the gripper [m].
+        tilt: [P] angle [rad].
+        opening: [P] gripper opening [m].
         seconds: [P] nominal time from the previous pose [s].
         spread: [P] standard deviation of the noise on the position, 0 where precision matters [m].
     """
@@ -210,12 +210,12 @@ def route(
     reach: float = 0.0,
     tilt: Sequence[float] = (),
 ) -> Waypoints:
-    """Make waypoints with the tool pointing down, from rows (anchor, offset, opening, s, spread).
+    """Make waypoints with the tool pointing down, from (anchor, offset, opening, seconds, spread).
 
     Args:
         rows: one per waypoint; the anchor is a pose of the layout or a position [3].
         lean, reach: as in `Waypoints`, the same for all.
-        tilt: as in `Waypoints`, one per row [rad]; empty for none.
+        tilt: as in `Waypoints`, one per row [rad]; empty: no tilt.
     """
     anchors, offsets, opening, seconds, spread = zip(*rows, strict=True)
     position = jnp.stack(anchors)[:, :3] + jnp.array(offsets)
@@ -231,9 +231,9 @@ def scatter(key: jax.Array, center: tuple[float, ...], spread: tuple[float, ...]
     return jnp.concatenate([jnp.array(center) + shift, jnp.zeros(2)])
 
 
-def raised(place: jax.Array, height: float) -> jax.Array:
+def raised(pose: jax.Array, height: float) -> jax.Array:
     """Move a pose [4] up by a height [m]."""
-    return place.at[2].add(height)
+    return pose.at[2].add(height)
 
 
 def open_box(inside: float, wall: float, height: float, *, floor: str, walls: str) -> str:

@@ -1,6 +1,6 @@
 """Open the pot: grasp the lid by its knob, lift it off, put it down beside the pot.
 
-All numbers are own choices with which both arms solve the task.
+All numbers are our choices, with which both arms solve the task.
 """
 
 import jax
@@ -19,11 +19,11 @@ from envs.tasks import (
     scatter,
 )
 
-_INSIDE, _WALL, _HEIGHT = 0.043, 0.005, 0.055  # m, of the pot: half the inner width, half a wall
+_INSIDE, _WALL, _HEIGHT = 0.043, 0.005, 0.055  # m, pot: half the inner width, half a wall, height
 _FOOT = 0.005  # m, radius of the lid's feet, which stand on the middle of the walls
 _KNOB, _KNOB_HEIGHT = 0.010, 0.030  # m, radius of the knob, and its center above the feet
 _LID = 0.055  # m, radius
-_POT, _POT_RANGE = (0.36, 0.10), (0.04, 0.04)  # m, of the random position
+_POT, _POT_RANGE = (0.36, 0.10), (0.04, 0.04)  # m, center and half range of the position
 _BESIDE = 0.175  # m from pot to lid, to the robot's right
 
 _STEEL, _RED = 'rgba=".55 .57 .60 1"', 'rgba=".62 .20 .16 1"'
@@ -35,7 +35,7 @@ _FEET = "".join(
     f'friction="1 .02 .001" solref=".01 1" {_STEEL}/>'
     for x, y in ((_RIM, 0), (-_RIM, 0), (0, _RIM), (0, -_RIM))
 )
-# Resting on four spheres, the lid has a hundredth of the residual velocity of one on a flat face.
+# On four spheres, the lid's residual velocity is a hundredth of that on a flat face.
 _SCENE = f"""
 <body name="pot">
   {open_box(_INSIDE, _WALL, _HEIGHT, floor=_RED, walls=f'conaffinity="10" {_RED}')}

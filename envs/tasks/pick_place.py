@@ -1,6 +1,6 @@
 """Pick the grape and place it in the basket: at rest inside, and released.
 
-All numbers are own choices with which both arms solve the task.
+All numbers are our choices, with which both arms solve the task.
 """
 
 import jax
@@ -22,9 +22,9 @@ from envs.tasks import (
 _RADIUS = 0.015  # m, a large table grape (12 g)
 _INSIDE = 0.046  # m, half the inner width of the basket
 _WALL = 0.003  # m, half the thickness of its walls
-_HEIGHT = 0.045  # m, of its walls
+_HEIGHT = 0.045  # m, height of its walls
 _CLEAR = 0.080  # m, height of the grape above the table that clears the basket's walls
-_GRAPE, _GRAPE_RANGE = (0.36, -0.08), (0.06, 0.10)  # m, of the random position
+_GRAPE, _GRAPE_RANGE = (0.36, -0.08), (0.06, 0.10)  # m, center and half range
 _BASKET, _BASKET_RANGE = (0.36, 0.155), (0.035, 0.035)  # m
 
 _BASKET_GEOM = 'conaffinity="3" rgba=".85 .65 .30 1"'

@@ -1,6 +1,6 @@
 """Pour the block out of the cup into the basket, and set the cup upright again.
 
-All numbers are own choices with which both arms solve the task.
+All numbers are our choices, with which both arms solve the task.
 """
 
 import math
@@ -22,18 +22,18 @@ from envs.tasks import (
     scatter,
 )
 
-_BLOCK = 0.010  # m, radius of the sphere that the block collides with
+_BLOCK = 0.010  # m, radius of the sphere that collides in place of the block
 _BOTTOM = 0.014  # m, half the inner width of the cup at its bottom
 _FLARE = math.radians(20.0)  # slant of the two walls over which the block can leave
-_HEIGHT, _THICK, _FOOT = 0.050, 0.002, 0.004  # m: of the cup, half a wall, a foot's radius
+_HEIGHT, _THICK, _FOOT = 0.050, 0.002, 0.004  # m: the cup's height, half a wall, a foot's radius
 _SIDE = 0.022  # m from the cup's middle to its upright walls
-_WIDTH = 2 * (_SIDE + 0.003)  # m, of the cup where it is grasped
+_WIDTH = 2 * (_SIDE + 0.003)  # m, width of the cup where it is grasped
 _CLEAR = 0.060  # m, height of the cup above the table that counts as lifted
 _GRIP = 0.033  # m, height at which the cup is grasped
 # The hand rotates about a point above the cup's mouth, from where the block falls straight down.
 _REACH = _HEIGHT - _GRIP + 0.03  # m from the grip
-_CUP, _CUP_RANGE = (0.33, -0.09), (0.03, 0.05)  # m, of the random position
-_INSIDE, _WALL, _BASKET_HEIGHT = 0.050, 0.003, 0.045  # m, of the basket, as in pick_place
+_CUP, _CUP_RANGE = (0.33, -0.09), (0.03, 0.05)  # m, center and half range
+_INSIDE, _WALL, _BASKET_HEIGHT = 0.050, 0.003, 0.045  # m, basket, names as in pick_place
 _BASKET, _BASKET_RANGE = (0.37, 0.12), (0.03, 0.03)  # m
 
 _BLUE, _BASKET_GEOM = 'rgba=".16 .38 .72 1"', 'conaffinity="1" rgba=".85 .65 .30 1"'
@@ -127,7 +127,7 @@ def _stages(view: View) -> dict[str, jax.Array]:
 def _waypoints(layout: Layout) -> Waypoints:
     cup, basket = (raised(layout[name], _GRIP + _REACH) for name in ("cup", "basket"))
     wide, closed = 0.066, 0.030  # m
-    # Some arms cannot point straight down high above the table: let them lean while they carry.
+    # Some arms cannot point straight down high above the table: tilt the hand while carrying.
     carry, level = math.radians(25.0), math.radians(94.0)
     return route(
         (cup, (0.0, 0.0, 0.070), wide, 1.5, 0.003),

@@ -1,6 +1,6 @@
 """Press the red button down past 75 % of its stroke, with the fingers.
 
-All numbers are own choices with which both arms solve the task.
+All numbers are our choices, with which both arms solve the task.
 """
 
 import jax
@@ -11,9 +11,9 @@ from envs.tasks import Layout, Task, View, Waypoints, gate, near, raised, route,
 
 _STROKE = 0.012  # m
 _TOP = 0.040  # m, height of the cap at rest
-_RADIUS = 0.024  # m, of the cap
+_RADIUS = 0.024  # m, radius of the cap
 _DEEP = 0.75 * _STROKE  # m, depth that counts as pressed
-_CENTER, _RANGE = (0.36, 0.0), (0.04, 0.04)  # m, of the random position
+_CENTER, _RANGE = (0.36, 0.0), (0.04, 0.04)  # m, center and half range of the position
 
 # A spring of 150 N/m gives 1.8 N at full stroke, far more than the cap's (compensated) weight.
 _SCENE = f"""

@@ -62,7 +62,11 @@ def test_bad_input_is_one_sentence(tmp_path, run, monkeypatch):
         (f"collect --actions voltage {press}", tmp_path / "new", "joint, delta_joint, end_eff"),
         (f"collect --distractors 5 {press}", tmp_path / "new", "distractors must be at most 4"),
         ("collect --task press dance --robot piper --out", tmp_path / "new", "dance"),
-        ("collect --task all --robot piper --out", tmp_path / "e.npz", "npz file holds one task"),
+        (
+            "collect --task all --robot piper --out",
+            tmp_path / "e.npz",
+            "npz file can hold only one task",
+        ),
         (f"play --image-size 33 {press}", tmp_path / "a.mp4", "must be even, got 33"),
         ("play --task dance --robot piper --out", tmp_path / "a.mp4", "dance"),
         ("gallery --task press --robot r2d2 --out", tmp_path / "g", "r2d2"),

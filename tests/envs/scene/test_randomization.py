@@ -194,9 +194,9 @@ def mujoco_xml(env):
         ({"friction": (0.0, 1.0)}, "friction is a factor"),
         ({"mass": 2.0}, "mass must be two finite numbers"),
         ({"position": (-np.inf, 0.0)}, "position must be two finite numbers"),
-        ({"size": (1.0, 1.5)}, "size must lie in 0.8 to 1.25"),
-        ({"field_of_view": (-90.0, 0.0)}, "field_of_view must lie in -20"),
-        ({"latency": (0.0, 0.2)}, "latency must lie in 0 to 0.1 s"),
+        ({"size": (1.0, 1.5)}, r"size must lie in \[0\.8, 1\.25\]"),
+        ({"field_of_view": (-90.0, 0.0)}, r"field_of_view must lie in \[-20"),
+        ({"latency": (0.0, 0.2)}, r"latency must lie in \[0, 0\.1\] s"),
     ],
 )
 def test_invalid_ranges_raise(env, ranges, message):
