@@ -45,7 +45,7 @@ _DESCRIPTIONS = {
     True: "Scripted expert episodes of {task} by {robot} in simulation.",
     False: "Recorded episodes of {task} by {robot}.",
 }
-# Episodes are read one by one, and PNG does not compress further (measured: 7 times as fast).
+# Episodes are read one by one, and PNG does not compress further: 7 times as fast (measured).
 _RECORDS = "group_size:1,uncompressed"
 
 

@@ -32,7 +32,7 @@ from lorasp_jax.data.video import VideoReader, decode_image
 from lorasp_jax.storage import hub
 
 _COLUMNS = ("timestamp", "frame_index", "episode_index", "task_index")
-_MAX_DIM = 10_000  # of a state or an action
+_MAX_DIM = 10_000  # limit for state and action
 _TIME_TOLERANCE = 0.25
 """Tolerance of timestamps, in frame periods, as for videos."""
 
@@ -217,8 +217,8 @@ class LeRobot:
             values = column.flatten().cast(pa.float64()).to_numpy(zero_copy_only=False)
         if dims != {dim}:
             raise ValueError(
-                f"{path} has {' or '.join(sorted(map(str, dims)))} dimensions in {key} of episode "
-                f"{entry.number}, but {dim} in meta/info.json"
+                f"{path} must have {dim} dimensions in {key} of episode {entry.number}, as in "
+                f"meta/info.json, got {' or '.join(sorted(map(str, dims)))}"
             )
         values = values.reshape(-1, dim)[:, self._columns[kind]]
         if self.keys.angles == "degrees":

@@ -32,7 +32,7 @@ from envs.datasets.files import (
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 _FIELD = re.compile(r"\{(\w+)(?::(\d{0,2}d?))?\}")
 """A field of a path template, with an optional width: {episode_index:06d}."""
-_MAX_VALUE_BYTES = 8  # of one value in memory
+_MAX_VALUE_BYTES = 8  # per value in memory
 
 
 @dataclass(frozen=True)
@@ -223,7 +223,8 @@ def _check(folder: Path, info: Mapping[str, Any], episodes: Sequence[EpisodeEntr
     for name, listed in (("total_episodes", len(episodes)), ("total_frames", frames)):
         if info.get(name, listed) != listed:
             raise ValueError(
-                f"{folder} has {name} {info[name]} in meta/info.json, but lists {listed}"
+                f"{folder} must have {name} {listed} in meta/info.json to match its episodes, got "
+                f"{info[name]}"
             )
 
 
