@@ -1,7 +1,7 @@
 """Silence XLA's alarms about slow compilation in programs that report it themselves.
 
 "Very slow compile? If you want to file a bug ..." and "Constant folding an instruction is taking
-> 1s" are logged as errors (xla/service/slow_operation_alarm.cc), and cannot be turned off alone.
+> 1s" are logged as errors (xla/service/slow_operation_alarm.cc); no setting turns off only these.
 """
 
 import os
@@ -23,7 +23,7 @@ def silence(
     """Log nothing below fatal from JAX's C++ code while this process compiles. Call it once.
 
     Failing compilations still raise, and errors outside compilation are still logged. A level set
-    in TF_CPP_MIN_LOG_LEVEL is respected; plugins such as CUDA's log by themselves.
+    in TF_CPP_MIN_LOG_LEVEL is respected; plugins (CUDA, for example) have their own logging.
 
     Args:
         set_level: sets the lowest level that is logged.
@@ -40,7 +40,7 @@ def silence(
 
 
 class Compilations:
-    """Counter of the compilations running in all threads, which sets the log level."""
+    """Count the compilations running in all threads and set the log level accordingly."""
 
     def __init__(self, set_level: Callable[[int], None]) -> None:
         self._set_level = set_level

@@ -17,13 +17,13 @@ class WholeFiles(_compat.FileCache):
     """
 
     def put(self, key: str, value: bytes) -> None:
-        """Write to a temporary file and rename it, replacing an entry that could not be read.
+        """Write to a temporary file and rename it, which also replaces an unreadable entry.
 
         Raises:
             OSError: the folder is not writable. JAX turns this into a warning.
         """
         if self.eviction_enabled or "://" in str(self.path):
-            super().put(key, value)  # safe: guarded by a lock, or writing whole objects
+            super().put(key, value)  # safe: takes a lock or writes whole objects
             return
         write_bytes(Path(self.path) / f"{key}-cache", value)
 
@@ -36,6 +36,6 @@ def enable() -> None:
     if jax.config.jax_compilation_cache_dir is None:
         folder = os.path.join(os.path.expanduser("~"), ".cache", "lorasp_jax", "xla")
         jax.config.update("jax_compilation_cache_dir", folder)
-    # JAX's default, whatever the environment says.
+    # JAX's default, regardless of the environment.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
     _compat.use_file_cache(WholeFiles)

@@ -3,7 +3,7 @@
 XLA's fusion emitters, which JAX 0.10 uses on CPU, make MJX 15 to 400 times slower (measured on two
 cores). An XLA flag turns them off, but XLA reads its flags once, when JAX starts a backend;
 `import envs` sets the flag if that has not happened yet. If it has, this package passes the option
-to its own `jax.jit` calls, but cannot do so for programs that others compile.
+to its own `jax.jit` calls, but cannot do so for programs that other code compiles.
 """
 
 import functools
@@ -22,7 +22,7 @@ _NEEDED = jax.__version_info__ < (0, 11)  # newer versions do not need the flag,
 
 
 def _set_flag() -> bool:
-    """Set the flag and return whether it was too late."""
+    """Set the flag; return True if it is too late for that."""
     flags = os.environ.get("XLA_FLAGS", "")
     if not _NEEDED or _NAME in flags:
         return False
@@ -35,7 +35,7 @@ def _set_flag() -> bool:
 _LATE = _set_flag()  # on import of this package
 
 
-@functools.cache  # it cannot change once JAX has started
+@functools.cache  # the result cannot change once JAX has started
 def is_late() -> bool:
     """Return whether this process compiles for CPU without the flag that it needs."""
     return (_LATE or _set_flag()) and jax.default_backend() == "cpu"
@@ -46,8 +46,8 @@ def warn_if_late() -> None:
     """Warn if simulation inside a user's own jit will be slow, and say how to fix it."""
     if is_late():
         warnings.warn(
-            "JAX was started before `import envs`, so with JAX below 0.11 simulation inside your "
-            "own jax.jit, env.rollout included, runs 15 to 400 times slower on CPU: import envs "
+            "JAX was started before `import envs`. With JAX < 0.11, simulation inside your own "
+            "jax.jit (including env.rollout) runs 15 to 400 times slower on CPU. Import envs "
             f"before JAX computes anything, or set XLA_FLAGS={FLAG}",
             stacklevel=3,
         )
@@ -59,19 +59,19 @@ def without_simulation() -> dict[str, str | bool] | None:
 
 
 def jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
-    """Do `jax.jit` with these options, fast on CPU even if the flag was set too late."""
+    """Apply `jax.jit` with these options, fast on CPU even if the flag could not be set."""
     plain = jax.jit(function, **options)
     if not _NEEDED:
         return plain
-    # JAX accepts compiler options only in an outermost jit.
+    # JAX accepts compiler options only in the outermost jit.
     fast = jax.jit(function, **options, compiler_options={_NAME: False})
 
-    def chosen() -> Callable[..., Any]:
+    def select() -> Callable[..., Any]:
         return fast if is_late() and _compat.is_untraced() else plain
 
     @functools.wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
-        return chosen()(*arguments, **named)
+        return select()(*arguments, **named)
 
-    call.lower = lambda *arguments, **named: chosen().lower(*arguments, **named)
+    call.lower = lambda *arguments, **named: select().lower(*arguments, **named)
     return call

@@ -1,4 +1,4 @@
-"""Tell the user what is being compiled if it takes long."""
+"""Report compilations that take long."""
 
 import contextlib
 import sys
@@ -20,7 +20,7 @@ PATIENCE = 2.0
 def announce(what: str) -> Iterator[None]:
     """Print a line to stderr if the enclosed compilation takes long, and another when it is done.
 
-    Of several processes only the first prints.
+    Only the first of several processes prints.
 
     Args:
         what: description of what is compiled.
@@ -48,15 +48,15 @@ def _print(line: str) -> None:
 
 
 class Calls:
-    """Record of the calls of one object: the first of each kind compiles."""
+    """Record of an object's calls, to announce those that compile: the first of each kind."""
 
     def __init__(self, name: str) -> None:
-        """Set the object's name in messages."""
+        """Set the name that messages give the object."""
         self._name = name
         self._called: set[tuple[Any, ...]] = set()
 
     def first(self, *call: Any) -> AbstractContextManager[None]:
-        """Wrap a call, given its name and everything that decides whether it recompiles."""
+        """Announce a call if it compiles, given its name and all that triggers recompilation."""
         if call in self._called or not _compat.is_untraced():
             return contextlib.nullcontext()
         self._called.add(call)

@@ -1,4 +1,4 @@
-"""Collect expert demonstrations in batches, each batch in one jitted call, images included.
+"""Collect batches of expert demonstrations, including images, in one jitted call per batch.
 
 A call scans over the control steps of an episode in W worlds and records robot states, actions and
 the poses of all geoms and cameras; images are rendered from those poses in bounded memory.
@@ -41,7 +41,7 @@ class Rollout:
     Attributes:
         state: f32 [T, W, J + 1] measured joints [rad] and gripper opening [m] before each action.
         action: f32 [T, W, J + 1] the expert's actions, without noise.
-        poses: of geoms and cameras, leading axes [T, W], before each action.
+        poses: poses of geoms and cameras before each action, leading axes [T, W].
         length: int32 [W] control steps until the world was done.
         success: bool [W].
         instruction: int32 [W] index into the task's instructions.
@@ -125,8 +125,8 @@ def collect(
         **options: further options of `envs.make`; the backend defaults to jax.
 
     Raises:
-        TypeError: an argument is not a number, or not a key.
-        ValueError: an unknown name, a number out of range, or an expert that fails too often.
+        TypeError: an argument has the wrong type.
+        ValueError: a name is unknown, a number is out of range, or the expert fails too often.
     """
     env = make_repeatable(task, robot, num_envs=worlds(num_episodes, num_envs), **options)
     parts = gather(env, num_episodes, key, action_noise, ranges, record=record)
@@ -146,8 +146,8 @@ def expert_success(
 ) -> jax.Array:
     """Return whether the expert solves each of `num_episodes` random layouts, bool [num_episodes].
 
-    Arguments are as in `collect`; `attempt` returns which worlds succeed, by default with the
-    expert in simulation.
+    Arguments are as in `collect`; `attempt` runs an episode in every world and returns which ones
+    succeed (default: the expert in simulation).
     """
     env = make_repeatable(task, robot, num_envs=worlds(num_episodes, num_envs), **options)
     ranges = prepare(ranges, env.control_dt)
@@ -159,7 +159,7 @@ def expert_success(
 
 
 def make_repeatable(task: str, robot: AnyRobot, **options: Any) -> Env:
-    """Call `envs.make`, by default with reproducible physics: Warp's order of sums varies."""
+    """Call `envs.make`, by default with reproducible physics: Warp's summation order varies."""
     options.setdefault("backend", "jax")
     return make(task, robot, **options)
 
@@ -181,7 +181,7 @@ def gather(
         env: W worlds, one attempt each per call.
         num_episodes, key, action_noise, ranges: as in `collect`.
         collected, attempted: episodes yielded and attempts made before an interruption; resuming
-            with them gives the same episodes as without it.
+            with them gives the same episodes as an uninterrupted run.
         record: as in `collect`.
 
     Raises:
@@ -194,11 +194,11 @@ def gather(
         raise ValueError(f"action_noise must be at least 0, got {action_noise}")
     for _ in range(attempted // env.num_envs):
         key, _ = jax.random.split(key)
-    tried = 0  # since the last success
+    tried = 0  # attempts since the last yield
     while collected < num_episodes:
         _check_success(env, collected, attempted)
         key, chunk_key = jax.random.split(key)
-        # Wait here, outside Python's lock, so that other threads can write their episodes.
+        # Wait here, with the GIL released, so that other threads can write their episodes.
         chunk, success = jax.block_until_ready(record(env, chunk_key, action_noise, ranges))
         wins = np.flatnonzero(success)[: num_episodes - collected]
         collected += len(wins)
@@ -244,7 +244,7 @@ def _check_success(env: Env, collected: int, attempted: int) -> None:
     if attempted >= _MIN_ATTEMPTS and collected < _MIN_SUCCESS * attempted:
         raise ValueError(
             f"the expert solved only {collected} of {attempted} layouts of {env.task.name!r} with "
-            f"{env.robot.name!r}, but should solve {_MIN_SUCCESS:.0%}: check the scene or lower "
+            f"{env.robot.name!r}, but must solve {_MIN_SUCCESS:.0%}: check the scene or lower "
             "action_noise"
         )
 
@@ -253,7 +253,7 @@ def _check_success(env: Env, collected: int, attempted: int) -> None:
 def record_expert(
     env: Env, key: jax.Array, action_noise: float | jax.Array, ranges: Randomization | None
 ) -> tuple[dict[str, Any], jax.Array]:
-    """Attempt random layouts with the expert and render images, as a `Record`."""
+    """Attempt random layouts with the expert and render images; implements `Record`."""
     tries = rollout(env, key, action_noise, ranges)
     steps, worlds = tries.action.shape[:2]
     # World-major order, so that the images of an episode are contiguous.

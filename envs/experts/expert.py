@@ -24,7 +24,7 @@ _PEAK = 1.875  # peak over mean speed of a minimum-jerk move: 30 s²(1 - s)² at
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """Knots [W, P + 1, J + 1] in joint space, and when they are due, [W, P + 1] in s."""
+    """Knots [W, P + 1, J + 1] in joint space and their times [W, P + 1] in s."""
 
     knots: jax.Array
     times: jax.Array
@@ -49,7 +49,7 @@ def act(env: Env, plan: Plan, state: State) -> jax.Array:
 
 
 def tool_rotations(robot: Robot, waypoints: Waypoints) -> jax.Array:
-    """Compute tool rotations [P, 3, 3]: the waypoints' plus the robot's lean and tilt."""
+    """Compute tool rotations [P, 3, 3] from the waypoints' and the robot's lean and tilt."""
     # The tcp's x axis points back to the base; y, along which the fingers open, stays level.
     angle = -(waypoints.lean * robot.lean + waypoints.tilt * robot.tilt_side)
     c, s, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle), jnp.ones_like(angle)

@@ -1,4 +1,4 @@
-"""Cache traced programs between processes, beside JAX's compilation cache.
+"""Share traced programs between processes, in addition to JAX's compilation cache.
 
 JAX's cache saves XLA's work, but its key needs the traced program, and tracing MJX takes 6 to 8 s
 of Python per scene (measured). Reading a program from this cache takes 0.2 s. Its key covers the
@@ -29,8 +29,8 @@ from envs.env import Env
 from envs.rendering.renderer import RayRenderer
 from envs.tasks import Task
 
-# Python can only trace one program at a time. Taking turns, the first program is compiled and runs
-# while the second is traced; all at once, none would start before the last is traced.
+# Python can only trace one program at a time. With this lock, the first program is compiled and
+# runs while the second is traced; without it, none would start before the last is traced.
 _TRACING = threading.Lock()
 _VERSIONED = ("jax", "jaxlib", "mujoco", "mujoco-mjx")
 _CHECKSUM = hashlib.sha256().digest_size  # bytes at the start of a file
@@ -42,12 +42,12 @@ def cached(
     """Wrap as `jax.jit(function, static_argnums=0)`, tracing once for all processes on a machine.
 
     Programs are cached only if JAX's compilation cache is enabled, for tasks of this package, and
-    without Warp, whose programs hold addresses of their process. Thread-safe; not for vmap.
+    without Warp, whose programs contain memory addresses. Thread-safe; not for vmap.
 
     Args:
-        function: a function of this package, of an `Env` and trees of arrays; returns arrays in
-            dicts, lists and tuples.
-        sources: a digest of the source files of the program; default: of this package's.
+        function: a function in this package that takes an `Env` and pytrees of arrays, and returns
+            arrays in dicts, lists and tuples.
+        sources: returns a digest of the program's source files; default: those of this package.
     """
     jitted = fast_cpu.jit(function, static_argnums=0)
 
@@ -81,7 +81,7 @@ def cached(
 
 
 def digest(env: Env) -> str:
-    """Compute the SHA-256 of the scene and the robot's kinematics and limits, hexadecimal."""
+    """Compute the hexadecimal SHA-256 of the scene and the robot's kinematics and limits."""
     scene = np.empty(mujoco.mj_sizeModel(env.model), np.uint8)
     mujoco.mj_saveModel(env.model, None, scene)
     digest = hashlib.sha256(scene.tobytes())
@@ -137,7 +137,7 @@ def _key(
 
 @functools.cache
 def _sources() -> str:
-    """Compute the SHA-256 of this package's source files, hexadecimal."""
+    """Compute the hexadecimal SHA-256 of this package's source files."""
     digest, package = hashlib.sha256(), Path(__file__).parents[1]
     for file in sorted(package.rglob("*.py")):
         digest.update(f"{file.relative_to(package)}\n".encode() + file.read_bytes())

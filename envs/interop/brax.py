@@ -33,15 +33,15 @@ _full_state = fast_cpu.jit(Env._full_state, static_argnums=0)
 class BraxEnv(base.Env):
     """One world of a task behind Brax's interface; Brax's wrappers batch, time and restart it.
 
-    Observations are those of `Env.full_state`, float32 [D], without images:
-    `state.pipeline_state` is the `envs.State` of one world, which `env.observe` can render.
+    Observations are those of `Env.full_state`, float32 [D], without images. `env.observe` renders
+    `state.pipeline_state`, the `envs.State` of one world.
 
     Actions, [A] in [-1, 1], are rescaled to `action_low` and `action_high` of the environment. The
-    sparse reward is 1 once, on success, so the return of an episode is its success. The dense
-    reward needs `action_repeat=1`, since Brax adds up the rewards of repeated actions without
-    discount. `done` means success or broken physics. Brax's wrapper sets the length of an episode
+    sparse reward is 1 once, on success, so the return of an episode is 1 on success, else 0. The
+    dense reward needs `action_repeat=1`, since Brax sums the rewards of repeated actions without
+    discounting. `done` means success or broken physics. Brax's wrapper sets the episode length
     (`env.max_steps` is the task's own limit) and marks its end as a truncation. Brax's
-    AutoResetWrapper restarts a world in its first state, layout included.
+    AutoResetWrapper restarts a world in its initial state, with the same layout.
 
     Attributes:
         env: the wrapped environment, with one world.
@@ -52,8 +52,8 @@ class BraxEnv(base.Env):
         """Wrap an environment.
 
         Args:
-            env: from `envs.make`; its number of worlds does not matter.
-            ranges: for every episode, as in `Env.reset`.
+            env: from `envs.make`; its number of worlds is ignored.
+            ranges: domain randomization of every episode, as in `Env.reset`.
 
         Raises:
             TypeError: `env` is not an environment.
@@ -107,7 +107,7 @@ class BraxEnv(base.Env):
 
     @property
     def action_size(self) -> int:
-        """A."""
+        """Length A of an action."""
         return len(self.env.action_low)
 
     @property
@@ -116,7 +116,7 @@ class BraxEnv(base.Env):
         return "mjx"
 
     def _fields(self, world: State) -> dict[str, Any]:
-        """Return the fields of Brax's state that follow from one world without an axis W."""
+        """Return the fields of Brax's state for one world, given without an axis W."""
         return {
             "pipeline_state": jax.tree.map(lambda x: x[None], world),
             "obs": _full_state(self.env, world),

@@ -34,17 +34,17 @@ except ImportError as error:
 Observation = Literal["pictures", "state", "full_state"]
 OBSERVATIONS: tuple[str, ...] = get_args(Observation)
 """state: dict with `state`, float32 [J + 1], measured joint angles [rad] and gripper opening [m].
-pictures: the same plus `image`, camera name -> uint8 [image_size, image_size, 3].
+pictures: the same plus `image`, dict from camera name to uint8 [image_size, image_size, 3].
 full_state: the privileged state of `Env.full_state`, float32 [D]."""
 
 
 class VectorEnv(gymnasium.vector.VectorEnv):
     """W worlds of a task behind Gymnasium's interface.
 
-    Observations are one of `OBSERVATIONS`, with leading axis W. Actions are those of `Env.step`,
+    Observations are one of `OBSERVATIONS`, with a leading axis W. Actions are as in `Env.step`,
     float32 [W, A]. Info: `success`, bool [W], and `instruction`, string [W].
 
-    Worlds restart automatically in Gymnasium's next-step mode: the step after a world ended ignores
+    Worlds restart automatically in Gymnasium's next-step mode: the step after a world ends ignores
     its action and returns the first observation of its next episode, with reward 0 and neither
     terminated nor truncated. The seed and the actions determine everything, including restarts.
 
@@ -67,8 +67,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
         Args:
             env: from `envs.make`.
-            observation: one of `OBSERVATIONS`; rendering pictures costs more than the physics.
-            ranges: for every episode, as in `Env.reset`.
+            observation: one of `OBSERVATIONS`; rendering images costs more than the physics.
+            ranges: domain randomization of every episode, as in `Env.reset`.
 
         Raises:
             TypeError: `env` is not an environment.
@@ -94,7 +94,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         """Restart all worlds; return observation and info.
 
         Args:
-            seed: seed of all randomness; None continues with the previous one.
+            seed: seed of all randomness; None continues the previous random sequence.
             options: not supported.
 
         Raises:
@@ -172,9 +172,9 @@ class SingleEnv(gymnasium.Env):
         """Wrap an environment.
 
         Args:
-            env: from `envs.make`; its number of worlds does not matter.
-            render_mode: rgb_array, to use `render`.
-            **options: of `VectorEnv`.
+            env: from `envs.make`; its number of worlds is ignored.
+            render_mode: rgb_array to use `render`, else None.
+            **options: keyword arguments of `VectorEnv`.
 
         Raises:
             ValueError: the observation or the render mode is unknown.
