@@ -9,9 +9,9 @@ Angles are in degrees unless the file has `<compiler angle="radian"/>`, as alway
 Joints, masses, gains, meshes, names (prefixed with "robot/") and the pose of the base are kept; a
 hinge's limits are the intersection of its range and its actuator's ctrlrange. Everything that
 belongs to a scene is dropped: floor, lights, options, keyframes, sensors, tendons, equalities. A
-camera "wrist" becomes the wrist camera; an arm without one gets that of our own robots. Only the
-fingers collide, each with a box around the ends of its colliding geoms and a small sphere at the
-tip, as on our own robots: MJX is slow with meshes.
+camera "wrist" becomes the wrist camera; an arm without one gets that of the built-in robots. As on
+those, only the fingers collide, each with a box around the ends of its colliding geoms and a small
+sphere at the tip: MJX is slow with meshes.
 """
 
 import os
@@ -24,7 +24,7 @@ from envs.mjcf import attaching, hands, posing, reading
 from envs.robots import Robot
 from envs.scene import scene
 
-# Own choices, rad/s and m/s: between Panda (2.175 to 2.61) and PiPER (3); both grippers' speed.
+# Own choices [rad/s, m/s]: between Panda (2.175 to 2.61) and PiPER (3); the speed of both grippers.
 _SPEED, _GRIPPER_SPEED = 2.5, 0.1
 
 
@@ -42,10 +42,10 @@ def load(
 
     Args:
         path: the MJCF file.
-        tcp: name of a site in the hand, with z pointing out between the fingers and y along which
-            they open. By default the site "tcp" if there is one, else the last joint's axis is z.
-            The tcp of the robot is on that z axis, `robots.TIP_LENGTH` before the fingers' ends.
-        speed: joint speed limits, one for all or one each [rad/s]; MJCF has none.
+        tcp: name of a site in the hand whose z axis points out between the fingers, which open
+            along its y axis. By default the site "tcp" if it exists, else the last joint's axis is
+            z. The robot's tcp is on that z axis, `robots.TIP_LENGTH` before the fingers' ends.
+        speed: speed limits [rad/s], one for all joints or one per joint; MJCF does not give them.
         gripper_speed: maximum speed of the opening [m/s].
         folder: folder that must contain all referenced files, such as meshes, after following
             links; by default the folder of the file.
@@ -94,7 +94,8 @@ def _read(
 def _positive(name: str, value: float | Sequence[float], count: int) -> np.ndarray:
     numbers = np.asarray(value, float)
     if numbers.shape not in ((), (count,)) or not np.all(numbers > 0):
-        raise ValueError(f"{name} must be positive, one number or {count}, got {value}")
+        several = f" or {count} of them" if count > 1 else ""
+        raise ValueError(f"{name} must be a positive number{several}, got {value}")
     return np.broadcast_to(numbers, count).copy()
 
 

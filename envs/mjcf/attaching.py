@@ -16,7 +16,7 @@ from envs.robots import Robot
 _BASE = "base"
 _PREFIX = "robot/"  # for all names in the user's file, to avoid clashes with the scene and tasks
 _DROPPED = ("keys", "sensors", "actuators", "tendons", "equalities", "pairs", "excludes", "lights")
-_UNSET = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default color; such a geom takes its material's
+_UNSET = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default color; such a geom uses its material's
 _SMALL = 0.01  # m, half-extent below which a mesh is not drawn; own choice
 _HIDDEN_GROUP = 3
 
@@ -31,7 +31,7 @@ class UserBody:
         fingers: names of the left and the right finger's joint.
         pads: collision shapes of the left and the right finger.
         gripper: the servo that closes the fingers.
-        mount: [4, 4] pose, in the last link, of the body that carries the fingers.
+        mount: [4, 4] pose of the body that carries the fingers, in the frame of the last link.
     """
 
     spec: mujoco.MjSpec
@@ -138,7 +138,7 @@ def _make_visual(model: mujoco.MjModel, geom_id: int, geom: Any) -> None:
     """Disable a geom's collisions; if it is a visible mesh, add primitives to draw in its place.
 
     Colors are moved from materials to geoms, since MuJoCo Warp prefers a material's color, which
-    `Appearance` does not change; only materials with a texture stay.
+    `Appearance` does not change; only textured materials remain.
     """
     geom.contype = geom.conaffinity = 0
     geom.group = min(geom.group, STAND_IN_GROUP - 1)

@@ -16,8 +16,8 @@ _MAX_VOLUME_RATIO = 0.85  # cut only if the total volume shrinks below this shar
 _MIN_EXTENT = (
     0.06  # m, extent above which a part may be cut; a pixel of a 64 px side camera is 6 mm wide
 )
-_MAX_DEPTH = 3  # of successive cuts
-_MIN_POINTS = 10  # points in a part
+_MAX_DEPTH = 3  # most successive cuts
+_MIN_POINTS = 10  # fewest points in a part
 _OUTLIERS = 0.01  # share of the points on each side that a shape may leave out
 _MIN_HALF_EXTENT = 0.0005  # m, smallest half-extent
 _BOX, _CYLINDER, _CAPSULE = (
@@ -115,5 +115,5 @@ def _closest(points: np.ndarray, rotations: list[np.ndarray]) -> tuple[Shape, fl
 
 
 def _signed(past: np.ndarray) -> np.ndarray:
-    """Compute the signed distance [N] to a convex shape from those to its S sides [N, S]."""
+    """Compute signed distances [N] to a convex shape from the distances [N, S] to its sides."""
     return np.linalg.norm(np.maximum(past, 0), axis=1) + np.minimum(past.max(axis=1), 0)

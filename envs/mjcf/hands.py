@@ -31,7 +31,7 @@ class Hand(NamedTuple):
 
     chain: np.ndarray  # [J, 4, 4] as in `Robot`
     tool: np.ndarray  # [4, 4]
-    mount: np.ndarray  # [4, 4] pose, in the last link, of the body that carries the fingers
+    mount: np.ndarray  # [4, 4] pose of the body that carries the fingers, in the last link's frame
     signs: np.ndarray  # [2]
     shifts: np.ndarray  # [2] m
     stroke: float  # m
@@ -58,7 +58,8 @@ def find(model: mujoco.MjModel, arm: Arm, tcp: str | None) -> Hand:
     left, right = (_end(_corners(model, data, joint) @ axes) for joint in arm.fingers)
     gap = left[0, 1] - right[1, 1]
     if gap < 2 * TIP_RADIUS:
-        raise ValueError(f"the fingers are only {1000 * gap:.0f} mm apart when they are open")
+        least = f"{2000 * TIP_RADIUS:.0f} mm"
+        raise ValueError(f"the fingers must open to at least {least}, got {1000 * gap:.0f} mm")
     pose = _pose(axes @ _center(data, axes, left, right, site), axes)
     carrier = model.body_parentid[model.jnt_bodyid[arm.fingers[0]]]
     frames = [np.eye(4), *(_frame(model, data, joint) for joint in arm.joints)]
@@ -80,14 +81,15 @@ def _open(model: mujoco.MjModel, data: mujoco.MjData, arm: Arm) -> tuple[np.ndar
     """Open the fingers in `data`.
 
     Returns:
-        Sign [2] of each joint's motion that opens the hand, and the direction [3] from the second
+        Sign [2] of each joint's motion as the hand opens, and the direction [3] from the second
         finger to the first.
     """
     mujoco.mj_kinematics(model, data)
     line = data.xaxis[arm.fingers[0]]
     along = data.xaxis[arm.fingers] @ line
     if abs(along[1]) < _PARALLEL:
-        raise ValueError(f"the fingers slide {_degrees(along[1])} deg apart, not along one line")
+        angle = _degrees(along[1])
+        raise ValueError(f"the fingers must slide along one line, got axes {angle} deg apart")
     address = model.jnt_qposadr[arm.fingers]
     centers = [_corners(model, data, joint).mean(axis=(0, 1)) @ line for joint in arm.fingers]
 
@@ -150,8 +152,8 @@ def _axes(
         z = data.xaxis[last] * (1 if data.xaxis[last] @ reach > 0 else -1)
         if abs(z @ across) > 1 - _PARALLEL:
             raise ValueError(
-                "the last joint's axis is not the hand's, so the file needs a site tcp with z "
-                "pointing out of the hand and y along which the fingers open"
+                "the last joint's axis is not perpendicular to the fingers' motion: add a site tcp "
+                "whose z axis points out of the hand and along whose y axis the fingers open"
             )
     z = z - (z @ across) * across
     z /= np.linalg.norm(z)

@@ -1,6 +1,6 @@
 """Choose the start pose, lean and tilt side of a user's arm.
 
-Our own robots define these as numbers; here they are searched for with inverse kinematics.
+The built-in robots specify these; for other arms, inverse kinematics finds them.
 """
 
 import dataclasses
@@ -24,11 +24,11 @@ _TABLE = np.array([(x, y, z) for x in (0.28, 0.43) for y in (-0.18, 0.19) for z 
 _POUR = np.array([(x, y, 0.2) for x in (0.34, 0.40) for y in (0.09, 0.15)])
 _TILTS = np.deg2rad([25, 94])  # of the task "pour": carrying the cup, pouring
 # Own choices.
-_TOLERANCE = 0.004  # m, error that counts as reached
+_TOLERANCE = 0.004  # m, largest error of a pose that counts as reached
 _LEVER = 0.1  # m, converts an error in angle to one in position
-_MARGIN = 0.05  # rad, kept free at both ends of each joint
+_MARGIN = 0.05  # rad, minimum distance to the limits of each joint
 _ROWS = 32  # poses solved at once
-_TRIES, _SPREAD = 8, 0.4  # random starts around the first guess, their standard deviation [rad]
+_TRIES, _SPREAD = 8, 0.4  # number of random starts, standard deviation around the guess [rad]
 
 
 def complete(robot: Robot) -> Robot:
@@ -46,8 +46,8 @@ def complete(robot: Robot) -> Robot:
     homes, errors, table_errors = _try_leans(inside, leans, turns)
     if errors.min() > _TOLERANCE:
         raise ValueError(
-            f"the hand must reach x 0.34 m, y 0 m, z 0.18 m, where episodes start, pointing down "
-            f"or leaning outwards by up to 45 deg; it misses by {1000 * errors.min():.0f} mm"
+            f"the hand must reach x 0.34 m, y 0 m, z 0.18 m (the start of every episode), pointing "
+            f"down or leaning outwards by up to 45 deg; it misses by {1000 * errors.min():.0f} mm"
         )
     cost = np.maximum(table_errors, _TOLERANCE)
     cost[errors > _TOLERANCE] = np.inf
@@ -80,7 +80,7 @@ def _try_leans(robot: Robot, leans: np.ndarray, turns: np.ndarray) -> tuple[np.n
     solutions, errors = _solve(robot, _HOME, lean, turn, starts, robot.home)
     good = errors <= np.maximum(errors.min(axis=1, keepdims=True), _TOLERANCE)
     first = solutions[np.arange(len(leans)), good.argmax(axis=1)]
-    # Draw redundant joints to the first guess, except the last joint, which depends on `turns`.
+    # Pull redundant joints to the first guess, except the last joint, which depends on `turns`.
     rest = np.tile(starts[0], (len(leans), 1))
     rest[:, -1] = first[:, -1]
     homes, errors = _solve(robot, _HOME, leans, turns, first, rest)
@@ -125,7 +125,7 @@ def _solve(
     return q.reshape(*shape, -1), error.reshape(shape)
 
 
-@jax.jit  # robots are traced: one compilation for all with the same number of joints
+@jax.jit  # robots are traced: those with the same number of joints share a compilation
 @functools.partial(jax.vmap, in_axes=(None,) * 4 + (0,) * 5)
 def _solve_block(
     chain: jax.Array,

@@ -14,7 +14,7 @@ from envs.scene import scene
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _KINDS = ("free", "ball", "slide", "hinge")
 _MAX_JOINTS = 16  # own choice: compile time grows with every joint
-_RADIANS_AS_DEGREES = np.deg2rad(4 * np.pi)  # rad, the widest range -2 pi to 2 pi read as degrees
+_RADIANS_AS_DEGREES = np.deg2rad(4 * np.pi)  # rad, width of -2 pi to 2 pi if read as degrees
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
@@ -29,7 +29,7 @@ class Arm(NamedTuple):
 
 
 class Gripper(NamedTuple):
-    """The fingers' actuators as one position servo of half the opening."""
+    """The fingers' actuators combined into one position servo of half the opening."""
 
     stiffness: float  # N/m
     damping: float  # N s/m
@@ -90,7 +90,8 @@ def find_arm(model: mujoco.MjModel) -> Arm:
         raise ValueError(f"the arm has {len(joints)} hinges; at most {_MAX_JOINTS} are supported")
     own = np.flatnonzero(model.body_rootid[model.jnt_bodyid] == base)
     if others := set(own.tolist()) - {*joints, *fingers}:
-        raise ValueError(f"{_names(model, others)}: neither part of the arm nor one of its fingers")
+        names = _names(model, others)
+        raise ValueError(f"every joint must belong to the arm or a finger, got {names}")
     if unlimited := [joint for joint in (*joints, *fingers) if not model.jnt_limited[joint]]:
         raise ValueError(f"every joint needs a range; {_names(model, unlimited)} have none")
     servos, gears = zip(*(_servo(model, joint) for joint in joints), strict=True)
@@ -131,9 +132,9 @@ def find_gripper(model: mujoco.MjModel, arm: Arm, signs: np.ndarray) -> Gripper:
         signs: [2], 1 for a finger joint whose positive direction opens the hand, else -1.
 
     Raises:
-        ValueError: there is none, or one is not a position actuator.
+        ValueError: the fingers have no actuator, or one that is not a position actuator.
     """
-    rates = np.zeros(model.nu)  # derivative of each actuator's length by half the opening
+    rates = np.zeros(model.nu)  # d(actuator length) / d(half the opening)
     for joint, sign in zip(arm.fingers, signs, strict=True):
         rates += sign * _rates(model, joint)
     acting = np.flatnonzero(rates).tolist()

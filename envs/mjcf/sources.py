@@ -18,20 +18,20 @@ from envs.datasets.files import check_memory, check_regular, read_text
 _FOLDERS = ("assetdir", "meshdir", "texturedir")  # attributes of compiler
 _DESCRIPTIONS = ("include", "model")  # elements that refer to another MJCF file
 _EXPANDED = ("include", "attach")  # elements that are replaced by those of another MJCF file
-# Limits are own choices, far above any robot; MuJoCo 3.17 takes seconds at _MAX_COPIES and
-# _MAX_ELEMENTS (measured).
+# Limits are own choices, far above the needs of any robot; MuJoCo 3.17 takes seconds at _MAX_COPIES
+# and _MAX_ELEMENTS (measured).
 _MAX_DEPTH, _MAX_TEXT = 20, 2**25
 _MAX_COPIES, _MAX_ELEMENTS = 1000, 10_000
 _MAX_ENTRIES, _MAX_PATHS = 10**6, 10**5
 _ENTRIES = {"dim", "num", "nsample"}  # attributes of sensors and actuators
-_MAX_RINGS = 300  # of a built-in mesh, which has as many vertices squared
+_MAX_RINGS = 300  # of a built-in mesh, which has up to the square of this number of vertices
 _BYTES = ("memory", "nstack")  # attributes of <size> that `reading` ignores
 _PIXEL_BYTES = 4
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def check(path: Path, folder: Path) -> None:
-    """Check that all files an MJCF file refers to are inside a folder, and its sizes reasonable.
+    """Check that an MJCF file refers only to files inside a folder and asks for reasonable sizes.
 
     Args:
         path: the MJCF file.
@@ -49,7 +49,7 @@ def check(path: Path, folder: Path) -> None:
 
 
 def _all_descriptions(path: Path, folder: Path) -> dict[Path, ElementTree.Element]:
-    """Parse a file and all MJCF files that it includes, directly or not."""
+    """Parse a file and all MJCF files that it includes, directly or indirectly."""
     check_regular(path)
     main, known, new, size = path.parent, {}, [path], 0
     for _ in range(_MAX_DEPTH):
@@ -67,7 +67,7 @@ def _all_descriptions(path: Path, folder: Path) -> dict[Path, ElementTree.Elemen
 def _check_growth(descriptions: dict[Path, ElementTree.Element], main: Path) -> None:
     """Raise a ValueError if a file includes itself, or expands to too many elements.
 
-    The first would crash this process; MuJoCo's time grows with the square of the second.
+    A cycle would crash this process; MuJoCo's time grows with the square of the element count.
     """
     included: dict[Path, set[Path]] = {}
     for path, root in descriptions.items():
@@ -94,7 +94,7 @@ def _check_growth(descriptions: dict[Path, ElementTree.Element], main: Path) -> 
 
 
 def _elements(element: ElementTree.Element, copies: float, inner: float) -> float:
-    """Bound the elements that one expands to, if each included file has at most `inner`."""
+    """Bound how many elements `element` expands to, with at most `inner` per included file."""
     more = inner if element.tag in _EXPANDED else 0.0
     below = copies * _copies(element)
     return copies * (1 + more) + sum(_elements(child, below, inner) for child in element)
@@ -166,7 +166,7 @@ def _numbers(element: ElementTree.Element, attribute: str) -> list[float]:
 
 
 def _check_image(path: Path) -> None:
-    """Raise a ValueError if the header of a PNG file claims a size that does not fit memory."""
+    """Raise a ValueError if the header of a PNG file claims a size that does not fit in memory."""
     with path.open("rb") as file:
         head = file.read(24)
     if head.startswith(_PNG) and len(head) == 24:

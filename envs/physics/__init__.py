@@ -1,1 +1,1 @@
-"""Simulate with MuJoCo MJX; only this folder depends on its implementations, JAX and Warp."""
+"""Simulate with MuJoCo MJX; only this folder depends on its JAX and Warp implementations."""

@@ -75,7 +75,7 @@ class Kinematics:
         )
 
     def _local(self, model: Any, qpos: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return qpos with unit quaternions, and each frame in its parent: quaternion, position."""
+        """Return normalized qpos, and the quaternion and position of each frame in its parent."""
         change = (qpos - model.qpos0)[model.jnt_qposadr][:, None]
         half = self._hinged * change / 2
         rotations = jnp.concatenate([jnp.cos(half), jnp.sin(half) * model.jnt_axis], axis=-1)

@@ -1,4 +1,4 @@
-"""Physics behind one small class, by MJX in JAX or by MuJoCo Warp.
+"""Simulate physics with MJX in JAX or with MuJoCo Warp, behind one small class.
 
 Worlds are batched by `jax.vmap`. Between steps a world's data is the same for both engines.
 """
@@ -69,7 +69,7 @@ def default_backend() -> str:
 class Physics:
     """Simulator of one MuJoCo model; methods are pure and take one world each.
 
-    Poses always come from MJX-JAX: they are cheap, and so `reset` gives the same on every engine.
+    Poses always come from MJX-JAX: this is cheap, and `reset` returns the same on every engine.
     """
 
     def __init__(self, model: mujoco.MjModel, backend: str) -> None:
@@ -127,7 +127,7 @@ class Physics:
             return jax.lax.scan(body, [getattr(start, name) for name in MOVING], controls)[0]
 
     def _step(self, model: Any, data: Any) -> Any:
-        """Do `mjx.step` for our scenes, which have no tendons, sensors or mocap bodies."""
+        """Run `mjx.step` reduced to our scenes, which have no tendons, sensors or mocap bodies."""
         mjx = _mjx()
         data = mjx.com_pos(model, self._kinematics(model, data))
         data = mjx.factor_m(model, mjx.crb(model, data))

@@ -22,7 +22,7 @@ def from_jax(function: Callable[..., None], like: Mapping[str, Any], **options: 
 
     Args:
         function: takes arrays as positional arguments, the outputs last.
-        like: a Warp array of the type of each, by name.
+        like: an example Warp array for each argument, by name, which sets its type.
         options: passed to `warp.jax_callable`.
     """
     kinds = {name: wp.array(dtype=x.dtype, ndim=x.ndim) for name, x in like.items()}

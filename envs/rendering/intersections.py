@@ -135,8 +135,8 @@ def nearest(
     Args:
         geoms: V geoms.
         kinds: V kinds, ascending.
-        x: `[P]` slope of each pixel's ray to the right.
-        y: `[P]` slope upwards.
+        x: `[P]` rightward slope of each pixel's ray.
+        y: `[P]` upward slope.
 
     Returns:
         Its index `[P]` (int32, 0 for no hit) and depth `[P]` (+inf for no hit), rounded down so
@@ -168,13 +168,13 @@ def unshadowed(
     caller handles self-shadowing: a convex geom is dark where its normal faces away from the light.
     """
 
-    def blocked(enter: Enter, other: jax.Array, lit: jax.Array) -> jax.Array:
+    def still_lit(enter: Enter, other: jax.Array, lit: jax.Array) -> jax.Array:
         geom = geoms(other)
         point = along(geom.eye, depth, ray(geom.axes, x, y))
         t = enter(point, geom.light, geom.half)
         return lit & ((t == jnp.inf) | (other == number))
 
-    return _over_kinds(blocked, jnp.full(x.shape, True), kinds, first=SPHERE)
+    return _over_kinds(still_lit, jnp.full(x.shape, True), kinds, first=SPHERE)
 
 
 def _over_kinds(

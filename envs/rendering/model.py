@@ -36,7 +36,7 @@ class Appearance:
     """Everything that an image depends on except geometry. Every field is traced.
 
     Attributes:
-        rgba: `[G, 4]` color of each geom of the MuJoCo model, 0 to 1; alpha is ignored, `build`
+        rgba: `[G, 4]` color of each geom of the MuJoCo model, 0 to 1; alpha is ignored: `build`
             decides what is visible.
         light: `[3]` direction towards the (directional) light in world axes, of any length.
         ambient: `[]` share of a geom's color that needs no light.
@@ -94,7 +94,7 @@ def build(mj_model: mujoco.MjModel, camera_names: Sequence[str]) -> RenderModel:
     """
     cameras = {mj_model.camera(i).name: i for i in range(mj_model.ncam)}
     if unknown := set(camera_names) - set(cameras):
-        raise ValueError(f"the model has no camera {unknown}, only {sorted(cameras)}")
+        raise ValueError(f"unknown cameras {sorted(unknown)}: choose from {sorted(cameras)}")
     drawn, stand_ins = is_visible(mj_model), mj_model.geom_group == STAND_IN_GROUP
     if stand_ins.any():
         drawn = drawn & (mj_model.geom_type != mujoco.mjtGeom.mjGEOM_MESH) | stand_ins

@@ -59,7 +59,7 @@ def render(
 
     Args:
         model: from `build`.
-        poses: of all geoms and cameras of the MuJoCo model.
+        poses: poses of all geoms and cameras of the MuJoCo model.
         height, width: image size [px].
         samples: average n x n evenly spread rays per pixel, at n² times the cost.
         appearance: replaces the model's own.
@@ -88,7 +88,7 @@ def render_batch(
     appearance: Appearance | None = None,
     size: jax.Array | np.ndarray | None = None,
 ) -> jax.Array:
-    """Render W worlds in bounded memory; all arrays, also in `appearance`, have a leading axis W.
+    """Render W worlds in bounded memory; `poses`, `appearance` and `size` have a leading axis W.
 
     Returns:
         uint8 `[W, K, height, width, 3]`.
@@ -200,7 +200,7 @@ def in_camera_frames(
     """Transform visible geoms to each camera's frame, leaves `[K, V]`; make views, leaves `[K]`."""
     geom_xpos, geom_xmat, cam_xpos, cam_xmat = poses
     _check_shapes(appearance, geom_xpos=geom_xpos, cam_xpos=cam_xpos, size=size)
-    visible, chosen = np.array(model.geoms), np.array(model.cameras)
+    visible, cameras = np.array(model.geoms), np.array(model.cameras)
     scale, half = unit_shapes(model, size)
     to_unit = _rows(jnp.swapaxes(geom_xmat[visible], -1, -2) / scale[:, :, None])
     light = _vec(jnp.asarray(appearance.light) / jnp.linalg.norm(appearance.light))
@@ -221,7 +221,8 @@ def in_camera_frames(
             appearance, position, rotation, jnp.tan(jnp.deg2rad(fovy) / 2) / height
         )
 
-    return jax.vmap(view)(cam_xpos[chosen], cam_xmat[chosen], jnp.asarray(appearance.fovy)[chosen])
+    fovy = jnp.asarray(appearance.fovy)
+    return jax.vmap(view)(cam_xpos[cameras], cam_xmat[cameras], fovy[cameras])
 
 
 def _camera(

@@ -73,7 +73,7 @@ def colors(
 
 
 def slopes(view: View, raster: Raster, pixel: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Compute the slopes of each pixel's ray to the right and upwards, both `[P]`."""
+    """Compute the rightward and upward slopes of each pixel's ray, both `[P]`."""
     row = jax.lax.div(pixel, jnp.int32(raster.width))
     column = pixel - raster.width * row
     x = (2 * column + 1 - raster.width).astype(jnp.float32)

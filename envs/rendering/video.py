@@ -19,7 +19,7 @@ def write_video(path: Path, frames: np.ndarray, fps: float) -> None:
     """
     height, width = frames.shape[1:3]
     if height % 2 or width % 2:
-        raise ValueError(f"a video needs even height and width, got {height} x {width}")
+        raise ValueError(f"a video's height and width must be even, got {height} x {width}")
     options = {"movflags": "+faststart"}  # browsers can play it while it loads
     with av.open(str(path), "w", format="mp4", options=options) as container:
         stream: Any = container.add_stream("libx264", rate=round(fps))

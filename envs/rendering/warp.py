@@ -29,7 +29,7 @@ class WarpRenderer:
 
         Args:
             model: shared by all worlds, with a light named "lamp".
-            rays: its ray caster; cameras, appearance and image size are taken from there.
+            rays: the model's ray caster, which provides cameras, appearance and image size.
             num_worlds: number of worlds that Warp renders at once.
         """
         self._mujoco, self.model = model, rays.model
@@ -66,10 +66,10 @@ class WarpRenderer:
         """Render images, uint8 `[N, K, height, width, 3]`, like `renderer.render_batch`.
 
         Args:
-            poses: of all geoms and cameras, leading axis N.
-            appearance: of each world, leading axis N; None for the model's own. Its ambient,
-                headlight and diffuse must be the model's times one factor; sky and checker are
-                always the model's.
+            poses: poses of all geoms and cameras, leading axis N.
+            appearance: appearance of each world, leading axis N; None for the model's own. Ambient,
+                headlight and diffuse must be the model's times a common factor; sky and checker
+                are always the model's.
             size: `[N, G, 3]` sizes of geoms; None for the model's own.
         """
         return self._batch(poses, appearance, size)
@@ -86,7 +86,7 @@ class WarpRenderer:
         if appearance is None:
             appearance = jax.tree.map(every, self.model.appearance)
         size = every(self.model.size) if size is None else size
-        # A call takes exactly `num_worlds`: pad the last chunk with the last world.
+        # A call takes exactly `num_worlds` worlds: pad the last chunk with the last world.
         padding = -number % chunk
 
         def chunks(x: jax.Array) -> jax.Array:
@@ -120,7 +120,7 @@ class WarpRenderer:
         return (jnp.clip(rgb * bright, 0, 255) + 0.5).astype(jnp.uint8)
 
     def _material_colors(self, appearance: Appearance) -> jax.Array:
-        """Color materials like the geoms that use them, [worlds, materials, 4]."""
+        """Return material colors [worlds, materials, 4], with the table geom's for its material."""
         colors = jnp.broadcast_to(
             jnp.asarray(self._mujoco.mat_rgba, jnp.float32),
             (self._num_worlds, self._mujoco.nmat, 4),
@@ -129,7 +129,7 @@ class WarpRenderer:
         return colors.at[:, self._mujoco.geom_matid[table]].set(appearance.rgba[:, table])
 
     def _callable(self) -> Any:
-        """Make the JAX callable: fields of model and data, a light position for each camera."""
+        """Make the JAX callable of model and data fields and of one light position per camera."""
         model, data = self._model, self._data
         fields = {name: model for name in _PER_WORLD} | {name: data for name in _POSES}
         like = {name: getattr(owner, name) for name, owner in fields.items()}

@@ -37,7 +37,7 @@ _MISSING = (
         ],
     ),
     (
-        "knob: neither part of the arm nor one of its fingers",
+        "every joint must belong to the arm or a finger, got knob",
         [
             (
                 '<site name="aside"',
@@ -72,15 +72,15 @@ _MISSING = (
         [('pos="0 -0.001 .025"', 'pos="0 -0.001 .025" contype="0" conaffinity="0"')],
     ),
     (
-        "the fingers slide 90 deg apart, not along one line",
+        "the fingers must slide along one line, got axes 90 deg apart",
         [('name="b" type="slide" axis="0 -1 0"', 'name="b" type="slide" axis="1 0 0"')],
     ),
     (
-        "the fingers are only 8 mm apart when they are open",
+        "the fingers must open to at least 10 mm, got 8 mm",
         [("-.045 -.005", "-.009 -.005"), (".005 .045", ".005 .009")],
     ),
     (
-        "the file needs a site tcp with z pointing out of the hand and y along which",
+        "add a site tcp whose z axis points out of the hand and along whose y axis",
         [('name="turn" axis="0 0 -1"', 'name="turn" axis="0 1 0"')],
     ),
     (
@@ -149,8 +149,8 @@ def test_settotalmass_raises(tmp_path):
         ({"tcp": "askew"}, "the y axis of site askew is 60 deg off the line along which"),
         ({"tcp": "inwards"}, "the z axis of site inwards must point out of the hand"),
         ({"tcp": "aside"}, "the z axis of site aside does not run between the fingers"),
-        ({"speed": [1.0, 2.0]}, "speed must be positive, one number or 6, got [1.0, 2.0]"),
-        ({"gripper_speed": 0.0}, "gripper_speed must be positive"),
+        ({"speed": [1.0, 2.0]}, "speed must be a positive number or 6 of them, got [1.0, 2.0]"),
+        ({"gripper_speed": 0.0}, "gripper_speed must be a positive number, got 0.0"),
     ],
 )
 def test_bad_options(tmp_path, options, message):
