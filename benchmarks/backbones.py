@@ -7,8 +7,8 @@ The training step is that of `lorasp_jax.training`, with AdamW and the auxiliary
 already on the device, with donated state. GiB is the memory of the compiled program including its
 arguments. MFU is the matmul FLOP/s of loss and gradients (`lorasp_jax.training.cost.flops`, without
 recomputation) relative to the device's bf16 peak. Sampling runs ten denoising steps in one program,
-from images to action chunk, with the model's `sampler`. "largest" is the largest batch with a step
-expected to fit in 24 GiB.
+from images to action chunk, with the model's `sampler`. "largest" is the largest batch whose step
+is expected to fit in 24 GiB.
 """
 
 import argparse
@@ -202,7 +202,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that define a step and its measurement."""
     parser.add_argument("--rank", type=int, default=128)
     parser.add_argument("--remat", choices=REMATS, default="products")
-    parser.add_argument("--unroll", choices=["yes", "no"], help="default: that of the size")
+    parser.add_argument("--unroll", choices=["yes", "no"], help="default: depends on the size")
     parser.add_argument("--dtype", default="bfloat16")
     parser.add_argument("--calls", type=int, default=5, help="steps queued at once")
     parser.add_argument("--json", type=Path, help="file for the results")

@@ -3,8 +3,8 @@
     JAX_PLATFORMS=cpu python -m benchmarks.compile_time
 
 The program is the gradient of a training loss with respect to the adapters, auxiliary losses
-included. Times are CPU seconds of this process on all cores, which other programs hardly affect,
-the best of several repeats. Ratios are relative to qwix's LoRA in the same run
+included. Times are the best of several repeats, in CPU seconds of this process on all cores, which
+other programs hardly affect. Ratios are relative to qwix's LoRA in the same run
 (`pip install qwix`), or to the bare model if qwix is not installed.
 """
 

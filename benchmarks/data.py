@@ -5,8 +5,8 @@
 
 Windows have two cameras and 50 actions and are shuffled. The import reads synthetic two-camera
 recordings in LeRobot's encoding (AV1 or H.264, a key frame every 2 frames), at full size and
-resized to 224 pixels as for published models. For comparison, the decoder alone runs with one video
-per core. Everything runs on the host; the accelerator is idle.
+resized to 224 pixels, as published models expect. For comparison, the decoder alone runs with one
+video per core. Everything runs on the host; the accelerator is idle.
 """
 
 import argparse
@@ -192,9 +192,9 @@ def statistics(steps: int) -> dict[str, Any]:
 def main() -> None:
     """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--steps", type=int, default=5000, help="in the cache (%(default)s)")
-    parser.add_argument("--batches", type=int, default=200, help="to time (%(default)s)")
-    parser.add_argument("--episodes", type=int, default=4, help="to import (%(default)s)")
+    parser.add_argument("--steps", type=int, default=5000, help="steps in the cache (%(default)s)")
+    parser.add_argument("--batches", type=int, default=200, help="batches to time (%(default)s)")
+    parser.add_argument("--episodes", type=int, default=4, help="episodes to import (%(default)s)")
     parser.add_argument("--json", type=Path, help="file for the results")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:

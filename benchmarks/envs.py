@@ -177,7 +177,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--tasks", nargs="+", default=["open_pot", "pour", "press", "pick_place"])
     parser.add_argument("--robot", default="piper")
-    parser.add_argument("--backends", nargs="+", help="default: jax, and warp if it is the default")
+    parser.add_argument(
+        "--backends", nargs="+", help="default: jax, plus warp on a single NVIDIA GPU"
+    )
     parser.add_argument("--batches", nargs="+", type=int, default=[16])
     parser.add_argument("--image-size", type=int, default=64)
     parser.add_argument("--jobs", type=int, default=1, help="programs to compile at once")

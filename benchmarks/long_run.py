@@ -2,9 +2,9 @@
 
     python -m benchmarks.long_run --tasks pour --backend warp --episodes 200 --num-envs 256
 
-After each fifth of the episodes of a task: the success rate, the number of broken worlds (ended
-because a position or velocity was not finite), and host and device memory. The exit code is 1 if a
-world broke, or if memory grew by more than 2 % after the first fifth.
+After each fifth of a task's episodes, a line reports the success rate, the number of broken worlds
+(ended because a position or velocity was not finite), and host and device memory. The exit code is
+1 if a world broke, or if memory grew by more than 2 % after the first fifth.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from envs.physics import physics
 from envs.state import State
 
 PARTS = 5
-MAX_GROWTH = 1.02  # of memory after the first part; chosen above the noise of allocators
+MAX_GROWTH = 1.02  # memory relative to that after the first part; chosen above allocator noise
 
 
 @dataclasses.dataclass

@@ -1,4 +1,4 @@
-"""Utilities of all benchmarks: timing, machine description, compact tables."""
+"""Utilities shared by all benchmarks: timing, machine description, compact tables."""
 
 import importlib.metadata
 import os

@@ -93,7 +93,7 @@ def linear_layers(config: BackboneConfig) -> tuple[Shapes, int]:
         if location.path != "vision/patch_embed"
     }
     shapes["language/lm_head"] = (config.language.width, config.vocabulary)
-    if isinstance(config, Pi0Config):  # tied to the embedding; the expert has one of its own
+    if isinstance(config, Pi0Config):  # the expert's lm_head, unlike the first, is not tied
         shapes["action/lm_head"] = (config.action.width, config.vocabulary)
         total += config.action.width * config.vocabulary
     return shapes, total

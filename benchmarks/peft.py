@@ -1,4 +1,4 @@
-"""Cost of adapters: a dense layer without and with every method, forward and with gradients.
+"""Cost of adapters: a dense layer with and without each method, forward and with gradients.
 
     python -m benchmarks.peft --json peft.json
     python -m benchmarks.peft --tokens 1024 --shapes 256x2048 2048x256 --dtype float32   # on a CPU
@@ -6,10 +6,10 @@
 For each shape [I, O]: the frozen layer alone ("bare"), LoRA as usually written (`usual_lora`,
 autodiff of x W + scale (x A) B), and this project's methods at rank R, with their losses. Gradients
 are with respect to the input and the adapter, as in training. Ratios are relative to the usual LoRA
-in the same run. Memory is that of the compiled program without its arguments. Then layers that
-share an input, "I:O,O,O", called one by one and grouped; finally the energy gate, compared with a
-copy of its scores. Inputs are created under jit, everything is warmed up twice, and ten calls are
-queued at once.
+in the same run. Memory is that of the compiled program without its arguments. Two more tables
+compare layers that share an input, "I:O,O,O", called one by one and grouped, and the energy gate
+with a copy of its scores. Inputs are created under jit, everything is warmed up twice, and ten
+calls are queued at once.
 """
 
 import argparse

@@ -40,7 +40,7 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     config = backbones.sized(options.backbone, options, options.remat)
     single = backbones.run_config(peft.LoRASP(rank=options.rank), ("all-linear",), batch)
 
-    def compiled(layout: tuple[str, int]) -> backbones.Step:
+    def compile_step(layout: tuple[str, int]) -> backbones.Step:
         name, number = layout
         fsdp = number if name == "fsdp" else 1
         mesh = meshes.make_mesh(fsdp, jax.devices()[:number])
@@ -50,7 +50,7 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     cases, single_rate = layouts(options.devices), None
     with ThreadPoolExecutor(options.threads) as pool:
         arrays = pool.submit(backbones.arrays, config, single)
-        steps = dict(zip(cases, pool.map(compiled, cases), strict=True))
+        steps = dict(zip(cases, pool.map(compile_step, cases), strict=True))
     for name, number in cases:
         step = steps.pop((name, number)).load(*arrays.result()[1:])
         rate = number * batch / best(step, calls=options.calls)
@@ -74,7 +74,7 @@ def main() -> None:
     parser.add_argument("--sizes", nargs="+", default=["small", "base"])
     parser.add_argument("--devices", type=int, nargs="+", default=[1, 2, 4])
     parser.add_argument("--batch", type=int, help="windows per device; default: by size")
-    parser.add_argument("--threads", type=int, default=8, help="for compilation")
+    parser.add_argument("--threads", type=int, default=8, help="compilation threads")
     backbones.add_options(parser)
     options = parser.parse_args()
     console, results = Console(soft_wrap=True), dict[str, Any](machine=machine("jax"))

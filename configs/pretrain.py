@@ -17,7 +17,7 @@ from lorasp_jax.peft import FullFineTuning
 
 
 def get_config(scale: str) -> Config:
-    """Return the config at `scale`; the bundled bases were trained with accelerator."""
+    """Return the config at `scale`; the bundled bases were trained at scale accelerator."""
     config = Config(
         name="pretrain",
         scale=scale,

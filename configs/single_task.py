@@ -2,7 +2,7 @@
 
     python train.py --config configs/single_task.py --tasks pour --name pour
 
-Everything but the tasks comes from configs/multitask.py; the default task is press.
+All settings except name and tasks come from configs/multitask.py; the default task is press.
 """
 
 import dataclasses

@@ -267,7 +267,8 @@ def main(config: Config) -> float:
     with messages.announce(f"the evaluation of {config.task} (including its episodes)"):
         success = float(np.mean(evaluate(env, learner.params, learner.moments, key)))
     print(
-        f"{success:.1%} of {config.episodes} unseen layouts, {time.process_time():.0f} CPU seconds"
+        f"solved {success:.1%} of {config.episodes} unseen layouts; "
+        f"{time.process_time():.0f} CPU seconds"
     )
     return success
 

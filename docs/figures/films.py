@@ -35,7 +35,7 @@ TILE, GAP, BAR = 216, 6, 26
 SPEED, EVERY = 2.0, 2
 """Playback speed relative to real time, and control steps per frame."""
 HOLD = 8
-"""Frames to hold the last image."""
+"""Number of frames that repeat the last image."""
 INK, PAPER = (110, 118, 129), (255, 255, 255, 0)
 """Gray text, legible on light and dark pages, and a transparent background."""
 SUCCESS = (18, 184, 134)
@@ -109,7 +109,8 @@ def record_task(policies: list[Policy], metadata: dict, task: str, key: jax.Arra
     before, after = (rollout(with_prompts(policy, env), key) for policy in policies)
     improved = np.asarray(after.success & ~before.success)
     world = int(np.argmax(improved))
-    print(f"{task}: {int(before.success.sum())} and {int(after.success.sum())} of {WORLDS}")
+    first, last = (int(rollout.success.sum()) for rollout in (before, after))
+    print(f"{task}: {first} successes before and {last} after adaptation, of {WORLDS}")
     camera = RayRenderer(env.render_model, 2 * TILE, 1)
     render = jax.jit(dataclasses.replace(env, renderer=camera).render)
     base, adapted = (render_video(render, rollout, world) for rollout in (before, after))
