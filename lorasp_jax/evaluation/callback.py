@@ -58,7 +58,7 @@ class Evaluation(Callback):
         self._pending_videos: Future | None = None
 
     def on_start(self, run: Run) -> None:
-        """Evaluate the base, also in a resumed run, and write before.json."""
+        """Evaluate the base, even in a resumed run, and write before.json."""
         results = self._evaluate_tasks(run, "before")
         write_json(run.folder / "before.json", {t: success(r) for t, r in results.items()})
 
@@ -66,7 +66,7 @@ class Evaluation(Callback):
         """Evaluate the policy in one batch of episodes per task, if due, and render videos.
 
         Returns:
-            `success/<task>`.
+            The success rate of each task, named `success/<task>`.
         """
         if not run.config.evaluates(step):
             return {}
@@ -101,8 +101,8 @@ class Evaluation(Callback):
             evaluate_task = functools.partial(self._evaluate_task, run, when, episodes, progress)
             tasks = run.config.tasks
             # Warp is not thread-safe.
-            mapped = map if physics.default_backend() == "warp" else map_threads
-            results = dict(zip(tasks, mapped(evaluate_task, tasks), strict=True))
+            map_tasks = map if physics.default_backend() == "warp" else map_threads
+            results = dict(zip(tasks, map_tasks(evaluate_task, tasks), strict=True))
         for task, result in results.items():
             low, high = (100 * bound for bound in result.ci95)
             run.console.print(
@@ -135,12 +135,12 @@ class Evaluation(Callback):
 
 
 class NoEvaluation(Callback):
-    """Replaces `Evaluation` for tasks that cannot be simulated: results without success rates."""
+    """Replaces `Evaluation` for tasks without a simulation; results have no success rates."""
 
     def on_end(self, run: Run) -> None:
         """Print a note and write results.json."""
         tasks, robot = ", ".join(run.config.tasks), run.config.robot
-        run.console.print(f"skipping evaluation: no simulation of {tasks} with {robot}")
+        run.console.print(f"skipping evaluation: cannot simulate {tasks} with {robot}")
         write_json(run.folder / "results.json", summarize(run, {}))
 
 

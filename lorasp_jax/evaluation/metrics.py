@@ -10,8 +10,8 @@ from lorasp_jax.peft import Aux
 Reports = dict[str, dict[str, Aux]]
 """Tower -> name of a linear layer -> `Aux` of its adapters, `[..., W, T]`.
 
-The images of a world are folded into W. The leading axis is layers, in the action expert preceded
-by denoising steps."""
+The images of a world are folded into W. The leading axis is layers; the action expert has an axis
+of denoising steps before it."""
 
 LayerRanks = dict[str, dict[str, jax.Array]]
 """Tower -> name of a linear layer -> active rank `[L]`."""
@@ -64,7 +64,7 @@ def layer_ranks(reports: Reports, running: jax.Array) -> LayerRanks:
 
 
 def rank_histogram(reports: Reports, running: jax.Array, rank: int) -> dict[str, jax.Array]:
-    """Count the tokens of a tower with each active rank, over all its layers.
+    """Count the tokens with each active rank, for each tower over all its layers.
 
     Args:
         reports: from one policy call; towers without a rank are omitted.
@@ -91,7 +91,7 @@ def _tokens(
 ) -> dict[str, dict[str, tuple[jax.Array, jax.Array]]]:
     """Return active rank and validity, `[..., W, T]` each, of the linear layers with a rank."""
 
-    def worlds(linear: Aux) -> tuple[jax.Array, jax.Array]:
+    def by_world(linear: Aux) -> tuple[jax.Array, jax.Array]:
         rank, mask = linear.active_rank, linear.token_mask
         assert rank is not None
         assert mask is not None  # backbones always set it
@@ -100,6 +100,6 @@ def _tokens(
         return rank.reshape(shape), valid
 
     return {
-        tower: {name: worlds(a) for name, a in linears.items() if a.active_rank is not None}
+        tower: {name: by_world(a) for name, a in linears.items() if a.active_rank is not None}
         for tower, linears in reports.items()
     }

@@ -19,7 +19,7 @@ from lorasp_jax.evaluation import metrics
 from lorasp_jax.policies.policy import Policy
 
 RECORDED_WORLDS = 8
-"""Number of worlds whose poses are recorded, from which the video is chosen."""
+"""Number of worlds whose poses are recorded; one of them becomes the video."""
 
 
 @jax.tree_util.register_dataclass
@@ -85,7 +85,7 @@ def make_rollout(
         chunk = policy.model.config.chunk
         if not 1 <= execute_steps <= chunk:
             raise ValueError(
-                f"execute_steps must be 1 to the chunk length, {chunk}, got {execute_steps}"
+                f"execute_steps must be from 1 to the chunk length ({chunk}), got {execute_steps}"
             )
         reset_key, sample_key = jax.random.split(key)
         policy = policy.with_sampler()
@@ -183,7 +183,7 @@ def _control_block(
 
 
 def _max_rank(policy: Policy) -> int:
-    """Return the largest adapter rank of a policy `with_sampler`; 0 if no method has a rank."""
+    """Return the largest adapter rank of a policy with a sampler; 0 if no method has a rank."""
     return max((getattr(method, "rank", 0) for method in policy.model.methods), default=0)
 
 

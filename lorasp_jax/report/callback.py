@@ -54,7 +54,7 @@ class Report(Callback):
         self._thread.shutdown()
 
     def _submit(self, folder: Path) -> Future:
-        """Start a report after the previous one; re-raise the error if that one failed."""
+        """Wait for the previous report, re-raising any error of it, and start a new one."""
         if self._latest:
             self._latest.result()
         self._latest = self._thread.submit(write_report, folder)

@@ -36,7 +36,7 @@ def svg(figure: Figure) -> str:
 
 @mpl.rc_context(_STYLE)
 def success(results: dict[str, Any]) -> Figure:
-    """Plot success before training and, in a finished run, after, with 95 % intervals."""
+    """Plot success before training and, for a finished run, after it, with 95 % intervals."""
     tasks = results["tasks"]
     figure = Figure(figsize=(6, 1.1 + 0.8 * len(tasks)), layout="constrained")
     axes = figure.subplots()

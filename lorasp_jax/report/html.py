@@ -53,7 +53,7 @@ def write_report(folder: Path) -> Path:
     For an unfinished run the page shows partial results and refreshes itself.
 
     Raises:
-        ValueError: the folder has no run, or damaged files.
+        ValueError: the folder contains no run, or damaged files.
     """
     rows = read_metrics(folder)
     config = read_json(
@@ -126,7 +126,7 @@ def _skipped(rows: figures.Rows) -> Iterable[str]:
 
 
 def _subtitle(config: dict[str, Any], results: dict[str, Any]) -> str:
-    """One line: method, backbone, robot, parameters (of a finished run), scale."""
+    """Format method, backbone, robot, parameters (of a finished run) and scale as one line."""
     line = (
         f"{config['peft']['method']} on {config['model']['backbone']} {config['model']['size']}, "
         f"robot {config['robot']}"
@@ -139,7 +139,7 @@ def _subtitle(config: dict[str, Any], results: dict[str, Any]) -> str:
 
 
 def _success(results: dict[str, Any]) -> Iterable[str]:
-    """Success rates; empty if the run was not evaluated."""
+    """Show success rates, or nothing if the run was not evaluated."""
     if results["tasks"]:
         yield "<h2>Success before and after</h2>"
         yield _image(figures.success(results))
@@ -147,13 +147,13 @@ def _success(results: dict[str, Any]) -> Iterable[str]:
 
 
 def _success_over_steps(rows: figures.Rows) -> Iterable[str]:
-    """Success over steps; empty if it was not measured during training."""
+    """Show success over steps, or nothing if it was not measured during training."""
     if any(name.startswith("success/") for row in rows for name in row):
         yield _image(figures.success_over_steps(rows))
 
 
 def _success_table(results: dict[str, Any]) -> str:
-    """Table of success before and after training, with intervals."""
+    """Return a table of success before and after training, with intervals."""
     tasks = results["tasks"].items()
     rows = ((task, *map(success_cell, value.values())) for task, value in tasks)
     return _table(("task", *next(iter(results["tasks"].values()))), rows)
@@ -167,7 +167,7 @@ def success_cell(value: dict[str, Any]) -> str:
 
 
 def _speed(rows: figures.Rows) -> Iterable[str]:
-    """Table of throughput and memory; empty if neither was logged."""
+    """Show a table of throughput and memory, or nothing if neither was logged."""
     summary = speed(rows)
     if summary:
         yield _table(("run statistics", ""), summary.items())
@@ -176,7 +176,7 @@ def _speed(rows: figures.Rows) -> Iterable[str]:
 def speed(rows: figures.Rows) -> dict[str, str]:
     """Summarize throughput and memory as label -> value with unit.
 
-    Medians, except for the fraction of all time spent waiting for data and the peak memory.
+    Values are medians, except for the total fraction of time waiting for data and peak memory.
     """
     entries = {
         "samples/s": ("speed/samples_per_second", median, "{:,.4g}".format),
@@ -198,7 +198,7 @@ def _memory(gib: float) -> str:
 
 
 def _with_wait(rows: figures.Rows) -> Iterable[dict[str, float]]:
-    """Add "waited" to the rows: the fraction of the run's time spent waiting for data in each."""
+    """Add "waited" to each row: its wait for data as a fraction of the run's total time."""
     rate, wait = "speed/samples_per_second", "speed/data_wait"
     total = sum(1 / row[rate] for row in rows if rate in row)
     for row in rows:
@@ -210,7 +210,7 @@ def _has_rank(rows: figures.Rows) -> bool:
 
 
 def _active_rank(results: dict[str, Any], rows: figures.Rows, rank: Any) -> Iterable[str]:
-    """Active rank in training and in closed loop; empty for methods without one."""
+    """Show active rank in training and in closed loop, or nothing for methods without one."""
     if not _has_rank(rows):
         return
     yield "<h2>Active rank</h2>"
@@ -225,7 +225,7 @@ def _active_rank(results: dict[str, Any], rows: figures.Rows, rank: Any) -> Iter
 
 
 def _table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """HTML table; all columns except the first contain numbers."""
+    """Return an HTML table; all columns except the first contain numbers."""
     head = "".join(f"<th>{html.escape(name)}</th>" for name in header)
     body = ""
     for first, *rest in rows:
@@ -241,12 +241,12 @@ def _image(figure: Figure) -> str:
 
 
 def _video(folder: Path, task: str) -> Path:
-    """Path of a task's video."""
+    """Return the path of a task's video."""
     return join_inside(folder, f"rollout_{task}.mp4")
 
 
 def _media(folder: Path, tasks: Collection[str]) -> Iterable[str]:
-    """First camera images and video of every task."""
+    """Show the first camera images and the video of every task."""
     if tasks:
         yield "<h2>Observations and rollouts</h2>"
     for task in tasks:

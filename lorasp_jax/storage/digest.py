@@ -37,7 +37,7 @@ def fingerprints(weights: Mapping[str, Any]) -> dict[str, str]:
 
 
 def with_digest(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Add the digest of JSON values to them.
+    """Return JSON values with their digest added.
 
     Raises:
         TypeError: a value is not JSON-serializable.
@@ -81,7 +81,7 @@ def _sum(array: Any, *, rounded: bool = False) -> Any:
 
 
 def host_sum(array: np.ndarray, block: int = 2**18) -> int:
-    """Compute `mixed_sum` in NumPy, in blocks of words that fit the CPU cache."""
+    """Compute `mixed_sum` in NumPy, in blocks of words that fit in the CPU cache."""
     words = np.ascontiguousarray(array).reshape(-1).view(f"uint{min(8 * array.itemsize, 32)}")
     total = 0
     for start in range(0, len(words), block):

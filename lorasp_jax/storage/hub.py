@@ -45,11 +45,11 @@ def local(
         where: a path; a Hub repository, hf://owner/name, cached by the Hub client; or a bucket URL,
             gs://bucket/folder, cached in lorasp_jax/ under the user's cache folder. Shipped bases,
             such as assets/pi0_nano, resolve from any folder.
-        only: file patterns to download from a repository; None: all but `IGNORED_PATTERNS`.
+        only: file patterns to download from a repository; None: all except `IGNORED_PATTERNS`.
         repository: type of the Hub repository.
 
     Raises:
-        ValueError: not found, not reachable, or an unsupported URL.
+        ValueError: `where` does not exist, is unreachable, or is an unsupported URL.
     """
     name, path = os.fspath(where), Path(where)
     if name.startswith(HUB):
@@ -93,8 +93,8 @@ def _not_found_message(name: str, path: Path) -> str:
     if _is_shipped(inside):
         return shipped.missing_base_message(name)
     if REPOSITORY.fullmatch(name):
-        return f"{name} does not exist; a Hub repository is written {HUB}{name}"
-    return f"{name} does not exist; it is neither {HUB}owner/name nor gs://bucket/path"
+        return f"{name} does not exist; for a Hub repository, pass {HUB}{name}"
+    return f"{name} does not exist; pass a path, {HUB}owner/name or gs://bucket/path"
 
 
 def is_remote(where: str | os.PathLike[str]) -> bool:
@@ -131,7 +131,8 @@ def _from_bucket(url: str) -> Path:
             if not target.exists():
                 _copy(*fsspec.core.url_to_fs(url), target)
     except ImportError as error:  # fsspec's message names only the backend package
-        raise ValueError(f'{url} needs a package: pip install "lorasp_jax[buckets]"') from error
+        install = 'pip install "lorasp_jax[buckets]"'
+        raise ValueError(f"Cannot download {url}: a package is missing. Run {install}.") from error
     except Exception as error:  # each backend raises its own errors
         raise ValueError(f"Cannot download {url}: {_first_line(error)}.") from error
     return target

@@ -23,6 +23,6 @@ def missing_base_message(name: str) -> str:
     if ROOT != PACKAGE:
         return message
     return (
-        f"{message}; choose one of these, or pass the folder of {Path(name).name} in a checkout of "
-        f"the project or of a base made with {EXPERIMENTS}/pretrain.py"
+        f"{message}; choose one of these, or pass the path to {Path(name).name} in a checkout of "
+        f"the project or to a base trained with {EXPERIMENTS}/pretrain.py"
     )

@@ -54,7 +54,7 @@ def test_missing_paths(name, no_hub):
 @pytest.mark.parametrize("name", ["runs/base", "lerobot/smolvla_base"])
 def test_missing_folders_never_resolve_to_the_hub(name, tmp_path, monkeypatch, no_hub):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match=f"{name} does not exist; .* is written hf://{name}$"):
+    with pytest.raises(ValueError, match=f"{name} does not exist; .*, pass hf://{name}$"):
         hub.local(name)
     with pytest.raises(ValueError, match="A Hub repository must be hf://owner/name, got"):
         hub.local("hf://too/many/parts")
@@ -71,7 +71,7 @@ def test_shipped_bases_resolve_from_any_folder(tmp_path, monkeypatch, no_hub):
     for name in ("assets/pi0_nan", "assets/../runs/pi0"):
         with pytest.raises(
             ValueError,
-            match=r"does not exist; the bases in .* are pi0_nano, |does not exist; it is",
+            match=r"does not exist; the bases in .* are pi0_nano, |does not exist; pass a path",
         ):
             hub.local(name)
 
@@ -83,7 +83,7 @@ def test_an_installed_package_names_its_bases(tmp_path, monkeypatch, no_hub):
     monkeypatch.setattr(shipped, "ROOT", tmp_path)
     monkeypatch.setattr(shipped, "PACKAGE", tmp_path)
     with pytest.raises(
-        ValueError, match=r"the bases in .*/assets are pi0_nano; choose one .* of pi0_small "
+        ValueError, match=r"the bases in .*/assets are pi0_nano; choose one .* path to pi0_small "
     ):
         hub.local("assets/pi0_small")
 
@@ -159,5 +159,7 @@ def test_a_missing_package_names_the_extra(monkeypatch):
         raise ImportError("Please install gcsfs to access Google Storage")
 
     monkeypatch.setattr("fsspec.core.url_to_fs", url_to_fs)
-    with pytest.raises(ValueError, match=r'needs a package: pip install "lorasp_jax\[buckets\]"'):
+    with pytest.raises(
+        ValueError, match=r'package is missing. Run pip install "lorasp_jax\[buckets\]"'
+    ):
         hub.local("gs://openpi-assets/no-such")
