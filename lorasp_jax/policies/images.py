@@ -12,7 +12,8 @@ def to_unit(name: str, image: jax.Array) -> jax.Array:
     """
     if image.dtype != jnp.uint8 or image.ndim != 4 or image.shape[-1] != 3:
         raise ValueError(
-            f"camera {name!r} needs uint8 [B, H, W, 3], got {image.dtype} {image.shape}."
+            f"The image of camera {name!r} must be uint8 [B, H, W, 3], "
+            f"got {image.dtype} {image.shape}."
         )
     return image.astype(jnp.float32) / 127.5 - 1
 
@@ -29,7 +30,7 @@ def resize_with_pad(
         size: height and width [pixels].
         centred: center the image, as in openpi (shared/image_tools.py) and LeRobot's pi0; False:
             align it right and bottom, as in LeRobot's SmolVLA.
-        antialias: smooth before downsampling, as in openpi; False as in PyTorch, hence LeRobot.
+        antialias: smooth before downsampling, as in openpi; False: as in PyTorch and LeRobot.
     """
     batch, height, width, channels = images.shape
     if height == width == size:

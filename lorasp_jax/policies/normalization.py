@@ -1,4 +1,4 @@
-"""Normalize robot states and actions to order one, and back.
+"""Normalize robot states and actions to order one, and unnormalize them.
 
 Every mode is an affine map: y = (x - shift) / divisor + offset and x = (y - offset) factor + shift.
 Divisor and factor are both the spread, guarded against division by zero in constant dimensions.
@@ -9,9 +9,9 @@ Each project has its own guard:
                          quantiles: 1st and 99th percentile, quantile10: 10th and 90th
     identity             y = x
 
-    ours      at least MIN_SPREAD, both ways
-    openpi    adds 1e-6, both ways (transforms.py, Normalize and Unnormalize, at 15a9616a)
-    lerobot   std: adds 1e-8 when normalizing only; ranges: 1e-8 in place of 0, both ways
+    ours      at least MIN_SPREAD, in both directions
+    openpi    adds 1e-6, in both directions (transforms.py, Normalize and Unnormalize, at 15a9616a)
+    lerobot   std: adds 1e-8, only to the divisor; ranges: 1e-8 in place of 0, in both directions
               (processor/normalize_processor.py, 0.6)
 """
 
@@ -75,8 +75,8 @@ def _affine_map(stats: Mapping[str, jax.Array], mode: Mode, convention: Conventi
     missing = [name for name in needed if name not in stats]
     if missing:
         raise ValueError(
-            f"Normalization {mode!r} needs {', '.join(needed)}; the statistics have "
-            f"{', '.join(stats) or 'nothing'}."
+            f"Normalization {mode!r} requires the statistics {', '.join(needed)}, "
+            f"got {', '.join(stats) or 'none'}."
         )
     first, second = (stats[name] for name in needed)
     spread = second if mode == "mean_std" else second - first

@@ -1,8 +1,8 @@
-"""Offline tokenizer of the project's own base weights: a tiny WordPiece of manipulation words.
+"""Offline tokenizer of the project's own base weights: WordPiece with manipulation words.
 
-Other words are split into characters, so every printable ASCII text encodes. The position of an
-entry is its id, and the shipped weights depend on it: entries are never moved or removed, and a new
-word replaces the next reserved entry.
+Other words, up to 100 characters long, are split into characters, so any printable ASCII text can
+be encoded. The position of an entry is its id, and the shipped weights depend on it: entries are
+never moved or removed, and a new word replaces the next reserved entry.
 """
 
 import functools
@@ -37,7 +37,7 @@ def _vocabulary() -> dict[str, int]:
 
 
 VOCABULARY = _vocabulary()
-"""Entry -> id; frozen."""
+"""Maps each entry to its id; must not change."""
 
 
 @functools.cache
@@ -49,14 +49,14 @@ def _tokenizer() -> tokenizers.Tokenizer:
 
 
 class Offline:
-    """The offline tokenizer behind the interface `tokenizer.Tokenizer`."""
+    """The offline tokenizer as an implementation of `tokenizer.Tokenizer`."""
 
     vocabulary = VOCABULARY_SIZE
 
     def encode(
         self, texts: Sequence[str], max_tokens: int, *, complete: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Encode the instructions as they are, without a prompt template; see `encode`."""
+        """Encode the instructions without a prompt template; see `encode`."""
         del complete
         return encode(texts, max_tokens)
 
@@ -72,16 +72,20 @@ def encode(texts: Sequence[str], max_tokens: int) -> tuple[np.ndarray, np.ndarra
         ids `[P, T]` int32, valid `[P, T]` bool.
 
     Raises:
-        ValueError: a text is empty, needs more than `max_tokens`, or has non-ASCII characters.
+        ValueError: a text is empty, needs more than `max_tokens` tokens, or contains characters
+            outside the vocabulary or words of more than 100 characters.
     """
     ids = np.zeros((len(texts), max_tokens), np.int32)
     valid = np.zeros((len(texts), max_tokens), bool)
     for row, text in enumerate(texts):
         tokens = _tokenizer().encode(text).ids
         if not 0 < len(tokens) <= max_tokens:
-            raise ValueError(f"{text!r} has {len(tokens)} tokens; valid are 1 to {max_tokens}.")
+            raise ValueError(f"{text!r} must have 1 to {max_tokens} tokens, got {len(tokens)}.")
         if VOCABULARY["[UNK]"] in tokens:
-            raise ValueError(f"{text!r} has characters that the offline tokenizer cannot encode.")
+            raise ValueError(
+                f"Cannot encode {text!r}: the offline tokenizer supports only ASCII characters and "
+                "words of up to 100 characters."
+            )
         ids[row, : len(tokens)] = tokens
         valid[row, : len(tokens)] = True
     return ids, valid

@@ -26,10 +26,10 @@ class Policy:
     processor: Processor
 
     def with_sampler(self) -> Self:
-        """Return a policy for repeated calls, with all weight-only computations done once.
+        """Return a policy for repeated calls: computations on weights alone are done once.
 
-        Call it before a `jax.lax` loop: XLA hoists this work out of the loop on a CPU, but does
-        not guarantee it.
+        Call it before a `jax.lax` loop: on a CPU, XLA hoists this work out of the loop, but this
+        is not guaranteed.
         """
         return dataclasses.replace(self, model=self.model.sampler())
 

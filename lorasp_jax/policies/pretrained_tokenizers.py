@@ -1,7 +1,7 @@
 """Tokenizers of published language models, loaded from their files.
 
 The file format implies the prompt template: openpi reads PaliGemma's SentencePiece model, LeRobot
-reads files of Hugging Face tokenizers for both pi0 and SmolVLA.
+reads Hugging Face tokenizer files for both pi0 and SmolVLA.
 """
 
 import warnings
@@ -28,7 +28,7 @@ class SentencePiece:
     def __init__(self, file: Path) -> None:
         try:
             self._model = sentencepiece.SentencePieceProcessor(model_file=str(file))
-            self._model.encode("", add_bos=True)  # if this works, every text encodes
+            self._model.encode("", add_bos=True)  # if this works, every text can be encoded
         except (OSError, RuntimeError, ValueError) as error:
             raise ValueError(f"{file} is not a SentencePiece model like PaliGemma's.") from error
 
@@ -40,7 +40,7 @@ class SentencePiece:
     def encode(
         self, texts: Sequence[str], max_tokens: int, *, complete: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Encode as BOS, the cleaned text, a newline; see `tokenizer.Tokenizer`."""
+        """Encode each text as BOS, the cleaned text and a newline; see `tokenizer.Tokenizer`."""
         rows = [
             self._model.encode(t if complete else prompts.openpi(t), add_bos=True) for t in texts
         ]
@@ -62,7 +62,7 @@ class TokenizersFile:
         try:
             self._model = tokenizers.Tokenizer.from_file(str(file))
         except Exception as error:  # the library raises Exception itself
-            raise ValueError(f"{file} is not a file of Hugging Face tokenizers.") from error
+            raise ValueError(f"{file} is not a Hugging Face tokenizer file.") from error
         self._model.no_truncation()
         self._model.no_padding()
         pads = [self._model.token_to_id(token) for token in PAD_TOKENS]
@@ -73,12 +73,12 @@ class TokenizersFile:
         self.vocabulary: int = 1 + max(self._model.get_vocab().values())
         """Largest token id + 1; the file may skip ids."""
         if self.vocabulary > np.iinfo(np.int32).max:
-            raise ValueError(f"{file} has token id {self.vocabulary - 1}, beyond int32.")
+            raise ValueError(f"{file} has token id {self.vocabulary - 1}, which exceeds int32.")
 
     def encode(
         self, texts: Sequence[str], max_tokens: int, *, complete: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Encode the text, a newline at its end, and the special tokens that the file adds (BOS).
+        """Encode each text with a final newline and the special tokens that the file adds (BOS).
 
         See `tokenizer.Tokenizer`.
         """
@@ -90,7 +90,7 @@ class TokenizersFile:
 def _pad(
     texts: Sequence[str], rows: Sequence[Sequence[int]], max_tokens: int, pad: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Truncate or right-pad the rows: ids `[P, T]` int32 and valid `[P, T]` bool."""
+    """Truncate or right-pad the rows to ids `[P, T]` int32 and valid `[P, T]` bool."""
     ids = np.full((len(rows), max_tokens), pad, np.int32)
     valid = np.zeros((len(rows), max_tokens), bool)
     for i, (text, row) in enumerate(zip(texts, rows, strict=True)):

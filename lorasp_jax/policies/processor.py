@@ -1,8 +1,8 @@
 """Convert robot observations to model inputs, and model outputs to robot actions.
 
-A robot uses some of the slots of a backbone's state and action vectors. This project's own weights
-have joints from slot 0 and the gripper in slot 7; published weights have the gripper right after
-the joints. Unused slots are zero.
+A robot uses some of the slots of a backbone's state and action vectors. Joints start at slot 0. The
+gripper is in slot 7 with this project's own weights, and directly after the joints with published
+weights. Unused slots are zero.
 """
 
 import dataclasses
@@ -55,8 +55,8 @@ def camera_slots(
     unknown = sorted(robot.keys() - set(cameras))
     if unknown or not robot:
         raise ValueError(
-            f"cameras must map at least one of the backbone's cameras ({', '.join(cameras)}) and "
-            f"no others, got {', '.join(unknown) or 'none'}."
+            f"The keys of cameras must be one or more of the backbone's cameras "
+            f"({', '.join(cameras)}), got {', '.join(unknown) or 'none'}."
         )
     return tuple((name, robot.get(name)) for name in cameras)
 
@@ -167,7 +167,9 @@ class Processor:
     def encode(
         self, raw: RawObservation, instruction: jax.Array, *, state_noise: jax.Array | None = None
     ) -> Observation:
-        """Convert a raw observation to model input; missing cameras give black, masked images.
+        """Convert a raw observation to model input.
+
+        Backbone cameras without a robot camera give black, masked images.
 
         Args:
             raw: images of any size and the robot's state.
@@ -185,8 +187,8 @@ class Processor:
         missing = sorted({name for name in sources.values() if name} - set(raw["image"]))
         if missing:
             raise ValueError(
-                f"The observation lacks camera {', '.join(missing)}; it has "
-                f"{', '.join(raw['image']) or 'none'}."
+                f"The observation must contain camera {', '.join(missing)}, "
+                f"got {', '.join(raw['image']) or 'none'}."
             )
         prompt = self.prompts.encode(instruction, state[:, np.array(self.robot_slots)])
         black = jnp.full((len(state), self.image_size, self.image_size, 3), -1.0)

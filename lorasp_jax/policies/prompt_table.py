@@ -1,9 +1,9 @@
 """Prompts of a robot, tokenized in advance, since no tokenizer runs inside `jax.jit`.
 
 pi0.5's prompt contains the state, "Task: press the button, State: 12 130 7;\\nAction: ". Its ids
-are assembled from those of the text before the numbers, of each number with its leading space, and
-of the last number with the text after it. This is correct if the tokenizer never merges a number
-with its neighbors, which is verified for every pair of numbers.
+are concatenated from parts tokenized separately: the text before the numbers, each number with its
+leading space, and the last number with the text after it. This is correct if the tokenizer never
+merges a number with its neighbors, which is verified for every pair of numbers.
 """
 
 import dataclasses
@@ -63,7 +63,7 @@ class PromptTable:
         Args:
             words: the tokenizer of the backbone's weights.
             instructions: P strings.
-            config: the backbone's; with `inputs.prompt_state` prompts contain the state.
+            config: the backbone's config; if `inputs.prompt_state`, prompts contain the state.
             num_joints: J of the robot.
 
         Raises:
@@ -83,7 +83,7 @@ class PromptTable:
         return dataclasses.replace(table, instructions=tuple(instructions))
 
     def select(self, instructions: Sequence[str]) -> "PromptTable":
-        """Return the table of some of its instructions, in the given order.
+        """Return a table of only these instructions, in this order.
 
         Raises:
             ValueError: the table lacks one of them.
@@ -134,7 +134,7 @@ def _check_merges(
 ) -> None:
     """Raise ValueError unless the assembled ids equal the tokenizer's for every pair of numbers."""
     rows = np.arange(prompts.STATE_BINS + 1)
-    # One prompt per number, which alternates with every number and is the first and last value.
+    # One prompt per number, which comes first and last and alternates with all numbers.
     others = (rows[:, None] + 1 + rows) % len(rows)
     pairs = np.stack([rows[:, None] + 0 * others, others], -1)
     state = _bin_centers(pairs.reshape(len(rows), -1) - 1)
@@ -150,8 +150,8 @@ def _check_merges(
     actual = table.encode(jnp.asarray(instruction), jnp.asarray(state))
     if not all(np.array_equal(a, b) for a, b in zip(actual, expected, strict=True)):
         raise ValueError(
-            "The tokenizer merges state values with their neighbors, so prompts that contain the "
-            "state cannot be tabulated: it belongs to a different model."
+            "Cannot tabulate prompts that contain the state: the tokenizer merges state values "
+            "with their neighbors. Use the backbone's own tokenizer."
         )
 
 
@@ -171,7 +171,9 @@ def _encode_complete(
     tokenizer: Tokenizer, texts: Sequence[str], min_tokens: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return ids and mask of complete prompts without truncation, at least `min_tokens` wide."""
-    upper_bound = max(len(text.encode()) for text in texts) + 8  # a byte per token; BOS, EOS
+    upper_bound = (
+        max(len(text.encode()) for text in texts) + 8
+    )  # at most a token per byte, BOS and EOS
     return tokenizer.encode(texts, max(upper_bound, min_tokens), complete=True)
 
 

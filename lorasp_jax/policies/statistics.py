@@ -77,7 +77,9 @@ class Statistics:
         """
         check_slots(slots, dim, len(slots))
         if self.dim < len(slots):
-            raise ValueError(f"The statistics have {self.dim} dimensions, the robot {len(slots)}.")
+            raise ValueError(
+                f"Statistics must have {len(slots)} or more dimensions, got {self.dim}."
+            )
 
         def move(stats: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
             moved = {name: np.full(dim, _UNUSED[name], np.float32) for name in stats}
@@ -116,7 +118,7 @@ class Statistics:
             AttributeError, KeyError, TypeError, ValueError, OverflowError, RecursionError
         ) as error:  # fmt: skip
             raise ValueError(
-                f"Statistics must be lists of numbers state_NAME and action_NAME, got "
+                f"Statistics must be lists of numbers named state_NAME and action_NAME, got "
                 f"{text[:80]!r} ({error})."
             ) from error
         return validate(both, "this JSON")
@@ -126,20 +128,20 @@ def validate(both: Mapping[str, Mapping[str, np.ndarray]], source: str) -> Stati
     """Create statistics from arrays by kind ("state", "action") and name.
 
     Raises:
-        ValueError: no statistics of a kind, unknown names, different lengths, values that are not
+        ValueError: no statistics of one kind, unknown names, different lengths, values that are not
             finite, or a negative standard deviation; the message names `source`.
     """
     arrays = [array for stats in both.values() for array in stats.values()]
     unknown = sorted({name for stats in both.values() for name in stats} - set(NAMES))
     inconsistent = any(array.ndim != 1 or array.shape != arrays[0].shape for array in arrays)
     if unknown or inconsistent or not all(both.values()):
-        problem = f"has {unknown[0]!r}" if unknown else "lacks one of them or differs in length"
+        problem = f"has {unknown[0]!r}" if unknown else "lacks a list or has unequal ones"
         raise ValueError(
             f"Statistics must be lists of equal length for state and for action, named "
             f"{', '.join(NAMES)}; {source} {problem}."
         )
     if not all(np.isfinite(array).all() for array in arrays):
-        raise ValueError(f"Statistics in {source} are not finite: they were never set.")
+        raise ValueError(f"Statistics in {source} must be finite; they may never have been set.")
     if any((stats.get("std", np.zeros(1)) < 0).any() for stats in both.values()):
         raise ValueError(f"Statistics in {source} have a negative standard deviation.")
     state, action = (

@@ -5,8 +5,8 @@ norm_stats.json           openpi: {"norm_stats": {"state": {"mean": [...], ...},
                           in a checkpoint under assets/<dataset>/
 meta/stats.json           LeRobot dataset: {"observation.state": {...}, "action": {...}, ...}
 meta/episodes_stats.jsonl LeRobot dataset, version 2.1: one such object per episode, under "stats"
-policy_preprocessor.json  LeRobot policy: the normalizer step, and the unnormalizer step of
-                          policy_postprocessor.json, each name a safetensors file with tensors
+policy_preprocessor.json  LeRobot policy: the normalizer step here and the unnormalizer step in
+                          policy_postprocessor.json each name a safetensors file with tensors
                           "observation.state.mean" and so on
 model.safetensors         older LeRobot policy: tensors among the weights, named
                           "normalize_inputs.buffer_observation_state.mean" or, by dataset,
@@ -78,7 +78,7 @@ def _select(groups: Mapping[str, Stats], dataset: str, where: str) -> Stats:
         raise ValueError(f"{where} has no statistics tensors.")
     if dataset not in groups:
         names = ", ".join(map(repr, sorted(groups)))
-        raise ValueError(f"{where} has statistics of {names}, not of {dataset!r}; choose one.")
+        raise ValueError(f"dataset must be one of {names} for {where}, got {dataset!r}.")
     return groups[dataset]
 
 
@@ -149,7 +149,7 @@ _READERS: dict[str, Callable[[list[Path]], dict[str, Stats]]] = {
 
 
 def _files(folder: Path, pattern: str) -> list[Path]:
-    """Return the matching regular files; a folder may have such a name, too."""
+    """Return the regular files that match; folders may match too."""
     return [path for path in sorted(folder.glob(pattern)) if path.is_file()]
 
 
@@ -164,7 +164,7 @@ def _arrays(stats: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 
 def _tensors(file: Path) -> list[tuple[str, np.ndarray]]:
-    """Load the statistics tensors of a file, not the weights among them."""
+    """Load only the statistics tensors of a file, not its weights."""
     with safetensors.safe_open(file, framework="np") as tensors:
         names = [name for name in tensors.keys() if TENSOR.fullmatch(name)]  # noqa: SIM118
         return [(name, tensors.get_tensor(name)) for name in names]

@@ -1,4 +1,4 @@
-"""The tokenizer interface, and loading any tokenizer by its path.
+"""Define the tokenizer interface and load any tokenizer by its path.
 
 Implementations: `offline_tokenizer` for the project's own base weights, `pretrained_tokenizers` for
 published language models.
@@ -28,7 +28,8 @@ class Tokenizer(Protocol):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Encode P instructions, padded on the right.
 
-        Longer ones are truncated with a warning; the offline tokenizer raises ValueError instead.
+        Instructions of more than T tokens are truncated with a warning; the offline tokenizer
+        raises ValueError instead.
 
         Args:
             texts: instructions.

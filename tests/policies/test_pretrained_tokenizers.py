@@ -90,7 +90,7 @@ def test_invalid_files_raise_one_sentence(tmp_path):
         tokenizer.load_tokenizer(tmp_path)
     for name, message in (
         ("a.model", "not a SentencePiece model"),
-        ("a.json", "Hugging Face tokenizers"),
+        ("a.json", "not a Hugging Face tokenizer file"),
     ):
         (tmp_path / name).write_text("{}")
         with pytest.raises(ValueError, match=message):

@@ -69,7 +69,7 @@ def test_encode():
 def test_invalid_observations_raise():
     proc = processor(6)
     state = jnp.zeros((2, 7))
-    with pytest.raises(ValueError, match=r"'side' needs uint8 \[B, H, W, 3\], got float32"):
+    with pytest.raises(ValueError, match=r"'side' must be uint8 \[B, H, W, 3\], got float32"):
         proc.encode(
             {"image": {"side": jnp.zeros((2, 16, 16, 3))}, "state": state}, jnp.zeros(2, int)
         )
@@ -156,7 +156,7 @@ def test_missing_cameras_are_black_and_masked():
     assert (wrist[:, :7] == -1).all()
     assert obs.images["right_wrist_0_rgb"].shape == (2, 28, 28, 3)
     assert (obs.images["right_wrist_0_rgb"] == -1).all()
-    with pytest.raises(ValueError, match="lacks camera wrist; it has side"):
+    with pytest.raises(ValueError, match="must contain camera wrist, got side"):
         proc.encode({**raw, "image": {"side": raw["image"]["side"]}}, jnp.zeros(2, int))
     with pytest.raises(ValueError, match=r"backbone's cameras \(base_0_rgb, .* got top"):
         published(cameras={"top": "side"})

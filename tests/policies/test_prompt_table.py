@@ -69,7 +69,7 @@ def test_long_prompts_are_truncated_like_the_tokenizer():
     actual = table.encode(jnp.array([0]), jnp.asarray(state[None]))
     assert actual.mask.all()
     np.testing.assert_array_equal(actual.ids, expected[0])
-    with pytest.raises(ValueError, match="valid are 1 to 35"):
+    with pytest.raises(ValueError, match="must have 1 to 35 tokens"):
         PromptTable.of(tokenizer.Offline(), TEXTS, config, num_joints=6)
 
 

@@ -76,5 +76,5 @@ def test_to_slots_reorders_and_drops_padding():
     statistics = long.to_slots(PIPER, DIM)
     assert statistics.state["min"].tolist() == [0, 1, 2, 3, 4, 5, -1, 6]
     assert statistics.state["mean"].tolist() == [4.5, 5.5, 6.5, 7.5, 8.5, 9.5, 0, 10.5]
-    with pytest.raises(ValueError, match="have 9 dimensions, the robot 10"):
+    with pytest.raises(ValueError, match="must have 10 or more dimensions, got 9"):
         long.to_slots(range(10), 32)
