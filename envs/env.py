@@ -80,7 +80,7 @@ class Env:
 
     @property
     def antialias(self) -> int:
-        """n, where each pixel takes n x n rays."""
+        """Square root of the number of rays per pixel."""
         return self.renderer.samples
 
     @property

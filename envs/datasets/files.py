@@ -184,7 +184,7 @@ def check_memory(size: int, what: object) -> None:
 
 
 def as_int(number: Any) -> int:
-    """Convert a number from a table to an int: tables with missing values have floats.
+    """Convert a table's number to an int; columns with missing values hold integers as floats.
 
     Raises:
         ValueError: it is not an integer, or its magnitude is 2^63 or more.

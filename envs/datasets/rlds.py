@@ -118,7 +118,7 @@ class ShardWriter:
         """Append a shard, and add its attempts to `attempted`.
 
         Raises:
-            ValueError: the arrays are inconsistent, or the metadata differ from those before.
+            ValueError: the arrays are inconsistent, or the metadata differ from earlier shards.
             OSError: the disk is full; earlier shards are unaffected.
         """
         episodes.validate()

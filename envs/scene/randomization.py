@@ -66,7 +66,7 @@ class Randomization:
 
     @classmethod
     def typical(cls) -> Self:
-        """Return moderate ranges for small arms and cameras, chosen so that experts succeed."""
+        """Return moderate ranges for small robots and their cameras; experts succeed with them."""
         return cls(
             position=(-0.01, 0.01),
             turn=(-0.1, 0.1),

@@ -121,7 +121,7 @@ class Writer:
     """Write a cache episode by episode; a context manager that completes the cache on success."""
 
     def __init__(self, folder: Path) -> None:
-        """Start in an existing folder."""
+        """Start a cache in an existing folder."""
         self.num_steps: int = 0
         self._folder, self._metadata = folder, {}
         self._tasks: list[str] = []
