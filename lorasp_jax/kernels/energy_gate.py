@@ -5,8 +5,8 @@ The gate keeps the smallest k with E_k >= η; ties go to the lowest index. Imple
 
 - "pairwise": for each direction, sum the energy of all directions that rank before it. O(R²),
   vectorized over rows and R; fastest on CPU up to R = 32.
-- "sort": sort the scores, accumulate energy, threshold. The reference; in rare rows the rounding of
-  its cumulative sum crosses η.
+- "sort": sort the scores, accumulate energy, threshold. The reference; rarely, rounding of its
+  cumulative sum changes whether η is reached.
 - "bisection": binary search for the threshold, bit by bit, without a sort.
 - "block": bisection that stops early, for the few rows of a kernel's block.
 - "pallas": "block" as a Triton kernel, one row per warp, scores in registers.
@@ -14,8 +14,8 @@ The gate keeps the smallest k with E_k >= η; ties go to the lowest index. Imple
 "sort", "block" and "pallas" reduce each row to its `Boundary`, the last kept (score, index), from
 which the mask follows elementwise.
 
-η is the decimal as written: 0.9 means 9/10, and E_k >= 9/10 is tested as 10 Σ_k >= 9 Σ, so that
-rounding of 0.9 does not change rows that reach the target exactly.
+η is the decimal as written: 0.9 means 9/10, and E_k >= 9/10 is tested as 10 Σ_k >= 9 Σ for the
+kept and total energies, so that rounding of 0.9 does not affect rows that reach it exactly.
 
 All implementations agree at the limits of fp32:
 
@@ -100,7 +100,7 @@ def energy_gate(
     name = implementation or default_implementation(scores.shape[-1])
     compute_mask = _mask_function(name, interpret)
     scores = scores.astype(jnp.float32)
-    constant = jnp.abs(jax.lax.stop_gradient(scores))  # also turns -0 into 0, without the sign bit
+    constant = jnp.abs(jax.lax.stop_gradient(scores))  # also clears the sign bit of -0
     keep_all = ratio.numerator == ratio.denominator
     mask = positive(constant) if keep_all else compute_mask(constant, ratio)
     return mask, mask.sum(-1).astype(jnp.float32), kept_energy(scores, mask)
@@ -126,7 +126,7 @@ def _mask_function(implementation: str, interpret: bool) -> Callable[[jax.Array,
         return masks[implementation]
     if implementation not in boundaries:
         valid = ", ".join(get_args(Implementation))
-        raise ValueError(f"Unknown energy gate {implementation!r}; valid are {valid}.")
+        raise ValueError(f"implementation must be one of {valid}, got {implementation!r}.")
     boundary = boundaries[implementation]
     # XLA may compute the scores twice, for the boundary and for the comparison with it, and round
     # them differently; the barrier prevents this. A kernel computes them once.
@@ -145,7 +145,7 @@ def positive(scores: jax.Array) -> jax.Array:
 
 
 def _pairwise_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
-    """Keep each positive score before which the energy falls short of the target."""
+    """Keep each positive score whose predecessors in rank fall short of the energy target."""
     energy = energies(scores)
     position = np.arange(scores.shape[-1])
 
@@ -184,7 +184,7 @@ def energy_share(scores: jax.Array) -> jax.Array:
 
 
 def _sorted_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
-    """Find the boundaries by sorting scores, the reference; needs neither argsort nor scatter."""
+    """Find the boundaries by sorting the scores (the reference), without argsort or scatter."""
     rows = scores.reshape(-1, scores.shape[-1])
     last = jax.vmap(lambda row: _sorted_row_boundary(row, ratio))(rows)
     return jax.tree.map(lambda leaf: leaf.reshape(*scores.shape[:-1], 1), last)
@@ -212,7 +212,7 @@ def _pallas_boundary(scores: jax.Array, ratio: Ratio, *, interpret: bool) -> Bou
 
 
 def _call_kernel(ratio: Ratio, interpret: bool, _: Any, arrays: Sequence[jax.Array]) -> tuple:
-    """Compute the columns of `Boundary` for rows of scores, and no sums for `by_rows`."""
+    """Compute the columns of `Boundary` for rows of scores; return no sums to `by_rows`."""
     from jax.experimental.pallas import triton  # absent from builds without NVIDIA support
 
     (rows,), column = arrays, pl.BlockSpec((1, 1), lambda i: (i, 0))

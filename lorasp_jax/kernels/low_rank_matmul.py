@@ -8,7 +8,7 @@ much as the adapter itself:
 - the P of all layers are concatenated into one matmul with x; the backward pass takes one more
   matmul for their gradients and one for the gradient of x through them;
 - if O >= I, x W + z U is one matmul, [x, z] [W; U];
-- if O > 2 I, so are g Wᵀ and g Uᵀ for the gradient g of y: g [W; U]ᵀ;
+- if O > 2 I, so are g Wᵀ and g Uᵀ for the gradient g of the output: g [W; U]ᵀ;
 - if the outputs of all layers together are at most as wide as x, its gradient is one matmul,
   [g, q] [W, P]ᵀ, with q the gradient of x P.
 
@@ -77,7 +77,7 @@ class LowRankLayer(NamedTuple):
     """U [R, O], fp32, cast to the dtype of x on use."""
 
 
-# jit traces and lowers it once for all layers of equal shapes.
+# jit traces and lowers the function once for all layers of equal shapes.
 @functools.partial(jax.jit, static_argnums=(0, 1))
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def low_rank_matmul(
@@ -90,7 +90,7 @@ def low_rank_matmul(
     """Return (x W + z U, aux) of each layer, where z, aux = f(params, x P, token_mask).
 
     Args:
-      methods: f of each layer, or of all; objects that compare equal must compute the same.
+      methods: f of each layer, or of all; objects that compare equal must compute the same f.
       rows_dtype: dtype of x P, which is accumulated in fp32.
       layers: arrays of each layer.
       x: [..., I]; x W + z U has its dtype.
@@ -214,7 +214,7 @@ def _split(widths: Sequence[int], columns: jax.Array) -> list[jax.Array]:
 
 
 def pad_columns(matrix: jax.Array) -> jax.Array:
-    """Zero-pad to a multiple of 8 columns; 132 columns doubled the time of LoRA-MoE's backward."""
+    """Zero-pad to a multiple of 8 columns; 132 doubled the time of LoRA-MoE's backward pass."""
     return jnp.pad(matrix, [(0, 0)] * (matrix.ndim - 1) + [(0, -matrix.shape[-1] % 8)])
 
 

@@ -34,7 +34,7 @@ class PackedTree:
         return cls(jnp.concatenate(flat, axis=-1), structure, shapes)
 
     def tree(self, load: Callable[[int, int], jax.Array] | None = None) -> Any:
-        """Unpack; `load`, (start, size) -> [..., size], replaces slicing of `values`."""
+        """Unpack; `load(start, size)` returns [..., size] in place of a slice of `values`."""
         load = load or (lambda start, size: self.values[..., start : start + size])
         parts = [load(*span) for span in spans(tuple(map(math.prod, self.shapes)))]
         leaves = [

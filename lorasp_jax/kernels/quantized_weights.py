@@ -105,7 +105,7 @@ def quantize_kernel(kernel: jax.Array, kind: Kind) -> QuantizedKernel:
       ValueError: unknown kind, or non-finite values.
     """
     if kind not in KINDS:
-        raise ValueError(f"Unknown quantization {kind!r}; valid are {', '.join(KINDS)}.")
+        raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}.")
     codes, scale = _codes(kernel, kind)
     if not bool(jnp.isfinite(scale).all()):
         raise ValueError("the kernel has NaN or infinite values.")

@@ -1,10 +1,10 @@
 """Trace a row-wise function into one GPU kernel, and its gradient into another.
 
 Between its matmuls an adapter applies a chain of small operations to each token: a nonlinearity, a
-gate, losses. XLA compiles the chain to a dozen kernels, stores the residuals of each, and copies
+gate and losses. XLA compiles the chain to a dozen kernels, stores the residuals of each, and copies
 all of them once more in a scan over layers. Here the chain is traced into one Triton kernel. The
 backward kernel recomputes the chain block by block and applies its VJP, so the only residuals are
-the input rows and, bit-packed, the function's mask.
+the input rows and the function's mask, packed into bits.
 
 The reference is the function itself, applied to all rows at once. LoRA-SP's chain with its gradient
 on an H200 (35k bf16 rows, R = 64, H = 32): 180 us as kernels, 500 us in XLA.

@@ -14,7 +14,7 @@ import numpy as np
 
 
 class Boundary(NamedTuple):
-    """Last kept position of each row: s > score is kept, and s == score up to index, inclusive."""
+    """Last kept score of each row; larger scores are kept too, and ties up to index inclusive."""
 
     score: jax.Array  # f32 [..., 1], [] for a single row; NaN where nothing is kept
     index: jax.Array  # int32, same shape
@@ -30,12 +30,12 @@ class Ratio(NamedTuple):
 def energies(scores: jax.Array) -> jax.Array:
     """Square the scores after scaling each row by a power of two to a maximum in [1/2, 1).
 
-    The scaling is exact, cancels in E_k and keeps the squares from overflow and underflow.
+    The scaling is exact, cancels in E_k and keeps the squares from overflowing or underflowing.
     For a maximum with exponent field e the factor is 2^(126 - e), whose own field is 253 - e (at
     least 1, so that it stays normal).
 
-    In a row with infinite scores these get energy 1 and finite ones 0, the limit. NaN stays NaN,
-    even on backends whose maximum ignores it, such as Triton.
+    In a row with infinite scores, these get energy 1 and finite scores energy 0, as in the limit.
+    NaN stays NaN, even on backends whose maximum ignores it, such as Triton.
     """
     largest = _by_row(jnp.max, jnp.abs(jax.lax.stop_gradient(scores)))
     exponent = jax.lax.shift_right_logical(_bits(largest), 23)
@@ -106,10 +106,11 @@ def bisected_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
 def block_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
     """Find the boundaries of a block of rows [..., R] inside a kernel.
 
-    One binary search finds the largest score s such that all scores >= s reach the target, a second
-    one the last tie of s that is needed. Both use only elementwise operations and row sums. The
-    loop stops once all rows of the block are decided (after 11 of 31 steps for softplus scores,
-    R = 128). For a single row the comparisons are on scalars, which are free in a kernel.
+    One binary search finds the largest score s such that the scores >= s together reach the target;
+    a second one finds the last tie of s that is needed. Both use only elementwise operations and
+    row sums. The first stops once all rows of the block are decided (after 11 of 31 steps for
+    softplus scores, R = 128). For a single row the comparisons are on scalars, which are free in a
+    kernel.
     """
     if scores.size == scores.shape[-1]:
         scores = scores.reshape(-1)

@@ -188,7 +188,7 @@ def test_invalid_target(eta):
 
 
 def test_unknown_implementation():
-    with pytest.raises(ValueError, match="valid are pairwise, sort, bisection, block, pallas"):
+    with pytest.raises(ValueError, match="one of pairwise, sort, bisection, block, pallas"):
         gate.energy_gate(jnp.ones(3), 0.9, implementation="argsort")
 
 
