@@ -74,7 +74,7 @@ class Noise:
 
 
 def seconds(call: Callable[[], Any]) -> float:
-    """Time a single call: for a second one the files would be in the page cache."""
+    """Time a single call; a second one would find the files in the page cache."""
     start = time.perf_counter()
     call()
     return time.perf_counter() - start

@@ -28,7 +28,7 @@ from envs.datasets.files import check_local
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Task and hyperparameters; the defaults, our own choice, solve press in minutes on a CPU."""
+    """Task and hyperparameters; the defaults, our choice, solve press in minutes on a CPU."""
 
     task: str = "press"
     robot: str = "piper"

@@ -13,7 +13,7 @@ import jax
 from envs import _compat
 
 PATIENCE = 2.0
-"""Seconds of compilation before a message appears; own choice."""
+"""Seconds of compilation before a message appears; our choice."""
 
 
 @contextlib.contextmanager

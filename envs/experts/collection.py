@@ -20,12 +20,12 @@ from envs.making import AnyRobot, make
 from envs.scene.randomization import Draw, Randomization, prepare
 from envs.state import Poses
 
-# Default number of worlds per call; own choice: fills the device and fits its memory.
+# Default number of worlds per call; our choice: fills the device and fits its memory.
 _NUM_ENVS = {"cpu": 32, "gpu": 256, "tpu": 256}
-# Give up if fewer than this share of attempts succeed, after this many attempts. Own choice: the
+# Give up if fewer than this share of attempts succeed, after this many attempts. Our choice: the
 # experts solve nearly all layouts, so less means that something is broken.
 _MIN_SUCCESS, _MIN_ATTEMPTS = 0.5, 16
-_MAX_EPISODES = 10**9  # own choice, a bound against typos
+_MAX_EPISODES = 10**9  # our choice, a bound against typos
 
 Record = Callable[
     [Env, jax.Array, float | jax.Array, Randomization | None], tuple[dict[str, Any], jax.Array]

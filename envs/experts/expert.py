@@ -17,7 +17,7 @@ from envs.robots import Robot, multiply
 from envs.state import State
 from envs.tasks import Waypoints
 
-_SPEED_FRACTION = 0.5  # share of the robot's joint speed limits that the expert uses; own choice
+_SPEED_FRACTION = 0.5  # share of the robot's joint speed limits that the expert uses; our choice
 _PEAK = 1.875  # peak over mean speed of a minimum-jerk move: 30 s²(1 - s)² at s = 1/2
 
 
@@ -33,7 +33,7 @@ class Plan:
 def plan(env: Env, state: State, key: jax.Array) -> Plan:
     """Plan a random solution for every world, starting from its robot's current pose.
 
-    Waypoints in free space get noise, and every duration is scaled by a factor in [0.8, 1.2] (own
+    Waypoints in free space get noise, and every duration is scaled by a factor in [0.8, 1.2] (our
     choices).
     """
     keys = jax.random.split(key, env.num_envs)
@@ -49,7 +49,7 @@ def act(env: Env, plan: Plan, state: State) -> jax.Array:
 
 
 def tool_rotations(robot: Robot, waypoints: Waypoints) -> jax.Array:
-    """Compute tool rotations [P, 3, 3] from the waypoints' and the robot's lean and tilt."""
+    """Compute tool rotations [P, 3, 3] from the waypoints and the robot's lean and tilt side."""
     # The tcp's x axis points back to the base; y, along which the fingers open, stays level.
     angle = -(waypoints.lean * robot.lean + waypoints.tilt * robot.tilt_side)
     c, s, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle), jnp.ones_like(angle)

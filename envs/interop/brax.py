@@ -31,7 +31,7 @@ _full_state = fast_cpu.jit(Env._full_state, static_argnums=0)
 
 
 class BraxEnv(base.Env):
-    """One world of a task behind Brax's interface; Brax's wrappers batch, time and restart it.
+    """One world of a task behind Brax's interface, for Brax's wrappers to batch and restart.
 
     Observations are those of `Env.full_state`, float32 [D], without images. `env.observe` renders
     `state.pipeline_state`, the `envs.State` of one world.

@@ -24,7 +24,7 @@ from envs.mjcf import attaching, hands, posing, reading
 from envs.robots import Robot
 from envs.scene import scene
 
-# Own choices [rad/s, m/s]: between Panda (2.175 to 2.61) and PiPER (3); the speed of both grippers.
+# Our choices [rad/s, m/s]: between Panda (2.175 to 2.61) and PiPER (3); the speed of both grippers.
 _SPEED, _GRIPPER_SPEED = 2.5, 0.1
 
 

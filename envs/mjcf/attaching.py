@@ -17,7 +17,7 @@ _BASE = "base"
 _PREFIX = "robot/"  # for all names in the user's file, to avoid clashes with the scene and tasks
 _DROPPED = ("keys", "sensors", "actuators", "tendons", "equalities", "pairs", "excludes", "lights")
 _UNSET = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default color; such a geom uses its material's
-_SMALL = 0.01  # m, half-extent below which a mesh is not drawn; own choice
+_SMALL = 0.01  # m, half-extent below which a mesh is not drawn; our choice
 _HIDDEN_GROUP = 3
 
 

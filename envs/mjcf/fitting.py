@@ -9,7 +9,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
-# Own choices.
+# Our choices.
 _POINTS = 500  # samples of a surface
 _CUTS = np.arange(1, 6) / 6  # candidate cuts, as fractions of a part's extent
 _MAX_VOLUME_RATIO = 0.85  # cut only if the total volume shrinks below this share

@@ -9,7 +9,7 @@ import numpy as np
 from envs.mjcf.reading import Arm
 from envs.robots import TIP_LENGTH, TIP_RADIUS
 
-_PARALLEL = 0.99  # smallest cosine between parallel directions (8 deg); own choice
+_PARALLEL = 0.99  # smallest cosine between parallel directions (8 deg); our choice
 _CORNERS = np.array(list(itertools.product((-1, 1), repeat=3)))
 
 

@@ -23,7 +23,7 @@ _LEANS = np.deg2rad(np.arange(0, 50, 5)).astype(np.float32)
 _TABLE = np.array([(x, y, z) for x in (0.28, 0.43) for y in (-0.18, 0.19) for z in (0.02, 0.15)])
 _POUR = np.array([(x, y, 0.2) for x in (0.34, 0.40) for y in (0.09, 0.15)])
 _TILTS = np.deg2rad([25, 94])  # of the task "pour": carrying the cup, pouring
-# Own choices.
+# Our choices.
 _TOLERANCE = 0.004  # m, largest error of a pose that counts as reached
 _LEVER = 0.1  # m, converts an error in angle to one in position
 _MARGIN = 0.05  # rad, minimum distance to the limits of each joint
@@ -47,7 +47,7 @@ def complete(robot: Robot) -> Robot:
     if errors.min() > _TOLERANCE:
         raise ValueError(
             f"the hand must reach x 0.34 m, y 0 m, z 0.18 m (the start of every episode), pointing "
-            f"down or leaning outwards by up to 45 deg; it misses by {1000 * errors.min():.0f} mm"
+            f"down or leaning outward by up to 45 deg; it misses by {1000 * errors.min():.0f} mm"
         )
     cost = np.maximum(table_errors, _TOLERANCE)
     cost[errors > _TOLERANCE] = np.inf
@@ -93,8 +93,8 @@ def _tilt_side(robot: Robot) -> int:
     carrying, pouring = np.array([[1.0], [-1.0]]) * _TILTS[:, None, None]
     solutions, _ = _solve(robot, _POUR, carrying, 0.0, robot.home, robot.home)
     _, errors = _solve(robot, _POUR, pouring, 0.0, solutions, robot.home)
-    outwards, back = errors.max(axis=1)
-    return 1 if outwards <= back else -1
+    outward, back = errors.max(axis=1)
+    return 1 if outward <= back else -1
 
 
 def _solve(
@@ -105,7 +105,7 @@ def _solve(
     Args:
         robot: the arm.
         at: [..., 3] positions [m].
-        lean, turn: [...] angles outwards and about z, from pointing down [rad].
+        lean, turn: [...] angles outward and about z, from pointing down [rad].
         start, home: [..., J] initial joint angles, and those that redundant joints tend to [rad].
 
     Returns:

@@ -18,7 +18,7 @@ from envs.datasets.files import check_memory, check_regular, read_text
 _FOLDERS = ("assetdir", "meshdir", "texturedir")  # attributes of compiler
 _DESCRIPTIONS = ("include", "model")  # elements that refer to another MJCF file
 _EXPANDED = ("include", "attach")  # elements that are replaced by those of another MJCF file
-# Limits are own choices, far above the needs of any robot; MuJoCo 3.17 takes seconds at _MAX_COPIES
+# Limits are our choices, far above the needs of any robot; MuJoCo 3.17 takes seconds at _MAX_COPIES
 # and _MAX_ELEMENTS (measured).
 _MAX_DEPTH, _MAX_TEXT = 20, 2**25
 _MAX_COPIES, _MAX_ELEMENTS = 1000, 10_000

@@ -26,7 +26,7 @@ BACKENDS: tuple[str, ...] = get_args(Backend)
 """jax runs everywhere; warp is much faster on NVIDIA GPUs, and runs on CPU, slowly, for tests."""
 
 MAX_GROWTH = 1.25
-"""Maximum factor on a geom's size in a world; own choice, Warp's bounding volumes allow for it."""
+"""Maximum factor on a geom's size in a world; our choice; Warp's bounding volumes grow by it."""
 
 
 @functools.cache

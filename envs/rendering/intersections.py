@@ -33,7 +33,7 @@ class Geom(NamedTuple):
 
     axes: Matrix  # rows of the matrix whose columns are the camera's axes
     eye: Vec  # the camera's position
-    light: Vec  # direction towards the light
+    light: Vec  # direction toward the light
     shrink: Vec  # 1 / half-extents before scaling [1/m]
     rgb: Vec
     half: jax.Array  # a capsule's half-length over its radius, else 0

@@ -11,7 +11,7 @@ import numpy as np
 
 from envs.rendering.intersections import BOX, CAPSULE, CYLINDER, PLANE, SPHERE
 
-# Defaults where a model does not specify them; own choices by eye. Shares of light, sky color at
+# Defaults where a model does not specify them, chosen by eye. Shares of light, sky color at
 # the horizon and at the zenith, edge [m] and contrast of the checker on planes.
 AMBIENT, HEADLIGHT, DIFFUSE = 0.35, 0.25, 0.5
 SKY = ((0.80, 0.84, 0.88), (0.45, 0.58, 0.75))
@@ -38,7 +38,7 @@ class Appearance:
     Attributes:
         rgba: `[G, 4]` color of each geom of the MuJoCo model, 0 to 1; alpha is ignored: `build`
             decides what is visible.
-        light: `[3]` direction towards the (directional) light in world axes, of any length.
+        light: `[3]` direction toward the (directional) light in world axes, of any length.
         ambient: `[]` share of a geom's color that needs no light.
         headlight: `[]` share lit from the camera, without shadows.
         diffuse: `[]` share lit by `light`, with shadows.

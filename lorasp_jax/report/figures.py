@@ -91,7 +91,7 @@ def success_over_steps(rows: Rows) -> Figure:
         _line(axes, rows, name, f"C{number}", name.removeprefix("success/"))
     axes.set_ylim(0, 1.03)
     axes.set_xlabel("step")
-    axes.set_title("success during training, in fewer episodes than at the end", loc="left")
+    axes.set_title("success during training (fewer episodes than at the end)", loc="left")
     axes.legend(frameon=False, loc="lower right")
     return figure
 

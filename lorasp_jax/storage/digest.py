@@ -98,7 +98,7 @@ def mixed_sum(array: jax.Array, *, rounded: bool = False) -> jax.Array:
     """Sum the bits of all elements (in bf16 if rounded), each mixed with its position: `[]` uint32.
 
     The mixing is the finalizer of MurmurHash3 (github.com/aappleby/smhasher, MurmurHash3.cpp:68), a
-    permutation of the 32-bit words: a change of a single word is always detected, any other change
+    permutation of the 32-bit words: a change of a single word is always detected; any other change
     is missed with probability 2^-32. Integer sums do not depend on the order.
     """
     if rounded or array.dtype == bool:
