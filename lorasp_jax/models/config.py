@@ -98,20 +98,20 @@ class BackboneConfig:
     action_dim: int
     """Number of slots in state and action vectors, A."""
     inputs: InputConfig = OURS
-    """How images, states and actions are preprocessed."""
+    """Preprocessing of images, states and actions."""
     dtype: str = "float32"
     """Dtype of the towers' matmuls; norms, softmax, projections and the loss run in fp32."""
     param_dtype: str = "float32"
     """Dtype of the stored parameters."""
     remat: Remat = "none"
-    """What the backward pass recomputes. "none": nothing; "products": everything except matmul
-    results, with half the memory and a few percent more compute; "full": whole layers, with the
-    least memory and a third more compute."""
+    """Rematerialization in the backward pass. "none" recomputes nothing; "products" recomputes
+    everything except matmul results, with half the memory and a few percent more compute; "full"
+    recomputes whole layers, with the least memory and a third more compute."""
     unroll: bool | None = None
-    """Unroll the loop over layers. This runs faster, especially for small layers, because a loop
-    copies the backward pass's residuals into and out of stacks, but takes two to three times as
-    long to compile. None unrolls unless `remat` is "full": XLA preserves remat order only inside a
-    loop."""
+    """Unroll the loop over layers. Unrolling takes two to three times as long to compile but runs
+    faster, especially for small layers, because a loop copies the backward pass's residuals into
+    and out of stacks. None unrolls unless `remat` is "full": XLA preserves the order of
+    rematerialization only inside a loop."""
 
     def __post_init__(self) -> None:
         """Validate the sizes."""

@@ -21,7 +21,7 @@ class InputConfig:
     action: Mode = "mean_std"
     """Normalization of actions."""
     delta: tuple[bool, ...] = ()
-    """Mask of action dimensions relative to the state at the start of the chunk, see
+    """Mask, True for action dimensions relative to the state at the start of the chunk; see
     `policies.processor.to_delta`. The action statistics are then those of relative actions."""
     convention: Convention = "ours"
     """Project whose guard against division by zero is used in normalization."""

@@ -58,7 +58,7 @@ def patterns(targets: str | Sequence[str]) -> list[str]:
 
 
 def _suggestion(target: str) -> str | None:
-    """Find the preset that a target misspells; substrings of preset names or patterns are valid."""
+    """Find the preset that a target misspells; None for substrings of preset names or patterns."""
     texts = (text for name, patterns in PRESETS.items() for text in (name, *patterns))
     if not _WORD.fullmatch(target) or any(target in text for text in texts):
         return None

@@ -173,10 +173,11 @@ def set_arrays(model: Model, arrays: Mapping[str, Any]) -> Model:
 
 
 def weights_hash(source: Folder | nnx.Module) -> str:
-    """SHA-256 of a model's base weights: names, shapes and values in fp32.
+    """Return the SHA-256 of a model's frozen parameters: names, shapes and values in fp32.
 
-    It identifies the frozen base: adapters are excluded, and a model with bf16 or fp32 parameters
-    has the same hash as the folder it was loaded from.
+    A loaded model has the same hash as its folder, whether its parameters are bf16 or fp32, and
+    keeps it when `adapt` adds adapters. The hash changes if `adapt` splits kernels or makes base
+    weights trainable (full fine-tuning), and after `combine` (frozen adapters) or `quantize`.
 
     Args:
         source: a folder that `save` wrote, or a model.
@@ -189,7 +190,7 @@ def weights_hash(source: Folder | nnx.Module) -> str:
 
 
 def named_arrays(model: nnx.Module, adapters: bool = True) -> dict[str, Any]:
-    """Return a model's parameters by "/"-joined path, in tree order."""
+    """Return a model's parameters, or only the frozen ones, by "/"-joined path in tree order."""
     state = nnx.state(model, nnx.Param if adapters else nnx.All(nnx.Param, nnx.Not(AdapterParam)))
     return by_path(nnx.to_pure_dict(state))
 

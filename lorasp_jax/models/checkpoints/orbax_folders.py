@@ -12,7 +12,7 @@ from typing import Any
 from envs.datasets.files import TEXT_BYTES, RefusedError, check_memory, check_only_files
 
 MANIFEST = "manifest.ocdbt"
-"""Root file of a TensorStore database, in one or more folders; read whole into memory."""
+"""Root file of a TensorStore database (a checkpoint may hold several); read into memory whole."""
 
 
 def check(folder: Path) -> None:
@@ -34,7 +34,7 @@ def suppress_repeated_errors() -> None:
     """When Orbax reads or writes fail, report only the exception that Orbax raises.
 
     Otherwise Orbax logs a traceback for each further failed operation, asyncio logs one for each
-    task that is never awaited, and Python prints errors from their threads and coroutines.
+    task that is never awaited, and Python prints errors from Orbax's threads and coroutines.
     """
     for name in ("absl", "asyncio"):
         logging.getLogger(name).addFilter(_is_not_from_orbax)

@@ -47,7 +47,7 @@ def attach(model: Any, leaves: Mapping[str, np.ndarray], *, scale: float = 1.0) 
             Checkpoints do not store it; openpi's own variants use 1.
 
     Raises:
-        ValueError: a leaf is missing, unexpected or does not fit the model.
+        ValueError: a leaf is missing or unexpected, or does not fit the model.
     """
     if not leaves:
         raise ValueError("openpi's LoRA must have at least one leaf, got none.")

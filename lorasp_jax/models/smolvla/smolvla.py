@@ -111,7 +111,7 @@ class Prefix(NamedTuple):
 
     Attributes:
         cache: keys and values `[L / 2, B, P, K, H]` of the language model's even layers.
-        cross: those of its odd layers, projected by the action expert; same shape.
+        cross: the same for the odd layers, projected by the action expert.
         valid: `[B, P]` bool.
     """
 

@@ -18,7 +18,7 @@ _SAVED = "saved"
 
 
 def save_for_backward(x: jax.Array) -> jax.Array:
-    """Mark x to be saved for the backward pass instead of the matmuls that produced it."""
+    """Mark x to be saved for the backward pass instead of the results of the matmuls before it."""
     return checkpoint_name(x, _SAVED)
 
 
@@ -56,7 +56,7 @@ def scan_depth(
         call: (block, x, the layer's slice of `per_layer`) -> (x, per-layer output).
         x: `[B, T, D]`.
         per_layer: pytree with a leading axis L, or None.
-        remat: what the backward pass recomputes; see `BackboneConfig.remat`.
+        remat: rematerialization policy; see `BackboneConfig.remat`.
         unroll: unroll the loop over layers instead of using `lax.scan`.
 
     Returns:
