@@ -1,7 +1,7 @@
 """Adapted dense layers: a functional core and its Flax NNX and Linen wrappers.
 
 `dense` works on arrays. `Dense` (Flax NNX) and `LinenDense` (Flax Linen) are drop-ins for
-`nnx.Linear` and `nn.Dense`. All leave adding the adapter's delta to `lorasp_jax.peft`.
+`nnx.Linear` and `nn.Dense`. All delegate the adapter's computation to `lorasp_jax.peft`.
 
 As a drop-in, `layer(x)` returns `y` alone and stores its aux for `collect_aux`. With NNX this works
 wherever the module is mutable: eagerly, or inside a jitted function that takes the model as an

@@ -15,7 +15,7 @@ from lorasp_jax.peft._shared_input import AdaptedKernel, apply_shared_input
 
 
 class DenseLayer(NamedTuple):
-    """Arguments of `dense` other than the input."""
+    """Arguments of `dense` other than the input and its mask."""
 
     kernel: jax.Array
     bias: jax.Array | None = None

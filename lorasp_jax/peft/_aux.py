@@ -47,7 +47,7 @@ def masked_mean(values: jax.Array, mask: jax.Array | None) -> jax.Array:
 
 
 def auxiliary_losses(aux: Any) -> dict[str, jax.Array]:
-    """Each auxiliary loss averaged over the adapted layers that have it, f32 scalars by name.
+    """Average each auxiliary loss over the adapted layers that have it: f32 scalars by name.
 
     Args:
       aux: any tree of `Aux`, such as the result of `collect_aux`. An `Aux` stacked by a scan over

@@ -1,7 +1,6 @@
 """`Method.bottleneck` of several layers in one call: a fused GPU kernel, or `jax.vmap`.
 
-Optional for a method. Used by `lorasp_jax.peft._shared_input` and by layers that are prepared for
-inference.
+Methods may omit it; `lorasp_jax.peft._shared_input` and layers prepared for inference use it.
 """
 
 import dataclasses
@@ -48,7 +47,7 @@ class BatchedBottleneck:
         widths: Sequence[int],
         token_mask: jax.Array | None,
     ) -> list[tuple[jax.Array, Aux]]:
-        """z and aux of each layer, see `BottleneckEach`; all widths must be equal."""
+        """Return z and aux of each layer; see `BottleneckEach`. All widths must be equal."""
         n = len(params)
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(self.pack, params))
         columns = range(0, sum(widths), widths[0])

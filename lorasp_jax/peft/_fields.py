@@ -34,9 +34,9 @@ def check_fields(owner: Any, prefix: str = "") -> None:
             continue
         value = getattr(owner, name)
         if not _fits(value, kind):
-            raise ValueError(f"{prefix}{name} must be {_describe(kind)}, got {short(value)}")
+            raise ValueError(f"{prefix}{name} must be {_describe(kind)}, got {short(value)}.")
         if type(value) is int and abs(value) > maximum.get(name, MAX_INT):
-            raise ValueError(f"{prefix}{name} must be at most {maximum[name]}, got {value}")
+            raise ValueError(f"{prefix}{name} must be at most {maximum[name]}, got {value}.")
 
 
 def check_names(cls: type, name: str, values: Sequence[Any], fields: Iterable[str]) -> None:

@@ -41,7 +41,7 @@ class Method:
         delta = z U,    z, aux = bottleneck(bottleneck_params(params), x P),
         P = down(params),    U = up(params)
 
-    x is [...tokens, I], a kernel [I, O]; the result has the dtype of x. Parameters are fp32.
+    x is [...tokens, I] and the kernel is [I, O]; the result has x's dtype. Parameters are fp32.
     """
 
     def __new__(cls, *values: Any, **fields: Any) -> "Method":

@@ -25,7 +25,7 @@ from lorasp_jax.peft import _fields
 from lorasp_jax.peft._aux import Aux
 from lorasp_jax.peft._method import Method, Params
 
-_INIT_STD = 0.02  # of A and B in PEFT
+_INIT_STD = 0.02  # PEFT's value for A and B
 _NAMES = {"lora_a", "lora_e", "lora_b"}
 
 Triplets = dict[str, jax.Array]
@@ -51,7 +51,7 @@ class AdaLoRA(Method):
     warmup: float = 0.1
     """Fraction of the training steps before pruning starts."""
     final: float = 0.3
-    """Fraction of the training steps, at the end, that keep the set of pruned triplets fixed."""
+    """Fraction of the training steps, at the end, in which the set of pruned triplets is fixed."""
     interval: int = 10
     """Steps from one pruning to the next."""
     importance_decay: float = 0.85

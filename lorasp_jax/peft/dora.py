@@ -40,7 +40,7 @@ class DoRA(LoRA):
         See `Method.init` for the arguments and results; here the kernel must have values.
 
         Raises:
-          ValueError: the kernel is not a matrix, or only a shape.
+          ValueError: the kernel is not a matrix or has no values.
         """
         if isinstance(kernel, jax.ShapeDtypeStruct):
             raise ValueError(

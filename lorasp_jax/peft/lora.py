@@ -77,7 +77,7 @@ class LoRA(Method):
         See `Method.init` for the arguments and results.
 
         Raises:
-          ValueError: the kernel is not a matrix; a kernel to be split is only a shape or has fewer
+          ValueError: the kernel is not a matrix; a kernel to be split has no values or has fewer
             than R rows or columns; or statistics are missing or have the wrong shape.
         """
         if self.needs_statistics:

@@ -33,9 +33,9 @@ class LoRAMoE(Method):
     """
 
     experts: int = 4
-    """E."""
+    """Number of experts, E."""
     rank: int = 32
-    """R of each expert."""
+    """Rank R of each expert."""
     alpha: float | None = None
     """α of the scale α/R. Defaults to 2 R."""
     routing: Literal["weighted", "top1"] = "weighted"

@@ -1,8 +1,8 @@
 """LoRA-SP as in its public code, which differs from the paper's equations.
 
 Use it to compare with results of that code, github.com/dhkim-furiosa/LoRA-SP at dfbf57d (PyTorch).
-This is an independent implementation that uses only facts about it. Differences from the paper
-(`lora_sp`):
+This is an independent implementation, based only on facts about that code. Differences from the
+paper (`lora_sp`):
 
 - Scores may be negative and are ranked by signed value.
 - The gate keeps the largest set whose energy does *not exceed* η, and at least one direction, so

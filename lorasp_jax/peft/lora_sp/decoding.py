@@ -1,8 +1,8 @@
 """LoRA-SP for a single token, loading only the active directions.
 
-A dense matmul with the bank costs the same for any mask. A single token is bound by the memory
-traffic of the bank, most of which is saved by gathering k of R rows of U and Vᵀ. Several tokens
-differ in their active directions, so the dense matmul is faster for them.
+A dense matmul with the bank costs the same for any mask. For a single token, this cost is the
+bank's memory traffic, most of which is saved by gathering only k of the R rows of U and Vᵀ. Several
+tokens differ in their active directions, so the dense matmul is faster for them.
 `python -m benchmarks.decoding` measures when gathering pays off.
 """
 
@@ -60,8 +60,8 @@ def decode(
 
     Returns:
       delta [O], equal to `method.delta` up to rounding if at most `capacity` directions are active;
-      and the number of active directions beyond `capacity`, int32 []; of all active directions,
-      the lowest-scoring ones are left out.
+      and the number of active directions beyond `capacity`, int32 []. The lowest-scoring active
+      directions are the ones left out.
 
     Raises:
       ValueError: `capacity` is not between 1 and R, or x has more than one token.
