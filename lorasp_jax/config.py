@@ -1,4 +1,4 @@
-"""Experiment configuration: frozen dataclasses; each file in `configs/` returns one `Config`."""
+"""Experiment config as frozen dataclasses; files in `configs/` return a `Config` per scale."""
 
 import math
 from dataclasses import dataclass, field
@@ -96,7 +96,7 @@ class DataConfig:
         _at_least(1, self, "episodes", "num_envs")
         _at_least(0, self, "action_noise", "fresh_every")
         if self.fresh_every and self.source:
-            raise ValueError("data.fresh_every needs the scripted expert: drop it or data.source")
+            raise ValueError("data.fresh_every cannot be combined with data.source: drop one")
 
 
 @dataclass(frozen=True)
@@ -120,15 +120,15 @@ class OptimConfig:
     clip_norm: float = 1.0
     """Gradients are clipped to this global norm."""
     accumulate: int = 1
-    """Gradient-accumulation micro-batches per step; more need less memory. The task loss is that of
-    the full batch, auxiliary losses are averaged over micro-batches."""
+    """Gradient-accumulation micro-batches per step; a larger number saves memory. The task loss is
+    that of the full batch; auxiliary losses are averaged over micro-batches."""
     ema: float = 0.0
     """Decay per step of the exponential moving average (EMA) of the trainable parameters, such as
     0.999; the average is then evaluated and exported. 0: no average."""
     state_noise: float = 0.02
     """Standard deviation of the noise added to normalized robot states during training."""
     max_skipped: int = 10
-    """Stop after this many consecutive skipped steps (loss or gradient non-finite or a spike)."""
+    """Stop after skipping this many consecutive steps (loss or gradient non-finite or spiking)."""
     spike: float = 0.0
     """Skip a step whose loss or gradient norm exceeds this multiple of its running mean; 0: skip
     only non-finite steps."""
@@ -207,7 +207,7 @@ class EvaluationConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """One experiment: robot, tasks, base, adapter method and how to train."""
+    """One experiment: robot, tasks, base, adapter method and training settings."""
 
     name: str
     """Name of the run; its folder is runs/<name>."""
@@ -259,8 +259,8 @@ class Config:
         _at_least(1, self, "fsdp", "log_every", "checkpoint_every", "image_size")
         if self.control_dt <= 0 or not 0 <= self.seed < 2**32:
             raise ValueError(
-                f"control_dt must be above 0 and seed in 0 to 2**32 - 1, got {self.control_dt} "
-                f"and {self.seed}"
+                "control_dt must be above 0 and seed must lie in [0, 2**32), "
+                f"got {self.control_dt} and {self.seed}"
             )
         if self.data.fresh_every % self.log_every:
             raise ValueError(

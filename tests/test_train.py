@@ -50,7 +50,7 @@ def files():
         ([*MULTITASK, "--model.checkpoint", "nowhere"], "nowhere"),
         ([*MULTITASK, *NANO, "--targets", "[a-z]+_prj"], "rule '[a-z]+_prj' applies to nothing"),
         ([*MULTITASK, *NANO, "--targets", "expert-onyl"], "unknown preset 'expert-onyl'"),
-        ([*MULTITASK, *NANO, "--control-dt", "0.2"], "with control_dt 0.1 s, this run has 0.2"),
+        ([*MULTITASK, *NANO, "--control-dt", "0.2"], "0.1 s, but this run has 0.2 s"),
         (
             [*MULTITASK, *NANO, "--evaluation.execute-steps", "11"],
             "must be between 1 and the chunk length 10",

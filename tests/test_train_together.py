@@ -57,8 +57,8 @@ def test_two_processes_with_simulated_tasks_train_as_one(tmp_path):
 @pytest.mark.parametrize(
     ("own", "reason"),
     [
-        ({1: ("--seed", 5)}, "different settings from the first process (seed is 5, not 0): start"),
-        ({1: ("--resume", "auto")}, "(resume is 'auto', not False): start all processes alike"),
+        ({1: ("--seed", 5)}, "those of the first process (seed is 5, not 0): use"),
+        ({1: ("--resume", "auto")}, "(resume is 'auto', not False): use the same ones in all"),
         ({1: ("--seed", "x")}, ": error: "),
         ({}, "error: runs/multitask already holds a run: add --resume"),
     ],

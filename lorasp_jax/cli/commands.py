@@ -36,7 +36,7 @@ def main() -> NoReturn:
 def exit_on_signals() -> None:
     """Exit silently on Ctrl-C or SIGTERM: until a command starts there is nothing to save.
 
-    Call it before the imports that start JAX, which take a second.
+    Call this before the imports that load JAX, which take about a second.
     """
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: os._exit(INTERRUPTED))

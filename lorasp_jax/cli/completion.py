@@ -23,7 +23,7 @@ def main(arguments: Sequence[str], program: str) -> int:
 
 
 def parser(program: str) -> argparse.ArgumentParser:
-    """Return the parser of the command."""
+    """Return the argument parser of this command."""
     import shtab
 
     parser = argparse.ArgumentParser(

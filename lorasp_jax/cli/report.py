@@ -10,7 +10,7 @@ from envs.cli.errors import parse_arguments, report_error
 
 
 def main(arguments: Sequence[str], program: str = "lorasp-jax report") -> int:
-    """Write report.html of a run; return the exit code: 0 success, 2 invalid input."""
+    """Write a run's report.html; return the exit code: 0 success, 2 invalid input."""
     options = parse_arguments(parser(program), arguments)  # before slow imports
     from lorasp_jax.report.html import write_report
 
@@ -23,9 +23,9 @@ def main(arguments: Sequence[str], program: str = "lorasp-jax report") -> int:
 
 
 def parser(program: str) -> argparse.ArgumentParser:
-    """Return the parser of the command."""
+    """Return the argument parser of this command."""
     parser = argparse.ArgumentParser(
-        prog=program, description="Rebuild report.html of a run from the files in its folder."
+        prog=program, description="Rebuild a run's report.html from the files in its folder."
     )
     parser.add_argument("run", type=Path, help="folder of the run, such as runs/multitask")
     return parser

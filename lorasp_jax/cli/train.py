@@ -42,7 +42,7 @@ def main(arguments: Sequence[str], program: str = "python train.py") -> int:
             options = {"resume": command.resume, "dry_run": command.dry_run}
             processes.agree("settings", to_json(command.config) | options)
             _execute(command, console, started)
-    except Exception as error:  # invalid input: one sentence; bugs: raised again
+    except Exception as error:  # prints one sentence for invalid input, re-raises bugs
         return report_error(error, errors, ": free some memory or disk space and add --resume")
     except KeyboardInterrupt:
         message = f"stopped; to resume: {resume_command(arguments, program)}"
@@ -52,7 +52,7 @@ def main(arguments: Sequence[str], program: str = "python train.py") -> int:
 
 
 def parser(program: str) -> argparse.ArgumentParser:
-    """Return the parser of the command, with the config fields of the default method."""
+    """Return this command's argument parser, with the config fields of the default method."""
     from lorasp_jax.training import overrides
 
     return overrides.completion_parser(program)

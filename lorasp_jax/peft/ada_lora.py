@@ -53,7 +53,7 @@ class AdaLoRA(Method):
     final: float = 0.3
     """Fraction of the training steps, at the end, in which the set of pruned triplets is fixed."""
     interval: int = 10
-    """Steps from one pruning to the next."""
+    """Steps between prunings."""
     importance_decay: float = 0.85
     """β1, EMA decay of the importance."""
     uncertainty_decay: float = 0.85

@@ -39,7 +39,7 @@ class LoRAMoE(Method):
     alpha: float | None = None
     """α of the scale α/R. Defaults to 2 R."""
     routing: Literal["weighted", "top1"] = "weighted"
-    """"weighted": all experts, weighted by probability. "top1": the most likely one per token."""
+    """"weighted": all experts, weighted by probability. "top1": each token's most likely expert."""
     gate_gradient: Literal["hard", "switch"] = "hard"
     """For "top1" only. "hard": the chosen expert has weight 1, so the router learns only from its
     own losses, as in LoRA-SP's code. "switch": its weight is p, which passes the task gradient

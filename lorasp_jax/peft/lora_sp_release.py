@@ -46,8 +46,8 @@ class LoRASPRelease(BankMethod):
     alpha: float | None = None
     """α of the scale α/R. Defaults to 2 R."""
     hidden_width: int | None = None
-    """None: the scores are x W1, as in the public code by default. H: they are the softmax of H
-    values times a matrix, initially 0/1, as in that code's `router_projection` (H = 4)."""
+    """None: the scores are x W1, the default of the public code. H: they are softmax(x W1) W2 with
+    width H and W2 initially 0/1, as with that code's option `router_projection` (H = 4)."""
     normalized_bank: bool = False
     """Keep the bank's directions orthonormal; see `LoRASP.normalized_bank`."""
 

@@ -19,18 +19,18 @@ from lorasp_jax.training.run_folder import read_json
 
 SIZES = ("nano", "small", "base", "nano_pi05", "base_pi05")
 TRAINING = "training.json"
-"""File next to base weights that describes their training, including the control period."""
+"""File next to the base weights with facts about their training, such as the control period."""
 
 
 def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str]:
-    """Load the frozen base, or initialize it randomly without a checkpoint; also return its hash.
+    """Return the frozen base, loaded or randomly initialized, and its hash.
 
     Args:
         config: configuration of the run.
-        abstract: return only shapes, and no hash, for a random or remote base.
+        abstract: return only shapes and an empty hash if the base is random or remote.
 
     Raises:
-        ValueError: an unknown backbone or size, or a checkpoint of a different one.
+        ValueError: the backbone or size is unknown, or the checkpoint does not match the config.
     """
     options, backbone_class = config.model, backbone.find(config.model.backbone)
     sizes = [size for size in SIZES if hasattr(backbone_class, size)]
@@ -60,7 +60,7 @@ def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str
 
 
 def with_config(model: Backbone, **changes: Any) -> Backbone:
-    """Return the model with changed config fields on which no parameter depends."""
+    """Return the model with some config fields changed; its parameters must not depend on them."""
     model_config = dataclasses.replace(model.config, **changes)
     if model_config == model.config:
         return model
@@ -76,5 +76,5 @@ def _check_control_dt(folder: Path, control_dt: float) -> None:
     trained = training["control_dt"]
     if trained != control_dt:
         raise ValueError(
-            f"{folder} was trained with control_dt {trained} s, this run has {control_dt}"
+            f"{folder} was trained with control_dt {trained} s, but this run has {control_dt} s"
         )

@@ -61,7 +61,7 @@ class Checkpoints:
     def restore(self, like: TrainState) -> TrainState | None:
         """Restore the newest intact checkpoint; None if there are no checkpoints.
 
-        Newer corrupt checkpoints are renamed and incomplete ones are removed, with a warning each.
+        Newer corrupt checkpoints are renamed and incomplete ones removed, with a warning for each.
 
         Args:
             like: state with the structure, dtypes and shardings to restore.
@@ -70,7 +70,7 @@ class Checkpoints:
             ValueError: all checkpoints are corrupt, or one belongs to a different base.
         """
         for step in self._remove_incomplete():
-            self._warn(f"removed the incomplete checkpoint at step {step}: its process was killed")
+            self._warn(f"removed the incomplete checkpoint at step {step}: saving was interrupted")
         processes.barrier("removed")
         corrupt: dict[int, str] = {}
         for step in sorted(self._manager.all_steps(), reverse=True):
@@ -116,7 +116,7 @@ class Checkpoints:
             orbax_folders.check(self._folder / str(step))
             checkpoint = self._manager.restore(step, args=arguments)
             base_hash, expected = (checkpoint["meta"][name] for name in ("base_hash", "digest"))
-        except Exception as error:  # Orbax raises any error of its storage
+        except Exception as error:  # Orbax raises storage errors of any type
             raise _CorruptError("unreadable") from error
         if digest(checkpoint["state"], str(base_hash)) != expected:
             raise _CorruptError("digest mismatch")
@@ -127,8 +127,8 @@ class Checkpoints:
             )
         return checkpoint["state"]
 
-    def _rename_corrupt(self, corrupt: dict[int, str], used: int) -> None:
-        """Rename corrupt checkpoints, with a warning each."""
+    def _rename_corrupt(self, corrupt: dict[int, str], resume_step: int) -> None:
+        """Rename corrupt checkpoints, with a warning for each."""
         for step, reason in corrupt.items():
             paths = (self._folder / f"{step}.damaged{suffix}" for suffix in _suffixes())
             renamed = next(path for path in paths if not path.exists())
@@ -136,7 +136,7 @@ class Checkpoints:
                 rename(self._folder / str(step), renamed)
             self._warn(
                 f"the checkpoint at step {step} is corrupt ({reason}): renamed to {renamed}, "
-                f"resuming from step {used}"
+                f"resuming from step {resume_step}"
             )
         processes.barrier("renamed")
         self._manager.reload()
@@ -162,18 +162,18 @@ class Checkpoints:
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
-        """Convert an error of Orbax about a failed write to a one-line ValueError."""
+        """Convert an Orbax error about a failed write to a one-line ValueError."""
         try:
             yield
-        except Exception as error:  # Orbax raises any error of its storage
+        except Exception as error:  # Orbax raises storage errors of any type
             self._remove_incomplete()
             full = [text for text in map(os.strerror, DISK_FULL) if text in str(error)]
             reason = full[0] if full else str(error).partition("\n")[0][:200]
             steps = self._steps()
-            remaining = f"the one at step {max(steps)} is intact" if steps else "there is no other"
+            remaining = f"the one at step {max(steps)} is intact" if steps else "no other exists"
             hint = "free some disk space and add --resume" if full else "add --resume"
             raise ValueError(
-                f"a checkpoint could not be written ({reason}), {remaining}: {hint}"
+                f"a checkpoint could not be written ({reason}); {remaining}: {hint}"
             ) from error
 
     def _warn(self, text: str) -> None:
@@ -182,7 +182,7 @@ class Checkpoints:
 
 
 class _CorruptError(Exception):
-    """A checkpoint is corrupt; the message gives the symptom."""
+    """A checkpoint is corrupt; the message states the symptom."""
 
 
 def _suffixes() -> Iterator[str]:
@@ -191,6 +191,6 @@ def _suffixes() -> Iterator[str]:
 
 
 def _by_path(tree: Any) -> dict[str, jax.Array]:
-    """Flatten a tree to a dict from path to leaf, so that files do not depend on containers."""
+    """Flatten a tree to a dict from path to leaf, so that files are independent of containers."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(path): leaf for path, leaf in leaves}

@@ -1,4 +1,4 @@
-"""The dataset of a run: opened, converted to a cache once, and summarized per task."""
+"""Open the dataset of a run, convert it to a cache once, and outline it per task."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ _DT_TOLERANCE = 0.01  # relative; 1/30 s has no exact decimal representation
 
 
 def open_dataset(config: Config, model: BackboneConfig, folder: Path) -> Source:
-    """Open the dataset of `config.data.source`, or the run's cache of it.
+    """Open the dataset at `config.data.source`, or the run's cache of it.
 
     Args:
         config: configuration of the run.
@@ -28,21 +28,21 @@ def open_dataset(config: Config, model: BackboneConfig, folder: Path) -> Source:
         folder: folder of the run.
 
     Raises:
-        ValueError: not a dataset, corrupt, or incompatible with the run.
+        ValueError: the source is not a dataset, is corrupt, or is incompatible with the run.
     """
     cache_folder = folder / _CACHE
     path = cache_folder if cache_folder.exists() else config.data.source
     source = open_source(path, Keys(image_size=model.image_size))
     if abs(source.control_dt / config.control_dt - 1) > _DT_TOLERANCE:
         raise ValueError(
-            f"{path} has a control period of {source.control_dt:.4g} s, this run has --control-dt "
-            f"{config.control_dt:g}: keep every N-th step with python -m lorasp_jax.data convert "
-            "--every N"
+            f"{path} has a control period of {source.control_dt:.4g} s, but this run has "
+            f"--control-dt {config.control_dt:g}: keep every N-th step with python -m "
+            "lorasp_jax.data convert --every N"
         )
     if len(source.cameras) > len(model.cameras):
         raise ValueError(
             f"{path} has cameras {', '.join(source.cameras)}, but the backbone takes at most "
-            f"{len(model.cameras)}: choose with python -m lorasp_jax.data convert --cameras"
+            f"{len(model.cameras)}: select cameras with python -m lorasp_jax.data convert --cameras"
         )
     _check_state_and_actions(source.episode(0, ()), model, path)
     return source
@@ -52,20 +52,20 @@ def _check_state_and_actions(first: Episodes, model: BackboneConfig, path: objec
     """Raise ValueError unless a policy can learn from the states and actions of an episode."""
     if first.actions != "joint":
         raise ValueError(
-            f"{path} has {first.actions} actions, policies learn joint targets: "
+            f"{path} has {first.actions} actions, but policies learn joint targets: "
             "collect with --actions joint"
         )
     try:
         robot_slots(first.state.shape[-1] - 1, model.inputs)
     except ValueError as error:
         raise ValueError(
-            f"{path} does not fit the backbone: {error} Choose with python -m lorasp_jax.data "
-            "convert --state-numbers and --action-numbers"
+            f"{path} does not fit the backbone: {error} Select entries with python -m "
+            "lorasp_jax.data convert --state-numbers and --action-numbers"
         ) from error
 
 
 def as_cache(source: Source, folder: Path, progress: Progress) -> Cache:
-    """Return the dataset as a cache, converted into the run's folder if necessary."""
+    """Return the dataset as a cache, which is created in the run's folder if necessary."""
     if isinstance(source, Cache):
         return source
     if not (folder / _CACHE).exists():
@@ -74,17 +74,17 @@ def as_cache(source: Source, folder: Path, progress: Progress) -> Cache:
 
 
 def outline(dataset: Cache) -> dict[str, Episodes]:
-    """Return the episodes of each task; every image is replaced by the task's first one."""
-    every = [dataset.episode(index, ()) for index in range(len(dataset))]
+    """Return the episodes of each task, with every image replaced by the task's first one."""
+    episodes = [dataset.episode(index, ()) for index in range(len(dataset))]
     groups: dict[str, Episodes] = {}
     for task in dataset.metadata["tasks"]:
-        indices = [index for index, episode in enumerate(every) if episode.task == task]
-        groups[task] = _pad(dataset, [every[index] for index in indices], indices[0])
+        indices = [index for index, episode in enumerate(episodes) if episode.task == task]
+        groups[task] = _pad(dataset, [episodes[index] for index in indices], indices[0])
     return groups
 
 
 def _pad(dataset: Cache, episodes: list[Episodes], first: int) -> Episodes:
-    """Stack the episodes of one task, padded with zeros to the longest."""
+    """Stack the episodes of one task, padded with zeros to the longest one."""
     length = np.array([episode.num_steps for episode in episodes], np.int32)
     shape = (len(episodes), int(length.max()))
     images = dataset.episode(first).image
@@ -112,9 +112,9 @@ def _pad(dataset: Cache, episodes: list[Episodes], first: int) -> Episodes:
 
 
 def is_simulated(dataset: Cache) -> bool:
-    """Whether a dataset was recorded in simulation, with tasks and a robot available here.
+    """Whether a dataset was recorded in simulation and its tasks and robot are available.
 
-    Matching names do not suffice: recordings of a real robot may bear the name of a task.
+    Matching names do not suffice: recordings of a real robot may use the same names.
     """
     metadata = dataset.metadata
     is_known = set(metadata["tasks"]) <= set(names("task")) and metadata["robot"] in names("robot")

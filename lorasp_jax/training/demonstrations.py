@@ -18,7 +18,7 @@ Progress = Callable[[str, int, int], None]
 
 
 def demonstrations(config: Config, folder: Path, progress: Progress) -> dict[str, Episodes]:
-    """Return episodes of every task, from `folder`/cache or collected and cached there."""
+    """Load the episodes of every task from `folder`/cache, or collect and cache them there."""
     paths = [folder / "cache" / f"{task}.npz" for task in config.tasks]
     load = functools.partial(_load_or_collect, config, progress=progress)
     episodes = map_threads(load, paths, config.tasks, _keys(config))
@@ -38,7 +38,7 @@ def _keys(config: Config) -> jax.Array:
 
 
 def map_threads(function: Callable, *arguments: Iterable[Any]) -> list[Any]:
-    """`map` in threads, as most of the time is compilation; an interrupt does not wait for them."""
+    """`map` in threads, as compiling takes most of the time; interrupts do not wait for them."""
     pool = ThreadPoolExecutor()
     try:
         return list(pool.map(function, *arguments))

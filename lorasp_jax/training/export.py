@@ -38,7 +38,7 @@ class Export(Callback):
 
 
 def write(run: Run) -> None:
-    """Write adapter.safetensors and adapter.json, or folder `base` after full fine-tuning."""
+    """Write adapter.safetensors and adapter.json, or the folder `base` after full fine-tuning."""
     config, metadata = run.config, _metadata(run)
     if config.peft.trains_base:
         folder = run.folder / BASE
@@ -52,7 +52,7 @@ def write(run: Run) -> None:
 
 
 def _metadata(run: Run) -> dict[str, Any]:
-    """Return the training data's properties and everything but weights that the policy needs."""
+    """Return properties of the training data and all that the policy needs besides weights."""
     config, first = run.config, next(iter(run.episodes.values()))
     processor = run.policy.processor
     return {
@@ -81,16 +81,16 @@ def load_policy(
 
     Args:
         folder: folder of the run.
-        base: location of the frozen base, see `models.load`; default: the one recorded.
-        words: location of the tokenizer; default: the one recorded.
-        any_base: accept a base with other weights than the one trained on, see `load_adapters`.
+        base: location of the frozen base, see `models.load`; default: the recorded one.
+        words: location of the tokenizer; default: the recorded one.
+        any_base: accept a base whose weights differ from those in training, see `load_adapters`.
 
     Returns:
         The policy; `Policy.sample` takes indices into `processor.prompts.instructions`.
 
     Raises:
-        ValueError: the run is not finished, its files are corrupt, or the base is missing or is a
-            different one.
+        ValueError: the run is not finished, its files are corrupt, or the base is missing or
+            differs from the one in training.
     """
     folder = Path(folder)
     is_full = (folder / BASE).is_dir()
@@ -129,8 +129,8 @@ def _processor(policy: Mapping[str, Any], config: Any, words: str) -> Processor:
     prompts = PromptTable.of(loaded, policy["instructions"], config, num_joints=joints)
     if _prompts_digest(prompts) != policy["prompts"]:
         raise ValueError(
-            f"the tokenizer {words or policy['tokenizer'] or 'of this version'} produces other "
-            "tokens than the one used in training: pass words= with the location of the original"
+            f"the tokenizer {words or policy['tokenizer'] or 'of this version'} produces "
+            "different tokens than in training: pass words= with the location of the original"
         )
     return Processor.of(
         config,
@@ -143,6 +143,6 @@ def _processor(policy: Mapping[str, Any], config: Any, words: str) -> Processor:
 
 
 def _prompts_digest(prompts: PromptTable) -> str:
-    """Identify a tokenizer by its effect on the policy: the tokens of the prompts."""
+    """Return a digest of the prompts' tokens, to recognize the tokenizer that produced them."""
     leaves = jax.tree_util.tree_leaves_with_path(prompts)
     return digest({jax.tree_util.keystr(path): jnp.asarray(leaf) for path, leaf in leaves})

@@ -1,10 +1,10 @@
 """Skip training steps whose loss or gradient is non-finite or spikes.
 
 A skipped step leaves parameters, their average and the optimizer state unchanged; the step count
-still advances, and with it the data position and the random streams. A step is accepted by its loss
-and gradient norm alone, before the updates are computed. `select` can then fuse, leaf by leaf, into
-the in-place update of the donated state; a decision that depended on the updates would keep all of
-them in memory together with the whole old state.
+still advances, and with it the data position and the random streams. Whether to accept a step is
+decided from its loss and gradient norm alone, before the updates are computed. `select` can then
+fuse, leaf by leaf, into the in-place update of the donated state; a decision that depended on the
+updates would keep all of them in memory together with the whole old state.
 
 Checking the gradient suffices: clipped to a finite norm, it changes each parameter by at most a few
 learning rates under AdamW. A non-finite update therefore means an absurdly high learning rate; the
@@ -26,7 +26,7 @@ WINDOW = 100
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Guard:
-    """Statistics of the accepted steps; part of the training state, so a resumed run decides alike.
+    """Statistics of the accepted steps; in the training state, so resumed runs skip the same steps.
 
     Attributes:
         counted: `[]` int32, number of accepted steps.
@@ -57,7 +57,7 @@ def check_step(
         loss: `[]`.
         grad_norm: `[]`.
         spike: skip the step if loss or gradient norm exceeds this multiple of its running mean; 0:
-            never.
+            skip only non-finite steps.
     """
     accept = jnp.isfinite(loss) & jnp.isfinite(grad_norm)
     if spike:

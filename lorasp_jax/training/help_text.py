@@ -12,7 +12,7 @@ import tyro
 from tyro.constructors import StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
 REGISTRY = tyro.constructors.ConstructorRegistry()
-"""Registry for `tyro.cli`, called with an instance as default. Fields that are None are left to
+"""Registry for calls of `tyro.cli` with a default instance. Fields that are None are left to
 tyro."""
 
 

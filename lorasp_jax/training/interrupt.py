@@ -19,7 +19,7 @@ class Stop:
 
 @contextlib.contextmanager
 def deferred() -> Iterator[Stop]:
-    """Inside this block the first SIGINT or SIGTERM only sets a flag; the second one interrupts.
+    """In this block the first SIGINT or SIGTERM sets a flag; the second raises KeyboardInterrupt.
 
     The caller checks the flag whenever its state is consistent and can be saved.
     """

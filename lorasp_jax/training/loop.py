@@ -29,7 +29,7 @@ from lorasp_jax.training.stepper import Collect, Stepper, make_stepper
 
 
 class RunError(ValueError):
-    """The run cannot continue; the message gives the reason and a remedy in one sentence."""
+    """The run cannot continue; the message states the reason and a remedy in one sentence."""
 
 
 def train(
@@ -48,8 +48,9 @@ def train(
         collect: collects new demonstrations if `data.fresh_every` is set.
 
     Raises:
-        RunError: too many consecutive steps were skipped; the last checkpoint is kept.
-        KeyboardInterrupt: stopped by a signal; the state is saved.
+        RunError: too many consecutive steps were skipped, or an update was non-finite; the last
+            checkpoint remains.
+        KeyboardInterrupt: a signal stopped the run; the state is saved.
     """
     graphdef, adapters, frozen = adaptation.split(run.policy.model)
     methods = adaptation.methods(run.policy.model).values()
@@ -79,7 +80,7 @@ def train(
     except RunError as error:
         for callback in callbacks:
             callback.on_stop(run, str(error))
-        # Otherwise another process could end the first one before it has written the reason.
+        # Otherwise another process could stop the first one before it writes the reason.
         processes.barrier("stopped")
         raise
     finally:
@@ -108,7 +109,7 @@ def _call_on_log(
 
 @contextlib.contextmanager
 def _local_policy(run: Run, name: str) -> Iterator[None]:
-    """Hold the run's policy on this process's device inside the block; wait for all at its end."""
+    """Put the run's policy on a local device in this block; wait for all processes at its end."""
     sharded, run.policy = run.policy, processes.to_local(run.policy)
     yield
     run.policy = sharded
@@ -119,7 +120,7 @@ def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) ->
     """Return the jitted scan over steps: (frozen, data, state, key, count) -> state, metrics.
 
     `data` is the whole dataset or one raw batch; metrics have a leading axis over steps.
-    `shardings` are `meshes.shardings` of the state.
+    `shardings` is `meshes.shardings` of the state.
     """
     optim, processor = run.config.optim, run.policy.processor
     mesh = shardings.step.mesh
@@ -142,7 +143,7 @@ def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) ->
         batch = jax.lax.with_sharding_constraint(batch, meshes.batch_sharding(mesh))
         return step(state, frozen, batch, loss_key)
 
-    # Keep the sharding of the state; another one would recompile the next call.
+    # Keep the state's sharding: a different one would make the next call recompile.
     @functools.partial(
         jax.jit,
         static_argnames="count",
@@ -209,9 +210,9 @@ def _failure(
     """Return an error if too many steps were skipped or an update was non-finite.
 
     Args:
-        optim: limits.
+        optim: optimizer settings with the limits.
         rows: metrics of each step of the log interval, `[count, ...]`.
-        values: their logged means.
+        values: logged means of these metrics.
         done: step at the end of the interval.
         saved: step of the last checkpoint.
     """

@@ -31,8 +31,8 @@ def make_optimizer(
     budgets = {method for method in methods if isinstance(method, AdaLoRA)}
     if len(budgets) > 1:
         raise ValueError(
-            "all AdaLoRA layers share one rank budget and need the same settings, got "
-            f"{len(budgets)} different ones"
+            "all AdaLoRA layers share one rank budget and must have the same settings, got "
+            f"{len(budgets)} different settings"
         )
     for method in dict.fromkeys(methods):
         optimizer = method.transform(optimizer, config.steps)

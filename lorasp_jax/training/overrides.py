@@ -33,7 +33,7 @@ class Command:
 
     Attributes:
         config: configuration of the experiment.
-        resume: resume the run of this name; "auto": if it exists.
+        resume: resume the run of this name; "auto": only if it exists.
         dry_run: stop before anything is collected, trained or written.
         wandb: Weights & Biases project, or None.
     """
@@ -77,7 +77,7 @@ def parse(arguments: Sequence[str], program: str = "python train.py") -> Command
     if wants_help:
         _option_parser(program, config.peft.name).print_help()
         print(f"\n{_scale_note(known.config, known.scale)}")
-        rest = ["--help"]  # only this: it may stand where an option expects a value
+        rest = ["--help"]  # drops the rest, where --help may follow an option that needs a value
     if known.method is not None:
         config = dataclasses.replace(config, peft=_with_rank_of(config.peft, known.method))
     if known.resume and known.dry_run:
@@ -88,7 +88,7 @@ def parse(arguments: Sequence[str], program: str = "python train.py") -> Command
 
 
 def completion_parser(program: str) -> argparse.ArgumentParser:
-    """Return a parser of all options, including the default method's, for shell completion."""
+    """Return a parser for all options, including the default method's, for shell completion."""
     parser = argparse.ArgumentParser(
         prog=program, parents=[_option_parser(program)], add_help=False, conflict_handler="resolve"
     )
@@ -100,7 +100,7 @@ def completion_parser(program: str) -> argparse.ArgumentParser:
 
 
 def _option_parser(program: str = "", method: str = "") -> argparse.ArgumentParser:
-    """Return a parser of the options that are not config fields.
+    """Return a parser for the options that are not config fields.
 
     Args:
         program: program name in the help text.
@@ -144,7 +144,7 @@ def _option_parser(program: str = "", method: str = "") -> argparse.ArgumentPars
 
 
 def _scale_note(path: Path | None, scale: str) -> str:
-    """Describe the scales of an experiment, and which one the printed defaults are for."""
+    """Compare an experiment's scales and name the scale of the printed defaults."""
     if path is None:
         return "the defaults below are built-in; add --config FILE to see the experiment's"
     table = differences(lambda scale: load(path, scale))
@@ -174,7 +174,7 @@ def load(path: Path, scale: str) -> Config:
     if not os.path.isfile(path):  # Path.is_file raises if a name is too long
         folder = path.parent if os.path.isdir(path.parent) else shipped.ROOT / shipped.EXPERIMENTS
         available = ", ".join(str(file) for file in sorted(folder.glob("*.py")))
-        hint = f": available are {available}" if available else ""
+        hint = f": available configs are {available}" if available else ""
         raise ValueError(f"config {path} does not exist{hint}")
     spec = importlib.util.spec_from_file_location(path.stem, path)
     if spec is None or spec.loader is None:
@@ -261,13 +261,13 @@ def _check_names(arguments: Sequence[str], config: Config) -> None:
 def _check_simulated(config: Config) -> None:
     """Raise ValueError for an unknown task or robot, before the simulator is imported.
 
-    A dataset brings its own tasks and robot, so then they are not checked.
+    They are not checked for a dataset, which defines its own tasks and robot.
     """
     if config.data.source:
         return
     for task in config.tasks:
         check("task", task)
-    if not config.robot.endswith(".xml"):  # an MJCF file of the user's
+    if not config.robot.endswith(".xml"):  # the user's own MJCF file
         check("robot", config.robot)
 
 
@@ -299,7 +299,7 @@ def _fields(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 def _concrete(config: Config) -> type[Config]:
     """Return a `Config` class with `peft` typed as the chosen method, to expose its fields.
 
-    `scale` is not an option: it only selects defaults.
+    `scale` is suppressed, because it only selects defaults.
     """
     return dataclasses.make_dataclass(
         "Config",

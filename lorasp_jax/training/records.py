@@ -5,12 +5,12 @@ A digest verifies that a file is intact, but not that this version wrote it.
 
 from typing import Any, TypeAlias
 
-Kind: TypeAlias = dict[Any, Any]
+Schema: TypeAlias = dict[Any, Any]
 """Schema of a JSON object, see `storage.json_values.check`."""
-TIMES: Kind = {str: float}
-RATE: Kind = {"success": float, "episodes": int, "ci95": (float, float)}
-BEFORE: Kind = {str: RATE}
-RESULTS: Kind = {
+TIMES: Schema = {str: float}
+RATE: Schema = {"success": float, "episodes": int, "ci95": (float, float)}
+BEFORE: Schema = {str: RATE}
+RESULTS: Schema = {
     "seconds": TIMES,
     "tasks": {str: {"before": RATE, "after": RATE}},
     "active_rank": {str: float},
@@ -19,10 +19,10 @@ RESULTS: Kind = {
     "trainable_parameters": int,
     "total_parameters": int,
 }
-ROW: Kind = {"step": float, str: float}
-DATASET: Kind = {"facts": {}, "streams": bool}
-STOPPED: Kind = {"reason": str}
-CONFIG: Kind = {
+ROW: Schema = {"step": float, str: float}
+DATASET: Schema = {"facts": {}, "streams": bool}
+STOPPED: Schema = {"reason": str}
+CONFIG: Schema = {
     "name": str,
     "scale": str,
     "robot": str,
@@ -30,4 +30,4 @@ CONFIG: Kind = {
     "model": {"backbone": str, "size": str},
     "optim": {"steps": int},
 }
-WITH_RANK: Kind = CONFIG | {"peft": {"method": str, "rank": int}}
+WITH_RANK: Schema = CONFIG | {"peft": {"method": str, "rank": int}}

@@ -1,4 +1,4 @@
-"""State of a run that all parts of training share, and callbacks."""
+"""State of a run, shared by all parts of training, and callbacks."""
 
 import contextlib
 import time
@@ -27,7 +27,7 @@ class Run:
         folder: folder for all files of the run.
         console: console for status messages.
         base_hash: hash of the frozen base.
-        episodes: demonstrations per task; for a dataset, with only the first images of each task.
+        episodes: demonstrations per task; those of a dataset contain one image per camera.
         dataset: all steps of a dataset, stored on disk; None: those of `episodes`.
         streams: read batches of the dataset from disk, because it does not fit on the device.
         devices: devices to train on; None: all.

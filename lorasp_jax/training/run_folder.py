@@ -30,11 +30,11 @@ from lorasp_jax.training import records
 from lorasp_jax.training.distributed import processes
 
 CONFIG_FILE, TIMES_FILE, DATASET_FILE = "config.json", "seconds.json", "dataset.json"
-"""Files of a run that failed before it produced any results."""
+"""Files that a run may leave behind if it fails before producing any results."""
 WILDCARDS = frozenset("*?[\\")
-"""Orbax globs its paths, so checkpoints below a folder with one of these cannot be found."""
+"""Orbax cannot find checkpoints under a path with one of these, because it globs its paths."""
 STOPPED = "stopped.json"
-"""File with the reason why training stopped; removed when it continues."""
+"""File with the reason that training stopped; removed when training continues."""
 
 
 def to_json(config: Config) -> dict[str, Any]:
@@ -49,14 +49,14 @@ def write_json(path: Path, value: Mapping[str, Any]) -> None:
 
 
 def read_json(path: Path, schema: Mapping[Any, Any] = MappingProxyType({})) -> dict[str, Any]:
-    """Read a file of `write_json`; {} if it does not exist.
+    """Read a file written by `write_json`; return {} if it does not exist.
 
     Args:
         path: the file.
         schema: required fields, see `json_values.check`.
 
     Raises:
-        ValueError: the file is corrupt, or another version wrote it.
+        ValueError: the file is corrupt or was written by another version.
     """
     if not path.exists():
         return {}
@@ -72,14 +72,14 @@ def open_run(config: Config, root: Path, *, resume: bool | Literal["auto"]) -> I
 
     Args:
         config: configuration of the run.
-        root: folder that holds the runs' folders.
+        root: parent of all run folders.
         resume: True: require a run with the same config; False: create the folder; "auto": resume
             if the run exists, otherwise create it.
 
     Raises:
-        ValueError: the folder cannot be created, has a wildcard in its path or is in use by another
-            process; there is a run and `resume` is False, or no run and it is True; the run has
-            another config; or the folder contains a pipe or a link to the outside.
+        ValueError: the folder cannot be created, is in use by another process, has a wildcard in
+            its path, or contains a pipe or a link that leads out of it; or a run exists but
+            `resume` is False, does not exist but `resume` is True, or has a different config.
     """
     folder = root / config.name
     if wildcards := WILDCARDS & set(str(folder.absolute())):
@@ -148,7 +148,7 @@ def record_dataset(folder: Path, facts: Mapping[str, Any], *, streams: bool) -> 
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock, a file next to it that names the last process to hold it."""
+    """Hold the folder's lock, a file next to the folder that names the lock's last holder."""
     file = folder.parent / f".{folder.name}.lock"
     try:
         lock = acquire(file)
@@ -185,7 +185,7 @@ def _differences(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -
 class MetricsLog:
     """Appends scalars to `metrics.jsonl` and to TensorBoard event files.
 
-    A resumed run drops rows after its start step, so that the log equals that of an uninterrupted
+    A resumed run drops rows after its start step, so that the log matches that of an uninterrupted
     run. Only the first process writes.
     """
 
@@ -199,10 +199,10 @@ class MetricsLog:
         write_text(self.path, "".join(map(_line, rows)))
         board = folder / "tensorboard"
         board.mkdir(exist_ok=True)
-        # Not SummaryWriter: if its writer thread fails, callers block forever. File names have a
-        # resolution of one second; the step as suffix keeps them unique.
+        # Not SummaryWriter: if its writer thread fails, callers block forever. File names contain
+        # the time in whole seconds; the step as a suffix keeps them unique.
         self._board = EventsWriter(str(board / "events"), f".{start_step:09}")
-        start = SessionLog(status=SessionLog.START)  # discards earlier events from this step on
+        start = SessionLog(status=SessionLog.START)  # discards old events from this step on
         self._add(start_step + 1, session_log=start)
 
     def write(
@@ -211,7 +211,7 @@ class MetricsLog:
         values: Mapping[str, float],
         histograms: Mapping[str, np.ndarray] = MappingProxyType({}),
     ) -> None:
-        """Log scalars at `step`, and histograms of arrays over layers to TensorBoard only.
+        """Log scalars at `step` and, to TensorBoard only, histograms of per-layer arrays.
 
         Non-finite values are omitted, because JSON cannot represent them.
         """

@@ -11,7 +11,7 @@ def differences(config_at: Callable[[str], Config]) -> str:
     """Return a table of the fields that differ between scales; empty if all are equal.
 
     Args:
-        config_at: returns the experiment at a scale.
+        config_at: returns the experiment's config at a scale.
     """
     configs = [dict(_values(config_at(scale))) for scale in SCALES]
     names = dict.fromkeys(name for config in configs for name in config)

@@ -63,7 +63,7 @@ class RunSetup:
         prompts: prompts of all instructions.
         joints: number of joints J of the robot.
         environments: one environment per task; empty with a dataset.
-        source: the dataset; None: the expert.
+        source: the dataset; None: collect with the expert.
         memory: estimated memory of one step.
         available: device memory [bytes].
     """
@@ -80,7 +80,7 @@ class RunSetup:
 
     @property
     def free_bytes(self) -> float:
-        """Device memory left by a training step [bytes]."""
+        """Device memory left over by a training step [bytes]."""
         return self.available - self.memory.peak
 
 
@@ -100,7 +100,7 @@ def build(
 
     Raises:
         ValueError: an unknown task, robot, backbone or size, an incompatible base or tokenizer, a
-            target without a match, or an invalid chunk or batch size.
+            target that matches no layer, or an invalid chunk or batch size.
     """
     sizes = {"image_size": config.image_size, "control_dt": config.control_dt}
     tasks = () if config.data.source else config.tasks
@@ -136,7 +136,7 @@ def prepare(
     load_base: LoadBase = base_model,
     collect: Collect = demonstrations,
 ) -> Run:
-    """Build a run and get its demonstrations.
+    """Build a run and load or collect its demonstrations.
 
     Args:
         config: configuration of the run.
@@ -160,7 +160,7 @@ def prepare(
             _load_dataset(run, built.source, built.free_bytes)
         else:
             run.episodes = _collect(run, built.prompts.instructions, collect)
-    run.streams = processes.any_process(run.streams)  # all or none, as batches are shared
+    run.streams = processes.any_process(run.streams)  # all or none: processes share batches
     relative = config.model.relative_actions
     inputs = processor([*run.episodes.values()], model.config, built.prompts, relative=relative)
     if config.peft.needs_statistics:
@@ -208,8 +208,8 @@ def _prompts_and_joints(
     try:
         prompts = PromptTable.of(tokenizer, first.instructions, model, num_joints=joints)
     except ValueError as error:
-        fields = "--model.tokenizer or --model.max-tokens"
-        raise ValueError(f"the dataset's instructions need another {fields}: {error}") from error
+        need = "need a different --model.tokenizer or --model.max-tokens"
+        raise ValueError(f"the dataset's instructions {need}: {error}") from error
     return prompts, joints
 
 
@@ -228,7 +228,7 @@ def _check_sizes(config: Config, chunk: int) -> None:
             f"batch_size must be a multiple of the {devices} devices{micro}, got {optim.batch_size}"
         )
     if jax.process_count() > 1 and config.data.fresh_every:
-        raise ValueError("data.fresh_every needs a single process: drop it or --distributed")
+        raise ValueError("data.fresh_every cannot be combined with --distributed: drop one")
     if optim.ema and isinstance(config.peft, peft.AdaLoRA):
         raise ValueError(
             "--optim.ema cannot be combined with ada_lora: averaging breaks its rank budget"
@@ -290,8 +290,8 @@ def processor(
         episodes: demonstrations of each task.
         model_config: sizes and inputs of the model.
         prompts: prompts of the instructions, in the order of the tasks.
-        relative: learn joint targets relative to the state at the start of the chunk; False: as
-            the model's config says.
+        relative: learn joint targets relative to the state at the start of the chunk; False: follow
+            the model's config.
     """
     joints = episodes[0].state.shape[-1] - 1
     slots, dim = robot_slots(joints, model_config.inputs), model_config.action_dim
@@ -333,16 +333,16 @@ def _load_dataset(run: Run, source: Source, free_bytes: float) -> None:
 def _collect(run: Run, instructions: Sequence[str], collect: Collect) -> dict[str, Episodes]:
     """Collect the demonstrations of each task, with a progress bar per task."""
     with bars(run.console, "episodes") as progress:
-        started: dict[str, TaskID] = {}
+        bar_ids: dict[str, TaskID] = {}
 
         def report(task: str, done: int, total: int) -> None:
             text = f"collecting {task}" if done else f"compiling the expert of {task} ..."
-            if task not in started:
-                started[task] = progress.add_task(text, total=total)
-            progress.update(started[task], completed=done, description=text)
+            if task not in bar_ids:
+                bar_ids[task] = progress.add_task(text, total=total)
+            progress.update(bar_ids[task], completed=done, description=text)
 
         episodes = collect(run.config, run.folder, report)
-    # Steps refer to their instruction by its index.
+    # Steps refer to instructions by index.
     if [phrase for group in episodes.values() for phrase in group.instructions] != [*instructions]:
         raise ValueError(
             f"{run.folder} holds demonstrations with different instructions: use another --name"

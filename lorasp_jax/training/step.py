@@ -22,7 +22,7 @@ Metrics = dict[str, jax.Array]
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class TrainState:
-    """State of training, without the frozen base.
+    """Training state, without the frozen base.
 
     Attributes:
         step: `[]` int32, number of steps taken, including skipped ones.
@@ -47,7 +47,7 @@ class TrainState:
 def init_state(
     adapters: Any, optimizer: optax.GradientTransformation, *, ema: bool = False
 ) -> TrainState:
-    """Return the initial state, with copies because a step donates the buffers of its state."""
+    """Return the initial state, which holds copies because each step donates its input buffers."""
     adapters = jax.tree.map(jnp.copy, adapters)
     average = jax.tree.map(jnp.copy, adapters) if ema else None
     step = jnp.zeros((), jnp.int32)
@@ -70,7 +70,7 @@ def active_ranks(aux: dict[str, dict[str, Aux]]) -> Metrics:
 
 
 def _layer_ranks(rank: jax.Array, mask: jax.Array | None) -> jax.Array:
-    """Average `[..., B, T]` over the valid tokens, giving `[L]`; L is 1 without leading axes."""
+    """Means of `[..., B, T]` over valid tokens, `[L]`; L is 1 if there are no leading axes."""
     mask = jnp.ones((), bool) if mask is None else mask
     tokens = (x.reshape(-1, *rank.shape[-2:]) for x in (rank, jnp.broadcast_to(mask, rank.shape)))
     return jax.vmap(masked_mean)(*tokens)
@@ -91,7 +91,7 @@ def loss_fn(
     """Flow-matching loss plus weighted auxiliary losses, eq. 14 of arXiv 2603.07404.
 
     The task loss is the mean over the elements that `batch.action_mask` marks as valid. `valid`
-    overrides their number, `noise` and `flow_time` override the sampled ones. `key` also drives
+    overrides their number; `noise` and `flow_time` override the sampled values. `key` also drives
     the adapters' dropout.
     """
     model = adaptation.with_dropout(nnx.merge(graphdef, adapters, frozen), key)
@@ -128,7 +128,7 @@ def gradients(
     gradient = jax.grad(loss_fn, has_aux=True)
     if parts == 1:
         return gradient(adapters, frozen, graphdef, batch, key, weights)
-    # Every n-th row goes into the same micro-batch, so that no row changes its device.
+    # Row i goes into micro-batch i % parts, so that no row moves to another device.
     split = lambda x: jnp.swapaxes(x.reshape(-1, parts, *x.shape[1:]), 0, 1)  # noqa: E731
     valid = jnp.sum(batch.action_mask) / parts
 
@@ -158,7 +158,7 @@ def train_step(
     ema: float = 0.0,
     spike: float = 0.0,
 ) -> tuple[TrainState, Metrics]:
-    """Take one step on the global batch, accumulated over `parts`; `key` is consumed.
+    """Take one step on the global batch, split into `parts` micro-batches; `key` is consumed.
 
     The average, if there is one, decays by `ema`. A step that `guard.check_step` does not accept
     changes only the step count and the guard.

@@ -46,7 +46,7 @@ class Stepper:
         self._compiled: dict[int, Future[Any]] = {}
 
     def compile(self, state: TrainState, count: int) -> Future[Any]:
-        """Start compiling `count` steps in a background thread, unless started before."""
+        """Start compiling `count` steps in a background thread, unless already started."""
         if count not in self._compiled:
             self._compiled[count] = _in_thread(self._compile, state, count)
         return self._compiled[count]
@@ -68,7 +68,7 @@ class StreamingStepper(Stepper):
     """Runs steps on batches read from disk; the next batch is prefetched to the device."""
 
     def __init__(self, jitted: Callable, frozen: Any, batches: Iterator[Raw], speed: Speed) -> None:
-        """Read the first batch; the other arguments are those of `Stepper`."""
+        """Read the first of `batches`; for the other arguments see `Stepper`."""
         super().__init__(jitted, frozen, next(batches), speed)
         self._batches = batches
 
@@ -110,19 +110,19 @@ class RefreshingStepper(Stepper):
             frozen: see `Stepper`.
             speed: see `Stepper`.
             config: configuration of the run.
-            collect: returns a generation on the device; all have equal shapes.
+            collect: returns a generation on the device; all generations have the same shapes.
             start: index of the first step.
         """
         self._every, self._last = config.data.fresh_every, config.optim.steps - 1
         self._collect = collect
         self._generation = self._generation_of(min(start, self._last))
-        # After the last step nothing trains: take generation 0, which is already collected.
+        # Nothing trains after the last step: use generation 0, which is already collected.
         first = self._generation if start <= self._last else 0
         super().__init__(jitted, frozen, collect(first), speed)
         self._collect_next()
 
     def __call__(self, state: TrainState, key: jax.Array, count: int) -> tuple[TrainState, Any]:
-        """Run `count` steps, all on the generation of the first one."""
+        """Run `count` steps, all on the generation of the first step."""
         if self._generation_of(int(state.step)) > self._generation:
             self.speed.begin()
             with self.speed.waiting(state):
@@ -148,13 +148,13 @@ def make_stepper(
     start: int,
     collect: Collect,
 ) -> Stepper:
-    """Create the stepper for the run's kind of data.
+    """Create the stepper that suits the run's data.
 
     Args:
         run: the run.
         jitted: jitted step function, see `loop.jit_steps`.
         frozen: frozen parameters, on the mesh.
-        mesh: mesh of the devices that train.
+        mesh: mesh of the training devices.
         start: index of the first step.
         collect: collects new demonstrations if `data.fresh_every` is set.
     """

@@ -10,18 +10,18 @@ from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import read_json, to_json, write_json
 
 RECORD = "wandb.json"
-"""File in a run's folder with the W&B run id, which a resumed run continues."""
+"""File in a run's folder with the id of the W&B run, which a resumed run continues."""
 
 
 class WeightsAndBiases(Callback):
     """Logs config, metrics, success rates and videos; a context manager that reports the exit code.
 
-    W&B keeps its own files in the folder of all runs. Configure it with its environment variables,
-    such as WANDB_MODE=offline.
+    W&B keeps its own files in the parent of the run's folder. Configure it with its environment
+    variables, such as WANDB_MODE=offline.
     """
 
     def __init__(self, project: str, config: Config, folder: Path) -> None:
-        """Start a W&B run, or continue that of this folder.
+        """Start a W&B run, or continue the one in this folder.
 
         Raises:
             ValueError: wandb is not installed, or reports an error.
@@ -29,7 +29,7 @@ class WeightsAndBiases(Callback):
         try:
             import wandb  # pyright: ignore[reportMissingImports]
         except ImportError as error:
-            raise ValueError("--wandb needs a package: pip install wandb") from error
+            raise ValueError("--wandb needs the package wandb: pip install wandb") from error
         self._wandb, record = wandb, folder / RECORD
         run_id = read_json(record, {"id": str}).get("id")
         try:

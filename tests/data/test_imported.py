@@ -55,7 +55,7 @@ def test_a_dataset_becomes_a_cache_once(tmp_path):
         (
             {"control_dt": 0.05},
             {},
-            r"has a control period of 0\.1 s, this run has --control-dt 0\.05",
+            r"has a control period of 0\.1 s, but this run has --control-dt 0\.05",
         ),
         ({}, {"cameras": ("side",)}, "has cameras side, wrist, but the backbone takes at most 1"),
     ],
@@ -73,10 +73,10 @@ def test_incompatible_datasets_are_refused_early(changes, model, sentence, tmp_p
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"actions": "delta_joint"}, "has delta_joint actions, policies learn joint"),
+        ({"actions": "delta_joint"}, "has delta_joint actions, but policies learn joint"),
         (
             dict.fromkeys(("state", "action"), np.zeros((3, 9, 14), np.float32)),
-            "1 to 7 for this backbone, got 13. Choose with .* --state-numbers",
+            "1 to 7 for this backbone, got 13. Select entries with .* --state-numbers",
         ),
     ],
 )

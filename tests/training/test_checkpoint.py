@@ -154,7 +154,7 @@ def test_incomplete_checkpoints_are_removed(folder):
     step, printed = restore(folder)
     assert (step, names(folder)) == (1, ["1"])
     for removed in (2, 7):
-        assert f"removed the incomplete checkpoint at step {removed}: its process" in printed
+        assert f"removed the incomplete checkpoint at step {removed}: saving" in printed
     shutil.rmtree(folder / "checkpoints/1")
     assert restore(folder) == (None, "")
 
@@ -162,7 +162,7 @@ def test_incomplete_checkpoints_are_removed(folder):
 def test_a_full_disk_leaves_the_previous_checkpoint(folder, caplog):
     """The file size limit is below the size of an array."""
     checkpoints = Checkpoints(folder, "base", Console(file=io.StringIO()))
-    message = r"could not be written \(File too large\), the one at step 2 is intact: free some"
+    message = r"could not be written \(File too large\); the one at step 2 is intact: free some"
     _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))
     try:

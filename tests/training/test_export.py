@@ -151,7 +151,7 @@ def test_another_tokenizer_is_rejected(tmp_path, monkeypatch):
         return np.where(valid, (ids + 1) % 300, 0), valid
 
     monkeypatch.setattr(tokenizer.Offline, "encode", other)
-    with pytest.raises(ValueError, match=r"produces other tokens than .*: pass words="):
+    with pytest.raises(ValueError, match=r"produces different tokens than .*: pass words="):
         export.load_policy(run.folder)
 
 

@@ -78,7 +78,7 @@ def test_each_generation_has_its_own_keys(monkeypatch):
 
 
 def test_what_does_not_go_together():
-    with pytest.raises(ValueError, match="fresh_every needs the scripted expert"):
+    with pytest.raises(ValueError, match="fresh_every cannot be combined with"):
         dataclasses.replace(FRESH.data, source="somewhere")
     with pytest.raises(ValueError, match="multiple of log_every, got 3 and 2"):
         dataclasses.replace(FRESH, data=dataclasses.replace(FRESH.data, fresh_every=3))

@@ -84,7 +84,7 @@ def test_errors_are_one_sentence(project, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "wandb", None if project == "arms" else Fake())
     assert train.main([*MULTITASK, "--wandb", project]) == 2
     printed = capsys.readouterr().err
-    expected = {"arms": "--wandb needs a package: pip install wandb", "refused": "not logged in"}
+    expected = {"arms": "needs the package wandb: pip install wandb", "refused": "not logged in"}
     assert expected[project] in printed
     assert printed.count("\n") == 1
     assert [path.name for path in tmp_path.rglob("*.json")] == ["config.json"]

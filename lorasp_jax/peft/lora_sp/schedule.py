@@ -32,7 +32,7 @@ class EnergySchedule:
     start: float = 1.0
     """Initial η; 1 prunes nothing."""
     curve: Literal["linear", "cosine"] = "linear"
-    """Interpolation from `start` to the target; "cosine" is half a period, flat at both ends."""
+    """Interpolation from `start` to the target; "cosine": half a cosine wave, flat at both ends."""
     share: float = 0.5
     """Fraction of the training steps after which η reaches the target."""
 

@@ -33,7 +33,7 @@ from lorasp_jax.training.step import init_state
 def dry_run(
     config: Config, folder: Path, console: Console, load_base: setup.LoadBase = base_model
 ) -> None:
-    """Build the run, compile its training step and print their cost; writes nothing.
+    """Build the run, compile its training step and print the cost, without writing anything.
 
     Args:
         config: configuration of the run.
@@ -110,7 +110,7 @@ def _blank_episode(config: Config, built: setup.RunSetup) -> Episodes:
 
 
 def _lower(run: Run, data: Steps | Raw) -> Any:
-    """Lower, from shapes, the steps that `loop.train` compiles first."""
+    """Lower the steps that `loop.train` compiles first, from shapes alone."""
     config, model = run.config, run.policy.model
     optimizer = make_optimizer(config.optim, adaptation.methods(model).values())
     mesh = meshes.make_mesh(config.fsdp, run.devices)
@@ -127,7 +127,7 @@ def _lower(run: Run, data: Steps | Raw) -> Any:
 
 
 def _with_sharding(tree: Any, sharding: jax.sharding.Sharding) -> Any:
-    """Return shapes with a sharding."""
+    """Attach a sharding to the shapes of a tree."""
     shape = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding)  # noqa: E731
     return jax.tree.map(shape, tree)
 
@@ -161,7 +161,7 @@ def _memory_table(built: setup.RunSetup, data: float, analysis: Any) -> Table:
     Args:
         built: setup of the run, with the estimate.
         data: size of the demonstrations, or of a streamed batch [bytes].
-        analysis: `memory_analysis` of the compiled step; None if the backend has none.
+        analysis: `memory_analysis` of the compiled step; None if the backend does not provide it.
     """
     estimate = {"demonstrations": data, **dataclasses.asdict(built.memory)}
     resident = ("base", "adapters", "optimizer", "demonstrations")

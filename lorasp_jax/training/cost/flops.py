@@ -19,7 +19,7 @@ without sparsity)."""
 
 _CUDNN = {"dot_product_attention_fwd_wrapper": 4, "dot_product_attention_bwd_wrapper": 8}
 """FLOPs of cuDNN attention in units of B N T S H: two matrix products in the forward pass, four in
-the backward pass (a fifth recomputes one)."""
+the backward pass (a fifth, a recomputation, is not counted)."""
 
 
 def count(function: Callable, *arguments: Any) -> float:
@@ -30,7 +30,7 @@ def count(function: Callable, *arguments: Any) -> float:
       arguments: arrays or `jax.ShapeDtypeStruct`s; only shapes and dtypes matter.
     """
     jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
-    return _of_jaxpr(_compat.eliminate_dead_code(jaxpr, [True] * len(jaxpr.outvars))[0])
+    return _jaxpr_flops(_compat.eliminate_dead_code(jaxpr, [True] * len(jaxpr.outvars))[0])
 
 
 def utilization(flop_count: float, seconds: float) -> float | None:
@@ -45,11 +45,11 @@ def peak() -> float | None:
     return next((value for name, value in PEAK.items() if kind.startswith(name)), None)
 
 
-def _of_jaxpr(jaxpr: Any) -> float:
-    return sum(_of_equation(equation) for equation in jaxpr.eqns)
+def _jaxpr_flops(jaxpr: Any) -> float:
+    return sum(_equation_flops(equation) for equation in jaxpr.eqns)
 
 
-def _of_equation(equation: Any) -> float:
+def _equation_flops(equation: Any) -> float:
     name, params = equation.primitive.name, equation.params
     if name == "dot_general":
         (contracted, _), _ = params["dimension_numbers"]
@@ -60,9 +60,9 @@ def _of_equation(equation: Any) -> float:
         batch, tokens, heads, size = query
         return float(_CUDNN[name] * batch * heads * tokens * key[1] * size)
     if name == "cond":
-        return max(_of_jaxpr(branch.jaxpr) for branch in params["branches"])
+        return max(_jaxpr_flops(branch.jaxpr) for branch in params["branches"])
     if name == "while":  # the number of iterations is unknown: count one
-        return _of_jaxpr(params["body_jaxpr"].jaxpr)
+        return _jaxpr_flops(params["body_jaxpr"].jaxpr)
     inner = [getattr(value, "jaxpr", value) for value in params.values()]
-    once = sum(_of_jaxpr(jaxpr) for jaxpr in inner if hasattr(jaxpr, "eqns"))
+    once = sum(_jaxpr_flops(jaxpr) for jaxpr in inner if hasattr(jaxpr, "eqns"))
     return once * (params["length"] if name == "scan" else 1)

@@ -1,6 +1,6 @@
 """Throughput, data wait and memory use per log interval.
 
-Nothing here blocks on the device: an interval ends when its metrics have been read anyway.
+Nothing here blocks on the device: by the end of an interval its metrics have been read anyway.
 """
 
 import contextlib
@@ -15,7 +15,7 @@ from lorasp_jax.training.cost.preflight import GIB
 
 
 class Speed:
-    """Meter of training speed; it is paused between intervals and during compilation."""
+    """Meter of training speed, paused between intervals and during compilation."""
 
     def __init__(self, batch_size: int, step_flops: float | None) -> None:
         """Create a meter that has not started.
@@ -37,8 +37,8 @@ class Speed:
     def waiting(self, results: Any) -> Iterator[None]:
         """Measure the time in this block, in which the host waits for the next batch.
 
-        It counts only if the device is idle at its end, having finished all steps dispatched so
-        far.
+        The time counts only if the device is idle at the end of the block, having finished all
+        steps dispatched so far.
 
         Args:
             results: pytree of arrays computed by the last dispatched step.

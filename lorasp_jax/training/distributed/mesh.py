@@ -53,7 +53,7 @@ def split_axis(shape: Sequence[int], size: int, fsdp: int, minimum: int) -> int 
 def shardings(tree: Any, mesh: Mesh, minimum: int = MINIMUM_SHARDED_BYTES) -> Any:
     """Return a sharding per array of a tree: large arrays over "fsdp", the others replicated.
 
-    It depends on shapes alone, so optimizer moments and averages are sharded like their parameters.
+    It depends on shape and dtype only, so moments and averages are sharded like their parameters.
     """
 
     def sharding(array: Any) -> NamedSharding:

@@ -43,8 +43,8 @@ class Peers:
             number: index of this process, 0 to `count` - 1.
             count: number of processes.
             say: prints a line.
-            hint: what to do after the connection is lost.
-            retry_interval: time between two attempts to connect [s].
+            hint: remedy printed if the connection is lost.
+            retry_interval: time between attempts to connect [s].
             notice_after: time without a connection before a notice is printed [s].
 
         Raises:
@@ -76,11 +76,11 @@ class Peers:
             raise ValueError(answer["refused"])
 
     def wait_for_root_cause(self) -> None:
-        """Let a failing process report first: it may be the cause of this one's failure."""
+        """Let another failing process report first: it may have made this one fail."""
         time.sleep(_ROOT_CAUSE_DELAY)
 
     def announce_exit(self, code: int) -> None:
-        """Tell the others that this process exits; wait for them unless the code is 0."""
+        """Tell the others that this process is exiting; wait for them unless the code is 0."""
         self._code = code
         self._send({"leaving": code, "reason": self.exit_reason})
         if code:
@@ -135,7 +135,7 @@ def split_address(address: str) -> tuple[str, int]:
 
 
 def listen(address: str) -> socket.socket:
-    """Listen at the port of an address of this host.
+    """Listen on the port of `address`, which is an address of this host.
 
     Raises:
         ValueError: the port is not available.
@@ -162,7 +162,7 @@ def _connect(
     """Connect to the first process, retrying until it is up; return the socket and its lines.
 
     Raises:
-        ValueError: nothing answers, or something other than a run.
+        ValueError: no run answers at the address.
     """
     start, notified = time.monotonic(), False
     while True:
@@ -187,7 +187,7 @@ def _open_connection(host: str, port: int) -> tuple[socket.socket, IO[bytes]]:
     """Connect to the first process of a run.
 
     Raises:
-        OSError: nothing answers, or something other than a run that waits for processes.
+        OSError: no run that waits for processes answers.
     """
     connection = socket.create_connection((host, port), timeout=_CONNECT_TIMEOUT)
     with contextlib.ExitStack() as stack:

@@ -44,7 +44,7 @@ def initialize(console: Console, hint: str) -> None:
 
     Args:
         console: console for the status messages of the first process.
-        hint: what to do after another process died.
+        hint: remedy printed if another process dies.
 
     Raises:
         ValueError: the environment does not describe the processes, they cannot be reached, or
@@ -63,7 +63,7 @@ def initialize(console: Console, hint: str) -> None:
     jax.config.update("jax_enable_preemption_service", False)  # `interrupt` handles signals
     jax.distributed.initialize(address, count, number)
     _delay_abort()
-    atexit.register(_peers.announce_exit, 0)  # runs before JAX's own, which waits for the others
+    atexit.register(_peers.announce_exit, 0)  # before JAX's handler, which waits for the others
     sys.excepthook = _exit_on_exception
 
 
@@ -84,16 +84,16 @@ def _cluster_info() -> tuple[str, int, int]:
             raise ValueError("no coordinator address")
     except (ValueError, RuntimeError) as error:
         raise ValueError(
-            "--distributed found no launcher: start with Slurm, Open MPI or on a TPU pod, or set "
+            "--distributed found no launcher: use Slurm, Open MPI or a TPU pod, or set "
             f"JAX_COORDINATOR_ADDRESS, {' and '.join(_VARIABLES)} ({error})"
         ) from error
     if not 0 <= number < count:
-        raise ValueError(f"JAX_PROCESS_ID must be 0 to {count - 1}, got {number}")
+        raise ValueError(f"JAX_PROCESS_ID must be between 0 and {count - 1}, got {number}")
     return address, count, number
 
 
 def _versions() -> dict[str, str]:
-    """Return the versions that must match for all processes to compute the same."""
+    """Return the versions that must match for all processes to compute the same results."""
     versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
     sources = hashlib.sha256()
     for package in ("envs", "lorasp_jax"):
@@ -105,13 +105,13 @@ def _versions() -> dict[str, str]:
 
 
 def _delay_abort() -> None:
-    """Delay SIGABRT, by which JAX ends a process without its coordinator, to report the loss first.
+    """Delay JAX's SIGABRT after the coordinator is lost, so that the loss is reported first.
 
     Python signal handlers do not run during abort(). C's `sleep` is async-signal-safe and can be
     the handler: called with the signal number, 6, it sleeps 6 s. JAX's own options do not help
     (tested with 0.10.2 and 0.12): `jax_enable_recoverability` covers only failures of processes
-    other than the first, and the client's `missed_heartbeat_callback` dies of std::bad_cast before
-    it is called.
+    other than the first, and the client's `missed_heartbeat_callback` fails with std::bad_cast
+    before it is called.
     """
     library = ctypes.CDLL(None)
     library.signal.argtypes = (ctypes.c_int, ctypes.c_void_p)
@@ -133,7 +133,7 @@ def agree(topic: str, facts: Mapping[str, Any]) -> None:
 
 
 class ExitConsole(Console):
-    """Console for the reason why this process exits; only the first process prints it."""
+    """Console for this process's exit reason; only the first process prints it."""
 
     def print(self, *objects: Any, **options: Any) -> None:
         """See `rich.console.Console.print`."""
@@ -185,7 +185,7 @@ def barrier(name: str) -> None:
 
 @contextlib.contextmanager
 def first_process_first(name: str) -> Iterator[None]:
-    """Run the block in the first process, then in the others, which find the files it wrote."""
+    """Run the block in the first process, then in the others, which can read the files it wrote."""
     if not is_first():
         barrier(name)
     yield
@@ -201,7 +201,7 @@ def any_process(flag: bool) -> bool:
 
 
 def device_put(tree: Any, shardings: Any) -> Any:
-    """Place arrays that every process holds on the devices of all processes.
+    """Place arrays, identical in all processes, on the devices of all processes.
 
     Args:
         tree: pytree of arrays, equal in all processes.

@@ -1,6 +1,6 @@
 """Rendezvous of a run's processes: a server thread in the first process, at the run's address.
 
-JAX's own service prints nothing while processes are missing, lets each process have other options,
+JAX's own service prints nothing while processes are missing, lets processes have different options,
 and notices a dead process only after 100 s. So all processes meet here first, then JAX's service
 takes over the address; the connections stay open, and a closed one shows at once that a process
 died.
@@ -25,10 +25,10 @@ MAX_MESSAGE_BYTES = 2**20
 JOIN_TIMEOUT = 180.0
 """Seconds to wait for missing processes, counted from the last one that joined."""
 EXIT_GRACE = 5.0
-"""Seconds the other processes have to exit by themselves after one has exited."""
+"""Seconds that the other processes have to exit by themselves after one exits."""
 _LAST_EXIT_GRACE = 3.0  # s that the first process, which hosts JAX's service, waits for the others
 _MAX_DIFFERENCES = 5  # listed in a message
-# A crashed machine closes no connection: after 30 s of silence, send 3 probes within 30 s.
+# A crashed machine leaves its connections open: after 30 s of silence, send 3 probes within 30 s.
 _KEEPALIVE = {"TCP_KEEPIDLE": 30, "TCP_KEEPINTVL": 10, "TCP_KEEPCNT": 3}
 
 
@@ -50,7 +50,7 @@ class _Member:
     """A process that has joined.
 
     Attributes:
-        facts: values it reported that are not compared yet, by topic.
+        facts: values it reported that have not been compared yet, by topic.
         exit: the exit code and reason it announced.
         closed: whether its connection is closed.
     """
@@ -79,9 +79,9 @@ class Rendezvous:
 
         Args:
             listener: socket that listens at the address.
-            address: address by which the other processes know it.
+            address: address at which the other processes reach the listener.
             count: number of processes, including this one.
-            hint: what to do after a process died.
+            hint: remedy printed if a process dies.
         """
         self._listener, self._address, self._count = listener, address, count
         self._hint, self._rejection = hint, ""
@@ -101,11 +101,11 @@ class Rendezvous:
         if not await self._until(settled, JOIN_TIMEOUT):
             missing = ", ".join(str(number) for number in sorted(everyone - present()))
             self._reject(
-                f"{len(present())} of {self._count} processes joined at {self._address}, and no "
-                f"other within {JOIN_TIMEOUT:.0f} s: check that process {missing} is running and "
-                "can reach this address"
+                f"{len(present())} of {self._count} processes joined at {self._address}, but no "
+                f"others joined within {JOIN_TIMEOUT:.0f} s: check that process {missing} is "
+                "running and can reach this address"
             )
-        server.close()  # JAX's service is the next to listen here
+        server.close()  # JAX's service listens here next
         self._answer()
         over = lambda: all(member.closed for member in self._members)  # noqa: E731
         await self._until(lambda: self._end or over())
@@ -114,7 +114,7 @@ class Rendezvous:
         await self._until(over)
 
     async def _until(self, holds: Callable[[], Any], timeout: float | None = None) -> bool:
-        """Wait until a condition holds; False if nothing changed for `timeout` seconds."""
+        """Wait until a condition holds; return False if nothing changes for `timeout` seconds."""
         while not holds():
             self._changed.clear()
             try:
@@ -145,11 +145,12 @@ class Rendezvous:
         self._changed.set()
 
     def _join(self, hello: dict[str, Any], writer: asyncio.StreamWriter) -> _Member:
-        """Add a process; one with an invalid number or count makes the whole run stop."""
+        """Add a process; reject the run if the process has an invalid number or count."""
         member = _Member(int(hello["process"]), str(hello["host"]), writer)
         if hello["of"] != self._count:
             self._reject(
-                f"{member} expects {hello['of']} processes, the first process {self._count}"
+                f"{member} expects {hello['of']} processes, but the first process expects "
+                f"{self._count}"
             )
         for other in self._members:
             if other.number == member.number:
@@ -172,7 +173,7 @@ class Rendezvous:
         self._changed.set()
 
     def _reject(self, reason: str) -> None:
-        """Stop the run; the first reason given is the one reported."""
+        """Stop the run; only the first reason is reported."""
         self._rejection = self._rejection or reason
         self._changed.set()
 
@@ -199,13 +200,13 @@ class Rendezvous:
             member.send({"leave": code, "say": ""})
         await self._until(lambda: all(member.closed for member in others), _LAST_EXIT_GRACE)
         for member in self._members:
-            if member.number == 0:  # one that fails itself has already printed why
+            if member.number == 0:  # if it failed, it has printed why
                 failed = member.exit is not None and member.exit[0] != 0
                 member.send({"leave": code, "say": "" if failed else reason})
 
 
 def _differences(first: _Member, other: _Member, topic: str) -> str:
-    """Describe how the facts of another process differ from the first one's; "" if they do not."""
+    """Describe how the facts of another process differ from the first one's; return "" if equal."""
     a, b = first.facts[topic], other.facts[topic]
     differences = [
         f"{name} is {b.get(name)!r}, not {a.get(name)!r}"
@@ -217,6 +218,6 @@ def _differences(first: _Member, other: _Member, topic: str) -> str:
     more = len(differences) - _MAX_DIFFERENCES
     rest = f" and {more} more" if more > 0 else ""
     return (
-        f"{other} has different {topic} from the first process "
-        f"({'; '.join(differences[:_MAX_DIFFERENCES])}{rest}): start all processes alike"
+        f"{other} has {topic} that differ from those of the first process "
+        f"({'; '.join(differences[:_MAX_DIFFERENCES])}{rest}): use the same ones in all processes"
     )

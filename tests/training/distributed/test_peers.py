@@ -78,13 +78,13 @@ def test_processes_agree_on_equal_facts_and_all_report_a_difference():
     reasons = agree(three, same, same, other, topic="base models")
     assert len({*reasons}) == 1
     assert reasons[0].startswith("process 2 on ")
-    assert "different base models from the first process" in reasons[0]
-    assert "(peft.method is None, not 'LoRA'; seed is 5, not 0): start all" in reasons[0]
+    assert "base models that differ from those of the first process" in reasons[0]
+    assert "(peft.method is None, not 'LoRA'; seed is 5, not 0): use the same" in reasons[0]
 
 
 def test_long_lists_of_differences_are_truncated():
     facts = [{f"field{i}": f"{i}{who}" for i in range(9)} for who in "ab"]
-    assert " and 4 more): start" in agree(connect(), *facts)[0]
+    assert " and 4 more): use" in agree(connect(), *facts)[0]
 
 
 def test_missing_processes_are_listed():
@@ -99,7 +99,7 @@ def test_missing_processes_are_listed():
     ("numbers", "counts", "reason"),
     [
         ((0, 1, 1), (3, 3, 3), r"process 1 on \S+ has the same number as process 1 on \S+: number"),
-        ((0, 1), (2, 3), r"process 1 on \S+ expects 3 processes, the first process 2"),
+        ((0, 1), (2, 3), r"process 1 on \S+ expects 3 processes, but the first process expects 2"),
     ],
 )
 def test_an_invalid_number_or_count_is_reported_by_all(numbers, counts, reason):

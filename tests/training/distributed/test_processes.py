@@ -99,10 +99,10 @@ def initialize(*environment, monkeypatch):
 @pytest.mark.parametrize(
     ("environment", "reason"),
     [
-        ((None, None, None), "found no launcher: start with Slurm.*no coordinator address"),
+        ((None, None, None), "found no launcher: use Slurm.*no coordinator address"),
         (("10.0.0.1:1", None, "0"), "or set JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and"),
         (("10.0.0.1:1", "2", "second"), "JAX_PROCESS_ID .*'second'"),
-        (("10.0.0.1:1", "2", "2"), "JAX_PROCESS_ID must be 0 to 1, got 2"),
+        (("10.0.0.1:1", "2", "2"), "JAX_PROCESS_ID must be between 0 and 1, got 2"),
         (("localhost", "2", "0"), "must be host:port, such as 10.0.0.1:1234, got 'localhost'"),
         (("localhost", "2", "1"), "must be host:port, such as 10.0.0.1:1234, got 'localhost'"),
     ],
