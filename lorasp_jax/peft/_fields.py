@@ -24,8 +24,8 @@ def check_fields(owner: Any, prefix: str = "") -> None:
       prefix: prefix of field names in messages, such as "optim.".
 
     Raises:
-      ValueError: a value of the wrong type, a number that is not finite, or an integer above
-        `MAX_INT` or the "max" in its field's metadata.
+      ValueError: a value of the wrong type, a number that is not finite, or an integer whose
+        magnitude exceeds `MAX_INT` or the "max" in its field's metadata.
     """
     fields = dataclasses.fields(owner) if dataclasses.is_dataclass(owner) else ()
     maximum = {field.name: field.metadata.get("max", MAX_INT) for field in fields}

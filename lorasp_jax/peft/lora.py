@@ -38,9 +38,10 @@ class LoRA(Method):
     initialization: Literal["kaiming", "gaussian", "pissa", "olora", "eva"] = "kaiming"
     """Initial A and B. "kaiming": A from U(±1/√I), B = 0. "gaussian": A from N(0, 1/R²), B = 0.
     "pissa": scale A B is the best rank-R approximation of the kernel (`principal_part`). "olora":
-    A B is the kernel's QR decomposition, truncated to rank R (`orthogonal_part`). Both leave the
-    residual W - scale A B in the kernel. "eva": A spans the principal directions of the layer's
-    inputs (`principal_inputs`), B = 0; `adapt` then needs `statistics`."""
+    A B is from a QR decomposition of the kernel's transpose, truncated to rank R
+    (`orthogonal_part`). Both leave the residual W - scale A B in the kernel. "eva": A spans the
+    principal directions of the layer's inputs (`principal_inputs`), B = 0; `adapt` then needs
+    `statistics`."""
     dropout: float = 0.0
     """Dropout rate on the adapter's input, in training only. Enable it with `with_dropout` (NNX) or
     rngs={"dropout": key} (Linen)."""

@@ -78,10 +78,10 @@ def base_arrays(model: nnx.Module) -> dict[str, np.ndarray]:
     """
     if jax.tree.leaves(nnx.state(model, (AdapterParam, AdapterSetParam))):
         raise ValueError(
-            "models.save needs a model without adapters: merge them or save them separately."
+            "saving needs a model without adapters: merge the adapters or save them separately."
         )
     if is_quantized(model):
-        raise ValueError("models.save needs unquantized kernels: save the base before quantizing.")
+        raise ValueError("saving needs unquantized kernels: save the base before quantizing.")
     arrays = named_arrays(model)
     expected = _shapes(named_arrays(nnx.eval_shape(lambda: model.config.create(nnx.Rngs(0)))))
     if mismatched := sorted(expected.items() ^ _shapes(arrays).items()):
