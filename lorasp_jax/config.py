@@ -123,7 +123,7 @@ class OptimConfig:
     """Gradient-accumulation micro-batches per step; a larger number saves memory. The task loss is
     that of the full batch; auxiliary losses are averaged over micro-batches."""
     ema: float = 0.0
-    """Decay per step of the exponential moving average (EMA) of the trainable parameters, such as
+    """Per-step decay of the exponential moving average (EMA) of the trainable parameters, such as
     0.999; the average is then evaluated and exported. 0: no average."""
     state_noise: float = 0.02
     """Standard deviation of the noise added to normalized robot states during training."""

@@ -116,7 +116,7 @@ class Checkpoints:
             orbax_folders.check(self._folder / str(step))
             checkpoint = self._manager.restore(step, args=arguments)
             base_hash, expected = (checkpoint["meta"][name] for name in ("base_hash", "digest"))
-        except Exception as error:  # Orbax raises storage errors of any type
+        except Exception as error:  # Orbax lets any storage error through
             raise _CorruptError("unreadable") from error
         if digest(checkpoint["state"], str(base_hash)) != expected:
             raise _CorruptError("digest mismatch")
@@ -165,7 +165,7 @@ class Checkpoints:
         """Convert an Orbax error about a failed write to a one-line ValueError."""
         try:
             yield
-        except Exception as error:  # Orbax raises storage errors of any type
+        except Exception as error:  # Orbax lets any storage error through
             self._remove_incomplete()
             full = [text for text in map(os.strerror, DISK_FULL) if text in str(error)]
             reason = full[0] if full else str(error).partition("\n")[0][:200]
@@ -191,6 +191,6 @@ def _suffixes() -> Iterator[str]:
 
 
 def _by_path(tree: Any) -> dict[str, jax.Array]:
-    """Flatten a tree to a dict from path to leaf, so that files are independent of containers."""
+    """Flatten a tree to a dict from path to leaf, so that files do not depend on node types."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(path): leaf for path, leaf in leaves}

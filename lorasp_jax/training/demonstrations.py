@@ -14,7 +14,7 @@ from lorasp_jax.config import Config
 from lorasp_jax.training.random_streams import RandomStream
 
 Progress = Callable[[str, int, int], None]
-"""Called with task, number of episodes collected and total."""
+"""Called with the task, the number of collected episodes and the total."""
 
 
 def demonstrations(config: Config, folder: Path, progress: Progress) -> dict[str, Episodes]:

@@ -30,7 +30,7 @@ class Guard:
 
     Attributes:
         counted: `[]` int32, number of accepted steps.
-        in_a_row: `[]` int32, number of steps skipped since the last accepted one.
+        in_a_row: `[]` int32, number of steps skipped since the last accepted step.
         loss: `[]` running mean of the loss over accepted steps.
         grad_norm: `[]` running mean of the global gradient norm over accepted steps.
     """

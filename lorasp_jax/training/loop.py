@@ -50,7 +50,7 @@ def train(
     Raises:
         RunError: too many consecutive steps were skipped, or an update was non-finite; the last
             checkpoint remains.
-        KeyboardInterrupt: a signal stopped the run; the state is saved.
+        KeyboardInterrupt: a signal stopped the run; the state is saved unless a second one follows.
     """
     graphdef, adapters, frozen = adaptation.split(run.policy.model)
     methods = adaptation.methods(run.policy.model).values()
@@ -210,7 +210,7 @@ def _failure(
     """Return an error if too many steps were skipped or an update was non-finite.
 
     Args:
-        optim: optimizer settings with the limits.
+        optim: optimizer settings, including the limits.
         rows: metrics of each step of the log interval, `[count, ...]`.
         values: logged means of these metrics.
         done: step at the end of the interval.

@@ -9,7 +9,7 @@ from lorasp_jax.peft import AdaLoRA, Method
 
 
 def learning_rate(config: OptimConfig) -> optax.Schedule:
-    """Return a schedule of linear warm-up from zero and cosine decay to `final_learning_rate`."""
+    """Return a schedule with linear warm-up from zero and cosine decay to `final_learning_rate`."""
     return optax.warmup_cosine_decay_schedule(
         init_value=0.0,
         peak_value=config.learning_rate,

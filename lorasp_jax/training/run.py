@@ -83,7 +83,7 @@ class Callback:
     """Hooks called during a run; override any of them."""
 
     def on_start(self, run: Run) -> None:
-        """Called before the first step, with the untrained policy; not called on resume."""
+        """Called with the untrained policy before training, unless a checkpoint was restored."""
 
     def on_log(self, run: Run, step: int, metrics: dict[str, float]) -> dict[str, float] | None:
         """Called at every log step, with the current policy.

@@ -61,7 +61,7 @@ class RunSetup:
         base_hash: hash of the base.
         model: the adapted base; data-initialized adapters are not initialized yet.
         prompts: prompts of all instructions.
-        joints: number of joints J of the robot.
+        joints: number of robot joints J.
         environments: one environment per task; empty with a dataset.
         source: the dataset; None: collect with the expert.
         memory: estimated memory of one step.

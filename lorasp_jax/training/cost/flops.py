@@ -34,7 +34,7 @@ def count(function: Callable, *arguments: Any) -> float:
 
 
 def utilization(flop_count: float, seconds: float) -> float | None:
-    """Return the fraction of the first device's peak; None if the peak is unknown."""
+    """Return the achieved fraction of the first device's peak; None if the peak is unknown."""
     peak_flops = peak()
     return peak_flops and flop_count / seconds / peak_flops
 

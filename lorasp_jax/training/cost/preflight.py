@@ -94,7 +94,7 @@ def choose_remat(
 
 
 def _out_of_memory_message(config: Config, memory: Memory, remat: Remat, available: float) -> str:
-    """Return an error message that suggests settings which need less memory."""
+    """Return an error message that suggests settings with lower memory use."""
     batch, fixed = config.optim.batch_size, memory.peak - HEADROOM * memory.activations
     fitting = math.floor(batch * (available - fixed) / (memory.peak - fixed))
     fitting -= fitting % (jax.device_count() * config.optim.accumulate)

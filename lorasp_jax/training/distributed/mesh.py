@@ -1,7 +1,7 @@
 """The ("data", "fsdp") device mesh and the shardings of arrays on it.
 
 One code path serves one device and many: the step is written for the global batch, and `jax.jit`
-with `NamedSharding` parallelizes it. This is the successor of `pmap` in today's JAX
+with `NamedSharding` parallelizes it. This replaces `pmap` in current JAX
 (docs.jax.dev/en/latest/migrate_pmap.html).
 """
 
@@ -51,7 +51,7 @@ def split_axis(shape: Sequence[int], size: int, fsdp: int, minimum: int) -> int 
 
 
 def shardings(tree: Any, mesh: Mesh, minimum: int = MINIMUM_SHARDED_BYTES) -> Any:
-    """Return a sharding per array of a tree: large arrays over "fsdp", the others replicated.
+    """Return a sharding for each array of a tree: large arrays over "fsdp", the others replicated.
 
     It depends on shape and dtype only, so moments and averages are sharded like their parameters.
     """

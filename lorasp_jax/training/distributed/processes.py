@@ -38,8 +38,8 @@ _peers: peers.Peers | None = None
 def initialize(console: Console, hint: str) -> None:
     """Connect to the other processes; call before JAX starts its backend.
 
-    If one process exits early afterwards, all exit. JAX finds the address by itself under Slurm,
-    Open MPI, Kubernetes and on TPU pods. Elsewhere set JAX_COORDINATOR_ADDRESS (host:port of the
+    From then on, if one process exits early, all exit. JAX finds the address by itself under Slurm,
+    Open MPI and Kubernetes and on TPU pods. Elsewhere set JAX_COORDINATOR_ADDRESS (host:port of the
     first process), JAX_NUM_PROCESSES and JAX_PROCESS_ID.
 
     Args:
@@ -71,7 +71,7 @@ def _cluster_info() -> tuple[str, int, int]:
     """Return the coordinator's address, the number of processes and the index of this one.
 
     Raises:
-        ValueError: the environment does not describe them, or is invalid.
+        ValueError: the environment does not define them, or is invalid.
     """
     try:
         count, number = (
@@ -177,7 +177,7 @@ def is_first() -> bool:
 
 
 def barrier(name: str) -> None:
-    """Wait for all processes, on the host: a collective on the devices would time out."""
+    """Wait for all processes on the host; a collective on the devices would time out."""
     import orbax.checkpoint as ocp
 
     ocp.multihost.get_barrier_sync_fn()(key=name, timeout_ms=_BARRIER_TIMEOUT)
@@ -201,11 +201,11 @@ def any_process(flag: bool) -> bool:
 
 
 def device_put(tree: Any, shardings: Any) -> Any:
-    """Place arrays, identical in all processes, on the devices of all processes.
+    """Place arrays on the devices of all processes.
 
     Args:
         tree: pytree of arrays, equal in all processes.
-        shardings: a sharding per array, or one for all.
+        shardings: one sharding per array, or a single one for all arrays.
     """
     if jax.process_count() == 1:
         return jax.device_put(tree, shardings)

@@ -27,7 +27,7 @@ JOIN_TIMEOUT = 180.0
 EXIT_GRACE = 5.0
 """Seconds that the other processes have to exit by themselves after one exits."""
 _LAST_EXIT_GRACE = 3.0  # s that the first process, which hosts JAX's service, waits for the others
-_MAX_DIFFERENCES = 5  # listed in a message
+_MAX_DIFFERENCES = 5  # per message
 # A crashed machine leaves its connections open: after 30 s of silence, send 3 probes within 30 s.
 _KEEPALIVE = {"TCP_KEEPIDLE": 30, "TCP_KEEPINTVL": 10, "TCP_KEEPCNT": 3}
 
@@ -78,7 +78,7 @@ class Rendezvous:
         """Serve in a thread of this process.
 
         Args:
-            listener: socket that listens at the address.
+            listener: socket that listens on the address.
             address: address at which the other processes reach the listener.
             count: number of processes, including this one.
             hint: remedy printed if a process dies.
@@ -178,7 +178,7 @@ class Rendezvous:
         self._changed.set()
 
     def _answer(self) -> None:
-        """Answer topics that all processes have reported, or every topic of a rejected run."""
+        """Answer topics that all processes have reported, or all topics if the run is rejected."""
         for topic in {topic for member in self._members for topic in member.facts}:
             reporting = [member for member in self._members if topic in member.facts]
             if len(reporting) < self._count and not self._rejection:
@@ -200,7 +200,7 @@ class Rendezvous:
             member.send({"leave": code, "say": ""})
         await self._until(lambda: all(member.closed for member in others), _LAST_EXIT_GRACE)
         for member in self._members:
-            if member.number == 0:  # if it failed, it has printed why
+            if member.number == 0:  # if it failed itself, it has printed why
                 failed = member.exit is not None and member.exit[0] != 0
                 member.send({"leave": code, "say": "" if failed else reason})
 
