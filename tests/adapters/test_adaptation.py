@@ -21,12 +21,12 @@ class Net(nnx.Module):
     """An nnx.Linear, a norm, a scanned stack and a list of layers."""
 
     def __init__(self, rngs, param_dtype=jnp.float32):
-        kinds = {"param_dtype": param_dtype, "rngs": rngs}
-        self.inp = nnx.Linear(5, WIDTH, **kinds)
-        self.norm = nnx.RMSNorm(WIDTH, **kinds)
+        options = {"param_dtype": param_dtype, "rngs": rngs}
+        self.inp = nnx.Linear(5, WIDTH, **options)
+        self.norm = nnx.RMSNorm(WIDTH, **options)
         stacked = nnx.vmap(lambda r: Dense(WIDTH, WIDTH, param_dtype=param_dtype, rngs=r))
         self.blocks = stacked(rngs.split(LAYERS))
-        self.heads = nnx.List([nnx.Linear(WIDTH, 2, use_bias=False, **kinds) for _ in range(2)])
+        self.heads = nnx.List([nnx.Linear(WIDTH, 2, use_bias=False, **options) for _ in range(2)])
 
     def __call__(self, x):
         graphdef, layers = nnx.split(self.blocks)
@@ -120,8 +120,8 @@ def test_the_model_is_not_modified(net):
     shared = {leaf.unsafe_buffer_pointer() for leaf in before[1]}
     frozen = jax.tree.leaves(adaptation.split(model)[2])
     assert {leaf.unsafe_buffer_pointer() for leaf in frozen} == shared  # no second copy
-    free = leaves(adapted(net, (".*", FullFineTuning())), AdapterParam)
-    assert not shared & {leaf.unsafe_buffer_pointer() for leaf in free}  # may be donated
+    trainable = leaves(adapted(net, (".*", FullFineTuning())), AdapterParam)
+    assert not shared & {leaf.unsafe_buffer_pointer() for leaf in trainable}  # may be donated
 
 
 def test_first_match_wins_and_none_skips(net):
@@ -162,7 +162,7 @@ def test_adapting_a_fully_fine_tuned_layer_freezes_it(net):
 
 
 def test_an_adapter_is_never_replaced(net, x):
-    """It may be trained already; existing adapters on other layers are unchanged."""
+    """It may already be trained; adapters on other layers are unchanged."""
     model = trained(adapted(net, ("inp", LoRA(rank=2))), x)
     with pytest.raises(ValueError, match="cannot adapt inp: the layer already has a lora adapter"):
         adapted(model, (".*", LoRA(rank=3)))
@@ -176,7 +176,7 @@ def test_rules_that_apply_to_nothing(net):
     with pytest.raises(ValueError, match=r"rule 'block/' applies to nothing.*blocks"):
         adapted(net, ("block/", LoRA(rank=2)))
     with pytest.raises(ValueError, match="rule 'norm'"):
-        adapted(net, ("norm", LoRA(rank=2)))  # a norm is no dense layer
+        adapted(net, ("norm", LoRA(rank=2)))  # a norm is not a dense layer
     with pytest.raises(ValueError, match="rule 'inp' applies to nothing"):
         adapted(net, (".*", LoRA(rank=2)), ("inp", SP))  # shadowed
     with pytest.raises(ValueError, match=r"rule '\(' is not a valid regular expression"):
@@ -197,8 +197,8 @@ def test_a_single_layer_is_a_model(x):
     np.testing.assert_allclose(model(x), layer(x), rtol=1e-5, atol=1e-6)
 
 
-def test_models_of_shapes():
-    """A model too large to build is adapted and counted under eval_shape."""
+def test_adapting_and_counting_an_abstract_model():
+    """Under eval_shape, models that are too large to build can be adapted and counted."""
     model = nnx.eval_shape(lambda: adapted(Net(nnx.Rngs(0)), ("blocks", SP)))
     per_layer = 8 * (WIDTH + WIDTH) + 4 * (WIDTH + 8) + 4 + 8
     assert adaptation.count(model).trainable == LAYERS * per_layer
@@ -227,7 +227,7 @@ def test_merge_equals_forward(net, x):
         lorasp_jax.merge(adapted(net, ("blocks", SP)))
 
 
-def test_tree_mode(net, x):
+def test_nnx_tree_mode(net, x):
     """Splitting, training and merging also run with NNX's upcoming defaults."""
     model = adapted(net, (".*", SP))
     graphdef, adapters, frozen = adaptation.split(model)

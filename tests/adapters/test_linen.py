@@ -120,7 +120,7 @@ def test_merged_equals_adapted(published, ids, rules):
     np.testing.assert_allclose(call(Net(), merged, ids), y, rtol=1e-3, atol=1e-3)
 
 
-def test_against_a_manually_merged_kernel(published, ids):
+def test_adapted_matches_a_manually_merged_kernel(published, ids):
     adapter, variables = attached(published, ids, ("embed|blocks/split", LoRA(rank=2, alpha=6)))
     variables = variables | {"adapters": with_noise(variables["adapters"], 0.3)}
     trained = variables["adapters"]
@@ -141,8 +141,8 @@ def test_gradients_and_aux(published, ids):
 
     def loss(adapters):
         full = variables | {"adapters": adapters}
-        y, kept = adapter.apply(full, ids, mutable=["intermediates"])
-        return jnp.sum(y**2), lorasp_jax.collect_aux(kept)
+        y, updated = adapter.apply(full, ids, mutable=["intermediates"])
+        return jnp.sum(y**2), lorasp_jax.collect_aux(updated)
 
     gradients, aux = jax.jit(jax.grad(loss, has_aux=True))(with_noise(variables["adapters"], 0.3))
     assert all(jnp.abs(g).max() > 0 for g in jax.tree.leaves(gradients))
@@ -178,7 +178,7 @@ def test_user_defined_einsums():
             return Product((2, 6, 3), name="q")("bd,ndh->nbh", x)
 
     x = jax.random.normal(jax.random.key(0), (4, 6))
-    einsums = {Product: lambda layer: ("w", None)}  # the equation comes with the call
+    einsums = {Product: lambda layer: ("w", None)}  # the equation is a call argument
     adapter = LinenAdapter(Outer(), [("q", LoRA(rank=2))], einsums)
     variables = with_noise(adapter.init(jax.random.key(0), x), 0.3)
     own = variables["adapters"]["q"]["lorasp_adapter"]

@@ -64,8 +64,8 @@ def test_merging_restores_classes(net):
 
 
 def test_only_two_modules_use_setattr():
-    """`paths.set_child`, and layers whose class names its kernel."""
+    """They are paths.py, for `set_child`, and layers.py, where an attribute names the kernel."""
     by_name = re.compile(r"\b(setattr|delattr)\(|\.__class__ =")
     sources = (ROOT / "lorasp_jax").rglob("*.py")
-    having = {path.name for path in sources if by_name.search(path.read_text())}
-    assert having == {"paths.py", "layers.py"}
+    users = {path.name for path in sources if by_name.search(path.read_text())}
+    assert users == {"paths.py", "layers.py"}

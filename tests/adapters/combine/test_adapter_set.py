@@ -34,14 +34,14 @@ def x():
 @pytest.fixture(scope="module")
 def members(kernel):
     """Parameters of each adapter, with noise added."""
-    found = {}
+    params_by_name = {}
     for i, (name, method) in enumerate(METHODS.items()):
         leaves, structure = jax.tree.flatten(method.init(jax.random.key(i), kernel)[0])
         keys = jax.random.split(jax.random.key(100 + i), len(leaves))
         noise = [0.5 * jax.random.normal(k, x.shape) for k, x in zip(keys, leaves, strict=True)]
-        moved = [a + b for a, b in zip(leaves, noise, strict=True)]
-        found[name] = jax.tree.unflatten(structure, moved)
-    return found
+        noisy = [a + b for a, b in zip(leaves, noise, strict=True)]
+        params_by_name[name] = jax.tree.unflatten(structure, noisy)
+    return params_by_name
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def apply(params, choice, x, kernel):
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_each_adapter(params, members, x, kernel, name):
+def test_single_adapter_matches_its_own_method(params, members, x, kernel, name):
     choice = jnp.array([float(other == name) for other in METHODS])
     y, aux = apply(params, choice, x, kernel)
     expected, report = METHODS[name].apply(members[name], x, kernel)
@@ -66,7 +66,7 @@ def test_each_adapter(params, members, x, kernel, name):
     np.testing.assert_allclose(aux.active_rank, report.active_rank)
 
 
-def test_the_base(params, x, kernel):
+def test_zero_weights_give_the_base(params, x, kernel):
     y, aux = apply(params, jnp.zeros(len(METHODS)), x, kernel)
     np.testing.assert_allclose(y, x @ kernel, rtol=1e-5, atol=1e-5)
     assert not aux.active_rank.any()
@@ -93,7 +93,7 @@ def test_choice_per_example(params, members, x, kernel):
 
 
 def test_rows_of_an_example_are_contiguous(params, x, kernel):
-    """[B, T, I] folded into [B T, I], as a vision tower folds its cameras."""
+    """Fold [B, T, I] into [B T, I], as a vision tower does with its cameras."""
     weights = jax.random.normal(jax.random.key(5), (4, len(METHODS)))
     y, _ = apply(params, weights, x, kernel)
     folded, _ = apply(params, weights, x.reshape(12, D_IN), kernel)
@@ -112,7 +112,7 @@ def test_without_a_bank(members, x, kernel):
 
 
 def test_merge(params, members, x, kernel):
-    """Merge the deltas into one kernel; none depends on the input."""
+    """Merge adapters whose deltas do not depend on the input."""
     mergeable = [name for name in METHODS if name not in ("sp", "moe")]
     method = AdapterSet(tuple(mergeable), tuple(OTHERS.get(name) for name in mergeable))
     own = {"bank": params["bank"], "others": {name: members[name] for name in ("dora", "ada")}}
@@ -137,7 +137,7 @@ def test_low_precision(params, x, kernel):
 
 @pytest.mark.slow
 def test_gradients(params, x, kernel):
-    """x, the weights and adapters with non-zero weight get gradients, the kernel does not."""
+    """Inputs, weights and adapters with non-zero weight get gradients; the kernel does not."""
     choice = jnp.zeros(len(METHODS)).at[1].set(1.0)
 
     def loss(params, choice, x, kernel):
@@ -146,10 +146,10 @@ def test_gradients(params, x, kernel):
     floats = {"others": params["others"]} | {"bank": dict(params["bank"])}
     rank = floats["bank"].pop("rank")
 
-    def of_floats(floats, *rest):
+    def loss_of_floats(floats, *rest):
         return loss({**floats, "bank": floats["bank"] | {"rank": rank}}, *rest)
 
-    own, weights, inputs, base = jax.grad(of_floats, (0, 1, 2, 3))(floats, choice, x, kernel)
+    own, weights, inputs, base = jax.grad(loss_of_floats, (0, 1, 2, 3))(floats, choice, x, kernel)
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(own))
     lora_b = own["bank"]["lora_b"]
     assert (lora_b[1] != 0).all()

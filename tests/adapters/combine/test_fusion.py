@@ -29,7 +29,7 @@ def pair():
     return lorasp_jax.combine(models)
 
 
-def test_the_full_rank_is_exact():
+def test_full_rank_fusion_is_exact():
     fused, errors = lorasp_jax.fuse(pair(), WEIGHTS)
     assert_close(call(fused, X), call(lorasp_jax.choose(pair(), WEIGHTS), X))
     assert {path: method.rank for path, method in adaptation.methods(fused).items()} == {
@@ -40,23 +40,23 @@ def test_the_full_rank_is_exact():
 
 
 def deltas(fused, path):
-    """Deltas of a layer's kernels, one by one."""
+    """Deltas of a layer's kernel matrices, [..., I, O]."""
     layer, base = getattr(lorasp_jax.merge(fused), path), getattr(NET, path)
     delta = np.asarray(layer.kernel.get_value() - base.kernel.get_value())
     return delta.reshape(-1, *delta.shape[-2:])
 
 
 @pytest.mark.parametrize("rank", [1, 2, 3])
-def test_truncation_is_the_best_of_its_rank(rank):
+def test_truncation_is_the_best_low_rank_approximation(rank):
     """Compare with the SVD of the full delta, for each layer of the stack."""
     fused, errors = lorasp_jax.fuse(pair(), WEIGHTS, rank=rank)
     exact = lorasp_jax.fuse(pair(), WEIGHTS).model
     for path in ("inp", "blocks"):
-        whole, ours = deltas(exact, path), deltas(fused, path)
-        left, values, right = np.linalg.svd(whole, full_matrices=False)
+        full, ours = deltas(exact, path), deltas(fused, path)
+        left, values, right = np.linalg.svd(full, full_matrices=False)
         best = left[..., :rank] * values[..., None, :rank] @ right[..., :rank, :]
         np.testing.assert_allclose(ours, best, atol=1e-4 * np.abs(best).max())
-        lost = np.linalg.norm(whole - best) / np.linalg.norm(whole)
+        lost = np.linalg.norm(full - best) / np.linalg.norm(full)
         assert errors[path] == pytest.approx(lost, rel=1e-3, abs=1e-5)
         assert getattr(fused, path).method == LoRA(rank=rank, alpha=rank)
 
@@ -78,7 +78,7 @@ def test_hugging_face():
         np.testing.assert_allclose(y, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
 
 
-def test_deltas_of_zero():
+def test_zero_deltas():
     a, b, error = truncated(jnp.ones((3, 4, 2)), jnp.zeros((3, 2, 5)), 1)
     assert error == 0.0
     np.testing.assert_array_equal(a @ b, 0)
@@ -96,7 +96,7 @@ def test_fuse_errors():
 
 
 UNMERGEABLE = ("dora", "full", "lora_moe", "lora_sp", "lora_sp_release")
-SPLITS = [LoRA(rank=2, initialization=start) for start in ("pissa", "olora")]
+SPLITS = [LoRA(rank=2, initialization=name) for name in ("pissa", "olora")]
 METHODS = [peft.create(n, rank=2) for n in peft.names() if n not in UNMERGEABLE]
 
 

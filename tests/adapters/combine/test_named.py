@@ -44,7 +44,7 @@ def test_each_adapter(name):
     assert_close(call(lorasp_jax.choose(combined(), name), X), call(models()[name], X))
 
 
-def test_the_base_and_the_first():
+def test_base_and_initial_choice():
     assert_close(call(lorasp_jax.choose(combined(), None), X), call(NET, X))
     assert_close(call(combined(), X), call(models()["pour"], X))
     assert named.names(combined()) == NAMES
@@ -58,7 +58,7 @@ def test_choice_per_example():
 
 
 def test_choices_do_not_recompile():
-    """Other names and weights, as a new model or as an array inside jit."""
+    """Change names and weights, by a new model or by an array inside jit."""
     traces = []
 
     @jax.jit
@@ -101,7 +101,7 @@ def test_swap_does_not_recompile():
     assert len(traces) == 1
 
 
-def test_weighted_sum_is_one_merged_model():
+def test_weighted_sum_merges_into_one_model():
     """Each merged kernel has the weighted sum of the adapters' deltas."""
     pair = lorasp_jax.combine({name: models()[name] for name in WEIGHTS})
     model = lorasp_jax.choose(pair, WEIGHTS)
@@ -116,7 +116,7 @@ def test_weighted_sum_is_one_merged_model():
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_extracting_one(tmp_path, name):
+def test_extracting_an_adapter(tmp_path, name):
     """The extracted adapter is unchanged, trainable, and can be saved."""
     alone = lorasp_jax.extract(combined(), name)
     assert_close(call(alone, X), call(models()[name], X))
@@ -132,16 +132,13 @@ def test_extracting_the_base():
     np.testing.assert_array_equal(call(base, X), call(NET, X))
 
 
-def test_nothing_is_trainable_and_the_base_is_shared():
+def test_combined_model_is_frozen_and_shares_the_base():
     assert not jax.tree.leaves(nnx.state(combined(), AdapterParam))
     assert combined().blocks.kernel.get_value() is NET.blocks.kernel.get_value()
     assert models()["pour"].blocks.method == LoRA(rank=3)
-    chosen = named.AdapterChoice
+    models_by_choice = (lorasp_jax.choose(combined(), name) for name in ("pour", "open"))
     assert not np.array_equal(
-        *(
-            jax.tree.leaves(nnx.state(lorasp_jax.choose(combined(), n), chosen))
-            for n in ("pour", "open")
-        )
+        *(jax.tree.leaves(nnx.state(model, named.AdapterChoice)) for model in models_by_choice)
     )
 
 
@@ -200,7 +197,7 @@ def test_swap_errors():
     ],
 )
 def test_hugging_face(case, choice):
-    """PEFT 0.21.2: single, disabled, two at once, mixed batch, weighted sum; tolerance 1e-5."""
+    """PEFT 0.21.2: one, none or two adapters, a mixed batch, a weighted sum; tolerance 1e-5."""
     golden, models = golden_models()
     model = lorasp_jax.choose(lorasp_jax.combine(models), choice)
     expected = golden[f"y/{case}"]
@@ -219,7 +216,7 @@ def test_half_weight_is_half_the_delta(name):
 
 @pytest.mark.slow
 def test_mixed_batch_through_pi0():
-    """Scanned towers, the cameras folded into the batch, a cache shared by both experts."""
+    """Test scanned towers, cameras folded into the batch, and a cache that both experts share."""
     config = Pi0Config.dummy()
     net, size = config.create(nnx.Rngs(0)), (2, config.image_size, config.image_size, 3)
     obs = Observation(

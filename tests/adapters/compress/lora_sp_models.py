@@ -1,4 +1,4 @@
-"""Models with LoRA-SP adapters and a calibration set, for the tests of pruning and distillation."""
+"""Models with LoRA-SP adapters and a calibration set, for tests of pruning and distillation."""
 
 import jax
 from flax import nnx
@@ -38,8 +38,11 @@ def perturbed(model, seed=0, size=1.0):
 
 
 def lora_sp_model(method, seed=0):
-    """Deltas are about as large as the base outputs: with far larger ones, three blocks and heads
-    amplify rounding errors of the first block a thousandfold."""
+    """Adapt a net with deltas about as large as the base outputs.
+
+    With far larger ones, three blocks and heads would amplify rounding errors of the first block a
+    thousandfold.
+    """
     net = Net(nnx.Rngs(0))
     model = adaptation.adapt(net, [("blocks|heads", method)], rngs=nnx.Rngs(1))
     return perturbed(model, seed, size=0.1)

@@ -31,7 +31,7 @@ def moments(net, batches):
 
 
 def inputs(net, x):
-    """Inputs of each layer, by evaluating the net's formula by hand."""
+    """Inputs of each layer, computed manually."""
     h = net.norm(net.inp(x))
     block_inputs = []
     for kernel, bias in zip(net.blocks.kernel[...], net.blocks.bias[...], strict=True):
@@ -40,7 +40,7 @@ def inputs(net, x):
     return {"inp": x, "blocks": np.stack(block_inputs), "heads/0": h, "heads/1": h}
 
 
-def test_moments_are_those_of_the_inputs_by_hand(net, batches, moments):
+def test_moments_match_a_manual_computation(net, batches, moments):
     layer_inputs = [inputs(net, x) for x in batches]
     assert set(moments) == {"inp", "blocks", "heads/0", "heads/1"}
     for path, moment in moments.items():
@@ -61,11 +61,11 @@ def test_padding_is_excluded():
     x = jax.random.normal(jax.random.key(0), (2, 7, 5))
     mask = jnp.arange(7)[None] < jnp.array([[3], [6]])
     forward = lambda model, x: model[0](x, token_mask=mask)  # noqa: E731
-    found = calibration.input_moments(
+    actual = calibration.input_moments(
         layer, [jnp.where(mask[..., None], x, jnp.nan)], forward=forward
     )
     rows = np.asarray(x)[np.asarray(mask)]
-    np.testing.assert_allclose(found["0"], rows.T @ rows, rtol=1e-5)
+    np.testing.assert_allclose(actual["0"], rows.T @ rows, rtol=1e-5)
 
 
 def test_missing_statistics_are_an_error(net, batches):
@@ -99,8 +99,8 @@ def test_eva_in_a_stack_is_saved_as_lora(net, batches, moments, tmp_path):
     native.save_adapters(tmp_path, model)
     loaded = native.load_adapters(tmp_path, net)
     again = native.load_adapters(tmp_path, model)
-    for found in (loaded, again):
-        np.testing.assert_array_equal(found(batches[0])[0], model(batches[0])[0])
+    for restored in (loaded, again):
+        np.testing.assert_array_equal(restored(batches[0])[0], model(batches[0])[0])
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Distillation: the best LoRA of its rank on the calibration set, with the reported error."""
+"""Distillation finds the best LoRA of a rank on the calibration set, and reports its error."""
 
 import dataclasses
 

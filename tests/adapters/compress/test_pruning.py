@@ -36,7 +36,7 @@ def batches():
 
 
 def deactivate(model, path, layer, directions):
-    """Prevent directions of one layer of a stack from being active, by very low logits."""
+    """Keep directions of one layer of a stack inactive, with very low logits."""
     (location,) = (p for p in paths.locate(nnx.List([model]), Dense) if p.path == path)
     params = location.child.adapter.get_value()
     b2 = params["router"]["b2"].at[layer, jnp.array(directions)].set(-30.0)

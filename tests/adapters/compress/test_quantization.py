@@ -40,7 +40,7 @@ def size(model):
 
 @pytest.mark.parametrize(("kind", "bits", "error"), [("int8", 8.125, 0.0051), ("nf4", 4.5, 0.092)])
 def test_memory_and_error(kind, bits, error):
-    """Bytes of all parameters; the reported error is that of the output for isotropic inputs."""
+    """Check the parameter bytes, and the reported error against outputs for isotropic inputs."""
     wide = nnx.Linear(256, 512, rngs=nnx.Rngs(0))
     smaller, errors = lorasp_jax.quantize(wide, [("", kind)])
     assert size(smaller) == 256 * 512 * bits / 8 + 512 * 4
@@ -56,15 +56,15 @@ def test_quantized_equals_dequantized(kind):
     model = quantized(kind)
     assert isinstance(model.blocks.kernel.get_value(), QuantizedKernel)
     assert_close(call(model, X), call(dequantized(model), X))
-    assert np.abs(call(model, X) - call(NET, X)).max() > 1e-4  # the kernels did change
+    assert np.abs(call(model, X) - call(NET, X)).max() > 1e-4  # quantization changed the kernels
     assert isinstance(NET.inp, nnx.Linear)
     graphdef, state = nnx.split(model)
     assert_close(jax.jit(lambda s: nnx.merge(graphdef, s)(X))(state), call(model, X))
 
 
 @pytest.mark.parametrize("name", mostly_slow(METHODS, ["lora", "lora_sp"]))
-def test_methods_over_a_quantized_base(name):
-    """By discovery: attached after or before, the same as over the widened kernels."""
+def test_methods_on_a_quantized_base(name):
+    """Adapters attached before or after quantization match those on dequantized kernels."""
     method = METHODS[name]
     if method.trains_base:
         with pytest.raises(ValueError, match="inp/kernel is quantized and cannot be fully"):
@@ -75,7 +75,7 @@ def test_methods_over_a_quantized_base(name):
     model = trained(("inp|blocks", method), seed=1, net=quantized("nf4"))
     assert_close(call(model, X), call(dequantized(model), X))
     later, _ = lorasp_jax.quantize(trained(("inp|blocks", method), seed=1), [("", "nf4")])
-    if method.additive:  # what DoRA starts from is of the kernel that it found
+    if method.additive:  # DoRA's initial magnitude depends on the kernel
         assert_close(call(later, X), call(model, X))
     count = adaptation.count(trained(("inp|blocks", method), seed=1))
     assert adaptation.count(model) == count
@@ -83,27 +83,27 @@ def test_methods_over_a_quantized_base(name):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_gradients_and_training(kind):
-    """They reach x and the adapters as over widened kernels; the base does not move."""
+    """Gradients match those with dequantized kernels, and a step reduces the loss."""
     model = trained(("blocks|inp", LoRA(rank=2)), seed=1, net=quantized(kind))
 
     def loss(adapters, x, graphdef, frozen):
         return jnp.mean((nnx.merge(graphdef, adapters, frozen)(x) - 1) ** 2)
 
-    found = []
+    all_gradients = []
     for one in (model, dequantized(model)):
         graphdef, adapters, frozen = adaptation.split(one)
         gradient = jax.jit(jax.grad(loss, (0, 1)), static_argnums=2)
-        found.append(gradient(adapters, X, graphdef, frozen))
-    for a, b in zip(*map(jax.tree.leaves, found), strict=True):
+        all_gradients.append(gradient(adapters, X, graphdef, frozen))
+    for a, b in zip(*map(jax.tree.leaves, all_gradients), strict=True):
         assert (a != 0).any()
         assert_close(a, b)
     graphdef, adapters, frozen = adaptation.split(model)
-    updates = jax.tree.map(lambda g: -0.1 * g, found[0][0])
+    updates = jax.tree.map(lambda g: -0.1 * g, all_gradients[0][0])
     after = loss(optax.apply_updates(adapters, updates), X, graphdef, frozen)
     assert after < loss(adapters, X, graphdef, frozen)
 
 
-def test_adapters_are_saved_as_ever(tmp_path):
+def test_adapters_on_a_quantized_base_are_saved(tmp_path):
     model = trained(("inp|blocks", SP), seed=1, net=quantized("int8"))
     save_adapters(tmp_path, model)
     assert_close(call(load_adapters(tmp_path, quantized("int8")), X), call(model, X))
@@ -111,7 +111,7 @@ def test_adapters_are_saved_as_ever(tmp_path):
     assert_close(call(own, X), call(model, X))
 
 
-def test_merge_widens_what_it_merges():
+def test_merge_dequantizes_only_adapted_kernels():
     model = trained(("blocks", LoRA(rank=2)), seed=1, net=quantized("nf4"))
     merged = lorasp_jax.merge(model)
     assert merged.blocks.kernel.get_value().dtype == jnp.float32
@@ -124,7 +124,7 @@ def test_merge_widens_what_it_merges():
 
 
 @pytest.mark.slow
-def test_named_adapters_over_one_quantized_base():
+def test_named_adapters_on_a_quantized_base():
     models = {
         n: trained(("", LoRA(rank=i)), seed=i, net=quantized("nf4"))
         for i, n in ((1, "a"), (2, "b"))
@@ -134,7 +134,7 @@ def test_named_adapters_over_one_quantized_base():
     assert_close(call(model, X), jnp.stack([y[i] for i, y in enumerate(each)]))
 
 
-def test_split_kernels_come_first():
+def test_adapters_that_split_kernels_come_first():
     pissa = LoRA(rank=2, initialization="pissa")
     with pytest.raises(ValueError, match="adapt first, then quantize"):
         adaptation.adapt(quantized("int8"), [("inp", pissa)], rngs=nnx.Rngs(0))
@@ -192,7 +192,7 @@ def test_shared_kernels_stay_shared():
     assert size(model) == 4 * 4 + 4 * 4
 
 
-def test_tables_and_reports():
+def test_summary_and_aux():
     """A summary counts weights, not bytes; adapters still report aux."""
     model = trained(("", LoRA(rank=2)), seed=1, net=quantized("nf4"))
     assert "inp" in lorasp_jax.summary(model)

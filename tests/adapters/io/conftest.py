@@ -1,4 +1,4 @@
-"""Fixtures of the adapter files' tests."""
+"""Fixtures for tests of adapter files."""
 
 import shutil
 from pathlib import Path

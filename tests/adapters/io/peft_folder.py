@@ -61,13 +61,13 @@ def adapted(*rules, seed=5):
     return trained(adaptation.adapt(Net(), rules, rngs=nnx.Rngs(1)), seed)
 
 
-def edit(folder, **changes):
+def edit_config(folder, **changes):
     """Change fields of the folder's config."""
     config = json.loads((folder / hugging_face.CONFIG).read_text()) | changes
     (folder / hugging_face.CONFIG).write_text(json.dumps(config))
 
 
-def retensor(folder, change):
+def edit_tensors(folder, change):
     """Apply a function to the folder's tensors."""
     tensors = safetensors.numpy.load_file(folder / hugging_face.TENSORS)
     safetensors.numpy.save_file(change(tensors), folder / hugging_face.TENSORS)

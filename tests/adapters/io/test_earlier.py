@@ -1,6 +1,6 @@
-"""Files of earlier versions still load and compute the same.
+"""Files of earlier versions still load and give the same outputs.
 
-`tests/golden/adapter_sp_earlier` is of commit 9fd9abf, whose LoRA-SP had 14 fields: an adapter of
+Commit 9fd9abf, whose LoRA-SP had 14 fields, wrote `tests/golden/adapter_sp_earlier`: an adapter of
 nine layers with their outputs, and the config.json of two runs.
 """
 
@@ -48,7 +48,7 @@ class Net(nnx.Module):
 
 
 @pytest.mark.parametrize("again", [False, True], ids=["earlier", "saved again"])
-def test_an_adapter_computes_the_same(tmp_path, again):
+def test_adapter_gives_the_same_outputs(tmp_path, again):
     model = lorasp_jax.load_adapters(FOLDER, Net())
     if again:
         lorasp_jax.save_adapters(tmp_path, model)
@@ -89,7 +89,7 @@ def test_a_run_resumes(tmp_path, file, method):
 
 
 @pytest.mark.parametrize("method", [*METHODS.values(), peft.LoRA(rank=2), peft.AdaLoRA(rank=4)])
-def test_settings_are_those_of_the_method(method):
+def test_settings_round_trip(method):
     settings = json.loads(json.dumps(peft.to_settings(method)))
     assert peft.from_settings(settings) == method
     assert upgrade(settings) == settings

@@ -21,8 +21,8 @@ from tests.adapters.io.peft_folder import (
     Net,
     Stack,
     adapted,
-    edit,
-    retensor,
+    edit_config,
+    edit_tensors,
     trained,
 )
 
@@ -44,7 +44,7 @@ def test_outputs_match_peft():
 
 @pytest.mark.parametrize("name", ["dora", "rs", "ada"])
 def test_outputs_of_trained_folders_match_peft(name):
-    """DoRA, rsLoRA and AdaLoRA, 20 steps of SGD in PEFT 0.21.2, ranks and α by pattern."""
+    """DoRA, rsLoRA and AdaLoRA, trained 20 SGD steps in PEFT 0.21.2; ranks and α by pattern."""
     arrays = dict(np.load(GOLDEN / "adapter_trained_io.npz"))
     model = hugging_face.load_peft(GOLDEN / f"adapter_{name}", Net(arrays))
     np.testing.assert_allclose(model(arrays["x"]), arrays[f"y/{name}"], rtol=0, atol=1e-5)
@@ -88,7 +88,7 @@ def test_round_trip(methods, tmp_path):
     assert np.abs(again(X) - Net()(X)).max() > 0.1
 
 
-def test_adalora_as_peft_saves_it(tmp_path):
+def test_adalora_saved_by_peft(tmp_path):
     rng = np.random.default_rng(0)
     a, b, e = rng.normal(size=(2, 24)), rng.normal(size=(40, 2)), rng.normal(size=(2, 1))
     parts = {"lora_A": a, "lora_B": b, "lora_E": e}
@@ -103,7 +103,7 @@ def test_adalora_as_peft_saves_it(tmp_path):
 
 
 def test_patterns_match_name_suffixes(copy):
-    edit(copy, alpha_pattern={r"lin\.2": 16}, rank_pattern={"2": 4})
+    edit_config(copy, alpha_pattern={r"lin\.2": 16}, rank_pattern={"2": 4})
     model = hugging_face.load_peft(copy, Net())
     assert [model.lin[i].method.scale for i in (0, 2)] == [2, 4]
 
@@ -128,7 +128,7 @@ def test_names_that_are_suffixes_of_others(tmp_path):
 
 
 def test_rank_stabilized(copy):
-    edit(copy, use_rslora=True)
+    edit_config(copy, use_rslora=True)
     assert hugging_face.load_peft(copy, Net()).lin[0].method.scale == 4
 
 
@@ -140,14 +140,14 @@ def test_stacks(tmp_path):
         f"blocks.{i}.layer" for i in range(3)
     ]
 
-    def shrink(tensors):  # the second layer's rank
+    def shrink(tensors):  # reduce the second layer's rank
         for side, cut in (("A", np.s_[:1]), ("B", np.s_[:, :1])):
             name = f"base_model.model.blocks.1.layer.lora_{side}.weight"
             tensors[name] = np.ascontiguousarray(tensors[name][cut])
         return tensors
 
-    retensor(tmp_path, shrink)
-    edit(tmp_path, alpha_pattern={"1.layer": 6.0})
+    edit_tensors(tmp_path, shrink)
+    edit_config(tmp_path, alpha_pattern={"1.layer": 6.0})
     again = hugging_face.load_peft(tmp_path, Stack(), names=module)
     ours, theirs = (adaptation.merge(m).layer.kernel.get_value() for m in (again, model))
     np.testing.assert_allclose(ours[::2], theirs[::2], atol=1e-5)
@@ -157,7 +157,7 @@ def test_stacks(tmp_path):
 
     with pytest.raises(ValueError, match=r"layer is a stack of layers: pass names"):
         hugging_face.load_peft(tmp_path, Stack())
-    retensor(tmp_path, lambda t: {k: v for k, v in t.items() if "blocks.2" not in k})
+    edit_tensors(tmp_path, lambda t: {k: v for k, v in t.items() if "blocks.2" not in k})
     with pytest.raises(ValueError, match="only some layers of the stack layer"):
         hugging_face.load_peft(tmp_path, Stack(), names=module)
 
@@ -204,7 +204,7 @@ def attention_folder(folder):
     return updates
 
 
-def test_attention_with_axes_of_heads_and_own_classes(tmp_path):
+def test_attention_with_head_axes_and_user_defined_einsums(tmp_path):
     """Kernels [D, N, H] and [N, H, D] match torch's with concatenated heads."""
     updates, base = attention_folder(tmp_path), Attention()
     einsums = {Own: lambda layer: ("w", "...i,io->...o")}
@@ -232,8 +232,8 @@ def test_attention_with_axes_of_heads_and_own_classes(tmp_path):
         hugging_face.load_peft(tmp_path, base, names=torch_names)
 
 
-def test_linen_attention_takes_the_same_folder(tmp_path):
-    """Layers are determined from a call; outputs match those of merged parameters."""
+def test_linen_attention_loads_the_same_folder(tmp_path):
+    """Outputs match those of merged parameters."""
 
     class Linen(nn.Module):
         @nn.compact

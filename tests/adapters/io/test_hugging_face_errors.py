@@ -7,13 +7,13 @@ import pytest
 
 from lorasp_jax.adapters.io import hugging_face
 from lorasp_jax.peft import DoRA, LoRA, LoRASP
-from tests.adapters.io.peft_folder import Net, adapted, edit, retensor
+from tests.adapters.io.peft_folder import Net, adapted, edit_config, edit_tensors
 
 
 def test_catastrophic_patterns_are_rejected(copy):
     """The module is named to trigger the backtracking."""
-    retensor(copy, lambda t: {n.replace("lin.0", "a" * 60): v for n, v in t.items()})
-    edit(copy, alpha_pattern={"(a+)+b": 8})
+    edit_tensors(copy, lambda t: {n.replace("lin.0", "a" * 60): v for n, v in t.items()})
+    edit_config(copy, alpha_pattern={"(a+)+b": 8})
     with pytest.raises(ValueError, match=r"the pattern '\(a\+\)\+b' could take too long"):
         hugging_face.load_peft(copy, Net())
 
@@ -41,7 +41,7 @@ def test_catastrophic_patterns_are_rejected(copy):
     ],
 )
 def test_unsupported_configs(copy, changes, message):
-    edit(copy, **changes)
+    edit_config(copy, **changes)
     with pytest.raises(ValueError, match=message):
         hugging_face.load_peft(copy, Net())
 
@@ -73,7 +73,7 @@ def extended(tensors):
     ],
 )
 def test_invalid_tensors(copy, change, message):
-    retensor(copy, change)
+    edit_tensors(copy, change)
     with pytest.raises(ValueError, match=message):
         hugging_face.load_peft(copy, Net())
 

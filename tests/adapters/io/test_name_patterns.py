@@ -35,14 +35,14 @@ PATTERNS = [
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)
-def test_as_peft_matches(pattern):
-    found = values_of({pattern: True}, NAMES, default=False)
-    assert found == {n: bool(re.match(rf"(.*\.)?({pattern})$", n)) for n in NAMES}
+def test_matches_are_those_of_peft(pattern):
+    values = values_of({pattern: True}, NAMES, default=False)
+    assert values == {n: bool(re.match(rf"(.*\.)?({pattern})$", n)) for n in NAMES}
 
 
 def test_the_first_match_wins():
-    found = values_of({"0.q": 1, "q": 2}, ["x.0.q", "x.1.q", "k"], default=3)
-    assert found == {"x.0.q": 1, "x.1.q": 2, "k": 3}
+    values = values_of({"0.q": 1, "q": 2}, ["x.0.q", "x.1.q", "k"], default=3)
+    assert values == {"x.0.q": 1, "x.1.q": 2, "k": 3}
 
 
 @pytest.mark.parametrize(
@@ -59,9 +59,9 @@ def test_catastrophic_patterns_are_rejected(pattern):
 def test_accepted_patterns_take_seconds():
     """The slowest accepted pattern, close to the limit, in process time."""
     names = [f"{'a' * 170}{i}" for i in range(50)]
-    began = time.process_time()
+    start = time.process_time()
     assert not any(values_of({".*a.*b": True}, names, default=False).values())
-    assert time.process_time() - began < 10
+    assert time.process_time() - start < 10
 
 
 @pytest.mark.parametrize("pattern", ["a)", "(a", "[a", "*a", "a**", "[z-a]", "a\\"])

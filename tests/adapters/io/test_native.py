@@ -46,7 +46,7 @@ def saved(tmp_path):
 
 @pytest.mark.parametrize("name", peft.names())
 def test_round_trip(tmp_path, name):
-    """Load into the bare base and into a model with the same adapters."""
+    """Load adapters into the bare base and into a model with the same adapters."""
     rule = (".*", peft.create(name))
     model = adapted(rule)
     save_adapters(tmp_path, model)
@@ -68,14 +68,14 @@ def test_description(saved):
     assert {path.name for path in saved.iterdir()} == {"adapter.json", "adapter.safetensors"}
 
 
-def test_another_base(saved):
+def test_base_with_another_name(saved):
     load_adapters(saved, Net(nnx.Rngs(0)), base="abc")
     with pytest.raises(ValueError, match="was trained on base 'abc', not on 'xyz'"):
         load_adapters(saved, Net(nnx.Rngs(0)), base="xyz")
 
 
-def with_other(model, change):
-    """Copy of the model with the first kernel by path modified."""
+def with_changed_array(model, change):
+    """Copy of the model with a change to its first frozen array."""
     graphdef, adapters, frozen = adaptation.split(model)
     first, *others = jax.tree.leaves(frozen)
     frozen = jax.tree.unflatten(jax.tree.structure(frozen), [change(first), *others])
@@ -83,26 +83,28 @@ def with_other(model, change):
 
 
 @pytest.mark.parametrize("bare", [True, False])
-def test_other_weights_of_the_same_shapes(saved, bare):
+def test_different_weights_of_the_same_shapes(saved, bare):
     model = Net(nnx.Rngs(0)) if bare else adapted((".*", SP))
-    other = with_other(model, lambda kernel: kernel.at[0, 0].add(0.5))
+    other = with_changed_array(model, lambda kernel: kernel.at[0, 0].add(0.5))
     with pytest.raises(
         ValueError, match=r"different base: 1 of .* differ, first 'blocks.*any_base=True"
     ):
         load_adapters(saved, other)
-    kept = load_adapters(saved, other, any_base=True)
-    assert_same(kept, with_other(load_adapters(saved, model), lambda k: k.at[0, 0].add(0.5)))
+    loaded = load_adapters(saved, other, any_base=True)
+    assert_same(
+        loaded, with_changed_array(load_adapters(saved, model), lambda k: k.at[0, 0].add(0.5))
+    )
 
 
 def test_the_same_weights_in_another_dtype(saved):
     half = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), Net(nnx.Rngs(0)))
     load_adapters(saved, half)
     mesh = jax.make_mesh((2,), ("data",), devices=jax.devices()[:2])
-    spread = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec(None))
-    load_adapters(saved, jax.device_put(Net(nnx.Rngs(0)), spread))
+    sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec(None))
+    load_adapters(saved, jax.device_put(Net(nnx.Rngs(0)), sharding))
 
 
-def test_models_that_do_not_fit(saved):
+def test_incompatible_models(saved):
     with pytest.raises(ValueError, match="have different adapters, first at 'blocks'"):
         load_adapters(saved, adapted((".*", LoRA(rank=2))))
     with pytest.raises(ValueError, match=r"does not fit the model: rule '\^blocks\$'"):
@@ -129,7 +131,7 @@ def test_sizes_larger_than_memory(saved, field, size):
 
 
 def resealed(old, new):
-    """A change with an updated digest."""
+    """Return a function that replaces bytes and updates the digest."""
 
     def damage(data):
         description = json.loads(data.replace(old, new))

@@ -18,7 +18,7 @@ from lorasp_jax.adapters.io import hugging_face
 from lorasp_jax.adapters.io.hugging_face_linen import load_peft_linen
 from lorasp_jax.peft import FullFineTuning, LoRA
 from tests import GOLDEN
-from tests.adapters.io.peft_folder import FOLDER, Net, edit, retensor
+from tests.adapters.io.peft_folder import FOLDER, Net, edit_config, edit_tensors
 
 
 @pytest.mark.parametrize(
@@ -57,13 +57,13 @@ def test_fully_trained_parameters_are_saved(name, tmp_path):
 @pytest.mark.parametrize("bias", ["all", "lora_only"])
 def test_missing_biases(bias, tmp_path):
     folder = shutil.copytree(FOLDER, tmp_path / "copy")
-    edit(folder, bias=bias)
+    edit_config(folder, bias=bias)
     with pytest.raises(ValueError, match=f"was trained with bias '{bias}', but has no bias"):
         hugging_face.load_peft(folder, Net())
     bare = Net()
     for layer in bare.lin:
         layer.bias, layer.use_bias = None, False
-    hugging_face.load_peft(folder, bare)  # has none that could have been trained
+    hugging_face.load_peft(folder, bare)  # without biases, none could have been trained
 
 
 class Stack(nnx.Module):
@@ -90,7 +90,7 @@ def numbered(path, index):
     return ".".join(["model", *map(str, index), *path.split("/")])
 
 
-def moved(model):
+def perturbed(model):
     """Add noise to all trainable parameters."""
     graphdef, adapters, frozen = adaptation.split(model)
     adapters = jax.tree.map(
@@ -110,14 +110,14 @@ RULES = {
 @pytest.mark.parametrize("name", RULES)
 def test_round_trip_of_stacks(name, tmp_path):
     """Each layer of a stack is a module, including norms; biases with head axes are flattened."""
-    model = moved(adaptation.adapt(Stack(), RULES[name], rngs=nnx.Rngs(1)))
+    model = perturbed(adaptation.adapt(Stack(), RULES[name], rngs=nnx.Rngs(1)))
     hugging_face.save_peft(tmp_path, model, names=numbered)
     tensors = safetensors.numpy.load_file(tmp_path / hugging_face.TENSORS)
-    whole = {k: v.shape for k, v in tensors.items() if "lora" not in k}
+    full_shapes = {k: v.shape for k, v in tensors.items() if "lora" not in k}
     if name == "all":
-        assert whole["base_model.model.model.split.bias"] == (6,)
-        assert whole["base_model.model.model.1.blocks.norm.bias"] == (6,)
-        assert whole["base_model.model.model.0.blocks.lin.base_layer.bias"] == (6,)
+        assert full_shapes["base_model.model.model.split.bias"] == (6,)
+        assert full_shapes["base_model.model.model.1.blocks.norm.bias"] == (6,)
+        assert full_shapes["base_model.model.model.0.blocks.lin.base_layer.bias"] == (6,)
     again = hugging_face.load_peft(tmp_path, Stack(), names=numbered)
     np.testing.assert_allclose(again(IDS), model(IDS), rtol=1e-5, atol=1e-5)
     assert adaptation.methods(again).keys() == adaptation.methods(model).keys()
@@ -143,10 +143,10 @@ class LinenStack(nn.Module):
 
 
 @pytest.mark.parametrize("name", RULES)
-def test_linen_takes_the_same_folder(name, tmp_path):
+def test_linen_loads_the_same_folder(name, tmp_path):
     """The same base in Linen gives the outputs of the saved NNX model."""
     base = Stack()
-    model = moved(adaptation.adapt(base, RULES[name], rngs=nnx.Rngs(1)))
+    model = perturbed(adaptation.adapt(base, RULES[name], rngs=nnx.Rngs(1)))
     hugging_face.save_peft(tmp_path, model, names=numbered)
     params = nnx.to_pure_dict(nnx.state(base, nnx.Param))
     adapter, loaded = load_peft_linen(
@@ -167,11 +167,11 @@ def test_fully_trained_convolution(tmp_path):
         tmp_path, adaptation.adapt(base, [("head", LoRA(rank=2))], rngs=nnx.Rngs(0))
     )
     kernel = np.arange(24, dtype=np.float32).reshape(3, 2, 2, 2)
-    retensor(tmp_path, lambda t: t | {"base_model.model.conv.weight": kernel})
-    edit(tmp_path, modules_to_save=["conv"])
-    found = hugging_face.load_peft(tmp_path, base).conv.kernel.get_value()
+    edit_tensors(tmp_path, lambda t: t | {"base_model.model.conv.weight": kernel})
+    edit_config(tmp_path, modules_to_save=["conv"])
+    loaded_kernel = hugging_face.load_peft(tmp_path, base).conv.kernel.get_value()
     for o, i, h, w in np.ndindex(kernel.shape):
-        assert found[h, w, i, o] == kernel[o, i, h, w]
+        assert loaded_kernel[h, w, i, o] == kernel[o, i, h, w]
 
 
 def test_dropout_rates_must_agree(tmp_path):
@@ -188,28 +188,28 @@ def test_dropout_rates_must_agree(tmp_path):
 
 
 def test_unsupported_module(tmp_path):
-    class Picture(nnx.Module):
+    class ConvNet(nnx.Module):
         def __init__(self):
             self.conv = nnx.Conv(2, 3, (3,), rngs=nnx.Rngs(0))
             self.head = nnx.Linear(3, 4, rngs=nnx.Rngs(1))
 
     rules = [("conv", FullFineTuning()), ("head", LoRA(rank=2))]
-    model = adaptation.adapt(Picture(), rules, rngs=nnx.Rngs(0))
+    model = adaptation.adapt(ConvNet(), rules, rngs=nnx.Rngs(0))
     with pytest.raises(ValueError, match="conv/kernel is fully trained, but PEFT cannot"):
         hugging_face.save_peft(tmp_path / "new", model)
 
 
 def test_only_hf_paths_are_downloaded(monkeypatch):
-    asked = []
+    downloads = []
 
     def download(name, *, allow_patterns, **options):
-        asked.append((name, sorted(allow_patterns)))
+        downloads.append((name, sorted(allow_patterns)))
         return str(FOLDER)
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
     model = hugging_face.load_peft("hf://somebody/adapter", Net())
     assert set(adaptation.methods(model)) == {"lin/0", "lin/2"}
-    assert asked == [("somebody/adapter", [hugging_face.CONFIG, hugging_face.TENSORS])]
+    assert downloads == [("somebody/adapter", [hugging_face.CONFIG, hugging_face.TENSORS])]
     with pytest.raises(ValueError, match=r"somebody/adapter has no adapter_config.json"):
         hugging_face.load_peft("somebody/adapter", Net())
-    assert len(asked) == 1
+    assert len(downloads) == 1

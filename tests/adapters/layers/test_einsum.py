@@ -1,4 +1,4 @@
-"""Compare adapted einsums with einsums of merged kernels, computed here by hand."""
+"""Compare adapted einsums with einsums of kernels that the tests merge manually."""
 
 import jax
 import jax.numpy as jnp
@@ -46,8 +46,10 @@ def test_equals_the_einsum_of_the_merged_kernel(equation, x, kernel, matrices, d
     y, aux = einsum(equation, x, kernel, None, {"lora_a": a, "lora_b": b}, METHOD)
     np.testing.assert_allclose(y, jnp.einsum(equation, x, merged), rtol=1e-4, atol=1e-4)
     np.testing.assert_array_equal(aux.active_rank, 3)
-    plain, _ = einsum(equation, x, kernel)
-    np.testing.assert_allclose(plain, jnp.einsum(equation, x, kernel), rtol=1e-5, atol=1e-5)
+    without_adapter, _ = einsum(equation, x, kernel)
+    np.testing.assert_allclose(
+        without_adapter, jnp.einsum(equation, x, kernel), rtol=1e-5, atol=1e-5
+    )
 
 
 def test_kernels_of_a_scanned_stack():
@@ -87,7 +89,7 @@ def test_bias_and_losses_over_batch_axes():
         ((2,), (0, 1), 1, (2, 3, 4, 5)),
     ],
 )
-def test_general_equations_are_dot_generals(axis, batch, outputs, shape):
+def test_general_equations_match_dot_general(axis, batch, outputs, shape):
     x, positive = normal(0, *shape), sorted(a % len(shape) for a in axis)
     inner = [shape[b] for b in batch] + [shape[a] for a in positive]
     kernel = normal(1, *inner, *(6, 7)[:outputs])
@@ -107,7 +109,7 @@ def test_unsupported_equations(equation):
         parse(equation)
 
 
-def test_shapes_that_do_not_match():
+def test_mismatched_shapes():
     with pytest.raises(
         ValueError, match=r"shapes \(2, 3\) and \(4, 5\) do not match the equation 'ab,bc->ac'"
     ):

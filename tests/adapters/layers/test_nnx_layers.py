@@ -124,7 +124,7 @@ def test_save_and_load(heads, vision, x, tmp_path):
         jax.tree.map(np.testing.assert_array_equal, loaded, call(model, *args))
 
 
-def test_aux_summary_and_print(heads, x):
+def test_aux_summary_and_repr(heads, x):
     model = adapted(heads, ("split|experts", SP), ("join", LoRA(rank=2)))
     assert "AdapterParam" in repr(model)
     assert "LoRASP(rank=8" in repr(model)
@@ -132,9 +132,9 @@ def test_aux_summary_and_print(heads, x):
     assert aux["experts"].active_rank.shape == (2, 4)
     rows = {line.split()[0]: line.split() for line in lorasp_jax.summary(model, aux).splitlines()}
     assert rows["path"][-2:] == ["active", "rank"]
-    found = float(aux["experts"].active_rank.mean())
+    active_rank = float(aux["experts"].active_rank.mean())
     assert rows["experts"][:4] == ["experts", "lora_sp", "2x3x3", "8"]
-    assert float(rows["experts"][-1]) == pytest.approx(found, abs=0.06)
+    assert float(rows["experts"][-1]) == pytest.approx(active_rank, abs=0.06)
     assert (rows["join"][-1], rows["blocks"][-1]) == ("2.0", "-")
     assert "active" not in lorasp_jax.summary(model)
     with pytest.raises(ValueError, match="aux has 'other', which is not a layer"):
@@ -144,7 +144,7 @@ def test_aux_summary_and_print(heads, x):
 @pytest.mark.slow
 def test_penalties(heads):
     model = perturbed(adapted(heads, ("split|experts", peft.create("ada_lora"))))
-    found = []
+    norms = []
     for name in ("split", "experts"):
         params = getattr(model, name).adapter.get_value()
         a = params["lora_a"].reshape(-1, *params["lora_a"].shape[-2:])
@@ -152,12 +152,12 @@ def test_penalties(heads):
         eye = np.eye(a.shape[-1])
         for one, two in zip(a, b, strict=True):
             sides = (one.T @ one - eye, two @ two.T - eye)
-            found.append(sum(np.linalg.norm(side) for side in sides) / 2)
+            norms.append(sum(np.linalg.norm(side) for side in sides) / 2)
     values = adaptation.penalties(model)
-    np.testing.assert_allclose(values["orthogonality"], np.mean(found), rtol=1e-4)
+    np.testing.assert_allclose(values["orthogonality"], np.mean(norms), rtol=1e-4)
 
 
-def test_attention_of_flax(x):
+def test_flax_attention(x):
     attention = nnx.MultiHeadAttention(2, 6, decode=False, rngs=nnx.Rngs(0))
     model = adapted(attention, ("query|value", SP), ("out", LoRA(rank=2)))
     x = x[None]
@@ -186,13 +186,12 @@ def test_embedding_and_convolution(vision, ids):
         old = getattr(base, name)
         old.set_value(old.get_value() + delta.reshape(old.get_value().shape))
     for ours, theirs in ((model, merged), (lorasp_jax.merge(model), merged)):
-        found = zip(call(ours, ids), call(theirs, ids), strict=True)
-        for got, expected in found:
-            np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-5)
+        for actual, expected in zip(call(ours, ids), call(theirs, ids), strict=True):
+            np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.slow
-def test_convolutions_of_two_dimensions():
+def test_two_dimensional_convolution():
     conv = nnx.Conv(2, 4, (3, 2), padding="CIRCULAR", kernel_dilation=2, rngs=nnx.Rngs(0))
     model = perturbed(adapted(conv, ("", LoRA(rank=2))))
     x = jax.random.normal(jax.random.key(0), (2, 2, 6, 5, 2))
@@ -210,7 +209,7 @@ def test_only_adapters_get_gradients(vision, ids):
 
 
 class Product(nnx.Module):
-    """A third-party einsum with other attribute names, whose shape the model reads."""
+    """A third-party einsum with its own attribute names; reads the shape of its kernel."""
 
     def __init__(self, einsum_str, shape, rngs):
         self.einsum_str = einsum_str
@@ -284,7 +283,7 @@ def test_unsupported_layers(heads, vision, tmp_path):
         adapted(heads, ("split", SP)).split(jnp.ones((1, 6)), out_sharding=object())
 
 
-def test_rules_cover_the_options_of_peft(heads):
+def test_rules_cover_peft_options(heads):
     """rank_pattern, alpha_pattern, exclude_modules, modules_to_save, bias."""
     rules = [
         ("join", FullFineTuning()),  # modules_to_save
@@ -293,8 +292,8 @@ def test_rules_cover_the_options_of_peft(heads):
         ("split", LoRA(rank=4, alpha=32)),  # rank_pattern, alpha_pattern
         (".*", LoRA(rank=2)),
     ]
-    found = adaptation.methods(adapted(heads, *rules))
-    assert found == {
+    methods = adaptation.methods(adapted(heads, *rules))
+    assert methods == {
         "join/kernel": FullFineTuning(),
         "split/bias": FullFineTuning(),
         "experts/bias": FullFineTuning(),

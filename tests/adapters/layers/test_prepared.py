@@ -1,4 +1,4 @@
-"""Fused layers compute the same as the original ones, with fewer matmuls."""
+"""Fused layers give the outputs of the original ones, with fewer matmuls."""
 
 import functools
 
@@ -26,10 +26,10 @@ class Net(nnx.Module):
     """Two layers with a shared input, one of them with a bias, and a third one."""
 
     def __init__(self, dtype="bfloat16"):
-        kinds = {"dtype": dtype, "rngs": nnx.Rngs(0)}
-        self.first = Dense(8, 8, **kinds, use_bias=False)
-        self.second = Dense(8, 12, **kinds)
-        self.third = Dense(8, 8, **kinds)
+        options = {"dtype": dtype, "rngs": nnx.Rngs(0)}
+        self.first = Dense(8, 8, **options, use_bias=False)
+        self.second = Dense(8, 12, **options)
+        self.third = Dense(8, 8, **options)
 
     def fuse_projections(self, *, copy_kernels=True):
         pair = self.first, self.second
@@ -66,35 +66,37 @@ def fused_counts(model):
 
 
 @pytest.mark.parametrize("name", mostly_slow(FUSABLE, ["lora_sp"]))
-def test_computes_the_same(name):
+def test_fused_layers_match_the_original_ones(name):
     model, x = adapted(METHODS[name], "float32"), jnp.sin(jnp.arange(96.0)).reshape(2, 6, 8)
     mask = jnp.arange(12).reshape(2, 6) % 5 != 0
     run = jax.jit(lambda model, x: model(x, mask))
     expected, aux = run(model, x)
     fused = prepare(model)
     assert fused_counts(fused) == [2, 0, 1]
-    found, other = run(fused, x)
-    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
-    assert jax.tree.structure(other) == jax.tree.structure(aux)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), other, aux)
+    actual, actual_aux = run(fused, x)
+    np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-4)
+    assert jax.tree.structure(actual_aux) == jax.tree.structure(aux)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), actual_aux, aux
+    )
 
 
 @pytest.mark.parametrize("name", mostly_slow(FUSABLE, ["lora_sp"]))
-def test_a_stack_computes_the_same(name):
-    """With fewer and with more rows than inputs."""
+def test_fused_stack_matches_the_original_one(name):
+    """Check inputs with fewer and with more rows than features."""
     model = adapted(METHODS[name], "float32")
     stack = jax.tree.map(lambda leaf: jnp.stack([leaf, 0.5 * leaf]), model)
     run = jax.jit(jax.vmap(lambda model, x: model(x), in_axes=(0, None)))
     fused = prepared.fuse_stack(stack)
     for rows in (4, 12):
         x = jnp.sin(jnp.arange(8.0 * rows)).reshape(1, rows, 8)
-        (expected, aux), (found, other) = run(stack, x), run(fused, x)
-        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
-        assert jax.tree.structure(other) == jax.tree.structure(aux)
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), other, aux)
+        (expected, aux), (actual, actual_aux) = run(stack, x), run(fused, x)
+        np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-4)
+        assert jax.tree.structure(actual_aux) == jax.tree.structure(aux)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), actual_aux, aux)
 
 
-def test_a_stacks_adapters_are_cast_before_the_loop():
+def test_adapters_of_a_stack_are_cast_before_the_loop():
     stack = jax.tree.map(lambda leaf: leaf[None], adapted(METHODS["lora"]))
     x = jnp.ones((2, 8), jnp.bfloat16)
 
@@ -109,7 +111,7 @@ def test_a_stacks_adapters_are_cast_before_the_loop():
     assert in_loop("optimization_barrier", fused) == 2  # one for each input
 
 
-def test_a_kernel_gets_the_packed_router_parameters():
+def test_fused_kernel_gets_packed_router_parameters():
     model = adapted(WithFusedKernel(rank=32, hidden_width=16), "float32")
     x = jnp.sin(jnp.arange(96.0)).reshape(2, 6, 8)
     fused = prepare(model)
@@ -120,14 +122,14 @@ def test_a_kernel_gets_the_packed_router_parameters():
     jax.tree.map(close, run(fused, x), run(model, x))
 
 
-def test_a_quantized_base_computes_the_same():
+def test_fused_quantized_layers_match_the_original_ones():
     model = quantize(adapted(METHODS["lora"], "float32"), [(".*", "int8")]).model
     fused, x = prepare(model), jnp.sin(jnp.arange(48.0)).reshape(6, 8)
     assert fused_counts(fused) == [2, 0, 1]
     np.testing.assert_allclose(fused(x)[0], model(x)[0], rtol=1e-4, atol=1e-4)
 
 
-def test_a_quantized_base_is_kept_if_kernels_are_not_copied():
+def test_kernels_stay_quantized_if_they_are_not_copied():
     model = quantize(adapted(METHODS["lora"], "float32"), [(".*", "int8")]).model
     expected, x = model(jnp.ones((6, 8)))[0], jnp.ones((6, 8))
     model.fuse_projections(copy_kernels=False)
@@ -143,7 +145,7 @@ def test_a_quantized_base_is_kept_if_kernels_are_not_copied():
         (51, 2048, 1184, 4),
         (51, 1024, 8512, 1),  # few inputs
         (816, 4096, 2208, 1),  # many tiles
-        (51, 2050, 64, 1),  # does not divide
+        (51, 2050, 64, 1),  # not divisible
     ],
 )
 def test_split_k_for_few_rows_and_many_inputs(rows, d_in, d_out, splits):
@@ -169,8 +171,12 @@ def test_layers_with_a_shared_input_run_two_matmuls():
 
 
 @pytest.mark.parametrize(
-    ("name", "dtype"),  # overrides `apply`, down-projects in fp32, has no explicit dtype
-    [("dora", "bfloat16"), ("lora_moe", "bfloat16"), ("lora", None)],
+    ("name", "dtype"),
+    [
+        ("dora", "bfloat16"),  # overrides `apply`
+        ("lora_moe", "bfloat16"),  # down-projects in fp32
+        ("lora", None),  # has no explicit dtype
+    ],
 )
 def test_other_layers_are_unchanged(name, dtype):
     model = prepare(adapted(METHODS[name], dtype))
@@ -179,14 +185,14 @@ def test_other_layers_are_unchanged(name, dtype):
 
 @pytest.mark.parametrize("second", ["ada_lora", "dora", None])
 def test_layers_of_two_methods_are_fused_individually(second):
-    """Or unchanged, for the last two."""
+    """The second layer is unchanged if its method is DoRA or if it has no adapter."""
     rules = [("second", second and METHODS[second]), (".*", METHODS["lora"])]
     model, x = trained(*rules, seed=1, net=Net("float32")), jnp.ones((2, 8))
     fused = prepare(model)
     assert fused_counts(fused) == [1, int(second == "ada_lora"), 1]
-    (found, other), (expected, aux) = fused(x), model(x)
-    np.testing.assert_allclose(found, expected, rtol=1e-4)
-    assert jax.tree.structure(other) == jax.tree.structure(aux)
+    (actual, actual_aux), (expected, aux) = fused(x), model(x)
+    np.testing.assert_allclose(actual, expected, rtol=1e-4)
+    assert jax.tree.structure(actual_aux) == jax.tree.structure(aux)
 
 
 @pytest.mark.parametrize(
