@@ -1,4 +1,4 @@
-"""Random changes to a folder's files; each takes a random generator and the files."""
+"""Change a folder's files randomly; each change takes a random generator and the files."""
 
 import contextlib
 import copy
@@ -37,23 +37,23 @@ ELEMENTS = [
 TYPES = [pa.string(), pa.int8(), pa.float64(), pa.list_(pa.float64()), pa.bool_(), pa.binary()]
 
 
-def described(r: random.Random, files: list[Path]) -> None:
+def change_json(r: random.Random, files: list[Path]) -> None:
     """Change or delete a value in a JSON file, or in one line of a JSONL file."""
     file = r.choice([file for file in files if file.suffix in (".json", ".jsonl")])
     lines = file.read_text().splitlines() if file.suffix == ".jsonl" else [file.read_text()]
     number = r.randrange(len(lines))
     value = {"": json.loads(lines[number])}
-    owner, key = r.choice(list(_places(value)))
+    owner, key = r.choice(list(_items(value)))
     if r.random() < 0.85:
         owner[key] = copy.deepcopy(r.choice(VALUES))
     else:
         del owner[key]
-    lines[number] = json.dumps(_sealed(value.get("", {})))
+    lines[number] = json.dumps(_with_valid_digest(value.get("", {})))
     file.write_text("\n".join(lines))
 
 
-def _sealed(value: Any) -> Any:
-    """Update the digest if there is one, so that it does not hide the error."""
+def _with_valid_digest(value: Any) -> Any:
+    """Update the digest, if any, so that a wrong digest does not hide other errors."""
     if not isinstance(value, dict) or DIGEST not in value:
         return value
     with contextlib.suppress(TypeError, RecursionError):
@@ -61,16 +61,16 @@ def _sealed(value: Any) -> Any:
     return value
 
 
-def _places(value: Any) -> Iterator[tuple[Any, Any]]:
+def _items(value: Any) -> Iterator[tuple[Any, Any]]:
     """Yield all values inside a JSON value as (container, key)."""
     keys = value if isinstance(value, dict) else range(min(len(value), 6))
     for key in keys:
         yield value, key
         if isinstance(value[key], dict | list):
-            yield from _places(value[key])
+            yield from _items(value[key])
 
 
-def damaged(r: random.Random, files: list[Path]) -> None:
+def change_bytes(r: random.Random, files: list[Path]) -> None:
     """Truncate a file, change its bits, or insert or remove bytes."""
     file = r.choice(files)
     data = bytearray(file.read_bytes())
@@ -91,7 +91,7 @@ def damaged(r: random.Random, files: list[Path]) -> None:
     file.write_bytes(data)
 
 
-def replaced(r: random.Random, files: list[Path]) -> None:
+def replace_file(r: random.Random, files: list[Path]) -> None:
     """Replace a file by another one, or by something that is not a regular file."""
     file, other = r.choice(files), r.choice(files)
     mine = file.read_bytes()
@@ -115,7 +115,7 @@ def replaced(r: random.Random, files: list[Path]) -> None:
             file.symlink_to("/dev/zero")
 
 
-def tabled(r: random.Random, files: list[Path]) -> None:
+def change_parquet(r: random.Random, files: list[Path]) -> None:
     """Change a value or the type of a column in a parquet file, or drop the column."""
     file = r.choice([file for file in files if file.suffix == ".parquet"])
     table = pq.read_table(file)
@@ -134,37 +134,37 @@ def tabled(r: random.Random, files: list[Path]) -> None:
         pq.write_table(r.choice(changes)(), file)  # values that pyarrow cannot write need no test
 
 
-def array(r: random.Random, found: np.ndarray) -> np.ndarray:
+def changed_array(r: random.Random, original: np.ndarray) -> np.ndarray:
     """Change the dtype, shape or values of an array."""
-    minus = np.array(-1).astype(found.dtype)  # the largest value for unsigned integers
+    minus = np.array(-1).astype(original.dtype)  # the largest value for unsigned integers
     with np.errstate(all="ignore"):
         changes = [
-            lambda: found.astype(r.choice(["f2", "f8", ">f4", "i8", "?", "U5", "S3"])),
+            lambda: original.astype(r.choice(["f2", "f8", ">f4", "i8", "?", "U5", "S3"])),
             lambda: np.where(
-                np.arange(found.size).reshape(found.shape), found, r.choice([minus, 99])
+                np.arange(original.size).reshape(original.shape), original, r.choice([minus, 99])
             ),
-            lambda: found.reshape(-1),
-            lambda: found[:-1],
-            lambda: found[:0],
-            lambda: found[None],
-            lambda: np.asfortranarray(found),
+            lambda: original.reshape(-1),
+            lambda: original[:-1],
+            lambda: original[:0],
+            lambda: original[None],
+            lambda: np.asfortranarray(original),
         ]
         return r.choice(changes)()
 
 
-def mapped(r: random.Random, files: list[Path]) -> None:
+def change_cache(r: random.Random, files: list[Path]) -> None:
     """Change an array of a cache, usually together with its checksum."""
     file = r.choice([file for file in files if file.suffix == ".npy"])
-    found = array(r, np.load(file))
-    np.save(file, found)
+    array = changed_array(r, np.load(file))
+    np.save(file, array)
     header = file.parent / "cache.json"
-    facts = json.loads(header.read_text())
-    if file.stem in facts["crc32"] and r.random() < 0.8:
-        facts["crc32"][file.stem] = zlib.crc32(found.tobytes())
-    header.write_text(json.dumps(_sealed(facts)))
+    content = json.loads(header.read_text())
+    if file.stem in content["crc32"] and r.random() < 0.8:
+        content["crc32"][file.stem] = zlib.crc32(array.tobytes())
+    header.write_text(json.dumps(_with_valid_digest(content)))
 
 
-def zipped(r: random.Random, files: list[Path]) -> None:
+def change_npz(r: random.Random, files: list[Path]) -> None:
     """Change an array in an .npz file, or a value in its header."""
     (file,) = files
     with np.load(file) as archive:
@@ -173,15 +173,15 @@ def zipped(r: random.Random, files: list[Path]) -> None:
     if name == "header":
         header = file.with_name("header.json")
         header.write_bytes(arrays[name].tobytes())
-        described(r, [header])
+        change_json(r, [header])
         arrays[name] = np.frombuffer(header.read_bytes(), np.uint8)
         header.unlink()
     else:
-        arrays[name] = array(r, arrays[name])
+        arrays[name] = changed_array(r, arrays[name])
     np.savez(file, **arrays)
 
 
-def drawn(r: random.Random, files: list[Path]) -> None:
+def change_mjcf(r: random.Random, files: list[Path]) -> None:
     """Change an attribute in an MJCF file, or add or remove an element."""
     (file,) = files
     text = file.read_text()

@@ -59,7 +59,7 @@ class Gemma(nnx.Module):
         return self.embedder.attend(self.final_norm(x)), cache
 
 
-def of_flax(rngs):
+def flax_gemma(rngs):
     """Return Flax's example at the same size."""
     from modules import AttentionType  # pyright: ignore[reportMissingImports]
     from transformer import Transformer  # pyright: ignore[reportMissingImports]

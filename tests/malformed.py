@@ -1,4 +1,4 @@
-"""Ways to corrupt a valid input, each a name and a function of its folder; check of the error."""
+"""Corrupt valid inputs, with a name and a function of the folder per case; check the error."""
 
 import json
 import random
@@ -46,43 +46,43 @@ def files(*patterns: str) -> Cases:
             yield f"{pattern} {name}", spoil
 
 
-def flips(pattern: str, places: tuple[int, ...]) -> Cases:
-    """Change one byte of a file."""
-    for place in places:
+def flips(pattern: str, positions: tuple[int, ...]) -> Cases:
+    """Invert one byte of a file."""
+    for position in positions:
 
-        def spoil(folder: Path, place: int = place) -> None:
+        def spoil(folder: Path, position: int = position) -> None:
             path = first(folder, pattern)
             data = bytearray(path.read_bytes())
-            data[place] ^= 0xFF
+            data[position] ^= 0xFF
             path.write_bytes(data)
 
-        yield f"{pattern} byte {place}", spoil
+        yield f"{pattern} byte {position}", spoil
 
 
 def fields(pattern: str, values: dict[str, list[Any]], line: int | None = None) -> Cases:
     """Change a field, such as a/b/c, of a JSON file or of a line in a JSONL file."""
-    for place, bad in values.items():
+    for field, bad in values.items():
         for value in bad:
 
-            def spoil(folder: Path, place: str = place, value: Any = value) -> None:
+            def spoil(folder: Path, field: str = field, value: Any = value) -> None:
                 path = first(folder, pattern)
                 lines = path.read_text().splitlines() if line is not None else [path.read_text()]
                 content = json.loads(lines[line or 0])
-                *above, key = place.split("/")
+                *parents, key = field.split("/")
                 owner = content
-                for name in above:
+                for name in parents:
                     owner = owner[name]
                 if value is ABSENT:
                     del owner[key]
                 else:
                     owner[key] = value
                 if isinstance(content, dict) and content.pop(DIGEST, None):
-                    content = with_digest(content)  # a valid digest must not hide the error
+                    content = with_digest(content)  # a wrong digest must not hide the error
                 lines[line or 0] = json.dumps(content)
                 path.write_text("\n".join(lines))
 
             shown = "absent" if value is ABSENT else repr(value)
-            yield f"{pattern} {place} {shown}", spoil
+            yield f"{pattern} {field} {shown}", spoil
 
 
 def columns(pattern: str, values: dict[str, list[Any]], row: int = 3) -> Cases:
@@ -104,8 +104,8 @@ def columns(pattern: str, values: dict[str, list[Any]], row: int = 3) -> Cases:
                     kind = table[column].type
                     ragged = isinstance(rows[row], list)
                     rows = pa.array(rows, pa.list_(pa.float32()) if ragged else kind)
-                place = table.column_names.index(column)
-                pq.write_table(table.set_column(place, column, rows), path)
+                index = table.column_names.index(column)
+                pq.write_table(table.set_column(index, column, rows), path)
 
             shown = getattr(value, "__name__", repr(value))
             yield f"{pattern} {column} {'absent' if value is ABSENT else shown}", spoil
@@ -125,9 +125,9 @@ def tensors(pattern: str, changes: dict[str, Callable[[dict[str, np.ndarray]], A
 def _on_first(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[dict[str, Any]], Any]:
     """Apply a change to the first tensor only."""
 
-    def changed(found: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        name = min(found)
-        return found | {name: np.ascontiguousarray(change(found[name]))}
+    def changed(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        name = min(arrays)
+        return arrays | {name: np.ascontiguousarray(change(arrays[name]))}
 
     return changed
 
@@ -139,10 +139,12 @@ def _one_nan(array: np.ndarray) -> np.ndarray:
 
 
 TENSORS: dict[str, Callable[[dict[str, np.ndarray]], Any]] = {
-    "none": lambda found: {},
-    "one missing": lambda found: {n: x for n, x in found.items() if n != min(found)},
-    "one more": lambda found: found | {"other": np.zeros(3, np.float32)},
-    "one renamed": lambda found: {n if n != min(found) else f"{n}_": x for n, x in found.items()},
+    "none": lambda arrays: {},
+    "one missing": lambda arrays: {n: x for n, x in arrays.items() if n != min(arrays)},
+    "one more": lambda arrays: arrays | {"other": np.zeros(3, np.float32)},
+    "one renamed": lambda arrays: {
+        n if n != min(arrays) else f"{n}_": x for n, x in arrays.items()
+    },
     "flat": _on_first(np.ravel),
     "scalar": _on_first(lambda x: np.ones((), np.float32)),
     "shorter": _on_first(lambda x: x[..., :-1]),

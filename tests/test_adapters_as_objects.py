@@ -1,7 +1,8 @@
-"""Laws of adapters as objects, for every method in `peft/`: a new file there is found by itself.
+"""Test removing, merging, saving and combining adapters, for every method in `peft/`.
 
-Off is the base, merging is the forward pass, unmerging restores, and what was saved, combined or
-extracted comes back. Methods for which the maths does not allow one of them say so.
+Removing an adapter restores the base's outputs, merging preserves outputs, unmerging restores the
+kernels, and saved, combined and extracted adapters round-trip. Methods that do not allow an
+operation raise an error.
 """
 
 import jax
@@ -20,8 +21,8 @@ from tests.nets import NET, X, assert_close, call, trained
 
 pytestmark = pytest.mark.slow
 
-STARTS = ["gaussian", "pissa", "olora"]
-METHODS = nets.METHODS | {start: LoRA(rank=2, initialization=start) for start in STARTS}
+INITIALIZATIONS = ["gaussian", "pissa", "olora"]
+METHODS = nets.METHODS | {name: LoRA(rank=2, initialization=name) for name in INITIALIZATIONS}
 LAYERS = "inp|blocks"
 
 
@@ -39,16 +40,16 @@ def parameters(model):
     return jax.tree.leaves(nnx.to_pure_dict(nnx.state(model, nnx.Param)))
 
 
-def test_off_is_the_base(method, model):
-    """Bit by bit where the adapter is taken away; beside another one, up to a sum with zeros."""
+def test_removing_the_adapter_restores_the_base(method, model):
+    """Outputs are bitwise equal without the adapter, and close if its weight is zero."""
     if method.trains_base:
         with pytest.raises(ValueError, match=r"own trains (blocks|inp)/(bias|kernel)"):
             lorasp_jax.combine({"own": model})
         return
     if method.splits_kernel:
-        for take_away in (strip_adapters, lambda model: lorasp_jax.combine({"own": model})):
+        for operation in (strip_adapters, lambda model: lorasp_jax.combine({"own": model})):
             with pytest.raises(ValueError, match="split the kernel"):
-                take_away(model)
+                operation(model)
         return
     assert np.abs(call(model, X) - call(NET, X)).max() > 1e-3
     pair = lorasp_jax.combine({"other": trained(("out", LoRA(rank=2)), seed=1), "own": model})
@@ -60,16 +61,16 @@ def test_off_is_the_base(method, model):
     assert_close(call(lorasp_jax.choose(pair, "own"), X), call(model, X))
 
 
-def test_merging_is_the_forward_pass_and_unmerging_restores(method, model):
+def test_merging_preserves_outputs_and_unmerging_restores_kernels(method, model):
     if isinstance(method, LoRASP | LoRASPRelease | LoRAMoE):
-        way_out = "keep the adapter" if isinstance(method, LoRAMoE) else "distill it into"
-        with pytest.raises(ValueError, match=rf"cannot merge (inp|blocks): .*{way_out}"):
+        advice = "keep the adapter" if isinstance(method, LoRAMoE) else "distill it into"
+        with pytest.raises(ValueError, match=rf"cannot merge (inp|blocks): .*{advice}"):
             lorasp_jax.merge(model)
         return
     merged = lorasp_jax.merge(model)
     assert not adaptation.methods(merged)
     assert_close(call(merged, X), call(model, X))
-    assert_close(call(lorasp_jax.merge(merged), X), call(model, X))  # again changes nothing
+    assert_close(call(lorasp_jax.merge(merged), X), call(model, X))  # merging twice is harmless
     if not method.additive and not method.trains_base:
         with pytest.raises(ValueError, match="unmerge"):
             lorasp_jax.unmerge(merged, model)
@@ -80,8 +81,8 @@ def test_merging_is_the_forward_pass_and_unmerging_restores(method, model):
     assert_close(call(back, X), call(model, X))
 
 
-def test_what_was_saved_comes_back(tmp_path, method, model):
-    """Alone, onto the base; and out of a combined model, where the method can have a name."""
+def test_saved_adapters_round_trip(tmp_path, method, model):
+    """Save the adapter alone, and after extracting it from a combined model if possible."""
     save_adapters(tmp_path / "alone", model)
     loaded = load_adapters(tmp_path / "alone", NET)
     np.testing.assert_array_equal(call(loaded, X), call(model, X))
@@ -97,7 +98,7 @@ def test_what_was_saved_comes_back(tmp_path, method, model):
 
 
 def test_mapped_choices(method, model):
-    """vmap over choices is one choice after the other, with gradients to x alike."""
+    """vmap over choices gives the values and gradients of x of separate calls."""
     if method.trains_base or method.splits_kernel:
         return
     pair = lorasp_jax.combine({"other": trained(("", LoRA(rank=2)), seed=1), "own": model})

@@ -21,7 +21,7 @@ from tests.test_scanned import EINSUMS, IDS, Llama
 RATE = 0.4
 KEY = jax.random.key(7)
 X = jax.random.normal(jax.random.key(0), (6, 5))
-WIDE = LoRA(rank=2, dropout=RATE)
+WITH_DROPOUT = LoRA(rank=2, dropout=RATE)
 
 
 def perturbed(params, seed=3):
@@ -30,37 +30,39 @@ def perturbed(params, seed=3):
     return jax.tree.map(noise, params)
 
 
-def same(a, b):
+def equal(a, b):
     return bool(jnp.array_equal(a, b))
 
 
 def test_dropped_fraction_is_zero_and_the_rest_is_rescaled():
-    seen = dropout(jnp.ones((200, 100), jnp.bfloat16), 0.25, KEY)
-    assert seen.dtype == jnp.bfloat16
-    np.testing.assert_allclose(jnp.unique(seen), [0, 4 / 3], rtol=4e-3)
-    np.testing.assert_allclose((seen == 0).mean(), 0.25, atol=0.01)
+    dropped = dropout(jnp.ones((200, 100), jnp.bfloat16), 0.25, KEY)
+    assert dropped.dtype == jnp.bfloat16
+    np.testing.assert_allclose(jnp.unique(dropped), [0, 4 / 3], rtol=4e-3)
+    np.testing.assert_allclose((dropped == 0).mean(), 0.25, atol=0.01)
 
 
-@pytest.mark.parametrize("method", [WIDE, DoRA(rank=2, dropout=RATE), AdaLoRA(2, dropout=RATE)])
+@pytest.mark.parametrize(
+    "method", [WITH_DROPOUT, DoRA(rank=2, dropout=RATE), AdaLoRA(2, dropout=RATE)]
+)
 def test_formula_matches_peft(method):
     """PEFT 0.21.2: lora_B(lora_A(dropout(x))); DoRA's magnitude rescales W dropout(x) (dora.py)."""
     kernel = jax.random.normal(jax.random.key(1), (5, 4))
     params = perturbed(method.init(jax.random.key(2), kernel)[0])
-    seen = dropout(X, RATE, KEY)
+    dropped = dropout(X, RATE, KEY)
     a, b = params["lora_a"], params["lora_b"]
     if isinstance(method, AdaLoRA):
         a = a * params["lora_e"]
-    delta = method.scale * seen @ a @ b
+    delta = method.scale * dropped @ a @ b
     if isinstance(method, DoRA):
         factor = column_factor(params["magnitude"], kernel + method.scale * a @ b)
-        delta = (factor - 1) * (seen @ kernel) + factor * delta
+        delta = (factor - 1) * (dropped @ kernel) + factor * delta
     y, aux = method.apply_with_dropout(params, X, kernel, KEY)
     np.testing.assert_allclose(y, X @ kernel + delta, rtol=1e-4, atol=1e-5)
     assert aux.active_rank.shape == X.shape[:-1]
-    slope = jax.grad(lambda kernel: method.apply_with_dropout(params, X, kernel, KEY)[0].sum())(
-        kernel
-    )
-    assert not slope.any()  # the base is frozen, as without dropout
+    kernel_gradient = jax.grad(
+        lambda kernel: method.apply_with_dropout(params, X, kernel, KEY)[0].sum()
+    )(kernel)
+    assert not kernel_gradient.any()  # the base is frozen, as without dropout
 
 
 def trained(base, rules, **options):
@@ -72,7 +74,7 @@ def trained(base, rules, **options):
 @pytest.mark.parametrize("path", ["conv", "split", "experts", "join", "blocks", "out"])
 def test_every_layer_type(path):
     """Outputs depend on the key in training and are deterministic in evaluation."""
-    model = trained(nets.Kinds(), [(path, WIDE)])
+    model = trained(nets.Kinds(), [(path, WITH_DROPOUT)])
     ids = jnp.array([[1, 2, 3], [4, 5, 6]])
 
     @jax.jit
@@ -81,46 +83,46 @@ def test_every_layer_type(path):
 
     first, second = run(KEY), run(jax.random.key(8))
     assert not np.allclose(first, second)
-    assert same(first, run(KEY))
+    assert equal(first, run(KEY))
     without = lorasp_jax.adapt(nets.Kinds(), [(path, LoRA(rank=2))], rngs=nnx.Rngs(1))
     graphdef, _, frozen = lorasp_jax.split(without)
-    assert same(model(ids), nnx.merge(graphdef, lorasp_jax.split(model)[1], frozen)(ids))
+    assert equal(model(ids), nnx.merge(graphdef, lorasp_jax.split(model)[1], frozen)(ids))
 
 
 def test_embedding_ids_are_never_dropped():
-    model = trained(nets.Kinds(), [("embed", WIDE)])
+    model = trained(nets.Kinds(), [("embed", WITH_DROPOUT)])
     ids = jnp.array([[1, 2, 3]])
-    assert same(lorasp_jax.with_dropout(model, KEY)(ids), model(ids))
+    assert equal(lorasp_jax.with_dropout(model, KEY)(ids), model(ids))
 
 
 def test_layers_experts_and_stacks_use_independent_masks():
-    model = lorasp_jax.with_dropout(trained(nets.Kinds(), [("out|join|blocks", WIDE)]), KEY)
+    model = lorasp_jax.with_dropout(trained(nets.Kinds(), [("out|join|blocks", WITH_DROPOUT)]), KEY)
     keys = [model.out.dropout_key, model.join.dropout_key, *model.blocks.dropout_key]
     assert len({tuple(jax.random.key_data(key).tolist()) for key in keys}) == 5
-    layer = trained(nets.Kinds(), [("experts", WIDE)]).experts
+    layer = trained(nets.Kinds(), [("experts", WITH_DROPOUT)]).experts
     x = jnp.ones((50, 2, 3))
-    twins = jax.tree.map(lambda p: p.at[1].set(p[0]), layer.adapter.get_value())
-    layer.adapter.set_value(twins)
+    equal_experts = jax.tree.map(lambda p: p.at[1].set(p[0]), layer.adapter.get_value())
+    layer.adapter.set_value(equal_experts)
     layer.kernel.set_value(layer.kernel.get_value().at[1].set(layer.kernel.get_value()[0]))
     layer.bias.set_value(jnp.zeros_like(layer.bias.get_value()))
     y = lorasp_jax.with_dropout(layer, KEY)(x)
-    assert same(layer(x)[:, 0], layer(x)[:, 1])
+    assert equal(layer(x)[:, 0], layer(x)[:, 1])
     assert not np.allclose(y[:, 0], y[:, 1])
 
 
 def test_dropout_is_off_in_derived_models(tmp_path):
     base = nnx.Linear(5, 4, rngs=nnx.Rngs(0))
-    model = trained(base, [("", WIDE)])
-    dropping = lorasp_jax.with_dropout(model, KEY)
-    assert not np.allclose(dropping(X), model(X))
-    again = nnx.merge(*lorasp_jax.split(dropping))
-    assert lorasp_jax.split(dropping)[0] == lorasp_jax.split(model)[0]
-    assert same(again(X), model(X))
-    np.testing.assert_allclose(lorasp_jax.merge(dropping)(X), model(X), atol=1e-5)
-    save_adapters(tmp_path / "a", dropping)
+    model = trained(base, [("", WITH_DROPOUT)])
+    training_model = lorasp_jax.with_dropout(model, KEY)
+    assert not np.allclose(training_model(X), model(X))
+    restored = nnx.merge(*lorasp_jax.split(training_model))
+    assert lorasp_jax.split(training_model)[0] == lorasp_jax.split(model)[0]
+    assert equal(restored(X), model(X))
+    np.testing.assert_allclose(lorasp_jax.merge(training_model)(X), model(X), atol=1e-5)
+    save_adapters(tmp_path / "a", training_model)
     loaded = load_adapters(tmp_path / "a", base)
-    assert loaded.method == WIDE
-    assert same(loaded(X), model(X))
+    assert loaded.method == WITH_DROPOUT
+    assert equal(loaded(X), model(X))
 
 
 def test_program_without_dropout_is_unchanged():
@@ -140,16 +142,16 @@ def test_program_without_dropout_is_unchanged():
         return text(False), text(True)
 
     base = nnx.Linear(5, 4, rngs=nnx.Rngs(0))
-    (plain, for_training), (evaluating, dropping) = program(base, 0.0), program(base, RATE)
-    assert plain == for_training == evaluating
-    assert "low_rank_matmul" in plain
-    assert "random_bits" in dropping
+    (expected, without), (evaluation, training) = program(base, 0.0), program(base, RATE)
+    assert expected == without == evaluation
+    assert "low_rank_matmul" in expected
+    assert "random_bits" in training
 
 
 @pytest.mark.parametrize("scanned", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_models_with_remat_and_scan(scanned):
     """Test the documented loss, which takes a key."""
-    rules = [("layers|head", WIDE)]
+    rules = [("layers|head", WITH_DROPOUT)]
     model = trained(Llama(remat=True, scanned=scanned), rules, einsums=EINSUMS)
     graphdef, adapters, frozen = lorasp_jax.split(model)
 
@@ -189,20 +191,20 @@ LINEN_IDS = jnp.array([[1, 2, 3], [4, 5, 6]])
 
 @pytest.mark.parametrize("path", ["blocks", "split", "conv"])
 def test_linen(path):
-    adapter = lorasp_jax.LinenAdapter(Linen(), [(path, WIDE)])
+    adapter = lorasp_jax.LinenAdapter(Linen(), [(path, WITH_DROPOUT)])
     variables = adapter.init(jax.random.key(0), LINEN_IDS)
     variables |= {"adapters": perturbed(variables["adapters"])}
     run = jax.jit(lambda key: adapter.apply(variables, LINEN_IDS, rngs={"dropout": key}))
     assert not np.allclose(run(KEY), run(jax.random.key(8)))
-    assert same(run(KEY), run(KEY))
+    assert equal(run(KEY), run(KEY))
     off = dataclasses.replace(adapter, rules=[(path, LoRA(rank=2))])
     expected = off.apply(variables, LINEN_IDS)
-    assert same(adapter.apply(variables, LINEN_IDS), expected)
-    assert same(off.apply(variables, LINEN_IDS, rngs={"dropout": KEY}), expected)
+    assert equal(adapter.apply(variables, LINEN_IDS), expected)
+    assert equal(off.apply(variables, LINEN_IDS, rngs={"dropout": KEY}), expected)
 
 
 def test_linen_scan_without_split_rngs():
-    adapter = lorasp_jax.LinenAdapter(Linen(streams=("params",)), [("blocks", WIDE)])
+    adapter = lorasp_jax.LinenAdapter(Linen(streams=("params",)), [("blocks", WITH_DROPOUT)])
     variables = adapter.init(jax.random.key(0), LINEN_IDS)
     adapter.apply(variables, LINEN_IDS)
     with pytest.raises(ValueError, match=r"blocks/dense has no rngs .* 'dropout' to split_rngs"):
@@ -210,10 +212,10 @@ def test_linen_scan_without_split_rngs():
 
 
 def test_linen_dense():
-    layer = LinenDense(4, method=WIDE)
+    layer = LinenDense(4, method=WITH_DROPOUT)
     variables = layer.init(jax.random.key(0), X)
     variables |= {"adapters": perturbed(variables["adapters"])}
     first, second = (layer.apply(variables, X, rngs={"dropout": k}) for k in jax.random.split(KEY))
     assert not np.allclose(first, second)
     expected = LinenDense(4, method=LoRA(rank=2)).apply(variables, X)
-    assert same(layer.apply(variables, X), expected)
+    assert equal(layer.apply(variables, X), expected)

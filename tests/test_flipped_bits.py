@@ -92,11 +92,11 @@ def dataset(folder: Path) -> None:
 
 
 def read_dataset(folder: Path) -> Any:
-    found = cache.Cache(folder)
+    source = cache.Cache(folder)
     return (
-        found.metadata,
-        [leaves(found.episode(n)) for n in range(len(found))],
-        leaves(found.statistics),
+        source.metadata,
+        [leaves(source.episode(n)) for n in range(len(source))],
+        leaves(source.statistics),
     )
 
 
@@ -107,8 +107,10 @@ def demonstrations(folder: Path) -> None:
 
 
 def read_demonstrations(folder: Path) -> Any:
-    found = Episodes.load(folder / "press.npz")
-    return leaves(found), {k: v for k, v in vars(found).items() if isinstance(v, (str, int, float))}
+    loaded = Episodes.load(folder / "press.npz")
+    return leaves(loaded), {
+        k: v for k, v in vars(loaded).items() if isinstance(v, (str, int, float))
+    }
 
 
 KINDS: dict[str, tuple[Callable[[Path], None], Callable[[Path], Any], int]] = {
@@ -148,11 +150,11 @@ def test_flipped_bit_is_harmless_or_raises(kind, tmp_path):
             flipped[position] ^= 1 << (position // step % 8)
             path.write_bytes(flipped)
             try:
-                found = read(folder)
+                loaded = read(folder)
             except ValueError as error:
                 messages.append(str(error))
             else:
-                assert same(found, expected), (
+                assert same(loaded, expected), (
                     path.name,
                     position,
                     bytes(flipped[position - 20 :][:40]),
@@ -181,16 +183,16 @@ def test_image_is_verified_when_first_read(tmp_path, reading):
     content = bytearray(path.read_bytes())
     content[-1] ^= 1
     path.write_bytes(content)
-    found = cache.Cache(tmp_path / "cache")
-    assert found.episode(0).num_steps == 5
-    images = found.steps.image["side"]
+    source = cache.Cache(tmp_path / "cache")
+    assert source.episode(0).num_steps == 5
+    images = source.steps.image["side"]
     assert images[np.arange(20)].shape == (20, 32, 32, 3)
-    last = found.num_steps - 1
+    last = source.num_steps - 1
     with pytest.raises(
         ValueError, match=rf"side\.npy is damaged \(wrong checksum of image {last}\)"
     ):
         {
-            "episode": lambda: found.episode(2),
+            "episode": lambda: source.episode(2),
             "steps": lambda: images[np.array([3, last])],
             "device": lambda: np.asarray(images),
         }[reading]()

@@ -57,19 +57,19 @@ def tokenize(folder: Path) -> None:
     tokenizer.load_tokenizer(folder).encode(["push the button"], 16)
 
 
-FILES: list[fuzzing.Change] = [fuzzing.damaged, fuzzing.replaced]
+FILES: list[fuzzing.Change] = [fuzzing.change_bytes, fuzzing.replace_file]
 KINDS: dict[str, tuple[Callable[[Path], Any], list[fuzzing.Change]]] = {
-    "rlds": (read, [*FILES, *[fuzzing.described] * 4]),
-    "rlds, resumed": (resume, [fuzzing.damaged, *[fuzzing.described] * 4]),
-    "cache": (read, [*FILES, fuzzing.described, *[fuzzing.mapped] * 2]),
-    "npz": (lambda folder: read(folder / "episodes.npz"), [*FILES, *[fuzzing.zipped] * 3]),
-    "lerobot v21": (read, [*FILES, *[fuzzing.described] * 2, *[fuzzing.tabled] * 2]),
-    "lerobot v3": (read, [*FILES, *[fuzzing.described] * 2, *[fuzzing.tabled] * 2]),
-    "statistics": (statistics_files.read, [*FILES, fuzzing.described]),
-    "tokenizer.json": (tokenize, [*FILES, *[fuzzing.described] * 2]),
-    "tokenizer.model": (tokenize, [fuzzing.replaced, *[fuzzing.damaged] * 4]),
-    "run": (show, [*FILES, *[fuzzing.described] * 6]),
-    "mjcf": (lambda folder: mjcf.load(folder / "arm.xml"), [*FILES, *[fuzzing.drawn] * 4]),
+    "rlds": (read, [*FILES, *[fuzzing.change_json] * 4]),
+    "rlds, resumed": (resume, [fuzzing.change_bytes, *[fuzzing.change_json] * 4]),
+    "cache": (read, [*FILES, fuzzing.change_json, *[fuzzing.change_cache] * 2]),
+    "npz": (lambda folder: read(folder / "episodes.npz"), [*FILES, *[fuzzing.change_npz] * 3]),
+    "lerobot v21": (read, [*FILES, *[fuzzing.change_json] * 2, *[fuzzing.change_parquet] * 2]),
+    "lerobot v3": (read, [*FILES, *[fuzzing.change_json] * 2, *[fuzzing.change_parquet] * 2]),
+    "statistics": (statistics_files.read, [*FILES, fuzzing.change_json]),
+    "tokenizer.json": (tokenize, [*FILES, *[fuzzing.change_json] * 2]),
+    "tokenizer.model": (tokenize, [fuzzing.replace_file, *[fuzzing.change_bytes] * 4]),
+    "run": (show, [*FILES, *[fuzzing.change_json] * 6]),
+    "mjcf": (lambda folder: mjcf.load(folder / "arm.xml"), [*FILES, *[fuzzing.change_mjcf] * 4]),
 }
 
 
@@ -83,12 +83,12 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     for name, fill in (("mjcf", write), ("run", finish)):
         (at / name).mkdir()
         fill(at / name)
-    found = {name: at / name for name in ("rlds", "cache", "npz", "mjcf", "run")}
+    folders = {name: at / name for name in ("rlds", "cache", "npz", "mjcf", "run")}
     for name, file in TOKENIZERS.items():
         (at / name).mkdir()
-        found[name] = shutil.copy(GOLDEN / "tokenizers" / file, at / name / name).parent
-    found |= {"rlds, resumed": at / "rlds", "statistics": golden("v21") / "meta"}
-    return found | {f"lerobot {version}": golden(version) for version in ("v21", "v3")}
+        folders[name] = shutil.copy(GOLDEN / "tokenizers" / file, at / name / name).parent
+    folders |= {"rlds, resumed": at / "rlds", "statistics": golden("v21") / "meta"}
+    return folders | {f"lerobot {version}": golden(version) for version in ("v21", "v3")}
 
 
 def check(kind: str, seeds: range, good: dict[str, Path], tmp_path: Path) -> None:
@@ -98,11 +98,11 @@ def check(kind: str, seeds: range, good: dict[str, Path], tmp_path: Path) -> Non
         r = random.Random(f"{kind} {seed}")
         r.choice(changes)(r, sorted(path for path in folder.rglob("*") if path.is_file()))
         error = None
-        with contextlib.suppress(IsADirectoryError):  # where a file should be written
+        with contextlib.suppress(IsADirectoryError):  # a folder is where a file should be written
             try:
                 reader(folder)
-            except Exception as found:
-                error = found
+            except Exception as raised:
+                error = raised
         if error is not None:
             error.add_note(f"{kind} {seed}")
             check_refusal(error, str(folder))

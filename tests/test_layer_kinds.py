@@ -71,25 +71,25 @@ def apply_dense_layers(dense_layers, x):
 
 
 def test_moments_equal_a_direct_computation():
-    found = calibration.input_moments(NET, IDS)
-    assert sorted(found) == ["blocks", "experts", "join", "out", "split"]
+    moments = calibration.input_moments(NET, IDS)
+    assert sorted(moments) == ["blocks", "experts", "join", "out", "split"]
     x = np.concatenate([NET.conv(NET.embed(ids)) for ids in IDS])
     heads = NET.split(x)
     mixed = np.tanh(NET.experts(heads))
-    seen = {"split": x, "join": mixed.reshape(*mixed.shape[:2], 6)}
-    for path, inputs in seen.items():
+    inputs_by_path = {"split": x, "join": mixed.reshape(*mixed.shape[:2], 6)}
+    for path, inputs in inputs_by_path.items():
         rows = np.asarray(inputs, np.float64).reshape(-1, 6)
-        np.testing.assert_allclose(found[path], rows.T @ rows, rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(moments[path], rows.T @ rows, rtol=1e-4, atol=1e-4)
     by_expert = np.einsum("btni,btnj->nij", heads, heads)
-    np.testing.assert_allclose(found["experts"], by_expert, rtol=1e-4, atol=1e-4)
-    assert found["blocks"].shape == (3, 6, 6)
-    start = lorasp_jax.adapt(
+    np.testing.assert_allclose(moments["experts"], by_expert, rtol=1e-4, atol=1e-4)
+    assert moments["blocks"].shape == (3, 6, 6)
+    model = lorasp_jax.adapt(
         NET,
         [("experts|blocks", LoRA(rank=2, initialization="eva"))],
         rngs=nnx.Rngs(0),
-        statistics=found,
+        statistics=moments,
     )
-    a = start.experts.adapter.get_value()["lora_a"][1]
+    a = model.experts.adapter.get_value()["lora_a"][1]
     right = np.linalg.svd(np.asarray(heads[:, :, 1]).reshape(-1, 3), full_matrices=False)[2][:2]
     np.testing.assert_allclose(np.abs(right @ a), np.eye(2), atol=1e-3)
 
@@ -158,17 +158,17 @@ def test_each_name_gives_the_outputs_of_its_model(models, combined):
 
 
 def test_adapters_per_example(models, combined):
-    found = call(lorasp_jax.choose(combined, ["b", None, "a", "b"]), IDS[0])
+    y = call(lorasp_jax.choose(combined, ["b", None, "a", "b"]), IDS[0])
     expected = [(models["b"], 0), (NET, 1), (models["a"], 2), (models["b"], 3)]
     for model, row in expected:
-        assert_close(found[row], call(model, IDS[0])[row])
+        assert_close(y[row], call(model, IDS[0])[row])
 
 
 def test_attend_of_an_embedding_with_two_adapters(models, combined):
     query = jax.random.normal(jax.random.key(0), (4, 6))
     attend = [lorasp_jax.choose(combined, one).embed.attend(query) for one in ("a", "b", None)]
-    for found, model in zip(attend, [*models.values(), NET], strict=True):
-        assert_close(found, model.embed.attend(query))
+    for actual, model in zip(attend, [*models.values(), NET], strict=True):
+        assert_close(actual, model.embed.attend(query))
     both = lorasp_jax.choose(combined, WEIGHTS).embed.attend(query)
     assert_close(both, attend[2] + 0.6 * (attend[0] - attend[2]) - 0.3 * (attend[1] - attend[2]))
 
@@ -212,14 +212,14 @@ def test_named_adapters_of_other_methods(models):
 
 def test_unmerging_restores_the_kernels(models):
     merged = lorasp_jax.merge(models["a"])
-    apart = lorasp_jax.unmerge(merged, models["a"])
-    assert adaptation.methods(apart) == adaptation.methods(models["a"])
-    for path, kernel in kernels(apart).items():
+    unmerged = lorasp_jax.unmerge(merged, models["a"])
+    assert adaptation.methods(unmerged) == adaptation.methods(models["a"])
+    for path, kernel in kernels(unmerged).items():
         np.testing.assert_allclose(kernel, kernels(NET)[path], rtol=1e-5, atol=1e-5)
-    assert_close(call(apart, IDS[0]), call(models["a"], IDS[0]))
+    assert_close(call(unmerged, IDS[0]), call(models["a"], IDS[0]))
 
 
-def test_unmerging_needs_the_same_layer_types(models):
+def test_unmerging_requires_the_same_layer_types(models):
     merged = lorasp_jax.merge(models["a"])
     merged.split = nnx.Linear(6, 6, rngs=nnx.Rngs(0))
     message = "cannot unmerge split: the layer must be a LinearGeneral, got a Linear"
@@ -244,9 +244,9 @@ def test_shared_layer_is_changed_once():
     merged = lorasp_jax.merge(model)
     assert merged.first is merged.second
     assert_close(merged(x), model(x))
-    apart = lorasp_jax.unmerge(merged, model)
-    assert_close(apart.first.kernel[...], net.first.kernel[...])
-    assert_close(apart(x), model(x))
+    unmerged = lorasp_jax.unmerge(merged, model)
+    assert_close(unmerged.first.kernel[...], net.first.kernel[...])
+    assert_close(unmerged(x), model(x))
     both = lorasp_jax.combine({"a": model, "b": net})
     assert_close(lorasp_jax.extract(both, "a")(x), model(x))
     assert_close(lorasp_jax.choose(both, None)(x), net(x))

@@ -163,10 +163,10 @@ def _rehashed(damage: Damage) -> Damage:
 def _adapter() -> Cases:
     yield from malformed.files("adapter.json", "adapter.safetensors")
     yield from malformed.flips("adapter.safetensors", (0, 9, 60, -1))
-    whole = [*malformed.tensors("adapter.safetensors", TENSORS)]
-    whole += [*malformed.files("adapter.safetensors")][1:]
-    whole += malformed.flips("adapter.safetensors", (0, 9, 60))
-    yield from ((f"{name}, rehashed", _rehashed(damage)) for name, damage in whole)
+    cases = [*malformed.tensors("adapter.safetensors", TENSORS)]
+    cases += [*malformed.files("adapter.safetensors")][1:]
+    cases += malformed.flips("adapter.safetensors", (0, 9, 60))
+    yield from ((f"{name}, rehashed", _rehashed(damage)) for name, damage in cases)
     values: dict[str, list[Any]] = {
         "format": [ABSENT, 3],
         "version": [ABSENT, 1, "2"],
@@ -188,23 +188,23 @@ def _adapter() -> Cases:
 
 def _escaped(values: dict[str, list[Any]]) -> Cases:
     """Like `malformed.fields` for adapter.json, where ~ stands for a slash within a name."""
-    for place, bad in values.items():
+    for field, bad in values.items():
         for value in bad:
 
-            def spoil(folder: Path, place: str = place, value: Any = value) -> None:
+            def spoil(folder: Path, field: str = field, value: Any = value) -> None:
                 path = folder / "adapter.json"
                 content = json.loads(path.read_text())
                 del content["digest"]
-                *above, key = (name.replace("~", "/") for name in place.split("/"))
+                *parents, key = (name.replace("~", "/") for name in field.split("/"))
                 owner = content
-                for name in above:
+                for name in parents:
                     owner = owner[name]
                 owner[key] = value
                 if value is ABSENT:
                     del owner[key]
                 path.write_text(json.dumps(with_digest(content)))
 
-            yield f"{place} {'absent' if value is ABSENT else value!r}", spoil
+            yield f"{field} {'absent' if value is ABSENT else value!r}", spoil
 
 
 def _peft() -> Cases:
@@ -227,10 +227,9 @@ KINDS: dict[str, tuple[Callable[[], Cases], Callable[[Path], Any]]]
 
 
 def _episodes() -> Episodes:
-    whole = random_episodes("press", 0)
-    return dataclasses.replace(
-        whole, image={n: np.ascontiguousarray(x[:, :, :8, :8]) for n, x in whole.image.items()}
-    )
+    episodes = random_episodes("press", 0)
+    images = {n: np.ascontiguousarray(x[:, :, :8, :8]) for n, x in episodes.image.items()}
+    return dataclasses.replace(episodes, image=images)
 
 
 @pytest.fixture(scope="module")

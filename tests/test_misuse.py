@@ -114,14 +114,14 @@ FIELDS = [
 def test_every_field_of_every_method(cls, field):
     """A wrong value raises an error that names the field, or the method works."""
     for value in BAD:
-        if (refusal := refused(cls, field, value)) is None:
+        if (message := error_message(cls, field, value)) is None:
             assert value in (None, True, -1)
         else:
-            assert "\n" not in refusal
-            assert field in refusal or repr(value) in refusal
+            assert "\n" not in message
+            assert field in message or repr(value) in message
 
 
-def refused(cls, field, value):
+def error_message(cls, field, value):
     """Return the error message, or None if the method can create its parameters."""
     try:
         method = cls(**{field: value})
@@ -176,7 +176,7 @@ def adapted(method=METHOD, net=NET):
     return lorasp_jax.adapt(net, [("inp", method)], rngs=nnx.Rngs(0))
 
 
-def refuses(call, message):
+def check_error(call, message):
     """Check that the call raises a short one-sentence error."""
     with pytest.raises(ValueError, match=re.escape(message)) as caught:
         call()
@@ -219,7 +219,7 @@ def refuses(call, message):
     ],
 )
 def test_layers(call, message):
-    refuses(call, message)
+    check_error(call, message)
 
 
 def test_kernels_that_cannot_be_adapted():
@@ -227,13 +227,13 @@ def test_kernels_that_cannot_be_adapted():
     zeros = nnx.initializers.zeros
     for d_in, d_out in ((0, 3), (3, 0)):
         net = nnx.Dict(inp=nnx.Linear(d_in, d_out, kernel_init=zeros, rngs=nnx.Rngs(0)))
-        refuses(lambda net=net: adapted(net=net), "cannot adapt inp: an adapter needs a")
+        check_error(lambda net=net: adapted(net=net), "cannot adapt inp: an adapter needs a")
     for value in (jnp.ones(3), "abc"):
         net = nnx.clone(NET)
         net["inp"].kernel.set_value(value)
-        refuses(lambda net=net: adapted(net=net), "cannot adapt inp: an adapter needs a")
+        check_error(lambda net=net: adapted(net=net), "cannot adapt inp: an adapter needs a")
     net["inp"].kernel = None
-    refuses(
+    check_error(
         lambda: adapted(net=net), "cannot adapt inp: its kernel must be an nnx.Variable, got None"
     )
 
@@ -241,7 +241,7 @@ def test_kernels_that_cannot_be_adapted():
 def test_8_bit_kernels_need_a_compute_dtype():
     kind = {"param_dtype": jnp.float8_e4m3fn, "rngs": nnx.Rngs(0)}
     net = nnx.Dict(inp=nnx.Linear(5, 4, **kind))
-    refuses(
+    check_error(
         lambda: adapted(net=net)["inp"](X), "cannot promote float32 input and float8_e4m3fn kernel"
     )
     net = nnx.Dict(inp=nnx.Linear(5, 4, dtype=jnp.float32, **kind))
@@ -266,15 +266,15 @@ LINEN = lorasp_jax.LinenAdapter(nn.Dense(3), [("", METHOD)])
 @pytest.mark.parametrize("variables", [{}, None, 5, {"params": 5}, {"adapters": {}}])
 def test_linen_variables(variables):
     message = 'variables must be a dict whose "params" is a dict'
-    refuses(lambda: LINEN.apply(variables, X), message)
-    refuses(lambda: LINEN.merge(variables, X), message)
-    refuses(lambda: LINEN.attach(KEY, variables, X), message)
+    check_error(lambda: LINEN.apply(variables, X), message)
+    check_error(lambda: LINEN.merge(variables, X), message)
+    check_error(lambda: LINEN.attach(KEY, variables, X), message)
 
 
 def test_linen_adapters_of_another_width():
     variables = LINEN.init(KEY, X)
     narrow = jax.tree.map(lambda a: a[:1], variables["adapters"])
-    refuses(lambda: LINEN.apply(variables | {"adapters": narrow}, X), "needs lora_a [5, 2]")
+    check_error(lambda: LINEN.apply(variables | {"adapters": narrow}, X), "needs lora_a [5, 2]")
 
 
 SHAPES = "holds shapes without values"
@@ -299,7 +299,7 @@ def test_not_a_model(model, tmp_path):
         lambda: lorasp_jax.fuse(model, {"a": 1.0}),
         lambda: lorasp_jax.prune(model, [X]),
     ):
-        refuses(call, message)
+        check_error(call, message)
 
 
 def test_abstract_models(tmp_path):
@@ -314,9 +314,11 @@ def test_abstract_models(tmp_path):
         lambda: lorasp_jax.save_adapters(tmp_path, model),
         lambda: lorasp_jax.save_peft(tmp_path, model),
     ):
-        refuses(call, SHAPES)
+        check_error(call, SHAPES)
     bare = nnx.eval_shape(lambda: nnx.clone(NET))
-    refuses(lambda: adapted(FullFineTuning(), bare), "inp/bias has a shape but no value: call this")
+    check_error(
+        lambda: adapted(FullFineTuning(), bare), "inp/bias has a shape but no value: call this"
+    )
 
 
 @pytest.mark.parametrize(
@@ -391,7 +393,7 @@ def test_abstract_models(tmp_path):
     ],
 )
 def test_other_arguments(call, message, tmp_path):
-    refuses(lambda: call(tmp_path / "new"), message)
+    check_error(lambda: call(tmp_path / "new"), message)
     assert not (tmp_path / "new").exists()
 
 
@@ -411,4 +413,4 @@ def test_other_arguments(call, message, tmp_path):
     ],
 )
 def test_long_values_are_truncated(call):
-    refuses(call, "qqq")
+    check_error(call, "qqq")

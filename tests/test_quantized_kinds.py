@@ -1,4 +1,4 @@
-"""Test quantized kernels of general, einsum, expert and scanned layers, which are not matrices."""
+"""Test quantization of general, einsum, expert and scanned layers, whose kernels have more axes."""
 
 import jax
 import jax.numpy as jnp
@@ -34,14 +34,14 @@ def quantized(request):
 
 def dequantized(model):
     """Return a copy of NET with the dequantized kernels in their original shapes."""
-    wide = nnx.clone(NET)
+    dequantized_copy = nnx.clone(NET)
     for path in MATRICES:
         kernel = np.asarray(getattr(model, path).kernel.get_value().astype(jnp.float32))
         if path == "blocks":  # "...d,fd->...f" in a stack
             kernel = kernel.swapaxes(-1, -2)
         old = getattr(NET, path).kernel[...]
-        getattr(wide, path).kernel = nnx.Param(jnp.asarray(kernel.reshape(old.shape)))
-    return wide
+        getattr(dequantized_copy, path).kernel = nnx.Param(jnp.asarray(kernel.reshape(old.shape)))
+    return dequantized_copy
 
 
 def with_adapters(net, model):
@@ -59,10 +59,10 @@ def test_quantized_matrices_represent_the_kernel(quantized):
         assert getattr(model, path).kernel_matrices().shape == shape
         old = getattr(NET, path).kernel[...]
         assert kernel.shape == old.shape  # models may read sizes from their kernels
-        wide = getattr(dequantized(model), path).kernel[...]
-        off = np.linalg.norm(wide - old) / np.linalg.norm(old)
+        restored = getattr(dequantized(model), path).kernel[...]
+        error = np.linalg.norm(restored - old) / np.linalg.norm(old)
         assert 0 < errors[path] < 0.2
-        np.testing.assert_allclose(off, errors[path], rtol=1e-4)
+        np.testing.assert_allclose(error, errors[path], rtol=1e-4)
     assert_close(call(model, IDS), call(dequantized(model), IDS))
     with pytest.raises(ValueError, match="no adapted layer stored any aux"):
         lorasp_jax.collect_aux(model)
@@ -85,8 +85,8 @@ def test_adapting_before_and_after_quantization(quantized):
 
         return jax.tree.leaves(jax.jit(jax.grad(loss))(adapters))
 
-    for found, wanted in zip(gradients(model), gradients(expected), strict=True):
-        np.testing.assert_allclose(found, wanted, rtol=1e-3, atol=1e-3)
+    for actual, desired in zip(gradients(model), gradients(expected), strict=True):
+        np.testing.assert_allclose(actual, desired, rtol=1e-3, atol=1e-3)
 
 
 def test_merging_dequantizes_only_merged_kernels(quantized):
@@ -119,23 +119,23 @@ class Tied(nnx.Module):
     """One kernel used by three layers in different ways."""
 
     def __init__(self):
-        self.there = nnx.Einsum("...i,io->...o", (6, 4), rngs=nnx.Rngs(0))
-        self.back = nnx.Einsum("...o,io->...i", (6, 4), rngs=nnx.Rngs(0))
-        self.again = nnx.Einsum("...i,io->...o", (6, 4), rngs=nnx.Rngs(0))
-        self.back.kernel = self.again.kernel = self.there.kernel
+        self.first = nnx.Einsum("...i,io->...o", (6, 4), rngs=nnx.Rngs(0))
+        self.transposed = nnx.Einsum("...o,io->...i", (6, 4), rngs=nnx.Rngs(0))
+        self.second = nnx.Einsum("...i,io->...o", (6, 4), rngs=nnx.Rngs(0))
+        self.transposed.kernel = self.second.kernel = self.first.kernel
 
     def __call__(self, x):
-        return self.again(self.back(self.there(x)))
+        return self.second(self.transposed(self.first(x)))
 
 
 def test_shared_kernel_is_quantized_once_per_layout():
     net = Tied()
     model, errors = lorasp_jax.quantize(net, [(".*", "int8")])
-    assert model.there.kernel is model.again.kernel
-    assert model.back.kernel_matrices().shape == (4, 6)
+    assert model.first.kernel is model.second.kernel
+    assert model.transposed.kernel_matrices().shape == (4, 6)
     x = jax.random.normal(jax.random.key(0), (5, 6))
-    lost = np.linalg.norm(model(x) - net(x)) / np.linalg.norm(net(x))
-    assert 0 < lost < 2 * sum(errors.values())
+    error = np.linalg.norm(model(x) - net(x)) / np.linalg.norm(net(x))
+    assert 0 < error < 2 * sum(errors.values())
 
 
 def test_embeddings_and_convolutions_are_not_quantized():

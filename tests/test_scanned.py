@@ -12,7 +12,7 @@ import lorasp_jax
 from lorasp_jax.adapters.io.native import load_adapters, save_adapters
 from lorasp_jax.peft import LoRASP
 
-WIDTH, HEADS, DEPTH, WORDS = 4, 2, 3, 7
+WIDTH, HEADS, DEPTH, VOCABULARY = 4, 2, 3, 7
 SP = LoRASP(rank=4, hidden_width=2)
 
 
@@ -50,12 +50,12 @@ class Llama(nnx.Module):
 
     def __init__(self, *, remat, scanned):
         rngs = nnx.Rngs(0)
-        self.embedder = nnx.Embed(WORDS, WIDTH, rngs=rngs)
+        self.embedder = nnx.Embed(VOCABULARY, WIDTH, rngs=rngs)
         if scanned:
             self.layers = nnx.vmap(lambda r: Layer(remat, rngs=r))(rngs.split(DEPTH))
         else:
             self.layers = nnx.List([Layer(remat, rngs=rngs) for _ in range(DEPTH)])
-        self.head = nnx.Linear(WIDTH, WORDS, rngs=rngs)
+        self.head = nnx.Linear(WIDTH, VOCABULARY, rngs=rngs)
 
     def __call__(self, ids):
         x = self.embedder(ids)
@@ -113,7 +113,7 @@ def test_documented_training_loop(remat, scanned, tmp_path):
         adapters, state, value, losses = step(adapters, state)
         history.append(float(value))
     assert history[-1] < history[0]
-    assert {name: found.shape for name, found in losses.items()} == dict.fromkeys(
+    assert {name: loss.shape for name, loss in losses.items()} == dict.fromkeys(
         ("balance", "spectral", "z"), ()
     )
     graphdef, _, frozen = lorasp_jax.split(model)
@@ -129,26 +129,27 @@ def test_documented_training_loop(remat, scanned, tmp_path):
 def test_remat_and_scan_do_not_change_results():
     """Loss and gradients of the stack equal those of separate layers."""
     model = adapted(Llama(remat=True, scanned=True))
-    plain = adapted(Llama(remat=False, scanned=False))
-    for place in ("embedder", "head"):
-        setattr(plain, place, getattr(model, place))
+    separate_layers = adapted(Llama(remat=False, scanned=False))
+    for name in ("embedder", "head"):
+        setattr(separate_layers, name, getattr(model, name))
     _, stack = nnx.split(model.layers)
     for i in range(DEPTH):
-        nnx.update(plain.layers[i], jax.tree.map(lambda leaf, i=i: leaf[i], stack))
-    values, gradients = zip(*(each(*loss_of(m)) for m in (model, plain)), strict=True)
+        nnx.update(separate_layers.layers[i], jax.tree.map(lambda leaf, i=i: leaf[i], stack))
+    values, gradients = zip(
+        *(value_and_gradient(*loss_of(m)) for m in (model, separate_layers)), strict=True
+    )
     np.testing.assert_allclose(values[0], values[1], rtol=1e-5)
-    of_stack, of_layers = (dict(nnx.to_flat_state(g)) for g in gradients)
-    for path, found in of_stack.items():
+    stacked, separate = (dict(nnx.to_flat_state(g)) for g in gradients)
+    for path, variable in stacked.items():
         if path[0] == "layers":
-            each_layer = [of_layers[("layers", i, *path[1:])].get_value() for i in range(DEPTH)]
-            found = found.get_value()
+            by_layer = [separate[("layers", i, *path[1:])].get_value() for i in range(DEPTH)]
             jax.tree.map(
                 lambda a, *b: np.testing.assert_allclose(a, jnp.stack(b), rtol=1e-3, atol=1e-6),
-                found,
-                *each_layer,
+                variable.get_value(),
+                *by_layer,
             )
 
 
-def each(loss, adapters):
+def value_and_gradient(loss, adapters):
     (value, _), gradient = jax.jit(jax.value_and_grad(loss, has_aux=True))(adapters)
     return value, gradient

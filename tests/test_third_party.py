@@ -23,12 +23,12 @@ POSITIONS = jnp.broadcast_to(jnp.arange(5), (2, 5))
 MASK = jnp.broadcast_to(jnp.tril(jnp.ones((5, 5), bool)), (2, 5, 5))
 
 
-@pytest.fixture(scope="module", params=["own", "of_flax"])
+@pytest.fixture(scope="module", params=["own", "flax"])
 def gemma(request):
     """Return a Gemma with random weights; Flax's example initializes some to zero."""
-    if request.param == "of_flax":
+    if request.param == "flax":
         pytest.importorskip("transformer", reason="flax/examples/gemma is not on the path")
-    model = (gemmas.Gemma if request.param == "own" else gemmas.of_flax)(nnx.Rngs(0))
+    model = (gemmas.Gemma if request.param == "own" else gemmas.flax_gemma)(nnx.Rngs(0))
     graphdef, params, rest = nnx.split(model, nnx.Param, ...)
     return nnx.merge(graphdef, perturbed(params, 0.2), rest)
 
@@ -36,8 +36,8 @@ def gemma(request):
 def perturbed(tree, size):
     leaves, structure = jax.tree.flatten(tree)
     keys = jax.random.split(jax.random.key(5), len(leaves))
-    moved = [v + size * jax.random.normal(k, v.shape) for k, v in zip(keys, leaves, strict=True)]
-    return jax.tree.unflatten(structure, moved)
+    noisy = [v + size * jax.random.normal(k, v.shape) for k, v in zip(keys, leaves, strict=True)]
+    return jax.tree.unflatten(structure, noisy)
 
 
 def called(model):
@@ -109,12 +109,12 @@ def test_nnx_gemma_with_named_adapters_and_quantization(gemma):
     pour = nnx.merge(graphdef, perturbed(adapters, 0.3), frozen)
     both = lorasp_jax.combine({"pour": pour, "press": press})
     np.testing.assert_allclose(logits(both), logits(pour), rtol=1e-3, atol=1e-4)
-    apart = lorasp_jax.unmerge(lorasp_jax.merge(pour), pour)
-    np.testing.assert_allclose(logits(apart), logits(pour), rtol=1e-3, atol=1e-4)
+    unmerged = lorasp_jax.unmerge(lorasp_jax.merge(pour), pour)
+    np.testing.assert_allclose(logits(unmerged), logits(pour), rtol=1e-3, atol=1e-4)
     small, errors = lorasp_jax.quantize(pour, [("attn|mlp", "int8")])
     assert len(errors) == 2 * 6
-    off = jnp.linalg.norm(logits(small) - logits(pour)) / jnp.linalg.norm(logits(pour))
-    assert 0 < off < 0.03
+    error = jnp.linalg.norm(logits(small) - logits(pour)) / jnp.linalg.norm(logits(pour))
+    assert 0 < error < 0.03
 
 
 @pytest.fixture(scope="module")
@@ -152,11 +152,11 @@ def test_linen_gemma(linen):
     @jax.jit
     def gradient(adapters):
         def loss(adapters):
-            out, kept = adapter.apply(
+            out, updated = adapter.apply(
                 variables | {"adapters": adapters}, *arguments, mutable=["intermediates"]
             )
             labels = optax.softmax_cross_entropy_with_integer_labels(out.logits, TOKENS)
-            return labels.mean(), lorasp_jax.collect_aux(kept)
+            return labels.mean(), lorasp_jax.collect_aux(updated)
 
         return jax.value_and_grad(loss, has_aux=True)(adapters)
 
@@ -181,5 +181,5 @@ def test_linen_gemma_merges(linen):
     merged = jax.jit(adapter.merge)(variables, *arguments)
     assert jax.tree.map(jnp.shape, merged) == jax.tree.map(jnp.shape, published)
     expected = jax.jit(adapter.apply)(variables, *arguments).logits
-    found = jax.jit(module.apply)(merged, *arguments).logits
-    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3)
+    actual = jax.jit(module.apply)(merged, *arguments).logits
+    np.testing.assert_allclose(actual, expected, rtol=1e-3, atol=1e-3)

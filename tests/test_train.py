@@ -20,14 +20,14 @@ NANO = ["--model.checkpoint", str(ROOT / "assets" / "pi0_nano")]
 
 
 @pytest.fixture(autouse=True)
-def elsewhere(tmp_path, monkeypatch):
+def _in_an_empty_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
 def files():
     """List all files except locks, which are next to the run folders."""
-    found = {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()}
-    return {path: content for path, content in found.items() if path.suffix != ".lock"}
+    contents = {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()}
+    return {path: content for path, content in contents.items() if path.suffix != ".lock"}
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ def wait(children):
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_two_processes_with_simulated_tasks_train_as_one(tmp_path):
+def test_two_processes_match_one_on_simulated_tasks(tmp_path):
     """Base and trainable parameters are large enough to be sharded over both processes."""
     shapes = nnx.state(nnx.eval_shape(lambda: Pi0Config.small().create(nnx.Rngs(0))))
     assert meshes.bytes_on_device(shapes, fsdp=2) < meshes.bytes_on_device(shapes, fsdp=1)
@@ -42,15 +42,15 @@ def test_two_processes_with_simulated_tasks_train_as_one(tmp_path):
         codes, _ = wait(start(count, *options, *joint, devices=2 // count, cwd=tmp_path))
         assert codes == [0] * count
         folders.append(tmp_path / "runs" / f"of{count}")
-    for expected, found in zip(*map(repeatable, folders), strict=True):
+    for expected, actual in zip(*map(repeatable, folders), strict=True):
         for name, value in expected.items():
-            assert found[name] == pytest.approx(value, rel=1e-4), name
+            assert actual[name] == pytest.approx(value, rel=1e-4), name
     one, two = (load_file(next(folder.glob("base/*.safetensors"))) for folder in folders)
     assert one.keys() == two.keys()
     for name, value in one.items():
-        expected, found = (x.astype(np.float32) for x in (value, two[name]))  # were bfloat16
+        expected, actual = (x.astype(np.float32) for x in (value, two[name]))  # from bfloat16
         atol = 1e-5 * abs(expected).max()
-        np.testing.assert_allclose(found, expected, rtol=2**-7, atol=atol, err_msg=name)
+        np.testing.assert_allclose(actual, expected, rtol=2**-7, atol=atol, err_msg=name)
 
 
 @pytest.mark.slow
