@@ -34,7 +34,7 @@ def main(
     options = parse_arguments(parser(program), arguments)
     options.record = record
     console = Console(stderr=True)
-    # Preallocating GPU memory takes a second (measured) of a command's half minute.
+    # Preallocating GPU memory would add a second to commands of half a minute (measured).
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     cache.enable()
     try:

@@ -87,7 +87,7 @@ def interpolate(commands: jax.Array, control_dt: float, latency: float | jax.Arr
 
 
 def _rotation_vector(rotation: jax.Array) -> jax.Array:
-    """Convert a rotation matrix [3, 3] by less than 180 degrees to a rotation vector [3]."""
+    """Convert a rotation matrix [3, 3], of less than 180 degrees, to a rotation vector [3]."""
     axis = robots.sine_axis(rotation)
     sine = jnp.linalg.norm(axis)
     angle = jnp.arctan2(sine, (jnp.trace(rotation) - 1) / 2)

@@ -24,7 +24,7 @@ from envs.scene import scene
 AnyRobot = str | os.PathLike[str] | Robot
 RendererName = Literal["rays", "warp"]
 RENDERERS: tuple[str, ...] = get_args(RendererName)
-# Upper bounds, which only catch typos: they exceed any device; and lower bounds other than 1.
+# Upper bounds, beyond any device, to catch typos; then lower bounds other than 1.
 _RANGES: dict[str, tuple[int, ...]] = {
     "num_envs": (2**20,),
     "image_size": (2**12,),

@@ -18,7 +18,7 @@ REFUSED = 2
 BROKEN_PIPE = 141
 """Exit code if the reader of the output has closed it, as shells report SIGPIPE."""
 MAX_LENGTH = 1000
-"""Maximum characters of a message."""
+"""Maximum number of characters in a message."""
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Error numbers of writes that ran out of space."""
 _STDOUT = 1

@@ -120,7 +120,7 @@ class Episodes:
 
         Raises:
             FileNotFoundError: the file does not exist.
-            ValueError: the file is damaged, of another format, or has another control period.
+            ValueError: the file is damaged, or has another format or control period.
         """
         arrays = _read(Path(path))
         try:
@@ -162,7 +162,7 @@ class Episodes:
                 )
 
     def validate_numbers(self) -> None:
-        """Do the checks of `validate` except for images."""
+        """Run the checks of `validate`, except those of images."""
         self._validate_metadata()
         if self.state.ndim != 3 or not self.state.size:
             raise ValueError(f"state must have shape [E, T, J + 1], got {self.state.shape}")
@@ -228,17 +228,17 @@ def concatenate(parts: Sequence[Episodes]) -> Episodes:
     """Concatenate episodes of the same task and robot, padding them to the longest.
 
     Raises:
-        ValueError: `parts` is empty, or they differ in metadata or image size.
+        ValueError: `parts` is empty, or its episodes differ in metadata or image size.
     """
     if not parts:
         raise ValueError("there is nothing to concatenate: parts is empty")
     for name in SHARED:
         values = {getattr(part, name) for part in parts}
         if len(values) > 1:
-            raise ValueError(f"cannot concatenate episodes of different {name}: {sorted(values)}")
+            raise ValueError(f"all parts must have the same {name}, got {sorted(values)}")
     shapes = {tuple(sorted((k, v.shape[2:]) for k, v in part.image.items())) for part in parts}
     if len(shapes) > 1:
-        raise ValueError(f"cannot concatenate episodes of different images: {sorted(shapes)}")
+        raise ValueError(f"all parts must have the same image shapes, got {sorted(shapes)}")
     steps = max(part.state.shape[1] for part in parts)
 
     def join(*arrays: Array) -> Array:
@@ -251,7 +251,7 @@ def concatenate(parts: Sequence[Episodes]) -> Episodes:
 
 
 def _dtype_and_shape(array: Any) -> str:
-    """Describe an array or tracer; return the `repr` of other leaves, as from a tree map."""
+    """Describe an array or tracer; return the `repr` of any other leaf of a mapped tree."""
     return f"{array.dtype}{list(array.shape)}" if hasattr(array, "dtype") else repr(array)
 
 

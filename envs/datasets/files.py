@@ -148,7 +148,7 @@ def read_json(path: Path, folder: Path | None = None) -> Any:
 
 @contextlib.contextmanager
 def as_value_error(path: Path, *also: type[Exception], remedy: str = "") -> Iterator[None]:
-    """Convert errors of reading a path to a ValueError that names it; refusals pass unchanged.
+    """Convert errors in reading a path to a ValueError that names it; refusals pass unchanged.
 
     Args:
         path: the file or folder read in the block.
@@ -184,7 +184,7 @@ def check_memory(size: int, what: object) -> None:
 
 
 def as_int(number: Any) -> int:
-    """Convert a table's number to an int; columns with missing values hold integers as floats.
+    """Convert a number from a table to an int; columns with missing values hold integers as floats.
 
     Raises:
         ValueError: it is not an integer, or its magnitude is 2^63 or more.

@@ -4,9 +4,9 @@
     episodes = rlds.read("data/press")
     source = tfds.builder_from_directory("data/press").as_data_source("train")  # with tfds alone
 
-Images are lossless PNG. Metadata that all episodes share are stored once for the
-dataset (`builder.info.metadata`, from metadata.json) and again in every episode, where floats are
-rounded to float32.
+Images are lossless PNG. Metadata that all episodes share are stored once for the dataset
+(`builder.info.metadata`, from metadata.json) and again in every episode, where floats are rounded
+to float32.
 """
 
 import contextlib
@@ -45,7 +45,7 @@ _DESCRIPTIONS = {
     True: "Scripted expert episodes of {task} by {robot} in simulation.",
     False: "Recorded episodes of {task} by {robot}.",
 }
-# Episodes are read one by one, and PNG does not compress further: 7 times as fast (measured).
+# Fits reading episodes one by one, and PNG does not compress further: 7x as fast (measured).
 _RECORDS = "group_size:1,uncompressed"
 
 

@@ -21,7 +21,7 @@ METADATA = "metadata.json"
 """Metadata file in a dataset's folder; tfds reads a file of this name."""
 THREADS = ThreadPoolExecutor(8)
 """Shared by all open datasets: more threads would only wait for the GIL."""
-# Types of metadata fields: in every dataset, and only in those with at least one shard.
+# Types of the metadata fields of every dataset, then of those only in datasets with shards.
 _TYPES: dict[str, Any] = {"options": dict, "parts": list, "steps": int, "attempted": int}
 _SHARD_TYPES: dict[str, Any] = {"task": str, "robot": str, "actions": str, "instructions": list}
 _SHARD_TYPES |= {"cameras": dict, "control_dt": int | float, "physics_dt": int | float}
@@ -98,7 +98,7 @@ class Reader:
             self._shared: dict[str, Any] = {name: self.metadata[name] for name in SHARED}
             self._shared |= {"instructions": tuple(self.metadata["instructions"]), "attempted": 1}
             builder = _builder(self.path, self.metadata["parts"])
-            # The schema decodes images: tfds would decode them one by one.
+            # `rlds_schema.episode` decodes only the selected cameras, after checking image sizes.
             encoded = {name: tfds.decode.SkipDecoding() for name in self.cameras.values()}
             decoders = {"steps": {"observation": encoded}}
             self._source = builder.as_data_source(SPLIT, decoders=decoders)

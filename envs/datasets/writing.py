@@ -1,8 +1,8 @@
 """Atomic writes of files and folders: write under a temporary name, then rename.
 
 Contents are synced to disk before the rename and the rename before the call returns, so a crash or
-a power failure never leaves a partial file under the final name. If anything fails, for
-example on a full disk, the temporary file is deleted and the old file is kept.
+a power failure never leaves a partial file under the final name. If anything fails, for example on
+a full disk, the temporary file is deleted and the old file is kept.
 """
 
 import contextlib

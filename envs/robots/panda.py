@@ -9,7 +9,7 @@ import numpy as np
 from envs import robots
 
 _QUARTER = np.pi / 2
-# Position in the previous link [m] and rotation about its x axis [rad] of each joint frame.
+# Joint frames: position in the previous link [m] and rotation about that link's x axis [rad].
 _FRAMES = (
     ((0.0, 0.0, 0.333), 0.0),
     ((0.0, 0.0, 0.0), -_QUARTER),
@@ -52,7 +52,7 @@ ROBOT = robots.Robot(
     stroke=0.08,  # two fingers of 0.04 m
     gripper_speed=0.1,  # Franka hand data sheet: 50 mm/s per finger
     body=robots.Primitives(
-        # Menagerie. Its passive joint damping (40, then 2) is added to the servo's kv: same effect.
+        # Menagerie's, with its passive joint damping (40, then 2) added to kv: same effect.
         stiffness=np.array([1000.0, 1000.0, 750.0, 750.0, 300.0, 300.0, 300.0]),
         damping=np.array([60.0, 60.0, 44.0, 44.0, 4.0, 4.0, 4.0]),
         armature=0.1,

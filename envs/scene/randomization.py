@@ -199,7 +199,7 @@ def changes(drawn: Draw, model: mujoco.MjModel, objects: np.ndarray) -> Changes:
     size = jnp.where(objects, drawn.size, 1.0)[:, None]
     # A body's position in its parent scales only if the parent does.
     parent_size = jnp.where(objects[model.body_parentid], drawn.size, 1.0)[:, None]
-    # The solver's estimates of 1 / mass and 1 / inertia of a free body.
+    # Factors on the solver's estimates of 1 / mass and 1 / inertia of a free body.
     inverse = 1 / jnp.stack([mass, mass * size[:, 0] ** 2], axis=1)
     return {
         "geom_size": geom_sizes(drawn, model, objects),

@@ -119,7 +119,7 @@ def _add_keys(parser: argparse.ArgumentParser) -> None:
     text = f"unit of the gripper opening {default}"
     add("--gripper", choices=("metres", "millimetres"), default=Keys.gripper, help=text)
     add("--every", type=int, default=1, help=f"keep every N-th frame {default}")
-    text = f"downscale larger images to this length of the longer side [px]; 0: never {default}"
+    text = f"downscale images whose longer side exceeds this length [px]; 0: never {default}"
     add("--image-size", type=int, default=224, help=text)
 
 

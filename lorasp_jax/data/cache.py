@@ -66,12 +66,12 @@ def write(
         sources: datasets with the same robot and image size; not modified.
         path: folder to create.
         progress: called with the steps done and the total.
-        waiting: called once if another process is writing this folder, before waiting for it; its
-            cache is kept if it was written from these datasets. None: raise instead.
+        waiting: called once if another process is writing this folder, before waiting for it; the
+            cache that it writes is accepted if it matches these datasets. None: raise instead.
 
     Raises:
-        ValueError: the path already exists or another process is writing it; or an episode is
-            damaged, or incompatible with the others.
+        ValueError: the path already exists; another process is writing it, or wrote a cache that
+            does not match; or an episode is damaged, or incompatible with the others.
         OSError: the disk is full.
     """
     path, total = Path(path), sum(source.num_steps for source in sources)
@@ -156,7 +156,7 @@ class Writer:
         """Append one episode, given as `Episodes` with E = 1.
 
         Raises:
-            ValueError: its arrays are inconsistent, or differ from those of earlier episodes.
+            ValueError: its arrays are inconsistent, or its metadata differ from earlier episodes.
         """
         episode.validate()
         self._metadata = self._metadata or _metadata(episode)
@@ -221,7 +221,7 @@ class Cache:
         """Open a cache.
 
         Raises:
-            ValueError: it is missing, damaged or of another format.
+            ValueError: it is missing, damaged or in another format.
         """
         self.path: Path = Path(path)
         header = self.path / HEADER

@@ -40,7 +40,7 @@ class Column:
 def map_column(
     path: Path, dtype: Any, shape: tuple[int | None, ...], crc32: int | None = None
 ) -> np.ndarray:
-    """Memory-map an array; its data is read only to verify a checksum.
+    """Memory-map an array, reading its data only to verify a checksum.
 
     Args:
         path: the .npy file.

@@ -69,7 +69,7 @@ def summarize(source: Source) -> Summary:
 
 
 def _names(episode: Episodes) -> dict[str, list[str]]:
-    """Return the names of dimensions in this project's own formats."""
+    """Return the dimension names of an episode in one of this project's own formats."""
     joints = [f"joint_{i + 1}" for i in range(episode.state.shape[2] - 1)]
     action = _END_EFFECTOR if episode.actions == "end_effector" else joints
     return {"state": [*joints, "gripper"], "action": [*action, "gripper"]}
@@ -102,7 +102,7 @@ def report(source: Source, console: Console) -> None:
 
 
 def hints(summary: Summary) -> list[str]:
-    """Return hints about probable unit errors; simulated episodes have no such errors."""
+    """Return hints about probable unit errors, which only real recordings have."""
     joints, gripper = np.abs(summary.state[:, :-1]).max(), np.abs(summary.state[:, -1]).max()
     texts = []
     if joints > 2 * math.pi:
@@ -186,7 +186,7 @@ def _row(source: Source, number: int) -> np.ndarray:
     caption = Image.new("RGB", (images.shape[1], LINE))
     phrase = episode.instructions[int(episode.instruction[0])]
     text = f"{number}: {phrase} ({episode.num_steps} steps)"
-    printable = text.encode("latin-1", "replace").decode("latin-1")  # the font's characters
+    printable = text.encode("latin-1", "replace").decode("latin-1")  # all the font has
     ImageDraw.Draw(caption).text((2, 1), printable, fill="white")
     return np.concatenate([np.asarray(caption), images])
 

@@ -146,7 +146,7 @@ class LeRobot:
         features = ", ".join(available.values()) or "none"
         if unknown := sorted(set(selected.values()) - set(available.values())):
             raise ValueError(
-                f"{self.path} has no camera {', '.join(unknown)}; its cameras are {features}"
+                f"{self.path} has no camera {', '.join(unknown)} (available: {features})"
             )
         if not selected:
             raise ValueError(f"{self.path} has no cameras: at least one is needed")

@@ -136,7 +136,7 @@ def _read_3(
     """Read tasks and episodes of version 3.0."""
     path = folder / "meta" / "tasks.parquet"
     with as_value_error(path):
-        # The tasks are the index of a pandas table, which may have lost its name "task".
+        # The tasks are the index of a pandas table; the index may have lost its name "task".
         rows = [
             {"task": row.pop("__index_level_0__", None), **row}
             for row in read_table(path, folder).to_pylist()

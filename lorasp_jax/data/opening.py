@@ -22,8 +22,8 @@ def open_source(where: str | os.PathLike[str], keys: Keys | None = None) -> Sour
         keys: feature mapping of a LeRobot dataset; the other formats need none.
 
     Raises:
-        ValueError: the dataset is missing, damaged or of unknown format; or `keys` select features
-            of a dataset in another format.
+        ValueError: the dataset is missing, damaged or in an unknown format; or `keys` select
+            features of a dataset in another format.
     """
     path = hub.local(where, repository="dataset")
     if is_lerobot(path):

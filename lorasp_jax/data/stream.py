@@ -51,8 +51,8 @@ class Stream:
         index, count = process
         if batch_size < 1 or chunk < 1 or start < 0 or batch_size % count:
             raise ValueError(
-                f"batch_size must be a multiple of the {count} processes, chunk at least 1 and "
-                f"start at least 0; got {batch_size}, {chunk} and {start}"
+                f"batch_size must be a positive multiple of {count}, the number of processes, "
+                f"chunk at least 1 and start at least 0; got {batch_size}, {chunk} and {start}"
             )
         self.position: int = start
 

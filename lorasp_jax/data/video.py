@@ -44,7 +44,7 @@ class VideoReader:
             raise ValueError(f"{path} cannot be read as a video ({first_line(error)})") from error
         self._stream.thread_type = "AUTO"
         self._frames: Iterator[Any] = self._container.decode(self._stream)
-        # Shared by all frames, without threads: creating one takes as long as a conversion.
+        # Shared by all frames, since creating a reformatter takes as long as a conversion.
         self._reformatter = VideoReformatter()
         self._end = 0.0  # s, where the last read ended
 
@@ -64,7 +64,7 @@ class VideoReader:
             uint8 `[ceil(length / every), H, W, 3]`.
 
         Raises:
-            ValueError: the video is too short, damaged, or of another frame rate.
+            ValueError: the video is too short or damaged, or has another frame rate.
         """
         tolerance, images = _TOLERANCE / fps, np.empty(0)
         if not abs(start - self._end) <= tolerance:  # also true after a failed read: _end is NaN

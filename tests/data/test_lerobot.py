@@ -278,7 +278,7 @@ def test_changed_metadata_are_harmless_or_refused(version, tmp_path):
     ],
 )
 def test_wrong_keys_list_the_available_ones(keys):
-    with pytest.raises(ValueError, match=r"its cameras are|lacks|no joint_9 .* joint_6, gripper"):
+    with pytest.raises(ValueError, match=r"available: |lacks|no joint_9 .* joint_6, gripper"):
         LeRobot(golden("v3"), Keys(**keys))
     with pytest.raises(ValueError, match="every must be at least 1"):
         Keys(every=0)

@@ -210,7 +210,7 @@ def test_concatenate_pads_to_the_longest():
     [{"robot": "panda"}, {"control_dt": 0.2}, {"task": "pour"}, {"actions": "delta_joint"}],
 )
 def test_concatenate_refuses_mixed_metadata(changes):
-    with pytest.raises(ValueError, match=f"episodes of different {next(iter(changes))}:"):
+    with pytest.raises(ValueError, match=f"parts must have the same {next(iter(changes))}, got"):
         concatenate([make(), make(**changes)])
     with pytest.raises(ValueError, match="empty"):
         concatenate([])
