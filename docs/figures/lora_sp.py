@@ -71,7 +71,7 @@ def draw(data: dict[str, np.ndarray], colors: dict[str, str], path: Path) -> Non
             draw_energies(axes, data, colors, token)
         draw_rank_map(figure, data)
         titles = {
-            0.25: r"one adapted layer:  $\Delta W(x) = U\,\Sigma(x)\,V$",
+            0.25: r"one adapted layer:  $y = xW + xV\,\Sigma(x)\,U$",
             0.632: "two patches: sorted energy $s_i^2$",
             0.857: "active rank of each patch",
         }

@@ -47,7 +47,7 @@ class AdaLoRA(Method):
     target_rank: int | None = None
     """Mean final rank per layer. Defaults to R / 2, rounded up; see `match_budget`."""
     alpha: float | None = None
-    """α of the scale α/R, where R is the initial rank throughout, as in PEFT. Defaults to 2 R."""
+    """α of the scale α/R, where R is the initial rank throughout, as in PEFT. None: 2 R."""
     warmup: float = 0.1
     """Fraction of the training steps before pruning starts."""
     final: float = 0.3

@@ -32,7 +32,7 @@ class LoRA(Method):
     """R. It must be at most min(I, O) for "pissa" and "olora", and at most I for "eva". The LoRA-SP
     paper's main baseline has rank 128."""
     alpha: float | None = None
-    """α. Defaults to 2 R, so α/R is 2, as in LoRA-SP."""
+    """α. None: 2 R, so α/R is 2, as in LoRA-SP."""
     rank_stabilized: bool = False
     """Scale by α/√R (rsLoRA) instead of α/R."""
     initialization: Literal["kaiming", "gaussian", "pissa", "olora", "eva"] = "kaiming"

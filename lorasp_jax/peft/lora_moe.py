@@ -37,7 +37,7 @@ class LoRAMoE(Method):
     rank: int = 32
     """Rank R of each expert."""
     alpha: float | None = None
-    """α of the scale α/R. Defaults to 2 R."""
+    """α of the scale α/R. None: 2 R."""
     routing: Literal["weighted", "top1"] = "weighted"
     """"weighted": all experts, weighted by probability. "top1": each token's most likely expert."""
     gate_gradient: Literal["hard", "switch"] = "hard"

@@ -44,7 +44,7 @@ class LoRASPRelease(BankMethod):
     energy_target: float = 0.9
     """η."""
     alpha: float | None = None
-    """α of the scale α/R. Defaults to 2 R."""
+    """α of the scale α/R. None: 2 R."""
     hidden_width: int | None = None
     """None: the scores are x W1, the default of the public code. H: they are softmax(x W1) W2 with
     width H and W2 initially 0/1, as with that code's option `router_projection` (H = 4)."""

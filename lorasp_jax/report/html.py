@@ -265,6 +265,7 @@ def _media(folder: Path, tasks: Collection[str]) -> Iterable[str]:
             "</figure>"
             "<figure><video width=400 controls autoplay loop muted "
             f'src="data:video/mp4;base64,{video_data}"></video>'
-            "<figcaption class=muted>one closed-loop episode of the adapted policy</figcaption>"
+            "<figcaption class=muted>a closed-loop episode of the adapted policy, a success if any "
+            "was recorded</figcaption>"
             "</figure>"
         )

@@ -130,7 +130,9 @@ def _option_parser(program: str = "", method: str = "") -> argparse.ArgumentPars
         help="resume the run of this name; with auto, start it if it does not exist",
     )
     parser.add_argument(
-        "--dry-run", action="store_true", help="compile, print sizes and memory, then exit"
+        "--dry-run",
+        action="store_true",
+        help="compile (minutes on a CPU), print sizes and memory, then exit",
     )
     parser.add_argument(
         "--wandb", metavar="PROJECT", help="also log to Weights & Biases; needs pip install wandb"

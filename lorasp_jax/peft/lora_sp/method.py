@@ -53,7 +53,7 @@ class LoRASP(BankMethod):
     energy_target: float = 0.9
     """η, interpreted as an exact decimal fraction."""
     alpha: float | None = None
-    """α of the scale α/R. Defaults to 2 R."""
+    """α of the scale α/R. None: 2 R."""
     hidden_width: int = 32
     """H, width of the router's hidden layer."""
     router: Router = "gelu"
