@@ -5,8 +5,8 @@ The gate keeps the smallest k with E_k >= η; ties go to the lowest index. Imple
 
 - "pairwise": for each direction, sum the energy of all directions that rank before it. O(R²),
   vectorized over rows and R; fastest on CPU up to R = 32.
-- "sort": sort the scores, accumulate energy, threshold. The reference; rarely, rounding of its
-  cumulative sum changes whether η is reached.
+- "sort": sort the scores, accumulate energy, threshold. The reference; in rare cases, rounding
+  of its cumulative sum changes whether η is reached.
 - "bisection": binary search for the threshold, bit by bit, without a sort.
 - "block": bisection that stops early, for the few rows of a kernel's block.
 - "pallas": "block" as a Triton kernel, one row per warp, scores in registers.

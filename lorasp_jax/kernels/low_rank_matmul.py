@@ -1,19 +1,19 @@
 """x W + f(x P) U with frozen W, for one or more layers with the same input x.
 
 P [I, Q] projects down, U [R, O] projects up, and f acts on the projected rows. `low_rank_matmul`
-computes this formula with fewer passes over wide arrays, because at these sizes one pass costs as
-much as the adapter itself:
+computes this formula with fewer passes over wide arrays, because at typical sizes one pass costs
+as much as the adapter itself:
 
 - no gradient is computed for W;
 - the P of all layers are concatenated into one matmul with x; the backward pass takes one more
   matmul for their gradients and one for the gradient of x through them;
 - if O >= I, x W + z U is one matmul, [x, z] [W; U];
-- if O > 2 I, so are g Wᵀ and g Uᵀ for the gradient g of the output: g [W; U]ᵀ;
+- if O > 2 I, g Wᵀ and g Uᵀ, with g the gradient of the output, are one matmul, g [W; U]ᵀ;
 - if the outputs of all layers together are at most as wide as x, its gradient is one matmul,
   [g, q] [W, P]ᵀ, with q the gradient of x P.
 
-The last three apply only to at least I tokens, since for fewer the copy of W dominates, and not on
-a CPU, where they save no time and triple the compile time. W is cast to the dtype of x within each
+The last three apply only to I or more tokens, since for fewer the copy of W dominates, and not on a
+CPU, where they save no time and triple the compile time. W is cast to the dtype of x within each
 pass and stored in its own dtype, so quantized weights are only briefly dequantized.
 """
 

@@ -29,7 +29,7 @@ def resize_with_pad(
         images: values in [-1, 1]; images of the right size are returned unchanged.
         size: height and width [pixels].
         centred: center the image, as in openpi (shared/image_tools.py) and LeRobot's pi0; False:
-            align it right and bottom, as in LeRobot's SmolVLA.
+            align it to the bottom right, as in LeRobot's SmolVLA.
         antialias: smooth before downsampling, as in openpi; False: as in PyTorch and LeRobot.
     """
     batch, height, width, channels = images.shape

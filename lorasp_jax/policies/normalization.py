@@ -1,13 +1,14 @@
 """Normalize robot states and actions to order one, and unnormalize them.
 
 Every mode is an affine map: y = (x - shift) / divisor + offset and x = (y - offset) factor + shift.
-Divisor and factor are both the spread, guarded against division by zero in constant dimensions.
-Each project has its own guard:
 
     mean_std             shift mean, spread std, offset 0
-    min_max, quantiles   shift low, spread (high - low) / 2, offset -1: [low, high] becomes [-1, 1];
+    min_max, quantiles   shift low, spread high - low, offset -1: [low, high] becomes [-1, 1];
                          quantiles: 1st and 99th percentile, quantile10: 10th and 90th
     identity             y = x
+
+Divisor and factor are both the spread, halved for ranges. Before that, each project guards it
+against zero in constant dimensions:
 
     ours      at least MIN_SPREAD, in both directions
     openpi    adds 1e-6, in both directions (transforms.py, Normalize and Unnormalize, at 15a9616a)

@@ -61,7 +61,7 @@ class TokenizersFile:
     def __init__(self, file: Path) -> None:
         try:
             self._model = tokenizers.Tokenizer.from_file(str(file))
-        except Exception as error:  # the library raises Exception itself
+        except Exception as error:  # tokenizers raises bare Exception
             raise ValueError(f"{file} is not a Hugging Face tokenizer file.") from error
         self._model.no_truncation()
         self._model.no_padding()

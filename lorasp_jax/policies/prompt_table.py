@@ -134,7 +134,7 @@ def _check_merges(
 ) -> None:
     """Raise ValueError unless the assembled ids equal the tokenizer's for every pair of numbers."""
     rows = np.arange(prompts.STATE_BINS + 1)
-    # One prompt per number, which comes first and last and alternates with all numbers.
+    # One prompt per number n, which alternates it with all numbers: n, n+1, n, n+2, ..., n, n.
     others = (rows[:, None] + 1 + rows) % len(rows)
     pairs = np.stack([rows[:, None] + 0 * others, others], -1)
     state = _bin_centers(pairs.reshape(len(rows), -1) - 1)
@@ -171,9 +171,8 @@ def _encode_complete(
     tokenizer: Tokenizer, texts: Sequence[str], min_tokens: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return ids and mask of complete prompts without truncation, at least `min_tokens` wide."""
-    upper_bound = (
-        max(len(text.encode()) for text in texts) + 8
-    )  # at most a token per byte, BOS and EOS
+    # At most one token per byte, plus special tokens such as BOS and EOS.
+    upper_bound = max(len(text.encode()) for text in texts) + 8
     return tokenizer.encode(texts, max(upper_bound, min_tokens), complete=True)
 
 

@@ -135,7 +135,9 @@ def validate(both: Mapping[str, Mapping[str, np.ndarray]], source: str) -> Stati
     unknown = sorted({name for stats in both.values() for name in stats} - set(NAMES))
     inconsistent = any(array.ndim != 1 or array.shape != arrays[0].shape for array in arrays)
     if unknown or inconsistent or not all(both.values()):
-        problem = f"has {unknown[0]!r}" if unknown else "lacks a list or has unequal ones"
+        problem = (
+            f"has {unknown[0]!r}" if unknown else "lacks a list or has lists of unequal length"
+        )
         raise ValueError(
             f"Statistics must be lists of equal length for state and for action, named "
             f"{', '.join(NAMES)}; {source} {problem}."

@@ -48,8 +48,8 @@ def read(where: str | os.PathLike[str], *, dataset: str = "") -> Statistics:
     """Read a robot's statistics, in the order of its joints; `Statistics.to_slots` reorders them.
 
     Args:
-        where: a file or a folder that contains one of the files above, tried in that order; or a
-            Hub repository or bucket URL, see `hub.local`.
+        where: one of the files above, or a folder to search for them in that order; or a Hub
+            repository or bucket URL, see `hub.local`.
         dataset: the dataset, if a checkpoint has several: the folder under openpi's assets/, or the
             name in LeRobot's tensors.
 
@@ -67,7 +67,9 @@ def read(where: str | os.PathLike[str], *, dataset: str = "") -> Statistics:
                 why = f"{type(error).__name__}: {str(error)[:200]}"
                 raise ValueError(f"Cannot read the statistics of {where} ({why}).") from error
             return validate(_select(groups, dataset, str(where)), str(where))
-    raise ValueError(f"{where} contains no statistics: none of {', '.join(_READERS)}.")
+    raise ValueError(
+        f"Cannot find statistics in {where}: it must be or contain one of {', '.join(_READERS)}."
+    )
 
 
 def _select(groups: Mapping[str, Stats], dataset: str, where: str) -> Stats:

@@ -154,7 +154,7 @@ def test_older_lerobot_policy(tmp_path, dataset):
 
 def test_invalid_files_raise_one_sentence(tmp_path):
     with pytest.raises(
-        ValueError, match=r"contains no statistics: none of statistics\.json, norm_"
+        ValueError, match=r"Cannot find statistics .* contain one of statistics\.json, norm_"
     ):
         statistics_files.read(tmp_path)
     path = tmp_path / "norm_stats.json"
