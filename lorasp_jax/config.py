@@ -23,7 +23,7 @@ def _check_name(name: str) -> None:
     valid = name not in ("", ".", "..") and "/" not in name and name.isprintable()
     if not valid or len(name.encode()) > MAX_NAME_BYTES:
         raise ValueError(
-            "name must be a printable folder name without '/' and with at most "
+            "name must be a printable folder name without '/' of at most "
             f"{MAX_NAME_BYTES} bytes, got {name!r}"
         )
 

@@ -123,7 +123,7 @@ class Checkpoints:
         if base_hash != self._base_hash:
             raise ValueError(
                 f"the checkpoint at step {step} was trained on a different base (hash "
-                f"{base_hash[:12]}, this base has {self._base_hash[:12]})"
+                f"{base_hash[:12]}, but this base has {self._base_hash[:12]})"
             )
         return checkpoint["state"]
 

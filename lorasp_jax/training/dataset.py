@@ -41,7 +41,7 @@ def open_dataset(config: Config, model: BackboneConfig, folder: Path) -> Source:
         )
     if len(source.cameras) > len(model.cameras):
         raise ValueError(
-            f"{path} has cameras {', '.join(source.cameras)}, but the backbone takes at most "
+            f"{path} has cameras {', '.join(source.cameras)}, but the backbone accepts at most "
             f"{len(model.cameras)}: select cameras with python -m lorasp_jax.data convert --cameras"
         )
     _check_state_and_actions(source.episode(0, ()), model, path)

@@ -225,7 +225,7 @@ def _check_sizes(config: Config, chunk: int) -> None:
     if optim.batch_size % (devices * optim.accumulate):
         micro = f" times {optim.accumulate} micro-batches" if optim.accumulate > 1 else ""
         raise ValueError(
-            f"batch_size must be a multiple of the {devices} devices{micro}, got {optim.batch_size}"
+            f"batch_size must be a multiple of {devices} devices{micro}, got {optim.batch_size}"
         )
     if jax.process_count() > 1 and config.data.fresh_every:
         raise ValueError("data.fresh_every cannot be combined with --distributed: drop one")

@@ -57,7 +57,7 @@ def test_a_dataset_becomes_a_cache_once(tmp_path):
             {},
             r"has a control period of 0\.1 s, but this run has --control-dt 0\.05",
         ),
-        ({}, {"cameras": ("side",)}, "has cameras side, wrist, but the backbone takes at most 1"),
+        ({}, {"cameras": ("side",)}, "has cameras side, wrist, but the backbone accepts at most 1"),
     ],
 )
 def test_incompatible_datasets_are_refused_early(changes, model, sentence, tmp_path):
