@@ -8,14 +8,14 @@ The paper does not say how it counts. These rules reproduce its percentages to t
   do not contain, and 450,046,176 for SmolVLA. "Trainable/Total" is
   adapters / (total + adapters).
 - LoRA-MoE has 4 experts of rank 32. AdaLoRA starts at rank 128 and has a diagonal that LoRA lacks.
-- LoRA-SP is `LoRASP.paper()`, with a router of width 4, and omits the five linear layers outside
-  the towers. 4 is the only constant width that fits both backbones; with those five layers 17.1
-  would be 17.2. The released code, with a router as wide as the bank, gives 12.0 and 23.0 instead
+- LoRA-SP is `LoRASP.paper()`, with a router of width 4, the only constant width that fits both
+  backbones. It omits the five linear layers outside the towers; with them, SmolVLA would have 17.2
+  instead of 17.1. The released code, with a router as wide as the bank, gives 12.0 and 23.0 instead
   of 9.2 and 17.1.
 
-Both columns are complete. The tables also report active ranks and success rates, which are
-measured, not counted; the success of LoRA-SP on pi0 differs between the tables (80 and 60 % for
-opening the pot).
+These rules cover every row of both columns. The tables also report active ranks and success rates,
+which are measured, not counted; the success of LoRA-SP on pi0 differs between the tables (80 and
+60 % for opening the pot).
 """
 
 import math

@@ -7,9 +7,9 @@ For each shape [I, O]: the frozen layer alone ("bare"), LoRA as usually written 
 autodiff of x W + scale (x A) B), and this project's methods at rank R, with their losses. Gradients
 are with respect to the input and the adapter, as in training. Ratios are relative to the usual LoRA
 in the same run. Memory is that of the compiled program without its arguments. Two more tables
-compare layers that share an input, "I:O,O,O", called one by one and grouped, and the energy gate
+compare separate and grouped calls of layers that share an input ("I:O,O,O"), and the energy gate
 with a copy of its scores. Inputs are created under jit, everything is warmed up twice, and ten
-calls are queued at once.
+calls are queued at once (for the gate, one call with 20 gates).
 """
 
 import argparse

@@ -48,7 +48,7 @@ def _print(line: str) -> None:
 
 
 class Calls:
-    """Record of an object's calls, to announce those that compile: the first of each kind."""
+    """Announce those calls of an object that compile: the first of each kind."""
 
     def __init__(self, name: str) -> None:
         """Set the name that messages give the object."""
@@ -56,7 +56,7 @@ class Calls:
         self._called: set[tuple[Any, ...]] = set()
 
     def first(self, *call: Any) -> AbstractContextManager[None]:
-        """Announce a call if it compiles, given its name and all that triggers recompilation."""
+        """Announce a call if it compiles; `call` is its name and all that causes recompilation."""
         if call in self._called or not _compat.is_untraced():
             return contextlib.nullcontext()
         self._called.add(call)

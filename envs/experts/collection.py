@@ -25,7 +25,7 @@ _NUM_ENVS = {"cpu": 32, "gpu": 256, "tpu": 256}
 # Give up if fewer than this share of attempts succeed, after this many attempts. Our choice: the
 # experts solve nearly all layouts, so less means that something is broken.
 _MIN_SUCCESS, _MIN_ATTEMPTS = 0.5, 16
-_MAX_EPISODES = 10**9  # our choice, a bound against typos
+_MAX_EPISODES = 10**9  # our choice; catches typos
 
 Record = Callable[
     [Env, jax.Array, float | jax.Array, Randomization | None], tuple[dict[str, Any], jax.Array]

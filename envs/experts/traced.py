@@ -39,10 +39,10 @@ _CHECKSUM = hashlib.sha256().digest_size  # bytes at the start of a file
 def cached(
     function: Callable[..., Any], sources: Callable[[], str] | None = None
 ) -> Callable[..., Any]:
-    """Wrap as `jax.jit(function, static_argnums=0)`, tracing once for all processes on a machine.
+    """Apply `jax.jit(..., static_argnums=0)`, tracing once for all processes on a machine.
 
     Programs are cached only if JAX's compilation cache is enabled, for tasks of this package, and
-    without Warp, whose programs contain memory addresses. Thread-safe; not for vmap.
+    without Warp, whose programs contain memory addresses. Thread-safe; cannot be vmapped.
 
     Args:
         function: a function in this package that takes an `Env` and pytrees of arrays, and returns

@@ -180,7 +180,7 @@ class SingleEnv(gymnasium.Env):
             ValueError: the observation or the render mode is unknown.
         """
         if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"unknown render_mode {render_mode!r}: choose from rgb_array")
+            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
         checks.instance("env", env, Env, "an environment from envs.make")
         self.render_mode = render_mode
         self.metadata = self.metadata | {"render_fps": round(1 / env.control_dt)}

@@ -24,8 +24,8 @@ from envs.mjcf import attaching, hands, posing, reading
 from envs.robots import Robot
 from envs.scene import scene
 
-# Our choices [rad/s, m/s]: between Panda (2.175 to 2.61) and PiPER (3); the speed of both grippers.
-_SPEED, _GRIPPER_SPEED = 2.5, 0.1
+_SPEED = 2.5  # rad/s; our choice, between Panda (2.175 to 2.61) and PiPER (3)
+_GRIPPER_SPEED = 0.1  # m/s; our choice, the same as for the built-in robots
 
 
 def load(

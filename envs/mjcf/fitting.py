@@ -13,11 +13,10 @@ import numpy as np
 _POINTS = 500  # samples of a surface
 _CUTS = np.arange(1, 6) / 6  # candidate cuts, as fractions of a part's extent
 _MAX_VOLUME_RATIO = 0.85  # cut only if the total volume shrinks below this share
-_MIN_EXTENT = (
-    0.06  # m, extent above which a part may be cut; a pixel of a 64 px side camera is 6 mm wide
-)
-_MAX_DEPTH = 3  # most successive cuts
-_MIN_POINTS = 10  # fewest points in a part
+# Shortest extent along which a part may be cut [m]; a pixel of a 64 px side camera is 6 mm wide.
+_MIN_EXTENT = 0.06
+_MAX_DEPTH = 3  # maximum number of successive cuts
+_MIN_POINTS = 10  # minimum number of points in a part
 _OUTLIERS = 0.01  # share of the points on each side that a shape may leave out
 _MIN_HALF_EXTENT = 0.0005  # m, smallest half-extent
 _BOX, _CYLINDER, _CAPSULE = (

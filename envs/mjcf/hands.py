@@ -128,7 +128,7 @@ def _site(model: mujoco.MjModel, tcp: str | None) -> str | None:
     if tcp is None:
         return "tcp" if "tcp" in names else None
     if tcp not in names:
-        raise ValueError(f"unknown site {tcp}; the sites are {', '.join(names) or 'none'}")
+        raise ValueError(f"unknown site {tcp}; sites in the file: {', '.join(names) or 'none'}")
     return tcp
 
 

@@ -19,7 +19,7 @@ from envs.tasks import tool_down
 
 _HOME = (0.34, 0.0, 0.18)  # m, start position of every robot's tcp
 _LEANS = np.deg2rad(np.arange(0, 50, 5)).astype(np.float32)
-# Corners of the space in which tasks place and carry objects, and of that in which they pour [m].
+# Corners of the boxes in which tasks place and carry objects, and in which they pour [m].
 _TABLE = np.array([(x, y, z) for x in (0.28, 0.43) for y in (-0.18, 0.19) for z in (0.02, 0.15)])
 _POUR = np.array([(x, y, 0.2) for x in (0.34, 0.40) for y in (0.09, 0.15)])
 _TILTS = np.deg2rad([25, 94])  # of the task "pour": carrying the cup, pouring
@@ -80,7 +80,7 @@ def _try_leans(robot: Robot, leans: np.ndarray, turns: np.ndarray) -> tuple[np.n
     solutions, errors = _solve(robot, _HOME, lean, turn, starts, robot.home)
     good = errors <= np.maximum(errors.min(axis=1, keepdims=True), _TOLERANCE)
     first = solutions[np.arange(len(leans)), good.argmax(axis=1)]
-    # Pull redundant joints to the first guess, except the last joint, which depends on `turns`.
+    # Pull redundant joints toward the first guess, except the last joint, which depends on `turns`.
     rest = np.tile(starts[0], (len(leans), 1))
     rest[:, -1] = first[:, -1]
     homes, errors = _solve(robot, _HOME, leans, turns, first, rest)

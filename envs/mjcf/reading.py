@@ -93,7 +93,7 @@ def find_arm(model: mujoco.MjModel) -> Arm:
         names = _names(model, others)
         raise ValueError(f"every joint must belong to the arm or a finger, got {names}")
     if unlimited := [joint for joint in (*joints, *fingers) if not model.jnt_limited[joint]]:
-        raise ValueError(f"every joint needs a range; {_names(model, unlimited)} have none")
+        raise ValueError(f"every joint needs a range; it is missing for {_names(model, unlimited)}")
     servos, gears = zip(*(_servo(model, joint) for joint in joints), strict=True)
     return Arm(base, joints, fingers, list(servos), list(gears))
 
@@ -194,7 +194,7 @@ def _names(model: mujoco.MjModel, joints: Iterable[int]) -> str:
 
 def _joints(model: mujoco.MjModel) -> str:
     names = (f"{_names(model, [i])} ({_KINDS[model.jnt_type[i]]})" for i in range(model.njnt))
-    return f"the joints are {', '.join(names) or 'none'}"
+    return f"joints in the file: {', '.join(names) or 'none'}"
 
 
 def _actuators(model: mujoco.MjModel) -> str:
@@ -205,4 +205,4 @@ def _actuators(model: mujoco.MjModel) -> str:
         names.append(
             f"{model.actuator(i).name or i} ({kind}, on {' and '.join(moved) or 'no joint'})"
         )
-    return f"the actuators are {', '.join(names) or 'none'}"
+    return f"actuators in the file: {', '.join(names) or 'none'}"

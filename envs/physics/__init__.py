@@ -1,1 +1,1 @@
-"""Simulate with MuJoCo MJX; only this folder depends on its JAX and Warp implementations."""
+"""Simulate with MuJoCo MJX; only this folder and `rendering.warp` import MJX or Warp."""

@@ -1,6 +1,6 @@
 """Forward kinematics of a MuJoCo model, which compiles in a sixth of the time of MJX's own.
 
-MJX walks down the body tree and unrolls every level, which was half of the compiled code of a step.
+MJX walks down the body tree and unrolls every level, which made up half of a step's compiled code.
 Here all frames, one per body and one per joint, are handled at once by pointer jumping: each starts
 with its pose in its parent, which becomes its pose in the frame two levels up, then four, then
 eight. After log2(depth) rounds of the same few operations it is the pose in the world.

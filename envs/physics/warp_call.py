@@ -18,12 +18,12 @@ def from_jax(function: Callable[..., None], like: Mapping[str, Any], **options: 
     """Make a function of Warp arrays callable under jit.
 
     On a GPU its first call is captured as a CUDA graph, so memory that outlives a call must be
-    allocated before; Warp copies arguments and results to and from the graph's buffers.
+    allocated beforehand; Warp copies arguments and results to and from the graph's buffers.
 
     Args:
         function: takes arrays as positional arguments, the outputs last.
         like: an example Warp array for each argument, by name, which sets its type.
-        options: passed to `warp.jax_callable`.
+        **options: passed to `warp.jax_callable`.
     """
     kinds = {name: wp.array(dtype=x.dtype, ndim=x.ndim) for name, x in like.items()}
     # Warp reads names and types of the arrays from the signature.

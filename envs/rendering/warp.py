@@ -120,7 +120,7 @@ class WarpRenderer:
         return (jnp.clip(rgb * bright, 0, 255) + 0.5).astype(jnp.uint8)
 
     def _material_colors(self, appearance: Appearance) -> jax.Array:
-        """Return material colors [worlds, materials, 4], with the table geom's for its material."""
+        """Return colors [worlds, materials, 4]; the table's material takes its geom's color."""
         colors = jnp.broadcast_to(
             jnp.asarray(self._mujoco.mat_rgba, jnp.float32),
             (self._num_worlds, self._mujoco.nmat, 4),

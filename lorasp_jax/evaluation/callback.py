@@ -121,7 +121,7 @@ class Evaluation(Callback):
         key = RandomStream.EVALUATION.key(run.config.seed, number)
         with contextlib.ExitStack() as compiles:
             if task not in self._rollouts:
-                what = f"the evaluation of {task} and running its first episodes"
+                what = f"the evaluation of {task} (including its first episodes)"
                 compiles.enter_context(messages.announce(what))
 
             def report(done: int, _: int) -> None:

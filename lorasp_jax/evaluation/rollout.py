@@ -198,7 +198,7 @@ def _result(runs: Sequence[Rollout]) -> Result:
         ci95=metrics.wilson_interval(successes, episodes),
         steps=float(np.mean([run.steps for run in runs])),
         active_rank=jax.tree.map(lambda *r: np.mean(r, axis=0).tolist(), *ranks),
-        # int64: the tokens of all policy calls overflow 32 bits.
+        # int64: token counts over all policy calls can overflow 32 bits.
         active_rank_histogram=jax.tree.map(
             lambda *counts: np.sum(counts, axis=(0, 1), dtype=np.int64), *histograms
         ),

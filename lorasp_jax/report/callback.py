@@ -54,7 +54,7 @@ class Report(Callback):
         self._thread.shutdown()
 
     def _submit(self, folder: Path) -> Future:
-        """Wait for the previous report, re-raising any error of it, and start a new one."""
+        """Wait for the previous report, raise its error if it failed, and start a new one."""
         if self._latest:
             self._latest.result()
         self._latest = self._thread.submit(write_report, folder)

@@ -30,7 +30,7 @@ IGNORED_PATTERNS = (
     "*.msgpack",
     "*.h5",
 )
-"""Files not to download: optimizer states, and the weights in formats of other libraries."""
+"""Files not to download: optimizer states, and weights in the formats of other libraries."""
 
 
 def local(

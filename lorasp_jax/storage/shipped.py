@@ -19,7 +19,7 @@ def is_under(path: Path, folder: str) -> bool:
 def missing_base_message(name: str) -> str:
     """Return the error message for a missing base in assets/, with the bases that exist."""
     bases = ", ".join(sorted(file.parent.name for file in ROOT.glob(f"{BASES}/*/config.json")))
-    message = f"{name} does not exist; the bases in {ROOT / BASES} are {bases or 'none'}"
+    message = f"{name} does not exist; bases in {ROOT / BASES}: {bases or 'none'}"
     if ROOT != PACKAGE:
         return message
     return (

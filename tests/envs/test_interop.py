@@ -302,5 +302,5 @@ def test_gymnasiums_own_checker_passes():
     assert env.step(commands(world)[0])[2:4] == (False, True)
     with pytest.raises(ResetNeeded, match="the episode has ended: call reset"):
         env.step(commands(world)[0])
-    with pytest.raises(ValueError, match="unknown render_mode 'human': choose from rgb_array"):
+    with pytest.raises(ValueError, match="render_mode must be None or 'rgb_array', got 'human'"):
         SingleEnv(world.env, render_mode="human")

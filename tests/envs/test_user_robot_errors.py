@@ -18,14 +18,14 @@ _HINGE = '<joint axis="0 0 1" range="0 1"/>'
 _KEY = '<key name="home" qpos="1 1 1 1 0 0 0 0 .5 1.5 0 1 0 -.02 .02"/>'
 _MISSING = (
     (
-        "the fingers need two slide joints; the joints are joint 0 (free), yaw (hinge)",
+        "the fingers need two slide joints; joints in the file: joint 0 (free), yaw (hinge)",
         [('<joint name="b" type="slide" axis="0 -1 0"', '<joint name="b" axis="0 -1 0"')],
     ),
     (
         "both fingers must be on the same body; they are on flange and wrist",
         [('<body name="b"', '</body><body name="b"'), ("      </body>\n    </frame>", "</frame>")],
     ),
-    ("all joints from the base to the hand must be hinges; the joints are", _NO_BALL),
+    ("all joints from the base to the hand must be hinges; joints in the file:", _NO_BALL),
     (
         "the arm has 18 hinges; at most 16 are supported",
         [
@@ -46,11 +46,11 @@ _MISSING = (
         ],
     ),
     (
-        "every joint needs a range; pitch, b have none",
+        "every joint needs a range; it is missing for pitch, b",
         [(' range="-30 130"', ""), (' range=".005 .045"', "")],
     ),
     (
-        "joint elbow needs a position actuator of its own, whose control is the joint angle; the",
+        "joint elbow needs a position actuator of its own, whose control is the joint angle; ",
         [('<position name="elbow"', '<motor name="elbow"')],
     ),
     (
@@ -59,7 +59,7 @@ _MISSING = (
     ),
     ("joint turn needs a position actuator", [('<position name="turn" joint="turn"/>', "")]),
     (
-        "the fingers need a position actuator; the actuators are grip (another kind, on a and b)",
+        "the fingers need a position actuator; actuators in the file: grip (another kind, on a",
         [
             (
                 '<position name="grip" tendon="grip" kp="400" kv="20"',
@@ -145,7 +145,7 @@ def test_settotalmass_raises(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"tcp": "hook"}, "unknown site hook; the sites are grip, askew, inwards, aside"),
+        ({"tcp": "hook"}, "unknown site hook; sites in the file: grip, askew, inwards, aside"),
         ({"tcp": "askew"}, "the y axis of site askew is 60 deg off the line along which"),
         ({"tcp": "inwards"}, "the z axis of site inwards must point out of the hand"),
         ({"tcp": "aside"}, "the z axis of site aside does not run between the fingers"),

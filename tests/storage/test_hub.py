@@ -71,7 +71,7 @@ def test_shipped_bases_resolve_from_any_folder(tmp_path, monkeypatch, no_hub):
     for name in ("assets/pi0_nan", "assets/../runs/pi0"):
         with pytest.raises(
             ValueError,
-            match=r"does not exist; the bases in .* are pi0_nano, |does not exist; pass a path",
+            match=r"does not exist; bases in .*: pi0_nano, |does not exist; pass a path",
         ):
             hub.local(name)
 
@@ -83,7 +83,7 @@ def test_an_installed_package_names_its_bases(tmp_path, monkeypatch, no_hub):
     monkeypatch.setattr(shipped, "ROOT", tmp_path)
     monkeypatch.setattr(shipped, "PACKAGE", tmp_path)
     with pytest.raises(
-        ValueError, match=r"the bases in .*/assets are pi0_nano; choose one .* path to pi0_small "
+        ValueError, match=r"bases in .*/assets: pi0_nano; choose one .* path to pi0_small "
     ):
         hub.local("assets/pi0_small")
 
