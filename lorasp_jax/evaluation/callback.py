@@ -33,9 +33,9 @@ TOWERS = ("vision", "language", "action")
 class Evaluation(Callback):
     """Evaluates every task of a run before, during and after training.
 
-    Adapters start at exactly zero, so the policy before the first step is the unadapted base. All
-    evaluations share one compilation; the final one uses different layouts. Videos are rendered in
-    the background while training continues.
+    Adapters initially leave the outputs unchanged, so the policy before the first step is the base.
+    All evaluations share one compilation; the final one uses different layouts. Videos are rendered
+    in the background while training continues.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class Evaluation(Callback):
         self._pending_videos: Future | None = None
 
     def on_start(self, run: Run) -> None:
-        """Evaluate the base, even in a resumed run, and write before.json."""
+        """Evaluate the base and write before.json."""
         results = self._evaluate_tasks(run, "before")
         write_json(run.folder / "before.json", {t: success(r) for t, r in results.items()})
 
