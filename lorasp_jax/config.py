@@ -23,8 +23,8 @@ def _check_name(name: str) -> None:
     valid = name not in ("", ".", "..") and "/" not in name and name.isprintable()
     if not valid or len(name.encode()) > MAX_NAME_BYTES:
         raise ValueError(
-            "name must be a printable folder name without '/' of at most "
-            f"{MAX_NAME_BYTES} bytes, got {name!r}"
+            f"name must be a printable folder name of at most {MAX_NAME_BYTES} bytes without "
+            f"'/', got {name!r}"
         )
 
 
@@ -190,7 +190,7 @@ class EvaluationConfig:
 
     @property
     def worlds(self) -> int:
-        """Number of parallel worlds: `num_envs`, or `episodes` if there are fewer."""
+        """Number of parallel worlds: `num_envs`, or `episodes` if that is smaller."""
         return min(self.episodes, self.num_envs)
 
     def __post_init__(self) -> None:
@@ -212,7 +212,7 @@ class Config:
     name: str
     """Name of the run; its folder is runs/<name>."""
     scale: str
-    """Preset of sizes: smoke, cpu or accelerator."""
+    """Size preset: smoke, cpu or accelerator."""
     peft: Method
     """Adapter method and its settings."""
     model: ModelConfig = field(default_factory=ModelConfig)

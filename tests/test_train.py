@@ -56,11 +56,11 @@ def files():
             "must be between 1 and the chunk length 10",
         ),
         ([*MULTITASK, *NANO, "--evaluation.episodes", "24"], "must be a multiple of num_envs"),
-        ([*MULTITASK, *NANO, "--optim.batch-size", "9"], "multiple of 8 devices"),
-        ([*MULTITASK, *NANO, "--fsdp", "3"], "fsdp must divide the number of devices, 8, got 3"),
+        ([*MULTITASK, *NANO, "--optim.batch-size", "9"], "multiple of 8 (8 devices), got 9"),
+        ([*MULTITASK, *NANO, "--fsdp", "3"], "fsdp must divide the number of devices (8), got 3"),
         (
             [*MULTITASK, *NANO, "--optim.batch-size", "24", "--optim.accumulate", "2"],
-            "multiple of 8 devices times 2 micro-batches, got 24",
+            "multiple of 16 (8 devices x 2 micro-batches), got 24",
         ),
         ([*MULTITASK, *NANO, "--optim.ema", "1"], "ema must lie in [0, 1), got 1"),
         ([*MULTITASK, *NANO, "--method", "ada_lora", "--optim.ema", "0.9"], "cannot be combined"),
@@ -85,9 +85,9 @@ def test_folder_of_another_run_is_not_changed(capsys):
     (folder / "metrics.jsonl").write_text("precious\n")
     before = files()
     assert train.main([*MULTITASK, *NANO]) == 2
-    assert "already holds a run: add --resume" in capsys.readouterr().err
+    assert "already contains a run: add --resume" in capsys.readouterr().err
     assert train.main([*MULTITASK, *NANO, "--resume"]) == 2
-    assert "holds no run to resume" in capsys.readouterr().err
+    assert "contains no run to resume" in capsys.readouterr().err
     assert files() == before
 
 
@@ -147,5 +147,6 @@ def test_finished_run_is_not_repeated(capsys):
     assert record["peft"]["method"] == "LoRASP"
     write_json(Path("runs/multitask/results.json"), RESULTS)
     assert train.main([*MULTITASK, "--model.checkpoint", "nowhere", "--resume"]) == 0
-    assert "this run has finished: runs/multitask/report.html" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "this run has already finished: see runs/multitask/report.html" in printed
     assert "Running: step" not in Path("runs/multitask/report.html").read_text()

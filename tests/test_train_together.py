@@ -60,7 +60,7 @@ def test_two_processes_match_one_on_simulated_tasks(tmp_path):
         ({1: ("--seed", 5)}, "those of the first process (seed is 5, not 0): use"),
         ({1: ("--resume", "auto")}, "(resume is 'auto', not False): use the same ones in all"),
         ({1: ("--seed", "x")}, ": error: "),
-        ({}, "error: runs/multitask already holds a run: add --resume"),
+        ({}, "error: runs/multitask already contains a run: add --resume"),
     ],
 )
 def test_first_process_prints_a_one_line_error(own, reason, tmp_path):

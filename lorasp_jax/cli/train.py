@@ -78,7 +78,8 @@ def _execute(command: "Command", console: Console, started: float) -> None:
         elif processes.is_first():
             from lorasp_jax.report.html import write_report
 
-            console.print(f"this run has finished: {write_report(folder)}", markup=False)
+            report = write_report(folder)
+            console.print(f"this run has already finished: see {report}", markup=False)
 
 
 def resume_command(arguments: Sequence[str], program: str) -> str:

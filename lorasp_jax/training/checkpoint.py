@@ -1,7 +1,8 @@
 """Orbax checkpoints of adapters, optimizer state and step; the frozen base is not saved.
 
-The data position and every random stream depend only on the seed and the step, so a restored run is
-bit-identical. The hash of the base and a digest of the saved values are stored as well.
+The data position and every random stream depend only on the seed and the step, so a resumed run is
+bit-identical to an uninterrupted one. The hash of the base and a digest of the saved values are
+stored as well.
 """
 
 import contextlib

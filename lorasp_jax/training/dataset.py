@@ -1,4 +1,4 @@
-"""Open the dataset of a run, convert it to a cache once, and outline it per task."""
+"""Open the dataset of a run, convert it to a cache once, and group its episodes by task."""
 
 from pathlib import Path
 

@@ -38,7 +38,7 @@ def _keys(config: Config) -> jax.Array:
 
 
 def map_threads(function: Callable, *arguments: Iterable[Any]) -> list[Any]:
-    """`map` in threads, as compiling takes most of the time; interrupts do not wait for them."""
+    """Map in threads, because compilation dominates; an interrupt does not wait for them."""
     pool = ThreadPoolExecutor()
     try:
         return list(pool.map(function, *arguments))

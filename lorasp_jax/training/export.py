@@ -52,7 +52,7 @@ def write(run: Run) -> None:
 
 
 def _metadata(run: Run) -> dict[str, Any]:
-    """Return properties of the training data and all that the policy needs besides weights."""
+    """Return the training data's properties and everything the policy needs besides weights."""
     config, first = run.config, next(iter(run.episodes.values()))
     processor = run.policy.processor
     return {
@@ -96,7 +96,7 @@ def load_policy(
     is_full = (folder / BASE).is_dir()
     path = folder / BASE / TRAINING if is_full else folder / native.DESCRIPTION
     if not path.is_file():
-        raise ValueError(f"{folder} holds no policy: no run has finished there")
+        raise ValueError(f"{folder} contains no policy: no run has finished there")
     metadata = read_json(path) if is_full else native.read_description(folder)["metadata"]
     try:
         policy = metadata["policy"]
@@ -109,7 +109,7 @@ def load_policy(
     try:
         model = models.load(source, config)
     except ValueError as error:
-        hint = "" if is_full else f" (pass base= if the base of {folder} has moved)"
+        hint = "" if is_full else f" (Pass base= if the base of {folder} has moved.)"
         raise ValueError(f"{error}{hint}") from error
     if not is_full:
         model = native.load_adapters(folder, model, any_base=any_base)
@@ -125,7 +125,7 @@ def _processor(policy: Mapping[str, Any], config: Any, words: str) -> Processor:
     try:
         loaded = tokenizer.load_tokenizer(words or hub.resolve_portable(policy["tokenizer"]))
     except ValueError as error:
-        raise ValueError(f"{error} (pass words= if the policy's tokenizer has moved)") from error
+        raise ValueError(f"{error} (Pass words= if the policy's tokenizer has moved.)") from error
     prompts = PromptTable.of(loaded, policy["instructions"], config, num_joints=joints)
     if _prompts_digest(prompts) != policy["prompts"]:
         raise ValueError(

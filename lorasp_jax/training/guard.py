@@ -26,7 +26,7 @@ WINDOW = 100
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Guard:
-    """Statistics of the accepted steps; in the training state, so resumed runs skip the same steps.
+    """Statistics of accepted steps, saved in the state so that resumed runs skip the same steps.
 
     Attributes:
         counted: `[]` int32, number of accepted steps.

@@ -77,7 +77,7 @@ def parse(arguments: Sequence[str], program: str = "python train.py") -> Command
     if wants_help:
         _option_parser(program, config.peft.name).print_help()
         print(f"\n{_scale_note(known.config, known.scale)}")
-        rest = ["--help"]  # drops the rest, where --help may follow an option that needs a value
+        rest = ["--help"]  # the rest may be incomplete, as in --seed --help
     if known.method is not None:
         config = dataclasses.replace(config, peft=_with_rank_of(config.peft, known.method))
     if known.resume and known.dry_run:
@@ -269,7 +269,7 @@ def _check_simulated(config: Config) -> None:
         return
     for task in config.tasks:
         check("task", task)
-    if not config.robot.endswith(".xml"):  # the user's own MJCF file
+    if not config.robot.endswith(".xml"):  # .xml: the user's own MJCF file
         check("robot", config.robot)
 
 

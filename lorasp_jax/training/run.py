@@ -1,4 +1,4 @@
-"""State of a run, shared by all parts of training, and callbacks."""
+"""The state of a run, shared by all parts of training, and the callback interface."""
 
 import contextlib
 import time
@@ -29,7 +29,7 @@ class Run:
         base_hash: hash of the frozen base.
         episodes: demonstrations per task; those of a dataset contain one image per camera.
         dataset: all steps of a dataset, stored on disk; None: those of `episodes`.
-        streams: read batches of the dataset from disk, because it does not fit on the device.
+        streams: whether batches are read from disk because the dataset does not fit on the device.
         devices: devices to train on; None: all.
         simulated: whether the tasks can be evaluated in simulation.
         policy: the current policy, valid inside callbacks; training donates its buffers in between.

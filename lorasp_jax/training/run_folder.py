@@ -34,7 +34,7 @@ CONFIG_FILE, TIMES_FILE, DATASET_FILE = "config.json", "seconds.json", "dataset.
 WILDCARDS = frozenset("*?[\\")
 """Orbax cannot find checkpoints under a path with one of these, because it globs its paths."""
 STOPPED = "stopped.json"
-"""File with the reason that training stopped; removed when training continues."""
+"""File with the reason why training stopped; removed when training continues."""
 
 
 def to_json(config: Config) -> dict[str, Any]:
@@ -93,8 +93,8 @@ def open_run(config: Config, root: Path, *, resume: bool | Literal["auto"]) -> I
             changed = _differences(_recorded(folder), to_json(config))
             if changed:
                 raise ValueError(
-                    f"{folder} holds a run with different settings ({', '.join(changed)}): resume "
-                    "with the original settings or use another --name"
+                    f"{folder} contains a run with different settings ({', '.join(changed)}): "
+                    "resume with the original settings or use another --name"
                 )
         else:
             _begin(config, folder)
@@ -111,7 +111,7 @@ def _begin(config: Config, folder: Path) -> None:
         allowed |= {*folder.glob(f".{name}.*{TEMPORARY_SUFFIX}")}  # left by a killed process
     if any(path not in allowed for path in folder.rglob("*") if not path.is_dir()):
         raise ValueError(
-            f"{folder} already holds a run: add --resume to continue it or use another --name"
+            f"{folder} already contains a run: add --resume to continue it or use another --name"
         )
     folder.mkdir(exist_ok=True)
     for path in allowed - {folder / CONFIG_FILE}:
@@ -165,7 +165,7 @@ def _locked(folder: Path) -> Iterator[None]:
 def _recorded(folder: Path) -> dict[str, Any]:
     """Return the config recorded in `folder` as JSON values."""
     if not (folder / CONFIG_FILE).exists():
-        raise ValueError(f"{folder} holds no run to resume: omit --resume to start one")
+        raise ValueError(f"{folder} contains no run to resume: omit --resume to start one")
     config = read_json(folder / CONFIG_FILE, records.CONFIG)
     return {**config, "peft": upgrade(config["peft"])}
 

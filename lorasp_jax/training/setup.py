@@ -223,9 +223,10 @@ def _check_sizes(config: Config, chunk: int) -> None:
         )
     optim, devices = config.optim, jax.device_count()
     if optim.batch_size % (devices * optim.accumulate):
-        micro = f" times {optim.accumulate} micro-batches" if optim.accumulate > 1 else ""
+        micro = f" x {optim.accumulate} micro-batches" if optim.accumulate > 1 else ""
         raise ValueError(
-            f"batch_size must be a multiple of {devices} devices{micro}, got {optim.batch_size}"
+            f"batch_size must be a multiple of {devices * optim.accumulate} ({devices} devices"
+            f"{micro}), got {optim.batch_size}"
         )
     if jax.process_count() > 1 and config.data.fresh_every:
         raise ValueError("data.fresh_every cannot be combined with --distributed: drop one")
@@ -241,7 +242,7 @@ def _adapt(
     method: peft.Method,
     statistics: Mapping[str, jax.Array] = MappingProxyType({}),
 ) -> Backbone:
-    """Attach the method to the run's target layers, initialized from the run's seed."""
+    """Add the method's adapters to the target layers, initialized from the run's seed."""
     rngs = nnx.Rngs(RandomStream.ADAPTERS.key(config.seed))
     rules = presets.rules(config.targets, method)
     return adaptation.adapt(model, rules, rngs=rngs, statistics=statistics)
@@ -336,7 +337,7 @@ def _collect(run: Run, instructions: Sequence[str], collect: Collect) -> dict[st
         bar_ids: dict[str, TaskID] = {}
 
         def report(task: str, done: int, total: int) -> None:
-            text = f"collecting {task}" if done else f"compiling the expert of {task} ..."
+            text = f"collecting {task}" if done else f"compiling the expert for {task} ..."
             if task not in bar_ids:
                 bar_ids[task] = progress.add_task(text, total=total)
             progress.update(bar_ids[task], completed=done, description=text)
@@ -345,6 +346,6 @@ def _collect(run: Run, instructions: Sequence[str], collect: Collect) -> dict[st
     # Steps refer to instructions by index.
     if [phrase for group in episodes.values() for phrase in group.instructions] != [*instructions]:
         raise ValueError(
-            f"{run.folder} holds demonstrations with different instructions: use another --name"
+            f"{run.folder} contains demonstrations with different instructions: use another --name"
         )
     return episodes

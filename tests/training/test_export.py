@@ -70,7 +70,7 @@ def test_a_policy_loads(tmp_path, method):
     run = make_run(tmp_path / "run", config, models.load(tmp_path / "base"))
     run.policy = with_random_adapters(run.policy)
     run.base_hash = models.weights_hash(tmp_path / "base")
-    with pytest.raises(ValueError, match="holds no policy: no run has finished there"):
+    with pytest.raises(ValueError, match="contains no policy: no run has finished there"):
         export.load_policy(run.folder)
     export.write(run)
     loaded = export.load_policy(run.folder)
@@ -127,7 +127,7 @@ def test_the_error_for_a_missing_base_suggests_a_remedy(tmp_path, monkeypatch):
     export.write(run)
     (tmp_path / "base").rename("moved")
     message = (
-        rf"^{tmp_path / 'base'} does not exist.* \(pass base= if the base of .*run has moved\)"
+        rf"^{tmp_path / 'base'} does not exist.* \(Pass base= if the base of .*run has moved\.\)"
     )
     with pytest.raises(ValueError, match=message):
         export.load_policy("run")

@@ -32,7 +32,7 @@ def open_run(*arguments, **options):
 def test_a_second_run_in_the_same_folder_is_rejected(tmp_path):
     folder = open_run(CONFIG, tmp_path, resume=False)
     (folder / "metrics.jsonl").write_text("precious")
-    with pytest.raises(ValueError, match="already holds a run"):
+    with pytest.raises(ValueError, match="already contains a run"):
         open_run(CONFIG, tmp_path, resume=False)
     assert (folder / "metrics.jsonl").read_text() == "precious"
 
@@ -98,7 +98,7 @@ def test_resume_auto_starts_or_continues(tmp_path):
     with pytest.raises(ValueError, match=r"different settings \(seed"):
         open_run(dataclasses.replace(CONFIG, seed=3), tmp_path, resume="auto")
     (folder / "config.json").unlink()
-    with pytest.raises(ValueError, match="already holds a run"):
+    with pytest.raises(ValueError, match="already contains a run"):
         open_run(CONFIG, tmp_path, resume="auto")
 
 
@@ -223,7 +223,7 @@ def test_a_run_with_results_is_not_overwritten(tmp_path, more):
     folder = open_run(CONFIG, tmp_path, resume=False)
     (folder / more).parent.mkdir(exist_ok=True)
     (folder / more).write_text("more")
-    with pytest.raises(ValueError, match="already holds a run: add --resume"):
+    with pytest.raises(ValueError, match="already contains a run: add --resume"):
         open_run(dataclasses.replace(CONFIG, seed=1), tmp_path, resume=False)
     assert (folder / more).read_text() == "more"
     assert json.loads((folder / "config.json").read_text())["seed"] == 0

@@ -28,7 +28,7 @@ from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
 from lorasp_jax.training.step import Metrics, init_state, loss_fn
 
 HEADROOM = 1.1
-"""Factor on the sum for memory that is not counted: temporaries, executable, fragmentation."""
+"""Factor applied to the sum to cover uncounted memory: temporaries, executable, fragmentation."""
 REMATS: tuple[Remat, ...] = ("none", "products", "full")
 GIB, MIB = 2**30, 2**20
 
@@ -188,8 +188,8 @@ def available_bytes() -> float:
     stats = jax.local_devices()[0].memory_stats()
     if stats and "bytes_limit" in stats:
         return float(stats["bytes_limit"])
-    machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return machine / jax.local_device_count()
+    host_bytes = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return host_bytes / jax.local_device_count()
 
 
 def _bytes(tree: Any) -> float:

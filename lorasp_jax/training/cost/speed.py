@@ -1,6 +1,6 @@
 """Throughput, data wait and memory use per log interval.
 
-Nothing here blocks on the device: an interval ends after its metrics have been read anyway.
+Nothing here blocks on the device: reading an interval's metrics has already waited for it.
 """
 
 import contextlib

@@ -1,1 +1,1 @@
-"""Training on several devices and in several processes: mesh, start, barriers and joint exit."""
+"""Training on several devices and in several processes: mesh, startup, barriers and exit."""

@@ -24,7 +24,7 @@ def make_mesh(fsdp: int = 1, devices: Sequence[Any] | None = None) -> Mesh:
     """
     devices = jax.devices() if devices is None else devices
     if fsdp < 1 or len(devices) % fsdp:
-        raise ValueError(f"fsdp must divide the number of devices, {len(devices)}, got {fsdp}")
+        raise ValueError(f"fsdp must divide the number of devices ({len(devices)}), got {fsdp}")
     grid = np.asarray(devices).reshape(-1, fsdp)
     return Mesh(grid, ("data", "fsdp"), axis_types=(AxisType.Auto, AxisType.Auto))
 

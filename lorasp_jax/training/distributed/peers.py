@@ -1,4 +1,4 @@
-"""Client side of `rendezvous`: the connection of each process to the other processes of its run."""
+"""Client side of `rendezvous`: connects a process to the server in the first process."""
 
 import contextlib
 import json
@@ -187,7 +187,7 @@ def _open_connection(host: str, port: int) -> tuple[socket.socket, IO[bytes]]:
     """Connect to the first process of a run.
 
     Raises:
-        OSError: no run that waits for processes answers.
+        OSError: no server answers, or it is not a run that waits for processes.
     """
     connection = socket.create_connection((host, port), timeout=_CONNECT_TIMEOUT)
     with contextlib.ExitStack() as stack:
@@ -198,7 +198,7 @@ def _open_connection(host: str, port: int) -> tuple[socket.socket, IO[bytes]]:
         except ValueError:
             greeting = None
         if greeting != rendezvous.GREETING:
-            raise OSError("the process listening there is not a run waiting for processes")
+            raise OSError("another program listens there, or the run has already started")
         connection.settimeout(None)
         rendezvous.keep_alive(connection)
         stack.pop_all()  # keep the connection open

@@ -1,4 +1,4 @@
-"""Runs in several processes: start, barriers, shared arrays and joint exit.
+"""Multi-process runs: startup, barriers, shared arrays and coordinated exit.
 
 All processes train; only the first one collects, evaluates, prints and writes. The runs folder must
 be on storage that all of them share. In a single process everything here is a no-op.
@@ -30,7 +30,7 @@ from lorasp_jax.training.distributed.rendezvous import JOIN_TIMEOUT, Rendezvous
 _BARRIER_TIMEOUT = 24 * 3600 * 1000  # ms; the first process may collect and evaluate for hours
 _VARIABLES = ("JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "mujoco", "mujoco-mjx")
-_UNCAUGHT = "failed with an exception, see its output for the traceback"
+_UNCAUGHT = "failed with an exception; see its output for the traceback"
 
 _peers: peers.Peers | None = None
 
@@ -105,7 +105,7 @@ def _versions() -> dict[str, str]:
 
 
 def _delay_abort() -> None:
-    """Delay JAX's SIGABRT after the coordinator is lost, so that the loss is reported first.
+    """Delay JAX's SIGABRT after the coordinator is lost, so that the cause is reported first.
 
     Python signal handlers do not run during abort(). C's `sleep` is async-signal-safe and can be
     the handler: called with the signal number, 6, it sleeps 6 s. JAX's own options do not help
@@ -177,7 +177,7 @@ def is_first() -> bool:
 
 
 def barrier(name: str) -> None:
-    """Wait for all processes on the host; a collective on the devices would time out."""
+    """Wait on the host for all processes; a collective on the devices would time out."""
     import orbax.checkpoint as ocp
 
     ocp.multihost.get_barrier_sync_fn()(key=name, timeout_ms=_BARRIER_TIMEOUT)

@@ -1,8 +1,8 @@
 """Rendezvous of a run's processes: a server thread in the first process, at the run's address.
 
 JAX's own service prints nothing while processes are missing, lets processes have different options,
-and notices a dead process only after 100 s. So all processes meet here first, then JAX's service
-takes over the address; the connections stay open, and a closed one shows at once that a process
+and notices a dead process only after 100 s. So all processes meet here first; then JAX's service
+takes over the address. The connections stay open, and a closed one shows at once that a process
 died.
 
 Messages are lines of JSON. A process sends the left column, the server the right one:
@@ -102,8 +102,8 @@ class Rendezvous:
             missing = ", ".join(str(number) for number in sorted(everyone - present()))
             self._reject(
                 f"{len(present())} of {self._count} processes joined at {self._address}, but no "
-                f"others joined within {JOIN_TIMEOUT:.0f} s: check that process {missing} is "
-                "running and can reach this address"
+                f"others joined within {JOIN_TIMEOUT:.0f} s: check that every missing process "
+                f"({missing}) is running and can reach this address"
             )
         server.close()  # JAX's service listens here next
         self._answer()
@@ -145,7 +145,7 @@ class Rendezvous:
         self._changed.set()
 
     def _join(self, hello: dict[str, Any], writer: asyncio.StreamWriter) -> _Member:
-        """Add a process; reject the run if the process has an invalid number or count."""
+        """Add a process; reject the run if the process's number is taken or its count differs."""
         member = _Member(int(hello["process"]), str(hello["host"]), writer)
         if hello["of"] != self._count:
             self._reject(
