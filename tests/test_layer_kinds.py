@@ -222,7 +222,7 @@ def test_unmerging_restores_the_kernels(models):
 def test_unmerging_requires_the_same_layer_types(models):
     merged = lorasp_jax.merge(models["a"])
     merged.split = nnx.Linear(6, 6, rngs=nnx.Rngs(0))
-    message = "cannot unmerge split: the layer must be a LinearGeneral, got a Linear"
+    message = "cannot unmerge split: the layer must be of class LinearGeneral, got Linear"
     with pytest.raises(ValueError, match=message):
         lorasp_jax.unmerge(merged, models["a"])
 

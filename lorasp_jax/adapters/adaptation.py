@@ -1,4 +1,4 @@
-"""Adapt a whole model: attach methods by path rules, split, count, merge.
+"""Adapt a whole model: attach adapters by path rules, split, count, merge.
 
 A rule is (pattern, method). Patterns are searched (`re.search`) in "/"-joined paths. The first
 match wins, even if its method cannot apply to that path: with [("vision", LoRA()),
@@ -136,7 +136,7 @@ def count(model: nnx.Module) -> Counts:
 
 
 def methods(model: nnx.Module) -> dict[str, Method]:
-    """Return methods by path: of the layer for adapters, of the parameter for full fine-tuning."""
+    """Return methods by path: the layer's for adapters, the parameter's for full fine-tuning."""
     methods_by_path = {}
     validate.module(model)
     for path, parent, name, _ in paths.locate(nnx.List([model]), AdapterParam):
@@ -195,7 +195,7 @@ def attach(
       layer: modified in place. Leading axes of its kernel are layers of a scanned stack.
       method: the adapter's method.
       key: typed PRNG key.
-      statistics: [..., I, I] of the layer's inputs, if the method requires them.
+      statistics: second moments [..., I, I] of the layer's inputs, if the method requires them.
 
     Raises:
       ValueError: the layer does not support the method, it already has an adapter, or the method
@@ -328,7 +328,7 @@ def init_stack(
     This is not jitted as a whole, so random draws compile once per I, not once per shape.
     """
     if len(getattr(kernel, "shape", ())) < 2:
-        raise ValueError(f"an adapter needs a kernel [..., I, O], got {short(kernel)}.")
+        raise ValueError(f"the kernel must have shape [..., I, O], got {short(kernel)}.")
     *leading, d_in, d_out = kernel.shape
     if not leading:
         return init(key, kernel, statistics=statistics)

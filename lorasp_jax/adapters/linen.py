@@ -1,11 +1,11 @@
 """Attach adapters to the layers of an unmodified Linen model, by path rules.
 
     adapter = lorasp_jax.LinenAdapter(model, rules)
-    variables = adapter.init(key, x)                       # or adapter.attach(key, published, x)
+    variables = adapter.init(key, x)                       # or adapter.attach(key, pretrained, x)
     y = adapter.apply(variables, x)
 
 The collection "adapters" is trainable; "params" keeps the structure of the model's own `init`, so
-published parameters fit. During a call, each adapter is one of its layer's parameters, so the
+pretrained parameters fit. During a call, each adapter is one of its layer's parameters, so the
 model's own transformations (scan, remat, vmap) also apply to it.
 """
 
@@ -89,7 +89,7 @@ class LinenAdapter:
     def attach(
         self, key: Any, variables: Mapping[str, Any], *args: Any, **kwargs: Any
     ) -> dict[str, Any]:
-        """Add the collection "adapters" to existing variables, for instance published ones.
+        """Add the collection "adapters" to existing variables, for instance pretrained ones.
 
         Args:
           key: as for `init`.
@@ -119,7 +119,7 @@ class LinenAdapter:
     def apply(
         self, variables: Mapping[str, Any], *args: Any, mutable: Any = False, **kwargs: Any
     ) -> Any:
-        """Apply the model with its adapters; returns what the model's own `apply` does.
+        """Apply the model with its adapters; returns the result of the model's own `apply`.
 
         Args:
           variables: from `init` or `attach`, possibly trained.
@@ -149,7 +149,7 @@ class LinenAdapter:
 
         Args:
           variables: as for `apply`.
-          *args: the model's call arguments, for a call that determines what its layers compute.
+          *args: the model's call arguments, for one call that shows what its layers compute.
           **kwargs: the model's call arguments.
 
         Raises:
@@ -186,7 +186,7 @@ class LinenAdapter:
 
         Args:
           variables: of the bare model.
-          *args: the model's call arguments, for a call that determines what its layers compute.
+          *args: the model's call arguments, for one call that shows what its layers compute.
           **kwargs: the model's call arguments.
         """
         shapes: dict[str, tuple[int, ...]] = {}

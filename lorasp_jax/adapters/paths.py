@@ -56,7 +56,7 @@ def replace(locations: Sequence[Location], make: Callable[[Location], Any]) -> N
     """Replace children in place, preserving sharing.
 
     Args:
-      locations: of the children to replace.
+      locations: the children to replace.
       make: returns the replacement for a location, or None to skip it. A shared child is replaced
         once, by the first result that is not None, at all its locations. A shared `nnx.Linear` is
         replaced separately at each location, so that each one has its own adapter.
@@ -101,7 +101,7 @@ def check_rules(rules: Any, valid: Callable[[Any], bool], what: str) -> None:
     Args:
       rules: user input.
       valid: whether the second item of a pair is valid.
-      what: valid second items, for the error message.
+      what: description of valid second items, for the error message.
     """
     pairs = f"rules must be a list of (pattern, {what}) pairs"
     if isinstance(rules, Mapping):
@@ -175,11 +175,11 @@ def no_match_message(pattern: str, layers: Sequence[str], others: Mapping[str, s
 
 
 EINSUMS_HINT = (
-    "If such a class is an einsum of its input and a parameter, pass einsums={Class: lambda layer: "
-    "(name, equation)}; FullFineTuning supports every class"
+    "If such a class computes an einsum of its input and a parameter, pass einsums={Class: "
+    "lambda layer: (name, equation)}; FullFineTuning supports every class"
 )
 
 
 def near_misses(query: str, names: Sequence[str]) -> str:
-    """Join up to five names: those most similar to the query, or the first if none is similar."""
+    """Join up to five names: those most similar to the query, else the first five."""
     return ", ".join(difflib.get_close_matches(query, names, n=5, cutoff=0.3) or names[:5])

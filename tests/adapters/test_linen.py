@@ -217,7 +217,5 @@ def test_wrong_variables(published, ids):
     with pytest.raises(ValueError, match="cannot merge dense: LoRA-SP"):
         adapter.merge(variables, ids)
     exact = LinenAdapter(nn.Dense(3, precision="highest"), [("", SP)])
-    with pytest.raises(
-        ValueError, match=r"cannot adapt the model: a Dense with a custom precision"
-    ):
+    with pytest.raises(ValueError, match=r"cannot adapt the model: Dense with a custom precision"):
         exact.init(jax.random.key(0), jnp.ones((1, 2)))

@@ -102,7 +102,7 @@ def with_kernel(value):
         (lambda: lorasp_jax.swap(named(), "a", SHAPES), "the model holds shapes without values"),
         (
             lambda: lorasp_jax.choose(named(), np.ones((0, 2))),
-            "weights must be floating point of shape [2]",
+            "weights must be a floating-point array [2]",
         ),
         (lambda: lorasp_jax.choose(named(), ["a", "b"])(X), "for 2 examples, but a layer got 3"),
     ],

@@ -200,7 +200,9 @@ def set_slot(bank: Params, slot: int, method: LoRA | None, params: Params) -> Pa
     bank, rank = dict(bank), 0 if method is None else method.rank
     capacity = bank["lora_a"].shape[-1]
     if rank > capacity:
-        raise ValueError(f"LoRA rank {rank} exceeds the maximum rank {capacity} of combine.")
+        raise ValueError(
+            f"LoRA rank {rank} exceeds the maximum rank {capacity}: combine with a larger rank."
+        )
     a, b = bank["lora_a"].at[..., slot, :].set(0), bank["lora_b"].at[..., slot, :, :].set(0)
     if method is not None:
         a = a.at[..., slot, :rank].set(params["lora_a"])

@@ -1,7 +1,7 @@
 """Fuse named LoRAs into one, and unmerge adapters from merged kernels.
 
-`fuse` replaces several LoRAs by their weighted sum: one LoRA that is exact, with the sum of their
-ranks, or the best approximation of a smaller rank, with its error. `unmerge` inverts `merge`.
+`fuse` replaces several LoRAs by their weighted sum as one LoRA: exactly, with the sum of their
+ranks, or by the best approximation of a smaller rank, with its error. `unmerge` inverts `merge`.
 """
 
 import re
@@ -26,7 +26,7 @@ class FusedAdapters(NamedTuple):
     """A model with one LoRA per layer, and the approximation errors.
 
     Attributes:
-      model: adapted by plain LoRA of scale 1; can be trained, saved and merged.
+      model: adapted with plain LoRA of scale 1; can be trained, saved and merged.
       errors: ‖ΔW − ΔW'‖ / ‖ΔW‖ by path, in the Frobenius norm over a whole stack: the relative
         error of the layer's delta for isotropic inputs.
     """
@@ -122,7 +122,7 @@ def _unmerged_layer(layer: nnx.Module, adapted: AdaptedLayer) -> AdaptedLayer:
     """Subtract the adapted layer's delta from the kernel and attach its adapter."""
     method, params = adapted.method_and_params()
     if not method.additive:
-        raise ValueError(f"{method} does not just add to its base.")
+        raise ValueError(f"{method} is not additive, so its merge cannot be undone.")
     layer = nnx_layers.make_adaptable_like(layer, adapted)
     kernel = layer.kernel_matrices()
     delta = adaptation.over_stack(method.merge, kernel)(params, jnp.zeros(kernel.shape))

@@ -65,7 +65,9 @@ def combine(models: Mapping[str, Model], *, rank: int | None = None) -> Model:
     for model in models.values():
         validate.with_values(model)
     if rank is not None and not (type(rank) is int and 0 <= rank <= MAX_SIZE):
-        raise ValueError(f"rank must be an integer up to {MAX_SIZE} or None, got {short(rank)}.")
+        raise ValueError(
+            f"rank must be an integer from 0 to {MAX_SIZE}, or None, got {short(rank)}."
+        )
     adapter_names = tuple(models)
     bases = {name: strip_adapters(model) for name, model in models.items()}
     adapters = {name: adapters_by_path(name, model) for name, model in models.items()}
@@ -110,7 +112,7 @@ def weights(
 ) -> jax.Array:
     """Convert a choice to an array f32 [A] or [B, A], for a jitted function that calls `choose`.
 
-    Arguments and errors are those of `choose`.
+    Takes the same arguments and raises the same errors as `choose`.
     """
     adapter_names = names(model)
     if isinstance(choice, jax.Array | np.ndarray):
@@ -134,7 +136,7 @@ def weights(
         or array.dtype.kind != "f"
     ):
         raise ValueError(
-            f"weights must be floating point of shape [{size}] or [B, {size}], got "
+            f"weights must be a floating-point array [{size}] or [B, {size}], got "
             f"{array.dtype} {array.shape}."
         )
     return jnp.asarray(array, jnp.float32)

@@ -116,7 +116,7 @@ def observe(
     forward: Forward = call,
     references: Mapping[str, tuple[Method, Params]] = MappingProxyType({}),
 ) -> dict[str, Sums]:
-    """Sum reports of some layers over batches.
+    """Sum the reports of the given layers over batches.
 
     Args:
       model: not modified.
@@ -147,7 +147,7 @@ def observe(
     if missing := sorted(reports.keys() - total.keys()):
         raise ValueError(
             f"no statistics for {paths.near_misses(missing[0], missing)}: every layer must be "
-            "called, and `forward` must return the aux of models that return it."
+            "called, and `forward` must return any aux that the model returns."
         )
     for path, sums in total.items():
         if not np.any(sums["tokens"]):

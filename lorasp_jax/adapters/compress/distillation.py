@@ -76,8 +76,8 @@ def _fitted(xx: jax.Array, xz: jax.Array, u: jax.Array, *, rank: int) -> Params:
 
     The full-rank optimum is M = (Σ x xᵀ)⁻¹ (Σ x zᵀ) U; the rank-r optimum projects onto the r
     leading right singular vectors of the fitted outputs X M (Reinsel and Velu, Multivariate
-    Reduced-Rank Regression, 1998, theorem 2.2). With Uᵀ = Q T, they are Q times those of the
-    narrower X M Q.
+    Reduced-Rank Regression, 1998, theorem 2.2). With Uᵀ = Q T, these vectors are Q times
+    those of the narrower X M Q.
     """
     values, vectors = jnp.linalg.eigh(xx)
     cutoff = len(values) * jnp.finfo(values.dtype).eps * values[-1]

@@ -85,8 +85,8 @@ def load_peft(
     methods' `dropout`, which is active only under `with_dropout`.
 
     Args:
-      folder: with adapter_config.json and adapter_model.safetensors; or a repository on the hub,
-        hf://owner/name, from which only these two files are downloaded.
+      folder: contains adapter_config.json and adapter_model.safetensors; or a repository on the
+        Hub, hf://owner/name, from which only these two files are downloaded.
       model: not modified; its adapters on other layers are kept.
       names: function (path, index) -> module name; index is the position in a stack, or ().
       einsums: as for `adapt`.
@@ -183,8 +183,8 @@ def save_peft(
 
     Args:
       folder: created if absent; an adapter in it is replaced.
-      model: adapted by LoRA and AdaLoRA, or by DoRA; fully fine-tuned parameters become PEFT's
-        `bias` and `modules_to_save`.
+      model: adapted with LoRA, AdaLoRA or both, or with DoRA only; fully fine-tuned parameters
+        become PEFT's `bias` and `modules_to_save`.
       names: as for `load_peft`.
       base: value of base_model_name_or_path.
 
@@ -195,7 +195,7 @@ def save_peft(
     folder, names = validate.folder(folder), checked_names(names)
     validate.with_values(model)
     if not isinstance(base, str | None):
-        raise ValueError(f"base must be a str, the base model's name, got {short(base)}.")
+        raise ValueError(f"base must be the base model's name (str), got {short(base)}.")
     layers = _supported_layers(model)
     use_dora, lora_dropout = _common_settings([layer.method for layer in layers.values()])
     modules = {
@@ -237,7 +237,7 @@ def _common_settings(methods: Collection[Any]) -> tuple[bool, float]:
     use_dora = {isinstance(method, DoRA) for method in methods}
     rates = {dropout_rate(method) for method in methods}
     if len(use_dora) != 1:
-        raise ValueError("a PEFT folder needs at least one adapter, and either LoRA or DoRA only.")
+        raise ValueError("a PEFT folder needs at least one adapter and cannot mix LoRA and DoRA.")
     if len(rates) != 1:
         raise ValueError(
             f"PEFT stores a single lora_dropout, but the adapters have {sorted(rates)}: set a "

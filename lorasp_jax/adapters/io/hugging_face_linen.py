@@ -30,7 +30,7 @@ def load_peft_linen(
       folder: as for `hugging_face.load_peft`.
       model: any Linen module.
       variables: of the model without adapters, with "params"; not modified.
-      *args: the model's call arguments, for a call that determines what its layers compute.
+      *args: the model's call arguments, for a call that shows what its layers compute.
       names: as for `hugging_face.load_peft`.
       einsums: as for `LinenAdapter`.
       **kwargs: the model's call arguments.

@@ -13,7 +13,7 @@ from typing import Any
 _parse = importlib.import_module("re._parser").parse
 _ONE_WAY = {"LITERAL", "NOT_LITERAL", "ANY", "IN", "AT"}
 MAX_WAYS = 3 * 10**8
-"""Limit for all patterns and names together, which take about ten seconds."""
+"""Limit for all patterns and names together: about ten seconds of matching."""
 
 
 def values_of(patterns: Mapping[str, Any], names: Collection[str], default: Any) -> dict[str, Any]:

@@ -63,7 +63,7 @@ def save_adapters(
     """
     folder, adapters = validate.folder(folder), nnx.state(validate.with_values(model), AdapterParam)
     if not isinstance(base, str):
-        raise ValueError(f"base must be a str, the base model's name, got {short(base)}.")
+        raise ValueError(f"base must be the base model's name (str), got {short(base)}.")
     tensors = {name: np.asarray(leaf) for name, leaf in _leaves_by_name(adapters).items()}
     if not tensors:
         raise ValueError(
@@ -147,7 +147,7 @@ def _adapt_as_saved(
     """Adapt the bare model with the methods of a file, by exact paths.
 
     Shapes are built and checked first: a damaged or malicious file could request more memory than
-    exists.
+    available.
     """
     try:
         # FullFineTuning first: an adapted layer may have fully fine-tuned parameters.
@@ -225,7 +225,7 @@ def _methods(saved: Mapping[str, Any], folder: pathlib.Path) -> dict[str, Method
     try:
         return {path: peft.from_settings(settings) for path, settings in saved.items()}
     except (ValueError, TypeError, OverflowError) as error:
-        raise ValueError(f"{folder} does not fit the model: {error}") from error
+        raise ValueError(f"{folder} has invalid adapter settings: {error}") from error
 
 
 def _checked_metadata(metadata: Any) -> dict[str, Any]:

@@ -77,8 +77,7 @@ def check_biases(
       adapted: paths of layers that the folder adapts.
 
     Raises:
-      ValueError: the folder has no biases, although according to its config biases of the model
-        were trained.
+      ValueError: the config says that biases of the model were trained, but the folder has none.
     """
     modules = [
         path.rpartition("/")[0] for path in parameter_paths if path.rpartition("/")[2] == "bias"
@@ -128,7 +127,7 @@ def _stack(name: str, size: Sequence[int], matrices: Sequence[int] | None) -> tu
     """Sizes of the leading stack axes of a parameter.
 
     Args:
-      name: of the parameter.
+      name: the parameter's name.
       size: its shape.
       matrices: shape [..., I, O] of its layer's kernel, for dense layers and einsums.
     """

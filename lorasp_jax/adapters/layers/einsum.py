@@ -96,7 +96,7 @@ def general_equation(axis: Sequence[int], batch: Sequence[int], outputs: int) ->
 
     Args:
       axis: axes of x to sum over; negative ones count from the end.
-      batch: leading axes of x, from 0, that the kernel also has.
+      batch: leading axes 0, 1, ... of x that the kernel also has.
       outputs: number of output axes.
     """
     letters = iter(string.ascii_letters)
@@ -146,7 +146,7 @@ def einsum(
     Args:
       equation: "x,kernel->y", see the module docstring.
       x, kernel: arrays with the axes in the equation.
-      bias: with the kernel axes that are also in y, in the order of y; or None.
+      bias: array with the kernel axes that are also in y, in y's order; or None.
       params: the adapter's parameters for `to_matrices(equation, kernel)`, or None.
       method: the adapter's method; required with `params`.
       dropout_key: as for `dense`.
@@ -194,7 +194,7 @@ def _sizes(equation: str, x: jax.Array, kernel: Any) -> tuple[Axes, dict[str, in
 
 
 def _order(equation: str, ndim: int) -> tuple[Axes, list[int]]:
-    """Axes, and the transpose order that makes a kernel [..., *batch, *inputs, *outputs]."""
+    """Axes, and the axis order that transposes a kernel to [..., *batch, *inputs, *outputs]."""
     axes = parse(equation)
     outer = ndim - len(axes.kernel)
     layout = axes.batch + axes.inputs + axes.outputs

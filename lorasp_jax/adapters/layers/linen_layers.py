@@ -48,7 +48,7 @@ class LayerCall(NamedTuple):
     Attributes:
       module: the layer.
       name: parameter name of the kernel.
-      equation: of an einsum; None for an embedding or a convolution.
+      equation: the einsum's equation; None for an embedding or a convolution.
       x: the einsum's input.
     """
 
@@ -111,10 +111,10 @@ def layer_call(module: nn.Module, einsums: nnx_layers.Einsums, args: Any, kwargs
     strings = [value for value in arguments if isinstance(value, str)]
     arrays = [value for value in arguments if isinstance(value, jax.Array | np.ndarray)]
     if equation is None and not strings:
-        raise ValueError(f"a {cls.__name__} was called without its equation.")
+        raise ValueError(f"this {cls.__name__} was called without its equation.")
     if not arrays or not module.has_variable("params", name):
         lacks = f"parameter {name!r}" if arrays else "input"
-        raise ValueError(f"a {cls.__name__} has no {lacks}.")
+        raise ValueError(f"this {cls.__name__} has no {lacks}.")
     return LayerCall(module, name, equation or strings[0], arrays[0])
 
 

@@ -22,8 +22,8 @@ from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import dropout, dropout_rate
 
 Einsums = Mapping[type, Callable[[Any], tuple[str, str | None]]]
-"""NNX or Linen layer class -> function of the layer that returns (kernel name, equation). A Linen
-layer that takes its equation as a str argument of its call has None instead."""
+"""NNX or Linen layer class -> function of the layer that returns (kernel name, equation). The
+equation is None for a Linen layer that takes it as a str argument of its call."""
 
 EINSUMS: Einsums = {
     nnx.LinearGeneral: lambda layer: (
@@ -157,7 +157,7 @@ def lookup(table: jax.Array, ids: jax.Array) -> jax.Array:
 
 
 def attend_delta(method: Method, params: Any, query: jax.Array) -> jax.Array:
-    """Inner products of queries [..., D] with the rows that scale A B adds to a table."""
+    """Inner products of queries [..., D] with the rows of LoRA's delta, scale · A B."""
     down, up = (matrix.astype(query.dtype) for matrix in (method.down(params), method.up(params)))
     return method.bottleneck(params, query @ up.T, None)[0].astype(query.dtype) @ down.T
 
@@ -166,7 +166,7 @@ def convolve(layer: Any, a: jax.Array, inputs: jax.Array) -> jax.Array:
     """Convolve inputs with A, using the layer's strides, padding and other settings.
 
     Args:
-      layer: an NNX or Linen convolution; both name their settings alike.
+      layer: an NNX or Linen convolution; both have the same attribute names.
       a: LoRA's A, [sizes · I, R].
       inputs: [..., *spatial, I].
     """
@@ -243,7 +243,9 @@ def make_adaptable_like(layer: Any, other: AdaptedLayer) -> AdaptedLayer:
         return layer
     mixin, original = (Dense, nnx.Linear) if isinstance(other, Dense) else type(other).__bases__
     if not isinstance(layer, original):
-        raise ValueError(f"the layer must be a {original.__name__}, got a {type(layer).__name__}.")
+        raise ValueError(
+            f"the layer must be of class {original.__name__}, got {type(layer).__name__}."
+        )
     if mixin is Dense:
         return to_dense(layer)
     return _with_mixin(layer, mixin, other.kernel_name, getattr(other, "kernel_equation", None))
@@ -269,7 +271,7 @@ def kernel_and_equation(layer: Any, known: type | None, einsums: Einsums) -> tup
             f"the einsums function of {type(layer).__name__} must return an equation, got None."
         )
     if not isinstance(getattr(layer, name, None), nnx.Param):
-        raise ValueError(f"a {type(layer).__name__} has no parameter {name!r}.")
+        raise ValueError(f"this {type(layer).__name__} has no parameter {name!r}.")
     einsum.parse(equation)
     return name, equation
 
@@ -330,7 +332,7 @@ def check_settings(layer: Any) -> None:
     """Raise ValueError for settings that adapted layers do not support."""
     for name, defaults in _DEFAULT_SETTINGS.items():
         if getattr(layer, name, defaults[0]) not in defaults:
-            raise ValueError(f"a {type(layer).__name__} with a custom {name} cannot be adapted.")
+            raise ValueError(f"{type(layer).__name__} with a custom {name} cannot be adapted.")
 
 
 def to_dense(linear: Dense | nnx.Linear) -> Dense:
@@ -363,7 +365,7 @@ def _with_mixin(
       layer: not modified.
       mixin: class that applies the adapter.
       name: attribute name of the kernel.
-      equation: of an einsum.
+      equation: the einsum's equation.
 
     Raises:
       ValueError: the layer already has an attribute that the mixin needs.

@@ -61,7 +61,7 @@ _pytree = functools.partial(jax.tree_util.register_dataclass, meta_fields=["bott
 @functools.partial(_pytree, data_fields=["params", "input_matrix", "output_matrix", "bias"])
 @dataclasses.dataclass(frozen=True)
 class FusedLayers:
-    """Layers of one method with a shared input."""
+    """Fused layers with the same method and a shared input."""
 
     bottleneck: BottleneckSpec
     params: Any
@@ -111,7 +111,7 @@ class Prepared(nnx.Module):
         return result
 
     def results(self, x: jax.Array, token_mask: jax.Array | None) -> list[tuple[jax.Array, Aux]]:
-        """Compute y and aux of each layer for x `[..., I]`; the list is empty without layers."""
+        """Compute y and aux of each layer for x `[..., I]`; an empty instance returns []."""
         if self.fused is None:
             return []
         fused = self.fused.get_value()
@@ -145,8 +145,8 @@ def fuse_layers(layers: Sequence[Layer], *, copy_kernels: bool = True) -> list[L
     unchanged.
 
     Args:
-        layers: in the order in which they are called.
-        copy_kernels: whether to fuse W too; use it for layers called repeatedly.
+      layers: in the order in which they are called.
+      copy_kernels: whether to fuse W too; use it for layers called repeatedly.
     """
     fusable = [layer for layer in layers if _is_fusable(layer)]
     fuse = _fused_layers if copy_kernels else _shared_projection

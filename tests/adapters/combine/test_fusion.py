@@ -147,7 +147,7 @@ def test_unmerge_errors():
     model = trained(("blocks", LoRA(rank=2)), seed=4)
     merged = lorasp_jax.merge(model)
     for method, message in (
-        (DoRA(rank=2), r"cannot unmerge blocks: DoRA.* does not just add"),
+        (DoRA(rank=2), r"cannot unmerge blocks: DoRA.* is not additive"),
         (SP, "cannot unmerge blocks: LoRA-SP chooses its directions per input"),
         (LoRAMoE(experts=2, rank=2), "cannot unmerge blocks: LoRA-MoE's delta depends"),
     ):

@@ -153,7 +153,7 @@ def test_unknown_names():
         lorasp_jax.choose(NET, "pour")
     for bad in (jnp.ones(3), [], np.array([0, 1, 2, 3]), np.ones((2, 2, 4))):
         with pytest.raises(
-            ValueError, match=r"must be floating point of shape \[4\] or \[B, 4\], got "
+            ValueError, match=r"must be a floating-point array \[4\] or \[B, 4\], got "
         ):
             lorasp_jax.choose(combined(), bad)
 

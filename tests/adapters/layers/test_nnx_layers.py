@@ -225,7 +225,7 @@ class Product(nnx.Module):
 
 WRONG_EINSUMS = [
     ({Product: lambda layer, x: ("w", x)}, "the einsums function of Product failed: .* missing 1"),
-    ({Product: lambda layer: ("kernel", "ab,bc->ac")}, "a Product has no parameter 'kernel'"),
+    ({Product: lambda layer: ("kernel", "ab,bc->ac")}, "this Product has no parameter 'kernel'"),
     (
         {Product: lambda layer: ("w", None)},
         "the einsums function of Product must return an equation, got None",
