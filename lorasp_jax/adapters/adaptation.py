@@ -328,7 +328,7 @@ def init_stack(
     This is not jitted as a whole, so random draws compile once per I, not once per shape.
     """
     if len(getattr(kernel, "shape", ())) < 2:
-        raise ValueError(f"the kernel must have shape [..., I, O], got {short(kernel)}.")
+        raise ValueError(f"an adapter needs a kernel [..., I, O], got {short(kernel)}.")
     *leading, d_in, d_out = kernel.shape
     if not leading:
         return init(key, kernel, statistics=statistics)

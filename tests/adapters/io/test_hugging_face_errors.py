@@ -93,7 +93,7 @@ def test_damaged_and_missing_files(copy, name):
     [
         ([("lin/0", LoRASP(rank=4))], "lin/0 uses lora_sp, which Hugging Face PEFT does not"),
         ([("lin/0", LoRA(rank=2, initialization="pissa"))], "split the kernel, so it cannot"),
-        ([("lin/0", LoRA(rank=2)), ("lin/1", DoRA(rank=2))], "either LoRA or DoRA"),
+        ([("lin/0", LoRA(rank=2)), ("lin/1", DoRA(rank=2))], "cannot mix LoRA and DoRA"),
         ([], "at least one adapter"),
     ],
 )
