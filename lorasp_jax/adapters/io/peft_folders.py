@@ -61,21 +61,7 @@ def read_folder(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{folder / CONFIG} is damaged or not a PEFT config: {error}") from error
     tensors = read_tensors(folder / TENSORS, read_bytes(folder / TENSORS))
-    if kind not in ("LORA", "ADALORA"):
-        raise ValueError(
-            f"{folder} has peft_type {str(kind)[:40]}; only LORA and ADALORA are supported."
-        )
-    if enabled := [name for name in _UNSUPPORTED if config.get(name) not in _DISABLED]:
-        raise ValueError(
-            f"{folder} sets {enabled[0]} to {reprlib.repr(config[enabled[0]])}, which is not "
-            "supported: merge the adapter in PEFT (merge_and_unload), and load the result."
-        )
-    if (initialization := config.get("init_lora_weights")) not in _BASE_PRESERVING:
-        raise ValueError(
-            f"the adapter in {folder} was trained on the residual base of "
-            f"{reprlib.repr(initialization)}: convert it to plain LoRA with PEFT's "
-            "path_initial_model_for_weight_conversion."
-        )
+    _check_supported(folder, kind, config)
     modules, full_values = collections.defaultdict(dict), {}
     for name, tensor in tensors.items():
         if match := _TENSOR.fullmatch(name):
@@ -95,6 +81,25 @@ def read_folder(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter
         return config, imported, full_values
     except (ValueError, TypeError, LookupError, ArithmeticError, RecursionError) as error:
         raise ValueError(f"{folder} is not a valid PEFT adapter: {error}") from error
+
+
+def _check_supported(folder: pathlib.Path, kind: object, config: Mapping[str, Any]) -> None:
+    """Raise ValueError if a PEFT config needs a feature that is missing here."""
+    if kind not in ("LORA", "ADALORA"):
+        raise ValueError(
+            f"{folder} has peft_type {str(kind)[:40]}; only LORA and ADALORA are supported."
+        )
+    if enabled := [name for name in _UNSUPPORTED if config.get(name) not in _DISABLED]:
+        raise ValueError(
+            f"{folder} sets {enabled[0]} to {reprlib.repr(config[enabled[0]])}, which is not "
+            "supported: merge the adapter in PEFT (merge_and_unload), and load the result."
+        )
+    if (initialization := config.get("init_lora_weights")) not in _BASE_PRESERVING:
+        raise ValueError(
+            f"the adapter in {folder} was trained on the residual base of "
+            f"{reprlib.repr(initialization)}: convert it to plain LoRA with PEFT's "
+            "path_initial_model_for_weight_conversion."
+        )
 
 
 def _is_fully_trained(config: Mapping[str, Any], module: str, kind: str) -> bool:

@@ -1,0 +1,89 @@
+"""Test that an invalid field of a method raises a one-sentence error that says what is valid."""
+
+import re
+
+import jax
+import pytest
+from flax import nnx
+
+import lorasp_jax
+from lorasp_jax import peft
+from lorasp_jax.peft import AdaLoRA, LoRA, LoRAMoE, LoRASP
+
+NET = nnx.Dict(inp=nnx.Linear(5, 4, rngs=nnx.Rngs(0)))
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"r": 8}, "lora has no field 'r' (did you mean 'rank'?); valid fields are rank, alpha"),
+        ({"lora_alpha": 8}, "did you mean 'alpha'?"),
+        ({"rank": "8"}, "rank must be int, got '8'"),
+        ({"rank": True}, "rank must be int, got True"),
+        ({"rank": 1.5}, "rank must be int, got 1.5"),
+        ({"rank": 10**12}, "rank must be at most 1048576"),
+        ({"alpha": float("nan")}, "alpha must be a finite number or None, got nan"),
+        ({"alpha": 1e308}, "alpha must be a finite number or None, got 1e+308"),
+        ({"alpha": 1e35}, "|alpha| must be between 1e-30 and 1e+30, got 1e+35"),
+        ({"alpha": 0}, "|alpha| must be between 1e-30 and 1e+30, got 0"),
+        (
+            {"alpha": -1.0, "initialization": "pissa"},
+            "alpha must be positive for 'pissa', got -1.0",
+        ),
+        ({"dropout": 1.0}, "dropout must be in [0, 1), got 1.0"),
+        ({"dropout": -0.1}, "dropout must be in [0, 1), got -0.1"),
+        ({"dropout": "0.1"}, "dropout must be a finite number, got '0.1'"),
+        ({"initialization": ["eva"]}, "initialization must be one of 'kaiming'"),
+    ],
+)
+def test_fields_of_lora(fields, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        LoRA(**fields)
+
+
+def test_too_many_values():
+    with pytest.raises(
+        ValueError, match=r"lora takes at most 5 values \(rank, .* dropout\), got 6"
+    ):
+        LoRA(1, 2.0, False, "kaiming", 0.1, 3)  # pyright: ignore[reportCallIssue]
+
+
+BAD = ["x", None, True, -1, 10**30, 1e308, float("nan"), float("inf"), [], {}, (), object]
+FIELDS = [
+    (cls, name) for cls in (LoRA, LoRASP, LoRAMoE, AdaLoRA) for name in cls.__dataclass_fields__
+]
+
+
+@pytest.mark.parametrize(("cls", "field"), FIELDS)
+def test_every_field_of_every_method(cls, field):
+    """A wrong value raises an error that names the field, or the method works."""
+    for value in BAD:
+        if (message := error_message(cls, field, value)) is None:
+            assert value in (None, True, -1)
+        else:
+            assert "\n" not in message
+            assert field in message or repr(value) in message
+
+
+def error_message(cls, field, value):
+    """Return the error message, or None if the method can create its parameters."""
+    try:
+        method = cls(**{field: value})
+    except ValueError as error:
+        return str(error)
+    assert jax.eval_shape(lambda: method.init_params(jax.random.key(0), 256, 256))
+    return None
+
+
+@pytest.mark.parametrize("initialization", ["pissa", "olora"])
+def test_rank_larger_than_a_split_kernel(initialization):
+    method = LoRA(rank=128, initialization=initialization)
+    with pytest.raises(
+        ValueError, match=r"cannot adapt inp: .* got rank 128 and a kernel \[5, 4\]"
+    ):
+        lorasp_jax.adapt(NET, [("inp", method)], rngs=nnx.Rngs(0))
+
+
+def test_unknown_field_of_a_method_gets_a_suggestion():
+    with pytest.raises(ValueError, match=r"lora_sp has no field 'energy_targt' \(did you mean"):
+        peft.create("lora_sp", energy_targt=0.9)
