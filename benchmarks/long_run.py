@@ -108,7 +108,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--tasks", nargs="+", default=["open_pot", "pour", "press", "pick_place"])
     parser.add_argument("--robot", default="piper")
-    parser.add_argument("--backend", help="default: warp or jax, by device")
+    parser.add_argument("--backend", help="default: warp on a single NVIDIA GPU, else jax")
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--num-envs", type=int, default=256)
     options = parser.parse_args(arguments)

@@ -61,7 +61,7 @@ def test_the_rank_budget_holds_in_the_loop_and_after_a_resume(tmp_path):
 
 def test_ada_lora_layers_need_the_same_settings():
     one, other = peft.AdaLoRA(target_rank=8), peft.AdaLoRA(target_rank=4)
-    with pytest.raises(ValueError, match="need the same settings, got 2 different"):
+    with pytest.raises(ValueError, match="must have the same settings, got 2 different"):
         make_optimizer(OptimConfig(), [one, peft.LoRA(), other])
     make_optimizer(OptimConfig(), [one, one, peft.LoRA()])
     assert isinstance(make_optimizer(OptimConfig()), optax.GradientTransformation)

@@ -219,5 +219,5 @@ def test_instructions_of_a_dataset_that_are_too_long_are_rejected():
     prompts, joints = setup._prompts_and_joints(source, [], tokenizer, fits)
     assert prompts.instructions == source.episode(0, ()).instructions
     assert joints == source.episode(0, ()).state.shape[-1] - 1
-    with pytest.raises(ValueError, match=r"--model\.max-tokens: 'pick up .*' has 11 tokens"):
+    with pytest.raises(ValueError, match=r"--model\.max-tokens: 'pick up .*' must have 1 to 10 "):
         setup._prompts_and_joints(source, [], tokenizer, model)

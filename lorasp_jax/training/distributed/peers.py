@@ -147,7 +147,7 @@ def listen(address: str) -> socket.socket:
         return socket.create_server(("", port), family=family, dualstack_ipv6=dual)
     except OSError as error:
         raise ValueError(
-            f"port {port} of {platform.node()} is not available ({error.strerror}): choose "
+            f"port {port} on {platform.node()} is not available ({error.strerror}): choose "
             "another one in JAX_COORDINATOR_ADDRESS or, under Slurm, in JAX_COORDINATOR_PORT"
         ) from error
 
@@ -198,7 +198,7 @@ def _open_connection(host: str, port: int) -> tuple[socket.socket, IO[bytes]]:
         except ValueError:
             greeting = None
         if greeting != rendezvous.GREETING:
-            raise OSError("another program listens there, or the run has already started")
+            raise OSError("another program is listening there, or the run has already started")
         connection.settimeout(None)
         rendezvous.keep_alive(connection)
         stack.pop_all()  # keep the connection open

@@ -219,5 +219,5 @@ def test_a_foreign_server_at_the_address_is_reported(monkeypatch):
                 connection.sendall(b"SSH-2.0\r\n")
 
         threading.Thread(target=answer, daemon=True).start()
-        with pytest.raises(ValueError, match=r"another program listens there, or"):
+        with pytest.raises(ValueError, match=r"another program is listening there, or"):
             peers.Peers(address, 1, 2, print, HINT)
