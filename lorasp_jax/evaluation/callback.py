@@ -1,4 +1,4 @@
-"""Measure success in simulation before, during and after training, with a video per task."""
+"""Measure success in simulation before, during and after training; render a video per task."""
 
 import contextlib
 import functools
@@ -34,8 +34,9 @@ class Evaluation(Callback):
     """Evaluates every task of a run before, during and after training.
 
     Adapters initially leave the outputs unchanged, so the policy before the first step is the base.
-    All evaluations share one compilation; the final one uses different layouts. Videos are rendered
-    in the background while training continues.
+    All evaluations of a task share one compilation; the final evaluation uses different layouts.
+    Videos of evaluations during training are rendered in the background; those of the final
+    evaluation are rendered after training, in the foreground.
     """
 
     def __init__(
@@ -44,12 +45,12 @@ class Evaluation(Callback):
         evaluate: Callable[..., Result] = evaluate,
         write_video: Callable[[Env, Poses, Path], None] = video.write_episode,
     ) -> None:
-        """Create the callback; compilation waits until the first evaluation.
+        """Create the callback, which compiles nothing until the first evaluation.
 
         Args:
-            compile_rollout: returns a task's environment and jitted rollout.
-            evaluate: evaluates a policy.
-            write_video: writes a video of an episode's poses to a file.
+            compile_rollout: (config, task) -> the task's environment and its jitted rollout.
+            evaluate: evaluates a policy, like `rollout.evaluate`.
+            write_video: renders an episode's poses and writes the video to a file.
         """
         self._compile_rollout, self._evaluate = compile_rollout, evaluate
         self._write_video = write_video
@@ -63,10 +64,10 @@ class Evaluation(Callback):
         write_json(run.folder / "before.json", {t: success(r) for t, r in results.items()})
 
     def on_log(self, run: Run, step: int, metrics: dict[str, float]) -> dict[str, float]:  # noqa: ARG002
-        """Evaluate the policy in one batch of episodes per task, if due, and render videos.
+        """If an evaluation is due, run one batch of episodes per task and start rendering videos.
 
         Returns:
-            The success rate of each task, named `success/<task>`.
+            The success rate of each task, named `success/<task>`; empty if no evaluation is due.
         """
         if not run.config.evaluates(step):
             return {}
@@ -87,7 +88,7 @@ class Evaluation(Callback):
         write_json(run.folder / "results.json", summarize(run, results))
 
     def _write_media(self, run: Run, results: dict[str, Result]) -> None:
-        """Write a video and the first camera images of each task."""
+        """Write a video of each task, and the first camera images of its first demonstration."""
         for task, result in results.items():
             images = {name: np.asarray(i[0, 0]) for name, i in run.episodes[task].image.items()}
             video.write_image(run.folder / f"cameras_{task}.png", video.side_by_side(images))
@@ -95,7 +96,10 @@ class Evaluation(Callback):
                 self._write_video(self._rollouts[task][0], result.poses, unfinished)
 
     def _evaluate_tasks(self, run: Run, when: str, episodes: int = 0) -> dict[str, Result]:
-        """Evaluate all tasks, compiling concurrently; `episodes` overrides the config if not 0."""
+        """Evaluate all tasks, concurrently unless the physics runs in Warp.
+
+        A nonzero `episodes` overrides the number in the config.
+        """
         progress_bars = bars(run.console, "episodes", shown=not episodes)
         with run.timed("evaluate"), progress_bars as progress:
             evaluate_task = functools.partial(self._evaluate_task, run, when, episodes, progress)
@@ -135,7 +139,7 @@ class Evaluation(Callback):
 
 
 class NoEvaluation(Callback):
-    """Replaces `Evaluation` for tasks without a simulation; results have no success rates."""
+    """Replaces `Evaluation` for tasks that cannot be simulated; records no success rates."""
 
     def on_end(self, run: Run) -> None:
         """Print a note and write results.json."""
@@ -145,7 +149,7 @@ class NoEvaluation(Callback):
 
 
 def success(result: Result) -> dict[str, Any]:
-    """Return a task's entry in results.json."""
+    """Return the success rate of a task, as recorded in before.json and results.json."""
     return {"success": result.success, "episodes": result.episodes, "ci95": list(result.ci95)}
 
 
@@ -181,11 +185,11 @@ def summarize(run: Run, after: dict[str, Result]) -> dict[str, Any]:
 
 
 def _mean(trees: list[Any]) -> Any:
-    """Average trees of the same structure with lists of numbers as leaves."""
+    """Average trees that have the same structure and lists of numbers as leaves."""
     is_list = lambda node: isinstance(node, list)  # noqa: E731
     return _map_trees(lambda *v: np.mean(v, axis=0).tolist(), trees, is_leaf=is_list)
 
 
 def _map_trees(function: Callable, trees: list[Any], **options: Any) -> Any:
-    """Apply `jax.tree.map` to any number of trees; without trees return {}."""
+    """Apply `jax.tree.map` to any number of trees; return {} if there are none."""
     return jax.tree.map(function, *trees, **options) if trees else {}

@@ -1,4 +1,4 @@
-"""Confidence intervals of success rates; active ranks of one policy call."""
+"""Confidence intervals of success rates, and statistics of active ranks in one policy call."""
 
 import math
 
@@ -10,11 +10,11 @@ from lorasp_jax.peft import Aux
 Reports = dict[str, dict[str, Aux]]
 """Tower -> name of a linear layer -> `Aux` of its adapters, `[..., W, T]`.
 
-The images of a world are folded into W. The leading axis is layers; the action expert has an axis
-of denoising steps before it."""
+W counts worlds and T tokens; in the vision tower, W also counts the images of each world. Stacked
+layers have a layer axis before W; in the action expert, an axis of denoising steps comes first."""
 
 LayerRanks = dict[str, dict[str, jax.Array]]
-"""Tower -> name of a linear layer -> active rank `[L]`."""
+"""Tower -> name of a linear layer -> active rank `[L]`; L = 1 for a layer that is not stacked."""
 
 
 def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
@@ -25,10 +25,10 @@ def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[f
     Args:
         successes: number of successful trials.
         trials: number of trials, at least 1.
-        z: normal quantile; the default gives 95 %.
+        z: quantile of the standard normal distribution; the default gives a 95 % interval.
 
     Returns:
-        Lower and upper bound.
+        The lower and the upper bound.
 
     Raises:
         ValueError: `trials` is not positive, or `successes` is not in 0..`trials`.
@@ -46,7 +46,7 @@ def layer_ranks(reports: Reports, running: jax.Array) -> LayerRanks:
     """Average each layer's active rank over valid tokens, running worlds and denoising steps.
 
     Args:
-        reports: from one policy call; linear layers without a rank are omitted.
+        reports: from one policy call; linear layers that report no active rank are omitted.
         running: `[W]` bool, unfinished worlds.
     """
 
@@ -64,15 +64,15 @@ def layer_ranks(reports: Reports, running: jax.Array) -> LayerRanks:
 
 
 def rank_histogram(reports: Reports, running: jax.Array, rank: int) -> dict[str, jax.Array]:
-    """Count the tokens with each active rank, for each tower over all its layers.
+    """Count active ranks per tower, over valid tokens, running worlds, layers and denoising steps.
 
     Args:
-        reports: from one policy call; towers without a rank are omitted.
+        reports: from one policy call; towers that report no active rank are omitted.
         running: `[W]` bool, unfinished worlds.
-        rank: R, the maximum active rank.
+        rank: R, the highest possible active rank.
 
     Returns:
-        `[R + 1]` int32 per tower; entry k is the number of tokens with active rank k.
+        `[R + 1]` int32 per tower; entry k counts active rank k, once per token, layer and step.
     """
 
     def count(active: jax.Array, valid: jax.Array) -> jax.Array:
@@ -89,7 +89,7 @@ def rank_histogram(reports: Reports, running: jax.Array, rank: int) -> dict[str,
 def _tokens(
     reports: Reports, running: jax.Array
 ) -> dict[str, dict[str, tuple[jax.Array, jax.Array]]]:
-    """Return active rank and validity, `[..., W, T]` each, of the linear layers with a rank."""
+    """Return active rank and validity, both `[..., W, T]`, of each linear layer with a rank."""
 
     def by_world(linear: Aux) -> tuple[jax.Array, jax.Array]:
         rank, mask = linear.active_rank, linear.token_mask

@@ -29,9 +29,9 @@ class Rollout:
 
     Attributes:
         success: `[W]` bool.
-        steps: `[W]` int32, control steps until success or the time limit.
-        active_rank: `[L]` per linear layer, mean over tokens and policy calls in unfinished worlds.
-        active_rank_histogram: `[calls, R + 1]` int32 per tower, see `metrics.rank_histogram`; R is
+        steps: `[W]` int32, control steps up to success or the time limit.
+        active_rank: `[L]` per linear layer, mean over tokens and policy calls of unfinished worlds.
+        active_rank_histogram: `[calls, R + 1]` int32 per tower; see `metrics.rank_histogram`. R is
             the largest adapter rank.
         poses: poses of the first worlds at every control step, leading axes `[time, worlds]`.
     """
@@ -52,10 +52,11 @@ class Result:
         episodes: number of episodes.
         ci95: 95 % Wilson interval of the success rate.
         steps: mean control steps per episode.
-        active_rank: mean active rank of each layer, by tower and linear layer.
-        active_rank_histogram: `[R + 1]` int64 per tower, number of tokens with each active rank
-            over all layers and policy calls in unfinished worlds; R is the largest adapter rank.
-        poses: poses of one recorded episode, successful if possible, leading axis time.
+        active_rank: mean active ranks by tower and linear layer, each a list over stacked layers.
+        active_rank_histogram: `[R + 1]` int64 per tower, the sum of `metrics.rank_histogram` over
+            all policy calls; R is the largest adapter rank.
+        poses: poses of one recorded episode, a successful one if possible; the leading axis is
+            time.
     """
 
     success: float
@@ -74,10 +75,10 @@ def make_rollout(
     denoise_steps: int = 10,
     ranges: Randomization | None = None,
 ) -> Callable[[Policy, jax.Array], Rollout]:
-    """Create a rollout of `env.num_envs` episodes, a pure function of policy and key to be jitted.
+    """Create a rollout of `env.num_envs` episodes: a pure function (policy, key) for `jax.jit`.
 
-    Every `execute_steps` control steps the policy observes and samples a new chunk in
-    `denoise_steps` Euler steps. For `ranges` see `env.reset`; recorded poses do not include colors.
+    Every `execute_steps` control steps, the policy observes and samples a new chunk in
+    `denoise_steps` Euler steps. For `ranges`, see `env.reset`; randomized colors are not recorded.
     """
     num_calls = -(-env.max_steps // execute_steps)
 
@@ -139,9 +140,10 @@ def evaluate(
     Args:
         policy: policy for the robot of `env`, with prompts for `env.instructions`.
         env: environment; `num_envs` episodes run in parallel.
-        key: PRNG key, which determines the layouts; consumed.
+        key: PRNG key that determines the layouts and the sampled actions; do not reuse it.
         num_episodes: a multiple of `env.num_envs`.
-        rollout: jitted `make_rollout(env)`; reuse it to compile only once.
+        rollout: jitted `make_rollout(env)`, to compile only once for several calls; None creates
+            one.
         progress: called with (completed, total) episodes.
 
     Raises:
@@ -166,7 +168,7 @@ def evaluate(
 def _control_block(
     env: Env, policy: Policy, execute_steps: int, denoise_steps: int, state: State, key: jax.Array
 ) -> tuple[State, tuple]:
-    """Observe, predict, execute; return the next state and the recorded data."""
+    """Observe, predict and execute; return the next state and the recorded data."""
     actions, aux = policy.sample(
         key, env.observe(state), state.info["instruction"], num_steps=denoise_steps, return_aux=True
     )
@@ -207,12 +209,15 @@ def _result(runs: Sequence[Rollout]) -> Result:
 
 
 def _with_prompts(policy: Policy, env: Env) -> Policy:
-    """Restrict the prompt table to the environment's instructions, in its order."""
+    """Restrict the prompt table to the environment's instructions, in the environment's order."""
     prompts = policy.processor.prompts.select(env.instructions)
     return Policy(policy.model, dataclasses.replace(policy.processor, prompts=prompts))
 
 
 def _recorded_episode(run: Rollout) -> Poses:
-    """Return the poses of the first successful recorded world, else of world 0, until its end."""
+    """Return the poses of the first recorded world that succeeds, or of world 0 if none does.
+
+    They end with the episode.
+    """
     world = int(jnp.argmax(run.success[:RECORDED_WORLDS]))
     return jax.tree.map(lambda x: x[: max(int(run.steps[world]), 1), world], run.poses)

@@ -27,9 +27,9 @@ def write_episode(env: Env, poses: Poses, path: Path) -> None:
     """Render a recorded episode and write it as a video at the control rate.
 
     Args:
-        env: the environment of the episode.
-        poses: poses of geoms and cameras, leading axis `[T]`.
-        path: MP4 file.
+        env: the environment in which the episode was recorded.
+        poses: poses of geoms and cameras; the leading axis is time.
+        path: of the MP4 file.
     """
     renderer = dataclasses.replace(env, renderer=RayRenderer(env.render_model, VIDEO_SIZE, 1))
     images = jax.jit(renderer.render)(poses)

@@ -1,8 +1,8 @@
 """Digests that detect corrupted data.
 
-Array digests are computed on the arrays' devices and do not depend on their sharding. Orbax misses
-some corruption: incompressible data is stored raw, and a flipped bit in it is restored as a
-different value. JSON digests are stored next to the values, under "digest".
+Array digests are computed on the arrays' devices and do not depend on the sharding. They are
+needed because Orbax misses some corruption: it stores incompressible data raw, so a flipped bit
+there silently restores a different value. JSON digests are stored with the values, under "digest".
 """
 
 import functools
@@ -21,7 +21,7 @@ DIGEST = "digest"
 
 
 def digest(arrays: Mapping[str, jax.Array], *extra: str) -> str:
-    """Return the SHA-256 of the arrays' names, dtypes, shapes and sums, and of `extra`, in hex."""
+    """Return a SHA-256 in hex, of `extra` and each array's name, dtype, shape and `mixed_sum`."""
     sums = jax.device_get({name: _sum(array) for name, array in arrays.items()})
     entries = [
         [name, str(array.dtype), list(array.shape), int(sums[name])]
@@ -31,7 +31,7 @@ def digest(arrays: Mapping[str, jax.Array], *extra: str) -> str:
 
 
 def fingerprints(weights: Mapping[str, Any]) -> dict[str, str]:
-    """Hash each array's values in bf16, so that fp32 and bf16 copies match; eight hex digits."""
+    """Hash each array to eight hex digits, in bf16 so that fp32 and bf16 copies match."""
     sums = jax.device_get({name: _sum(array, rounded=True) for name, array in weights.items()})
     return {name: f"{int(value):08x}" for name, value in sums.items()}
 
@@ -60,15 +60,15 @@ def verify_digest(content: Any) -> dict[str, Any]:
 
 
 def _json_digest(values: Mapping[str, Any]) -> str:
-    """Return the first 16 digits of the values' SHA-256, independent of their formatting."""
-    normalized = json.loads(json.dumps(values))  # turns keys into strings
+    """Return the first 16 hex digits of the SHA-256 of JSON values, independent of formatting."""
+    normalized = json.loads(json.dumps(values))  # turns all keys into strings
     return hashlib.sha256(json.dumps(normalized, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _sum(array: Any, *, rounded: bool = False) -> Any:
     """Compute `mixed_sum`, optionally of floats rounded to bf16.
 
-    Arrays in host memory use NumPy, which compiles nothing for their shapes.
+    Arrays in host memory are summed with NumPy, which avoids a compilation for each shape.
     """
     rounded = rounded and jnp.issubdtype(array.dtype, jnp.floating)
     on_host = isinstance(array, np.ndarray) or (
@@ -81,7 +81,7 @@ def _sum(array: Any, *, rounded: bool = False) -> Any:
 
 
 def host_sum(array: np.ndarray, block: int = 2**18) -> int:
-    """Compute `mixed_sum` in NumPy, in blocks of words that fit in the CPU cache."""
+    """Compute `mixed_sum` in NumPy, `block` words at a time so that they fit in the CPU cache."""
     words = np.ascontiguousarray(array).reshape(-1).view(f"uint{min(8 * array.itemsize, 32)}")
     total = 0
     for start in range(0, len(words), block):
@@ -95,11 +95,13 @@ def host_sum(array: np.ndarray, block: int = 2**18) -> int:
 
 @functools.partial(jax.jit, static_argnames="rounded")
 def mixed_sum(array: jax.Array, *, rounded: bool = False) -> jax.Array:
-    """Sum the bits of all elements (in bf16 if rounded), each mixed with its position: `[]` uint32.
+    """Sum the 32-bit words of all elements, each mixed with its position: `[]` uint32.
 
-    The mixing is the finalizer of MurmurHash3 (github.com/aappleby/smhasher, MurmurHash3.cpp:68), a
-    permutation of the 32-bit words: a change of a single word is always detected; any other change
-    is missed with probability 2^-32. Integer sums do not depend on the order.
+    Elements are read bitwise as integers, 64-bit ones as two words; `rounded` casts them to bf16
+    first. The mixing function is the finalizer of MurmurHash3 (github.com/aappleby/smhasher,
+    MurmurHash3.cpp:68), a permutation of the 32-bit words, so a change of a single word is always
+    detected. Any other change is missed with probability 2^-32. The order of summation does not
+    matter, because integer addition is exact.
     """
     if rounded or array.dtype == bool:
         array = array.astype(jnp.bfloat16 if rounded else jnp.uint8)

@@ -18,8 +18,8 @@ HUB = "hf://"
 REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 """Repository id on the Hub, owner/name."""
 BUCKET = re.compile(r"(gs|s3|memory)://[\w.-]+(/[\w.+=@-]+)*/?")
-"""Folder or file in a bucket; other URLs, such as web pages or file://, are rejected. memory:// is
-fsspec's in-memory store, for tests."""
+"""URL of a folder or file in a bucket; other URLs, such as web pages or file://, are rejected.
+memory:// is fsspec's in-memory store, for tests."""
 IGNORED_PATTERNS = (
     "train_state/*",
     "*.bin",
@@ -30,7 +30,7 @@ IGNORED_PATTERNS = (
     "*.msgpack",
     "*.h5",
 )
-"""Files not to download: optimizer states, and weights in the formats of other libraries."""
+"""Files not to download from the Hub: optimizer states, and weights in other libraries' formats."""
 
 
 def local(
@@ -39,13 +39,14 @@ def local(
     only: list[str] | None = None,
     repository: Literal["model", "dataset"] = "model",
 ) -> Path:
-    """Return a local path, downloading if necessary.
+    """Return the local path of a file or folder, downloading it if necessary.
 
     Args:
-        where: a path; a Hub repository, hf://owner/name, cached by the Hub client; or a bucket URL,
-            gs://bucket/folder, cached in lorasp_jax/ under the user's cache folder. Shipped bases,
-            such as assets/pi0_nano, resolve from any folder.
-        only: file patterns to download from a repository; None: all except `IGNORED_PATTERNS`.
+        where: a path, a Hub repository (hf://owner/name) or a bucket URL (gs://bucket/folder). The
+            Hub client caches repositories; buckets are cached in lorasp_jax/ under the user's cache
+            folder. Shipped bases, such as assets/pi0_nano, resolve from any working directory.
+        only: patterns of the files to download from a Hub repository; None selects all files.
+            `IGNORED_PATTERNS` are skipped in either case.
         repository: type of the Hub repository.
 
     Raises:
@@ -67,7 +68,7 @@ def local(
 
 
 def portable_path(where: str) -> str:
-    """Return a path to record, which `resolve_portable` resolves from any folder; "" stays ""."""
+    """Return a path that `resolve_portable` resolves from any working directory; "" stays ""."""
     if not where or "://" in where:
         return where
     path = Path(where)
@@ -130,7 +131,7 @@ def _from_bucket(url: str) -> Path:
         with locked(target, lambda: print(waiting, file=sys.stderr)):
             if not target.exists():
                 _copy(*fsspec.core.url_to_fs(url), target)
-    except ImportError as error:  # fsspec's message names only the backend package
+    except ImportError as error:  # fsspec's message names only the backend's package
         install = 'pip install "lorasp_jax[buckets]"'
         raise ValueError(f"Cannot download {url}: a package is missing. Run {install}.") from error
     except Exception as error:  # each backend raises its own errors

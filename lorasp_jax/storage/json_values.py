@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 MAX_NUMBER = 1e38
-"""Upper bound on the numbers in our files: counts, checksums, and sums and means of fp32."""
+"""Upper bound on the magnitude of numbers in our files: counts, checksums, fp32 sums and means."""
 _NAMES: dict[Any, str] = {
     str: "a string",
     int: "a whole number",
@@ -18,9 +18,10 @@ def check(value: Any, kind: Any, name: str = "") -> None:
 
     Args:
         value: parsed JSON value.
-        kind: a type; [kind] for a list of any length, (kind, kind) for a list of two; {"a": kind}
-            for an object with at least the key "a"; {str: kind} for the type of all other values.
-        name: dotted path of the value, for the message.
+        kind: the schema. A type stands for itself, [kind] for a list of any length and (kind, kind)
+            for a list of two. {"a": kind} stands for an object with at least the key "a"; values of
+            keys that are not listed may be anything, or match the kind under the key `str`.
+        name: dotted path of the value, for the error message.
     """
     if isinstance(kind, type):
         if not _is(value, kind):
@@ -42,7 +43,7 @@ def check(value: Any, kind: Any, name: str = "") -> None:
 
 
 def _is(value: Any, kind: type) -> bool:
-    """Return whether a value has a JSON type: integers are numbers, booleans are not."""
+    """Return whether a value has a JSON type; integers count as numbers, booleans do not."""
     if not isinstance(value, int | float if kind is float else kind):
         return False
     return isinstance(value, bool) == (kind is bool) and (kind is str or abs(value) <= MAX_NUMBER)

@@ -1,13 +1,14 @@
-"""Files shipped with the project, configs/ and assets/, whose paths resolve from any folder.
+"""Files shipped with the project: configs/ and assets/ resolve from any working directory.
 
-A checkout has both beside the package; a wheel has them inside it, with only the nano bases.
+A checkout has both folders beside the package; a wheel has both inside the package, with only the
+nano bases.
 """
 
 from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parents[1]
 ROOT = PACKAGE if (PACKAGE / "assets").is_dir() else PACKAGE.parent
-"""Folder with configs/ and assets/: the root of a checkout, or the installed package."""
+"""Folder that contains configs/ and assets/: the root of a checkout, or the installed package."""
 BASES, EXPERIMENTS = "assets", "configs"
 
 
@@ -17,7 +18,7 @@ def is_under(path: Path, folder: str) -> bool:
 
 
 def missing_base_message(name: str) -> str:
-    """Return the error message for a missing base in assets/, with the bases that exist."""
+    """Return the error message for a missing base in assets/; it lists the bases that exist."""
     bases = ", ".join(sorted(file.parent.name for file in ROOT.glob(f"{BASES}/*/config.json")))
     message = f"{name} does not exist; bases in {ROOT / BASES}: {bases or 'none'}"
     if ROOT != PACKAGE:
