@@ -1,4 +1,4 @@
-"""Adapt a whole model: attach adapters by path rules, split, count, merge.
+"""Adapt a whole model by path rules; split, count and merge its parameters.
 
 A rule is (pattern, method). Patterns are searched (`re.search`) in "/"-joined paths. The first
 match wins, even if its method cannot apply to that path: with [("vision", LoRA()),
@@ -11,8 +11,8 @@ Hugging Face PEFT's options map to rules, most specific first:
     bias="all"                     ("bias$", FullFineTuning()), (".*", LoRA())
     exclude_modules                ("head", None), (".*", LoRA())
 
-A rule ("bias$", FullFineTuning()) also unfreezes the biases of layers that another rule adapts,
-since their kernels have different paths.
+The rule ("bias$", FullFineTuning()) also unfreezes the biases of layers that another rule adapts,
+since its pattern does not match the paths of the layers themselves.
 """
 
 import math
@@ -54,22 +54,22 @@ def adapt(
     """Attach adapters to layers, or unfreeze base weights for full fine-tuning, by path rules.
 
     Adapters apply to every `Dense`, `nnx.Linear` (which becomes a `Dense`), `nnx.LinearGeneral` and
-    `nnx.Einsum` at its path, for instance "language/gate_proj"; LoRA also applies to `nnx.Embed`
-    and `nnx.Conv`. A stacked kernel [L, I, O] gets stacked adapters. The layer's own weights are
-    frozen. Subclasses that override `__call__` are skipped.
-    `FullFineTuning` applies to every parameter under the paths it matches, including norms,
-    embeddings and biases, and converts each to an fp32 `AdapterParam`.
+    `nnx.Einsum` whose path matches, for instance "language/gate_proj"; LoRA also applies to
+    `nnx.Embed` and `nnx.Conv`. A stacked kernel [L, I, O] gets stacked adapters. An adapted layer's
+    own weights are frozen. Subclasses that override `__call__` are skipped.
+    `FullFineTuning` applies to every floating-point parameter under the paths it matches, including
+    norms, embeddings and biases, and converts each of them to an fp32 `AdapterParam`.
 
     Args:
       model: not modified; the result shares its frozen arrays.
       rules: (pattern, method or None) pairs, first match wins.
-      rngs: source of the adapters' keys. A layer's initial adapter depends only on the key and the
-        layer's path.
+      rngs: source of the key from which adapters are initialized. A layer's initial adapter depends
+        only on this key and the layer's path.
       einsums: extra layer classes that compute one einsum of their input and a parameter, mapped to
         a function layer -> (parameter name, equation), as in
         {gemma.Einsum: lambda layer: ("w", layer.einsum_str)}.
-      statistics: [..., I, I] by path from `calibration.input_moments`, for data-driven
-        initialization.
+      statistics: second moments [..., I, I] of layer inputs by path, from
+        `calibration.input_moments`; for data-driven initialization.
 
     Returns:
       The adapted model.
@@ -96,7 +96,7 @@ def split(model: nnx.Module) -> tuple[nnx.GraphDef[Any], nnx.State[Any, Any], nn
     biases and unadapted layers.
 
     `nnx.merge(graphdef, adapters, frozen, copy=True)` restores the model, also inside jit and grad.
-    Without `copy=True`, models that use `nnx.scan` or `nnx.remat` cannot be called there.
+    Without `copy=True`, models that use `nnx.scan` or `nnx.remat` cannot be called inside these.
     """
     graphdef, adapters, frozen = nnx.split(_wrapped_copy(model)[0], AdapterParam, ...)
     return graphdef, adapters, frozen
@@ -105,13 +105,13 @@ def split(model: nnx.Module) -> tuple[nnx.GraphDef[Any], nnx.State[Any, Any], nn
 def with_dropout(model: Model, key: jax.Array) -> Model:
     """Enable the adapters' `dropout` for one training step.
 
-    Call it inside the loss, with a fresh key per step:
+    Call this function inside the loss, with a new key for each step:
 
         model = with_dropout(nnx.merge(graphdef, adapters, frozen, copy=True), key)
 
     Every other function, such as `adapt`, `load_adapters`, `split` and `merge`, returns a model
-    with dropout off. Layers of a stack use independent masks; a layer called twice reuses its mask
-    for inputs of equal shape.
+    with dropout off. The layers of a stack use independent masks. A layer that is called twice
+    reuses its mask if the inputs have the same shape.
 
     Args:
       model: not modified; adapters without dropout are unaffected.
@@ -136,7 +136,7 @@ def count(model: nnx.Module) -> Counts:
 
 
 def methods(model: nnx.Module) -> dict[str, Method]:
-    """Return methods by path: the layer's for adapters, the parameter's for full fine-tuning."""
+    """Return methods by path: of the layer for an adapter, of the parameter if fully fine-tuned."""
     methods_by_path = {}
     validate.module(model)
     for path, parent, name, _ in paths.locate(nnx.List([model]), AdapterParam):
@@ -150,8 +150,9 @@ def methods(model: nnx.Module) -> dict[str, Method]:
 def merge(model: Model) -> Model:
     """Fold the adapters into the kernels; the result has no adapters and is entirely frozen.
 
-    For embeddings, both lookup and `attend` use the adapter. Code that reads the table directly
-    does not, yet merging changes the table. An adapted quantized kernel is dequantized.
+    Both lookups and `attend` of an adapted embedding use the adapter. Code that reads the table
+    directly does not, but will see the change after merging. An adapted quantized kernel is
+    dequantized.
 
     Raises:
       ValueError: a method's delta depends on the input, or the model has shapes without values.
@@ -176,7 +177,7 @@ def _merged(location: paths.Location) -> nnx.Module:
 
 
 def penalties(model: nnx.Module) -> dict[str, jax.Array]:
-    """Regularization losses by name, each averaged over the matrices whose method defines it."""
+    """Regularization losses by name, each averaged over all matrices whose method defines it."""
     losses: dict[str, list[jax.Array]] = {}
     for _, _, _, layer in paths.locate(nnx.List([validate.module(model)]), AdaptedLayer):
         if layer.adapter is not None:
@@ -189,16 +190,16 @@ def penalties(model: nnx.Module) -> dict[str, jax.Array]:
 def attach(
     layer: AdaptedLayer, method: Method, key: jax.Array, statistics: jax.Array | None = None
 ) -> None:
-    """Attach a newly initialized adapter to the layer and freeze its own weights.
+    """Attach a newly initialized adapter to a layer, and freeze the layer's own weights.
 
     Args:
-      layer: modified in place. Leading axes of its kernel are layers of a scanned stack.
+      layer: modified in place. Leading axes of its kernel index the layers of a scanned stack.
       method: the adapter's method.
       key: typed PRNG key.
       statistics: second moments [..., I, I] of the layer's inputs, if the method requires them.
 
     Raises:
-      ValueError: the layer does not support the method, it already has an adapter, or the method
+      ValueError: the layer does not support the method or already has an adapter, or the method
         would split a quantized kernel.
     """
     if layer.adapter is not None and layer.method is not None:
@@ -325,7 +326,8 @@ def init_stack(
 ) -> tuple[Params, Any]:
     """Apply a method's `init` to a kernel [..., I, O], with an independent key per matrix.
 
-    This is not jitted as a whole, so random draws compile once per I, not once per shape.
+    This function is not jitted as a whole, so that random draws compile once per I, not once per
+    kernel shape.
     """
     if len(getattr(kernel, "shape", ())) < 2:
         raise ValueError(f"an adapter needs a kernel [..., I, O], got {short(kernel)}.")

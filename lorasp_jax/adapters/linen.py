@@ -5,8 +5,8 @@
     y = adapter.apply(variables, x)
 
 The collection "adapters" is trainable; "params" keeps the structure of the model's own `init`, so
-pretrained parameters fit. During a call, each adapter is one of its layer's parameters, so the
-model's own transformations (scan, remat, vmap) also apply to it.
+pretrained parameters fit. During a call, each adapter is stored among its layer's parameters, so
+the model's own transformations (scan, remat, vmap) also apply to it.
 """
 
 import dataclasses
@@ -47,16 +47,16 @@ class LinenAdapter:
     Adapters apply to `nn.Dense`, `nn.DenseGeneral` and `nn.Einsum` at their paths; LoRA also
     applies to `nn.Embed` and `nn.Conv`, as in `adapt` for NNX. `FullFineTuning` applies to every
     parameter under the paths it matches and moves it to "adapters" in fp32. Paths in a scanned
-    stack have no index, and adapters are stacked like the kernels; `collect_aux` gets the aux of
-    these layers only if the model's own scan lists "intermediates". Subclasses that override
-    `__call__` are skipped.
+    stack have no index, and adapters are stacked like the kernels. `collect_aux` finds the aux of
+    such layers only if the `variable_axes` of the model's own scan include "intermediates".
+    Subclasses that override `__call__` are skipped.
 
     Attributes:
       model: any Linen module; for a Hugging Face Flax model, its `.module`.
       rules: (pattern, method or None) pairs, first match wins.
       einsums: extra layer classes that compute one einsum of their input and a parameter, as for
-        `adapt`; {gemma.Einsum: lambda layer: ("w", None)} if the layer takes its equation as a call
-        argument.
+        `adapt`. The equation is None if it is an argument of the layer's call, as in
+        {gemma.Einsum: lambda layer: ("w", None)}.
     """
 
     model: nn.Module
@@ -74,7 +74,7 @@ class LinenAdapter:
             )
 
     def init(self, key: Any, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        """Initialize the model's variables with its own `init`, and attach "adapters".
+        """Initialize the variables with the model's own `init`, and add the collection "adapters".
 
         Args:
           key: typed PRNG key, or a dictionary of keys with one for "params".
@@ -93,7 +93,7 @@ class LinenAdapter:
 
         Args:
           key: as for `init`.
-          variables: with "params"; not modified.
+          variables: variables of the bare model, with "params"; not modified.
           *args: the model's call arguments.
           **kwargs: the model's call arguments.
 
@@ -145,7 +145,7 @@ class LinenAdapter:
         """Fold the adapters into the parameters; returns variables of the bare model.
 
         Do not adapt an embedding whose table the model also reads directly, for example for tied
-        logits: the adapter affects only lookups, but merging changes the table itself.
+        logits: the adapter affects only lookups and `attend`, but merging changes the table itself.
 
         Args:
           variables: as for `apply`.

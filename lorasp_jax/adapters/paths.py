@@ -26,10 +26,10 @@ class Location(NamedTuple):
 
 
 def locate(root: nnx.List[Any], kind: type | tuple[type, ...]) -> list[Location]:
-    """List all modules or variables of a type.
+    """List all modules or variables of the given types.
 
     Args:
-      root: `nnx.List([model])`; paths start at the model.
+      root: `nnx.List([model])`; paths are relative to the model.
       kind: type or types to look for.
     """
 
@@ -57,9 +57,9 @@ def replace(locations: Sequence[Location], make: Callable[[Location], Any]) -> N
 
     Args:
       locations: the children to replace.
-      make: returns the replacement for a location, or None to skip it. A shared child is replaced
-        once, by the first result that is not None, at all its locations. A shared `nnx.Linear` is
-        replaced separately at each location, so that each one has its own adapter.
+      make: returns the replacement for a location, or None to skip it. For a shared child, the
+        first result that is not None replaces it at all its locations. A shared `nnx.Linear` is
+        replaced separately at each location, so that each location has its own adapter.
     """
     replacements: dict[Hashable, Any] = {}
     for location in locations:
@@ -71,7 +71,7 @@ def replace(locations: Sequence[Location], make: Callable[[Location], Any]) -> N
 
 
 def _identity(location: Location) -> Hashable:
-    """Key that is equal for locations with the same replacement."""
+    """Key that is equal for locations that get the same replacement."""
     return location.path if isinstance(location.child, nnx.Linear) else id(location.child)
 
 
@@ -145,7 +145,7 @@ def locate_other_matrices(
 ) -> list[Location]:
     """List parameters with two or more axes in modules that adapters do not support.
 
-    Scales and biases are skipped: those of stacked norms have a second axis, but are not matrices.
+    Scales and biases are skipped: in stacked norms they have two axes, but are not matrices.
     """
     supported = {id(location.child) for location in locate_layers(root, einsums)}
     return [
@@ -181,5 +181,5 @@ EINSUMS_HINT = (
 
 
 def near_misses(query: str, names: Sequence[str]) -> str:
-    """Join up to five names: those most similar to the query, else the first five."""
+    """Join up to five names that resemble the query, or the first five if none does."""
     return ", ".join(difflib.get_close_matches(query, names, n=5, cutoff=0.3) or names[:5])

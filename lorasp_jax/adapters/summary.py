@@ -21,14 +21,15 @@ def summary(model: nnx.Module, aux: Mapping[str, Aux] | None = None) -> str:
     """Format a table of a model's layers, other trainable parameters and other matrices.
 
     Columns: path, method, kernel shape, rank, parameters (base and adapter), trainable parameters,
-    and with `aux` the mean active rank. A line below gives the trainable share and what is frozen.
+    and, if `aux` is given, mean active rank. Lines below the table give the trainable share, the
+    modules that are entirely frozen and any unsupported classes.
 
     Args:
       model: adapted or not.
-      aux: by path, from `collect_aux` after a call of the model.
+      aux: aux of layers by path, from `collect_aux` after a call of the model.
 
     Raises:
-      ValueError: aux has the path of a layer that the model lacks.
+      ValueError: aux has a path that is not a layer of the model.
     """
     rows = _rows(validate.module(model))
     if aux is not None and not (
@@ -119,7 +120,7 @@ def collect_aux(model: nnx.Module | Mapping[str, Any]) -> dict[str, Aux]:
         Linen model returned from `apply(..., mutable=["intermediates"])`.
 
     Returns:
-      Aux by "/"-joined path of the layer.
+      Aux of each layer, by "/"-joined path.
 
     Raises:
       ValueError: no adapted layer stored any aux.

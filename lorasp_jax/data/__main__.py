@@ -147,7 +147,7 @@ def _camera(text: str) -> tuple[str, str]:
 
 @contextmanager
 def _progress_bar(title: str) -> Iterator[tuple["Report", Callable[[str], None]]]:
-    """Yield a progress callback, whose first call shows the bar, and a function to print a line."""
+    """Yield a progress callback, which shows the bar when first called, and a line printer."""
     progress = bars(Console(stderr=True), "steps")
     bar = progress.add_task(title, total=None)
     print_line = functools.partial(

@@ -1,8 +1,8 @@
 """Training batches: windows of demonstrations.
 
-Episodes are stored as flat per-step arrays, on the device if they fit, else in files; a batch is a
-gather. The batch of a training step depends only on the run's key or seed and the step number, so
-one integer is enough to resume the data of a run.
+Episodes are stored as flat per-step arrays, on the device if they fit there, otherwise in files. A
+batch is gathered from these arrays. It depends only on the run's key or seed and the number of the
+training step, so this number suffices to resume where a run left off in the data.
 """
 
 import dataclasses
@@ -44,7 +44,7 @@ class Steps:
         image: camera name -> `[N, H, W, 3]` uint8.
         state: `[N, J+1]` joints [rad] and gripper opening [m].
         action: `[N, J+1]` joint targets [rad] and gripper opening [m].
-        end: `[N]` int32, index after the last step of the same episode.
+        end: `[N]` int32, index just past the last step of the same episode.
         instruction: `[N]` int32, row of the processor's token table.
     """
 
@@ -77,7 +77,7 @@ class Raw:
 
 
 def flatten(episodes: Sequence[Episodes]) -> Steps:
-    """Concatenate the valid steps of all episodes; instruction indices are offset."""
+    """Concatenate the valid steps of all `Episodes`, numbering their instructions consecutively."""
     parts: list[Steps] = []
     step_offset = instruction_offset = 0
     for group in episodes:
@@ -142,9 +142,10 @@ def gather(steps: Steps, start: Array, chunk: int) -> Raw:
 
 
 def encode(key: jax.Array, raw: Raw, processor: Processor, *, state_noise: float) -> Batch:
-    """Normalize a batch for the model; `key` draws the noise added to the normalized state.
+    """Normalize a batch for the model; `key` seeds the noise added to the normalized state.
 
-    The action mask is False where a chunk repeats the last action of its episode.
+    The action mask is False where a chunk repeats the last action of its episode, and outside
+    `Processor.flow_slots`.
     """
     batch: Any = jax.tree.map(jnp.asarray, raw)
     observed: RawObservation = {"image": batch.image, "state": batch.state}
@@ -163,7 +164,7 @@ def sample_batch(
     chunk: int,
     state_noise: float,
 ) -> Batch:
-    """Draw `batch_size` windows uniformly over steps; `key` is consumed."""
+    """Sample `batch_size` windows that start at uniformly random steps; `key` is consumed."""
     start_key, noise_key = jax.random.split(key)
     start = jax.random.randint(start_key, (batch_size,), 0, steps.end.shape[0])
     return encode(noise_key, gather(steps, start, chunk), processor, state_noise=state_noise)

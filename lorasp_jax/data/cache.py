@@ -3,11 +3,13 @@
     cache.write([open_source("my_dataset")], "my_cache", lambda done, total: None)
     steps = cache.Cache("my_cache").steps
 
-A cache is a folder of memory-mapped .npy files, including raw images; cache.json, with the metadata
-that all episodes share and the files' checksums; and statistics.json. Checksums of images are in
-files of their own, and each image is verified when it is first read. A batch is one gather per
-file. Measured on two cores for batches of 64 shuffled windows of two cameras: 37,000 windows/s at
-128 x 128 pixels and 18,000 at 224 x 168, versus 6,500 and 3,800 from array_record files.
+A cache is a folder of memory-mapped .npy files, which include raw images. cache.json contains the
+metadata that all episodes share and the checksums of the files, and statistics.json contains the
+statistics of states and actions; it exists only if actions are joint targets. Image checksums have
+separate files, and each image is verified when it is first read. Reading a batch takes one gather
+per file. Measured on two cores, for batches of 64 shuffled windows with two cameras: 37,000
+windows/s at 128 x 128 pixels and 18,000 at 224 x 168, versus 6,500 and 3,800 from array_record
+files.
 """
 
 import json
@@ -66,12 +68,13 @@ def write(
         sources: datasets with the same robot and image size; not modified.
         path: folder to create.
         progress: called with the steps done and the total.
-        waiting: called once if another process is writing this folder, before waiting for it; the
-            cache that it writes is accepted if it matches these datasets. None: raise instead.
+        waiting: called once before waiting, if another process is writing this folder. The cache
+            written by that process is accepted if it matches these datasets. If `waiting` is None,
+            raise an error instead of waiting.
 
     Raises:
-        ValueError: the path already exists; another process is writing it, or wrote a cache that
-            does not match; or an episode is damaged, or incompatible with the others.
+        ValueError: the path already exists, another process is writing it or wrote a cache that
+            does not match, or an episode is damaged or incompatible with the others.
         OSError: the disk is full.
     """
     path, total = Path(path), sum(source.num_steps for source in sources)
@@ -105,7 +108,7 @@ def _check_same(cache: "Cache", sources: Sequence[Source], steps: int) -> None:
 
 
 def _prefetch(sources: Sequence[Source], reader: ThreadPoolExecutor) -> Iterator[Episodes]:
-    """Yield all episodes, prefetching one: two are in memory at a time."""
+    """Yield all episodes; prefetch the next one, so that two are in memory at a time."""
     pending = None
     for source in sources:
         for number in range(len(source)):
@@ -133,7 +136,7 @@ class Writer:
         return self
 
     def __exit__(self, error: Any, *_: Any) -> None:
-        """Close all files; on success, write statistics and header."""
+        """Close all files; on success, write the header and, for joint targets, statistics."""
         for column in self._columns.values():
             column.close()
         if error is not None:
@@ -156,7 +159,8 @@ class Writer:
         """Append one episode, given as `Episodes` with E = 1.
 
         Raises:
-            ValueError: its arrays are inconsistent, or its metadata differ from earlier episodes.
+            ValueError: its arrays are inconsistent, or its metadata differs from that of earlier
+                episodes.
         """
         episode.validate()
         self._metadata = self._metadata or _metadata(episode)
@@ -186,7 +190,7 @@ class Writer:
 
 
 def _check_compatible(shared: dict[str, Any], episode: Episodes) -> None:
-    """Raise ValueError if an episode's metadata differ from what all episodes must share."""
+    """Raise ValueError if an episode's metadata differs from what all episodes must share."""
     for name, value in _metadata(episode).items():
         if value != shared[name]:
             raise ValueError(
@@ -209,7 +213,7 @@ class Cache:
     Attributes:
         kind: name of the format.
         path: the folder.
-        metadata: content of cache.json: robot, tasks, instructions, control_dt and so on.
+        metadata: content of cache.json, including robot, tasks, instructions and control_dt.
         cameras: name -> height and width.
         statistics: of states and actions, in the robot's units; None unless actions are joint
             targets.
@@ -221,7 +225,7 @@ class Cache:
         """Open a cache.
 
         Raises:
-            ValueError: it is missing, damaged or in another format.
+            ValueError: the cache is missing, damaged or in another format.
         """
         self.path: Path = Path(path)
         header = self.path / HEADER
@@ -263,7 +267,7 @@ class Cache:
         )
 
     def episode(self, number: int, cameras: Sequence[str] | None = None) -> Episodes:
-        """Load one episode, with images from `cameras`; None: from all."""
+        """Load one episode, with images from `cameras`, or from all cameras if None."""
         rows = slice(self._end[number] - self._columns["length"][number], self._end[number])
         row = slice(number, number + 1)
         selected = self.cameras if cameras is None else cameras

@@ -32,7 +32,7 @@ class Column:
         self._file.close()
 
     def _write_header(self) -> None:
-        # NumPy pads the header, so that the first dimension can grow in place.
+        # NumPy pads the header so that the first dimension can grow in place.
         header = self._header | {"shape": (self._length, *self._row_shape)}
         np.lib.format.write_array_header_1_0(self._file, header)
 
@@ -46,7 +46,7 @@ def map_column(
         path: the .npy file.
         dtype: expected dtype.
         shape: expected shape; None matches any dimension.
-        crc32: expected checksum of the array's bytes; None: not verified.
+        crc32: expected checksum of the array's bytes; None skips the check.
 
     Raises:
         ValueError: the file is missing or damaged.

@@ -9,9 +9,9 @@ import numpy as np
 
 
 class CheckedImages:
-    """A memory-mapped array of images, uint8 `[N, H, W, 3]`; indexing reads and verifies them.
+    """A memory-mapped array of images, uint8 `[N, H, W, 3]`; indexing reads and verifies images.
 
-    The file may be larger than memory, so images are verified only when they are read.
+    The file may be larger than memory, so each image is verified only when it is first read.
     """
 
     def __init__(self, path: Path, array: np.ndarray, checksums: np.ndarray) -> None:

@@ -21,7 +21,7 @@ from lorasp_jax.data.source import Source
 from lorasp_jax.data.video import downscale
 
 EPISODES, FRAMES, TILE, LINE = 6, 5, 128, 14
-"""Contact sheet: rows, images per row, longer side of an image and height of a caption [px]."""
+"""Contact sheet: number of rows, images per row, longer image side [px] and caption height [px]."""
 _MAX_INSTRUCTIONS = 10  # in the report
 _END_EFFECTOR = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")  # action dimensions
 
@@ -34,7 +34,7 @@ class Summary:
         state: f32 `[N, J+1]`, all episodes concatenated.
         action: f32 `[N, A]`.
         length: int `[E]`, steps of each episode.
-        names: "state" and "action" -> names of their dimensions.
+        names: "state" and "action" -> names of the dimensions.
         phrases: instruction -> number of episodes.
         robot: name of the robot.
         tasks: names of the tasks.
@@ -102,7 +102,7 @@ def report(source: Source, console: Console) -> None:
 
 
 def hints(summary: Summary) -> list[str]:
-    """Return hints about probable unit errors, which only real recordings have."""
+    """Return hints about probable unit errors in a recording."""
     joints, gripper = np.abs(summary.state[:, :-1]).max(), np.abs(summary.state[:, -1]).max()
     texts = []
     if joints > 2 * math.pi:
@@ -154,7 +154,7 @@ def default_path(dataset: str) -> Path:
     """Return the default path of a dataset's contact sheet, in the user's cache folder.
 
     Args:
-        dataset: its path or id.
+        dataset: path or id of the dataset.
     """
     path = Path(os.path.realpath(dataset))
     digest = hashlib.sha256(str(path if path.exists() else dataset).encode()).hexdigest()[:8]
@@ -186,7 +186,7 @@ def _row(source: Source, number: int) -> np.ndarray:
     caption = Image.new("RGB", (images.shape[1], LINE))
     phrase = episode.instructions[int(episode.instruction[0])]
     text = f"{number}: {phrase} ({episode.num_steps} steps)"
-    printable = text.encode("latin-1", "replace").decode("latin-1")  # all the font has
+    printable = text.encode("latin-1", "replace").decode("latin-1")  # characters in the font
     ImageDraw.Draw(caption).text((2, 1), printable, fill="white")
     return np.concatenate([np.asarray(caption), images])
 

@@ -1,4 +1,4 @@
-"""Feature mapping of a LeRobot dataset, separate from the reader, which is slow to import."""
+"""Feature mapping of a LeRobot dataset; a separate module, since the reader is slow to import."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -9,23 +9,23 @@ from lorasp_jax.peft import _fields
 
 @dataclasses.dataclass(frozen=True)
 class Keys:
-    """Features of a dataset that hold state, action and images, and their units.
+    """Which features of a dataset contain state, action and images, and in which units.
 
-    State and action list the joints first, then the gripper opening.
+    In state and action, the joints come first, then the gripper opening.
 
     Attributes:
         state: feature with the measured joints and gripper.
         action: feature with the commanded joints and gripper.
-        state_numbers: names or indices of the state dimensions to use, in order; empty: all.
+        state_numbers: names or indices of the state dimensions to use, in order; all if empty.
         action_numbers: the same for the action.
-        cameras: camera -> feature; empty: all image features, named without the prefix
-            observation.images.
+        cameras: camera -> feature; if empty, all image features, named without the prefix
+            "observation.images.".
         angles: unit of the joints.
         gripper: unit of the gripper opening.
         every: keep every N-th frame, with the last action before the next kept frame; 3 turns
             30 Hz into 10 Hz.
         image_size: maximum length of the longer image side [px], to which larger images are
-            downscaled; 0: no limit.
+            downscaled; 0 means no limit.
     """
 
     state: str = "observation.state"

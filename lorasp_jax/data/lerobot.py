@@ -3,9 +3,9 @@
     dataset = LeRobot("hf://lerobot/some_dataset", Keys(angles="degrees", gripper="millimetres"))
     episodes = dataset.episode(0)
 
-States and actions are columns of parquet files; images are video frames, or PNG or JPEG files in
-further columns. Each episode is returned as `Episodes` with E = 1, in this project's order and
-units.
+States and actions are columns of parquet files. Images are video frames, or PNG or JPEG files in
+other columns. Each episode is returned as `Episodes` with E = 1, with dimensions in this project's
+order and units.
 """
 
 import os
@@ -34,7 +34,7 @@ from lorasp_jax.storage import hub
 _COLUMNS = ("timestamp", "frame_index", "episode_index", "task_index")
 _MAX_DIM = 10_000  # limit for state and action
 _TIME_TOLERANCE = 0.25
-"""Tolerance of timestamps, in frame periods, as for videos."""
+"""Tolerance of timestamps, in frame periods; the same as for videos."""
 
 
 class LeRobot:
@@ -43,13 +43,13 @@ class LeRobot:
     Attributes:
         kind: name and version of the format.
         name: name of the dataset.
-        path: its folder.
-        index: its metadata.
-        keys: mapping of its features.
+        path: folder of the dataset.
+        index: metadata of the dataset.
+        keys: feature mapping.
         cameras: camera -> feature.
         control_dt: time between two steps [s].
-        names: "state" and "action" -> names of the selected dimensions, in order; their indices if
-            they have no names.
+        names: "state" and "action" -> names of the selected dimensions, in order; indices where the
+            dataset has no names.
     """
 
     def __init__(
@@ -58,12 +58,12 @@ class LeRobot:
         """Open a dataset.
 
         Args:
-            source: a folder, or hf://owner/name, which is downloaded from the hub.
-            keys: mapping of its features; None: LeRobot's usual names.
-            name: name of the dataset; empty: that of the folder or repository.
+            source: a folder, or hf://owner/name, which is downloaded from the Hub.
+            keys: feature mapping; None uses LeRobot's usual names.
+            name: name of the dataset; if empty, that of the folder or repository.
 
         Raises:
-            ValueError: it is missing or damaged, or lacks a feature named in `keys`.
+            ValueError: the dataset is missing or damaged, or lacks a feature named in `keys`.
         """
         self.path: Path = hub.local(source, repository="dataset")
         self.index: Index = read_index(self.path)
@@ -105,10 +105,10 @@ class LeRobot:
 
         Args:
             number: index of the episode.
-            cameras: cameras to load; None: all.
+            cameras: cameras to load, or None for all.
 
         Raises:
-            ValueError: it is damaged, or does not match the metadata.
+            ValueError: the episode is damaged, or does not match the metadata.
         """
         entry = self.index.episodes[number]
         table = self._frames(entry)
@@ -184,7 +184,7 @@ class LeRobot:
         return [by_name[name] for name in selected]
 
     def _frames(self, entry: EpisodeEntry) -> Any:
-        """Read the episode's rows from its parquet file, and check that they are complete."""
+        """Read the episode's rows from its parquet file; check frame numbers and timestamps."""
         path, number = entry.table, entry.number
         with as_value_error(path):
             if self._table[0] != path:
@@ -257,7 +257,7 @@ class LeRobot:
             return np.stack([first, *(decode_image(file, size) for file in files[1:])])
 
     def _video(self, camera: str, path: Path) -> VideoReader:
-        """Open a camera's video; it stays open, since the next episode may be in the same file."""
+        """Return a camera's video, kept open since the next episode may be in the same file."""
         video = self._videos.get(camera)
         if video is None or video.path != path:
             if video is not None:

@@ -1,4 +1,4 @@
-"""Metadata and file layout of LeRobot datasets: the only code that depends on their version.
+"""Metadata and file layout of LeRobot datasets: the only code that depends on the format version.
 
     2.x   one parquet file per episode, one video per episode and camera; meta/*.jsonl
     3.0   many episodes per parquet file and per video; meta/**/*.parquet
@@ -32,7 +32,7 @@ from envs.datasets.files import (
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 _FIELD = re.compile(r"\{(\w+)(?::(\d{0,2}d?))?\}")
 """A field of a path template, with an optional width: {episode_index:06d}."""
-_MAX_VALUE_BYTES = 8  # per value in memory
+_MAX_VALUE_BYTES = 8  # maximum size of a value in memory
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,10 @@ class EpisodeEntry:
     """Files of an episode.
 
     Attributes:
-        number: its index in the dataset.
+        number: index of the episode in the dataset.
         length: number of frames.
-        table: parquet file with its states and actions, and possibly those of other episodes.
-        videos: feature -> video file, and start time of the episode in it [s].
+        table: parquet file with the episode's states and actions, and possibly other episodes'.
+        videos: feature -> video file, and start time of the episode in that file [s].
     """
 
     number: int
@@ -82,7 +82,7 @@ def read_index(folder: Path) -> Index:
     """Read the metadata of a dataset.
 
     Raises:
-        ValueError: it is damaged, or not a LeRobot dataset of a supported version.
+        ValueError: the dataset is damaged, or not a LeRobot dataset of a supported version.
     """
     path = folder / "meta" / "info.json"
     if not path.is_file():
@@ -180,7 +180,7 @@ def read_table(
     Args:
         path: the file.
         folder: the dataset's folder.
-        columns: columns to read; None: all.
+        columns: columns to read, or None for all.
         without: prefix of columns to skip.
 
     Raises:
@@ -198,7 +198,7 @@ def read_table(
 
 
 def _size(metadata: pq.FileMetaData, columns: set[str]) -> int:
-    """Estimate the bytes of columns in memory; equal values take almost no space in the file."""
+    """Estimate the bytes of columns in memory; repeated values take almost none in the file."""
     groups = (metadata.row_group(i) for i in range(metadata.num_row_groups))
     chunks = (group.column(j) for group in groups for j in range(group.num_columns))
     return sum(

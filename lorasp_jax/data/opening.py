@@ -18,12 +18,12 @@ def open_source(where: str | os.PathLike[str], keys: Keys | None = None) -> Sour
     """Open a LeRobot or RLDS dataset, a cache, or an .npz file of episodes.
 
     Args:
-        where: a path, or hf://owner/name of a LeRobot dataset on the hub.
+        where: a path, or hf://owner/name of a LeRobot dataset on the Hub.
         keys: feature mapping of a LeRobot dataset; the other formats need none.
 
     Raises:
-        ValueError: the dataset is missing, damaged or in an unknown format; or `keys` select
-            features of a dataset in another format.
+        ValueError: the dataset is missing, damaged or in an unknown format, or `keys` has feature
+            options although the dataset is not a LeRobot dataset.
     """
     path = hub.local(where, repository="dataset")
     if is_lerobot(path):

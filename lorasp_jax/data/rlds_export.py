@@ -1,4 +1,4 @@
-"""Export any dataset as RLDS, for use by other programs; training needs a cache instead."""
+"""Export any dataset as RLDS for other programs; for training, write a cache instead."""
 
 import os
 from pathlib import Path
@@ -23,11 +23,11 @@ def to_rlds(
         source: a dataset of one task; not modified.
         path: folder to create.
         progress: called with the steps done and the total.
-        episodes_per_file: episodes per file, all held in memory at once.
+        episodes_per_file: number of episodes per file; these are in memory at the same time.
 
     Raises:
         ValueError: the path already exists, another process is writing it, there are several tasks,
-            or the metadata of episodes differ.
+            or metadata differs between episodes.
         OSError: the disk is full.
     """
     tasks = sorted({source.episode(number, ()).task for number in (0, len(source) - 1)})

@@ -37,5 +37,5 @@ class Source(Protocol):
         ...
 
     def episode(self, number: int, cameras: Sequence[str] | None = None) -> Episodes:
-        """Load one episode into host memory, with images from `cameras`; None: from all."""
+        """Load one episode into host memory, with images from `cameras`, or from all if None."""
         ...

@@ -2,8 +2,9 @@
 
     for raw in Stream(Cache("my_cache").steps, batch_size=32, chunk=50, seed=0, start=1000):
 
-A batch depends only on seed and position. The global batch is the same, row for row, for any
-number of processes, so a run may resume with a different number.
+For given data and batch size, a batch depends only on the seed and its position. The global batch
+is the same, row for row, for any number of processes, so a run may resume with a different number
+of processes.
 """
 
 from typing import Any
@@ -34,15 +35,16 @@ class Stream:
         start: int = 0,
         process: tuple[int, int] = (0, 1),
     ) -> None:
-        """Prefetch in a background thread.
+        """Create a stream, which prefetches in a background thread.
 
         Args:
             steps: steps to sample from, see `Cache.steps`.
-            batch_size: windows in a batch, over all processes.
-            chunk: C, actions in a window.
-            seed: seed of the order, which differs in every epoch.
+            batch_size: number of windows in a batch, over all processes.
+            chunk: C, the number of actions in a window.
+            seed: seed of the shuffling; every epoch has a different order.
             start: `position` to resume from.
-            process: index of this process and number of processes; each gets its share of a batch.
+            process: index of this process, and number of processes; each process gets an equal
+                share of a batch.
 
         Raises:
             ValueError: an argument is out of range, or `batch_size` is not a multiple of the number

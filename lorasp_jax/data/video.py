@@ -19,8 +19,8 @@ _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
 _OPTIONS = {"format_whitelist": _CONTAINERS, "protocol_whitelist": "file"}
 _FORMATS = ("PNG", "JPEG")
 _TOLERANCE = 0.25
-"""Tolerance of a frame's time, in frame periods: small enough that no frame is mistaken for the
-next one, and that a wrong frame rate is noticed within the first frames."""
+"""Tolerance of a frame's time, in frame periods: small enough not to mistake a frame for the next
+one, and to notice a wrong frame rate within the first few frames."""
 
 
 class VideoReader:
@@ -34,7 +34,7 @@ class VideoReader:
         """Open the file.
 
         Raises:
-            ValueError: it is missing or damaged.
+            ValueError: the file is missing or damaged.
         """
         self.path = path
         try:
@@ -44,9 +44,9 @@ class VideoReader:
             raise ValueError(f"{path} cannot be read as a video ({first_line(error)})") from error
         self._stream.thread_type = "AUTO"
         self._frames: Iterator[Any] = self._container.decode(self._stream)
-        # Shared by all frames, since creating a reformatter takes as long as a conversion.
+        # Shared by all frames, since creating a reformatter takes as long as converting a frame.
         self._reformatter = VideoReformatter()
-        self._end = 0.0  # s, where the last read ended
+        self._end = 0.0  # end time of the last read [s]
 
     def read(
         self, start: float, length: int, fps: float, *, every: int = 1, image_size: int = 0
@@ -89,7 +89,7 @@ class VideoReader:
         return images
 
     def _seek(self, start: float) -> None:
-        """Seek to the last key frame before a time [s]."""
+        """Seek to the last key frame at or before a time [s]."""
         try:
             self._container.seek(round(start / self._stream.time_base), stream=self._stream)
         except (av.error.FFmpegError, OSError, OverflowError) as error:
@@ -133,9 +133,10 @@ def decode_image(file: bytes, image_size: int = 0) -> np.ndarray:
 
 
 def downscale(image: np.ndarray, image_size: int) -> np.ndarray:
-    """Downscale uint8 `[H, W, 3]` to at most `image_size` pixels on the longer side; 0: no limit.
+    """Downscale uint8 `[H, W, 3]` to at most `image_size` pixels on the longer side.
 
-    Uses the filter of openpi's clients (openpi_client/image_tools.py), bilinear with antialiasing.
+    If `image_size` is 0, there is no limit. The filter is bilinear with antialiasing, as in
+    openpi's clients (openpi_client/image_tools.py).
     """
     height, width, _ = image.shape
     longest = max(height, width)

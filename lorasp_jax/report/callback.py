@@ -1,4 +1,4 @@
-"""Update report.html during a run, and print a summary table at its end."""
+"""Update report.html during a run, and print a summary table at the end."""
 
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -32,7 +32,7 @@ class Report(Callback):
         self._submit(run.folder)
 
     def on_log(self, run: Run, step: int, metrics: dict[str, float]) -> None:  # noqa: ARG002
-        """Update the report unless the latest is recent or still being written."""
+        """Update the report unless the latest one is recent or still being written."""
         (run.folder / STOPPED).unlink(missing_ok=True)
         if time.perf_counter() - self._started > INTERVAL and (
             not self._latest or self._latest.done()
@@ -46,7 +46,7 @@ class Report(Callback):
         run.console.print(final_table(run.folder))
 
     def on_stop(self, run: Run, reason: str) -> None:
-        """Write the final report, with the reason why the run stopped."""
+        """Write the final report, including the reason why the run stopped."""
         write_json(run.folder / STOPPED, {"reason": reason})
         run.console.print(
             f"report up to this step: {self._submit(run.folder).result()}", markup=False
@@ -73,7 +73,7 @@ def final_table(folder: Path) -> Table:
         raise ValueError(f"no finished run in {folder}: results.json is missing")
     rows = [
         row for row in read_metrics(folder) if "task" in row
-    ]  # rows in which all steps were skipped have no loss
+    ]  # a row has no loss if all its steps were skipped
     table = Table("", title=folder.name)
     for column in ("before", "after"):
         table.add_column(column, no_wrap=True)

@@ -8,7 +8,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 COLORS = {"vision": "#4269d0", "language": "#efb118", "action": "#3ca951", "before": "#9498a0"}
-"""Color of each tower in every figure; gray for results before training."""
+"""Color of each tower in every figure; results before training are gray."""
 
 _STYLE: Any = {
     "font.size": 10,
@@ -21,7 +21,7 @@ _STYLE: Any = {
 }
 
 _BARS = {"before": (-0.18, "before"), "after": (0.18, "vision")}
-"""Offset and color of each bar."""
+"""Offset of each bar, and key of its color in `COLORS`."""
 
 Rows = Sequence[dict[str, float]]
 
@@ -148,7 +148,7 @@ def rank_histogram(histogram: dict[str, Sequence[int]]) -> Figure:
 
 
 def _color(tower: str) -> str:
-    """Return a tower's color; gray for a tower that this version does not know."""
+    """Return a tower's color, or gray for a tower that this version does not know."""
     return COLORS.get(tower, COLORS["before"])
 
 

@@ -48,12 +48,13 @@ pre { background: var(--box); padding: 1rem; overflow-x: auto; font-size: 13px; 
 
 
 def write_report(folder: Path) -> Path:
-    """Write `folder`/report.html from its results.json, metrics.jsonl, config.json and videos.
+    """Write report.html into a run's folder, from the records, images and videos there.
 
-    For an unfinished run the page shows partial results and refreshes itself.
+    For an unfinished run, the page shows partial results. It also refreshes itself, unless the run
+    was stopped.
 
     Raises:
-        ValueError: the folder contains no run, or damaged files.
+        ValueError: the folder contains no run, or its files are damaged.
     """
     rows = read_metrics(folder)
     config = read_json(
@@ -93,7 +94,7 @@ def write_report(folder: Path) -> Path:
 
 
 def _unfinished(folder: Path) -> dict[str, Any]:
-    """Return the available part of results.json."""
+    """Return the part of results.json that is already available."""
     before = read_json(folder / "before.json", records.BEFORE).items()
     return {
         "seconds": read_json(folder / TIMES_FILE, records.TIMES),
@@ -126,7 +127,7 @@ def _skipped(rows: figures.Rows) -> Iterable[str]:
 
 
 def _subtitle(config: dict[str, Any], results: dict[str, Any]) -> str:
-    """Format method, backbone, robot, parameters (of a finished run) and scale as one line."""
+    """Format method, backbone, robot, parameters (if the run is finished) and scale as a line."""
     line = (
         f"{config['peft']['method']} on {config['model']['backbone']} {config['model']['size']}, "
         f"robot {config['robot']}"
@@ -176,7 +177,7 @@ def _speed(rows: figures.Rows) -> Iterable[str]:
 def speed(rows: figures.Rows) -> dict[str, str]:
     """Summarize throughput and memory as label -> value with unit.
 
-    Values are medians, except for the total fraction of time waiting for data and peak memory.
+    Values are medians, except for peak memory and the fraction of all time spent waiting for data.
     """
     entries = {
         "samples/s": ("speed/samples_per_second", median, "{:,.4g}".format),
@@ -210,7 +211,7 @@ def _has_rank(rows: figures.Rows) -> bool:
 
 
 def _active_rank(results: dict[str, Any], rows: figures.Rows, rank: Any) -> Iterable[str]:
-    """Show active rank in training and in closed loop, or nothing for methods without one."""
+    """Show active rank in training and in closed loop; show nothing if the method has none."""
     if not _has_rank(rows):
         return
     yield "<h2>Active rank</h2>"

@@ -2,10 +2,11 @@
 
     y = x W + Σ_i w_i Δ_i(x)
 
-The weights w are an array, not static structure, so selecting other adapters does not recompile.
-For a method that is not additive (DoRA), Δ_i is its output minus x W. All LoRAs share one bank,
-padded to one rank, and together cost one matmul for A and one for B; other methods are computed
-one by one, even with weight 0.
+The weights w are an array, not static structure, so selecting other adapters causes no
+recompilation. For a method that is not additive (DoRA), Δ_i is its output minus x W. All LoRAs are
+padded to one rank and share one bank. The down-projections of all additive adapters are
+concatenated into one matmul, and so are their up-projections. For adapters other than LoRA,
+everything else is computed one by one. Adapters with weight 0 are computed too.
 """
 
 import dataclasses
@@ -21,7 +22,7 @@ from lorasp_jax.peft._method import Params
 
 
 class AdapterChoice(nnx.Variable[Any]):
-    """Weights of a layer's adapters, f32 [..., A], or [..., B, A] per example."""
+    """Weights of a layer's A adapters: f32 [..., A], or [..., B, A] for B examples."""
 
 
 class AdapterSetParam(nnx.Param[Any]):
@@ -51,17 +52,17 @@ class AdapterSet(Method):
     """Weighted sum of A adapters.
 
     Parameters:
-      choice: w, f32 [A], or [B, A] per example of a batch. In that case inputs have B rows, or k B
-        with k contiguous rows per example.
+      choice: w, f32 [A], or [B, A] with a row per example of a batch. In the latter case, inputs
+        have B rows, or k B rows with k contiguous rows per example.
       bank: K LoRAs padded to one rank R: lora_a [I, K, R], lora_b [K, R, O], scale f32 [K] and rank
         int32 [K], which is 0 for an adapter that the layer does not have.
       others: parameters of the other adapters, by name.
     """
 
     names: tuple[str, ...]
-    """Names of the A adapters."""
+    """Names of all A adapters."""
     methods: tuple[Method | None, ...]
-    """Their methods; None for adapters in the bank."""
+    """Method of each adapter; None for an adapter in the bank."""
 
     @property
     def bank_names(self) -> list[str]:
@@ -88,7 +89,7 @@ class AdapterSet(Method):
     def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
-        """Multiply each adapter's z by its weight. There are no losses: a set is not trainable."""
+        """Multiply each adapter's z by its weight. There are no losses: sets are not trained."""
         weights, bank = self._weights(params["choice"], rows), params["bank"]
         bank_weights = _stack([weights[name] for name in self.bank_names])
         columns = jnp.repeat(bank_weights * bank["scale"], bank["lora_a"].shape[-1], axis=-1)
@@ -153,7 +154,7 @@ class AdapterSet(Method):
         """Compute W + Σ_i w_i ΔW_i in fp32.
 
         Raises:
-          ValueError: the weights differ per example, or a delta depends on the input.
+          ValueError: the weights are per example, or a delta depends on the input.
         """
         if params["choice"].ndim > 1:
             raise ValueError(

@@ -1,7 +1,8 @@
 """Fuse named LoRAs into one, and unmerge adapters from merged kernels.
 
-`fuse` replaces several LoRAs by their weighted sum as one LoRA: exactly, with the sum of their
-ranks, or by the best approximation of a smaller rank, with its error. `unmerge` inverts `merge`.
+`fuse` replaces several LoRAs by a single LoRA that computes their weighted sum. The result is exact
+if its rank is the sum of their ranks. At a smaller rank it is the best approximation, and `fuse`
+also returns the error. `unmerge` inverts `adaptation.merge`.
 """
 
 import re
@@ -27,8 +28,9 @@ class FusedAdapters(NamedTuple):
 
     Attributes:
       model: adapted with plain LoRA of scale 1; can be trained, saved and merged.
-      errors: ‖ΔW − ΔW'‖ / ‖ΔW‖ by path, in the Frobenius norm over a whole stack: the relative
-        error of the layer's delta for isotropic inputs.
+      errors: relative error ‖ΔW − ΔW'‖ / ‖ΔW‖ by path, where ΔW is the weighted sum and ΔW' the
+        delta of the fused LoRA. The Frobenius norm is taken over all layers of a stack. For
+        isotropic inputs, this is also the relative RMS error of x ΔW'.
     """
 
     model: nnx.Module
@@ -38,15 +40,17 @@ class FusedAdapters(NamedTuple):
 def fuse(
     model: nnx.Module, weights: Mapping[str, float], *, rank: int | None = None
 ) -> FusedAdapters:
-    """Fuse LoRAs of a combined model into one LoRA, their weighted sum.
+    """Fuse LoRAs of a combined model into one LoRA that computes their weighted sum.
 
     Args:
       model: from `combine`; not modified.
-      weights: w_i by name; may be negative.
-      rank: maximum rank, reached by truncated SVD. None uses the sum of the ranks, which is exact.
+      weights: weight of each LoRA in the sum, by name; weights may be negative.
+      rank: maximum rank of the fused LoRA in each layer; a truncated SVD reduces larger ranks. None
+        keeps the sum of the ranks, which makes the result exact.
 
     Raises:
-      ValueError: as for `choose`; no weights, a rank below 1, or a method other than LoRA.
+      ValueError: as for `choose`, or weights is empty, rank is below 1, or a named adapter is not
+        plain LoRA.
     """
     if rank is not None:
         validate.size("rank", rank)
@@ -73,19 +77,19 @@ def fuse(
 def unmerge(merged: Model, adapted: nnx.Module) -> Model:
     """Invert `merge`: restore the adapted model from the merged one and the adapters.
 
-    The delta is subtracted in fp32 and the result rounded to the kernel's dtype, so each entry is
-    restored to within eps/2 (|W + ΔW| + |W|) (eps 1.2e-7 in fp32, 7.8e-3 in bf16). Fully
-    fine-tuned weights, for example biases, are taken from the adapted model and are trainable.
+    The delta is subtracted in fp32 and the result rounded to the kernel's dtype, so each entry of W
+    is restored to within eps/2 (|W + ΔW| + |W|), where eps is 1.2e-7 in fp32 and 7.8e-3 in bf16.
+    Fully fine-tuned weights, such as biases, are taken from the adapted model and are trainable.
 
     Args:
       merged: from `merge`; not modified.
-      adapted: model with the adapters; its base is not used. For a saved adapter that did not split
-        its kernel, use `load_adapters(folder, merged, any_base=True)`.
+      adapted: model with the adapters; its base is not used. Saved adapters that do not split
+        kernels can be loaded for this with `load_adapters(folder, merged, any_base=True)`.
 
     Raises:
       ValueError: the merged model has adapters, lacks a layer or has one of a different class, or
-        an adapter did not just add a constant delta: DoRA also rescales the kernel, which
-        cannot be undone from the result.
+        merging an adapter did more than add a delta that is independent of the kernel. For example,
+        DoRA also rescales the kernel, which cannot be undone.
     """
     validate.with_values(merged)
     if named.adapter_sets(validate.with_values(adapted)):
@@ -135,7 +139,10 @@ def _unmerged_layer(layer: nnx.Module, adapted: AdaptedLayer) -> AdaptedLayer:
 def _fused_lora(
     factors: list[tuple[jax.Array, jax.Array]], rank: int | None
 ) -> tuple[LoRA, Params, float]:
-    """LoRA of scale 1 equal to Σ A_i B_i, its parameters, and its relative error."""
+    """LoRA of scale 1 that computes Σ A_i B_i, its parameters, and its relative error.
+
+    It is an approximation if the ranks of the factors (A_i, B_i) add up to more than `rank`.
+    """
     a = jnp.concatenate([a for a, _ in factors], axis=-1)
     b = jnp.concatenate([b for _, b in factors], axis=-2)
     error = 0.0
@@ -146,11 +153,12 @@ def _fused_lora(
 
 
 def truncated(a: jax.Array, b: jax.Array, rank: int) -> tuple[jax.Array, jax.Array, float]:
-    """Best low-rank approximation A' B' of A [..., I, R] B [..., R, O], and its relative error.
+    """Factors A' and B' of the best approximation of A B at the given rank, and its relative error.
 
-    A B = Q_a (R_a R_bᵀ) Q_bᵀ by QR of A and Bᵀ, so the SVD is only of an R x R matrix. A' and B'
-    each get the square root of the singular values, so that ‖A'‖ = ‖B'‖; the error is
-    sqrt(Σ discarded² / Σ all²).
+    A is [..., I, R] and B is [..., R, O]. With the QR decompositions A = Q_a R_a and Bᵀ = Q_b R_b,
+    A B = Q_a (R_a R_bᵀ) Q_bᵀ, so an SVD of a matrix no larger than R x R suffices. A' and B' each
+    contain the square roots of the singular values, so that ‖A'‖ = ‖B'‖. The relative error is the
+    norm of the discarded singular values over the norm of all of them.
     """
     (qa, ra), (qb, rb) = jnp.linalg.qr(a), jnp.linalg.qr(jnp.swapaxes(b, -1, -2))
     left, values, right = jnp.linalg.svd(ra @ jnp.swapaxes(rb, -1, -2), full_matrices=False)

@@ -7,10 +7,10 @@
     model = choose(model, None)                                   # the base
 
 The choice is an array, not static structure, so a jitted function that takes the model as an
-argument does not recompile when it changes (except once, between a shared and a per-example
-choice). Use `extract(model, "pour")` to get one adapter, for example for `save_adapters`, and
-`swap(model, "pour", other)` to replace it. `lorasp_jax.adapters.combine.adapter_set` describes the
-math.
+argument does not recompile when the choice changes. The one exception is the first change between
+a shared and a per-example choice. Use `extract(model, "pour")` to get one adapter, for example for
+`save_adapters`, and `swap(model, "pour", other)` to replace it. For the math, see
+`lorasp_jax.adapters.combine.adapter_set`.
 """
 
 import math
@@ -48,17 +48,19 @@ AdaptedLayers: TypeAlias = dict[str, AdaptedLayer]
 def combine(models: Mapping[str, Model], *, rank: int | None = None) -> Model:
     """Combine the adapters of several models in one model; the first one is active initially.
 
-    The adapters may differ in method, rank, scale and adapted layers, of any kind that `adapt`
-    supports. The result has no trainable parameters.
+    The models may differ in the methods, ranks and scales of their adapters, and in which layers
+    are adapted. All layer classes that `adapt` supports are allowed. The result has no trainable
+    parameters.
 
     Args:
       models: models by name, adapted from the same base; not modified. The result shares their
         base. A model without adapters reserves an empty slot for `swap`.
-      rank: maximum LoRA rank per layer; None uses the largest present.
+      rank: LoRA rank to reserve in each layer. None reserves the largest rank that the models have
+        there.
 
     Raises:
-      ValueError: no models, different bases, trainable base weights, an adapter that splits its
-        kernel, or a LoRA that exceeds `rank`.
+      ValueError: there are no models, their bases differ, base weights are trainable, an adapter
+        splits its kernel, or the rank of a LoRA exceeds `rank`.
     """
     if not isinstance(models, Mapping) or not models or not all(map(_is_text, models)):
         raise ValueError("models must be a non-empty mapping from name (str) to model.")
@@ -110,7 +112,7 @@ def choose(model: Model, choice: Selection | Sequence[Selection] | jax.Array | n
 def weights(
     model: nnx.Module, choice: Selection | Sequence[Selection] | jax.Array | np.ndarray
 ) -> jax.Array:
-    """Convert a choice to an array f32 [A] or [B, A], for a jitted function that calls `choose`.
+    """Convert a choice to an f32 array [A] or [B, A], for jitted functions that call `choose`.
 
     Takes the same arguments and raises the same errors as `choose`.
     """
@@ -156,9 +158,8 @@ def names(model: nnx.Module) -> tuple[str, ...]:
 def extract(model: Model, name: str | None) -> Model:
     """Extract one adapter as a separate model, as it was before `combine`.
 
-    The result can be trained, saved and merged.
-
-    A LoRA's rank and scale are restored, with the scale expressed as alpha = scale · rank.
+    The result can be trained, saved and merged. A LoRA regains its rank and scale; the scale is
+    expressed as alpha = scale · rank.
 
     Args:
       model: from `combine`; not modified.
@@ -188,8 +189,8 @@ def with_adapters(
 
     Args:
       base: from `strip_adapters`.
-      adapters: by path, a template layer that supports the adapter, the method (None for no
-        adapter) and the parameters.
+      adapters: a tuple for each path: a template layer that supports the adapter, the method (None
+        for no adapter) and the parameters.
     """
 
     def make_adapted(location: Location) -> AdaptedLayer | None:
@@ -208,8 +209,9 @@ def with_adapters(
 def swap(model: Model, name: str, other: nnx.Module) -> Model:
     """Replace the adapter `name` without recompilation.
 
-    LoRAs of any scale are interchangeable up to the rank reserved by `combine`; other methods need
-    identical settings. The current choice is unchanged.
+    A LoRA can be replaced by a LoRA of any scale, up to the rank that `combine` reserved. Other
+    adapters can only be replaced by ones with the same method and settings. The current choice is
+    kept.
 
     Args:
       model: from `combine`; not modified.
@@ -242,7 +244,7 @@ def swap(model: Model, name: str, other: nnx.Module) -> Model:
 
 
 def strip_adapters(model: Model) -> Model:
-    """Copy the model without its adapters, sharing the base; trainable base weights are unchanged.
+    """Copy the model without its adapters, sharing the base; trainable base weights stay trainable.
 
     Raises:
       ValueError: an adapter split its kernel.
@@ -264,7 +266,7 @@ def strip_adapters(model: Model) -> Model:
 
 
 def adapters_by_path(name: str, model: nnx.Module) -> AdaptedLayers:
-    """Adapted layers by path.
+    """Adapted layers of the model called `name`, by path.
 
     Raises:
       ValueError: base weights are trainable, or the model is already combined.

@@ -1,10 +1,10 @@
-"""Collect activation statistics of a model's layers, summed over a calibration set's valid tokens.
+"""Collect activation statistics of a model's layers over the valid tokens of a calibration set.
 
 Covers dense layers and einsums; embeddings and convolutions are skipped.
 
-Each layer's method is wrapped in one that does not change the output, but reports sums in `Aux`
-under the layer's path. This works for any adaptable model: third-party models store the sums in
-their layers, and scanned models return them stacked.
+Each layer's method is wrapped in a method that leaves the output unchanged, but reports sums in
+`Aux` under the layer's path. This works for any adaptable model: the layers of third-party models
+store the sums, and scanned models return them stacked.
 """
 
 import dataclasses
@@ -39,7 +39,7 @@ def call(model: Any, batch: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Layer:
-    """Inputs and outputs of one layer call, for one matrix [I, O]; passed to a report function.
+    """Inputs and outputs of one layer call with one kernel matrix; the input of a report function.
 
     Attributes:
       method: the layer's method, or None.
@@ -121,17 +121,18 @@ def observe(
     Args:
       model: not modified.
       batches: inputs of `forward`; use one shape to avoid recompilation.
-      reports: report functions by layer path, see `paths.locate_matmul_layers`.
+      reports: report functions by the path of their layer, see `paths.locate_matmul_layers`.
       forward: how to call the model.
-      references: adapters to compare some layers' outputs with, by path.
+      references: adapters whose outputs are compared with those of some layers, by path.
 
     Returns:
-      Sums by path, including "tokens", the valid-token count. All have the leading axes of the
-      layer's kernel matrices: those of a scanned stack and the batch axes of an einsum.
+      Sums by path, including "tokens", the number of valid tokens. All sums have the leading axes
+      of the layer's kernel matrices, which are those of a scanned stack and the batch axes of an
+      einsum.
 
     Raises:
       ValueError: there are no batches or no valid tokens, values are not finite, a layer was not
-        called or its aux not returned by `forward`, or it has a custom matmul or precision.
+        called, its aux was not returned by `forward`, or it has a custom matmul or precision.
     """
     if not isinstance(batches, Iterable) or isinstance(batches, str | Mapping):
         raise ValueError(f"batches must be an iterable of inputs, got {short(batches)}.")
@@ -229,8 +230,8 @@ def input_moments(
 ) -> dict[str, jax.Array]:
     """Uncentered second moments Σ x xᵀ of layer inputs, f32 [..., I, I] by path.
 
-    Required by `adapt(..., statistics=...)` for LoRA's initialization "eva". Covers dense layers
-    and einsums whose path matches; third-party einsum classes only after adaptation.
+    LoRA's initialization "eva" requires them in `adapt(..., statistics=...)`. Covers dense layers
+    and einsums whose path matches the pattern; third-party einsum layers must already be adapted.
 
     Raises:
       ValueError: as for `observe`, or the pattern matches no dense layer or einsum.

@@ -1,8 +1,8 @@
 """Replace LoRA-SP adapters by smaller ones and measure the error on a calibration set.
 
-Shared by `pruning` and `distillation`. Layer errors are measured on the inputs that each layer has
-in the original model. Works on every layer that LoRA-SP supports, dense or einsum; batch axes of an
-einsum are treated like those of a stack.
+Shared by `pruning` and `distillation`. The error of a layer is measured on the inputs that it
+receives in the original model. Every layer that LoRA-SP supports can be compacted, dense or einsum;
+batch axes of an einsum are treated like the axes of a stack.
 """
 
 from collections.abc import Sequence
@@ -29,8 +29,9 @@ class Compaction(NamedTuple):
 
     Attributes:
       ranks: required rank by path, int [...], one per layer of a stack.
-      layer_errors: ‖Δy‖ / ‖y‖ by path, f32 [...]; y without bias, norms over valid tokens.
-      output_error: ‖Δ‖ / ‖output‖ over all model outputs.
+      layer_errors: relative error ‖Δy‖ / ‖y‖ of each layer's output y by path, f32 [...]. The bias
+        is not part of y, and the norms are over valid tokens.
+      output_error: relative error ‖Δy‖ / ‖y‖ over all outputs y of the model.
     """
 
     ranks: dict[str, np.ndarray]
@@ -83,7 +84,7 @@ def _errors(
     replacements: Replacements,
     forward: Forward,
 ) -> tuple[dict[str, np.ndarray], float]:
-    """Relative errors by layer, and of the model output."""
+    """Relative error of each layer, by path, and relative error of the model output."""
     reports = dict.fromkeys(replacements, _squared_error)
     sums = calibration.observe(model, batches, reports, forward, replacements)
     layers = {

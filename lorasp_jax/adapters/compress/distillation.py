@@ -1,4 +1,4 @@
-"""Distill LoRA-SP adapters into LoRA adapters, which can be merged."""
+"""Distill LoRA-SP adapters into LoRA adapters, which can be merged into the kernels."""
 
 import functools
 from collections.abc import Sequence
@@ -29,18 +29,18 @@ def distill(
     *,
     forward: Forward = calibration.call,
 ) -> tuple[adaptation.Model, Compaction]:
-    """Replace LoRA-SP adapters by LoRA adapters, which can be merged.
+    """Replace LoRA-SP adapters by LoRA adapters, which can be merged into the kernels.
 
-    Each layer gets the rank-r update with the least squared output error on the calibration set
-    (reduced-rank regression of the delta on the input). The mean update E[ΔW(x)] would ignore that
-    the scores depend on the same x that they multiply.
+    Each layer gets the rank-r update with the smallest squared output error on the calibration set
+    (reduced-rank regression of the delta on the input). The mean update E[ΔW(x)] would be worse: it
+    ignores that the scores in ΔW(x) x depend on the same x.
 
     Args:
       model: not modified.
-      batches: calibration set. With fewer tokens than a layer has inputs, the update is
-        undetermined in directions without energy, and set to zero there.
-      rank: LoRA rank, limited to the bank's. None uses the bank's rank, which suffices for the
-        optimum over all ranks.
+      batches: calibration set. If it has fewer tokens than a layer has input features, the update
+        is undetermined along input directions that do not occur, and is set to zero there.
+      rank: LoRA rank, at most the bank's rank. None uses the bank's rank; a larger rank could not
+        reduce the error.
       forward: how to call the model on a batch; see `lorasp_jax.adapters.compress.calibration`.
 
     Raises:
@@ -75,9 +75,9 @@ def _fitted(xx: jax.Array, xz: jax.Array, u: jax.Array, *, rank: int) -> Params:
     """A [I, r] and B [r, O] that minimize Σ ‖z U - x A B‖² over the calibration set.
 
     The full-rank optimum is M = (Σ x xᵀ)⁻¹ (Σ x zᵀ) U; the rank-r optimum projects onto the r
-    leading right singular vectors of the fitted outputs X M (Reinsel and Velu, Multivariate
-    Reduced-Rank Regression, 1998, theorem 2.2). With Uᵀ = Q T, these vectors are Q times
-    those of the narrower X M Q.
+    leading right singular vectors of the fitted outputs X M, where the rows of X are the inputs
+    (Reinsel and Velu, Multivariate Reduced-Rank Regression, 1998, theorem 2.2). With the QR
+    decomposition Uᵀ = Q T, these vectors are Q times those of the narrower X M Q.
     """
     values, vectors = jnp.linalg.eigh(xx)
     cutoff = len(values) * jnp.finfo(values.dtype).eps * values[-1]

@@ -35,16 +35,16 @@ def prune(
     """Prune LoRA-SP directions that are rarely active.
 
     Drops each direction that is active for at most a fraction `tolerance` of the valid calibration
-    tokens. The bank's arrays shrink, but the router still scores dropped directions, since E_k is
-    relative to the energy of all directions. So dropping a direction that was never active leaves
-    every output unchanged, ties included, and dropping any other removes exactly its contribution.
-    All layers of a stack have the same rank, the largest that any of them needs; the others keep
-    additional directions.
+    tokens. The bank's arrays shrink, but the router still scores dropped directions, since a
+    token's active rank is determined from the energy of all directions. So dropping a direction
+    that was never active leaves every output unchanged, even if scores are tied, and dropping any
+    other direction removes exactly its contribution. All layers of a stack have the same rank, the
+    largest that any of them needs; layers that need less keep additional directions.
 
     Args:
       model: not modified; the result shares its frozen arrays and can be trained further.
       batches: calibration set.
-      tolerance: maximum fraction of tokens, in [0, 1), for which a dropped direction is active.
+      tolerance: largest fraction of tokens, in [0, 1), for which a dropped direction may be active.
       forward: how to call the model on a batch; see `lorasp_jax.adapters.compress.calibration`.
 
     Raises:

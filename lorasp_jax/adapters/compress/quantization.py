@@ -5,9 +5,10 @@
 Kernels of dense layers and einsums (flattened to matrices) are quantized to 8 or 4.5 bits per
 weight. Adapters, biases, norms, embeddings and convolutions are unchanged, and everything else
 works as before: gradients flow to x and the adapters, and adapters can be saved separately,
-attached and combined. `merge` dequantizes the kernels of the layers it merges and adds the delta.
+attached and combined. `merge` dequantizes the kernel of each adapted layer before adding the delta.
 
-Apply adapters that split a kernel (PiSSA, OLoRA) first; the residual is then quantized.
+Adapters that split a kernel (PiSSA, OLoRA) must be attached before quantization, which then
+quantizes the residual.
 """
 
 import re
@@ -34,8 +35,9 @@ class QuantizationResult(NamedTuple):
 
     Attributes:
       model: the quantized model.
-      errors: ‖W − Ŵ‖ / ‖W‖ by path, in the Frobenius norm over a whole stack: the relative error of
-        the layer's output for isotropic inputs.
+      errors: relative error ‖W − Ŵ‖ / ‖W‖ of the quantized kernel Ŵ by path, in the Frobenius norm
+        over all layers of a stack. For isotropic inputs, this is also the relative RMS error of the
+        layer's output, without bias.
     """
 
     model: nnx.Module
@@ -47,9 +49,9 @@ def quantize(model: nnx.Module, rules: Sequence[tuple[str, Kind | None]]) -> Qua
 
     Args:
       model: not modified; the result shares all other arrays with it.
-      rules: (pattern, "int8" or "nf4" or None) pairs, first match wins, as for `adapt`; None skips
-        the path. They apply to `Dense`, `nnx.Linear`, `nnx.LinearGeneral`, `nnx.Einsum` and other
-        einsum classes that are already adapted.
+      rules: (pattern, kind) pairs, where kind is "int8", "nf4" or None. As for `adapt`, the first
+        match wins, and None skips the path. Rules apply to `Dense`, `nnx.Linear`,
+        `nnx.LinearGeneral`, `nnx.Einsum` and adapted layers of other einsum classes.
 
     Raises:
       ValueError: a rule applies to no layer (the message lists near misses), a kind is unknown, or

@@ -1,1 +1,1 @@
-"""Adapter files in this project's format and in Hugging Face PEFT's."""
+"""Adapter files in this project's format and in that of Hugging Face PEFT."""

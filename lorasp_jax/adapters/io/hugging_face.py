@@ -1,9 +1,9 @@
-"""Load and save Hugging Face PEFT adapter folders: LoRA, rsLoRA, DoRA, pruned AdaLoRA.
+"""Load and save Hugging Face PEFT adapter folders: LoRA, rsLoRA, DoRA and pruned AdaLoRA.
 
 A folder has adapter_config.json and adapter_model.safetensors, with tensors named
-base_model.model.<module>.lora_A.weight etc., in torch's layout [out, in]. A function
-`names(path, index)` maps each layer, and its index in a scanned stack, to its module name; by
-default "a/0/b" becomes "a.0.b". (Format of PEFT 0.21.2.)
+base_model.model.<module>.lora_A.weight etc., in torch's layout [out, in] (format of PEFT 0.21.2). A
+function `names(path, index)` returns the module name of the layer at a path and, in a scanned
+stack, at an index; by default "a/0/b" becomes "a.0.b".
 """
 
 import collections
@@ -78,14 +78,14 @@ def load_peft(
 ) -> adaptation.Model:
     """Load the adapters of a Hugging Face PEFT folder into a model.
 
-    Biases and modules that were trained in full (`bias`, `modules_to_save`) are fully
-    fine-tuned here too. Adapters apply to dense layers and einsums, including those of
+    Biases and modules that PEFT trained in full (`bias`, `modules_to_save`) become trainable
+    parameters here too. Adapters apply to dense layers and einsums, including those of
     `nnx.MultiHeadAttention`, whose kernels match torch's with concatenated heads. AdaLoRA is loaded
-    as the equivalent LoRA. Smaller ranks in a stack are zero-padded. `lora_dropout` becomes the
-    methods' `dropout`, which is active only under `with_dropout`.
+    as the equivalent LoRA. If ranks differ within a stack, adapters are zero-padded to the largest.
+    `lora_dropout` becomes the methods' `dropout`, which is active only under `with_dropout`.
 
     Args:
-      folder: contains adapter_config.json and adapter_model.safetensors; or a repository on the
+      folder: folder with adapter_config.json and adapter_model.safetensors, or a repository on the
         Hub, hf://owner/name, from which only these two files are downloaded.
       model: not modified; its adapters on other layers are kept.
       names: function (path, index) -> module name; index is the position in a stack, or ().
@@ -162,7 +162,7 @@ def match_folder(
 
 
 def _local_folder(folder: str | os.PathLike[str]) -> pathlib.Path:
-    """Return a local folder; download hf:// paths from the hub."""
+    """Return the path of a local folder; download a repository hf://owner/name from the Hub."""
     if not isinstance(folder, str) or "://" not in folder:
         return validate.folder(folder)
     from lorasp_jax.storage import hub
@@ -182,15 +182,15 @@ def save_peft(
     AdaLoRA is saved as the equivalent LoRA, without pruned directions.
 
     Args:
-      folder: created if absent; an adapter in it is replaced.
+      folder: created if absent; an existing adapter in the folder is replaced.
       model: adapted with LoRA, AdaLoRA or both, or with DoRA only; fully fine-tuned parameters
         become PEFT's `bias` and `modules_to_save`.
       names: as for `load_peft`.
       base: value of base_model_name_or_path.
 
     Raises:
-      ValueError: PEFT does not support an adapter, both LoRA and DoRA are used, or the dropout
-        rates differ.
+      ValueError: there are no adapters, PEFT does not support one of them, LoRA and DoRA are mixed,
+        or the dropout rates differ.
     """
     folder, names = validate.folder(folder), checked_names(names)
     validate.with_values(model)
@@ -233,7 +233,7 @@ def _supported_layers(model: nnx.Module) -> dict[str, AdaptedLayer]:
 
 
 def _common_settings(methods: Collection[Any]) -> tuple[bool, float]:
-    """`use_dora` and `lora_dropout`; raise ValueError if they differ, or there are no methods."""
+    """`use_dora` and `lora_dropout`; raise ValueError unless all methods agree on both."""
     use_dora = {isinstance(method, DoRA) for method in methods}
     rates = {dropout_rate(method) for method in methods}
     if len(use_dora) != 1:
@@ -272,7 +272,7 @@ def _check_used(
 
 
 def _stacked(adapters: list[Adapter], leading: list[int]) -> tuple[float, Adapter]:
-    """Stack adapters with a common scale and zero-padded to a common rank."""
+    """Stack adapters, rescaled to a common scale and zero-padded to a common rank."""
     rank, scale = max(1, *(a["lora_a"].shape[1] for a in adapters)), float(adapters[0]["scale"])
 
     def padded(adapter: Adapter) -> Adapter:
@@ -328,7 +328,7 @@ def _config(modules: Mapping[str, tuple[float, Adapter]], base: str | None) -> d
         "base_model_name_or_path": base,
         "r": rank,
         "lora_alpha": alpha,
-        # Without the ^ a key would also match longer names that end in it.
+        # Without the ^, a key would also match longer names that end with this name.
         "rank_pattern": {f"^{re.escape(n)}": r for n, r in ranks.items() if r != rank},
         "alpha_pattern": {f"^{re.escape(n)}": a for n, a in alphas.items() if a != alpha},
         "target_modules": sorted(modules),

@@ -29,8 +29,8 @@ def load_peft_linen(
     Args:
       folder: as for `hugging_face.load_peft`.
       model: any Linen module.
-      variables: of the model without adapters, with "params"; not modified.
-      *args: the model's call arguments, for a call that shows what its layers compute.
+      variables: variables of the bare model, with "params"; not modified.
+      *args: the model's call arguments, for calls that show what its layers compute.
       names: as for `hugging_face.load_peft`.
       einsums: as for `LinenAdapter`.
       **kwargs: the model's call arguments.

@@ -1,7 +1,7 @@
 """Match untrusted regular expressions against module names, rejecting catastrophic backtracking.
 
-Python's `re` tries every way in which a pattern may match, for instance 2**30 ways for (a+)+b and
-thirty "a"s. `_ways` derives an upper bound from the parsed pattern.
+Python's `re` may try every way in which a pattern could match: about 2**30 for the pattern (a+)+b
+and a name of thirty letters "a". `_ways` derives an upper bound from the parsed pattern.
 """
 
 import importlib
@@ -17,14 +17,14 @@ MAX_WAYS = 3 * 10**8
 
 
 def values_of(patterns: Mapping[str, Any], names: Collection[str], default: Any) -> dict[str, Any]:
-    """Value of the first pattern that matches each name, or a suffix of it after a dot.
+    """For each name, the value of the first pattern that matches it, or its end after some dot.
 
     As in Hugging Face PEFT (get_pattern_key of 0.21.2): re.match(rf"(.*\\.)?({pattern})$", name).
 
     Args:
       patterns: values by pattern.
-      names: module names, "a.0.b".
-      default: value of names without a match.
+      names: module names, as in "a.0.b".
+      default: value of a name without a match.
 
     Returns:
       Values by name.

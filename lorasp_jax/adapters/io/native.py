@@ -49,13 +49,13 @@ def save_adapters(
 ) -> None:
     """Save a model's trainable parameters, without the frozen base.
 
-    Files are written atomically; an existing adapter in the folder is replaced.
+    Each file is written atomically; an existing adapter in the folder is replaced.
 
     Args:
       folder: created if absent.
       model: an adapted model.
       base: optional name of the base; its weights are identified by fingerprints regardless.
-      metadata: any JSON-serializable dict.
+      metadata: any JSON-serializable dict with str keys.
 
     Raises:
       ValueError: the model has no trainable parameters, or metadata does not round-trip through
@@ -96,15 +96,15 @@ def load_adapters(
     """Load the adapters of a folder into a model.
 
     A model without adapters is adapted as described in the file; an adapted model must have the
-    same adapters.
+    same methods at the same paths.
 
     Args:
       folder: written by `save_adapters`.
       model: not modified.
       base: if given, must equal the name of the base that the adapters were saved for.
-      any_base: skip the base check. By default every base array must match the one used in
-        training, up to bf16 rounding; arrays quantized on one side only, or split by an adapter,
-        are not compared.
+      any_base: whether to skip the base check. By default, every base array must match the one used
+        in training, up to bf16 rounding. An array is not compared if only one of the two is
+        quantized, or if an adapter split it.
       einsums: as passed to `adapt`.
 
     Raises:
@@ -146,8 +146,8 @@ def _adapt_as_saved(
 ) -> adaptation.Model:
     """Adapt the bare model with the methods of a file, by exact paths.
 
-    Shapes are built and checked first: a damaged or malicious file could request more memory than
-    available.
+    Only shapes are built and checked first: a damaged or malicious file could request more memory
+    than is available.
     """
     try:
         # FullFineTuning first: an adapted layer may have fully fine-tuned parameters.
@@ -162,7 +162,7 @@ def _adapt_as_saved(
 
 
 def _frozen_weights(model: nnx.Module) -> dict[str, jax.Array]:
-    """Base parameters with values, by path, except those split by an adapter."""
+    """Base parameters that have values, by path, except those split by an adapter."""
     split = [path for path, method in adaptation.methods(model).items() if method.splits_kernel]
     leaves = _leaves_by_name(nnx.state(model, nnx.All(nnx.Param, nnx.Not(AdapterParam))))
     return {
@@ -259,14 +259,14 @@ def read_bytes(path: pathlib.Path) -> bytes:
 
 
 def read_tensors(path: pathlib.Path, data: bytes) -> dict[str, np.ndarray]:
-    """Decode the tensors of a safetensors file by name.
+    """Decode the content of a safetensors file into tensors by name.
 
     Args:
-      path: of the file, for error messages.
+      path: path of the file, for error messages.
       data: the file's content.
 
     Raises:
-      ValueError: the file is damaged, or a tensor is not finite floating point.
+      ValueError: the file is damaged, or a tensor is not floating-point or not finite.
     """
     try:
         tensors = dict(sorted(safetensors.numpy.load(data).items()))
@@ -295,10 +295,10 @@ def _read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 def read_description(folder: pathlib.Path) -> dict[str, Any]:
-    """Read adapter.json of a folder.
+    """Read the adapter.json in a folder.
 
     Raises:
-      ValueError: it is missing, damaged, or of an unsupported format or version.
+      ValueError: the file is missing, damaged, or of an unsupported format or version.
     """
     path = folder / DESCRIPTION
     try:

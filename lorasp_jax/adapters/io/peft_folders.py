@@ -1,8 +1,9 @@
 """Read and validate a Hugging Face PEFT folder, as arrays by module.
 
 Type checks cover the fields of `LoraConfig` and `AdaLoraConfig` of PEFT 0.21.2 that have a simple
-JSON type. All may be null or absent, except those that determine an adapter's scale. Wrong types
-are rejected because they are ambiguous: "use_rslora": "false" is truthy in Python.
+JSON type. Any of these may be null or absent, except `peft_type` and the fields that determine an
+adapter's scale. Values of a wrong type are rejected because they are ambiguous: "use_rslora":
+"false" is truthy in Python.
 """
 
 import collections
@@ -27,9 +28,9 @@ _TENSOR = re.compile(
     rf"{re.escape(PREFIX)}(.+)\.(lora_A|lora_B|lora_E|lora_magnitude_vector)(\.weight)?"
 )
 _FULL_TENSOR = re.compile(rf"{re.escape(PREFIX)}(.+?)(\.base_layer)?\.(weight|bias)")
-_ADA_CONSTANT = 1e-5  # AdaLoRA's scale is α/(r + this)
-# Initializations that do not change the base. With the others (PiSSA, OLoRA, CorDA, LoRA-GA, LoftQ)
-# A and B fit only the residual base.
+_ADA_CONSTANT = 1e-5  # AdaLoRA's scale is α/(init_r + this)
+# Initializations that do not change the base. With other initializations (PiSSA, OLoRA, CorDA,
+# LoRA-GA, LoftQ), A and B fit only the residual base.
 _BASE_PRESERVING = (None, True, False, "gaussian", "orthogonal", "eva", "mica")
 # Fields that are not supported, and the values that disable them.
 _DISABLED = (None, False, [], {}, "none")
@@ -44,7 +45,7 @@ FullTensors = dict[tuple[str, str], np.ndarray]
 
 
 def read_folder(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter], FullTensors]:
-    """Read the config, the adapters by module in this project's layout, and full parameters.
+    """Read the config, the adapters by module in this project's layout, and fully trained tensors.
 
     Raises:
       ValueError: files are missing or damaged, or the adapter is not supported.
@@ -84,7 +85,7 @@ def read_folder(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter
 
 
 def _check_supported(folder: pathlib.Path, kind: object, config: Mapping[str, Any]) -> None:
-    """Raise ValueError if a PEFT config needs a feature that is missing here."""
+    """Raise ValueError if a PEFT config needs a feature that this project lacks."""
     if kind not in ("LORA", "ADALORA"):
         raise ValueError(
             f"{folder} has peft_type {str(kind)[:40]}; only LORA and ADALORA are supported."

@@ -1,8 +1,8 @@
 """Fully trained biases and modules in Hugging Face PEFT folders.
 
-`bias` "all" and "lora_only" make biases trainable, stored as <module>.base_layer.bias for adapted
-layers and <module>.bias for others. `modules_to_save` makes whole modules trainable; weights are
-stored in torch's layout, [out, in] for a dense layer.
+With `bias` "all" or "lora_only", PEFT trains biases. It stores them as <module>.base_layer.bias for
+adapted layers and as <module>.bias for other layers. `modules_to_save` makes whole modules
+trainable. Weights are stored in torch's layout, [out, in] for a dense layer.
 """
 
 import math
@@ -21,7 +21,7 @@ from lorasp_jax.peft._fields import short
 
 Names = Callable[[str, tuple[int, ...]], str]
 _TORCH_NAMES = {"kernel": "weight", "embedding": "weight", "scale": "weight", "bias": "bias"}
-# Number of axes of a parameter outside dense layers and einsums; additional ones are stack axes.
+# Number of axes of a parameter outside dense layers and einsums; additional axes are stack axes.
 _AXES = {"embedding": 2, "scale": 1, "bias": 1}
 
 
@@ -35,7 +35,8 @@ def full_parameters(
     """A folder's fully trained parameters, by path, in the model's layout.
 
     Raises:
-      ValueError: the model lacks a parameter, or its shape differs.
+      ValueError: the model lacks a parameter or has it with another shape, or the folder has it for
+        only some layers of a stack.
     """
     values, unused = {}, dict(full)
     for path, size in sizes.items() if full else ():
@@ -67,7 +68,7 @@ def check_biases(
     parameter_paths: Collection[str],
     adapted: Collection[str],
 ) -> None:
-    """Check that a folder whose biases were trained contains them.
+    """Check that a folder contains biases if its config says that biases were trained.
 
     Args:
       folder: PEFT folder.
@@ -77,7 +78,7 @@ def check_biases(
       adapted: paths of layers that the folder adapts.
 
     Raises:
-      ValueError: the config says that biases of the model were trained, but the folder has none.
+      ValueError: the config says that biases were trained, but the folder has none.
     """
     modules = [
         path.rpartition("/")[0] for path in parameter_paths if path.rpartition("/")[2] == "bias"
@@ -92,7 +93,7 @@ def check_biases(
 def export_full_parameters(
     model: nnx.Module, adapted: Collection[str], names: Names
 ) -> tuple[Adapter, dict[str, Any]]:
-    """A model's fully trained parameters by PEFT name, and the config fields that describe them.
+    """A model's fully trained parameters by PEFT name, and the PEFT config fields to go with them.
 
     Raises:
       ValueError: PEFT cannot store a parameter.
@@ -128,8 +129,9 @@ def _stack(name: str, size: Sequence[int], matrices: Sequence[int] | None) -> tu
 
     Args:
       name: the parameter's name.
-      size: its shape.
-      matrices: shape [..., I, O] of its layer's kernel, for dense layers and einsums.
+      size: the parameter's shape.
+      matrices: shape [..., I, O] of the kernel matrices of its layer, or None if the layer is
+        neither dense nor an einsum.
     """
     if matrices is not None:
         return tuple(matrices[:-2])

@@ -1,15 +1,16 @@
 """Adapted einsums: kernels with any number of input, output and batch axes.
 
-In an equation "x,kernel->y", x and y may each contain one "...". Each kernel axis is one of
+In an equation "x,kernel->y", x and y may both contain one "...", or neither may. Each kernel axis
+is one of these:
 
-    batch    in x, kernel and y: a separate linear map per index, for instance one per expert
-    input    in x and kernel: summed over
+    batch    in x, kernel and y; each index has its own linear map, as in a mixture of experts
+    input    in x and kernel; summed over
     output   in kernel and y
 
 An adapter treats the kernel as a stack of matrices [*batch, I, O], with inputs and outputs
 flattened in the order of the kernel's axes; its parameters have the batch axes as leading axes,
 like those of a scanned stack. For example, "BTD,NDH->BTNH" has one adapter with D inputs and N·H
-outputs. A quantized kernel is stored as that stack of matrices, along with the sizes of its axes.
+outputs. A quantized kernel is stored as such a stack, along with the sizes of its original axes.
 """
 
 import dataclasses
@@ -75,7 +76,7 @@ def parse(equation: str) -> Axes:
     """Parse an equation.
 
     Raises:
-      ValueError: it is not a linear map from x to y for each index of the batch axes.
+      ValueError: the equation is not a linear map from x to y for each index of the batch axes.
     """
     match = _EQUATION.fullmatch(equation.replace(" ", ""))
     axes = Axes(*match.groups()) if match else Axes("", "", "")
@@ -152,8 +153,8 @@ def einsum(
       dropout_key: as for `dense`.
 
     Returns:
-      y in the dtype of x, and the adapter's aux; its arrays have leading batch axes, except the
-      losses, which are averaged over them.
+      y in the dtype of x, and the adapter's aux. Arrays in aux have the batch axes as leading axes,
+      except for losses, which are averaged over the batch axes.
 
     Raises:
       ValueError: the equation cannot be adapted, or the shapes do not match it.

@@ -98,8 +98,8 @@ def layer_call(module: nn.Module, einsums: nnx_layers.Einsums, args: Any, kwargs
     """Inspect a call of a supported layer with these arguments.
 
     Raises:
-      ValueError: the layer has a custom matmul or precision, or lacks its equation, input or
-        kernel.
+      ValueError: the layer has a custom matmul or precision, or its equation, input or kernel is
+        missing.
     """
     cls = supported_class(module, einsums)
     if cls is nn.Embed or cls is nn.Conv:

@@ -22,8 +22,8 @@ from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import dropout, dropout_rate
 
 Einsums = Mapping[type, Callable[[Any], tuple[str, str | None]]]
-"""NNX or Linen layer class -> function of the layer that returns (kernel name, equation). The
-equation is None for a Linen layer that takes it as a str argument of its call."""
+"""NNX or Linen layer class -> function of a layer that returns (kernel name, equation). The
+equation is None for a Linen layer that takes the equation as a str argument of its call."""
 
 EINSUMS: Einsums = {
     nnx.LinearGeneral: lambda layer: (
@@ -80,7 +80,7 @@ class EinsumLayer(AdaptedLayer):
         return einsum.to_matrices(self.kernel_equation, super().kernel_matrices())
 
     def stack_shape(self) -> tuple[int, ...]:
-        """Sizes of the stack axes, which exclude the axes of the equation."""
+        """Sizes of the stack axes: the leading kernel axes that are not in the equation."""
         shape = super().kernel_matrices().shape
         return tuple(shape[: len(shape) - len(einsum.parse(self.kernel_equation).kernel)])
 
@@ -100,7 +100,7 @@ class EinsumLayer(AdaptedLayer):
 
 
 class LoRALayer(AdaptedLayer):
-    """Mixin for a layer that adds the delta of one or more LoRAs to its class's output."""
+    """Mixin for a layer that adds the delta of one or more LoRAs to its original output."""
 
     def adapter_init(self, method: Method) -> Callable[[jax.Array, jax.Array], Any]:
         """See `lora_init`."""
@@ -188,8 +188,8 @@ def lora_init(layer: Any, method: Method) -> Callable[[jax.Array, jax.Array], An
     """Function (key, kernel) that initializes LoRA for an embedding or a convolution.
 
     Raises:
-      ValueError: the method is not LoRA or its initialization needs the kernel or statistics, or
-        the convolution is grouped or masked.
+      ValueError: the method is not plain LoRA, its initialization needs the kernel or statistics,
+        or the convolution is grouped or masked.
     """
     if type(method) is not LoRA or method.splits_kernel or method.needs_statistics:
         raise ValueError(
@@ -207,7 +207,7 @@ def make_adaptable(layer: nnx.Module, einsums: Einsums) -> AdaptedLayer:
     """Convert a layer to one that can carry an adapter.
 
     Args:
-      layer: of a supported class, not modified; an `AdaptedLayer` is returned as is.
+      layer: a layer of a supported class; not modified. An `AdaptedLayer` is returned as is.
       einsums: extra einsum layer classes.
 
     Raises:
@@ -232,8 +232,8 @@ def make_adaptable_like(layer: Any, other: AdaptedLayer) -> AdaptedLayer:
     """Convert a layer to one that can carry the adapter of another layer.
 
     Args:
-      layer: of the other layer's class, adapted or not; not modified. Returned as is if it can
-        already carry the adapter.
+      layer: a layer of the other layer's original class, adapted or not; not modified. It is
+        returned as is if it can already carry the adapter.
       other: the adapted layer, not modified.
 
     Raises:
@@ -305,7 +305,7 @@ def matrices_shape(layer: Any, einsums: Einsums) -> tuple[int, ...]:
     """Shape [..., *batch, I, O] of a layer's kernel as a stack of matrices.
 
     Args:
-      layer: dense or an einsum, adapted or not.
+      layer: a dense layer or an einsum, adapted or not.
       einsums: extra einsum layer classes.
 
     Raises:

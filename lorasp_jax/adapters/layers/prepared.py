@@ -1,14 +1,16 @@
 """Adapted layers prepared for inference: precompute whatever does not depend on the input.
 
-For layers called repeatedly on few tokens, as in flow sampling, kernel launches dominate. Layers
-with a shared input are therefore fused into one input matrix and one output matrix:
+A layer with kernel W, down-projection P and up-projection U computes y = x W + f(x P) U. If layers
+are called repeatedly on few tokens, as in flow sampling, GPU kernel launches dominate the time.
+Layers with a shared input are therefore fused into one input matrix and one output matrix:
 
     [x W, x P] = x [W, P]         W and P of all layers, concatenated
-    y = x W + z diag(U)           with z = f(x P)
+    y = x W + z diag(U)           with z = f(x P), and diag(U) block-diagonal
 
-The functions f of all layers run as one kernel. Stacked layers that run once, such as the vision
-tower's, only get P and U cast to the compute dtype: copying W would cost more than it saves. The
-original layers are removed. For training, see `lorasp_jax.kernels.low_rank_matmul`.
+The functions f of all layers run as one GPU kernel. For stacked layers that run once, such as the
+vision tower's, only the P are concatenated, and P and U are cast to the compute dtype: copying W
+would cost more than it saves. The original layers are removed. For training, see
+`lorasp_jax.kernels.low_rank_matmul`.
 """
 
 import dataclasses
@@ -97,7 +99,7 @@ class FusedArrays(nnx.Variable[Any]):
 
 
 class Prepared(nnx.Module):
-    """Fused layers, stored in place of the first; empty instances replace the others."""
+    """Fused layers, stored in place of the first layer; empty instances replace the others."""
 
     def __init__(self, arrays: FusedLayers | SharedProjection | None = None) -> None:
         self.fused = None if arrays is None else FusedArrays(arrays)
@@ -140,13 +142,15 @@ class FusableModule(Protocol):
 def fuse_layers(layers: Sequence[Layer], *, copy_kernels: bool = True) -> list[Layer]:
     """Return replacements for layers with a shared input.
 
-    `Dense` layers with an explicit dtype and a method that computes just x W + z U are fused:
-    together if they agree on method and dtype, else individually. Other layers are returned
-    unchanged.
+    A single (unstacked) adapted `Dense` can be fused if it has an explicit dtype and its method
+    computes exactly x W + z U. If all layers can be fused and agree on method and dtype, they are
+    fused together. Otherwise each layer that can be fused is fused individually, and the other
+    layers are returned unchanged.
 
     Args:
-      layers: in the order in which they are called.
-      copy_kernels: whether to fuse W too; use it for layers called repeatedly.
+      layers: layers, in the order in which they are called.
+      copy_kernels: whether to copy W into the fused input matrix, as is best for layers that are
+        called repeatedly.
     """
     fusable = [layer for layer in layers if _is_fusable(layer)]
     fuse = _fused_layers if copy_kernels else _shared_projection
@@ -161,7 +165,7 @@ def fuse_layer(layer: Layer, *, copy_kernels: bool = True) -> Layer:
 
 
 def fuse_stack(blocks: Block) -> Block:
-    """Prepare stacked blocks [L, ...] for a single pass: cast all adapter matrices up front."""
+    """Prepare stacked modules [L, ...] for a single pass, without copying their kernels."""
 
     def fuse(block: Block) -> Block:
         block.fuse_projections(copy_kernels=False)
@@ -173,7 +177,7 @@ def fuse_stack(blocks: Block) -> Block:
 def _call_fused(
     fused: FusedLayers, x: jax.Array, token_mask: jax.Array | None
 ) -> tuple[Sequence[jax.Array], Aux]:
-    """y of each layer, and aux [n, ...]."""
+    """Output y of each layer, and aux with leading axis n."""
     ends = list(itertools.accumulate(fused.bottleneck.out_sizes))
     projected = matmul(x, fused.input_matrix)
     z, aux = _bottleneck(fused, projected, ends[-1], token_mask)
@@ -204,9 +208,9 @@ def _bottleneck(
     start: int,
     token_mask: jax.Array | None,
 ) -> tuple[jax.Array, Aux]:
-    """z of all layers, concatenated, in the dtype of `projected`, and aux.
+    """Concatenated z of all layers, in the dtype of `projected`, and aux.
 
-    The down-projections x P start at column `start` of `projected`.
+    The products x P start at column `start` of `projected`.
     """
     kernel, width, out_sizes = arrays.bottleneck
     columns = range(start, start + len(out_sizes) * width, width)
@@ -217,8 +221,8 @@ def _bottleneck(
 def matmul(x: jax.Array, matrix: jax.Array) -> jax.Array:
     """x @ matrix in the dtype of x, as a split-K matmul where that uses a GPU better.
 
-    A GPU computes output tiles in parallel, but each tile sums over I sequentially. Few rows and a
-    narrow matrix leave most SMs idle.
+    A GPU computes output tiles in parallel, but sums over I sequentially within each tile. With few
+    rows and a narrow matrix, most SMs would be idle.
 
     Args:
       x: [..., I].
@@ -244,7 +248,7 @@ def _num_splits(rows: int, d_in: int, d_out: int) -> int:
 
 
 def _is_fusable(layer: Layer) -> TypeGuard[Dense]:
-    """Whether this is a single (unstacked) adapted `Dense` that computes just x W + z U."""
+    """Whether this is a single (unstacked) adapted `Dense` that computes exactly x W + z U."""
     if type(layer) is not Dense or layer.adapter is None or layer.dtype is None:
         return False
     method, _ = layer.method_and_params()
@@ -270,7 +274,7 @@ def _matrices(
 def _bottleneck_spec(
     layers: Sequence[Dense], downs: Sequence[jax.Array]
 ) -> tuple[BottleneckSpec, Any]:
-    """f and its parameters, stacked [n, ...]; a leaf is None if the layers' shapes differ."""
+    """Function f and its stacked parameters [n, ...]; a leaf is None if shapes differ."""
     adapters = [layer.method_and_params() for layer in layers]
     kernels = {method.fused_kernel(params) or VmapBottleneck(method) for method, params in adapters}
     kernel = kernels.pop() if len(kernels) == 1 else VmapBottleneck(adapters[0][0])
