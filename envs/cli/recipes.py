@@ -1,4 +1,4 @@
-"""The recipe of a dataset: all settings that determine its episodes."""
+"""Recipes of datasets: all settings that determine the episodes."""
 
 import argparse
 import dataclasses

@@ -7,15 +7,16 @@ The gate keeps the smallest k with E_k >= η; ties go to the lowest index. Imple
   vectorized over rows and R; fastest on CPU up to R = 32.
 - "sort": sort the scores, accumulate energy, threshold. The reference; in rare cases, rounding
   of its cumulative sum changes whether η is reached.
-- "bisection": binary search for the threshold, bit by bit, without a sort.
-- "block": bisection that stops early, for the few rows of a kernel's block.
+- "bisection": binary search for the threshold, one bit per step, without a sort.
+- "block": bisection that stops early, for the few rows that one kernel block holds.
 - "pallas": "block" as a Triton kernel, one row per warp, scores in registers.
 
-"sort", "block" and "pallas" reduce each row to its `Boundary`, the last kept (score, index), from
-which the mask follows elementwise.
+"sort", "block" and "pallas" reduce each row to its `Boundary`, the last kept (score, index); the
+mask is then computed elementwise.
 
-η is the decimal as written: 0.9 means 9/10, and E_k >= 9/10 is tested as 10 Σ_k >= 9 Σ for the
-kept and total energies, so that rounding of 0.9 does not affect rows that reach it exactly.
+η is the decimal as written: 0.9 means 9/10, and E_k >= 9/10 is tested as 10 Σ_k >= 9 Σ, where
+Σ_k is the kept and Σ the total energy, so that rounding of 0.9 does not affect rows that reach it
+exactly.
 
 All implementations agree at the limits of fp32:
 
@@ -48,11 +49,12 @@ from lorasp_jax.kernels.threshold_search import (
 Implementation = Literal["pairwise", "sort", "bisection", "block", "pallas"]
 
 MIN_TARGET = 2.0**-64
-"""Smaller η are raised to this value, since they would underflow in fp32. The mask is the same: one
-direction, since no bank has 2^64 directions."""
+"""A smaller η is raised to this value, since it would underflow in fp32. The mask does not change:
+either η keeps one direction, since no bank has 2^64."""
 
 PAIRWISE_RANK = 32
-"""Largest R with "pairwise" as the default on CPU; above it bisection is faster (on two cores)."""
+"""Largest R for which "pairwise" is the default on CPU; above it, bisection is faster (on two
+cores)."""
 
 
 def exact_ratio(energy_target: float) -> Ratio:
@@ -115,7 +117,7 @@ def default_implementation(rank: int) -> Implementation:
 
 
 def _mask_function(implementation: str, interpret: bool) -> Callable[[jax.Array, Ratio], jax.Array]:
-    """Return the function from scores [..., R] and η to the mask."""
+    """Return the function that maps scores [..., R] and η to the mask."""
     masks = {"pairwise": _pairwise_mask, "bisection": bisected_mask}
     boundaries = {
         "sort": _sorted_boundary,
@@ -160,7 +162,7 @@ def _pairwise_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
 
 
 def kept_mask(scores: jax.Array, last: Boundary) -> jax.Array:
-    """Return the mask of the scores up to the boundary, bool [..., R]."""
+    """Return the mask of the scores that rank at or before the boundary, bool [..., R]."""
     position = jax.lax.broadcasted_iota(jnp.int32, scores.shape, scores.ndim - 1)
     return (scores > last.score) | ((scores == last.score) & (position <= last.index))
 
@@ -184,7 +186,7 @@ def energy_share(scores: jax.Array) -> jax.Array:
 
 
 def _sorted_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
-    """Find the boundaries by sorting the scores (the reference), without argsort or scatter."""
+    """Find the boundaries by sorting (the reference), with neither argsort nor a scattered mask."""
     rows = scores.reshape(-1, scores.shape[-1])
     last = jax.vmap(lambda row: _sorted_row_boundary(row, ratio))(rows)
     return jax.tree.map(lambda leaf: leaf.reshape(*scores.shape[:-1], 1), last)
@@ -203,7 +205,7 @@ def _sorted_row_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
 
 
 def _pallas_boundary(scores: jax.Array, ratio: Ratio, *, interpret: bool) -> Boundary:
-    """Run the block search as a Triton kernel; R is padded with zeros, which are never kept."""
+    """Run `block_boundary` as a Triton kernel; R is padded with zeros, which are never kept."""
     *leading, rank = scores.shape
     width = max(pl.next_power_of_2(rank), 2)
     rows = jnp.pad(scores.reshape(-1, rank), ((0, 0), (0, width - rank)))

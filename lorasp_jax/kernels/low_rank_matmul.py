@@ -7,9 +7,9 @@ as much as the adapter itself:
 - no gradient is computed for W;
 - the P of all layers are concatenated into one matmul with x; the backward pass takes one more
   matmul for their gradients and one for the gradient of x through them;
-- if O >= I, x W + z U is one matmul, [x, z] [W; U];
+- if O >= I, x W + z U with z = f(x P) is one matmul, [x, z] [W; U];
 - if O > 2 I, g Wᵀ and g Uᵀ, with g the gradient of the output, are one matmul, g [W; U]ᵀ;
-- if the outputs of all layers together are at most as wide as x, its gradient is one matmul,
+- if the outputs of all layers together are at most as wide as x, the gradient of x is one matmul,
   [g, q] [W, P]ᵀ, with q the gradient of x P.
 
 The last three apply only to I or more tokens, since for fewer the copy of W dominates, and not on a
@@ -90,9 +90,10 @@ def low_rank_matmul(
     """Return (x W + z U, aux) of each layer, where z, aux = f(params, x P, token_mask).
 
     Args:
-      methods: f of each layer, or of all; objects that compare equal must compute the same f.
+      methods: a tuple with the f of each layer, or one object for all layers; objects that compare
+        equal must compute the same f.
       rows_dtype: dtype of x P, which is accumulated in fp32.
-      layers: arrays of each layer.
+      layers: the arrays of each layer.
       x: [..., I]; x W + z U has its dtype.
       token_mask: bool [...tokens] or None, passed to each f.
     """
@@ -209,12 +210,12 @@ def _widths(layers: Sequence[LowRankLayer]) -> list[int]:
 
 
 def _split(widths: Sequence[int], columns: jax.Array) -> list[jax.Array]:
-    """Split columns [..., at least ΣQ] into [..., Q] of each layer, without the padding."""
+    """Split [..., at least ΣQ] into the columns [..., Q] of each layer, without the padding."""
     return jnp.split(columns, list(itertools.accumulate(widths)), axis=-1)[:-1]
 
 
 def pad_columns(matrix: jax.Array) -> jax.Array:
-    """Zero-pad to a multiple of 8 columns; 132 doubled the time of LoRA-MoE's backward pass."""
+    """Zero-pad to a multiple of 8 columns; a width of 132 doubled LoRA-MoE's backward time."""
     return jnp.pad(matrix, [(0, 0)] * (matrix.ndim - 1) + [(0, -matrix.shape[-1] % 8)])
 
 

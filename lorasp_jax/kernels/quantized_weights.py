@@ -1,10 +1,11 @@
-"""Frozen weights quantized to 8 or 4 bits: int8 per column, nf4 per block of 64 inputs.
+"""Frozen weights quantized to int8 with one scale per column, or to nf4 with one per 64 inputs.
 
-Quantization is symmetric, with one scale per group. nf4 is the 4-bit NormalFloat of QLoRA (Dettmers
-et al., arXiv 2305.14314, appendix E) without double quantization of the scales: 4.5 bits per
-weight. If m is the largest magnitude of a group, the error of a weight is at most m/255 in int8 and
-0.152 m, half the widest gap of the table, in nf4. Adapted layers store only the codes and scales,
-and dequantize the kernel at each matmul, in both passes.
+Quantization is symmetric. The weights that share a scale form a group: a whole column in int8, 64
+inputs of a column in nf4. nf4 is the 4-bit NormalFloat of QLoRA (Dettmers et al., arXiv 2305.14314,
+appendix E) without double quantization of the scales, and takes 4.5 bits per weight. If m is the
+largest magnitude of a group, the error of a weight is at most m/255 in int8 and 0.152 m, half the
+widest gap of the table, in nf4. Adapted layers store only the codes and scales, and dequantize the
+kernel at each matmul, in both passes.
 """
 
 import dataclasses
@@ -22,7 +23,7 @@ NF4_BLOCK = 64
 """Inputs per scale in nf4 (arXiv 2305.14314, section 3)."""
 INT8_BOUND = 127.5
 """The scale is the largest magnitude divided by this: half a step above 127, so that the outermost
-codes get a full bin (as in qwix 0.1.8, with which the tests compare)."""
+codes get a full bin (as in qwix 0.1.8, against which the tests compare)."""
 # Quantiles of a normal distribution, including 0, scaled to [-1, 1]; arXiv 2305.14314,
 # appendix E.
 NF4 = (
@@ -38,7 +39,7 @@ NF4 = (
 class QuantizedKernel:
     """A quantized kernel [..., I, O] with the `shape`, `dtype` and `astype` of an array.
 
-    A pytree of arrays that keep the leading axes, so it works with scan, vmap and sharding.
+    A pytree; its arrays keep the kernel's leading axes, so it works with scan, vmap and sharding.
     """
 
     codes: jax.Array

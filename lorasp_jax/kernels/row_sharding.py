@@ -1,7 +1,7 @@
-"""Run row-wise kernels on arrays with rows sharded over devices.
+"""Run row-wise kernels on arrays whose rows are sharded over devices.
 
 A kernel is opaque to XLA, which would gather all rows on every device. With a sharding rule
-(jax.experimental.custom_partitioning) each device runs the kernel on its own rows, for any mesh
+(jax.experimental.custom_partitioning), each device runs the kernel on its own rows, for any mesh
 shape and axis names.
 """
 
@@ -22,16 +22,16 @@ Kernel = Callable[[Arrays, Arrays], tuple[Arrays, Arrays]]
 def by_rows(kernel: Kernel, shared: Arrays, arrays: Arrays) -> tuple[Arrays, Arrays]:
     """Run the kernel with each device processing its own rows.
 
-    Under `jax.vmap` every device processes all rows. No gradient is defined.
+    Under `jax.vmap`, every device processes all rows. No gradient is defined.
 
     Args:
       kernel: (shared, arrays) -> (outputs, sums). Row i of the outputs depends only on row i of the
-        arrays; sums are additive over rows.
+        arrays; the sums of disjoint sets of rows add up.
       shared: replicated arrays of any shape.
-      arrays: [T, ...] each, sharded over T.
+      arrays: each [T, ...], sharded over T.
 
     Returns:
-      outputs [T, ...] each, sharded like the arrays, and sums of any shape.
+      outputs, each [T, ...] and sharded like the arrays; and sums of any shape.
     """
     num_shared = len(shared)
 

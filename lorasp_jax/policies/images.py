@@ -23,19 +23,20 @@ def resize_with_pad(
 ) -> jax.Array:
     """Resize `[B, H, W, 3]` to `[B, size, size, 3]`, bilinearly, keeping the aspect ratio.
 
-    The rest is padded with black (-1).
+    The remaining area is padded with black (-1).
 
     Args:
-        images: values in [-1, 1]; images of the right size are returned unchanged.
+        images: values in [-1, 1]; images already of this size are returned unchanged.
         size: height and width [pixels].
-        centred: center the image, as in openpi (shared/image_tools.py) and LeRobot's pi0; False:
-            align it to the bottom right, as in LeRobot's SmolVLA.
-        antialias: smooth before downsampling, as in openpi; False: as in PyTorch and LeRobot.
+        centred: center the image, as in openpi (shared/image_tools.py) and LeRobot's pi0; False
+            aligns it to the bottom right, as in LeRobot's SmolVLA.
+        antialias: smooth before downsampling, as in openpi; False does not, as in PyTorch and
+            LeRobot.
     """
     batch, height, width, channels = images.shape
     if height == width == size:
         return images
-    # Float arithmetic, as in both projects: 116 pixels become 223, not 224.
+    # Float arithmetic, as in openpi and LeRobot: 116 pixels become 223, not 224.
     ratio = max(width / size, height / size)
     inner = (max(1, int(height / ratio)), max(1, int(width / ratio)))
     shape = (batch, *inner, channels)

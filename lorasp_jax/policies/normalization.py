@@ -4,11 +4,12 @@ Every mode is an affine map: y = (x - shift) / divisor + offset and x = (y - off
 
     mean_std             shift mean, spread std, offset 0
     min_max, quantiles   shift low, spread high - low, offset -1: [low, high] becomes [-1, 1];
-                         quantiles: 1st and 99th percentile, quantile10: 10th and 90th
+                         low and high: minimum and maximum in min_max, percentiles 1 and 99
+                         in quantiles, 10 and 90 in quantile10
     identity             y = x
 
-Divisor and factor are both the spread, halved for ranges. Before that, each project guards it
-against zero in constant dimensions:
+Divisor and factor are both the spread, halved for ranges. Before any halving, each convention
+guards the spread against zero in constant dimensions:
 
     ours      at least MIN_SPREAD, in both directions
     openpi    adds 1e-6, in both directions (transforms.py, Normalize and Unnormalize, at 15a9616a)
@@ -28,7 +29,7 @@ MIN_SPREAD = 1e-3
 """Lower bound on the spread [rad, m], so that noise in a constant dimension (such as a gripper that
 stays open) is not amplified."""
 BOUNDS = {"min_max": ("min", "max"), "quantiles": ("q01", "q99"), "quantile10": ("q10", "q90")}
-"""Names of the statistics that map to -1 and 1."""
+"""Names of the statistics whose values map to -1 and 1."""
 _OPENPI, _LEROBOT = 1e-6, 1e-8
 
 
@@ -48,7 +49,7 @@ def normalize(
         values: `[..., J]` [rad, m].
         stats: their statistics by name, `[J]` each.
         mode: see the module docstring.
-        convention: the project whose guard against small spreads to use.
+        convention: the project whose guard against small spreads applies.
 
     Raises:
         ValueError: a statistic that the mode needs is missing.

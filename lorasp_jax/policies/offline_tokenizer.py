@@ -1,8 +1,8 @@
 """Offline tokenizer of the project's own base weights: WordPiece with manipulation words.
 
-Other words, up to 100 characters long, are split into characters, so any printable ASCII text can
-be encoded. The position of an entry is its id, and the shipped weights depend on it: entries are
-never moved or removed, and a new word replaces the next reserved entry.
+Other words, up to 100 characters long, are split into characters, so any printable ASCII text
+without longer words can be encoded. The position of an entry is its id, and the shipped weights
+depend on it: entries are never moved or removed, and a new word replaces the next reserved entry.
 """
 
 import functools
@@ -56,7 +56,7 @@ class Offline:
     def encode(
         self, texts: Sequence[str], max_tokens: int, *, complete: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Encode the instructions without a prompt template; see `encode`."""
+        """Encode the instructions without a prompt template; see the function `encode`."""
         del complete
         return encode(texts, max_tokens)
 

@@ -18,7 +18,7 @@ class Policy:
     """Maps raw observations to robot commands. A pytree, usable in `jax.jit` and `jax.lax.scan`.
 
     Attributes:
-        model: backbone, or its `sampler()`; anything with `sample_actions`.
+        model: the backbone, its `sampler()`, or anything else with `sample_actions`.
         processor: converts between the robot and the backbone.
     """
 
@@ -26,10 +26,10 @@ class Policy:
     processor: Processor
 
     def with_sampler(self) -> Self:
-        """Return a policy for repeated calls: computations on weights alone are done once.
+        """Return a policy for repeated calls: computations on weights alone run once.
 
-        Call it before a `jax.lax` loop: on a CPU, XLA hoists this work out of the loop, but this
-        is not guaranteed.
+        Call it before a `jax.lax` loop: on a CPU, XLA hoists these computations out of the loop
+        anyway, but does not guarantee it.
         """
         return dataclasses.replace(self, model=self.model.sampler())
 
@@ -46,10 +46,10 @@ class Policy:
 
         Args:
             key: typed PRNG key for the initial noise of the flow.
-            observation: as returned by `env.observe`, leading axis B.
-            instruction: `[B]` int32, row indices of the processor's prompt table.
+            observation: as returned by `env.observe`, with leading axis B.
+            instruction: `[B]` int32, rows of the processor's prompt table.
             num_steps: Euler steps of the flow-matching sampler.
-            return_aux: also return the adapters' `Aux`, see the backbone's `sample_actions`.
+            return_aux: also return the adapters' `Aux`; see the backbone's `sample_actions`.
 
         Returns:
             `[B, C, J+1]` f32 joint targets [rad] and gripper opening [m], or (chunk, aux).

@@ -1,7 +1,7 @@
 """Tokenizers of published language models, loaded from their files.
 
-The file format implies the prompt template: openpi reads PaliGemma's SentencePiece model, LeRobot
-reads Hugging Face tokenizer files for both pi0 and SmolVLA.
+The file format implies the prompt template: openpi reads PaliGemma's SentencePiece model, and
+LeRobot reads Hugging Face tokenizer files for both pi0 and SmolVLA.
 """
 
 import warnings
@@ -45,7 +45,7 @@ class SentencePiece:
             self._model.encode(t if complete else prompts.openpi(t), add_bos=True) for t in texts
         ]
         if not complete:
-            # Encoded separately, so that it never merges with the last piece of the text.
+            # Encoded separately, so that the newline never merges with the last piece of the text.
             newline = self._model.encode("\n")
             rows = [row + newline for row in rows]
         return _pad(texts, rows, max_tokens, pad=0)

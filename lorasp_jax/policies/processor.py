@@ -32,7 +32,7 @@ def robot_slots(num_joints: int, inputs: InputConfig = OURS) -> tuple[int, ...]:
     PiPER has (0..5, 7) and Panda (0..6, 7); without a dedicated gripper slot, (0..6) and (0..7).
 
     Raises:
-        ValueError: more joints than there are slots before the gripper's.
+        ValueError: no joints, or more joints than there are slots before the gripper's.
     """
     gripper = num_joints if inputs.gripper_slot is None else inputs.gripper_slot
     if not 0 < num_joints <= gripper:
@@ -43,7 +43,7 @@ def robot_slots(num_joints: int, inputs: InputConfig = OURS) -> tuple[int, ...]:
 def camera_slots(
     cameras: Sequence[str], robot: Mapping[str, str]
 ) -> tuple[tuple[str, str | None], ...]:
-    """Pair each backbone camera with the robot camera that feeds it, or None, for `Processor`.
+    """Pair each backbone camera with the robot camera that feeds it or with None, for `Processor`.
 
     Args:
         cameras: the backbone's cameras, `config.cameras`.
@@ -100,13 +100,13 @@ class Processor:
     """Converts observations and actions of one robot and its tasks. A pytree.
 
     Attributes:
-        robot_slots: slots of the robot's J+1 dimensions, see `robot_slots`.
+        robot_slots: slots of the robot's J+1 dimensions; see the function `robot_slots`.
         statistics: statistics of states and actions, by slot.
         prompts: tokenized prompts of the instructions.
         image_size: height and width of the backbone's images [pixels].
         inputs: input conventions that the backbone was trained with.
-        cameras: pairs (backbone camera, robot camera or None), see `camera_slots`; empty if the
-            names are the same.
+        cameras: pairs (backbone camera, robot camera or None), see `camera_slots`; empty if robot
+            and backbone use the same names.
     """
 
     robot_slots: tuple[int, ...] = field(metadata={"static": True})
@@ -134,9 +134,10 @@ class Processor:
             statistics: the robot's statistics, in the order of its joints or already in slots.
             prompts: tokenized prompts of the instructions.
             num_joints: J.
-            cameras: backbone camera -> robot camera, see `camera_slots`; None: the same names.
+            cameras: backbone camera -> robot camera, see `camera_slots`; None if the names are
+                equal.
             delta: mask of relative action dimensions, see `to_delta`; `statistics` must be those of
-                the relative actions. None: the mask in the config.
+                the relative actions. None selects the mask in the config.
 
         Raises:
             ValueError: joints, statistics or cameras do not fit the backbone, or the delta mask is
@@ -169,7 +170,7 @@ class Processor:
     ) -> Observation:
         """Convert a raw observation to model input.
 
-        Backbone cameras without a robot camera give black, masked images.
+        A backbone camera without a robot camera gets black images and a False mask.
 
         Args:
             raw: images of any size and the robot's state.

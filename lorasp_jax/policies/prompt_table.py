@@ -1,9 +1,9 @@
-"""Prompts of a robot, tokenized in advance, since no tokenizer runs inside `jax.jit`.
+"""Prompts of a robot, tokenized in advance, since no tokenizer can run inside `jax.jit`.
 
-pi0.5's prompt contains the state, "Task: press the button, State: 12 130 7;\\nAction: ". Its ids
-are concatenated from parts tokenized separately: the text before the numbers, each number with its
-leading space, and the last number with the text after it. This is correct if the tokenizer never
-merges a number with its neighbors, which is verified for every pair of numbers.
+pi0.5's prompt contains the state, "Task: press the button, State: 12 130 7;\\nAction: ". Its
+token ids are concatenated from parts tokenized separately: the text before the numbers, each number
+with its leading space, and the last number with the text after it. This is correct if the tokenizer
+never merges a number with its neighbors, which is verified for every pair of numbers.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ class Ids(NamedTuple):
     mask: jax.Array
 
     def gather(self, rows: jax.Array) -> "Ids":
-        """Gather rows `[B, n]` or `[B]` and flatten each to `[B, n K]`."""
+        """Gather the rows with indices `[B, n]` or `[B]`, and flatten the result to `[B, n K]`."""
         return Ids(*(jnp.asarray(a)[rows].reshape(len(rows), -1) for a in self))
 
 
@@ -38,9 +38,9 @@ class PromptTable:
 
     Attributes:
         start: `[P, T]`, one row per instruction: the prompt, or the part of it before the state.
-        numbers: one row per bin, -1 first: a state value with its leading space. None if prompts do
-            not contain the state.
-        last: the same for the last state value, with the end of the prompt.
+        numbers: one row per bin, starting with bin -1: the tokens of a state value with its leading
+            space. None if prompts do not contain the state.
+        last: the same for the last state value, followed by the end of the prompt.
         instructions: P strings.
     """
 
@@ -68,7 +68,7 @@ class PromptTable:
 
         Raises:
             ValueError: the tokenizer rejects an instruction, gives ids beyond the backbone's
-                vocabulary, or merges state values.
+                vocabulary, or merges state values with their neighbors.
         """
         if config.inputs.prompt_state:
             table = _with_state(words, instructions, config.max_tokens, num_joints + 1)
@@ -134,7 +134,7 @@ def _check_merges(
 ) -> None:
     """Raise ValueError unless the assembled ids equal the tokenizer's for every pair of numbers."""
     rows = np.arange(prompts.STATE_BINS + 1)
-    # One prompt per number n, which alternates it with all numbers: n, n+1, n, n+2, ..., n, n.
+    # One prompt per number n, in which n alternates with all numbers: n, n+1, n, n+2, ..., n, n.
     others = (rows[:, None] + 1 + rows) % len(rows)
     pairs = np.stack([rows[:, None] + 0 * others, others], -1)
     state = _bin_centers(pairs.reshape(len(rows), -1) - 1)

@@ -1,4 +1,4 @@
-"""Prompt templates of the published language models."""
+"""Prompt templates of published policies."""
 
 import numpy as np
 
@@ -11,15 +11,15 @@ PI05_END = ";\nAction: "
 
 
 def openpi(text: str) -> str:
-    """Clean an instruction as openpi does for pi0, without the newline that starts the answer.
+    """Clean an instruction as openpi does for pi0, without the newline that precedes the answer.
 
-    Strip whitespace; replace underscores and newlines by spaces (openpi, models/tokenizer.py).
+    Strip whitespace; replace underscores and newlines with spaces (openpi, models/tokenizer.py).
     """
     return text.strip().replace("_", " ").replace("\n", " ")
 
 
 def lerobot(text: str) -> str:
-    """Append a newline unless there is one (LeRobot, newline_task_processor.py)."""
+    """Append a newline unless the text ends in one (LeRobot, newline_task_processor.py)."""
     return text if text.endswith("\n") else f"{text}\n"
 
 

@@ -14,7 +14,8 @@ from lorasp_jax.storage.digest import DIGEST, verify_digest, with_digest
 NAMES = ("mean", "std", "min", "max", "q01", "q99", "q10", "q90")
 """Names of all supported statistics."""
 _UNUSED: dict[str, float] = dict(zip(NAMES, (0, 1, -1, 1, -1, 1, -1, 1), strict=True))
-"""Values in unused slots, which make every normalization mode the identity."""
+"""Values for unused slots: with them, every normalization mode is the identity, up to its guard
+against zero."""
 
 
 @jax.tree_util.register_dataclass
@@ -23,7 +24,7 @@ class Statistics:
     """Statistics of states and of actions by name, each `[A]` f32. A pytree.
 
     Attributes:
-        state: some of `NAMES`; mean and std are 0 and 1 in unused slots.
+        state: arrays by name, for some of `NAMES`; in unused slots, mean is 0 and std is 1.
         action: the same for actions.
     """
 
@@ -49,7 +50,8 @@ class Statistics:
 
         Args:
             state: `[..., J+1]` joints [rad] and gripper [m].
-            action: `[..., J+1]` as the policy predicts them, absolute or relative to the state.
+            action: `[..., J+1]` actions as the policy predicts them, absolute or relative to the
+                state.
             valid: `[...]` bool, False at padding.
             slots: slots of the J+1 dimensions.
             dim: number of slots, A.
@@ -90,7 +92,7 @@ class Statistics:
         return Statistics(move(self.state), move(self.action))
 
     def to_json(self) -> str:
-        """Return a JSON object of lists, "state_mean" and so on, exact in fp32, with a digest."""
+        """Return JSON: an object of lists named "state_mean" etc., exact in fp32, and a digest."""
         both = {"state": self.state, "action": self.action}
         lists = {
             f"{kind}_{name}": np.asarray(stats[name]).tolist()

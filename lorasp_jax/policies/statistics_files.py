@@ -34,7 +34,7 @@ TENSOR = re.compile(
     r"(?:(?:un)?normalize_\w+\.)?(?:(?:(?P<dataset>.+)[._])?buffer[._])?"
     r"(?P<kind>observation[._]state|action)\.(?P<name>\w+)"
 )
-"""Name of a statistic in LeRobot's safetensors files."""
+"""Pattern of the names of statistics in LeRobot's safetensors files."""
 _EPISODE_STATISTICS = ("count", "mean", "std", "min", "max")
 _UNREADABLE = (
     OSError, AttributeError, KeyError, TypeError, ValueError, OverflowError, RecursionError,
@@ -48,10 +48,10 @@ def read(where: str | os.PathLike[str], *, dataset: str = "") -> Statistics:
     """Read a robot's statistics, in the order of its joints; `Statistics.to_slots` reorders them.
 
     Args:
-        where: one of the files above, or a folder to search for them in that order; or a Hub
-            repository or bucket URL, see `hub.local`.
-        dataset: the dataset, if a checkpoint has several: the folder under openpi's assets/, or the
-            name in LeRobot's tensors.
+        where: one of the files in the module docstring, or a folder to search for them in that
+            order: a local path, a Hub repository or a bucket URL; see `hub.local`.
+        dataset: the dataset, if a checkpoint has several: its folder under openpi's assets/, or its
+            name in the names of LeRobot's tensors.
 
     Raises:
         ValueError: no statistics, damaged files, several datasets or an unknown one, no state or
@@ -111,7 +111,7 @@ def _episodes(files: list[Path]) -> dict[str, Stats]:
 
 
 def _aggregate(episodes: list[Mapping[str, Any]]) -> dict[str, np.ndarray]:
-    """Aggregate like LeRobot 0.3.3 (compute_stats.py, aggregate_feature_stats): no quantiles."""
+    """Aggregate as LeRobot 0.3.3 (compute_stats.py, aggregate_feature_stats), without quantiles."""
     values = {
         name: np.array([stats[name] for stats in episodes], float) for name in _EPISODE_STATISTICS
     }
@@ -151,7 +151,7 @@ _READERS: dict[str, Callable[[list[Path]], dict[str, Stats]]] = {
 
 
 def _files(folder: Path, pattern: str) -> list[Path]:
-    """Return the regular files that match; folders may match too."""
+    """Return the regular files that match the pattern; matching folders are left out."""
     return [path for path in sorted(folder.glob(pattern)) if path.is_file()]
 
 

@@ -34,7 +34,7 @@ class Tokenizer(Protocol):
         Args:
             texts: instructions.
             max_tokens: T.
-            complete: the texts are complete prompts, such as those of `prompts.pi05`, and are
+            complete: True if the texts are complete prompts, such as those of `prompts.pi05`, to be
                 encoded unchanged.
 
         Returns:
@@ -48,11 +48,11 @@ def load_tokenizer(where: str | os.PathLike[str]) -> Tokenizer:
 
     Args:
         where: a SentencePiece `.model`, a `tokenizer.json`, or a folder that contains one of them:
-            a local path, a Hub repository or a bucket URL, see `hub.local`. Empty: the offline
-            tokenizer.
+            a local path, a Hub repository or a bucket URL; see `hub.local`. An empty string
+            selects the offline tokenizer.
 
     Raises:
-        ValueError: the path does not exist or contains no tokenizer.
+        ValueError: the path does not exist or contains no valid tokenizer.
     """
     from envs.datasets.files import TEXT_BYTES
     from lorasp_jax.policies.pretrained_tokenizers import SentencePiece, TokenizersFile
