@@ -9,7 +9,7 @@ import importlib
 import importlib.util
 from typing import TYPE_CHECKING, Any
 
-import envs.compilation.fast_cpu  # first, before anything starts JAX
+import envs.compilation.fast_cpu  # first: it must run before anything starts JAX
 import envs.interop.ids
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ envs.interop.ids.register()
 
 
 def __getattr__(name: str) -> Any:
-    """Import public names and modules lazily: MJX takes seconds, too long for `--help`."""
+    """Import public names and modules lazily: importing MJX delays `--help` by seconds."""
     if name in _MODULES:
         return getattr(importlib.import_module(f"envs.{_MODULES[name]}"), name)
     if name == "rlds":

@@ -24,7 +24,7 @@ _DEFAULT = "(default: %(default)s)"
 def main(
     arguments: Sequence[str], program: str = "python -m envs", record: Record | None = None
 ) -> int:
-    """Run a command and return its exit code: 0 success, 2 invalid input, 130 interrupted.
+    """Run a command; return its exit code: 0 success, 2 error, 130 interrupted, 141 closed stdout.
 
     Args:
         arguments: command-line arguments.
@@ -34,7 +34,7 @@ def main(
     options = parse_arguments(parser(program), arguments)
     options.record = record
     console = Console(stderr=True)
-    # Preallocating GPU memory would add a second to commands of half a minute (measured).
+    # Preallocating GPU memory would add a second to commands that take half a minute (measured).
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     cache.enable()
     try:
@@ -99,7 +99,7 @@ def _add_command(
 
 
 def seed(text: str) -> int:
-    """Parse a seed; JAX uses only its low 32 bits."""
+    """Parse a seed of up to 32 bits; JAX would ignore higher ones."""
     if not 0 <= (value := int(text)) < 2**32:
         raise argparse.ArgumentTypeError(f"must be 0 to {2**32 - 1}, got {value}")
     return value

@@ -7,12 +7,12 @@ from jax._src import compilation_cache, core, lru_cache, xla_bridge
 from jaxlib import utils
 
 FileCache = lru_cache.LRUCache
-"""JAX's file cache of compiled programs. Public settings cover only its folder, not how it writes,
-and a process could read an entry that another process is still writing."""
+"""JAX's file cache of compiled programs. No public setting changes how it writes entries, and by
+default a process could read an entry that another process is still writing."""
 
 
 def use_file_cache(kind: type[FileCache]) -> None:
-    """Make JAX use this class for its cache; no public setting can."""
+    """Make JAX use this class for its cache; no public setting does this."""
     compilation_cache.LRUCache = kind  # pyright: ignore[reportPrivateImportUsage]
 
 
@@ -22,9 +22,9 @@ backend, and then `import envs` could no longer set the flag that makes MJX fast
 
 is_untraced = core.trace_state_clean
 """Return whether the caller is outside of all JAX transformations; `jax.core` has had no public
-name for it since 0.4.36. Without it, a step inside a user's `jax.jit` would be announced as a
-compilation, and get compiler options that JAX rejects there."""
+name for this check since 0.4.36. Without it, a step inside a user's `jax.jit` would be announced as
+a compilation, and would get compiler options that JAX rejects there."""
 
 set_min_log_level = utils.absl_set_min_log_level
 """Set the log level of JAX's C++ code at run time, to silence XLA's alarms about slow compilation;
-TF_CPP_MIN_LOG_LEVEL is only read at start."""
+TF_CPP_MIN_LOG_LEVEL is read only at startup."""

@@ -1,9 +1,9 @@
-"""Action modes, each converted to joint targets.
+"""Action modes, each converted to joint targets; J is the number of joints, A the action length.
 
     joint         [J + 1] joint targets [rad], gripper opening [m]
     delta_joint   [J + 1] change of the joint targets [rad], gripper opening [m]
-    end_effector  [7] translation [m] and rotation vector [rad] of the tcp, both in the base frame,
-                  gripper opening [m]
+    end_effector  [7] translation [m] and rotation vector [rad] of the tcp (tool center point),
+                  both in the base frame, gripper opening [m]
 
 Changes are relative to the last targets, not to measured positions, so that servo lag does not make
 an arm creep.
@@ -25,7 +25,7 @@ MODES: tuple[str, ...] = get_args(Mode)
 TARGET_DT = 0.02
 """Period at which joint targets are interpolated between two actions [s]; our choice (50 Hz)."""
 
-_TOOL_SPEED = np.array([0.5] * 3 + [2.0] * 3, np.float32)  # limits, our choice [m/s, rad/s]
+_TOOL_SPEED = np.array([0.5] * 3 + [2.0] * 3, np.float32)  # speed limits, our choice [m/s, rad/s]
 
 
 def bounds(mode: Mode, robot: Robot, control_dt: float) -> tuple[np.ndarray, np.ndarray]:
@@ -55,7 +55,7 @@ def to_targets(mode: Mode, robot: Robot, command: jax.Array, action: jax.Array) 
 def from_targets(mode: Mode, robot: Robot, command: jax.Array, targets: jax.Array) -> jax.Array:
     """Invert `to_targets`: return the action [A] that leads from `command` to `targets`.
 
-    An end-effector action does not determine the joints of an arm with more than six.
+    An end-effector action does not determine the targets of an arm with more than six joints.
     """
     if mode == "joint":
         return targets
@@ -87,7 +87,7 @@ def interpolate(commands: jax.Array, control_dt: float, latency: float | jax.Arr
 
 
 def _rotation_vector(rotation: jax.Array) -> jax.Array:
-    """Convert a rotation matrix [3, 3], of less than 180 degrees, to a rotation vector [3]."""
+    """Convert a rotation [3, 3] by less than 180 degrees to a rotation vector [3]."""
     axis = robots.sine_axis(rotation)
     sine = jnp.linalg.norm(axis)
     angle = jnp.arctan2(sine, (jnp.trace(rotation) - 1) / 2)

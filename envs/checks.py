@@ -1,4 +1,4 @@
-"""Check arguments before anything is computed; errors are one sentence."""
+"""Check arguments before anything is computed; each error message is one sentence."""
 
 import math
 import numbers
@@ -13,8 +13,8 @@ def count(name: str, value: Any, maximum: int, minimum: int = 1) -> int:
     """Check that a value is an integer from `minimum` to `maximum`, and return it as an int.
 
     Raises:
-        TypeError: it is not an integer.
-        ValueError: it is out of range.
+        TypeError: the value is not an integer.
+        ValueError: the value is out of range.
     """
     if isinstance(value, bool | np.bool_) or not isinstance(value, numbers.Integral):
         raise TypeError(f"{name} must be an integer, got {value!r}")
@@ -30,8 +30,8 @@ def number(name: str, value: Any) -> float:
     """Check that a value is a finite real number or scalar array, and return it as a float.
 
     Raises:
-        TypeError: it is not a real number.
-        ValueError: it is not finite.
+        TypeError: the value is not a real number.
+        ValueError: the value is not finite.
     """
     real = isinstance(value, numbers.Real) and not isinstance(value, bool)
     if not real and not (is_numeric(value) and value.shape == ()):
@@ -45,7 +45,7 @@ def key(value: Any) -> Any:
     """Check that a value is a key from `jax.random.key` or `jax.random.PRNGKey`, and return it.
 
     Raises:
-        TypeError: it is not a key, or is an array of keys.
+        TypeError: the value is not a key, or is an array of keys.
     """
     dtype, shape = getattr(value, "dtype", None), getattr(value, "shape", None)
     if dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key):
@@ -60,8 +60,8 @@ def action(value: Any, shape: tuple[int, ...]) -> Any:
     """Check that a value is a numeric array of this shape, and return it.
 
     Raises:
-        TypeError: it is not a numeric array.
-        ValueError: its shape is different.
+        TypeError: the value is not a numeric array.
+        ValueError: the array has another shape.
     """
     if not is_numeric(value):
         raise TypeError(f"action must be a numeric array {list(shape)}, got {short(value)}")
@@ -71,7 +71,7 @@ def action(value: Any, shape: tuple[int, ...]) -> Any:
 
 
 def instance(name: str, value: Any, kind: type, expected: str) -> None:
-    """Raise a TypeError if a value is not an instance of `kind`, described by `expected`."""
+    """Raise a TypeError that asks for `expected` if a value is not an instance of `kind`."""
     if not isinstance(value, kind):
         raise TypeError(f"{name} must be {expected}, got {short(value)}")
 

@@ -29,7 +29,7 @@ from envs.scene.randomization import Draw, Randomization
 from envs.state import Changes, Data, Poses, State, Trajectory, where
 from envs.tasks import Layout, Task, View
 
-_HOME_NOISE = 0.03  # rad, half the range of random start poses around home; our choice
+_HOME_NOISE = 0.03  # rad, half the range of random start angles around home; our choice
 _START_OPENING = 0.04  # m, gripper opening at reset; our choice
 
 
@@ -109,11 +109,11 @@ class Env:
         return round(self.task.expert_time / self.control_dt)
 
     def reset(self, key: jax.Array, ranges: Randomization | None = None) -> State:
-        """Start W worlds with a random layout, instruction and start pose near home.
+        """Start W worlds, each with a random layout, instruction and start pose near home.
 
         Args:
             key: source of all randomness.
-            ranges: domain randomization; None: disabled.
+            ranges: ranges of domain randomization; None disables it.
 
         Raises:
             TypeError, ValueError: the key or a range is invalid.
@@ -127,20 +127,20 @@ class Env:
 
         Args:
             state: W worlds.
-            action: [W, A], by default A = J + 1 joint targets [rad] and gripper opening [m]; see
-                `envs.actions` for other modes. Clipped to `action_low`, `action_high` and the
-                robot's speed limits.
+            action: [W, A], by default J joint targets [rad] and the gripper opening [m], so that
+                A = J + 1; see `envs.actions` for other modes. Actions are clipped to `action_low`,
+                `action_high` and the robot's speed limits.
 
         Returns:
             The worlds `control_dt` later. Worlds that were done are unchanged.
 
         Raises:
-            TypeError: the action is not a numeric array, or the state not a `State`.
+            TypeError: the action is not a numeric array, or the state is not a `State`.
             ValueError: the action's shape or the state's number of worlds is wrong.
         """
         self._check_worlds(state)
         action = checks.action(action, (self.num_envs, len(self.action_low)))
-        # A weakly typed action, such as jnp.full(shape, 0.0), would recompile the step.
+        # A weakly typed action, such as jnp.full(shape, 0.0), would make JAX recompile the step.
         action = jax.lax.convert_element_type(action, jnp.float32)
         with self._calls.first("step", state.info["draw"] is None):
             return self._batched_step(state, action)
@@ -153,7 +153,7 @@ class Env:
             measured joint angles [rad] and gripper opening [m].
 
         Raises:
-            TypeError, ValueError: an invalid state, as in `step`.
+            TypeError, ValueError: the state is invalid, as in `step`.
         """
         self._check_worlds(state)
         with self._calls.first("images", state.info["draw"] is None):
@@ -253,7 +253,8 @@ class Env:
 
         Args:
             poses: poses of all geoms and cameras, leading axis N.
-            draw: randomized values of these worlds, leading axis N, from `State.info`.
+            draw: randomized values of these scenes, leading axis N, from `State.info`; None: not
+                randomized.
         """
         appearance, size = jax.vmap(self._appearance)(draw) if draw else (None, None)
         images = self.renderer(poses, appearance, size)
@@ -354,7 +355,7 @@ class Env:
         return self._with_cameras(draw, self.physics.start(self._changes(draw, layout), qpos))
 
     def _changes(self, draw: Draw | None, layout: Layout) -> Changes:
-        """Return one world's changes to the model: randomized values, poses of fixed bodies."""
+        """Return one world's changes to the model: randomized values and poses of fixed bodies."""
         changes = randomization.changes(draw, self.model, self._objects) if draw else {}
         return changes | placing.fixed_bodies(self.model, layout, changes)
 

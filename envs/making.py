@@ -24,7 +24,8 @@ from envs.scene import scene
 AnyRobot = str | os.PathLike[str] | Robot
 RendererName = Literal["rays", "warp"]
 RENDERERS: tuple[str, ...] = get_args(RendererName)
-# Upper bounds, beyond any device, to catch typos; then lower bounds other than 1.
+# For each argument the upper bound, then the lower bound unless it is 1. The upper bounds of the
+# first three are beyond any device, to catch typos.
 _RANGES: dict[str, tuple[int, ...]] = {
     "num_envs": (2**20,),
     "image_size": (2**12,),
@@ -67,9 +68,9 @@ def make(
             which also draws meshes and textures).
 
     Raises:
-        TypeError: an argument that should be a number or a robot is not.
-        ValueError: an unknown name (the message lists the known ones), an unsuitable robot, or a
-            number out of range.
+        TypeError: `robot`, `control_dt` or an integer argument has the wrong type.
+        ValueError: a name is unknown (the message lists the known ones), the robot is unsuitable,
+            the discount is invalid, or another number is out of range.
     """
     fast_cpu.warn_if_late()
     task_definition, robot_model = _find("task", task), _find_robot(robot)
@@ -124,12 +125,12 @@ def _check_dt(value: float, time_limit: float) -> float:
 
 
 def _counts(**values: Any) -> Iterator[int]:
-    """Check integers against `_RANGES`."""
+    """Check integers against `_RANGES`, and return them as ints."""
     return (checks.count(name, value, *_RANGES[name]) for name, value in values.items())
 
 
 def _check_choices(**values: tuple[Any, Sequence[str]]) -> None:
-    """Check names against their valid choices: argument = (value, choices)."""
+    """Check names against their valid choices, each passed as argument=(value, choices)."""
     for name, (value, known) in values.items():
         if value not in known:
             raise ValueError(f"unknown {name} {value!r}: choose from {', '.join(known)}")

@@ -5,13 +5,13 @@ from pathlib import Path
 
 
 def names(kind: str) -> list[str]:
-    """List the modules that define a "task" or "robot", as a global `TASK` or `ROBOT`."""
+    """List the modules that define a global `TASK` (kind "task") or `ROBOT` (kind "robot")."""
     defines = re.compile(rf"^{kind.upper()}\b", re.MULTILINE)
     folder = Path(__file__).parent / f"{kind}s"
     return sorted(p.stem for p in folder.glob("[!_]*.py") if defines.search(p.read_text("utf-8")))
 
 
 def check(kind: str, name: str) -> None:
-    """Raise a ValueError that lists the known names if this is not one of them."""
+    """Raise a ValueError that lists the known names if `name` is not one of them."""
     if name not in names(kind):
         raise ValueError(f"unknown {kind} {name!r}: choose from {', '.join(names(kind))}")

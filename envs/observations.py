@@ -24,7 +24,7 @@ def parts(
     """Compute the parts of the privileged state (`Env.full_state`) of one world, f32, by name.
 
     - `joints` [J + 1]: joint angles [rad] and gripper opening [m]; `joint_speeds` [J + 1]: their
-      derivatives per second; `command` [J + 1]: the last targets.
+      time derivatives [rad/s, m/s]; `command` [J + 1]: the last targets.
     - `tool` [9]: position [m], x axis and y axis of the tcp.
     - `<body>` [9]: position relative to the tcp [m], x axis and y axis; for free bodies also
       `<body>_speed` [6]: linear [m/s] and angular [rad/s] velocity.
@@ -73,7 +73,7 @@ def layout(model: mujoco.MjModel, joints: int, bodies: Iterable[str]) -> dict[st
 
 
 def _with_opening(values: jax.Array, count: int) -> jax.Array:
-    """Return the values of the `count` joints, and the sum over both fingers."""
+    """Return the values of the first `count` joints, and the sum over both fingers."""
     return jnp.append(values[:count], values[count] + values[count + 1])
 
 

@@ -25,7 +25,7 @@ REWARDS: tuple[str, ...] = get_args(Reward)
 
 
 def potential(stages: dict[str, jax.Array]) -> jax.Array:
-    """Compute the progress of a task: the share of stages passed, plus part of the next, in [0, 1].
+    """Compute a task's progress in [0, 1]: stages passed, and part of the next, as a share of all.
 
     Args:
         stages: completed share of each stage, f32 [...] in [0, 1], first to last. A stage with
@@ -49,7 +49,7 @@ def after_step(before: State, after: State, stages: dict[str, jax.Array], discou
 
     Args:
         before, after: the world before and after the step.
-        stages: stages of the world after the step.
+        stages: completed share of each stage after the step, as in `potential`.
         discount: the learner's discount.
     """
     success = after.info["success"]

@@ -42,7 +42,7 @@ class Data:
 
 
 class Poses(NamedTuple):
-    """Poses of all geoms and cameras of a scene, in the world frame; with any leading axes.
+    """Poses of all G geoms and N cameras of a scene, in the world frame, with any leading axes.
 
     Attributes:
         geom_xpos: `[G, 3]` positions of the geoms [m].
@@ -75,7 +75,7 @@ class State:
 
     Attributes:
         data: positions, velocities and poses.
-        reward: f32 [W], of the last step; if sparse, 1 on success.
+        reward: f32 [W], of the last step; the sparse reward is 1 on success, else 0.
         done: bool [W], latched; a done world stays frozen until `reset_done`.
         metrics: f32 [W] each, the task's measurements.
         info: success bool [W]; steps int32 [W]; instruction int32 [W], index into

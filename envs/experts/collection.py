@@ -20,17 +20,17 @@ from envs.making import AnyRobot, make
 from envs.scene.randomization import Draw, Randomization, prepare
 from envs.state import Poses
 
-# Default number of worlds per call; our choice: fills the device and fits its memory.
+# Default number of worlds per call; our choice: it fills the device and fits its memory.
 _NUM_ENVS = {"cpu": 32, "gpu": 256, "tpu": 256}
-# Give up if fewer than this share of attempts succeed, after this many attempts. Our choice: the
-# experts solve nearly all layouts, so less means that something is broken.
+# Give up if, after this many attempts or more, less than this share has succeeded. Our choice: the
+# experts solve nearly all layouts, so a lower share means that something is broken.
 _MIN_SUCCESS, _MIN_ATTEMPTS = 0.5, 16
 _MAX_EPISODES = 10**9  # our choice; catches typos
 
 Record = Callable[
     [Env, jax.Array, float | jax.Array, Randomization | None], tuple[dict[str, Any], jax.Array]
 ]
-"""Attempt an episode in every world; return the arrays of `Episodes`, and which succeeded."""
+"""Attempt an episode in every world; return the arrays of `Episodes`, and success [W]."""
 
 
 @jax.tree_util.register_dataclass
@@ -40,7 +40,7 @@ class Rollout:
 
     Attributes:
         state: f32 [T, W, J + 1] measured joints [rad] and gripper opening [m] before each action.
-        action: f32 [T, W, J + 1] the expert's actions, without noise.
+        action: f32 [T, W, A] the expert's actions, without noise.
         poses: poses of geoms and cameras before each action, leading axes [T, W].
         length: int32 [W] control steps until the world was done.
         success: bool [W].
@@ -63,12 +63,13 @@ def rollout(
     action_noise: float | jax.Array = 0.0,
     ranges: Randomization | None = None,
 ) -> Rollout:
-    """Run the expert on fresh random layouts; call it under jit.
+    """Run the expert on fresh random layouts; call this function under jit.
 
     Args:
         env: W worlds.
         key: source of all randomness.
-        action_noise: standard deviation [rad] of Gaussian noise on the executed joint targets.
+        action_noise: standard deviation of Gaussian noise on all entries of the executed actions
+            except the gripper opening, in their units [rad, or m for the tcp's translation].
             Recorded actions are without noise, so they demonstrate recovery.
         ranges: domain randomization, see `envs.scene.randomization`.
     """
@@ -108,7 +109,7 @@ def collect(
     record: Record | None = None,
     **options: Any,
 ) -> Episodes:
-    """Collect successful demonstrations by the scripted expert, on the device.
+    """Collect successful demonstrations of the scripted expert, on the device.
 
     Episodes are padded to the expert's time limit.
 
@@ -117,7 +118,7 @@ def collect(
         robot: as in `envs.make`.
         num_episodes: number of episodes E to return.
         key: source of all randomness; the same key gives the same episodes.
-        num_envs: number of worlds W simulated at once; None chooses by device.
+        num_envs: number of worlds W simulated at once; None: chosen by device.
         action_noise: see `rollout`.
         ranges: see `rollout`.
         progress: called with (episodes so far, num_episodes), first with 0 before compilation.
@@ -159,7 +160,7 @@ def expert_success(
 
 
 def make_repeatable(task: str, robot: AnyRobot, **options: Any) -> Env:
-    """Call `envs.make`, by default with reproducible physics: Warp's summation order varies."""
+    """Call `envs.make`, by default with reproducible physics: Warp's order of addition varies."""
     options.setdefault("backend", "jax")
     return make(task, robot, **options)
 
@@ -175,7 +176,7 @@ def gather(
     attempted: int = 0,
     record: Record | None = None,
 ) -> Iterator[Episodes]:
-    """Yield successful episodes call by call, `num_episodes` in total.
+    """Yield the successful episodes of each call of `record`, `num_episodes` in total.
 
     Args:
         env: W worlds, one attempt each per call.
@@ -212,7 +213,7 @@ def gather(
 
 
 def _metadata(env: Env) -> dict[str, Any]:
-    """Return the fields of `Episodes` that describe their environment."""
+    """Return the fields of `Episodes` that describe the environment."""
     return {
         "instructions": env.instructions,
         "task": env.task.name,

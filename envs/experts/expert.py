@@ -18,13 +18,13 @@ from envs.state import State
 from envs.tasks import Waypoints
 
 _SPEED_FRACTION = 0.5  # share of the robot's joint speed limits that the expert uses; our choice
-_PEAK = 1.875  # peak over mean speed of a minimum-jerk move: 30 s²(1 - s)² at s = 1/2
+_PEAK = 1.875  # ratio of peak to mean speed of a minimum-jerk move: 30 s²(1 - s)² at s = 1/2
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """Knots [W, P + 1, J + 1] in joint space and their times [W, P + 1] in s."""
+    """Knots [W, P + 1, J + 1] in joint space, with times [W, P + 1] in s, for P waypoints."""
 
     knots: jax.Array
     times: jax.Array
@@ -33,15 +33,15 @@ class Plan:
 def plan(env: Env, state: State, key: jax.Array) -> Plan:
     """Plan a random solution for every world, starting from its robot's current pose.
 
-    Waypoints in free space get noise, and every duration is scaled by a factor in [0.8, 1.2] (our
-    choices).
+    Waypoints in free space get noise, and every duration is scaled by a random factor in [0.8, 1.2]
+    (our choices).
     """
     keys = jax.random.split(key, env.num_envs)
     return jax.vmap(lambda info, key: _plan(env, info, key))(state.info, keys)
 
 
 def act(env: Env, plan: Plan, state: State) -> jax.Array:
-    """Return the actions [W, A] for the next control step; after the end, hold the last pose."""
+    """Return the actions [W, A] for the next control step; past the plan, hold its last pose."""
     seconds = (state.info["steps"] + 1).astype(jnp.float32) * env.control_dt
     targets = jax.vmap(_interpolate)(plan.knots, plan.times, seconds)
     convert = functools.partial(actions.from_targets, env.actions, env.robot)

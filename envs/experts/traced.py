@@ -1,9 +1,9 @@
 """Share traced programs between processes, in addition to JAX's compilation cache.
 
-JAX's cache saves XLA's work, but its key needs the traced program, and tracing MJX takes 6 to 8 s
-of Python per scene (measured). Reading a program from this cache takes 0.2 s. Its key covers the
-scene, all source files of this package, all settings of JAX and the package versions, so a change
-to any of them retraces.
+JAX's cache avoids XLA's work, but a lookup needs the traced program, and tracing MJX takes 6 to 8 s
+of Python per scene (measured). Reading a program from the cache of this module takes 0.2 s. This
+cache's key covers the scene, all source files of this package, all settings of JAX and the package
+versions, so a change to any of them causes a new trace.
 """
 
 import functools
@@ -41,8 +41,9 @@ def cached(
 ) -> Callable[..., Any]:
     """Apply `jax.jit(..., static_argnums=0)`, tracing once for all processes on a machine.
 
-    Programs are cached only if JAX's compilation cache is enabled, for tasks of this package, and
-    without Warp, whose programs contain memory addresses. Thread-safe; cannot be vmapped.
+    Programs are cached only if JAX's compilation cache is in a local folder, the task is one of
+    this package, and Warp is not used, since its programs contain memory addresses. Thread-safe;
+    cannot be vmapped.
 
     Args:
         function: a function in this package that takes an `Env` and pytrees of arrays, and returns
@@ -103,7 +104,7 @@ def _is_cacheable(env: Env) -> bool:
 
 
 def _is_shipped(task: Task) -> bool:
-    """Return whether the task is one of this package, fully defined by its source files."""
+    """Return whether the task belongs to this package, whose source files define it fully."""
     name = f"{tasks.__name__}.{task.name}"
     spec = importlib.util.find_spec(name)
     return spec is not None and importlib.import_module(name).TASK is task
@@ -111,7 +112,7 @@ def _is_shipped(task: Task) -> bool:
 
 def _settings() -> tuple[Any, ...]:
     """Return all settings of JAX as this thread sees them."""
-    settings = sorted(jax.config.values.items())  # global values, without context managers
+    settings = sorted(jax.config.values.items())  # global values, without those of context managers
     return tuple((name, getattr(jax.config, name, value)) for name, value in settings)
 
 
@@ -145,7 +146,7 @@ def _sources() -> str:
 
 
 def _load(file: Path) -> export.Exported | None:
-    """Load a cached program; None if it is missing or damaged."""
+    """Load a cached program; return None if it is missing or damaged."""
     try:
         data = bytearray(file.read_bytes())
     except OSError:

@@ -1,4 +1,4 @@
-"""Wrap an environment for Brax, to train from states with Brax's wrappers.
+"""Wrap an environment for Brax, to train from states, not images, with Brax's wrappers.
 
 env = brax.envs.training.wrap(BraxEnv(envs.make("press")), episode_length=80)
 state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), 4096))
@@ -36,11 +36,13 @@ class BraxEnv(base.Env):
     Observations are those of `Env.full_state`, float32 [D], without images. `env.observe` renders
     `state.pipeline_state`, the `envs.State` of one world.
 
-    Actions, [A] in [-1, 1], are rescaled to `action_low` and `action_high` of the environment. The
+    Actions, [A] in [-1, 1], are rescaled to the range from the environment's `action_low` to its
+    `action_high`. The
     sparse reward is 1 once, on success, so the return of an episode is 1 on success, else 0. The
     dense reward needs `action_repeat=1`, since Brax sums the rewards of repeated actions without
-    discounting. `done` means success or broken physics. Brax's wrapper sets the episode length
-    (`env.max_steps` is the task's own limit) and marks its end as a truncation. Brax's
+    discounting. `done` means success or broken physics. Brax's EpisodeWrapper
+    sets the episode length (`env.max_steps` is the task's own limit) and marks an episode that
+    reaches this length as truncated. Brax's
     AutoResetWrapper restarts a world in its initial state, with the same layout.
 
     Attributes:

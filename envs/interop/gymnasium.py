@@ -4,7 +4,8 @@ env = VectorEnv(envs.make("press", num_envs=64, image_size=64))
 observation, info = env.reset(seed=0)
 observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
 
-`gymnasium.make_vec` and `gymnasium.make` call `make_vec` and `make` (`envs.interop.ids`).
+`gymnasium.make_vec` and `gymnasium.make` call `make_vec` and `make` of this module, which
+`envs.interop.ids` registers.
 """
 
 import dataclasses
@@ -45,8 +46,9 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     float32 [W, A]. Info: `success`, bool [W], and `instruction`, string [W].
 
     Worlds restart automatically in Gymnasium's next-step mode: the step after a world ends ignores
-    its action and returns the first observation of its next episode, with reward 0 and neither
-    terminated nor truncated. The seed and the actions determine everything, including restarts.
+    the action for that world and returns the first observation of its next episode, with reward 0
+    and neither terminated nor truncated. The seed and the actions determine everything, including
+    restarts.
 
     Attributes:
         env: the wrapped environment.
@@ -109,7 +111,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     def step(
         self, actions: np.ndarray
     ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Simulate one control step of every world, or restart worlds that have ended.
+        """Simulate one control step of every world, but restart worlds that have ended.
 
         Args:
             actions: [W, A], units and limits as in `Env.step`.
@@ -136,7 +138,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         ended = state.done
         if not np.any(ended):
             return after
-        # The caller must still see worlds that end in this very step: restart only earlier ones.
+        # Restart only worlds that ended earlier: the caller must still see those that end now.
         ended_only = dataclasses.replace(after, done=ended)
         fresh = self.env.reset_done(ended_only, self._key(), self.ranges)
         return dataclasses.replace(fresh, done=after.done & ~ended)
@@ -258,7 +260,7 @@ def make(
 
 
 def _space(env: Env, observation: str) -> spaces.Space[Any]:
-    """Return the space of one world's observations, unbounded: joints can exceed their limits."""
+    """Return one world's observation space; states are unbounded: joints can exceed limits."""
     if observation not in OBSERVATIONS:
         raise ValueError(
             f"unknown observation {observation!r}: choose from {', '.join(OBSERVATIONS)}"

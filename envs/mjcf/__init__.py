@@ -10,8 +10,8 @@ Joints, masses, gains, meshes, names (prefixed with "robot/") and the pose of th
 hinge's limits are the intersection of its range and its actuator's ctrlrange. Everything that
 belongs to a scene is dropped: floor, lights, options, keyframes, sensors, tendons, equalities. A
 camera "wrist" becomes the wrist camera; an arm without one gets that of the built-in robots. As on
-those, only the fingers collide, each with a box around the ends of its colliding geoms and a small
-sphere at the tip: MJX is slow with meshes.
+these robots, only the fingers collide, each with a box around the ends of its colliding geoms and a
+small sphere at the tip: MJX is slow with meshes.
 """
 
 import os
@@ -43,8 +43,9 @@ def load(
     Args:
         path: the MJCF file.
         tcp: name of a site in the hand whose z axis points out between the fingers, which open
-            along its y axis. By default the site "tcp" if it exists, else the last joint's axis is
-            z. The robot's tcp is on that z axis, `robots.TIP_LENGTH` before the fingers' ends.
+            along its y axis. The default is the site "tcp" if it exists; otherwise z is the last
+            joint's axis. The robot's tcp is on that z axis, `robots.TIP_LENGTH` before the
+            fingers' ends.
         speed: speed limits [rad/s], one for all joints or one per joint; MJCF does not give them.
         gripper_speed: maximum speed of the opening [m/s].
         folder: folder that must contain all referenced files, such as meshes, after following
@@ -69,7 +70,7 @@ def _read(
     gripper: float,
     folder: str | os.PathLike[str] | None,
 ) -> Robot:
-    """Read the robot; its home is a guess, its lean and tilt side are placeholders."""
+    """Read the robot; its home is a guess, and its lean and tilt side are placeholders."""
     spec, model = reading.read(path, folder)
     arm = reading.find_arm(model)
     hand = hands.find(model, arm, tcp)
@@ -100,7 +101,7 @@ def _positive(name: str, value: float | Sequence[float], count: int) -> np.ndarr
 
 
 def _guess_home(model: mujoco.MjModel, arm: reading.Arm, mid_range: np.ndarray) -> np.ndarray:
-    """Return initial joint angles [J] for the start pose: the keyframe "home", else mid-range."""
+    """Return a first guess [J] of the start pose: the keyframe "home", or else mid-range."""
     for i in range(model.nkey):
         if model.key(i).name == "home":
             return model.key_qpos[i, model.jnt_qposadr[arm.joints]]

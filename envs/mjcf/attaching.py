@@ -16,14 +16,14 @@ from envs.robots import Robot
 _BASE = "base"
 _PREFIX = "robot/"  # for all names in the user's file, to avoid clashes with the scene and tasks
 _DROPPED = ("keys", "sensors", "actuators", "tendons", "equalities", "pairs", "excludes", "lights")
-_UNSET = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default color; such a geom uses its material's
+_UNSET = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default; a geom of this color has its material's
 _SMALL = 0.01  # m, half-extent below which a mesh is not drawn; our choice
 _HIDDEN_GROUP = 3
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class UserBody:
-    """Body of a robot from a user's file, see `robots.Body`.
+    """Body of a robot from a user's file; see `robots.Body`.
 
     Attributes:
         spec: the user's model; the joints of its fingers measure half the opening.
@@ -114,7 +114,7 @@ def prepare(
 def _add_servo(
     spec: mujoco.MjSpec, model: mujoco.MjModel, joint: str, servo: int, gear: float
 ) -> None:
-    """Add a copy of the user's actuator that acts on the joint itself."""
+    """Copy the user's actuator; the copy acts on the joint itself, not through a tendon."""
     new = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     new.gear[0] = gear
     for name in (

@@ -10,15 +10,15 @@ import mujoco
 import numpy as np
 
 # Our choices.
-_POINTS = 500  # samples of a surface
+_POINTS = 500  # points sampled on the surface of a mesh
 _CUTS = np.arange(1, 6) / 6  # candidate cuts, as fractions of a part's extent
 _MAX_VOLUME_RATIO = 0.85  # cut only if the total volume shrinks below this share
-# Shortest extent along which a part may be cut [m]; a pixel of a 64 px side camera is 6 mm wide.
+# Shortest extent along which a part may be cut [m]; in a 64 px side image, a pixel is 6 mm wide.
 _MIN_EXTENT = 0.06
 _MAX_DEPTH = 3  # maximum number of successive cuts
 _MIN_POINTS = 10  # minimum number of points in a part
 _OUTLIERS = 0.01  # share of the points on each side that a shape may leave out
-_MIN_HALF_EXTENT = 0.0005  # m, smallest half-extent
+_MIN_HALF_EXTENT = 0.0005  # m, smallest half-extent of a shape
 _BOX, _CYLINDER, _CAPSULE = (
     mujoco.mjtGeom.mjGEOM_BOX,
     mujoco.mjtGeom.mjGEOM_CYLINDER,
@@ -34,7 +34,7 @@ class Shape:
         kind: MuJoCo's geom type: box, cylinder or capsule.
         size: [3] in MuJoCo's convention for that type [m].
         position, rotation: [3] in m and [3, 3].
-        distance: mean distance of the mesh's points to its surface [m].
+        distance: mean distance from the points of the part to the shape's surface [m].
     """
 
     kind: mujoco.mjtGeom
@@ -45,7 +45,7 @@ class Shape:
 
 
 def fit(model: mujoco.MjModel, geom: int) -> list[Shape]:
-    """Approximate a mesh geom by shapes in its frame, aligned with its inertia or file axes."""
+    """Approximate a mesh geom by shapes in its frame, along its axes of inertia or of its file."""
     mesh = model.geom_dataid[geom]
     file_axes = np.empty(9)
     mujoco.mju_quat2Mat(file_axes, model.mesh_quat[mesh])

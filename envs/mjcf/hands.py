@@ -1,4 +1,4 @@
-"""Locate the hand of a user's robot: its frame, how its fingers move, where they collide."""
+"""Locate the hand of a user's robot: its frame, how its fingers move and where they collide."""
 
 import itertools
 from typing import NamedTuple
@@ -25,8 +25,8 @@ class Pad(NamedTuple):
 class Hand(NamedTuple):
     """The hand of an arm.
 
-    For a finger joint at q, sign * q + shift is the distance of its pad from the tcp, which is half
-    the opening.
+    For a finger joint at q, sign * q + shift is half the opening: the distance from the tcp to the
+    finger's pad.
     """
 
     chain: np.ndarray  # [J, 4, 4] as in `Robot`
@@ -43,12 +43,12 @@ def find(model: mujoco.MjModel, arm: Arm, tcp: str | None) -> Hand:
 
     Args:
         model: the user's model.
-        arm: its joints.
+        arm: from `reading.find_arm`.
         tcp: as in `envs.mjcf.load`.
 
     Raises:
-        ValueError: the fingers do not slide along one line or have no colliding geom, or the site
-            does not exist or does not match the fingers.
+        ValueError: the fingers do not slide along one line, do not open far enough or have no
+            colliding geom, or the site does not exist or does not match the fingers.
     """
     data = mujoco.MjData(model)
     data.qpos[model.jnt_qposadr[arm.joints]] = 0

@@ -26,8 +26,8 @@ _TILTS = np.deg2rad([25, 94])  # of the task "pour": carrying the cup, pouring
 # Our choices.
 _TOLERANCE = 0.004  # m, largest error of a pose that counts as reached
 _LEVER = 0.1  # m, converts an error in angle to one in position
-_MARGIN = 0.05  # rad, minimum distance to the limits of each joint
-_ROWS = 32  # poses solved at once
+_MARGIN = 0.05  # rad, minimum distance of each joint from its limits
+_ROWS = 32  # number of poses solved at once
 _TRIES, _SPREAD = 8, 0.4  # number of random starts, standard deviation around the guess [rad]
 
 
@@ -51,7 +51,7 @@ def complete(robot: Robot) -> Robot:
         )
     cost = np.maximum(table_errors, _TOLERANCE)
     cost[errors > _TOLERANCE] = np.inf
-    # Prefer the smallest lean, then the orientation farther from the last joint's limits.
+    # At equal cost prefer the smallest lean, then the last joint farther from its limits.
     margin = np.abs(homes[:, -1:] - [robot.lower[-1], robot.upper[-1]]).min(axis=1)
     best = np.lexsort((-margin, leans, cost))[0]
     if cost[best] > _TOLERANCE:
@@ -69,8 +69,8 @@ def _try_leans(robot: Robot, leans: np.ndarray, turns: np.ndarray) -> tuple[np.n
     """Try N leans and rotations of the tcp about z.
 
     Returns:
-        Homes [N, J] in rad, their errors at the start pose [N] and, starting from there, at the
-        worst point of the table [N], in m.
+        Homes [N, J] in rad, their errors at the start pose [N] and, starting from those homes, at
+        the worst point of the table [N], in m.
     """
     rng = np.random.default_rng(0)
     spread = _SPREAD * rng.standard_normal((_TRIES, robot.num_joints))
@@ -105,7 +105,7 @@ def _solve(
     Args:
         robot: the arm.
         at: [..., 3] positions [m].
-        lean, turn: [...] angles outward and about z, from pointing down [rad].
+        lean, turn: [...] angles of the tcp from pointing down: outward, and about its z axis [rad].
         start, home: [..., J] initial joint angles, and those that redundant joints tend to [rad].
 
     Returns:

@@ -14,7 +14,7 @@ from envs.scene import scene
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _KINDS = ("free", "ball", "slide", "hinge")
 _MAX_JOINTS = 16  # our choice: compile time grows with every joint
-_RADIANS_AS_DEGREES = np.deg2rad(4 * np.pi)  # rad, width of -2 pi to 2 pi if read as degrees
+_RADIANS_AS_DEGREES = np.deg2rad(4 * np.pi)  # rad: -2 pi to 2 pi misread as degrees
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
@@ -29,7 +29,7 @@ class Arm(NamedTuple):
 
 
 class Gripper(NamedTuple):
-    """The fingers' actuators combined into one position servo of half the opening."""
+    """The fingers' actuators combined into one position servo, which controls half the opening."""
 
     stiffness: float  # N/m
     damping: float  # N s/m
@@ -46,7 +46,8 @@ def read(
         folder: folder that must contain all referenced files; by default that of the file.
 
     Raises:
-        ValueError: the file does not exist, MuJoCo rejects it, or it refers to files elsewhere.
+        ValueError: the file does not exist, MuJoCo rejects it, it refers to files outside of
+            `folder`, or it asks for something too large.
     """
     path = Path(path).absolute()
     if not os.path.isfile(path):  # Path.is_file raises if a name is too long
@@ -154,7 +155,7 @@ def _servo(model: mujoco.MjModel, joint: int) -> tuple[int, float]:
     others = np.any([_rates(model, j) for j in range(model.njnt) if j != joint], axis=0)
     for i in np.flatnonzero(rates * ~others).tolist():
         gain = model.actuator_gainprm[i, 0]
-        # No force if control = angle: gain * control and bias * rate * angle cancel.
+        # There is no force if control = angle: gain * control and bias * rate * angle cancel.
         if _is_servo(model, i) and np.isclose(gain, -model.actuator_biasprm[i, 1] * rates[i]):
             return i, float(rates[i])
     raise ValueError(

@@ -24,7 +24,7 @@ _MAX_DEPTH, _MAX_TEXT = 20, 2**25
 _MAX_COPIES, _MAX_ELEMENTS = 1000, 10_000
 _MAX_ENTRIES, _MAX_PATHS = 10**6, 10**5
 _ENTRIES = {"dim", "num", "nsample"}  # attributes of sensors and actuators
-_MAX_RINGS = 300  # of a built-in mesh, which has up to the square of this number of vertices
+_MAX_RINGS = 300  # of vertices in a built-in mesh, which has at most this number squared
 _BYTES = ("memory", "nstack")  # attributes of <size> that `reading` ignores
 _PIXEL_BYTES = 4
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -67,7 +67,7 @@ def _all_descriptions(path: Path, folder: Path) -> dict[Path, ElementTree.Elemen
 def _check_growth(descriptions: dict[Path, ElementTree.Element], main: Path) -> None:
     """Raise a ValueError if a file includes itself, or expands to too many elements.
 
-    A cycle would crash this process; MuJoCo's time grows with the square of the element count.
+    A cycle would crash this process; loading takes time quadratic in the number of elements.
     """
     included: dict[Path, set[Path]] = {}
     for path, root in descriptions.items():
@@ -94,7 +94,7 @@ def _check_growth(descriptions: dict[Path, ElementTree.Element], main: Path) -> 
 
 
 def _elements(element: ElementTree.Element, copies: float, inner: float) -> float:
-    """Bound how many elements `element` expands to, with at most `inner` per included file."""
+    """Return an upper bound on what `element` expands to, given `inner` for included files."""
     more = inner if element.tag in _EXPANDED else 0.0
     below = copies * _copies(element)
     return copies * (1 + more) + sum(_elements(child, below, inner) for child in element)
@@ -122,7 +122,7 @@ def _referenced(
 
 
 def _portable(name: str) -> str:
-    """Replace backslashes, which MuJoCo accepts too."""
+    """Replace backslashes, which MuJoCo also accepts, by slashes."""
     return name.replace("\\", "/")
 
 
@@ -158,7 +158,7 @@ def _copies(element: ElementTree.Element) -> float:
 
 
 def _numbers(element: ElementTree.Element, attribute: str) -> list[float]:
-    """Parse the numbers in an attribute; if malformed, leave the error to MuJoCo."""
+    """Parse an attribute's numbers, raised to at least 1; leave malformed ones to MuJoCo."""
     try:
         return [max(1.0, float(text)) for text in element.get(attribute, "").split()]
     except ValueError:

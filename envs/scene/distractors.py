@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from envs.tasks import Layout
 
-_SIZE = 0.016  # m, half the width of each, and the height of its center; our choice
+_SIZE = 0.016  # m, half the typical width of an object, and the height of its center; our choice
 _SHAPES = (  # our choices, in colors that no task uses
     f'type="box" size="{_SIZE} {_SIZE} {_SIZE}" rgba=".15 .55 .30 1"',
     f'type="sphere" size="{_SIZE}" rgba=".95 .75 .15 1"',
@@ -35,7 +35,8 @@ def mjcf(count: int) -> str:
 def place(key: jax.Array, layout: Layout, count: int) -> Layout:
     """Sample poses of `count` distractors, clear of the layout and of one another.
 
-    Each takes the first of `_TRIES` random positions with enough clearance, else the clearest one.
+    Each distractor takes the first of `_TRIES` random positions with enough clearance, or else the
+    position with the most.
     """
     occupied = jnp.stack([pose[:2] for pose in layout.values()])
     placed: Layout = {}

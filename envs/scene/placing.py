@@ -12,7 +12,7 @@ from envs.tasks import Layout
 
 
 def positions(model: mujoco.MjModel, layout: Layout, joints: jax.Array) -> jax.Array:
-    """Return the qpos of one world: the robot's joints first, free bodies as in the layout."""
+    """Return the qpos of one world: first the robot's joints, then free bodies as in the layout."""
     qpos = jnp.asarray(model.qpos0, jnp.float32).at[: len(joints)].set(joints)
     for name, pose in layout.items():
         body = model.body(name)
