@@ -25,7 +25,7 @@ from envs.names import names
 from envs.rendering import video
 
 WORLDS = 4
-"""Parallel attempts of `play`, since the expert may fail; one success is shown."""
+"""Number of parallel attempts in `play`, since the expert may fail; one success is shown."""
 _EVERY = 2  # control steps per frame of a GIF
 
 
@@ -124,7 +124,7 @@ def _is_done(options: argparse.Namespace, env: envs.Env, file: Path) -> bool:
         if existing == recipe and not options.overwrite:
             return True
     elif partial.exists() and _is_complete(rlds.metadata(partial), recipe):
-        return False  # perhaps killed before it deleted the shards: `_save` compares both
+        return False  # perhaps killed before `_save` deleted the shards; `_save` compares both
     _refuse_existing(options, file)
     return False
 
@@ -161,7 +161,7 @@ def _collect_concurrently(
 
 
 def _collect(options: argparse.Namespace, env: envs.Env, out: Path, report: Report) -> str:
-    """Collect one task, resuming an interrupted call; return a summary."""
+    """Collect the episodes of one task, resuming an interrupted call; return a summary."""
     writer = rlds.ShardWriter(_partial(out), recipes.recipe(options, env))
     report(writer.num_episodes, options.num_episodes)
     for shard in collection.gather(
@@ -203,7 +203,7 @@ def _save(options: argparse.Namespace, folder: Path, out: Path) -> None:
 
 
 def _are_same(one: Episodes, other: Episodes) -> bool:
-    """Return whether arrays and metadata are equal."""
+    """Return whether both have equal arrays and metadata."""
     trees = [jax.tree.flatten(episodes) for episodes in (one, other)]
     (leaves, metadata), (other_leaves, other_metadata) = trees
     return metadata == other_metadata and all(map(np.array_equal, leaves, other_leaves))

@@ -1,7 +1,8 @@
 """Report errors of a command in one sentence; only bugs show a traceback.
 
 Bad input raises ValueError everywhere in the project. Inaccessible files and exhausted memory are
-not bugs, either. If the reader of a pipe has closed it, nothing is reported.
+not bugs, either. If the reader of the output has closed the pipe, nothing is
+reported.
 """
 
 import argparse
@@ -16,7 +17,7 @@ from rich.console import Console
 REFUSED = 2
 """Exit code after bad input."""
 BROKEN_PIPE = 141
-"""Exit code if the reader of the output has closed it, as shells report SIGPIPE."""
+"""Exit code if the reader of the output has closed the pipe, as shells report SIGPIPE."""
 MAX_LENGTH = 1000
 """Maximum number of characters in a message."""
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -94,7 +95,7 @@ def _stdout_is_closed() -> bool:
 
 
 def _is_out_of_memory(error: Exception) -> bool:
-    """Return whether a JAX device ran out of memory, by type name, to avoid importing JAX."""
+    """Return whether a JAX device ran out of memory, judged by type name to avoid importing JAX."""
     return type(error).__name__ == "JaxRuntimeError" and "RESOURCE_EXHAUSTED" in str(error)
 
 

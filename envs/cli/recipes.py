@@ -1,4 +1,4 @@
-"""Recipes of datasets: all settings that determine the episodes."""
+"""The recipe of a dataset: all settings that determine its episodes."""
 
 import argparse
 import dataclasses

@@ -1,4 +1,4 @@
-"""Show an expert episode in MuJoCo's viewer, in real time and repeatedly."""
+"""Show an expert episode in MuJoCo's viewer, in real time and in a loop."""
 
 import itertools
 import time
@@ -22,7 +22,7 @@ from envs.state import State
 def check_display() -> None:
     """Raise a ValueError if no window can be opened."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", glfw.GLFWError)  # `init` returns False as well
+        warnings.simplefilter("ignore", glfw.GLFWError)  # `init` also returns False
         if not glfw.init():
             raise ValueError("cannot open a window without a display: add --out FILE.mp4")
 
@@ -38,7 +38,7 @@ def episode(
     """Simulate a successful episode of the expert.
 
     Args:
-        env: environment with W parallel attempts.
+        env: environment; its parallel worlds are independent attempts.
         key: source of all randomness.
         tries: maximum number of resets.
         plan: replacement for the compiled `expert.plan`.
@@ -71,7 +71,7 @@ def episode(
 
 
 def show(model: mujoco.MjModel, positions: np.ndarray, seconds: float) -> None:
-    """Replay joint positions `[T, nq]` until the window is closed, each for `seconds`.
+    """Replay joint positions `[T, nq]` until the window is closed, each row for `seconds`.
 
     Raises:
         ValueError: no window can be opened.

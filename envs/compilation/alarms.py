@@ -1,7 +1,7 @@
 """Silence XLA's alarms about slow compilation in programs that report it themselves.
 
 "Very slow compile? If you want to file a bug ..." and "Constant folding an instruction is taking
-> 1s" are logged as errors (xla/service/slow_operation_alarm.cc); no setting turns off only these.
+> 1s" are logged as errors (xla/service/slow_operation_alarm.cc); no setting turns off just those.
 """
 
 import os
@@ -20,7 +20,7 @@ _FATAL, _JAX_DEFAULT = 3, 1  # levels of TF_CPP_MIN_LOG_LEVEL
 def silence(
     set_level: Callable[[int], None] = _compat.set_min_log_level,
 ) -> "Compilations | None":
-    """Log nothing below fatal from JAX's C++ code while this process compiles. Call it once.
+    """Log nothing below fatal from JAX's C++ code while this process compiles. Call this once.
 
     Failing compilations still raise, and errors outside compilation are still logged. A level set
     in TF_CPP_MIN_LOG_LEVEL is respected; plugins (CUDA, for example) have their own logging.
@@ -49,7 +49,7 @@ class Compilations:
 
     def on_start(self, event: str, value: float, **_: Any) -> None:
         """Handle a scalar that JAX records."""
-        del value  # the time
+        del value  # the start time
         self._count(event, 1)
 
     def on_end(self, event: str, duration_secs: float, **_: Any) -> None:

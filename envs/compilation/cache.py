@@ -12,8 +12,8 @@ from envs.datasets.writing import write_bytes
 class WholeFiles(_compat.FileCache):
     """JAX's file cache, with atomic writes.
 
-    JAX writes entries in place: another process may read half of one, and an entry left half
-    written by a killed process is never rewritten.
+    JAX writes entries in place: another process may read a partial entry, and a partial entry left
+    by a killed process is never rewritten.
     """
 
     def put(self, key: str, value: bytes) -> None:
@@ -31,7 +31,7 @@ class WholeFiles(_compat.FileCache):
 def enable() -> None:
     """Cache compiled programs in JAX_COMPILATION_CACHE_DIR, by default ~/.cache/lorasp_jax/xla.
 
-    Call it before anything is compiled.
+    Call this before anything is compiled.
     """
     if jax.config.jax_compilation_cache_dir is None:
         folder = os.path.join(os.path.expanduser("~"), ".cache", "lorasp_jax", "xla")

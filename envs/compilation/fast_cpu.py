@@ -54,12 +54,12 @@ def warn_if_late() -> None:
 
 
 def without_simulation() -> dict[str, str | bool] | None:
-    """Return compiler options for programs without simulation, which the flag slows down on CPU."""
+    """Return compiler options to undo the flag, which on CPU slows programs without simulation."""
     return {_NAME: True} if _NEEDED and jax.default_backend() == "cpu" else None
 
 
 def jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
-    """Apply `jax.jit` with these options, fast on CPU even if the flag could not be set."""
+    """Apply `jax.jit`; simulation is fast on CPU even if the flag could not be set in time."""
     plain = jax.jit(function, **options)
     if not _NEEDED:
         return plain

@@ -1,4 +1,4 @@
-"""Report compilations that take long."""
+"""Report compilations that take a long time."""
 
 import contextlib
 import sys
@@ -18,7 +18,7 @@ PATIENCE = 2.0
 
 @contextlib.contextmanager
 def announce(what: str) -> Iterator[None]:
-    """Print a line to stderr if the enclosed compilation takes long, and another when it is done.
+    """Print a line to stderr if the enclosed compilation exceeds `PATIENCE`, and one when it ends.
 
     Only the first of several processes prints.
 
@@ -48,15 +48,15 @@ def _print(line: str) -> None:
 
 
 class Calls:
-    """Announce those calls of an object that compile: the first of each kind."""
+    """Announce compilation by an object's methods: in the first call of each kind."""
 
     def __init__(self, name: str) -> None:
-        """Set the name that messages give the object."""
+        """Set the object's name in messages."""
         self._name = name
         self._called: set[tuple[Any, ...]] = set()
 
     def first(self, *call: Any) -> AbstractContextManager[None]:
-        """Announce a call if it compiles; `call` is its name and all that causes recompilation."""
+        """Announce a call that compiles; `call` is its name and all that requires recompilation."""
         if call in self._called or not _compat.is_untraced():
             return contextlib.nullcontext()
         self._called.add(call)

@@ -40,11 +40,11 @@ _HEADERS: Any = {
 )
 @dataclasses.dataclass(frozen=True)
 class Episodes:
-    """E episodes of one task and robot, padded to T control steps.
+    """E episodes of one task and a robot with J joints, padded to T control steps.
 
     Attributes:
         image: camera name -> uint8 `[E, T, H, W, 3]`, observed before each action.
-        state: f32 `[E, T, J + 1]` measured joint angles [rad] and gripper opening [m], before each
+        state: f32 `[E, T, J + 1]` joint angles [rad] and gripper opening [m], measured before each
             action.
         action: f32 `[E, T, A]` commands; by default A = J + 1 joint targets [rad] and gripper
             opening [m].
@@ -56,7 +56,7 @@ class Episodes:
         control_dt: time between two actions [s].
         physics_dt: time step of the simulation [s]; 0 for recordings of real robots.
         attempted: number of attempts; these episodes are the successful ones.
-        actions: action mode, see `envs.actions`.
+        actions: action mode (see `envs.actions`).
     """
 
     image: dict[str, Array]
@@ -225,10 +225,10 @@ def check_camera(name: str) -> None:
 
 
 def concatenate(parts: Sequence[Episodes]) -> Episodes:
-    """Concatenate episodes of the same task and robot, padding them to the longest.
+    """Concatenate episodes of the same task and robot, padding them to the length of the longest.
 
     Raises:
-        ValueError: `parts` is empty, or its episodes differ in metadata or image size.
+        ValueError: `parts` is empty, or its episodes differ in a field of `SHARED` or image shape.
     """
     if not parts:
         raise ValueError("there is nothing to concatenate: parts is empty")

@@ -1,7 +1,7 @@
 """Checks of untrusted files: their location, their type and their size.
 
-A name in a dataset or a model may be a URL, lead out of its folder or refer to a pipe; a size in it
-may exceed any memory. All code that opens such files calls these checks first.
+A name in a dataset or a model may be a URL, lead out of its folder or refer to a pipe; a size
+recorded there may exceed any memory. All code that opens such files calls these checks first.
 """
 
 import contextlib
@@ -58,8 +58,8 @@ def check_regular(path: Path, folder: Path | None = None) -> Path:
 
     Args:
         path: the file, or a link to it.
-        folder: folder that must contain the file after following links; None: anywhere. A snapshot
-            in the cache of the Hugging Face hub may link to where the cache stores its files.
+        folder: folder that must contain the file once links are resolved; None: anywhere. A
+            snapshot in the Hugging Face cache may link to files elsewhere in that cache.
 
     Raises:
         RefusedError: it is not a regular file, or is outside of the folder.
@@ -94,7 +94,7 @@ def check_only_files(folder: Path, home: Path | None = None) -> None:
 
     Args:
         folder: the folder, searched recursively.
-        home: folder that must contain everything after following links; None: anywhere.
+        home: folder that must contain everything once links are resolved; None: anywhere.
 
     Raises:
         RefusedError: it contains something else, or leads out of `home`.
@@ -120,7 +120,7 @@ def read_bytes(path: Path, folder: Path | None = None) -> bytes:
 
 
 def read_text(path: Path, folder: Path | None = None) -> str:
-    """Read a UTF-8 file, see `read_bytes`.
+    """Read a UTF-8 file (see `read_bytes`).
 
     Raises:
         RefusedError: as in `read_bytes`.
@@ -131,7 +131,7 @@ def read_text(path: Path, folder: Path | None = None) -> str:
 
 
 def read_json(path: Path, folder: Path | None = None) -> Any:
-    """Read a JSON file, see `read_text`.
+    """Read a JSON file (see `read_text`).
 
     Raises:
         RefusedError: as in `read_text`.
@@ -148,7 +148,7 @@ def read_json(path: Path, folder: Path | None = None) -> Any:
 
 @contextlib.contextmanager
 def as_value_error(path: Path, *also: type[Exception], remedy: str = "") -> Iterator[None]:
-    """Convert errors in reading a path to a ValueError that names it; refusals pass unchanged.
+    """Convert read errors to a ValueError that names the path; a RefusedError passes unchanged.
 
     Args:
         path: the file or folder read in the block.
@@ -196,7 +196,7 @@ def as_int(number: Any) -> int:
 
 
 def _check_contained(path: Path, folder: Path | None) -> None:
-    """Raise RefusedError if a path, after following links, is outside of a folder."""
+    """Raise RefusedError if a path, with links resolved, is outside of a folder."""
     real = Path(os.path.realpath(path))
     if folder is not None and not any(real.is_relative_to(f) for f in _allowed_folders(folder)):
         raise RefusedError(
@@ -207,9 +207,9 @@ def _check_contained(path: Path, folder: Path | None) -> None:
 def _allowed_folders(folder: Path) -> list[Path]:
     """Return the folders in which the files of a folder may be stored.
 
-    A snapshot is cache/datasets--OWNER--NAME/snapshots/REVISION/, whose files are links into the
-    blobs/ of the dataset, which may link into the blobs/ of the cache (huggingface_hub 2.4.0,
-    file_download.py and utils/_shared_blobs.py).
+    The files of a snapshot, cache/datasets--OWNER--NAME/snapshots/REVISION/, are links into the
+    dataset's blobs/, whose files may in turn be links into the cache's blobs/ (huggingface_hub
+    2.4.0, file_download.py and utils/_shared_blobs.py).
     """
     folder = Path(os.path.realpath(folder))
     allowed = [folder]

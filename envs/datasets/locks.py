@@ -10,7 +10,7 @@ import filelock
 
 from envs.datasets.files import check_local
 
-_RETRY = 0.2  # s, time for a second attempt, in case the last holder deletes the lock file
+_RETRY = 0.2  # s, long enough for a second attempt if the last holder deletes the lock file
 
 
 @contextlib.contextmanager
@@ -70,7 +70,7 @@ def acquire(file: Path, *, wait: bool = False) -> AbstractContextManager[Any]:
             raise OSError(None, "not a regular file but a pipe", str(file))
         lock = filelock.FileLock(file, fallback_to_soft=False)
         return lock.acquire(timeout=-1 if wait else _RETRY)
-    except filelock.Timeout:  # is an OSError, too
+    except filelock.Timeout:  # also an OSError
         raise
     except OSError as error:
         raise ValueError(f"cannot open {error.filename or file}: {error.strerror}") from error

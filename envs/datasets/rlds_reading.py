@@ -18,17 +18,17 @@ from envs.datasets.files import RefusedError, as_int, check_regular, read_json
 
 FORMAT, SPLIT = "envs-rlds-1", "train"
 METADATA = "metadata.json"
-"""Metadata file in a dataset's folder; tfds reads a file of this name."""
+"""Metadata file in a dataset's folder; tfds also reads a file of this name."""
 THREADS = ThreadPoolExecutor(8)
 """Shared by all open datasets: more threads would only wait for the GIL."""
-# Types of the metadata fields of every dataset, then of those only in datasets with shards.
+# Types of the metadata fields in every dataset, then of those only in datasets with shards.
 _TYPES: dict[str, Any] = {"options": dict, "parts": list, "steps": int, "attempted": int}
 _SHARD_TYPES: dict[str, Any] = {"task": str, "robot": str, "actions": str, "instructions": list}
 _SHARD_TYPES |= {"cameras": dict, "control_dt": int | float, "physics_dt": int | float}
 
 
 def read(path: str | os.PathLike[str]) -> Episodes:
-    """Read a dataset from `write` or `python -m envs collect` into host memory.
+    """Read a dataset written by `write` or `python -m envs collect` into host memory.
 
     Episodes are padded with zeros to the longest one.
 
@@ -43,7 +43,7 @@ def read(path: str | os.PathLike[str]) -> Episodes:
 
 
 def metadata(path: Path) -> dict[str, Any]:
-    """Read the metadata of a dataset, see `ShardWriter`.
+    """Read the metadata of a dataset (see `ShardWriter`).
 
     Raises:
         FileNotFoundError: the folder does not exist.
@@ -68,11 +68,11 @@ def metadata(path: Path) -> dict[str, Any]:
 
 
 class Reader:
-    """A dataset from `write` or `python -m envs collect`, read one episode at a time.
+    """A dataset written by `write` or `python -m envs collect`, read one episode at a time.
 
     Attributes:
         kind: name of the format.
-        path: its folder.
+        path: folder of the dataset.
         metadata: see `ShardWriter`.
         cameras: camera -> feature of its images.
         control_dt: time between two actions [s].
@@ -98,7 +98,7 @@ class Reader:
             self._shared: dict[str, Any] = {name: self.metadata[name] for name in SHARED}
             self._shared |= {"instructions": tuple(self.metadata["instructions"]), "attempted": 1}
             builder = _builder(self.path, self.metadata["parts"])
-            # `rlds_schema.episode` decodes only the selected cameras, after checking image sizes.
+            # `rlds_schema.episode` decodes images of the selected cameras, after checking sizes.
             encoded = {name: tfds.decode.SkipDecoding() for name in self.cameras.values()}
             decoders = {"steps": {"observation": encoded}}
             self._source = builder.as_data_source(SPLIT, decoders=decoders)
@@ -145,5 +145,5 @@ def _builder(folder: Path, parts: Sequence[int]) -> Any:
 
 
 def as_value_error(path: Path, remedy: str = "") -> contextlib.AbstractContextManager[None]:
-    """Convert errors like `files.as_value_error`, including those of protobuf."""
+    """Convert errors as `files.as_value_error` does, including those of protobuf."""
     return files.as_value_error(path, ParseError, remedy=remedy)

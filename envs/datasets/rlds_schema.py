@@ -1,4 +1,4 @@
-"""The schema of RLDS datasets: an episode as one record of tensorflow-datasets (tfds).
+"""The schema of RLDS datasets: each episode is one record of tensorflow-datasets (tfds).
 
 Features are named as in Open X-Embodiment.
 """
@@ -55,9 +55,9 @@ _ALLOWED = {
     "jsonFeature": [],
     "json_feature": [],
 }
-"""Fields of a description that tfds interprets, as spelled by tfds and by protobuf -> allowed
-values. The last two, and "type" at the top level, hold features in older formats, which also name
-classes."""
+"""Maps each field that tfds interprets in a description, as spelled by tfds and by protobuf, to its
+allowed values. The last two fields, and "type" at the top level, hold features in older formats,
+which also name classes."""
 
 
 def features(episodes: Episodes) -> tfds.features.FeaturesDict:
@@ -119,11 +119,11 @@ def stored(folder: Path) -> tfds.features.FeaturesDict:
 
 
 def check_description(folder: Path, *names: str) -> None:
-    """Raise unless files are safe for tfds, which imports classes and expands templates in them.
+    """Raise unless files are safe for tfds, which imports classes and expands templates they name.
 
     Raises:
-        RefusedError: a file names classes other than those of `features`, or shards other than
-            `FILES`.
+        RefusedError: a file names a class, data type or encoding that `features` does not use, or
+            shards other than `FILES`.
         ValueError: a file is damaged.
         OSError: a file is missing.
     """
@@ -162,7 +162,7 @@ def serializer(features: tfds.features.FeaturesDict) -> ExampleSerializer:
 def record(
     serializer: ExampleSerializer, episodes: Episodes, number: int, episode_id: int
 ) -> bytes:
-    """Serialize one of the episodes, which must be in host memory."""
+    """Serialize episode `number` of `episodes`, whose arrays must be in host memory."""
     steps, phrase = int(episodes.length[number]), int(episodes.instruction[number])
     images = {
         image_feature(camera): _encode(array[number, :steps])
@@ -233,7 +233,7 @@ def _encode(images: Any) -> list[bytes]:
     encoder takes 88 at best, OpenCV's 141 and PIL's 177, for files 15 % larger.
     """
     count, height, width, _ = images.shape
-    rows = np.zeros((count, height, 1 + 3 * width), np.uint8)  # each begins with 0: no filter
+    rows = np.zeros((count, height, 1 + 3 * width), np.uint8)  # each row begins with 0: no filter
     rows[..., 1:] = images.reshape(count, height, 3 * width)
     header = struct.pack(">2I5B", width, height, 8, 2, 0, 0, 0)  # 8 bits per channel, RGB
     start, end = b"\x89PNG\r\n\x1a\n" + _chunk(b"IHDR", header), _chunk(b"IEND", b"")

@@ -19,7 +19,7 @@ TEMPORARY_SUFFIX = ".tmp"
 
 @contextlib.contextmanager
 def atomic_file(file: Path) -> Iterator[Path]:
-    """Yield a path to write to, which replaces the file if the block succeeds.
+    """Yield a temporary path to write to; it replaces the file if the block succeeds.
 
     Raises:
         OSError: the file cannot be written, for example because the disk is full.
@@ -35,13 +35,13 @@ def atomic_file(file: Path) -> Iterator[Path]:
 
 
 def write_bytes(file: Path, data: bytes | bytearray) -> None:
-    """Replace a file, see `atomic_file`."""
+    """Replace a file (see `atomic_file`)."""
     with atomic_file(file) as temporary:
         temporary.write_bytes(data)
 
 
 def write_text(file: Path, text: str) -> None:
-    """Replace a text file in UTF-8, see `atomic_file`."""
+    """Replace a text file in UTF-8 (see `atomic_file`)."""
     write_bytes(file, text.encode())
 
 
@@ -49,8 +49,8 @@ def write_text(file: Path, text: str) -> None:
 def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a new folder to fill, which is renamed to `path` if the block succeeds.
 
-    Only one process at a time may create a path, see `envs.datasets.locks.locked`: leftovers of a
-    killed process are deleted first.
+    Only one process at a time may create a path (see `envs.datasets.locks.locked`), because
+    leftovers of a killed process are deleted first.
 
     Raises:
         ValueError: the path already exists.
@@ -89,7 +89,7 @@ def replace_folder(new: Path, path: Path, check: Callable[[Path], object]) -> No
 
 
 def recover_folder(path: Path) -> None:
-    """Finish an interrupted `replace_folder`: keep the new folder if in place, else the old one."""
+    """Finish an interrupted `replace_folder`: keep the new folder if present, else the old."""
     if not path.exists() and _old(path).exists():
         rename(_old(path), path)
     elif _old(path).exists():
@@ -106,7 +106,7 @@ def sync(path: Path) -> None:
     """Wait until a file's content, or the entries of a folder, are on disk.
 
     Raises:
-        OSError: they cannot be written, for example because the disk is full.
+        OSError: the data cannot be written, for example because the disk is full.
     """
     descriptor = os.open(path, os.O_RDONLY)
     try:

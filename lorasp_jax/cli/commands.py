@@ -34,7 +34,7 @@ def main() -> NoReturn:
 
 
 def exit_on_signals() -> None:
-    """Exit silently on Ctrl-C or SIGTERM: until a command starts there is nothing to save.
+    """Exit silently on Ctrl-C or SIGTERM: until a command starts, there is nothing to save.
 
     Call this before the imports that load JAX, which take about a second.
     """

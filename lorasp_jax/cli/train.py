@@ -23,7 +23,7 @@ RUNS = Path("runs")
 def main(arguments: Sequence[str], program: str = "python train.py") -> int:
     """Run one experiment; return the exit code.
 
-    0: success, 2: invalid input or a run that cannot continue, 130: stopped by a signal.
+    0: success; 2: invalid input or a run that cannot continue; 130: stopped by a signal.
     """
     started = time.perf_counter()
     cache.enable()

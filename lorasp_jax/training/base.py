@@ -19,7 +19,7 @@ from lorasp_jax.training.run_folder import read_json
 
 SIZES = ("nano", "small", "base", "nano_pi05", "base_pi05")
 TRAINING = "training.json"
-"""File next to the base weights with facts about their training, such as the control period."""
+"""File beside the base weights that describes their training, such as the control period."""
 
 
 def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str]:
@@ -27,7 +27,8 @@ def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str
 
     Args:
         config: configuration of the run.
-        abstract: return only shapes and an empty hash if the base is random or remote.
+        abstract: return only shapes and an empty hash if the base is randomly initialized or
+            remote.
 
     Raises:
         ValueError: the backbone or size is unknown, or the checkpoint does not match the config.
@@ -60,7 +61,7 @@ def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str
 
 
 def with_config(model: Backbone, **changes: Any) -> Backbone:
-    """Return the model with some config fields changed; its parameters must not depend on them."""
+    """Return the model with changed config fields, on which its parameters must not depend."""
     model_config = dataclasses.replace(model.config, **changes)
     if model_config == model.config:
         return model

@@ -26,7 +26,7 @@ from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.step import TrainState
 
 COMMIT_MARKER = "commit_success.txt"
-"""File that Orbax writes into the folder of a checkpoint once it is complete."""
+"""File that Orbax writes into the folder of a checkpoint once the checkpoint is complete."""
 
 
 class Checkpoints:
@@ -60,7 +60,7 @@ class Checkpoints:
             )
 
     def restore(self, like: TrainState) -> TrainState | None:
-        """Restore the newest intact checkpoint; None if there are no checkpoints.
+        """Restore the newest intact checkpoint; return None if there are no checkpoints.
 
         Newer corrupt checkpoints are renamed and incomplete ones removed, with a warning for each.
 

@@ -24,7 +24,7 @@ def open_dataset(config: Config, model: BackboneConfig, folder: Path) -> Source:
 
     Args:
         config: configuration of the run.
-        model: the backbone's config; images of a LeRobot dataset are resized to its image size.
+        model: the backbone's config; LeRobot images are resized to the image size in it.
         folder: folder of the run.
 
     Raises:
@@ -74,7 +74,7 @@ def as_cache(source: Source, folder: Path, progress: Progress) -> Cache:
 
 
 def outline(dataset: Cache) -> dict[str, Episodes]:
-    """Return the episodes of each task, with every image replaced by the task's first one."""
+    """Return the episodes of each task, with one image per camera standing in for all."""
     episodes = [dataset.episode(index, ()) for index in range(len(dataset))]
     groups: dict[str, Episodes] = {}
     for task in dataset.metadata["tasks"]:
@@ -84,7 +84,7 @@ def outline(dataset: Cache) -> dict[str, Episodes]:
 
 
 def _pad(dataset: Cache, episodes: list[Episodes], first: int) -> Episodes:
-    """Stack the episodes of one task, padded with zeros to the longest one."""
+    """Stack the episodes of one task, padded with zeros to the length of the longest."""
     length = np.array([episode.num_steps for episode in episodes], np.int32)
     shape = (len(episodes), int(length.max()))
     images = dataset.episode(first).image

@@ -26,7 +26,7 @@ def demonstrations(config: Config, folder: Path, progress: Progress) -> dict[str
 
 
 def fresh_demonstrations(config: Config, generation: int) -> dict[str, Episodes]:
-    """Collect new episodes of every task for generation 1, 2, ...; they are not cached."""
+    """Collect new episodes of every task for one generation (1, 2, ...), without caching them."""
     keys = jax.vmap(lambda key: jax.random.fold_in(key, generation))(_keys(config))
     collect = functools.partial(_collect, config)
     return dict(zip(config.tasks, map_threads(collect, config.tasks, keys), strict=True))
@@ -38,7 +38,7 @@ def _keys(config: Config) -> jax.Array:
 
 
 def map_threads(function: Callable, *arguments: Iterable[Any]) -> list[Any]:
-    """Map in threads, because compilation dominates; an interrupt does not wait for them."""
+    """Map in threads, because compilation dominates; an interrupt does not wait for the threads."""
     pool = ThreadPoolExecutor()
     try:
         return list(pool.map(function, *arguments))

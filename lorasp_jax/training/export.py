@@ -30,7 +30,7 @@ BASE = "base"
 
 
 class Export(Callback):
-    """Exports the trained policy after the last step, see `write`."""
+    """Exports the trained policy after the last step (see `write`)."""
 
     def on_end(self, run: Run) -> None:
         """Write the trained policy."""
@@ -81,16 +81,16 @@ def load_policy(
 
     Args:
         folder: folder of the run.
-        base: location of the frozen base, see `models.load`; default: the recorded one.
+        base: location of the frozen base (see `models.load`); default: the recorded one.
         words: location of the tokenizer; default: the recorded one.
-        any_base: accept a base whose weights differ from those in training, see `load_adapters`.
+        any_base: accept a base with other weights than the one in training (see `load_adapters`).
 
     Returns:
         The policy; `Policy.sample` takes indices into `processor.prompts.instructions`.
 
     Raises:
         ValueError: the run is not finished, its files are corrupt, or the base is missing or
-            differs from the one in training.
+            differs from the one used in training.
     """
     folder = Path(folder)
     is_full = (folder / BASE).is_dir()
@@ -143,6 +143,6 @@ def _processor(policy: Mapping[str, Any], config: Any, words: str) -> Processor:
 
 
 def _prompts_digest(prompts: PromptTable) -> str:
-    """Return a digest of the prompts' tokens, to recognize the tokenizer that produced them."""
+    """Return a digest of the prompts' tokens, to detect a change of the tokenizer."""
     leaves = jax.tree_util.tree_leaves_with_path(prompts)
     return digest({jax.tree_util.keystr(path): jnp.asarray(leaf) for path, leaf in leaves})

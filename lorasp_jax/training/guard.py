@@ -2,13 +2,13 @@
 
 A skipped step leaves parameters, their average and the optimizer state unchanged; the step count
 still advances, and with it the data position and the random streams. Whether to accept a step is
-decided from its loss and gradient norm alone, before the updates are computed. `select` can then
-fuse, leaf by leaf, into the in-place update of the donated state; a decision that depended on the
-updates would keep all of them in memory together with the whole old state.
+decided from its loss and gradient norm alone, before the updates are computed. XLA can then
+fuse `select`, leaf by leaf, into the in-place update of the donated state; a decision that depended
+on the updates would keep all of them in memory together with the whole old state.
 
-Checking the gradient suffices: clipped to a finite norm, it changes each parameter by at most a few
-learning rates under AdamW. A non-finite update therefore means an absurdly high learning rate; the
-loop then stops before saving.
+Checking loss and gradient suffices: under AdamW, a gradient clipped to a finite norm changes each
+parameter by at most a few times the learning rate. A non-finite update therefore means an absurdly
+high learning rate; the loop then stops before saving.
 """
 
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ WINDOW = 100
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Guard:
-    """Statistics of accepted steps, saved in the state so that resumed runs skip the same steps.
+    """Statistics of the steps so far, part of the state so that a resumed run skips the same steps.
 
     Attributes:
         counted: `[]` int32, number of accepted steps.
@@ -43,7 +43,7 @@ class Guard:
     @staticmethod
     def initial() -> "Guard":
         """Return the statistics before the first step."""
-        # Four separate arrays, because each buffer is donated.
+        # Four separate arrays, because a buffer can be donated only once per call.
         return Guard(*(jnp.zeros((), dtype) for dtype in ("int32", "int32", "float32", "float32")))
 
 
@@ -54,8 +54,8 @@ def check_step(
 
     Args:
         guard: statistics before the step.
-        loss: `[]`.
-        grad_norm: `[]`.
+        loss: `[]` loss of the step.
+        grad_norm: `[]` global gradient norm of the step.
         spike: skip the step if loss or gradient norm exceeds this multiple of its running mean; 0:
             skip only non-finite steps.
     """
@@ -86,8 +86,8 @@ def summarize(steps: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         steps: metrics by name, `[steps, ...]`, including `in_a_row` of `Guard` after each step.
 
     Returns:
-        Means over the accepted steps, `[...]`, absent if all were skipped; "skipped": the number
-        of skipped steps.
+        Means `[...]` over the accepted steps, if there are any, and the number of skipped steps as
+        "skipped".
     """
     accepted = steps["in_a_row"] == 0
     names = [name for name in steps if name != "in_a_row"] if accepted.any() else []

@@ -12,8 +12,8 @@ import tyro
 from tyro.constructors import StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
 REGISTRY = tyro.constructors.ConstructorRegistry()
-"""Registry for calls of `tyro.cli` with a default instance. Fields that are None are left to
-tyro."""
+"""Registry for `tyro.cli` calls that pass a default instance. A dataclass field whose default is
+None is left to tyro."""
 
 
 @REGISTRY.struct_rule

@@ -21,7 +21,7 @@ class Stop:
 def deferred() -> Iterator[Stop]:
     """In this block the first SIGINT or SIGTERM sets a flag; the second raises KeyboardInterrupt.
 
-    The caller checks the flag whenever its state is consistent and can be saved.
+    The caller checks the flag whenever the training state is consistent and can be saved.
     """
     stop = Stop()
 
@@ -29,7 +29,7 @@ def deferred() -> Iterator[Stop]:
         if stop.requested:
             raise KeyboardInterrupt
         stop.requested = True
-        os.write(1, _MESSAGE)  # print is not reentrant: it raises if the signal interrupts a print
+        os.write(1, _MESSAGE)  # print is not reentrant: it would raise inside another print
 
     with _handlers(handle):
         yield stop

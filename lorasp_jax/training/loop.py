@@ -42,15 +42,16 @@ def train(
     """Train the adapters of `run.policy`, then set `run.policy` to the trained policy.
 
     Args:
-        run: the run.
-        callbacks: callbacks, called in order.
+        run: the run to train.
+        callbacks: objects whose hooks are called, in order.
         resume: continue from the newest checkpoint, if there is one.
         collect: collects new demonstrations if `data.fresh_every` is set.
 
     Raises:
         RunError: too many consecutive steps were skipped, or an update was non-finite; the last
-            checkpoint remains.
-        KeyboardInterrupt: a signal stopped the run; the state is saved unless a second one follows.
+            checkpoint is kept.
+        KeyboardInterrupt: a signal stopped the run; the state is saved unless a second signal
+            follows.
     """
     graphdef, adapters, frozen = adaptation.split(run.policy.model)
     methods = adaptation.methods(run.policy.model).values()
@@ -80,7 +81,7 @@ def train(
     except RunError as error:
         for callback in callbacks:
             callback.on_stop(run, str(error))
-        # Otherwise another process could stop the first one before it writes the reason.
+        # Otherwise another process could make the first one exit before `on_stop` is done.
         processes.barrier("stopped")
         raise
     finally:
@@ -90,7 +91,7 @@ def train(
 
 
 def _call(callbacks: Sequence[Callback], run: Run, hook: str) -> None:
-    """Call a hook of all callbacks."""
+    """Call one hook of every callback."""
     with _local_policy(run, hook):
         for callback in callbacks:
             getattr(callback, hook)(run)
@@ -99,7 +100,7 @@ def _call(callbacks: Sequence[Callback], run: Run, hook: str) -> None:
 def _call_on_log(
     callbacks: Sequence[Callback], run: Run, done: int, values: dict[str, float]
 ) -> dict[str, float]:
-    """Return the scalars to log, merged with those of the callbacks, which may evaluate."""
+    """Return the scalars to log, including those of the callbacks, which may run an evaluation."""
     local_policy = _local_policy(run, f"evaluated at step {done}")
     with local_policy if run.config.evaluates(done) else contextlib.nullcontext():
         for callback in callbacks:
@@ -109,7 +110,7 @@ def _call_on_log(
 
 @contextlib.contextmanager
 def _local_policy(run: Run, name: str) -> Iterator[None]:
-    """Put the run's policy on a local device in this block; wait for all processes at its end."""
+    """Keep the run's policy on a local device in this block, then wait for all processes."""
     sharded, run.policy = run.policy, processes.to_local(run.policy)
     yield
     run.policy = sharded
@@ -120,7 +121,7 @@ def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) ->
     """Return the jitted scan over steps: (frozen, data, state, key, count) -> state, metrics.
 
     `data` is the whole dataset or one raw batch; metrics have a leading axis over steps.
-    `shardings` is `meshes.shardings` of the state.
+    `shardings` are those of the state, from `meshes.shardings`.
     """
     optim, processor = run.config.optim, run.policy.processor
     mesh = shardings.step.mesh
@@ -143,7 +144,7 @@ def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) ->
         batch = jax.lax.with_sharding_constraint(batch, meshes.batch_sharding(mesh))
         return step(state, frozen, batch, loss_key)
 
-    # Keep the state's sharding: a different one would make the next call recompile.
+    # Keep the state's sharding: the next call, already compiled, accepts no other.
     @functools.partial(
         jax.jit,
         static_argnames="count",
@@ -207,12 +208,12 @@ def _loop(
 def _failure(
     optim: OptimConfig, rows: dict[str, Any], values: dict[str, float], done: int, saved: int
 ) -> RunError | None:
-    """Return an error if too many steps were skipped or an update was non-finite.
+    """Return an error if too many consecutive steps were skipped or an update was non-finite.
 
     Args:
         optim: optimizer settings, including the limits.
         rows: metrics of each step of the log interval, `[count, ...]`.
-        values: logged means of these metrics.
+        values: means of these metrics, as logged.
         done: step at the end of the interval.
         saved: step of the last checkpoint.
     """

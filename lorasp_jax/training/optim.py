@@ -22,10 +22,10 @@ def learning_rate(config: OptimConfig) -> optax.Schedule:
 def make_optimizer(
     config: OptimConfig, methods: Collection[Method] = ()
 ) -> optax.GradientTransformation:
-    """Create AdamW on clipped gradients, with the transformations of the adapter methods.
+    """Create AdamW with gradient clipping and the transformations of the adapter methods.
 
     Raises:
-        ValueError: AdaLoRA, whose layers share one rank budget, is used with different settings.
+        ValueError: AdaLoRA layers, which share one rank budget, have different settings.
     """
     optimizer = optax.adamw(learning_rate(config), b2=config.b2, weight_decay=config.weight_decay)
     budgets = {method for method in methods if isinstance(method, AdaLoRA)}
@@ -40,7 +40,7 @@ def make_optimizer(
 
 
 def auxiliary_weights(config: AuxiliaryConfig, steps: int) -> dict[str, optax.Schedule]:
-    """Return a schedule per auxiliary loss: linear warm-up to its weight."""
+    """Return a schedule for the weight of each auxiliary loss: linear warm-up from zero."""
     warmup_steps = max(round(config.warmup * steps), 1)
     return {
         name: optax.linear_schedule(0.0, weight, warmup_steps)

@@ -165,10 +165,10 @@ def choose_scale(scale: str) -> str:
 def load(path: Path, scale: str) -> Config:
     """Load an experiment file and call its `get_config(scale)`.
 
-    Bundled experiments, such as configs/multitask.py, resolve from any working directory.
+    Bundled experiments, such as configs/multitask.py, are found from any working directory.
 
     Raises:
-        ValueError: the file does not exist, its code fails, or it does not return a `Config`.
+        ValueError: the file is missing, its code fails, or `get_config` does not return a `Config`.
     """
     bundled = shipped.ROOT / path
     if shipped.is_under(path, shipped.EXPERIMENTS) and not os.path.exists(path):
@@ -227,8 +227,8 @@ def _with_subconfigs(
 ) -> tuple[Config, list[str]]:
     """Create the optional sub-configs of the method; return config and remaining arguments.
 
-    `--peft.schedule.start 0.5` creates a schedule, `--peft.schedule None` removes it. With
-    `create_all` every sub-config is created, to list its options in the help text.
+    `--peft.schedule.start 0.5` creates a schedule; `--peft.schedule None` removes it. With
+    `create_all` every sub-config is created, so that the help text lists its options.
     """
     method: Any = config.peft
     rest = [part for a in arguments for part in (a.split("=") if a.endswith("=None") else [a])]
@@ -299,9 +299,9 @@ def _fields(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _concrete(config: Config) -> type[Config]:
-    """Return a `Config` class with `peft` typed as the chosen method, to expose its fields.
+    """Return a `Config` class whose `peft` has the chosen method's type, to expose its fields.
 
-    `scale` is suppressed, because it only selects defaults.
+    `scale` is hidden from tyro, because it only selects defaults.
     """
     return dataclasses.make_dataclass(
         "Config",

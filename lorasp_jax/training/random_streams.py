@@ -18,5 +18,5 @@ class RandomStream(enum.IntEnum):
     """Must stay the largest value: evaluation n uses 10 + n."""
 
     def key(self, seed: int, number: int = 0) -> jax.Array:
-        """Return the key of the stream; `number` is the evaluation's index, else 0."""
+        """Return the key of the stream; `number` is the index of an evaluation, 0 otherwise."""
         return jax.random.fold_in(jax.random.key(seed), self + number)

@@ -1,12 +1,13 @@
 """Schemas of a run's JSON files.
 
-A digest verifies that a file is intact, but not that this version wrote it.
+The digest in a file shows that it is intact, but not that this version of the program wrote it;
+the schema does.
 """
 
 from typing import Any, TypeAlias
 
 Schema: TypeAlias = dict[Any, Any]
-"""Schema of a JSON object, see `storage.json_values.check`."""
+"""Schema of a JSON object (see `storage.json_values.check`)."""
 TIMES: Schema = {str: float}
 RATE: Schema = {"success": float, "episodes": int, "ci95": (float, float)}
 BEFORE: Schema = {str: RATE}

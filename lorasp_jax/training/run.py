@@ -27,14 +27,14 @@ class Run:
         folder: folder for all files of the run.
         console: console for status messages.
         base_hash: hash of the frozen base.
-        episodes: demonstrations per task; those of a dataset contain one image per camera.
-        dataset: all steps of a dataset, stored on disk; None: those of `episodes`.
+        episodes: demonstrations per task; those of a dataset repeat one image per camera.
+        dataset: all steps of a dataset, stored on disk; None: train on `episodes`.
         streams: whether batches are read from disk because the dataset does not fit on the device.
         devices: devices to train on; None: all.
         simulated: whether the tasks can be evaluated in simulation.
-        policy: the current policy, valid inside callbacks; training donates its buffers in between.
+        policy: the current policy, valid inside callbacks; elsewhere, training donates its buffers.
         started: `time.perf_counter()` when this process started.
-        seconds: time per phase, and "total", over all processes that worked on this run [s].
+        seconds: time per phase, and "total", including earlier processes that this one resumes [s].
     """
 
     config: Config
@@ -64,7 +64,7 @@ class Run:
     def timed(self, phase: str) -> Iterator[None]:
         """Add the time spent in this block to `seconds[phase]`, even if it is interrupted.
 
-        Nested phases are not counted twice: their time belongs to the inner phase.
+        The time of a nested phase belongs to that phase alone, so it is not counted twice.
         """
         others = lambda: sum(self.seconds.values()) - self.seconds["total"]  # noqa: E731
         start, before = time.perf_counter(), others()

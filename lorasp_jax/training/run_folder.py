@@ -32,7 +32,7 @@ from lorasp_jax.training.distributed import processes
 CONFIG_FILE, TIMES_FILE, DATASET_FILE = "config.json", "seconds.json", "dataset.json"
 """Files that a run may leave behind if it fails before producing any results."""
 WILDCARDS = frozenset("*?[\\")
-"""Orbax cannot find checkpoints under a path with one of these, because it globs its paths."""
+"""Orbax cannot find checkpoints under a path with one of these: it takes paths for patterns."""
 STOPPED = "stopped.json"
 """File with the reason why training stopped; removed when training continues."""
 
@@ -53,7 +53,7 @@ def read_json(path: Path, schema: Mapping[Any, Any] = MappingProxyType({})) -> d
 
     Args:
         path: the file.
-        schema: required fields, see `json_values.check`.
+        schema: required fields (see `json_values.check`).
 
     Raises:
         ValueError: the file is corrupt or was written by another version.
@@ -78,8 +78,8 @@ def open_run(config: Config, root: Path, *, resume: bool | Literal["auto"]) -> I
 
     Raises:
         ValueError: the folder cannot be created, is in use by another process, has a wildcard in
-            its path, or contains a pipe or a link that leads out of it; or a run exists but
-            `resume` is False, does not exist but `resume` is True, or has a different config.
+            its path, or contains a pipe or a link that leads out of it; or the run exists
+            although `resume` is False, is missing although it is True, or has a different config.
     """
     folder = root / config.name
     if wildcards := WILDCARDS & set(str(folder.absolute())):
@@ -122,8 +122,8 @@ def _begin(config: Config, folder: Path) -> None:
 def record_dataset(folder: Path, facts: Mapping[str, Any], *, streams: bool) -> bool:
     """Record the run's dataset and return whether to stream it.
 
-    A run that started streaming keeps streaming, because streamed batches differ from those
-    sampled on the device.
+    A run that started streaming keeps streaming, because streamed batches differ from
+    batches sampled on the device.
 
     Args:
         folder: folder of the run.
@@ -148,7 +148,7 @@ def record_dataset(folder: Path, facts: Mapping[str, Any], *, streams: bool) -> 
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock, a file next to the folder that names the lock's last holder."""
+    """Hold the folder's lock: a file beside the folder, in which each holder writes its name."""
     file = folder.parent / f".{folder.name}.lock"
     try:
         lock = acquire(file)
@@ -199,7 +199,7 @@ class MetricsLog:
         write_text(self.path, "".join(map(_line, rows)))
         board = folder / "tensorboard"
         board.mkdir(exist_ok=True)
-        # Not SummaryWriter: if its writer thread fails, callers block forever. File names contain
+        # SummaryWriter would block its callers forever if its thread failed. File names contain
         # the time in whole seconds; the step as a suffix keeps them unique.
         self._board = EventsWriter(str(board / "events"), f".{start_step:09}")
         start = SessionLog(status=SessionLog.START)  # discards old events from this step on

@@ -1,4 +1,4 @@
-"""Comparison of an experiment's scales, for its help text."""
+"""Comparison of an experiment's scales, for the help text."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -8,7 +8,7 @@ from lorasp_jax.config import SCALES, Config
 
 
 def differences(config_at: Callable[[str], Config]) -> str:
-    """Return a table of the fields that differ between scales; empty if all are equal.
+    """Return a table of the fields that differ between scales, or an empty string if none do.
 
     Args:
         config_at: returns the experiment's config at a scale.

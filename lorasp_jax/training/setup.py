@@ -44,12 +44,12 @@ from lorasp_jax.training.run import Run
 from lorasp_jax.training.run_folder import record_dataset
 
 STATISTICS_BATCHES = 8
-"""Batches used for data-driven initialization."""
+"""Number of batches used for data-driven initialization."""
 
 LoadBase = Callable[..., tuple[Backbone, str]]
-"""Loads the frozen base and its hash, see `base_model`."""
+"""Loads the frozen base and its hash (see `base_model`)."""
 Collect = Callable[[Config, Path, Progress], dict[str, Episodes]]
-"""Collects the demonstrations of each task, see `demonstrations`."""
+"""Collects the demonstrations of each task (see `demonstrations`)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,11 +59,11 @@ class RunSetup:
     Attributes:
         base: the frozen base, with the chosen rematerialization.
         base_hash: hash of the base.
-        model: the adapted base; data-initialized adapters are not initialized yet.
+        model: the base with adapters, before any data-driven initialization.
         prompts: prompts of all instructions.
         joints: number of robot joints J.
-        environments: one environment per task; empty with a dataset.
-        source: the dataset; None: collect with the expert.
+        environments: one environment per task; empty if the config names a dataset.
+        source: the dataset; None: the expert collects demonstrations.
         memory: estimated memory of one step.
         available: device memory [bytes].
     """
@@ -160,7 +160,7 @@ def prepare(
             _load_dataset(run, built.source, built.free_bytes)
         else:
             run.episodes = _collect(run, built.prompts.instructions, collect)
-    run.streams = processes.any_process(run.streams)  # all or none: processes share batches
+    run.streams = processes.any_process(run.streams)  # in all or none: they share batches
     relative = config.model.relative_actions
     inputs = processor([*run.episodes.values()], model.config, built.prompts, relative=relative)
     if config.peft.needs_statistics:
@@ -214,7 +214,7 @@ def _prompts_and_joints(
 
 
 def _check_sizes(config: Config, chunk: int) -> None:
-    """Raise ValueError unless chunk, batch and number of devices are compatible."""
+    """Raise ValueError if chunk, batch, devices or training options cannot be combined."""
     meshes.make_mesh(config.fsdp)
     if config.evaluation.execute_steps > chunk:
         raise ValueError(
@@ -283,9 +283,9 @@ def processor(
     *,
     relative: bool = False,
 ) -> Processor:
-    """Build the processor from the statistics of the demonstrations and the prompts.
+    """Build the processor from the prompts and the statistics of the demonstrations.
 
-    The robot's cameras are assigned to the backbone's camera slots in order; slots may stay empty.
+    The robot's cameras fill the backbone's camera slots, in order of name; slots may stay empty.
 
     Args:
         episodes: demonstrations of each task.

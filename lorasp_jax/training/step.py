@@ -26,9 +26,9 @@ class TrainState:
 
     Attributes:
         step: `[]` int32, number of steps taken, including skipped ones.
-        adapters: trainable parameters, an `nnx.State` of `AdapterParam`.
+        adapters: trainable parameters, an `nnx.State` of `AdapterParam`s.
         opt_state: state of the optimizer.
-        guard: statistics for skipping bad steps.
+        guard: statistics that decide which steps to skip.
         average: exponential moving average of the adapters, or None.
     """
 
@@ -40,14 +40,14 @@ class TrainState:
 
     @property
     def eval_adapters(self) -> Any:
-        """The adapters to evaluate and export: their average if there is one."""
+        """The adapters to evaluate and export: their moving average, if one is kept."""
         return self.adapters if self.average is None else self.average
 
 
 def init_state(
     adapters: Any, optimizer: optax.GradientTransformation, *, ema: bool = False
 ) -> TrainState:
-    """Return the initial state, which holds copies because each step donates its input buffers."""
+    """Return the initial state, with copies of the adapters because steps donate their buffers."""
     adapters = jax.tree.map(jnp.copy, adapters)
     average = jax.tree.map(jnp.copy, adapters) if ema else None
     step = jnp.zeros((), jnp.int32)
@@ -55,7 +55,10 @@ def init_state(
 
 
 def active_ranks(aux: dict[str, dict[str, Aux]]) -> Metrics:
-    """Return active ranks averaged over valid tokens, per tower (scalar) and linear layer `[L]`."""
+    """Return active ranks averaged over valid tokens.
+
+    There is a scalar per tower, and an array `[L]` over the L stacked layers per linear layer.
+    """
     metrics: Metrics = {}
     for tower, linears in aux.items():
         ranks = {
@@ -70,7 +73,7 @@ def active_ranks(aux: dict[str, dict[str, Aux]]) -> Metrics:
 
 
 def _layer_ranks(rank: jax.Array, mask: jax.Array | None) -> jax.Array:
-    """Means of `[..., B, T]` over valid tokens, `[L]`; L is 1 if there are no leading axes."""
+    """Average ranks `[..., B, T]` over valid tokens to `[L]`; L is 1 without leading axes."""
     mask = jnp.ones((), bool) if mask is None else mask
     tokens = (x.reshape(-1, *rank.shape[-2:]) for x in (rank, jnp.broadcast_to(mask, rank.shape)))
     return jax.vmap(masked_mean)(*tokens)
@@ -88,11 +91,11 @@ def loss_fn(
     noise: jax.Array | None = None,
     flow_time: jax.Array | None = None,
 ) -> tuple[jax.Array, Metrics]:
-    """Flow-matching loss plus weighted auxiliary losses, eq. 14 of arXiv 2603.07404.
+    """Return the flow-matching loss plus weighted auxiliary losses (arXiv 2603.07404, eq. 14).
 
     The task loss is the mean over the elements that `batch.action_mask` marks as valid. `valid`
-    overrides their number; `noise` and `flow_time` override the sampled values. `key` also drives
-    the adapters' dropout.
+    overrides their number; `noise` and `flow_time` override the sampled values. `key` drives this
+    sampling and the adapters' dropout. The metrics include the unweighted auxiliary losses.
     """
     model = adaptation.with_dropout(nnx.merge(graphdef, adapters, frozen), key)
     mask = batch.action_mask
@@ -120,7 +123,7 @@ def gradients(
     weights: Metrics,
     parts: int = 1,
 ) -> tuple[Any, Metrics]:
-    """Return the gradient of `loss_fn` and its metrics, accumulated over `parts` micro-batches.
+    """Return the gradient and the metrics of `loss_fn`, accumulated over `parts` micro-batches.
 
     The task loss is that of the whole batch, up to rounding; auxiliary losses and active ranks are
     averaged over the micro-batches.
@@ -158,10 +161,10 @@ def train_step(
     ema: float = 0.0,
     spike: float = 0.0,
 ) -> tuple[TrainState, Metrics]:
-    """Take one step on the global batch, split into `parts` micro-batches; `key` is consumed.
+    """Take one step on the global batch, split into `parts` micro-batches; do not reuse `key`.
 
-    The average, if there is one, decays by `ema`. A step that `guard.check_step` does not accept
-    changes only the step count and the guard.
+    The moving average, if one is kept, has decay factor `ema`. A step that `guard.check_step`
+    rejects changes only the step count and the guard.
     """
     now = {name: jnp.asarray(schedule(state.step)) for name, schedule in weights.items()}
     grads, metrics = gradients(state.adapters, frozen, graphdef, batch, key, now, parts)

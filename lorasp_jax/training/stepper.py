@@ -1,4 +1,4 @@
-"""Run several training steps per call, on data that is on the device, streamed or re-collected."""
+"""Run several training steps per call, on data held on the device, streamed or collected anew."""
 
 import functools
 from collections.abc import Callable, Iterator
@@ -22,11 +22,11 @@ from lorasp_jax.training.run import Run
 from lorasp_jax.training.step import TrainState
 
 Collect = Callable[[Config, int], dict[str, Episodes]]
-"""Collects demonstrations per task for generation 1, 2, ..., see `fresh_demonstrations`."""
+"""Collects demonstrations per task for generation 1, 2, ... (see `fresh_demonstrations`)."""
 
 
 class Stepper:
-    """Runs steps, (state, key, count) -> state, metrics; compiles once per count.
+    """Runs steps, (state, key, count) -> state, metrics; compiles once per value of `count`.
 
     Attributes:
         speed: meter of training speed.
@@ -36,7 +36,7 @@ class Stepper:
         """Store the arguments; nothing is compiled yet.
 
         Args:
-            jitted: jitted step function, see `loop.jit_steps`.
+            jitted: jitted step function (see `loop.jit_steps`).
             frozen: frozen parameters, on the mesh.
             data: the whole dataset or one raw batch, on the mesh.
             speed: meter of training speed.
@@ -46,7 +46,7 @@ class Stepper:
         self._compiled: dict[int, Future[Any]] = {}
 
     def compile(self, state: TrainState, count: int) -> Future[Any]:
-        """Start compiling `count` steps in a background thread, unless already started."""
+        """Start compiling `count` steps in a background thread, unless it has already begun."""
         if count not in self._compiled:
             self._compiled[count] = _in_thread(self._compile, state, count)
         return self._compiled[count]
@@ -73,7 +73,7 @@ class StreamingStepper(Stepper):
         self._batches = batches
 
     def compile(self, state: TrainState, count: int) -> Future[Any]:  # noqa: ARG002
-        """Start compiling a single step: every step has its own batch."""
+        """Start compiling a single step, because every step has its own batch."""
         return super().compile(state, 1)
 
     def __call__(self, state: TrainState, key: jax.Array, count: int) -> tuple[TrainState, Any]:
@@ -91,7 +91,7 @@ class RefreshingStepper(Stepper):
     """Runs steps on demonstrations that are replaced every `data.fresh_every` steps.
 
     Each generation, 0, 1, ..., is used for that many steps while the device collects the next one.
-    A generation depends only on the run's seed and its own number, so a resumed run reproduces it.
+    A generation depends only on its number and the run's seed, so a resumed run reproduces it.
     """
 
     def __init__(
@@ -116,13 +116,13 @@ class RefreshingStepper(Stepper):
         self._every, self._last = config.data.fresh_every, config.optim.steps - 1
         self._collect = collect
         self._generation = self._generation_of(min(start, self._last))
-        # Nothing trains after the last step: use generation 0, which is already collected.
+        # If the last step is done, nothing trains: use generation 0, which exists already.
         first = self._generation if start <= self._last else 0
         super().__init__(jitted, frozen, collect(first), speed)
         self._collect_next()
 
     def __call__(self, state: TrainState, key: jax.Array, count: int) -> tuple[TrainState, Any]:
-        """Run `count` steps, all on the generation of the first step."""
+        """Run `count` steps, all on the generation of the first of them."""
         if self._generation_of(int(state.step)) > self._generation:
             self.speed.begin()
             with self.speed.waiting(state):
@@ -152,7 +152,7 @@ def make_stepper(
 
     Args:
         run: the run.
-        jitted: jitted step function, see `loop.jit_steps`.
+        jitted: jitted step function (see `loop.jit_steps`).
         frozen: frozen parameters, on the mesh.
         mesh: mesh of the training devices.
         start: index of the first step.
@@ -197,7 +197,7 @@ def _batches(run: Run, mesh: jax.sharding.Mesh, start: int) -> Iterator[Raw]:
 
 
 def _speed(run: Run) -> Speed:
-    """Create the speed meter; FLOPs are counted only if the device's peak is known."""
+    """Create the speed meter; FLOPs are counted only if the device's peak FLOP/s is known."""
     size = run.config.optim.batch_size
     if flops.peak() is None:
         return Speed(size, None)

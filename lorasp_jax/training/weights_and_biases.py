@@ -14,10 +14,10 @@ RECORD = "wandb.json"
 
 
 class WeightsAndBiases(Callback):
-    """Logs config, metrics, success rates and videos; a context manager that reports the exit code.
+    """Logs config, metrics, success rates and videos; as a context manager, reports the exit code.
 
-    W&B keeps its own files in the parent of the run's folder. Configure it with its environment
-    variables, such as WANDB_MODE=offline.
+    W&B keeps its own files in the parent of the run's folder. Its environment variables, such as
+    WANDB_MODE=offline, configure it.
     """
 
     def __init__(self, project: str, config: Config, folder: Path) -> None:
@@ -71,7 +71,7 @@ class WeightsAndBiases(Callback):
         self._run.log({"step": step, **metrics})
 
     def on_end(self, run: Run) -> None:
-        """Log the success rates after training and the videos."""
+        """Log the rollout videos and the success rates after training."""
         results = read_json(run.folder / "results.json", records.RESULTS)
         after = {task: result["after"] for task, result in results["tasks"].items()}
         self._log_success(run.config.optim.steps, after)

@@ -37,7 +37,7 @@ def dry_run(
 
     Args:
         config: configuration of the run.
-        folder: folder of the run; a dataset cache in it is used.
+        folder: folder of the run; a dataset cache in it is used if present.
         console: console to print on.
         load_base: loads the frozen base and its hash.
 
@@ -160,7 +160,7 @@ def _memory_table(built: setup.RunSetup, data: float, analysis: Any) -> Table:
 
     Args:
         built: setup of the run, with the estimate.
-        data: size of the demonstrations, or of a streamed batch [bytes].
+        data: size per device of the demonstrations or of a streamed batch [bytes].
         analysis: `memory_analysis` of the compiled step; None if the backend does not provide it.
     """
     estimate = {"demonstrations": data, **dataclasses.asdict(built.memory)}

@@ -1,4 +1,4 @@
-"""Count the FLOPs (floating-point operations) of a JAX function's matrix products in its jaxpr.
+"""Count the FLOPs (floating-point operations) of the matrix products in a function's jaxpr.
 
 Model FLOPs utilization is this count per second divided by the device's peak (Chowdhery et al.,
 arXiv 2204.02311, appendix B). Trace the function without rematerialization: recomputation in the
@@ -18,16 +18,16 @@ PEAK = {"NVIDIA H200": 989e12, "NVIDIA H100": 989e12, "NVIDIA A100": 312e12, "TP
 without sparsity)."""
 
 _CUDNN = {"dot_product_attention_fwd_wrapper": 4, "dot_product_attention_bwd_wrapper": 8}
-"""FLOPs of cuDNN attention in units of B N T S H: two matrix products in the forward pass, four in
-the backward pass (a fifth, a recomputation, is not counted)."""
+"""FLOPs of cuDNN attention in units of batch size x heads x queries x keys x head size. The forward
+pass has two matrix products, the backward pass four (and a fifth, a recomputation, not counted)."""
 
 
 def count(function: Callable, *arguments: Any) -> float:
-    """Count the FLOPs of one call, two per multiply-add; unused results are not counted.
+    """Count the FLOPs of one call, two per multiply-add, except for operations with unused results.
 
     Args:
-      function: a function that `jax.jit` accepts.
-      arguments: arrays or `jax.ShapeDtypeStruct`s; only shapes and dtypes matter.
+        function: a function that `jax.jit` accepts.
+        arguments: arrays or `jax.ShapeDtypeStruct`s; only shapes and dtypes matter.
     """
     jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
     return _jaxpr_flops(_compat.eliminate_dead_code(jaxpr, [True] * len(jaxpr.outvars))[0])
@@ -40,7 +40,7 @@ def utilization(flop_count: float, seconds: float) -> float | None:
 
 
 def peak() -> float | None:
-    """Return the peak FLOP/s of the first device, see `PEAK`; None if unknown."""
+    """Return the peak FLOP/s of the first device (see `PEAK`); None if unknown."""
     kind = jax.devices()[0].device_kind
     return next((value for name, value in PEAK.items() if kind.startswith(name)), None)
 

@@ -1,8 +1,8 @@
 """Estimate the device memory of a training step from shapes alone, before compilation.
 
-Base, adapters, gradients and optimizer state are counted exactly. Activations are the residuals
-that JAX saves for the backward pass, an upper bound that XLA may reduce. `HEADROOM` covers the
-temporaries of a layer.
+Base, adapters, gradients and optimizer state are counted exactly. Activations are the batch
+and the residuals that JAX saves for the backward pass, an upper bound since XLA may save fewer.
+`HEADROOM` covers the rest.
 """
 
 import dataclasses
@@ -28,7 +28,7 @@ from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
 from lorasp_jax.training.step import Metrics, init_state, loss_fn
 
 HEADROOM = 1.1
-"""Factor applied to the sum to cover uncounted memory: temporaries, executable, fragmentation."""
+"""Factor on the total that covers uncounted memory: temporaries, executable, fragmentation."""
 REMATS: tuple[Remat, ...] = ("none", "products", "full")
 GIB, MIB = 2**30, 2**20
 
@@ -79,7 +79,7 @@ class AbstractStep(NamedTuple):
 def choose_remat(
     config: Config, backbone: BackboneConfig, available: float
 ) -> tuple[Remat, Memory]:
-    """Return the least rematerialization that fits in `available` bytes per device, and its memory.
+    """Return the least rematerialization that fits in `available` device bytes, and its estimate.
 
     Raises:
         ValueError: no allowed setting fits; the message suggests changes.

@@ -1,6 +1,7 @@
 """Throughput, data wait and memory use per log interval.
 
-Nothing here blocks on the device: reading an interval's metrics has already waited for it.
+Nothing here blocks on the device: reading the metrics of an interval has already waited
+for the device.
 """
 
 import contextlib
@@ -53,8 +54,8 @@ class Speed:
 
         Returns:
             `speed/samples_per_second`; `speed/flop_utilisation`, if FLOPs are counted and the
-            device's peak is known; `speed/data_wait`, the fraction of the time that the device
-            waited for data, for runs that stream or replace it; `memory/in_use_gib` and
+            device's peak is known; `speed/data_wait`, the fraction of the time in which the
+            device waited for data, if data is streamed or replaced; `memory/in_use_gib` and
             `memory/peak_gib` of this process's first device, if it reports them.
         """
         assert self._start is not None

@@ -30,19 +30,20 @@ def make_mesh(fsdp: int = 1, devices: Sequence[Any] | None = None) -> Mesh:
 
 
 def replicated(mesh: Mesh) -> NamedSharding:
-    """Sharding with the whole array on every device."""
+    """Return the sharding with the whole array on every device."""
     return NamedSharding(mesh, PartitionSpec())
 
 
 def batch_sharding(mesh: Mesh) -> NamedSharding:
-    """Sharding with the leading axis split over all devices."""
+    """Return the sharding with the leading axis split over all devices."""
     return NamedSharding(mesh, PartitionSpec(("data", "fsdp")))
 
 
 def split_axis(shape: Sequence[int], size: int, fsdp: int, minimum: int) -> int | None:
     """Return the axis to shard over `fsdp` devices; None: replicate.
 
-    It is the largest axis that `fsdp` divides; arrays of `size` < `minimum` bytes are replicated.
+    It is the largest axis with a length divisible by `fsdp`. Arrays of `size` < `minimum` bytes
+    are replicated.
     """
     divisible = [axis for axis, length in enumerate(shape) if length % fsdp == 0]
     if fsdp == 1 or not divisible or size < minimum:
@@ -53,7 +54,8 @@ def split_axis(shape: Sequence[int], size: int, fsdp: int, minimum: int) -> int 
 def shardings(tree: Any, mesh: Mesh, minimum: int = MINIMUM_SHARDED_BYTES) -> Any:
     """Return a sharding for each array of a tree: large arrays over "fsdp", the others replicated.
 
-    It depends on shape and dtype only, so moments and averages are sharded like their parameters.
+    A sharding depends only on shape and dtype, so optimizer moments and averages of parameters are
+    sharded like the parameters.
     """
 
     def sharding(array: Any) -> NamedSharding:

@@ -61,11 +61,11 @@ class Peers:
         self._listener.start()
 
     def agree(self, topic: str, facts: Mapping[str, Any]) -> None:
-        """Block until all processes report equal facts.
+        """Wait until all processes have reported their facts, which must be equal.
 
         Args:
             topic: plural noun for the facts, used in messages.
-            facts: JSON values by name, possibly nested mappings.
+            facts: JSON values by name, possibly in nested mappings.
 
         Raises:
             ValueError: the facts of another process differ, or the run was rejected earlier.
@@ -76,11 +76,11 @@ class Peers:
             raise ValueError(answer["refused"])
 
     def wait_for_root_cause(self) -> None:
-        """Let another failing process report first: it may have made this one fail."""
+        """Let another failing process report first: its failure may have caused this one."""
         time.sleep(_ROOT_CAUSE_DELAY)
 
     def announce_exit(self, code: int) -> None:
-        """Tell the others that this process is exiting; wait for them unless the code is 0."""
+        """Announce that this process is exiting; wait for an answer unless the code is 0."""
         self._code = code
         self._send({"leaving": code, "reason": self.exit_reason})
         if code:
@@ -159,7 +159,7 @@ def _connect(
     retry_interval: float,
     notice_after: float,
 ) -> tuple[socket.socket, IO[bytes]]:
-    """Connect to the first process, retrying until it is up; return the socket and its lines.
+    """Connect to the first process, retrying until it is up; return the socket and a reader.
 
     Raises:
         ValueError: no run answers at the address.
@@ -187,7 +187,7 @@ def _open_connection(host: str, port: int) -> tuple[socket.socket, IO[bytes]]:
     """Connect to the first process of a run.
 
     Raises:
-        OSError: no server answers, or it is not a run that waits for processes.
+        OSError: no server answers, or the server is not that of a run waiting for processes.
     """
     connection = socket.create_connection((host, port), timeout=_CONNECT_TIMEOUT)
     with contextlib.ExitStack() as stack:

@@ -1,7 +1,7 @@
 """Multi-process runs: startup, barriers, shared arrays and coordinated exit.
 
 All processes train; only the first one collects, evaluates, prints and writes. The runs folder must
-be on storage that all of them share. In a single process everything here is a no-op.
+be on storage that all of them share. In a single process nothing here waits for others.
 """
 
 import atexit
@@ -36,7 +36,7 @@ _peers: peers.Peers | None = None
 
 
 def initialize(console: Console, hint: str) -> None:
-    """Connect to the other processes; call before JAX starts its backend.
+    """Connect to the other processes; call this before JAX starts its backend.
 
     From then on, if one process exits early, all exit. JAX finds the address by itself under Slurm,
     Open MPI and Kubernetes and on TPU pods. Elsewhere set JAX_COORDINATOR_ADDRESS (host:port of the
@@ -119,11 +119,11 @@ def _delay_abort() -> None:
 
 
 def agree(topic: str, facts: Mapping[str, Any]) -> None:
-    """Block until all processes report equal facts.
+    """Wait until all processes have reported their facts, which must be equal.
 
     Args:
         topic: plural noun for the facts, used in messages.
-        facts: JSON values by name, possibly nested mappings.
+        facts: JSON values by name, possibly in nested mappings.
 
     Raises:
         ValueError: the facts of another process differ.
@@ -133,7 +133,7 @@ def agree(topic: str, facts: Mapping[str, Any]) -> None:
 
 
 class ExitConsole(Console):
-    """Console for this process's exit reason; only the first process prints it."""
+    """Console that records this process's exit reason; only the first process prints."""
 
     def print(self, *objects: Any, **options: Any) -> None:
         """See `rich.console.Console.print`."""
@@ -185,7 +185,7 @@ def barrier(name: str) -> None:
 
 @contextlib.contextmanager
 def first_process_first(name: str) -> Iterator[None]:
-    """Run the block in the first process, then in the others, which can read the files it wrote."""
+    """Run the block in the first process, then in the others, which can read the files written."""
     if not is_first():
         barrier(name)
     yield

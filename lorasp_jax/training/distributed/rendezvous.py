@@ -2,8 +2,8 @@
 
 JAX's own service prints nothing while processes are missing, lets processes have different options,
 and notices a dead process only after 100 s. So all processes meet here first; then JAX's service
-takes over the address. The connections stay open, and a closed one shows at once that a process
-died.
+takes over the address. The connections stay open, so that one that closes shows at once
+that a process died.
 
 Messages are lines of JSON. A process sends the left column, the server the right one:
 
@@ -38,7 +38,7 @@ def encode(message: dict[str, Any]) -> bytes:
 
 
 def keep_alive(connection: socket.socket) -> None:
-    """Make a connection close within a minute of the other machine's failure."""
+    """Make a connection close within a minute if the other machine fails."""
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for name, value in _KEEPALIVE.items():
         if hasattr(socket, name):  # not available on every system
@@ -178,7 +178,7 @@ class Rendezvous:
         self._changed.set()
 
     def _answer(self) -> None:
-        """Answer topics that all processes have reported, or all topics if the run is rejected."""
+        """Answer each topic that all processes have reported, or all topics of a rejected run."""
         for topic in {topic for member in self._members for topic in member.facts}:
             reporting = [member for member in self._members if topic in member.facts]
             if len(reporting) < self._count and not self._rejection:
@@ -191,7 +191,7 @@ class Rendezvous:
                 member.send({"topic": topic, "refused": self._rejection})
 
     async def _shut_down(self, code: int, reason: str) -> None:
-        """Make all processes exit because one did, the first process last."""
+        """Make all processes exit because one did; the first process exits last."""
         lost = lambda: any(m.closed and not m.exit for m in self._members)  # noqa: E731
         announced = lambda: all(m.exit for m in self._members)  # noqa: E731
         await self._until(lambda: announced() or lost(), EXIT_GRACE)
