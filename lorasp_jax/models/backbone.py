@@ -63,7 +63,7 @@ class Backbone(nnx.Module):
     """The action expert, with stacked `blocks`."""
 
     def _make_projections(self, state_width: int, rngs: nnx.Rngs) -> None:
-        """Create the projections of state, noisy actions, flow time and velocity."""
+        """Create the layers that embed state, noisy actions and time, and predict velocities."""
         width, dim = self.config.action.width, self.config.action_dim
         options: Any = {"dtype": jnp.float32, "param_dtype": self.config.param_dtype, "rngs": rngs}
         self.state_proj: Layer = Dense(dim, state_width, **options)
@@ -73,7 +73,7 @@ class Backbone(nnx.Module):
         self.action_out_proj: Layer = Dense(width, dim, **options)
 
     def fuse_projections(self, *, copy_kernels: bool = True) -> None:
-        """See `prepared.FusableModule`; the projections outside the towers share no input."""
+        """See `prepared.FusableModule`; no two layers outside the towers share an input."""
         self.state_proj = fuse_layer(self.state_proj, copy_kernels=copy_kernels)
         self.action_in_proj = fuse_layer(self.action_in_proj, copy_kernels=copy_kernels)
         self.action_time_mlp_in = fuse_layer(self.action_time_mlp_in, copy_kernels=copy_kernels)
@@ -88,7 +88,7 @@ class Backbone(nnx.Module):
         Args:
             x_t: `[B, C, A]`.
             flow_time: `[B]`.
-            action_valid: `[B, C]` bool, False for steps to exclude from the adapters' aux.
+            action_valid: `[B, C]` bool, False for actions to exclude from the adapters' aux.
 
         Returns:
             `[B, C, D]` f32, and the adapters' aux.
@@ -122,12 +122,12 @@ class Backbone(nnx.Module):
             obs: the observation that the prefix was computed from.
             x_t: `[B, C, A]`.
             flow_time: `[B]`.
-            action_valid: `[B, C]` bool, False for steps to exclude from the adapters' aux.
+            action_valid: `[B, C]` bool, False for actions to exclude from the adapters' aux.
         """
         raise NotImplementedError
 
     def encode_images(self, obs: Observation) -> tuple[jax.Array, jax.Array, ModelAux]:
-        """Encode the images as tokens, ordered by camera.
+        """Encode the images as tokens, in the order of `config.cameras`.
 
         Returns:
             tokens `[B, P, D]`, valid `[B, P]` bool, aux of the vision tower's adapters.
@@ -170,8 +170,9 @@ class Backbone(nnx.Module):
             key: typed PRNG key to sample `noise` and `flow_time` if they are not given.
             obs: the observation.
             actions: `[B, C, A]` normalized.
-            action_mask: `[B, C, A]` bool. Slots with no valid step are zero in x_t; steps with no
-                valid slot are excluded from the adapters' aux. The returned loss is not masked.
+            action_mask: `[B, C, A]` bool, True for valid elements. A slot that is valid in no step
+                is zero in x_t; a step with no valid slot is excluded from the adapters' aux. The
+                returned loss is not masked.
             noise: `[B, C, A]`.
             flow_time: `[B]`.
 
@@ -192,18 +193,18 @@ class Backbone(nnx.Module):
         return per_element, merge_action_aux(aux, action_aux)
 
     def sample_actions(self, key: jax.Array, obs: Observation, **options: Any) -> Any:
-        """Sample action chunks; see `Sampler.sample_actions` for arguments."""
+        """Sample action chunks; see `Sampler.sample_actions` for the arguments."""
         return self.sampler().sample_actions(key, obs, **options)
 
     def sampler(self) -> Sampler:
-        """Create a sampler for repeated calls of `sample_actions`."""
+        """Create a sampler, for repeated calls to its `sample_actions`."""
         return Sampler.from_model(self)
 
 
 def suffix_mask_and_positions(
     prefix_valid: jax.Array, prefix_block: np.ndarray, block: np.ndarray
 ) -> tuple[jax.Array, jax.Array]:
-    """Attention mask and positions of the suffix tokens, which are all valid.
+    """Compute the attention mask and positions of the suffix tokens, which are all valid.
 
     Args:
         prefix_valid: `[B, P]` bool.

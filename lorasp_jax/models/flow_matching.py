@@ -40,7 +40,7 @@ def interpolate(
     Args:
         noise: `[B, C, A]`.
         actions: `[B, C, A]`.
-        flow_time: `[B]`.
+        flow_time: t, `[B]`.
     """
     t = flow_time[:, None, None]
     return t * noise + (1 - t) * actions, noise - actions
@@ -58,7 +58,7 @@ def loss(
     """Compute the squared error (v_t - u_t)^2 per element in fp32, without masks or reduction.
 
     Args:
-        velocity: the model.
+        velocity: the velocity model.
         key: PRNG key to sample `noise` and `flow_time` if they are not given; do not reuse it.
         actions: `[B, C, A]` normalized.
         slots: bool broadcastable to `[B, C, A]`; x_t is zero where False, so that unused slots do
@@ -85,8 +85,8 @@ def sample(
     """Integrate x from time 1 to 0 with `num_steps` Euler steps, x <- x - v(x, t) / num_steps.
 
     Args:
-        velocity: the model.
-        noise: `[B, C, A]` x at time 1.
+        velocity: the velocity model.
+        noise: `[B, C, A]`, which is x at time 1.
         num_steps: number of Euler steps; step k is at time 1 - k / num_steps.
         slots: see `loss`.
 

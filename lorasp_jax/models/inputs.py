@@ -15,21 +15,21 @@ class InputConfig:
     centred: bool = True
     """Pad non-square images on both sides; False pads only the left or the top."""
     antialias: bool = True
-    """Antialias when downscaling images."""
+    """Apply an antialiasing filter when downscaling images."""
     state: Mode = "mean_std"
     """Normalization of states; see `policies.normalization`."""
     action: Mode = "mean_std"
     """Normalization of actions."""
     delta: tuple[bool, ...] = ()
-    """Mask, True for action dimensions relative to the state at the start of the chunk; see
+    """True for each action dimension that is relative to the state at the start of the chunk; see
     `policies.processor.to_delta`. The action statistics are then those of relative actions."""
     convention: Convention = "ours"
-    """Project whose guard against division by zero is used in normalization."""
+    """The project whose guard against division by zero is used in normalization."""
     gripper_slot: int | None = 7
     """Gripper slot in state and action vectors; None means the first slot after the joints."""
     quiet_slots: bool = True
-    """Keep the robot's unused slots at zero in the flow. False treats them like the others:
-    they contain noise in the flow and zeros in the data, and count in the loss."""
+    """Keep the slots that the robot does not use at zero in the flow. False treats them like the
+    others: they contain noise in the flow and zeros in the data, and count in the loss."""
     prompt_state: bool = False
     """Put the normalized state into the prompt; see `policies.prompts.pi05`."""
     masks_missing: bool = True
@@ -37,15 +37,18 @@ class InputConfig:
 
 
 OURS = InputConfig()
-"""Weights trained by this project."""
+"""Preprocessing for weights trained by this project."""
 OPENPI = InputConfig(convention="openpi", gripper_slot=None, quiet_slots=False)
-"""pi0 in openpi (shared/image_tools.py, transforms.py at 15a9616a)."""
+"""Preprocessing for pi0 in openpi (shared/image_tools.py, transforms.py at 15a9616a)."""
 _PI05 = {"state": "quantiles", "action": "quantiles", "prompt_state": True}
 OURS_PI05, OPENPI_PI05 = (dataclasses.replace(inputs, **_PI05) for inputs in (OURS, OPENPI))
-"""pi0.5 here and in openpi (training/config.py, use_quantile_norm, ModelTransformFactory)."""
+"""Preprocessing for pi0.5, here and in openpi (training/config.py: use_quantile_norm,
+ModelTransformFactory)."""
 LEROBOT_PI0 = dataclasses.replace(OPENPI, antialias=False, convention="lerobot")
-"""pi0 in LeRobot 0.6 (policies/common/vla_utils.py, processor/normalize_processor.py)."""
+"""Preprocessing for pi0 in LeRobot 0.6 (policies/common/vla_utils.py,
+processor/normalize_processor.py)."""
 LEROBOT_PI05 = dataclasses.replace(LEROBOT_PI0, **_PI05)
-"""pi0.5 in LeRobot 0.6 (policies/pi05/processor_pi05.py, configuration_pi05.py)."""
+"""Preprocessing for pi0.5 in LeRobot 0.6 (policies/pi05/processor_pi05.py,
+configuration_pi05.py)."""
 LEROBOT_SMOLVLA = dataclasses.replace(LEROBOT_PI0, centred=False, masks_missing=False)
-"""SmolVLA in LeRobot 0.6 (policies/smolvla/modeling_smolvla.py)."""
+"""Preprocessing for SmolVLA in LeRobot 0.6 (policies/smolvla/modeling_smolvla.py)."""

@@ -1,4 +1,4 @@
-"""Observations as backbone inputs, normalized and tokenized."""
+"""Observations in the form that backbones take: normalized and tokenized."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -29,7 +29,7 @@ class Observation:
 
 
 def abstract_observation(config: BackboneConfig, batch: int) -> Observation:
-    """Create an observation of ShapeDtypeStructs with a backbone's input shapes."""
+    """Create an observation of ShapeDtypeStructs with the shapes of a backbone's inputs."""
 
     def abstract(dtype: str, *shape: int) -> Any:
         return jax.ShapeDtypeStruct((batch, *shape), dtype)

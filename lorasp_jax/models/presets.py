@@ -4,7 +4,8 @@
     model = adapt(model, presets.rules(["vision", "language/.*q_proj"], LoRA()), rngs=rngs)
 
 A preset is a list of regular expressions over layer paths, as in `lorasp_jax.adapt`. With
-`FullFineTuning` they also match norms and embeddings. Anything that no rule matches stays frozen.
+`FullFineTuning`, the expressions also match norms and embeddings. Anything that no rule matches
+stays frozen.
 """
 
 import difflib
@@ -19,13 +20,13 @@ _PROJECTIONS = r"^(state_proj|action_in_proj|action_out_proj|(action_)?time_mlp_
 
 PRESETS: dict[str, tuple[str, ...]] = {
     # The linear layers in Table I of arXiv 2603.07404 that affect the actions. The paper's code
-    # adapts every `nn.Linear`, which excludes the patch embedding, a convolution there.
+    # adapts every `nn.Linear`, but not the patch embedding, which is a convolution there.
     "paper": ("^(?!vision/patch_embed)",),
-    # Includes the patch embedding, a linear layer here.
+    # Includes the patch embedding, which is a linear layer here.
     "all-linear": (".*",),
     # The layers that openpi's "gemma_2b_lora" and "gemma_300m_lora" adapt (models/gemma.py).
     "openpi": (r"^(language|action)/blocks/(.*/)?[a-z]+_proj$",),
-    # The layers that LeRobot trains with `train_expert_only`.
+    # The layers that LeRobot trains if `train_expert_only` is set.
     "expert-only": ("^action/", _PROJECTIONS),
     "vision": ("^vision/",),
     "language": ("^language/",),
@@ -38,7 +39,7 @@ _WORD = re.compile(r"[A-Za-z_ -]+")
 
 
 def patterns(targets: str | Sequence[str]) -> list[str]:
-    """Expand preset names in a list of targets to regular expressions.
+    """Replace the preset names in a list of targets with their regular expressions.
 
     Args:
         targets: preset names and regular expressions over layer paths, in any combination.
@@ -58,7 +59,7 @@ def patterns(targets: str | Sequence[str]) -> list[str]:
 
 
 def _suggestion(target: str) -> str | None:
-    """Find the preset that a target misspells; None for substrings of preset names or patterns."""
+    """Find the preset that a target misspells; None if a preset's name or pattern contains it."""
     texts = (text for name, patterns in PRESETS.items() for text in (name, *patterns))
     if not _WORD.fullmatch(target) or any(target in text for text in texts):
         return None

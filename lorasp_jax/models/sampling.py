@@ -46,9 +46,9 @@ class FlowModel(prepared.FusableModule, Protocol):
 class Sampler:
     """Samples action chunks from a backbone, with input-independent results precomputed once.
 
-    It copies the weights; drop the reference to the backbone to free the originals.
-    The weights are a flat list, because passing a module with about a thousand arrays to a jitted
-    function adds too much dispatch latency for some control loops.
+    A sampler copies most of the weights; drop all references to the backbone to free the originals.
+    The weights are stored as a flat list, because passing a module with about a thousand arrays to
+    a jitted function adds too much dispatch latency for some control loops.
     """
 
     weights: list[jax.Array]
@@ -88,9 +88,10 @@ class Sampler:
             obs: the observation.
             num_steps: Euler steps.
             noise: `[B, C, A]` initial noise of the flow.
-            slots: `[A]` bool, slots to sample; the others stay zero. None samples all.
+            slots: `[A]` bool, slots to sample; the others stay zero. None samples all slots.
             return_aux: also return the adapters' aux. `aux["action"]` has a leading step axis,
-                before the layer axis; aux of layers that run once is broadcast over the steps.
+                before the layer axis; aux of action layers that run only once is broadcast over
+                the steps.
 
         Returns:
             `[B, C, A]` f32 normalized actions, or (actions, aux).
@@ -117,7 +118,7 @@ class Sampler:
 
 
 def _prefix_model(model: FlowModel) -> FlowModel:
-    """Inference copy for the prefix, with unstacked blocks so that no loop copies weights."""
+    """Copy a model to run the prefix, with unstacked blocks so that no loop copies weights."""
     model = nnx.merge(*nnx.split(model))
     for tower in (model.vision, model.language):
         tower.blocks = unstack(prepared.fuse_stack(tower.blocks))
@@ -125,7 +126,7 @@ def _prefix_model(model: FlowModel) -> FlowModel:
 
 
 def _suffix_model(model: FlowModel) -> FlowModel:
-    """Inference copy for the flow steps, with input-independent results precomputed."""
+    """Copy a model to run the flow steps, with input-independent results precomputed."""
     model = nnx.merge(*nnx.split(model))
     del model.vision, model.language
     model.action.blocks = unstack(model.action.blocks)

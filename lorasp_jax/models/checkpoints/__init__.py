@@ -1,1 +1,1 @@
-"""Load and save backbone weights, in this project's layout and in published ones."""
+"""Load and save backbone weights, in this project's layout and in published layouts."""

@@ -2,7 +2,7 @@
 
 A layout is a list of rules; each maps some of their leaves to some of ours, and back. Values are
 only sliced, transposed, stacked and reshaped, so the conversion is exact. Shapes are checked before
-reshaping, because a model with different heads can have the same number of elements.
+reshaping, because models with different head counts can have the same number of elements.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
@@ -32,12 +32,12 @@ class Rule(NamedTuple):
 
 
 def copied(ours: str, theirs: str) -> Rule:
-    """Rule for the same array under another name."""
+    """Rule for an array that they store unchanged under another name."""
     return Rule((ours,), (theirs,), lambda shape: [shape], list, lambda a: [a])
 
 
 def reshaped(ours: str, theirs: str, ours_shape: Shape, theirs_shape: Shape) -> Rule:
-    """Rule for the same values, in the same order, in another shape."""
+    """Rule for an array that they store with the same order of elements, in another shape."""
     return Rule(
         (ours,),
         (theirs,),
@@ -96,11 +96,11 @@ def to_ours(
         theirs: their leaves by name; consumed leaves are popped to free their memory.
         shapes: shapes of our leaves, by path in our model.
         source: name of the checkpoint in error messages.
-        convert: called with (name, array) for each of our leaves as soon as it is read; its result
-            is stored.
+        convert: (name, array) -> leaf to return; called for each of our leaves as soon as the
+            array is read.
 
     Returns:
-        Results of `convert`, by path in our model.
+        The results of `convert`, by path in our model.
 
     Raises:
         ModelMismatchError: missing, unexpected or wrongly shaped leaves.
@@ -127,7 +127,7 @@ def to_ours(
         expected = rule.shapes(*(shapes[name] for name in rule.ours))
         ours = rule.to_ours(pop(*leaf) for leaf in zip(rule.theirs, expected, strict=True))
         converted |= {name: convert(name, a) for name, a in zip(rule.ours, ours, strict=True)}
-        del ours  # free it before the next rule reads its arrays
+        del ours  # free our arrays before the next rule reads more
     return converted
 
 

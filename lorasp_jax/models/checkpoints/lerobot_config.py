@@ -1,7 +1,8 @@
 """Convert a LeRobot policy's config.json to a backbone config.
 
-Each backbone package provides a module `lerobot` with `TYPES`: policy type -> function (fields) ->
-config with the tower sizes. Fields that all policies share are read here.
+Each backbone package provides a module `lerobot` with a mapping `TYPES` from policy types to
+functions, each of which converts the fields to a config with the tower sizes. Fields that all
+policies share are read here.
 """
 
 import dataclasses
@@ -104,8 +105,8 @@ def _shared_fields(config: BackboneConfig, fields: Fields) -> dict[str, Any]:
 
 
 def _delta(fields: Fields) -> tuple[bool, ...]:
-    """Mask of relative actions: all except those whose name contains an excluded word; actions
-    without a name are relative (LeRobot 0.6, processor/relative_action_processor.py)."""
+    """Return a mask, True for relative action dimensions: all those without an excluded word in
+    their name, or without a name (LeRobot 0.6, processor/relative_action_processor.py)."""
     if not fields.get("use_relative_actions"):
         return ()
     size = fields["output_features"]["action"]["shape"][0]
@@ -116,7 +117,7 @@ def _delta(fields: Fields) -> tuple[bool, ...]:
 
 
 def _cameras(fields: Fields) -> tuple[str, ...]:
-    """Camera names without LeRobot's prefix; cameras that are always empty come last."""
+    """Return the camera names without LeRobot's prefix; cameras that are always empty come last."""
     names = []
     for key, feature in (fields.get("input_features") or {}).items():
         if feature["type"] == "VISUAL":

@@ -29,9 +29,9 @@ class ModelFolder:
 
     Attributes:
         folder: its path.
-        layout: "ours" (this project's config.json), "openpi" (Orbax folder `params`) or "lerobot"
-            (safetensors and a config.json with the policy type).
-        fields: contents of config.json, empty if there is no such file.
+        layout: "ours" (this project's config.json), "openpi" (Orbax folder `params`) or, for any
+            other folder, "lerobot" (safetensors and a config.json with the policy type).
+        fields: contents of config.json; empty if there is no such file.
     """
 
     folder: Path
@@ -40,7 +40,7 @@ class ModelFolder:
 
     @functools.cached_property
     def config(self) -> BackboneConfig:
-        """The config that `load` uses by default; no weights are read.
+        """The config that `load` uses if none is passed; no weights are read.
 
         Raises:
             ValueError: the folder does not specify sizes, or its model is not supported.
@@ -53,7 +53,7 @@ class ModelFolder:
 
     @property
     def inputs(self) -> InputConfig | None:
-        """Input preprocessing from a LeRobot policy's config.json, or None without such a file.
+        """Input preprocessing from a LeRobot policy's config.json; None if there is no such file.
 
         Raises:
             ValueError: config.json describes an unsupported model.
@@ -61,7 +61,7 @@ class ModelFolder:
         return self.config.inputs if self.layout == "lerobot" and "type" in self.fields else None
 
     def load(self, config: BackboneConfig | None = None) -> Any:
-        """Load the model; see the function `load` for the argument and errors."""
+        """Load the model; the function `load` documents the argument and the errors."""
         if self.layout == "ours":
             return native.load_native(self.folder, config)
         if config is not None and self.layout == "lerobot" and "type" in self.fields:
@@ -122,10 +122,10 @@ def load(where: str | os.PathLike[str], config: Any = None) -> Any:
 
 
 def load_config(where: str | os.PathLike[str]) -> Any:
-    """Return the config that `load` uses by default; no weights are read.
+    """Return the config that `load` uses if none is passed; no weights are read.
 
     Raises:
-        ValueError: under the same conditions as `load`.
+        ValueError: `where` cannot be reached or does not specify the sizes of a supported model.
     """
     return find(where).config
 
@@ -172,7 +172,7 @@ def _parse_lerobot(
 
 
 def _require_same_heads(config: Any, folder: Path, fields: dict[str, Any]) -> None:
-    """Raise ValueError if head counts differ; LeRobot's tensor shapes do not reveal them."""
+    """Raise ValueError if config type or head counts differ; tensor shapes do not reveal heads."""
     stored = _parse_lerobot(lerobot_config.parse_towers, folder, fields)
     if not isinstance(config, type(stored)):
         expected, actual = (type(c).__name__ for c in (stored, config))

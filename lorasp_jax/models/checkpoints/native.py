@@ -34,22 +34,22 @@ SHARD_BYTES = 15 * 2**20
 HEADER_BYTES = 2**16
 """Bytes reserved for a shard's header: names, shapes and offsets of a few hundred tensors."""
 RUNTIME_FIELDS = ("dtype", "param_dtype", "remat", "unroll")
-"""Config fields that affect how the model runs, not its architecture."""
+"""Config fields that affect how a model runs, but not its architecture."""
 
 Folder = str | os.PathLike[str]
 Model = TypeVar("Model", bound=nnx.Module)
 
 
 def save(folder: Folder, model: Any) -> None:
-    """Save a model without adapters, replacing any model in the folder.
+    """Save a model that has no adapters, replacing any model in the folder.
 
     Args:
         folder: created if missing.
         model: a backbone.
 
     Raises:
-        ValueError: the model has adapters or quantized kernels or does not match its config, or the
-            folder is a URL.
+        ValueError: the model has adapters or quantized kernels, the model does not match its
+            config, or the folder is a URL.
     """
     check_local(folder := pathlib.Path(folder))
     arrays = {name: a.astype(jnp.bfloat16) for name, a in base_arrays(model).items()}
@@ -71,7 +71,7 @@ def save(folder: Folder, model: Any) -> None:
 
 
 def base_arrays(model: nnx.Module) -> dict[str, np.ndarray]:
-    """Return every parameter of a model by "/"-joined path, in its param_dtype.
+    """Return every parameter of a model by "/"-joined path, without casting.
 
     Raises:
         ValueError: the model has adapters or quantized kernels, or does not match its config.
@@ -94,7 +94,7 @@ def _shapes(arrays: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
 
 
 def _write(folder: pathlib.Path, files: Mapping[str, bytes]) -> None:
-    """Write a model's files, by name, and delete weight files of a previous model."""
+    """Write a model's files, given by name, and delete weight files of a previous model."""
     folder.mkdir(parents=True, exist_ok=True)
     for file, data in files.items():
         write_bytes(folder / file, data)
@@ -148,7 +148,7 @@ def set_arrays(model: Model, arrays: Mapping[str, Any]) -> Model:
 
     Args:
         model: may be abstract, from `nnx.eval_shape`.
-        arrays: new values by "/"-joined path.
+        arrays: the new values by "/"-joined path.
 
     Raises:
         ValueError: missing, unexpected or wrongly shaped arrays.
@@ -176,8 +176,9 @@ def weights_hash(source: Folder | nnx.Module) -> str:
     """Return the SHA-256 of a model's frozen parameters: names, shapes and values in fp32.
 
     A loaded model has the same hash as its folder, whether its parameters are bf16 or fp32, and
-    keeps it when `adapt` adds adapters. The hash changes if `adapt` splits kernels or makes base
-    weights trainable (full fine-tuning), and after `combine` (frozen adapters) or `quantize`.
+    keeps this hash when `adapt` adds adapters. The hash changes if `adapt` splits kernels or makes
+    base weights trainable (full fine-tuning). It also changes after `combine`, which adds frozen
+    adapters, and after `quantize`.
 
     Args:
         source: a folder that `save` wrote, or a model.
@@ -190,7 +191,7 @@ def weights_hash(source: Folder | nnx.Module) -> str:
 
 
 def named_arrays(model: nnx.Module, adapters: bool = True) -> dict[str, Any]:
-    """Return a model's parameters, or only the frozen ones, by "/"-joined path in tree order."""
+    """Return parameters by "/"-joined path, in tree order; only frozen ones if not `adapters`."""
     state = nnx.state(model, nnx.Param if adapters else nnx.All(nnx.Param, nnx.Not(AdapterParam)))
     return by_path(nnx.to_pure_dict(state))
 

@@ -12,14 +12,14 @@ from typing import Any
 from envs.datasets.files import TEXT_BYTES, RefusedError, check_memory, check_only_files
 
 MANIFEST = "manifest.ocdbt"
-"""Root file of a TensorStore database (a checkpoint may hold several); read into memory whole."""
+"""Root file of a TensorStore database, read into memory whole; a checkpoint may have several."""
 
 
 def check(folder: Path) -> None:
     """Raise if Orbax cannot open a folder safely; its C++ code could hang or crash this process.
 
     Raises:
-        RefusedError: an entry is not a regular file or is too large.
+        RefusedError: an entry is too large or is neither a regular file nor a folder.
         OSError: a link is broken or a file is not readable.
     """
     check_only_files(folder)
@@ -31,7 +31,7 @@ def check(folder: Path) -> None:
 
 
 def suppress_repeated_errors() -> None:
-    """When Orbax reads or writes fail, report only the exception that Orbax raises.
+    """If a read or write by Orbax fails, report only the exception that Orbax raises.
 
     Otherwise Orbax logs a traceback for each further failed operation, asyncio logs one for each
     task that is never awaited, and Python prints errors from Orbax's threads and coroutines.

@@ -7,8 +7,8 @@ Each backbone package provides a module `published_names`:
     UNUSED               LeRobot tensors that the model does not use
     TIED                 unused tensor -> the tensor it is tied to
 
-Arrays are converted one at a time and released once copied, so loading takes little more host
-memory than the model itself.
+Arrays are converted one at a time, and each is released once copied, so loading takes little more
+host memory than the model itself.
 """
 
 import importlib
@@ -51,8 +51,9 @@ def load_published(folder: Path, config: Any) -> tuple[Any, list[str]]:
         config: model sizes and parameter dtype.
 
     Returns:
-        The model, with adapters if the checkpoint has openpi's LoRA, and names of unused tensors:
-        heads, and the normalization statistics of older LeRobot versions (see `statistics_files`).
+        The model, with adapters if the checkpoint has openpi's LoRA, and the names of unused
+        tensors: language-model heads and the normalization statistics of older LeRobot versions
+        (see `statistics_files`).
 
     Raises:
         ValueError: unknown layout or damaged files.
@@ -93,8 +94,8 @@ def save(folder: Path, model: Any, layout: str, dtypes: Mapping[str, Any] | None
         dtypes: dtype of each saved leaf, from `stored_dtypes`; None keeps the model's dtypes.
 
     Raises:
-        ValueError: unknown layout; adapters or quantized kernels; parameter shapes that do not
-            match the model's config; or the folder is a URL or already contains a checkpoint.
+        ValueError: the layout is unknown, the model has adapters, quantized kernels or shapes that
+            do not match its config, or the folder is a URL or already contains a checkpoint.
     """
     check_local(folder)
     published_names = _published_names(model.config)
@@ -120,7 +121,7 @@ def save(folder: Path, model: Any, layout: str, dtypes: Mapping[str, Any] | None
 
 
 def stored_dtypes(folder: Path, config: Any) -> dict[str, np.dtype]:
-    """The dtype of each leaf in a published checkpoint, for `save`.
+    """Return the dtype of each leaf in a published checkpoint, as an argument for `save`.
 
     Raises:
         ValueError: unknown layout or damaged files.
@@ -152,7 +153,7 @@ def _open(folder: Path, lerobot_name: Callable[[str], str]) -> tuple[str, Mutabl
 
 
 def orbax_folder(folder: Path) -> Path | None:
-    """Return openpi's Orbax folder, or None if this is not an openpi checkpoint."""
+    """Return the Orbax folder of an openpi checkpoint, or None if this is no such checkpoint."""
     candidates = (folder / "params", folder)
     return next((path for path in candidates if (path / "_METADATA").exists()), None)
 
@@ -178,7 +179,7 @@ def _restore(folder: Path) -> dict[str, np.ndarray]:
 
 
 def _check_size(folder: Path, tree: Any) -> None:
-    """Raise ValueError if the arrays are implausibly large for the files.
+    """Raise ValueError if the arrays are implausibly large for the size of the files.
 
     Orbax reads missing chunks as zeros, so a small folder can declare arrays of any size.
     """

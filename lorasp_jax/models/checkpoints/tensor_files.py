@@ -16,7 +16,7 @@ SINGLE, INDEX = "model.safetensors", "model.safetensors.index.json"
 
 
 def weight_files(folder: Path) -> list[Path]:
-    """List the shards in a folder's index, or its single safetensors file if it has no index.
+    """List the shards in a folder's index or, without an index, its single safetensors file.
 
     Raises:
         ValueError: the index is damaged or names files outside the folder.
@@ -40,7 +40,8 @@ class TensorFiles(MutableMapping[str, np.ndarray]):
         rename: stored name -> name in this mapping.
 
     Raises:
-        ValueError: a file is missing, damaged or truncated, or two tensors get the same name.
+        ValueError: a file is missing, damaged or truncated, or `rename` maps two tensors to
+            one name.
     """
 
     def __init__(self, files: list[Path], rename: Callable[[str], str] = str) -> None:
@@ -68,7 +69,7 @@ class TensorFiles(MutableMapping[str, np.ndarray]):
         self._tensors[new] = self._tensors.pop(old)
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """Read a tensor; raise ValueError if it does not fit into this machine's memory."""
+        """Read a tensor; raise ValueError if the tensor is larger than this machine's memory."""
         file, stored = self._tensors[name]
         tensor = file.get_slice(stored)
         bits = re.search(r"\d+", tensor.get_dtype())  # "BF16", "F8_E4M3", "BOOL"

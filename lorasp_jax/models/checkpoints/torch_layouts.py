@@ -1,6 +1,6 @@
-"""Layout rules for the building blocks of PyTorch policies, named as in Hugging Face Transformers.
+"""Layout rules for parts of PyTorch policies whose names follow Hugging Face Transformers.
 
-PyTorch stores a linear layer as [O, I], one array per layer; ours are stacks [L, I, O].
+PyTorch stores each linear layer as a matrix [O, I]; ours are stacked over layers, [L, I, O].
 """
 
 from collections.abc import Iterable, Sequence
@@ -27,7 +27,7 @@ def linear(ours: str, theirs: str) -> list[Rule]:
 
 
 def siglip(theirs: str, size: VisionConfig) -> list[Rule]:
-    """Rules for our `vision` tower without its head."""
+    """Rules for our `vision` tower, except its head."""
     patches, norm = f"{theirs}.embeddings.patch_embedding", f"{theirs}.post_layernorm"
     rules = [
         _patches("vision/patch_embed/kernel", f"{patches}.weight", size),
@@ -50,8 +50,8 @@ def decoder(ours: str, theirs: str, layers: Iterable[int], *, adaptive: bool = F
 
     Args:
         ours: path of our stack.
-        theirs: prefix of their module.
-        layers: indices of their layers.
+        theirs: path of their module.
+        layers: indices of their layers that form the stack.
         adaptive: whether the norms are pi0.5's adaptive norms.
     """
     paths = [f"{theirs}.layers.{i}" for i in layers]

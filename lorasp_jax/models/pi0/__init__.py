@@ -1,4 +1,4 @@
-"""pi0 and pi0.5: SigLIP, two Gemma experts with shared attention, flow matching over actions."""
+"""pi0 and pi0.5: SigLIP and two Gemma experts with shared attention, for flow matching."""
 
 from lorasp_jax.models.config import ExpertConfig, VisionConfig
 from lorasp_jax.models.pi0.pi0 import Pi0, Pi0Config

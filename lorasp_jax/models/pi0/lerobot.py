@@ -10,7 +10,7 @@ from lorasp_jax.models.pi0.pi0 import Pi0Config
 
 
 def pi0_config(fields: Mapping[str, Any]) -> Pi0Config:
-    """Use the published sizes with the file's Gemma variant for each expert."""
+    """Return a config with the published sizes of the Gemma variants that the fields name."""
     config = Pi0Config.base()
     sizes = {"gemma_2b": config.language, "gemma_300m": config.action}
     return dataclasses.replace(
@@ -25,7 +25,7 @@ def pi05_config(fields: Mapping[str, Any]) -> Pi0Config:
     """Like `pi0_config`, but for pi0.5.
 
     Raises:
-        ValueError: the policy uses memory of past observations.
+        ValueError: the policy has a memory of past observations.
     """
     require(fields, {"use_visual_memory": False, "use_proprioceptive_memory": False})
     config = Pi0Config.base_pi05()

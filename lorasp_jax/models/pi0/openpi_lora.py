@@ -1,14 +1,15 @@
 """Convert openpi's LoRA weights to equivalent adapters of our layers.
 
-openpi has two matrices for each einsum kernel, with the kernel's head axes (models/lora.py).
-W is a kernel, A and B its `lora_a` and `lora_b`, n a head, s = alpha / rank, or alpha / √rank:
+openpi adapts each einsum kernel with two arrays that keep the kernel's head axes (models/lora.py).
+W is a kernel; A and B are its `lora_a` and `lora_b`. N heads, numbered n or m, have dimension H; D
+is the width, r the rank of a pair (A, B), and s = alpha / r or alpha / √r:
 
     q_einsum, kv_einsum    [N, D, H]    ΔW[n] = s A[n] B[n], one pair for each head
-    attn_vec_einsum        [N, H, D]    ΔW[n] = s A[n] Σ_m B[m]: A's outputs summed over heads
-    gating_einsum, linear               ΔW = A B, independent of alpha
+    attn_vec_einsum        [N, H, D]    ΔW[n] = s A[n] Σ_m B[m]: one sum for all heads
+    gating_einsum, linear               ΔW = A B, independent of alpha; no heads
 
-For pairs of rank r, the first row becomes a LoRA of rank N r with a block-diagonal B, the second a
-LoRA of rank r. Both conversions are exact. Training also updates the zeros outside the blocks.
+The first row becomes a LoRA of rank N r with a block-diagonal B, the others become LoRAs of rank r.
+All conversions are exact. Further training also updates the zeros of B outside its diagonal blocks.
 """
 
 from collections.abc import Mapping, MutableMapping
@@ -27,7 +28,7 @@ _LAYERS = "PaliGemma/llm/layers"
 _TOWERS = {"language": "", "action": "_1"}  # our tower -> openpi's suffix
 _ATTENTION = ("q_proj", "k_proj", "v_proj", "o_proj")
 Pair = tuple[np.ndarray, np.ndarray]
-"""A [L, ..., I, R] and B [L, ..., R, O]."""
+"""A [L, ..., I, r] and B [L, ..., r, O]."""
 
 
 def pop_lora(leaves: MutableMapping[str, Any]) -> dict[str, Any]:
@@ -37,14 +38,14 @@ def pop_lora(leaves: MutableMapping[str, Any]) -> dict[str, Any]:
 
 
 def attach(model: Any, leaves: Mapping[str, np.ndarray], *, scale: float = 1.0) -> Any:
-    """Attach openpi's LoRA to a pi0 as adapters.
+    """Attach openpi's LoRA weights to a pi0 model as adapters.
 
     Args:
-        model: not modified; the result shares its arrays.
+        model: a pi0 model; it is not modified, but the result shares its arrays.
         leaves: openpi's LoRA arrays by "/"-joined path below `params`, from `pop_lora`, for one
             expert or both.
-        scale: openpi's alpha / rank of the attention layers, or alpha / √rank with its `rslora`.
-            Checkpoints do not store it; openpi's own variants use 1.
+        scale: s of the attention layers: alpha / rank, or alpha / √rank with openpi's `rslora`.
+            Checkpoints do not store this scale; openpi's own variants use 1.
 
     Raises:
         ValueError: a leaf is missing or unexpected, or does not fit the model.
@@ -73,7 +74,7 @@ def attach(model: Any, leaves: Mapping[str, np.ndarray], *, scale: float = 1.0) 
 def _expert_pairs(
     leaves: dict[str, np.ndarray], size: ExpertConfig, ours: str, suffix: str
 ) -> dict[str, Pair]:
-    """Pop one expert's leaves and convert them to (A, B) by path of our layer."""
+    """Pop one expert's leaves and convert them to pairs (A, B), by the path of our layer."""
     layers, width, mlp = size.depth, size.width, size.mlp
     heads, kv_heads, head_dim = size.heads, size.kv_heads, size.head_dim
 
@@ -98,7 +99,7 @@ def _expert_pairs(
 
 
 def _pop_pair(leaves: dict[str, np.ndarray], prefix: str, kernel: tuple[int, ...]) -> Pair:
-    """Pop A [..., I, R] and B [..., R, O] of a kernel [..., I, O] from `leaves`."""
+    """Pop A [..., I, r] and B [..., r, O] of a kernel [..., I, O] from `leaves`."""
     names = f"{prefix}lora_a", f"{prefix}lora_b"
     for name in names:
         if name not in leaves:

@@ -1,4 +1,4 @@
-"""pi0 (Black et al., arXiv 2410.24164): flow matching over actions on a vision-language model.
+"""pi0 (Black et al., arXiv 2410.24164): a vision-language model with flow matching on actions.
 
 Tokens form three blocks: [images, instruction], [state], [noisy actions]. Each block attends to
 itself and to earlier blocks. The first block is the prefix, processed by the language expert; the
@@ -71,7 +71,7 @@ class Pi0Config(BackboneConfig):
 
     @classmethod
     def small(cls) -> Pi0Config:
-        """For one accelerator: about 9.5 M parameters, 64 tokens per camera."""
+        """Sizes for one accelerator: about 9.5 M parameters, 64 tokens per camera."""
         return cls.miniature(
             vision=VisionConfig(width=256, depth=4, mlp=768, heads=4, patch=8),
             language=ExpertConfig(192, 6, 512, heads=8, kv_heads=1, head_dim=32),
@@ -80,7 +80,7 @@ class Pi0Config(BackboneConfig):
 
     @classmethod
     def nano(cls) -> Pi0Config:
-        """For a CPU: about 1 M parameters, 16 tokens per camera."""
+        """Sizes for a CPU: about 1 M parameters, 16 tokens per camera."""
         return cls.miniature(
             vision=VisionConfig(width=96, depth=2, mlp=256, heads=3, patch=16),
             language=ExpertConfig(96, 3, 192, heads=4, kv_heads=1, head_dim=32),
@@ -89,12 +89,12 @@ class Pi0Config(BackboneConfig):
 
     @classmethod
     def nano_pi05(cls) -> Pi0Config:
-        """pi0.5 for a CPU; `max_tokens` fits the offline tokenizer's prompts with the state."""
+        """pi0.5 for a CPU; `max_tokens` fits the offline tokenizer's prompts with state."""
         return dataclasses.replace(cls.nano(), pi05=True, max_tokens=64, inputs=OURS_PI05)
 
     @classmethod
     def dummy(cls) -> Pi0Config:
-        """For tests: compiles and runs in seconds."""
+        """Sizes for tests: the model compiles and runs in seconds."""
         return cls.miniature(
             vision=VisionConfig(width=32, depth=2, mlp=48, heads=2, patch=16),
             language=ExpertConfig(48, 2, 64, heads=4, kv_heads=2, head_dim=16),
@@ -107,11 +107,11 @@ class Pi0Config(BackboneConfig):
 
 
 class Prefix(NamedTuple):
-    """Encoded images and instruction, as input to the action expert.
+    """Encoded images and instruction, from which the action expert reads.
 
     Attributes:
-        cache: keys and values `[L, B, P, K, H]` of every layer.
-        valid: `[B, P]` bool.
+        cache: keys and values `[L, B, P, K, H]` of all layers of the language expert.
+        valid: `[B, P]` bool, False for padding and missing cameras.
         out: `[B, P, D]` output of the language expert.
     """
 
@@ -159,7 +159,7 @@ class Pi0(Backbone):
             obs: only the state is used.
             x_t: `[B, C, A]`.
             flow_time: `[B]`.
-            action_valid: `[B, C]` bool, False for steps to exclude from the adapters' aux.
+            action_valid: `[B, C]` bool, False for actions to exclude from the adapters' aux.
 
         Returns:
             `[B, 1 + C, D]` f32, and the adapters' aux.
@@ -204,7 +204,7 @@ class Pi0(Backbone):
         return v_t, {**expert_aux, **aux, **time_aux, "action_out_proj": out_aux}
 
     def norm_condition(self, flow_time: jax.Array) -> tuple[jax.Array | None, LayerAux]:
-        """Return the condition for adaptive norms and the adapters' aux; pi0 has neither."""
+        """Return the condition for adaptive norms and the adapters' aux: None and empty for pi0."""
         del flow_time
         return None, {}
 
@@ -215,7 +215,7 @@ class Pi05(Pi0):
     make_expert = AdaptiveExpert
 
     def _make_projections(self, state_width: int, rngs: nnx.Rngs) -> None:
-        """Create the projections of noisy actions, flow time and velocity."""
+        """Create the layers that embed noisy actions and flow time and predict velocities."""
         del state_width
         width, dim = self.config.action.width, self.config.action_dim
         options: Any = {"dtype": jnp.float32, "param_dtype": self.config.param_dtype, "rngs": rngs}
@@ -225,7 +225,7 @@ class Pi05(Pi0):
         self.action_out_proj: Layer = Dense(width, dim, **options)
 
     def fuse_projections(self, *, copy_kernels: bool = True) -> None:
-        """See `prepared.FusableModule`; the projections outside the towers share no input."""
+        """See `prepared.FusableModule`; no two layers outside the towers share an input."""
         self.action_in_proj = fuse_layer(self.action_in_proj, copy_kernels=copy_kernels)
         self.time_mlp_in = fuse_layer(self.time_mlp_in, copy_kernels=copy_kernels)
         self.time_mlp_out = fuse_layer(self.time_mlp_out, copy_kernels=copy_kernels)

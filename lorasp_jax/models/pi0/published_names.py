@@ -1,8 +1,8 @@
 """Names and shapes of pi0's parameters as openpi and LeRobot publish them.
 
-openpi fuses several projections into one einsum kernel (keys and values, gate and up) and keeps
-separate head axes. LeRobot stores PyTorch's transposed matrices, one per layer. This project stores
-matrices [I, O] under Hugging Face's names, stacked over layers.
+openpi fuses some projections into one einsum kernel (keys with values, gate with up) and keeps head
+axes separate. LeRobot stores PyTorch's transposed matrices [O, I], one for each layer. This project
+stores matrices [I, O] under Hugging Face's names, stacked over layers.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ _VISION = f"{_PALIGEMMA}.model.vision_tower.vision_model"
 _LANGUAGE = f"{_PALIGEMMA}.model.language_model"
 _PROJECTIONS05 = ("action_in_proj", "time_mlp_in", "time_mlp_out", "action_out_proj")
 UNUSED = (f"{_PALIGEMMA}.lm_head.weight", f"{_EXPERT}.lm_head.weight")
-"""LeRobot's language-model heads, which the model does not use."""
+"""Language-model heads in LeRobot's checkpoints, which the model does not use."""
 TIED = {UNUSED[0]: f"{_LANGUAGE}.embed_tokens.weight"}
 """Unused tensor -> the tensor it is tied to."""
 
@@ -80,7 +80,7 @@ def _openpi_vision(config: Pi0Config) -> list[Rule]:
 
 
 def _openpi_expert(tower: str, size: ExpertConfig, suffix: str) -> list[Rule]:
-    """Rules for one expert's projections; openpi's action expert has the suffix "_1"."""
+    """Rules for one expert's projections; openpi marks the action expert with the suffix "_1"."""
     layers, ours = f"{_LLM}/layers", f"{tower}/blocks"
     depth, width, heads, kv_heads = size.depth, size.width, size.heads, size.kv_heads
     inner = heads * size.head_dim
@@ -89,6 +89,7 @@ def _openpi_expert(tower: str, size: ExpertConfig, suffix: str) -> list[Rule]:
         return f"{ours}/{name}/kernel"
 
     return [
+        # openpi's shapes, with N query heads, K key heads and MLP width F:
         # q: [L, N, D, H]; k and v: [L, 2, K, D, H]; gate and up: [L, 2, D, F].
         Rule(
             (kernel("q_proj"),),
@@ -151,9 +152,9 @@ def _heads_first(kernel: np.ndarray, heads: int) -> np.ndarray:
 
 
 def lerobot_name(name: str) -> str:
-    """Map a tensor name of any LeRobot version to the current name.
+    """Map a tensor name from any LeRobot version to the current name.
 
-    Older versions keep the towers in other modules.
+    In older versions, the towers belong to other modules.
     """
     if name.endswith("lm_head.weight"):
         return UNUSED["gemma_expert." in name]

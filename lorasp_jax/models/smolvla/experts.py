@@ -1,8 +1,8 @@
 """SmolVLA's experts: SmolLM2 (arXiv 2502.02737), and an action expert that uses SmolLM2's cache.
 
 Even layers of the action expert attend to the language model's keys and values and to their own, as
-in pi0. Odd layers are cross-attention: they attend only to projections of the keys and values of
-the same layer of the language model, so action tokens do not attend to each other there.
+in pi0. Odd layers use cross-attention: they attend only to projections of the language model's
+keys and values in the same layer, so action tokens do not attend to each other there.
 """
 
 import functools
@@ -27,7 +27,7 @@ from lorasp_jax.models.transformer.layers import (
 
 
 class SelfBlock(ExpertBlock):
-    """One SmolLM2 layer: a Gemma layer with SiLU and norms that store the factor itself."""
+    """One SmolLM2 layer: a Gemma layer, but with SiLU and norms that store their factor."""
 
     make_norm = staticmethod(functools.partial(RMSNorm, eps=1e-5, offset=0.0))
     activation = staticmethod(jax.nn.silu)
@@ -49,7 +49,7 @@ class CrossBlock(SelfBlock):
     def project_cache(self, cache: KeysValues, valid: jax.Array) -> tuple[KeysValues, LayerAux]:
         """Compute this layer's keys and values `[B, P, K, H]` from the language model's.
 
-        The language model has already applied RoPE to its keys; it is not applied again.
+        The language model has already applied RoPE to its keys, so this layer does not.
         """
         aux: LayerAux = {}
         keys, values = cache
@@ -67,7 +67,7 @@ class CrossBlock(SelfBlock):
         keys_values: KeysValues,
         token_mask: jax.Array,
     ) -> tuple[jax.Array, LayerAux]:
-        """Apply the layer to x `[B, T, D]`.
+        """Apply the layer to x.
 
         Args:
             x: `[B, T, D]`.
@@ -85,7 +85,7 @@ class CrossBlock(SelfBlock):
 
 
 class SmolLM2(LanguageExpert):
-    """SmolLM2. Actions do not depend on `lm_head`; it is loaded so that it can be saved again."""
+    """SmolLM2. Actions do not depend on `lm_head`, which is loaded only to be saved again."""
 
     block = SelfBlock
 
@@ -121,7 +121,7 @@ class ActionExpert(nnx.Module):
             valid: `[B, P]` bool.
 
         Returns:
-            Keys and values `[L / 2, B, P, K, H]` for the self-attention layers and for the
+            Keys and values `[L / 2, B, P, K, H]` for the self-attention layers, the same for the
             cross-attention layers, and the adapters' aux.
         """
         even, odd = (jax.tree.map(lambda a, i=i: a[i::2], cache) for i in (0, 1))
@@ -149,7 +149,8 @@ class ActionExpert(nnx.Module):
 
         Args:
             x: `[B, T, D]`.
-            position: `[B, T]` int32, continuing the prefix's; cross-attention restarts at zero.
+            position: `[B, T]` int32, continuing those of the prefix. Cross-attention layers instead
+                number these tokens from zero.
             mask: `[B, T, P + T]` bool.
             cache: prefix keys and values for self-attention, from `project_cache`.
             cross: prefix keys and values for cross-attention, from `project_cache`.

@@ -17,7 +17,7 @@ _FIXED = {
 
 
 def smolvla_config(fields: Mapping[str, Any]) -> SmolVLAConfig:
-    """Use the published sizes with the file's language depth and expert width.
+    """Return a config with the published sizes, but the fields' language depth and expert width.
 
     Raises:
         ValueError: unsupported attention, special tokens or number of expert layers.

@@ -1,4 +1,4 @@
-"""SmolVLA (Shukor et al., arXiv 2506.01844): flow matching on a small vision-language model.
+"""SmolVLA (Shukor et al., arXiv 2506.01844): a small vision-language model with flow matching.
 
 Tokens form blocks: [images, instruction], [state], and one block per noisy action. Each block
 attends to itself and to earlier blocks. Images, instruction and state are the prefix, processed by
@@ -57,8 +57,8 @@ class SmolVLAConfig(BackboneConfig):
     def base(cls) -> SmolVLAConfig:
         """The published SmolVLA, 450,046,176 parameters (LeRobot, policies/smolvla).
 
-        The action expert has 3/4 of the language model's width, 720, and an MLP of width
-        256 ceil(int(4 int(2 * 720 / 3)) / 256) = 2048 (smolvlm_with_expert.py).
+        The action expert's width is 720, 3/4 of the language model's; its MLP has width
+        256 ceil(4 int(2 * 720 / 3) / 256) = 2048 (smolvlm_with_expert.py).
         """
         return cls(
             vision=VisionConfig(width=768, depth=12, mlp=3072, heads=12, patch=16, shuffle=4),
@@ -76,7 +76,7 @@ class SmolVLAConfig(BackboneConfig):
 
     @classmethod
     def small(cls) -> SmolVLAConfig:
-        """For one accelerator: about 9 M parameters, 64 patches and 16 tokens per camera."""
+        """Sizes for one accelerator: about 9 M parameters, 64 patches and 16 tokens per camera."""
         return cls.miniature(
             vision=VisionConfig(width=256, depth=4, mlp=768, heads=4, patch=8, shuffle=2),
             language=ExpertConfig(256, 6, 640, heads=6, kv_heads=2, head_dim=32),
@@ -85,7 +85,7 @@ class SmolVLAConfig(BackboneConfig):
 
     @classmethod
     def nano(cls) -> SmolVLAConfig:
-        """For a CPU: about 1 M parameters, 16 tokens per camera."""
+        """Sizes for a CPU: about 1 M parameters, 16 tokens per camera."""
         return cls.miniature(
             vision=VisionConfig(width=96, depth=2, mlp=256, heads=3, patch=8, shuffle=2),
             language=ExpertConfig(96, 4, 192, heads=3, kv_heads=1, head_dim=32),
@@ -94,7 +94,7 @@ class SmolVLAConfig(BackboneConfig):
 
     @classmethod
     def dummy(cls) -> SmolVLAConfig:
-        """For tests: compiles and runs in seconds."""
+        """Sizes for tests: the model compiles and runs in seconds."""
         return cls.miniature(
             vision=VisionConfig(width=32, depth=2, mlp=48, heads=2, patch=8, shuffle=2),
             language=ExpertConfig(48, 4, 64, heads=4, kv_heads=2, head_dim=16),
@@ -107,12 +107,12 @@ class SmolVLAConfig(BackboneConfig):
 
 
 class Prefix(NamedTuple):
-    """Encoded images, instruction and state, as input to the action expert.
+    """Encoded images, instruction and state, from which the action expert reads.
 
     Attributes:
         cache: keys and values `[L / 2, B, P, K, H]` of the language model's even layers.
         cross: the same for the odd layers, projected by the action expert.
-        valid: `[B, P]` bool.
+        valid: `[B, P]` bool, False for padding and missing cameras.
     """
 
     cache: KeysValues
@@ -165,7 +165,7 @@ class SmolVLA(Backbone):
             obs: unused; the state is in the prefix.
             x_t: `[B, C, A]`.
             flow_time: `[B]`.
-            action_valid: `[B, C]` bool, False for steps to exclude from the adapters' aux.
+            action_valid: `[B, C]` bool, False for actions to exclude from the adapters' aux.
 
         Returns:
             `[B, C, D]` f32, and the adapters' aux.

@@ -9,27 +9,28 @@ MASKED = -2.3819763e38
 """Logit of a masked key. Finite, so that a fully masked row gets a uniform softmax, not NaN."""
 
 CUDNN_MIN_QUERIES, CUDNN_MIN_HEAD_DIM = 128, 64
-"""Minimum sizes for which attention uses cuDNN. Published models reach them; the miniatures do not,
-so their results are bitwise reproducible."""
+"""Minimum sizes for which attention uses cuDNN. Published models reach both; miniatures do not,
+which keeps the results of miniatures bitwise reproducible."""
 
 KEY_MULTIPLE, MIN_PADDED_KEYS = 128, 512
-"""Without cuDNN, `MIN_PADDED_KEYS` or more keys are padded to a multiple of `KEY_MULTIPLE`."""
+"""Without cuDNN, attention with a mask and at least `MIN_PADDED_KEYS` keys pads the keys to a
+multiple of `KEY_MULTIPLE`."""
 
 CUDNN_MULTIPLE = 8
-"""cuDNN needs query and key counts divisible by 8 (16-byte alignment of the mask)."""
+"""With a mask, cuDNN needs query and key counts divisible by 8 (16-byte alignment of the mask)."""
 
 
 def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) -> jax.Array:
-    """Grouped-query attention with fp32 softmax; uses cuDNN for long 16-bit sequences on GPUs.
+    """Grouped-query attention with fp32 softmax; uses cuDNN for long 16-bit float inputs on GPUs.
 
-    cuDNN accumulates gradients in nondeterministic order, so two runs differ in the last bits;
-    `CUDNN_MIN_HEAD_DIM` keeps small models on the deterministic path.
+    cuDNN accumulates gradients in nondeterministic order, so two runs differ by rounding errors;
+    `CUDNN_MIN_QUERIES` and `CUDNN_MIN_HEAD_DIM` keep small models on the deterministic path.
 
     Args:
         q: `[B, T, N, H]`, already scaled.
         k: `[B, S, K, H]`; each key head serves N / K query heads.
         v: `[B, S, K, H]`.
-        mask: `[B, T, S]` bool, or None to attend everywhere.
+        mask: `[B, T, S]` bool, or None to attend to all keys.
 
     Returns:
         `[B, T, N H]`.
@@ -42,7 +43,7 @@ def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) 
         y = attend(q, k, v, mask=None if mask is None else mask[:, None])
         return y[:, :tokens].reshape(batch, tokens, heads * size)
     k, v, mask = _pad_keys(k, v, mask)
-    # For K = 1, this axis order needs no transposes of q, weights or result.
+    # For K = 1, this axis order needs no transposes of q, the weights or the result.
     q = q.reshape(batch, tokens, k.shape[2], -1, size)
     logits = jnp.einsum("BTKGH,BSKH->BKTGS", q, k, preferred_element_type=jnp.float32)
     if mask is not None:
@@ -54,7 +55,7 @@ def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) 
 def _pad_keys(
     k: jax.Array, v: jax.Array, mask: jax.Array | None
 ) -> tuple[jax.Array, jax.Array, jax.Array | None]:
-    """Append masked keys; otherwise XLA pads the attention weights, which costs another copy."""
+    """Append masked keys; XLA would instead pad the attention weights, which costs another copy."""
     padding = -k.shape[1] % KEY_MULTIPLE
     if mask is None or padding == 0 or k.shape[1] < MIN_PADDED_KEYS:
         return k, v, mask
@@ -66,7 +67,7 @@ def _use_cudnn(q: jax.Array, k: jax.Array, mask: jax.Array | None) -> bool:
     """Whether cuDNN supports these arrays and is worth its launch overhead."""
     queries, head_dim, keys = q.shape[1], q.shape[3], k.shape[1]
     half_precision = q.dtype in (jnp.bfloat16, jnp.float16)
-    even = mask is not None or (queries % 2 == 0 and keys % 2 == 0)  # masked inputs are padded
+    even = mask is not None or (queries % 2 == 0 and keys % 2 == 0)  # inputs with a mask are padded
     supported = CUDNN_MIN_HEAD_DIM <= head_dim <= 256 and head_dim % 8 == 0 and even
     large = queries >= CUDNN_MIN_QUERIES
     return jax.default_backend() == "gpu" and half_precision and supported and large

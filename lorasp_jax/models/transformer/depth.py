@@ -18,12 +18,12 @@ _SAVED = "saved"
 
 
 def save_for_backward(x: jax.Array) -> jax.Array:
-    """Mark x to be saved for the backward pass instead of the results of the matmuls before it."""
+    """Mark x to be saved for the backward pass, instead of the matmul results that yield x."""
     return checkpoint_name(x, _SAVED)
 
 
 def _save_products(primitive: Any, *shapes: Any, **params: Any) -> Any:
-    """Save results of matmuls and expensive primitives, and `save_for_backward` values."""
+    """Save results of matmuls and expensive primitives, and values from `save_for_backward`."""
     if primitive.name in _EXPENSIVE_TO_RECOMPUTE or params.get("name") == _SAVED:
         return True
     return jax.checkpoint_policies.dots_with_no_batch_dims_saveable(primitive, *shapes, **params)
@@ -35,7 +35,7 @@ Block = TypeVar("Block", bound=nnx.Module)
 
 
 def stack(make: Callable[[nnx.Rngs], Block], depth: int, rngs: nnx.Rngs) -> Block:
-    """Initialize `depth` blocks as one module whose parameters have a leading axis L."""
+    """Initialize L = `depth` blocks as one module whose parameters have a leading axis L."""
     keys = jax.random.split(rngs.params(), depth)
     return jax.vmap(lambda key: make(nnx.Rngs(params=key)))(keys)
 
@@ -91,7 +91,7 @@ def scan_depth(
 def _split_layers(stacked: Any) -> list[Any]:
     """Split arrays [L, ...] into layers. The backward pass concatenates the layers' gradients.
 
-    Indexing each layer instead would sum L gradients padded with zeros.
+    If each layer were indexed instead, the backward pass would add L zero-padded gradients.
     """
     leaves, structure = jax.tree.flatten(stacked)
     slices = zip(*(jax.lax.split(leaf, [1] * len(leaf)) for leaf in leaves), strict=True)
@@ -104,8 +104,8 @@ def _split_layers(stacked: Any) -> list[Any]:
 class _LayerSlice(NamedTuple):
     """Lazy slice of one layer from stacked arrays.
 
-    Under `jax.checkpoint` the backward pass slices the stack again, instead of saving every layer's
-    slice in the forward pass.
+    Under `jax.checkpoint`, the backward pass slices the stack again, so the forward pass need not
+    save every layer's slice.
     """
 
     trained: Any
@@ -114,7 +114,7 @@ class _LayerSlice(NamedTuple):
     """Stacked frozen arrays [L, ...]."""
     index: np.int32
     gradient_sinks: Any
-    """Slice of `trained` whose value is unused; it receives the layer's gradient."""
+    """The layer's slices of `trained`; their values are unused, and the gradients flow to them."""
 
     def materialize(self) -> tuple[Any, Any]:
         """Return the layer's trainable and frozen arrays [...]."""
@@ -132,7 +132,7 @@ def _slice(stack: jax.Array, index: np.int32) -> jax.Array:
 
 @jax.custom_jvp
 def _slice_with_gradient(stack: jax.Array, index: np.int32, sink: jax.Array) -> jax.Array:
-    """stack[index]; its gradient flows to `sink`, which has the same value."""
+    """Return stack[index]; the gradient flows to `sink`, which has the same value."""
     del sink
     return _slice(stack, index)
 
@@ -145,11 +145,11 @@ def _(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
 def _lazy_slices(trained: Any, frozen: Any) -> list[_LayerSlice]:
     """Slice arrays [L, ...] lazily, one slice per layer."""
     depth = len(jax.tree.leaves((trained, frozen))[0])
-    sinks = _split_layers(trained) or [trained] * depth  # there may be no trainable arrays
+    sinks = _split_layers(trained) or [trained] * depth  # no slices if no array is trainable
     return [_LayerSlice(trained, frozen, np.int32(i), sink) for i, sink in enumerate(sinks)]
 
 
 def unstack(blocks: nnx.Module) -> nnx.List[Any]:
-    """Split stacked blocks into a list, so that an outer loop does not slice weights."""
+    """Split stacked blocks into a list, so that a loop around `scan_depth` slices no weights."""
     graphdef, state = nnx.split(blocks)
     return nnx.List([nnx.merge(graphdef, layer) for layer in _split_layers(state)])

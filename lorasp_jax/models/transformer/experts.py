@@ -30,13 +30,13 @@ from lorasp_jax.models.transformer.layers import (
 )
 
 KeysValues = tuple[jax.Array, jax.Array]
-"""Keys after RoPE, and values: each `[B, S, K, H]`, or `[L, B, S, K, H]` for all layers."""
+"""Keys after RoPE, and values; both are `[B, S, K, H]`, or `[L, B, S, K, H]` for all layers."""
 
 
 class ExpertBlock(nnx.Module):
     """One Gemma layer (arXiv 2403.08295): RMS norms, rotary grouped-query attention, GeGLU.
 
-    It has no biases. Subclasses override the norm and the activation.
+    The layer has no biases. Subclasses may override the norm and the activation.
     """
 
     make_norm = staticmethod(RMSNorm)
@@ -103,13 +103,13 @@ class ExpertBlock(nnx.Module):
         Args:
             x: `[B, T, D]`.
             table: RoPE sine and cosine for these tokens, from `rope_table`.
-            mask: `[B, T, S + T]` bool over the cached keys, then this layer's keys.
+            mask: `[B, T, S + T]` bool over the cached keys followed by this layer's keys.
             cache: keys and values of preceding tokens, or None (S = 0).
             token_mask: `[B, T]` bool, False for tokens to exclude from the adapters' aux.
             condition: `[B, 1, D]` for adaptive norms, or None.
 
         Returns:
-            x, then this layer's keys and values, and the adapters' aux.
+            The new x, and a pair of this layer's keys and values and the adapters' aux.
         """
         h, gate, norm_aux = self.input_layernorm.normalize(x, condition)
         qkv = {"q_proj": self.q_proj, "k_proj": self.k_proj, "v_proj": self.v_proj}
@@ -173,7 +173,7 @@ class Expert(nnx.Module):
         Args:
             x: `[B, T, D]`.
             position: `[B, T]` int32.
-            mask: `[B, T, S + T]` bool over the cached keys, then this expert's keys.
+            mask: `[B, T, S + T]` bool over the cached keys followed by this expert's keys.
             cache: keys and values `[L, B, S, K, H]` of preceding tokens, or None (S = 0).
             token_mask: `[B, T]` bool, False for tokens to exclude from the adapters' aux.
             condition: `[B, 1, D]` for adaptive norms, or None.
@@ -215,7 +215,7 @@ class AdaptiveExpert(Expert):
 
 
 def adaptive_norm(size: ExpertConfig, config: BackboneConfig, rngs: nnx.Rngs) -> AdaptiveRMSNorm:
-    """Create an adaptive norm of an expert's width."""
+    """Create an adaptive norm with the width of an expert."""
     options = {"dtype": config.dtype, "param_dtype": config.param_dtype, "rngs": rngs}
     return AdaptiveRMSNorm(size.width, **options)
 

@@ -1,4 +1,4 @@
-"""Building blocks shared by the backbones: norms, shared-input layers, RoPE and masks."""
+"""Components shared by the backbones: norms, layers with a shared input, RoPE and masks."""
 
 import math
 from typing import Any, TypeAlias
@@ -19,7 +19,7 @@ ModelAux = dict[str, LayerAux]
 
 
 def rms_normalize(x: jax.Array, eps: float) -> jax.Array:
-    """x / sqrt(mean(x^2) + eps) over the last axis, in fp32."""
+    """Compute x / sqrt(mean(x^2) + eps) over the last axis, in fp32."""
     x = x.astype(jnp.float32)
     return x * jax.lax.rsqrt(jnp.mean(jnp.square(x), axis=-1, keepdims=True) + eps)
 
@@ -27,7 +27,7 @@ def rms_normalize(x: jax.Array, eps: float) -> jax.Array:
 class RMSNorm(nnx.Module):
     """x / sqrt(mean(x^2) + eps) * (offset + scale), computed in fp32, returned in the dtype of x.
 
-    Gemma stores the factor minus one (offset 1); other models store the factor itself (offset 0).
+    Gemma stores the factor minus one (offset 1), whereas other models store the factor (offset 0).
     """
 
     def __init__(
@@ -50,13 +50,13 @@ class RMSNorm(nnx.Module):
     def normalize(
         self, x: jax.Array, condition: jax.Array | None
     ) -> tuple[jax.Array, int, LayerAux]:
-        """Like `AdaptiveRMSNorm.normalize`, but without a condition: gate 1, empty aux."""
+        """Like `AdaptiveRMSNorm.normalize`, but unconditional: the gate is 1, the aux empty."""
         del condition
         return self(x), 1, {}
 
 
 class AdaptiveRMSNorm(nnx.Module):
-    """RMSNorm with scale, shift and gate computed from a condition, pi0.5's "adaRMS".
+    """RMSNorm with scale, shift and gate computed from a condition, called "adaRMS" in pi0.5.
 
         y = x / sqrt(mean(x^2) + eps) * (1 + scale) + shift
         scale, shift, gate = split(dense(condition))
@@ -117,12 +117,12 @@ class LayerNorm(nnx.Module):
 def apply_to_shared_input(
     x: jax.Array, token_mask: jax.Array | None, **layers: Layer
 ) -> tuple[list[jax.Array], LayerAux]:
-    """Apply layers to the same input; adapters of `Dense` layers share one matmul with x.
+    """Apply layers to the same input; the adapters of `Dense` layers share one matmul with x.
 
     Args:
         x: `[B, T, I]`.
         token_mask: `[B, T]` bool, False for tokens to exclude from the adapters' aux.
-        layers: by name. Fused layers must be in the order in which they were fused.
+        layers: the layers by name. Fused layers must come in the order in which they were fused.
 
     Returns:
         y `[B, T, O]` of each layer, and the adapters' aux by layer name.
@@ -151,19 +151,19 @@ def nest_aux(module: str, aux: LayerAux) -> LayerAux:
 
 
 def merge_action_aux(aux: ModelAux, action: LayerAux) -> ModelAux:
-    """Merge the aux of the flow steps into the "action" aux of the prefix."""
+    """Add the aux of the flow steps to the "action" aux of the prefix."""
     return {**aux, "action": {**aux.get("action", {}), **action}}
 
 
 def positions(valid: jax.Array) -> jax.Array:
-    """Number the valid tokens from 0, `[B, T]` int32; padding repeats the previous number."""
+    """Number the valid tokens from 0, `[B, T]` int32; padding repeats the previous one."""
     return jnp.cumsum(valid, axis=-1, dtype=jnp.int32) - 1
 
 
 def block_mask(
     query_block: np.ndarray, key_block: np.ndarray, query_valid: jax.Array, key_valid: jax.Array
 ) -> jax.Array:
-    """Attention mask: queries attend to valid keys of their own block and of earlier blocks.
+    """Create a mask: valid queries attend to valid keys of their own and of earlier token blocks.
 
     Args:
         query_block: `[T]` int, block number of each query token.
@@ -196,7 +196,7 @@ def rope_table(position: jax.Array, head_dim: int) -> tuple[jax.Array, jax.Array
 def rope(x: jax.Array, table: tuple[jax.Array, jax.Array], scale: float = 1.0) -> jax.Array:
     """Apply RoPE to x `[B, T, N, H]` in fp32 and multiply by `scale`.
 
-    Each head's first half is rotated against its second half.
+    Each element of a head's first half is rotated together with its counterpart in the second half.
     """
     sin, cos = table
     first, second = jnp.split(x.astype(jnp.float32), 2, axis=-1)
@@ -205,7 +205,7 @@ def rope(x: jax.Array, table: tuple[jax.Array, jax.Array], scale: float = 1.0) -
 
 
 def time_embedding(flow_time: jax.Array, width: int) -> jax.Array:
-    """Sinusoidal embedding `[B, width]` f32 of times `[B]`, with periods from 4e-3 to 4.
+    """Compute sinusoidal embeddings `[B, width]` f32 of times `[B]`, with periods from 4e-3 to 4.
 
     Sines come first, then cosines. The periods match openpi's `create_sinusoidal_pos_embedding`
     (models/pi0.py).

@@ -1,4 +1,4 @@
-"""SigLIP vision tower (Zhai et al., arXiv 2303.15343) with a projection to language tokens."""
+"""SigLIP vision tower (Zhai et al., arXiv 2303.15343) with a projection to the language model."""
 
 import jax
 import jax.numpy as jnp
@@ -51,11 +51,11 @@ class VisionBlock(nnx.Module):
 
 
 class SigLIP(nnx.Module):
-    """Encodes images as language tokens.
+    """Encodes images as tokens for the language model.
 
     The patch embedding is a dense layer over flattened patches, equivalent to the usual strided
-    convolution. The head merges each `shuffle` x `shuffle` square of tokens into one (pixel
-    shuffle).
+    convolution. The head turns each `shuffle` x `shuffle` square of tokens into one token
+    (pixel shuffle).
     """
 
     def __init__(self, config: BackboneConfig, *, head_bias: bool = True, rngs: nnx.Rngs) -> None:
@@ -83,7 +83,7 @@ class SigLIP(nnx.Module):
             present: `[B]` bool, False for a missing camera's placeholder.
 
         Returns:
-            `[B, T, D]` tokens of the language model's width, and the adapters' aux.
+            Tokens `[B, T, D]`, with the language model's width D, and the adapters' aux.
         """
         mask = jnp.broadcast_to(present[:, None], (images.shape[0], self.config.patches))
         aux: LayerAux = {}
@@ -108,7 +108,7 @@ class SigLIP(nnx.Module):
 def patches(images: jax.Array, size: int) -> jax.Array:
     """Split images `[B, H, W, C]` into patches `[B, T, C size^2]`.
 
-    Patches are in row-major order, each flattened as (y, x, c).
+    The patches are in row-major order, and each patch is flattened in the order (y, x, channel).
     """
     batch, height, width, channels = images.shape
     grid = images.reshape(batch, height // size, size, width // size, size, channels)
