@@ -1,8 +1,8 @@
 """Report errors of a command in one sentence; only bugs show a traceback.
 
 Bad input raises ValueError everywhere in the project. Inaccessible files and exhausted memory are
-not bugs, either. If the reader of the output has closed the pipe, nothing is
-reported.
+not bugs, either. If the reader of the output has closed the pipe, nothing
+is reported.
 """
 
 import argparse

@@ -48,7 +48,7 @@ def _print(line: str) -> None:
 
 
 class Calls:
-    """Announce compilation by an object's methods: in the first call of each kind."""
+    """Announce the calls to an object that trigger compilation: the first of each kind."""
 
     def __init__(self, name: str) -> None:
         """Set the object's name in messages."""
@@ -56,7 +56,7 @@ class Calls:
         self._called: set[tuple[Any, ...]] = set()
 
     def first(self, *call: Any) -> AbstractContextManager[None]:
-        """Announce a call that compiles; `call` is its name and all that requires recompilation."""
+        """Announce a call if it compiles; `call` is its name and what else causes compilation."""
         if call in self._called or not _compat.is_untraced():
             return contextlib.nullcontext()
         self._called.add(call)

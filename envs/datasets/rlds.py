@@ -68,7 +68,7 @@ def write(episodes: Episodes, path: str | os.PathLike[str]) -> None:
 
 
 class ShardWriter:
-    """Write a dataset shard by shard, after those already in its folder.
+    """Write a dataset shard by shard, resuming after the complete shards in its folder.
 
     The metadata file lists the complete shards and is replaced atomically after each one, so the
     process may be killed at any time: an incomplete shard is ignored.

@@ -119,7 +119,7 @@ def stored(folder: Path) -> tfds.features.FeaturesDict:
 
 
 def check_description(folder: Path, *names: str) -> None:
-    """Raise unless files are safe for tfds, which imports classes and expands templates they name.
+    """Raise unless files are safe for tfds, which imports classes and expands templates in them.
 
     Raises:
         RefusedError: a file names a class, data type or encoding that `features` does not use, or

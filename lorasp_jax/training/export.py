@@ -83,7 +83,7 @@ def load_policy(
         folder: folder of the run.
         base: location of the frozen base (see `models.load`); default: the recorded one.
         words: location of the tokenizer; default: the recorded one.
-        any_base: accept a base with other weights than the one in training (see `load_adapters`).
+        any_base: accept a base whose weights differ from the original's (see `load_adapters`).
 
     Returns:
         The policy; `Policy.sample` takes indices into `processor.prompts.instructions`.

@@ -26,7 +26,7 @@ WINDOW = 100
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Guard:
-    """Statistics of the steps so far, part of the state so that a resumed run skips the same steps.
+    """Statistics of past steps, saved in the state so that resumed runs skip the same steps.
 
     Attributes:
         counted: `[]` int32, number of accepted steps.

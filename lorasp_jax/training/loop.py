@@ -144,7 +144,7 @@ def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) ->
         batch = jax.lax.with_sharding_constraint(batch, meshes.batch_sharding(mesh))
         return step(state, frozen, batch, loss_key)
 
-    # Keep the state's sharding: the next call, already compiled, accepts no other.
+    # Keep the state's sharding, because the compiled program accepts no other as its input.
     @functools.partial(
         jax.jit,
         static_argnames="count",

@@ -301,7 +301,7 @@ def _fields(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 def _concrete(config: Config) -> type[Config]:
     """Return a `Config` class whose `peft` has the chosen method's type, to expose its fields.
 
-    `scale` is hidden from tyro, because it only selects defaults.
+    `scale` is not an option here, because it only selects defaults.
     """
     return dataclasses.make_dataclass(
         "Config",

@@ -32,9 +32,9 @@ class Run:
         streams: whether batches are read from disk because the dataset does not fit on the device.
         devices: devices to train on; None: all.
         simulated: whether the tasks can be evaluated in simulation.
-        policy: the current policy, valid inside callbacks; elsewhere, training donates its buffers.
+        policy: the current policy, valid in callbacks and after training; steps donate its buffers.
         started: `time.perf_counter()` when this process started.
-        seconds: time per phase, and "total", including earlier processes that this one resumes [s].
+        seconds: time per phase, and "total" [s], including the earlier processes of a resumed run.
     """
 
     config: Config

@@ -32,7 +32,7 @@ from lorasp_jax.training.distributed import processes
 CONFIG_FILE, TIMES_FILE, DATASET_FILE = "config.json", "seconds.json", "dataset.json"
 """Files that a run may leave behind if it fails before producing any results."""
 WILDCARDS = frozenset("*?[\\")
-"""Orbax cannot find checkpoints under a path with one of these: it takes paths for patterns."""
+"""Orbax cannot find checkpoints under a path with one of these, because it uses glob patterns."""
 STOPPED = "stopped.json"
 """File with the reason why training stopped; removed when training continues."""
 

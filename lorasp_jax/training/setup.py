@@ -160,7 +160,7 @@ def prepare(
             _load_dataset(run, built.source, built.free_bytes)
         else:
             run.episodes = _collect(run, built.prompts.instructions, collect)
-    run.streams = processes.any_process(run.streams)  # in all or none: they share batches
+    run.streams = processes.any_process(run.streams)  # in all or in none, since they share batches
     relative = config.model.relative_actions
     inputs = processor([*run.episodes.values()], model.config, built.prompts, relative=relative)
     if config.peft.needs_statistics:

@@ -57,7 +57,7 @@ def init_state(
 def active_ranks(aux: dict[str, dict[str, Aux]]) -> Metrics:
     """Return active ranks averaged over valid tokens.
 
-    There is a scalar per tower, and an array `[L]` over the L stacked layers per linear layer.
+    Each tower has a scalar and, per kind of linear layer, an array `[L]` over its L layers.
     """
     metrics: Metrics = {}
     for tower, linears in aux.items():

@@ -2,8 +2,8 @@
 
 JAX's own service prints nothing while processes are missing, lets processes have different options,
 and notices a dead process only after 100 s. So all processes meet here first; then JAX's service
-takes over the address. The connections stay open, so that one that closes shows at once
-that a process died.
+takes over the address. The connections stay open: one that closes without notice shows at
+once that a process died.
 
 Messages are lines of JSON. A process sends the left column, the server the right one:
 
