@@ -94,8 +94,8 @@ def save(folder: Path, model: Any, layout: str, dtypes: Mapping[str, Any] | None
         dtypes: dtype of each saved leaf, from `stored_dtypes`; None keeps the model's dtypes.
 
     Raises:
-        ValueError: the layout is unknown, the model has adapters, quantized kernels or shapes that
-            do not match its config, or the folder is a URL or already contains a checkpoint.
+        ValueError: the layout is unknown, the model has adapters or quantized kernels or does not
+            match its config, or the folder is a URL or already contains a checkpoint.
     """
     check_local(folder)
     published_names = _published_names(model.config)

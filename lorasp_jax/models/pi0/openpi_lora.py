@@ -5,10 +5,10 @@ W is a kernel; A and B are its `lora_a` and `lora_b`. N heads, numbered n or m, 
 is the width, r the rank of a pair (A, B), and s = alpha / r or alpha / √r:
 
     q_einsum, kv_einsum    [N, D, H]    ΔW[n] = s A[n] B[n], one pair for each head
-    attn_vec_einsum        [N, H, D]    ΔW[n] = s A[n] Σ_m B[m]: one sum for all heads
+    attn_vec_einsum        [N, H, D]    ΔW[n] = s A[n] Σ_m B[m], the same sum over m for every n
     gating_einsum, linear               ΔW = A B, independent of alpha; no heads
 
-The first row becomes a LoRA of rank N r with a block-diagonal B, the others become LoRAs of rank r.
+The first row becomes a LoRA of rank N r with a block-diagonal B; the others become LoRAs of rank r.
 All conversions are exact. Further training also updates the zeros of B outside its diagonal blocks.
 """
 

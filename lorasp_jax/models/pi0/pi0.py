@@ -215,7 +215,7 @@ class Pi05(Pi0):
     make_expert = AdaptiveExpert
 
     def _make_projections(self, state_width: int, rngs: nnx.Rngs) -> None:
-        """Create the layers that embed noisy actions and flow time and predict velocities."""
+        """Create the layers that embed noisy actions and flow time, and predict velocities."""
         del state_width
         width, dim = self.config.action.width, self.config.action_dim
         options: Any = {"dtype": jnp.float32, "param_dtype": self.config.param_dtype, "rngs": rngs}

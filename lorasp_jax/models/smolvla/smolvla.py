@@ -1,4 +1,4 @@
-"""SmolVLA (Shukor et al., arXiv 2506.01844): a small vision-language model with flow matching.
+"""SmolVLA (Shukor et al., arXiv 2506.01844): a small VLM with flow matching on actions.
 
 Tokens form blocks: [images, instruction], [state], and one block per noisy action. Each block
 attends to itself and to earlier blocks. Images, instruction and state are the prefix, processed by

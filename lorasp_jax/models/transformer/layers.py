@@ -50,7 +50,7 @@ class RMSNorm(nnx.Module):
     def normalize(
         self, x: jax.Array, condition: jax.Array | None
     ) -> tuple[jax.Array, int, LayerAux]:
-        """Like `AdaptiveRMSNorm.normalize`, but unconditional: the gate is 1, the aux empty."""
+        """Like `AdaptiveRMSNorm.normalize`, but unconditional: gate 1 and no aux."""
         del condition
         return self(x), 1, {}
 
@@ -156,7 +156,7 @@ def merge_action_aux(aux: ModelAux, action: LayerAux) -> ModelAux:
 
 
 def positions(valid: jax.Array) -> jax.Array:
-    """Number the valid tokens from 0, `[B, T]` int32; padding repeats the previous one."""
+    """Number the valid tokens from 0, `[B, T]` int32; padding repeats the previous number."""
     return jnp.cumsum(valid, axis=-1, dtype=jnp.int32) - 1
 
 
