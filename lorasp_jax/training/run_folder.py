@@ -148,7 +148,7 @@ def record_dataset(folder: Path, facts: Mapping[str, Any], *, streams: bool) -> 
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock: a file beside the folder, in which each holder writes its name."""
+    """Hold the folder's lock: a file beside the folder, in which each holder identifies itself."""
     file = folder.parent / f".{folder.name}.lock"
     try:
         lock = acquire(file)

@@ -184,7 +184,7 @@ def abstract_batch(config: BackboneConfig, size: int) -> Batch:
 
 
 def available_bytes() -> float:
-    """Return JAX's memory limit on the first device; on CPU, host memory per device."""
+    """Return JAX's memory limit on the first device, or host memory per device if none is set."""
     stats = jax.local_devices()[0].memory_stats()
     if stats and "bytes_limit" in stats:
         return float(stats["bytes_limit"])
