@@ -63,7 +63,7 @@ def run_config(method: peft.Method, targets: tuple[str, ...], batch: int) -> Con
 
 
 def arrays(config: BackboneConfig, run: Config | None) -> tuple[Any, Any, Any]:
-    """Initialize graph, adapters and frozen arrays on the device; no adapters without a run."""
+    """Return the graph, and adapters (none without a run) and frozen arrays on the device."""
 
     def model(key: jax.Array) -> Backbone:
         return preflight.adapted_model(run, config, key) if run else config.create(nnx.Rngs(key))
@@ -154,7 +154,7 @@ def training(name: str, label: str, run: Config, options: argparse.Namespace, re
 
 
 def largest(name: str, run: Config, options: argparse.Namespace) -> int:
-    """Extrapolate the largest batch expected to fit in `options.gib` from two batch sizes."""
+    """Extrapolate, from two batch sizes, the largest one expected to fit in `options.gib` GiB."""
     config = sized(name, options, "full")
 
     def bytes_of(batch: int) -> float:

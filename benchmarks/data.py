@@ -182,7 +182,7 @@ def decode(folder: Path, codec: str) -> dict[str, Any]:
 
 
 def statistics(steps: int) -> dict[str, Any]:
-    """Time the normalization statistics of `steps` steps."""
+    """Time the measurement of normalization statistics over `steps` steps."""
     rows = np.random.default_rng(0).standard_normal((steps, 7), np.float32)
     valid = np.ones(steps, bool)
     call = lambda: Statistics.measure(rows, rows, valid, slots=range(7), dim=7)  # noqa: E731

@@ -1,12 +1,12 @@
-"""Latency of LoRA-SP layers for one token: full bank compared with gathered active directions.
+"""Latency of LoRA-SP layers for one token: the full bank compared with gathered active directions.
 
     python -m benchmarks.decoding --json decoding.json
     python -m benchmarks.decoding --dtype float32 --shapes 1024x1024 --ranks 128 512   # on a CPU
 
 Several layers with separate arrays run in one program, so that neither launch overhead nor cache
-hits dominate. Capacities are fractions of R. The initial router keeps about 0.9 R, so the gather
-drops directions beyond its capacity, which does not affect the time. "gain" is dense time divided
-by gathered time.
+hits dominate. Capacities are fractions of the rank R. The initial router keeps about 0.9 R, so the
+gather drops directions beyond its capacity, which does not affect the time. "gain" is dense time
+divided by gathered time.
 """
 
 import argparse

@@ -2,11 +2,11 @@
 
     python -m benchmarks.envs --batches 256 1024 4096 --json envs.json
 
-For each task, backend and batch size: compile time (`--jobs` programs at once), physics steps/s,
-control steps/s without and with rendering both cameras ("control+images/s"), images/s of the ray
-caster alone (hard shadows, two cameras), memory, and the speed relative to MuJoCo's C engine on the
-same scene with one thread per core ("over C"). Actions are noise around the start pose. Inputs are
-created under jit; times are the best of three calls after two warm-ups.
+The columns, for each task, backend and batch size, are compile time (`--jobs` programs at once),
+physics steps/s, control steps/s without and with rendering both cameras ("control+images/s"),
+images/s of the ray caster alone (hard shadows, two cameras), memory, and the speed relative to
+MuJoCo's C engine on the same scene with one thread per core ("over C"). Actions are noise around
+the start pose. Inputs are created under jit; times are the best of three calls after two warm-ups.
 """
 
 import argparse
@@ -127,7 +127,7 @@ def mujoco_c(env: Env, state: State) -> float:
 
 
 def playground(backend: Any, batch: Any) -> tuple[Callable[[], Any], int]:
-    """Compile MuJoCo Playground's environment, with enough memory for each world's contacts.
+    """Compile MuJoCo Playground's `PLAYGROUND`, with enough memory for each world's contacts.
 
     Returns:
         A compiled call, and its number of physics steps over all worlds.

@@ -59,13 +59,13 @@ class Report:
 
 
 def passed(parts: list[Report]) -> bool:
-    """Return whether no world broke and no memory grew after the first part."""
+    """Return whether no world broke and no memory grew beyond `MAX_GROWTH`."""
     first, last = parts[0].memory, parts[-1].memory
     return not parts[-1].broken and all(last[k] <= MAX_GROWTH * first[k] for k in first)
 
 
 def run(env: Env, episodes: int) -> Iterator[Report]:
-    """Run consecutive expert episodes in all worlds, rendering at the end of each."""
+    """Run consecutive expert episodes in all worlds, rendering at the end of each episode."""
     ranges = Randomization.typical()
 
     @jax.jit
@@ -93,7 +93,7 @@ def run(env: Env, episodes: int) -> Iterator[Report]:
 
 
 def memory(env: Env) -> dict[str, float]:
-    """Return the memory in use by allocator [MiB]."""
+    """Return the memory in use [MiB], by allocator."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     used: dict[str, float] = {"host": pages * 4096 / 2**20}
     if stats := jax.devices()[0].memory_stats():  # None on CPU

@@ -4,8 +4,8 @@ The paper does not say how it counts. These rules reproduce its percentages to t
 
 - Every linear layer of the PyTorch models has an adapter (422 in pi0, 303 in SmolVLA), including
   the unused lm_heads. The patch embedding is a convolution there and has no adapter.
-- The totals are 3,501,372,176 for pi0, including its expert's lm_head, which openpi's checkpoints
-  do not contain, and 450,046,176 for SmolVLA. "Trainable/Total" is
+- The totals are 3,501,372,176 for pi0, including the action expert's lm_head, which openpi's
+  checkpoints do not contain, and 450,046,176 for SmolVLA. "Trainable/Total" is
   adapters / (total + adapters).
 - LoRA-MoE has 4 experts of rank 32. AdaLoRA starts at rank 128 and has a diagonal that LoRA lacks.
 - LoRA-SP is `LoRASP.paper()`, with a router of width 4, the only constant width that fits both
@@ -93,7 +93,7 @@ def linear_layers(config: BackboneConfig) -> tuple[Shapes, int]:
         if location.path != "vision/patch_embed"
     }
     shapes["language/lm_head"] = (config.language.width, config.vocabulary)
-    if isinstance(config, Pi0Config):  # the expert's lm_head, unlike the first, is not tied
+    if isinstance(config, Pi0Config):  # the action expert's lm_head is not tied
         shapes["action/lm_head"] = (config.action.width, config.vocabulary)
         total += config.action.width * config.vocabulary
     return shapes, total

@@ -3,13 +3,13 @@
     python -m benchmarks.peft --json peft.json
     python -m benchmarks.peft --tokens 1024 --shapes 256x2048 2048x256 --dtype float32   # on a CPU
 
-For each shape [I, O]: the frozen layer alone ("bare"), LoRA as usually written (`usual_lora`,
-autodiff of x W + scale (x A) B), and this project's methods at rank R, with their losses. Gradients
-are with respect to the input and the adapter, as in training. Ratios are relative to the usual LoRA
-in the same run. Memory is that of the compiled program without its arguments. Two more tables
-compare separate and grouped calls of layers that share an input ("I:O,O,O"), and the energy gate
-with a copy of its scores. Inputs are created under jit, everything is warmed up twice, and ten
-calls are queued at once (for the gate, one call with 20 gates).
+The layers, for each shape [I, O], are the frozen layer alone ("bare"), LoRA as usually written
+(`usual_lora`, autodiff of x W + scale (x A) B), and this project's methods at rank R, with their
+losses. Gradients are with respect to the input and the adapter, as in training. Ratios are relative
+to the usual LoRA in the same run. Memory is that of the compiled program without its arguments. Two
+more tables compare separate and grouped calls of layers that share an input ("I:O,O,O"), and the
+energy gate with a copy of its scores. Inputs are created under jit, everything is warmed up twice,
+and ten calls are queued at once (for the gate, one call with 20 gates).
 """
 
 import argparse
@@ -29,10 +29,11 @@ from lorasp_jax.kernels.energy_gate import energy_gate
 from lorasp_jax.peft._shared_input import apply_shared_input
 
 SHAPES = ((2048, 16384), (16384, 2048), (2048, 2048), (1152, 4304))
-# Query, key and value of pi0's language model and vision tower; gate and up of a smaller MLP.
+# Query, key and value projections of pi0's language model and vision tower; gate and up projections
+# of a smaller MLP.
 SHARED_INPUT = ((2048, (2048, 256, 256)), (1152, (1152, 1152, 1152)), (1024, (4096, 4096)))
 QUEUED = 10
-COPIES = 20  # gates per program: a single one is dominated by its launch
+COPIES = 20  # gates per program: the launch dominates the time of a single gate
 LOSS_WEIGHT = 1e-2
 
 Layer = Callable[[Any, jax.Array, Any], tuple[Any, Any]]
@@ -51,7 +52,7 @@ def usual_lora(params: Any, x: jax.Array, kernel: jax.Array) -> tuple[jax.Array,
 
 
 def layers(rank: int) -> Iterator[tuple[str, Layer, Any]]:
-    """Yield name, function and the method that creates its parameters."""
+    """Yield each layer's name, its function and the method that creates its parameters."""
     yield "bare", bare, peft.LoRA(rank=1)
     yield "usual LoRA", usual_lora, peft.LoRA(rank=rank)
     for name in peft.names():

@@ -4,9 +4,9 @@
     python -m benchmarks.scaling --devices 1 2 --sizes nano --batch 4 --rank 8 --dtype float32
 
 The batch per device ("batch") is constant. "data" replicates all weights on each device; "fsdp"
-shards base, adapters and optimizer state over the devices and gathers each layer's weights when
-needed. "efficiency" is the rate divided by the number of devices and by the rate of one device;
-GiB is the memory of the program on each device.
+shards base weights, adapters and optimizer state over the devices and gathers each layer's weights
+when needed. "efficiency" is the rate divided by the number of devices and by the rate of one
+device; GiB is the memory of the program on each device.
 """
 
 import argparse

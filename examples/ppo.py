@@ -64,7 +64,7 @@ class Batch(NamedTuple):
     action: jax.Array
     log_prob: jax.Array
     value: jax.Array
-    error: jax.Array
+    error: jax.Array  # of temporal differences
     done: jax.Array
     success: jax.Array
 
@@ -86,7 +86,7 @@ def apply(layers: list[tuple[jax.Array, jax.Array]], x: jax.Array) -> jax.Array:
 
 
 def observe(env: envs.Env, moments: dict[str, jax.Array], state: envs.State) -> jax.Array:
-    """Return the full state [W, D], normalized by its running mean and variance."""
+    """Return the full state [W, D], normalized by running mean and variance and clipped."""
     return jnp.clip(
         (env.full_state(state) - moments["mean"]) / jnp.sqrt(moments["variance"] + 1e-6), -5.0, 5.0
     )
@@ -138,7 +138,7 @@ def advantages(config: Config, batch: Batch) -> jax.Array:
 
 
 def loss(params: Any, config: Config, batch: Batch, advantage: jax.Array) -> jax.Array:
-    """Compute PPO's clipped objective plus the critic's squared error."""
+    """Compute the loss: the critic's squared error minus PPO's clipped objective."""
     ratio = jnp.exp(log_prob(params, batch.x, batch.action) - batch.log_prob)
     scaled = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-6)
     clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
@@ -207,7 +207,7 @@ def init(env: envs.Env, config: Config, key: jax.Array) -> Learner:
 def evaluate(
     env: envs.Env, params: Any, moments: dict[str, jax.Array], key: jax.Array
 ) -> jax.Array:
-    """Return whether the noise-free policy solves each of W unseen layouts, bool [W]."""
+    """Return whether the policy without noise solves each of W unseen layouts, bool [W]."""
 
     def body(state: envs.State, _: None) -> tuple[envs.State, None]:
         return act(env, state, apply(params["actor"], observe(env, moments, state))), None

@@ -1,9 +1,9 @@
-"""Forward kinematics of a MuJoCo model, which compiles in a sixth of the time of MJX's own.
+"""Forward kinematics of a MuJoCo model; it compiles in a sixth of the time of MJX's own.
 
 MJX walks down the body tree and unrolls every level, which made up half of a step's compiled code.
-Here all frames, one per body and one per joint, are handled at once by pointer jumping: each starts
-with its pose in its parent, which becomes its pose in the frame two levels up, then four, then
-eight. After log2(depth) rounds of the same few operations it is the pose in the world.
+Here all frames, one per body and one per joint, are handled at once by pointer jumping: a frame
+starts with its pose in its parent, then gets its pose in the frame two levels up, then four, then
+eight. After log2(depth) rounds of the same few operations all poses are in the world frame.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ class Kinematics:
     def __init__(self, model: mujoco.MjModel) -> None:
         """Precompute the tree of frames."""
         self._joints = model.nbody + np.arange(model.njnt)  # joint frames follow body frames
-        self._bodies = np.arange(model.nbody)  # each body's frame after all of its joints
+        self._bodies = np.arange(model.nbody)  # index of each body's frame after all its joints
         self._parents = np.zeros(model.nbody + model.njnt, int)
         for body in range(1, model.nbody):
             self._parents[body] = self._bodies[model.body_parentid[body]]
@@ -47,7 +47,7 @@ class Kinematics:
     def __call__(self, model: Any, data: Any) -> Any:
         """Return MJX's data with all poses computed from `qpos`.
 
-        `xanchor` of slide and free joints, which nothing reads, is the position after the motion.
+        `xanchor` of slide and free joints, which nothing reads, is the position after their motion.
         """
         qpos, quats, positions = self._local(model, data.qpos)
         frames = jnp.concatenate([_matrices(quats), positions[..., None]], axis=-1)

@@ -1,6 +1,6 @@
 """Simulate physics with MJX in JAX or with MuJoCo Warp, behind one small class.
 
-Worlds are batched by `jax.vmap`. Between steps a world's data is the same for both engines.
+Worlds are batched by `jax.vmap`. Between steps, both engines describe a world by the same `Data`.
 """
 
 import contextlib
@@ -26,12 +26,12 @@ BACKENDS: tuple[str, ...] = get_args(Backend)
 """jax runs everywhere; warp is much faster on NVIDIA GPUs, and runs on CPU, slowly, for tests."""
 
 MAX_GROWTH = 1.25
-"""Maximum factor on a geom's size in a world; our choice; Warp's bounding volumes grow by it."""
+"""Maximum factor on a geom's size in a world, our choice; Warp's bounding volumes grow by it."""
 
 
 @functools.cache
 def _mjx() -> Any:
-    """Import MJX when the first environment is made: it takes seconds, too long for `--help`."""
+    """Import MJX when the first environment is made: the import would delay `--help` by seconds."""
     if importlib.util.find_spec("warp"):
         import warp
 
@@ -69,7 +69,7 @@ def default_backend() -> str:
 class Physics:
     """Simulator of one MuJoCo model; methods are pure and take one world each.
 
-    Poses always come from MJX-JAX: this is cheap, and `reset` returns the same on every engine.
+    Poses are always computed in JAX: this is cheap, and `reset` returns the same with any engine.
     """
 
     def __init__(self, model: mujoco.MjModel, backend: str) -> None:
@@ -105,7 +105,7 @@ class Physics:
 
         Args:
             changes: fields of the model that differ in this world.
-            data: its current data.
+            data: current data of this world.
             controls: `[S, nu]` actuator targets, one row per physics step.
 
         Returns:
@@ -127,7 +127,7 @@ class Physics:
             return jax.lax.scan(body, [getattr(start, name) for name in MOVING], controls)[0]
 
     def _step(self, model: Any, data: Any) -> Any:
-        """Run `mjx.step` reduced to our scenes, which have no tendons, sensors or mocap bodies."""
+        """Run `mjx.step` without tendons, sensors and mocap bodies, which our scenes lack."""
         mjx = _mjx()
         data = mjx.com_pos(model, self._kinematics(model, data))
         data = mjx.factor_m(model, mjx.crb(model, data))

@@ -1,8 +1,8 @@
 """Call MuJoCo Warp inside jit, on NVIDIA GPUs.
 
 MJX can call MuJoCo Warp too, but once per physics step, passing some 350 arrays through Python each
-time: this takes 2 ms (measured) for 0.6 ms of work in 4,096 worlds. Here all physics steps between
-two actions are one call with a dozen arrays, and one CUDA graph.
+time: this takes 2 ms (measured), while a step of 4,096 worlds takes 0.6 ms. Here all physics steps
+between two actions are one call with a dozen arrays, and one CUDA graph.
 """
 
 import copy
@@ -19,16 +19,16 @@ from envs.physics import warp_call
 from envs.state import MOVING, Changes, Data
 
 # Warp computes the geom poses of fixed bodies once, for the model that all worlds share, so each
-# world passes its own.
+# world passes its own poses.
 _FIXED = ("geom_xpos", "geom_xmat")
 
 
 class WarpSteps:
     """Simulator of batches of worlds with one MuJoCo model.
 
-    Device memory for each number of worlds is allocated when its first call is traced, and never
-    freed. Not thread-safe: operations that one thread traces while another captures a graph would
-    become part of that graph.
+    Device memory for each number of worlds is allocated when the first call with that number is
+    traced, and is never freed. Not thread-safe: operations that one thread traces while another
+    captures a graph would become part of that graph.
     """
 
     def __init__(self, model: mujoco.MjModel, *, contacts: int, rows: int, growth: float) -> None:

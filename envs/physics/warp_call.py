@@ -1,4 +1,4 @@
-"""Call functions of Warp arrays from JAX."""
+"""Call, from JAX, functions that take Warp arrays."""
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
@@ -17,12 +17,13 @@ def device() -> Any:
 def from_jax(function: Callable[..., None], like: Mapping[str, Any], **options: Any) -> Any:
     """Make a function of Warp arrays callable under jit.
 
-    On a GPU its first call is captured as a CUDA graph, so memory that outlives a call must be
-    allocated beforehand; Warp copies arguments and results to and from the graph's buffers.
+    On a GPU the first call of `function` is captured as a CUDA graph, so memory that outlives a
+    call must be allocated beforehand; Warp copies arguments and results to and from the graph's
+    buffers.
 
     Args:
         function: takes arrays as positional arguments, the outputs last.
-        like: an example Warp array for each argument, by name, which sets its type.
+        like: an example Warp array for each argument, by name, to set the argument's type.
         **options: passed to `warp.jax_callable`.
     """
     kinds = {name: wp.array(dtype=x.dtype, ndim=x.ndim) for name, x in like.items()}
@@ -40,7 +41,7 @@ def from_jax(function: Callable[..., None], like: Mapping[str, Any], **options: 
 
 
 def flattening_vmap(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Make `vmap` fold its axis into the leading axis of worlds of all arrays."""
+    """Make `vmap` fold the mapped axis into the leading axis of all arrays, that of worlds."""
 
     @jax.custom_batching.custom_vmap
     def run(*arguments: Any) -> Any:

@@ -1,1 +1,1 @@
-"""Render images of the worlds by ray casting."""
+"""Render images of the worlds, with a ray caster in JAX or with MuJoCo Warp."""

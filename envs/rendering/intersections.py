@@ -28,7 +28,7 @@ _TINY = 1e-12  # stands in for a zero direction component or squared length in a
 class Geom(NamedTuple):
     """A geom and a camera, in the geom's unit frame.
 
-    Components are scalars, or arrays `[P]` with the geom of each pixel.
+    Components are scalars, or arrays `[P]` with the values of each pixel's geom.
     """
 
     axes: Matrix  # rows of the matrix whose columns are the camera's axes
@@ -139,8 +139,8 @@ def nearest(
         y: `[P]` upward slope.
 
     Returns:
-        Its index `[P]` (int32, 0 for no hit) and depth `[P]` (+inf for no hit), rounded down so
-        that its lowest bits can hold the index.
+        Index `[P]` of that geom (int32, 0 for no hit) and depth `[P]` (+inf for no hit), rounded
+        down so that its lowest bits can hold the index.
     """
     low = (1 << len(kinds).bit_length()) - 1
 

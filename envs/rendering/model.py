@@ -11,15 +11,15 @@ import numpy as np
 
 from envs.rendering.intersections import BOX, CAPSULE, CYLINDER, PLANE, SPHERE
 
-# Defaults where a model does not specify them, chosen by eye. Shares of light, sky color at
-# the horizon and at the zenith, edge [m] and contrast of the checker on planes.
+# Defaults, chosen by eye, for what a model does not specify: shares of light, sky color at the
+# horizon and at the zenith, edge [m] and contrast of the checker on planes.
 AMBIENT, HEADLIGHT, DIFFUSE = 0.35, 0.25, 0.5
 SKY = ((0.80, 0.84, 0.88), (0.45, 0.58, 0.75))
 SQUARE, CONTRAST = 0.1, 0.12
 
 STAND_IN_GROUP = 5  # geom group of primitives that are drawn in place of meshes
-_INFINITE = 1e4  # [m] half-extent of a plane of size 0, MuJoCo's "infinite"; beyond any camera
-# MuJoCo geom type -> kind, and the entries of its size that are half-extents along x, y, z.
+_INFINITE = 1e4  # [m] half-extent of a plane of size 0, MuJoCo's "infinite"; beyond any view
+# MuJoCo geom type -> kind, and the entries of a geom's size that are its half-extents in x, y, z.
 _SHAPES = {
     int(mujoco.mjtGeom.mjGEOM_PLANE): (PLANE, (0, 1, 2)),
     int(mujoco.mjtGeom.mjGEOM_SPHERE): (SPHERE, (0, 0, 0)),
@@ -69,10 +69,10 @@ class RenderModel:
     Attributes:
         appearance: the model's own colors, light and fields of view.
         size: `[G, 3]` size of each geom of the MuJoCo model [m].
-        geoms: V ids of the visible geoms in the MuJoCo model.
-        kinds: V kinds of `intersections`, ascending.
-        sides: V triples: the entries of a geom's size that are half-extents along x, y, z.
-        cameras: K ids of the cameras in the MuJoCo model.
+        geoms: ids of the V visible geoms in the MuJoCo model.
+        kinds: kinds of these geoms, as in `intersections`, ascending.
+        sides: for each of these geoms, the entries of its size that are half-extents in x, y, z.
+        cameras: ids of the K cameras in the MuJoCo model.
     """
 
     appearance: Appearance
@@ -89,7 +89,7 @@ def build(mj_model: mujoco.MjModel, camera_names: Sequence[str]) -> RenderModel:
     Meshes are left out if the model has primitives in `STAND_IN_GROUP` to draw in their place.
 
     Raises:
-        ValueError: if a camera does not exist, a visible geom is not a primitive, or no geom is
+        ValueError: a camera does not exist, a visible geom is not a primitive, or no geom is
             visible.
     """
     cameras = {mj_model.camera(i).name: i for i in range(mj_model.ncam)}

@@ -5,11 +5,11 @@ Geoms are sorted by kind when the model is built. Rendering an image takes three
 1. For each kind, loop over its geoms: how far along every pixel's ray is the geom? Depth and geom
    index share one int32 (the bits of a positive float sort like an integer; the lowest few hold the
    index), so the loop carries a single array and XLA compiles each iteration to one vectorized
-   kernel. On two CPU cores a [geoms, pixels] table with argmin was 3 to 5 times slower.
+   kernel. On two CPU cores, a [geoms, pixels] table with argmin was 3 to 5 times slower.
 2. Gather pose, size and color of the nearest geom per pixel, and compute one normal.
 3. Loop once more for hard shadows: does another geom block the way to the light?
 
-`samples` > 1 takes several rays per pixel for smooth edges; all steps run once for each. Light,
+`samples` > 1 casts several rays per pixel for smooth edges; all steps run once per ray. Light,
 colors and fields of view (`Appearance`) and geom sizes are traced, so they can differ between
 worlds. Cameras follow MuJoCo (looking along -z, y up). Geoms that contain the camera are not drawn.
 """
@@ -61,7 +61,7 @@ def render(
         model: from `build`.
         poses: poses of all geoms and cameras of the MuJoCo model.
         height, width: image size [px].
-        samples: average n x n evenly spread rays per pixel, at n² times the cost.
+        samples: n, to average n x n evenly spread rays per pixel at n² times the cost.
         appearance: replaces the model's own.
         size: `[G, 3]` replaces the model's own `geom_size` [m].
     """

@@ -14,11 +14,14 @@ from envs.rendering.intersections import PLANE, Geoms, Matrix, Vec, along, dot, 
 
 
 class View(NamedTuple):
-    """One camera and its light; every leaf is a scalar. Shares and colors as in `Appearance`."""
+    """One camera and its light; every leaf is a scalar.
+
+    Shares and colors are as in `Appearance`.
+    """
 
     position: Vec
     rotation: Matrix
-    pixel: jax.Array  # half a pixel's edge, one meter away [m]
+    pixel: jax.Array  # half the edge of a pixel seen at one meter [m]
     ambient: jax.Array
     headlight: jax.Array
     diffuse: jax.Array

@@ -8,14 +8,14 @@ import av
 import numpy as np
 from PIL import Image
 
-_COLORS = 256  # the largest palette of a GIF
+_COLORS = 256  # colors in the largest palette that a GIF allows
 
 
 def write_video(path: Path, frames: np.ndarray, fps: float) -> None:
     """Write `[T, H, W, 3]` uint8 frames as H.264 in MP4 (yuv420p, which browsers play).
 
     Raises:
-        ValueError: if H or W is odd, which yuv420p does not allow.
+        ValueError: H or W is odd, which yuv420p does not allow.
     """
     height, width = frames.shape[1:3]
     if height % 2 or width % 2:

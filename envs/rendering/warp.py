@@ -1,6 +1,6 @@
 """Call MuJoCo Warp's batch renderer inside jit, on NVIDIA GPUs: fast, with meshes and textures.
 
-Its images resemble those of the ray caster: same light, same checker, same sky.
+Its images resemble those of the ray caster: they share light, checker and sky.
 """
 
 import copy
@@ -68,7 +68,7 @@ class WarpRenderer:
         Args:
             poses: poses of all geoms and cameras, leading axis N.
             appearance: appearance of each world, leading axis N; None for the model's own. Ambient,
-                headlight and diffuse must be the model's times a common factor; sky and checker
+                headlight and diffuse must equal the model's times a common factor; sky and checker
                 are always the model's.
             size: `[N, G, 3]` sizes of geoms; None for the model's own.
         """
@@ -107,7 +107,7 @@ class WarpRenderer:
             .at[:, 0]
             .set(light / jnp.linalg.norm(light, axis=-1, keepdims=True))
         )
-        # Lights are the same for all pixels of a call, so each camera has its own lamp.
+        # Lights are the same for all pixels of a call, so each camera gets its own lamp position.
         position = jnp.repeat(cam_xpos[:, self.model.cameras, None], self._mujoco.nlight, axis=2)
         per_world = (size, appearance.rgba, self._material_colors(appearance), appearance.fovy)
         lights = (direction, *jnp.moveaxis(position, 1, 0))
@@ -129,7 +129,7 @@ class WarpRenderer:
         return colors.at[:, self._mujoco.geom_matid[table]].set(appearance.rgba[:, table])
 
     def _callable(self) -> Any:
-        """Make the JAX callable of model and data fields and of one light position per camera."""
+        """Make the JAX callable that takes model and data fields and a lamp position per camera."""
         model, data = self._model, self._data
         fields = {name: model for name in _PER_WORLD} | {name: data for name in _POSES}
         like = {name: getattr(owner, name) for name, owner in fields.items()}

@@ -1,9 +1,9 @@
 """A robot arm's parameters, and its MJCF with primitive shapes.
 
 A robot's joint chain is defined once; its MuJoCo bodies and its analytic kinematics both derive
-from it and cannot disagree. All hands share one tool frame, `tcp`: z points out of the hand, y is
-the axis along which the fingers open, and the finger tips end `TIP_LENGTH` further along z. Tasks
-and experts therefore need not know the robot.
+from this chain and cannot disagree. All hands share one tool frame, `tcp`: z points out of the
+hand, y is the axis along which the fingers open, and the finger tips end `TIP_LENGTH` further along
+z. Tasks and experts therefore need not know the robot.
 """
 
 import dataclasses
@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 TIP_LENGTH = 0.012  # m from the tcp to the end of the finger tips on every hand; our choice
-TIP_RADIUS = 0.005  # m, sphere at each finger tip to touch tables, walls, buttons; our choice
+TIP_RADIUS = 0.005  # m, of the sphere with which a finger tip touches its surroundings; our choice
 
 # The wrist camera sits on the outer side of the hand and looks along it, tilted 22 degrees towards
 # the tips. Our choice: the tips are in the lower half of the image, the object above them.
@@ -35,7 +35,7 @@ class Body(Protocol):
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Robot:
-    """One arm with a two-finger gripper; J joints. Positions in m, angles in rad.
+    """One arm with J joints and a two-finger gripper. Positions are in m, angles in rad.
 
     Attributes:
         name: name of the robot's module, or path of a user's MJCF file.

@@ -21,7 +21,7 @@ _FRAMES = (
 )
 _CHAIN = np.stack([robots.translation(*p) @ robots.rotation("x", a) for p, a in _FRAMES])
 
-# Shapes and colors are our choices; masses [kg] are Menagerie's.
+# Shapes and colors are our choices, and masses [kg] are Menagerie's.
 _WHITE, _LIGHT = 'rgba=".93 .93 .93 1"', 'rgba=".70 .72 .75 1"'
 _DARK = 'rgba=".25 .25 .27 1"'
 _LINKS = (
@@ -48,11 +48,12 @@ ROBOT = robots.Robot(
     speed=np.array([2.175] * 4 + [2.61] * 3),  # Franka data sheet [rad/s]
     home=np.array([0.0, -0.354, 0.0, -2.897, 0.0, 2.543, 0.785]),
     lean=0.0,
-    tilt_side=-1,  # tilting outwards, joint 6 would reach its limit before 90 degrees
+    tilt_side=-1,  # if tilted outwards, joint 6 would reach its limit before 90 degrees
     stroke=0.08,  # two fingers of 0.04 m
     gripper_speed=0.1,  # Franka hand data sheet: 50 mm/s per finger
     body=robots.Primitives(
-        # Menagerie's, with its passive joint damping (40, then 2) added to kv: same effect.
+        # Menagerie's gains, with its passive joint damping (40, then 2) added to kv, which
+        # has the same effect.
         stiffness=np.array([1000.0, 1000.0, 750.0, 750.0, 300.0, 300.0, 300.0]),
         damping=np.array([60.0, 60.0, 44.0, 44.0, 4.0, 4.0, 4.0]),
         armature=0.1,

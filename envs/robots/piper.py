@@ -75,7 +75,7 @@ def to_sdk_zeros(q: jax.Array) -> jax.Array:
     return q - jax.numpy.asarray(_SDK_OFFSET, q.dtype)
 
 
-# Shapes and colors are our choices; masses [kg] are Menagerie's; link 6 with gripper weighs .45.
+# Shapes and colors are our choices; masses [kg] are Menagerie's. Link 6 and the hand weigh .45.
 _DARK, _GRAY = 'rgba=".13 .14 .16 1"', 'rgba=".30 .32 .35 1"'
 _LINKS = (
     f'<geom type="capsule" size=".042" fromto="0 0 -.035 0 0 .01" mass=".098" {_GRAY}/>',
@@ -97,7 +97,7 @@ ROBOT = robots.Robot(
     speed=np.full(6, 3.0),  # piper_sdk, [rad/s]
     home=np.array([0.0, 1.528, -1.248, 0.0, 1.029, 0.0]),
     lean=np.deg2rad(20.0),  # our choice
-    tilt_side=1,  # tilting inwards, joint 5 would soon reach its limit
+    tilt_side=1,  # if tilted inwards, joint 5 would soon reach its limit
     stroke=0.07,  # piper_sdk, GripperCtrl [m]
     gripper_speed=0.1,  # our choice, same as the Panda's [m/s]
     body=robots.Primitives(

@@ -66,7 +66,7 @@ class Randomization:
 
     @classmethod
     def typical(cls) -> Self:
-        """Return moderate ranges for small robots and their cameras; experts succeed with them."""
+        """Return moderate ranges for small robots and their cameras; the experts still succeed."""
         return cls(
             position=(-0.01, 0.01),
             turn=(-0.1, 0.1),
@@ -103,7 +103,7 @@ class Randomization:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Draw:
-    """Values drawn for one world, fields as in `Randomization`; N cameras, G geoms of the model.
+    """Values drawn for one world, with fields as in `Randomization`, N cameras and G geoms.
 
     Attributes:
         size, friction, brightness, latency: [].

@@ -12,7 +12,7 @@ from envs.rendering.model import AMBIENT, CONTRAST, DIFFUSE, HEADLIGHT, SKY, SQU
 from envs.robots import Robot
 
 CAMERAS = ("side", "wrist")
-PHYSICS_DT = 0.005  # s; our choice: the largest that is stable with solref .01 (at least 2 steps)
+PHYSICS_DT = 0.005  # s; our choice: the largest that is stable with solref .01 s (2 steps or more)
 
 # Solver settings are our choices from grasping experiments: with fewer than 2 iterations nothing is
 # grasped; elliptic cones take six times as long. Only spheres, boxes and the table plane collide.
@@ -52,8 +52,9 @@ _SCENE = """
   </equality>
 </mujoco>
 """
-# Make MuJoCo's other renderers resemble the ray caster. Their headlight shines along the camera's
-# axis; the lamp replaces it in renderers that can place a light at the camera, like the ray caster.
+# Make the images of MuJoCo's own renderers resemble the ray caster's. Their headlight shines along
+# the camera's axis; where a light can be placed at the camera, as in the ray caster, the lamp
+# replaces the headlight.
 _VISUALS = """
   <visual>
     <headlight ambient="{ambient} {ambient} {ambient}" specular="0 0 0"

@@ -1,6 +1,6 @@
 """Manipulation tasks: one module per task, found by the `TASK` that it defines.
 
-Shared module: `_task`, the class of tasks, and helpers.
+Shared module: `_task`, with the class of tasks and helpers for them.
 """
 
 from envs.tasks._task import (

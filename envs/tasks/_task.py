@@ -5,8 +5,8 @@ request (`instructions`), a solution as poses of the hand (`waypoints`) and the 
 (`stages`). It does not depend on the robot.
 
 Contact masks: each role has a bit of contype, 1 for carried objects, 2 for finger tips, 4 for
-surfaces that only finger pads hold, 8 for feet. A geom that may touch a role has its bit in
-conaffinity; no other pairs collide.
+surfaces that only finger pads hold, 8 for feet. A geom that may touch a role has that role's
+bit in conaffinity; no other pairs collide.
 """
 
 import dataclasses
@@ -75,7 +75,7 @@ class View:
         return jnp.linalg.norm((self.position(body) - self.position(other))[:2])
 
     def released(self, grip: jax.Array, width: float, away: float = 0.06) -> jax.Array:
-        """Return whether the hand has released an object: opened wider than it, or moved away.
+        """Return whether the hand has opened wider than an object that it held, or moved away.
 
         Args:
             grip: [3] point at which the object is held [m].
@@ -86,11 +86,11 @@ class View:
         return wider | (jnp.linalg.norm(grip - self.tcp) > away)
 
     def reaching(self, grip: jax.Array) -> jax.Array:
-        """Progress of a stage that ends with the tcp within 15 mm of grip [3]."""
+        """Progress of a stage that ends with the tcp within 15 mm of `grip` [3]."""
         return near(jnp.linalg.norm(grip - self.tcp), within=0.015)
 
     def grasping(self, grip: jax.Array, width: float) -> jax.Array:
-        """Progress of a stage that ends with the fingers closed around `width` [m] at grip [3]."""
+        """Progress of a stage that ends with fingers closed around `width` [m] at `grip` [3]."""
         gap = self.opening - width * self.size
         return gate(self.reaching(grip) >= 1, near(gap, within=0.005, scale=0.02))
 
@@ -122,8 +122,8 @@ class View:
 class Waypoints:
     """A sequence of P poses of the hand.
 
-    Each robot rotates them about the axis along which its fingers open: by `lean` times its own
-    lean (`Robot.lean`), and by `tilt` to the side that its wrist allows (`Robot.tilt_side`).
+    Each robot rotates these poses about the axis along which its fingers open: by `lean` times its
+    own lean (`Robot.lean`), and by `tilt` to the side that its wrist allows (`Robot.tilt_side`).
 
     Attributes:
         position: [P, 3] of a point on the hand's axis, `reach` behind the tcp [m].
@@ -177,7 +177,7 @@ class Task:
 
 
 def near(distance: jax.Array, within: float = 0.0, scale: float = 0.1) -> jax.Array:
-    """Progress of a stage that ends with a distance <= `within` [m]; decays as exp(-x / scale)."""
+    """Progress of a stage that ends with distance <= `within` [m]: exp(-excess / scale)."""
     return jnp.exp(-jnp.maximum(distance - within, 0.0) / scale)
 
 

@@ -28,7 +28,8 @@ _GRAPE, _GRAPE_RANGE = (0.36, -0.08), (0.06, 0.10)  # m, center and half range
 _BASKET, _BASKET_RANGE = (0.36, 0.155), (0.035, 0.035)  # m
 
 _BASKET_GEOM = 'conaffinity="3" rgba=".85 .65 .30 1"'
-# The free joint's damping stops a rolling grape within half a second: 1.4 m r² / damping.
+# The free joint's damping stops a rolling grape within half a second: the time constant,
+# 1.4 m r² / damping for mass m and radius r, is 0.38 s.
 _SCENE = f"""
 <body name="basket">
   {open_box(_INSIDE, _WALL, _HEIGHT, floor=_BASKET_GEOM, walls=_BASKET_GEOM)}

@@ -33,7 +33,7 @@ _GRIP = 0.033  # m, height at which the cup is grasped
 # The hand rotates about a point above the cup's mouth, from where the block falls straight down.
 _REACH = _HEIGHT - _GRIP + 0.03  # m from the grip
 _CUP, _CUP_RANGE = (0.33, -0.09), (0.03, 0.05)  # m, center and half range
-_INSIDE, _WALL, _BASKET_HEIGHT = 0.050, 0.003, 0.045  # m, basket, names as in pick_place
+_INSIDE, _WALL, _BASKET_HEIGHT = 0.050, 0.003, 0.045  # m, basket; named as in pick_place
 _BASKET, _BASKET_RANGE = (0.37, 0.12), (0.03, 0.03)  # m
 
 _BLUE, _BASKET_GEOM = 'rgba=".16 .38 .72 1"', 'conaffinity="1" rgba=".85 .65 .30 1"'
@@ -111,7 +111,7 @@ def _stages(view: View) -> dict[str, jax.Array]:
     over = jnp.maximum(carried, near(view.apart("block", "basket"), within=0.04))
     inside = view.inside("block", "basket", _INSIDE, _BASKET_HEIGHT)
     tilted = jnp.clip((1 - view.upright("cup")) / 2, 0.0, 0.9)
-    level = jnp.clip(view.upright("cup") / 0.9, 0.0, 1.0)  # it may lean while grasped
+    level = jnp.clip(view.upright("cup") / 0.9, 0.0, 1.0)  # the cup may lean while grasped
     standing = gate(inside, level * near(cup[2], within=0.009))
     return {
         "reach": view.reaching(grip),
