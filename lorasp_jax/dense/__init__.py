@@ -5,14 +5,14 @@
 
 As a drop-in, `layer(x)` returns `y` alone and stores its aux for `collect_aux`. With NNX this works
 wherever the module is mutable: eagerly, or inside a jitted function that takes the model as an
-argument or merges it itself,
+argument or rebuilds it with `nnx.merge`:
 
     def loss(adapters):
         model = nnx.merge(graphdef, adapters, frozen, copy=True)
         y = model(x)
         aux = lorasp_jax.collect_aux(model)
 
-A model captured in a closure by `jax.jit` also works, but stores no aux. Alternatively,
+A model that a jitted function captures in its closure also works, but stores no aux. Alternatively,
 `layer(x, return_aux=True)` returns aux as a second result and stores nothing.
 """
 

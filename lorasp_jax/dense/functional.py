@@ -94,7 +94,7 @@ def dense_shared_input(
 
 
 def _checked_matrix(layer: DenseLayer, x: jax.Array, token_mask: jax.Array | None) -> jax.Array:
-    """The layer's kernel as a matrix [I, O], after validating layer, input and mask."""
+    """Validate layer, input and mask; return the layer's kernel as a matrix [I, O]."""
     _validate.tokens(x, token_mask)
     validate.layer(layer, x.shape[-1])
     return layer.kernel.reshape(layer.kernel.shape[0], math.prod(layer.kernel.shape[1:]))
@@ -112,7 +112,8 @@ def cast_input(dtype: Dtype | None, x: Any, kernel: Any) -> jax.Array:
     """Cast x to the compute dtype; None promotes the dtypes of x and kernel.
 
     Raises:
-      ValueError: x is not an array, or the dtypes cannot be promoted, such as for 8-bit kernels.
+      ValueError: x is not an array, or the dtypes cannot be promoted, as with 8-bit floating-point
+        kernels.
     """
     try:
         return validate.array(x).astype(dtype or jnp.promote_types(x.dtype, kernel.dtype))

@@ -22,7 +22,7 @@ KERNEL_INIT = jax.nn.initializers.lecun_normal()  # same as nnx.Linear and nn.De
 
 
 class AdapterParam(nnx.LoRAParam[Any]):
-    """A trainable parameter: an adapter's, or a base weight. No other variables are trainable."""
+    """A parameter to train: an adapter's, or a base weight. No other variables are trained."""
 
 
 class AdapterAux(nnx.Intermediate[Any]):
@@ -53,8 +53,8 @@ class AdaptedLayer(nnx.Module):
       kernel_name: attribute name of the layer's kernel.
       adapter: `AdapterParam` holding the method's parameters, or None.
       method: the adapter's method, static.
-      stored_aux: aux of the last call. Absent rather than None before that, so that it does not
-        change the layer's graph structure.
+      stored_aux: aux of the last call. Before the first call it is absent rather than None, so that
+        it is not part of the layer's graph structure.
       stored_dropout_key: the key set by `with_dropout`; absent otherwise.
     """
 
@@ -120,7 +120,7 @@ class AdaptedLayer(nnx.Module):
 
     def store_aux(self, aux: Aux) -> None:
         """Store aux for `collect_aux` if the layer is mutable."""
-        # A module of an outer trace is immutable; collect_aux then raises.
+        # A module created in an outer trace is immutable; collect_aux then raises.
         with contextlib.suppress(flax.errors.TraceContextError):
             self.stored_aux = AdapterAux(aux)
 

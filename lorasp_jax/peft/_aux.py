@@ -17,7 +17,7 @@ class Aux:
 
     Attributes:
       active_rank: f32 [...tokens], number of active directions; None if the method has no rank.
-      kept_energy: f32 [...tokens], E_k of eq. (12); None without a gate.
+      kept_energy: f32 [...tokens], E_k of eq. (12) of the LoRA-SP paper; None without a gate.
       losses: fp32 scalars by name, averaged over the valid tokens.
       token_mask: bool [...tokens], True for valid tokens; None if all are valid.
       usage: f32 [R], number of valid tokens that use each direction; None without a gate.
@@ -51,7 +51,7 @@ def auxiliary_losses(aux: Any) -> dict[str, jax.Array]:
 
     Args:
       aux: any tree of `Aux`, such as the result of `collect_aux`. An `Aux` stacked by a scan over
-        depth counts as one layer per entry.
+        layers counts as one layer per stacked entry.
 
     Raises:
       ValueError: a leaf of the tree is not an `Aux`.

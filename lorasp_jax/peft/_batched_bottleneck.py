@@ -1,6 +1,7 @@
 """`Method.bottleneck` of several layers in one call: a fused GPU kernel, or `jax.vmap`.
 
-Methods may omit it; `lorasp_jax.peft._shared_input` and layers prepared for inference use it.
+A method need not provide a fused kernel. `lorasp_jax.peft._shared_input` and layers prepared for
+inference make such calls.
 """
 
 import dataclasses
@@ -21,7 +22,7 @@ class BatchedBottleneck:
     """
 
     def pack(self, params: Any) -> Any:
-        """Convert a layer's `bottleneck_params` for `bottleneck_all`, once instead of per call."""
+        """Convert a layer's `bottleneck_params` for `bottleneck_all`, once for many calls."""
         return params
 
     def bottleneck_all(
@@ -36,7 +37,7 @@ class BatchedBottleneck:
           token_mask: see `Method.delta`.
 
         Returns:
-          z of all layers, concatenated [...tokens, n R], and aux [n, ...] with token_mask unset.
+          z of all layers, concatenated to [...tokens, n R], and aux [n, ...] with token_mask unset.
         """
         raise NotImplementedError
 

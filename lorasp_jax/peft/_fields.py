@@ -12,7 +12,7 @@ MAX_FLOAT32 = (2 - 2**-23) * 2.0**127
 MAX_QUOTED = 300
 """Maximum length of a value quoted in an error message [characters]."""
 MAX_INT = 2**31 - 1
-"""Upper bound for integers unless stated otherwise: the int32 maximum."""
+"""Default upper bound for integers: the int32 maximum."""
 
 
 def check_fields(owner: Any, prefix: str = "") -> None:
@@ -24,8 +24,8 @@ def check_fields(owner: Any, prefix: str = "") -> None:
       prefix: prefix of field names in messages, such as "optim.".
 
     Raises:
-      ValueError: a value of the wrong type, a number that is not finite, or an integer whose
-        magnitude exceeds `MAX_INT` or the "max" in its field's metadata.
+      ValueError: a value of the wrong type, a number that is not finite in fp32, or an integer
+        whose magnitude exceeds the "max" in its field's metadata, or `MAX_INT` if there is none.
     """
     fields = dataclasses.fields(owner) if dataclasses.is_dataclass(owner) else ()
     maximum = {field.name: field.metadata.get("max", MAX_INT) for field in fields}

@@ -1,8 +1,8 @@
 """Base class for adapter methods.
 
 A method is a frozen dataclass of hyperparameters. It holds no arrays: `init` creates the parameter
-pytree, and everything else is a pure function of it. It is framework-agnostic; the NNX and Linen
-wrappers are in `lorasp_jax.dense`.
+pytree, and everything else is a pure function of that pytree. Methods are framework-agnostic; the
+NNX and Linen wrappers are in `lorasp_jax.dense`.
 """
 
 import dataclasses
@@ -41,7 +41,8 @@ class Method:
         delta = z U,    z, aux = bottleneck(bottleneck_params(params), x P),
         P = down(params),    U = up(params)
 
-    x is [...tokens, I] and the kernel is [I, O]; the result has x's dtype. Parameters are fp32.
+    x is [...tokens, I] and the kernel is [I, O]; the result has x's dtype. The
+    parameters of an adapter are fp32.
     """
 
     def __new__(cls, *values: Any, **fields: Any) -> "Method":
@@ -81,7 +82,7 @@ class Method:
 
     @property
     def is_low_rank_sum(self) -> bool:
-        """True if the method does not override `apply`, so it computes exactly x W + z U."""
+        """True if the method does not override `apply`, so the layer computes exactly x W + z U."""
         return type(self).apply is Method.apply
 
     @property
@@ -106,7 +107,7 @@ class Method:
 
         Args:
           key: typed random key.
-          kernel: [I, O] array or ShapeDtypeStruct; only the shape is used here.
+          kernel: [I, O] array or ShapeDtypeStruct; this implementation uses only its shape.
           statistics: activation statistics, for data-driven initialization.
 
         Returns:
@@ -220,8 +221,8 @@ class Method:
     ) -> tuple[jax.Array, Aux]:
         """`apply` with dropout: the adapter sees dropout(x), the kernel sees x.
 
-        A method that is not additive (DoRA) is applied to dropout(x) as a whole, and the rest,
-        (x - dropout(x)) W, is added unscaled, as in Hugging Face PEFT.
+        A method that is not additive (DoRA) is applied to dropout(x) as a whole, and the
+        remainder (x - dropout(x)) W is added unscaled, as in Hugging Face PEFT.
 
         Args:
           params: from `init`.
@@ -278,7 +279,7 @@ class Method:
     def transform(
         self, optimizer: optax.GradientTransformation, total_steps: int
     ) -> optax.GradientTransformation:
-        """Wrap the optimizer to run the method's own update after each of `total_steps` steps."""
+        """Wrap the optimizer to run the method's own update, if any, in each training step."""
         del total_steps
         return optimizer
 

@@ -30,7 +30,7 @@ def upgrade(settings: Mapping[str, Any]) -> Settings:
     """Convert a method's settings from any version to the current format.
 
     Args:
-      settings: the fields, and "method", the name of the method or of its class.
+      settings: the fields, plus "method": the name of the method or of its class.
     """
     old = dict(settings)
     if str(old.get("method")) not in _RELEASE_NAMES or not _EARLIER_FIELDS & old.keys():

@@ -35,8 +35,8 @@ Triplets = dict[str, jax.Array]
 class AdaLoRA(Method):
     """Adapter whose rank is allocated during training.
 
-    Parameters: lora_a [I, R], lora_e [R], lora_b [R, O]: (I + O + 1) R in total. Pruned
-    triplets have a lora_e of exactly 0.
+    Parameters: lora_a [I, R], lora_e [R], lora_b [R, O]: (I + O + 1) R in total. Each
+    allocation zeroes the lora_e of the triplets it prunes, and the last one does so for good.
 
     Raises:
       ValueError: an invalid rank, interval, fraction or decay.
@@ -133,16 +133,16 @@ class AdaLoRA(Method):
         """Wrap the optimizer so that its steps also allocate the rank budget across all layers.
 
         Wrap the complete optimizer, including its learning rate. Gradient clipping may be chained
-        before it; any transformation after it would undo the pruning. Importance is computed from
-        the updated parameters. All AdaLoRA layers in the tree share one budget.
+        before the wrapped optimizer; any transformation after it would undo the pruning. Importance
+        is computed from the updated parameters. All AdaLoRA layers in the tree share one budget.
 
         Args:
           optimizer: for any parameter tree that includes AdaLoRA parameters.
           total_steps: T.
 
         Raises:
-          ValueError: no steps remain between warm-up and final phase, or, in `init`, the tree has
-            no AdaLoRA parameters.
+          ValueError: no steps remain between warm-up and final phase. The optimizer's `init` raises
+            it too, if the tree has no AdaLoRA parameters.
         """
         _fields.positive_int("total_steps", total_steps)
         begin, end = round(self.warmup * total_steps), total_steps - round(self.final * total_steps)
@@ -175,7 +175,7 @@ class AdaLoRA(Method):
 
 
 class AllocationState(NamedTuple):
-    """Optimizer state. Each list has one entry per adapted layer, in tree order."""
+    """Optimizer state. Lists have one entry per adapted layer or stack of layers, in tree order."""
 
     step: jax.Array
     importance: list[Triplets]
@@ -263,7 +263,7 @@ def _importance(importance: list[Triplets], uncertainty: list[Triplets]) -> list
 
 
 def _keep(scores: list[jax.Array], num_pruned: jax.Array) -> list[jax.Array]:
-    """Eq. (6): keep all but the `num_pruned` least important triplets; ties are pruned too."""
+    """Eq. (6): keep all but the `num_pruned` least important triplets and any tied with them."""
     ordered = jnp.sort(jnp.concatenate([s.ravel() for s in scores]))
     threshold = jnp.where(num_pruned > 0, ordered[jnp.maximum(num_pruned - 1, 0)], -jnp.inf)
     return [s > threshold for s in scores]

@@ -37,7 +37,7 @@ class DoRA(LoRA):
     ) -> tuple[Params, Kernel]:
         """Initialize LoRA's parameters, and the magnitude to the norms of the kernel's columns.
 
-        See `Method.init` for the arguments and results; here the kernel must have values.
+        See `Method.init` for the arguments and results; unlike there, the kernel must have values.
 
         Raises:
           ValueError: the kernel is not a matrix or has no values.
@@ -79,9 +79,9 @@ class DoRA(LoRA):
 def column_factor(magnitude: jax.Array, adapted: jax.Array) -> jax.Array:
     """m / ‖V‖, f32 [O], for magnitude [O] and V [I, O]. V receives no gradient.
 
-    V is formed explicitly to compute its norms. Expanding them per column w + s A b as
-    ‖w‖² + 2 s (wᵀA) b + s² bᵀ(AᵀA) b would avoid that, but cost as much (I O R for WᵀA) and
-    suffer from cancellation where V is much shorter than W.
+    V is formed explicitly to compute its norms. With s the scale, expanding the norm of
+    a column w + s A b as ‖w‖² + 2 s (wᵀA) b + s² bᵀ(AᵀA) b would avoid that, but would cost as
+    much (I O R for WᵀA) and suffer from cancellation where V is much shorter than W.
 
     A zero column has no direction to rescale. Its factor is m + 1, or 1 for the initial m = 0,
     so B can learn even from a zero kernel.

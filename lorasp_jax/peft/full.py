@@ -14,7 +14,7 @@ from lorasp_jax.peft._method import Kernel, Method, Params
 class FullFineTuning(Method):
     """Train the kernel.
 
-    Its parameters are {"kernel": [I, O]}. The NNX and Linen wrappers make no second copy: they
+    The parameters are {"kernel": [I, O]}. The NNX and Linen wrappers make no second copy: they
     train the layer's own weights.
     """
 

@@ -1,8 +1,9 @@
 """LoRA: ΔW = (α/R) A B of fixed rank (Hu et al., arXiv 2106.09685), optionally with rsLoRA scaling.
 
 Conventions and initializations follow Hugging Face PEFT. Initially, B = 0 and A is Kaiming-uniform
-(a = √5, so U(±1/√I)), Gaussian or computed from inputs; alternatively, A B is split off the kernel
-and the residual is frozen. The scale is α/R, or α/√R for rsLoRA (Kalajdzievski, arXiv 2312.03732).
+(a = √5, so U(±1/√I)), Gaussian or computed from inputs; alternatively, scale A B is split off the
+kernel and the residual is frozen. The scale is α/R, or α/√R for rsLoRA (Kalajdzievski, arXiv
+2312.03732).
 """
 
 import dataclasses
@@ -109,10 +110,10 @@ class LoRA(Method):
     def init_table(
         self, key: jax.Array, table: Kernel, *, statistics: Any = None
     ) -> tuple[Params, Kernel]:
-        """Initialize parameters for an embedding [V, D]: A zero, B from N(0, 1), as in PEFT.
+        """Initialize parameters for an embedding table: A zero, B from N(0, 1), as in PEFT.
 
-        Rows of A that are not looked up receive no gradient and stay zero, so their entries do not
-        change.
+        Rows of A that are never looked up receive no gradient and stay zero, so the embeddings of
+        their tokens do not change.
         """
         del statistics
         entries, width = table.shape
@@ -136,7 +137,7 @@ class LoRA(Method):
 
     @property
     def as_saved(self) -> "LoRA":
-        """This method, with "eva" replaced: only `init` needs the statistics."""
+        """This method, with "kaiming" in place of "eva": only `init` needs the statistics."""
         if self.needs_statistics:
             return dataclasses.replace(self, initialization="kaiming")
         return self

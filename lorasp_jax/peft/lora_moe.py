@@ -4,9 +4,9 @@
 
 "weighted" uses w = p, as in LoRAMoE (Dou et al., arXiv 2312.09979); "top1" keeps only the most
 likely expert, as in Switch (Fedus et al., arXiv 2101.03961). Both are baselines of LoRA-SP (arXiv
-2603.07404), whose released code has 4 experts of rank 32 in every linear layer, the defaults here.
-The router losses are those of Switch and ST-MoE. LoRAMoE's localized balancing, which needs a type
-for each task, is omitted, as in the released code.
+2603.07404), whose released code has 4 experts of rank 32 in every linear layer, as by default here.
+The router losses are those of Switch and ST-MoE. LoRAMoE's localized balancing, which needs every
+task labeled with a type, is omitted, as in the released code.
 """
 
 import dataclasses
@@ -24,8 +24,8 @@ from lorasp_jax.peft.lora_sp.router import cast_and_clip
 class LoRAMoE(Method):
     """Mixture of E adapters of rank R each.
 
-    Parameters: lora_a [I, E R], lora_b [E R, O], expert i in columns (rows) i R to (i + 1) R, and
-    router [I, E]: (I + O) E R + I E in total.
+    Parameters: lora_a [I, E R], lora_b [E R, O] and router [I, E]: (I + O) E R + I E in total.
+    Expert i has columns i R to (i + 1) R of lora_a and the same rows of lora_b.
 
     Raises:
       ValueError: `experts` or `rank` below 1, an unknown routing or gate gradient, or "switch"
@@ -120,11 +120,11 @@ def _one_hot_argmax(probabilities: jax.Array) -> jax.Array:
 
 
 def balance_loss(probabilities: jax.Array, valid: jax.Array | None) -> jax.Array:
-    """Load balancing, E Σ_i f_i P_i: 1 if all experts are used equally, at most E.
+    """Load-balancing loss, E Σ_i f_i P_i: 1 if all experts are used equally, at most E.
 
     Fedus et al. (arXiv 2101.03961, eq. 4): f_i is the fraction of valid tokens whose most likely
-    expert is i (no gradient), P_i the mean of p_i over valid tokens. All valid tokens are pooled,
-    as in the paper; Hugging Face's Switch computes the loss per sequence and averages.
+    expert is i (no gradient), and P_i is the mean of p_i over valid tokens. All valid tokens are
+    pooled, as in the paper; Hugging Face's Switch computes the loss per sequence and averages.
 
     Args:
       probabilities: the router's softmax, f32 [...tokens, E].
@@ -140,7 +140,7 @@ def balance_loss(probabilities: jax.Array, valid: jax.Array | None) -> jax.Array
 
 
 def z_loss(logits: jax.Array, valid: jax.Array | None) -> jax.Array:
-    """Mean of logsumexp(logits)² over the valid tokens, which keeps the logits small.
+    """Mean of logsumexp(logits)² over the valid tokens; it keeps the logits small.
 
     Zoph et al. (arXiv 2202.08906, eq. 5), unchanged: zero logits give (ln E)².
 

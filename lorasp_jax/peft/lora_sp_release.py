@@ -1,15 +1,16 @@
 """LoRA-SP as in its public code, which differs from the paper's equations.
 
-Use it to compare with results of that code, github.com/dhkim-furiosa/LoRA-SP at dfbf57d (PyTorch).
-This is an independent implementation, based only on facts about that code. Differences from the
-paper (`lora_sp`):
+Use this method to compare with results of that code, github.com/dhkim-furiosa/LoRA-SP at dfbf57d
+(PyTorch). This is an independent implementation, based only on facts about that code. Differences
+from the paper (`lora_sp`):
 
 - Scores may be negative and are ranked by signed value.
 - The gate keeps the largest set whose energy does *not exceed* η, and at least one direction, so
   E_k is usually below η.
 - The spectral loss is a ratio of sums over tokens.
 - The balance loss is Switch's, on a softmax over all scores with the pruned ones set to 0.
-- The z-loss is ln(1 + lse) with lse clipped to [-1, 10], and thus -inf at the lower end.
+- The z-loss is ln(1 + lse), where lse is the logsumexp of the scores clipped to [-1, 10]; at -1
+  it is thus -inf.
 
 Unlike in the public code, padding is excluded, everything is in fp32, and the router's input has no
 dropout (5 % there).
@@ -63,7 +64,7 @@ class LoRASPRelease(BankMethod):
         return ("w1",) if self.hidden_width is None else ("w2",)
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
-        """Initialize V and W1 randomly, U (or its gain) to zero; the delta is zero."""
+        """Initialize V and W1 randomly and U (or the gain) to zero; the delta is zero."""
         input_key, score_key = jax.random.split(key)
         inputs = kaiming_uniform(input_key, (d_in, self.rank + (self.hidden_width or self.rank)))
         v, w1 = jnp.split(inputs, [self.rank], axis=1)
@@ -77,7 +78,7 @@ class LoRASPRelease(BankMethod):
     def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
-        """z = scale Σ(x) V x from x [V, W1], and the gate's statistics and losses."""
+        """Compute z = scale Σ(x) V x and aux from the rows x [V, W1]."""
         valid = jnp.ones(rows.shape[:-1], bool) if token_mask is None else token_mask
         v_x, hidden = jnp.split(rows, [self.rank], axis=-1)
         scores = release_scores(params["router"], hidden)

@@ -1,4 +1,7 @@
-"""LoRA-SP's bank of rank-one directions: U [R, O] and V [I, R] of ΔW = U Σ(x) V."""
+"""LoRA-SP's bank of rank-one directions, U and V of ΔW = U Σ(x) V.
+
+For inputs as rows, both are stored transposed: U as u [R, O] and V as v [I, R].
+"""
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +38,7 @@ def normalized_bank(bank: Bank) -> Bank:
     """Normalize a bank so that ‖ΔW(x)‖² = c² Σ_i s_i(x)², from which eq. (4) follows.
 
     The rank-one terms u_i v_i must be orthonormal under the Frobenius inner product, which factors
-    into (u_i u_j)(v_i v_j). It suffices to orthonormalize the factor on the wider side of the
+    into (u_i · u_j)(v_i · v_j). It suffices to orthonormalize the factor on the wider side of the
     kernel and to scale the other's vectors to unit norm. All terms share c = gain √O, so that the
     entries of U initially change as fast as in a bank that is not normalized.
 
@@ -54,7 +57,7 @@ def normalized_bank(bank: Bank) -> Bank:
 
 
 def _orthonormal(columns: jax.Array) -> jax.Array:
-    """Orthonormalize columns [n, R], R <= n, smoothly: LAPACK's signs may flip, so fix them."""
+    """Orthonormalize columns [n, R], R <= n, fixing signs, which LAPACK may flip between inputs."""
     orthonormal, triangular = jnp.linalg.qr(columns)
     return orthonormal * jnp.where(jnp.diagonal(triangular) < 0, -1.0, 1.0)
 
@@ -80,7 +83,8 @@ class BankMethod(Method):
 
     Parameters: bank.u [R, O], bank.v [I, R], bank.gain [] if the bank is normalized; router.w1
     [I, H] and the router's other arrays. `lorasp_jax.prune` removes directions from the bank only.
-    The router still scores them, after the R remaining ones: their energy is part of E_k.
+    The router still scores the pruned directions, listed after the R remaining ones; their energy
+    is part of E_k.
     """
 
     rank: int

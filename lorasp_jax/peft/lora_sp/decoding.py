@@ -1,8 +1,8 @@
-"""LoRA-SP for a single token, loading only the active directions.
+"""LoRA-SP for a single token, loading only its highest-scoring directions.
 
 A dense matmul with the bank costs the same for any mask. For a single token, this cost is the
-bank's memory traffic, most of which is saved by gathering only k of the R rows of U and Vᵀ. Several
-tokens differ in their active directions, so the dense matmul is faster for them.
+bank's memory traffic, most of which is saved by gathering only `capacity` of the R rows of U and
+Vᵀ. Several tokens differ in their active directions, so the dense matmul is faster for them.
 `python -m benchmarks.decoding` measures when gathering pays off.
 """
 

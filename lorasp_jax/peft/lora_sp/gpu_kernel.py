@@ -1,6 +1,6 @@
 """`LoRASP.bottleneck` as a single GPU kernel, for the default router and gate.
 
-Layers with a shared input share one launch, with their columns concatenated.
+Layers with a shared input run in one launch, with their columns concatenated.
 """
 
 import dataclasses

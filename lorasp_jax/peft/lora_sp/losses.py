@@ -1,6 +1,7 @@
 """LoRA-SP's auxiliary losses, eqs. (13) and (14) of the paper (arXiv 2603.07404), in fp32.
 
-Each layer sums the required quantities over its valid tokens, excluding padding.
+Each layer sums the required quantities over its valid tokens, excluding padding and tokens
+whose scores are all zero.
 """
 
 import dataclasses
@@ -24,7 +25,7 @@ class LossSums(NamedTuple):
     z: jax.Array
     """(logsumexp(logits) - ln n)² for n logits."""
     kept: jax.Array
-    """Active directions, 0 or 1 each; no gradient."""
+    """1 for each active direction, else 0; no gradient."""
     share: jax.Array
     """Each direction's share of the energy."""
 
@@ -32,7 +33,7 @@ class LossSums(NamedTuple):
 def loss_sums(
     scores: jax.Array, logits: jax.Array, mask: jax.Array, energy: jax.Array, valid: jax.Array
 ) -> LossSums:
-    """Sum over n rows: scores and mask [n, R], logits [n, :], kept energy and valid [n, 1].
+    """Sum over T rows: scores and mask [T, R], logits [T, n], kept energy and valid [T, 1].
 
     Rows with all-zero scores are excluded: they carry no signal for the router. NaN propagates.
     """
@@ -54,7 +55,7 @@ def loss_sums(
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class Losses(Mapping[str, jax.Array]):
-    """The auxiliary losses of eq. (14) by name: f32 [], or [L] for stacked layers.
+    """The auxiliary losses of eqs. (13) and (14) by name: f32 [], or [L] for stacked layers.
 
     They are computed on access: once for all stacked layers, instead of a dozen tiny operations in
     each layer.
@@ -84,7 +85,8 @@ def balance_loss(sums: LossSums) -> jax.Array:
     """Balance term of eq. (14): R Σ_i f_i P_i, 1 if all directions are used equally.
 
     The load-balancing loss of Fedus et al. (arXiv 2101.03961, eq. 4) for k(x) choices per token:
-    f_i is direction i's share of all active directions (no gradient), P_i its mean energy share.
+    f_i is direction i's share of all active directions (no gradient), and P_i is its mean energy
+    share.
     """
     kept = jax.lax.stop_gradient(sums.kept)
     frequency = kept / jnp.maximum(kept.sum(-1, keepdims=True), 1)

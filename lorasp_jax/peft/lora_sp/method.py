@@ -89,7 +89,7 @@ class LoRASP(BankMethod):
         return "w2", "b2"
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
-        """Initialize V and the router randomly, U (or its gain) to zero; the delta is zero."""
+        """Initialize V and the router randomly and U (or the gain) to zero; the delta is zero."""
         input_key, score_key = jax.random.split(key)
         # V and W1 share a distribution: draw them together to compile once.
         inputs = kaiming_uniform(input_key, (d_in, self.rank + self.hidden_width))
@@ -103,7 +103,7 @@ class LoRASP(BankMethod):
     def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
-        """z = scale Σ(x) V x of eq. (9) from x [V, W1], and the gate's statistics and losses."""
+        """Compute z = scale Σ(x) V x of eq. (9) from the rows x [V, W1], and aux."""
         tokens = rows.shape[:-1]
         valid = jnp.ones(tokens, bool) if token_mask is None else token_mask
         v_x, hidden = jnp.split(rows.reshape(-1, rows.shape[-1]), [self.rank], axis=1)
@@ -131,7 +131,7 @@ class LoRASP(BankMethod):
         return jnp.broadcast_to(mask, by_token.shape).reshape(scores.shape)
 
     def fused_kernel(self, params: Params) -> FusedBottleneck | None:
-        """A fused NVIDIA GPU kernel for the default router and gate; None for others."""
+        """A fused NVIDIA GPU kernel for the default router and gate; None if it does not apply."""
         num_scores = params["router"]["w2"].shape[-1]
         default = (self.router, self.granularity, self.schedule) == ("gelu", "token", None)
         if not default or num_scores > self.rank or default_implementation(num_scores) != "pallas":

@@ -44,7 +44,7 @@ def energy_gate(scores: jax.Array, energy_target: float) -> tuple[jax.Array, jax
 
 def losses(scores: Any, logits: Any, mask: Any, kept_energy: Any) -> dict[str, jax.Array]:
     """Eq. (13), L_spec = 1 - E_k(x), and the balance and z terms of eq. (14), as token means."""
-    frequency = mask.mean(0) / mask.mean(0).sum()  # share of active directions
+    frequency = mask.mean(0) / mask.mean(0).sum()  # share of all active directions
     share = jnp.mean(scores**2 / (scores**2).sum(-1, keepdims=True), axis=0)  # share of the energy
     num_directions = scores.shape[-1]
     log_mean_exp = jax.nn.logsumexp(logits, axis=-1) - math.log(num_directions)

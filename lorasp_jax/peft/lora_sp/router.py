@@ -17,11 +17,12 @@ Granularity = Literal["token", "sample", "layer"]
 SCORE_INIT_STD = 0.01
 INVERSE_SOFTPLUS_OF_ONE = math.log(math.e - 1)
 INITIAL_LOGIT = {"gelu": INVERSE_SOFTPLUS_OF_ONE, "gelu_relu": 1.0, "gelu_softmax": 0.0}
-"""Initial logit of every direction, by router; it yields scores of 1."""
+"""Initial output bias of every direction, by router; a logit of this value yields a score of 1."""
 
 MAX_PROJECTED = 2.0**40
 """Bound to which |x W1| is clipped. Scores grow linearly with x and the delta quadratically;
-for x beyond 1e19, z would overflow fp32 to infinity, and U = 0 would turn that into NaN."""
+for x beyond 1e19, z would overflow fp32 to infinity, and U = 0 would turn that infinity into
+NaN."""
 
 _RATIO = np.polynomial.Chebyshev.interpolate(lambda e: np.log1p(e) / e, 8, domain=[0, 1])
 _LOG1P = _RATIO.convert(kind=np.polynomial.Polynomial).coef[::-1].tolist()
@@ -33,8 +34,8 @@ def init_output_layer(
 ) -> dict[str, jax.Array]:
     """Initialize the router's second layer w2 [H, R], and its biases b1 [H], b2 [R] if it has any.
 
-    Routers with biases start with scores of 1. The second layer of a "softmax" router starts as a
-    0/1 matrix that assigns each of the R directions one of the H values.
+    Routers with biases start with scores close to 1. The second layer of a "softmax" router starts
+    as a 0/1 matrix that assigns each of the R directions one of the H hidden units.
     """
     if router == "softmax":
         assignment = np.arange(rank) * hidden_width // rank
@@ -74,7 +75,7 @@ def router_scores(
 
 
 def cast_and_clip(hidden: jax.Array) -> jax.Array:
-    """Cast x W1 to fp32 and clip it: scores, losses and gradients are finite for any finite x."""
+    """Cast x W1 to fp32 and clip it; scores, losses and gradients are finite for any finite x."""
     return clip(hidden.astype(jnp.float32), MAX_PROJECTED)
 
 
@@ -90,7 +91,7 @@ def gelu(x: jax.Array) -> jax.Array:
 
 @jax.custom_jvp
 def softplus(x: jax.Array) -> jax.Array:
-    """log(1 + e^x), relative error 3e-7, for a GPU kernel limited by its number of instructions.
+    """log(1 + e^x), relative error 3e-7, for a GPU kernel bound by its instruction count.
 
     With `jax.nn.softplus` and `jax.nn.gelu`, the kernel's gradient has 25 % more PTX instructions
     (H200).

@@ -59,7 +59,7 @@ class EnergySchedule:
 def scheduled_gate(scores: jax.Array, target: jax.Array) -> jax.Array:
     """The mask of `energy_gate`, bool [..., R], for a traced η f32 [].
 
-    Exact for η as an fp32 number; `energy_gate` instead takes η as a decimal fraction.
+    Exact for η rounded to fp32, whereas `energy_gate` takes η as a decimal fraction.
     """
     constant = jnp.abs(jax.lax.stop_gradient(scores.astype(jnp.float32)))
     below_one = bisected_mask(constant, Ratio(jnp.maximum(target, MIN_TARGET), 1))
