@@ -99,7 +99,7 @@ def _add_command(
 
 
 def seed(text: str) -> int:
-    """Parse a seed of up to 32 bits; JAX would ignore higher ones."""
+    """Parse a seed of up to 32 bits; JAX would ignore higher bits."""
     if not 0 <= (value := int(text)) < 2**32:
         raise argparse.ArgumentTypeError(f"must be 0 to {2**32 - 1}, got {value}")
     return value

@@ -1,4 +1,6 @@
-"""Action modes, each converted to joint targets; J is the number of joints, A the action length.
+"""Action modes, each converted to joint targets.
+
+J is the number of joints without the gripper, and A is the length of an action.
 
     joint         [J + 1] joint targets [rad], gripper opening [m]
     delta_joint   [J + 1] change of the joint targets [rad], gripper opening [m]

@@ -25,7 +25,7 @@ AnyRobot = str | os.PathLike[str] | Robot
 RendererName = Literal["rays", "warp"]
 RENDERERS: tuple[str, ...] = get_args(RendererName)
 # For each argument the upper bound, then the lower bound unless it is 1. The upper bounds of the
-# first three are beyond any device, to catch typos.
+# first three exceed what any device can hold; they only catch typos.
 _RANGES: dict[str, tuple[int, ...]] = {
     "num_envs": (2**20,),
     "image_size": (2**12,),

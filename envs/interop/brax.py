@@ -37,13 +37,12 @@ class BraxEnv(base.Env):
     `state.pipeline_state`, the `envs.State` of one world.
 
     Actions, [A] in [-1, 1], are rescaled to the range from the environment's `action_low` to its
-    `action_high`. The
-    sparse reward is 1 once, on success, so the return of an episode is 1 on success, else 0. The
-    dense reward needs `action_repeat=1`, since Brax sums the rewards of repeated actions without
-    discounting. `done` means success or broken physics. Brax's EpisodeWrapper
-    sets the episode length (`env.max_steps` is the task's own limit) and marks an episode that
-    reaches this length as truncated. Brax's
-    AutoResetWrapper restarts a world in its initial state, with the same layout.
+    `action_high`. The sparse reward is 1 once, on success, so the return of an episode is 1 on
+    success, else 0. The dense reward needs `action_repeat=1`, since Brax sums the rewards of
+    repeated actions without discounting. `done` means success or broken physics. Brax's
+    EpisodeWrapper sets the episode length (`env.max_steps` is the task's own limit) and marks an
+    episode that reaches this length as truncated. Brax's AutoResetWrapper restarts a world in its
+    initial state, with the same layout.
 
     Attributes:
         env: the wrapped environment, with one world.

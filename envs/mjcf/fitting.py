@@ -45,7 +45,7 @@ class Shape:
 
 
 def fit(model: mujoco.MjModel, geom: int) -> list[Shape]:
-    """Approximate a mesh geom by shapes in its frame, along its axes of inertia or of its file."""
+    """Approximate a mesh geom by shapes aligned with its inertia axes or its file's axes."""
     mesh = model.geom_dataid[geom]
     file_axes = np.empty(9)
     mujoco.mju_quat2Mat(file_axes, model.mesh_quat[mesh])

@@ -51,7 +51,7 @@ def complete(robot: Robot) -> Robot:
         )
     cost = np.maximum(table_errors, _TOLERANCE)
     cost[errors > _TOLERANCE] = np.inf
-    # At equal cost prefer the smallest lean, then the last joint farther from its limits.
+    # At equal cost, prefer the smallest lean, then the larger margin of the last joint.
     margin = np.abs(homes[:, -1:] - [robot.lower[-1], robot.upper[-1]]).min(axis=1)
     best = np.lexsort((-margin, leans, cost))[0]
     if cost[best] > _TOLERANCE:

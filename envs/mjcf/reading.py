@@ -14,7 +14,7 @@ from envs.scene import scene
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _KINDS = ("free", "ball", "slide", "hinge")
 _MAX_JOINTS = 16  # our choice: compile time grows with every joint
-_RADIANS_AS_DEGREES = np.deg2rad(4 * np.pi)  # rad: -2 pi to 2 pi misread as degrees
+_RADIANS_AS_DEGREES = np.deg2rad(4 * np.pi)  # width [rad] of +-2 pi misread as degrees
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 

@@ -24,7 +24,7 @@ _MAX_DEPTH, _MAX_TEXT = 20, 2**25
 _MAX_COPIES, _MAX_ELEMENTS = 1000, 10_000
 _MAX_ENTRIES, _MAX_PATHS = 10**6, 10**5
 _ENTRIES = {"dim", "num", "nsample"}  # attributes of sensors and actuators
-_MAX_RINGS = 300  # of vertices in a built-in mesh, which has at most this number squared
+_MAX_RINGS = 300  # rings per built-in mesh; each has at most as many vertices
 _BYTES = ("memory", "nstack")  # attributes of <size> that `reading` ignores
 _PIXEL_BYTES = 4
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -94,7 +94,7 @@ def _check_growth(descriptions: dict[Path, ElementTree.Element], main: Path) -> 
 
 
 def _elements(element: ElementTree.Element, copies: float, inner: float) -> float:
-    """Return an upper bound on what `element` expands to, given `inner` for included files."""
+    """Bound the number of elements that `element` expands to, given `inner` per included file."""
     more = inner if element.tag in _EXPANDED else 0.0
     below = copies * _copies(element)
     return copies * (1 + more) + sum(_elements(child, below, inner) for child in element)
