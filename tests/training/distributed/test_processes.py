@@ -116,5 +116,5 @@ def test_an_invalid_environment_is_one_sentence(environment, reason, monkeypatch
 def test_a_port_in_use_is_one_sentence(monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"127.0.0.1:{taken.getsockname()[1]}"
-        with pytest.raises(ValueError, match=r"port \d+ of .* not available .Address already in"):
+        with pytest.raises(ValueError, match=r"port \d+ on .* not available .Address already in"):
             initialize(address, "2", "0", monkeypatch=monkeypatch)
