@@ -48,10 +48,6 @@ def lora_sp_model(method, seed=0):
     return perturbed(model, seed, size=0.1)
 
 
-def calibration_batches():
-    return [jax.random.normal(jax.random.key(i), (TOKENS, 5)) for i in range(2)]
-
-
 def forward(model, batch):
     y, aux = model(batch)
     return y, aux  # the stack's aux; the heads store theirs

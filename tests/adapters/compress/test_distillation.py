@@ -13,7 +13,6 @@ from lorasp_jax.dense import AdapterParam, Dense
 from lorasp_jax.peft import LoRA
 from tests.adapters.compress.lora_sp_models import (
     VARIANTS,
-    calibration_batches,
     call,
     forward,
     lora_sp_model,
@@ -22,11 +21,6 @@ from tests.adapters.compress.lora_sp_models import (
 from tests.cases import mostly_slow
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module")
-def batches():
-    return calibration_batches()
 
 
 @pytest.mark.parametrize("rank", mostly_slow([None, 2], [None]))

@@ -18,7 +18,6 @@ from tests.adapters.compress.lora_sp_models import (
     RANK,
     TOKENS,
     VARIANTS,
-    calibration_batches,
     call,
     forward,
     lora_sp_model,
@@ -28,11 +27,6 @@ from tests.adapters.test_adaptation import Net, trained
 from tests.cases import mostly_slow
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module")
-def batches():
-    return calibration_batches()
 
 
 def deactivate(model, path, layer, directions):
