@@ -12,7 +12,7 @@ from rich.console import Console
 
 from envs import actions
 from envs.cli import commands
-from envs.cli.errors import parse_arguments, report_error
+from envs.cli.errors import INTERRUPTED, parse_arguments, report_error
 from envs.compilation import alarms, cache
 from envs.experts.collection import Record
 from envs.names import names
@@ -44,7 +44,7 @@ def main(
     except KeyboardInterrupt as stop:
         state = str(stop) or "temporary files were removed"
         console.print(f"interrupted; {state}", soft_wrap=True)
-        return 130
+        return INTERRUPTED
     return 0
 
 

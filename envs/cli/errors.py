@@ -1,8 +1,7 @@
 """Report errors of a command in one sentence; only bugs show a traceback.
 
 Bad input raises ValueError everywhere in the project. Inaccessible files and exhausted memory are
-not bugs, either. If the reader of the output has closed the pipe, nothing
-is reported.
+not bugs, either. If the reader of the output has closed the pipe, nothing is reported.
 """
 
 import argparse
@@ -16,6 +15,8 @@ from rich.console import Console
 
 REFUSED = 2
 """Exit code after bad input."""
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells report SIGINT."""
 BROKEN_PIPE = 141
 """Exit code if the reader of the output has closed the pipe, as shells report SIGPIPE."""
 MAX_LENGTH = 1000

@@ -20,7 +20,8 @@ COMMANDS = {
 """Module and help text of each command. A module has `main(arguments, program)`, which returns the
 exit code, and `parser(program)`, which returns its options for shell completion."""
 INTERRUPTED = 130
-"""Exit code after SIGINT or SIGTERM, as in shells."""
+"""Exit code after SIGINT or SIGTERM: 128 + 2, as shells report SIGINT. `envs.cli.errors` defines it
+too, but importing that takes a second."""
 
 
 def main() -> NoReturn:

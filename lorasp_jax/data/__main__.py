@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from envs.cli.bars import bars
-from envs.cli.errors import parse_arguments, report_error
+from envs.cli.errors import INTERRUPTED, parse_arguments, report_error
 from envs.datasets.files import check_local
 from lorasp_jax.data.keys import Keys
 
@@ -21,10 +21,8 @@ if TYPE_CHECKING:
 
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.data") -> int:
     """Run a command and return its exit code: 0 success, 2 invalid input, 130 interrupted."""
-    options = parse_arguments(
-        parser(program), arguments
-    )  # before the slow imports, so that --help is fast
-    import jax
+    options = parse_arguments(parser(program), arguments)
+    import jax  # not earlier: --help is fast without it
 
     jax.config.update("jax_platforms", "cpu")  # leave accelerators to other processes
     errors = Console(stderr=True)
@@ -34,7 +32,7 @@ def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.data") -
         return report_error(error, errors)
     except KeyboardInterrupt:
         errors.print("interrupted; temporary files were removed")
-        return 130
+        return INTERRUPTED
     return 0
 
 
