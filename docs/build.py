@@ -53,10 +53,12 @@ PICTURE = re.compile(
 
 
 def public_names(module: str) -> list[str]:
-    """Return `__all__` of a module, or its classes and functions without a leading underscore."""
-    path = ROOT / module.replace(".", "/")
-    file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    """Return the public names: `__all__`, the imports of the stub, or what the module defines."""
+    file = source_file(module)
     body = ast.parse(file.read_text()).body
+    if file.suffix == ".pyi":
+        names = [a.name for node in body if isinstance(node, ast.ImportFrom) for a in node.names]
+        return sorted(names, key=str.lower)
     for node in body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
             return sorted(ast.literal_eval(node.value), key=str.lower)
@@ -65,15 +67,22 @@ def public_names(module: str) -> list[str]:
     return [name for name in defined if not name.startswith("_")]
 
 
+def source_file(module: str) -> Path:
+    """Return the file that lists the names of a module: the stub, if it has one."""
+    path = ROOT / module.replace(".", "/")
+    if not path.is_dir():
+        return path.with_suffix(".py")
+    stub = path / "__init__.pyi"
+    return stub if stub.exists() else path / "__init__.py"
+
+
 def is_module(parent: str, name: str) -> bool:
     """Return whether a public name is a module, like `lorasp_jax.peft`."""
-    folder = ROOT / parent.replace(".", "/")
-    file = folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")
-    for node in ast.parse(file.read_text()).body:
-        for imported in ast.walk(node):
-            if isinstance(imported, ast.ImportFrom) and name in {a.name for a in imported.names}:
-                path = ROOT / (imported.module or "").replace(".", "/") / name
-                return path.is_dir() or path.with_suffix(".py").is_file()
+    for node in ast.walk(ast.parse(source_file(parent).read_text())):
+        if isinstance(node, ast.ImportFrom) and name in {a.name for a in node.names}:
+            origin = f"{parent}." * node.level + (node.module or "")
+            path = ROOT / origin.replace(".", "/") / name
+            return path.is_dir() or path.with_suffix(".py").is_file()
     return False
 
 

@@ -15,9 +15,10 @@ from lorasp_jax import peft
 PUBLIC = {
     "lorasp_jax": """
         AdaLoRA DoRA FullFineTuning LinenAdapter LoRA LoRAMoE LoRASP LoRASPRelease adapt
-        auxiliary_losses choose collect_aux combine count dense distill extract fuse
-        hugging_face input_moments load_adapters load_peft merge named peft penalties prune
-        quantize save_adapters save_peft split summary swap unmerge with_dropout
+        auxiliary_losses choose collect_aux combine config count data dense distill evaluation
+        extract fuse hugging_face input_moments load_adapters load_peft merge models named peft
+        penalties policies prune quantize save_adapters save_peft split summary swap training
+        unmerge with_dropout
     """,
     "lorasp_jax.peft": """
         AdaLoRA Aux DoRA EnergySchedule FullFineTuning LoRA LoRAMoE LoRASP LoRASPRelease Method
@@ -31,7 +32,8 @@ PUBLIC = {
     "lorasp_jax.training": "load_policy",
     "lorasp_jax.evaluation": "Result evaluate make_rollout",
     "envs": """
-        Env Episodes Randomization State Trajectory collect expert_success make rlds
+        Env Episodes Randomization State Trajectory collect compilation expert_success interop
+        make mjcf rlds robots
     """,
 }
 """Contents of `__all__` by module."""
@@ -41,7 +43,6 @@ SHOWN = {
     "lorasp_jax.models.published": "load_published",
     "lorasp_jax.models.smolvla": "SmolVLAConfig",
     "lorasp_jax.config": "Config DataConfig EvaluationConfig ModelConfig OptimConfig",
-    "envs": "compilation interop mjcf robots",
     "envs.compilation.cache": "enable",
     "envs.interop.brax": "BraxEnv",
     "envs.interop.gymnasium": "VectorEnv",

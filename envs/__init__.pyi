@@ -1,0 +1,14 @@
+# Public names: `__init__.py` imports each on first access.
+from . import compilation as compilation
+from . import interop as interop
+from . import mjcf as mjcf
+from . import robots as robots
+from .datasets import rlds as rlds
+from .datasets.episodes import Episodes as Episodes
+from .env import Env as Env
+from .experts.collection import collect as collect
+from .experts.collection import expert_success as expert_success
+from .making import make as make
+from .scene.randomization import Randomization as Randomization
+from .state import State as State
+from .state import Trajectory as Trajectory

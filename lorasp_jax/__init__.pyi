@@ -1,0 +1,44 @@
+# Public names: `__init__.py` imports each on first access.
+from . import config as config
+from . import data as data
+from . import dense as dense
+from . import evaluation as evaluation
+from . import models as models
+from . import peft as peft
+from . import policies as policies
+from . import training as training
+from .adapters.adaptation import adapt as adapt
+from .adapters.adaptation import count as count
+from .adapters.adaptation import merge as merge
+from .adapters.adaptation import penalties as penalties
+from .adapters.adaptation import split as split
+from .adapters.adaptation import with_dropout as with_dropout
+from .adapters.combine import named as named
+from .adapters.combine.fusion import fuse as fuse
+from .adapters.combine.fusion import unmerge as unmerge
+from .adapters.combine.named import choose as choose
+from .adapters.combine.named import combine as combine
+from .adapters.combine.named import extract as extract
+from .adapters.combine.named import swap as swap
+from .adapters.compress.calibration import input_moments as input_moments
+from .adapters.compress.distillation import distill as distill
+from .adapters.compress.pruning import prune as prune
+from .adapters.compress.quantization import quantize as quantize
+from .adapters.io import hugging_face as hugging_face
+from .adapters.io.hugging_face import load_peft as load_peft
+from .adapters.io.hugging_face import save_peft as save_peft
+from .adapters.io.native import load_adapters as load_adapters
+from .adapters.io.native import save_adapters as save_adapters
+from .adapters.linen import LinenAdapter as LinenAdapter
+from .adapters.summary import collect_aux as collect_aux
+from .adapters.summary import summary as summary
+from .peft import AdaLoRA as AdaLoRA
+from .peft import DoRA as DoRA
+from .peft import FullFineTuning as FullFineTuning
+from .peft import LoRA as LoRA
+from .peft import LoRAMoE as LoRAMoE
+from .peft import LoRASP as LoRASP
+from .peft import LoRASPRelease as LoRASPRelease
+from .peft._aux import auxiliary_losses as auxiliary_losses
+
+__version__: str
