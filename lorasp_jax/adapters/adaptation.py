@@ -1,8 +1,8 @@
 """Adapt a whole model by path rules; split, count and merge its parameters.
 
 A rule is (pattern, method). Patterns are searched (`re.search`) in "/"-joined paths. The first
-match wins, even if its method cannot apply to that path: with [("vision", LoRA()),
-(".*", FullFineTuning())] the vision tower's norms stay frozen. The method `None` skips the path.
+match wins, even if its method cannot apply to that path. For example, [("vision", LoRA()),
+(".*", FullFineTuning())] leaves the vision tower's norms frozen. The method `None` skips the path.
 
 Hugging Face PEFT's options map to rules, most specific first:
 
@@ -11,8 +11,8 @@ Hugging Face PEFT's options map to rules, most specific first:
     bias="all"                     ("bias$", FullFineTuning()), (".*", LoRA())
     exclude_modules                ("head", None), (".*", LoRA())
 
-The rule ("bias$", FullFineTuning()) also unfreezes the biases of layers that another rule adapts,
-since its pattern does not match the paths of the layers themselves.
+The rule ("bias$", FullFineTuning()) also unfreezes the biases of adapted layers. It does not match
+the paths of the layers themselves, so another rule can adapt them.
 """
 
 import math
@@ -54,25 +54,23 @@ def adapt(
     """Attach adapters to layers, or unfreeze base weights for full fine-tuning, by path rules.
 
     Adapters apply to every `Dense`, `nnx.Linear` (which becomes a `Dense`), `nnx.LinearGeneral` and
-    `nnx.Einsum` whose path matches, for instance "language/gate_proj"; LoRA also applies to
-    `nnx.Embed` and `nnx.Conv`. A stacked kernel [L, I, O] gets stacked adapters. An adapted layer's
-    own weights are frozen. Subclasses that override `__call__` are skipped.
-    `FullFineTuning` applies to every floating-point parameter under the paths it matches, including
-    norms, embeddings and biases, and converts each of them to an fp32 `AdapterParam`.
+    `nnx.Einsum` whose path matches, for instance "language/gate_proj". LoRA also applies to
+    `nnx.Embed` and `nnx.Conv`. Subclasses that override `__call__` are skipped. A stacked kernel
+    [L, I, O] gets stacked adapters. An adapted layer's own weights are frozen.
+
+    `FullFineTuning` converts every floating-point parameter under a matching path to an fp32
+    `AdapterParam`, including norms, embeddings and biases.
 
     Args:
       model: not modified; the result shares its frozen arrays.
-      rules: (pattern, method or None) pairs, first match wins.
-      rngs: source of the key from which adapters are initialized. A layer's initial adapter depends
-        only on this key and the layer's path.
+      rules: (pattern, method or None) pairs; see the module docstring.
+      rngs: supplies one key. A layer's initial adapter depends only on this key and the layer's
+        path.
       einsums: extra layer classes that compute one einsum of their input and a parameter, mapped to
         a function layer -> (parameter name, equation), as in
         {gemma.Einsum: lambda layer: ("w", layer.einsum_str)}.
       statistics: second moments [..., I, I] of layer inputs by path, from
         `calibration.input_moments`; for data-driven initialization.
-
-    Returns:
-      The adapted model.
 
     Raises:
       ValueError: a pattern is not a valid regular expression, a rule applies to nothing (the
@@ -92,11 +90,11 @@ def adapt(
 def split(model: nnx.Module) -> tuple[nnx.GraphDef[Any], nnx.State[Any, Any], nnx.State[Any, Any]]:
     """Split a model into (graphdef, adapters, frozen); `adapters` is the trainable state.
 
-    Differentiate with respect to `adapters` only: differentiating the whole model would also train
+    Differentiate with respect to `adapters` only; the gradient of the whole model would also train
     biases and unadapted layers.
 
-    `nnx.merge(graphdef, adapters, frozen, copy=True)` restores the model, also inside jit and grad.
-    Without `copy=True`, models that use `nnx.scan` or `nnx.remat` cannot be called inside these.
+    `nnx.merge(graphdef, adapters, frozen, copy=True)` restores the model. Inside jit or grad,
+    models that use `nnx.scan` or `nnx.remat` need `copy=True`.
     """
     graphdef, adapters, frozen = nnx.split(_wrapped_copy(model)[0], AdapterParam, ...)
     return graphdef, adapters, frozen
@@ -105,13 +103,12 @@ def split(model: nnx.Module) -> tuple[nnx.GraphDef[Any], nnx.State[Any, Any], nn
 def with_dropout(model: Model, key: jax.Array) -> Model:
     """Enable the adapters' `dropout` for one training step.
 
-    Call this function inside the loss, with a new key for each step:
+    Call this inside the loss, with a new key for each step:
 
         model = with_dropout(nnx.merge(graphdef, adapters, frozen, copy=True), key)
 
-    Every other function, such as `adapt`, `load_adapters`, `split` and `merge`, returns a model
-    with dropout off. The layers of a stack use independent masks. A layer that is called twice
-    reuses its mask if the inputs have the same shape.
+    `adapt`, `load_adapters`, `split` and `merge` return models with dropout off. The layers of a
+    stack use independent masks. A layer called twice on inputs of one shape reuses its mask.
 
     Args:
       model: not modified; adapters without dropout are unaffected.
@@ -136,7 +133,7 @@ def count(model: nnx.Module) -> Counts:
 
 
 def methods(model: nnx.Module) -> dict[str, Method]:
-    """Return methods by path: of the layer for an adapter, of the parameter if fully fine-tuned."""
+    """Return methods by the path of an adapted layer or of a fully fine-tuned parameter."""
     methods_by_path = {}
     validate.module(model)
     for path, parent, name, _ in paths.locate(nnx.List([model]), AdapterParam):
@@ -150,9 +147,8 @@ def methods(model: nnx.Module) -> dict[str, Method]:
 def merge(model: Model) -> Model:
     """Fold the adapters into the kernels; the result has no adapters and is entirely frozen.
 
-    Both lookups and `attend` of an adapted embedding use the adapter. Code that reads the table
-    directly does not, but will see the change after merging. An adapted quantized kernel is
-    dequantized.
+    An embedding's adapter affects only lookups and `attend`, but merging changes the table for all
+    code that reads it. A quantized kernel with an adapter is dequantized.
 
     Raises:
       ValueError: a method's delta depends on the input, or the model has shapes without values.
@@ -236,9 +232,9 @@ def _check_statistics(statistics: Any) -> None:
 
 
 def _wrapped_copy(model: nnx.Module) -> nnx.List[Any]:
-    """Copy the model, sharing its arrays, without stored aux and dropout keys.
+    """Copy the model without stored aux and dropout keys, sharing its arrays.
 
-    The copy is wrapped in a List so that a model that is itself a layer can be replaced.
+    The copy is wrapped in a List so that the model can be replaced if it is itself a layer.
     """
     model = nnx.clone(validate.module(model))
     nnx.pop(model, nnx.Any(AdapterAux, DropoutKey))
@@ -326,8 +322,7 @@ def init_stack(
 ) -> tuple[Params, Any]:
     """Apply a method's `init` to a kernel [..., I, O], with an independent key per matrix.
 
-    This function is not jitted as a whole, so that random draws compile once per I, not once per
-    kernel shape.
+    Not jitted as a whole, so that random draws compile once per I, not once per kernel shape.
     """
     if len(getattr(kernel, "shape", ())) < 2:
         raise ValueError(f"an adapter needs a kernel [..., I, O], got {short(kernel)}.")

@@ -4,9 +4,9 @@
     variables = adapter.init(key, x)                       # or adapter.attach(key, pretrained, x)
     y = adapter.apply(variables, x)
 
-The collection "adapters" is trainable; "params" keeps the structure of the model's own `init`, so
-pretrained parameters fit. During a call, each adapter is stored among its layer's parameters, so
-the model's own transformations (scan, remat, vmap) also apply to it.
+The collection "adapters" is trainable; "params" holds the model's frozen parameters. During a call,
+each adapter is stored among its layer's parameters, so the model's own transformations (scan,
+remat, vmap) also apply to it.
 """
 
 import dataclasses
@@ -33,8 +33,8 @@ from lorasp_jax.peft import Method, _validate
 from lorasp_jax.peft._method import dropout_rate
 
 ADAPTER = "lorasp_adapter"  # parameter name of an adapter in its layer
-# Marks the model's scopes, since its code may apply other modules with their own variables, as
-# Hugging Face's tied heads do.
+# Marks the model's own scopes. Its code may apply other modules with separate variables, as Hugging
+# Face's tied heads do.
 MODEL_FLAG = "lorasp_jax"
 DROPOUT_FLAG = "lorasp_jax_dropout"  # marks scopes of a call with rngs for "dropout"
 Function = Callable[..., Any]
@@ -44,19 +44,18 @@ Function = Callable[..., Any]
 class LinenAdapter:
     """A Linen model with adapters in its layers; the model itself is not modified.
 
-    Adapters apply to `nn.Dense`, `nn.DenseGeneral` and `nn.Einsum` at their paths; LoRA also
-    applies to `nn.Embed` and `nn.Conv`, as in `adapt` for NNX. `FullFineTuning` applies to every
-    parameter under the paths it matches and moves it to "adapters" in fp32. Paths in a scanned
-    stack have no index, and adapters are stacked like the kernels. `collect_aux` finds the aux of
-    such layers only if the `variable_axes` of the model's own scan include "intermediates".
-    Subclasses that override `__call__` are skipped.
+    Adapters apply to `nn.Dense`, `nn.DenseGeneral` and `nn.Einsum`; LoRA also applies to `nn.Embed`
+    and `nn.Conv`. Subclasses that override `__call__` are skipped. `FullFineTuning` moves every
+    parameter under a matching path to "adapters", in fp32.
+
+    Paths in a scanned stack have no index, and adapters are stacked like the kernels. For
+    `collect_aux`, the `variable_axes` of the model's own scan must include "intermediates".
 
     Attributes:
       model: any Linen module; for a Hugging Face Flax model, its `.module`.
       rules: (pattern, method or None) pairs, first match wins.
-      einsums: extra layer classes that compute one einsum of their input and a parameter, as for
-        `adapt`. The equation is None if it is an argument of the layer's call, as in
-        {gemma.Einsum: lambda layer: ("w", None)}.
+      einsums: extra layer classes, as for `adapt`. The equation is None if it is an argument of the
+        layer's call, as in {gemma.Einsum: lambda layer: ("w", None)}.
     """
 
     model: nn.Module
@@ -64,7 +63,6 @@ class LinenAdapter:
     einsums: Einsums = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Validate the fields."""
         check_method_rules(self.rules)
         nnx_layers.check_einsums(self.einsums)
         if not isinstance(self.model, nn.Module):
@@ -119,7 +117,7 @@ class LinenAdapter:
     def apply(
         self, variables: Mapping[str, Any], *args: Any, mutable: Any = False, **kwargs: Any
     ) -> Any:
-        """Apply the model with its adapters; returns the result of the model's own `apply`.
+        """Like the model's own `apply`, with the adapters.
 
         Args:
           variables: from `init` or `attach`, possibly trained.
@@ -129,8 +127,8 @@ class LinenAdapter:
           **kwargs: as for the model's `apply`; the adapters' dropout is on if rngs has "dropout".
 
         Raises:
-          ValueError: the variables lack an adapter that the rules require, "params" is mutable, or
-            a scan does not pass on the rngs for dropout.
+          ValueError: the adapters in the variables do not match the rules, "params" is mutable, or
+            a scan or vmap does not split the rngs for dropout.
         """
         if _compat.is_mutable(mutable, "params"):
             raise ValueError(
@@ -144,12 +142,13 @@ class LinenAdapter:
     def merge(self, variables: Mapping[str, Any], *args: Any, **kwargs: Any) -> dict[str, Any]:
         """Fold the adapters into the parameters; returns variables of the bare model.
 
-        Do not adapt an embedding whose table the model also reads directly, for example for tied
-        logits: the adapter affects only lookups and `attend`, but merging changes the table itself.
+        An embedding's adapter affects only lookups and `attend`, but merging changes the table
+        itself. So do not adapt an embedding whose table the model also reads directly, as for tied
+        logits.
 
         Args:
           variables: as for `apply`.
-          *args: the model's call arguments, for one call that shows what its layers compute.
+          *args: the model's call arguments; the model is called once to find its layers.
           **kwargs: the model's call arguments.
 
         Raises:
@@ -165,7 +164,7 @@ class LinenAdapter:
     def _visit_layers(
         self, visit: Function, variables: Mapping[str, Any], *args: Any, **kwargs: Any
     ) -> Any:
-        """Call the model, calling `visit` on each of its modules; return the new parameters."""
+        """Call the model and `visit` each of its modules; return the new parameters."""
 
         def interceptor(
             next_fun: Function, args: Any, kwargs: Any, context: nn.module.InterceptorContext
@@ -186,7 +185,7 @@ class LinenAdapter:
 
         Args:
           variables: of the bare model.
-          *args: the model's call arguments, for one call that shows what its layers compute.
+          *args: the model's call arguments; the model is called once to find its layers.
           **kwargs: the model's call arguments.
         """
         shapes: dict[str, tuple[int, ...]] = {}
@@ -207,7 +206,7 @@ class LinenAdapter:
         return shapes
 
     def _supported_class(self, module: nn.Module) -> type[nn.Module] | None:
-        """Supported class whose `__call__` the layer uses, if it belongs to the model."""
+        """`supported_class`, or None if the module does not belong to the model."""
         return supported_class(module, self.einsums) if _is_model_module(module) else None
 
     def _rule(self, module: nn.Module) -> tuple[int, Method] | None:
@@ -337,7 +336,7 @@ def _is_model_module(module: nn.Module) -> bool:
 
 
 def _dropout_key(module: nn.Module, method: Method) -> jax.Array | None:
-    """Key for the method's dropout; None if it has no dropout or the call has no rngs for it."""
+    """Key for the adapter's dropout; None if dropout is off."""
     assert module.scope is not None
     if not dropout_rate(method) or not module.scope.has_flag(DROPOUT_FLAG):
         return None

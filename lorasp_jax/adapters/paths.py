@@ -28,9 +28,7 @@ class Location(NamedTuple):
 def locate(root: nnx.List[Any], kind: type | tuple[type, ...]) -> list[Location]:
     """List all modules or variables of the given types.
 
-    Args:
-      root: `nnx.List([model])`; paths are relative to the model.
-      kind: type or types to look for.
+    `root` is `nnx.List([model])`; paths are relative to the model.
     """
 
     def walk() -> Iterator[Location]:
@@ -48,18 +46,16 @@ def unique(locations: list[Location]) -> list[Location]:
 
 
 def set_child(location: Location, child: Any) -> None:
-    """Replace the child at a location. The parent may be a third-party class, hence `setattr`."""
+    """Replace the child at a location."""
     setattr(location.parent, location.name, child)
 
 
 def replace(locations: Sequence[Location], make: Callable[[Location], Any]) -> None:
-    """Replace children in place, preserving sharing.
+    """Replace children in place.
 
-    Args:
-      locations: the children to replace.
-      make: returns the replacement for a location, or None to skip it. For a shared child, the
-        first result that is not None replaces it at all its locations. A shared `nnx.Linear` is
-        replaced separately at each location, so that each location has its own adapter.
+    `make` returns the replacement for a location, or None to skip it. A shared child gets one
+    replacement for all its locations, the first that is not None. Only a shared `nnx.Linear` is
+    replaced at each location separately, so that each has its own adapter.
     """
     replacements: dict[Hashable, Any] = {}
     for location in locations:
@@ -98,10 +94,7 @@ def locate_matmul_layers(
 def check_rules(rules: Any, valid: Callable[[Any], bool], what: str) -> None:
     """Raise ValueError unless `rules` is a non-empty list of (pattern, value) pairs.
 
-    Args:
-      rules: user input.
-      valid: whether the second item of a pair is valid.
-      what: description of valid second items, for the error message.
+    `valid` checks one value; `what` describes valid values in the error message.
     """
     pairs = f"rules must be a list of (pattern, {what}) pairs"
     if isinstance(rules, Mapping):
@@ -145,7 +138,7 @@ def locate_other_matrices(
 ) -> list[Location]:
     """List parameters with two or more axes in modules that adapters do not support.
 
-    Scales and biases are skipped: in stacked norms they have two axes, but are not matrices.
+    Scales and biases are skipped, since those of stacked norms have two axes.
     """
     supported = {id(location.child) for location in locate_layers(root, einsums)}
     return [

@@ -26,10 +26,10 @@ def summary(model: nnx.Module, aux: Mapping[str, Aux] | None = None) -> str:
 
     Args:
       model: adapted or not.
-      aux: aux of layers by path, from `collect_aux` after a call of the model.
+      aux: from `collect_aux`.
 
     Raises:
-      ValueError: aux has a path that is not a layer of the model.
+      ValueError: aux is not from `collect_aux`, or has a path that is not a layer of the model.
     """
     rows = _rows(validate.module(model))
     if aux is not None and not (

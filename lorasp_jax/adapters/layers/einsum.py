@@ -1,16 +1,16 @@
 """Adapted einsums: kernels with any number of input, output and batch axes.
 
-In an equation "x,kernel->y", x and y may both contain one "...", or neither may. Each kernel axis
-is one of these:
+In an equation "x,kernel->y", x and y contain one "..." each, or none. Each kernel axis is one of
+these:
 
     batch    in x, kernel and y; each index has its own linear map, as in a mixture of experts
     input    in x and kernel; summed over
     output   in kernel and y
 
-An adapter treats the kernel as a stack of matrices [*batch, I, O], with inputs and outputs
-flattened in the order of the kernel's axes; its parameters have the batch axes as leading axes,
-like those of a scanned stack. For example, "BTD,NDH->BTNH" has one adapter with D inputs and N·H
-outputs. A quantized kernel is stored as such a stack, along with the sizes of its original axes.
+An adapter treats the kernel as a stack of matrices [*batch, I, O]: input and output axes are
+flattened to I and O, in the kernel's order. Its parameters have the batch axes as leading axes. For
+example, "BTD,NDH->BTNH" has one adapter with D inputs and N·H outputs. A quantized kernel is stored
+as such a stack, along with the sizes of its original axes.
 """
 
 import dataclasses
@@ -142,19 +142,19 @@ def einsum(
     method: Method | None = None,
     dropout_key: jax.Array | None = None,
 ) -> tuple[jax.Array, Aux]:
-    """Einsum of x and kernel plus bias, with an adapter if `method` and `params` are given.
+    """Einsum of x and kernel, plus bias; with an adapter if `method` and `params` are given.
 
     Args:
-      equation: "x,kernel->y", see the module docstring.
+      equation: "x,kernel->y"; see the module docstring.
       x, kernel: arrays with the axes in the equation.
-      bias: array with the kernel axes that are also in y, in y's order; or None.
+      bias: has the kernel axes that are also in y, in y's order; or None.
       params: the adapter's parameters for `to_matrices(equation, kernel)`, or None.
       method: the adapter's method; required with `params`.
       dropout_key: as for `dense`.
 
     Returns:
-      y in the dtype of x, and the adapter's aux. Arrays in aux have the batch axes as leading axes,
-      except for losses, which are averaged over the batch axes.
+      y in the dtype of x, and the adapter's aux. Losses are averaged over the batch axes; the other
+      arrays in aux have these as leading axes.
 
     Raises:
       ValueError: the equation cannot be adapted, or the shapes do not match it.

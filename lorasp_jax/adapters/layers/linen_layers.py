@@ -95,7 +95,7 @@ class LayerCall(NamedTuple):
 
 
 def layer_call(module: nn.Module, einsums: nnx_layers.Einsums, args: Any, kwargs: Any) -> LayerCall:
-    """Inspect a call of a supported layer with these arguments.
+    """Inspect a call of a supported layer.
 
     Raises:
       ValueError: the layer has a custom matmul or precision, or its equation, input or kernel is
@@ -121,7 +121,7 @@ def layer_call(module: nn.Module, einsums: nnx_layers.Einsums, args: Any, kwargs
 def with_lora(
     module: nn.Module, method: Any, params: Any, key: Any, y: jax.Array, inputs: jax.Array
 ) -> tuple[jax.Array, Aux]:
-    """Add LoRA's delta to the output y of an embedding or a convolution; return it with aux."""
+    """Add LoRA's delta to the output y of an embedding or a convolution; return y and aux."""
     a = params["lora_a"]
     conv = isinstance(module, nn.Conv)
     if conv and key is not None:

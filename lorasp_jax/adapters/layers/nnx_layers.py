@@ -1,8 +1,8 @@
 """Adapted einsums, embeddings and convolutions in third-party NNX models.
 
-An adapted layer replaces the original one. It has the same attributes and subclasses the original
-class, so model code that accesses the layer still works; `without_adapter` restores the original
-class. `nnx.Linear` becomes a `Dense`.
+An adapted layer subclasses the original class and keeps its attributes, so model code that accesses
+the layer still works. `without_adapter` restores the original class. `nnx.Linear` becomes a `Dense`
+instead.
 """
 
 import functools
@@ -22,8 +22,8 @@ from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import dropout, dropout_rate
 
 Einsums = Mapping[type, Callable[[Any], tuple[str, str | None]]]
-"""NNX or Linen layer class -> function of a layer that returns (kernel name, equation). The
-equation is None for a Linen layer that takes the equation as a str argument of its call."""
+"""Functions layer -> (kernel name, equation), by NNX or Linen layer class. The equation is None for
+a Linen layer that takes it as a str argument of its call."""
 
 EINSUMS: Einsums = {
     nnx.LinearGeneral: lambda layer: (
@@ -32,7 +32,7 @@ EINSUMS: Einsums = {
     ),
     nnx.Einsum: lambda layer: ("kernel", layer.einsum_str),
 }
-# Settings that adapted layers do not support, and their default values.
+# Adapted layers support these settings only at the listed values.
 _DEFAULT_SETTINGS: dict[str, tuple[Any, ...]] = {
     "dot_general": (None, jax.lax.dot_general),
     "dot_general_cls": (None,),
@@ -47,7 +47,7 @@ class EinsumLayer(AdaptedLayer):
     """Mixin for a layer that computes an einsum of its input and its kernel.
 
     Attributes:
-      kernel_equation: the equation, see `lorasp_jax.adapters.layers.einsum`.
+      kernel_equation: see `lorasp_jax.adapters.layers.einsum`.
     """
 
     kernel_equation: str
@@ -211,7 +211,8 @@ def make_adaptable(layer: nnx.Module, einsums: Einsums) -> AdaptedLayer:
       einsums: extra einsum layer classes.
 
     Raises:
-      ValueError: the layer has a custom matmul or precision.
+      ValueError: the layer has a custom matmul or precision, its equation cannot be adapted, or it
+        has an attribute named like one that adapted layers need.
     """
     if isinstance(layer, AdaptedLayer):
         return layer
@@ -232,9 +233,9 @@ def make_adaptable_like(layer: Any, other: AdaptedLayer) -> AdaptedLayer:
     """Convert a layer to one that can carry the adapter of another layer.
 
     Args:
-      layer: a layer of the other layer's original class, adapted or not; not modified. It is
-        returned as is if it can already carry the adapter.
-      other: the adapted layer, not modified.
+      layer: of the other layer's original class; not modified. It is returned as is if it can
+        already carry the adapter.
+      other: the adapted layer; not modified.
 
     Raises:
       ValueError: the layer is of a different class.
@@ -287,7 +288,7 @@ def check_einsums(einsums: Any) -> None:
 
 
 def describe_einsum(describe: Callable[[Any], Any], layer: Any) -> tuple[str, str | None]:
-    """Call a function of `Einsums`; raise ValueError if it fails or returns a wrong type."""
+    """Call an `Einsums` function; raise ValueError if it fails or returns a wrong type."""
     try:
         name, equation = describe(layer)
     except (TypeError, ValueError, AttributeError) as error:
@@ -361,14 +362,8 @@ def _with_mixin(
 ) -> AdaptedLayer:
     """Copy a layer, sharing its variables, with the mixin added to its class.
 
-    Args:
-      layer: not modified.
-      mixin: class that applies the adapter.
-      name: attribute name of the kernel.
-      equation: the einsum's equation.
-
-    Raises:
-      ValueError: the layer already has an attribute that the mixin needs.
+    `name` is the kernel's attribute name. Raises ValueError if the layer already has an attribute
+    that the mixin needs.
     """
     names = ("adapter", "method", "kernel_name") + (("kernel_equation",) if equation else ())
     if taken := [name for name in names if hasattr(layer, name)]:
@@ -388,10 +383,7 @@ def _restore_class(layer: AdaptedLayer) -> Any:
 
 
 def _with_class(layer: nnx.Module, kind: type[nnx.Module]) -> Any:
-    """Copy a layer as an instance of another class, which declares no additional attributes.
-
-    Like `copy.copy`, this skips `__init__`, whose arguments are no longer known.
-    """
+    """Copy a layer as an instance of another class, without calling `__init__`."""
     new = object.__new__(kind)
     vars(new).update(vars(layer))
     return new

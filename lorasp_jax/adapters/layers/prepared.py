@@ -1,16 +1,16 @@
 """Adapted layers prepared for inference: precompute whatever does not depend on the input.
 
-A layer with kernel W, down-projection P and up-projection U computes y = x W + f(x P) U. If layers
-are called repeatedly on few tokens, as in flow sampling, GPU kernel launches dominate the time.
-Layers with a shared input are therefore fused into one input matrix and one output matrix:
+A layer with kernel W, down-projection P and up-projection U computes y = x W + f(x P) U. When
+layers are called repeatedly on few tokens, as in flow sampling, GPU kernel launches dominate the
+time. Layers with a shared input are therefore fused into one input and one output matrix:
 
     [x W, x P] = x [W, P]         W and P of all layers, concatenated
     y = x W + z diag(U)           with z = f(x P), and diag(U) block-diagonal
 
-The functions f of all layers run as one GPU kernel. For stacked layers that run once, such as the
-vision tower's, only the P are concatenated, and P and U are cast to the compute dtype: copying W
-would cost more than it saves. The original layers are removed. For training, see
-`lorasp_jax.kernels.low_rank_matmul`.
+The functions f of all layers run as one GPU kernel if their method provides it. For stacked layers
+that run once, such as the vision tower's, copying W would cost more than it saves: only the P are
+concatenated, and P and U are cast to the compute dtype. The original layers are removed. For
+training, see `lorasp_jax.kernels.low_rank_matmul`.
 """
 
 import dataclasses
@@ -67,7 +67,7 @@ class FusedLayers:
 
     bottleneck: BottleneckSpec
     params: Any
-    """Parameters of f, stacked [n, ...]; a leaf is None if the layers' shapes differ."""
+    """Parameters of f, stacked [n, ...]; a leaf is None if its shape differs between layers."""
     input_matrix: jax.Array
     """[W, P], [I, ΣO + ΣQ], padded."""
     output_matrix: jax.Array
@@ -142,15 +142,15 @@ class FusableModule(Protocol):
 def fuse_layers(layers: Sequence[Layer], *, copy_kernels: bool = True) -> list[Layer]:
     """Return replacements for layers with a shared input.
 
-    A single (unstacked) adapted `Dense` can be fused if it has an explicit dtype and its method
-    computes exactly x W + z U. If all layers can be fused and agree on method and dtype, they are
-    fused together. Otherwise each layer that can be fused is fused individually, and the other
-    layers are returned unchanged.
+    A single (unstacked) adapted `Dense` can be fused if it has an explicit dtype, and its method
+    computes exactly x W + z U and does not need x P in fp32. If all layers can be fused and agree
+    on method and dtype, they are fused together. Otherwise each fusable layer is fused alone, and
+    the others are returned unchanged.
 
     Args:
-      layers: layers, in the order in which they are called.
-      copy_kernels: whether to copy W into the fused input matrix, as is best for layers that are
-        called repeatedly.
+      layers: layers in call order.
+      copy_kernels: whether to copy W into the fused input matrix; best for layers that are called
+        repeatedly.
     """
     fusable = [layer for layer in layers if _is_fusable(layer)]
     fuse = _fused_layers if copy_kernels else _shared_projection
@@ -189,7 +189,7 @@ def _call_fused(
 def _call_shared(
     shared: SharedProjection, x: jax.Array, token_mask: jax.Array | None
 ) -> tuple[Sequence[jax.Array], Aux]:
-    """Like `_call_fused`."""
+    """`_call_fused` without a copy of W."""
     # Without the barrier XLA fuses x W and x P into one matmul and copies W.
     projected = matmul(jax.lax.optimization_barrier(x), shared.down)
     z, aux = _bottleneck(shared, projected, 0, token_mask)
@@ -219,10 +219,10 @@ def _bottleneck(
 
 
 def matmul(x: jax.Array, matrix: jax.Array) -> jax.Array:
-    """x @ matrix in the dtype of x, as a split-K matmul where that uses a GPU better.
+    """x @ matrix in the dtype of x, as a split-K matmul if there are few output tiles.
 
-    A GPU computes output tiles in parallel, but sums over I sequentially within each tile. With few
-    rows and a narrow matrix, most SMs would be idle.
+    A GPU computes output tiles in parallel, but sums over I sequentially within each tile. Few
+    tiles would leave most SMs idle.
 
     Args:
       x: [..., I].
@@ -248,7 +248,7 @@ def _num_splits(rows: int, d_in: int, d_out: int) -> int:
 
 
 def _is_fusable(layer: Layer) -> TypeGuard[Dense]:
-    """Whether this is a single (unstacked) adapted `Dense` that computes exactly x W + z U."""
+    """Whether `fuse_layers` can fuse the layer."""
     if type(layer) is not Dense or layer.adapter is None or layer.dtype is None:
         return False
     method, _ = layer.method_and_params()
@@ -274,7 +274,7 @@ def _matrices(
 def _bottleneck_spec(
     layers: Sequence[Dense], downs: Sequence[jax.Array]
 ) -> tuple[BottleneckSpec, Any]:
-    """Function f and its stacked parameters [n, ...]; a leaf is None if shapes differ."""
+    """The `BottleneckSpec`, and the parameters of f as in `FusedLayers`."""
     adapters = [layer.method_and_params() for layer in layers]
     kernels = {method.fused_kernel(params) or VmapBottleneck(method) for method, params in adapters}
     kernel = kernels.pop() if len(kernels) == 1 else VmapBottleneck(adapters[0][0])
