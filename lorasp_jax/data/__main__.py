@@ -1,4 +1,4 @@
-"""Command line: `python -m lorasp_jax.data inspect | convert --help`."""
+"""Inspect or convert datasets: `python -m lorasp_jax.data --help`."""
 
 import argparse
 import functools
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 
 def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.data") -> int:
-    """Run a command and return its exit code: 0 success, 2 invalid input, 130 interrupted."""
+    """Run a command and return its exit code: 0 for success, or one of `envs.cli.errors`."""
     options = parse_arguments(parser(program), arguments)
-    import jax  # not earlier: --help is fast without it
+    import jax  # imported here to keep --help fast
 
     jax.config.update("jax_platforms", "cpu")  # leave accelerators to other processes
     errors = Console(stderr=True)
@@ -101,7 +101,7 @@ def parser(program: str) -> argparse.ArgumentParser:
 
 
 def _add_keys(parser: argparse.ArgumentParser) -> None:
-    """Add the options that map the features of a LeRobot dataset, see `Keys`."""
+    """Add one option per field of `Keys`."""
     add = parser.add_argument_group("LeRobot datasets").add_argument
     default = "(default: %(default)s)"
     add("--state", default=Keys.state, help=f"feature with measured joints and gripper {default}")
@@ -145,7 +145,7 @@ def _camera(text: str) -> tuple[str, str]:
 
 @contextmanager
 def _progress_bar(title: str) -> Iterator[tuple["Report", Callable[[str], None]]]:
-    """Yield a progress callback, which shows the bar when first called, and a line printer."""
+    """Yield a progress callback and a line printer; the callback's first call shows the bar."""
     progress = bars(Console(stderr=True), "steps")
     bar = progress.add_task(title, total=None)
     print_line = functools.partial(

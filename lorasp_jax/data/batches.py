@@ -1,8 +1,8 @@
 """Training batches: windows of demonstrations.
 
 Episodes are stored as flat per-step arrays, on the device if they fit there, otherwise in files. A
-batch is gathered from these arrays. It depends only on the run's key or seed and the number of the
-training step, so this number suffices to resume where a run left off in the data.
+batch depends only on the run's key or seed and on the training step, so the step number is all that
+is needed to resume.
 """
 
 import dataclasses
@@ -44,7 +44,7 @@ class Steps:
         image: camera name -> `[N, H, W, 3]` uint8.
         state: `[N, J+1]` joints [rad] and gripper opening [m].
         action: `[N, J+1]` joint targets [rad] and gripper opening [m].
-        end: `[N]` int32, index just past the last step of the same episode.
+        end: `[N]` int32, index just past the last step of the episode.
         instruction: `[N]` int32, row of the processor's token table.
     """
 
@@ -77,7 +77,7 @@ class Raw:
 
 
 def flatten(episodes: Sequence[Episodes]) -> Steps:
-    """Concatenate the valid steps of all `Episodes`, numbering their instructions consecutively."""
+    """Concatenate all episodes without padding, and number their instructions consecutively."""
     parts: list[Steps] = []
     step_offset = instruction_offset = 0
     for group in episodes:
@@ -104,7 +104,7 @@ def flatten(episodes: Sequence[Episodes]) -> Steps:
 
 
 def fit_to_size(steps: Steps, size: int) -> Steps:
-    """Truncate to `size` steps, or repeat the steps cyclically up to `size`."""
+    """Truncate to `size` steps, or repeat the steps cyclically to reach `size`."""
     number = len(steps.end)
     rows = np.arange(size) % number
     fitted = jax.tree.map(lambda array: array[rows], steps)
@@ -113,7 +113,7 @@ def fit_to_size(steps: Steps, size: int) -> Steps:
 
 
 def windows(steps: Steps, start: Array, chunk: int) -> tuple[Array, Array]:
-    """Compute the step indices of chunks; past the end of an episode, its last step is repeated.
+    """Compute the step indices of chunks, repeating the last step past the end of an episode.
 
     Args:
         steps: the N steps to index.
@@ -121,7 +121,7 @@ def windows(steps: Steps, start: Array, chunk: int) -> tuple[Array, Array]:
         chunk: C.
 
     Returns:
-        `[B, C]` int32 indices, and `[B, C]` bool, False where a step is repeated.
+        Indices, `[B, C]` int32, and a mask, `[B, C]` bool, False where the last step is repeated.
     """
     xp = jnp if isinstance(start, jax.Array) else np
     window = start[:, None] + xp.arange(chunk)
@@ -130,7 +130,7 @@ def windows(steps: Steps, start: Array, chunk: int) -> tuple[Array, Array]:
 
 
 def gather(steps: Steps, start: Array, chunk: int) -> Raw:
-    """Gather the windows that start at the steps `start` `[B]`, see `windows`."""
+    """Gather the windows that start at steps `start`, `[B]`; see `windows`."""
     window, inside = windows(steps, start, chunk)
     return Raw(
         image={name: image[start] for name, image in steps.image.items()},
@@ -142,11 +142,7 @@ def gather(steps: Steps, start: Array, chunk: int) -> Raw:
 
 
 def encode(key: jax.Array, raw: Raw, processor: Processor, *, state_noise: float) -> Batch:
-    """Normalize a batch for the model; `key` seeds the noise added to the normalized state.
-
-    The action mask is False where a chunk repeats the last action of its episode, and outside
-    `Processor.flow_slots`.
-    """
+    """Normalize a batch for the model; `key` seeds the noise added to the normalized state."""
     batch: Any = jax.tree.map(jnp.asarray, raw)
     observed: RawObservation = {"image": batch.image, "state": batch.state}
     noise = state_noise * jax.random.normal(key, (len(batch.state), processor.statistics.dim))
@@ -164,7 +160,7 @@ def sample_batch(
     chunk: int,
     state_noise: float,
 ) -> Batch:
-    """Sample `batch_size` windows that start at uniformly random steps; `key` is consumed."""
+    """Sample `batch_size` windows that start at uniformly random steps."""
     start_key, noise_key = jax.random.split(key)
     start = jax.random.randint(start_key, (batch_size,), 0, steps.end.shape[0])
     return encode(noise_key, gather(steps, start, chunk), processor, state_noise=state_noise)

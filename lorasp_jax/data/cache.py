@@ -1,15 +1,17 @@
-"""A flat on-disk cache of a dataset's steps, written once and read by training.
+"""A dataset's steps as flat files on disk, written once and read by training.
 
     cache.write([open_source("my_dataset")], "my_cache", lambda done, total: None)
     steps = cache.Cache("my_cache").steps
 
-A cache is a folder of memory-mapped .npy files, which include raw images. cache.json contains the
-metadata that all episodes share and the checksums of the files, and statistics.json contains the
-statistics of states and actions; it exists only if actions are joint targets. Image checksums have
-separate files, and each image is verified when it is first read. Reading a batch takes one gather
-per file. Measured on two cores, for batches of 64 shuffled windows with two cameras: 37,000
-windows/s at 128 x 128 pixels and 18,000 at 224 x 168, versus 6,500 and 3,800 from array_record
-files.
+A cache is a folder of memory-mapped .npy files, including raw images. There are two more files:
+
+    cache.json        metadata that all episodes share, and checksums of the files
+    statistics.json   statistics of states and actions; only if actions are joint targets
+
+Each image has its own checksum, which is verified when the image is first read. Reading a batch
+takes one gather per file. On two cores, with batches of 64 shuffled windows with two cameras, this
+gives 37,000 windows/s at 128 x 128 pixels and 18,000 at 224 x 168. From array_record files, it is
+6,500 and 3,800.
 """
 
 import json
@@ -38,7 +40,7 @@ from lorasp_jax.storage.json_values import check
 FORMAT = "lorasp-cache-1"
 HEADER, STATISTICS = "cache.json", "statistics.json"
 ROWS = ("state", "action", "length", "instruction", "task")
-"""Columns other than images: state and action per step; length, instruction, task per episode."""
+"""Columns other than images: state and action per step, and the others per episode."""
 _IMAGE, _CHECKSUM = "image_", "crc32_"
 _DTYPES = {"state": np.float32, "action": np.float32, "image": np.uint8, "crc32": np.uint32}
 METADATA = tuple(name for name in SHARED if name not in ("task", "instructions"))
@@ -68,9 +70,9 @@ def write(
         sources: datasets with the same robot and image size; not modified.
         path: folder to create.
         progress: called with the steps done and the total.
-        waiting: called once before waiting, if another process is writing this folder. The cache
-            written by that process is accepted if it matches these datasets. If `waiting` is None,
-            raise an error instead of waiting.
+        waiting: called once if another process is writing this folder, before waiting for it. The
+            cache that it writes is accepted if it matches these datasets. None raises an error
+            instead of waiting.
 
     Raises:
         ValueError: the path already exists, another process is writing it or wrote a cache that
@@ -108,7 +110,7 @@ def _check_same(cache: "Cache", sources: Sequence[Source], steps: int) -> None:
 
 
 def _prefetch(sources: Sequence[Source], reader: ThreadPoolExecutor) -> Iterator[Episodes]:
-    """Yield all episodes; prefetch the next one, so that two are in memory at a time."""
+    """Yield all episodes while loading the next one; two are in memory at a time."""
     pending = None
     for source in sources:
         for number in range(len(source)):
@@ -132,7 +134,6 @@ class Writer:
         self._columns: dict[str, Column] = {}
 
     def __enter__(self) -> Self:
-        """Return the writer itself."""
         return self
 
     def __exit__(self, error: Any, *_: Any) -> None:
@@ -190,7 +191,7 @@ class Writer:
 
 
 def _check_compatible(shared: dict[str, Any], episode: Episodes) -> None:
-    """Raise ValueError if an episode's metadata differs from what all episodes must share."""
+    """Raise ValueError unless an episode's metadata equals `shared`."""
     for name, value in _metadata(episode).items():
         if value != shared[name]:
             raise ValueError(
@@ -215,8 +216,8 @@ class Cache:
         path: the folder.
         metadata: content of cache.json, including robot, tasks, instructions and control_dt.
         cameras: name -> height and width.
-        statistics: of states and actions, in the robot's units; None unless actions are joint
-            targets.
+        statistics: statistics of states and actions in the robot's units; None unless actions are
+            joint targets.
     """
 
     kind = "cache"
@@ -267,7 +268,7 @@ class Cache:
         )
 
     def episode(self, number: int, cameras: Sequence[str] | None = None) -> Episodes:
-        """Load one episode, with images from `cameras`, or from all cameras if None."""
+        """Load one episode with images from `cameras`; None means all cameras."""
         rows = slice(self._end[number] - self._columns["length"][number], self._end[number])
         row = slice(number, number + 1)
         selected = self.cameras if cameras is None else cameras
@@ -313,7 +314,7 @@ class Cache:
         return map_column(path, dtype, shape, self.metadata["crc32"].get(name))
 
     def _map_images(self, name: str, size: Sequence[int]) -> np.ndarray | CheckedImages:
-        """Memory-map a camera's images; old caches have no checksums for them."""
+        """Memory-map a camera's images; old caches lack checksums for them."""
         array = self._map(_IMAGE + name, (self.num_steps, *size, 3))
         if _CHECKSUM + name not in self.metadata["crc32"]:
             return array
@@ -329,7 +330,6 @@ class Cache:
 
 
 def _read_header(path: Path) -> dict[str, Any]:
-    """Read and check cache.json."""
     header: dict[str, Any] = read_json(path, path.parent)
     if DIGEST in header:
         header = verify_digest(header)

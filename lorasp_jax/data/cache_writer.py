@@ -13,7 +13,7 @@ class Column:
     """An .npy file that grows along its first axis."""
 
     def __init__(self, path: Path, like: np.ndarray) -> None:
-        """Create an empty file for rows with the dtype and shape of those in `like`."""
+        """Create an empty file for rows of the same dtype and shape as those of `like`."""
         self._file = path.open("wb")
         self._header = {"descr": np.lib.format.dtype_to_descr(like.dtype), "fortran_order": False}
         self._row_shape, self._length = like.shape[1:], 0
@@ -40,7 +40,7 @@ class Column:
 def map_column(
     path: Path, dtype: Any, shape: tuple[int | None, ...], crc32: int | None = None
 ) -> np.ndarray:
-    """Memory-map an array, reading its data only to verify a checksum.
+    """Memory-map an array; its data is read only to verify a checksum.
 
     Args:
         path: the .npy file.

@@ -9,13 +9,13 @@ import numpy as np
 
 
 class CheckedImages:
-    """A memory-mapped array of images, uint8 `[N, H, W, 3]`; indexing reads and verifies images.
+    """A memory-mapped array of images, uint8 `[N, H, W, 3]`; indexing reads and verifies them.
 
-    The file may be larger than memory, so each image is verified only when it is first read.
+    Opening verifies nothing, because the file may be larger than memory.
     """
 
     def __init__(self, path: Path, array: np.ndarray, checksums: np.ndarray) -> None:
-        """Wrap a memory-mapped array, without reading it.
+        """Wrap a memory-mapped array.
 
         Args:
             path: the file.

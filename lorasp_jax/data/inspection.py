@@ -21,14 +21,14 @@ from lorasp_jax.data.source import Source
 from lorasp_jax.data.video import downscale
 
 EPISODES, FRAMES, TILE, LINE = 6, 5, 128, 14
-"""Contact sheet: number of rows, images per row, longer image side [px] and caption height [px]."""
+"""Contact sheet: rows, time steps per row, longer image side [px], caption height [px]."""
 _MAX_INSTRUCTIONS = 10  # in the report
 _END_EFFECTOR = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")  # action dimensions
 
 
 @dataclasses.dataclass(frozen=True)
 class Summary:
-    """A dataset without its images.
+    """Numbers and texts of a dataset, without its images.
 
     Attributes:
         state: f32 `[N, J+1]`, all episodes concatenated.
@@ -69,7 +69,7 @@ def summarize(source: Source) -> Summary:
 
 
 def _names(episode: Episodes) -> dict[str, list[str]]:
-    """Return the dimension names of an episode in one of this project's own formats."""
+    """Return the dimension names of an episode in this project's own formats."""
     joints = [f"joint_{i + 1}" for i in range(episode.state.shape[2] - 1)]
     action = _END_EFFECTOR if episode.actions == "end_effector" else joints
     return {"state": [*joints, "gripper"], "action": [*action, "gripper"]}
@@ -117,13 +117,12 @@ def hints(summary: Summary) -> list[str]:
 
 
 def _image_sizes(source: Source) -> list[str]:
-    """Return each camera with the size of its images."""
+    """Return each camera with its image size [px], such as "wrist 128 x 96"."""
     image = source.episode(0).image
     return [f"{name} {x.shape[3]} x {x.shape[2]}" for name, x in image.items()]
 
 
 def _value_table(summary: Summary) -> Table:
-    """Make a table with a row per dimension of state and action."""
     table = Table(box=None, padding=(0, 1, 0, 0))
     table.add_column("")
     for title in ("min", "max", "mean", "std"):
@@ -154,7 +153,7 @@ def default_path(dataset: str) -> Path:
     """Return the default path of a dataset's contact sheet, in the user's cache folder.
 
     Args:
-        dataset: path or id of the dataset.
+        dataset: path or URL of the dataset.
     """
     path = Path(os.path.realpath(dataset))
     digest = hashlib.sha256(str(path if path.exists() else dataset).encode()).hexdigest()[:8]
@@ -186,7 +185,7 @@ def _row(source: Source, number: int) -> np.ndarray:
     caption = Image.new("RGB", (images.shape[1], LINE))
     phrase = episode.instructions[int(episode.instruction[0])]
     text = f"{number}: {phrase} ({episode.num_steps} steps)"
-    printable = text.encode("latin-1", "replace").decode("latin-1")  # characters in the font
+    printable = text.encode("latin-1", "replace").decode("latin-1")  # the font has no others
     ImageDraw.Draw(caption).text((2, 1), printable, fill="white")
     return np.concatenate([np.asarray(caption), images])
 

@@ -1,4 +1,4 @@
-"""Feature mapping of a LeRobot dataset; a separate module, since the reader is slow to import."""
+"""Feature mapping of a LeRobot dataset, apart from the reader, which is slow to import."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -22,10 +22,10 @@ class Keys:
             "observation.images.".
         angles: unit of the joints.
         gripper: unit of the gripper opening.
-        every: keep every N-th frame, with the last action before the next kept frame; 3 turns
-            30 Hz into 10 Hz.
-        image_size: maximum length of the longer image side [px], to which larger images are
-            downscaled; 0 means no limit.
+        every: keep every N-th frame, paired with the last action before the next kept frame; 3
+            turns 30 Hz into 10 Hz.
+        image_size: maximum length of the longer image side [px]; larger images are downscaled. 0
+            means no limit.
     """
 
     state: str = "observation.state"

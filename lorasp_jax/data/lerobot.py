@@ -4,8 +4,7 @@
     episodes = dataset.episode(0)
 
 States and actions are columns of parquet files. Images are video frames, or PNG or JPEG files in
-other columns. Each episode is returned as `Episodes` with E = 1, with dimensions in this project's
-order and units.
+other columns. Each episode is returned as `Episodes` with E = 1, in this project's order and units.
 """
 
 import os
@@ -34,7 +33,7 @@ from lorasp_jax.storage import hub
 _COLUMNS = ("timestamp", "frame_index", "episode_index", "task_index")
 _MAX_DIM = 10_000  # limit for state and action
 _TIME_TOLERANCE = 0.25
-"""Tolerance of timestamps, in frame periods; the same as for videos."""
+"""Tolerance of timestamps, in frame periods; as for videos."""
 
 
 class LeRobot:
@@ -48,8 +47,8 @@ class LeRobot:
         keys: feature mapping.
         cameras: camera -> feature.
         control_dt: time between two steps [s].
-        names: "state" and "action" -> names of the selected dimensions, in order; indices where the
-            dataset has no names.
+        names: "state" and "action" -> names of the selected dimensions, in order; their indices if
+            the dataset has no names.
     """
 
     def __init__(
@@ -136,7 +135,6 @@ class LeRobot:
         return episode
 
     def _cameras(self) -> dict[str, str]:
-        """Map the selected cameras to their features."""
         available = {
             key.removeprefix("observation.").removeprefix("images."): key
             for key, feature in self.index.features.items()
@@ -156,7 +154,7 @@ class LeRobot:
         return self.index.features[key]["dtype"] == "video"
 
     def _names(self, kind: str) -> list[str]:
-        """Return the names of a feature's dimensions, or their indices if they have no names."""
+        """Return the names of a feature's dimensions, or their indices if they are unnamed."""
         key = getattr(self.keys, kind)
         with as_value_error(self.path / "meta" / "info.json"):
             feature = self.index.features[key]
@@ -257,7 +255,7 @@ class LeRobot:
             return np.stack([first, *(decode_image(file, size) for file in files[1:])])
 
     def _video(self, camera: str, path: Path) -> VideoReader:
-        """Return a camera's video, kept open since the next episode may be in the same file."""
+        """Return a camera's video, left open because the next episode may be in the same file."""
         video = self._videos.get(camera)
         if video is None or video.path != path:
             if video is not None:

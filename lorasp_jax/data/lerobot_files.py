@@ -1,4 +1,4 @@
-"""Metadata and file layout of LeRobot datasets: the only code that depends on the format version.
+"""Metadata and file layout of LeRobot datasets; no other code depends on the format version.
 
     2.x   one parquet file per episode, one video per episode and camera; meta/*.jsonl
     3.0   many episodes per parquet file and per video; meta/**/*.parquet
@@ -42,8 +42,8 @@ class EpisodeEntry:
     Attributes:
         number: index of the episode in the dataset.
         length: number of frames.
-        table: parquet file with the episode's states and actions, and possibly other episodes'.
-        videos: feature -> video file, and start time of the episode in that file [s].
+        table: parquet file with states and actions; other episodes may share it.
+        videos: feature -> video file, and the episode's start time in it [s].
     """
 
     number: int
@@ -136,7 +136,7 @@ def _read_3(
     """Read tasks and episodes of version 3.0."""
     path = folder / "meta" / "tasks.parquet"
     with as_value_error(path):
-        # The tasks are the index of a pandas table; the index may have lost its name "task".
+        # Instructions are the index of a pandas table, stored under this key if it has no name.
         rows = [
             {"task": row.pop("__index_level_0__", None), **row}
             for row in read_table(path, folder).to_pylist()
@@ -157,7 +157,7 @@ def _read_3(
 def _video_3(
     folder: Path, info: Mapping[str, Any], key: str, row: Mapping[str, Any]
 ) -> tuple[Path, float]:
-    """Return an episode's video and its start in that file [s], in version 3.0."""
+    """Return an episode's video file and its start time in that file [s], in version 3.0."""
     at = {name: as_int(row[f"videos/{key}/{name}"]) for name in ("chunk_index", "file_index")}
     start = float(row[f"videos/{key}/from_timestamp"])
     if not 0 <= start < math.inf:
@@ -166,7 +166,7 @@ def _video_3(
 
 
 def _format(template: Any, **values: Any) -> str:
-    """Fill in a path template; `str.format` would also evaluate attributes, which is not safe."""
+    """Fill in a path template. `str.format` is unsafe, because it evaluates attributes."""
     if not isinstance(template, str) or set("{}") & set(_FIELD.sub("", template)):
         raise ValueError(f"invalid path template {template!r}")
     return _FIELD.sub(lambda field: format(values[field[1]], field[2] or ""), template)
@@ -185,7 +185,7 @@ def read_table(
 
     Raises:
         KeyError: a column is missing.
-        Exception: raised by `files.check_regular` or pyarrow, see `as_value_error`.
+        Exception: from `envs.datasets.files` or pyarrow; `as_value_error` converts it.
     """
     with pq.ParquetFile(check_regular(path, folder)) as file:
         available = file.schema_arrow.names
@@ -198,7 +198,7 @@ def read_table(
 
 
 def _size(metadata: pq.FileMetaData, columns: set[str]) -> int:
-    """Estimate the bytes of columns in memory; repeated values take almost none in the file."""
+    """Estimate the size of columns in memory [bytes]; the file stores repeated values only once."""
     groups = (metadata.row_group(i) for i in range(metadata.num_row_groups))
     chunks = (group.column(j) for group in groups for j in range(group.num_columns))
     return sum(
@@ -233,5 +233,5 @@ def _json_lines(path: Path, folder: Path) -> Iterator[dict[str, Any]]:
 
 
 def as_value_error(path: Path) -> contextlib.AbstractContextManager[None]:
-    """Convert errors like `files.as_value_error`, including those of pyarrow."""
+    """Convert errors like `files.as_value_error`, and those of pyarrow."""
     return files.as_value_error(path, pa.ArrowException)

@@ -19,11 +19,12 @@ def open_source(where: str | os.PathLike[str], keys: Keys | None = None) -> Sour
 
     Args:
         where: a path, or hf://owner/name of a LeRobot dataset on the Hub.
-        keys: feature mapping of a LeRobot dataset; the other formats need none.
+        keys: feature mapping of a LeRobot dataset; other formats ignore `image_size` and reject
+            all other settings.
 
     Raises:
-        ValueError: the dataset is missing, damaged or in an unknown format, or `keys` has feature
-            options although the dataset is not a LeRobot dataset.
+        ValueError: the dataset is missing, damaged or in an unknown format, or `keys` does not fit
+            its format.
     """
     path = hub.local(where, repository="dataset")
     if is_lerobot(path):

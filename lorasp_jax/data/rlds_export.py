@@ -17,13 +17,13 @@ def to_rlds(
     *,
     episodes_per_file: int = 16,
 ) -> None:
-    """Write an RLDS folder, which appears only once it is complete; see `envs.datasets.rlds`.
+    """Write an RLDS folder (see `envs.datasets.rlds`), which appears only once it is complete.
 
     Args:
         source: a dataset of one task; not modified.
         path: folder to create.
         progress: called with the steps done and the total.
-        episodes_per_file: number of episodes per file; these are in memory at the same time.
+        episodes_per_file: number of episodes per file; those of one file are in memory together.
 
     Raises:
         ValueError: the path already exists, another process is writing it, there are several tasks,

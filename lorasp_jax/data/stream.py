@@ -1,10 +1,9 @@
-"""Stream endless, shuffled batches of windows from a cache with Grain, resumable by position.
+"""Stream shuffled batches of windows from a cache, endlessly, with Grain.
 
     for raw in Stream(Cache("my_cache").steps, batch_size=32, chunk=50, seed=0, start=1000):
 
-For given data and batch size, a batch depends only on the seed and its position. The global batch
-is the same, row for row, for any number of processes, so a run may resume with a different number
-of processes.
+For given data and batch size, a global batch depends only on the seed and its position. A run can
+therefore resume at any position, and with a different number of processes.
 """
 
 from typing import Any
@@ -35,7 +34,7 @@ class Stream:
         start: int = 0,
         process: tuple[int, int] = (0, 1),
     ) -> None:
-        """Create a stream, which prefetches in a background thread.
+        """Create a stream that prefetches in a background thread.
 
         Args:
             steps: steps to sample from, see `Cache.steps`.
@@ -43,8 +42,8 @@ class Stream:
             chunk: C, the number of actions in a window.
             seed: seed of the shuffling; every epoch has a different order.
             start: `position` to resume from.
-            process: index of this process, and number of processes; each process gets an equal
-                share of a batch.
+            process: index of this process, and number of processes; each gets an equal share of a
+                batch.
 
         Raises:
             ValueError: an argument is out of range, or `batch_size` is not a multiple of the number
@@ -71,7 +70,6 @@ class Stream:
         self._iterator.set_state({"next_index": start})
 
     def __iter__(self) -> "Stream":
-        """Return the stream itself."""
         return self
 
     def __next__(self) -> Raw:

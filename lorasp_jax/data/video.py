@@ -19,8 +19,8 @@ _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
 _OPTIONS = {"format_whitelist": _CONTAINERS, "protocol_whitelist": "file"}
 _FORMATS = ("PNG", "JPEG")
 _TOLERANCE = 0.25
-"""Tolerance of a frame's time, in frame periods: small enough not to mistake a frame for the next
-one, and to notice a wrong frame rate within the first few frames."""
+"""Tolerance of a frame's time, in frame periods. It is small enough to tell adjacent frames apart,
+and to notice a wrong frame rate within a few frames."""
 
 
 class VideoReader:
@@ -44,7 +44,7 @@ class VideoReader:
             raise ValueError(f"{path} cannot be read as a video ({first_line(error)})") from error
         self._stream.thread_type = "AUTO"
         self._frames: Iterator[Any] = self._container.decode(self._stream)
-        # Shared by all frames, since creating a reformatter takes as long as converting a frame.
+        # Shared by all frames: creating a reformatter takes as long as converting a frame.
         self._reformatter = VideoReformatter()
         self._end = 0.0  # end time of the last read [s]
 
@@ -135,8 +135,8 @@ def decode_image(file: bytes, image_size: int = 0) -> np.ndarray:
 def downscale(image: np.ndarray, image_size: int) -> np.ndarray:
     """Downscale uint8 `[H, W, 3]` to at most `image_size` pixels on the longer side.
 
-    If `image_size` is 0, there is no limit. The filter is bilinear with antialiasing, as in
-    openpi's clients (openpi_client/image_tools.py).
+    0 means no limit. The filter is bilinear with antialiasing, as in openpi's clients
+    (openpi_client/image_tools.py).
     """
     height, width, _ = image.shape
     longest = max(height, width)
