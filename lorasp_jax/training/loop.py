@@ -29,7 +29,7 @@ from lorasp_jax.training.stepper import Collect, Stepper, make_stepper
 
 
 class RunError(ValueError):
-    """The run cannot continue; the message states the reason and a remedy in one sentence."""
+    """The run cannot continue; the message states the reason and a remedy."""
 
 
 def train(
@@ -43,15 +43,15 @@ def train(
 
     Args:
         run: the run to train.
-        callbacks: objects whose hooks are called, in order.
+        callbacks: called in order.
         resume: continue from the newest checkpoint, if there is one.
         collect: collects new demonstrations if `data.fresh_every` is set.
 
     Raises:
-        RunError: too many consecutive steps were skipped, or an update was non-finite; the last
+        RunError: too many consecutive steps were skipped, or an update was non-finite. The last
             checkpoint is kept.
-        KeyboardInterrupt: a signal stopped the run; the state is saved unless a second signal
-            follows.
+        KeyboardInterrupt: a signal stopped the run. The state is saved first, unless a second
+            signal arrives.
     """
     graphdef, adapters, frozen = adaptation.split(run.policy.model)
     methods = adaptation.methods(run.policy.model).values()
@@ -100,7 +100,7 @@ def _call(callbacks: Sequence[Callback], run: Run, hook: str) -> None:
 def _call_on_log(
     callbacks: Sequence[Callback], run: Run, done: int, values: dict[str, float]
 ) -> dict[str, float]:
-    """Return the scalars to log, including those of the callbacks, which may run an evaluation."""
+    """Return `values` with the scalars that callbacks add; a callback may evaluate the policy."""
     local_policy = _local_policy(run, f"evaluated at step {done}")
     with local_policy if run.config.evaluates(done) else contextlib.nullcontext():
         for callback in callbacks:
@@ -144,7 +144,7 @@ def jit_steps(run: Run, graphdef: Any, optimizer: Any, shardings: TrainState) ->
         batch = jax.lax.with_sharding_constraint(batch, meshes.batch_sharding(mesh))
         return step(state, frozen, batch, loss_key)
 
-    # Keep the state's sharding, because the compiled program accepts no other as its input.
+    # Keep the state's sharding: the compiled program accepts no other as its input.
     @functools.partial(
         jax.jit,
         static_argnames="count",
@@ -211,9 +211,9 @@ def _failure(
     """Return an error if too many consecutive steps were skipped or an update was non-finite.
 
     Args:
-        optim: optimizer settings, including the limits.
+        optim: the limits.
         rows: metrics of each step of the log interval, `[count, ...]`.
-        values: means of these metrics, as logged.
+        values: means of these metrics.
         done: step at the end of the interval.
         saved: step of the last checkpoint.
     """

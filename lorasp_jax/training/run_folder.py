@@ -32,7 +32,7 @@ from lorasp_jax.training.distributed import processes
 CONFIG_FILE, TIMES_FILE, DATASET_FILE = "config.json", "seconds.json", "dataset.json"
 """Files that a run may leave behind if it fails before producing any results."""
 WILDCARDS = frozenset("*?[\\")
-"""Orbax cannot find checkpoints under a path with one of these, because it uses glob patterns."""
+"""Not allowed in a run's path: Orbax treats paths as glob patterns and would find no checkpoint."""
 STOPPED = "stopped.json"
 """File with the reason why training stopped; removed when training continues."""
 
@@ -51,12 +51,8 @@ def write_json(path: Path, value: Mapping[str, Any]) -> None:
 def read_json(path: Path, schema: Mapping[Any, Any] = MappingProxyType({})) -> dict[str, Any]:
     """Read a file written by `write_json`; return {} if it does not exist.
 
-    Args:
-        path: the file.
-        schema: required fields (see `json_values.check`).
-
     Raises:
-        ValueError: the file is corrupt or was written by another version.
+        ValueError: the file is corrupt or does not match `schema` (see `json_values.check`).
     """
     if not path.exists():
         return {}
@@ -73,13 +69,13 @@ def open_run(config: Config, root: Path, *, resume: bool | Literal["auto"]) -> I
     Args:
         config: configuration of the run.
         root: parent of all run folders.
-        resume: True: require a run with the same config; False: create the folder; "auto": resume
-            if the run exists, otherwise create it.
+        resume: False creates the folder; True requires a run with the same config; "auto" resumes
+            the run if it exists and creates it otherwise.
 
     Raises:
-        ValueError: the folder cannot be created, is in use by another process, has a wildcard in
-            its path, or contains a pipe or a link that leads out of it; or the run exists
-            although `resume` is False, is missing although it is True, or has a different config.
+        ValueError: the path contains a wildcard, or another process uses the folder. For a new
+            run: the folder already contains a run, or is a file. To resume: the folder contains no
+            run, a run with another config, a pipe, or a symlink that points outside it.
     """
     folder = root / config.name
     if wildcards := WILDCARDS & set(str(folder.absolute())):
@@ -122,13 +118,8 @@ def _begin(config: Config, folder: Path) -> None:
 def record_dataset(folder: Path, facts: Mapping[str, Any], *, streams: bool) -> bool:
     """Record the run's dataset and return whether to stream it.
 
-    A run that started streaming keeps streaming, because streamed batches differ from
-    batches sampled on the device.
-
-    Args:
-        folder: folder of the run.
-        facts: JSON values that identify the dataset.
-        streams: whether the dataset is too large for this device.
+    `streams` tells whether the dataset is too large for this device. A run that started streaming
+    keeps streaming, because streamed batches differ from batches sampled on the device.
 
     Raises:
         ValueError: the run started with a different dataset.
@@ -148,7 +139,7 @@ def record_dataset(folder: Path, facts: Mapping[str, Any], *, streams: bool) -> 
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock: a file beside the folder, in which each holder identifies itself."""
+    """Lock the folder through a file beside it, which names the process that holds the lock."""
     file = folder.parent / f".{folder.name}.lock"
     try:
         lock = acquire(file)
@@ -163,7 +154,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _recorded(folder: Path) -> dict[str, Any]:
-    """Return the config recorded in `folder` as JSON values."""
+    """Return the config recorded in `folder`."""
     if not (folder / CONFIG_FILE).exists():
         raise ValueError(f"{folder} contains no run to resume: omit --resume to start one")
     config = read_json(folder / CONFIG_FILE, records.CONFIG)
@@ -185,12 +176,11 @@ def _differences(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -
 class MetricsLog:
     """Appends scalars to `metrics.jsonl` and to TensorBoard event files.
 
-    A resumed run drops rows after its start step, so that the log matches that of an uninterrupted
-    run. Only the first process writes.
+    Only the first process writes.
     """
 
     def __init__(self, folder: Path, start_step: int = 0) -> None:
-        """Open the log of the run in `folder`, which resumes at `start_step`."""
+        """Open the log and drop rows after `start_step`, from which the run resumes."""
         self.path: Path = folder / "metrics.jsonl"
         self._writes = processes.is_first()
         if not self._writes:
@@ -199,8 +189,8 @@ class MetricsLog:
         write_text(self.path, "".join(map(_line, rows)))
         board = folder / "tensorboard"
         board.mkdir(exist_ok=True)
-        # SummaryWriter would block its callers forever if its thread failed. File names contain
-        # the time in whole seconds; the step as a suffix keeps them unique.
+        # SummaryWriter would block its callers forever if its thread failed. The step makes file
+        # names unique, because their time has a resolution of 1 s.
         self._board = EventsWriter(str(board / "events"), f".{start_step:09}")
         start = SessionLog(status=SessionLog.START)  # discards old events from this step on
         self._add(start_step + 1, session_log=start)
@@ -228,7 +218,6 @@ class MetricsLog:
         self._add(step, summary=Summary(value=[value for s in summaries for value in s.value]))
 
     def _add(self, step: int, **content: Any) -> None:
-        """Write an event and flush it."""
         self._board.write_event(Event(wall_time=time.time(), step=step, **content))
         self._board.flush()
 

@@ -47,9 +47,9 @@ STATISTICS_BATCHES = 8
 """Number of batches used for data-driven initialization."""
 
 LoadBase = Callable[..., tuple[Backbone, str]]
-"""Loads the frozen base and its hash (see `base_model`)."""
+"""Signature of `base_model`."""
 Collect = Callable[[Config, Path, Progress], dict[str, Episodes]]
-"""Collects the demonstrations of each task (see `demonstrations`)."""
+"""Signature of `demonstrations`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,13 +58,12 @@ class RunSetup:
 
     Attributes:
         base: the frozen base, with the chosen rematerialization.
-        base_hash: hash of the base.
         model: the base with adapters, before any data-driven initialization.
         prompts: prompts of all instructions.
         joints: number of robot joints J.
-        environments: one environment per task; empty if the config names a dataset.
-        source: the dataset; None: the expert collects demonstrations.
-        memory: estimated memory of one step.
+        environments: one per task; empty if the config names a dataset.
+        source: the dataset; None if the expert collects demonstrations.
+        memory: estimate for one step.
         available: device memory [bytes].
     """
 
@@ -80,23 +79,18 @@ class RunSetup:
 
     @property
     def free_bytes(self) -> float:
-        """Device memory left over by a training step [bytes]."""
+        """Device memory that a training step leaves free [bytes]."""
         return self.available - self.memory.peak
 
 
 def build(
     config: Config, folder: Path, *, abstract: bool = False, load_base: LoadBase = base_model
 ) -> RunSetup:
-    """Load or create the base and attach the adapters, without writing anything.
+    """Load or create the base and attach the adapters, without writing to `folder`.
 
-    This validates the config before any long-running work.
-
-    Args:
-        config: configuration of the run.
-        folder: folder of the run.
-        abstract: build only shapes, for a dry run: nothing is downloaded, and the bundled tokenizer
-            replaces a remote one.
-        load_base: loads the frozen base and its hash.
+    This validates the config before any long-running work. With `abstract`, for a dry run, the
+    adapted model has only shapes. A remote dataset is then still downloaded, but not a remote base
+    or tokenizer; the bundled tokenizer is used instead.
 
     Raises:
         ValueError: an unknown task, robot, backbone or size, an incompatible base or tokenizer, a
@@ -138,13 +132,7 @@ def prepare(
 ) -> Run:
     """Build a run and load or collect its demonstrations.
 
-    Args:
-        config: configuration of the run.
-        folder: folder of the run.
-        console: console for status messages.
-        started: `time.perf_counter()` when this process started.
-        load_base: loads the frozen base and its hash.
-        collect: collects the demonstrations if the config names no dataset.
+    `started` is the value of `time.perf_counter()` when this process started.
 
     Raises:
         ValueError: see `build`; also if the dataset cannot be read or the expert fails.
@@ -160,7 +148,7 @@ def prepare(
             _load_dataset(run, built.source, built.free_bytes)
         else:
             run.episodes = _collect(run, built.prompts.instructions, collect)
-    run.streams = processes.any_process(run.streams)  # in all or in none, since they share batches
+    run.streams = processes.any_process(run.streams)  # all or none: they share batches
     relative = config.model.relative_actions
     inputs = processor([*run.episodes.values()], model.config, built.prompts, relative=relative)
     if config.peft.needs_statistics:
@@ -181,7 +169,7 @@ def headline(config: Config, model: Backbone) -> str:
 
 
 def _camera_summary(run: Run, processor: Processor) -> str:
-    """Describe on one line how the dataset's cameras map to the backbone's camera slots."""
+    """Describe on one line which camera fills which of the backbone's camera slots."""
     images = next(iter(run.episodes.values())).image
     cameras = [
         f"{name} ({images[name].shape[3]} x {images[name].shape[2]}) -> {slot}"
@@ -198,7 +186,7 @@ def _prompts_and_joints(
     tokenizer: Tokenizer,
     model: BackboneConfig,
 ) -> tuple[PromptTable, int]:
-    """Return the prompts for all instructions of the dataset or tasks, and the number of joints."""
+    """Return the prompts for all instructions, and the robot's number of joints."""
     if source is None:
         joints = environments[0].robot.num_joints
         instructions = [phrase for env in environments for phrase in env.instructions]
@@ -285,14 +273,9 @@ def processor(
 ) -> Processor:
     """Build the processor from the prompts and the statistics of the demonstrations.
 
-    The robot's cameras fill the backbone's camera slots, in order of name; slots may stay empty.
-
-    Args:
-        episodes: demonstrations of each task.
-        model_config: sizes and inputs of the model.
-        prompts: prompts of the instructions, in the order of the tasks.
-        relative: learn joint targets relative to the state at the start of the chunk; False: follow
-            the model's config.
+    Cameras, sorted by name, fill the backbone's camera slots from the first on. With `relative`,
+    joint targets are relative to the state at the start of the chunk; otherwise the model's config
+    decides.
     """
     joints = episodes[0].state.shape[-1] - 1
     slots, dim = robot_slots(joints, model_config.inputs), model_config.action_dim
@@ -313,7 +296,7 @@ def processor(
 
 
 def _load_dataset(run: Run, source: Source, free_bytes: float) -> None:
-    """Load the dataset, with a progress bar; stream it if it is larger than `free_bytes`."""
+    """Load the dataset; stream it if it is larger than `free_bytes`."""
     with bars(run.console, "steps") as progress:
         bar = progress.add_task(f"reading {run.config.data.source}", total=None)
         report = lambda done, total: progress.update(bar, completed=done, total=total)  # noqa: E731
@@ -332,7 +315,7 @@ def _load_dataset(run: Run, source: Source, free_bytes: float) -> None:
 
 
 def _collect(run: Run, instructions: Sequence[str], collect: Collect) -> dict[str, Episodes]:
-    """Collect the demonstrations of each task, with a progress bar per task."""
+    """Collect demonstrations, with a progress bar per task."""
     with bars(run.console, "episodes") as progress:
         bar_ids: dict[str, TaskID] = {}
 

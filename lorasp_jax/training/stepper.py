@@ -26,17 +26,13 @@ Collect = Callable[[Config, int], dict[str, Episodes]]
 
 
 class Stepper:
-    """Runs steps, (state, key, count) -> state, metrics; compiles once per value of `count`.
-
-    Attributes:
-        speed: meter of training speed.
-    """
+    """Runs steps, (state, key, count) -> state, metrics; compiles once per value of `count`."""
 
     def __init__(self, jitted: Callable, frozen: Any, data: Steps | Raw, speed: Speed) -> None:
         """Store the arguments; nothing is compiled yet.
 
         Args:
-            jitted: jitted step function (see `loop.jit_steps`).
+            jitted: step function from `loop.jit_steps`.
             frozen: frozen parameters, on the mesh.
             data: the whole dataset or one raw batch, on the mesh.
             speed: meter of training speed.
@@ -46,7 +42,7 @@ class Stepper:
         self._compiled: dict[int, Future[Any]] = {}
 
     def compile(self, state: TrainState, count: int) -> Future[Any]:
-        """Start compiling `count` steps in a background thread, unless it has already begun."""
+        """Start compiling `count` steps in a background thread, unless already started."""
         if count not in self._compiled:
             self._compiled[count] = _in_thread(self._compile, state, count)
         return self._compiled[count]
@@ -68,7 +64,7 @@ class StreamingStepper(Stepper):
     """Runs steps on batches read from disk; the next batch is prefetched to the device."""
 
     def __init__(self, jitted: Callable, frozen: Any, batches: Iterator[Raw], speed: Speed) -> None:
-        """Read the first of `batches`; for the other arguments see `Stepper`."""
+        """Read the first batch; for the other arguments see `Stepper`."""
         super().__init__(jitted, frozen, next(batches), speed)
         self._batches = batches
 
@@ -90,7 +86,7 @@ class StreamingStepper(Stepper):
 class RefreshingStepper(Stepper):
     """Runs steps on demonstrations that are replaced every `data.fresh_every` steps.
 
-    Each generation, 0, 1, ..., is used for that many steps while the device collects the next one.
+    Each generation (0, 1, ...) is used for that many steps; meanwhile the device collects the next.
     A generation depends only on its number and the run's seed, so a resumed run reproduces it.
     """
 
@@ -103,26 +99,20 @@ class RefreshingStepper(Stepper):
         collect: Callable[[int], Steps],
         start: int,
     ) -> None:
-        """Collect the generation of the first step and start collecting the next one.
+        """Collect the generation of step `start` and start collecting the next one.
 
-        Args:
-            jitted: see `Stepper`.
-            frozen: see `Stepper`.
-            speed: see `Stepper`.
-            config: configuration of the run.
-            collect: returns a generation on the device; all generations have the same shapes.
-            start: index of the first step.
+        `collect` returns a generation on the device; all generations have the same shapes.
         """
         self._every, self._last = config.data.fresh_every, config.optim.steps - 1
         self._collect = collect
         self._generation = self._generation_of(min(start, self._last))
-        # If the last step is done, nothing trains: use generation 0, which exists already.
+        # After the last step nothing trains: use generation 0, which exists already.
         first = self._generation if start <= self._last else 0
         super().__init__(jitted, frozen, collect(first), speed)
         self._collect_next()
 
     def __call__(self, state: TrainState, key: jax.Array, count: int) -> tuple[TrainState, Any]:
-        """Run `count` steps, all on the generation of the first of them."""
+        """Run `count` steps on the generation of `state.step`."""
         if self._generation_of(int(state.step)) > self._generation:
             self.speed.begin()
             with self.speed.waiting(state):
@@ -135,7 +125,7 @@ class RefreshingStepper(Stepper):
         return step // self._every
 
     def _collect_next(self) -> None:
-        """Start collecting the next generation in a thread, if any step will train on it."""
+        """Start collecting the next generation in a thread, if a step will use it."""
         if self._generation_of(self._last) > self._generation:
             self._next = _in_thread(self._collect, self._generation + 1)
 
@@ -150,13 +140,8 @@ def make_stepper(
 ) -> Stepper:
     """Create the stepper that suits the run's data.
 
-    Args:
-        run: the run.
-        jitted: jitted step function (see `loop.jit_steps`).
-        frozen: frozen parameters, on the mesh.
-        mesh: mesh of the training devices.
-        start: index of the first step.
-        collect: collects new demonstrations if `data.fresh_every` is set.
+    `start` is the index of the first step. `collect` is called only if `data.fresh_every` is set.
+    For the other arguments see `Stepper`.
     """
     speed = _speed(run)
     if run.streams:

@@ -1,8 +1,7 @@
 """The ("data", "fsdp") device mesh and the shardings of arrays on it.
 
-One code path serves one device and many: the step is written for the global batch, and `jax.jit`
-with `NamedSharding` parallelizes it. This replaces `pmap` in current JAX
-(docs.jax.dev/en/latest/migrate_pmap.html).
+The step is written for the global batch. `jax.jit` with `NamedSharding` parallelizes it over any
+number of devices, which replaces `pmap` (docs.jax.dev/en/latest/migrate_pmap.html).
 """
 
 from collections.abc import Sequence
@@ -40,10 +39,10 @@ def batch_sharding(mesh: Mesh) -> NamedSharding:
 
 
 def split_axis(shape: Sequence[int], size: int, fsdp: int, minimum: int) -> int | None:
-    """Return the axis to shard over `fsdp` devices; None: replicate.
+    """Return the axis to shard over `fsdp` devices, or None to replicate the array.
 
-    It is the largest axis with a length divisible by `fsdp`. Arrays of `size` < `minimum` bytes
-    are replicated.
+    The longest axis divisible by `fsdp` is sharded. Arrays of `size` < `minimum` bytes are
+    replicated.
     """
     divisible = [axis for axis, length in enumerate(shape) if length % fsdp == 0]
     if fsdp == 1 or not divisible or size < minimum:

@@ -76,11 +76,11 @@ class Peers:
             raise ValueError(answer["refused"])
 
     def wait_for_root_cause(self) -> None:
-        """Let another failing process report first: its failure may have caused this one."""
+        """Wait briefly, to let a process that failed earlier report the cause."""
         time.sleep(_ROOT_CAUSE_DELAY)
 
     def announce_exit(self, code: int) -> None:
-        """Announce that this process is exiting; wait for an answer unless the code is 0."""
+        """Announce that this process is exiting; unless `code` is 0, wait to be told to exit."""
         self._code = code
         self._send({"leaving": code, "reason": self.exit_reason})
         if code:
@@ -101,7 +101,7 @@ class Peers:
             self._stop(1, f"{lost}: {cause}; {self._hint}")
 
     def _stop(self, code: int, reason: str) -> None:
-        """Exit this process at once, whatever its other threads are doing."""
+        """Print `reason` and exit without waiting for other threads."""
         if reason:
             self._say(reason)
         os._exit(self._code or code)

@@ -1,7 +1,7 @@
 """Multi-process runs: startup, barriers, shared arrays and coordinated exit.
 
-All processes train; only the first one collects, evaluates, prints and writes. The runs folder must
-be on storage that all of them share. In a single process nothing here waits for others.
+All processes train; only the first one collects, evaluates, prints and writes. All of them must
+share the storage of the runs folder. The functions also work in a single process.
 """
 
 import atexit
@@ -38,13 +38,11 @@ _peers: peers.Peers | None = None
 def initialize(console: Console, hint: str) -> None:
     """Connect to the other processes; call this before JAX starts its backend.
 
-    From then on, if one process exits early, all exit. JAX finds the address by itself under Slurm,
-    Open MPI and Kubernetes and on TPU pods. Elsewhere set JAX_COORDINATOR_ADDRESS (host:port of the
+    From then on, if one process fails, all exit. JAX finds the address by itself under Slurm, Open
+    MPI and Kubernetes and on TPU pods. Elsewhere set JAX_COORDINATOR_ADDRESS (host:port of the
     first process), JAX_NUM_PROCESSES and JAX_PROCESS_ID.
 
-    Args:
-        console: console for the status messages of the first process.
-        hint: remedy printed if another process dies.
+    `hint` is a remedy, printed if another process dies.
 
     Raises:
         ValueError: the environment does not describe the processes, they cannot be reached, or
@@ -93,7 +91,7 @@ def _cluster_info() -> tuple[str, int, int]:
 
 
 def _versions() -> dict[str, str]:
-    """Return the versions that must match for all processes to compute the same results."""
+    """Return what must match in all processes: package versions and a hash of the source."""
     versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
     sources = hashlib.sha256()
     for package in ("envs", "lorasp_jax"):
@@ -107,11 +105,12 @@ def _versions() -> dict[str, str]:
 def _delay_abort() -> None:
     """Delay JAX's SIGABRT after the coordinator is lost, so that the cause is reported first.
 
-    Python signal handlers do not run during abort(). C's `sleep` is async-signal-safe and can be
-    the handler: called with the signal number, 6, it sleeps 6 s. JAX's own options do not help
-    (tested with 0.10.2 and 0.12): `jax_enable_recoverability` covers only failures of processes
-    other than the first, and the client's `missed_heartbeat_callback` fails with std::bad_cast
-    before it is called.
+    Python signal handlers do not run during abort(), so the handler is C's `sleep`, which is
+    async-signal-safe. It is called with the signal number, 6, and therefore sleeps 6 s.
+
+    JAX's own options do not help (tested with 0.10.2 and 0.12). `jax_enable_recoverability` does
+    not cover a failure of the first process. The client's `missed_heartbeat_callback` fails with
+    std::bad_cast before it is called.
     """
     library = ctypes.CDLL(None)
     library.signal.argtypes = (ctypes.c_int, ctypes.c_void_p)
@@ -119,11 +118,7 @@ def _delay_abort() -> None:
 
 
 def agree(topic: str, facts: Mapping[str, Any]) -> None:
-    """Wait until all processes have reported their facts, which must be equal.
-
-    Args:
-        topic: plural noun for the facts, used in messages.
-        facts: JSON values by name, possibly in nested mappings.
+    """Wait until all processes have reported equal facts (see `Peers.agree`).
 
     Raises:
         ValueError: the facts of another process differ.
@@ -133,7 +128,7 @@ def agree(topic: str, facts: Mapping[str, Any]) -> None:
 
 
 class ExitConsole(Console):
-    """Console that records this process's exit reason; only the first process prints."""
+    """Console that records what it prints as the exit reason; only the first process prints."""
 
     def print(self, *objects: Any, **options: Any) -> None:
         """See `rich.console.Console.print`."""
@@ -145,7 +140,7 @@ class ExitConsole(Console):
 
 
 def exit_all(code: int) -> NoReturn:
-    """Exit this process at once, with all its threads, and make the other processes exit."""
+    """Exit without waiting for this process's threads, and make the other processes exit."""
     sys.stdout.flush()
     sys.stderr.flush()
     if _peers is not None:
@@ -154,7 +149,6 @@ def exit_all(code: int) -> NoReturn:
 
 
 def _say(text: str) -> None:
-    """Print a message about the other processes."""
     errors = Console(stderr=True)
     errors.show_cursor()  # a progress bar may have hidden it
     errors.print(text, style="red", soft_wrap=True, highlight=False, markup=False)
@@ -163,7 +157,7 @@ def _say(text: str) -> None:
 def _exit_on_exception(
     kind: type[BaseException], error: BaseException, traceback: TracebackType | None
 ) -> NoReturn:
-    """Exit at once on an uncaught exception; JAX would wait for the other processes first."""
+    """Exit at once on an uncaught exception; without this, JAX waits for the other processes."""
     if _peers is not None:
         _peers.wait_for_root_cause()
         _peers.exit_reason = _UNCAUGHT
@@ -201,11 +195,9 @@ def any_process(flag: bool) -> bool:
 
 
 def device_put(tree: Any, shardings: Any) -> Any:
-    """Place arrays on the devices of all processes.
+    """Place a pytree of arrays, equal in all processes, on the devices of all processes.
 
-    Args:
-        tree: pytree of arrays, equal in all processes.
-        shardings: one sharding per array, or a single one for all arrays.
+    `shardings` is one sharding for all arrays or a pytree with one for each.
     """
     if jax.process_count() == 1:
         return jax.device_put(tree, shardings)

@@ -1,9 +1,9 @@
 """Rendezvous of a run's processes: a server thread in the first process, at the run's address.
 
-JAX's own service prints nothing while processes are missing, lets processes have different options,
-and notices a dead process only after 100 s. So all processes meet here first; then JAX's service
-takes over the address. The connections stay open: one that closes without notice shows at
-once that a process died.
+JAX's own service prints nothing while processes are missing, does not compare their options, and
+notices a dead process only after 100 s. All processes therefore meet here first; JAX's service then
+takes over the address. The connections stay open, so that the death of a process is noticed at
+once.
 
 Messages are lines of JSON. A process sends the left column, the server the right one:
 
@@ -25,10 +25,10 @@ MAX_MESSAGE_BYTES = 2**20
 JOIN_TIMEOUT = 180.0
 """Seconds to wait for missing processes, counted from the last one that joined."""
 EXIT_GRACE = 5.0
-"""Seconds that the other processes have to exit by themselves after one exits."""
-_LAST_EXIT_GRACE = 3.0  # s that the first process, which hosts JAX's service, waits for the others
+"""Seconds that the other processes have to announce their own exit after one fails."""
+_LAST_EXIT_GRACE = 3.0  # s; the first process exits last because it hosts JAX's service
 _MAX_DIFFERENCES = 5  # per message
-# A crashed machine leaves its connections open: after 30 s of silence, send 3 probes within 30 s.
+# A crashed machine leaves its connections open. After 30 s of silence, send 3 probes, 10 s apart.
 _KEEPALIVE = {"TCP_KEEPIDLE": 30, "TCP_KEEPINTVL": 10, "TCP_KEEPCNT": 3}
 
 
@@ -50,9 +50,8 @@ class _Member:
     """A process that has joined.
 
     Attributes:
-        facts: values it reported that have not been compared yet, by topic.
+        facts: reported values by topic, until they are compared.
         exit: the exit code and reason it announced.
-        closed: whether its connection is closed.
     """
 
     number: int
@@ -66,7 +65,6 @@ class _Member:
         return f"process {self.number} on {self.host}"
 
     def send(self, message: dict[str, Any]) -> None:
-        """Send a message unless the connection is closed."""
         if not self.closed:
             self.writer.write(encode(message))
 
@@ -78,8 +76,8 @@ class Rendezvous:
         """Serve in a thread of this process.
 
         Args:
-            listener: socket that listens on the address.
-            address: address at which the other processes reach the listener.
+            listener: socket that accepts the connections.
+            address: host:port of the listener, for messages.
             count: number of processes, including this one.
             hint: remedy printed if a process dies.
         """
@@ -162,7 +160,6 @@ class Rendezvous:
         return member
 
     def _receive(self, member: _Member, message: dict[str, Any]) -> None:
-        """Handle a message from a process."""
         if "topic" in message:
             member.facts[message["topic"]] = message["facts"]
             self._answer()
@@ -173,7 +170,7 @@ class Rendezvous:
         self._changed.set()
 
     def _reject(self, reason: str) -> None:
-        """Stop the run; only the first reason is reported."""
+        """Reject the run; only the first reason is reported."""
         self._rejection = self._rejection or reason
         self._changed.set()
 
@@ -191,7 +188,7 @@ class Rendezvous:
                 member.send({"topic": topic, "refused": self._rejection})
 
     async def _shut_down(self, code: int, reason: str) -> None:
-        """Make all processes exit because one did; the first process exits last."""
+        """Make all processes exit because one failed; the first process exits last."""
         lost = lambda: any(m.closed and not m.exit for m in self._members)  # noqa: E731
         announced = lambda: all(m.exit for m in self._members)  # noqa: E731
         await self._until(lambda: announced() or lost(), EXIT_GRACE)
