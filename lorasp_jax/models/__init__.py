@@ -1,4 +1,4 @@
-"""Vision-language-action backbones and their checkpoints; each backbone is a subpackage here."""
+"""Vision-language-action backbones, each a subpackage, and their checkpoints."""
 
 from lorasp_jax.models import pi0, smolvla
 from lorasp_jax.models.checkpoints import published

@@ -41,7 +41,7 @@ def find(name: str) -> type[BackboneConfig]:
     """Return the config class of a backbone.
 
     Raises:
-        ValueError: unknown backbone; the message lists the available ones.
+        ValueError: unknown backbone.
     """
     if name not in names():
         raise ValueError(f"unknown backbone {name!r}: choose one of {', '.join(names())}.")
@@ -63,7 +63,7 @@ class Backbone(nnx.Module):
     """The action expert, with stacked `blocks`."""
 
     def _make_projections(self, state_width: int, rngs: nnx.Rngs) -> None:
-        """Create the layers that embed state, noisy actions and time, and predict velocities."""
+        """Create the layers outside the towers; `state_width` is the width of the state token."""
         width, dim = self.config.action.width, self.config.action_dim
         options: Any = {"dtype": jnp.float32, "param_dtype": self.config.param_dtype, "rngs": rngs}
         self.state_proj: Layer = Dense(dim, state_width, **options)
@@ -73,7 +73,7 @@ class Backbone(nnx.Module):
         self.action_out_proj: Layer = Dense(width, dim, **options)
 
     def fuse_projections(self, *, copy_kernels: bool = True) -> None:
-        """See `prepared.FusableModule`; no two layers outside the towers share an input."""
+        """See `prepared.FusableModule`. No two of these layers share an input."""
         self.state_proj = fuse_layer(self.state_proj, copy_kernels=copy_kernels)
         self.action_in_proj = fuse_layer(self.action_in_proj, copy_kernels=copy_kernels)
         self.action_time_mlp_in = fuse_layer(self.action_time_mlp_in, copy_kernels=copy_kernels)
@@ -104,7 +104,7 @@ class Backbone(nnx.Module):
         return h, aux | {"action_time_mlp_in": in_aux, "action_time_mlp_out": out_aux}
 
     def run_prefix(self, obs: Observation) -> tuple[Any, ModelAux]:
-        """Encode the observation independently of the actions."""
+        """Encode the observation for `run_suffix`; also return the adapters' aux."""
         raise NotImplementedError
 
     def run_suffix(
@@ -115,11 +115,11 @@ class Backbone(nnx.Module):
         flow_time: jax.Array,
         action_valid: jax.Array | None = None,
     ) -> tuple[jax.Array, LayerAux]:
-        """Predict the velocity `[B, C, A]` f32, given the prefix.
+        """Predict the velocity `[B, C, A]` f32; also return the adapters' aux.
 
         Args:
-            prefix: from `run_prefix`.
-            obs: the observation that the prefix was computed from.
+            prefix: result of `run_prefix` for `obs`.
+            obs: the observation.
             x_t: `[B, C, A]`.
             flow_time: `[B]`.
             action_valid: `[B, C]` bool, False for actions to exclude from the adapters' aux.
@@ -170,9 +170,9 @@ class Backbone(nnx.Module):
             key: typed PRNG key to sample `noise` and `flow_time` if they are not given.
             obs: the observation.
             actions: `[B, C, A]` normalized.
-            action_mask: `[B, C, A]` bool, True for valid elements. A slot that is valid in no step
-                is zero in x_t; a step with no valid slot is excluded from the adapters' aux. The
-                returned loss is not masked.
+            action_mask: `[B, C, A]` bool, True for valid elements. It does not mask the returned
+                loss. Slots that are never valid in a chunk are zero in x_t. Actions without valid
+                slots are excluded from the adapters' aux.
             noise: `[B, C, A]`.
             flow_time: `[B]`.
 
@@ -197,7 +197,7 @@ class Backbone(nnx.Module):
         return self.sampler().sample_actions(key, obs, **options)
 
     def sampler(self) -> Sampler:
-        """Create a sampler, for repeated calls to its `sample_actions`."""
+        """Create a sampler, which prepares the weights once for repeated sampling."""
         return Sampler.from_model(self)
 
 

@@ -12,11 +12,11 @@ from lorasp_jax.models.inputs import OURS, InputConfig
 from lorasp_jax.peft import _fields
 
 VOCABULARY_SIZE = 320
-"""Rows of the embedding table in this project's own base models, including reserved tokens."""
+"""Rows of the embedding table in this project's base models, including reserved tokens."""
 
 Remat = Literal["none", "products", "full"]
 _MAX_SIZE = 2**24
-"""Upper bound for any size, far beyond existing models; rejects absurd values in config files."""
+"""Upper bound for sizes, far beyond existing models; rejects absurd values in config files."""
 _MAX_DEPTH = 1000
 
 
@@ -40,21 +40,20 @@ class VisionConfig:
     patch: int
     """Side of a patch [pixels]."""
     shuffle: int = 1
-    """Side of the square of tokens that pixel shuffle merges into one [tokens]."""
+    """Pixel shuffle merges each `shuffle` x `shuffle` square of tokens into one token."""
 
     def __post_init__(self) -> None:
-        """Validate the sizes."""
         _check_sizes(self)
 
     @property
     def kernel_sizes(self) -> tuple[int, ...]:
-        """The sizes that determine kernel shapes; the number of heads does not."""
+        """Sizes that determine kernel shapes; the number of heads does not."""
         return self.width, self.depth, self.mlp, self.patch, self.shuffle
 
 
 @dataclass(frozen=True)
 class ExpertConfig:
-    """Sizes of one expert; both experts must have equal depth, heads, kv_heads and head_dim."""
+    """Sizes of one expert. Depth, heads, kv_heads and head_dim must be equal for both experts."""
 
     width: int
     depth: int
@@ -64,7 +63,6 @@ class ExpertConfig:
     head_dim: int
 
     def __post_init__(self) -> None:
-        """Validate the sizes."""
         _check_sizes(self)
 
     @property
@@ -104,17 +102,16 @@ class BackboneConfig:
     param_dtype: str = "float32"
     """Dtype of the stored parameters."""
     remat: Remat = "none"
-    """Rematerialization in the backward pass. "none" recomputes nothing; "products" recomputes
-    everything except matmul results, with half the memory and a few percent more compute; "full"
-    recomputes whole layers, with the least memory and a third more compute."""
+    """Rematerialization in the backward pass. "none" recomputes nothing. "products" recomputes all
+    but products with weights: half the memory, a few percent more compute. "full" recomputes whole
+    layers: the least memory, a third more compute."""
     unroll: bool | None = None
-    """Unroll the loop over layers. Unrolling takes two to three times as long to compile but runs
-    faster, especially for small layers, because a loop copies the backward pass's residuals into
-    and out of stacks. None unrolls unless `remat` is "full": XLA preserves the order of
-    rematerialization only inside a loop."""
+    """Unroll the loop over layers. Compilation takes two to three times as long, but training runs
+    faster, especially with small layers: a loop copies residuals into and out of stacked arrays.
+    None unrolls unless `remat` is "full", because XLA preserves the order of rematerialization only
+    inside a loop."""
 
     def __post_init__(self) -> None:
-        """Validate the sizes."""
         _check_sizes(self)
         language, action = self.language, self.action
         for name in ("depth", "heads", "kv_heads", "head_dim"):
@@ -159,7 +156,7 @@ class BackboneConfig:
         chunk: int = 10,
         unroll: bool | None = None,
     ) -> Self:
-        """A config for the simulation: two cameras, offline tokenizer, one robot arm."""
+        """Create a config for the simulation: two cameras, offline tokenizer, one robot arm."""
         return cls(
             vision,
             language,
@@ -194,7 +191,7 @@ class BackboneConfig:
 
         Raises:
             TypeError, KeyError: missing or unknown fields, or an unknown dtype.
-            ValueError: a field has a value of the wrong type.
+            ValueError: a value of the wrong type, or inconsistent sizes.
         """
         inputs = fields.get("inputs", {}) if isinstance(fields, dict) else None
         if not isinstance(inputs, dict):

@@ -1,7 +1,7 @@
 """Flow matching (Lipman et al., arXiv 2210.02747) as in pi0: time 1 is noise, time 0 is data.
 
-This is the convention of pi0's published code and checkpoints; the paper (arXiv 2410.24164,
-section IV) uses the opposite direction of time.
+This is the convention of pi0's code and checkpoints. Time runs the other way in pi0's paper (arXiv
+2410.24164, section IV).
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ Velocity = Callable[[jax.Array, jax.Array], tuple[jax.Array, Any]]
 def sample_time(key: jax.Array, batch: int) -> jax.Array:
     """Sample flow times `[B]` from 0.999 Beta(1.5, 1) + 0.001, which favors noise and excludes 0.
 
-    Beta(a, 1) has the CDF t^a, so U^(1/a) is an exact sample. Do not reuse `key`.
+    Beta(a, 1) has the CDF t^a, so U^(1/a) with uniform U is an exact sample. Do not reuse `key`.
     """
     return 0.999 * jax.random.uniform(key, (batch,)) ** (1 / 1.5) + 0.001
 
@@ -61,8 +61,8 @@ def loss(
         velocity: the velocity model.
         key: PRNG key to sample `noise` and `flow_time` if they are not given; do not reuse it.
         actions: `[B, C, A]` normalized.
-        slots: bool broadcastable to `[B, C, A]`; x_t is zero where False, so that unused slots do
-            not affect the model. None uses all slots.
+        slots: bool broadcastable to `[B, C, A]`, False for unused slots, where x_t is zero. None
+            uses all slots.
         noise: `[B, C, A]` standard normal.
         flow_time: `[B]`.
 

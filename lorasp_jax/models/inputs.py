@@ -1,4 +1,4 @@
-"""Input preprocessing that a backbone's weights were trained with: images, normalization, slots."""
+"""Input preprocessing that a backbone's weights expect: images, normalization, slots."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -24,16 +24,17 @@ class InputConfig:
     """True for each action dimension that is relative to the state at the start of the chunk; see
     `policies.processor.to_delta`. The action statistics are then those of relative actions."""
     convention: Convention = "ours"
-    """The project whose guard against division by zero is used in normalization."""
+    """Project whose guard against division by zero applies in normalization."""
     gripper_slot: int | None = 7
     """Gripper slot in state and action vectors; None means the first slot after the joints."""
     quiet_slots: bool = True
-    """Keep the slots that the robot does not use at zero in the flow. False treats them like the
-    others: they contain noise in the flow and zeros in the data, and count in the loss."""
+    """Keep slots that the robot does not use at zero in the flow and out of the loss. False treats
+    them like other slots whose actions are zero."""
     prompt_state: bool = False
     """Put the normalized state into the prompt; see `policies.prompts.pi05`."""
     masks_missing: bool = True
-    """Replace a missing camera's image with a black, masked one; False omits the camera."""
+    """Whether the weights expect black, masked images for missing cameras. False omits such cameras
+    from the model's inputs."""
 
 
 OURS = InputConfig()

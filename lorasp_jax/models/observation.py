@@ -1,4 +1,4 @@
-"""Observations in the form that backbones take: normalized and tokenized."""
+"""Observations as backbones expect them: normalized and tokenized."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -18,7 +18,7 @@ class Observation:
         image_masks: camera name -> `[B]` bool, False where the camera is missing.
         tokens: `[B, T]` int32 ids of the instruction, padded.
         token_mask: `[B, T]` bool, False at padding.
-        state: `[B, A]` f32, normalized robot state, arranged in the backbone's slots.
+        state: `[B, A]` f32, normalized robot state in the backbone's slots.
     """
 
     images: dict[str, jax.Array]

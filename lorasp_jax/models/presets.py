@@ -19,10 +19,10 @@ _PROJECTIONS = r"^(state_proj|action_in_proj|action_out_proj|(action_)?time_mlp_
 """Projections outside the towers."""
 
 PRESETS: dict[str, tuple[str, ...]] = {
-    # The linear layers in Table I of arXiv 2603.07404 that affect the actions. The paper's code
-    # adapts every `nn.Linear`, but not the patch embedding, which is a convolution there.
+    # As in Table I of arXiv 2603.07404, except layers that do not affect the actions. The paper's
+    # code adapts every `nn.Linear`; the patch embedding is a convolution there.
     "paper": ("^(?!vision/patch_embed)",),
-    # Includes the patch embedding, which is a linear layer here.
+    # The patch embedding is a linear layer here.
     "all-linear": (".*",),
     # The layers that openpi's "gemma_2b_lora" and "gemma_300m_lora" adapt (models/gemma.py).
     "openpi": (r"^(language|action)/blocks/(.*/)?[a-z]+_proj$",),
@@ -59,7 +59,7 @@ def patterns(targets: str | Sequence[str]) -> list[str]:
 
 
 def _suggestion(target: str) -> str | None:
-    """Find the preset that a target misspells; None if a preset's name or pattern contains it."""
+    """Find the preset that a target misspells; None for substrings of preset names or patterns."""
     texts = (text for name, patterns in PRESETS.items() for text in (name, *patterns))
     if not _WORD.fullmatch(target) or any(target in text for text in texts):
         return None

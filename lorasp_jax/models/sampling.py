@@ -1,4 +1,4 @@
-"""Sample action chunks by integrating the flow, with input-independent results precomputed."""
+"""Sample action chunks by integrating the flow."""
 
 import dataclasses
 import functools
@@ -47,8 +47,8 @@ class Sampler:
     """Samples action chunks from a backbone, with input-independent results precomputed once.
 
     A sampler copies most of the weights; drop all references to the backbone to free the originals.
-    The weights are stored as a flat list, because passing a module with about a thousand arrays to
-    a jitted function adds too much dispatch latency for some control loops.
+    The weights are a flat list, because a jitted call with a module of about a thousand arrays has
+    too much dispatch latency for some control loops.
     """
 
     weights: list[jax.Array]
@@ -89,9 +89,8 @@ class Sampler:
             num_steps: Euler steps.
             noise: `[B, C, A]` initial noise of the flow.
             slots: `[A]` bool, slots to sample; the others stay zero. None samples all slots.
-            return_aux: also return the adapters' aux. `aux["action"]` has a leading step axis,
-                before the layer axis; aux of action layers that run only once is broadcast over
-                the steps.
+            return_aux: also return the adapters' aux. `aux["action"]` has a step axis before the
+                layer axis. The aux of action layers that run only once is broadcast over steps.
 
         Returns:
             `[B, C, A]` f32 normalized actions, or (actions, aux).
@@ -118,7 +117,7 @@ class Sampler:
 
 
 def _prefix_model(model: FlowModel) -> FlowModel:
-    """Copy a model to run the prefix, with unstacked blocks so that no loop copies weights."""
+    """Copy a model for the prefix, blocks unstacked so that an outer loop slices no weights."""
     model = nnx.merge(*nnx.split(model))
     for tower in (model.vision, model.language):
         tower.blocks = unstack(prepared.fuse_stack(tower.blocks))
@@ -126,7 +125,7 @@ def _prefix_model(model: FlowModel) -> FlowModel:
 
 
 def _suffix_model(model: FlowModel) -> FlowModel:
-    """Copy a model to run the flow steps, with input-independent results precomputed."""
+    """Copy a model for the flow steps, with input-independent results precomputed."""
     model = nnx.merge(*nnx.split(model))
     del model.vision, model.language
     model.action.blocks = unstack(model.action.blocks)

@@ -37,7 +37,7 @@ def copied(ours: str, theirs: str) -> Rule:
 
 
 def reshaped(ours: str, theirs: str, ours_shape: Shape, theirs_shape: Shape) -> Rule:
-    """Rule for an array that they store with the same order of elements, in another shape."""
+    """Rule for an array that they store in the same order of elements but a different shape."""
     return Rule(
         (ours,),
         (theirs,),
@@ -93,14 +93,13 @@ def to_ours(
 
     Args:
         rules: the layout.
-        theirs: their leaves by name; consumed leaves are popped to free their memory.
-        shapes: shapes of our leaves, by path in our model.
+        theirs: their leaves by name; each is popped when it is read, to free its memory.
+        shapes: shapes of our leaves by path.
         source: name of the checkpoint in error messages.
-        convert: (name, array) -> leaf to return; called for each of our leaves as soon as the
-            array is read.
+        convert: (path, array) -> leaf to return, called as soon as a rule's arrays are read.
 
     Returns:
-        The results of `convert`, by path in our model.
+        Our leaves by path.
 
     Raises:
         ModelMismatchError: missing, unexpected or wrongly shaped leaves.
@@ -127,7 +126,7 @@ def to_ours(
         expected = rule.shapes(*(shapes[name] for name in rule.ours))
         ours = rule.to_ours(pop(*leaf) for leaf in zip(rule.theirs, expected, strict=True))
         converted |= {name: convert(name, a) for name, a in zip(rule.ours, ours, strict=True)}
-        del ours  # free our arrays before the next rule reads more
+        del ours  # free them before the next rule reads more
     return converted
 
 

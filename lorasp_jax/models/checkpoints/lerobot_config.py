@@ -1,8 +1,7 @@
 """Convert a LeRobot policy's config.json to a backbone config.
 
-Each backbone package provides a module `lerobot` with a mapping `TYPES` from policy types to
-functions, each of which converts the fields to a config with the tower sizes. Fields that all
-policies share are read here.
+Each backbone package has a module `lerobot`, whose `TYPES` maps policy types to functions. They
+convert the fields to a config with the tower sizes. Fields that all policies share are read here.
 """
 
 import dataclasses
@@ -105,8 +104,11 @@ def _shared_fields(config: BackboneConfig, fields: Fields) -> dict[str, Any]:
 
 
 def _delta(fields: Fields) -> tuple[bool, ...]:
-    """Return a mask, True for relative action dimensions: all those without an excluded word in
-    their name, or without a name (LeRobot 0.6, processor/relative_action_processor.py)."""
+    """Return the mask of relative action dimensions: all whose names contain no excluded word.
+
+    Dimensions without a name are relative, too (LeRobot 0.6,
+    processor/relative_action_processor.py).
+    """
     if not fields.get("use_relative_actions"):
         return ()
     size = fields["output_features"]["action"]["shape"][0]
@@ -117,7 +119,7 @@ def _delta(fields: Fields) -> tuple[bool, ...]:
 
 
 def _cameras(fields: Fields) -> tuple[str, ...]:
-    """Return the camera names without LeRobot's prefix; cameras that are always empty come last."""
+    """Return the camera names without LeRobot's prefix; placeholder cameras come last."""
     names = []
     for key, feature in (fields.get("input_features") or {}).items():
         if feature["type"] == "VISUAL":

@@ -53,7 +53,7 @@ class ModelFolder:
 
     @property
     def inputs(self) -> InputConfig | None:
-        """Input preprocessing from a LeRobot policy's config.json; None if there is no such file.
+        """Input preprocessing from a LeRobot policy's config.json; None without such a file.
 
         Raises:
             ValueError: config.json describes an unsupported model.
@@ -61,7 +61,7 @@ class ModelFolder:
         return self.config.inputs if self.layout == "lerobot" and "type" in self.fields else None
 
     def load(self, config: BackboneConfig | None = None) -> Any:
-        """Load the model; the function `load` documents the argument and the errors."""
+        """Load the model; see the function `load`."""
         if self.layout == "ours":
             return native.load_native(self.folder, config)
         if config is not None and self.layout == "lerobot" and "type" in self.fields:
@@ -111,8 +111,8 @@ def load(where: str | os.PathLike[str], config: Any = None) -> Any:
 
     Args:
         where: a folder, "hf://owner/name" or "gs://bucket/folder"; see `hub.local`.
-        config: model sizes, dtype and param_dtype. None uses the sizes in this project's or
-            LeRobot's config.json; for openpi, those of the published pi0.
+        config: model sizes, dtype and param_dtype. None uses the sizes in config.json or, for
+            openpi, those of the published pi0.
 
     Raises:
         ValueError: `where` cannot be reached or has none of these layouts, files are damaged, or
@@ -172,7 +172,7 @@ def _parse_lerobot(
 
 
 def _require_same_heads(config: Any, folder: Path, fields: dict[str, Any]) -> None:
-    """Raise ValueError if config type or head counts differ; tensor shapes do not reveal heads."""
+    """Raise ValueError if config type or heads differ; tensor shapes do not reveal heads."""
     stored = _parse_lerobot(lerobot_config.parse_towers, folder, fields)
     if not isinstance(config, type(stored)):
         expected, actual = (type(c).__name__ for c in (stored, config))

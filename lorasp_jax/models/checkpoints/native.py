@@ -1,9 +1,9 @@
 """Save and load backbone weights: config.json and safetensors in bf16.
 
 Large models are split into shards with Hugging Face's index. Tensor names are "/"-joined paths;
-tensors of stacked layers keep their leading layer axis. config.json names the backbone and its
-sizes and holds a hash of config and weights, so that loading rejects a folder that is damaged or
-half-written, or whose head counts were edited.
+stacked layers keep their leading layer axis. config.json contains the backbone's name and sizes,
+and a hash of config and weights. Loading checks the hash and so rejects damaged, half-written or
+edited folders.
 """
 
 import dataclasses
@@ -41,15 +41,15 @@ Model = TypeVar("Model", bound=nnx.Module)
 
 
 def save(folder: Folder, model: Any) -> None:
-    """Save a model that has no adapters, replacing any model in the folder.
+    """Save a model without adapters, replacing any model in the folder.
 
     Args:
         folder: created if missing.
         model: a backbone.
 
     Raises:
-        ValueError: the model has adapters or quantized kernels, the model does not match its
-            config, or the folder is a URL.
+        ValueError: the model has adapters or quantized kernels or does not match its config, or
+            the folder is a URL.
     """
     check_local(folder := pathlib.Path(folder))
     arrays = {name: a.astype(jnp.bfloat16) for name, a in base_arrays(model).items()}
@@ -71,7 +71,7 @@ def save(folder: Folder, model: Any) -> None:
 
 
 def base_arrays(model: nnx.Module) -> dict[str, np.ndarray]:
-    """Return every parameter of a model by "/"-joined path, without casting.
+    """Return every parameter of a model by "/"-joined path, in its own dtype.
 
     Raises:
         ValueError: the model has adapters or quantized kernels, or does not match its config.
@@ -94,7 +94,7 @@ def _shapes(arrays: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
 
 
 def _write(folder: pathlib.Path, files: Mapping[str, bytes]) -> None:
-    """Write a model's files, given by name, and delete weight files of a previous model."""
+    """Write files by name, and delete weight files of a previous model."""
     folder.mkdir(parents=True, exist_ok=True)
     for file, data in files.items():
         write_bytes(folder / file, data)
@@ -108,8 +108,8 @@ def load_native(folder: Folder, config: Any = None) -> Any:
 
     Args:
         folder: folder with config.json and safetensors.
-        config: sets the `RUNTIME_FIELDS`, such as dtypes; its other fields must match the stored
-            model. None uses the stored config, in fp32.
+        config: sets the `RUNTIME_FIELDS`; its other fields must match the stored model. None uses
+            the stored config, in fp32.
 
     Raises:
         ValueError: files are missing, damaged or in another format, or do not match `config`.
@@ -175,10 +175,10 @@ def set_arrays(model: Model, arrays: Mapping[str, Any]) -> Model:
 def weights_hash(source: Folder | nnx.Module) -> str:
     """Return the SHA-256 of a model's frozen parameters: names, shapes and values in fp32.
 
-    A loaded model has the same hash as its folder, whether its parameters are bf16 or fp32, and
-    keeps this hash when `adapt` adds adapters. The hash changes if `adapt` splits kernels or makes
-    base weights trainable (full fine-tuning). It also changes after `combine`, which adds frozen
-    adapters, and after `quantize`.
+    A folder and the model loaded from it have the same hash, in bf16 and in fp32. Adding adapters
+    with `adapt` keeps the hash, unless it splits kernels or makes base weights trainable (full
+    fine-tuning). The hash changes after `quantize`, and after `combine`, which adds frozen
+    adapters.
 
     Args:
         source: a folder that `save` wrote, or a model.
@@ -191,7 +191,7 @@ def weights_hash(source: Folder | nnx.Module) -> str:
 
 
 def named_arrays(model: nnx.Module, adapters: bool = True) -> dict[str, Any]:
-    """Return parameters by "/"-joined path, in tree order; only frozen ones if not `adapters`."""
+    """Return parameters by "/"-joined path, in tree order; only frozen ones unless `adapters`."""
     state = nnx.state(model, nnx.Param if adapters else nnx.All(nnx.Param, nnx.Not(AdapterParam)))
     return by_path(nnx.to_pure_dict(state))
 
@@ -203,7 +203,7 @@ def by_path(tree: Any) -> dict[str, Any]:
 
 
 def _digest(description: Mapping[str, Any], arrays: Mapping[str, Any]) -> str:
-    """SHA-256 of a folder's content: backbone name, config and weights."""
+    """SHA-256 of backbone name, config and weights."""
     text = json.dumps([description["backbone"], description["config"]], sort_keys=True)
     return hashlib.sha256(f"{text}{_hash(arrays)}".encode()).hexdigest()
 

@@ -1,4 +1,4 @@
-"""Check a folder before Orbax opens it, and filter the errors that Orbax repeats."""
+"""Check folders before Orbax opens them, and hide errors that Orbax repeats."""
 
 import asyncio
 import functools
@@ -12,11 +12,11 @@ from typing import Any
 from envs.datasets.files import TEXT_BYTES, RefusedError, check_memory, check_only_files
 
 MANIFEST = "manifest.ocdbt"
-"""Root file of a TensorStore database, read into memory whole; a checkpoint may have several."""
+"""Root file of a TensorStore database, read whole; a checkpoint may have several."""
 
 
 def check(folder: Path) -> None:
-    """Raise if Orbax cannot open a folder safely; its C++ code could hang or crash this process.
+    """Raise if opening a folder could make Orbax's C++ code hang or crash this process.
 
     Raises:
         RefusedError: an entry is too large or is neither a regular file nor a folder.
@@ -31,10 +31,10 @@ def check(folder: Path) -> None:
 
 
 def suppress_repeated_errors() -> None:
-    """If a read or write by Orbax fails, report only the exception that Orbax raises.
+    """After a failed read or write, report only the exception that Orbax raises.
 
-    Otherwise Orbax logs a traceback for each further failed operation, asyncio logs one for each
-    task that is never awaited, and Python prints errors from Orbax's threads and coroutines.
+    Otherwise Orbax logs a traceback for every other failed operation, asyncio one for every task
+    that is never awaited, and Python prints errors from Orbax's threads and coroutines.
     """
     for name in ("absl", "asyncio"):
         logging.getLogger(name).addFilter(_is_not_from_orbax)

@@ -1,14 +1,13 @@
 """Load and save published checkpoints: openpi's Orbax folders, LeRobot's safetensors.
 
-Each backbone package provides a module `published_names`:
+Each backbone package has a module `published_names`:
 
     LAYOUTS              layout name -> function (config) -> rules
     lerobot_name(name)   version-independent name of a LeRobot tensor
     UNUSED               LeRobot tensors that the model does not use
     TIED                 unused tensor -> the tensor it is tied to
 
-Arrays are converted one at a time, and each is released once copied, so loading takes little more
-host memory than the model itself.
+Arrays are converted one at a time and released once copied, to save host memory.
 """
 
 import importlib
@@ -52,8 +51,7 @@ def load_published(folder: Path, config: Any) -> tuple[Any, list[str]]:
 
     Returns:
         The model, with adapters if the checkpoint has openpi's LoRA, and the names of unused
-        tensors: language-model heads and the normalization statistics of older LeRobot versions
-        (see `statistics_files`).
+        tensors: language-model heads, and normalization statistics from older LeRobot versions.
 
     Raises:
         ValueError: unknown layout or damaged files.
@@ -90,7 +88,7 @@ def save(folder: Path, model: Any, layout: str, dtypes: Mapping[str, Any] | None
     Args:
         folder: created if missing; must not already contain a checkpoint of this layout.
         model: a backbone without adapters.
-        layout: "openpi" or "lerobot".
+        layout: "openpi" (pi0 only) or "lerobot".
         dtypes: dtype of each saved leaf, from `stored_dtypes`; None keeps the model's dtypes.
 
     Raises:
@@ -121,7 +119,7 @@ def save(folder: Path, model: Any, layout: str, dtypes: Mapping[str, Any] | None
 
 
 def stored_dtypes(folder: Path, config: Any) -> dict[str, np.dtype]:
-    """Return the dtype of each leaf in a published checkpoint, as an argument for `save`.
+    """Return the dtype of each leaf in a published checkpoint, for `save`.
 
     Raises:
         ValueError: unknown layout or damaged files.
@@ -153,7 +151,7 @@ def _open(folder: Path, lerobot_name: Callable[[str], str]) -> tuple[str, Mutabl
 
 
 def orbax_folder(folder: Path) -> Path | None:
-    """Return the Orbax folder of an openpi checkpoint, or None if this is no such checkpoint."""
+    """Return the Orbax folder of an openpi checkpoint, or None if there is none."""
     candidates = (folder / "params", folder)
     return next((path for path in candidates if (path / "_METADATA").exists()), None)
 

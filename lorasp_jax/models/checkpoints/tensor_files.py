@@ -33,7 +33,7 @@ def weight_files(folder: Path) -> list[Path]:
 
 
 class TensorFiles(MutableMapping[str, np.ndarray]):
-    """Mapping from names to tensors. Each access reads the tensor from its file, without a cache.
+    """Mapping from names to tensors. Each access reads from the file; nothing is cached.
 
     Args:
         files: from `weight_files`.
@@ -69,7 +69,7 @@ class TensorFiles(MutableMapping[str, np.ndarray]):
         self._tensors[new] = self._tensors.pop(old)
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """Read a tensor; raise ValueError if the tensor is larger than this machine's memory."""
+        """Read a tensor; raise ValueError if it is larger than this machine's memory."""
         file, stored = self._tensors[name]
         tensor = file.get_slice(stored)
         bits = re.search(r"\d+", tensor.get_dtype())  # "BF16", "F8_E4M3", "BOOL"

@@ -1,6 +1,6 @@
-"""Layout rules for parts of PyTorch policies whose names follow Hugging Face Transformers.
+"""Layout rules for the parts of PyTorch policies that are named as in Hugging Face Transformers.
 
-PyTorch stores each linear layer as a matrix [O, I]; ours are stacked over layers, [L, I, O].
+PyTorch stores each linear layer as a matrix [O, I]. Ours are stacked over layers, [L, I, O].
 """
 
 from collections.abc import Iterable, Sequence

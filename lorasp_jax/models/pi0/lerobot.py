@@ -25,7 +25,7 @@ def pi05_config(fields: Mapping[str, Any]) -> Pi0Config:
     """Like `pi0_config`, but for pi0.5.
 
     Raises:
-        ValueError: the policy has a memory of past observations.
+        ValueError: the policy uses past observations.
     """
     require(fields, {"use_visual_memory": False, "use_proprioceptive_memory": False})
     config = Pi0Config.base_pi05()

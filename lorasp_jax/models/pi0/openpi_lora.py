@@ -1,15 +1,14 @@
 """Convert openpi's LoRA weights to equivalent adapters of our layers.
 
-openpi adapts each einsum kernel with two arrays that keep the kernel's head axes (models/lora.py).
-W is a kernel; A and B are its `lora_a` and `lora_b`. N heads, numbered n or m, have dimension H; D
-is the width, r the rank of a pair (A, B), and s = alpha / r or alpha / √r:
+openpi adapts each einsum kernel W with A = `lora_a` and B = `lora_b`, which keep the kernel's head
+axes (models/lora.py). For N heads of dimension H, width D, rank r, and s = alpha / r or alpha / √r:
 
-    q_einsum, kv_einsum    [N, D, H]    ΔW[n] = s A[n] B[n], one pair for each head
-    attn_vec_einsum        [N, H, D]    ΔW[n] = s A[n] Σ_m B[m], the same sum over m for every n
-    gating_einsum, linear               ΔW = A B, independent of alpha; no heads
+    q_einsum, kv_einsum    [N, D, H]    ΔW[n] = s A[n] B[n], one pair (A, B) per head n
+    attn_vec_einsum        [N, H, D]    ΔW[n] = s A[n] Σ_m B[m], the same sum over heads for every n
+    gating_einsum, linear               ΔW = A B, without heads and independent of alpha
 
-The first row becomes a LoRA of rank N r with a block-diagonal B; the others become LoRAs of rank r.
-All conversions are exact. Further training also updates the zeros of B outside its diagonal blocks.
+The first row becomes a LoRA of rank N r with a block-diagonal B, the others LoRAs of rank r. The
+conversion is exact. Further training also updates the zeros outside B's diagonal blocks.
 """
 
 from collections.abc import Mapping, MutableMapping
@@ -32,7 +31,7 @@ Pair = tuple[np.ndarray, np.ndarray]
 
 
 def pop_lora(leaves: MutableMapping[str, Any]) -> dict[str, Any]:
-    """Remove openpi's LoRA leaves from `leaves` and return them, by path."""
+    """Pop openpi's LoRA leaves, by path."""
     names = [name for name in leaves if name.endswith(("lora_a", "lora_b"))]
     return {name: leaves.pop(name) for name in names}
 
@@ -42,13 +41,13 @@ def attach(model: Any, leaves: Mapping[str, np.ndarray], *, scale: float = 1.0) 
 
     Args:
         model: a pi0 model; it is not modified, but the result shares its arrays.
-        leaves: openpi's LoRA arrays by "/"-joined path below `params`, from `pop_lora`, for one
-            expert or both.
+        leaves: LoRA arrays of one expert or both, from `pop_lora`, by "/"-joined path below
+            `params`.
         scale: s of the attention layers: alpha / rank, or alpha / √rank with openpi's `rslora`.
-            Checkpoints do not store this scale; openpi's own variants use 1.
+            Checkpoints do not store it; openpi's own variants use 1.
 
     Raises:
-        ValueError: a leaf is missing or unexpected, or does not fit the model.
+        ValueError: leaves are missing, unexpected or wrongly shaped.
     """
     if not leaves:
         raise ValueError("openpi's LoRA must have at least one leaf, got none.")
@@ -74,7 +73,7 @@ def attach(model: Any, leaves: Mapping[str, np.ndarray], *, scale: float = 1.0) 
 def _expert_pairs(
     leaves: dict[str, np.ndarray], size: ExpertConfig, ours: str, suffix: str
 ) -> dict[str, Pair]:
-    """Pop one expert's leaves and convert them to pairs (A, B), by the path of our layer."""
+    """Pop one expert's leaves and convert them to pairs (A, B) by our layers' paths."""
     layers, width, mlp = size.depth, size.width, size.mlp
     heads, kv_heads, head_dim = size.heads, size.kv_heads, size.head_dim
 

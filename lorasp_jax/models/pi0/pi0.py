@@ -40,8 +40,7 @@ class Pi0Config(BackboneConfig):
     """Sizes and runtime options of a pi0 or pi0.5 model."""
 
     pi05: bool = False
-    """Build pi0.5: the flow time conditions the action expert's norms, and the state is part of the
-    prompt instead of a token."""
+    """Build pi0.5 instead of pi0; see the module docstring."""
 
     def create(self, rngs: nnx.Rngs) -> Pi0:
         """Create a model with random weights; works under `nnx.eval_shape`."""
@@ -107,7 +106,7 @@ class Pi0Config(BackboneConfig):
 
 
 class Prefix(NamedTuple):
-    """Encoded images and instruction, from which the action expert reads.
+    """Encoded images and instruction.
 
     Attributes:
         cache: keys and values `[L, B, P, K, H]` of all layers of the language expert.
@@ -170,7 +169,7 @@ class Pi0(Backbone):
         return jnp.concatenate([state_token, h], axis=1), {"state_proj": state_aux, **aux}
 
     def run_prefix(self, obs: Observation) -> tuple[Prefix, ModelAux]:
-        """Encode images and instruction independently of the actions."""
+        """Encode images and instruction; also return the adapters' aux."""
         tokens, valid, vision_aux = self.embed_prefix(obs)
         block = np.zeros(valid.shape[1], int)
         mask = block_mask(block, block, valid, valid)
@@ -204,7 +203,7 @@ class Pi0(Backbone):
         return v_t, {**expert_aux, **aux, **time_aux, "action_out_proj": out_aux}
 
     def norm_condition(self, flow_time: jax.Array) -> tuple[jax.Array | None, LayerAux]:
-        """Return the condition for adaptive norms and the adapters' aux: None and empty for pi0."""
+        """Return the condition for adaptive norms and the adapters' aux; pi0 has neither."""
         del flow_time
         return None, {}
 
@@ -215,7 +214,7 @@ class Pi05(Pi0):
     make_expert = AdaptiveExpert
 
     def _make_projections(self, state_width: int, rngs: nnx.Rngs) -> None:
-        """Create the layers that embed noisy actions and flow time, and predict velocities."""
+        """Create the layers outside the towers; the state needs none."""
         del state_width
         width, dim = self.config.action.width, self.config.action_dim
         options: Any = {"dtype": jnp.float32, "param_dtype": self.config.param_dtype, "rngs": rngs}
@@ -225,7 +224,7 @@ class Pi05(Pi0):
         self.action_out_proj: Layer = Dense(width, dim, **options)
 
     def fuse_projections(self, *, copy_kernels: bool = True) -> None:
-        """See `prepared.FusableModule`; no two layers outside the towers share an input."""
+        """See `prepared.FusableModule`. No two of these layers share an input."""
         self.action_in_proj = fuse_layer(self.action_in_proj, copy_kernels=copy_kernels)
         self.time_mlp_in = fuse_layer(self.time_mlp_in, copy_kernels=copy_kernels)
         self.time_mlp_out = fuse_layer(self.time_mlp_out, copy_kernels=copy_kernels)
@@ -240,7 +239,7 @@ class Pi05(Pi0):
     ) -> tuple[jax.Array, LayerAux]:
         """Embed noisy actions as tokens `[B, C, D]` f32; also return the adapters' aux.
 
-        `obs` and `flow_time` are unused: the prompt contains the state, and the norms use the time.
+        `obs` and `flow_time` are unused: the state is in the prompt, and the time conditions norms.
         """
         del obs, flow_time
         x_t = x_t.astype(jnp.float32)

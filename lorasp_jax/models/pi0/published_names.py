@@ -1,8 +1,8 @@
 """Names and shapes of pi0's parameters as openpi and LeRobot publish them.
 
-openpi fuses some projections into one einsum kernel (keys with values, gate with up) and keeps head
-axes separate. LeRobot stores PyTorch's transposed matrices [O, I], one for each layer. This project
-stores matrices [I, O] under Hugging Face's names, stacked over layers.
+openpi fuses keys with values and gate with up into one einsum kernel each, and keeps head axes
+separate. LeRobot stores PyTorch's transposed matrices [O, I], one per layer. This project stores
+matrices [I, O] under Hugging Face's names, stacked over layers.
 """
 
 import numpy as np
@@ -154,7 +154,7 @@ def _heads_first(kernel: np.ndarray, heads: int) -> np.ndarray:
 def lerobot_name(name: str) -> str:
     """Map a tensor name from any LeRobot version to the current name.
 
-    In older versions, the towers belong to other modules.
+    Older versions have the towers in other modules.
     """
     if name.endswith("lm_head.weight"):
         return UNUSED["gemma_expert." in name]

@@ -1,8 +1,8 @@
 """SmolVLA's experts: SmolLM2 (arXiv 2502.02737), and an action expert that uses SmolLM2's cache.
 
 Even layers of the action expert attend to the language model's keys and values and to their own, as
-in pi0. Odd layers use cross-attention: they attend only to projections of the language model's
-keys and values in the same layer, so action tokens do not attend to each other there.
+in pi0. Odd layers use cross-attention: they attend only to projections of the language model's keys
+and values in the same layer. Action tokens do not attend to each other there.
 """
 
 import functools
@@ -27,14 +27,14 @@ from lorasp_jax.models.transformer.layers import (
 
 
 class SelfBlock(ExpertBlock):
-    """One SmolLM2 layer: a Gemma layer, but with SiLU and norms that store their factor."""
+    """One SmolLM2 layer: like Gemma's, but with SiLU, and norms with offset 0."""
 
     make_norm = staticmethod(functools.partial(RMSNorm, eps=1e-5, offset=0.0))
     activation = staticmethod(jax.nn.silu)
 
 
 class CrossBlock(SelfBlock):
-    """An action-expert layer that attends only to the language model's keys and values."""
+    """Cross-attention layer of the action expert."""
 
     def __init__(self, size: ExpertConfig, config: BackboneConfig, *, rngs: nnx.Rngs) -> None:
         super().__init__(size, config, context=size.kv_heads * size.head_dim, rngs=rngs)
@@ -49,7 +49,7 @@ class CrossBlock(SelfBlock):
     def project_cache(self, cache: KeysValues, valid: jax.Array) -> tuple[KeysValues, LayerAux]:
         """Compute this layer's keys and values `[B, P, K, H]` from the language model's.
 
-        The language model has already applied RoPE to its keys, so this layer does not.
+        The language model's keys already include RoPE.
         """
         aux: LayerAux = {}
         keys, values = cache
@@ -121,7 +121,7 @@ class ActionExpert(nnx.Module):
             valid: `[B, P]` bool.
 
         Returns:
-            Keys and values `[L / 2, B, P, K, H]` for the self-attention layers, the same for the
+            Keys and values `[L / 2, B, P, K, H]` for the self-attention layers, those for the
             cross-attention layers, and the adapters' aux.
         """
         even, odd = (jax.tree.map(lambda a, i=i: a[i::2], cache) for i in (0, 1))
@@ -149,8 +149,8 @@ class ActionExpert(nnx.Module):
 
         Args:
             x: `[B, T, D]`.
-            position: `[B, T]` int32, continuing those of the prefix. Cross-attention layers instead
-                number these tokens from zero.
+            position: `[B, T]` int32, continuing the prefix's, for self-attention layers.
+                Cross-attention layers number these tokens from zero.
             mask: `[B, T, P + T]` bool.
             cache: prefix keys and values for self-attention, from `project_cache`.
             cross: prefix keys and values for cross-attention, from `project_cache`.

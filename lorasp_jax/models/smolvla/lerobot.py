@@ -17,7 +17,7 @@ _FIXED = {
 
 
 def smolvla_config(fields: Mapping[str, Any]) -> SmolVLAConfig:
-    """Return a config with the published sizes, but the fields' language depth and expert width.
+    """Return the published config with depth and expert width from the fields.
 
     Raises:
         ValueError: unsupported attention, special tokens or number of expert layers.

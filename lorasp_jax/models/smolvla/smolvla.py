@@ -41,7 +41,6 @@ class SmolVLAConfig(BackboneConfig):
     """
 
     def __post_init__(self) -> None:
-        """Validate the sizes."""
         super().__post_init__()
         if self.action.depth % 2:
             raise ValueError(
@@ -107,7 +106,7 @@ class SmolVLAConfig(BackboneConfig):
 
 
 class Prefix(NamedTuple):
-    """Encoded images, instruction and state, from which the action expert reads.
+    """Encoded images, instruction and state.
 
     Attributes:
         cache: keys and values `[L / 2, B, P, K, H]` of the language model's even layers.
@@ -174,7 +173,7 @@ class SmolVLA(Backbone):
         return self.embed_actions(x_t, flow_time, action_valid)
 
     def run_prefix(self, obs: Observation) -> tuple[Prefix, ModelAux]:
-        """Encode images, instruction and state independently of the actions."""
+        """Encode images, instruction and state; also return the adapters' aux."""
         tokens, valid, aux = self.embed_prefix(obs)
         block = _prefix_block(valid.shape[1])
         mask = block_mask(block, block, valid, valid)

@@ -9,12 +9,12 @@ MASKED = -2.3819763e38
 """Logit of a masked key. Finite, so that a fully masked row gets a uniform softmax, not NaN."""
 
 CUDNN_MIN_QUERIES, CUDNN_MIN_HEAD_DIM = 128, 64
-"""Minimum sizes for which attention uses cuDNN. Published models reach both; miniatures do not,
-which keeps the results of miniatures bitwise reproducible."""
+"""Minimum sizes for cuDNN. Miniatures do not reach both, so their results are bitwise
+reproducible."""
 
 KEY_MULTIPLE, MIN_PADDED_KEYS = 128, 512
-"""Without cuDNN, attention with a mask and at least `MIN_PADDED_KEYS` keys pads the keys to a
-multiple of `KEY_MULTIPLE`."""
+"""Without cuDNN, masked attention pads `MIN_PADDED_KEYS` or more keys to a multiple of
+`KEY_MULTIPLE`."""
 
 CUDNN_MULTIPLE = 8
 """With a mask, cuDNN needs query and key counts divisible by 8 (16-byte alignment of the mask)."""
@@ -23,8 +23,8 @@ CUDNN_MULTIPLE = 8
 def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) -> jax.Array:
     """Grouped-query attention with fp32 softmax; uses cuDNN for long 16-bit float inputs on GPUs.
 
-    cuDNN accumulates gradients in nondeterministic order, so two runs differ by rounding errors;
-    `CUDNN_MIN_QUERIES` and `CUDNN_MIN_HEAD_DIM` keep small models on the deterministic path.
+    cuDNN accumulates gradients in nondeterministic order, so they differ between runs by rounding
+    errors.
 
     Args:
         q: `[B, T, N, H]`, already scaled.
@@ -55,7 +55,7 @@ def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) 
 def _pad_keys(
     k: jax.Array, v: jax.Array, mask: jax.Array | None
 ) -> tuple[jax.Array, jax.Array, jax.Array | None]:
-    """Append masked keys; XLA would instead pad the attention weights, which costs another copy."""
+    """Append masked keys. XLA would instead pad the attention weights, which costs another copy."""
     padding = -k.shape[1] % KEY_MULTIPLE
     if mask is None or padding == 0 or k.shape[1] < MIN_PADDED_KEYS:
         return k, v, mask
@@ -67,7 +67,7 @@ def _use_cudnn(q: jax.Array, k: jax.Array, mask: jax.Array | None) -> bool:
     """Whether cuDNN supports these arrays and is worth its launch overhead."""
     queries, head_dim, keys = q.shape[1], q.shape[3], k.shape[1]
     half_precision = q.dtype in (jnp.bfloat16, jnp.float16)
-    even = mask is not None or (queries % 2 == 0 and keys % 2 == 0)  # inputs with a mask are padded
+    even = mask is not None or (queries % 2 == 0 and keys % 2 == 0)  # masked inputs get padded
     supported = CUDNN_MIN_HEAD_DIM <= head_dim <= 256 and head_dim % 8 == 0 and even
     large = queries >= CUDNN_MIN_QUERIES
     return jax.default_backend() == "gpu" and half_precision and supported and large
@@ -76,10 +76,7 @@ def _use_cudnn(q: jax.Array, k: jax.Array, mask: jax.Array | None) -> bool:
 def _pad_for_cudnn(
     q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Append masked keys and fully masked queries up to multiples of `CUDNN_MULTIPLE`.
-
-    The caller drops the results of the appended queries.
-    """
+    """Append masked keys and queries up to multiples of `CUDNN_MULTIPLE`."""
     queries, keys = (-a.shape[1] % CUDNN_MULTIPLE for a in (q, k))
     q, k, v = (_pad_tokens(a, n) for a, n in ((q, queries), (k, keys), (v, keys)))
     return q, k, v, jnp.pad(mask, ((0, 0), (0, queries), (0, keys)))

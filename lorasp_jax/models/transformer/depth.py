@@ -18,12 +18,12 @@ _SAVED = "saved"
 
 
 def save_for_backward(x: jax.Array) -> jax.Array:
-    """Mark x to be saved for the backward pass, instead of the matmul results that yield x."""
+    """Mark x to be saved for the backward pass, in place of the matmul results it comes from."""
     return checkpoint_name(x, _SAVED)
 
 
 def _save_products(primitive: Any, *shapes: Any, **params: Any) -> Any:
-    """Save results of matmuls and expensive primitives, and values from `save_for_backward`."""
+    """Save matmuls without batch axes, expensive primitives and values marked for saving."""
     if primitive.name in _EXPENSIVE_TO_RECOMPUTE or params.get("name") == _SAVED:
         return True
     return jax.checkpoint_policies.dots_with_no_batch_dims_saveable(primitive, *shapes, **params)
@@ -89,9 +89,9 @@ def scan_depth(
 
 
 def _split_layers(stacked: Any) -> list[Any]:
-    """Split arrays [L, ...] into layers. The backward pass concatenates the layers' gradients.
+    """Split arrays [L, ...] into layers, so that the backward pass concatenates their gradients.
 
-    If each layer were indexed instead, the backward pass would add L zero-padded gradients.
+    With indexing, the backward pass would add L zero-padded gradients.
     """
     leaves, structure = jax.tree.flatten(stacked)
     slices = zip(*(jax.lax.split(leaf, [1] * len(leaf)) for leaf in leaves), strict=True)
@@ -104,8 +104,7 @@ def _split_layers(stacked: Any) -> list[Any]:
 class _LayerSlice(NamedTuple):
     """Lazy slice of one layer from stacked arrays.
 
-    Under `jax.checkpoint`, the backward pass slices the stack again, so the forward pass need not
-    save every layer's slice.
+    Under `jax.checkpoint`, the backward pass slices again, so no slices are saved.
     """
 
     trained: Any
@@ -114,7 +113,7 @@ class _LayerSlice(NamedTuple):
     """Stacked frozen arrays [L, ...]."""
     index: np.int32
     gradient_sinks: Any
-    """The layer's slices of `trained`; their values are unused, and the gradients flow to them."""
+    """The layer's slices of `trained`. They receive the gradients; their values are unused."""
 
     def materialize(self) -> tuple[Any, Any]:
         """Return the layer's trainable and frozen arrays [...]."""
@@ -132,7 +131,7 @@ def _slice(stack: jax.Array, index: np.int32) -> jax.Array:
 
 @jax.custom_jvp
 def _slice_with_gradient(stack: jax.Array, index: np.int32, sink: jax.Array) -> jax.Array:
-    """Return stack[index]; the gradient flows to `sink`, which has the same value."""
+    """Return stack[index], with its gradient flowing to `sink`, which has the same value."""
     del sink
     return _slice(stack, index)
 

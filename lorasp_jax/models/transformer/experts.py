@@ -1,8 +1,8 @@
 """Experts that share attention: a mixture of transformers (pi0, arXiv 2410.24164).
 
-An expert's tokens also attend to the cached keys and values that the preceding expert computed in
-the same layer. Language tokens never attend to action tokens, so the whole language expert runs
-first and the action expert then uses its cache, both in training and in sampling.
+In each layer, action tokens attend to the language expert's keys and values and to their own.
+Language tokens never attend to action tokens. The language expert therefore runs first, and the
+action expert uses its cached keys and values, in training as in sampling.
 """
 
 import functools
@@ -50,14 +50,7 @@ class ExpertBlock(nnx.Module):
         context: int | None = None,
         rngs: nnx.Rngs,
     ) -> None:
-        """Initialize the weights.
-
-        Args:
-            size: sizes of this expert.
-            config: the backbone's config.
-            context: input width of k_proj and v_proj; None means `size.width`.
-            rngs: source of the random weights.
-        """
+        """`context` is the input width of k_proj and v_proj; None means `size.width`."""
         options: dict[str, Any] = {
             "use_bias": False,
             "dtype": config.dtype,
@@ -109,7 +102,7 @@ class ExpertBlock(nnx.Module):
             condition: `[B, 1, D]` for adaptive norms, or None.
 
         Returns:
-            The new x, and a pair of this layer's keys and values and the adapters' aux.
+            x, and a pair: this layer's keys and values, and the adapters' aux.
         """
         h, gate, norm_aux = self.input_layernorm.normalize(x, condition)
         qkv = {"q_proj": self.q_proj, "k_proj": self.k_proj, "v_proj": self.v_proj}

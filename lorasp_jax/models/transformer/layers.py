@@ -27,7 +27,7 @@ def rms_normalize(x: jax.Array, eps: float) -> jax.Array:
 class RMSNorm(nnx.Module):
     """x / sqrt(mean(x^2) + eps) * (offset + scale), computed in fp32, returned in the dtype of x.
 
-    Gemma stores the factor minus one (offset 1), whereas other models store the factor (offset 0).
+    Gemma stores the factor minus one (offset 1); other models store the factor itself (offset 0).
     """
 
     def __init__(
@@ -61,8 +61,8 @@ class AdaptiveRMSNorm(nnx.Module):
         y = x / sqrt(mean(x^2) + eps) * (1 + scale) + shift
         scale, shift, gate = split(dense(condition))
 
-    The gate multiplies the output of the residual branch that takes y as its input. The dense layer
-    is initialized to zero, so the branches initially contribute nothing (openpi, models/gemma.py).
+    The gate multiplies the output of the residual branch whose input is y. The dense layer is
+    initialized to zero, so the branches initially contribute nothing (openpi, models/gemma.py).
     """
 
     def __init__(self, width: int, *, dtype: Any, param_dtype: Any, rngs: nnx.Rngs) -> None:
@@ -163,7 +163,7 @@ def positions(valid: jax.Array) -> jax.Array:
 def block_mask(
     query_block: np.ndarray, key_block: np.ndarray, query_valid: jax.Array, key_valid: jax.Array
 ) -> jax.Array:
-    """Create a mask: valid queries attend to valid keys of their own and of earlier token blocks.
+    """Let valid queries attend to valid keys of their own token block and of earlier blocks.
 
     Args:
         query_block: `[T]` int, block number of each query token.
@@ -196,7 +196,7 @@ def rope_table(position: jax.Array, head_dim: int) -> tuple[jax.Array, jax.Array
 def rope(x: jax.Array, table: tuple[jax.Array, jax.Array], scale: float = 1.0) -> jax.Array:
     """Apply RoPE to x `[B, T, N, H]` in fp32 and multiply by `scale`.
 
-    Each element of a head's first half is rotated together with its counterpart in the second half.
+    Element i of a head is rotated together with element i + H/2.
     """
     sin, cos = table
     first, second = jnp.split(x.astype(jnp.float32), 2, axis=-1)

@@ -54,8 +54,8 @@ class SigLIP(nnx.Module):
     """Encodes images as tokens for the language model.
 
     The patch embedding is a dense layer over flattened patches, equivalent to the usual strided
-    convolution. The head turns each `shuffle` x `shuffle` square of tokens into one token
-    (pixel shuffle).
+    convolution. The head maps each `shuffle` x `shuffle` square of tokens to one token (pixel
+    shuffle).
     """
 
     def __init__(self, config: BackboneConfig, *, head_bias: bool = True, rngs: nnx.Rngs) -> None:
@@ -108,7 +108,7 @@ class SigLIP(nnx.Module):
 def patches(images: jax.Array, size: int) -> jax.Array:
     """Split images `[B, H, W, C]` into patches `[B, T, C size^2]`.
 
-    The patches are in row-major order, and each patch is flattened in the order (y, x, channel).
+    Patches are in row-major order, each flattened in the order (y, x, channel).
     """
     batch, height, width, channels = images.shape
     grid = images.reshape(batch, height // size, size, width // size, size, channels)
