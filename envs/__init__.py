@@ -10,7 +10,7 @@ import lazy_loader
 import envs.compilation.fast_cpu  # first: it must run before anything starts JAX
 import envs.interop.ids
 
-# Importing MJX would delay `--help` by seconds.
+# Lazy, because importing MJX would delay `--help` by seconds.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 envs.interop.ids.register()

@@ -24,11 +24,13 @@ _DEFAULT = "(default: %(default)s)"
 def main(
     arguments: Sequence[str], program: str = "python -m envs", record: Record | None = None
 ) -> int:
-    """Run a command; return its exit code: 0 success, 2 error, 130 interrupted, 141 closed stdout.
+    """Run a command and return its exit code.
+
+    The code is 0 on success, 2 after an error, 130 if interrupted and 141 if stdout was closed.
 
     Args:
         arguments: command-line arguments.
-        program: program name for help and errors.
+        program: name shown in help and errors.
         record: as in `envs.collect`.
     """
     options = parse_arguments(parser(program), arguments)
@@ -87,7 +89,7 @@ def parser(program: str) -> argparse.ArgumentParser:
 def _add_command(
     subparsers: Any, command: Callable[..., None], image_size: int, prefix: str = ""
 ) -> Callable[..., Any]:
-    """Add a command with the options that all commands share; return its `add_argument`."""
+    """Add a command with the shared options; return its `add_argument`."""
     text = command.__doc__
     sub = subparsers.add_parser(command.__name__, help=text, description=text)
     sub.set_defaults(command=command)

@@ -7,8 +7,8 @@ from jax._src import compilation_cache, core, lru_cache, xla_bridge
 from jaxlib import utils
 
 FileCache = lru_cache.LRUCache
-"""JAX's file cache of compiled programs. No public setting changes how it writes entries, and by
-default a process could read an entry that another process is still writing."""
+"""JAX's file cache of compiled programs. By default, one process can read an entry that another is
+still writing, and no public setting changes this."""
 
 
 def use_file_cache(kind: type[FileCache]) -> None:
@@ -21,10 +21,10 @@ backends_are_initialized = xla_bridge.backends_are_initialized
 backend, and then `import envs` could no longer set the flag that makes MJX fast on CPU."""
 
 is_untraced = core.trace_state_clean
-"""Return whether the caller is outside of all JAX transformations; `jax.core` has had no public
-name for this check since 0.4.36. Without it, a step inside a user's `jax.jit` would be announced as
-a compilation, and would get compiler options that JAX rejects there."""
+"""Return whether no JAX transformation is tracing the caller. `jax.core` has had no public name for
+this since 0.4.36. Without this check, a step inside a user's `jax.jit` would be announced as a
+compilation, and would get compiler options that JAX rejects there."""
 
 set_min_log_level = utils.absl_set_min_log_level
-"""Set the log level of JAX's C++ code at run time, to silence XLA's alarms about slow compilation;
-TF_CPP_MIN_LOG_LEVEL is read only at startup."""
+"""Set the log level of JAX's C++ code, to silence XLA's alarms about slow compilation. Unlike
+TF_CPP_MIN_LOG_LEVEL, it can be changed after startup."""

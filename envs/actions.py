@@ -1,4 +1,4 @@
-"""Action modes, each converted to joint targets.
+"""Action modes, and their conversion to joint targets.
 
 J is the number of joints without the gripper, and A is the length of an action.
 
@@ -25,13 +25,13 @@ Mode = Literal["joint", "delta_joint", "end_effector"]
 MODES: tuple[str, ...] = get_args(Mode)
 
 TARGET_DT = 0.02
-"""Period at which joint targets are interpolated between two actions [s]; our choice (50 Hz)."""
+"""Time between interpolated joint targets [s]; our choice (50 Hz)."""
 
 _TOOL_SPEED = np.array([0.5] * 3 + [2.0] * 3, np.float32)  # speed limits, our choice [m/s, rad/s]
 
 
 def bounds(mode: Mode, robot: Robot, control_dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and highest actions, float32 [A], for a control period in seconds."""
+    """Return the lowest and the highest action, float32 [A]; `control_dt` is in s."""
     if mode == "joint":
         return robot.action_low, robot.action_high
     speed = _TOOL_SPEED if mode == "end_effector" else robot.action_speed[:-1]
@@ -40,9 +40,9 @@ def bounds(mode: Mode, robot: Robot, control_dt: float) -> tuple[np.ndarray, np.
 
 
 def to_targets(mode: Mode, robot: Robot, command: jax.Array, action: jax.Array) -> jax.Array:
-    """Convert one world's action [A] to targets [J + 1], given its last targets [J + 1].
+    """Convert one world's action [A] to targets [J + 1], given its last targets `command` [J + 1].
 
-    If an end-effector pose is out of reach, use the closest one that inverse kinematics finds.
+    An end-effector pose that is out of reach becomes the closest one that inverse kinematics finds.
     """
     if mode == "joint":
         return action
@@ -57,7 +57,7 @@ def to_targets(mode: Mode, robot: Robot, command: jax.Array, action: jax.Array) 
 def from_targets(mode: Mode, robot: Robot, command: jax.Array, targets: jax.Array) -> jax.Array:
     """Invert `to_targets`: return the action [A] that leads from `command` to `targets`.
 
-    An end-effector action does not determine the targets of an arm with more than six joints.
+    With more than six joints, `to_targets` may find other targets for an end-effector action.
     """
     if mode == "joint":
         return targets
@@ -82,14 +82,14 @@ def interpolate(commands: jax.Array, control_dt: float, latency: float | jax.Arr
     fraction = jnp.arange(1, moves + 1, dtype=jnp.float32)[:, None] / moves
     # The targets of the previous control step, followed by those of this one.
     path = commands[:-1, None] + fraction * jnp.diff(commands, axis=0)[:, None]
-    path = path.at[..., -1].multiply(0.5)  # each finger makes half of the opening
+    path = path.at[..., -1].multiply(0.5)  # each finger moves by half of it
     targets = jnp.repeat(path.reshape(2 * moves, -1), repeats, axis=0)
     delay = jnp.round(latency / scene.PHYSICS_DT).astype(jnp.int32)
     return jax.lax.dynamic_slice_in_dim(targets, moves * repeats - delay, moves * repeats)
 
 
 def _rotation_vector(rotation: jax.Array) -> jax.Array:
-    """Convert a rotation [3, 3] by less than 180 degrees to a rotation vector [3]."""
+    """Convert a rotation matrix [3, 3] to a rotation vector [3] of less than 180 degrees."""
     axis = robots.sine_axis(rotation)
     sine = jnp.linalg.norm(axis)
     angle = jnp.arctan2(sine, (jnp.trace(rotation) - 1) / 2)

@@ -1,4 +1,4 @@
-"""Check arguments before anything is computed; each error message is one sentence."""
+"""Checks of arguments; each error message is one sentence."""
 
 import math
 import numbers
@@ -61,7 +61,7 @@ def action(value: Any, shape: tuple[int, ...]) -> Any:
 
     Raises:
         TypeError: the value is not a numeric array.
-        ValueError: the array has another shape.
+        ValueError: the array has a different shape.
     """
     if not is_numeric(value):
         raise TypeError(f"action must be a numeric array {list(shape)}, got {short(value)}")
@@ -77,7 +77,7 @@ def instance(name: str, value: Any, kind: type, expected: str) -> None:
 
 
 def is_numeric(value: Any) -> bool:
-    """Return whether a value is an array of real numbers; lists are not."""
+    """Return whether a value is an array (not a list) of integers or floats."""
     dtype = getattr(value, "dtype", None)
     return dtype is not None and (
         jnp.issubdtype(dtype, jnp.integer) or jnp.issubdtype(dtype, jnp.floating)

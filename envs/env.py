@@ -35,7 +35,7 @@ _START_OPENING = 0.04  # m, gripper opening at reset; our choice
 
 @enum.unique
 class _LayoutStream(enum.IntEnum):
-    """Streams of randomness derived from the key of a layout."""
+    """Numbers that `jax.random.fold_in` combines with the key of a layout."""
 
     DISTRACTORS = 1
     RANDOMIZATION = 2
@@ -127,9 +127,9 @@ class Env:
 
         Args:
             state: W worlds.
-            action: [W, A], by default J joint targets [rad] and the gripper opening [m], so that
-                A = J + 1; see `envs.actions` for other modes. Actions are clipped to `action_low`,
-                `action_high` and the robot's speed limits.
+            action: [W, A], by default J joint targets [rad] and the gripper opening [m]; see
+                `envs.actions` for other modes. Actions are clipped to `action_low`, `action_high`
+                and the robot's speed limits.
 
         Returns:
             The worlds `control_dt` later. Worlds that were done are unchanged.
@@ -149,8 +149,8 @@ class Env:
         """Render and measure what a policy observes.
 
         Returns:
-            `image`: camera name -> uint8 [W, image_size, image_size, 3]; `state`: f32 [W, J + 1]
-            measured joint angles [rad] and gripper opening [m].
+            `image`: camera name -> uint8 [W, image_size, image_size, 3].
+            `state`: f32 [W, J + 1] measured joint angles [rad] and gripper opening [m].
 
         Raises:
             TypeError, ValueError: the state is invalid, as in `step`.
@@ -175,7 +175,7 @@ class Env:
         """Run a policy in fresh worlds until the time limit; return the last state and all steps.
 
         Args:
-            policy: (observation, key) -> action [W, A]. The observation is that of `observe` plus
+            policy: (observation, key) -> action [W, A]. The observation is that of `observe`, plus
                 `instruction`, int32 [W]. Images that the policy does not read are not rendered.
             key: source of all randomness.
             ranges: as in `reset`.
@@ -206,8 +206,8 @@ class Env:
         """Restart the worlds that are done; pass the same ranges as to `reset`.
 
         Raises:
-            TypeError: as in `reset` and `step`.
-            ValueError: only one of `reset` and `reset_done` has ranges, or a range is invalid.
+            TypeError, ValueError: as in `reset` and `step`.
+            ValueError: only one of `reset` and `reset_done` got ranges.
         """
         self._check_worlds(state)
         if (ranges is None) != (state.info["draw"] is None):
@@ -239,7 +239,6 @@ class Env:
         return jax.vmap(self._full_state)(state)
 
     def _full_state(self, state: State) -> jax.Array:
-        """Return the privileged state of one world, f32 [D]."""
         parts = observations.parts(self.model, state.data, state.info["command"], self._task_bodies)
         return jnp.concatenate([*parts.values()])
 
@@ -253,8 +252,8 @@ class Env:
 
         Args:
             poses: poses of all geoms and cameras, leading axis N.
-            draw: randomized values of these scenes, leading axis N, from `State.info`; None: not
-                randomized.
+            draw: randomized values of these scenes from `State.info`, leading axis N; None if they
+                are not randomized.
         """
         appearance, size = jax.vmap(self._appearance)(draw) if draw else (None, None)
         images = self.renderer(poses, appearance, size)
@@ -355,7 +354,7 @@ class Env:
         return self._with_cameras(draw, self.physics.start(self._changes(draw, layout), qpos))
 
     def _changes(self, draw: Draw | None, layout: Layout) -> Changes:
-        """Return one world's changes to the model: randomized values and poses of fixed bodies."""
+        """Return one world's changes to the model: randomized values, poses of fixed bodies."""
         changes = randomization.changes(draw, self.model, self._objects) if draw else {}
         return changes | placing.fixed_bodies(self.model, layout, changes)
 

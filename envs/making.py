@@ -24,8 +24,8 @@ from envs.scene import scene
 AnyRobot = str | os.PathLike[str] | Robot
 RendererName = Literal["rays", "warp"]
 RENDERERS: tuple[str, ...] = get_args(RendererName)
-# For each argument the upper bound, then the lower bound unless it is 1. The upper bounds of the
-# first three exceed what any device can hold; they only catch typos.
+# Upper bound of each argument, then its lower bound unless that is 1. The first three upper bounds
+# are beyond any practical use and only catch typos.
 _RANGES: dict[str, tuple[int, ...]] = {
     "num_envs": (2**20,),
     "image_size": (2**12,),
@@ -57,7 +57,7 @@ def make(
             `envs.mjcf.load`.
         num_envs: number of parallel worlds W.
         image_size: height and width of images [px].
-        antialias: n, to cast n x n rays per pixel: smoother edges at n² times the cost.
+        antialias: n, for n x n rays per pixel: smoother edges at n² times the cost.
         control_dt: time between actions [s], a multiple of 0.02.
         actions: action mode: joint, delta_joint or end_effector, see `envs.actions`.
         reward: sparse (1 on success) or dense (shaped by progress), see `envs.rewards`.
@@ -130,14 +130,13 @@ def _counts(**values: Any) -> Iterator[int]:
 
 
 def _check_choices(**values: tuple[Any, Sequence[str]]) -> None:
-    """Check names against their valid choices, each passed as argument=(value, choices)."""
+    """Check choices by name, each passed as argument=(value, valid choices)."""
     for name, (value, known) in values.items():
         if value not in known:
             raise ValueError(f"unknown {name} {value!r}: choose from {', '.join(known)}")
 
 
 def _check_learning(actions: Mode, reward: Reward, discount: float) -> None:
-    """Check action mode, reward and discount."""
     _check_choices(actions=(actions, MODES), reward=(reward, REWARDS))
     real = isinstance(discount, numbers.Real) and not isinstance(discount, bool)
     if not real or not 0 < discount <= 1:

@@ -21,19 +21,20 @@ _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 def parts(
     model: mujoco.MjModel, data: Any, command: jax.Array, bodies: Iterable[str]
 ) -> dict[str, jax.Array]:
-    """Compute the parts of the privileged state (`Env.full_state`) of one world, f32, by name.
+    """Compute the parts of one world's privileged state (`Env.full_state`) by name, all f32.
 
-    - `joints` [J + 1]: joint angles [rad] and gripper opening [m]; `joint_speeds` [J + 1]: their
-      time derivatives [rad/s, m/s]; `command` [J + 1]: the last targets.
+    - `joints` [J + 1]: joint angles [rad] and gripper opening [m].
+    - `joint_speeds` [J + 1]: their time derivatives [rad/s, m/s].
+    - `command` [J + 1]: the last targets [rad, m].
     - `tool` [9]: position [m], x axis and y axis of the tcp.
-    - `<body>` [9]: position relative to the tcp [m], x axis and y axis; for free bodies also
-      `<body>_speed` [6]: linear [m/s] and angular [rad/s] velocity.
-    - `<body>/<joint>` [2]: position and speed of each hinge or slide of a body.
+    - `<body>` [9]: position relative to the tcp [m], x axis and y axis.
+    - `<body>_speed` [6], of free bodies: linear [m/s] and angular [rad/s] velocity.
+    - `<body>/<joint>` [2]: position and speed of each hinge [rad, rad/s] or slide [m, m/s].
 
     Args:
         model: the scene.
-        data: one world, `envs.state.Data` or MuJoCo's own.
-        command: [J + 1] last targets of joints and opening.
+        data: one world, as `envs.state.Data` or `mujoco.MjData`.
+        command: [J + 1] last targets.
         bodies: names of the task's bodies.
     """
     view, count = View(model, data), len(command) - 1
@@ -50,7 +51,7 @@ def parts(
         result[name] = jnp.concatenate([view.position(name) - view.tcp, axes[:, 0], axes[:, 1]])
         if body.jntnum[0]:
             first = body.dofadr[0]
-            angular = multiply(axes, data.qvel[first + 3 : first + 6])  # qvel is in the body frame
+            angular = multiply(axes, data.qvel[first + 3 : first + 6])  # from the body frame
             result[f"{name}_speed"] = jnp.concatenate([data.qvel[first : first + 3], angular])
         for joint in _joints(model, name):
             values = data.qpos[joint.qposadr[0]], data.qvel[joint.dofadr[0]]

@@ -3,13 +3,12 @@
     reward = success + discount * potential(after) - potential(before)
 
 The discounted sum of the shaping terms depends only on the start of an episode, so optimal policies
-stay optimal (Ng, Harada and Russell 1999, https://dl.acm.org/doi/10.5555/645528.657613), provided
-that
+stay optimal (Ng, Harada and Russell 1999, https://dl.acm.org/doi/10.5555/645528.657613). This needs
 
-- the discount is the learner's own, passed to `envs.make`;
-- the potential of terminal states is 0. Only success is terminal; after a time limit or broken
-  physics the learner bootstraps from the last state, whose potential therefore counts;
-- no shaping spans two episodes: a done world gets 0 until it restarts, and a restart gets 0.
+- the learner's own discount, passed to `envs.make`;
+- a potential of 0 in terminal states. Only success is terminal: after a time limit or broken
+  physics, the learner bootstraps from the last state, so its potential counts;
+- no shaping across episodes. A done world gets 0 until it restarts, and a restart gets 0.
 """
 
 import dataclasses
@@ -25,7 +24,7 @@ REWARDS: tuple[str, ...] = get_args(Reward)
 
 
 def potential(stages: dict[str, jax.Array]) -> jax.Array:
-    """Compute a task's progress in [0, 1]: stages passed, and part of the next, as a share of all.
+    """Compute a task's progress: (stages passed + share of the next) / number of stages, in [0, 1].
 
     Args:
         stages: completed share of each stage, f32 [...] in [0, 1], first to last. A stage with
@@ -49,7 +48,7 @@ def after_step(before: State, after: State, stages: dict[str, jax.Array], discou
 
     Args:
         before, after: the world before and after the step.
-        stages: completed share of each stage after the step, as in `potential`.
+        stages: as in `potential`, after the step.
         discount: the learner's discount.
     """
     success = after.info["success"]

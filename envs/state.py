@@ -76,14 +76,18 @@ class State:
     Attributes:
         data: positions, velocities and poses.
         reward: f32 [W], of the last step; the sparse reward is 1 on success, else 0.
-        done: bool [W], latched; a done world stays frozen until `reset_done`.
-        metrics: f32 [W] each, the task's measurements.
-        info: success bool [W]; steps int32 [W]; instruction int32 [W], index into
-            `env.instructions`; command f32 [W, J + 1], the last targets sent to the robot [rad, m];
-            earlier, the targets before those; held int32 [W], consecutive control steps at the
-            goal; broken bool [W], frozen at the last finite state because physics diverged; layout,
-            body name -> [W, 4] at reset: x, y, z [m], yaw [rad]; draw, randomized values from
-            `envs.scene.randomization`, or None.
+        done: bool [W]; a done world stays frozen until `reset_done`.
+        metrics: f32 [W] each, the task's measurements and the terms of a dense reward.
+        info: more about each world, by name:
+
+            - `success` bool [W], `steps` int32 [W];
+            - `instruction` int32 [W]: index into `env.instructions`;
+            - `command` f32 [W, J + 1]: last targets sent to the robot [rad, m];
+            - `earlier` f32 [W, J + 1]: the targets before `command`;
+            - `held` int32 [W]: consecutive control steps at the goal;
+            - `broken` bool [W]: physics diverged, and the world is frozen at its last finite state;
+            - `layout`: body name -> f32 [W, 4] at reset: x, y, z [m] and yaw [rad];
+            - `draw`: randomized values from `envs.scene.randomization`, or None.
     """
 
     data: Data
@@ -112,7 +116,7 @@ class Trajectory:
 
 
 def where(condition: jax.Array, yes: Any, no: Any) -> Any:
-    """Apply `jnp.where` to two trees; the condition has the leading axes of every leaf."""
+    """Apply `jnp.where` to two trees; the condition's axes are the leading axes of every leaf."""
 
     def choose(a: jax.Array, b: jax.Array) -> jax.Array:
         shape = condition.shape + (1,) * (a.ndim - condition.ndim)

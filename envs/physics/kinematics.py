@@ -1,9 +1,9 @@
 """Forward kinematics of a MuJoCo model; it compiles in a sixth of the time of MJX's own.
 
-MJX walks down the body tree and unrolls every level, which made up half of a step's compiled code.
-Here all frames, one per body and one per joint, are handled at once by pointer jumping: a frame
-starts with its pose in its parent, then gets its pose in the frame two levels up, then four, then
-eight. After log2(depth) rounds of the same few operations all poses are in the world frame.
+MJX unrolls every level of the body tree, which made up half of a step's compiled code. Here all
+frames, one per body and one per joint, are handled at once by pointer jumping. Each frame starts
+with its pose in its parent, then gets its pose in the frame two levels up, then four, then eight.
+After log2(depth) rounds, all poses are in the world frame.
 """
 
 from collections.abc import Callable
@@ -17,8 +17,7 @@ import numpy as np
 _FREE, _BALL, _SLIDE, _HINGE = (
     int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for name in ("FREE", "BALL", "SLIDE", "HINGE")
 )
-# A quaternion product sums over the components of the first factor, each times the components of
-# the second in this order and with these signs.
+# For the quaternion product a b = sum_i a[i] * b[_ORDER[i]] * _SIGN[i].
 _ORDER = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])
 _SIGN = np.array([[1, 1, 1, 1], [-1, 1, -1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1]], np.float32)
 
@@ -30,9 +29,8 @@ class Kinematics:
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        """Precompute the tree of frames."""
         self._joints = model.nbody + np.arange(model.njnt)  # joint frames follow body frames
-        self._bodies = np.arange(model.nbody)  # index of each body's frame after all its joints
+        self._bodies = np.arange(model.nbody)  # frame of each body after all its joints
         self._parents = np.zeros(model.nbody + model.njnt, int)
         for body in range(1, model.nbody):
             self._parents[body] = self._bodies[model.body_parentid[body]]
@@ -47,7 +45,7 @@ class Kinematics:
     def __call__(self, model: Any, data: Any) -> Any:
         """Return MJX's data with all poses computed from `qpos`.
 
-        `xanchor` of slide and free joints, which nothing reads, is the position after their motion.
+        `xanchor` of slide and free joints is the position after their motion; nothing reads it.
         """
         qpos, quats, positions = self._local(model, data.qpos)
         frames = jnp.concatenate([_matrices(quats), positions[..., None]], axis=-1)
@@ -107,7 +105,7 @@ class Kinematics:
 
 
 def _compose(outer: jax.Array, inner: jax.Array) -> jax.Array:
-    """Compose poses; written as sums, not as matmul, so that no device rounds to TF32 or bf16."""
+    """Compose poses by sums; in a matmul, some devices would round to TF32 or bf16."""
     terms = [outer[..., :, i, None] * inner[..., i, None, :] for i in range(3)]
     return terms[0] + terms[1] + terms[2] + outer * np.array([0, 0, 0, 1], np.float32)
 

@@ -1,4 +1,4 @@
-"""Simulate physics with MJX in JAX or with MuJoCo Warp, behind one small class.
+"""Simulate physics with MJX in JAX or with MuJoCo Warp.
 
 Worlds are batched by `jax.vmap`. Between steps, both engines describe a world by the same `Data`.
 """
@@ -26,12 +26,12 @@ BACKENDS: tuple[str, ...] = get_args(Backend)
 """jax runs everywhere; warp is much faster on NVIDIA GPUs, and runs on CPU, slowly, for tests."""
 
 MAX_GROWTH = 1.25
-"""Maximum factor on a geom's size in a world, our choice; Warp's bounding volumes grow by it."""
+"""Maximum factor on geom sizes, our choice; Warp's bounding volumes are enlarged by it."""
 
 
 @functools.cache
 def _mjx() -> Any:
-    """Import MJX when the first environment is made: the import would delay `--help` by seconds."""
+    """Import MJX late, since importing it with `envs` would delay `--help` by seconds."""
     if importlib.util.find_spec("warp"):
         import warp
 
@@ -43,8 +43,8 @@ def _mjx() -> Any:
     for line in printed.getvalue().splitlines():
         if not line.startswith(("Failed to import warp:", "Failed to import mujoco_warp:")):
             print(line, file=sys.stdout)
-    # MJX sums over the children of bodies with scatters, whose order of addition is undefined on
-    # GPU: on an H200, two calls with the same input differed in the last bits.
+    # MJX sums over a body's children with scatters. Their order of addition is undefined on GPU: on
+    # an H200, two calls with the same input differed in the last bits.
     ordered = types.SimpleNamespace(**vars(jax))
     ordered.ops = types.SimpleNamespace(segment_sum=_sum_in_order)
     mujoco.mjx._src.scan.jax = ordered
@@ -69,7 +69,7 @@ def default_backend() -> str:
 class Physics:
     """Simulator of one MuJoCo model; methods are pure and take one world each.
 
-    Poses are always computed in JAX: this is cheap, and `reset` returns the same with any engine.
+    Poses are always computed in JAX, which is cheap and makes `reset` independent of the engine.
     """
 
     def __init__(self, model: mujoco.MjModel, backend: str) -> None:
@@ -105,11 +105,8 @@ class Physics:
 
         Args:
             changes: fields of the model that differ in this world.
-            data: current data of this world.
+            data: the world before these steps.
             controls: `[S, nu]` actuator targets, one row per physics step.
-
-        Returns:
-            The data after S steps, with all poses up to date.
         """
         return self._with_poses(changes, self._simulate(changes, data, controls))
 
@@ -158,7 +155,7 @@ def require_warp(option: str) -> None:
     """Check that warp-lang, which `option` asks for, is installed and can run here.
 
     Raises:
-        ValueError: it is missing, or JAX sees more than one GPU.
+        ValueError: warp-lang is missing, or JAX sees more than one GPU.
     """
     if not importlib.util.find_spec("warp"):
         raise ValueError(f"{option} 'warp' needs warp-lang: pip install -e '.[warp]'")

@@ -1,4 +1,4 @@
-"""Call, from JAX, functions that take Warp arrays."""
+"""Call functions of Warp arrays from JAX."""
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
@@ -17,13 +17,13 @@ def device() -> Any:
 def from_jax(function: Callable[..., None], like: Mapping[str, Any], **options: Any) -> Any:
     """Make a function of Warp arrays callable under jit.
 
-    On a GPU the first call of `function` is captured as a CUDA graph, so memory that outlives a
-    call must be allocated beforehand; Warp copies arguments and results to and from the graph's
+    On a GPU, the first call of `function` is captured as a CUDA graph, so memory that outlives a
+    call must be allocated beforehand. Warp copies arguments and results to and from the graph's
     buffers.
 
     Args:
         function: takes arrays as positional arguments, the outputs last.
-        like: an example Warp array for each argument, by name, to set the argument's type.
+        like: argument name -> a Warp array of the same dtype and number of axes.
         **options: passed to `warp.jax_callable`.
     """
     kinds = {name: wp.array(dtype=x.dtype, ndim=x.ndim) for name, x in like.items()}
@@ -41,7 +41,7 @@ def from_jax(function: Callable[..., None], like: Mapping[str, Any], **options: 
 
 
 def flattening_vmap(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Make `vmap` fold the mapped axis into the leading axis of all arrays, that of worlds."""
+    """Make `vmap` fold its axis into the leading axis of all arrays, the axis of worlds."""
 
     @jax.custom_batching.custom_vmap
     def run(*arguments: Any) -> Any:
