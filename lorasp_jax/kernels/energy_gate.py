@@ -1,22 +1,21 @@
 """Energy gate of LoRA-SP: keep the fewest directions whose squared scores reach an energy target.
 
-For scores s >= 0 let E_k be the fraction of the energy Σ s² in the k largest scores (paper eq. 12).
-The gate keeps the smallest k with E_k >= η; ties go to the lowest index. Implementations:
+For scores s >= 0, let E_k be the fraction of the energy Σ s² in the k largest scores (paper eq.
+12). The gate keeps the smallest k with E_k >= η; ties go to the lowest index. Implementations:
 
 - "pairwise": for each direction, sum the energy of all directions that rank before it. O(R²),
   vectorized over rows and R; fastest on CPU up to R = 32.
-- "sort": sort the scores, accumulate energy, threshold. The reference; in rare cases, rounding
-  of its cumulative sum changes whether η is reached.
+- "sort": sort the scores, accumulate energy, threshold. The reference; in rare cases, rounding of
+  its cumulative sum changes whether η is reached.
 - "bisection": binary search for the threshold, one bit per step, without a sort.
-- "block": bisection that stops early, for the few rows that one kernel block holds.
+- "block": bisection that stops early, for the few rows in a block of a kernel.
 - "pallas": "block" as a Triton kernel, one row per warp, scores in registers.
 
-"sort", "block" and "pallas" reduce each row to its `Boundary`, the last kept (score, index); the
-mask is then computed elementwise.
+"sort", "block" and "pallas" find each row's `Boundary`, the last kept (score, index). Comparing the
+scores with it gives the mask.
 
-η is the decimal as written: 0.9 means 9/10, and E_k >= 9/10 is tested as 10 Σ_k >= 9 Σ, where
-Σ_k is the kept and Σ the total energy, so that rounding of 0.9 does not affect rows that reach it
-exactly.
+η is the decimal as written, so 0.9 means 9/10. E_k >= 9/10 is tested as 10 Σ_k >= 9 Σ, where Σ_k is
+the kept and Σ the total energy. Rows that reach η exactly thus do not depend on its rounding.
 
 All implementations agree at the limits of fp32:
 
@@ -49,11 +48,11 @@ from lorasp_jax.kernels.threshold_search import (
 Implementation = Literal["pairwise", "sort", "bisection", "block", "pallas"]
 
 MIN_TARGET = 2.0**-64
-"""A smaller η is raised to this value, since it would underflow in fp32. The mask does not change:
-either η keeps one direction, since no bank has 2^64."""
+"""A smaller η could underflow in fp32 and is raised to this value. Both keep one direction, because
+no bank has 2^64."""
 
 PAIRWISE_RANK = 32
-"""Largest R for which "pairwise" is the default on CPU; above it, bisection is faster (on two
+"""Largest R at which "pairwise" is the default on CPU. Above it, "bisection" is faster (on two
 cores)."""
 
 
@@ -130,8 +129,8 @@ def _mask_function(implementation: str, interpret: bool) -> Callable[[jax.Array,
         valid = ", ".join(get_args(Implementation))
         raise ValueError(f"implementation must be one of {valid}, got {implementation!r}.")
     boundary = boundaries[implementation]
-    # XLA may compute the scores twice, for the boundary and for the comparison with it, and round
-    # them differently; the barrier prevents this. A kernel computes them once.
+    # Without a barrier, XLA may compute the scores twice, for the boundary and for the comparison
+    # with it, and round them differently. "block" runs in a kernel, which computes them once.
     barrier = (lambda scores: scores) if implementation == "block" else jax.lax.optimization_barrier
 
     def compute_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
@@ -147,7 +146,7 @@ def positive(scores: jax.Array) -> jax.Array:
 
 
 def _pairwise_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
-    """Keep each positive score whose predecessors in rank fall short of the energy target."""
+    """Keep each positive score if those that rank before it fall short of the energy target."""
     energy = energies(scores)
     position = np.arange(scores.shape[-1])
 
@@ -186,7 +185,7 @@ def energy_share(scores: jax.Array) -> jax.Array:
 
 
 def _sorted_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
-    """Find the boundaries by sorting (the reference), with neither argsort nor a scattered mask."""
+    """Find the boundaries by sorting, without argsort or a scatter."""
     rows = scores.reshape(-1, scores.shape[-1])
     last = jax.vmap(lambda row: _sorted_row_boundary(row, ratio))(rows)
     return jax.tree.map(lambda leaf: leaf.reshape(*scores.shape[:-1], 1), last)
@@ -214,7 +213,7 @@ def _pallas_boundary(scores: jax.Array, ratio: Ratio, *, interpret: bool) -> Bou
 
 
 def _call_kernel(ratio: Ratio, interpret: bool, _: Any, arrays: Sequence[jax.Array]) -> tuple:
-    """Compute the columns of `Boundary` for rows of scores; return no sums to `by_rows`."""
+    """Compute the columns of `Boundary`; there are no sums for `by_rows`."""
     from jax.experimental.pallas import triton  # absent from builds without NVIDIA support
 
     (rows,), column = arrays, pl.BlockSpec((1, 1), lambda i: (i, 0))

@@ -1,20 +1,20 @@
 """x W + f(x P) U with frozen W, for one or more layers with the same input x.
 
-P [I, Q] projects down, U [R, O] projects up, and f acts on the projected rows. `low_rank_matmul`
-computes this formula with fewer passes over wide arrays, because at typical sizes one pass costs
-as much as the adapter itself:
+P [I, Q] projects down, U [R, O] projects up, and f acts on the projected rows: z = f(x P). At
+typical sizes, one pass over a wide array costs as much as the adapter itself. `low_rank_matmul`
+therefore merges matmuls. Let g be the gradient of the output, and q that of x P:
 
-- no gradient is computed for W;
-- the P of all layers are concatenated into one matmul with x; the backward pass takes one more
-  matmul for their gradients and one for the gradient of x through them;
-- if O >= I, x W + z U with z = f(x P) is one matmul, [x, z] [W; U];
-- if O > 2 I, g Wᵀ and g Uᵀ, with g the gradient of the output, are one matmul, g [W; U]ᵀ;
-- if the outputs of all layers together are at most as wide as x, the gradient of x is one matmul,
-  [g, q] [W, P]ᵀ, with q the gradient of x P.
+- W gets no gradient.
+- One matmul computes x P for all layers. In the backward pass, one computes the gradients of all P,
+  and another the gradient of x through them.
+- If O >= I, x W + z U is one matmul, [x, z] [W; U].
+- If O > 2 I, g Wᵀ and g Uᵀ are one matmul, g [W; U]ᵀ.
+- If the outputs of all layers together are at most as wide as x, the gradient of x is one matmul,
+  [g, q] [W, P]ᵀ.
 
-The last three apply only to I or more tokens, since for fewer the copy of W dominates, and not on a
-CPU, where they save no time and triple the compile time. W is cast to the dtype of x within each
-pass and stored in its own dtype, so quantized weights are only briefly dequantized.
+The last three copy W, which pays off only for I or more tokens. They are not used on a CPU, where
+they save no time and triple the compile time. W is stored in its own dtype and cast to the dtype of
+x in each pass, so quantized weights are only briefly dequantized.
 """
 
 import functools
@@ -94,7 +94,7 @@ def low_rank_matmul(
         equal must compute the same f.
       rows_dtype: dtype of x P, which is accumulated in fp32.
       layers: the arrays of each layer.
-      x: [..., I]; x W + z U has its dtype.
+      x: [..., I]; the outputs have its dtype.
       token_mask: bool [...tokens] or None, passed to each f.
     """
     projected = jnp.matmul(x, _concat_downs(layers, x), preferred_element_type=rows_dtype)
@@ -195,7 +195,7 @@ def _input_gradient(
 
 
 def _should_concat(w: jax.Array, x: jax.Array) -> bool:
-    """Return whether concatenating W pays off: with at least I tokens, and not on a CPU."""
+    """Return whether concatenating W pays off (see the module docstring)."""
     return math.prod(x.shape[:-1]) >= w.shape[0] and platform() != "cpu"
 
 

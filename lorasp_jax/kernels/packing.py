@@ -16,7 +16,7 @@ import jax.numpy as jnp
 )
 @dataclasses.dataclass(frozen=True)
 class PackedTree:
-    """A pytree of fp32 arrays packed flat, so a kernel gets one operand and XLA makes one copy."""
+    """A pytree of fp32 arrays in one flat array: one operand of a kernel, one copy in XLA."""
 
     values: jax.Array
     """Concatenated leaves: [N], or [n, N] for n stacked trees."""
@@ -34,7 +34,7 @@ class PackedTree:
         return cls(jnp.concatenate(flat, axis=-1), structure, shapes)
 
     def tree(self, load: Callable[[int, int], jax.Array] | None = None) -> Any:
-        """Unpack; `load(start, size)`, if given, returns [..., size] in place of a slice."""
+        """Unpack; `load(start, size)` -> [..., size], if given, replaces slicing."""
         load = load or (lambda start, size: self.values[..., start : start + size])
         parts = [load(*span) for span in spans(tuple(map(math.prod, self.shapes)))]
         leaves = [
@@ -44,5 +44,5 @@ class PackedTree:
 
 
 def spans(widths: tuple[int, ...]) -> list[tuple[int, int]]:
-    """Return (start, width) of each of several adjacent column groups with these widths."""
+    """Return each group's (start, width) for adjacent column groups of these widths."""
     return list(zip(itertools.accumulate(widths[:-1], initial=0), widths, strict=True))

@@ -4,12 +4,10 @@ import jax
 
 
 def platform() -> str:
-    """Return "cpu", "gpu" or "tpu": the platform of the abstract mesh's device if it has one, else
-    JAX's default.
+    """Return "cpu", "gpu" or "tpu": JAX's default, unless the abstract mesh names a device.
 
-    A host without a GPU can thus lower a program for an NVIDIA GPU, under
-    `jax.sharding.use_abstract_mesh` with an `abstract_device` of platform "cuda". JAX retraces a
-    function under a different mesh.
+    A host without a GPU can thus lower a program for one. Set an `abstract_device` of platform
+    "cuda" with `jax.sharding.use_abstract_mesh`. JAX retraces a function under a different mesh.
     """
     device = jax.sharding.get_abstract_mesh().abstract_device
     if device is None:

@@ -1,11 +1,11 @@
-"""Frozen weights quantized to int8 with one scale per column, or to nf4 with one per 64 inputs.
+"""Frozen weights quantized to int8 or nf4.
 
-Quantization is symmetric. The weights that share a scale form a group: a whole column in int8, 64
-inputs of a column in nf4. nf4 is the 4-bit NormalFloat of QLoRA (Dettmers et al., arXiv 2305.14314,
-appendix E) without double quantization of the scales, and takes 4.5 bits per weight. If m is the
-largest magnitude of a group, the error of a weight is at most m/255 in int8 and 0.152 m, half the
-widest gap of the table, in nf4. Adapted layers store only the codes and scales, and dequantize the
-kernel at each matmul, in both passes.
+There is no zero point, only a scale: one per column in int8, one per 64 inputs of a column in nf4.
+nf4 is the 4-bit NormalFloat of QLoRA (Dettmers et al., arXiv 2305.14314, appendix E) without double
+quantization of the scales, and takes 4.5 bits per weight. Let m be the largest magnitude of the
+weights that share a scale. Their error is at most m/255 in int8, and 0.152 m in nf4 (half the
+widest gap of the table). Adapted layers store only codes and scales, and dequantize the kernel at
+each matmul of both passes.
 """
 
 import dataclasses
@@ -22,10 +22,9 @@ KINDS: tuple[Kind, ...] = ("int8", "nf4")
 NF4_BLOCK = 64
 """Inputs per scale in nf4 (arXiv 2305.14314, section 3)."""
 INT8_BOUND = 127.5
-"""The scale is the largest magnitude divided by this: half a step above 127, so that the outermost
-codes get a full bin (as in qwix 0.1.8, against which the tests compare)."""
-# Quantiles of a normal distribution, including 0, scaled to [-1, 1]; arXiv 2305.14314,
-# appendix E.
+"""The scale is the largest magnitude divided by this. Half a step above 127, it gives the outermost
+codes a full bin, as in qwix 0.1.8."""
+# Quantiles of a normal distribution, including 0, scaled to [-1, 1]; arXiv 2305.14314, appendix E.
 NF4 = (
     -1.0, -0.6961928009986877, -0.5250730514526367, -0.39491748809814453, -0.28444138169288635,
     -0.18477343022823334, -0.09105003625154495, 0.0, 0.07958029955625534, 0.16093020141124725,
@@ -52,8 +51,8 @@ class QuantizedKernel:
     dtype: Any = dataclasses.field(metadata={"static": True})
     """Dtype of the original kernel."""
     axes: tuple[int, ...] | None = dataclasses.field(default=None, metadata={"static": True})
-    """Shape of the original einsum kernel without stacked axes; None for a matrix. Codes and the
-    result of `astype` are matrices in either case."""
+    """Shape of the original einsum kernel without stacked axes; None for a matrix. Codes are
+    matrices in either case, as is the result of `astype`."""
     batch: int = dataclasses.field(default=0, metadata={"static": True})
     """Number of leading axes of the codes that belong to `axes`."""
 

@@ -20,13 +20,13 @@ Kernel = Callable[[Arrays, Arrays], tuple[Arrays, Arrays]]
 
 
 def by_rows(kernel: Kernel, shared: Arrays, arrays: Arrays) -> tuple[Arrays, Arrays]:
-    """Run the kernel with each device processing its own rows.
+    """Run the kernel on each device's own rows.
 
     Under `jax.vmap`, every device processes all rows. No gradient is defined.
 
     Args:
       kernel: (shared, arrays) -> (outputs, sums). Row i of the outputs depends only on row i of the
-        arrays; the sums of disjoint sets of rows add up.
+        arrays. The sums of all devices are added up.
       shared: replicated arrays of any shape.
       arrays: each [T, ...], sharded over T.
 
@@ -63,7 +63,7 @@ def _partition(flat: Callable, num_shared: int, mesh: Any, operands: Any, result
     axes = first.sharding.spec[0]
     names = axes if isinstance(axes, tuple) else () if axes is None else (axes,)
     if first.shape[0] % math.prod(mesh.shape[name] for name in names):
-        names = ()  # XLA would pad the shards, and the sums would include the padding
+        names = ()  # otherwise XLA pads the shards, and the sums include the padding
     rows, replicated = (NamedSharding(mesh, PartitionSpec(axes)) for axes in (names or None, None))
 
     def own_rows(*operands: jax.Array) -> tuple[Arrays, Arrays]:

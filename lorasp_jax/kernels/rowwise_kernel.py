@@ -1,10 +1,10 @@
 """Trace a row-wise function into one GPU kernel, and its gradient into another.
 
-Between its matmuls an adapter applies a chain of small operations to each token: a nonlinearity, a
-gate and losses. XLA compiles the chain to a dozen kernels, stores the residuals of each, and in a
-scan over layers copies these residuals once more. Here the chain is traced into one Triton kernel.
-The backward kernel recomputes the chain block by block and applies its VJP, so the only residuals
-are the input rows and the function's mask, packed into bits.
+Between its matmuls, an adapter applies a chain of small operations to each token: a nonlinearity, a
+gate and losses. XLA compiles the chain to a dozen kernels and stores the residuals of each; a scan
+over layers copies them once more. Here the chain is one Triton kernel. The backward kernel
+recomputes the chain block by block and applies its VJP. It needs only the input rows and the
+function's mask, packed into bits.
 
 The reference is the function itself, applied to all rows at once. On an H200 (35k bf16 rows, 64
 directions, router width 32), LoRA-SP's chain and its gradient take 180 us as kernels and 500 us in
@@ -32,15 +32,16 @@ class Launch(NamedTuple):
     warps: int
     """Warps per program."""
     programs: int
-    """Maximum number of programs that share the blocks; each writes one partial sum."""
+    """Target number of programs per function; there are more if they cannot share the blocks
+    evenly. Each writes one partial sum."""
 
 
 FORWARD = Launch(16, 2, 816)
 BACKWARD = Launch(16, 4, 512)
-"""Launch parameters of the two passes, chosen by hand; no sweep is recorded."""
+"""Launch parameters of the two passes, chosen by hand."""
 FEW, FEW_ROWS = Launch(1, 1, 8192), 1024
-"""Launch parameters of both passes for up to FEW_ROWS rows, where latency matters: one warp per
-row. Chosen by hand."""
+"""Launch parameters of both passes for up to FEW_ROWS rows, chosen by hand: one warp per row, for
+low latency."""
 
 
 Columns = list[jax.Array]
@@ -83,12 +84,15 @@ def rowwise_kernel(
     If `shared` stacks n trees, the kernel applies n functions, each to its own columns of `rows`.
 
     Args:
-      function: (shared, columns, valid, mask) -> (output, sums, mask, statistics) on a block of b
-        rows, where b is 1 or a power of two. columns: [b, width] each. valid: bool [b, 1]. output:
-        [b, O]. sums: pytree of fp32 arrays, summed over blocks. mask: bool [b, K], K >= 8; None in
-        the forward pass, which computes it; a constant in the backward pass. statistics: list of
-        [b, 1] without gradient. Triton limits the operations: dimensions must be powers of two, at
-        least 16 in a matmul.
+      function: (shared, columns, valid, mask) -> (output, sums, mask, statistics), on a block of b
+        rows. Triton requires dimensions to be powers of two, and at least 16 in a matmul.
+        columns: list of [b, width].
+        valid: bool [b, 1].
+        mask: bool [b, K], K >= 8. The forward pass passes None, and the function computes the mask.
+          The backward pass passes this mask as a constant.
+        output: [b, O].
+        sums: pytree of fp32 arrays, summed over blocks.
+        statistics: list of [b, 1], without gradient.
       shared: small fp32 arrays used by every row: a pytree, a `PackedTree`, or a `PackedTree` that
         stacks n trees.
       rows: [T, at least start + n * sum(widths)].
@@ -98,9 +102,9 @@ def rowwise_kernel(
       interpret: run the kernel bodies without a GPU, slowly.
 
     Returns:
-      output [T, O], sums, statistics [T, 1] each; for n stacked trees output [T, n O], sums with a
-      leading axis n, statistics [T, n]. All but the statistics are differentiable in `shared` and
-      `rows`.
+      output [T, O], sums, and the list of statistics, [T, 1] each. For n stacked trees: output
+      [T, n O], sums with a leading axis n, statistics [T, n]. Output and sums are differentiable in
+      `shared` and `rows`.
     """
     launches = (FEW, FEW) if len(rows) <= FEW_ROWS else (FORWARD, BACKWARD)
     packed, valid = PackedTree.of(shared), valid.astype(jnp.int8)
@@ -124,7 +128,7 @@ def _forward(static: tuple, packed: PackedTree, rows: jax.Array, valid: jax.Arra
 def _run(
     static: tuple, packed: PackedTree, rows: jax.Array, valid: jax.Array, *, keep_mask: bool
 ) -> tuple[tuple, Sequence[jax.Array]]:
-    """Return the results of `rowwise_kernel`, and a list of the bit-packed mask if `keep_mask`."""
+    """Return the results of `rowwise_kernel` and, in a list, the bit-packed mask if `keep_mask`."""
     function, widths, start, (launch, _), interpret = static
 
     def block(shared: Any, columns: Columns, valid: Columns) -> tuple[list[Columns], Any]:
@@ -205,8 +209,7 @@ def _call(
 ) -> tuple[list[jax.Array], list[jax.Array]]:
     """Launch the kernel; return the outputs and the packed sums.
 
-    Each program loops over consecutive blocks of one function and accumulates their sums; XLA
-    adds up the sums of all programs.
+    Each program adds up the sums of its own blocks; XLA adds up those of all programs.
     """
     from jax.experimental.pallas import triton  # absent from builds without NVIDIA support
 
@@ -226,7 +229,7 @@ def _call(
         interpret=interpret,
         name="rowwise_kernel",
     )(values, arrays)
-    # All sums are in one array, so that XLA reduces them in one kernel.
+    # All sums share one array, so that XLA reduces them in one kernel.
     return [output[:num_rows] for output in outputs], [partial_sums.sum(0)]
 
 
@@ -249,7 +252,6 @@ def _bit_numbers(bits: jax.Array) -> jax.Array:
 
 
 def _shape(dtype: Any, *shape: int) -> jax.ShapeDtypeStruct:
-    """Return a ShapeDtypeStruct of this dtype and shape."""
     return jax.ShapeDtypeStruct(shape, dtype)
 
 

@@ -1,8 +1,8 @@
 """Find the energy gate's threshold by bisection, without a sort.
 
-Non-negative fp32 numbers sort like their bit patterns read as integers, so a binary search over
-these integers needs only comparisons and row sums: over all rows at once in XLA, or over a few rows
-in a kernel body.
+Non-negative fp32 numbers sort like their bit patterns read as integers. A binary search over these
+integers needs only comparisons and row sums. `bisected_mask` searches all rows at once in XLA,
+`block_boundary` a few rows in a kernel.
 """
 
 import functools
@@ -15,7 +15,7 @@ import numpy as np
 
 
 class Boundary(NamedTuple):
-    """Last kept score of each row; larger scores and ties up to and including `index` are kept."""
+    """Last kept score of each row; larger ones are kept, and ties up to and including `index`."""
 
     score: jax.Array  # f32 [..., 1], [] for a single row; NaN where nothing is kept
     index: jax.Array  # int32, same shape
@@ -31,12 +31,12 @@ class Ratio(NamedTuple):
 def energies(scores: jax.Array) -> jax.Array:
     """Square the scores after scaling each row by a power of two to a maximum of order 1.
 
-    The scaling is exact, cancels in E_k, and keeps the squares from overflowing and the largest
-    from underflowing. For a maximum with exponent field e the factor is 2^(126 - e), which scales
-    it to [1/2, 1). The factor's own field is 253 - e, but at least 1, so that it stays normal.
+    The scaling is exact and cancels in E_k. No square overflows, and the largest does not
+    underflow. If the maximum has the exponent field e, the factor 2^(126 - e) scales it to
+    [1/2, 1). The factor's own field is 253 - e, but at least 1, so that it stays normal.
 
-    In a row with infinite scores, those get energy 1 and finite scores get 0, as in the limit.
-    NaN stays NaN, even on backends whose maximum ignores it, such as Triton.
+    Infinite scores get energy 1, and finite scores in the same row 0. NaN stays NaN, even if the
+    maximum ignores it, as in Triton.
     """
     largest = _by_row(jnp.max, jnp.abs(jax.lax.stop_gradient(scores)))
     exponent = jax.lax.shift_right_logical(_bits(largest), 23)
@@ -59,9 +59,9 @@ def _float(bits: jax.Array) -> jax.Array:
 
 
 class _Bracket(NamedTuple):
-    """Search interval of scores, as their bit patterns, int32 [..., 1].
+    """Search interval of scores, as bit patterns, int32 [..., 1].
 
-    The energy of the scores >= `low` reaches the target; that of the scores >= `high` does not.
+    The scores >= `low` together reach the energy target; those >= `high` do not.
     """
 
     low: jax.Array
@@ -75,14 +75,14 @@ class _Bracket(NamedTuple):
 def bisected_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
     """Compute the mask, bool [..., R], with a search over all rows at once in XLA.
 
-    The search builds, from the highest bit down, the largest threshold such that the scores at or
-    above it reach the target. Each step also decides some scores: if those at or above a candidate
-    fall short of the target, they are all kept; otherwise all scores below it are dropped. At the
-    end only ties with the threshold are undecided; a tie is kept if the energy before it falls
-    short.
+    The search finds the largest threshold such that the scores at or above it reach the target. It
+    sets one bit per step, from the highest down. Each step also decides some scores. If those at or
+    above the candidate fall short of the target, all of them are kept. Otherwise, all scores below
+    it are dropped. At the end, only ties with the threshold are undecided. A tie is kept if the
+    energy before it falls short of the target.
 
-    Scores are decided inside the loop because the threshold must not be compared with them outside:
-    XLA may recompute the scores there and round them differently.
+    Comparing the scores with the threshold after the loop would be simpler, but XLA may recompute
+    them there and round them differently.
     """
     energy = energies(scores)
     target = ratio.numerator * energy.sum(-1, keepdims=True)
@@ -108,11 +108,10 @@ def bisected_mask(scores: jax.Array, ratio: Ratio) -> jax.Array:
 def block_boundary(scores: jax.Array, ratio: Ratio) -> Boundary:
     """Find the boundaries of a block of rows [..., R] inside a kernel.
 
-    One binary search finds the largest score s such that the scores >= s together reach the target;
-    a second one finds the last tie with s that is needed. Both use only elementwise operations and
-    row sums. The first stops once all rows of the block are decided (after 11 of 31 steps for
-    softplus scores, R = 128). For a single row the results are scalars, whose comparisons cost
-    nothing in a kernel.
+    One binary search finds the largest score s such that the scores >= s together reach the target.
+    It stops once all rows of the block are decided: for softplus scores and R = 128, after 11 of 31
+    steps. A second search finds the last tie with s that is needed. A single row gives scalars,
+    whose comparisons cost nothing in a kernel.
     """
     if scores.size == scores.shape[-1]:
         scores = scores.reshape(-1)
