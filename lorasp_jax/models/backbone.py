@@ -52,7 +52,7 @@ class Backbone(nnx.Module):
     """A vision-language model with an action expert.
 
     Subclasses implement `run_prefix`, which runs once per observation, and `run_suffix`, which runs
-    at every flow step.
+    at every flow step. Both also return aux, the adapters' losses and statistics.
     """
 
     config: BackboneConfig
@@ -88,7 +88,7 @@ class Backbone(nnx.Module):
         Args:
             x_t: `[B, C, A]`.
             flow_time: `[B]`.
-            action_valid: `[B, C]` bool, False for actions to exclude from the adapters' aux.
+            action_valid: `[B, C]` bool, False excludes an action from aux.
 
         Returns:
             `[B, C, D]` f32, and the adapters' aux.
@@ -104,7 +104,7 @@ class Backbone(nnx.Module):
         return h, aux | {"action_time_mlp_in": in_aux, "action_time_mlp_out": out_aux}
 
     def run_prefix(self, obs: Observation) -> tuple[Any, ModelAux]:
-        """Encode the observation for `run_suffix`; also return the adapters' aux."""
+        """Encode the observation for `run_suffix`."""
         raise NotImplementedError
 
     def run_suffix(
@@ -115,14 +115,14 @@ class Backbone(nnx.Module):
         flow_time: jax.Array,
         action_valid: jax.Array | None = None,
     ) -> tuple[jax.Array, LayerAux]:
-        """Predict the velocity `[B, C, A]` f32; also return the adapters' aux.
+        """Predict the velocity `[B, C, A]` f32.
 
         Args:
             prefix: result of `run_prefix` for `obs`.
             obs: the observation.
             x_t: `[B, C, A]`.
             flow_time: `[B]`.
-            action_valid: `[B, C]` bool, False for actions to exclude from the adapters' aux.
+            action_valid: `[B, C]` bool, False excludes an action from aux.
         """
         raise NotImplementedError
 

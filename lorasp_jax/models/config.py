@@ -156,7 +156,7 @@ class BackboneConfig:
         chunk: int = 10,
         unroll: bool | None = None,
     ) -> Self:
-        """Create a config for the simulation: two cameras, offline tokenizer, one robot arm."""
+        """Create a config for simulation: two cameras, offline tokenizer, one robot arm."""
         return cls(
             vision,
             language,

@@ -87,7 +87,7 @@ def sample(
     Args:
         velocity: the velocity model.
         noise: `[B, C, A]`, which is x at time 1.
-        num_steps: number of Euler steps; step k is at time 1 - k / num_steps.
+        num_steps: step k is at time 1 - k / num_steps.
         slots: see `loss`.
 
     Returns:

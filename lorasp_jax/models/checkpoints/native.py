@@ -176,9 +176,8 @@ def weights_hash(source: Folder | nnx.Module) -> str:
     """Return the SHA-256 of a model's frozen parameters: names, shapes and values in fp32.
 
     A folder and the model loaded from it have the same hash, in bf16 and in fp32. Adding adapters
-    with `adapt` keeps the hash, unless it splits kernels or makes base weights trainable (full
-    fine-tuning). The hash changes after `quantize`, and after `combine`, which adds frozen
-    adapters.
+    with `adapt` keeps the hash, unless `adapt` splits kernels or makes base weights trainable (full
+    fine-tuning). `quantize` changes the hash, and so does `combine`, which adds frozen adapters.
 
     Args:
         source: a folder that `save` wrote, or a model.

@@ -33,8 +33,8 @@ def check(folder: Path) -> None:
 def suppress_repeated_errors() -> None:
     """After a failed read or write, report only the exception that Orbax raises.
 
-    Otherwise Orbax logs a traceback for every other failed operation, asyncio one for every task
-    that is never awaited, and Python prints errors from Orbax's threads and coroutines.
+    Otherwise Orbax logs a traceback for every other failed operation, and asyncio for every task
+    that is never awaited. Python also prints errors from Orbax's threads and coroutines.
     """
     for name in ("absl", "asyncio"):
         logging.getLogger(name).addFilter(_is_not_from_orbax)

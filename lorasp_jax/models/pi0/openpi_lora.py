@@ -31,7 +31,7 @@ Pair = tuple[np.ndarray, np.ndarray]
 
 
 def pop_lora(leaves: MutableMapping[str, Any]) -> dict[str, Any]:
-    """Pop openpi's LoRA leaves, by path."""
+    """Pop openpi's LoRA leaves and return them by path."""
     names = [name for name in leaves if name.endswith(("lora_a", "lora_b"))]
     return {name: leaves.pop(name) for name in names}
 

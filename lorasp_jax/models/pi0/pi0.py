@@ -152,24 +152,14 @@ class Pi0(Backbone):
         flow_time: jax.Array,
         action_valid: jax.Array | None = None,
     ) -> tuple[jax.Array, LayerAux]:
-        """Embed state and noisy actions as tokens.
-
-        Args:
-            obs: only the state is used.
-            x_t: `[B, C, A]`.
-            flow_time: `[B]`.
-            action_valid: `[B, C]` bool, False for actions to exclude from the adapters' aux.
-
-        Returns:
-            `[B, 1 + C, D]` f32, and the adapters' aux.
-        """
+        """Embed state and noisy actions as tokens `[B, 1 + C, D]` f32; see `embed_actions`."""
         valid, state = jnp.ones((x_t.shape[0], 1), bool), obs.state[:, None].astype(jnp.float32)
         state_token, state_aux = self.state_proj(state, token_mask=valid, return_aux=True)
         h, aux = self.embed_actions(x_t, flow_time, action_valid)
         return jnp.concatenate([state_token, h], axis=1), {"state_proj": state_aux, **aux}
 
     def run_prefix(self, obs: Observation) -> tuple[Prefix, ModelAux]:
-        """Encode images and instruction; also return the adapters' aux."""
+        """Encode images and instruction."""
         tokens, valid, vision_aux = self.embed_prefix(obs)
         block = np.zeros(valid.shape[1], int)
         mask = block_mask(block, block, valid, valid)
@@ -184,7 +174,7 @@ class Pi0(Backbone):
         flow_time: jax.Array,
         action_valid: jax.Array | None = None,
     ) -> tuple[jax.Array, LayerAux]:
-        """Predict velocities `[B, C, A]` f32 given the prefix; see `embed_suffix` for arguments."""
+        """Predict the velocity `[B, C, A]` f32; see `Backbone.run_suffix`."""
         batch, chunk = x_t.shape[:2]
         if action_valid is None:
             action_valid = jnp.ones((batch, chunk), bool)
@@ -237,7 +227,7 @@ class Pi05(Pi0):
         flow_time: jax.Array,
         action_valid: jax.Array | None = None,
     ) -> tuple[jax.Array, LayerAux]:
-        """Embed noisy actions as tokens `[B, C, D]` f32; also return the adapters' aux.
+        """Embed noisy actions as tokens `[B, C, D]` f32.
 
         `obs` and `flow_time` are unused: the state is in the prompt, and the time conditions norms.
         """

@@ -89,7 +89,7 @@ def _openpi_expert(tower: str, size: ExpertConfig, suffix: str) -> list[Rule]:
         return f"{ours}/{name}/kernel"
 
     return [
-        # openpi's shapes, with N query heads, K key heads and MLP width F:
+        # openpi's shapes, with N query heads, K kv heads and MLP width F:
         # q: [L, N, D, H]; k and v: [L, 2, K, D, H]; gate and up: [L, 2, D, F].
         Rule(
             (kernel("q_proj"),),

@@ -74,7 +74,7 @@ class CrossBlock(SelfBlock):
             table: RoPE sine and cosine for these tokens, from `rope_table`.
             mask: `[B, T, P]` bool.
             keys_values: from `project_cache`.
-            token_mask: `[B, T]` bool, False for tokens to exclude from the adapters' aux.
+            token_mask: `[B, T]` bool, False excludes a token from aux.
         """
         h, *_ = self.input_layernorm.normalize(x, None)
         q, q_aux = self.q_proj(h, token_mask=token_mask, return_aux=True)
@@ -91,7 +91,7 @@ class SmolLM2(LanguageExpert):
 
     def __init__(self, size: ExpertConfig, config: BackboneConfig, *, rngs: nnx.Rngs) -> None:
         super().__init__(size, config, rngs=rngs)
-        self.lm_head = nnx.Param(jnp.array(self.embedding.get_value()))  # a separate buffer
+        self.lm_head = nnx.Param(jnp.array(self.embedding.get_value()))  # a copy of the buffer
 
 
 class LayerPair(nnx.Module):
@@ -154,7 +154,7 @@ class ActionExpert(nnx.Module):
             mask: `[B, T, P + T]` bool.
             cache: prefix keys and values for self-attention, from `project_cache`.
             cross: prefix keys and values for cross-attention, from `project_cache`.
-            token_mask: `[B, T]` bool, False for tokens to exclude from the adapters' aux.
+            token_mask: `[B, T]` bool, False excludes a token from aux.
 
         Returns:
             `[B, T, D]`, and the adapters' aux, stacked over layer pairs.

@@ -56,7 +56,7 @@ class SmolVLAConfig(BackboneConfig):
     def base(cls) -> SmolVLAConfig:
         """The published SmolVLA, 450,046,176 parameters (LeRobot, policies/smolvla).
 
-        The action expert's width is 720, 3/4 of the language model's; its MLP has width
+        The action expert's width is 3/4 of the language model's. Its MLP has width
         256 ceil(4 int(2 * 720 / 3) / 256) = 2048 (smolvlm_with_expert.py).
         """
         return cls(
@@ -158,22 +158,12 @@ class SmolVLA(Backbone):
         flow_time: jax.Array,
         action_valid: jax.Array | None = None,
     ) -> tuple[jax.Array, LayerAux]:
-        """Embed noisy actions as tokens.
-
-        Args:
-            obs: unused; the state is in the prefix.
-            x_t: `[B, C, A]`.
-            flow_time: `[B]`.
-            action_valid: `[B, C]` bool, False for actions to exclude from the adapters' aux.
-
-        Returns:
-            `[B, C, D]` f32, and the adapters' aux.
-        """
+        """See `embed_actions`; `obs` is unused, because the state is in the prefix."""
         del obs
         return self.embed_actions(x_t, flow_time, action_valid)
 
     def run_prefix(self, obs: Observation) -> tuple[Prefix, ModelAux]:
-        """Encode images, instruction and state; also return the adapters' aux."""
+        """Encode images, instruction and state."""
         tokens, valid, aux = self.embed_prefix(obs)
         block = _prefix_block(valid.shape[1])
         mask = block_mask(block, block, valid, valid)
@@ -190,7 +180,7 @@ class SmolVLA(Backbone):
         flow_time: jax.Array,
         action_valid: jax.Array | None = None,
     ) -> tuple[jax.Array, LayerAux]:
-        """Predict velocities `[B, C, A]` f32 given the prefix; see `embed_suffix` for arguments."""
+        """Predict the velocity `[B, C, A]` f32; see `Backbone.run_suffix`."""
         if action_valid is None:
             action_valid = jnp.ones(x_t.shape[:2], bool)
         tokens, aux = self.embed_suffix(obs, x_t, flow_time, action_valid)

@@ -23,8 +23,7 @@ CUDNN_MULTIPLE = 8
 def attention(q: jax.Array, k: jax.Array, v: jax.Array, mask: jax.Array | None) -> jax.Array:
     """Grouped-query attention with fp32 softmax; uses cuDNN for long 16-bit float inputs on GPUs.
 
-    cuDNN accumulates gradients in nondeterministic order, so they differ between runs by rounding
-    errors.
+    cuDNN accumulates gradients in nondeterministic order: two runs differ by rounding errors.
 
     Args:
         q: `[B, T, N, H]`, already scaled.

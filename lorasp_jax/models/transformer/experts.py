@@ -98,7 +98,7 @@ class ExpertBlock(nnx.Module):
             table: RoPE sine and cosine for these tokens, from `rope_table`.
             mask: `[B, T, S + T]` bool over the cached keys followed by this layer's keys.
             cache: keys and values of preceding tokens, or None (S = 0).
-            token_mask: `[B, T]` bool, False for tokens to exclude from the adapters' aux.
+            token_mask: `[B, T]` bool, False excludes a token from aux.
             condition: `[B, 1, D]` for adaptive norms, or None.
 
         Returns:
@@ -168,7 +168,7 @@ class Expert(nnx.Module):
             position: `[B, T]` int32.
             mask: `[B, T, S + T]` bool over the cached keys followed by this expert's keys.
             cache: keys and values `[L, B, S, K, H]` of preceding tokens, or None (S = 0).
-            token_mask: `[B, T]` bool, False for tokens to exclude from the adapters' aux.
+            token_mask: `[B, T]` bool, False excludes a token from aux.
             condition: `[B, 1, D]` for adaptive norms, or None.
 
         Returns:

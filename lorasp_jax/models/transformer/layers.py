@@ -121,7 +121,7 @@ def apply_to_shared_input(
 
     Args:
         x: `[B, T, I]`.
-        token_mask: `[B, T]` bool, False for tokens to exclude from the adapters' aux.
+        token_mask: `[B, T]` bool, False excludes a token from aux.
         layers: the layers by name. Fused layers must come in the order in which they were fused.
 
     Returns:
@@ -163,7 +163,7 @@ def positions(valid: jax.Array) -> jax.Array:
 def block_mask(
     query_block: np.ndarray, key_block: np.ndarray, query_valid: jax.Array, key_valid: jax.Array
 ) -> jax.Array:
-    """Let valid queries attend to valid keys of their own token block and of earlier blocks.
+    """Create a mask: valid queries attend to valid keys of their own and earlier token blocks.
 
     Args:
         query_block: `[T]` int, block number of each query token.

@@ -80,7 +80,7 @@ class SigLIP(nnx.Module):
 
         Args:
             images: `[B, H, W, 3]` f32 in [-1, 1].
-            present: `[B]` bool, False for a missing camera's placeholder.
+            present: `[B]` bool, False for missing cameras.
 
         Returns:
             Tokens `[B, T, D]`, with the language model's width D, and the adapters' aux.
