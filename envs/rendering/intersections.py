@@ -1,13 +1,17 @@
 """Intersect the rays of one camera with primitive geoms: nearest hit, shadows, surface normals.
 
-Every geom is scaled to a unit shape in its own frame before it is intersected: a sphere or
-ellipsoid to the unit sphere, a cylinder to radius 1 and half-length 1, a box to the cube
-[-1, 1]^3, a plane to z = 0 with half-extents 1, a capsule to radius 1 (its half-length `half`
-stays a parameter). Scaling does not change the ray parameter t.
+Each geom is first scaled to a unit shape in its own frame:
+
+- sphere, ellipsoid: the unit sphere
+- cylinder: radius 1 and half-length 1
+- box: the cube [-1, 1]^3
+- plane: z = 0 with half-extents 1
+- capsule: radius 1; the half-length `half` stays a parameter
+
+Scaling does not change the ray parameter t.
 
 Vectors are triples of component arrays, so that XLA fuses everything into one loop over pixels.
-Components broadcast: camera rays have one origin and many directions, shadow rays many origins and
-one direction.
+Components broadcast: camera rays share an origin, and shadow rays share a direction.
 """
 
 import functools
@@ -22,18 +26,18 @@ Matrix = tuple[Vec, ...]  # three rows
 
 PLANE, SPHERE, CAPSULE, CYLINDER, BOX = range(5)
 _MISS = 0x7F800000  # the bits of float32 +inf
-_TINY = 1e-12  # stands in for a zero direction component or squared length in a denominator
+_TINY = 1e-12  # replaces zero in a denominator
 
 
 class Geom(NamedTuple):
-    """A geom and a camera, in the geom's unit frame.
+    """A geom, the camera and the light, in the geom's unit frame.
 
-    Components are scalars, or arrays `[P]` with the values of each pixel's geom.
+    Components are scalars, or `[P]` for one geom per pixel.
     """
 
     axes: Matrix  # rows of the matrix whose columns are the camera's axes
     eye: Vec  # the camera's position
-    light: Vec  # direction toward the light
+    light: Vec  # direction to the light
     shrink: Vec  # 1 / half-extents before scaling [1/m]
     rgb: Vec
     half: jax.Array  # a capsule's half-length over its radius, else 0
@@ -86,7 +90,7 @@ def _round_side(o: Vec, d: Vec) -> tuple[jax.Array, jax.Array, jax.Array, jax.Ar
 
 
 def _capsule(o: Vec, d: Vec, half: jax.Array) -> jax.Array:
-    """Intersect the infinite cylinder, or the end's sphere where the ray enters beyond that end."""
+    """Intersect the infinite cylinder, or an end's sphere if the ray enters beyond that end."""
     a, b, c, root = _round_side(o, d)
     t = (-b - jnp.sqrt(jnp.maximum(root, 0))) / jnp.maximum(a, _TINY)
     z = o[2] + t * d[2]
@@ -130,7 +134,7 @@ ENTER: tuple[Enter, ...] = (_plane, _sphere, _capsule, _cylinder, _box)
 def nearest(
     geoms: Geoms, kinds: tuple[int, ...], x: jax.Array, y: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Find the first geom along the rays eye + depth * (x, y, -1) in the camera's frame.
+    """Find the first geom that each ray eye + depth * (x, y, -1) hits, in the camera's frame.
 
     Args:
         geoms: V geoms.
@@ -139,8 +143,8 @@ def nearest(
         y: `[P]` upward slope.
 
     Returns:
-        Index `[P]` of that geom (int32, 0 for no hit) and depth `[P]` (+inf for no hit), rounded
-        down so that its lowest bits can hold the index.
+        Index `[P]` of that geom, int32, 0 for no hit. Depth `[P]`, +inf for no hit, rounded down
+        because its lowest bits hold the index during the search.
     """
     low = (1 << len(kinds).bit_length()) - 1
 
@@ -164,7 +168,7 @@ def unshadowed(
 ) -> jax.Array:
     """Return whether no other geom blocks the way from a surface point to the light, bool `[P]`.
 
-    Takes the arguments and results of `nearest`, with finite depth. Planes cast no shadows. The
+    Takes the arguments and results of `nearest`; depth must be finite. Planes cast no shadows. The
     caller handles self-shadowing: a convex geom is dark where its normal faces away from the light.
     """
 
@@ -199,8 +203,8 @@ def surface(
     """Compute the shading terms of surface points at finite `depth` `[P]` on each pixel's geom.
 
     Returns:
-        Cosine `[P]` between the normal and the direction to the light; cosine `[P]`, at least 0,
-        between the normal and the reversed ray, times the ray's length.
+        Cosine `[P]` between the normal and the direction to the light. Cosine `[P]`, at least 0,
+        between the normal and the reversed ray, multiplied by the length of (x, y, -1).
     """
     slope = ray(geom.axes, x, y)
     outward = _gradient(along(geom.eye, depth, slope), geom.kind, geom.half)
@@ -214,7 +218,7 @@ def _gradient(point: Vec, kind: jax.Array, half: jax.Array) -> Vec:
     """Compute an outward normal of any length at a surface point, in the unit frame."""
     x, y, z = point
     ax, ay, az = jnp.abs(x), jnp.abs(y), jnp.abs(z)
-    flat_end = z * z > x * x + y * y  # a cylinder has |z| < 1 = |(x, y)| on its side
+    flat_end = z * z > x * x + y * y  # on a cylinder's side, |z| < 1 = |(x, y)|
     face = jnp.maximum(jnp.maximum(ax, ay), az)
     box, cylinder, plane = kind == BOX, kind == CYLINDER, kind == PLANE
     keep_x = ~plane & ~(box & (ax < face)) & ~(cylinder & flat_end)

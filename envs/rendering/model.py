@@ -11,15 +11,14 @@ import numpy as np
 
 from envs.rendering.intersections import BOX, CAPSULE, CYLINDER, PLANE, SPHERE
 
-# Defaults, chosen by eye, for what a model does not specify: shares of light, sky color at the
-# horizon and at the zenith, edge [m] and contrast of the checker on planes.
+# Defaults, chosen by eye, for what a MuJoCo model does not specify; see `Appearance`.
 AMBIENT, HEADLIGHT, DIFFUSE = 0.35, 0.25, 0.5
 SKY = ((0.80, 0.84, 0.88), (0.45, 0.58, 0.75))
-SQUARE, CONTRAST = 0.1, 0.12
+SQUARE, CONTRAST = 0.1, 0.12  # checker on planes: edge [m] and contrast
 
 STAND_IN_GROUP = 5  # geom group of primitives that are drawn in place of meshes
-_INFINITE = 1e4  # [m] half-extent of a plane of size 0, MuJoCo's "infinite"; beyond any view
-# MuJoCo geom type -> kind, and the entries of a geom's size that are its half-extents in x, y, z.
+_INFINITE = 1e4  # m, half-extent given to an infinite plane, whose size is 0 in MuJoCo
+# MuJoCo geom type -> kind, and where a geom's size holds its half-extents in x, y, z.
 _SHAPES = {
     int(mujoco.mjtGeom.mjGEOM_PLANE): (PLANE, (0, 1, 2)),
     int(mujoco.mjtGeom.mjGEOM_SPHERE): (SPHERE, (0, 0, 0)),
@@ -33,13 +32,13 @@ _SHAPES = {
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Appearance:
-    """Everything that an image depends on except geometry. Every field is traced.
+    """Everything except geometry that an image depends on. Every field is traced.
 
     Attributes:
-        rgba: `[G, 4]` color of each geom of the MuJoCo model, 0 to 1; alpha is ignored: `build`
-            decides what is visible.
-        light: `[3]` direction toward the (directional) light in world axes, of any length.
-        ambient: `[]` share of a geom's color that needs no light.
+        rgba: `[G, 4]` color of each geom of the MuJoCo model, 0 to 1. Alpha is ignored, since
+            `build` decides what is visible.
+        light: `[3]` direction to the light in world axes, of any length.
+        ambient: `[]` share of a geom's color that shows without any light.
         headlight: `[]` share lit from the camera, without shadows.
         diffuse: `[]` share lit by `light`, with shadows.
         sky: `[2, 3]` color at the horizon and at the zenith.
@@ -70,8 +69,8 @@ class RenderModel:
         appearance: the model's own colors, light and fields of view.
         size: `[G, 3]` size of each geom of the MuJoCo model [m].
         geoms: ids of the V visible geoms in the MuJoCo model.
-        kinds: kinds of these geoms, as in `intersections`, ascending.
-        sides: for each of these geoms, the entries of its size that are half-extents in x, y, z.
+        kinds: V kinds, as in `intersections`, ascending.
+        sides: where each visible geom's size holds its half-extents in x, y, z.
         cameras: ids of the K cameras in the MuJoCo model.
     """
 
@@ -86,7 +85,7 @@ class RenderModel:
 def build(mj_model: mujoco.MjModel, camera_names: Sequence[str]) -> RenderModel:
     """Collect the visible geoms (alpha > 0, group < 3) of a model, sorted by kind.
 
-    Meshes are left out if the model has primitives in `STAND_IN_GROUP` to draw in their place.
+    If the model has primitives in `STAND_IN_GROUP`, they are drawn in place of all meshes.
 
     Raises:
         ValueError: a camera does not exist, a visible geom is not a primitive, or no geom is
@@ -125,11 +124,15 @@ def is_visible(mj_model: mujoco.MjModel) -> np.ndarray:
 
 
 def unit_shapes(model: RenderModel, size: jax.Array | np.ndarray) -> tuple[jax.Array, jax.Array]:
-    """Compute the scale from unit shapes to visible geoms of sizes `[G, 3]`.
+    """Compute the scale of the visible geoms relative to their unit shapes.
+
+    Args:
+        model: from `build`.
+        size: `[G, 3]` sizes of all geoms [m].
 
     Returns:
-        Half-extents `[V, 3]` [m], which become 1 in the unit frame; half-length over radius of
-        capsules `[V]`, 0 for other kinds.
+        Half-extents `[V, 3]` [m], which become 1 in the unit frame. Half-length over radius `[V]`
+        of capsules, 0 for other kinds.
     """
     size = jnp.asarray(size)[np.array(model.geoms)]
     scale = jnp.take_along_axis(size, np.array(model.sides), axis=1)

@@ -1,17 +1,16 @@
 """Render images inside jit on any accelerator, with a ray caster over primitive geoms.
 
-Geoms are sorted by kind when the model is built. Rendering an image takes three steps:
+Each ray takes three steps:
 
-1. For each kind, loop over its geoms: how far along every pixel's ray is the geom? Depth and geom
-   index share one int32 (the bits of a positive float sort like an integer; the lowest few hold the
-   index), so the loop carries a single array and XLA compiles each iteration to one vectorized
-   kernel. On two CPU cores, a [geoms, pixels] table with argmin was 3 to 5 times slower.
-2. Gather pose, size and color of the nearest geom per pixel, and compute one normal.
+1. Loop over the geoms, kind by kind, to find the nearest one. The bits of a positive float sort
+   like an integer, so depth and geom index share one int32, with the index in the lowest bits. The
+   loop then carries a single array, and XLA compiles each iteration to one vectorized kernel. On
+   two CPU cores, a [geoms, pixels] table with argmin was 3 to 5 times slower.
+2. Gather the nearest geom's pose, size and color, and compute its normal.
 3. Loop once more for hard shadows: does another geom block the way to the light?
 
-`samples` > 1 casts several rays per pixel for smooth edges; all steps run once per ray. Light,
-colors and fields of view (`Appearance`) and geom sizes are traced, so they can differ between
-worlds. Cameras follow MuJoCo (looking along -z, y up). Geoms that contain the camera are not drawn.
+`Appearance` and geom sizes are traced, so they can differ between worlds. Cameras follow MuJoCo
+(looking along -z, y up). Geoms that contain the camera are not drawn.
 """
 
 import dataclasses
@@ -39,8 +38,8 @@ __all__ = [
     "render_batch",
 ]
 
-# Pixels rendered at once. CPU: the few live arrays fit a core's cache (fastest at 64 and 128 px).
-# Accelerators: about 120 bytes per pixel are live (measured), so this takes about 1 GiB.
+# Pixels rendered at once. On CPU, the live arrays then fit a core's cache (fastest at 64 and
+# 128 px). On accelerators, they take about 1 GiB (120 bytes per pixel, measured).
 _PIXELS_ON_CPU, _PIXELS_ON_ACCELERATOR = 2**14, 2**23
 
 
@@ -61,7 +60,7 @@ def render(
         model: from `build`.
         poses: poses of all geoms and cameras of the MuJoCo model.
         height, width: image size [px].
-        samples: n, to average n x n evenly spread rays per pixel at n² times the cost.
+        samples: n, for the mean of n x n evenly spread rays per pixel, at n² times the cost.
         appearance: replaces the model's own.
         size: `[G, 3]` replaces the model's own `geom_size` [m].
     """
@@ -124,7 +123,7 @@ class Renderer(Protocol):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RayRenderer:
-    """Ray caster of an environment, which renders square images of N worlds per call.
+    """Ray caster of an environment; renders square images of N worlds per call.
 
     Attributes:
         model: from `build`.
@@ -164,10 +163,10 @@ def cast(
     """Find the geom and depth that each pixel of one world sees; arguments as for `render`.
 
     Returns:
-        Geom id in the MuJoCo model, int32 `[K, height, width]`, -1 for none; depth along the
-        camera's axis [m], f32 `[K, height, width]`, +inf for none. Depth is rounded down by less
-        than 2^-16 of its value (for up to 127 visible geoms): 15 micrometers at a meter. Single
-        precision adds more for a small geom far away: 0.1 mm, measured, on a sphere of radius 4 mm
+        Geom id in the MuJoCo model, int32 `[K, height, width]`, -1 for none. Depth along the
+        camera's axis [m], f32 `[K, height, width]`, +inf for none. With up to 127 visible geoms,
+        depth is rounded down by less than 2^-16 of its value: 15 micrometers at a meter. Single
+        precision costs more on a small, distant geom: 0.1 mm, measured, on a sphere of radius 4 mm
         at a meter.
     """
     size = model.size if size is None else size
@@ -183,7 +182,7 @@ def cast(
 
 
 def _table(geoms: Geom) -> Geoms:
-    """Make a lookup from leaves `[V]`: one gather for all fields, pixels along the last axis."""
+    """Make a lookup that gathers all fields of `geoms`, leaves `[V]`, at once."""
     table, tree = shading.pack(geoms), jax.tree.structure(geoms)
     return lambda number: jax.tree.unflatten(
         tree, list(table.at[:, number].get(mode="promise_in_bounds"))
@@ -197,7 +196,7 @@ def in_camera_frames(
     poses: Poses,
     height: int,
 ) -> tuple[Geom, View]:
-    """Transform visible geoms to each camera's frame, leaves `[K, V]`; make views, leaves `[K]`."""
+    """Compute a `Geom` with leaves `[K, V]`, for all cameras and geoms, and views, leaves `[K]`."""
     geom_xpos, geom_xmat, cam_xpos, cam_xmat = poses
     _check_shapes(appearance, geom_xpos=geom_xpos, cam_xpos=cam_xpos, size=size)
     visible, cameras = np.array(model.geoms), np.array(model.cameras)

@@ -1,8 +1,4 @@
-"""Compute pixel colors.
-
-Nothing here slices or gathers: a view is a tree of scalars, geoms are looked up by index through a
-function, and pixels are one axis of any length.
-"""
+"""Compute the colors of pixels, which form one axis of any length."""
 
 from typing import Any, NamedTuple
 
@@ -21,7 +17,7 @@ class View(NamedTuple):
 
     position: Vec
     rotation: Matrix
-    pixel: jax.Array  # half the edge of a pixel seen at one meter [m]
+    pixel: jax.Array  # half a pixel's edge at a depth of one meter [m]
     ambient: jax.Array
     headlight: jax.Array
     diffuse: jax.Array
@@ -49,11 +45,11 @@ def colors(
 ) -> Vec:
     """Compute pixel colors, a triple of uint8 `[P]`: the mean of `samples` x `samples` rays.
 
-    Each ray's color is clipped to [0, 1] before averaging (there is no gamma to undo), as if a
-    larger image were scaled down; otherwise overexposed edges would stay jagged.
+    Each ray's color is clipped to [0, 1] before averaging; otherwise overexposed edges would stay
+    jagged.
 
     Args:
-        geoms: V geoms in the frame of `view`.
+        geoms: V geoms, as seen by `view`.
         kinds: V kinds, ascending.
         view: the camera.
         raster: size of the image.
@@ -99,7 +95,7 @@ def _color(geoms: Geoms, kinds: tuple[int, ...], view: View, x: jax.Array, y: ja
     odd = squares - 2 * jnp.floor(squares / 2) == 1
     square = jnp.where((geom.kind == PLANE) & odd, 1 - view.contrast, 1)
     light = view.ambient + jnp.where(lit, view.diffuse * to_light, 0)
-    # The division comes last: XLA would recompute anything cheaper for each of the three channels.
+    # Divide last: XLA would recompute a cheaper last operation for each of the three channels.
     shade = square * (light * length + view.headlight * to_eye) / length
     up = jnp.clip(direction[2] / length, 0, 1)
     sky = along(

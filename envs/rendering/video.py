@@ -8,7 +8,7 @@ import av
 import numpy as np
 from PIL import Image
 
-_COLORS = 256  # colors in the largest palette that a GIF allows
+_COLORS = 256  # in a GIF's largest palette
 
 
 def write_video(path: Path, frames: np.ndarray, fps: float) -> None:
@@ -38,7 +38,7 @@ def side_by_side(images: Mapping[str, np.ndarray]) -> np.ndarray:
 
 def write_gif(path: Path, frames: np.ndarray, seconds: float) -> None:
     """Write `[T, H, W, 3]` uint8 frames as a looping GIF, `seconds` per frame."""
-    # One palette for all frames: colors do not flicker, and the file is half the size.
+    # With one palette for all frames, colors do not flicker and the file is half the size.
     method = Image.Quantize.MAXCOVERAGE  # small objects keep their color
     palette = Image.fromarray(np.concatenate(frames)).quantize(_COLORS, method)
     none = Image.Dither.NONE

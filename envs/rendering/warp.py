@@ -1,6 +1,6 @@
 """Call MuJoCo Warp's batch renderer inside jit, on NVIDIA GPUs: fast, with meshes and textures.
 
-Its images resemble those of the ray caster: they share light, checker and sky.
+Light, checker and sky resemble those of the ray caster.
 """
 
 import copy
@@ -29,12 +29,12 @@ class WarpRenderer:
 
         Args:
             model: shared by all worlds, with a light named "lamp".
-            rays: the model's ray caster, which provides cameras, appearance and image size.
+            rays: ray caster whose cameras, appearance, image size and samples are used.
             num_worlds: number of worlds that Warp renders at once.
         """
         self._mujoco, self.model = model, rays.model
-        # Render a larger image for several rays per pixel: Warp's own supersampling needs one field
-        # of view for all worlds.
+        # For several rays per pixel, render a larger image and average it. Warp's own supersampling
+        # needs the same field of view in all worlds.
         self.image_size, self.samples = rays.image_size, rays.samples
         self._num_worlds = num_worlds
         with_lamp = _with_lamp(model)
@@ -67,9 +67,9 @@ class WarpRenderer:
 
         Args:
             poses: poses of all geoms and cameras, leading axis N.
-            appearance: appearance of each world, leading axis N; None for the model's own. Ambient,
-                headlight and diffuse must equal the model's times a common factor; sky and checker
-                are always the model's.
+            appearance: appearance of each world, leading axis N; None for the model's own. In each
+                world, ambient, headlight and diffuse must be the model's times one factor, which
+                scales the whole image. `sky` and `checker` are ignored.
             size: `[N, G, 3]` sizes of geoms; None for the model's own.
         """
         return self._batch(poses, appearance, size)
@@ -98,7 +98,6 @@ class WarpRenderer:
         return images.reshape(-1, *images.shape[2:])[:number]
 
     def _render_chunk(self, poses: Poses, appearance: Appearance, size: jax.Array) -> jax.Array:
-        """Render one chunk of worlds."""
         geom_xpos, geom_xmat, cam_xpos, cam_xmat = poses
         worlds, side = self._num_worlds, self.image_size
         own, light = self.model.appearance, -appearance.light
@@ -107,7 +106,7 @@ class WarpRenderer:
             .at[:, 0]
             .set(light / jnp.linalg.norm(light, axis=-1, keepdims=True))
         )
-        # Lights are the same for all pixels of a call, so each camera gets its own lamp position.
+        # The lamp replaces the headlight, so it moves to each camera that renders.
         position = jnp.repeat(cam_xpos[:, self.model.cameras, None], self._mujoco.nlight, axis=2)
         per_world = (size, appearance.rgba, self._material_colors(appearance), appearance.fovy)
         lights = (direction, *jnp.moveaxis(position, 1, 0))
@@ -129,7 +128,7 @@ class WarpRenderer:
         return colors.at[:, self._mujoco.geom_matid[table]].set(appearance.rgba[:, table])
 
     def _callable(self) -> Any:
-        """Make the JAX callable that takes model and data fields and a lamp position per camera."""
+        """Make a JAX function of model fields, data fields and one light position per camera."""
         model, data = self._model, self._data
         fields = {name: model for name in _PER_WORLD} | {name: data for name in _POSES}
         like = {name: getattr(owner, name) for name, owner in fields.items()}
@@ -152,7 +151,7 @@ class WarpRenderer:
 
 
 def _with_lamp(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Copy the model, with the lamp on and the headlight, which shines along the camera, off."""
+    """Copy the model, with the lamp turned on and the headlight turned off."""
     model = copy.copy(model)
     model.vis.headlight.diffuse[:] = 0.0
     model.light_active[model.light("lamp").id] = True
