@@ -35,8 +35,8 @@ def mjcf(count: int) -> str:
 def place(key: jax.Array, layout: Layout, count: int) -> Layout:
     """Sample poses of `count` distractors, clear of the layout and of one another.
 
-    Each distractor takes the first of `_TRIES` random positions with enough clearance, or else the
-    position with the most.
+    Each distractor takes the first of `_TRIES` random positions that is clear enough, or else the
+    clearest.
     """
     occupied = jnp.stack([pose[:2] for pose in layout.values()])
     placed: Layout = {}

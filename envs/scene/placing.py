@@ -1,4 +1,4 @@
-"""Apply a layout to a MuJoCo model: free bodies through qpos, fixed ones through the model."""
+"""Place a layout's bodies: free ones through qpos, fixed ones by changing the MuJoCo model."""
 
 import copy
 

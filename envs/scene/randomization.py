@@ -25,7 +25,7 @@ from envs.tasks import Layout
 
 Range = tuple[float, float]
 _POSITIVE = ("size", "mass", "friction", "gains", "brightness")
-_MAX_FOV_CHANGE = 20.0  # deg; our choice: the narrowest camera has 32
+_MAX_FOV_CHANGE = 20.0  # deg, our choice; the narrowest field of view is 32
 _ZERO, _ONE = (0.0, 0.0), (1.0, 1.0)
 
 
@@ -84,7 +84,7 @@ class Randomization:
         )
 
     def check(self, control_dt: float) -> None:
-        """Raise a ValueError if a range is invalid; `control_dt` in s bounds the latency."""
+        """Raise a ValueError if a range is invalid; latency must not exceed `control_dt` [s]."""
         for name, value in vars(self).items():
             if not _is_range(value):
                 raise ValueError(f"{name} must be two finite numbers (low, high), got {value}")
@@ -103,7 +103,7 @@ class Randomization:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Draw:
-    """Values drawn for one world, with fields as in `Randomization`, N cameras and G geoms.
+    """Values drawn for one world with N cameras and G geoms; fields are as in `Randomization`.
 
     Attributes:
         size, friction, brightness, latency: [].
@@ -176,7 +176,7 @@ def draw(
         latency=uniform("latency"),
     )
     move = jnp.stack([*uniform("position", 2), jnp.float32(0.0), uniform("turn")])
-    scale = jnp.ones(4).at[2].set(drawn.size)  # heights are sums of object sizes
+    scale = jnp.ones(4).at[2].set(drawn.size)  # heights in a layout are sums of object sizes
     return drawn, {name: pose * scale + move for name, pose in layout.items()}
 
 
@@ -223,7 +223,7 @@ def move_cameras(drawn: Draw, data: Data) -> Data:
 
 
 def appearance(drawn: Draw, base: Appearance) -> Appearance:
-    """Change the model's appearance to that drawn for one world."""
+    """Apply one world's draw to the model's appearance."""
     rgb = jnp.clip(base.rgba[:, :3] + drawn.colour, 0.0, 1.0)
     return dataclasses.replace(
         base,

@@ -12,10 +12,10 @@ from envs.rendering.model import AMBIENT, CONTRAST, DIFFUSE, HEADLIGHT, SKY, SQU
 from envs.robots import Robot
 
 CAMERAS = ("side", "wrist")
-PHYSICS_DT = 0.005  # s; our choice: the largest that is stable with solref .01 s (2 steps or more)
+PHYSICS_DT = 0.005  # s, our choice: half of solref (.01 s), the largest stable step
 
-# Solver settings are our choices from grasping experiments: with fewer than 2 iterations nothing is
-# grasped; elliptic cones take six times as long. Only spheres, boxes and the table plane collide.
+# Solver settings are our choices from grasping experiments. With fewer than 2 iterations nothing is
+# grasped, and elliptic cones take six times as long. Only spheres, boxes and the table collide.
 _SCENE = """
 <mujoco>
   <compiler angle="radian"/>
@@ -52,9 +52,9 @@ _SCENE = """
   </equality>
 </mujoco>
 """
-# Make the images of MuJoCo's own renderers resemble the ray caster's. Their headlight shines along
-# the camera's axis; where a light can be placed at the camera, as in the ray caster, the lamp
-# replaces the headlight.
+# Make the images of MuJoCo's own renderers resemble the ray caster's. MuJoCo's headlight shines
+# along the camera's axis, the ray caster's shines from the camera's position. A renderer that can
+# move lights puts the lamp at the camera and turns the headlight off.
 _VISUALS = """
   <visual>
     <headlight ambient="{ambient} {ambient} {ambient}" specular="0 0 0"
@@ -83,7 +83,7 @@ def build(objects: str, robot: Robot) -> mujoco.MjModel:
 
 @contextlib.contextmanager
 def as_python_warnings() -> Iterator[None]:
-    """Turn MuJoCo's warnings, usually written to a file in the working folder, into Python's."""
+    """Turn MuJoCo's warnings, which it would write to a log file, into Python warnings."""
     before, messages = mujoco.get_mju_user_warning(), []
     mujoco.set_mju_user_warning(messages.append)
     try:

@@ -1,6 +1,6 @@
 """Manipulation tasks: one module per task, found by the `TASK` that it defines.
 
-Shared module: `_task`, with the class of tasks and helpers for them.
+The class `Task` and helpers for all tasks are in `_task`.
 """
 
 from envs.tasks._task import (

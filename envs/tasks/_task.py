@@ -4,9 +4,9 @@ A task defines the objects on the table (`scene`, `place`), success (`check`), p
 request (`instructions`), a solution as poses of the hand (`waypoints`) and the progress along it
 (`stages`). It does not depend on the robot.
 
-Contact masks: each role has a bit of contype, 1 for carried objects, 2 for finger tips, 4 for
-surfaces that only finger pads hold, 8 for feet. A geom that may touch a role has that role's
-bit in conaffinity; no other pairs collide.
+In contact masks, each role is one bit of `contype`: 1 for carried objects, 2 for finger tips, 4 for
+surfaces that only finger pads touch, 8 for feet. A geom that may touch a role has that role's bit
+in `conaffinity`.
 """
 
 import dataclasses
@@ -19,10 +19,10 @@ import mujoco
 
 from envs.robots import TIP_LENGTH, multiply
 
-_ALMOST = 0.99  # upper bound on the progress of a stage before it is passed; our choice
+_ALMOST = 0.99  # maximum progress of a stage that is not passed yet; our choice
 
 Layout = dict[str, jax.Array]
-"""Body name -> pose at reset: [4], x, y, z in m and yaw in rad."""
+"""Body name -> pose [4] at reset: x, y, z [m] and yaw [rad]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +38,7 @@ class View:
         return self.data.xpos[self.model.body(body).id]
 
     def above(self, body: str, height: float) -> jax.Array:
-        """Return the point [3] at `height` * size above a body's position [m]."""
+        """Return the point [3] that lies `height` * `size` above a body's position [m]."""
         return self.position(body) + self.size * jnp.array([0.0, 0.0, height])
 
     def upright(self, body: str) -> jax.Array:
@@ -46,7 +46,7 @@ class View:
         return self.data.xmat[self.model.body(body).id].reshape(3, 3)[2, 2]
 
     def on(self, body: str, height: float) -> jax.Array:
-        """Return the point [3] at `height` * size along a body's own z axis [m]."""
+        """Return the point [3] that lies `height` * `size` along a body's own z axis [m]."""
         axis = self.data.xmat[self.model.body(body).id].reshape(3, 3)[:, 2]
         return self.position(body) + self.size * height * axis
 
@@ -60,7 +60,7 @@ class View:
         return self.data.qpos[self.model.joint(name).qposadr[0]]
 
     def inside(self, body: str, box: str, half_width: float, height: float) -> jax.Array:
-        """Return whether a body's position is inside a square box, itself a body.
+        """Return whether a body's position is inside another body, a square box.
 
         Args:
             body, box: names of the bodies.
@@ -75,12 +75,12 @@ class View:
         return jnp.linalg.norm((self.position(body) - self.position(other))[:2])
 
     def released(self, grip: jax.Array, width: float, away: float = 0.06) -> jax.Array:
-        """Return whether the hand has opened wider than an object that it held, or moved away.
+        """Return whether the hand has let go of an object by opening wider or by moving away.
 
         Args:
             grip: [3] point at which the object is held [m].
             width: width of the object there, at size 1 [m].
-            away: distance from the grip at which the hand no longer holds the object [m].
+            away: distance from `grip` beyond which the tcp has moved away [m].
         """
         wider = self.opening > width * self.size + 0.005
         return wider | (jnp.linalg.norm(grip - self.tcp) > away)
@@ -107,7 +107,7 @@ class View:
 
     @property
     def tip(self) -> jax.Array:
-        """Position [3] of the point between the ends of the finger tips [m]."""
+        """Position [3] midway between the ends of the finger tips [m]."""
         rotation = self.data.site_xmat[self.model.site("tcp").id].reshape(3, 3)
         return self.tcp + TIP_LENGTH * rotation[:, 2]
 
@@ -126,14 +126,14 @@ class Waypoints:
     own lean (`Robot.lean`), and by `tilt` to the side that its wrist allows (`Robot.tilt_side`).
 
     Attributes:
-        position: [P, 3] of a point on the hand's axis, `reach` behind the tcp [m].
-        reach: [P] distance of that point, about which the hand rotates, from the tcp [m].
-        rotation: [P, 3, 3] of the tcp before leaning and tilting.
+        position: [P, 3] pivot of these rotations, a point on the hand's axis behind the tcp [m].
+        reach: [P] distance from the pivot to the tcp [m].
+        rotation: [P, 3, 3] rotation of the tcp before leaning and tilting.
         lean: [P] share of the robot's own lean.
         tilt: [P] angle [rad].
         opening: [P] gripper opening [m].
         seconds: [P] nominal time from the previous pose [s].
-        spread: [P] standard deviation of the noise on the position, 0 where precision matters [m].
+        spread: [P] standard deviation of noise on the position [m], 0 where precision matters.
     """
 
     position: jax.Array
@@ -152,7 +152,7 @@ class Task:
 
     Attributes:
         name: name of the task's module.
-        scene: MJCF of the bodies on the table; `place` positions fixed and free bodies.
+        scene: MJCF of the bodies on the table, fixed or free; `place` positions them.
         instructions: phrasings of the request, at most 8 words each.
         time_limit: time after which an episode ends [s].
         expert_time: time after which the expert stops [s].
@@ -161,7 +161,7 @@ class Task:
         check: view -> (bool scalar, metrics); whether the goal is reached now.
         waypoints: layout -> a solution as poses of the hand.
         stages: view -> completed share of each stage of that solution, f32 in [0, 1], by name,
-            first to last; 1 passes the stage and all before it. See `envs.rewards`.
+            first to last. A share of 1 passes the stage and all before it; see `envs.rewards`.
     """
 
     name: str
@@ -195,7 +195,7 @@ def tool_down(position: jax.Array) -> jax.Array:
     """Return tcp rotations [..., 3, 3] pointing down, fingers opening across the line to the base.
 
     Args:
-        position: [..., 3] of the tcp; the arm's base is at the origin.
+        position: [..., 3] position of the tcp relative to the arm's base.
     """
     yaw = azimuth(position)
     c, s, zero = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw)
@@ -210,10 +210,11 @@ def route(
     reach: float = 0.0,
     tilt: Sequence[float] = (),
 ) -> Waypoints:
-    """Make waypoints with the tool pointing down, from (anchor, offset, opening, seconds, spread).
+    """Make waypoints with the tool pointing down.
 
     Args:
-        rows: one per waypoint; the anchor is a pose of the layout or a position [3].
+        rows: (anchor, offset, opening, seconds, spread) of each waypoint. The anchor is a pose of
+            the layout or a position [3]; the offset [m] is added to it.
         lean, reach: as in `Waypoints`, the same for all.
         tilt: as in `Waypoints`, one per row [rad]; empty: no tilt.
     """
@@ -241,7 +242,7 @@ def open_box(inside: float, wall: float, height: float, *, floor: str, walls: st
 
     Args:
         inside, wall, height: half the inner width, half the walls' thickness, their height [m].
-        floor, walls: MJCF attributes of the floor (4 mm) and of every wall.
+        floor, walls: MJCF attributes of the floor (4 mm thick) and of every wall.
     """
     side, middle, long = inside + wall, height / 2, inside + 2 * wall
     return f"""

@@ -1,6 +1,6 @@
 """Open the pot: grasp the lid by its knob, lift it off, put it down beside the pot.
 
-All numbers are our choices, with which both arms solve the task.
+All numbers are our choices; both arms solve the task with them.
 """
 
 import jax
@@ -19,23 +19,24 @@ from envs.tasks import (
     scatter,
 )
 
-_INSIDE, _WALL, _HEIGHT = 0.043, 0.005, 0.055  # m, pot: half the inner width, half a wall, height
+# m, the pot: half its inner width, half the thickness of its walls, its height
+_INSIDE, _WALL, _HEIGHT = 0.043, 0.005, 0.055
 _FOOT = 0.005  # m, radius of the lid's feet, which stand on the middle of the walls
 _KNOB, _KNOB_HEIGHT = 0.010, 0.030  # m, radius of the knob, and its center above the feet
-_LID = 0.055  # m, radius
+_LID = 0.055  # m, radius of the lid
 _POT, _POT_RANGE = (0.36, 0.10), (0.04, 0.04)  # m, center and half range of the position
-_BESIDE = 0.175  # m from pot to lid, to the robot's right
+_BESIDE = 0.175  # m, how far to the right of the pot the expert puts the lid
 
 _STEEL, _RED = 'rgba=".55 .57 .60 1"', 'rgba=".62 .20 .16 1"'
 _RIM = _INSIDE + _WALL
-_BARELY_BESIDE = _LID + _RIM + _WALL  # m from pot to lid when they just do not overlap
+_BARELY_BESIDE = _LID + _RIM + _WALL  # m, distance at which pot and lid just do not overlap
 _CLEAR = 0.020  # m, height of the lid above the pot that counts as lifted off
 _FEET = "".join(
     f'<geom type="sphere" size="{_FOOT}" pos="{x} {y} {_FOOT}" contype="8" condim="4" mass=".005" '
     f'friction="1 .02 .001" solref=".01 1" {_STEEL}/>'
     for x, y in ((_RIM, 0), (-_RIM, 0), (0, _RIM), (0, -_RIM))
 )
-# On four spheres, the lid's residual velocity is a hundredth of that on a flat face.
+# With four spheres as feet, the lid's residual velocity is a hundredth of that with a flat face.
 _SCENE = f"""
 <body name="pot">
   {open_box(_INSIDE, _WALL, _HEIGHT, floor=_RED, walls=f'conaffinity="10" {_RED}')}

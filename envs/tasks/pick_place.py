@@ -1,6 +1,6 @@
 """Pick the grape and place it in the basket: at rest inside, and released.
 
-All numbers are our choices, with which both arms solve the task.
+All numbers are our choices; both arms solve the task with them.
 """
 
 import jax
@@ -28,8 +28,8 @@ _GRAPE, _GRAPE_RANGE = (0.36, -0.08), (0.06, 0.10)  # m, center and half range
 _BASKET, _BASKET_RANGE = (0.36, 0.155), (0.035, 0.035)  # m
 
 _BASKET_GEOM = 'conaffinity="3" rgba=".85 .65 .30 1"'
-# The free joint's damping stops a rolling grape within half a second: the time constant,
-# 1.4 m r² / damping for mass m and radius r, is 0.38 s.
+# The free joint's damping stops a rolling grape. For mass m and radius r, the time constant is
+# 1.4 m r² / damping = 0.38 s.
 _SCENE = f"""
 <body name="basket">
   {open_box(_INSIDE, _WALL, _HEIGHT, floor=_BASKET_GEOM, walls=_BASKET_GEOM)}

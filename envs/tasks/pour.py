@@ -1,6 +1,6 @@
 """Pour the block out of the cup into the basket, and set the cup upright again.
 
-All numbers are our choices, with which both arms solve the task.
+All numbers are our choices; both arms solve the task with them.
 """
 
 import math
@@ -25,12 +25,13 @@ from envs.tasks import (
 _BLOCK = 0.010  # m, radius of the sphere that collides in place of the block
 _BOTTOM = 0.014  # m, half the inner width of the cup at its bottom
 _FLARE = math.radians(20.0)  # slant of the two walls over which the block can leave
-_HEIGHT, _THICK, _FOOT = 0.050, 0.002, 0.004  # m: the cup's height, half a wall, a foot's radius
+# m, the cup: its height, half the thickness of its walls, radius of its feet
+_HEIGHT, _THICK, _FOOT = 0.050, 0.002, 0.004
 _SIDE = 0.022  # m from the cup's middle to its upright walls
 _WIDTH = 2 * (_SIDE + 0.003)  # m, width of the cup where it is grasped
 _CLEAR = 0.060  # m, height of the cup above the table that counts as lifted
 _GRIP = 0.033  # m, height at which the cup is grasped
-# The hand rotates about a point above the cup's mouth, from where the block falls straight down.
+# The hand pivots about a point above the cup's mouth, so that the block falls straight down there.
 _REACH = _HEIGHT - _GRIP + 0.03  # m from the grip
 _CUP, _CUP_RANGE = (0.33, -0.09), (0.03, 0.05)  # m, center and half range
 _INSIDE, _WALL, _BASKET_HEIGHT = 0.050, 0.003, 0.045  # m, basket; named as in pick_place

@@ -1,6 +1,6 @@
 """Press the red button down past 75 % of its stroke, with the fingers.
 
-All numbers are our choices, with which both arms solve the task.
+All numbers are our choices; both arms solve the task with them.
 """
 
 import jax
@@ -15,7 +15,7 @@ _RADIUS = 0.024  # m, radius of the cap
 _DEEP = 0.75 * _STROKE  # m, depth that counts as pressed
 _CENTER, _RANGE = (0.36, 0.0), (0.04, 0.04)  # m, center and half range of the position
 
-# A spring of 150 N/m gives 1.8 N at full stroke, far more than the cap's (compensated) weight.
+# The spring of 150 N/m resists with 1.8 N at full stroke.
 _SCENE = f"""
 <body name="button">
   <geom type="cylinder" size=".040 .012" pos="0 0 .012" rgba=".20 .22 .26 1"/>
@@ -49,7 +49,7 @@ def _stages(view: View) -> dict[str, jax.Array]:
 
 
 def _offset(view: View) -> jax.Array:
-    """Return the vector [3] from the top of the cap, pressed or not, to the finger tips [m]."""
+    """Return the vector [3] from the current top of the cap to the finger tips [m]."""
     down = view.joint("button") * jnp.array([0.0, 0.0, 1.0])
     return view.tip - view.above("button", _TOP) + down
 
