@@ -17,7 +17,7 @@ from rich.progress import (
 from rich.text import Text
 
 Report = Callable[[int, int], None]
-"""Called with the number of items done and their total."""
+"""Called with the number of items done and the total."""
 _PERIOD = 600.0
 """Time over which the rate is averaged [s]; no rate is shown until two updates fall within it."""
 
@@ -29,7 +29,7 @@ def bars(console: Console, unit: str, *, per_step: int = 1, shown: bool = True) 
         console: console to draw on.
         unit: unit of the rate, such as "episodes".
         per_step: units per step of the bar.
-        shown: False hides the bars, since a console shows only one `Progress` at a time.
+        shown: False hides the bars, for when the console already shows another `Progress`.
     """
     columns = (
         TextColumn("{task.description}"),
@@ -42,7 +42,7 @@ def bars(console: Console, unit: str, *, per_step: int = 1, shown: bool = True) 
 
 
 def collecting(progress: Progress, title: str, stop: threading.Event) -> Report:
-    """Make a progress callback that moves a bar; the first call, before compilation, adds the bar.
+    """Make a progress callback that updates a bar; its first call, before compilation, adds it.
 
     The callback raises KeyboardInterrupt once `stop` is set.
     """

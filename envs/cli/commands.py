@@ -1,4 +1,4 @@
-"""The commands of `python -m envs`; each takes the parsed options and a console for output."""
+"""The commands of `python -m envs`; each takes parsed options and a console for output."""
 
 import argparse
 import contextlib
@@ -25,7 +25,7 @@ from envs.names import names
 from envs.rendering import video
 
 WORLDS = 4
-"""Number of parallel attempts in `play`, since the expert may fail; one success is shown."""
+"""Number of parallel attempts in `play`, which shows one success; the expert may fail."""
 _EVERY = 2  # control steps per frame of a GIF
 
 
@@ -124,7 +124,7 @@ def _is_done(options: argparse.Namespace, env: envs.Env, file: Path) -> bool:
         if existing == recipe and not options.overwrite:
             return True
     elif partial.exists() and _is_complete(rlds.metadata(partial), recipe):
-        return False  # perhaps killed before `_save` deleted the shards; `_save` compares both
+        return False  # `_save` may have been killed before it deleted the shards: repeat it
     _refuse_existing(options, file)
     return False
 
@@ -154,7 +154,7 @@ def _collect_concurrently(
         finally:
             stop.set()
     errors = [future.exception() for future in running.values()]
-    # An error stops the other tasks with KeyboardInterrupt, so raise the error first.
+    # An error stops the other tasks with KeyboardInterrupt: raise the error, not the interrupts.
     for error in sorted(filter(None, errors), key=lambda e: isinstance(e, KeyboardInterrupt)):
         raise error
     return {file: future.result() for file, future in running.items()}

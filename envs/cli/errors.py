@@ -1,7 +1,7 @@
-"""Report errors of a command in one sentence; only bugs show a traceback.
+"""Report a command's errors on one line; only bugs show a traceback.
 
-Bad input raises ValueError everywhere in the project. Inaccessible files and exhausted memory are
-not bugs, either. If the reader of the output has closed the pipe, nothing is reported.
+Bad input (ValueError everywhere in this project), inaccessible files and exhausted memory are not
+bugs. Nothing is reported if the reader of stdout has closed the pipe.
 """
 
 import argparse
@@ -18,7 +18,7 @@ REFUSED = 2
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells report SIGINT."""
 BROKEN_PIPE = 141
-"""Exit code if the reader of the output has closed the pipe, as shells report SIGPIPE."""
+"""Exit code if the reader of stdout has closed the pipe, as shells report SIGPIPE."""
 MAX_LENGTH = 1000
 """Maximum number of characters in a message."""
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -32,8 +32,8 @@ def parse_arguments(
     """Parse the options of a command.
 
     Raises:
-        SystemExit: after help or bad options, as in argparse; with `BROKEN_PIPE` if the reader of
-            the help has closed the pipe.
+        SystemExit: after help or bad options, as in argparse; with code `BROKEN_PIPE` if the reader
+            of stdout has closed the pipe.
     """
     try:
         return parser.parse_args(arguments)
@@ -53,7 +53,7 @@ def report_error(error: Exception, errors: Console, remedy: str = "") -> int:
     Args:
         error: the exception; raised again if it is a bug.
         errors: console to print to.
-        remedy: what to do if disk or memory is full, as the end of the message.
+        remedy: advice to append to the message if disk or memory is full.
 
     Returns:
         The exit code.
@@ -101,6 +101,6 @@ def _is_out_of_memory(error: Exception) -> bool:
 
 
 def _one_line(error: Exception) -> str:
-    """Return the message on one line; keep both ends of a long message, which may quote a file."""
+    """Return the message on one line, cutting out the middle if it is too long."""
     text, half = " ".join(str(error).split()), MAX_LENGTH // 2
     return text if len(text) <= MAX_LENGTH else f"{text[:half]} ... {text[-half:]}"

@@ -20,10 +20,10 @@ _FATAL, _JAX_DEFAULT = 3, 1  # levels of TF_CPP_MIN_LOG_LEVEL
 def silence(
     set_level: Callable[[int], None] = _compat.set_min_log_level,
 ) -> "Compilations | None":
-    """Log nothing below fatal from JAX's C++ code while this process compiles. Call this once.
+    """Log only fatal errors from JAX's C++ code while this process compiles. Call this once.
 
     Failing compilations still raise, and errors outside compilation are still logged. A level set
-    in TF_CPP_MIN_LOG_LEVEL is respected; plugins (CUDA, for example) have their own logging.
+    in TF_CPP_MIN_LOG_LEVEL is respected. Plugins such as CUDA's have their own logging.
 
     Args:
         set_level: sets the lowest level that is logged.

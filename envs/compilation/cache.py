@@ -12,8 +12,8 @@ from envs.datasets.writing import write_bytes
 class WholeFiles(_compat.FileCache):
     """JAX's file cache, with atomic writes.
 
-    JAX writes entries in place: another process may read a partial entry, and a partial entry left
-    by a killed process is never rewritten.
+    JAX writes entries in place, so another process may read a partial entry. If a process is killed
+    while it writes, its partial entry is never rewritten.
     """
 
     def put(self, key: str, value: bytes) -> None:

@@ -1,9 +1,9 @@
 """Make MJX fast on CPU with JAX < 0.11.
 
 XLA's fusion emitters, which JAX 0.10 uses on CPU, make MJX 15 to 400 times slower (measured on two
-cores). An XLA flag turns them off, but XLA reads its flags once, when JAX starts a backend;
-`import envs` sets the flag if that has not happened yet. If it has, this package passes the option
-to its own `jax.jit` calls, but cannot do so for programs that other code compiles.
+cores). An XLA flag turns them off, but XLA reads its flags only once, when JAX starts a backend. If
+no backend has started, `import envs` sets the flag. Otherwise this package passes the option to its
+own `jax.jit` calls, but cannot do so for programs that other code compiles.
 """
 
 import functools
@@ -54,12 +54,12 @@ def warn_if_late() -> None:
 
 
 def without_simulation() -> dict[str, str | bool] | None:
-    """Return compiler options to undo the flag, which on CPU slows programs without simulation."""
+    """Return compiler options that undo the flag, which slows other programs on CPU."""
     return {_NAME: True} if _NEEDED and jax.default_backend() == "cpu" else None
 
 
 def jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
-    """Apply `jax.jit`; simulation is fast on CPU even if the flag could not be set in time."""
+    """Apply `jax.jit`, with fast simulation on CPU even if it was too late to set the flag."""
     plain = jax.jit(function, **options)
     if not _NEEDED:
         return plain

@@ -13,7 +13,7 @@ import jax
 from envs import _compat
 
 PATIENCE = 2.0
-"""Seconds of compilation before a message appears; our choice."""
+"""Seconds of compilation before a message appears; an arbitrary choice."""
 
 
 @contextlib.contextmanager
@@ -48,15 +48,15 @@ def _print(line: str) -> None:
 
 
 class Calls:
-    """Announce the calls to an object that trigger compilation: the first of each kind."""
+    """Announce method calls on an object that trigger compilation: the first of each kind."""
 
     def __init__(self, name: str) -> None:
-        """Set the object's name in messages."""
+        """Set the name that messages use for the object."""
         self._name = name
         self._called: set[tuple[Any, ...]] = set()
 
     def first(self, *call: Any) -> AbstractContextManager[None]:
-        """Announce a call if it compiles; `call` is its name and what else causes compilation."""
+        """Announce a call if it compiles; `call` is its name plus whatever forces a recompile."""
         if call in self._called or not _compat.is_untraced():
             return contextlib.nullcontext()
         self._called.add(call)

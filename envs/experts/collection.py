@@ -1,7 +1,7 @@
 """Collect batches of expert demonstrations, including images, in one jitted call per batch.
 
-A call scans over the control steps of an episode in W worlds and records robot states, actions and
-the poses of all geoms and cameras; images are rendered from those poses in bounded memory.
+A call scans over the control steps of one episode in W worlds. It records robot states, actions and
+the poses of all geoms and cameras, then renders images from those poses in bounded memory.
 """
 
 import dataclasses
@@ -20,10 +20,10 @@ from envs.making import AnyRobot, make
 from envs.scene.randomization import Draw, Randomization, prepare
 from envs.state import Poses
 
-# Default number of worlds per call; our choice: it fills the device and fits its memory.
+# Default number of worlds per call, our choice: enough to fill the device, within its memory.
 _NUM_ENVS = {"cpu": 32, "gpu": 256, "tpu": 256}
-# Give up if, after this many attempts or more, less than this share has succeeded. Our choice: the
-# experts solve nearly all layouts, so a lower share means that something is broken.
+# Give up after this many attempts if less than this share has succeeded. Our choice: the experts
+# solve nearly all layouts, so a lower share means that something is broken.
 _MIN_SUCCESS, _MIN_ATTEMPTS = 0.5, 16
 _MAX_EPISODES = 10**9  # our choice; catches typos
 
@@ -68,9 +68,9 @@ def rollout(
     Args:
         env: W worlds.
         key: source of all randomness.
-        action_noise: standard deviation of Gaussian noise on all entries of the executed actions
-            except the gripper opening, in their units [rad, or m for the tcp's translation].
-            Recorded actions are without noise, so they demonstrate recovery.
+        action_noise: standard deviation of Gaussian noise on the executed actions, in their units
+            [rad, or m for the tcp's translation]. The gripper opening gets no noise. Recorded
+            actions are without noise, so they demonstrate recovery.
         ranges: domain randomization, see `envs.scene.randomization`.
     """
     reset_key, plan_key, noise_key = jax.random.split(key, 3)
@@ -109,7 +109,7 @@ def collect(
     record: Record | None = None,
     **options: Any,
 ) -> Episodes:
-    """Collect successful demonstrations of the scripted expert, on the device.
+    """Collect successful demonstrations of the scripted expert.
 
     Episodes are padded to the expert's time limit.
 
@@ -147,8 +147,8 @@ def expert_success(
 ) -> jax.Array:
     """Return whether the expert solves each of `num_episodes` random layouts, bool [num_episodes].
 
-    Arguments are as in `collect`; `attempt` runs an episode in every world and returns which ones
-    succeed (default: the expert in simulation).
+    Arguments are as in `collect`, except `attempt`. It runs an episode in every world and returns
+    success, bool [W]; default: the expert in simulation.
     """
     env = make_repeatable(task, robot, num_envs=worlds(num_episodes, num_envs), **options)
     ranges = prepare(ranges, env.control_dt)
@@ -160,7 +160,7 @@ def expert_success(
 
 
 def make_repeatable(task: str, robot: AnyRobot, **options: Any) -> Env:
-    """Call `envs.make`, by default with reproducible physics: Warp's order of addition varies."""
+    """Call `envs.make`; the backend defaults to jax, since Warp's order of addition varies."""
     options.setdefault("backend", "jax")
     return make(task, robot, **options)
 
@@ -199,7 +199,7 @@ def gather(
     while collected < num_episodes:
         _check_success(env, collected, attempted)
         key, chunk_key = jax.random.split(key)
-        # Wait here, with the GIL released, so that other threads can write their episodes.
+        # Wait here without holding the GIL, so that other threads can write their episodes.
         chunk, success = jax.block_until_ready(record(env, chunk_key, action_noise, ranges))
         wins = np.flatnonzero(success)[: num_episodes - collected]
         collected += len(wins)

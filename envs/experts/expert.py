@@ -1,8 +1,8 @@
 """The scripted expert of every task and robot.
 
-Planning happens once per episode: inverse kinematics at the task's waypoints, then a minimum-jerk
-path through them in joint space, slowed down where a joint would be too fast. Acting reads the path
-one control step ahead and returns an action in the environment's action mode, as a policy does.
+Planning happens once per episode. It solves inverse kinematics at the task's waypoints, then joins
+them by minimum-jerk moves in joint space, slowed down where a joint would be too fast. Acting reads
+this path one control step ahead and returns an action in the environment's action mode.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from envs.state import State
 from envs.tasks import Waypoints
 
 _SPEED_FRACTION = 0.5  # share of the robot's joint speed limits that the expert uses; our choice
-_PEAK = 1.875  # ratio of peak to mean speed of a minimum-jerk move: 30 s²(1 - s)² at s = 1/2
+_PEAK = 1.875  # peak speed of a minimum-jerk move over its mean: 30 s²(1 - s)² at s = 1/2
 
 
 @jax.tree_util.register_dataclass
@@ -31,10 +31,10 @@ class Plan:
 
 
 def plan(env: Env, state: State, key: jax.Array) -> Plan:
-    """Plan a random solution for every world, starting from its robot's current pose.
+    """Plan a random solution for every world, starting from the last command.
 
     Waypoints in free space get noise, and every duration is scaled by a random factor in [0.8, 1.2]
-    (our choices).
+    (our choice).
     """
     keys = jax.random.split(key, env.num_envs)
     return jax.vmap(lambda info, key: _plan(env, info, key))(state.info, keys)
@@ -60,7 +60,7 @@ def tool_rotations(robot: Robot, waypoints: Waypoints) -> jax.Array:
 def _plan(env: Env, info: dict, key: jax.Array) -> Plan:
     position_key, time_key = jax.random.split(key)
     size = info["draw"].size if info["draw"] else 1.0
-    # Objects scale from the table up, and so do the heights at which they are grasped.
+    # Objects grow from the table up: plan at size 1, then scale the heights.
     waypoints = env.task.waypoints({k: v.at[2].divide(size) for k, v in info["layout"].items()})
     noise = jax.random.normal(position_key, waypoints.position.shape) * waypoints.spread[:, None]
     start = info["command"]
@@ -81,7 +81,7 @@ def _plan(env: Env, info: dict, key: jax.Array) -> Plan:
 def _joints(
     robot: Robot, positions: jax.Array, rotations: jax.Array, start: jax.Array
 ) -> jax.Array:
-    """Solve for joint angles [P, J] at the waypoints, each starting from the one before."""
+    """Compute joint angles [P, J] at the waypoints, starting each search at the last solution."""
 
     def body(q: jax.Array, target: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         q = robots.inverse_kinematics(robot, *target, q)

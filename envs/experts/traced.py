@@ -1,9 +1,9 @@
-"""Share traced programs between processes, in addition to JAX's compilation cache.
+"""Cache traced programs in files, in addition to JAX's cache of compiled programs.
 
-JAX's cache avoids XLA's work, but a lookup needs the traced program, and tracing MJX takes 6 to 8 s
-of Python per scene (measured). Reading a program from the cache of this module takes 0.2 s. This
-cache's key covers the scene, all source files of this package, all settings of JAX and the package
-versions, so a change to any of them causes a new trace.
+JAX has to trace a program before it can look it up, and tracing MJX takes 6 to 8 s per scene
+(measured). Reading a traced program from a file takes 0.2 s. The cache key covers the scene, all
+source files of this package, all settings of JAX and the package versions. A change to any of them
+causes a new trace.
 """
 
 import functools
@@ -29,8 +29,8 @@ from envs.env import Env
 from envs.rendering.renderer import RayRenderer
 from envs.tasks import Task
 
-# Python can only trace one program at a time. With this lock, the first program is compiled and
-# runs while the second is traced; without it, none would start before the last is traced.
+# Python can only trace one program at a time. With this lock, the first program compiles and runs
+# while the second is traced. Without it, none would start before the last is traced.
 _TRACING = threading.Lock()
 _VERSIONED = ("jax", "jaxlib", "mujoco", "mujoco-mjx")
 _CHECKSUM = hashlib.sha256().digest_size  # bytes at the start of a file
@@ -41,9 +41,9 @@ def cached(
 ) -> Callable[..., Any]:
     """Apply `jax.jit(..., static_argnums=0)`, tracing once for all processes on a machine.
 
-    Programs are cached only if JAX's compilation cache is in a local folder, the task is one of
-    this package, and Warp is not used, since its programs contain memory addresses. Thread-safe;
-    cannot be vmapped.
+    Programs are cached only if JAX's compilation cache is a local folder and the task comes with
+    this package. Programs that use Warp are not cached, since they contain memory addresses. The
+    result is thread-safe, but cannot be vmapped.
 
     Args:
         function: a function in this package that takes an `Env` and pytrees of arrays, and returns
@@ -104,7 +104,7 @@ def _is_cacheable(env: Env) -> bool:
 
 
 def _is_shipped(task: Task) -> bool:
-    """Return whether the task belongs to this package, whose source files define it fully."""
+    """Return whether the task comes with this package, so that source files define it fully."""
     name = f"{tasks.__name__}.{task.name}"
     spec = importlib.util.find_spec(name)
     return spec is not None and importlib.import_module(name).TASK is task

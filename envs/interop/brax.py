@@ -1,4 +1,4 @@
-"""Wrap an environment for Brax, to train from states, not images, with Brax's wrappers.
+"""Wrap an environment for Brax, to train from states (not images) with Brax's wrappers.
 
 env = brax.envs.training.wrap(BraxEnv(envs.make("press")), episode_length=80)
 state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), 4096))
@@ -33,16 +33,16 @@ _full_state = fast_cpu.jit(Env._full_state, static_argnums=0)
 class BraxEnv(base.Env):
     """One world of a task behind Brax's interface, for Brax's wrappers to batch and restart.
 
-    Observations are those of `Env.full_state`, float32 [D], without images. `env.observe` renders
-    `state.pipeline_state`, the `envs.State` of one world.
+    Observations are those of `Env.full_state`, float32 [D], without images. To render, call
+    `observe` of the attribute `env` on `state.pipeline_state`, an `envs.State` of one world.
 
-    Actions, [A] in [-1, 1], are rescaled to the range from the environment's `action_low` to its
-    `action_high`. The sparse reward is 1 once, on success, so the return of an episode is 1 on
-    success, else 0. The dense reward needs `action_repeat=1`, since Brax sums the rewards of
-    repeated actions without discounting. `done` means success or broken physics. Brax's
-    EpisodeWrapper sets the episode length (`env.max_steps` is the task's own limit) and marks an
-    episode that reaches this length as truncated. Brax's AutoResetWrapper restarts a world in its
-    initial state, with the same layout.
+    Actions, [A] in [-1, 1], are rescaled to the range from `env.action_low` to `env.action_high`.
+    The sparse reward is 1 once, on success. The dense reward needs `action_repeat=1`, since Brax
+    sums the rewards of repeated actions without discounting.
+
+    `done` means success or broken physics. Brax's EpisodeWrapper sets the episode length and marks
+    episodes that reach it as truncated; the task's own limit is `env.max_steps`. Brax's
+    AutoResetWrapper restarts a world in its initial state, with the same layout.
 
     Attributes:
         env: the wrapped environment, with one world.
@@ -66,7 +66,7 @@ class BraxEnv(base.Env):
         self.ranges = ranges
 
     def reset(self, rng: jax.Array) -> base.State:
-        """Start one world; the key `rng` is the source of all randomness.
+        """Start one world; `rng` is the key for all randomness.
 
         Raises:
             TypeError: `rng` is not a key.
@@ -98,7 +98,7 @@ class BraxEnv(base.Env):
         clock = jnp.zeros_like(world.info["steps"])
         world = dataclasses.replace(world, info=world.info | {"steps": clock})
         reward = jnp.where(before.done, 0.0, world.reward)
-        metrics = state.metrics | world.metrics  # wrappers add their own
+        metrics = state.metrics | world.metrics  # keep those that wrappers have added
         return state.replace(reward=reward, metrics=metrics, **self._fields(world))
 
     @property
@@ -117,7 +117,7 @@ class BraxEnv(base.Env):
         return "mjx"
 
     def _fields(self, world: State) -> dict[str, Any]:
-        """Return the fields of Brax's state for one world, given without an axis W."""
+        """Return fields of Brax's state; the leaves of `world` have no axis W."""
         return {
             "pipeline_state": jax.tree.map(lambda x: x[None], world),
             "obs": _full_state(self.env, world),

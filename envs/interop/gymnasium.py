@@ -43,12 +43,11 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     """W worlds of a task behind Gymnasium's interface.
 
     Observations are one of `OBSERVATIONS`, with a leading axis W. Actions are as in `Env.step`,
-    float32 [W, A]. Info: `success`, bool [W], and `instruction`, string [W].
+    float32 [W, A]. Info has `success`, bool [W], and `instruction`, string [W].
 
     Worlds restart automatically in Gymnasium's next-step mode: the step after a world ends ignores
-    the action for that world and returns the first observation of its next episode, with reward 0
-    and neither terminated nor truncated. The seed and the actions determine everything, including
-    restarts.
+    its action and returns the first observation of its next episode. That step has reward 0 and is
+    neither terminated nor truncated. The seed determines all randomness, including restarts.
 
     Attributes:
         env: the wrapped environment.
@@ -111,7 +110,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     def step(
         self, actions: np.ndarray
     ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Simulate one control step of every world, but restart worlds that have ended.
+        """Simulate one control step of every world, and restart the worlds that have ended.
 
         Args:
             actions: [W, A], units and limits as in `Env.step`.
@@ -207,7 +206,7 @@ class SingleEnv(gymnasium.Env):
 
         Raises:
             gymnasium.error.ResetNeeded: before the first `reset`, and after the end of an episode.
-            ValueError: the action's shape is wrong.
+            TypeError, ValueError: as in `VectorEnv.step`.
         """
         state = self.vector.state
         if state is not None and bool(state.done[0]):
@@ -260,7 +259,7 @@ def make(
 
 
 def _space(env: Env, observation: str) -> spaces.Space[Any]:
-    """Return one world's observation space; states are unbounded: joints can exceed limits."""
+    """Return one world's observation space; joints can exceed limits, so states are unbounded."""
     if observation not in OBSERVATIONS:
         raise ValueError(
             f"unknown observation {observation!r}: choose from {', '.join(OBSERVATIONS)}"

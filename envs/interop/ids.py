@@ -10,7 +10,7 @@ from envs.names import names
 
 
 def register() -> None:
-    """Register the ids if Gymnasium is installed; their modules are imported only when used."""
+    """Register the ids if Gymnasium is installed; environments are imported on first use."""
     try:
         import gymnasium
     except ImportError:
