@@ -20,8 +20,8 @@ COMMANDS = {
 """Module and help text of each command. A module has `main(arguments, program)`, which returns the
 exit code, and `parser(program)`, which returns its options for shell completion."""
 INTERRUPTED = 130
-"""Exit code after SIGINT or SIGTERM: 128 + 2, as shells report SIGINT. `envs.cli.errors` defines it
-too, but importing that takes a second."""
+"""Exit code after SIGINT (128 + 2, as in shells) or SIGTERM. Repeats the constant of
+`envs.cli.errors`, whose import takes a second."""
 
 
 def main() -> NoReturn:
@@ -44,13 +44,7 @@ def exit_on_signals() -> None:
 
 
 def run(command: str, arguments: Sequence[str], program: str) -> NoReturn:
-    """Run one command and exit with its exit code.
-
-    Args:
-        command: one of `COMMANDS`.
-        arguments: its command-line arguments.
-        program: program name in the help text.
-    """
+    """Run one of `COMMANDS` and exit with its exit code."""
     from envs.compilation import alarms
 
     alarms.silence()

@@ -22,7 +22,6 @@ class Report(Callback):
     """
 
     def __init__(self) -> None:
-        """Create the callback; nothing is written yet."""
         self._thread = ThreadPoolExecutor(1)
         self._latest: Future | None = None
         self._started = -float("inf")

@@ -131,8 +131,7 @@ def layer_ranks(layers: dict[str, dict[str, Sequence[float]]], rank: int) -> Fig
 def rank_histogram(histogram: dict[str, Sequence[int]]) -> Figure:
     """Plot the distribution of active rank over tokens, one panel per tower.
 
-    Args:
-        histogram: tower -> number of tokens with active rank 0, 1, ...
+    `histogram` maps a tower to its numbers of tokens with active rank 0, 1, ...
     """
     figure = Figure(figsize=(9, 2.8), layout="constrained")
     panels = figure.subplots(1, len(histogram), sharey=True, squeeze=False)[0]

@@ -50,8 +50,8 @@ pre { background: var(--box); padding: 1rem; overflow-x: auto; font-size: 13px; 
 def write_report(folder: Path) -> Path:
     """Write report.html into a run's folder, from the records, images and videos there.
 
-    For an unfinished run, the page shows partial results. It also refreshes itself, unless the run
-    was stopped.
+    The page of an unfinished run shows partial results and refreshes itself, unless the run
+    stopped.
 
     Raises:
         ValueError: the folder contains no run, or its files are damaged.
@@ -127,7 +127,7 @@ def _skipped(rows: figures.Rows) -> Iterable[str]:
 
 
 def _subtitle(config: dict[str, Any], results: dict[str, Any]) -> str:
-    """Format method, backbone, robot, parameters (if the run is finished) and scale as a line."""
+    """Describe the run on one line, with parameter counts if it is finished."""
     line = (
         f"{config['peft']['method']} on {config['model']['backbone']} {config['model']['size']}, "
         f"robot {config['robot']}"
@@ -140,7 +140,7 @@ def _subtitle(config: dict[str, Any], results: dict[str, Any]) -> str:
 
 
 def _success(results: dict[str, Any]) -> Iterable[str]:
-    """Show success rates, or nothing if the run was not evaluated."""
+    """Show success rates if the run was evaluated."""
     if results["tasks"]:
         yield "<h2>Success before and after</h2>"
         yield _image(figures.success(results))
@@ -148,13 +148,12 @@ def _success(results: dict[str, Any]) -> Iterable[str]:
 
 
 def _success_over_steps(rows: figures.Rows) -> Iterable[str]:
-    """Show success over steps, or nothing if it was not measured during training."""
+    """Show success over steps if it was measured during training."""
     if any(name.startswith("success/") for row in rows for name in row):
         yield _image(figures.success_over_steps(rows))
 
 
 def _success_table(results: dict[str, Any]) -> str:
-    """Return a table of success before and after training, with intervals."""
     tasks = results["tasks"].items()
     rows = ((task, *map(success_cell, value.values())) for task, value in tasks)
     return _table(("task", *next(iter(results["tasks"].values()))), rows)
@@ -168,7 +167,7 @@ def success_cell(value: dict[str, Any]) -> str:
 
 
 def _speed(rows: figures.Rows) -> Iterable[str]:
-    """Show a table of throughput and memory, or nothing if neither was logged."""
+    """Show a table of throughput and memory, if logged."""
     summary = speed(rows)
     if summary:
         yield _table(("run statistics", ""), summary.items())
@@ -177,7 +176,7 @@ def _speed(rows: figures.Rows) -> Iterable[str]:
 def speed(rows: figures.Rows) -> dict[str, str]:
     """Summarize throughput and memory as label -> value with unit.
 
-    Values are medians, except for peak memory and the fraction of all time spent waiting for data.
+    Throughput and utilization are medians; "data wait" is a fraction of the whole training time.
     """
     entries = {
         "samples/s": ("speed/samples_per_second", median, "{:,.4g}".format),
@@ -194,12 +193,11 @@ def speed(rows: figures.Rows) -> dict[str, str]:
 
 
 def _memory(gib: float) -> str:
-    """Format memory in GiB, or in MiB below 1 GiB."""
     return f"{gib:.2f} GiB" if gib >= 1 else f"{1024 * gib:.1f} MiB"
 
 
 def _with_wait(rows: figures.Rows) -> Iterable[dict[str, float]]:
-    """Add "waited" to each row: its wait for data as a fraction of the run's total time."""
+    """Add "waited" to rows: the wait for data as a fraction of the whole training time."""
     rate, wait = "speed/samples_per_second", "speed/data_wait"
     total = sum(1 / row[rate] for row in rows if rate in row)
     for row in rows:
@@ -211,7 +209,7 @@ def _has_rank(rows: figures.Rows) -> bool:
 
 
 def _active_rank(results: dict[str, Any], rows: figures.Rows, rank: Any) -> Iterable[str]:
-    """Show active rank in training and in closed loop; show nothing if the method has none."""
+    """Show active rank in training and in closed loop, if the method has one."""
     if not _has_rank(rows):
         return
     yield "<h2>Active rank</h2>"
@@ -242,7 +240,6 @@ def _image(figure: Figure) -> str:
 
 
 def _video(folder: Path, task: str) -> Path:
-    """Return the path of a task's video."""
     return join_inside(folder, f"rollout_{task}.mp4")
 
 

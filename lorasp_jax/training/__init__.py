@@ -2,5 +2,5 @@
 
 import lazy_loader
 
-# `train.py --help` does not need them.
+# Lazy, because `train.py --help` needs none of these modules.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -25,10 +25,8 @@ TRAINING = "training.json"
 def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str]:
     """Return the frozen base, loaded or randomly initialized, and its hash.
 
-    Args:
-        config: configuration of the run.
-        abstract: return only shapes and an empty hash if the base is randomly initialized or
-            remote.
+    With `abstract`, a base that is remote or randomly initialized has only shapes and an empty
+    hash.
 
     Raises:
         ValueError: the backbone or size is unknown, or the checkpoint does not match the config.
@@ -61,7 +59,7 @@ def base_model(config: Config, *, abstract: bool = False) -> tuple[Backbone, str
 
 
 def with_config(model: Backbone, **changes: Any) -> Backbone:
-    """Return the model with changed config fields, on which its parameters must not depend."""
+    """Return the model with changed config fields, which must not affect its parameters."""
     model_config = dataclasses.replace(model.config, **changes)
     if model_config == model.config:
         return model

@@ -26,14 +26,14 @@ from lorasp_jax.training.distributed import processes
 from lorasp_jax.training.step import TrainState
 
 COMMIT_MARKER = "commit_success.txt"
-"""File that Orbax writes into the folder of a checkpoint once the checkpoint is complete."""
+"""File that Orbax writes into a checkpoint's folder once the checkpoint is complete."""
 
 
 class Checkpoints:
     """Asynchronous checkpoints of one run; the newest two are kept."""
 
     def __init__(self, folder: Path, base_hash: str, console: Console) -> None:
-        """Open `folder`/checkpoints for a run on the base with hash `base_hash`."""
+        """Open `folder`/checkpoints for a run on the base with this hash."""
         orbax_folders.suppress_repeated_errors()
         atomic = ocp.options.AtomicityOptions(mode=ocp.options.AtomicityMode.COMMIT_FILE)
         options = ocp.CheckpointManagerOptions(max_to_keep=2, atomicity_options=atomic)
@@ -63,9 +63,7 @@ class Checkpoints:
         """Restore the newest intact checkpoint; return None if there are no checkpoints.
 
         Newer corrupt checkpoints are renamed and incomplete ones removed, with a warning for each.
-
-        Args:
-            like: state with the structure, dtypes and shardings to restore.
+        `like` has the structure, dtypes and shardings of the result.
 
         Raises:
             ValueError: all checkpoints are corrupt, or one belongs to a different base.
@@ -178,7 +176,6 @@ class Checkpoints:
             ) from error
 
     def _warn(self, text: str) -> None:
-        """Print a warning."""
         self._console.print(f"warning: {text}", style="bold yellow", markup=False, soft_wrap=True)
 
 
@@ -187,7 +184,6 @@ class _CorruptError(Exception):
 
 
 def _suffixes() -> Iterator[str]:
-    """Yield "", ".1", ".2", ..."""
     return itertools.chain([""], (f".{number}" for number in itertools.count(1)))
 
 

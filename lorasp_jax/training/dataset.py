@@ -20,12 +20,9 @@ _DT_TOLERANCE = 0.01  # relative; 1/30 s has no exact decimal representation
 
 
 def open_dataset(config: Config, model: BackboneConfig, folder: Path) -> Source:
-    """Open the dataset at `config.data.source`, or the run's cache of it.
+    """Open the dataset at `config.data.source`, or its cache in `folder`.
 
-    Args:
-        config: configuration of the run.
-        model: the backbone's config; LeRobot images are resized to the image size in it.
-        folder: folder of the run.
+    LeRobot images are resized to the model's image size.
 
     Raises:
         ValueError: the source is not a dataset, is corrupt, or is incompatible with the run.
@@ -65,7 +62,7 @@ def _check_state_and_actions(first: Episodes, model: BackboneConfig, path: objec
 
 
 def as_cache(source: Source, folder: Path, progress: Progress) -> Cache:
-    """Return the dataset as a cache, which is created in the run's folder if necessary."""
+    """Return the dataset as a cache, created in the run's folder if necessary."""
     if isinstance(source, Cache):
         return source
     if not (folder / _CACHE).exists():
@@ -74,7 +71,7 @@ def as_cache(source: Source, folder: Path, progress: Progress) -> Cache:
 
 
 def outline(dataset: Cache) -> dict[str, Episodes]:
-    """Return the episodes of each task, with one image per camera standing in for all."""
+    """Return the episodes of each task; one image per camera stands in for all others."""
     episodes = [dataset.episode(index, ()) for index in range(len(dataset))]
     groups: dict[str, Episodes] = {}
     for task in dataset.metadata["tasks"]:

@@ -52,7 +52,7 @@ def write(run: Run) -> None:
 
 
 def _metadata(run: Run) -> dict[str, Any]:
-    """Return the training data's properties and everything the policy needs besides weights."""
+    """Describe the training data and everything that the policy needs besides weights."""
     config, first = run.config, next(iter(run.episodes.values()))
     processor = run.policy.processor
     return {
@@ -120,7 +120,6 @@ def load_policy(
 
 
 def _processor(policy: Mapping[str, Any], config: Any, words: str) -> Processor:
-    """Create the processor of an exported policy."""
     joints = policy["num_joints"]
     try:
         loaded = tokenizer.load_tokenizer(words or hub.resolve_portable(policy["tokenizer"]))
@@ -143,6 +142,6 @@ def _processor(policy: Mapping[str, Any], config: Any, words: str) -> Processor:
 
 
 def _prompts_digest(prompts: PromptTable) -> str:
-    """Return a digest of the prompts' tokens, to detect a change of the tokenizer."""
+    """Return a digest of the prompts' tokens, which reveals a change of the tokenizer."""
     leaves = jax.tree_util.tree_leaves_with_path(prompts)
     return digest({jax.tree_util.keystr(path): jnp.asarray(leaf) for path, leaf in leaves})

@@ -1,14 +1,15 @@
 """Skip training steps whose loss or gradient is non-finite or spikes.
 
-A skipped step leaves parameters, their average and the optimizer state unchanged; the step count
-still advances, and with it the data position and the random streams. Whether to accept a step is
-decided from its loss and gradient norm alone, before the updates are computed. XLA can then
-fuse `select`, leaf by leaf, into the in-place update of the donated state; a decision that depended
-on the updates would keep all of them in memory together with the whole old state.
+A skipped step leaves parameters, their average and the optimizer state unchanged. The step count
+still advances, and with it the data position and the random streams.
 
-Checking loss and gradient suffices: under AdamW, a gradient clipped to a finite norm changes each
-parameter by at most a few times the learning rate. A non-finite update therefore means an absurdly
-high learning rate; the loop then stops before saving.
+The decision depends only on loss and gradient norm, so XLA can fuse `select` into the in-place
+update of the donated state. If it depended on the updates, all updates and the whole old state
+would have to be in memory at once.
+
+Loss and gradient norm suffice: under AdamW, a gradient clipped to a finite norm changes each
+parameter by at most a few times the learning rate. A non-finite update means an absurdly high
+learning rate; the loop then stops before saving.
 """
 
 from collections.abc import Mapping
@@ -52,12 +53,8 @@ def check_step(
 ) -> tuple[jax.Array, Guard]:
     """Return whether to accept a step, `[]` bool, and the updated statistics.
 
-    Args:
-        guard: statistics before the step.
-        loss: `[]` loss of the step.
-        grad_norm: `[]` global gradient norm of the step.
-        spike: skip the step if loss or gradient norm exceeds this multiple of its running mean; 0:
-            skip only non-finite steps.
+    A step is rejected if its loss `[]` or global gradient norm `[]` is non-finite or exceeds
+    `spike` times its running mean. With `spike` 0, only non-finite steps are rejected.
     """
     accept = jnp.isfinite(loss) & jnp.isfinite(grad_norm)
     if spike:
@@ -75,19 +72,15 @@ def check_step(
 
 
 def select(accept: jax.Array, after: Any, before: Any) -> Any:
-    """Select `after` if the step is accepted, else `before`, leaf by leaf."""
+    """Return `after` if the step is accepted, else `before`."""
     return jax.tree.map(lambda new, old: jnp.where(accept, new, old), after, before)
 
 
 def summarize(steps: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Summarize the metrics of several steps for the log.
+    """Return the means `[...]` of metrics `[steps, ...]` over the accepted steps, if any.
 
-    Args:
-        steps: metrics by name, `[steps, ...]`, including `in_a_row` of `Guard` after each step.
-
-    Returns:
-        Means `[...]` over the accepted steps, if there are any, and the number of skipped steps as
-        "skipped".
+    The number of skipped steps is added as "skipped". `steps` must include `in_a_row` of `Guard`
+    after each step.
     """
     accepted = steps["in_a_row"] == 0
     names = [name for name in steps if name != "in_a_row"] if accepted.any() else []

@@ -12,8 +12,8 @@ import tyro
 from tyro.constructors import StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
 REGISTRY = tyro.constructors.ConstructorRegistry()
-"""Registry for `tyro.cli` calls that pass a default instance. A dataclass field whose default is
-None is left to tyro."""
+"""Pass this to `tyro.cli` together with a default instance. Where the default of a dataclass is
+None, tyro's own rules apply."""
 
 
 @REGISTRY.struct_rule

@@ -21,7 +21,7 @@ class Stop:
 def deferred() -> Iterator[Stop]:
     """In this block the first SIGINT or SIGTERM sets a flag; the second raises KeyboardInterrupt.
 
-    The caller checks the flag whenever the training state is consistent and can be saved.
+    The caller checks the flag where the training state can be saved.
     """
     stop = Stop()
 

@@ -40,7 +40,7 @@ def make_optimizer(
 
 
 def auxiliary_weights(config: AuxiliaryConfig, steps: int) -> dict[str, optax.Schedule]:
-    """Return a schedule for the weight of each auxiliary loss: linear warm-up from zero."""
+    """Return the weight schedule of each auxiliary loss: linear warm-up from zero."""
     warmup_steps = max(round(config.warmup * steps), 1)
     return {
         name: optax.linear_schedule(0.0, weight, warmup_steps)

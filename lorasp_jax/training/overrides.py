@@ -32,10 +32,9 @@ class Command:
     """A parsed command line.
 
     Attributes:
-        config: configuration of the experiment.
         resume: resume the run of this name; "auto": only if it exists.
         dry_run: stop before anything is collected, trained or written.
-        wandb: Weights & Biases project, or None.
+        wandb: Weights & Biases project.
     """
 
     config: Config
@@ -45,11 +44,7 @@ class Command:
 
 
 def parse(arguments: Sequence[str], program: str = "python train.py") -> Command:
-    """Parse command-line arguments.
-
-    Args:
-        arguments: the command line.
-        program: program name in the help text.
+    """Parse command-line arguments; `program` is the program name in the help text.
 
     Raises:
         ValueError: an unknown config, scale, method, field, task or robot, or an invalid value.
@@ -102,9 +97,7 @@ def completion_parser(program: str) -> argparse.ArgumentParser:
 def _option_parser(program: str = "", method: str = "") -> argparse.ArgumentParser:
     """Return a parser for the options that are not config fields.
 
-    Args:
-        program: program name in the help text.
-        method: the experiment's method, for the help text.
+    `program` and `method`, the experiment's method, appear in the help text.
     """
     parser = argparse.ArgumentParser(
         prog=program,
@@ -263,7 +256,7 @@ def _check_names(arguments: Sequence[str], config: Config) -> None:
 def _check_simulated(config: Config) -> None:
     """Raise ValueError for an unknown task or robot, before the simulator is imported.
 
-    They are not checked for a dataset, which defines its own tasks and robot.
+    With a dataset, which defines its own tasks and robot, nothing is checked.
     """
     if config.data.source:
         return
@@ -301,7 +294,7 @@ def _fields(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 def _concrete(config: Config) -> type[Config]:
     """Return a `Config` class whose `peft` has the chosen method's type, to expose its fields.
 
-    `scale` is not an option here, because it only selects defaults.
+    `scale` is hidden, because it only selects defaults.
     """
     return dataclasses.make_dataclass(
         "Config",

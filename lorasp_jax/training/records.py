@@ -1,7 +1,6 @@
 """Schemas of a run's JSON files.
 
-The digest in a file shows that it is intact, but not that this version of the program wrote it;
-the schema does.
+A file's digest shows that the file is intact. Its schema shows that this version can use it.
 """
 
 from typing import Any, TypeAlias

@@ -23,7 +23,6 @@ class Run:
     """A run, as passed to callbacks.
 
     Attributes:
-        config: configuration of the run.
         folder: folder for all files of the run.
         console: console for status messages.
         base_hash: hash of the frozen base.
@@ -32,7 +31,8 @@ class Run:
         streams: whether batches are read from disk because the dataset does not fit on the device.
         devices: devices to train on; None: all.
         simulated: whether the tasks can be evaluated in simulation.
-        policy: the current policy, valid in callbacks and after training; steps donate its buffers.
+        policy: the current policy; read it in callbacks or after training, since each step donates
+            its buffers.
         started: `time.perf_counter()` when this process started.
         seconds: time per phase, and "total" [s], including the earlier processes of a resumed run.
     """
@@ -64,7 +64,7 @@ class Run:
     def timed(self, phase: str) -> Iterator[None]:
         """Add the time spent in this block to `seconds[phase]`, even if it is interrupted.
 
-        The time of a nested phase belongs to that phase alone, so it is not counted twice.
+        The time of a nested phase counts only for the nested phase.
         """
         others = lambda: sum(self.seconds.values()) - self.seconds["total"]  # noqa: E731
         start, before = time.perf_counter(), others()

@@ -8,10 +8,9 @@ from lorasp_jax.config import SCALES, Config
 
 
 def differences(config_at: Callable[[str], Config]) -> str:
-    """Return a table of the fields that differ between scales, or an empty string if none do.
+    """Return a table of the fields that differ between scales, or "" if none do.
 
-    Args:
-        config_at: returns the experiment's config at a scale.
+    `config_at` returns the experiment's config at a scale.
     """
     configs = [dict(_values(config_at(scale))) for scale in SCALES]
     names = dict.fromkeys(name for config in configs for name in config)

@@ -47,7 +47,7 @@ class TrainState:
 def init_state(
     adapters: Any, optimizer: optax.GradientTransformation, *, ema: bool = False
 ) -> TrainState:
-    """Return the initial state, with copies of the adapters because steps donate their buffers."""
+    """Return the initial state. It copies the adapters, because steps donate their buffers."""
     adapters = jax.tree.map(jnp.copy, adapters)
     average = jax.tree.map(jnp.copy, adapters) if ema else None
     step = jnp.zeros((), jnp.int32)
@@ -57,7 +57,7 @@ def init_state(
 def active_ranks(aux: dict[str, dict[str, Aux]]) -> Metrics:
     """Return active ranks averaged over valid tokens.
 
-    Each tower has a scalar and, per kind of linear layer, an array `[L]` over its L layers.
+    Each tower gets a scalar and, per kind of linear layer, an array `[L]` over its layers.
     """
     metrics: Metrics = {}
     for tower, linears in aux.items():
@@ -73,7 +73,7 @@ def active_ranks(aux: dict[str, dict[str, Aux]]) -> Metrics:
 
 
 def _layer_ranks(rank: jax.Array, mask: jax.Array | None) -> jax.Array:
-    """Average ranks `[..., B, T]` over valid tokens to `[L]`; L is 1 without leading axes."""
+    """Average ranks `[..., B, T]` over valid tokens, giving `[L]`; L is 1 without leading axes."""
     mask = jnp.ones((), bool) if mask is None else mask
     tokens = (x.reshape(-1, *rank.shape[-2:]) for x in (rank, jnp.broadcast_to(mask, rank.shape)))
     return jax.vmap(masked_mean)(*tokens)
@@ -93,9 +93,10 @@ def loss_fn(
 ) -> tuple[jax.Array, Metrics]:
     """Return the flow-matching loss plus weighted auxiliary losses (arXiv 2603.07404, eq. 14).
 
-    The task loss is the mean over the elements that `batch.action_mask` marks as valid. `valid`
-    overrides their number; `noise` and `flow_time` override the sampled values. `key` drives this
-    sampling and the adapters' dropout. The metrics include the unweighted auxiliary losses.
+    The task loss is the mean over the elements that `batch.action_mask` marks as valid; `valid`
+    overrides their number. `key` seeds the adapters' dropout and the sampling of noise and flow
+    time; `noise` and `flow_time` override the samples. The metrics include the unweighted
+    auxiliary losses.
     """
     model = adaptation.with_dropout(nnx.merge(graphdef, adapters, frozen), key)
     mask = batch.action_mask
@@ -125,8 +126,8 @@ def gradients(
 ) -> tuple[Any, Metrics]:
     """Return the gradient and the metrics of `loss_fn`, accumulated over `parts` micro-batches.
 
-    The task loss is that of the whole batch, up to rounding; auxiliary losses and active ranks are
-    averaged over the micro-batches.
+    Up to rounding, the task loss is that of the whole batch. Auxiliary losses and active ranks are
+    means over the micro-batches.
     """
     gradient = jax.grad(loss_fn, has_aux=True)
     if parts == 1:
@@ -163,7 +164,7 @@ def train_step(
 ) -> tuple[TrainState, Metrics]:
     """Take one step on the global batch, split into `parts` micro-batches; do not reuse `key`.
 
-    The moving average, if one is kept, has decay factor `ema`. A step that `guard.check_step`
+    `ema` is the decay factor of the moving average, if one is kept. A step that `guard.check_step`
     rejects changes only the step count and the guard.
     """
     now = {name: jnp.asarray(schedule(state.step)) for name, schedule in weights.items()}

@@ -10,14 +10,14 @@ from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import read_json, to_json, write_json
 
 RECORD = "wandb.json"
-"""File in a run's folder with the id of the W&B run, which a resumed run continues."""
+"""File in a run's folder with the id of the W&B run, to continue that one on resume."""
 
 
 class WeightsAndBiases(Callback):
     """Logs config, metrics, success rates and videos; as a context manager, reports the exit code.
 
-    W&B keeps its own files in the parent of the run's folder. Its environment variables, such as
-    WANDB_MODE=offline, configure it.
+    W&B keeps its own files in the parent of the run's folder and reads its environment variables,
+    such as WANDB_MODE=offline.
     """
 
     def __init__(self, project: str, config: Config, folder: Path) -> None:
@@ -47,7 +47,6 @@ class WeightsAndBiases(Callback):
         self._run.define_metric("*", step_metric="step")
 
     def __enter__(self) -> Self:
-        """Return self."""
         return self
 
     def __exit__(

@@ -33,13 +33,9 @@ from lorasp_jax.training.step import init_state
 def dry_run(
     config: Config, folder: Path, console: Console, load_base: setup.LoadBase = base_model
 ) -> None:
-    """Build the run, compile its training step and print the cost, without writing anything.
+    """Build the run, compile its training step and print the cost, without writing to `folder`.
 
-    Args:
-        config: configuration of the run.
-        folder: folder of the run; a dataset cache in it is used if present.
-        console: console to print on.
-        load_base: loads the frozen base and its hash.
+    A dataset cache in `folder` is used if present.
 
     Raises:
         ValueError: see `setup.build`.
@@ -66,10 +62,10 @@ def dry_run(
 
 
 def _abstract_data(run: Run, built: setup.RunSetup) -> Any:
-    """Return the shapes of a step's data, `Steps` or `Raw`; also set the policy of the run.
+    """Return the shapes of a step's data, `Steps` or `Raw`, and set `run.policy`.
 
-    Statistics come from the dataset's first episode. Without a dataset they come from a blank step,
-    and every demonstration is assumed to last as long as its task allows.
+    Statistics come from the dataset's first episode. Without a dataset, they come from a blank
+    step, and all demonstrations are assumed to have the maximum length.
     """
     config, source = run.config, built.source
     first = source.episode(0) if source else _blank_episode(config, built)
@@ -156,12 +152,10 @@ def _parameter_table(model: nnx.Module) -> Table:
 
 
 def _memory_table(built: setup.RunSetup, data: float, analysis: Any) -> Table:
-    """Tabulate estimated memory and the compiled program's memory, per device.
+    """Tabulate the memory per device, as estimated and as compiled.
 
-    Args:
-        built: setup of the run, with the estimate.
-        data: size per device of the demonstrations or of a streamed batch [bytes].
-        analysis: `memory_analysis` of the compiled step; None if the backend does not provide it.
+    `data` is the size per device of the demonstrations or of a streamed batch [bytes]. `analysis`
+    is the `memory_analysis` of the compiled step, or None if the backend does not provide it.
     """
     estimate = {"demonstrations": data, **dataclasses.asdict(built.memory)}
     resident = ("base", "adapters", "optimizer", "demonstrations")

@@ -1,8 +1,8 @@
 """Count the FLOPs (floating-point operations) of the matrix products in a function's jaxpr.
 
 Model FLOPs utilization is this count per second divided by the device's peak (Chowdhery et al.,
-arXiv 2204.02311, appendix B). Trace the function without rematerialization: recomputation in the
-backward pass does not count as work. Elementwise operations are not counted.
+arXiv 2204.02311, appendix B). Elementwise operations are not counted. Trace the function without
+rematerialization, because recomputation does not count as work.
 """
 
 import math
@@ -19,15 +19,14 @@ without sparsity)."""
 
 _CUDNN = {"dot_product_attention_fwd_wrapper": 4, "dot_product_attention_bwd_wrapper": 8}
 """FLOPs of cuDNN attention in units of batch size x heads x queries x keys x head size. The forward
-pass has two matrix products, the backward pass four (and a fifth, a recomputation, not counted)."""
+pass has two matrix products, the backward pass four; a fifth is recomputation and not counted."""
 
 
 def count(function: Callable, *arguments: Any) -> float:
-    """Count the FLOPs of one call, two per multiply-add, except for operations with unused results.
+    """Count the FLOPs of one call, two per multiply-add.
 
-    Args:
-        function: a function that `jax.jit` accepts.
-        arguments: arrays or `jax.ShapeDtypeStruct`s; only shapes and dtypes matter.
+    Operations with unused results are not counted. `function` must work with `jax.jit`;
+    `arguments` are arrays or `jax.ShapeDtypeStruct`s.
     """
     jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
     return _jaxpr_flops(_compat.eliminate_dead_code(jaxpr, [True] * len(jaxpr.outvars))[0])

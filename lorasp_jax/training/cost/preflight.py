@@ -1,8 +1,7 @@
 """Estimate the device memory of a training step from shapes alone, before compilation.
 
-Base, adapters, gradients and optimizer state are counted exactly. Activations are the batch
-and the residuals that JAX saves for the backward pass, an upper bound since XLA may save fewer.
-`HEADROOM` covers the rest.
+Base, adapters, gradients and optimizer state are counted exactly. Activations are the batch and
+the residuals that JAX saves for the backward pass; XLA may save fewer. `HEADROOM` covers the rest.
 """
 
 import dataclasses
@@ -28,13 +27,13 @@ from lorasp_jax.training.optim import auxiliary_weights, make_optimizer
 from lorasp_jax.training.step import Metrics, init_state, loss_fn
 
 HEADROOM = 1.1
-"""Factor on the total that covers uncounted memory: temporaries, executable, fragmentation."""
+"""Factor on the total to cover temporaries, the executable and fragmentation."""
 REMATS: tuple[Remat, ...] = ("none", "products", "full")
 GIB, MIB = 2**30, 2**20
 
 
 def byte_unit(size: float) -> tuple[int, str]:
-    """Return the unit (bytes, name) in which to print `size` bytes: GiB, or MiB below 1 GiB."""
+    """Return the unit (bytes, name) for printing `size` bytes: GiB, or MiB below 1 GiB."""
     return (GIB, "GiB") if size >= GIB else (MIB, "MiB")
 
 
@@ -54,7 +53,6 @@ class Memory:
         return HEADROOM * sum(dataclasses.astuple(self))
 
     def __str__(self) -> str:
-        """List all parts and the peak in GiB or MiB."""
         unit, name = byte_unit(self.peak)
         parts = [f"{part} {value / unit:.2f}" for part, value in dataclasses.asdict(self).items()]
         return f"{', '.join(parts)}, peak {self.peak / unit:.2f} {name}"
@@ -82,7 +80,7 @@ def choose_remat(
     """Return the least rematerialization that fits in `available` device bytes, and its estimate.
 
     Raises:
-        ValueError: no allowed setting fits; the message suggests changes.
+        ValueError: none fits; the message suggests changes.
     """
     remat = config.model.remat
     choices = REMATS if remat == "auto" else (remat,)
@@ -112,12 +110,7 @@ def _out_of_memory_message(config: Config, memory: Memory, remat: Remat, availab
 
 
 def estimate_memory(config: Config, backbone: BackboneConfig) -> Memory:
-    """Estimate the memory of one training step, sharded over `config.fsdp` devices.
-
-    Args:
-        config: configuration of the run.
-        backbone: config of the backbone.
-    """
+    """Estimate the memory of one training step, sharded over `config.fsdp` devices."""
     local_batch = max(1, config.optim.batch_size // jax.device_count())
     step = abstract_step(config, backbone, max(1, local_batch // config.optim.accumulate))
     optimizer = make_optimizer(config.optim, {config.peft.as_saved})

@@ -1,7 +1,6 @@
 """Throughput, data wait and memory use per log interval.
 
-Nothing here blocks on the device: reading the metrics of an interval has already waited
-for the device.
+Nothing here waits for the device; the loop has already done so by reading the interval's metrics.
 """
 
 import contextlib
@@ -21,9 +20,8 @@ class Speed:
     def __init__(self, batch_size: int, step_flops: float | None) -> None:
         """Create a meter that has not started.
 
-        Args:
-            batch_size: windows per step, over all devices.
-            step_flops: FLOPs per step, over all devices; None: not counted.
+        `batch_size` and `step_flops` are windows and FLOPs per step over all devices. None means
+        that FLOPs are not counted.
         """
         self._batch_size, self._step_flops = batch_size, step_flops
         self._start: float | None = None
@@ -38,11 +36,8 @@ class Speed:
     def waiting(self, results: Any) -> Iterator[None]:
         """Measure the time in this block, in which the host waits for the next batch.
 
-        The time counts only if the device is idle at the end of the block, having finished all
-        steps dispatched so far.
-
-        Args:
-            results: pytree of arrays computed by the last dispatched step.
+        The time counts only if the device is idle at the end of the block: `results`, arrays from
+        the last dispatched step, must be ready by then.
         """
         start = time.perf_counter()
         yield
@@ -52,11 +47,11 @@ class Speed:
     def end(self, steps: int) -> dict[str, float]:
         """Stop the clock after `steps` steps and return the metrics of the interval.
 
-        Returns:
-            `speed/samples_per_second`; `speed/flop_utilisation`, if FLOPs are counted and the
-            device's peak is known; `speed/data_wait`, the fraction of the time in which the
-            device waited for data, if data is streamed or replaced; `memory/in_use_gib` and
-            `memory/peak_gib` of this process's first device, if it reports them.
+        - `speed/samples_per_second`: windows per second over all devices.
+        - `speed/flop_utilisation`: fraction of the peak FLOP/s, if both numbers are known.
+        - `speed/data_wait`: fraction of the time in which the device waited for data, if data was
+          streamed or replaced.
+        - `memory/in_use_gib`, `memory/peak_gib`: see `memory`.
         """
         assert self._start is not None
         seconds = time.perf_counter() - self._start
@@ -71,7 +66,7 @@ class Speed:
 
 
 def memory() -> dict[str, float]:
-    """Return current and peak memory use [GiB]; {} if the device does not report them."""
+    """Return current and peak memory use of the first local device [GiB], or {} if unknown."""
     stats = jax.local_devices()[0].memory_stats() or {}
     names = {"memory/in_use_gib": "bytes_in_use", "memory/peak_gib": "peak_bytes_in_use"}
     return {name: stats[key] / GIB for name, key in names.items() if key in stats}
