@@ -2,11 +2,12 @@
 
     y = x W + Σ_i w_i Δ_i(x)
 
-The weights w are an array, not static structure, so selecting other adapters causes no
-recompilation. For a method that is not additive (DoRA), Δ_i is its output minus x W. All LoRAs are
-padded to one rank and share one bank. The down-projections of all additive adapters are
-concatenated into one matmul, and so are their up-projections. For adapters other than LoRA,
-everything else is computed one by one. Adapters with weight 0 are computed too.
+The weights w are an array, so choosing other adapters does not recompile. For a method that is not
+additive (DoRA), Δ_i is its output minus x W.
+
+LoRAs share one bank, padded to a common rank. One matmul computes the down-projections of all
+additive adapters, and another their up-projections. Everything else runs separately for each
+adapter that is not a LoRA. Adapters with weight 0 are computed too.
 """
 
 import dataclasses
@@ -30,20 +31,19 @@ class AdapterSetParam(nnx.Param[Any]):
 
 
 class NamedAdapters(nnx.Module):
-    """The adapter of a layer in a combined model: parameters of an `AdapterSet`.
+    """A layer's `adapter` in a combined model: the parameters of an `AdapterSet`.
 
     Attributes:
-      choice: `AdapterChoice` with the weights.
-      params: `AdapterSetParam` with all other parameters. Both have the leading axes of a stack.
+      choice: the weights; has the leading axes of a stack.
+      params: all other parameters; have the leading axes of a stack.
     """
 
     def __init__(self, params: Params, choice: jax.Array) -> None:
-        """Wrap the arrays in variables."""
         self.choice: AdapterChoice = AdapterChoice(choice)
         self.params: AdapterSetParam = AdapterSetParam(params)
 
     def get_value(self) -> Params:
-        """The parameters of the `AdapterSet`."""
+        """All parameters of the `AdapterSet`."""
         return {"choice": self.choice.get_value(), **self.params.get_value()}
 
 
@@ -52,17 +52,17 @@ class AdapterSet(Method):
     """Weighted sum of A adapters.
 
     Parameters:
-      choice: w, f32 [A], or [B, A] with a row per example of a batch. In the latter case, inputs
-        have B rows, or k B rows with k contiguous rows per example.
+      choice: w, f32 [A], or [B, A] with a row per example. Inputs then have k B rows, with k
+        contiguous rows per example.
       bank: K LoRAs padded to one rank R: lora_a [I, K, R], lora_b [K, R, O], scale f32 [K] and rank
-        int32 [K], which is 0 for an adapter that the layer does not have.
+        int32 [K]. The rank is 0 for an adapter that the layer does not have.
       others: parameters of the other adapters, by name.
     """
 
     names: tuple[str, ...]
-    """Names of all A adapters."""
+    """All A names."""
     methods: tuple[Method | None, ...]
-    """Method of each adapter; None for an adapter in the bank."""
+    """Method of each adapter; None if it is in the bank."""
 
     @property
     def bank_names(self) -> list[str]:
@@ -76,7 +76,7 @@ class AdapterSet(Method):
 
     @property
     def down_in_fp32(self) -> bool:
-        """Whether any of the adapters needs its down-projection in fp32."""
+        """Whether any adapter needs its down-projection in fp32."""
         return any(method.down_in_fp32 for method in self.others.values())
 
     def down(self, params: Params) -> jax.Array:
@@ -89,7 +89,7 @@ class AdapterSet(Method):
     def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
-        """Multiply each adapter's z by its weight. There are no losses: sets are not trained."""
+        """Multiply each adapter's z by its weight; no losses, since sets are not trained."""
         weights, bank = self._weights(params["choice"], rows), params["bank"]
         bank_weights = _stack([weights[name] for name in self.bank_names])
         columns = jnp.repeat(bank_weights * bank["scale"], bank["lora_a"].shape[-1], axis=-1)
@@ -169,7 +169,7 @@ class AdapterSet(Method):
         return merged.astype(kernel.dtype)
 
     def _weights(self, choice: jax.Array, x: jax.Array) -> dict[str, jax.Array]:
-        """Weights by name, each a scalar, or [rows, 1, ...] to broadcast over the tokens of x."""
+        """Weights by name: scalars, or [rows, 1, ...] to broadcast over the tokens of x."""
         if choice.ndim > 1:
             examples, rows = len(choice), x.shape[0] if x.ndim > 1 else 1
             if rows % examples:
@@ -182,7 +182,7 @@ class AdapterSet(Method):
 
 
 def empty_bank(size: int, rank: int, shape: tuple[int, ...]) -> Params:
-    """Create a bank with K empty slots for LoRAs up to a rank, for kernels [..., I, O]."""
+    """Create a bank with `size` empty slots for LoRAs up to `rank`, for kernels [..., I, O]."""
     *leading, d_in, d_out = shape
     return {
         "lora_a": jnp.zeros((*leading, d_in, size, rank)),
@@ -214,7 +214,7 @@ def set_slot(bank: Params, slot: int, method: LoRA | None, params: Params) -> Pa
 
 
 def get_slot(bank: Params, slot: int) -> tuple[LoRA | None, Params]:
-    """The LoRA in a slot and its parameters, or (None, None) if empty; inverse of `set_slot`."""
+    """The LoRA in a slot and its parameters, or (None, None) if the slot is empty."""
     rank = int(bank["rank"][..., slot].max())
     if not rank:
         return None, None

@@ -1,9 +1,4 @@
-"""Fuse named LoRAs into one, and unmerge adapters from merged kernels.
-
-`fuse` replaces several LoRAs by a single LoRA that computes their weighted sum. The result is exact
-if its rank is the sum of their ranks. At a smaller rank it is the best approximation, and `fuse`
-also returns the error. `unmerge` inverts `adaptation.merge`.
-"""
+"""Fuse named LoRAs into one, and unmerge adapters from merged kernels."""
 
 import re
 from collections.abc import Mapping
@@ -27,7 +22,7 @@ class FusedAdapters(NamedTuple):
     """A model with one LoRA per layer, and the approximation errors.
 
     Attributes:
-      model: adapted with plain LoRA of scale 1; can be trained, saved and merged.
+      model: adapted with plain LoRA of scale 1.
       errors: relative error ‖ΔW − ΔW'‖ / ‖ΔW‖ by path, where ΔW is the weighted sum and ΔW' the
         delta of the fused LoRA. The Frobenius norm is taken over all layers of a stack. For
         isotropic inputs, this is also the relative RMS error of x ΔW'.
@@ -44,9 +39,9 @@ def fuse(
 
     Args:
       model: from `combine`; not modified.
-      weights: weight of each LoRA in the sum, by name; weights may be negative.
-      rank: maximum rank of the fused LoRA in each layer; a truncated SVD reduces larger ranks. None
-        keeps the sum of the ranks, which makes the result exact.
+      weights: weight of each LoRA by name; may be negative.
+      rank: maximum rank of the fused LoRA in each layer. If the LoRAs' ranks add up to more, the
+        result is the best approximation of that rank. None keeps the sum, so the result is exact.
 
     Raises:
       ValueError: as for `choose`, or weights is empty, rank is below 1, or a named adapter is not
@@ -77,19 +72,18 @@ def fuse(
 def unmerge(merged: Model, adapted: nnx.Module) -> Model:
     """Invert `merge`: restore the adapted model from the merged one and the adapters.
 
-    The delta is subtracted in fp32 and the result rounded to the kernel's dtype, so each entry of W
-    is restored to within eps/2 (|W + ΔW| + |W|), where eps is 1.2e-7 in fp32 and 7.8e-3 in bf16.
+    The delta is subtracted in fp32 and the result rounded to the kernel's dtype. Each entry of W is
+    restored to within eps/2 (|W + ΔW| + |W|), where eps is 1.2e-7 in fp32 and 7.8e-3 in bf16.
     Fully fine-tuned weights, such as biases, are taken from the adapted model and are trainable.
 
     Args:
       merged: from `merge`; not modified.
-      adapted: model with the adapters; its base is not used. Saved adapters that do not split
-        kernels can be loaded for this with `load_adapters(folder, merged, any_base=True)`.
+      adapted: model with the adapters; its base is not used. For saved adapters that do not split
+        kernels, pass `load_adapters(folder, merged, any_base=True)`.
 
     Raises:
-      ValueError: the merged model has adapters, lacks a layer or has one of a different class, or
-        merging an adapter did more than add a delta that is independent of the kernel. For example,
-        DoRA also rescales the kernel, which cannot be undone.
+      ValueError: the merged model has adapters, lacks a layer or has one of a different class, the
+        adapted model is from `combine`, or a method cannot be merged or is not additive (DoRA).
     """
     validate.with_values(merged)
     if named.adapter_sets(validate.with_values(adapted)):
@@ -139,9 +133,9 @@ def _unmerged_layer(layer: nnx.Module, adapted: AdaptedLayer) -> AdaptedLayer:
 def _fused_lora(
     factors: list[tuple[jax.Array, jax.Array]], rank: int | None
 ) -> tuple[LoRA, Params, float]:
-    """LoRA of scale 1 that computes Σ A_i B_i, its parameters, and its relative error.
+    """LoRA of scale 1 that computes Σ A_i B_i of the factors (A_i, B_i), truncated to `rank`.
 
-    It is an approximation if the ranks of the factors (A_i, B_i) add up to more than `rank`.
+    Returns its method, parameters and relative error.
     """
     a = jnp.concatenate([a for a, _ in factors], axis=-1)
     b = jnp.concatenate([b for _, b in factors], axis=-2)
@@ -156,7 +150,7 @@ def truncated(a: jax.Array, b: jax.Array, rank: int) -> tuple[jax.Array, jax.Arr
     """Factors A' and B' of the best approximation of A B at the given rank, and its relative error.
 
     A is [..., I, R] and B is [..., R, O]. With the QR decompositions A = Q_a R_a and Bᵀ = Q_b R_b,
-    A B = Q_a (R_a R_bᵀ) Q_bᵀ, so an SVD of a matrix no larger than R x R suffices. A' and B' each
+    A B = Q_a (R_a R_bᵀ) Q_bᵀ. So an SVD of R_a R_bᵀ, no larger than R x R, suffices. A' and B' each
     contain the square roots of the singular values, so that ‖A'‖ = ‖B'‖. The relative error is the
     norm of the discarded singular values over the norm of all of them.
     """

@@ -6,11 +6,10 @@
     model = choose(model, ["pour", "press", None, "pour"])        # one per example of a batch
     model = choose(model, None)                                   # the base
 
-The choice is an array, not static structure, so a jitted function that takes the model as an
-argument does not recompile when the choice changes. The one exception is the first change between
-a shared and a per-example choice. Use `extract(model, "pour")` to get one adapter, for example for
-`save_adapters`, and `swap(model, "pour", other)` to replace it. For the math, see
-`lorasp_jax.adapters.combine.adapter_set`.
+The choice is an array, so a new choice does not recompile a jitted function that takes the model as
+an argument. The only exception is the first change between a shared and a per-example choice.
+`extract(model, "pour")` gets one adapter, for example for `save_adapters`, and
+`swap(model, "pour", other)` replaces it. For the math, see `combine.adapter_set`.
 """
 
 import math
@@ -46,17 +45,15 @@ AdaptedLayers: TypeAlias = dict[str, AdaptedLayer]
 
 
 def combine(models: Mapping[str, Model], *, rank: int | None = None) -> Model:
-    """Combine the adapters of several models in one model; the first one is active initially.
+    """Combine the adapters of several models in one model; the first adapter is active initially.
 
     The models may differ in the methods, ranks and scales of their adapters, and in which layers
-    are adapted. All layer classes that `adapt` supports are allowed. The result has no trainable
-    parameters.
+    are adapted. The result has no trainable parameters.
 
     Args:
-      models: models by name, adapted from the same base; not modified. The result shares their
-        base. A model without adapters reserves an empty slot for `swap`.
-      rank: LoRA rank to reserve in each layer. None reserves the largest rank that the models have
-        there.
+      models: models by name, adapted from the same base; not modified. The result shares the base.
+        A model without adapters reserves an empty slot for `swap`.
+      rank: LoRA rank to reserve in each layer. None reserves the largest that any model has there.
 
     Raises:
       ValueError: there are no models, their bases differ, base weights are trainable, an adapter
@@ -89,12 +86,14 @@ def combine(models: Mapping[str, Model], *, rank: int | None = None) -> Model:
 def choose(model: Model, choice: Selection | Sequence[Selection] | jax.Array | np.ndarray) -> Model:
     """Select adapters; also works inside jit.
 
+    A choice per example applies along the first axis of a layer's input (for einsums, the first
+    one that is not in the kernel). If the model folds other axes into the batch axis, as in
+    [B * cameras, ...], each example's rows must be contiguous.
+
     Args:
       model: from `combine`; not modified, the result shares its arrays.
       choice: a name, weights by name, or None for the base; a sequence of these, one per example of
-        the batch; or an array from `weights`, f32 [A] or [B, A]. The batch axis is the first input
-        axis (for einsums, the first one that is not in the kernel). If the model folds other axes
-        into it, as in [B * cameras, ...], each example's rows must be contiguous.
+        the batch; or an array from `weights`, f32 [A] or [B, A].
 
     Raises:
       ValueError: the model has no named adapters, a name is unknown (the message lists near
@@ -114,7 +113,7 @@ def weights(
 ) -> jax.Array:
     """Convert a choice to an f32 array [A] or [B, A], for jitted functions that call `choose`.
 
-    Takes the same arguments and raises the same errors as `choose`.
+    See `choose` for the arguments and errors.
     """
     adapter_names = names(model)
     if isinstance(choice, jax.Array | np.ndarray):
@@ -158,12 +157,11 @@ def names(model: nnx.Module) -> tuple[str, ...]:
 def extract(model: Model, name: str | None) -> Model:
     """Extract one adapter as a separate model, as it was before `combine`.
 
-    The result can be trained, saved and merged. A LoRA regains its rank and scale; the scale is
-    expressed as alpha = scale · rank.
+    The result can be trained, saved and merged. A LoRA's alpha becomes scale · rank.
 
     Args:
       model: from `combine`; not modified.
-      name: name of the adapter; None returns the base without adapters.
+      name: the adapter; None returns the base without adapters.
 
     Raises:
       ValueError: the model has no named adapters, or the name is unknown (the message lists near
@@ -189,8 +187,8 @@ def with_adapters(
 
     Args:
       base: from `strip_adapters`.
-      adapters: a tuple for each path: a template layer that supports the adapter, the method (None
-        for no adapter) and the parameters.
+      adapters: by path, a template layer that supports the adapter, the method (None for no
+        adapter) and the parameters.
     """
 
     def make_adapted(location: Location) -> AdaptedLayer | None:
@@ -209,13 +207,12 @@ def with_adapters(
 def swap(model: Model, name: str, other: nnx.Module) -> Model:
     """Replace the adapter `name` without recompilation.
 
-    A LoRA can be replaced by a LoRA of any scale, up to the rank that `combine` reserved. Other
-    adapters can only be replaced by ones with the same method and settings. The current choice is
-    kept.
+    A LoRA can be replaced by any LoRA up to the rank that `combine` reserved. Other adapters can
+    only be replaced by ones with the same method and settings. The current choice is kept.
 
     Args:
       model: from `combine`; not modified.
-      name: name of the adapter to replace; the new adapter takes this name.
+      name: the adapter to replace; the new one takes this name.
       other: model adapted from the same base.
 
     Raises:
@@ -366,7 +363,7 @@ def _weight_row(adapter_names: tuple[str, ...], selection: Selection) -> list[fl
 
 
 def index_of(adapter_names: tuple[str, ...], name: str) -> int:
-    """Index of a name; raise ValueError with near misses if it is unknown."""
+    """Index of a name; raise ValueError with near misses if the name is unknown."""
     if name not in adapter_names:
         close = paths.near_misses(str(name), adapter_names)
         raise ValueError(f"unknown adapter {short(name)}; the model has {close}.")

@@ -2,9 +2,9 @@
 
 Covers dense layers and einsums; embeddings and convolutions are skipped.
 
-Each layer's method is wrapped in a method that leaves the output unchanged, but reports sums in
-`Aux` under the layer's path. This works for any adaptable model: the layers of third-party models
-store the sums, and scanned models return them stacked.
+Each layer's method is wrapped in `Observed`, which leaves the output unchanged and reports sums in
+`Aux` under the layer's path. The sums are read from the model's output and from the layers that
+store aux.
 """
 
 import dataclasses
@@ -26,8 +26,8 @@ from lorasp_jax.peft._fields import short
 from lorasp_jax.peft._method import Aux, Method, Params
 
 Forward = Callable[[Any, Any], Any]
-"""(model, batch) -> output pytree. If the model's layers return their aux, it must be part of the
-output; all other arrays are treated as output."""
+"""(model, batch) -> output pytree, which must include any aux that the model returns. All other
+arrays in it count as output."""
 Sums = dict[str, jax.Array]
 Report = Callable[["Layer"], Sums]
 
@@ -39,7 +39,7 @@ def call(model: Any, batch: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Layer:
-    """Inputs and outputs of one layer call with one kernel matrix; the input of a report function.
+    """The argument of a report function: one layer call with one kernel matrix.
 
     Attributes:
       method: the layer's method, or None.
@@ -47,7 +47,7 @@ class Layer:
       x: [...tokens, I].
       kernel: [I, O].
       y: [...tokens, O], without bias.
-      reference_y: [...tokens, O], output of the adapter to compare with, or None.
+      reference_y: [...tokens, O], output with the reference adapter, or None.
       aux: the method's aux.
       valid: bool [...tokens].
     """
@@ -71,7 +71,7 @@ class Layer:
 class Observed(Method):
     """Wrap a layer's method to report sums.
 
-    Parameters: those of the wrapped method, or a pair of these and the reference method's.
+    Parameters: those of `inner`, or the pair of these and those of `reference`.
     """
 
     path: str
@@ -121,14 +121,13 @@ def observe(
     Args:
       model: not modified.
       batches: inputs of `forward`; use one shape to avoid recompilation.
-      reports: report functions by the path of their layer, see `paths.locate_matmul_layers`.
+      reports: report functions by layer path; see `paths.locate_matmul_layers`.
       forward: how to call the model.
-      references: adapters whose outputs are compared with those of some layers, by path.
+      references: reference adapters by layer path, for `Layer.reference_y`.
 
     Returns:
       Sums by path, including "tokens", the number of valid tokens. All sums have the leading axes
-      of the layer's kernel matrices, which are those of a scanned stack and the batch axes of an
-      einsum.
+      of the layer's kernel matrices: those of a scanned stack and the batch axes of an einsum.
 
     Raises:
       ValueError: there are no batches or no valid tokens, values are not finite, a layer was not

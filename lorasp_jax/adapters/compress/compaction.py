@@ -1,8 +1,7 @@
 """Replace LoRA-SP adapters by smaller ones and measure the error on a calibration set.
 
-Shared by `pruning` and `distillation`. The error of a layer is measured on the inputs that it
-receives in the original model. Every layer that LoRA-SP supports can be compacted, dense or einsum;
-batch axes of an einsum are treated like the axes of a stack.
+Shared by `pruning` and `distillation`. A layer's error is measured on the inputs that the layer
+receives in the original model. Batch axes of an einsum are treated like the axes of a stack.
 """
 
 from collections.abc import Sequence

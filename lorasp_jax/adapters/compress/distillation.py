@@ -1,4 +1,4 @@
-"""Distill LoRA-SP adapters into LoRA adapters, which can be merged into the kernels."""
+"""Distill LoRA-SP adapters into LoRA adapters."""
 
 import functools
 from collections.abc import Sequence
@@ -37,10 +37,10 @@ def distill(
 
     Args:
       model: not modified.
-      batches: calibration set. If it has fewer tokens than a layer has input features, the update
-        is undetermined along input directions that do not occur, and is set to zero there.
-      rank: LoRA rank, at most the bank's rank. None uses the bank's rank; a larger rank could not
-        reduce the error.
+      batches: calibration set. The update is zero along input directions that do not occur in it,
+        for instance if it has fewer tokens than a layer has input features.
+      rank: LoRA rank. None uses the bank's rank, which also caps `rank`, because a larger rank
+        could not reduce the error.
       forward: how to call the model on a batch; see `lorasp_jax.adapters.compress.calibration`.
 
     Raises:
@@ -74,7 +74,7 @@ def _regression_sums(layer: Layer) -> Sums:
 def _fitted(xx: jax.Array, xz: jax.Array, u: jax.Array, *, rank: int) -> Params:
     """A [I, r] and B [r, O] that minimize Σ ‖z U - x A B‖² over the calibration set.
 
-    The full-rank optimum is M = (Σ x xᵀ)⁻¹ (Σ x zᵀ) U; the rank-r optimum projects onto the r
+    The full-rank optimum is M = (Σ x xᵀ)⁻¹ (Σ x zᵀ) U. The rank-r optimum projects M onto the r
     leading right singular vectors of the fitted outputs X M, where the rows of X are the inputs
     (Reinsel and Velu, Multivariate Reduced-Rank Regression, 1998, theorem 2.2). With the QR
     decomposition Uᵀ = Q T, these vectors are Q times those of the narrower X M Q.

@@ -36,15 +36,14 @@ def prune(
 
     Drops each direction that is active for at most a fraction `tolerance` of the valid calibration
     tokens. The bank's arrays shrink, but the router still scores dropped directions, since a
-    token's active rank is determined from the energy of all directions. So dropping a direction
-    that was never active leaves every output unchanged, even if scores are tied, and dropping any
-    other direction removes exactly its contribution. All layers of a stack have the same rank, the
-    largest that any of them needs; layers that need less keep additional directions.
+    token's active rank depends on the energy of all directions. So a dropped direction loses its
+    own contribution, but the layer's other directions stay active for the same tokens. All layers
+    of a stack keep as many directions as the one that needs most.
 
     Args:
       model: not modified; the result shares its frozen arrays and can be trained further.
       batches: calibration set.
-      tolerance: largest fraction of tokens, in [0, 1), for which a dropped direction may be active.
+      tolerance: in [0, 1). With 0, outputs on the calibration set do not change.
       forward: how to call the model on a batch; see `lorasp_jax.adapters.compress.calibration`.
 
     Raises:

@@ -3,9 +3,9 @@
     model, errors = quantize(model, [("vision", None), (".*", "nf4")])
 
 Kernels of dense layers and einsums (flattened to matrices) are quantized to 8 or 4.5 bits per
-weight. Adapters, biases, norms, embeddings and convolutions are unchanged, and everything else
-works as before: gradients flow to x and the adapters, and adapters can be saved separately,
-attached and combined. `merge` dequantizes the kernel of each adapted layer before adding the delta.
+weight. Adapters, biases, norms, embeddings and convolutions are unchanged. Gradients still flow to
+x and the adapters, and adapters can still be attached, saved and combined. `merge` dequantizes the
+kernel of each adapted layer before adding the delta.
 
 Adapters that split a kernel (PiSSA, OLoRA) must be attached before quantization, which then
 quantizes the residual.
@@ -25,8 +25,8 @@ from lorasp_jax.dense import AdaptedLayer, AdapterParam, validate
 from lorasp_jax.kernels.quantized_weights import KINDS, Kind, QuantizedKernel, quantize_kernel
 from lorasp_jax.peft._fields import short
 
-# (id of a variable, equation, kind) -> (quantized variable, original variable, error). The original
-# is stored so that its id stays valid.
+# (id of a variable, equation, kind) -> (quantized variable, original variable, error). Storing the
+# original keeps its id valid.
 Shared: TypeAlias = dict[tuple[int, str, Kind], tuple[nnx.Param[Any], nnx.Param[Any], float]]
 
 
@@ -34,7 +34,7 @@ class QuantizationResult(NamedTuple):
     """A model with quantized kernels, and the quantization errors.
 
     Attributes:
-      model: the quantized model.
+      model: with quantized kernels.
       errors: relative error ‖W − Ŵ‖ / ‖W‖ of the quantized kernel Ŵ by path, in the Frobenius norm
         over all layers of a stack. For isotropic inputs, this is also the relative RMS error of the
         layer's output, without bias.
@@ -48,7 +48,7 @@ def quantize(model: nnx.Module, rules: Sequence[tuple[str, Kind | None]]) -> Qua
     """Quantize the kernels of dense layers and einsums by path rules.
 
     Args:
-      model: not modified; the result shares all other arrays with it.
+      model: not modified; the result shares all other arrays.
       rules: (pattern, kind) pairs, where kind is "int8", "nf4" or None. As for `adapt`, the first
         match wins, and None skips the path. Rules apply to `Dense`, `nnx.Linear`,
         `nnx.LinearGeneral`, `nnx.Einsum` and adapted layers of other einsum classes.

@@ -1,9 +1,10 @@
 """Load and save Hugging Face PEFT adapter folders: LoRA, rsLoRA, DoRA and pruned AdaLoRA.
 
 A folder has adapter_config.json and adapter_model.safetensors, with tensors named
-base_model.model.<module>.lora_A.weight etc., in torch's layout [out, in] (format of PEFT 0.21.2). A
-function `names(path, index)` returns the module name of the layer at a path and, in a scanned
-stack, at an index; by default "a/0/b" becomes "a.0.b".
+base_model.model.<module>.lora_A.weight etc., in torch's layout [out, in] (format of PEFT 0.21.2).
+
+A function `names(path, index)` returns a layer's module name; `index` is the position in a scanned
+stack, or (). By default, "a/0/b" becomes "a.0.b".
 """
 
 import collections
@@ -78,17 +79,17 @@ def load_peft(
 ) -> adaptation.Model:
     """Load the adapters of a Hugging Face PEFT folder into a model.
 
-    Biases and modules that PEFT trained in full (`bias`, `modules_to_save`) become trainable
-    parameters here too. Adapters apply to dense layers and einsums, including those of
-    `nnx.MultiHeadAttention`, whose kernels match torch's with concatenated heads. AdaLoRA is loaded
-    as the equivalent LoRA. If ranks differ within a stack, adapters are zero-padded to the largest.
-    `lora_dropout` becomes the methods' `dropout`, which is active only under `with_dropout`.
+    Adapters apply to dense layers and einsums, including those of `nnx.MultiHeadAttention`, whose
+    heads are concatenated as in torch. Biases and modules that PEFT trained in full (`bias`,
+    `modules_to_save`) become trainable parameters. AdaLoRA is loaded as the equivalent LoRA. If
+    ranks differ within a stack, adapters are zero-padded to the largest. `lora_dropout` becomes the
+    methods' `dropout`, which is active only under `with_dropout`.
 
     Args:
-      folder: folder with adapter_config.json and adapter_model.safetensors, or a repository on the
-        Hub, hf://owner/name, from which only these two files are downloaded.
+      folder: local folder, or a Hub repository hf://owner/name, from which only the two files are
+        downloaded.
       model: not modified; its adapters on other layers are kept.
-      names: function (path, index) -> module name; index is the position in a stack, or ().
+      names: function (path, index) -> module name; see the module docstring.
       einsums: as for `adapt`.
 
     Raises:
@@ -129,8 +130,7 @@ def match_folder(
       names: as for `load_peft`.
 
     Returns:
-      Rules for `adapt` that reproduce the folder's adapters, the adapters' parameters by path, and
-      the fully trained parameters by path.
+      Rules for `adapt`, the adapters' parameters by path, and the fully trained parameters by path.
 
     Raises:
       ValueError: as for `load_peft`.
@@ -162,7 +162,7 @@ def match_folder(
 
 
 def _local_folder(folder: str | os.PathLike[str]) -> pathlib.Path:
-    """Return the path of a local folder; download a repository hf://owner/name from the Hub."""
+    """Return the folder's local path, after downloading a repository hf://owner/name."""
     if not isinstance(folder, str) or "://" not in folder:
         return validate.folder(folder)
     from lorasp_jax.storage import hub
@@ -182,8 +182,8 @@ def save_peft(
     AdaLoRA is saved as the equivalent LoRA, without pruned directions.
 
     Args:
-      folder: created if absent; an existing adapter in the folder is replaced.
-      model: adapted with LoRA, AdaLoRA or both, or with DoRA only; fully fine-tuned parameters
+      folder: created if absent; an adapter in it is replaced.
+      model: adapted with LoRA, AdaLoRA or both, or with DoRA only. Fully fine-tuned parameters
         become PEFT's `bias` and `modules_to_save`.
       names: as for `load_peft`.
       base: value of base_model_name_or_path.

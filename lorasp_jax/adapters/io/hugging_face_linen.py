@@ -30,7 +30,7 @@ def load_peft_linen(
       folder: as for `hugging_face.load_peft`.
       model: any Linen module.
       variables: variables of the bare model, with "params"; not modified.
-      *args: the model's call arguments, for calls that show what its layers compute.
+      *args: the model's call arguments; the model is called to find its layers.
       names: as for `hugging_face.load_peft`.
       einsums: as for `LinenAdapter`.
       **kwargs: the model's call arguments.

@@ -1,7 +1,7 @@
 """Match untrusted regular expressions against module names, rejecting catastrophic backtracking.
 
 Python's `re` may try every way in which a pattern could match: about 2**30 for the pattern (a+)+b
-and a name of thirty letters "a". `_ways` derives an upper bound from the parsed pattern.
+and a name of thirty a's. `_ways` computes an upper bound from the parsed pattern.
 """
 
 import importlib
@@ -17,7 +17,7 @@ MAX_WAYS = 3 * 10**8
 
 
 def values_of(patterns: Mapping[str, Any], names: Collection[str], default: Any) -> dict[str, Any]:
-    """For each name, the value of the first pattern that matches it, or its end after some dot.
+    """Map each name to the value of the first pattern that matches it or a suffix after a dot.
 
     As in Hugging Face PEFT (get_pattern_key of 0.21.2): re.match(rf"(.*\\.)?({pattern})$", name).
 
@@ -25,9 +25,6 @@ def values_of(patterns: Mapping[str, Any], names: Collection[str], default: Any)
       patterns: values by pattern.
       names: module names, as in "a.0.b".
       default: value of a name without a match.
-
-    Returns:
-      Values by name.
 
     Raises:
       ValueError: a pattern is invalid or not supported, or matching could take too long.
@@ -54,9 +51,7 @@ def values_of(patterns: Mapping[str, Any], names: Collection[str], default: Any)
 
 
 def _ways(tree: Iterable[tuple[Any, Any]], length: int) -> int:
-    """Upper bound on the ways in which a parsed pattern can match `length` characters.
-
-    The result is capped at `MAX_WAYS` + 1.
+    """Upper bound, at most `MAX_WAYS` + 1, on the number of ways to match `length` characters.
 
     Raises:
       ValueError: the pattern has a construct that PEFT's patterns do not need.

@@ -1,9 +1,8 @@
 """Save and load adapters: a folder with adapter.safetensors (tensors) and adapter.json (metadata).
 
-The JSON contains the method of every adapted path, the identity of the base (fingerprints of its
-weights and an optional name), user metadata, a checksum of the tensor file, and a digest of the
-JSON itself. Tensor names are "/"-joined paths; tensors of stacked layers keep their leading layer
-axes.
+The JSON contains the method of every adapted path, fingerprints and an optional name of the base,
+user metadata, a checksum of the tensor file, and a digest of the JSON itself. Tensor names are
+"/"-joined paths; tensors of stacked layers keep their leading layer axes.
 """
 
 import hashlib
@@ -49,12 +48,12 @@ def save_adapters(
 ) -> None:
     """Save a model's trainable parameters, without the frozen base.
 
-    Each file is written atomically; an existing adapter in the folder is replaced.
+    Each file is written atomically.
 
     Args:
-      folder: created if absent.
+      folder: created if absent; an adapter in it is replaced.
       model: an adapted model.
-      base: optional name of the base; its weights are identified by fingerprints regardless.
+      base: optional name of the base, in addition to the fingerprints of its weights.
       metadata: any JSON-serializable dict with str keys.
 
     Raises:
@@ -95,13 +94,13 @@ def load_adapters(
 ) -> adaptation.Model:
     """Load the adapters of a folder into a model.
 
-    A model without adapters is adapted as described in the file; an adapted model must have the
-    same methods at the same paths.
+    A model without adapters is first adapted as saved. An adapted model must have the same methods
+    at the same paths.
 
     Args:
       folder: written by `save_adapters`.
       model: not modified.
-      base: if given, must equal the name of the base that the adapters were saved for.
+      base: if given, must equal the name that was saved.
       any_base: whether to skip the base check. By default, every base array must match the one used
         in training, up to bf16 rounding. An array is not compared if only one of the two is
         quantized, or if an adapter split it.
@@ -146,11 +145,10 @@ def _adapt_as_saved(
 ) -> adaptation.Model:
     """Adapt the bare model with the methods of a file, by exact paths.
 
-    Only shapes are built and checked first: a damaged or malicious file could request more memory
-    than is available.
+    Shapes are checked first, since a damaged or malicious file could request too much memory.
     """
     try:
-        # FullFineTuning first: an adapted layer may have fully fine-tuned parameters.
+        # FullFineTuning first, since an adapted layer may have fully fine-tuned parameters.
         paths = sorted(methods, key=lambda path: not methods[path].trains_base)
         rules = [(f"^{re.escape(path)}$", methods[path]) for path in paths]
         adapt = lambda: adaptation.adapt(model, rules, rngs=nnx.Rngs(0), einsums=einsums)  # noqa: E731
@@ -192,7 +190,7 @@ def _matched_leaves(
     methods: Mapping[str, Method],
     folder: pathlib.Path,
 ) -> dict[str, Any]:
-    """Leaves of the adapters by name, after checking that each has a tensor of matching shape."""
+    """Leaves of the adapters by name; raise ValueError if names or shapes of tensors differ."""
     leaves = _leaves_by_name(adapters)
     if different := sorted(leaves.keys() ^ tensors.keys()):
         raise ValueError(f"{folder} and the model have different tensors, first {different[0]!r}.")
@@ -262,7 +260,7 @@ def read_tensors(path: pathlib.Path, data: bytes) -> dict[str, np.ndarray]:
     """Decode the content of a safetensors file into tensors by name.
 
     Args:
-      path: path of the file, for error messages.
+      path: for error messages.
       data: the file's content.
 
     Raises:
@@ -281,7 +279,7 @@ def read_tensors(path: pathlib.Path, data: bytes) -> dict[str, np.ndarray]:
 
 
 def _read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Read the description and the tensors, and verify the tensors' checksum."""
+    """Read and verify the description and the tensors."""
     for name in (DESCRIPTION, TENSORS):
         if not (folder / name).is_file():
             raise ValueError(

@@ -1,9 +1,9 @@
 """Read and validate a Hugging Face PEFT folder, as arrays by module.
 
 Type checks cover the fields of `LoraConfig` and `AdaLoraConfig` of PEFT 0.21.2 that have a simple
-JSON type. Any of these may be null or absent, except `peft_type` and the fields that determine an
-adapter's scale. Values of a wrong type are rejected because they are ambiguous: "use_rslora":
-"false" is truthy in Python.
+JSON type. A wrong type is rejected even if Python could use the value: the string "false" would
+count as true. Fields may be null or absent, except `peft_type` and those that determine an
+adapter's scale.
 """
 
 import collections
@@ -29,8 +29,8 @@ _TENSOR = re.compile(
 )
 _FULL_TENSOR = re.compile(rf"{re.escape(PREFIX)}(.+?)(\.base_layer)?\.(weight|bias)")
 _ADA_CONSTANT = 1e-5  # AdaLoRA's scale is α/(init_r + this)
-# Initializations that do not change the base. With other initializations (PiSSA, OLoRA, CorDA,
-# LoRA-GA, LoftQ), A and B fit only the residual base.
+# Initializations that do not change the base. With others (PiSSA, OLoRA, CorDA, LoRA-GA, LoftQ), A
+# and B fit only the residual base.
 _BASE_PRESERVING = (None, True, False, "gaussian", "orthogonal", "eva", "mica")
 # Fields that are not supported, and the values that disable them.
 _DISABLED = (None, False, [], {}, "none")
@@ -45,7 +45,7 @@ FullTensors = dict[tuple[str, str], np.ndarray]
 
 
 def read_folder(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter], FullTensors]:
-    """Read the config, the adapters by module in this project's layout, and fully trained tensors.
+    """Read the config, the adapters by module in this project's layout, and the `FullTensors`.
 
     Raises:
       ValueError: files are missing or damaged, or the adapter is not supported.

@@ -1,8 +1,8 @@
 """Fully trained biases and modules in Hugging Face PEFT folders.
 
 With `bias` "all" or "lora_only", PEFT trains biases. It stores them as <module>.base_layer.bias for
-adapted layers and as <module>.bias for other layers. `modules_to_save` makes whole modules
-trainable. Weights are stored in torch's layout, [out, in] for a dense layer.
+adapted layers and as <module>.bias for others. `modules_to_save` makes whole modules trainable.
+Weights are stored in torch's layout, [out, in] for a dense layer.
 """
 
 import math
@@ -35,8 +35,8 @@ def full_parameters(
     """A folder's fully trained parameters, by path, in the model's layout.
 
     Raises:
-      ValueError: the model lacks a parameter or has it with another shape, or the folder has it for
-        only some layers of a stack.
+      ValueError: the model lacks a parameter or has a different shape, or the folder covers only
+        some layers of a stack.
     """
     values, unused = {}, dict(full)
     for path, size in sizes.items() if full else ():
@@ -68,17 +68,14 @@ def check_biases(
     parameter_paths: Collection[str],
     adapted: Collection[str],
 ) -> None:
-    """Check that a folder contains biases if its config says that biases were trained.
+    """Raise ValueError if the folder has no biases, but its config says that some were trained.
 
     Args:
       folder: PEFT folder.
-      bias: "none", "all" or "lora_only".
+      bias: the config's "none", "all" or "lora_only".
       full: the folder's fully trained parameters.
       parameter_paths: paths of the model's parameters.
       adapted: paths of layers that the folder adapts.
-
-    Raises:
-      ValueError: the config says that biases were trained, but the folder has none.
     """
     modules = [
         path.rpartition("/")[0] for path in parameter_paths if path.rpartition("/")[2] == "bias"
@@ -93,7 +90,7 @@ def check_biases(
 def export_full_parameters(
     model: nnx.Module, adapted: Collection[str], names: Names
 ) -> tuple[Adapter, dict[str, Any]]:
-    """A model's fully trained parameters by PEFT name, and the PEFT config fields to go with them.
+    """A model's fully trained parameters by PEFT name, and the PEFT config fields about them.
 
     Raises:
       ValueError: PEFT cannot store a parameter.
