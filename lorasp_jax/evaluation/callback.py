@@ -33,10 +33,9 @@ TOWERS = ("vision", "language", "action")
 class Evaluation(Callback):
     """Evaluates every task of a run before, during and after training.
 
-    Adapters initially leave the outputs unchanged, so the policy before the first step is the base.
-    All evaluations of a task share one compilation; the final evaluation uses different layouts.
-    Videos of evaluations during training are rendered in the background; those of the final
-    evaluation are rendered after training, in the foreground.
+    The first evaluation measures the base, since new adapters leave its outputs unchanged. The
+    final evaluation uses other layouts than the earlier ones. All evaluations of a task share one
+    compilation. Videos are rendered in the background during training, in the foreground after it.
     """
 
     def __init__(
@@ -45,7 +44,7 @@ class Evaluation(Callback):
         evaluate: Callable[..., Result] = evaluate,
         write_video: Callable[[Env, Poses, Path], None] = video.write_episode,
     ) -> None:
-        """Create the callback, which compiles nothing until the first evaluation.
+        """Create the callback; nothing compiles until the first evaluation.
 
         Args:
             compile_rollout: (config, task) -> the task's environment and its jitted rollout.
@@ -88,7 +87,7 @@ class Evaluation(Callback):
         write_json(run.folder / "results.json", summarize(run, results))
 
     def _write_media(self, run: Run, results: dict[str, Result]) -> None:
-        """Write a video of each task, and the first camera images of its first demonstration."""
+        """Write each task's video and the initial camera images of its first demonstration."""
         for task, result in results.items():
             images = {name: np.asarray(i[0, 0]) for name, i in run.episodes[task].image.items()}
             video.write_image(run.folder / f"cameras_{task}.png", video.side_by_side(images))
@@ -118,7 +117,6 @@ class Evaluation(Callback):
     def _evaluate_task(
         self, run: Run, when: str, episodes: int, progress: Progress, task: str
     ) -> Result:
-        """Evaluate one task with a progress bar."""
         episodes = episodes or run.config.evaluation.episodes
         bar = progress.add_task(f"compiling the evaluation of {task} ...", total=episodes)
         number = 2 * run.config.tasks.index(task) + (when == "after")
@@ -185,11 +183,11 @@ def summarize(run: Run, after: dict[str, Result]) -> dict[str, Any]:
 
 
 def _mean(trees: list[Any]) -> Any:
-    """Average trees that have the same structure and lists of numbers as leaves."""
+    """Average trees of the same structure, whose leaves are lists of numbers."""
     is_list = lambda node: isinstance(node, list)  # noqa: E731
     return _map_trees(lambda *v: np.mean(v, axis=0).tolist(), trees, is_leaf=is_list)
 
 
 def _map_trees(function: Callable, trees: list[Any], **options: Any) -> Any:
-    """Apply `jax.tree.map` to any number of trees; return {} if there are none."""
+    """Apply `jax.tree.map`, but return {} if there are no trees."""
     return jax.tree.map(function, *trees, **options) if trees else {}

@@ -10,8 +10,8 @@ from lorasp_jax.peft import Aux
 Reports = dict[str, dict[str, Aux]]
 """Tower -> name of a linear layer -> `Aux` of its adapters, `[..., W, T]`.
 
-W counts worlds and T tokens; in the vision tower, W also counts the images of each world. Stacked
-layers have a layer axis before W; in the action expert, an axis of denoising steps comes first."""
+W is the number of worlds, times the images of each in the vision tower. T is the number of tokens.
+Stacked layers have a layer axis before W. In the action expert, denoising steps come first."""
 
 LayerRanks = dict[str, dict[str, jax.Array]]
 """Tower -> name of a linear layer -> active rank `[L]`; L = 1 for a layer that is not stacked."""
@@ -72,7 +72,8 @@ def rank_histogram(reports: Reports, running: jax.Array, rank: int) -> dict[str,
         rank: R, the highest possible active rank.
 
     Returns:
-        `[R + 1]` int32 per tower; entry k counts active rank k, once per token, layer and step.
+        `[R + 1]` int32 per tower; entry k counts the tokens with active rank k, in each layer
+        and denoising step.
     """
 
     def count(active: jax.Array, valid: jax.Array) -> jax.Array:
@@ -89,7 +90,7 @@ def rank_histogram(reports: Reports, running: jax.Array, rank: int) -> dict[str,
 def _tokens(
     reports: Reports, running: jax.Array
 ) -> dict[str, dict[str, tuple[jax.Array, jax.Array]]]:
-    """Return active rank and validity, both `[..., W, T]`, of each linear layer with a rank."""
+    """Return active rank and validity, both `[..., W, T]`, of each layer that has a rank."""
 
     def by_world(linear: Aux) -> tuple[jax.Array, jax.Array]:
         rank, mask = linear.active_rank, linear.token_mask

@@ -30,7 +30,7 @@ class Rollout:
     Attributes:
         success: `[W]` bool.
         steps: `[W]` int32, control steps up to success or the time limit.
-        active_rank: `[L]` per linear layer, mean over tokens and policy calls of unfinished worlds.
+        active_rank: `[L]` per linear layer, mean over tokens, policy calls and unfinished worlds.
         active_rank_histogram: `[calls, R + 1]` int32 per tower; see `metrics.rank_histogram`. R is
             the largest adapter rank.
         poses: poses of the first worlds at every control step, leading axes `[time, worlds]`.
@@ -75,10 +75,10 @@ def make_rollout(
     denoise_steps: int = 10,
     ranges: Randomization | None = None,
 ) -> Callable[[Policy, jax.Array], Rollout]:
-    """Create a rollout of `env.num_envs` episodes: a pure function (policy, key) for `jax.jit`.
+    """Create a pure function (policy, key) that runs `env.num_envs` episodes, to be jitted.
 
     Every `execute_steps` control steps, the policy observes and samples a new chunk in
-    `denoise_steps` Euler steps. For `ranges`, see `env.reset`; randomized colors are not recorded.
+    `denoise_steps` Euler steps. `ranges` is passed to `env.reset`; its colors are not recorded.
     """
     num_calls = -(-env.max_steps // execute_steps)
 
@@ -110,7 +110,7 @@ def make_rollout(
 def compiled_rollout(
     config: Config, task: str
 ) -> tuple[Env, Callable[[Policy, jax.Array], Rollout]]:
-    """Create the environment of a task and its jitted rollout, which compiles when first called."""
+    """Create the environment of a task and its jitted rollout."""
     env = envs.make(
         task,
         robot=config.robot,
@@ -140,10 +140,10 @@ def evaluate(
     Args:
         policy: policy for the robot of `env`, with prompts for `env.instructions`.
         env: environment; `num_envs` episodes run in parallel.
-        key: PRNG key that determines the layouts and the sampled actions; do not reuse it.
+        key: PRNG key of the layouts and the sampled actions.
         num_episodes: a multiple of `env.num_envs`.
-        rollout: jitted `make_rollout(env)`, to compile only once for several calls; None creates
-            one.
+        rollout: a jitted `make_rollout(env)` to share between calls so that it compiles only once;
+            None creates one.
         progress: called with (completed, total) episodes.
 
     Raises:
@@ -168,7 +168,7 @@ def evaluate(
 def _control_block(
     env: Env, policy: Policy, execute_steps: int, denoise_steps: int, state: State, key: jax.Array
 ) -> tuple[State, tuple]:
-    """Observe, predict and execute; return the next state and the recorded data."""
+    """Observe, predict a chunk and execute it; return the next state and the records."""
     actions, aux = policy.sample(
         key, env.observe(state), state.info["instruction"], num_steps=denoise_steps, return_aux=True
     )
@@ -215,9 +215,6 @@ def _with_prompts(policy: Policy, env: Env) -> Policy:
 
 
 def _recorded_episode(run: Rollout) -> Poses:
-    """Return the poses of the first recorded world that succeeds, or of world 0 if none does.
-
-    They end with the episode.
-    """
+    """Return one episode's poses: of the first recorded world that succeeds, or else of world 0."""
     world = int(jnp.argmax(run.success[:RECORDED_WORLDS]))
     return jax.tree.map(lambda x: x[: max(int(run.steps[world]), 1), world], run.poses)

@@ -28,8 +28,8 @@ def write_episode(env: Env, poses: Poses, path: Path) -> None:
 
     Args:
         env: the environment in which the episode was recorded.
-        poses: poses of geoms and cameras; the leading axis is time.
-        path: of the MP4 file.
+        poses: the leading axis is time.
+        path: MP4 file to write.
     """
     renderer = dataclasses.replace(env, renderer=RayRenderer(env.render_model, VIDEO_SIZE, 1))
     images = jax.jit(renderer.render)(poses)

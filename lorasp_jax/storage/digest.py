@@ -1,8 +1,8 @@
 """Digests that detect corrupted data.
 
-Array digests are computed on the arrays' devices and do not depend on the sharding. They are
-needed because Orbax misses some corruption: it stores incompressible data raw, so a flipped bit
-there silently restores a different value. JSON digests are stored with the values, under "digest".
+Array digests are computed on the arrays' devices and do not depend on the sharding. Orbax misses
+some corruption: it stores incompressible data raw, where a flipped bit silently restores a
+different value. JSON digests are stored with the values, under "digest".
 """
 
 import functools
@@ -21,7 +21,7 @@ DIGEST = "digest"
 
 
 def digest(arrays: Mapping[str, jax.Array], *extra: str) -> str:
-    """Return a SHA-256 in hex, of `extra` and each array's name, dtype, shape and `mixed_sum`."""
+    """Return the SHA-256 (hex) of `extra` and each array's name, dtype, shape and `mixed_sum`."""
     sums = jax.device_get({name: _sum(array) for name, array in arrays.items()})
     entries = [
         [name, str(array.dtype), list(array.shape), int(sums[name])]
@@ -46,7 +46,7 @@ def with_digest(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def verify_digest(content: Any) -> dict[str, Any]:
-    """Verify the digest added by `with_digest` and return the values without it.
+    """Verify the digest of `with_digest` and return the values without it.
 
     Raises:
         ValueError: the digest is missing or does not match.
@@ -97,11 +97,11 @@ def host_sum(array: np.ndarray, block: int = 2**18) -> int:
 def mixed_sum(array: jax.Array, *, rounded: bool = False) -> jax.Array:
     """Sum the 32-bit words of all elements, each mixed with its position: `[]` uint32.
 
-    Elements are read bitwise as integers, 64-bit ones as two words; `rounded` casts them to bf16
-    first. The mixing function is the finalizer of MurmurHash3 (github.com/aappleby/smhasher,
-    MurmurHash3.cpp:68), a permutation of the 32-bit words, so a change of a single word is always
-    detected. Any other change is missed with probability 2^-32. The order of summation does not
-    matter, because integer addition is exact.
+    Elements are read bitwise as integers, 64-bit ones as two words. `rounded` first casts them to
+    bf16. Words are mixed by the finalizer of MurmurHash3 (github.com/aappleby/smhasher,
+    MurmurHash3.cpp:68), a permutation of 32-bit words. A change of a single word is therefore
+    always detected, and any other is missed with probability 2^-32. Integer addition is exact, so
+    the order of summation does not matter.
     """
     if rounded or array.dtype == bool:
         array = array.astype(jnp.bfloat16 if rounded else jnp.uint8)

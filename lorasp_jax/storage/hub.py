@@ -1,4 +1,4 @@
-"""Resolve model files: local paths, Hugging Face Hub repositories, cloud buckets.
+"""Resolve local paths, Hugging Face Hub repositories and cloud buckets.
 
 Only hf:// paths reach the Hub, so a missing folder never resolves to a repository of the same name.
 """
@@ -18,8 +18,7 @@ HUB = "hf://"
 REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 """Repository id on the Hub, owner/name."""
 BUCKET = re.compile(r"(gs|s3|memory)://[\w.-]+(/[\w.+=@-]+)*/?")
-"""URL of a folder or file in a bucket; other URLs, such as web pages or file://, are rejected.
-memory:// is fsspec's in-memory store, for tests."""
+"""URL of a folder or file in a bucket; memory:// is fsspec's in-memory store, for tests."""
 IGNORED_PATTERNS = (
     "train_state/*",
     "*.bin",
@@ -45,8 +44,8 @@ def local(
         where: a path, a Hub repository (hf://owner/name) or a bucket URL (gs://bucket/folder). The
             Hub client caches repositories; buckets are cached in lorasp_jax/ under the user's cache
             folder. Shipped bases, such as assets/pi0_nano, resolve from any working directory.
-        only: patterns of the files to download from a Hub repository; None selects all files.
-            `IGNORED_PATTERNS` are skipped in either case.
+        only: patterns of the files to download from a Hub repository; None means all.
+            `IGNORED_PATTERNS` are always skipped.
         repository: type of the Hub repository.
 
     Raises:
@@ -89,7 +88,6 @@ def _is_shipped(path: Path) -> bool:
 
 
 def _not_found_message(name: str, path: Path) -> str:
-    """Return the error message for a missing path, with suggestions."""
     inside = path.relative_to(shipped.ROOT) if path.is_relative_to(shipped.ROOT) else path
     if _is_shipped(inside):
         return shipped.missing_base_message(name)
@@ -99,7 +97,7 @@ def _not_found_message(name: str, path: Path) -> str:
 
 
 def is_remote(where: str | os.PathLike[str]) -> bool:
-    """Return whether `where` is a Hub or bucket URL, from which `local` downloads."""
+    """Return whether `where` is a URL, which `local` would download."""
     return "://" in os.fspath(where)
 
 

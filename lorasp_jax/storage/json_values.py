@@ -18,9 +18,9 @@ def check(value: Any, kind: Any, name: str = "") -> None:
 
     Args:
         value: parsed JSON value.
-        kind: the schema. A type stands for itself, [kind] for a list of any length and (kind, kind)
-            for a list of two. {"a": kind} stands for an object with at least the key "a"; values of
-            keys that are not listed may be anything, or match the kind under the key `str`.
+        kind: the schema: a type, [kind] for a list of any length, (kind, kind) for a list of two,
+            or {"a": kind} for an object with at least the key "a". Other keys may have any value;
+            if the schema has the key `str`, they must match its kind.
         name: dotted path of the value, for the error message.
     """
     if isinstance(kind, type):
@@ -50,5 +50,4 @@ def _is(value: Any, kind: type) -> bool:
 
 
 def _truncated(value: Any) -> str:
-    """Return the start of a value's repr."""
     return repr(value)[:40]

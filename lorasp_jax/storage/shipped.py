@@ -1,7 +1,7 @@
-"""Files shipped with the project: configs/ and assets/ resolve from any working directory.
+"""Files shipped with the project, in configs/ and assets/.
 
-A checkout has both folders beside the package; a wheel has both inside the package, with only the
-nano bases.
+In a checkout, both folders are beside the package. In a wheel, they are inside it, and assets/ has
+only the nano bases.
 """
 
 from pathlib import Path
