@@ -3,12 +3,14 @@
     python -m benchmarks.backbones --json backbones.json
     python -m benchmarks.backbones --size nano --batch 4 --rank 8 --dtype float32    # on a CPU
 
-The training step is that of `lorasp_jax.training`, with AdamW and the auxiliary losses, on a batch
-already on the device, with donated state. GiB is the memory of the compiled program including its
-arguments. MFU is the matmul FLOP/s of loss and gradients (`lorasp_jax.training.cost.flops`, without
-recomputation) relative to the device's bf16 peak. Sampling runs ten denoising steps in one program,
-from images to action chunk, with the model's `sampler`. "largest" is the largest batch whose step
-is expected to fit in 24 GiB.
+The training step is that of `lorasp_jax.training`, with AdamW and the auxiliary losses. Its batch
+is already on the device, and its state is donated. The table "largest" uses the largest batch whose
+step is expected to fit in `--gib`. Sampling runs ten denoising steps in one program, from images to
+action chunk, with the model's `sampler`.
+
+GiB is the memory of the compiled program, including its arguments. MFU is the matmul FLOP/s of loss
+and gradients relative to the device's bf16 peak, without recomputation
+(`lorasp_jax.training.cost.flops`).
 """
 
 import argparse
@@ -63,7 +65,7 @@ def run_config(method: peft.Method, targets: tuple[str, ...], batch: int) -> Con
 
 
 def arrays(config: BackboneConfig, run: Config | None) -> tuple[Any, Any, Any]:
-    """Return the graph, and adapters (none without a run) and frozen arrays on the device."""
+    """Return the graph, adapters and frozen arrays; without a run, there are no adapters."""
 
     def model(key: jax.Array) -> Backbone:
         return preflight.adapted_model(run, config, key) if run else config.create(nnx.Rngs(key))
@@ -89,7 +91,7 @@ class Step:
 
     Args:
         config: the backbone's config.
-        run: the run's config; its batch size is global.
+        run: the run's config; its batch is spread over the mesh.
         mesh: device mesh; by default only the first device.
     """
 
@@ -154,7 +156,7 @@ def training(name: str, label: str, run: Config, options: argparse.Namespace, re
 
 
 def largest(name: str, run: Config, options: argparse.Namespace) -> int:
-    """Extrapolate, from two batch sizes, the largest one expected to fit in `options.gib` GiB."""
+    """Extrapolate from two batch sizes to the largest one expected to fit in `options.gib` GiB."""
     config = sized(name, options, "full")
 
     def bytes_of(batch: int) -> float:

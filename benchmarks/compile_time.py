@@ -2,9 +2,9 @@
 
     JAX_PLATFORMS=cpu python -m benchmarks.compile_time
 
-The program is the gradient of a training loss with respect to the adapters, auxiliary losses
-included. Times are the best of several repeats, in CPU seconds of this process on all cores, which
-other programs hardly affect. Ratios are relative to qwix's LoRA in the same run
+The program is the gradient of a training loss, including auxiliary losses, with respect to the
+adapters. Times are CPU seconds of this process on all cores, which other programs hardly affect,
+and the best of several repeats. Ratios are relative to qwix's LoRA in the same run
 (`pip install qwix`), or to the bare model if qwix is not installed.
 """
 
@@ -46,7 +46,7 @@ class Stack(nnx.Module):
 
 
 def models(base: Stack, x: jax.Array, rank: int) -> Iterator[tuple[str, Any, Any]]:
-    """Yield name, model and type of the trainable variables; the reference comes first."""
+    """Yield each model's name, the model and its type of trainable variables, reference first."""
     if importlib.util.find_spec("qwix"):
         import qwix  # pyright: ignore[reportMissingImports]
 

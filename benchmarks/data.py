@@ -3,10 +3,10 @@
     python -m benchmarks.data --json data.json
     python -m benchmarks.data --steps 50000 --batches 500     # larger than the page cache
 
-Windows have two cameras and 50 actions and are shuffled. The import reads synthetic two-camera
-recordings in LeRobot's encoding (AV1 or H.264, a key frame every 2 frames), at full size and
-resized to 224 pixels, as published models expect. For comparison, the decoder alone runs with one
-video per core. Everything runs on the host; the accelerator is idle.
+A window is one training sample: images of two cameras and 50 actions. Windows are shuffled. The
+import reads synthetic two-camera recordings in LeRobot's encoding (AV1 or H.264, a key frame every
+2 frames). Images keep their size or are resized to 224 pixels, as published models expect. For
+comparison, the decoder runs alone, with one video per core. The accelerator is not used.
 """
 
 import argparse
@@ -96,7 +96,7 @@ def read_cache(folder: Path, steps: int, size: tuple[int, int], batch: int, batc
 
 
 def record(folder: Path, episodes: int, codec: str) -> None:
-    """Write a LeRobot 2.1 dataset; its episodes share one video per camera."""
+    """Write a LeRobot 2.1 dataset, whose episodes repeat one video per camera."""
     rng, lines = np.random.default_rng(0), []
     for number in range(episodes):
         state, action = (rng.standard_normal((EPISODE, 7), np.float32) for _ in range(2))
@@ -156,7 +156,7 @@ def texture(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
 
 
 def import_dataset(folder: Path, codec: str, image_size: int) -> dict[str, Any]:
-    """Measure steps/s and images/s of importing a LeRobot dataset into a cache, with statistics."""
+    """Measure steps/s and images/s of importing a LeRobot dataset into a cache."""
     source = LeRobot(folder / codec, Keys(image_size=image_size))
     target = folder / f"imported_{codec}_{image_size}"
     rate = source.num_steps / seconds(lambda: cache.write([source], target, lambda *_: None))
@@ -182,7 +182,7 @@ def decode(folder: Path, codec: str) -> dict[str, Any]:
 
 
 def statistics(steps: int) -> dict[str, Any]:
-    """Time the measurement of normalization statistics over `steps` steps."""
+    """Time the computation of normalization statistics over `steps` steps."""
     rows = np.random.default_rng(0).standard_normal((steps, 7), np.float32)
     valid = np.ones(steps, bool)
     call = lambda: Statistics.measure(rows, rows, valid, slots=range(7), dim=7)  # noqa: E731

@@ -4,9 +4,9 @@
     python -m benchmarks.decoding --dtype float32 --shapes 1024x1024 --ranks 128 512   # on a CPU
 
 Several layers with separate arrays run in one program, so that neither launch overhead nor cache
-hits dominate. Capacities are fractions of the rank R. The initial router keeps about 0.9 R, so the
-gather drops directions beyond its capacity, which does not affect the time. "gain" is dense time
-divided by gathered time.
+hits dominate. Capacity, the number of directions gathered, is a fraction of the rank R. An
+untrained router keeps about 0.9 R directions, more than the capacity; the gather drops the rest,
+which does not affect its time. "gain" is dense time divided by gathered time.
 """
 
 import argparse
@@ -26,7 +26,7 @@ DIVISORS = (2, 4, 8)
 
 
 def measure(shape: tuple[int, int], rank: int, dtype: str, num_layers: int) -> dict[str, Any]:
-    """Measure microseconds per layer, dense and for each capacity."""
+    """Measure microseconds per layer, with the full bank and with each capacity."""
     method = LoRASP(rank=rank)
 
     def draw(key: jax.Array) -> Any:

@@ -2,11 +2,16 @@
 
     python -m benchmarks.envs --batches 256 1024 4096 --json envs.json
 
-The columns, for each task, backend and batch size, are compile time (`--jobs` programs at once),
-physics steps/s, control steps/s without and with rendering both cameras ("control+images/s"),
-images/s of the ray caster alone (hard shadows, two cameras), memory, and the speed relative to
-MuJoCo's C engine on the same scene with one thread per core ("over C"). Actions are noise around
-the start pose. Inputs are created under jit; times are the best of three calls after two warm-ups.
+Each row is one task, backend and batch size:
+
+- compile s: compile time, with `--jobs` programs compiling at once
+- physics/s, control/s: physics steps and control steps, without rendering
+- control+images/s: control steps, with both cameras rendered in each
+- images/s: the ray caster alone, with hard shadows, both cameras
+- MiB: temporary memory of the program, plus Warp's
+- over C: physics/s relative to MuJoCo's C engine on the same scene, with one thread per core
+
+Actions are noise around the start pose. Times are the best of three calls after two warm-ups.
 """
 
 import argparse
@@ -100,7 +105,7 @@ class Case:
 
 
 def time_images(env: Env, state: State, size: int) -> float:
-    """Measure images/s of the renderer alone: all worlds, both cameras, `size` x `size` px."""
+    """Measure images/s of the ray caster alone: all worlds, both cameras, `size` x `size` px."""
     poses = Poses.of(state.data)
     draw = jax.jit(
         lambda poses: renderer.render_batch(

@@ -2,9 +2,9 @@
 
     python -m benchmarks.long_run --tasks pour --backend warp --episodes 200 --num-envs 256
 
-After each fifth of a task's episodes, a line reports the success rate, the number of broken worlds
-(ended because a position or velocity was not finite), and host and device memory. The exit code is
-1 if a world broke, or if memory grew by more than 2 % after the first fifth.
+A line after each fifth of a task's episodes reports the success rate, the number of broken worlds,
+and host and device memory. A world is broken once a position or velocity is not finite. The exit
+code is 1 if a world broke, or if memory grew by more than 2 % after the first fifth.
 """
 
 import argparse

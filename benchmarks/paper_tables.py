@@ -4,18 +4,17 @@ The paper does not say how it counts. These rules reproduce its percentages to t
 
 - Every linear layer of the PyTorch models has an adapter (422 in pi0, 303 in SmolVLA), including
   the unused lm_heads. The patch embedding is a convolution there and has no adapter.
-- The totals are 3,501,372,176 for pi0, including the action expert's lm_head, which openpi's
-  checkpoints do not contain, and 450,046,176 for SmolVLA. "Trainable/Total" is
+- Totals without adapters are 3,501,372,176 for pi0 and 450,046,176 for SmolVLA. pi0's includes the
+  action expert's lm_head, which openpi's checkpoints do not contain. "Trainable/Total" is
   adapters / (total + adapters).
 - LoRA-MoE has 4 experts of rank 32. AdaLoRA starts at rank 128 and has a diagonal that LoRA lacks.
 - LoRA-SP is `LoRASP.paper()`, with a router of width 4, the only constant width that fits both
   backbones. It omits the five linear layers outside the towers; with them, SmolVLA would have 17.2
-  instead of 17.1. The released code, with a router as wide as the bank, gives 12.0 and 23.0 instead
-  of 9.2 and 17.1.
+  instead of 17.1. The released code has a router as wide as the bank, which gives 12.0 and 23.0
+  instead of 9.2 and 17.1.
 
-These rules cover every row of both columns. The tables also report active ranks and success rates,
-which are measured, not counted; the success of LoRA-SP on pi0 differs between the tables (80 and
-60 % for opening the pot).
+The tables disagree on a measured number: the success of LoRA-SP on pi0 when opening the pot is 80 %
+in one and 60 % in the other.
 """
 
 import math
@@ -56,12 +55,7 @@ BACKBONES: dict[str, BackboneConfig] = {"π0": Pi0Config.base(), "SmolVLA": Smol
 
 
 def count(config: BackboneConfig, method: Method) -> Counts:
-    """Count trainable and total parameters as the paper does, from shapes alone.
-
-    Args:
-        config: config of a backbone.
-        method: an adapter method, or full fine-tuning.
-    """
+    """Count trainable and total parameters as the paper does, from shapes alone."""
     shapes, total = linear_layers(config)
     if method.trains_base:
         return Counts(total, total)

@@ -3,13 +3,18 @@
     python -m benchmarks.peft --json peft.json
     python -m benchmarks.peft --tokens 1024 --shapes 256x2048 2048x256 --dtype float32   # on a CPU
 
-The layers, for each shape [I, O], are the frozen layer alone ("bare"), LoRA as usually written
-(`usual_lora`, autodiff of x W + scale (x A) B), and this project's methods at rank R, with their
-losses. Gradients are with respect to the input and the adapter, as in training. Ratios are relative
-to the usual LoRA in the same run. Memory is that of the compiled program without its arguments. Two
-more tables compare separate and grouped calls of layers that share an input ("I:O,O,O"), and the
-energy gate with a copy of its scores. Inputs are created under jit, everything is warmed up twice,
-and ten calls are queued at once (for the gate, one call with 20 gates).
+Each shape [I, O] has these rows:
+
+- bare: the frozen layer alone
+- usual LoRA: autodiff of x W + scale (x A) B, as LoRA is usually written
+- this project's methods at rank R, with their losses
+
+Gradients are with respect to the input and the adapter, as in training. Ratios are relative to the
+usual LoRA in the same run. Memory is that of the compiled program without its arguments.
+
+A second table compares separate with grouped calls of layers that share an input ("I:O,O,O"). A
+third compares the energy gate with a copy of its scores. Everything is warmed up twice, and ten
+calls are queued at once (for the gate, one call with 20 gates).
 """
 
 import argparse
@@ -132,7 +137,7 @@ def measure_shared_input(
 
 
 def _summed(layers: Callable[..., Any], *arguments: Any) -> tuple[list[jax.Array], Any]:
-    """Return the outputs of several layers, and the sums of their losses by name."""
+    """Return the outputs of several layers, and each loss summed over the layers."""
     outputs = layers(*arguments)
     losses = (dict(aux.losses) for _, aux in outputs)
     return [y for y, _ in outputs], jax.tree.map(lambda *x: sum(x), *losses)
@@ -166,7 +171,7 @@ def measure(options: argparse.Namespace, shape: tuple[int, int]) -> Iterator[dic
 
 
 def measure_gate(options: argparse.Namespace) -> dict[str, Any]:
-    """Measure the gate, and a copy of its scores for comparison, fp32 [tokens, R]."""
+    """Time the gate on fp32 scores [tokens, R], and a copy of these scores for comparison."""
     keys = jax.random.split(jax.random.key(0), COPIES)
     draw = jax.jit(jax.vmap(lambda key: jax.random.normal(key, (options.tokens, options.rank))))
     scores = [*jax.nn.softplus(draw(keys))]

@@ -1,12 +1,12 @@
-"""Scaling of training over the devices of a host: LoRA-SP on all linear layers, random weights.
+"""How training scales across the devices of a host: LoRA-SP on all linear layers, random weights.
 
     python -m benchmarks.scaling --devices 1 2 4 --json scaling.json
     python -m benchmarks.scaling --devices 1 2 --sizes nano --batch 4 --rank 8 --dtype float32
 
-The batch per device ("batch") is constant. "data" replicates all weights on each device; "fsdp"
+The batch per device ("batch") is constant. "data" replicates all weights on each device. "fsdp"
 shards base weights, adapters and optimizer state over the devices and gathers each layer's weights
-when needed. "efficiency" is the rate divided by the number of devices and by the rate of one
-device; GiB is the memory of the program on each device.
+when needed. "efficiency" is the rate per device relative to the rate on one device; "GiB" is the
+program's memory per device.
 """
 
 import argparse
