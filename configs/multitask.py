@@ -7,7 +7,7 @@
 Loads the base pretrained on a simulated Franka Panda (assets/), collects PiPER demonstrations with
 the scripted expert, evaluates the base, trains adapters jointly on the paper's four tasks,
 evaluates again and writes runs/multitask/report.html. Expected results and times are in the README.
-On a CPU only two tasks are trained; pass `--tasks open_pot pour press pick_place` for all four.
+Scale cpu trains only two tasks; pass `--tasks open_pot pour press pick_place` for all four.
 """
 
 from lorasp_jax.config import Config, DataConfig, EvaluationConfig, ModelConfig, OptimConfig

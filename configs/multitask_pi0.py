@@ -6,10 +6,10 @@
     python train.py --config configs/multitask_pi0.py --model.size base_pi05 \\
         --model.checkpoint gs://openpi-assets/checkpoints/pi05_base
 
-Downloads weights and tokenizer from openpi's buckets unless you pass your own; weights may be in
-openpi's or LeRobot's layout. Needs a GPU with 80 GB or, with `--model.remat full`, 24 GB;
-`--fsdp N` shards the base over N devices. pi0 has three camera slots; the third is masked. The last
-command adapts pi0.5.
+The last command adapts pi0.5. Weights and tokenizer are downloaded from public buckets unless you
+pass your own; weights may be in openpi's or LeRobot's layout. Needs a GPU with 80 GB or, with
+`--model.remat full`, 24 GB; `--fsdp N` shards the base over N devices. The third of pi0's camera
+slots is masked.
 """
 
 from lorasp_jax.config import Config, DataConfig, EvaluationConfig, ModelConfig, OptimConfig

@@ -64,7 +64,7 @@ class Batch(NamedTuple):
     action: jax.Array
     log_prob: jax.Array
     value: jax.Array
-    error: jax.Array  # of temporal differences
+    error: jax.Array  # temporal-difference error
     done: jax.Array
     success: jax.Array
 
@@ -105,7 +105,7 @@ def log_prob(params: Any, x: jax.Array, action: jax.Array) -> jax.Array:
 
 
 def rollout(env: envs.Env, config: Config, learner: Learner, key: jax.Array) -> Any:
-    """Take T steps in every world, restarting finished worlds; return final state and steps."""
+    """Take T steps in every world, restarting finished ones; return last state and all steps."""
     params, moments = learner.params, learner.moments
 
     def value(x: jax.Array) -> jax.Array:
