@@ -6,12 +6,14 @@
 The file must describe an arm: up to 16 hinges from its base to a hand with two sliding fingers, and
 a position actuator for each hinge and for the fingers. Parts are recognized by type, not by name.
 Angles are in degrees unless the file has `<compiler angle="radian"/>`, as always in MJCF.
-Joints, masses, gains, meshes, names (prefixed with "robot/") and the pose of the base are kept; a
-hinge's limits are the intersection of its range and its actuator's ctrlrange. Everything that
-belongs to a scene is dropped: floor, lights, options, keyframes, sensors, tendons, equalities. A
-camera "wrist" becomes the wrist camera; an arm without one gets that of the built-in robots. As on
-these robots, only the fingers collide, each with a box around the ends of its colliding geoms and a
-small sphere at the tip: MJX is slow with meshes.
+
+Joints, masses, gains, meshes, names (prefixed with "robot/") and the pose of the base are kept.
+Everything that belongs to a scene is dropped: floor, lights, options, keyframes, sensors, tendons,
+equalities. A hinge's limits are the intersection of its range and its actuator's ctrlrange. A
+camera "wrist" becomes the wrist camera; an arm without one gets that of the built-in robots.
+
+As on the built-in robots, only the fingers collide, because MJX is slow with meshes. Each finger
+gets a small sphere at its tip, and a box around those of its colliding geoms that reach near it.
 """
 
 import os
@@ -24,7 +26,7 @@ from envs.mjcf import attaching, hands, posing, reading
 from envs.robots import Robot
 from envs.scene import scene
 
-_SPEED = 2.5  # rad/s; our choice, between Panda (2.175 to 2.61) and PiPER (3)
+_SPEED = 2.5  # rad/s; our choice; Panda has 2.175 to 2.61, PiPER 3
 _GRIPPER_SPEED = 0.1  # m/s; our choice, the same as for the built-in robots
 
 
@@ -42,18 +44,17 @@ def load(
 
     Args:
         path: the MJCF file.
-        tcp: name of a site in the hand whose z axis points out between the fingers, which open
-            along its y axis. The default is the site "tcp" if it exists; otherwise z is the last
-            joint's axis. The robot's tcp is on that z axis, `robots.TIP_LENGTH` before the
-            fingers' ends.
-        speed: speed limits [rad/s], one for all joints or one per joint; MJCF does not give them.
+        tcp: name of a site in the hand, by default "tcp". Its z axis must point out between the
+            fingers, which must open along its y axis. Without a site, z is the last joint's axis.
+            The robot's tcp is midway between the fingers, `robots.TIP_LENGTH` before their ends.
+        speed: speed limits [rad/s], one for all joints or one per joint; MJCF has none.
         gripper_speed: maximum speed of the opening [m/s].
-        folder: folder that must contain all referenced files, such as meshes, after following
-            links; by default the folder of the file.
+        folder: folder that must contain all referenced files, such as meshes, once links are
+            resolved; by default the folder of the file.
 
     Raises:
-        ValueError: the file cannot be read, refers to files outside of `folder`, or lacks something
-            that tasks need; the message says what is needed and what the file has.
+        ValueError: a speed is not positive, or the file cannot be read, refers to files outside of
+            `folder` or lacks something that tasks need. The message says what is needed.
     """
     try:
         robot = _read(path, tcp, speed, gripper_speed, folder)
@@ -70,7 +71,7 @@ def _read(
     gripper: float,
     folder: str | os.PathLike[str] | None,
 ) -> Robot:
-    """Read the robot; its home is a guess, and its lean and tilt side are placeholders."""
+    """Read the robot; `posing.complete` will replace its home, lean and tilt side."""
     spec, model = reading.read(path, folder)
     arm = reading.find_arm(model)
     hand = hands.find(model, arm, tcp)
@@ -101,7 +102,7 @@ def _positive(name: str, value: float | Sequence[float], count: int) -> np.ndarr
 
 
 def _guess_home(model: mujoco.MjModel, arm: reading.Arm, mid_range: np.ndarray) -> np.ndarray:
-    """Return a first guess [J] of the start pose: the keyframe "home", or else mid-range."""
+    """Guess the start pose [J]: the keyframe "home" if it exists, else mid-range."""
     for i in range(model.nkey):
         if model.key(i).name == "home":
             return model.key_qpos[i, model.jnt_qposadr[arm.joints]]

@@ -16,7 +16,7 @@ from envs.robots import Robot
 _BASE = "base"
 _PREFIX = "robot/"  # for all names in the user's file, to avoid clashes with the scene and tasks
 _DROPPED = ("keys", "sensors", "actuators", "tendons", "equalities", "pairs", "excludes", "lights")
-_UNSET = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default; a geom of this color has its material's
+_UNSET = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default color; such a geom has that of its material
 _SMALL = 0.01  # m, half-extent below which a mesh is not drawn; our choice
 _HIDDEN_GROUP = 3
 
@@ -30,7 +30,7 @@ class UserBody:
         root: name of the base's body.
         fingers: names of the left and the right finger's joint.
         pads: collision shapes of the left and the right finger.
-        gripper: the servo that closes the fingers.
+        gripper: servo of the fingers.
         mount: [4, 4] pose of the body that carries the fingers, in the frame of the last link.
     """
 
@@ -42,7 +42,7 @@ class UserBody:
     mount: np.ndarray
 
     def mjcf(self, _: Robot, /) -> tuple[str, str]:
-        """Return an empty base body as a mount for the robot, and no actuators."""
+        """Return an empty base body, which `attach` fills, and no actuators."""
         return f'<body name="{_BASE}"/>', ""
 
     def attach(self, robot: Robot, scene: mujoco.MjSpec) -> None:
@@ -82,7 +82,7 @@ def prepare(
         arm, gripper, hand: its parts.
 
     Raises:
-        ValueError: the file sets the total mass, which would be lost in a scene.
+        ValueError: the file uses settotalmass, which would be lost in a scene.
     """
     if spec.compiler.settotalmass > 0:
         raise ValueError("settotalmass is not supported: give bodies and geoms their own masses")
@@ -104,7 +104,7 @@ def prepare(
     for geom_id, geom in geoms.items():
         if model.body_rootid[model.geom_bodyid[geom_id]] == arm.root:
             _make_visual(model, geom_id, geom)
-    # Frames around the root are not attached, so use the pose that the compiler computed from them.
+    # Frames around the root are not attached with it, so use the pose that the compiler computed.
     root.pos, root.quat = model.body_pos[arm.root], model.body_quat[arm.root]
     root.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
     names = [joint.name for joint in fingers]
@@ -114,7 +114,7 @@ def prepare(
 def _add_servo(
     spec: mujoco.MjSpec, model: mujoco.MjModel, joint: str, servo: int, gear: float
 ) -> None:
-    """Copy the user's actuator; the copy acts on the joint itself, not through a tendon."""
+    """Copy the user's actuator; the copy always acts on the joint, never through a tendon."""
     new = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     new.gear[0] = gear
     for name in (
@@ -137,8 +137,8 @@ def _redefine(joint: Any, sign: float, shift: float) -> None:
 def _make_visual(model: mujoco.MjModel, geom_id: int, geom: Any) -> None:
     """Disable a geom's collisions; if it is a visible mesh, add primitives to draw in its place.
 
-    Colors are moved from materials to geoms, since MuJoCo Warp prefers a material's color, which
-    `Appearance` does not change; only textured materials remain.
+    A geom keeps only a textured material; other materials are replaced by their color. Otherwise,
+    MuJoCo Warp would use the material's color, which `Appearance` does not change.
     """
     geom.contype = geom.conaffinity = 0
     geom.group = min(geom.group, STAND_IN_GROUP - 1)

@@ -1,7 +1,7 @@
 """Approximate meshes by primitive shapes, for a renderer that does not draw triangles.
 
-A mesh is split into a few parts wherever that shrinks the total volume of their bounding boxes
-enough, and each part is replaced by the box, cylinder or capsule closest to its surface.
+A mesh is cut into parts as long as a cut shrinks the total volume of their bounding boxes enough.
+Each part is replaced by the box, cylinder or capsule closest to its surface.
 """
 
 import dataclasses
@@ -34,7 +34,7 @@ class Shape:
         kind: MuJoCo's geom type: box, cylinder or capsule.
         size: [3] in MuJoCo's convention for that type [m].
         position, rotation: [3] in m and [3, 3].
-        distance: mean distance from the points of the part to the shape's surface [m].
+        distance: mean distance of the part's points from the shape's surface [m].
     """
 
     kind: mujoco.mjtGeom
@@ -45,7 +45,7 @@ class Shape:
 
 
 def fit(model: mujoco.MjModel, geom: int) -> list[Shape]:
-    """Approximate a mesh geom by shapes aligned with its inertia axes or its file's axes."""
+    """Approximate a mesh geom by shapes along its inertia axes or the axes of its file."""
     mesh = model.geom_dataid[geom]
     file_axes = np.empty(9)
     mujoco.mju_quat2Mat(file_axes, model.mesh_quat[mesh])
@@ -90,7 +90,7 @@ def _fit(points: np.ndarray, rotations: list[np.ndarray], depth: int) -> list[Sh
 
 
 def _closest(points: np.ndarray, rotations: list[np.ndarray]) -> tuple[Shape, float]:
-    """Return the closest shape with one of these rotations, and the volume of the smallest box."""
+    """Return the closest shape and the volume of the smallest box, both over these rotations."""
     shapes = []
     for rotation in rotations:
         local = points @ rotation
@@ -114,5 +114,5 @@ def _closest(points: np.ndarray, rotations: list[np.ndarray]) -> tuple[Shape, fl
 
 
 def _signed(past: np.ndarray) -> np.ndarray:
-    """Compute signed distances [N] to a convex shape from the distances [N, S] to its sides."""
+    """Compute signed distances [N] to a shape from those past its perpendicular sides, [N, S]."""
     return np.linalg.norm(np.maximum(past, 0), axis=1) + np.minimum(past.max(axis=1), 0)

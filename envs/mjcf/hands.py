@@ -1,4 +1,4 @@
-"""Locate the hand of a user's robot: its frame, how its fingers move and where they collide."""
+"""Locate the hand of a user's robot: its frame, its fingers' motion and their collision shapes."""
 
 import itertools
 from typing import NamedTuple
@@ -25,8 +25,7 @@ class Pad(NamedTuple):
 class Hand(NamedTuple):
     """The hand of an arm.
 
-    For a finger joint at q, sign * q + shift is half the opening: the distance from the tcp to the
-    finger's pad.
+    If a finger's joint is at q, its pad is sign * q + shift [m] from the tcp: half the opening.
     """
 
     chain: np.ndarray  # [J, 4, 4] as in `Robot`
@@ -48,7 +47,8 @@ def find(model: mujoco.MjModel, arm: Arm, tcp: str | None) -> Hand:
 
     Raises:
         ValueError: the fingers do not slide along one line, do not open far enough or have no
-            colliding geom, or the site does not exist or does not match the fingers.
+            colliding geom; or the site does not exist, or does not match the fingers; or there is
+            no site, and the last joint's axis does not match them.
     """
     data = mujoco.MjData(model)
     data.qpos[model.jnt_qposadr[arm.joints]] = 0
@@ -81,8 +81,8 @@ def _open(model: mujoco.MjModel, data: mujoco.MjData, arm: Arm) -> tuple[np.ndar
     """Open the fingers in `data`.
 
     Returns:
-        Sign [2] of each joint's motion as the hand opens, and the direction [3] from the second
-        finger to the first.
+        The sign [2] of each joint's motion when the hand opens, and the direction [3] from the
+        second finger to the first.
     """
     mujoco.mj_kinematics(model, data)
     line = data.xaxis[arm.fingers[0]]
@@ -161,7 +161,7 @@ def _axes(
 
 
 def _end(corners: np.ndarray) -> np.ndarray:
-    """Return the bounds [2, 3] of the boxes [N, 8, 3] near the end of a finger."""
+    """Return the bounds [2, 3] of those boxes of a finger, [N, 8, 3], that reach near its end."""
     reach = corners[:, :, 2].max(axis=1)
     near = corners[reach > reach.max() - 2 * TIP_LENGTH].reshape(-1, 3)
     return np.stack([near.min(axis=0), near.max(axis=0)])
@@ -170,7 +170,7 @@ def _end(corners: np.ndarray) -> np.ndarray:
 def _center(
     data: mujoco.MjData, axes: np.ndarray, left: np.ndarray, right: np.ndarray, site: str | None
 ) -> np.ndarray:
-    """Compute the coordinates of the tcp [3] along the hand's axes."""
+    """Compute the tcp's coordinates [3] along the hand's axes."""
     x = np.mean([left[:, 0], right[:, 0]])
     if site:
         x = data.site(site).xpos @ axes[:, 0]
@@ -197,7 +197,7 @@ def _pose(position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 
 
 def _pad(data: mujoco.MjData, body: int, pose: np.ndarray, box: np.ndarray) -> Pad:
-    """Make a finger's pad from its bounds [2, 3], given along the axes of the tcp's pose [4, 4]."""
+    """Make a finger's pad from its bounds [2, 3] along the axes of the tcp's pose [4, 4]."""
     axes, origin = pose[:3, :3], pose[:3, 3]
     low, high = box - origin @ axes
     side = np.sign(low[1] + high[1])
@@ -212,5 +212,5 @@ def _pad(data: mujoco.MjData, body: int, pose: np.ndarray, box: np.ndarray) -> P
 
 
 def _degrees(cosine: float) -> float:
-    """Return the angle between two lines, rounded [deg]."""
+    """Return the angle between two lines, rounded to degrees."""
     return round(np.rad2deg(np.arccos(min(abs(cosine), 1.0))))

@@ -1,6 +1,6 @@
-"""Choose the start pose, lean and tilt side of a user's arm.
+"""Choose the start pose, lean and tilt side of a robot arm supplied by the user.
 
-The built-in robots specify these; for other arms, inverse kinematics finds them.
+The built-in robots specify these; for other arms, they are found by inverse kinematics.
 """
 
 import dataclasses
@@ -19,20 +19,22 @@ from envs.tasks import tool_down
 
 _HOME = (0.34, 0.0, 0.18)  # m, start position of every robot's tcp
 _LEANS = np.deg2rad(np.arange(0, 50, 5)).astype(np.float32)
-# Corners of the boxes in which tasks place and carry objects, and in which they pour [m].
+# Corners of the regions in which tasks place and carry objects, and in which they pour [m].
 _TABLE = np.array([(x, y, z) for x in (0.28, 0.43) for y in (-0.18, 0.19) for z in (0.02, 0.15)])
 _POUR = np.array([(x, y, 0.2) for x in (0.34, 0.40) for y in (0.09, 0.15)])
-_TILTS = np.deg2rad([25, 94])  # of the task "pour": carrying the cup, pouring
-# Our choices.
+_TILTS = np.deg2rad([25, 94])  # in the task "pour": while carrying the cup, while pouring
+# Our choices, not dictated by the tasks.
 _TOLERANCE = 0.004  # m, largest error of a pose that counts as reached
 _LEVER = 0.1  # m, converts an error in angle to one in position
 _MARGIN = 0.05  # rad, minimum distance of each joint from its limits
-_ROWS = 32  # number of poses solved at once
+_ROWS = 32  # poses solved at once
 _TRIES, _SPREAD = 8, 0.4  # number of random starts, standard deviation around the guess [rad]
 
 
 def complete(robot: Robot) -> Robot:
     """Set home, lean and tilt side; rotate the tcp by 180 degrees about z if that fits better.
+
+    Warn if the arm misses parts of the table.
 
     Args:
         robot: a robot whose home is a first guess.
@@ -51,7 +53,7 @@ def complete(robot: Robot) -> Robot:
         )
     cost = np.maximum(table_errors, _TOLERANCE)
     cost[errors > _TOLERANCE] = np.inf
-    # At equal cost, prefer the smallest lean, then the larger margin of the last joint.
+    # At equal cost, prefer the smallest lean, then the largest margin of the last joint.
     margin = np.abs(homes[:, -1:] - [robot.lower[-1], robot.upper[-1]]).min(axis=1)
     best = np.lexsort((-margin, leans, cost))[0]
     if cost[best] > _TOLERANCE:
@@ -69,8 +71,8 @@ def _try_leans(robot: Robot, leans: np.ndarray, turns: np.ndarray) -> tuple[np.n
     """Try N leans and rotations of the tcp about z.
 
     Returns:
-        Homes [N, J] in rad, their errors at the start pose [N] and, starting from those homes, at
-        the worst point of the table [N], in m.
+        Homes [N, J] in rad, their errors [N] in m at the start pose, and the largest errors [N] in
+        m over the table.
     """
     rng = np.random.default_rng(0)
     spread = _SPREAD * rng.standard_normal((_TRIES, robot.num_joints))
@@ -89,7 +91,7 @@ def _try_leans(robot: Robot, leans: np.ndarray, turns: np.ndarray) -> tuple[np.n
 
 
 def _tilt_side(robot: Robot) -> int:
-    """Return the side, 1 or -1 as in `Robot`, to which the hand tilts more accurately to pour."""
+    """Return the tilt side, 1 or -1 as in `Robot`, with the smaller error when pouring."""
     carrying, pouring = np.array([[1.0], [-1.0]]) * _TILTS[:, None, None]
     solutions, _ = _solve(robot, _POUR, carrying, 0.0, robot.home, robot.home)
     _, errors = _solve(robot, _POUR, pouring, 0.0, solutions, robot.home)
@@ -105,8 +107,8 @@ def _solve(
     Args:
         robot: the arm.
         at: [..., 3] positions [m].
-        lean, turn: [...] angles of the tcp from pointing down: outward, and about its z axis [rad].
-        start, home: [..., J] initial joint angles, and those that redundant joints tend to [rad].
+        lean, turn: [...] angles outward from pointing down, and about the tcp's z axis [rad].
+        start, home: [..., J] initial joint angles, and those redundant joints are pulled to [rad].
 
     Returns:
         Joint angles [..., J] in rad, and their errors [...] in m.
@@ -125,7 +127,7 @@ def _solve(
     return q.reshape(*shape, -1), error.reshape(shape)
 
 
-@jax.jit  # robots are traced: those with the same number of joints share a compilation
+@jax.jit  # the arm is traced, so arms with the same number of joints share a compilation
 @functools.partial(jax.vmap, in_axes=(None,) * 4 + (0,) * 5)
 def _solve_block(
     chain: jax.Array,

@@ -14,7 +14,7 @@ from envs.scene import scene
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _KINDS = ("free", "ball", "slide", "hinge")
 _MAX_JOINTS = 16  # our choice: compile time grows with every joint
-_RADIANS_AS_DEGREES = np.deg2rad(4 * np.pi)  # width [rad] of +-2 pi misread as degrees
+_RADIANS_AS_DEGREES = np.deg2rad(4 * np.pi)  # width [rad] if +-2 pi is read as degrees
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
@@ -47,7 +47,7 @@ def read(
 
     Raises:
         ValueError: the file does not exist, MuJoCo rejects it, it refers to files outside of
-            `folder`, or it asks for something too large.
+            `folder`, or something in it is too large.
     """
     path = Path(path).absolute()
     if not os.path.isfile(path):  # Path.is_file raises if a name is too long
@@ -59,8 +59,8 @@ def read(
     try:
         with scene.as_python_warnings():
             spec = mujoco.MjSpec.from_file(str(path))
-            spec.memory = -1  # automatic: this model itself is never simulated
-            # Keep the ids of bodies and geoms.
+            spec.memory = -1  # automatic, whatever the file asks for
+            # Merge no bodies and drop no geoms: both would change the ids in the model.
             spec.compiler.fusestatic = spec.compiler.discardvisual = False
             return spec, spec.compile()
     except ValueError as error:
@@ -155,7 +155,7 @@ def _servo(model: mujoco.MjModel, joint: int) -> tuple[int, float]:
     others = np.any([_rates(model, j) for j in range(model.njnt) if j != joint], axis=0)
     for i in np.flatnonzero(rates * ~others).tolist():
         gain = model.actuator_gainprm[i, 0]
-        # There is no force if control = angle: gain * control and bias * rate * angle cancel.
+        # At control = angle, the force must be 0: gain * control and bias * rate * angle cancel.
         if _is_servo(model, i) and np.isclose(gain, -model.actuator_biasprm[i, 1] * rates[i]):
             return i, float(rates[i])
     raise ValueError(
@@ -165,7 +165,7 @@ def _servo(model: mujoco.MjModel, joint: int) -> tuple[int, float]:
 
 
 def _rates(model: mujoco.MjModel, joint: int) -> np.ndarray:
-    """Compute the derivative of every actuator's length with respect to a joint, [nu]."""
+    """Compute the derivatives [nu] of the actuators' lengths with respect to a joint."""
     rates = np.zeros(model.nu)
     for i in range(model.nu):
         target, gear = model.actuator_trnid[i, 0], model.actuator_gear[i, 0]

@@ -15,16 +15,16 @@ from xml.etree import ElementTree
 
 from envs.datasets.files import check_memory, check_regular, read_text
 
-_FOLDERS = ("assetdir", "meshdir", "texturedir")  # attributes of compiler
+_FOLDERS = ("assetdir", "meshdir", "texturedir")  # attributes of <compiler>
 _DESCRIPTIONS = ("include", "model")  # elements that refer to another MJCF file
-_EXPANDED = ("include", "attach")  # elements that are replaced by those of another MJCF file
-# Limits are our choices, far above the needs of any robot; MuJoCo 3.17 takes seconds at _MAX_COPIES
-# and _MAX_ELEMENTS (measured).
+_EXPANDED = ("include", "attach")  # elements replaced by the content of another MJCF file
+# Limits are our choices, far above the needs of any robot. At _MAX_COPIES and _MAX_ELEMENTS, MuJoCo
+# 3.17 takes seconds (measured).
 _MAX_DEPTH, _MAX_TEXT = 20, 2**25
 _MAX_COPIES, _MAX_ELEMENTS = 1000, 10_000
 _MAX_ENTRIES, _MAX_PATHS = 10**6, 10**5
 _ENTRIES = {"dim", "num", "nsample"}  # attributes of sensors and actuators
-_MAX_RINGS = 300  # rings per built-in mesh; each has at most as many vertices
+_MAX_RINGS = 300  # rings per built-in mesh, and vertices per ring
 _BYTES = ("memory", "nstack")  # attributes of <size> that `reading` ignores
 _PIXEL_BYTES = 4
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -35,10 +35,10 @@ def check(path: Path, folder: Path) -> None:
 
     Args:
         path: the MJCF file.
-        folder: folder that must contain all referenced files, after following links.
+        folder: folder that must contain all referenced files, once links are resolved.
 
     Raises:
-        ValueError: a file is outside, or something is too large.
+        ValueError: a file is outside of the folder, or something is too large.
     """
     descriptions = _all_descriptions(path, folder)
     for root in descriptions.values():
@@ -67,7 +67,7 @@ def _all_descriptions(path: Path, folder: Path) -> dict[Path, ElementTree.Elemen
 def _check_growth(descriptions: dict[Path, ElementTree.Element], main: Path) -> None:
     """Raise a ValueError if a file includes itself, or expands to too many elements.
 
-    A cycle would crash this process; loading takes time quadratic in the number of elements.
+    MuJoCo would crash on a cycle, and loads in time quadratic in the number of elements.
     """
     included: dict[Path, set[Path]] = {}
     for path, root in descriptions.items():
@@ -94,7 +94,7 @@ def _check_growth(descriptions: dict[Path, ElementTree.Element], main: Path) -> 
 
 
 def _elements(element: ElementTree.Element, copies: float, inner: float) -> float:
-    """Bound the number of elements that `element` expands to, given `inner` per included file."""
+    """Return a bound on the elements that `element` expands to, with `inner` per included file."""
     more = inner if element.tag in _EXPANDED else 0.0
     below = copies * _copies(element)
     return copies * (1 + more) + sum(_elements(child, below, inner) for child in element)
@@ -103,7 +103,7 @@ def _elements(element: ElementTree.Element, copies: float, inner: float) -> floa
 def _referenced(
     descriptions: dict[Path, ElementTree.Element], main: Path, kinds: tuple[str, ...]
 ) -> Iterator[Path]:
-    """Yield all existing files that elements of these kinds (empty: all) may refer to."""
+    """Yield the existing files that elements of these kinds (empty: all kinds) may refer to."""
     elements = [element for root in descriptions.values() for element in root.iter()]
     below = {_portable(e.get(name, "")) for e in elements for name in _FOLDERS}
     folders = {main, *(path.parent for path in descriptions)}
@@ -113,7 +113,7 @@ def _referenced(
         for attribute, value in element.attrib.items()
         if attribute.startswith("file") and (not kinds or element.tag in kinds)
     }
-    names |= {os.path.basename(name) for name in names}  # for strippath
+    names |= {os.path.basename(name) for name in names}  # strippath drops folders
     parts = folders, below, {os.path.relpath(folder, main) for folder in folders}, names
     if math.prod(map(len, parts)) > _MAX_PATHS:
         raise ValueError(f"its file names and folders combine to more than {_MAX_PATHS} paths")
@@ -158,7 +158,7 @@ def _copies(element: ElementTree.Element) -> float:
 
 
 def _numbers(element: ElementTree.Element, attribute: str) -> list[float]:
-    """Parse an attribute's numbers, raised to at least 1; leave malformed ones to MuJoCo."""
+    """Parse an attribute's numbers, each at least 1; MuJoCo reports malformed ones."""
     try:
         return [max(1.0, float(text)) for text in element.get(attribute, "").split()]
     except ValueError:

@@ -1,6 +1,6 @@
 """Robot arms: one module per robot, found by the `ROBOT` that it defines.
 
-Shared modules: `arm_kinematics`, forward and inverse kinematics; `_robot`, the class of robots.
+`_robot` and `arm_kinematics` are shared by all robots.
 """
 
 import importlib
@@ -53,7 +53,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> ModuleType:
-    """Import a robot's module on access, so that `import envs` makes `envs.robots.piper` work."""
+    """Import a robot's module on access, so `envs.robots.piper` works after `import envs`."""
     if importlib.util.find_spec(f"envs.robots.{name}") is None:
         raise AttributeError(f"module 'envs.robots' has no attribute {name!r}")
     return importlib.import_module(f"envs.robots.{name}")

@@ -1,9 +1,10 @@
 """A robot arm's parameters, and its MJCF with primitive shapes.
 
-A robot's joint chain is defined once; its MuJoCo bodies and its analytic kinematics both derive
-from this chain and cannot disagree. All hands share one tool frame, `tcp`: z points out of the
-hand, y is the axis along which the fingers open, and the finger tips end `TIP_LENGTH` further along
-z. Tasks and experts therefore need not know the robot.
+The MuJoCo bodies and the analytic kinematics both derive from one joint chain and cannot disagree.
+
+All hands share one tool frame, the `tcp` (tool center point), so tasks and experts need not know
+the robot. Its z axis points out of the hand, the fingers open along its y axis, and the finger tips
+end at z = `TIP_LENGTH`.
 """
 
 import dataclasses
@@ -15,7 +16,7 @@ import numpy as np
 TIP_LENGTH = 0.012  # m from the tcp to the end of the finger tips on every hand; our choice
 TIP_RADIUS = 0.005  # m, of the sphere with which a finger tip touches its surroundings; our choice
 
-# The wrist camera sits on the outer side of the hand and looks along it, tilted 22 degrees towards
+# The wrist camera sits on the outer side of the hand and looks along it, tilted 22 degrees toward
 # the tips. Our choice: the tips are in the lower half of the image, the object above them.
 WRIST_POSITION, WRIST_FOVY = (-0.08, 0.0, -0.093), 75.0  # m, deg
 WRIST_AXES = (0.0, -1.0, 0.0, -0.9272, 0.0, 0.3746)  # x and y axes of the camera in the tcp frame
@@ -25,7 +26,7 @@ class Body(Protocol):
     """The simulated part of a robot: bodies, joints, geoms, actuators."""
 
     def mjcf(self, robot: "Robot", /) -> tuple[str, str]:
-        """Return MJCF of the body tree, base at the world's origin, and of the position servos."""
+        """Return MJCF of the body tree, with its base at the origin, and of the position servos."""
         ...
 
     def attach(self, robot: "Robot", scene: mujoco.MjSpec) -> None:
@@ -39,15 +40,16 @@ class Robot:
 
     Attributes:
         name: name of the robot's module, or path of a user's MJCF file.
-        chain: [J, 4, 4] fixed transform from link i-1 (base first) to joint i, a hinge about z.
+        chain: [J, 4, 4] transform from the previous link (first the base) to each joint at angle 0;
+            joints are hinges about z.
         tool: [4, 4] pose of the tcp in the last link.
         lower, upper: [J] joint limits [rad].
         speed: [J] joint speed limits [rad/s].
         home: [J] start pose [rad]: tcp at (.34, 0, .18) m, tool pointing down plus `lean`.
-        lean: angle by which the hand leans outwards when it works from above [rad], chosen to keep
-            the wrist within its limits over the whole table in front of the robot.
-        tilt_side: side to which the hand can tilt by 90 degrees from pointing down: 1 outwards, -1
-            back towards the base.
+        lean: angle by which the hand leans outward when it works from above [rad], so that the
+            wrist stays within its limits over the whole table in front of the robot.
+        tilt_side: side to which the hand can tilt by 90 degrees from pointing down: 1 is outward,
+            -1 is back toward the base.
         stroke: largest gripper opening, both fingers together [m].
         gripper_speed: maximum speed of the opening [m/s].
         body: the simulated part.
@@ -92,7 +94,7 @@ class Robot:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Primitives:
-    """A robot body built from primitive shapes on the joint chain.
+    """A robot's body, built from primitive shapes on the joint chain.
 
     Attributes:
         stiffness, damping: [J] gains of the position actuators [N m/rad, N m s/rad].
@@ -140,8 +142,8 @@ class Primitives:
         xml = ""
         for i, (kp, kv) in enumerate(zip(self.stiffness, self.damping, strict=True)):
             xml += f'<position name="joint{i + 1}" joint="joint{i + 1}" kp="{kp}" kv="{kv}"/>'
-        # The target is half the opening. kp, kv: our choice; they hold a 12 g grape without slip
-        # and stay below 20 N at full stroke.
+        # The target is half the opening. kp and kv are our choices: they hold a 12 g grape without
+        # slip, and the force stays below 20 N at full stroke.
         return xml + '<position name="gripper" joint="left" kp="400" kv="20"/>'
 
 

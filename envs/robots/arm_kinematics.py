@@ -8,8 +8,8 @@ import numpy as np
 
 from envs.robots._robot import Robot
 
-# Damped least squares: damping, weight of rotation [m/rad], largest step [rad]. Our choices: with
-# them, an expert placed the grape in 64 of 64 worlds.
+# For damped least squares: damping, weight of rotation [m/rad], largest step [rad]. Our choices,
+# with which an expert placed the grape in 64 of 64 worlds.
 _DAMPING, _ROTATION_WEIGHT, _MAX_STEP = 0.03, 0.3, 0.3
 _ITERATIONS = 60  # our choice
 _POSTURE_GAIN = 0.1  # our choice: share of the way home that redundant joints move per iteration
@@ -71,11 +71,7 @@ def forward_kinematics(chain: np.ndarray | jax.Array, q: jax.Array) -> tuple[jax
 
 
 def tool_pose(robot: Robot | Geometry, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Compute the pose of the tcp and its Jacobian.
-
-    Args:
-        robot: the arm.
-        q: [J] joint angles [rad].
+    """Compute the pose of the tcp and its Jacobian at joint angles q [J] in rad.
 
     Returns:
         Position [3] in m, rotation [3, 3], Jacobian [6, J]: three linear rows, then three angular.
@@ -92,7 +88,7 @@ def tool_pose(robot: Robot | Geometry, q: jax.Array) -> tuple[jax.Array, jax.Arr
 def inverse_kinematics(
     robot: Robot | Geometry, position: jax.Array, rotation: jax.Array, start: jax.Array
 ) -> jax.Array:
-    """Solve for joint angles [J] within the limits that bring the tcp to a pose.
+    """Solve for joint angles [J] in rad, within the limits, that bring the tcp to a pose.
 
     Args:
         robot: the arm.

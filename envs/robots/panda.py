@@ -1,7 +1,7 @@
 """Franka Emika Panda: seven joints and a parallel gripper with 80 mm stroke.
 
-Kinematics, joint ranges, masses and servo gains are from MuJoCo Menagerie's `mjx_panda.xml`, speed
-limits from Franka's data sheet. Shapes are primitives along the links.
+Kinematics, joint ranges, masses and servo gains are from MuJoCo Menagerie's `mjx_panda.xml`. Speed
+limits are from Franka's data sheet. Shapes are primitives along the links.
 """
 
 import numpy as np
@@ -33,10 +33,10 @@ _LINKS = (
     f'<geom type="capsule" size=".048" fromto="0 0 0 .075 0 0" mass="1.667" {_WHITE}/>',
     f'<geom type="cylinder" size=".044 .02" pos="0 0 .08" mass=".736" {_LIGHT}/>',
 )
-# The hand sits 107 mm from joint 7, rotated by -45 degrees about z; the finger bodies start 58.4 mm
-# further and their pads end 53.9 mm after that (.0584 + .0539 = .1123 m from the hand). The tcp is
-# rotated by another 180 degrees, under which the gripper is symmetric, so that its x axis points
-# back to the base when the tool points down, as on the other robots.
+# The hand sits 107 mm from joint 7, rotated by -45 degrees about z. The finger bodies start 58.4 mm
+# further on, and their pads end 53.9 mm after that: .0584 + .0539 = .1123 m from the hand. The tcp
+# is rotated by another 180 degrees, so that its x axis points back to the base when the tool points
+# down, as on the other robots. The gripper is symmetric under this rotation.
 _HAND = robots.translation(0, 0, 0.107) @ robots.rotation("z", np.pi - np.pi / 4)
 
 ROBOT = robots.Robot(
@@ -48,12 +48,12 @@ ROBOT = robots.Robot(
     speed=np.array([2.175] * 4 + [2.61] * 3),  # Franka data sheet [rad/s]
     home=np.array([0.0, -0.354, 0.0, -2.897, 0.0, 2.543, 0.785]),
     lean=0.0,
-    tilt_side=-1,  # if tilted outwards, joint 6 would reach its limit before 90 degrees
+    tilt_side=-1,  # tilted outward, joint 6 would reach its limit before 90 degrees
     stroke=0.08,  # two fingers of 0.04 m
     gripper_speed=0.1,  # Franka hand data sheet: 50 mm/s per finger
     body=robots.Primitives(
-        # Menagerie's gains, with its passive joint damping (40, then 2) added to kv, which
-        # has the same effect.
+        # Menagerie's gains; its passive joint damping (40, then 2) is added to kv, which has the
+        # same effect.
         stiffness=np.array([1000.0, 1000.0, 750.0, 750.0, 300.0, 300.0, 300.0]),
         damping=np.array([60.0, 60.0, 44.0, 44.0, 4.0, 4.0, 4.0]),
         armature=0.1,

@@ -1,9 +1,8 @@
 """AgileX PiPER: six joints and a parallel gripper with 70 mm stroke.
 
 Kinematics, limits and speeds are from the vendor's `piper_sdk` 0.6.2. Masses and servo gains are
-from MuJoCo Menagerie's `agilex_piper` (commit cd165455), whose link masses exclude the motors, so
-joints are gravity-compensated and the dynamics are not realistic. Shapes are primitives along the
-links.
+from MuJoCo Menagerie's `agilex_piper` (commit cd165455). Its link masses exclude the motors, so
+gravity is compensated and the dynamics are not realistic. Shapes are primitives along the links.
 """
 
 import jax
@@ -47,8 +46,8 @@ def forward_kinematics(q: jax.Array, *, sdk_offset: bool = False) -> tuple[jax.A
 
     Args:
         q: [..., 6] joint angles [rad].
-        sdk_offset: use the vendor SDK's default zeros (dh_is_offset=1) of joints 2 and 3, which
-            differ by 2 degrees from the URDF's; check which ones your arm's firmware uses.
+        sdk_offset: use the SDK's default zeros (dh_is_offset=1) of joints 2 and 3, which differ by
+            2 degrees from the URDF's. Check which ones your arm's firmware uses.
 
     Returns:
         Positions [..., 6, 3] in m and rotations [..., 6, 3, 3].
@@ -63,15 +62,12 @@ def forward_kinematics(q: jax.Array, *, sdk_offset: bool = False) -> tuple[jax.A
 
 
 def from_sdk_zeros(q: jax.Array) -> jax.Array:
-    """Convert joint angles [..., 6] in rad from an arm with the SDK's zeros to this model's.
-
-    The vendor SDK's default zeros (dh_is_offset=1) of joints 2 and 3 differ from ours by 2 degrees.
-    """
+    """Convert joint angles [..., 6] in rad from the SDK's default zeros to this model's zeros."""
     return q + jax.numpy.asarray(_SDK_OFFSET, q.dtype)
 
 
 def to_sdk_zeros(q: jax.Array) -> jax.Array:
-    """Convert this model's joint angles [..., 6] in rad to those of an arm with the SDK's zeros."""
+    """Convert joint angles [..., 6] in rad from this model's zeros to the SDK's default zeros."""
     return q - jax.numpy.asarray(_SDK_OFFSET, q.dtype)
 
 
@@ -97,7 +93,7 @@ ROBOT = robots.Robot(
     speed=np.full(6, 3.0),  # piper_sdk, [rad/s]
     home=np.array([0.0, 1.528, -1.248, 0.0, 1.029, 0.0]),
     lean=np.deg2rad(20.0),  # our choice
-    tilt_side=1,  # if tilted inwards, joint 5 would soon reach its limit
+    tilt_side=1,  # tilted inward, joint 5 would soon reach its limit
     stroke=0.07,  # piper_sdk, GripperCtrl [m]
     gripper_speed=0.1,  # our choice, same as the Panda's [m/s]
     body=robots.Primitives(
