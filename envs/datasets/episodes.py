@@ -225,10 +225,10 @@ def check_camera(name: str) -> None:
 
 
 def concatenate(parts: Sequence[Episodes]) -> Episodes:
-    """Concatenate episodes of the same task and robot, padding them to the length of the longest.
+    """Concatenate episodes of one task and robot, padded to the longest.
 
     Raises:
-        ValueError: `parts` is empty, or its episodes differ in a field of `SHARED` or image shape.
+        ValueError: `parts` is empty, or its episodes differ in image shapes or a field of `SHARED`.
     """
     if not parts:
         raise ValueError("there is nothing to concatenate: parts is empty")
@@ -251,7 +251,7 @@ def concatenate(parts: Sequence[Episodes]) -> Episodes:
 
 
 def _dtype_and_shape(array: Any) -> str:
-    """Describe an array or tracer; return the `repr` of any other leaf of a mapped tree."""
+    """Describe an array or tracer, or return the `repr` of what a tree map put in its place."""
     return f"{array.dtype}{list(array.shape)}" if hasattr(array, "dtype") else repr(array)
 
 
@@ -272,7 +272,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
 
 
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
-    """Read one array, after checking its size against its header, which NumPy trusts."""
+    """Read one array after checking its size, since NumPy trusts the size in its header."""
     with archive.open(member) as file:
         if (version := np.lib.format.read_magic(file)) not in _HEADERS:
             raise ValueError(f"{member.filename} has unsupported .npy version {version}")

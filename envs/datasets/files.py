@@ -1,6 +1,6 @@
 """Checks of untrusted files: their location, their type and their size.
 
-A name in a dataset or a model may be a URL, lead out of its folder or refer to a pipe; a size
+A name in a dataset or a model may be a URL, lead out of its folder or refer to a pipe. A size
 recorded there may exceed any memory. All code that opens such files calls these checks first.
 """
 
@@ -58,12 +58,12 @@ def check_regular(path: Path, folder: Path | None = None) -> Path:
 
     Args:
         path: the file, or a link to it.
-        folder: folder that must contain the file once links are resolved; None: anywhere. A
-            snapshot in the Hugging Face cache may link to files elsewhere in that cache.
+        folder: folder that must contain the file once links are resolved; None: anywhere. If it is
+            a snapshot in the Hugging Face cache, links into that cache are allowed.
 
     Raises:
         RefusedError: it is not a regular file, or is outside of the folder.
-        OSError: it is missing, or may not be read.
+        OSError: it is missing or unreadable.
     """
     real = Path(os.path.realpath(path, strict=True))
     mode = real.stat().st_mode
@@ -77,11 +77,11 @@ def check_regular(path: Path, folder: Path | None = None) -> Path:
 
 
 def path_beside(file: Path, name: object) -> Path:
-    """Return the path of a file that `file` refers to, in the same folder; it may be missing.
+    """Return the path of the file `name` in the same folder as `file`; it may be missing.
 
     Raises:
         RefusedError: the name leads elsewhere, or to something that is not a regular file.
-        OSError: it may not be read.
+        OSError: it is unreadable.
     """
     if not isinstance(name, str) or Path(name).name != name or name in ("", "..") or "\0" in name:
         raise RefusedError(f"{file} refers to {name!r}, which is not a file beside it")
@@ -98,7 +98,7 @@ def check_only_files(folder: Path, home: Path | None = None) -> None:
 
     Raises:
         RefusedError: it contains something else, or leads out of `home`.
-        OSError: a link is broken, or a file may not be read.
+        OSError: a link is broken, or a file is unreadable.
     """
     for path in folder.rglob("*"):
         if path.is_dir():
@@ -111,7 +111,7 @@ def read_bytes(path: Path, folder: Path | None = None) -> bytes:
     """Read a file after the checks of `check_regular`.
 
     Raises:
-        RefusedError: as in `check_regular`; or it is larger than `TEXT_BYTES`.
+        RefusedError: as in `check_regular`, or it is larger than `TEXT_BYTES`.
         OSError: as in `check_regular`.
     """
     if (size := check_regular(path, folder).stat().st_size) > TEXT_BYTES:
@@ -152,7 +152,7 @@ def as_value_error(path: Path, *also: type[Exception], remedy: str = "") -> Iter
 
     Args:
         path: the file or folder read in the block.
-        also: exceptions that a library raises for damaged files, besides Python's own.
+        also: further exceptions that a library raises for damaged files.
         remedy: what to do, as the end of the message.
     """
     try:
@@ -184,7 +184,7 @@ def check_memory(size: int, what: object) -> None:
 
 
 def as_int(number: Any) -> int:
-    """Convert a number from a table to an int; columns with missing values hold integers as floats.
+    """Convert a number from a table to an int; it is a float if its column has missing values.
 
     Raises:
         ValueError: it is not an integer, or its magnitude is 2^63 or more.
@@ -196,7 +196,7 @@ def as_int(number: Any) -> int:
 
 
 def _check_contained(path: Path, folder: Path | None) -> None:
-    """Raise RefusedError if a path, with links resolved, is outside of a folder."""
+    """Raise RefusedError if a path is outside of a folder once links are resolved."""
     real = Path(os.path.realpath(path))
     if folder is not None and not any(real.is_relative_to(f) for f in _allowed_folders(folder)):
         raise RefusedError(
@@ -207,9 +207,9 @@ def _check_contained(path: Path, folder: Path | None) -> None:
 def _allowed_folders(folder: Path) -> list[Path]:
     """Return the folders in which the files of a folder may be stored.
 
-    The files of a snapshot, cache/datasets--OWNER--NAME/snapshots/REVISION/, are links into the
-    dataset's blobs/, whose files may in turn be links into the cache's blobs/ (huggingface_hub
-    2.4.0, file_download.py and utils/_shared_blobs.py).
+    In the Hugging Face cache, the files of a snapshot, datasets--OWNER--NAME/snapshots/REVISION/,
+    are links into the dataset's blobs/. The files there may be links into the cache's own blobs/
+    (huggingface_hub 2.4.0, file_download.py and utils/_shared_blobs.py).
     """
     folder = Path(os.path.realpath(folder))
     allowed = [folder]

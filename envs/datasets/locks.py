@@ -18,12 +18,11 @@ def locked(path: Path, waiting: Callable[[], None] | None = None) -> Iterator[No
     """Keep other processes and threads from writing the same file or folder.
 
     The lock is a file next to the path, deleted at the end. If the block raises, empty folders
-    created for the lock file are deleted, too.
+    created for it are deleted, too.
 
     Args:
         path: the file or folder.
-        waiting: called once if another process holds the lock, before waiting for it; None: raise
-            instead.
+        waiting: called before waiting for another process that holds the lock; None: raise instead.
 
     Raises:
         ValueError: another process holds the lock and `waiting` is None, the path is a URL, or the

@@ -4,9 +4,8 @@
     episodes = rlds.read("data/press")
     source = tfds.builder_from_directory("data/press").as_data_source("train")  # with tfds alone
 
-Images are lossless PNG. Metadata that all episodes share is stored once for the dataset
-(`builder.info.metadata`, from metadata.json); every episode repeats most of it, with floats rounded
-to float32.
+Images are lossless PNG. Metadata that all episodes share is in metadata.json, which tfds reads as
+`builder.info.metadata`. Every episode repeats most of it, with floats rounded to float32.
 """
 
 import contextlib
@@ -53,7 +52,7 @@ def write(episodes: Episodes, path: str | os.PathLike[str]) -> None:
     """Write a dataset folder, which appears only once it is complete.
 
     Args:
-        episodes: successful episodes, as from `envs.collect`: the last step gets reward 1.
+        episodes: successful episodes, as from `envs.collect`. Their last steps get reward 1.
         path: folder to create.
 
     Raises:
@@ -70,14 +69,18 @@ def write(episodes: Episodes, path: str | os.PathLike[str]) -> None:
 class ShardWriter:
     """Write a dataset shard by shard, resuming after the complete shards in its folder.
 
-    The metadata file lists the complete shards and is replaced atomically after each one, so the
-    process may be killed at any time: an incomplete shard is ignored.
+    The process may be killed at any time: the metadata file lists the complete shards and is
+    replaced atomically after each one, and an incomplete shard is ignored.
 
     Attributes:
         folder: folder of the shards.
-        metadata: content of metadata.json: fields of `Episodes`; `options`, how the episodes were
-            made; `parts`, the number of episodes in each shard; `steps`, the total number of
-            control steps; `cameras`, height and width of each camera's images.
+        metadata: content of metadata.json:
+
+            - the fields of `Episodes` that all shards share;
+            - `options`: how the episodes were made;
+            - `parts`: number of episodes in each shard;
+            - `steps`, `attempted`: total number of control steps and of attempts;
+            - `cameras`: height and width of each camera's images.
     """
 
     def __init__(self, folder: Path, options: Mapping[str, Any]):
@@ -85,7 +88,7 @@ class ShardWriter:
 
         Args:
             folder: created if it does not exist.
-            options: JSON values, which must equal those that the folder was created with.
+            options: JSON values; an existing folder must have been created with the same.
 
         Raises:
             ValueError: the options differ, or a shard is damaged.
@@ -118,8 +121,7 @@ class ShardWriter:
         """Append a shard, and add its attempts to `attempted`.
 
         Raises:
-            ValueError: the arrays are inconsistent, or the metadata differs from that of earlier
-                shards.
+            ValueError: the arrays are inconsistent, or the metadata differs from earlier shards.
             OSError: the disk is full; earlier shards are unaffected.
         """
         episodes.validate()

@@ -18,10 +18,10 @@ from envs.datasets.files import RefusedError, as_int, check_regular, read_json
 
 FORMAT, SPLIT = "envs-rlds-1", "train"
 METADATA = "metadata.json"
-"""Metadata file in a dataset's folder; tfds also reads a file of this name."""
+"""Metadata file in a dataset's folder; tfds reads it, too."""
 THREADS = ThreadPoolExecutor(8)
 """Shared by all open datasets: more threads would only wait for the GIL."""
-# Types of the metadata fields in every dataset, then of those only in datasets with shards.
+# Types of metadata fields: those of every dataset, then those that appear with the first shard.
 _TYPES: dict[str, Any] = {"options": dict, "parts": list, "steps": int, "attempted": int}
 _SHARD_TYPES: dict[str, Any] = {"task": str, "robot": str, "actions": str, "instructions": list}
 _SHARD_TYPES |= {"cameras": dict, "control_dt": int | float, "physics_dt": int | float}
@@ -98,7 +98,7 @@ class Reader:
             self._shared: dict[str, Any] = {name: self.metadata[name] for name in SHARED}
             self._shared |= {"instructions": tuple(self.metadata["instructions"]), "attempted": 1}
             builder = _builder(self.path, self.metadata["parts"])
-            # `rlds_schema.episode` decodes images of the selected cameras, after checking sizes.
+            # `rlds_schema.episode` decodes only selected cameras, and checks image sizes first.
             encoded = {name: tfds.decode.SkipDecoding() for name in self.cameras.values()}
             decoders = {"steps": {"observation": encoded}}
             self._source = builder.as_data_source(SPLIT, decoders=decoders)
@@ -127,7 +127,7 @@ class Reader:
 
 
 def _builder(folder: Path, parts: Sequence[int]) -> Any:
-    """Make tfds's builder for a folder, after checking its files and the episodes in each shard."""
+    """Make tfds's builder for a folder, after checking its files and the length of each shard."""
     rlds_schema.check_description(folder, rlds_schema.FEATURES, rlds_schema.INFO)
     builder: Any = tfds.builder_from_directory(folder)
     split = builder.info.splits[SPLIT]

@@ -1,6 +1,6 @@
 """The schema of RLDS datasets: each episode is one record of tensorflow-datasets (tfds).
 
-Features are named as in Open X-Embodiment.
+Features have the names of Open X-Embodiment.
 """
 
 import io
@@ -19,7 +19,7 @@ from envs.datasets.episodes import Episodes
 from envs.datasets.files import RefusedError, read_json
 
 FEATURES, INFO = "features.json", "dataset_info.json"
-"""Files in a dataset's folder with tfds's description of the dataset."""
+"""Files of tfds that describe a dataset, in the dataset's folder."""
 FILES = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_INDEX}"
 """Template of shard names, as used by tfds.core.SequentialWriter."""
 _MAIN = {"side": "image"}  # feature of the main camera; the others are <name>_image
@@ -55,9 +55,9 @@ _ALLOWED = {
     "jsonFeature": [],
     "json_feature": [],
 }
-"""Maps each field that tfds interprets in a description, as spelled by tfds and by protobuf, to its
-allowed values. The last two fields, and "type" at the top level, hold features in older formats,
-which also name classes."""
+"""Allowed values of each field that tfds interprets in a description. Fields are spelled as by tfds
+and as by protobuf. The last two fields, and "type" at the top level, are of older formats and are
+refused: they name classes, too."""
 
 
 def features(episodes: Episodes) -> tfds.features.FeaturesDict:
@@ -119,7 +119,7 @@ def stored(folder: Path) -> tfds.features.FeaturesDict:
 
 
 def check_description(folder: Path, *names: str) -> None:
-    """Raise unless files are safe for tfds, which imports classes and expands templates in them.
+    """Raise unless tfds, which imports the classes named in these files, can read them safely.
 
     Raises:
         RefusedError: a file names a class, data type or encoding that `features` does not use, or
@@ -200,7 +200,7 @@ def episode(
     """Convert an example from tfds to an episode in host memory.
 
     Args:
-        example: an example from tfds, with encoded images.
+        example: the example, with encoded images.
         cameras: camera -> feature of its images.
         sizes: camera -> height and width of its images.
         metadata: the metadata fields of `Episodes`.
@@ -229,8 +229,8 @@ def _encode(images: Any) -> list[bytes]:
     """Encode uint8 `[T, H, W, 3]` images in host memory as PNG files (ISO/IEC 15948).
 
     No library is as fast: zlib releases the GIL, and rendered images compress best without a
-    filter. Measured for images of 128 px on 16 cores: 8 threads take 56 us per image; ffmpeg's
-    encoder takes 88 at best, OpenCV's 141 and PIL's 177, for files 15 % larger.
+    filter. On 16 cores, 8 threads take 56 us per image of 128 px (measured). At best, ffmpeg's
+    encoder takes 88 us, OpenCV's 141 and PIL's 177, for files 15% larger.
     """
     count, height, width, _ = images.shape
     rows = np.zeros((count, height, 1 + 3 * width), np.uint8)  # each row begins with 0: no filter

@@ -1,8 +1,8 @@
 """Atomic writes of files and folders: write under a temporary name, then rename.
 
-Contents are synced to disk before the rename and the rename before the call returns, so a crash or
-a power failure never leaves a partial file under the final name. If anything fails, for example on
-a full disk, the temporary file is deleted and the old file is kept.
+Contents are synced to disk before the rename, and the rename before the call returns. A crash or a
+power failure thus never leaves a partial file under the final name. If a write fails, the temporary
+file is deleted and the old file is kept.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ def atomic_file(file: Path) -> Iterator[Path]:
     """Yield a temporary path to write to; it replaces the file if the block succeeds.
 
     Raises:
-        OSError: the file cannot be written, for example because the disk is full.
+        OSError: the file cannot be written, for example to a full disk.
     """
     temporary = file.with_name(f".{file.name}.{secrets.token_hex(4)}{TEMPORARY_SUFFIX}")
     try:
@@ -49,12 +49,12 @@ def write_text(file: Path, text: str) -> None:
 def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a new folder to fill, which is renamed to `path` if the block succeeds.
 
-    Only one process at a time may create a path (see `envs.datasets.locks.locked`), because
-    leftovers of a killed process are deleted first.
+    Leftovers of a killed process are deleted first, so only one process at a time may create a path
+    (see `envs.datasets.locks.locked`).
 
     Raises:
         ValueError: the path already exists.
-        OSError: something cannot be written, for example because the disk is full.
+        OSError: something cannot be written, for example to a full disk.
     """
     path = Path(path)
     if path.exists():
@@ -76,9 +76,11 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
 def replace_folder(new: Path, path: Path, check: Callable[[Path], object]) -> None:
     """Rename a complete folder to `path`, then delete the folder that it replaces, if any.
 
+    If the process is killed, `recover_folder` completes the replacement.
+
     Args:
         new: the complete folder.
-        path: its new name. If the process is killed, `recover_folder` completes the replacement.
+        path: its new name.
         check: called with `path` if it exists; raises if it must not be deleted.
     """
     if path.exists():
@@ -89,7 +91,7 @@ def replace_folder(new: Path, path: Path, check: Callable[[Path], object]) -> No
 
 
 def recover_folder(path: Path) -> None:
-    """Finish an interrupted `replace_folder`: keep the new folder if present, else the old."""
+    """Finish an interrupted `replace_folder`: keep the new folder if there is one, else the old."""
     if not path.exists() and _old(path).exists():
         rename(_old(path), path)
     elif _old(path).exists():
