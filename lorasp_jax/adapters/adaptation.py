@@ -64,8 +64,7 @@ def adapt(
     Args:
       model: not modified; the result shares its frozen arrays.
       rules: (pattern, method or None) pairs; see the module docstring.
-      rngs: supplies one key. A layer's initial adapter depends only on this key and the layer's
-        path.
+      rngs: supplies one key, from which each layer derives its own by its path.
       einsums: extra layer classes that compute one einsum of their input and a parameter, mapped to
         a function layer -> (parameter name, equation), as in
         {gemma.Einsum: lambda layer: ("w", layer.einsum_str)}.
@@ -108,7 +107,7 @@ def with_dropout(model: Model, key: jax.Array) -> Model:
         model = with_dropout(nnx.merge(graphdef, adapters, frozen, copy=True), key)
 
     `adapt`, `load_adapters`, `split` and `merge` return models with dropout off. The layers of a
-    stack use independent masks. A layer called twice on inputs of one shape reuses its mask.
+    stack use independent masks. A layer called twice with the same input shape reuses its mask.
 
     Args:
       model: not modified; adapters without dropout are unaffected.
@@ -160,7 +159,7 @@ def merge(model: Model) -> Model:
 
 
 def _merged(location: paths.Location) -> nnx.Module:
-    """Fold the adapter into the kernel and return the layer without it."""
+    """Fold the adapter into the kernel; return the layer without an adapter."""
     layer = location.child
     if layer.adapter is not None:
         try:

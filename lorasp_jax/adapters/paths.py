@@ -55,7 +55,7 @@ def replace(locations: Sequence[Location], make: Callable[[Location], Any]) -> N
 
     `make` returns the replacement for a location, or None to skip it. A shared child gets one
     replacement for all its locations, the first that is not None. Only a shared `nnx.Linear` is
-    replaced at each location separately, so that each has its own adapter.
+    replaced separately at each location, so that each location has its own adapter.
     """
     replacements: dict[Hashable, Any] = {}
     for location in locations:

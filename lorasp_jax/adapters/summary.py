@@ -107,7 +107,6 @@ def _row(path: str, method: str, kernel: Any, rank: Any, counts: Counts) -> Row:
 
 
 def _align(row: Row, widths: list[int]) -> list[str]:
-    """Left-align the first three cells and right-align the others."""
     left, right = zip(row[:3], widths[:3], strict=True), zip(row[3:], widths[3:], strict=True)
     return [cell.ljust(w) for cell, w in left] + [cell.rjust(w) for cell, w in right]
 

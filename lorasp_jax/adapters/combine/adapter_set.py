@@ -5,8 +5,8 @@
 The weights w are an array, so choosing other adapters does not recompile. For a method that is not
 additive (DoRA), Δ_i is its output minus x W.
 
-LoRAs share one bank, padded to a common rank. One matmul computes the down-projections of all
-additive adapters, and another their up-projections. Everything else runs separately for each
+LoRAs are padded to a common rank and share one bank. One matmul computes the down-projections of
+all additive adapters, and another their up-projections. Everything else runs separately for each
 adapter that is not a LoRA. Adapters with weight 0 are computed too.
 """
 
@@ -33,9 +33,11 @@ class AdapterSetParam(nnx.Param[Any]):
 class NamedAdapters(nnx.Module):
     """A layer's `adapter` in a combined model: the parameters of an `AdapterSet`.
 
+    All arrays have the leading axes of a stack.
+
     Attributes:
-      choice: the weights; has the leading axes of a stack.
-      params: all other parameters; have the leading axes of a stack.
+      choice: the weights.
+      params: all other parameters.
     """
 
     def __init__(self, params: Params, choice: jax.Array) -> None:
@@ -60,7 +62,7 @@ class AdapterSet(Method):
     """
 
     names: tuple[str, ...]
-    """All A names."""
+    """Names of all A adapters."""
     methods: tuple[Method | None, ...]
     """Method of each adapter; None if it is in the bank."""
 

@@ -294,7 +294,6 @@ def _check_same_base(first: nnx.Module, name: str, second: nnx.Module, other: st
 
 
 def _parameters(model: nnx.Module) -> dict[str, Any]:
-    """Parameter leaves by path."""
     state = nnx.to_pure_dict(nnx.state(model, nnx.Param))
     leaves = jax.tree_util.tree_leaves_with_path(state)
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}

@@ -51,7 +51,7 @@ def values_of(patterns: Mapping[str, Any], names: Collection[str], default: Any)
 
 
 def _ways(tree: Iterable[tuple[Any, Any]], length: int) -> int:
-    """Upper bound, at most `MAX_WAYS` + 1, on the number of ways to match `length` characters.
+    """Upper bound on the number of ways to match `length` characters, capped at `MAX_WAYS` + 1.
 
     Raises:
       ValueError: the pattern has a construct that PEFT's patterns do not need.

@@ -219,7 +219,6 @@ def _leaves_by_name(adapters: nnx.State) -> dict[str, jax.Array]:
 
 
 def _methods(saved: Mapping[str, Any], folder: pathlib.Path) -> dict[str, Method]:
-    """Methods of a description, by path."""
     try:
         return {path: peft.from_settings(settings) for path, settings in saved.items()}
     except (ValueError, TypeError, OverflowError) as error:

@@ -211,8 +211,8 @@ def make_adaptable(layer: nnx.Module, einsums: Einsums) -> AdaptedLayer:
       einsums: extra einsum layer classes.
 
     Raises:
-      ValueError: the layer has a custom matmul or precision, its equation cannot be adapted, or it
-        has an attribute named like one that adapted layers need.
+      ValueError: the layer has a custom matmul or precision, its equation cannot be adapted, or an
+        attribute that adapted layers need already exists.
     """
     if isinstance(layer, AdaptedLayer):
         return layer

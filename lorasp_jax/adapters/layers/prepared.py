@@ -7,7 +7,7 @@ time. Layers with a shared input are therefore fused into one input and one outp
     [x W, x P] = x [W, P]         W and P of all layers, concatenated
     y = x W + z diag(U)           with z = f(x P), and diag(U) block-diagonal
 
-The functions f of all layers run as one GPU kernel if their method provides it. For stacked layers
+The functions f of all layers run as one GPU kernel if their method has one. For stacked layers
 that run once, such as the vision tower's, copying W would cost more than it saves: only the P are
 concatenated, and P and U are cast to the compute dtype. The original layers are removed. For
 training, see `lorasp_jax.kernels.low_rank_matmul`.
@@ -210,7 +210,7 @@ def _bottleneck(
 ) -> tuple[jax.Array, Aux]:
     """Concatenated z of all layers, in the dtype of `projected`, and aux.
 
-    The products x P start at column `start` of `projected`.
+    The columns of x P begin at `start` in `projected`.
     """
     kernel, width, out_sizes = arrays.bottleneck
     columns = range(start, start + len(out_sizes) * width, width)
