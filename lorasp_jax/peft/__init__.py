@@ -1,6 +1,6 @@
 """Framework-agnostic adapter methods, one frozen dataclass per file or folder.
 
-`create("lora_sp", rank=64)` finds a method by its module name; adding a method takes one new file.
+`create("lora_sp", rank=64)` finds a method by its module name, so a new method is one new file.
 Modules that begin with `_` are shared by the methods.
 """
 
@@ -41,7 +41,7 @@ __all__ = [
 
 
 def names() -> list[str]:
-    """Names of the methods: the modules of this package that do not begin with `_`."""
+    """Names of all methods."""
     return sorted(m.name for m in pkgutil.iter_modules(__path__) if not m.name.startswith("_"))
 
 
@@ -63,7 +63,7 @@ def find(name: str) -> type[Method]:
 
 
 def create(name: str, **fields: Any) -> Method:
-    """Create the method `name` (a module name such as lora, lora_sp or full) with the given fields.
+    """Create a method by name, such as "lora", "lora_sp" or "full".
 
     Raises:
       ValueError: unknown method, unknown field or invalid value.
@@ -72,7 +72,7 @@ def create(name: str, **fields: Any) -> Method:
 
 
 def from_settings(settings: Any) -> Method:
-    """Create a method from the settings that `to_settings` wrote, in this or an earlier version.
+    """Create a method from settings written by this or an earlier version of `to_settings`.
 
     Raises:
       ValueError: `settings` does not name a method, or `create` rejects it.

@@ -1,4 +1,4 @@
-"""Auxiliary outputs of an adapted layer. Padding is excluded from every average."""
+"""Auxiliary outputs of adapted layers, and their averages over valid tokens."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -17,10 +17,11 @@ class Aux:
 
     Attributes:
       active_rank: f32 [...tokens], number of active directions; None if the method has no rank.
-      kept_energy: f32 [...tokens], E_k of eq. (12) of the LoRA-SP paper; None without a gate.
+      kept_energy: f32 [...tokens], the active directions' fraction of the score energy: E_k of
+        eq. (12) of the LoRA-SP paper. None for methods without an energy gate.
       losses: fp32 scalars by name, averaged over the valid tokens.
       token_mask: bool [...tokens], True for valid tokens; None if all are valid.
-      usage: f32 [R], number of valid tokens that use each direction; None without a gate.
+      usage: f32 [R], number of valid tokens that use each direction; None without an energy gate.
       statistics: sums over valid tokens, by layer path; empty except during calibration
         (`lorasp_jax.adapters.compress.calibration`).
     """
@@ -50,8 +51,8 @@ def auxiliary_losses(aux: Any) -> dict[str, jax.Array]:
     """Average each auxiliary loss over the adapted layers that have it: f32 scalars by name.
 
     Args:
-      aux: any tree of `Aux`, such as the result of `collect_aux`. An `Aux` stacked by a scan over
-        layers counts as one layer per stacked entry.
+      aux: any tree of `Aux`, such as the result of `collect_aux`. An `Aux` stacked by a scan counts
+        once per layer.
 
     Raises:
       ValueError: a leaf of the tree is not an `Aux`.

@@ -1,7 +1,6 @@
-"""`Method.bottleneck` of several layers in one call: a fused GPU kernel, or `jax.vmap`.
+"""Compute `Method.bottleneck` of several layers in one call.
 
-A method need not provide a fused kernel. `lorasp_jax.peft._shared_input` and layers prepared for
-inference make such calls.
+Used for layers with a shared input, in training and in models prepared for inference.
 """
 
 import dataclasses
@@ -16,13 +15,13 @@ from lorasp_jax.peft._aux import Aux
 
 
 class BatchedBottleneck:
-    """`bottleneck` of n layers of one method.
+    """Computes `bottleneck` of n layers of one method.
 
-    Instances are hashable; equal instances compute the same function.
+    Instances must be hashable, and equal instances must compute the same function.
     """
 
     def pack(self, params: Any) -> Any:
-        """Convert a layer's `bottleneck_params` for `bottleneck_all`, once for many calls."""
+        """Convert a layer's `bottleneck_params` to the form that `bottleneck_all` expects."""
         return params
 
     def bottleneck_all(
@@ -32,12 +31,13 @@ class BatchedBottleneck:
 
         Args:
           params: from `pack`, stacked [n, ...].
-          projected: [...tokens, C], which includes x P of all layers.
-          columns: range of the layers' start columns; its step is the width Q.
+          projected: [...tokens, C], contains the rows x P of all layers.
+          columns: start column of each layer in `projected`. The step is the width Q of x P.
           token_mask: see `Method.delta`.
 
         Returns:
-          z of all layers, concatenated to [...tokens, n R], and aux [n, ...] with token_mask unset.
+          z of all layers, concatenated to [...tokens, n R], and their aux, stacked to [n, ...] with
+          token_mask unset.
         """
         raise NotImplementedError
 
@@ -59,13 +59,13 @@ class BatchedBottleneck:
     def bottleneck(
         self, params: Any, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
-        """`bottleneck` of a single layer."""
+        """Apply `Method.bottleneck` of a single layer."""
         return self.bottleneck_each([params], rows, [rows.shape[-1]], token_mask)[0]
 
 
 @dataclasses.dataclass(frozen=True)
 class VmapBottleneck(BatchedBottleneck):
-    """Fallback for a method without a fused kernel: `jax.vmap` over the layers."""
+    """Applies `jax.vmap` to the `bottleneck` of a method without a fused kernel."""
 
     method: Bottleneck
 

@@ -16,7 +16,9 @@ MAX_INT = 2**31 - 1
 
 
 def check_fields(owner: Any, prefix: str = "") -> None:
-    """Check field values against their annotations. Ints are valid floats; bools are not numbers.
+    """Check field values against their annotations.
+
+    An int is a valid float; a bool is neither.
 
     Args:
       owner: a dataclass instance. Only annotations that are classes, unions, `Literal` or
@@ -24,8 +26,8 @@ def check_fields(owner: Any, prefix: str = "") -> None:
       prefix: prefix of field names in messages, such as "optim.".
 
     Raises:
-      ValueError: a value of the wrong type, a number that is not finite in fp32, or an integer
-        whose magnitude exceeds the "max" in its field's metadata, or `MAX_INT` if there is none.
+      ValueError: a value has the wrong type, a number is not finite in fp32, or an integer's
+        magnitude exceeds the "max" in its field's metadata (default `MAX_INT`).
     """
     fields = dataclasses.fields(owner) if dataclasses.is_dataclass(owner) else ()
     maximum = {field.name: field.metadata.get("max", MAX_INT) for field in fields}
@@ -70,7 +72,10 @@ def short(value: Any) -> str:
 
 
 def is_array(value: Any) -> bool:
-    """Whether a value has a dtype and a shape. (`hasattr` is always True for `nnx.Rngs`.)"""
+    """Whether a value has a dtype and a shape tuple.
+
+    (`hasattr` alone is not enough: `nnx.Rngs` with a default stream has every attribute.)
+    """
     return hasattr(value, "dtype") and isinstance(getattr(value, "shape", None), tuple)
 
 

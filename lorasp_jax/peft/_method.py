@@ -1,8 +1,8 @@
 """Base class for adapter methods.
 
-A method is a frozen dataclass of hyperparameters. It holds no arrays: `init` creates the parameter
-pytree, and everything else is a pure function of that pytree. Methods are framework-agnostic; the
-NNX and Linen wrappers are in `lorasp_jax.dense`.
+A method is a frozen dataclass of hyperparameters and holds no arrays. `init` creates the parameter
+pytree; everything else is a pure function of it. The NNX and Linen wrappers are in
+`lorasp_jax.dense`.
 """
 
 import dataclasses
@@ -30,19 +30,19 @@ class ShapeLike(Protocol):
 Kernel: TypeAlias = jax.Array | ShapeLike
 
 MAX_SIZE = 2**20
-"""Upper bound for ranks and widths. Larger values are likely mistakes and would exhaust memory."""
+"""Upper bound for ranks and widths. Larger values are likely mistakes."""
 MAX_ALPHA = 1e30
 """Upper bound for |α| and 1/|α|, so that α/R neither overflows nor underflows in fp32."""
 
 
 class Method:
-    """Base class. An additive method implements `init_params` and the four parts of its update:
+    """Base class. An additive method implements `init_params`, `down`, `bottleneck`, `up`, `merge`:
 
-        delta = z U,    z, aux = bottleneck(bottleneck_params(params), x P),
-        P = down(params),    U = up(params)
+        z, aux = bottleneck(bottleneck_params(params), x P),    P = down(params)
+        delta = z U,    U = up(params)
 
-    x is [...tokens, I] and the kernel is [I, O]; the result has x's dtype. The
-    parameters of an adapter are fp32.
+    x is [...tokens, I], the kernel W is [I, O], and delta has x's dtype. The parameters of an
+    adapter are fp32.
     """
 
     def __new__(cls, *values: Any, **fields: Any) -> "Method":
@@ -77,7 +77,7 @@ class Method:
 
     @property
     def down_in_fp32(self) -> bool:
-        """True if x P must be in fp32, whatever the dtype of x."""
+        """True to keep x P in fp32, whatever the dtype of x."""
         return False
 
     @property
@@ -97,7 +97,7 @@ class Method:
 
     @property
     def as_saved(self) -> "Method":
-        """The method to save with the parameters, used to load them again."""
+        """The method to save with the parameters and to load them with."""
         return self
 
     def init(
@@ -148,7 +148,7 @@ class Method:
         raise NotImplementedError
 
     def fused_kernel(self, params: Params) -> BatchedBottleneck | None:
-        """A fused GPU kernel for `bottleneck` if the parameters' shapes allow one, else None."""
+        """A fused GPU kernel for `bottleneck`, or None if none supports these parameters."""
         del params
 
     def up(self, params: Params) -> jax.Array:
@@ -158,7 +158,7 @@ class Method:
     def delta(
         self, params: Params, x: jax.Array, *, token_mask: jax.Array | None = None
     ) -> tuple[jax.Array, Aux]:
-        """Compute the adapter's addition to x @ kernel, [...tokens, O], and aux.
+        """Compute what the adapter adds to x @ kernel, [...tokens, O], and aux.
 
         Args:
           params: from `init`.
@@ -195,9 +195,9 @@ class Method:
         *,
         token_mask: jax.Array | None = None,
     ) -> tuple[jax.Array, Aux]:
-        """The adapted linear layer without bias, [...tokens, O]: x @ kernel + delta, fused.
+        """Apply the adapted linear layer without its bias: x @ kernel + delta, [...tokens, O].
 
-        `kernel` receives no gradient. See `delta` for the arguments.
+        `kernel` receives no gradient. See `delta` for the other arguments.
 
         Raises:
           ValueError: x, the mask or the kernel has the wrong shape or dtype, or the parameters
@@ -221,8 +221,8 @@ class Method:
     ) -> tuple[jax.Array, Aux]:
         """`apply` with dropout: the adapter sees dropout(x), the kernel sees x.
 
-        A method that is not additive (DoRA) is applied to dropout(x) as a whole, and the
-        remainder (x - dropout(x)) W is added unscaled, as in Hugging Face PEFT.
+        A method that is not additive (DoRA) has no separate delta. It is applied to dropout(x), and
+        (x - dropout(x)) W is added, as in Hugging Face PEFT.
 
         Args:
           params: from `init`.
@@ -293,7 +293,7 @@ class Method:
 
 
 def name_of(cls: type[Method]) -> str:
-    """The name of the file that defines a method, or of the folder containing its `method.py`."""
+    """The name of a method: its file's, or its folder's if the file is `method.py`."""
     folder, _, file = cls.__module__.rpartition(".")
     return folder.rpartition(".")[2] if file == "method" else file
 
@@ -310,6 +310,6 @@ def dropout(x: jax.Array, rate: float, key: jax.Array) -> jax.Array:
 
 
 def kaiming_uniform(key: jax.Array, shape: tuple[int, int]) -> jax.Array:
-    """U(±1/√I) for an [I, R] matrix: Kaiming-uniform with a = √5, as in PyTorch and PEFT."""
+    """Sample an [I, R] matrix from U(±1/√I): Kaiming-uniform, a = √5, as in PyTorch and PEFT."""
     bound = shape[0] ** -0.5
     return jax.random.uniform(key, shape, jnp.float32, -bound, bound)

@@ -18,7 +18,7 @@ _EARLIER_FIELDS = {
 """Fields of LoRA-SP that only earlier versions had."""
 _RELEASE_NAMES = {"lora_sp": "lora_sp_release", "LoRASP": "LoRASPRelease"}
 _GELU_ROUTERS = {"softplus": "gelu", "relu": "gelu_relu", "softmax": "gelu_softmax"}
-"""Stored score function -> current router name, for router "gelu" of earlier versions."""
+"""Score function -> current router name, for settings of earlier versions with router "gelu"."""
 
 
 def to_settings(method: Any) -> Settings:

@@ -18,8 +18,8 @@ def apply_shared_input(
 ) -> list[tuple[jax.Array, Aux]]:
     """Compute `Method.apply` of several layers for the same input.
 
-    Layers whose methods compute exactly x W + z U (`Method.is_low_rank_sum`) and agree on
-    `down_in_fp32` share one matmul for their down-projections. Kernels receive no gradient.
+    Layers with `Method.is_low_rank_sum` and the same `down_in_fp32` share one matmul for their
+    down-projections. Kernels receive no gradient.
     """
     groups: dict[bool, list[int]] = {}
     results: dict[int, tuple[jax.Array, Aux]] = {}

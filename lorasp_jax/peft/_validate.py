@@ -38,7 +38,7 @@ def tokens(x: Any, token_mask: Any) -> None:
 def params(method: Any, values: Any, shape: tuple[int, ...]) -> None:
     """Raise ValueError if the parameters do not fit the method and a kernel [I, O].
 
-    Without this check, some mismatches would silently use the scale of a different rank.
+    Without this check, parameters of a different rank could silently get the wrong scale.
     """
     actual = _shapes(values)
     for name, expected in method.shapes(_initial_shapes(method, shape), actual).items():

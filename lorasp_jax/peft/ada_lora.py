@@ -1,9 +1,9 @@
 """AdaLoRA: ΔW = s A diag(e) B, pruned to a rank budget shared by all layers (arXiv 2303.10512).
 
-During training, the triplets (a column of A, an entry of e, a row of B) to which the loss is least
-sensitive are pruned. `AdaLoRA.transform` wraps the optimizer to do this in the same jitted step, so
-that a training loop cannot omit it. The arithmetic matches Hugging Face PEFT 0.21.2. One function
-per equation of the paper:
+A triplet is a column of A, an entry of e and a row of B. Training prunes the triplets to which the
+loss is least sensitive. `AdaLoRA.transform` makes this part of the optimizer, so that no training
+loop can omit it. The arithmetic matches Hugging Face PEFT 0.21.2. Each equation of the paper has a
+function:
 
     (1)  update          P Λ Q, here A diag(e) B                      `AdaLoRA.bottleneck`
     (4)  orthogonality   ‖PᵀP − I‖ + ‖QQᵀ − I‖                        `AdaLoRA.penalty`
@@ -35,8 +35,8 @@ Triplets = dict[str, jax.Array]
 class AdaLoRA(Method):
     """Adapter whose rank is allocated during training.
 
-    Parameters: lora_a [I, R], lora_e [R], lora_b [R, O]: (I + O + 1) R in total. Each
-    allocation zeroes the lora_e of the triplets it prunes, and the last one does so for good.
+    Parameters: lora_a [I, R], lora_e [R], lora_b [R, O]: (I + O + 1) R in total. Pruning a triplet
+    zeroes its entry of lora_e. Until the last allocation, a pruned triplet can return.
 
     Raises:
       ValueError: an invalid rank, interval, fraction or decay.
@@ -63,7 +63,6 @@ class AdaLoRA(Method):
     rngs={"dropout": key} (Linen)."""
 
     def __post_init__(self) -> None:
-        """Validate the fields."""
         super().__post_init__()
         if self.rank < 1 or not 1 <= self.final_rank <= self.rank or self.interval < 1:
             raise ValueError(
@@ -92,7 +91,7 @@ class AdaLoRA(Method):
         return (2 * self.rank if self.alpha is None else self.alpha) / (self.rank + 1e-5)
 
     def match_budget(self, mean_active_rank: float) -> "AdaLoRA":
-        """Return a copy with LoRA-SP's measured mean active rank as `target_rank` (Table I)."""
+        """Return a copy whose `target_rank` is LoRA-SP's measured mean active rank, rounded."""
         return dataclasses.replace(self, target_rank=round(mean_active_rank))
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
@@ -130,19 +129,19 @@ class AdaLoRA(Method):
     def transform(
         self, optimizer: optax.GradientTransformation, total_steps: int
     ) -> optax.GradientTransformation:
-        """Wrap the optimizer so that its steps also allocate the rank budget across all layers.
+        """Wrap the optimizer so that its steps also allocate one rank budget to all layers.
 
-        Wrap the complete optimizer, including its learning rate. Gradient clipping may be chained
-        before the wrapped optimizer; any transformation after it would undo the pruning. Importance
-        is computed from the updated parameters. All AdaLoRA layers in the tree share one budget.
+        Wrap the complete optimizer, including its learning rate: any transformation chained after
+        it would undo the pruning. Gradient clipping may be chained before it. Importance is
+        computed from the updated parameters.
 
         Args:
           optimizer: for any parameter tree that includes AdaLoRA parameters.
-          total_steps: T.
+          total_steps: number of training steps.
 
         Raises:
-          ValueError: no steps remain between warm-up and final phase. The optimizer's `init` raises
-            it too, if the tree has no AdaLoRA parameters.
+          ValueError: no steps remain between warm-up and final phase. The wrapped optimizer's
+            `init` also raises it, for a tree without AdaLoRA parameters.
         """
         _fields.positive_int("total_steps", total_steps)
         begin, end = round(self.warmup * total_steps), total_steps - round(self.final * total_steps)
@@ -183,7 +182,7 @@ class AllocationState(NamedTuple):
     uncertainty: list[Triplets]
     """Ū, EMA of each parameter's uncertainty."""
     kept: list[jax.Array]
-    """Bool mask shaped like lora_e: the entries that the last allocation kept."""
+    """Bool masks shaped like lora_e, True for entries that the latest allocation kept."""
     inner: Any
 
 
@@ -206,9 +205,10 @@ def _initial_state(params: Any, inner: Any) -> AllocationState:
 def _allocate(
     method: AdaLoRA, state: AllocationState, scores: list[jax.Array], begin: int, end: int
 ) -> tuple[list[jax.Array], list[jax.Array]]:
-    """Masks shaped like lora_e: entries kept by the last allocation, and entries to zero now.
+    """Masks shaped like lora_e: entries kept by the latest allocation, and entries to zero now.
 
-    Between allocations, pruned entries train and can become nonzero; after the last, they stay 0.
+    Between allocations, pruned entries train and can become nonzero. After the last allocation,
+    they stay 0.
     """
     step, total = state.step, sum(s.size for s in scores)
     table = budgets(total, total // method.rank * method.final_rank, begin, end)
@@ -257,20 +257,20 @@ def _sensitivity(
 
 
 def _importance(importance: list[Triplets], uncertainty: list[Triplets]) -> list[jax.Array]:
-    """Eqs. (7), (11): S of each triplet, Ī Ū of its e plus the means over its A and B vectors."""
+    """Eqs. (7), (11): S of each triplet: Ī Ū of e plus its means over both vectors."""
     scores = jax.tree.map(jnp.multiply, importance, uncertainty)
     return [s["lora_e"] + s["lora_a"].mean(-2) + s["lora_b"].mean(-1) for s in scores]
 
 
 def _keep(scores: list[jax.Array], num_pruned: jax.Array) -> list[jax.Array]:
-    """Eq. (6): keep all but the `num_pruned` least important triplets and any tied with them."""
+    """Eq. (6): prune the `num_pruned` least important triplets and their ties; keep the others."""
     ordered = jnp.sort(jnp.concatenate([s.ravel() for s in scores]))
     threshold = jnp.where(num_pruned > 0, ordered[jnp.maximum(num_pruned - 1, 0)], -jnp.inf)
     return [s > threshold for s in scores]
 
 
 def _zero_pruned(updates: Any, params: list[Triplets], pruned: list[jax.Array]) -> Any:
-    """Replace updates so that pruned entries of lora_e become exactly 0."""
+    """Change the updates so that pruned entries of lora_e become exactly 0."""
     pairs = iter(zip(params, pruned, strict=True))
 
     def replace(node: Any) -> Any:

@@ -4,9 +4,9 @@ Liu et al., arXiv 2402.09353. With V = W + scale A B and a trained magnitude m p
 
     y = x V · m / ‖V‖,
 
-where ‖V‖ is the L2 norm over the input dimension, one per output. m is initialized to ‖W‖, so the
-layer initially computes x W. The norm is treated as a constant in the gradient (section 4.3 of the
-paper), and the layer's bias is added afterwards without rescaling, both as in Hugging Face PEFT.
+where ‖V‖ holds the L2 norm of each column. m is initialized to ‖W‖, so the layer initially computes
+x W. As in Hugging Face PEFT, the gradient treats ‖V‖ as a constant (section 4.3 of the paper), and
+the layer's bias is not rescaled.
 """
 
 import dataclasses
@@ -37,10 +37,10 @@ class DoRA(LoRA):
     ) -> tuple[Params, Kernel]:
         """Initialize LoRA's parameters, and the magnitude to the norms of the kernel's columns.
 
-        See `Method.init` for the arguments and results; unlike there, the kernel must have values.
+        See `Method.init` for the arguments and results.
 
         Raises:
-          ValueError: the kernel is not a matrix or has no values.
+          ValueError: the kernel has no values, or `LoRA.init` rejects an argument.
         """
         if isinstance(kernel, jax.ShapeDtypeStruct):
             raise ValueError(
@@ -60,7 +60,7 @@ class DoRA(LoRA):
     ) -> tuple[jax.Array, Aux]:
         """Eq. (5): (x W + scale x A B) · m / ‖V‖, [...tokens, O]. The kernel receives no gradient.
 
-        The factor is applied in fp32: bf16 rounding would rescale a whole column by up to 0.4 %.
+        The factor m / ‖V‖ is in fp32: rounding it to bf16 would change a column by up to 0.4 %.
         """
         y, aux = super().apply(params, x, kernel, token_mask=token_mask)
         factor = column_factor(params["magnitude"], self._adapted(params, kernel))
@@ -79,12 +79,12 @@ class DoRA(LoRA):
 def column_factor(magnitude: jax.Array, adapted: jax.Array) -> jax.Array:
     """m / ‖V‖, f32 [O], for magnitude [O] and V [I, O]. V receives no gradient.
 
-    V is formed explicitly to compute its norms. With s the scale, expanding the norm of
-    a column w + s A b as ‖w‖² + 2 s (wᵀA) b + s² bᵀ(AᵀA) b would avoid that, but would cost as
-    much (I O R for WᵀA) and suffer from cancellation where V is much shorter than W.
+    The norms are computed from V itself. Expanding the squared norm of a column w + s A b into
+    three terms would avoid forming V. It would cost as much, I O R for WᵀA, and suffer from
+    cancellation where V is much shorter than W.
 
-    A zero column has no direction to rescale. Its factor is m + 1, or 1 for the initial m = 0,
-    so B can learn even from a zero kernel.
+    A zero column has no direction to rescale. Its factor is m + 1, which is initially 1, so B can
+    learn even from a zero kernel.
     """
     norm = column_norms(jax.lax.stop_gradient(adapted))
     is_zero = norm == 0
@@ -92,5 +92,5 @@ def column_factor(magnitude: jax.Array, adapted: jax.Array) -> jax.Array:
 
 
 def column_norms(kernel: Any) -> jax.Array:
-    """L2 norms over the input dimension of a kernel [I, O], f32 [O]."""
+    """L2 norms of the columns of a kernel [I, O], f32 [O]."""
     return jnp.linalg.norm(kernel.astype(jnp.float32), axis=0)

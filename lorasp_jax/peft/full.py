@@ -14,8 +14,8 @@ from lorasp_jax.peft._method import Kernel, Method, Params
 class FullFineTuning(Method):
     """Train the kernel.
 
-    The parameters are {"kernel": [I, O]}. The NNX and Linen wrappers make no second copy: they
-    train the layer's own weights.
+    Parameters: {"kernel": [I, O]}. The NNX and Linen wrappers train the layer's own weights, not
+    a copy.
     """
 
     trains_base: ClassVar[bool] = True

@@ -1,9 +1,7 @@
-"""LoRA: ΔW = (α/R) A B of fixed rank (Hu et al., arXiv 2106.09685), optionally with rsLoRA scaling.
+"""LoRA: ΔW = scale A B of fixed rank R (Hu et al., arXiv 2106.09685).
 
-Conventions and initializations follow Hugging Face PEFT. Initially, B = 0 and A is Kaiming-uniform
-(a = √5, so U(±1/√I)), Gaussian or computed from inputs; alternatively, scale A B is split off the
-kernel and the residual is frozen. The scale is α/R, or α/√R for rsLoRA (Kalajdzievski, arXiv
-2312.03732).
+The scale is α/R, or α/√R for rsLoRA (Kalajdzievski, arXiv 2312.03732). Conventions and
+initializations follow Hugging Face PEFT.
 """
 
 import dataclasses
@@ -48,7 +46,6 @@ class LoRA(Method):
     rngs={"dropout": key} (Linen)."""
 
     def __post_init__(self) -> None:
-        """Validate the fields."""
         super().__post_init__()
         if self.rank < 1:
             raise ValueError(f"rank must be at least 1, got {self.rank}.")
@@ -79,8 +76,9 @@ class LoRA(Method):
         See `Method.init` for the arguments and results.
 
         Raises:
-          ValueError: the kernel is not a matrix; a kernel to be split has no values or has fewer
-            than R rows or columns; or statistics are missing or have the wrong shape.
+          ValueError: `Method.init` rejects an argument. For "pissa" and "olora": the kernel has no
+            values, or R > min(I, O). For "eva": statistics are missing or have the wrong shape, or
+            R > I.
         """
         if self.needs_statistics:
             _validate.matrix(kernel)
@@ -101,7 +99,7 @@ class LoRA(Method):
         return params, (kernel.astype(jnp.float32) - self.scale * (a @ b)).astype(kernel.dtype)
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
-        """Initialize A randomly and B to zero, so that the initial delta is exactly zero."""
+        """Initialize A randomly and B to zero; the delta is exactly zero."""
         shape = (d_in, self.rank)
         gaussian = self.initialization == "gaussian"
         a = jax.random.normal(key, shape) / self.rank if gaussian else kaiming_uniform(key, shape)
@@ -137,7 +135,7 @@ class LoRA(Method):
 
     @property
     def as_saved(self) -> "LoRA":
-        """This method, with "kaiming" in place of "eva": only `init` needs the statistics."""
+        """The method with "kaiming" instead of "eva", so that loading needs no statistics."""
         if self.needs_statistics:
             return dataclasses.replace(self, initialization="kaiming")
         return self
@@ -162,7 +160,7 @@ def principal_part(kernel: jax.Array, rank: int, scale: float) -> tuple[jax.Arra
 def orthogonal_part(kernel: jax.Array, rank: int, scale: float) -> tuple[jax.Array, jax.Array]:
     """A [I, R] and B [R, O] from a rank-R QR of the kernel's transpose; B's rows are orthonormal.
 
-    OLoRA (Büyükakyüz, arXiv 2406.01775, algorithm 1), which does not divide by the scale.
+    As in OLoRA (Büyükakyüz, arXiv 2406.01775, algorithm 1), A B does not depend on the scale.
     """
     del scale
     orthonormal, triangular = jnp.linalg.qr(kernel.T)

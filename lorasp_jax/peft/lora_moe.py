@@ -2,11 +2,11 @@
 
     ΔW(x) = (α/R) Σ_i w_i(x) A_i B_i,    p(x) = softmax(x W_g)
 
-"weighted" uses w = p, as in LoRAMoE (Dou et al., arXiv 2312.09979); "top1" keeps only the most
+"weighted" uses w = p, as in LoRAMoE (Dou et al., arXiv 2312.09979). "top1" keeps only the most
 likely expert, as in Switch (Fedus et al., arXiv 2101.03961). Both are baselines of LoRA-SP (arXiv
-2603.07404), whose released code has 4 experts of rank 32 in every linear layer, as by default here.
-The router losses are those of Switch and ST-MoE. LoRAMoE's localized balancing, which needs every
-task labeled with a type, is omitted, as in the released code.
+2603.07404). Its public code has 4 experts of rank 32 in every linear layer, the defaults here. The
+router losses are those of Switch and ST-MoE. LoRAMoE's localized balancing needs a type label for
+every task; it is omitted here, as in that code.
 """
 
 import dataclasses
@@ -46,7 +46,6 @@ class LoRAMoE(Method):
     on to the router."""
 
     def __post_init__(self) -> None:
-        """Validate the fields."""
         super().__post_init__()
         if self.experts < 1 or self.rank < 1:
             raise ValueError(
@@ -80,7 +79,7 @@ class LoRAMoE(Method):
     def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
-        """Eq. (2) of the LoRA-SP paper: z = scale w(x) x A; each w_i scales R columns."""
+        """Eq. (2) of the LoRA-SP paper: z = scale · w(x) ⊙ (x A); each w_i scales R columns."""
         del params
         expert_inputs, logits = jnp.split(rows, [self.experts * self.rank], axis=-1)
         logits = cast_and_clip(logits)
@@ -123,8 +122,8 @@ def balance_loss(probabilities: jax.Array, valid: jax.Array | None) -> jax.Array
     """Load-balancing loss, E Σ_i f_i P_i: 1 if all experts are used equally, at most E.
 
     Fedus et al. (arXiv 2101.03961, eq. 4): f_i is the fraction of valid tokens whose most likely
-    expert is i (no gradient), and P_i is the mean of p_i over valid tokens. All valid tokens are
-    pooled, as in the paper; Hugging Face's Switch computes the loss per sequence and averages.
+    expert is i (no gradient), and P_i is the mean of p_i over valid tokens. Both pool the tokens of
+    all sequences, as in the paper; Hugging Face's Switch averages the loss over sequences.
 
     Args:
       probabilities: the router's softmax, f32 [...tokens, E].
@@ -142,7 +141,7 @@ def balance_loss(probabilities: jax.Array, valid: jax.Array | None) -> jax.Array
 def z_loss(logits: jax.Array, valid: jax.Array | None) -> jax.Array:
     """Mean of logsumexp(logits)² over the valid tokens; it keeps the logits small.
 
-    Zoph et al. (arXiv 2202.08906, eq. 5), unchanged: zero logits give (ln E)².
+    As in Zoph et al. (arXiv 2202.08906, eq. 5), with no offset: zero logits give (ln E)².
 
     Args:
       logits: f32 [...tokens, E].

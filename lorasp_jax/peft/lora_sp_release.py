@@ -1,16 +1,17 @@
-"""LoRA-SP as in its public code, which differs from the paper's equations.
+"""LoRA-SP as implemented in its public code, which differs from the paper's equations.
 
-Use this method to compare with results of that code, github.com/dhkim-furiosa/LoRA-SP at dfbf57d
-(PyTorch). This is an independent implementation, based only on facts about that code. Differences
-from the paper (`lora_sp`):
+Use this method only to compare with results of that code, github.com/dhkim-furiosa/LoRA-SP at
+dfbf57d (PyTorch). This is an independent implementation, based only on facts about that code.
+Differences from the paper (`lora_sp`):
 
 - Scores may be negative and are ranked by signed value.
 - The gate keeps the largest set whose energy does *not exceed* η, and at least one direction, so
   E_k is usually below η.
-- The spectral loss is a ratio of sums over tokens.
-- The balance loss is Switch's, on a softmax over all scores with the pruned ones set to 0.
-- The z-loss is ln(1 + lse), where lse is the logsumexp of the scores clipped to [-1, 10]; at -1
-  it is thus -inf.
+- The spectral loss is 1 minus the ratio of kept to total energy, both summed over tokens.
+- The balance loss is that of Switch Transformer, on a softmax over all scores with the inactive
+  ones set to 0.
+- The z-loss is ln(1 + lse), where lse is logsumexp(scores) clipped to [-1, 10]. It is -inf at
+  lse = -1.
 
 Unlike in the public code, padding is excluded, everything is in fp32, and the router's input has no
 dropout (5 % there).
@@ -53,7 +54,6 @@ class LoRASPRelease(BankMethod):
     """Keep the bank's directions orthonormal; see `LoRASP.normalized_bank`."""
 
     def __post_init__(self) -> None:
-        """Validate the fields."""
         super().__post_init__()
         if self.hidden_width is not None and self.hidden_width < 1:
             raise ValueError(f"hidden_width must be at least 1, got {self.hidden_width}.")
@@ -83,7 +83,7 @@ class LoRASPRelease(BankMethod):
         v_x, hidden = jnp.split(rows, [self.rank], axis=-1)
         scores = release_scores(params["router"], hidden)
         mask = release_gate(scores, self.energy_target)
-        # Trailing scores belong to pruned directions.
+        # Scores after the first R belong to directions that `lorasp_jax.prune` removed.
         mask &= jnp.arange(mask.shape[-1]) < self.rank
         usage = (mask & valid[..., None]).reshape(-1, mask.shape[-1]).astype(jnp.float32).sum(0)
         energy = kept_energy(scores, mask)
@@ -99,7 +99,7 @@ def release_scores(router: dict[str, jax.Array], hidden: jax.Array) -> jax.Array
 
 
 def release_gate(scores: jax.Array, energy_target: float) -> jax.Array:
-    """Mask, bool [..., R]: the k largest scores for the largest k with E_k <= η, but at least one.
+    """Keep the k largest scores, for the largest k with E_k <= η, but at least one: bool [..., R].
 
     Ties go to the lowest index. No gradient.
     """
