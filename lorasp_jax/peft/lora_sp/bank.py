@@ -1,6 +1,6 @@
 """LoRA-SP's bank of rank-one directions, U and V of ΔW = U Σ(x) V.
 
-For inputs as rows, both are stored transposed: U as u [R, O] and V as v [I, R].
+Inputs are rows here, so both are stored transposed: U as u [R, O] and V as v [I, R].
 """
 
 import jax
@@ -37,10 +37,10 @@ def init_bank(key: jax.Array, v: jax.Array, d_out: int, *, normalized: bool) -> 
 def normalized_bank(bank: Bank) -> Bank:
     """Normalize a bank so that ‖ΔW(x)‖² = c² Σ_i s_i(x)², from which eq. (4) follows.
 
-    The rank-one terms u_i v_i must be orthonormal under the Frobenius inner product, which factors
-    into (u_i · u_j)(v_i · v_j). It suffices to orthonormalize the factor on the wider side of the
-    kernel and to scale the other's vectors to unit norm. All terms share c = gain √O, so that the
-    entries of U initially change as fast as in a bank that is not normalized.
+    The rank-one terms u_i v_i must be orthonormal under the Frobenius inner product, which is
+    (u_i · u_j)(v_i · v_j). So the factor on the wider side of the kernel gets orthonormal vectors,
+    and the other factor gets unit vectors. All terms share c = gain √O, so that the entries of U
+    initially change as fast as in a bank that is not normalized.
 
     Args:
       bank: u [R, O] and v [I, R], both of full rank, and gain [].
@@ -57,7 +57,7 @@ def normalized_bank(bank: Bank) -> Bank:
 
 
 def _orthonormal(columns: jax.Array) -> jax.Array:
-    """Orthonormalize columns [n, R], R <= n, fixing signs, which LAPACK may flip between inputs."""
+    """Orthonormalize columns [n, R], R <= n. Fix their signs, which LAPACK may flip."""
     orthonormal, triangular = jnp.linalg.qr(columns)
     return orthonormal * jnp.where(jnp.diagonal(triangular) < 0, -1.0, 1.0)
 
@@ -67,8 +67,8 @@ def apply_masked_scores(
 ) -> jax.Array:
     """Eq. (11): Σ(x) V x, zero outside the mask, in the dtype of v_x = V x [..., n].
 
-    Scores and mask may be wider than n: the trailing ones belong to pruned directions. NaN scores
-    are not in the mask, but propagate: a row whose energy [..., 1] is NaN becomes NaN.
+    Scores and mask may be wider than n; their trailing entries belong to pruned directions. NaN
+    propagates through the energy [..., 1], since the mask of a row with NaN scores is empty.
     """
     n, dtype = v_x.shape[-1], v_x.dtype
     if n < scores.shape[-1]:
@@ -83,8 +83,7 @@ class BankMethod(Method):
 
     Parameters: bank.u [R, O], bank.v [I, R], bank.gain [] if the bank is normalized; router.w1
     [I, H] and the router's other arrays. `lorasp_jax.prune` removes directions from the bank only.
-    The router still scores the pruned directions, listed after the R remaining ones; their energy
-    is part of E_k.
+    The router still scores them, after the R remaining ones, and their energy is part of E_k.
     """
 
     rank: int
@@ -93,7 +92,6 @@ class BankMethod(Method):
     normalized_bank: bool
 
     def __post_init__(self) -> None:
-        """Validate the fields."""
         super().__post_init__()
         exact_ratio(self.energy_target)
         if self.rank < 1:

@@ -1,9 +1,9 @@
 """LoRA-SP for a single token, loading only its highest-scoring directions.
 
-A dense matmul with the bank costs the same for any mask. For a single token, this cost is the
-bank's memory traffic, most of which is saved by gathering only `capacity` of the R rows of U and
-Vᵀ. Several tokens differ in their active directions, so the dense matmul is faster for them.
-`python -m benchmarks.decoding` measures when gathering pays off.
+A dense matmul reads the whole bank, whatever the mask. For a single token, this memory traffic is
+most of the cost, so `decode` gathers only `capacity` of the R rows of U and Vᵀ. Several tokens have
+different active directions, so the dense matmul is faster for them. `python -m benchmarks.decoding`
+measures when gathering pays off.
 """
 
 from typing import NamedTuple
@@ -35,7 +35,7 @@ def prepare(method: LoRASP, params: Params, dtype: jax.typing.DTypeLike) -> Deco
     """Convert the parameters of one layer for `decode`, with bank and W1 in the compute dtype.
 
     Raises:
-      ValueError: the masks of the method depend on more than the token.
+      ValueError: the granularity is not "token", or η has a schedule.
     """
     if (method.granularity, method.schedule) != ("token", None):
         raise ValueError(
@@ -50,7 +50,7 @@ def prepare(method: LoRASP, params: Params, dtype: jax.typing.DTypeLike) -> Deco
 def decode(
     method: LoRASP, params: DecodingParams, x: jax.Array, *, capacity: int
 ) -> tuple[jax.Array, jax.Array]:
-    """Compute the delta of one token from gathered rows of the bank: z = Σ(x) V x, then z U.
+    """Compute the delta of one token from its highest-scoring active directions.
 
     Args:
       method: static.
@@ -59,9 +59,9 @@ def decode(
       capacity: maximum number of directions to gather, 1 to R, static.
 
     Returns:
-      delta [O], equal to `method.delta` up to rounding if at most `capacity` directions are active;
-      and the number of active directions beyond `capacity`, int32 []. The lowest-scoring active
-      directions are the ones left out.
+      delta [O], and the number of active directions beyond `capacity`, int32 []. If there are any,
+      the lowest-scoring ones are left out of delta. Otherwise delta equals that of `method.delta`
+      up to rounding.
 
     Raises:
       ValueError: `capacity` is not between 1 and R, or x has more than one token.

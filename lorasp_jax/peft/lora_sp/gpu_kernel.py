@@ -1,6 +1,6 @@
 """`LoRASP.bottleneck` as a single GPU kernel, for the default router and gate.
 
-Layers with a shared input run in one launch, with their columns concatenated.
+Layers with a shared input run in one launch.
 """
 
 import dataclasses
@@ -76,12 +76,12 @@ def bottleneck_block(
       router: b1 [H], w2 [H, R], b2 [R].
       columns: V x [n, R] and x W1 [n, H], of the same dtype.
       valid: bool [n, 1], False for padding.
-      mask: bool [n, R], the gate's mask if already known, else None; it has no gradient.
+      mask: bool [n, R], the gate's mask. None in the forward pass, which computes it. No gradient.
       energy_target: η.
       scale: α/R.
 
     Returns:
-      z [n, R], the losses' sums over rows, the mask, and active rank and kept energy, f32 [n, 1]
+      z [n, R], the losses' sums over rows, the mask, and [active rank, kept energy], f32 [n, 1]
       each.
     """
     v_x, hidden = columns

@@ -1,7 +1,7 @@
 """LoRA-SP's auxiliary losses, eqs. (13) and (14) of the paper (arXiv 2603.07404), in fp32.
 
-Each layer sums the required quantities over its valid tokens, excluding padding and tokens
-whose scores are all zero.
+They are computed from each layer's sums over tokens. Padding and tokens with all-zero scores are
+excluded.
 """
 
 import dataclasses
@@ -16,7 +16,7 @@ from lorasp_jax.kernels.energy_gate import energy_share
 
 
 class LossSums(NamedTuple):
-    """Sums over valid rows, for computing the losses: f32 [1], except `kept` and `share` [R]."""
+    """Sums over valid rows: f32 [1], except `kept` and `share` [R]."""
 
     rows: jax.Array
     """Number of valid rows."""
@@ -57,8 +57,8 @@ def loss_sums(
 class Losses(Mapping[str, jax.Array]):
     """The auxiliary losses of eqs. (13) and (14) by name: f32 [], or [L] for stacked layers.
 
-    They are computed on access: once for all stacked layers, instead of a dozen tiny operations in
-    each layer.
+    They are computed on access, once for all stacked layers, rather than as a dozen tiny operations
+    in each layer.
     """
 
     sums: LossSums
@@ -82,11 +82,11 @@ def spectral_loss(sums: LossSums) -> jax.Array:
 
 @jax.jit
 def balance_loss(sums: LossSums) -> jax.Array:
-    """Balance term of eq. (14): R Σ_i f_i P_i, 1 if all directions are used equally.
+    """Balance term of eq. (14): R Σ_i f_i P_i, which is 1 if all directions are used equally.
 
-    The load-balancing loss of Fedus et al. (arXiv 2101.03961, eq. 4) for k(x) choices per token:
-    f_i is direction i's share of all active directions (no gradient), and P_i is its mean energy
-    share.
+    It is the load-balancing loss of Fedus et al. (arXiv 2101.03961, eq. 4) for k(x) choices per
+    token. f_i is direction i's share of all active directions (no gradient), and P_i is its mean
+    energy share.
     """
     kept = jax.lax.stop_gradient(sums.kept)
     frequency = kept / jnp.maximum(kept.sum(-1, keepdims=True), 1)
@@ -97,8 +97,8 @@ def balance_loss(sums: LossSums) -> jax.Array:
 def z_loss(sums: LossSums) -> jax.Array:
     """z term of eq. (14): mean of (logsumexp(logits) - ln n)² over valid rows, for n logits.
 
-    Zoph et al. (arXiv 2202.08906, eq. 5) do not subtract ln n, and so push down the logits of a
-    wide router even when they are all zero.
+    Without ln n, as in Zoph et al. (arXiv 2202.08906, eq. 5), the loss of a wide router would push
+    down even zero logits.
     """
     return _mean(sums.z, sums)
 

@@ -1,8 +1,8 @@
 """LoRA-SP, Select-Prune (arXiv 2603.07404): a wide bank of rank-one directions, pruned per token.
 
-A small router scores the R directions of a bank for each token; only the smallest set whose squared
-scores reach the energy target η stays active. `reference` implements the paper in sixty lines.
-`LoRASP.bottleneck` computes the same result faster, from these functions:
+A small router scores the R directions of a bank for each token. Only the smallest set whose squared
+scores reach a fraction η of their sum stays active. `reference` implements the paper in sixty
+lines. `LoRASP.bottleneck` computes the same result faster, from these functions:
 
     (10) scores       s(x) = router(x) >= 0                           `router.router_scores`
     (12) energy gate  smallest k with E_k(x) >= η                     `energy_gate`
@@ -70,7 +70,6 @@ class LoRASP(BankMethod):
     and score energy is proportional to ΔW energy (see `bank`). Requires R <= max(I, O)."""
 
     def __post_init__(self) -> None:
-        """Validate the fields."""
         super().__post_init__()
         if self.hidden_width < 1:
             raise ValueError(f"hidden_width must be at least 1, got {self.hidden_width}.")
@@ -103,7 +102,7 @@ class LoRASP(BankMethod):
     def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
-        """Compute z = scale Σ(x) V x of eq. (9) from the rows x [V, W1], and aux."""
+        """Compute z = scale Σ(x) V x of eq. (9), and aux, from the rows x [V, W1]."""
         tokens = rows.shape[:-1]
         valid = jnp.ones(tokens, bool) if token_mask is None else token_mask
         v_x, hidden = jnp.split(rows.reshape(-1, rows.shape[-1]), [self.rank], axis=1)
@@ -117,7 +116,7 @@ class LoRASP(BankMethod):
         return z.reshape(*tokens, self.rank), aux
 
     def _mask(self, params: Params, scores: jax.Array, valid: jax.Array) -> jax.Array:
-        """Bool mask of the gate, shaped like scores [T, >= R]; False for pruned directions."""
+        """The gate's mask for scores [T, n], n >= R: bool [T, n], False for pruned directions."""
         by_token = scores.reshape(*valid.shape, scores.shape[-1])
         pooled = pooled_scores(by_token, valid, self.granularity)
         if self.schedule is None:

@@ -2,9 +2,9 @@
 
     y = x W + ΔW(x) x,    ΔW(x) = U Σ(x) V                                        (9)
 
-W is frozen. V projects the input onto R directions; U maps them to the output. For each token a
-small router scores the directions; only the smallest set that holds a fraction η of the energy
-stays active. `lorasp_jax.peft.lora_sp.method` computes the same result faster, as a test checks.
+W is frozen. V projects the input onto R directions; U maps them to the output. A small router
+scores the directions for each token. Only the smallest set that holds a fraction η of the energy,
+the sum of squared scores, stays active. `lorasp_jax.peft.lora_sp.method` computes the same faster.
 
 T: tokens, I: input width, O: output width, R: directions, H: the router's hidden width.
 """
@@ -31,7 +31,7 @@ def update(bank: dict[str, jax.Array], x: jax.Array, scores: jax.Array) -> jax.A
 def energy_gate(scores: jax.Array, energy_target: float) -> tuple[jax.Array, jax.Array]:
     """Eq. (12): keep the k largest scores for the smallest k with E_k(x) >= η.
 
-    Ties go to the lowest index. Returns the mask, bool [T, R], without a gradient, and E_k(x), [T].
+    Ties go to the lowest index. Returns the mask, bool [T, R] without gradient, and E_k(x), [T].
     """
     energy = scores**2
     order = jnp.argsort(-jax.lax.stop_gradient(energy), axis=-1)

@@ -1,6 +1,6 @@
 """LoRA-SP's router: eq. (10) of the paper (arXiv 2603.07404), and score pooling.
 
-Everything is in fp32. `method` combines the router with the gate, bank and losses.
+Everything is in fp32.
 """
 
 import functools
@@ -20,9 +20,8 @@ INITIAL_LOGIT = {"gelu": INVERSE_SOFTPLUS_OF_ONE, "gelu_relu": 1.0, "gelu_softma
 """Initial output bias of every direction, by router; a logit of this value yields a score of 1."""
 
 MAX_PROJECTED = 2.0**40
-"""Bound to which |x W1| is clipped. Scores grow linearly with x and the delta quadratically;
-for x beyond 1e19, z would overflow fp32 to infinity, and U = 0 would turn that infinity into
-NaN."""
+"""Bound to which |x W1| is clipped. z grows quadratically with x. Without the bound, it would
+overflow fp32 to infinity for x beyond 1e19, and U = 0 would turn that infinity into NaN."""
 
 _RATIO = np.polynomial.Chebyshev.interpolate(lambda e: np.log1p(e) / e, 8, domain=[0, 1])
 _LOG1P = _RATIO.convert(kind=np.polynomial.Polynomial).coef[::-1].tolist()
@@ -35,7 +34,7 @@ def init_output_layer(
     """Initialize the router's second layer w2 [H, R], and its biases b1 [H], b2 [R] if it has any.
 
     Routers with biases start with scores close to 1. The second layer of a "softmax" router starts
-    as a 0/1 matrix that assigns each of the R directions one of the H hidden units.
+    as a 0/1 matrix that assigns one of the H hidden units to each of the R directions.
     """
     if router == "softmax":
         assignment = np.arange(rank) * hidden_width // rank
@@ -53,16 +52,16 @@ def router_scores(
     """Eq. (10): h = φ(x W1 + b1), s(x) = ψ(h W2 + b2) with a non-negative ψ.
 
     For "gelu", "gelu_relu" and "gelu_softmax", φ is GELU and ψ is softplus, ReLU or R times the
-    softmax over directions. "softmax" has no biases: φ is softmax and ψ is ReLU, which has no
-    effect while W2 is the initial 0/1 matrix and keeps the scores non-negative once it is trained.
+    softmax over directions. "softmax" has no biases; φ is softmax and ψ is ReLU. With the initial
+    0/1 matrix W2, this ReLU has no effect. With a trained W2, it keeps the scores non-negative.
 
     Args:
       router: w2 [H, R], and b1 [H], b2 [R] unless `kind` is "softmax".
-      hidden: x W1, [..., H] in any dtype; cast to fp32 here.
+      hidden: x W1, [..., H] of any dtype.
       kind: the router variant.
 
     Returns:
-      scores f32 [..., R], and the logits for the z-loss: the input of ψ [..., R], or of the softmax
+      scores f32 [..., R], and the logits for the z-loss: the input of ψ [..., R], or that of φ
       [..., H] if `kind` is "softmax".
     """
     hidden = cast_and_clip(hidden)
@@ -75,7 +74,7 @@ def router_scores(
 
 
 def cast_and_clip(hidden: jax.Array) -> jax.Array:
-    """Cast x W1 to fp32 and clip it; scores, losses and gradients are finite for any finite x."""
+    """Cast x W1 to fp32, clipped so that scores, losses and gradients are finite for finite x."""
     return clip(hidden.astype(jnp.float32), MAX_PROJECTED)
 
 
@@ -91,10 +90,10 @@ def gelu(x: jax.Array) -> jax.Array:
 
 @jax.custom_jvp
 def softplus(x: jax.Array) -> jax.Array:
-    """log(1 + e^x), relative error 3e-7, for a GPU kernel bound by its instruction count.
+    """log(1 + e^x) in few instructions, relative error 3e-7.
 
-    With `jax.nn.softplus` and `jax.nn.gelu`, the kernel's gradient has 25 % more PTX instructions
-    (H200).
+    The instruction count limits the speed of the fused GPU kernel. With `jax.nn.softplus` and
+    `jax.nn.gelu`, its gradient has 25 % more PTX instructions (H200).
     """
     e = jnp.exp(-jnp.abs(x))
     first, *others = _LOG1P
@@ -119,14 +118,14 @@ def _matmul(rows: jax.Array, matrix: jax.Array) -> jax.Array:
 def pooled_scores(scores: jax.Array, valid: jax.Array, granularity: Granularity) -> jax.Array:
     """Root mean square of the scores over the valid tokens that share a mask.
 
-    Directions that hold a fraction η of the pooled energy thus hold η of the total energy of all
-    valid tokens of the sample or layer, though not necessarily of each token.
+    Directions that hold a fraction η of the pooled energy hold η of these tokens' total energy,
+    though not necessarily η of each token's.
 
     Args:
       scores: f32 [...tokens, R].
       valid: bool [...tokens], False for padding.
       granularity: "token": no pooling. "sample": over the last token axis. "layer": over all token
-        axes, i.e. over the whole batch.
+        axes, the whole batch.
 
     Returns:
       f32 [...tokens, R], pooled axes reduced to size 1. Scores without token axes are returned
@@ -134,7 +133,7 @@ def pooled_scores(scores: jax.Array, valid: jax.Array, granularity: Granularity)
     """
     if granularity == "token" or scores.ndim == 1:
         return scores
-    # The mask needs no gradient, and the square root has an infinite one at 0.
+    # The mask needs no gradient, and that of the square root is infinite at 0.
     scores = jax.lax.stop_gradient(scores)
     axes = (scores.ndim - 2,) if granularity == "sample" else tuple(range(scores.ndim - 1))
     valid = valid[..., None]

@@ -1,8 +1,8 @@
 """Schedule of the energy target η during training.
 
-The training progress is stored among the adapter's parameters, as `progress`. It thus reaches the
-layers of any model (scanned, rematerialized or sharded), is saved and loaded with the adapter, and
-never triggers recompilation. Only the optimizer (`with_schedule`) updates it; it has no gradient.
+The training progress is one of the adapter's parameters, `progress`. It thus reaches the layers of
+any model, is saved with the adapter and never triggers recompilation. It has no gradient; only the
+optimizer returned by `with_schedule` updates it.
 """
 
 import dataclasses
@@ -59,7 +59,7 @@ class EnergySchedule:
 def scheduled_gate(scores: jax.Array, target: jax.Array) -> jax.Array:
     """The mask of `energy_gate`, bool [..., R], for a traced η f32 [].
 
-    Exact for η rounded to fp32, whereas `energy_gate` takes η as a decimal fraction.
+    η is exactly its fp32 value here, whereas `energy_gate` reads it as a decimal fraction.
     """
     constant = jnp.abs(jax.lax.stop_gradient(scores.astype(jnp.float32)))
     below_one = bisected_mask(constant, Ratio(jnp.maximum(target, MIN_TARGET), 1))
