@@ -41,7 +41,8 @@ def dense(
       kernel: [I, *O]. Several output axes are flattened into one for the adapter.
       bias: broadcastable to [*O], or None.
       params: the adapter's parameters for the kernel as a matrix [I, O], or None.
-      method: the adapter's method, given together with `params`.
+      method: the adapter's method, given together with `params`. A method that trains the base
+        weights takes no `params`.
       dropout_key: key for the adapter's dropout; None disables dropout.
       token_mask: bool [...tokens]; False marks padding, excluded from losses and statistics.
 
@@ -49,8 +50,8 @@ def dense(
       y [...tokens, *O] in the dtype of x, and the adapter's aux.
 
     Raises:
-      ValueError: x is not floating point, its last axis does not match the kernel, or the mask has
-        the wrong shape.
+      ValueError: x is not floating point, the shapes do not match, or `params` and `method` do not
+        go together.
     """
     layer = DenseLayer(kernel, bias, params, method, dropout_key)
     matrix = _checked_matrix(layer, x, token_mask)
@@ -70,7 +71,7 @@ def dense_shared_input(
 
     Args:
       x: [...tokens, I].
-      layers: (kernel, bias, params, method, dropout_key) of each layer; see `dense`.
+      layers: arguments of `dense` for each layer.
       token_mask: bool [...tokens].
 
     Returns:
@@ -94,7 +95,7 @@ def dense_shared_input(
 
 
 def _checked_matrix(layer: DenseLayer, x: jax.Array, token_mask: jax.Array | None) -> jax.Array:
-    """Validate layer, input and mask; return the layer's kernel as a matrix [I, O]."""
+    """Validate layer, input and mask; return the kernel as a matrix [I, O]."""
     _validate.tokens(x, token_mask)
     validate.layer(layer, x.shape[-1])
     return layer.kernel.reshape(layer.kernel.shape[0], math.prod(layer.kernel.shape[1:]))

@@ -22,7 +22,7 @@ KERNEL_INIT = jax.nn.initializers.lecun_normal()  # same as nnx.Linear and nn.De
 
 
 class AdapterParam(nnx.LoRAParam[Any]):
-    """A parameter to train: an adapter's, or a base weight. No other variables are trained."""
+    """A parameter to train: an adapter's, or a base weight under full fine-tuning."""
 
 
 class AdapterAux(nnx.Intermediate[Any]):
@@ -30,7 +30,7 @@ class AdapterAux(nnx.Intermediate[Any]):
 
 
 def reject_out_sharding(out_sharding: Any) -> None:
-    """Raise ValueError unless out_sharding is None. (Some models pass it to every layer.)"""
+    """Raise ValueError unless out_sharding is None. Some models pass it to every layer."""
     if out_sharding is not None:
         raise ValueError(
             "adapted layers do not support out_sharding: constrain the output's sharding instead."
@@ -53,8 +53,8 @@ class AdaptedLayer(nnx.Module):
       kernel_name: attribute name of the layer's kernel.
       adapter: `AdapterParam` holding the method's parameters, or None.
       method: the adapter's method, static.
-      stored_aux: aux of the last call. Before the first call it is absent rather than None, so that
-        it is not part of the layer's graph structure.
+      stored_aux: aux of the last call. The attribute is absent before the first call, so that it is
+        not part of the layer's graph structure.
       stored_dropout_key: the key set by `with_dropout`; absent otherwise.
     """
 
@@ -78,7 +78,7 @@ class AdaptedLayer(nnx.Module):
         return getattr(self, self.kernel_name)
 
     def set_kernel_variable(self, variable: Any) -> None:
-        """Replace the variable that holds the kernel; it may be shared with other layers."""
+        """Replace the variable that holds the kernel; layers that share the old one keep it."""
         setattr(self, self.kernel_name, variable)
 
     def stack_shape(self) -> tuple[int, ...]:

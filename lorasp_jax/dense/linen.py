@@ -17,10 +17,9 @@ from lorasp_jax.peft._method import Params, dropout_rate
 class LinenDense(nn.Module):
     """A dense layer with an optional adapter, a drop-in for `nn.Dense`.
 
-    Kernel and bias are in the collection "params", the adapter's parameters in "adapters", so that
-    the adapter's trainable parameters form their own collection. Full fine-tuning trains "params"
-    and has no "adapters". If "intermediates" is mutable, aux is sown there for `collect_aux`.
-    Passing an rng for "dropout" enables the method's dropout.
+    Kernel and bias are in the collection "params", the adapter's parameters in "adapters". Full
+    fine-tuning trains "params" and has no "adapters". If "intermediates" is mutable, aux is sown
+    there for `collect_aux`. Passing an rng for "dropout" enables the method's dropout.
 
     Attributes:
       features: O.

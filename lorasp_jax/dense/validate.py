@@ -1,4 +1,4 @@
-"""Validate arguments before any computation; each error message is a single sentence."""
+"""Validate arguments before any computation."""
 
 import os
 import pathlib
