@@ -28,15 +28,14 @@ def resize_with_pad(
     Args:
         images: values in [-1, 1]; images already of this size are returned unchanged.
         size: height and width [pixels].
-        centred: center the image, as in openpi (shared/image_tools.py) and LeRobot's pi0; False
+        centred: center the image, as in openpi (shared/image_tools.py) and LeRobot's pi0. False
             aligns it to the bottom right, as in LeRobot's SmolVLA.
-        antialias: smooth before downsampling, as in openpi; False does not, as in PyTorch and
-            LeRobot.
+        antialias: smooth before downsampling, as in openpi. PyTorch and LeRobot do not.
     """
     batch, height, width, channels = images.shape
     if height == width == size:
         return images
-    # Float arithmetic, as in openpi and LeRobot: 116 pixels become 223, not 224.
+    # Rounded down as in openpi and LeRobot: 116 pixels scaled to 224 come out as 223.
     ratio = max(width / size, height / size)
     inner = (max(1, int(height / ratio)), max(1, int(width / ratio)))
     shape = (batch, *inner, channels)

@@ -2,19 +2,22 @@
 
 Every mode is an affine map: y = (x - shift) / divisor + offset and x = (y - offset) factor + shift.
 
-    mean_std             shift mean, spread std, offset 0
-    min_max, quantiles   shift low, spread high - low, offset -1: [low, high] becomes [-1, 1];
-                         low and high: minimum and maximum in min_max, percentiles 1 and 99
-                         in quantiles, 10 and 90 in quantile10
-    identity             y = x
+    mode         shift   spread      offset
+    mean_std     mean    std         0
+    min_max      min     max - min   -1
+    quantiles    q01     q99 - q01   -1
+    quantile10   q10     q90 - q10   -1
+    identity     y = x
 
-Divisor and factor are both the spread, halved for ranges. Before any halving, each convention
-guards the spread against zero in constant dimensions:
+In `mean_std`, divisor and factor are the spread. In the next three modes they are half the spread,
+which maps the two bounds to -1 and 1.
 
-    ours      at least MIN_SPREAD, in both directions
-    openpi    adds 1e-6, in both directions (transforms.py, Normalize and Unnormalize, at 15a9616a)
-    lerobot   std: adds 1e-8, only to the divisor; ranges: 1e-8 in place of 0, in both directions
-              (processor/normalize_processor.py, 0.6)
+In constant dimensions the spread is 0. Each convention guards the spread, before it is halved:
+
+    ours      at least MIN_SPREAD
+    openpi    adds 1e-6 (transforms.py, Normalize and Unnormalize, at 15a9616a)
+    lerobot   mean_std: adds 1e-8 to the divisor only
+              other modes: replaces 0 by 1e-8 (processor/normalize_processor.py, 0.6)
 """
 
 from collections.abc import Mapping
@@ -49,7 +52,7 @@ def normalize(
         values: `[..., J]` [rad, m].
         stats: their statistics by name, `[J]` each.
         mode: see the module docstring.
-        convention: the project whose guard against small spreads applies.
+        convention: see the module docstring.
 
     Raises:
         ValueError: a statistic that the mode needs is missing.

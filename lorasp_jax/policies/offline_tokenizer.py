@@ -1,8 +1,9 @@
 """Offline tokenizer of the project's own base weights: WordPiece with manipulation words.
 
-Other words, up to 100 characters long, are split into characters, so any printable ASCII text
-without longer words can be encoded. The position of an entry is its id, and the shipped weights
-depend on it: entries are never moved or removed, and a new word replaces the next reserved entry.
+Other words are split into shorter pieces, down to single characters. So any printable ASCII text
+can be encoded if its words have at most 100 characters. The position of an entry is its id, and the
+shipped weights depend on it. Never move or remove an entry; a new word replaces the next reserved
+entry.
 """
 
 import functools
@@ -37,7 +38,7 @@ def _vocabulary() -> dict[str, int]:
 
 
 VOCABULARY = _vocabulary()
-"""Maps each entry to its id; must not change."""
+"""Maps each entry to its id, which must not change."""
 
 
 @functools.cache

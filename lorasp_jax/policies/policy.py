@@ -26,10 +26,10 @@ class Policy:
     processor: Processor
 
     def with_sampler(self) -> Self:
-        """Return a policy for repeated calls: computations on weights alone run once.
+        """Return a policy for repeated calls, which runs computations on weights alone only once.
 
-        Call it before a `jax.lax` loop: on a CPU, XLA hoists these computations out of the loop
-        anyway, but does not guarantee it.
+        Call it before a `jax.lax` loop. XLA hoists these computations out of the loop on a CPU, but
+        does not guarantee it.
         """
         return dataclasses.replace(self, model=self.model.sampler())
 

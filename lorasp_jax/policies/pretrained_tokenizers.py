@@ -28,7 +28,7 @@ class SentencePiece:
     def __init__(self, file: Path) -> None:
         try:
             self._model = sentencepiece.SentencePieceProcessor(model_file=str(file))
-            self._model.encode("", add_bos=True)  # if this works, every text can be encoded
+            self._model.encode("", add_bos=True)  # raises if there is no BOS
         except (OSError, RuntimeError, ValueError) as error:
             raise ValueError(f"{file} is not a SentencePiece model like PaliGemma's.") from error
 
@@ -45,7 +45,7 @@ class SentencePiece:
             self._model.encode(t if complete else prompts.openpi(t), add_bos=True) for t in texts
         ]
         if not complete:
-            # Encoded separately, so that the newline never merges with the last piece of the text.
+            # Encoded separately, so that the newline never merges with the end of the text.
             newline = self._model.encode("\n")
             rows = [row + newline for row in rows]
         return _pad(texts, rows, max_tokens, pad=0)
@@ -78,7 +78,7 @@ class TokenizersFile:
     def encode(
         self, texts: Sequence[str], max_tokens: int, *, complete: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Encode each text with a final newline and the special tokens that the file adds (BOS).
+        """Encode each text with a final newline and the file's special tokens, such as BOS.
 
         See `tokenizer.Tokenizer`.
         """

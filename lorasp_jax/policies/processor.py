@@ -43,7 +43,7 @@ def robot_slots(num_joints: int, inputs: InputConfig = OURS) -> tuple[int, ...]:
 def camera_slots(
     cameras: Sequence[str], robot: Mapping[str, str]
 ) -> tuple[tuple[str, str | None], ...]:
-    """Pair each backbone camera with the robot camera that feeds it or with None, for `Processor`.
+    """Pair each backbone camera with the robot camera that feeds it, or with None, for `Processor`.
 
     Args:
         cameras: the backbone's cameras, `config.cameras`.
@@ -136,8 +136,8 @@ class Processor:
             num_joints: J.
             cameras: backbone camera -> robot camera, see `camera_slots`; None if the names are
                 equal.
-            delta: mask of relative action dimensions, see `to_delta`; `statistics` must be those of
-                the relative actions. None selects the mask in the config.
+            delta: mask of relative action dimensions, see `to_delta`. The action statistics must be
+                those of the relative actions. None selects the mask in the config.
 
         Raises:
             ValueError: joints, statistics or cameras do not fit the backbone, or the delta mask is

@@ -1,9 +1,9 @@
-"""Prompts of a robot, tokenized in advance, since no tokenizer can run inside `jax.jit`.
+"""Prompts for a robot, tokenized in advance because tokenizers cannot run inside `jax.jit`.
 
-pi0.5's prompt contains the state, "Task: press the button, State: 12 130 7;\\nAction: ". Its
-token ids are concatenated from parts tokenized separately: the text before the numbers, each number
-with its leading space, and the last number with the text after it. This is correct if the tokenizer
-never merges a number with its neighbors, which is verified for every pair of numbers.
+pi0.5's prompt contains the state, as in "Task: press the button, State: 12 130 7;\\nAction: ". Its
+parts are tokenized separately and then concatenated: the text before the numbers, each number with
+its leading space, and the last number with the text after it. This is correct only if the tokenizer
+never merges a number with its neighbors. `_check_merges` verifies that for every pair of numbers.
 """
 
 import dataclasses
@@ -38,8 +38,8 @@ class PromptTable:
 
     Attributes:
         start: `[P, T]`, one row per instruction: the prompt, or the part of it before the state.
-        numbers: one row per bin, starting with bin -1: the tokens of a state value with its leading
-            space. None if prompts do not contain the state.
+        numbers: one row per bin, the tokens of a state value with its leading space. Row 0 is bin
+            -1, for values below -1. None if prompts do not contain the state.
         last: the same for the last state value, followed by the end of the prompt.
         instructions: P strings.
     """
@@ -61,10 +61,10 @@ class PromptTable:
         """Tokenize the instructions for a backbone.
 
         Args:
-            words: the tokenizer of the backbone's weights.
+            words: the tokenizer that belongs to the backbone's weights.
             instructions: P strings.
             config: the backbone's config; if `inputs.prompt_state`, prompts contain the state.
-            num_joints: J of the robot.
+            num_joints: J, the robot's number of joints.
 
         Raises:
             ValueError: the tokenizer rejects an instruction, gives ids beyond the backbone's

@@ -11,9 +11,10 @@ PI05_END = ";\nAction: "
 
 
 def openpi(text: str) -> str:
-    """Clean an instruction as openpi does for pi0, without the newline that precedes the answer.
+    """Clean an instruction as openpi does for pi0 (models/tokenizer.py).
 
-    Strip whitespace; replace underscores and newlines with spaces (openpi, models/tokenizer.py).
+    Surrounding whitespace is stripped; underscores and newlines inside become spaces. The newline
+    that openpi appends is not added.
     """
     return text.strip().replace("_", " ").replace("\n", " ")
 
@@ -24,12 +25,13 @@ def lerobot(text: str) -> str:
 
 
 def pi05(text: str, state: np.ndarray) -> str:
-    """Return the full prompt of pi0.5, as openpi (models/tokenizer.py) and LeRobot
-    (processor_pi05.py) write it.
+    """Return the full prompt of pi0.5.
+
+    It is that of openpi (models/tokenizer.py) and LeRobot (processor_pi05.py).
 
     Args:
         text: instruction.
-        state: `[J+1]`, normalized; values below -1 are written as -1, values of 1 or more as 255.
+        state: `[J+1]`, normalized. Values below -1 become bin -1, values of 1 or more bin 255.
     """
     bins = np.digitize(state, EDGES) - 1
     return f"{pi05_start(text)} {' '.join(map(str, bins))}{PI05_END}"

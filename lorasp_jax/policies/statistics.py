@@ -14,7 +14,7 @@ from lorasp_jax.storage.digest import DIGEST, verify_digest, with_digest
 NAMES = ("mean", "std", "min", "max", "q01", "q99", "q10", "q90")
 """Names of all supported statistics."""
 _UNUSED: dict[str, float] = dict(zip(NAMES, (0, 1, -1, 1, -1, 1, -1, 1), strict=True))
-"""Values for unused slots: with them, every normalization mode is the identity, up to its guard
+"""Statistics of unused slots. They make every normalization mode the identity, up to its guard
 against zero."""
 
 
@@ -70,8 +70,8 @@ class Statistics:
         """Move a robot's statistics into a backbone's slots.
 
         Args:
-            slots: slots of the robot's J+1 dimensions; further dimensions of the statistics are
-                dropped, since openpi pads its files.
+            slots: slots of the robot's J+1 dimensions. Further dimensions of the statistics are
+                dropped, because openpi pads its files.
             dim: number of slots, A.
 
         Raises:
@@ -92,7 +92,7 @@ class Statistics:
         return Statistics(move(self.state), move(self.action))
 
     def to_json(self) -> str:
-        """Return JSON: an object of lists named "state_mean" etc., exact in fp32, and a digest."""
+        """Return a JSON object: lists such as "state_mean", exact in fp32, and a digest."""
         both = {"state": self.state, "action": self.action}
         lists = {
             f"{kind}_{name}": np.asarray(stats[name]).tolist()
@@ -104,7 +104,7 @@ class Statistics:
 
     @classmethod
     def from_json(cls, text: str) -> "Statistics":
-        """Parse the output of `to_json`; a file from another source may lack the digest.
+        """Parse the output of `to_json`. The digest may be missing.
 
         Raises:
             ValueError: invalid content, or the digest does not match.

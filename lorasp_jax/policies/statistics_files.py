@@ -49,9 +49,9 @@ def read(where: str | os.PathLike[str], *, dataset: str = "") -> Statistics:
 
     Args:
         where: one of the files in the module docstring, or a folder to search for them in that
-            order: a local path, a Hub repository or a bucket URL; see `hub.local`.
-        dataset: the dataset, if a checkpoint has several: its folder under openpi's assets/, or its
-            name in the names of LeRobot's tensors.
+            order. It can be a local path, a Hub repository or a bucket URL; see `hub.local`.
+        dataset: the dataset, if a checkpoint has several. For openpi, its folder under assets/; for
+            LeRobot, its name within the tensor names.
 
     Raises:
         ValueError: no statistics, damaged files, several datasets or an unknown one, no state or
@@ -151,7 +151,7 @@ _READERS: dict[str, Callable[[list[Path]], dict[str, Stats]]] = {
 
 
 def _files(folder: Path, pattern: str) -> list[Path]:
-    """Return the regular files that match the pattern; matching folders are left out."""
+    """Return the files that match the pattern, without folders."""
     return [path for path in sorted(folder.glob(pattern)) if path.is_file()]
 
 

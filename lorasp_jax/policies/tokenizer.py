@@ -1,4 +1,4 @@
-"""Define the tokenizer interface and load any tokenizer by its path.
+"""Define the tokenizer interface and load tokenizers from a path.
 
 Implementations: `offline_tokenizer` for the project's own base weights, `pretrained_tokenizers` for
 published language models.
@@ -47,8 +47,8 @@ def load_tokenizer(where: str | os.PathLike[str]) -> Tokenizer:
     """Load a tokenizer from a file.
 
     Args:
-        where: a SentencePiece `.model`, a `tokenizer.json`, or a folder that contains one of them:
-            a local path, a Hub repository or a bucket URL; see `hub.local`. An empty string
+        where: a SentencePiece `.model`, a `tokenizer.json`, or a folder that contains one of them,
+            given as a local path, Hub repository or bucket URL; see `hub.local`. An empty string
             selects the offline tokenizer.
 
     Raises:
