@@ -9,9 +9,9 @@ A cache is a folder of memory-mapped .npy files, including raw images. There are
     statistics.json   statistics of states and actions; only if actions are joint targets
 
 Each image has its own checksum, which is verified when the image is first read. Reading a batch
-takes one gather per file. On two cores, with batches of 64 shuffled windows with two cameras, this
-gives 37,000 windows/s at 128 x 128 pixels and 18,000 at 224 x 168. From array_record files, it is
-6,500 and 3,800.
+takes one gather per file. On two cores (batches of 64 shuffled windows, two cameras), this gives
+37,000 windows/s at 128 x 128 pixels and 18,000 at 224 x 168; array_record files give 6,500 and
+3,800.
 """
 
 import json
@@ -71,7 +71,7 @@ def write(
         path: folder to create.
         progress: called with the steps done and the total.
         waiting: called once if another process is writing this folder, before waiting for it. The
-            cache that it writes is accepted if it matches these datasets. None raises an error
+            other process's cache is accepted if it matches these datasets. None raises an error
             instead of waiting.
 
     Raises:

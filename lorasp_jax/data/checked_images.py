@@ -11,7 +11,7 @@ import numpy as np
 class CheckedImages:
     """A memory-mapped array of images, uint8 `[N, H, W, 3]`; indexing reads and verifies them.
 
-    Opening verifies nothing, because the file may be larger than memory.
+    Opening does not verify them, because the file may be larger than memory.
     """
 
     def __init__(self, path: Path, array: np.ndarray, checksums: np.ndarray) -> None:

@@ -21,14 +21,14 @@ from lorasp_jax.data.source import Source
 from lorasp_jax.data.video import downscale
 
 EPISODES, FRAMES, TILE, LINE = 6, 5, 128, 14
-"""Contact sheet: rows, time steps per row, longer image side [px], caption height [px]."""
+"""Contact sheet: episodes, time steps per episode, longer image side [px], caption height [px]."""
 _MAX_INSTRUCTIONS = 10  # in the report
 _END_EFFECTOR = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")  # action dimensions
 
 
 @dataclasses.dataclass(frozen=True)
 class Summary:
-    """Numbers and texts of a dataset, without its images.
+    """The content of a dataset, except its images.
 
     Attributes:
         state: f32 `[N, J+1]`, all episodes concatenated.

@@ -33,7 +33,7 @@ from lorasp_jax.storage import hub
 _COLUMNS = ("timestamp", "frame_index", "episode_index", "task_index")
 _MAX_DIM = 10_000  # limit for state and action
 _TIME_TOLERANCE = 0.25
-"""Tolerance of timestamps, in frame periods; as for videos."""
+"""Tolerance of timestamps, in frame periods, as for videos."""
 
 
 class LeRobot:

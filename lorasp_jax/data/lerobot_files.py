@@ -185,7 +185,7 @@ def read_table(
 
     Raises:
         KeyError: a column is missing.
-        Exception: from `envs.datasets.files` or pyarrow; `as_value_error` converts it.
+        Exception: any error that `as_value_error` converts.
     """
     with pq.ParquetFile(check_regular(path, folder)) as file:
         available = file.schema_arrow.names

@@ -23,7 +23,7 @@ def to_rlds(
         source: a dataset of one task; not modified.
         path: folder to create.
         progress: called with the steps done and the total.
-        episodes_per_file: number of episodes per file; those of one file are in memory together.
+        episodes_per_file: number of episodes per file, all in memory until it is written.
 
     Raises:
         ValueError: the path already exists, another process is writing it, there are several tasks,

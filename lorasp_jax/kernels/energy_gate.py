@@ -4,7 +4,7 @@ For scores s >= 0, let E_k be the fraction of the energy Σ s² in the k largest
 12). The gate keeps the smallest k with E_k >= η; ties go to the lowest index. Implementations:
 
 - "pairwise": for each direction, sum the energy of all directions that rank before it. O(R²),
-  vectorized over rows and R; fastest on CPU up to R = 32.
+  vectorized over rows and R; fastest on a CPU for small R.
 - "sort": sort the scores, accumulate energy, threshold. The reference; in rare cases, rounding of
   its cumulative sum changes whether η is reached.
 - "bisection": binary search for the threshold, one bit per step, without a sort.

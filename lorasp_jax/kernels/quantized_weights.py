@@ -54,7 +54,7 @@ class QuantizedKernel:
     """Shape of the original einsum kernel without stacked axes; None for a matrix. Codes are
     matrices in either case, as is the result of `astype`."""
     batch: int = dataclasses.field(default=0, metadata={"static": True})
-    """Number of leading axes of the codes that belong to `axes`."""
+    """Number of batch axes of the einsum; in the codes, they follow the stacked axes."""
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -97,7 +97,7 @@ def _not_found_message(name: str, path: Path) -> str:
 
 
 def is_remote(where: str | os.PathLike[str]) -> bool:
-    """Return whether `where` is a URL, which `local` would download."""
+    """Return whether `where` is a URL that `local` downloads."""
     return "://" in os.fspath(where)
 
 

@@ -20,7 +20,7 @@ def check(value: Any, kind: Any, name: str = "") -> None:
         value: parsed JSON value.
         kind: the schema: a type, [kind] for a list of any length, (kind, kind) for a list of two,
             or {"a": kind} for an object with at least the key "a". Other keys may have any value;
-            if the schema has the key `str`, they must match its kind.
+            if the schema has the type `str` as a key, they must match its kind.
         name: dotted path of the value, for the error message.
     """
     if isinstance(kind, type):
