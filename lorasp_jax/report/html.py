@@ -115,7 +115,6 @@ def _progress(folder: Path, config: dict[str, Any], rows: figures.Rows) -> Itera
 
 
 def _skipped(rows: figures.Rows) -> Iterable[str]:
-    """Show the number of skipped steps, if any."""
     skipped = [(row["step"], row["skipped"]) for row in rows if row.get("skipped")]
     if skipped:
         total = sum(count for _, count in skipped)
@@ -167,7 +166,6 @@ def success_cell(value: dict[str, Any]) -> str:
 
 
 def _speed(rows: figures.Rows) -> Iterable[str]:
-    """Show a table of throughput and memory, if logged."""
     summary = speed(rows)
     if summary:
         yield _table(("run statistics", ""), summary.items())

@@ -38,7 +38,7 @@ def _keys(config: Config) -> jax.Array:
 
 
 def map_threads(function: Callable, *arguments: Iterable[Any]) -> list[Any]:
-    """Map in threads, because compilation dominates; an interrupt does not wait for the threads."""
+    """Map in threads, to compile in parallel; an interrupt does not wait for the threads."""
     pool = ThreadPoolExecutor()
     try:
         return list(pool.map(function, *arguments))
@@ -49,7 +49,6 @@ def map_threads(function: Callable, *arguments: Iterable[Any]) -> list[Any]:
 def _load_or_collect(
     config: Config, path: Path, task: str, key: jax.Array, *, progress: Progress
 ) -> Episodes:
-    """Load the episodes of one task, or collect and save them."""
     if path.exists():
         return Episodes.load(path, control_dt=config.control_dt)
     report = lambda done, total: progress(task, done, total)  # noqa: E731
@@ -62,7 +61,7 @@ def _load_or_collect(
 def _collect(
     config: Config, task: str, key: jax.Array, progress: Callable[[int, int], None] | None = None
 ) -> Episodes:
-    """Collect episodes of one task with the scripted expert."""
+    """Collect episodes with the scripted expert."""
     return envs.collect(
         task,
         robot=config.robot,

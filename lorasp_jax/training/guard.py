@@ -3,9 +3,9 @@
 A skipped step leaves parameters, their average and the optimizer state unchanged. The step count
 still advances, and with it the data position and the random streams.
 
-The decision depends only on loss and gradient norm, so XLA can fuse `select` into the in-place
-update of the donated state. If it depended on the updates, all updates and the whole old state
-would have to be in memory at once.
+The decision to skip depends only on loss and gradient norm, so XLA can fuse `select` into the
+in-place update of the donated state. If it depended on the updates, all updates and the whole old
+state would have to be in memory at once.
 
 Loss and gradient norm suffice: under AdamW, a gradient clipped to a finite norm changes each
 parameter by at most a few times the learning rate. A non-finite update means an absurdly high

@@ -210,12 +210,8 @@ def _failure(
 ) -> RunError | None:
     """Return an error if too many consecutive steps were skipped or an update was non-finite.
 
-    Args:
-        optim: the limits.
-        rows: metrics of each step of the log interval, `[count, ...]`.
-        values: means of these metrics.
-        done: step at the end of the interval.
-        saved: step of the last checkpoint.
+    `rows` are the metrics `[count, ...]` of the steps up to `done`, and `values` their means. The
+    last checkpoint is at step `saved`.
     """
     remedy = f"nothing after step {saved} was saved: try a lower --optim.learning-rate"
     if (skipped := rows["in_a_row"].max()) >= optim.max_skipped:

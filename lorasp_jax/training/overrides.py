@@ -267,7 +267,7 @@ def _check_simulated(config: Config) -> None:
 
 
 def _sentence(message: str) -> str:
-    """Return the first paragraph of tyro's framed error message, without its title, on one line."""
+    """Return the first paragraph below the title of tyro's framed error message, on one line."""
     lines = [line.strip(" │╭╮╰╯─-") for line in message.splitlines()]
     body = itertools.takewhile(bool, itertools.dropwhile(lambda line: not line, lines[1:]))
     return " ".join(body).removeprefix("Error parsing ").removeprefix("Config: ")

@@ -23,9 +23,6 @@ class Run:
     """A run, as passed to callbacks.
 
     Attributes:
-        folder: folder for all files of the run.
-        console: console for status messages.
-        base_hash: hash of the frozen base.
         episodes: demonstrations per task; those of a dataset repeat one image per camera.
         dataset: all steps of a dataset, stored on disk; None: train on `episodes`.
         streams: whether batches are read from disk because the dataset does not fit on the device.

@@ -273,8 +273,8 @@ def processor(
 ) -> Processor:
     """Build the processor from the prompts and the statistics of the demonstrations.
 
-    Cameras, sorted by name, fill the backbone's camera slots from the first on. With `relative`,
-    joint targets are relative to the state at the start of the chunk; otherwise the model's config
+    Cameras, sorted by name, fill the backbone's camera slots in order. With `relative`, joint
+    targets are relative to the state at the start of the chunk; otherwise the model's config
     decides.
     """
     joints = episodes[0].state.shape[-1] - 1

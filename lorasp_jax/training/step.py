@@ -27,7 +27,6 @@ class TrainState:
     Attributes:
         step: `[]` int32, number of steps taken, including skipped ones.
         adapters: trainable parameters, an `nnx.State` of `AdapterParam`s.
-        opt_state: state of the optimizer.
         guard: statistics that decide which steps to skip.
         average: exponential moving average of the adapters, or None.
     """

@@ -1,4 +1,7 @@
-"""Run several training steps per call, on data held on the device, streamed or collected anew."""
+"""Run several training steps per call.
+
+The data is on the device, streamed from disk, or replaced by newly collected demonstrations.
+"""
 
 import functools
 from collections.abc import Callable, Iterator

@@ -10,7 +10,7 @@ from lorasp_jax.training.run import Callback, Run
 from lorasp_jax.training.run_folder import read_json, to_json, write_json
 
 RECORD = "wandb.json"
-"""File in a run's folder with the id of the W&B run, to continue that one on resume."""
+"""File in a run's folder with the id of the W&B run, which is continued on resume."""
 
 
 class WeightsAndBiases(Callback):
@@ -21,7 +21,7 @@ class WeightsAndBiases(Callback):
     """
 
     def __init__(self, project: str, config: Config, folder: Path) -> None:
-        """Start a W&B run, or continue the one in this folder.
+        """Start a W&B run, or continue the one recorded in `folder`.
 
         Raises:
             ValueError: wandb is not installed, or reports an error.

@@ -59,14 +59,7 @@ class Memory:
 
 
 class AbstractStep(NamedTuple):
-    """Loss function of a training step and the shapes of its inputs.
-
-    Attributes:
-        loss: (adapters, frozen, batch) -> loss, metrics.
-        adapters: shapes of the trainable parameters.
-        frozen: shapes of the frozen parameters.
-        batch: shapes of the batch.
-    """
+    """The loss of a training step, (adapters, frozen, batch) -> loss, metrics, and input shapes."""
 
     loss: Callable[[Any, Any, Batch], tuple[jax.Array, Metrics]]
     adapters: Any
@@ -92,7 +85,7 @@ def choose_remat(
 
 
 def _out_of_memory_message(config: Config, memory: Memory, remat: Remat, available: float) -> str:
-    """Return an error message that suggests settings with lower memory use."""
+    """Suggest settings that need less memory."""
     batch, fixed = config.optim.batch_size, memory.peak - HEADROOM * memory.activations
     fitting = math.floor(batch * (available - fixed) / (memory.peak - fixed))
     fitting -= fitting % (jax.device_count() * config.optim.accumulate)

@@ -36,8 +36,8 @@ class Speed:
     def waiting(self, results: Any) -> Iterator[None]:
         """Measure the time in this block, in which the host waits for the next batch.
 
-        The time counts only if the device is idle at the end of the block: `results`, arrays from
-        the last dispatched step, must be ready by then.
+        The time counts only if the device is idle at the end of the block, that is, if the
+        `results` of the last dispatched step are ready.
         """
         start = time.perf_counter()
         yield
@@ -48,7 +48,7 @@ class Speed:
         """Stop the clock after `steps` steps and return the metrics of the interval.
 
         - `speed/samples_per_second`: windows per second over all devices.
-        - `speed/flop_utilisation`: fraction of the peak FLOP/s, if both numbers are known.
+        - `speed/flop_utilisation`: fraction of the device's peak FLOP/s, if known.
         - `speed/data_wait`: fraction of the time in which the device waited for data, if data was
           streamed or replaced.
         - `memory/in_use_gib`, `memory/peak_gib`: see `memory`.

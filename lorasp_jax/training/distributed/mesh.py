@@ -1,7 +1,7 @@
 """The ("data", "fsdp") device mesh and the shardings of arrays on it.
 
-The step is written for the global batch. `jax.jit` with `NamedSharding` parallelizes it over any
-number of devices, which replaces `pmap` (docs.jax.dev/en/latest/migrate_pmap.html).
+The training step is written for the global batch. `jax.jit` with `NamedSharding` parallelizes it
+over any number of devices; this replaces `pmap` (docs.jax.dev/en/latest/migrate_pmap.html).
 """
 
 from collections.abc import Sequence

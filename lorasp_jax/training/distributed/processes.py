@@ -1,7 +1,7 @@
 """Multi-process runs: startup, barriers, shared arrays and coordinated exit.
 
-All processes train; only the first one collects, evaluates, prints and writes. All of them must
-share the storage of the runs folder. The functions also work in a single process.
+All processes train; only the first one collects, evaluates, prints and writes. The runs folder must
+be on storage that they share. The functions also work in a single process.
 """
 
 import atexit
