@@ -285,14 +285,13 @@ class Cache:
         )
 
     def _map_columns(self) -> dict[str, np.ndarray]:
-        """Memory-map all `ROWS`."""
         shapes = {"state": (self.num_steps, self.metadata["numbers"])}
         shapes |= {"action": (self.num_steps, None), "length": (None,)}
         columns = {name: self._map(name, shape) for name, shape in shapes.items()}
         return columns | {name: self._map(name, columns["length"].shape) for name in ROWS[3:]}
 
     def _check_columns(self) -> None:
-        """Raise ValueError if episode lengths, task indices or instruction indices are invalid."""
+        """Raise ValueError if lengths, task indices or instruction indices are invalid."""
         length = self._columns["length"]
         if not len(length) or length.min() < 1 or self._end[-1] != self.num_steps:
             total = int(self._end[-1]) if len(length) else 0

@@ -36,7 +36,6 @@ class CheckedImages:
         self.nbytes: int = array.nbytes
 
     def __len__(self) -> int:
-        """Number of images, N."""
         return len(self._array)
 
     def __getitem__(self, index: Any) -> np.ndarray:

@@ -39,7 +39,6 @@ class Keys:
     image_size: int = 0
 
     def __post_init__(self) -> None:
-        """Check the fields."""
         _fields.check_fields(self)
         if not isinstance(self.cameras, Mapping):
             raise ValueError(f"cameras must be a mapping, name -> feature, got {self.cameras!r}")

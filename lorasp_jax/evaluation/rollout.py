@@ -54,7 +54,7 @@ class Result:
         steps: mean control steps per episode.
         active_rank: mean active ranks by tower and linear layer, each a list over stacked layers.
         active_rank_histogram: `[R + 1]` int64 per tower, the sum of `metrics.rank_histogram` over
-            all policy calls; R is the largest adapter rank.
+            all policy calls.
         poses: poses of one recorded episode, a successful one if possible; the leading axis is
             time.
     """
@@ -185,7 +185,7 @@ def _control_block(
 
 
 def _max_rank(policy: Policy) -> int:
-    """Return the largest adapter rank of a policy with a sampler; 0 if no method has a rank."""
+    """Return the largest adapter rank; 0 if no method has a rank."""
     return max((getattr(method, "rank", 0) for method in policy.model.methods), default=0)
 
 

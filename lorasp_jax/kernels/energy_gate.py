@@ -69,7 +69,7 @@ def exact_ratio(energy_target: float) -> Ratio:
     if not 0 < ratio <= 1:
         raise ValueError(f"energy_target must lie in (0, 1], got {energy_target!r}.")
     ratio = max(ratio, fractions.Fraction(MIN_TARGET))
-    power = 2 ** ratio.denominator.bit_length()  # scale both without rounding
+    power = 2 ** ratio.denominator.bit_length()  # scaling by it is exact
     return Ratio(ratio.numerator / power, ratio.denominator / power)
 
 
@@ -89,7 +89,7 @@ def energy_gate(
       scores: [..., R], non-negative, cast to fp32. For negative scores the magnitude is used.
       energy_target: η in (0, 1], a Python number, interpreted as an exact decimal.
       implementation: see the module docstring; None for `default_implementation(R)`.
-      interpret: run the kernel of "pallas" as XLA operations, without a GPU.
+      interpret: run "pallas" without a GPU, slowly.
 
     Returns:
       mask bool [..., R], active_rank f32 [...] = k, kept_energy f32 [...] = E_k.

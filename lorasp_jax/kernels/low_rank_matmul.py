@@ -70,7 +70,7 @@ class LowRankLayer(NamedTuple):
     params: Any
     """Parameters of f."""
     kernel: jax.Array | QuantizedKernel | Any
-    """W [I, O] of any dtype; frozen: no gradient is computed."""
+    """W [I, O] of any dtype, frozen."""
     down: jax.Array
     """P [I, Q], fp32, cast to the dtype of x on use."""
     up: jax.Array
@@ -117,7 +117,6 @@ def _forward(
     x: jax.Array,
     token_mask: jax.Array | None,
 ) -> tuple:
-    """Compute `low_rank_matmul` and the residuals of its backward pass."""
     widths = _widths(layers)
     projected = jnp.matmul(x, _concat_downs(layers, x), preferred_element_type=rows_dtype)
 

@@ -99,7 +99,7 @@ def rowwise_kernel(
       widths: widths of the column groups of one function.
       valid: bool [T, 1], passed to `function`.
       start: first column of `rows` to use.
-      interpret: run the kernel bodies without a GPU, slowly.
+      interpret: run without a GPU, slowly.
 
     Returns:
       output [T, O], sums, and the list of statistics, [T, 1] each. For n stacked trees: output

@@ -68,7 +68,7 @@ def _json_digest(values: Mapping[str, Any]) -> str:
 def _sum(array: Any, *, rounded: bool = False) -> Any:
     """Compute `mixed_sum`, optionally of floats rounded to bf16.
 
-    Arrays in host memory are summed with NumPy, which avoids a compilation for each shape.
+    Arrays in host memory use NumPy, which avoids a compilation for each shape.
     """
     rounded = rounded and jnp.issubdtype(array.dtype, jnp.floating)
     on_host = isinstance(array, np.ndarray) or (
