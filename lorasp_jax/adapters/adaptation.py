@@ -63,7 +63,7 @@ def adapt(
 
     Args:
       model: not modified; the result shares its frozen arrays.
-      rules: (pattern, method or None) pairs; see the module docstring.
+      rules: (pattern, method or None) pairs, first match wins.
       rngs: supplies one key, from which each layer derives its own by its path.
       einsums: extra layer classes that compute one einsum of their input and a parameter, mapped to
         a function layer -> (parameter name, equation), as in
@@ -187,11 +187,8 @@ def attach(
 ) -> None:
     """Attach a newly initialized adapter to a layer, and freeze the layer's own weights.
 
-    Args:
-      layer: modified in place. Leading axes of its kernel index the layers of a scanned stack.
-      method: the adapter's method.
-      key: typed PRNG key.
-      statistics: second moments [..., I, I] of the layer's inputs, if the method requires them.
+    The layer is modified in place; leading axes of its kernel index the layers of a scanned stack.
+    `statistics` are the second moments [..., I, I] of its inputs, if the method requires them.
 
     Raises:
       ValueError: the layer does not support the method or already has an adapter, or the method

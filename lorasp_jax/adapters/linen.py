@@ -183,10 +183,7 @@ class LinenAdapter:
     ) -> dict[str, tuple[int, ...]]:
         """Kernel shapes [..., *batch, I, O] of dense layers and einsums, by path.
 
-        Args:
-          variables: of the bare model.
-          *args: the model's call arguments; the model is called once to find its layers.
-          **kwargs: the model's call arguments.
+        The arguments are those of the bare model, which is called once to find its layers.
         """
         shapes: dict[str, tuple[int, ...]] = {}
 

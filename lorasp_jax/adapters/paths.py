@@ -153,10 +153,8 @@ def locate_other_matrices(
 def no_match_message(pattern: str, layers: Sequence[str], others: Mapping[str, str]) -> str:
     """Error message for a rule that applies to nothing.
 
-    Args:
-      pattern: the rule's pattern.
-      layers: paths of the layers that adapters support.
-      others: class names of other modules with matrices, by path.
+    `layers` are the paths of supported layers. `others` maps the paths of other modules with
+    matrices to their class names.
     """
     close = near_misses(pattern, layers) or "none"
     text = f"rule {short(pattern)} applies to nothing; available layers: {close}"

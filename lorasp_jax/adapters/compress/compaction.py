@@ -58,14 +58,9 @@ def replace_adapters(
     ranks: dict[str, np.ndarray],
     forward: Forward,
 ) -> tuple[adaptation.Model, Compaction]:
-    """Replace adapters in a copy of the model, and measure the errors.
+    """Replace adapters in a copy of the model, and measure the errors on the batches.
 
-    Args:
-      model: not modified.
-      batches: calibration set.
-      replacements: new adapters by path.
-      ranks: required ranks, for the returned `Compaction`.
-      forward: how to call the model on a batch.
+    `ranks` are stored in the returned `Compaction`.
     """
     root = nnx.List([nnx.clone(model)])
     for location in paths.locate(root, AdaptedLayer):

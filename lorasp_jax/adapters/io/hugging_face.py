@@ -2,9 +2,6 @@
 
 A folder has adapter_config.json and adapter_model.safetensors, with tensors named
 base_model.model.<module>.lora_A.weight etc., in torch's layout [out, in] (format of PEFT 0.21.2).
-
-A function `names(path, index)` returns a layer's module name; `index` is the position in a scanned
-stack, or (). By default, "a/0/b" becomes "a.0.b".
 """
 
 import collections
@@ -86,10 +83,11 @@ def load_peft(
     methods' `dropout`, which is active only under `with_dropout`.
 
     Args:
-      folder: local folder, or a Hub repository hf://owner/name, from which only the two files are
-        downloaded.
+      folder: local folder with adapter_config.json and adapter_model.safetensors, or a Hub
+        repository hf://owner/name, from which only these two files are downloaded.
       model: not modified; its adapters on other layers are kept.
-      names: function (path, index) -> module name; see the module docstring.
+      names: function (path, index) -> module name; index is the position in a scanned stack, or ().
+        By default, "a/0/b" becomes "a.0.b".
       einsums: as for `adapt`.
 
     Raises:

@@ -258,9 +258,7 @@ def read_bytes(path: pathlib.Path) -> bytes:
 def read_tensors(path: pathlib.Path, data: bytes) -> dict[str, np.ndarray]:
     """Decode the content of a safetensors file into tensors by name.
 
-    Args:
-      path: for error messages.
-      data: the file's content.
+    `path` is only for error messages.
 
     Raises:
       ValueError: the file is damaged, or a tensor is not floating-point or not finite.

@@ -70,12 +70,7 @@ def check_biases(
 ) -> None:
     """Raise ValueError if the folder has no biases, but its config says that some were trained.
 
-    Args:
-      folder: PEFT folder.
-      bias: the config's "none", "all" or "lora_only".
-      full: the folder's fully trained parameters.
-      parameter_paths: paths of the model's parameters.
-      adapted: paths of layers that the folder adapts.
+    `bias` is the config's "none", "all" or "lora_only"; `adapted` are the paths of adapted layers.
     """
     modules = [
         path.rpartition("/")[0] for path in parameter_paths if path.rpartition("/")[2] == "bias"
@@ -124,11 +119,8 @@ def _module(location: paths.Location) -> str:
 def _stack(name: str, size: Sequence[int], matrices: Sequence[int] | None) -> tuple[int, ...]:
     """Sizes of the leading stack axes of a parameter.
 
-    Args:
-      name: the parameter's name.
-      size: the parameter's shape.
-      matrices: shape [..., I, O] of the kernel matrices of its layer, or None if the layer is
-        neither dense nor an einsum.
+    `size` is the parameter's shape. `matrices` is the shape [..., I, O] of its layer's kernel
+    matrices, or None if the layer is neither dense nor an einsum.
     """
     if matrices is not None:
         return tuple(matrices[:-2])

@@ -204,11 +204,9 @@ def lora_init(layer: Any, method: Method) -> Callable[[jax.Array, jax.Array], An
 
 
 def make_adaptable(layer: nnx.Module, einsums: Einsums) -> AdaptedLayer:
-    """Convert a layer to one that can carry an adapter.
+    """Convert a layer of a supported class to one that can carry an adapter.
 
-    Args:
-      layer: a layer of a supported class; not modified. An `AdaptedLayer` is returned as is.
-      einsums: extra einsum layer classes.
+    The layer is not modified; an `AdaptedLayer` is returned as is.
 
     Raises:
       ValueError: the layer has a custom matmul or precision, its equation cannot be adapted, or an
@@ -232,13 +230,10 @@ def make_adaptable(layer: nnx.Module, einsums: Einsums) -> AdaptedLayer:
 def make_adaptable_like(layer: Any, other: AdaptedLayer) -> AdaptedLayer:
     """Convert a layer to one that can carry the adapter of another layer.
 
-    Args:
-      layer: of the other layer's original class; not modified. It is returned as is if it can
-        already carry the adapter.
-      other: the adapted layer; not modified.
+    The layer is not modified; it is returned as is if it can already carry the adapter.
 
     Raises:
-      ValueError: the layer is of a different class.
+      ValueError: the layer is not of the other layer's original class.
     """
     if isinstance(layer, type(other)):
         return layer
@@ -303,11 +298,7 @@ def describe_einsum(describe: Callable[[Any], Any], layer: Any) -> tuple[str, st
 
 
 def matrices_shape(layer: Any, einsums: Einsums) -> tuple[int, ...]:
-    """Shape [..., *batch, I, O] of a layer's kernel as a stack of matrices.
-
-    Args:
-      layer: a dense layer or an einsum, adapted or not.
-      einsums: extra einsum layer classes.
+    """Shape [..., *batch, I, O] of the kernel matrices of a dense layer or einsum, adapted or not.
 
     Raises:
       ValueError: the equation cannot be adapted.

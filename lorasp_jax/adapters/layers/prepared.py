@@ -219,14 +219,10 @@ def _bottleneck(
 
 
 def matmul(x: jax.Array, matrix: jax.Array) -> jax.Array:
-    """x @ matrix in the dtype of x, as a split-K matmul if there are few output tiles.
+    """x [..., I] @ matrix [I, O], in the dtype of x; split-K if there are few output tiles.
 
     A GPU computes output tiles in parallel, but sums over I sequentially within each tile. Few
     tiles would leave most SMs idle.
-
-    Args:
-      x: [..., I].
-      matrix: [I, O].
     """
     d_in, d_out = matrix.shape
     splits = _num_splits(math.prod(x.shape[:-1]), d_in, d_out)
