@@ -179,7 +179,7 @@ def barrier(name: str) -> None:
 
 @contextlib.contextmanager
 def first_process_first(name: str) -> Iterator[None]:
-    """Run the block in the first process, then in the others, which can read the files written."""
+    """Run the block in the first process, then in the others, which can read the first's files."""
     if not is_first():
         barrier(name)
     yield
