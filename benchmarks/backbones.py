@@ -59,7 +59,7 @@ def sized(name: str, options: argparse.Namespace, remat: Remat = "none") -> Back
 
 
 def run_config(method: peft.Method, targets: tuple[str, ...], batch: int) -> Config:
-    """Return a run config with this method."""
+    """Return the config of a run."""
     optim = OptimConfig(batch_size=batch)
     return Config(name="benchmark", scale="", peft=method, targets=targets, optim=optim)
 

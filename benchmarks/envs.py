@@ -43,7 +43,7 @@ from envs.state import Poses, State
 
 CONTROL_STEPS = 10  # per timed call
 C_STEPS = 500  # physics steps per timed call of the C engine
-IMAGE_SIZES = (64, 128)  # [px] of the renderer's columns
+IMAGE_SIZES = (64, 128)  # px, in the columns images/s
 PLAYGROUND, PLAYGROUND_CONTACTS = "PandaPickCube", 24  # contacts per world: Playground's default
 
 

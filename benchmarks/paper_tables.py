@@ -12,9 +12,6 @@ The paper does not say how it counts. These rules reproduce its percentages to t
   backbones. It omits the five linear layers outside the towers; with them, SmolVLA would have 17.2
   instead of 17.1. The released code has a router as wide as the bank, which gives 12.0 and 23.0
   instead of 9.2 and 17.1.
-
-The tables disagree on a measured number: the success of LoRA-SP on pi0 when opening the pot is 80 %
-in one and 60 % in the other.
 """
 
 import math
@@ -94,7 +91,6 @@ def linear_layers(config: BackboneConfig) -> tuple[Shapes, int]:
 
 
 def _size(method: Method, d_in: int, d_out: int) -> int:
-    """Count the parameters of one adapter."""
     kernel = jax.ShapeDtypeStruct((d_in, d_out), jnp.float32)
     params = jax.eval_shape(lambda key: method.init(key, kernel)[0], jax.random.key(0))
     return sum(leaf.size for leaf in jax.tree.leaves(params))

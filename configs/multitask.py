@@ -4,10 +4,10 @@
     python train.py --config configs/multitask.py --model.backbone smolvla --name smolvla
     python train.py --config configs/multitask.py --method lora --peft.rank 16 --name lora
 
-Loads the base pretrained on a simulated Franka Panda (assets/), collects PiPER demonstrations with
-the scripted expert, evaluates the base, trains adapters jointly on the paper's four tasks,
-evaluates again and writes runs/multitask/report.html. Expected results and times are in the README.
-Scale cpu trains only two tasks; pass `--tasks open_pot pour press pick_place` for all four.
+Collects PiPER demonstrations with the scripted expert, evaluates the base that was pretrained on a
+simulated Franka Panda (assets/), trains adapters jointly on the paper's four tasks, evaluates again
+and writes runs/multitask/report.html. Expected results and times are in the README. Scale cpu
+trains only two tasks; pass `--tasks open_pot pour press pick_place` for all four.
 """
 
 from lorasp_jax.config import Config, DataConfig, EvaluationConfig, ModelConfig, OptimConfig

@@ -42,9 +42,10 @@ def bars(console: Console, unit: str, *, per_step: int = 1, shown: bool = True) 
 
 
 def collecting(progress: Progress, title: str, stop: threading.Event) -> Report:
-    """Make a progress callback that updates a bar; its first call, before compilation, adds it.
+    """Make a progress callback that updates a bar.
 
-    The callback raises KeyboardInterrupt once `stop` is set.
+    The first call, before compilation, adds the bar. Once `stop` is set, the callback raises
+    KeyboardInterrupt.
     """
     bar: TaskID | None = None
 

@@ -94,7 +94,6 @@ def play(options: argparse.Namespace, console: Console) -> None:
 
 
 def _env(options: argparse.Namespace, task: str) -> envs.Env:
-    """Make the environment to collect in."""
     env = collection.make_repeatable(
         task,
         options.robot,
@@ -203,7 +202,6 @@ def _save(options: argparse.Namespace, folder: Path, out: Path) -> None:
 
 
 def _are_same(one: Episodes, other: Episodes) -> bool:
-    """Return whether both have equal arrays and metadata."""
     trees = [jax.tree.flatten(episodes) for episodes in (one, other)]
     (leaves, metadata), (other_leaves, other_metadata) = trees
     return metadata == other_metadata and all(map(np.array_equal, leaves, other_leaves))
@@ -215,7 +213,6 @@ def _partial(out: Path) -> Path:
 
 
 def _progress(out: Path, num_episodes: int) -> str:
-    """Describe the progress of an interrupted collection."""
     folder = _partial(out)
     done = sum(rlds.metadata(folder)["parts"])
     return f"{done} of {num_episodes} episodes are in {folder}; run the same command to resume"

@@ -41,8 +41,7 @@ def episode(
         env: environment; its parallel worlds are independent attempts.
         key: source of all randomness.
         tries: maximum number of resets.
-        plan: replacement for the compiled `expert.plan`.
-        act: replacement for the compiled `expert.act`.
+        plan, act: replacements for the compiled `expert.plan` and `expert.act`.
 
     Returns:
         Model of the successful world, and the joint positions `[T, nq]` over time.

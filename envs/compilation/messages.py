@@ -21,9 +21,6 @@ def announce(what: str) -> Iterator[None]:
     """Print a line to stderr if the enclosed compilation exceeds `PATIENCE`, and one when it ends.
 
     Only the first of several processes prints.
-
-    Args:
-        what: description of what is compiled.
     """
     config = jax.config
     cached = config.jax_enable_compilation_cache and config.jax_compilation_cache_dir is not None

@@ -22,8 +22,8 @@ from envs.state import Poses
 
 # Default number of worlds per call, our choice: enough to fill the device, within its memory.
 _NUM_ENVS = {"cpu": 32, "gpu": 256, "tpu": 256}
-# Give up after this many attempts if less than this share has succeeded. Our choice: the experts
-# solve nearly all layouts, so a lower share means that something is broken.
+# Give up if less than this share of at least this many attempts has succeeded. Our choice: the
+# experts solve nearly all layouts, so a lower share means that something is broken.
 _MIN_SUCCESS, _MIN_ATTEMPTS = 0.5, 16
 _MAX_EPISODES = 10**9  # our choice; catches typos
 
@@ -114,13 +114,11 @@ def collect(
     Episodes are padded to the expert's time limit.
 
     Args:
-        task: as in `envs.make`.
-        robot: as in `envs.make`.
+        task, robot: as in `envs.make`.
         num_episodes: number of episodes E to return.
         key: source of all randomness; the same key gives the same episodes.
         num_envs: number of worlds W simulated at once; None: chosen by device.
-        action_noise: see `rollout`.
-        ranges: see `rollout`.
+        action_noise, ranges: as in `rollout`.
         progress: called with (episodes so far, num_episodes), first with 0 before compilation.
         record: function that attempts an episode in every world; default: the expert in simulation.
         **options: further options of `envs.make`; the backend defaults to jax.
@@ -213,7 +211,6 @@ def gather(
 
 
 def _metadata(env: Env) -> dict[str, Any]:
-    """Return the fields of `Episodes` that describe the environment."""
     return {
         "instructions": env.instructions,
         "task": env.task.name,

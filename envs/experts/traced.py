@@ -123,7 +123,6 @@ def _folder() -> Path:
 def _key(
     env: Env, tree: Any, kinds: tuple[Any, ...], settings: tuple[Any, ...], sources: str
 ) -> str:
-    """Hash everything that the program depends on."""
     parts = [
         digest(env),
         env.task.name,

@@ -124,11 +124,7 @@ def is_visible(mj_model: mujoco.MjModel) -> np.ndarray:
 
 
 def unit_shapes(model: RenderModel, size: jax.Array | np.ndarray) -> tuple[jax.Array, jax.Array]:
-    """Compute the scale of the visible geoms relative to their unit shapes.
-
-    Args:
-        model: from `build`.
-        size: `[G, 3]` sizes of all geoms [m].
+    """Compute the shape parameters of visible geoms from the sizes `[G, 3]` of all geoms [m].
 
     Returns:
         Half-extents `[V, 3]` [m], which become 1 in the unit frame. Half-length over radius `[V]`

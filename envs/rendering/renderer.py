@@ -105,7 +105,7 @@ def render_batch(
 
 
 class Renderer(Protocol):
-    """Renderer of an environment; see `RayRenderer`."""
+    """What `RayRenderer` and `WarpRenderer` share."""
 
     @property
     def model(self) -> RenderModel: ...  # noqa: D102
@@ -196,7 +196,7 @@ def in_camera_frames(
     poses: Poses,
     height: int,
 ) -> tuple[Geom, View]:
-    """Compute a `Geom` with leaves `[K, V]`, for all cameras and geoms, and views, leaves `[K]`."""
+    """Compute the `Geom` of all cameras and geoms, leaves `[K, V]`, and the views, leaves `[K]`."""
     geom_xpos, geom_xmat, cam_xpos, cam_xmat = poses
     _check_shapes(appearance, geom_xpos=geom_xpos, cam_xpos=cam_xpos, size=size)
     visible, cameras = np.array(model.geoms), np.array(model.cameras)

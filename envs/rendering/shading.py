@@ -51,8 +51,7 @@ def colors(
     Args:
         geoms: V geoms, as seen by `view`.
         kinds: V kinds, ascending.
-        view: the camera.
-        raster: size of the image.
+        view, raster: camera and image size.
         pixel: int32 `[P]` pixel indices in row-major order.
     """
     x, y = slopes(view, raster, pixel)

@@ -18,7 +18,7 @@ from envs.rendering.renderer import Appearance, RayRenderer
 from envs.state import Poses
 
 _PER_WORLD = ("geom_size", "geom_rgba", "mat_rgba", "cam_fovy")  # fields of Warp's model
-_POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "light_xdir")  # fields of its data
+_POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "light_xdir")  # fields of Warp's data
 
 
 class WarpRenderer:
@@ -77,7 +77,6 @@ class WarpRenderer:
     def _all(
         self, poses: Poses, appearance: Appearance | None, size: jax.Array | None
     ) -> jax.Array:
-        """Render all worlds, chunk by chunk."""
         number, chunk = len(poses.geom_xpos), self._num_worlds
 
         def every(x: Any) -> jax.Array:

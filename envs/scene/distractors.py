@@ -1,12 +1,12 @@
-"""Distractors: objects on the table that the task does not use."""
+"""Distractors: objects on the table that the task does not use. All numbers are our choices."""
 
 import jax
 import jax.numpy as jnp
 
 from envs.tasks import Layout
 
-_SIZE = 0.016  # m, half the typical width of an object, and the height of its center; our choice
-_SHAPES = (  # our choices, in colors that no task uses
+_SIZE = 0.016  # m, half the typical width of an object, and the height of its center
+_SHAPES = (  # in colors that no task uses
     f'type="box" size="{_SIZE} {_SIZE} {_SIZE}" rgba=".15 .55 .30 1"',
     f'type="sphere" size="{_SIZE}" rgba=".95 .75 .15 1"',
     f'type="box" size="{_SIZE / 2} {1.5 * _SIZE} {_SIZE}" rgba=".90 .90 .86 1"',
@@ -15,8 +15,8 @@ _SHAPES = (  # our choices, in colors that no task uses
 MAX_COUNT = len(_SHAPES)
 
 _LOW, _HIGH = (0.27, -0.21), (0.45, 0.21)  # m, part of the table that the side camera sees
-_CLEARANCE = 0.10  # m between centers, where possible; our choice
-_TRIES = 64  # random positions per distractor; our choice
+_CLEARANCE = 0.10  # m between centers, where possible
+_TRIES = 64  # random positions per distractor
 
 
 def names(count: int) -> list[str]:

@@ -62,9 +62,7 @@ class View:
     def inside(self, body: str, box: str, half_width: float, height: float) -> jax.Array:
         """Return whether a body's position is inside another body, a square box.
 
-        Args:
-            body, box: names of the bodies.
-            half_width, height: half the inner width of the box, and its height, at size 1 [m].
+        `half_width` is half the box's inner width; both lengths are at size 1 [m].
         """
         axes = self.data.xmat[self.model.body(box).id].reshape(3, 3)
         offset = multiply(self.position(body) - self.position(box), axes) / self.size
@@ -158,7 +156,7 @@ class Task:
         expert_time: time after which the expert stops [s].
         hold_steps: consecutive control steps for which `check` must hold.
         place: key -> random layout.
-        check: view -> (bool scalar, metrics); whether the goal is reached now.
+        check: view -> (whether the goal is reached now, bool scalar; metrics).
         waypoints: layout -> a solution as poses of the hand.
         stages: view -> completed share of each stage of that solution, f32 in [0, 1], by name,
             first to last. A share of 1 passes the stage and all before it; see `envs.rewards`.
@@ -192,10 +190,9 @@ def azimuth(position: jax.Array) -> jax.Array:
 
 
 def tool_down(position: jax.Array) -> jax.Array:
-    """Return tcp rotations [..., 3, 3] pointing down, fingers opening across the line to the base.
+    """Return tcp rotations [..., 3, 3] that point down, at positions [..., 3] from the base.
 
-    Args:
-        position: [..., 3] position of the tcp relative to the arm's base.
+    The fingers open across the line to the base.
     """
     yaw = azimuth(position)
     c, s, zero = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw)
