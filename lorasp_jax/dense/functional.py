@@ -67,7 +67,7 @@ def dense(
 def dense_shared_input(
     x: jax.Array, layers: Sequence[DenseLayer], *, token_mask: jax.Array | None = None
 ) -> list[tuple[jax.Array, Aux]]:
-    """`dense` for several layers with a shared input; their adapters share one down-projection.
+    """`dense` for several layers with a shared input. Adapters without dropout share one matmul.
 
     Args:
       x: [...tokens, I].

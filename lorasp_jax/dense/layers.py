@@ -22,7 +22,7 @@ KERNEL_INIT = jax.nn.initializers.lecun_normal()  # same as nnx.Linear and nn.De
 
 
 class AdapterParam(nnx.LoRAParam[Any]):
-    """A parameter to train: an adapter's, or a base weight under full fine-tuning."""
+    """A parameter to train: an adapter's, or a base weight. No other variables are trained."""
 
 
 class AdapterAux(nnx.Intermediate[Any]):

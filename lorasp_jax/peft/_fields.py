@@ -8,7 +8,6 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 MAX_FLOAT32 = (2 - 2**-23) * 2.0**127
-"""Largest finite fp32 value."""
 MAX_QUOTED = 300
 """Maximum length of a value quoted in an error message [characters]."""
 MAX_INT = 2**31 - 1
@@ -72,10 +71,7 @@ def short(value: Any) -> str:
 
 
 def is_array(value: Any) -> bool:
-    """Whether a value has a dtype and a shape tuple.
-
-    (`hasattr` alone is not enough: `nnx.Rngs` with a default stream has every attribute.)
-    """
+    """Whether a value has a dtype and a shape tuple. (`nnx.Rngs` can have any attribute.)"""
     return hasattr(value, "dtype") and isinstance(getattr(value, "shape", None), tuple)
 
 

@@ -36,7 +36,9 @@ MAX_ALPHA = 1e30
 
 
 class Method:
-    """Base class. An additive method implements `init_params`, `down`, `bottleneck`, `up`, `merge`:
+    """Base class.
+
+    An additive method implements `init_params`, `down`, `bottleneck`, `up` and `merge`:
 
         z, aux = bottleneck(bottleneck_params(params), x P),    P = down(params)
         delta = z U,    U = up(params)

@@ -129,7 +129,7 @@ class AdaLoRA(Method):
     def transform(
         self, optimizer: optax.GradientTransformation, total_steps: int
     ) -> optax.GradientTransformation:
-        """Wrap the optimizer so that its steps also allocate one rank budget to all layers.
+        """Wrap the optimizer so that its steps also prune all layers to one shared rank budget.
 
         Wrap the complete optimizer, including its learning rate: any transformation chained after
         it would undo the pruning. Gradient clipping may be chained before it. Importance is
@@ -257,13 +257,13 @@ def _sensitivity(
 
 
 def _importance(importance: list[Triplets], uncertainty: list[Triplets]) -> list[jax.Array]:
-    """Eqs. (7), (11): S of each triplet: Ī Ū of e plus its means over both vectors."""
+    """Eqs. (7), (11): S of each triplet is Ī Ū of e plus its means over both vectors."""
     scores = jax.tree.map(jnp.multiply, importance, uncertainty)
     return [s["lora_e"] + s["lora_a"].mean(-2) + s["lora_b"].mean(-1) for s in scores]
 
 
 def _keep(scores: list[jax.Array], num_pruned: jax.Array) -> list[jax.Array]:
-    """Eq. (6): prune the `num_pruned` least important triplets and their ties; keep the others."""
+    """Eq. (6): masks without the `num_pruned` least important triplets and their ties."""
     ordered = jnp.sort(jnp.concatenate([s.ravel() for s in scores]))
     threshold = jnp.where(num_pruned > 0, ordered[jnp.maximum(num_pruned - 1, 0)], -jnp.inf)
     return [s > threshold for s in scores]

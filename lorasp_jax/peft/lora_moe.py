@@ -4,9 +4,9 @@
 
 "weighted" uses w = p, as in LoRAMoE (Dou et al., arXiv 2312.09979). "top1" keeps only the most
 likely expert, as in Switch (Fedus et al., arXiv 2101.03961). Both are baselines of LoRA-SP (arXiv
-2603.07404). Its public code has 4 experts of rank 32 in every linear layer, the defaults here. The
-router losses are those of Switch and ST-MoE. LoRAMoE's localized balancing needs a type label for
-every task; it is omitted here, as in that code.
+2603.07404). LoRA-SP's public code has 4 experts of rank 32 in every linear layer, the defaults
+here. The router losses are those of Switch and ST-MoE. LoRAMoE's localized balancing needs a type
+label for every task; it is omitted here, as in LoRA-SP's code.
 """
 
 import dataclasses

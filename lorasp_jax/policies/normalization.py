@@ -46,11 +46,11 @@ class _AffineMap(NamedTuple):
 def normalize(
     values: jax.Array, stats: Mapping[str, jax.Array], mode: Mode, convention: Convention
 ) -> jax.Array:
-    """Normalize states or actions to `[..., J]` f32.
+    """Normalize states or actions to `[..., J+1]` f32.
 
     Args:
-        values: `[..., J]` [rad, m].
-        stats: their statistics by name, `[J]` each.
+        values: `[..., J+1]` [rad, m].
+        stats: their statistics by name, `[J+1]` each.
         mode: see the module docstring.
         convention: see the module docstring.
 
@@ -67,7 +67,7 @@ def normalize(
 def unnormalize(
     values: jax.Array, stats: Mapping[str, jax.Array], mode: Mode, convention: Convention
 ) -> jax.Array:
-    """Invert `normalize`: return `[..., J]` f32 [rad, m]."""
+    """Invert `normalize`: return `[..., J+1]` f32 [rad, m]."""
     values = values.astype(jnp.float32)
     if mode == "identity":
         return values

@@ -65,9 +65,9 @@ def to_delta(actions: jax.Array, state: jax.Array, mask: Sequence[bool]) -> jax.
     """Make actions relative to the state at the start of their chunk (openpi, DeltaActions).
 
     Args:
-        actions: `[..., C, J]`.
-        state: `[..., J]`.
-        mask: True for dimensions to make relative, usually the joints and not the gripper; missing
+        actions: `[..., C, J+1]`.
+        state: `[..., J+1]`.
+        mask: True for dimensions to make relative, usually the joints and not the gripper. Missing
             trailing entries are False.
     """
     return actions - _offset(actions, state, mask)
@@ -88,7 +88,7 @@ def check_delta(mask: Sequence[bool], num_joints: int) -> None:
 
 
 def _offset(actions: jax.Array, state: jax.Array, mask: Sequence[bool]) -> jax.Array:
-    """Return the state `[..., 1, J]` f32 where the mask is True, else zero."""
+    """Return the state `[..., 1, J+1]` f32 where the mask is True, else zero."""
     full_mask = np.zeros(actions.shape[-1], bool)
     full_mask[: len(mask)] = mask
     return jnp.where(full_mask, state, 0)[..., None, :].astype(jnp.float32)

@@ -1,9 +1,9 @@
 """Prompts for a robot, tokenized in advance because tokenizers cannot run inside `jax.jit`.
 
 pi0.5's prompt contains the state, as in "Task: press the button, State: 12 130 7;\\nAction: ". Its
-parts are tokenized separately and then concatenated: the text before the numbers, each number with
-its leading space, and the last number with the text after it. This is correct only if the tokenizer
-never merges a number with its neighbors. `_check_merges` verifies that for every pair of numbers.
+ids are concatenated from tabulated parts: the text before the numbers, each number with its leading
+space, and the last number with the text after it. This is correct only if the tokenizer never
+merges a number with its neighbors. `_check_merges` verifies that for every pair of numbers.
 """
 
 import dataclasses

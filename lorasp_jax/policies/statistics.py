@@ -21,10 +21,11 @@ against zero."""
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Statistics:
-    """Statistics of states and of actions by name, each `[A]` f32. A pytree.
+    """Statistics of states and of actions. A pytree.
 
     Attributes:
-        state: arrays by name, for some of `NAMES`; in unused slots, mean is 0 and std is 1.
+        state: f32 arrays by name, for some of `NAMES`. They are `[A]` in slots, where unused slots
+            have mean 0 and std 1, or `[J+1]` before `to_slots`.
         action: the same for actions.
     """
 
@@ -33,7 +34,7 @@ class Statistics:
 
     @property
     def dim(self) -> int:
-        """A, the number of slots."""
+        """Length of the arrays: A, or J+1 before `to_slots`."""
         return next(iter(self.state.values())).shape[-1]
 
     @classmethod
@@ -164,7 +165,7 @@ def check_slots(slots: Sequence[int], dim: int, length: int) -> None:
 
 
 def _measure(rows: np.ndarray) -> dict[str, jax.Array]:
-    """Compute the statistics of rows `[N, J]` f64."""
+    """Compute the statistics of rows `[N, J+1]` f64."""
     q01, q10, q90, q99 = np.quantile(rows, [0.01, 0.1, 0.9, 0.99], axis=0)
     stats = {
         "mean": rows.mean(axis=0),

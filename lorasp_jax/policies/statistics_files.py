@@ -1,13 +1,13 @@
 """Read statistics in the file formats of openpi and LeRobot, and in our own JSON.
 
 statistics.json           ours
-norm_stats.json           openpi: {"norm_stats": {"state": {"mean": [...], ...}, "actions": ...}};
-                          in a checkpoint under assets/<dataset>/
+norm_stats.json           openpi: {"norm_stats": {"state": {"mean": [...], ...}, "actions": ...}}.
+                          Checkpoints have it in assets/<dataset>/
 meta/stats.json           LeRobot dataset: {"observation.state": {...}, "action": {...}, ...}
 meta/episodes_stats.jsonl LeRobot dataset, version 2.1: one such object per episode, under "stats"
-policy_preprocessor.json  LeRobot policy: the normalizer step here and the unnormalizer step in
-                          policy_postprocessor.json each name a safetensors file with tensors
-                          "observation.state.mean" and so on
+policy_preprocessor.json  LeRobot policy: its normalizer step names a safetensors file with tensors
+                          "observation.state.mean" and so on, as does the unnormalizer step of
+                          policy_postprocessor.json
 model.safetensors         older LeRobot policy: tensors among the weights, named
                           "normalize_inputs.buffer_observation_state.mean" or, by dataset,
                           "normalize_inputs.so100_buffer_observation_state.mean"

@@ -38,9 +38,9 @@ def normalized_bank(bank: Bank) -> Bank:
     """Normalize a bank so that ‖ΔW(x)‖² = c² Σ_i s_i(x)², from which eq. (4) follows.
 
     The rank-one terms u_i v_i must be orthonormal under the Frobenius inner product, which is
-    (u_i · u_j)(v_i · v_j). So the factor on the wider side of the kernel gets orthonormal vectors,
-    and the other factor gets unit vectors. All terms share c = gain √O, so that the entries of U
-    initially change as fast as in a bank that is not normalized.
+    (u_i · u_j)(v_i · v_j). It suffices that the factor on the wider side of the kernel has
+    orthonormal vectors and the other factor unit vectors. All terms share c = gain √O, so that the
+    entries of U initially change as fast as in a bank that is not normalized.
 
     Args:
       bank: u [R, O] and v [I, R], both of full rank, and gain [].

@@ -2,9 +2,9 @@
 
     y = x W + ΔW(x) x,    ΔW(x) = U Σ(x) V                                        (9)
 
-W is frozen. V projects the input onto R directions; U maps them to the output. A small router
-scores the directions for each token. Only the smallest set that holds a fraction η of the energy,
-the sum of squared scores, stays active. `lorasp_jax.peft.lora_sp.method` computes the same faster.
+W is frozen. V projects the input onto R directions; U maps them to the output. For each token, a
+small router scores the directions. Only the smallest set that holds a fraction η of the energy (the
+squared scores) stays active. `lorasp_jax.peft.lora_sp.method` computes the same result faster.
 
 T: tokens, I: input width, O: output width, R: directions, H: the router's hidden width.
 """

@@ -133,7 +133,7 @@ def pooled_scores(scores: jax.Array, valid: jax.Array, granularity: Granularity)
     """
     if granularity == "token" or scores.ndim == 1:
         return scores
-    # The mask needs no gradient, and that of the square root is infinite at 0.
+    # The mask needs no gradient, and the gradient of the square root is infinite at 0.
     scores = jax.lax.stop_gradient(scores)
     axes = (scores.ndim - 2,) if granularity == "sample" else tuple(range(scores.ndim - 1))
     valid = valid[..., None]

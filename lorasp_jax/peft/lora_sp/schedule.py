@@ -37,7 +37,6 @@ class EnergySchedule:
     """Fraction of the training steps after which η reaches the target."""
 
     def __post_init__(self) -> None:
-        """Validate the fields."""
         _fields.check_fields(self, "schedule.")
         for name in ("start", "share"):
             if not 0 < getattr(self, name) <= 1:
