@@ -7,7 +7,7 @@ Each row is one task, backend and batch size:
 - compile s: compile time, with `--jobs` programs compiling at once
 - physics/s, control/s: physics steps and control steps, without rendering
 - control+images/s: control steps, with both cameras rendered in each
-- images/s: the ray caster alone, with hard shadows, both cameras
+- images/s: the ray caster alone, with both cameras and hard shadows
 - MiB: temporary memory of the program, plus Warp's
 - over C: physics/s relative to MuJoCo's C engine on the same scene, with one thread per core
 

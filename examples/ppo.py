@@ -4,8 +4,8 @@
     python examples/ppo.py --num-envs 2048 --learning-rate 3e-4     # every field is an option
 
 PPO is Schulman et al. 2017 (arXiv 1707.06347), with generalized advantage estimation (arXiv
-1506.02438). With this package's dense reward, pass the learner's discount to the environment, and
-bootstrap from the last state of an episode that reaches the time limit: only success is terminal.
+1506.02438). With this package's dense reward, pass the learner's discount to the environment. Only
+success is terminal, so bootstrap from the last state of an episode that reaches the time limit.
 """
 
 import dataclasses
@@ -138,7 +138,7 @@ def advantages(config: Config, batch: Batch) -> jax.Array:
 
 
 def loss(params: Any, config: Config, batch: Batch, advantage: jax.Array) -> jax.Array:
-    """Compute the loss: the critic's squared error minus PPO's clipped objective."""
+    """Compute the critic's squared error minus PPO's clipped objective."""
     ratio = jnp.exp(log_prob(params, batch.x, batch.action) - batch.log_prob)
     scaled = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-6)
     clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)

@@ -116,8 +116,9 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             actions: [W, A], units and limits as in `Env.step`.
 
         Returns:
-            Observation; reward, float32 [W], sparse or dense as chosen in `envs.make`; terminated,
-            bool [W], on success; truncated, bool [W], on a time limit or broken physics; info.
+            Observation, reward, terminated, truncated and info. The reward, float32 [W], is sparse
+            or dense as chosen in `envs.make`. Worlds terminate on success, bool [W], and are
+            truncated by the time limit or broken physics, bool [W].
 
         Raises:
             gymnasium.error.ResetNeeded: before the first `reset`.

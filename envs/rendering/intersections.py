@@ -35,7 +35,7 @@ class Geom(NamedTuple):
     Components are scalars, or `[P]` for one geom per pixel.
     """
 
-    axes: Matrix  # rows of the matrix whose columns are the camera's axes
+    axes: Matrix  # the camera's axes in its columns
     eye: Vec  # the camera's position
     light: Vec  # direction to the light
     shrink: Vec  # 1 / half-extents before scaling [1/m]
