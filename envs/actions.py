@@ -57,7 +57,7 @@ def to_targets(mode: Mode, robot: Robot, command: jax.Array, action: jax.Array) 
 def from_targets(mode: Mode, robot: Robot, command: jax.Array, targets: jax.Array) -> jax.Array:
     """Invert `to_targets`: return the action [A] that leads from `command` to `targets`.
 
-    With more than six joints, `to_targets` may find other targets for an end-effector action.
+    For an arm with more than six joints, an end-effector action does not determine the targets.
     """
     if mode == "joint":
         return targets
@@ -82,7 +82,7 @@ def interpolate(commands: jax.Array, control_dt: float, latency: float | jax.Arr
     fraction = jnp.arange(1, moves + 1, dtype=jnp.float32)[:, None] / moves
     # The targets of the previous control step, followed by those of this one.
     path = commands[:-1, None] + fraction * jnp.diff(commands, axis=0)[:, None]
-    path = path.at[..., -1].multiply(0.5)  # each finger moves by half of it
+    path = path.at[..., -1].multiply(0.5)  # each finger moves by half the opening
     targets = jnp.repeat(path.reshape(2 * moves, -1), repeats, axis=0)
     delay = jnp.round(latency / scene.PHYSICS_DT).astype(jnp.int32)
     return jax.lax.dynamic_slice_in_dim(targets, moves * repeats - delay, moves * repeats)

@@ -112,7 +112,7 @@ class Env:
         """Start W worlds, each with a random layout, instruction and start pose near home.
 
         Args:
-            key: source of all randomness.
+            key: random key.
             ranges: ranges of domain randomization; None disables it.
 
         Raises:
@@ -177,7 +177,7 @@ class Env:
         Args:
             policy: (observation, key) -> action [W, A]. The observation is that of `observe`, plus
                 `instruction`, int32 [W]. Images that the policy does not read are not rendered.
-            key: source of all randomness.
+            key: random key.
             ranges: as in `reset`.
 
         Raises:
@@ -354,13 +354,12 @@ class Env:
         return self._with_cameras(draw, self.physics.start(self._changes(draw, layout), qpos))
 
     def _changes(self, draw: Draw | None, layout: Layout) -> Changes:
-        """Return one world's changes to the model: randomized values, poses of fixed bodies."""
         changes = randomization.changes(draw, self.model, self._objects) if draw else {}
         return changes | placing.fixed_bodies(self.model, layout, changes)
 
     @functools.cached_property
     def _objects(self) -> np.ndarray:
-        """Mask of the bodies of the task's objects and distractors, bool [bodies]."""
+        """Whether each body belongs to an object or distractor, bool [bodies]."""
         names = [*self._task_bodies, *distractors.names(self.distractors)]
         return randomization.in_subtrees(self.model, names)
 

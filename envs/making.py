@@ -99,7 +99,7 @@ def make(
 def _renderer(
     name: str, model: mujoco.MjModel, image_size: int, antialias: int, num_envs: int
 ) -> render.Renderer:
-    """Make the renderer of this name; Warp's takes cameras and appearance from the ray caster."""
+    """Make the renderer; Warp's takes cameras and appearance from the ray caster."""
     _check_choices(renderer=(name, RENDERERS))
     rays = render.RayRenderer(render.build(model, scene.CAMERAS), image_size, antialias)
     if name == "rays":
@@ -144,7 +144,6 @@ def _check_learning(actions: Mode, reward: Reward, discount: float) -> None:
 
 
 def _find_robot(robot: AnyRobot) -> Robot:
-    """Return the robot given by a `Robot`, a name or an MJCF file."""
     if isinstance(robot, Robot):
         return robot
     path = os.fspath(robot) if isinstance(robot, str | os.PathLike) else None

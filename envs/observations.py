@@ -31,11 +31,7 @@ def parts(
     - `<body>_speed` [6], of free bodies: linear [m/s] and angular [rad/s] velocity.
     - `<body>/<joint>` [2]: position and speed of each hinge [rad, rad/s] or slide [m, m/s].
 
-    Args:
-        model: the scene.
-        data: one world, as `envs.state.Data` or `mujoco.MjData`.
-        command: [J + 1] last targets.
-        bodies: names of the task's bodies.
+    `data` is one world, as `envs.state.Data` or `mujoco.MjData`. `bodies` names the task's bodies.
     """
     view, count = View(model, data), len(command) - 1
     tool = data.site_xmat[model.site("tcp").id].reshape(3, 3)

@@ -46,10 +46,7 @@ def at_reset(state: State, stages: dict[str, jax.Array]) -> State:
 def after_step(before: State, after: State, stages: dict[str, jax.Array], discount: float) -> State:
     """Give one world its dense reward after a step, with the reward's terms in its metrics.
 
-    Args:
-        before, after: the world before and after the step.
-        stages: as in `potential`, after the step.
-        discount: the learner's discount.
+    `stages` is as in `potential`, after the step.
     """
     success = after.info["success"]
     discounted = jnp.where(success, 0.0, discount * potential(stages))

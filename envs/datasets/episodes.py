@@ -51,8 +51,7 @@ class Episodes:
         length: int32 `[E]` number of valid steps, 1 to T; the rest is padding.
         instruction: int32 `[E]` index into `instructions`.
         instructions: phrasings of the task.
-        task: name of the task.
-        robot: name of the robot.
+        task, robot: their names.
         control_dt: time between two actions [s].
         physics_dt: time step of the simulation [s]; 0 for recordings of real robots.
         attempted: number of attempts; these episodes are the successful ones.
@@ -73,7 +72,6 @@ class Episodes:
     actions: str = "joint"
 
     def __repr__(self) -> str:
-        """Show the metadata, and the dtype and shape of every array."""
         arrays = {name: getattr(self, name) for name in _ARRAYS}
         arrays |= {_IMAGE + name: images for name, images in self.image.items()}
         fields = [f"{name}={_dtype_and_shape(array)}" for name, array in arrays.items()]
@@ -263,7 +261,6 @@ def _pad(xp: Any, array: Array, steps: int) -> Array:
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
-    """Read all arrays of an .npz file."""
     check_regular(path)
     with as_value_error(path), zipfile.ZipFile(path) as archive:
         members = archive.infolist()

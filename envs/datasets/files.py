@@ -123,19 +123,17 @@ def read_text(path: Path, folder: Path | None = None) -> str:
     """Read a UTF-8 file (see `read_bytes`).
 
     Raises:
-        RefusedError: as in `read_bytes`.
-        OSError: as in `check_regular`.
+        RefusedError, OSError: as in `read_bytes`.
         ValueError: it is not UTF-8.
     """
     return read_bytes(path, folder).decode()
 
 
 def read_json(path: Path, folder: Path | None = None) -> Any:
-    """Read a JSON file (see `read_text`).
+    """Read a JSON file (see `read_bytes`).
 
     Raises:
-        RefusedError: as in `read_text`.
-        OSError: as in `check_regular`.
+        RefusedError, OSError: as in `read_bytes`.
         ValueError: it is not JSON, is nested too deeply, or has a string with a lone surrogate.
     """
     try:

@@ -44,7 +44,8 @@ _DESCRIPTIONS = {
     True: "Scripted expert episodes of {task} by {robot} in simulation.",
     False: "Recorded episodes of {task} by {robot}.",
 }
-# 7x as fast (measured): episodes are read one by one, and PNG data does not compress further.
+# 7x as fast as the default (measured), since episodes are read one by one and PNG data does not
+# compress further.
 _RECORDS = "group_size:1,uncompressed"
 
 

@@ -46,8 +46,7 @@ def metadata(path: Path) -> dict[str, Any]:
     """Read the metadata of a dataset (see `ShardWriter`).
 
     Raises:
-        FileNotFoundError: the folder does not exist.
-        ValueError: it is damaged or not a dataset of this format.
+        FileNotFoundError, ValueError: as in `read`.
     """
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist")
@@ -85,8 +84,7 @@ class Reader:
         """Open a dataset.
 
         Raises:
-            FileNotFoundError: the folder does not exist.
-            ValueError: it is damaged or not a dataset of this format.
+            FileNotFoundError, ValueError: as in `read`.
         """
         self.path: Path = Path(path)
         self.metadata: dict[str, Any] = metadata(self.path)

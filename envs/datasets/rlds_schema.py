@@ -94,7 +94,6 @@ def features(episodes: Episodes) -> tfds.features.FeaturesDict:
 
 
 def _metadata() -> tfds.features.FeaturesDict:
-    """Define the metadata features of an episode."""
     types = tfds.features
     metadata = {
         "episode_id": types.Scalar(np.int64, doc="index of the episode in the dataset"),

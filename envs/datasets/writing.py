@@ -76,12 +76,8 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
 def replace_folder(new: Path, path: Path, check: Callable[[Path], object]) -> None:
     """Rename a complete folder to `path`, then delete the folder that it replaces, if any.
 
-    If the process is killed, `recover_folder` completes the replacement.
-
-    Args:
-        new: the complete folder.
-        path: its new name.
-        check: called with `path` if it exists; raises if it must not be deleted.
+    `check` is called with `path` if it exists, and raises if it must not be deleted. If the process
+    is killed, `recover_folder` completes the replacement.
     """
     if path.exists():
         check(path)
@@ -108,7 +104,7 @@ def sync(path: Path) -> None:
     """Wait until a file's content, or the entries of a folder, are on disk.
 
     Raises:
-        OSError: the data cannot be written, for example because the disk is full.
+        OSError: the data cannot be written, for example to a full disk.
     """
     descriptor = os.open(path, os.O_RDONLY)
     try:

@@ -74,12 +74,7 @@ class UserBody:
 def prepare(
     spec: mujoco.MjSpec, model: mujoco.MjModel, arm: Arm, gripper: Gripper, hand: Hand
 ) -> UserBody:
-    """Prepare the body of a user's robot.
-
-    Args:
-        spec: source of `model`; modified in place.
-        model: the user's model.
-        arm, gripper, hand: its parts.
+    """Prepare the body of a user's robot, modifying `spec`, the source of `model`, in place.
 
     Raises:
         ValueError: the file uses settotalmass, which would be lost in a scene.
@@ -130,7 +125,7 @@ def _redefine(joint: Any, sign: float, shift: float) -> None:
     joint.axis = sign * joint.axis
     joint.ref = sign * joint.ref + shift
     joint.springref = sign * joint.springref + shift
-    joint.range = max(low, 0.0), high  # boxes can overlap where the fingers themselves do not
+    joint.range = max(low, 0.0), high  # low < 0: the boxes overlap where the fingers do not
     joint.actfrcrange = sorted(sign * joint.actfrcrange)
 
 

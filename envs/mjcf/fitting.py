@@ -114,5 +114,5 @@ def _closest(points: np.ndarray, rotations: list[np.ndarray]) -> tuple[Shape, fl
 
 
 def _signed(past: np.ndarray) -> np.ndarray:
-    """Compute signed distances [N] to a shape from those past its perpendicular sides, [N, S]."""
+    """Compute signed distances [N] to a shape from those to its perpendicular sides [N, S]."""
     return np.linalg.norm(np.maximum(past, 0), axis=1) + np.minimum(past.max(axis=1), 0)

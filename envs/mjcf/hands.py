@@ -38,12 +38,7 @@ class Hand(NamedTuple):
 
 
 def find(model: mujoco.MjModel, arm: Arm, tcp: str | None) -> Hand:
-    """Locate the hand of an arm.
-
-    Args:
-        model: the user's model.
-        arm: from `reading.find_arm`.
-        tcp: as in `envs.mjcf.load`.
+    """Locate the hand of an arm; `tcp` is as in `envs.mjcf.load`.
 
     Raises:
         ValueError: the fingers do not slide along one line, do not open far enough or have no

@@ -34,10 +34,7 @@ _TRIES, _SPREAD = 8, 0.4  # number of random starts, standard deviation around t
 def complete(robot: Robot) -> Robot:
     """Set home, lean and tilt side; rotate the tcp by 180 degrees about z if that fits better.
 
-    Warn if the arm misses parts of the table.
-
-    Args:
-        robot: a robot whose home is a first guess.
+    The home passed in is a first guess. Warn if the arm misses parts of the table.
 
     Raises:
         ValueError: the robot cannot reach the common start pose.

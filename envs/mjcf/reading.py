@@ -41,9 +41,7 @@ def read(
 ) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
     """Read and compile an MJCF file.
 
-    Args:
-        path: the file.
-        folder: folder that must contain all referenced files; by default that of the file.
+    All files that it refers to must be in `folder`, by default its own.
 
     Raises:
         ValueError: the file does not exist, MuJoCo rejects it, it refers to files outside of
@@ -127,10 +125,7 @@ def find_limits(model: mujoco.MjModel, arm: Arm) -> tuple[np.ndarray, np.ndarray
 def find_gripper(model: mujoco.MjModel, arm: Arm, signs: np.ndarray) -> Gripper:
     """Combine the fingers' actuators, which may act on one finger, on both, or on a tendon.
 
-    Args:
-        model: the user's model.
-        arm: from `find_arm`.
-        signs: [2], 1 for a finger joint whose positive direction opens the hand, else -1.
+    `signs` [2] is 1 for a finger joint whose positive direction opens the hand, else -1.
 
     Raises:
         ValueError: the fingers have no actuator, or one that is not a position actuator.

@@ -33,12 +33,8 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 def check(path: Path, folder: Path) -> None:
     """Check that an MJCF file refers only to files inside a folder and asks for reasonable sizes.
 
-    Args:
-        path: the MJCF file.
-        folder: folder that must contain all referenced files, once links are resolved.
-
     Raises:
-        ValueError: a file is outside of the folder, or something is too large.
+        ValueError: a file is outside of the folder once links are resolved, or a size is too large.
     """
     descriptions = _all_descriptions(path, folder)
     for root in descriptions.values():

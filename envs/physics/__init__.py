@@ -1,1 +1,1 @@
-"""Simulate with MuJoCo MJX; only this folder and `rendering.warp` import MJX or Warp."""
+"""Physics simulation; only this folder and `rendering.warp` import MJX or Warp."""

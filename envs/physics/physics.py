@@ -84,7 +84,7 @@ class Physics:
         device = jax.local_devices()[0]  # MJX's default is the first device of all processes
         self._model = mjx.put_model(model, impl="jax", device=device)
         data = mjx.make_data(model, impl="jax", device=device)
-        self._data = jax.device_put(jax.tree.map(np.asarray, data))  # strongly typed
+        self._data = jax.device_put(jax.tree.map(np.asarray, data))  # without weak types
         self._kinematics = Kinematics(model)
         self._with_poses = jax.jit(self._with_poses)  # traced once for `start` and `advance`
         self._simulate = self._mjx_steps
@@ -101,7 +101,7 @@ class Physics:
         return self._with_poses(changes, [qpos, zero, zero])
 
     def advance(self, changes: Changes, data: Data, controls: jax.Array) -> Data:
-        """Simulate one world for S physics steps.
+        """Simulate one world for S physics steps; return it with all poses up to date.
 
         Args:
             changes: fields of the model that differ in this world.

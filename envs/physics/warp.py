@@ -18,7 +18,7 @@ from mujoco.mjx.third_party import mujoco_warp
 from envs.physics import warp_call
 from envs.state import MOVING, Changes, Data
 
-# A step of Warp leaves the geom poses of fixed bodies as they are. They differ between worlds, so
+# A step of Warp does not compute the geom poses of fixed bodies. These differ between worlds, so
 # they are copied into Warp's data before the first step.
 _FIXED = ("geom_xpos", "geom_xmat")
 
@@ -64,7 +64,7 @@ class WarpSteps:
         return warp_call.flattening_vmap(run)
 
     def _callable(self, names: tuple[str, ...]) -> Any:
-        """Make a function for JAX; it takes controls [S, W, nu], `names`, `_FIXED` and `MOVING`."""
+        """Make a JAX function of controls [S, W, nu] and fields `names`, `_FIXED` and `MOVING`."""
         if names not in self._callables:
 
             def simulate(*arrays: Any) -> None:

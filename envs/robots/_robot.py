@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 TIP_LENGTH = 0.012  # m from the tcp to the end of the finger tips on every hand; our choice
-TIP_RADIUS = 0.005  # m, of the sphere with which a finger tip touches its surroundings; our choice
+TIP_RADIUS = 0.005  # m, of the sphere that collides at each finger tip; our choice
 
 # The wrist camera sits on the outer side of the hand and looks along it, tilted 22 degrees toward
 # the tips. Our choice: the tips are in the lower half of the image, the object above them.
