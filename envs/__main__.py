@@ -27,7 +27,7 @@ def main(
     """Run a command and return its exit code.
 
     The code is 0 on success, 2 after an error, 130 if interrupted and 141 if stdout was closed.
-    `program` is its name in help and errors; `record` is as in `envs.collect`.
+    `program` is the name shown in help and errors; `record` is as in `envs.collect`.
     """
     options = parse_arguments(parser(program), arguments)
     options.record = record
