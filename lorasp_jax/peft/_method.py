@@ -226,12 +226,7 @@ class Method:
         A method that is not additive (DoRA) has no separate delta. It is applied to dropout(x), and
         (x - dropout(x)) W is added, as in Hugging Face PEFT.
 
-        Args:
-          params: from `init`.
-          x: [...tokens, I].
-          kernel: [I, O]; receives no gradient.
-          key: typed random key.
-          token_mask: see `delta`.
+        `key` is a typed random key. See `apply` for the other arguments.
         """
         x_dropped = dropout(x, dropout_rate(self), key)
         kernel = jax.lax.stop_gradient(kernel.astype(x.dtype))

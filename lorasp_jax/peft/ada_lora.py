@@ -263,7 +263,7 @@ def _importance(importance: list[Triplets], uncertainty: list[Triplets]) -> list
 
 
 def _keep(scores: list[jax.Array], num_pruned: jax.Array) -> list[jax.Array]:
-    """Eq. (6): masks without the `num_pruned` least important triplets and their ties."""
+    """Eq. (6): masks without the `num_pruned` least important triplets and any tied with them."""
     ordered = jnp.sort(jnp.concatenate([s.ravel() for s in scores]))
     threshold = jnp.where(num_pruned > 0, ordered[jnp.maximum(num_pruned - 1, 0)], -jnp.inf)
     return [s > threshold for s in scores]

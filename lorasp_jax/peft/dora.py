@@ -79,9 +79,8 @@ class DoRA(LoRA):
 def column_factor(magnitude: jax.Array, adapted: jax.Array) -> jax.Array:
     """m / ‖V‖, f32 [O], for magnitude [O] and V [I, O]. V receives no gradient.
 
-    The norms are computed from V itself. Expanding the squared norm of a column w + s A b into
-    three terms would avoid forming V. It would cost as much, I O R for WᵀA, and suffer from
-    cancellation where V is much shorter than W.
+    Expanding ‖w + s A b‖² for each column would avoid forming V. It would cost as much, I O R for
+    WᵀA, and suffer from cancellation where V is much shorter than W.
 
     A zero column has no direction to rescale. Its factor is m + 1, which is initially 1, so B can
     learn even from a zero kernel.

@@ -123,7 +123,7 @@ def balance_loss(probabilities: jax.Array, valid: jax.Array | None) -> jax.Array
 
     Fedus et al. (arXiv 2101.03961, eq. 4): f_i is the fraction of valid tokens whose most likely
     expert is i (no gradient), and P_i is the mean of p_i over valid tokens. Both pool the tokens of
-    all sequences, as in the paper; Hugging Face's Switch averages the loss over sequences.
+    all sequences, unlike in Hugging Face's Switch.
 
     Args:
       probabilities: the router's softmax, f32 [...tokens, E].

@@ -60,7 +60,7 @@ class LoRASPRelease(BankMethod):
 
     @property
     def score_arrays(self) -> tuple[str, ...]:
-        """Names of the router's arrays whose last axis indexes the scores."""
+        """See `BankMethod.score_arrays`."""
         return ("w1",) if self.hidden_width is None else ("w2",)
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:

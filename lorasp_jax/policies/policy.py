@@ -28,8 +28,7 @@ class Policy:
     def with_sampler(self) -> Self:
         """Return a policy for repeated calls, which runs computations on weights alone only once.
 
-        Call it before a `jax.lax` loop. XLA hoists these computations out of the loop on a CPU, but
-        does not guarantee it.
+        Call it before a `jax.lax` loop, since XLA does not guarantee to hoist these computations.
         """
         return dataclasses.replace(self, model=self.model.sampler())
 

@@ -1,7 +1,6 @@
 """LoRA-SP's auxiliary losses, eqs. (13) and (14) of the paper (arXiv 2603.07404), in fp32.
 
-They are computed from each layer's sums over tokens. Padding and tokens with all-zero scores are
-excluded.
+They are computed from each layer's sums over its tokens, without padding.
 """
 
 import dataclasses

@@ -84,7 +84,7 @@ class LoRASP(BankMethod):
 
     @property
     def score_arrays(self) -> tuple[str, ...]:
-        """Names of the router's arrays whose last axis indexes the scores."""
+        """See `BankMethod.score_arrays`."""
         return "w2", "b2"
 
     def init_params(self, key: jax.Array, d_in: int, d_out: int) -> Params:
