@@ -219,7 +219,9 @@ def main() -> None:
     parser.add_argument(
         "--sampled", type=int, nargs="+", default=[1, 8], help="batch sizes for sampling"
     )
-    parser.add_argument("--gib", type=float, default=24, help="memory for the largest batch")
+    parser.add_argument(
+        "--gib", type=float, default=24, help="memory [GiB] that the largest batch must fit in"
+    )
     parser.add_argument("--only", choices=["training", "largest", "sampling"])
     add_options(parser)
     options = parser.parse_args()

@@ -1,7 +1,7 @@
 """Speed of the data pipeline: windows/s from the cache, time to first batch, LeRobot import.
 
     python -m benchmarks.data --json data.json
-    python -m benchmarks.data --steps 50000 --batches 500     # larger than the page cache
+    python -m benchmarks.data --steps 50000 --batches 500     # 16 GB
 
 A window is one training sample: images of two cameras and 50 actions. Windows are shuffled. The
 import reads synthetic two-camera recordings in LeRobot's encoding (AV1 or H.264, a key frame every
@@ -74,7 +74,7 @@ class Noise:
 
 
 def seconds(call: Callable[[], Any]) -> float:
-    """Time a single call; a second one would find the files in the page cache."""
+    """Time a single call."""
     start = time.perf_counter()
     call()
     return time.perf_counter() - start

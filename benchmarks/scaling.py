@@ -73,7 +73,9 @@ def main() -> None:
     parser.add_argument("--backbone", default="pi0")
     parser.add_argument("--sizes", nargs="+", default=["small", "base"])
     parser.add_argument("--devices", type=int, nargs="+", default=[1, 2, 4])
-    parser.add_argument("--batch", type=int, help="windows per device; default: by size")
+    parser.add_argument(
+        "--batch", type=int, help="windows per device (default: depends on the size)"
+    )
     parser.add_argument("--threads", type=int, default=8, help="compilation threads")
     backbones.add_options(parser)
     options = parser.parse_args()

@@ -64,7 +64,9 @@ def action(value: Any, shape: tuple[int, ...]) -> Any:
         ValueError: the array has a different shape.
     """
     if not is_numeric(value):
-        raise TypeError(f"action must be a numeric array {list(shape)}, got {short(value)}")
+        raise TypeError(
+            f"action must be a numeric array of shape {list(shape)}, got {short(value)}"
+        )
     if value.shape != shape:
         raise ValueError(f"action must have shape {shape}, got {value.shape}")
     return value

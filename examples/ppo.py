@@ -28,7 +28,7 @@ from envs.datasets.files import check_local
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Task and hyperparameters; the defaults, our choice, solve press in minutes on a CPU."""
+    """Task and hyperparameters. The defaults (our choice) solve press in minutes on a CPU."""
 
     task: str = "press"
     robot: str = "piper"
@@ -264,7 +264,7 @@ def main(config: Config) -> float:
     draw(config, curve)
     key = jax.random.key(config.seed + 1_000_000)
     env = make(config, config.episodes)
-    with messages.announce(f"the evaluation of {config.task} (including its episodes)"):
+    with messages.announce(f"the evaluation of {config.task}"):
         success = float(np.mean(evaluate(env, learner.params, learner.moments, key)))
     print(
         f"solved {success:.1%} of {config.episodes} unseen layouts; "

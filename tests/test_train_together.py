@@ -73,4 +73,6 @@ def test_first_process_prints_a_one_line_error(own, reason, tmp_path):
     assert out.startswith("waiting for 2 processes at 127.0.0.1:")
     assert reason in error
     assert error.count("\n") == 1
-    assert other == ("", "")
+    # A process that waits for more than a few seconds, on a busy machine, says so.
+    lines = [line for output in other for line in output.splitlines()]
+    assert all(line.startswith("process 1 is waiting for the first process") for line in lines)

@@ -35,7 +35,7 @@ def announce(what: str) -> Iterator[None]:
         timer.cancel()
     seconds = time.monotonic() - start
     if seconds > PATIENCE:
-        hint = "" if cached else "; envs.compilation.cache.enable() caches it for the next start"
+        hint = "" if cached else "; envs.compilation.cache.enable() caches it for later runs"
         _print(f"compiled {what} in {seconds:.0f} s{hint}")
 
 

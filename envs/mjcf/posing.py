@@ -56,7 +56,7 @@ def complete(robot: Robot) -> Robot:
     if cost[best] > _TOLERANCE:
         warnings.warn(
             f"robot {robot.name} misses parts of the table by up to "
-            f"{1000 * table_errors[best]:.0f} mm: it cannot solve every layout of the tasks",
+            f"{1000 * table_errors[best]:.0f} mm: it cannot solve every task layout",
             stacklevel=3,
         )
     tool = robot.tool @ robots.rotation("z", float(turns[best]))

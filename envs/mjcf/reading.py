@@ -14,7 +14,7 @@ from envs.scene import scene
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _KINDS = ("free", "ball", "slide", "hinge")
 _MAX_JOINTS = 16  # our choice: compile time grows with every joint
-_RADIANS_AS_DEGREES = np.deg2rad(4 * np.pi)  # width [rad] if +-2 pi is read as degrees
+_RADIANS_AS_DEGREES = np.deg2rad(4 * np.pi)  # width of +-2 pi, read as degrees
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from envs.robots._robot import Robot
 
-# For damped least squares: damping, weight of rotation [m/rad], largest step [rad]. Our choices,
-# with which an expert placed the grape in 64 of 64 worlds.
+# For damped least squares: damping, weight of rotation [m/rad], largest step [rad]. Our choices;
+# with them, the expert of pick_place succeeded in 64 of 64 worlds.
 _DAMPING, _ROTATION_WEIGHT, _MAX_STEP = 0.03, 0.3, 0.3
 _ITERATIONS = 60  # our choice
 _POSTURE_GAIN = 0.1  # our choice: share of the way home that redundant joints move per iteration

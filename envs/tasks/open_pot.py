@@ -22,14 +22,14 @@ from envs.tasks import (
 # m, the pot: half its inner width, half the thickness of its walls, its height
 _INSIDE, _WALL, _HEIGHT = 0.043, 0.005, 0.055
 _FOOT = 0.005  # m, radius of the lid's feet, which stand on the middle of the walls
-_KNOB, _KNOB_HEIGHT = 0.010, 0.030  # m, radius of the knob, and its center above the feet
+_KNOB, _KNOB_HEIGHT = 0.010, 0.030  # m, radius of the knob, height of its center above the feet
 _LID = 0.055  # m, radius of the lid
 _POT, _POT_RANGE = (0.36, 0.10), (0.04, 0.04)  # m, center and half range of the position
 _BESIDE = 0.175  # m, how far to the right of the pot the expert puts the lid
 
 _STEEL, _RED = 'rgba=".55 .57 .60 1"', 'rgba=".62 .20 .16 1"'
 _RIM = _INSIDE + _WALL
-_BARELY_BESIDE = _LID + _RIM + _WALL  # m, distance at which pot and lid just do not overlap
+_BARELY_BESIDE = _LID + _RIM + _WALL  # m, distance at which pot and lid just clear each other
 _CLEAR = 0.020  # m, height of the lid above the pot that counts as lifted off
 _FEET = "".join(
     f'<geom type="sphere" size="{_FOOT}" pos="{x} {y} {_FOOT}" contype="8" condim="4" mass=".005" '

@@ -161,7 +161,10 @@ def _video_3(
     at = {name: as_int(row[f"videos/{key}/{name}"]) for name in ("chunk_index", "file_index")}
     start = float(row[f"videos/{key}/from_timestamp"])
     if not 0 <= start < math.inf:
-        raise ValueError(f"episode {row['episode_index']} starts at {start} s in its {key} video")
+        raise ValueError(
+            f"episode {row['episode_index']} must start at a finite time >= 0 in its {key} video, "
+            f"got {start} s"
+        )
     return join_inside(folder, _format(info["video_path"], video_key=key, **at)), start
 
 
@@ -223,8 +226,7 @@ def _check(folder: Path, info: Mapping[str, Any], episodes: Sequence[EpisodeEntr
     for name, listed in (("total_episodes", len(episodes)), ("total_frames", frames)):
         if info.get(name, listed) != listed:
             raise ValueError(
-                f"{folder} must have {name} {listed} in meta/info.json to match its episodes, got "
-                f"{info[name]}"
+                f"{folder}/meta/info.json has {name} {info[name]}, but the dataset lists {listed}"
             )
 
 

@@ -32,8 +32,8 @@ class Launch(NamedTuple):
     warps: int
     """Warps per program."""
     programs: int
-    """Target number of programs per function; there are more if they cannot share the blocks
-    evenly. Each writes one partial sum."""
+    """Approximate number of programs per function; the actual number divides the number of blocks.
+    Each writes one partial sum."""
 
 
 FORWARD = Launch(16, 2, 816)

@@ -36,8 +36,9 @@ def check_fields(owner: Any, prefix: str = "") -> None:
         value = getattr(owner, name)
         if not _fits(value, kind):
             raise ValueError(f"{prefix}{name} must be {_describe(kind)}, got {short(value)}.")
-        if type(value) is int and abs(value) > maximum.get(name, MAX_INT):
-            raise ValueError(f"{prefix}{name} must be at most {maximum[name]}, got {value}.")
+        if type(value) is int and abs(value) > maximum[name]:
+            bound = f"at most {maximum[name]}" if value > 0 else f"at least -{maximum[name]}"
+            raise ValueError(f"{prefix}{name} must be {bound}, got {value}.")
 
 
 def check_names(cls: type, name: str, values: Sequence[Any], fields: Iterable[str]) -> None:

@@ -45,7 +45,7 @@ def params(method: Any, values: Any, shape: tuple[int, ...]) -> None:
         if actual.get(name) != expected:
             raise ValueError(
                 f"{method.name} for a kernel {list(shape)} needs {name} {list(expected)}, got "
-                f"{actual.get(name)}."
+                f"{list(actual[name]) if name in actual else 'none'}."
             )
 
 

@@ -5,7 +5,7 @@ loss is least sensitive. `AdaLoRA.transform` makes this part of the optimizer, s
 loop can omit it. The arithmetic matches Hugging Face PEFT 0.21.2. Each equation of the paper has a
 function:
 
-    (1)  update          P Λ Q, here A diag(e) B                      `AdaLoRA.bottleneck`
+    (3)  update          P Λ Q, here A diag(e) B                      `AdaLoRA.bottleneck`
     (4)  orthogonality   ‖PᵀP − I‖ + ‖QQᵀ − I‖                        `AdaLoRA.penalty`
     (7)-(11) importance  Ī, Ū, S of each triplet                      `_sensitivity`, `_importance`
     (6)  allocation      keep the b(t) most important triplets        `_keep`
@@ -110,7 +110,7 @@ class AdaLoRA(Method):
     def bottleneck(
         self, params: Params, rows: jax.Array, token_mask: jax.Array | None
     ) -> tuple[jax.Array, Aux]:
-        """Eq. (1): z = s x A diag(e). The active rank is the number of nonzero entries of e."""
+        """Eq. (3): z = s x A diag(e). The active rank is the number of nonzero entries of e."""
         del token_mask
         rank = (params["lora_e"] != 0).sum().astype(jnp.float32)
         z = rows * (self.scale * params["lora_e"]).astype(rows.dtype)
@@ -257,7 +257,7 @@ def _sensitivity(
 
 
 def _importance(importance: list[Triplets], uncertainty: list[Triplets]) -> list[jax.Array]:
-    """Eqs. (7), (11): S of each triplet is Ī Ū of e plus its means over both vectors."""
+    """Eqs. (7), (11): S of a triplet: Ī Ū of its entry of e, plus the mean Ī Ū of each vector."""
     scores = jax.tree.map(jnp.multiply, importance, uncertainty)
     return [s["lora_e"] + s["lora_a"].mean(-2) + s["lora_b"].mean(-1) for s in scores]
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 STATE_BINS = 256
-"""Number of bins of [-1, 1] into which pi0.5 discretizes the state."""
+"""Number of equal bins over [-1, 1] for the state in pi0.5's prompt."""
 EDGES = np.linspace(-1, 1, STATE_BINS + 1)[:-1]
 """Lower edges of the bins, exact in fp32."""
 PI05_END = ";\nAction: "
@@ -25,9 +25,9 @@ def lerobot(text: str) -> str:
 
 
 def pi05(text: str, state: np.ndarray) -> str:
-    """Return the full prompt of pi0.5.
+    """Return the full prompt of pi0.5, as in openpi (models/tokenizer.py).
 
-    It is that of openpi (models/tokenizer.py) and LeRobot (processor_pi05.py).
+    LeRobot's is the same (processor_pi05.py).
 
     Args:
         text: instruction.

@@ -24,8 +24,8 @@ class Statistics:
     """Statistics of states and of actions. A pytree.
 
     Attributes:
-        state: f32 arrays by name, for some of `NAMES`. They are `[A]` in slots, where unused slots
-            have mean 0 and std 1, or `[J+1]` before `to_slots`.
+        state: f32 arrays by name, for some of `NAMES`. Their shape is `[J+1]` before `to_slots`
+            and `[A]` after it; unused slots then have mean 0 and std 1.
         action: the same for actions.
     """
 

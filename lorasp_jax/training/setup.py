@@ -94,7 +94,7 @@ def build(
 
     Raises:
         ValueError: an unknown task, robot, backbone or size, an incompatible base or tokenizer, a
-            target that matches no layer, or an invalid chunk or batch size.
+            target that matches no layer, or an invalid batch size or number of steps to execute.
     """
     sizes = {"image_size": config.image_size, "control_dt": config.control_dt}
     tasks = () if config.data.source else config.tasks

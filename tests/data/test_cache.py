@@ -246,7 +246,7 @@ def test_opening(tmp_path, simulated):
     ):
         with pytest.raises(ValueError, match=sentence):
             open_source(where)
-    with pytest.raises(ValueError, match="is not a LeRobot dataset: feature options"):
+    with pytest.raises(ValueError, match="is not a LeRobot dataset: options such as"):
         open_source(simulated[1].path, Keys(angles="degrees"))
 
 

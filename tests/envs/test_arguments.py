@@ -95,7 +95,7 @@ def test_raw_keys_are_accepted(worlds, raw):
 @pytest.mark.parametrize(
     ("action", "message"),
     [
-        ([[0.0] * 7] * 2, r"action must be a numeric array \[2, 7\], got a list"),
+        ([[0.0] * 7] * 2, r"action must be a numeric array of shape \[2, 7\], got a list"),
         (None, "action must be a numeric array"),
         (np.full((2, 7), "a"), "action must be a numeric array"),
         (np.zeros((2, 7), bool), "action must be a numeric array .* got an array of bool"),

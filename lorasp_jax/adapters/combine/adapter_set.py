@@ -33,7 +33,7 @@ class AdapterSetParam(nnx.Param[Any]):
 class NamedAdapters(nnx.Module):
     """A layer's `adapter` in a combined model: the parameters of an `AdapterSet`.
 
-    All arrays have the leading axes of a stack.
+    In stacked layers, all arrays have the leading axes of the stack.
 
     Attributes:
       choice: the weights.

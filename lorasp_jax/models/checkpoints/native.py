@@ -238,7 +238,8 @@ def _saved_fields(config: Any) -> dict[str, Any]:
 
 def _difference(stored: Any, config: Any) -> str:
     a, b = _saved_fields(stored), _saved_fields(config)
-    pairs = [f"{k} is {a.get(k)}, not {b.get(k)}" for k in sorted(a | b) if a.get(k) != b.get(k)]
+    different = (k for k in sorted(a | b) if a.get(k) != b.get(k))
+    pairs = [f"{k} is {a.get(k)} in the folder, {b.get(k)} in the config" for k in different]
     return "; ".join(pairs) or f"the stored model is a {type(stored).__name__}"
 
 

@@ -1,6 +1,6 @@
 """Layout rules for the parts of PyTorch policies that are named as in Hugging Face Transformers.
 
-PyTorch stores each linear layer as a matrix [O, I]. Ours are stacked over layers, [L, I, O].
+PyTorch stores a linear layer as a matrix [O, I]. Ours are [I, O], stacked to [L, I, O] in towers.
 """
 
 from collections.abc import Iterable, Sequence
@@ -15,7 +15,8 @@ PROJECTIONS = (
     "action_time_mlp_out",
     "action_out_proj",
 )
-"""Projections outside the towers of pi0 and SmolVLA; every layout uses these names."""
+"""Projections outside the towers of pi0 and SmolVLA. Their names are the same in all published
+layouts and here."""
 
 
 def linear(ours: str, theirs: str) -> list[Rule]:

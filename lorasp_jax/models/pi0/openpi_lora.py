@@ -50,7 +50,7 @@ def attach(model: Any, leaves: Mapping[str, np.ndarray], *, scale: float = 1.0) 
         ValueError: leaves are missing, unexpected or wrongly shaped.
     """
     if not leaves:
-        raise ValueError("openpi's LoRA must have at least one leaf, got none.")
+        raise ValueError("leaves must contain LoRA weights of openpi, got none.")
     pairs, remaining = {}, dict(leaves)
     for tower, suffix in _TOWERS.items():
         if any(f"einsum{suffix}/lora_" in name for name in leaves):

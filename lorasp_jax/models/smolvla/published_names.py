@@ -7,7 +7,7 @@ from lorasp_jax.models.checkpoints.torch_layouts import PROJECTIONS, decoder, li
 from lorasp_jax.models.smolvla.smolvla import SmolVLAConfig
 
 UNUSED: tuple[str, ...] = ()
-"""Empty: the model keeps SmolLM2's head, because LeRobot trains and saves it."""
+"""Empty: the model keeps SmolLM2's head, because LeRobot saves it."""
 TIED: dict[str, str] = {}
 
 _VLM = "vlm_with_expert.vlm"

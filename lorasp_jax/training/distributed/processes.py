@@ -82,7 +82,7 @@ def _cluster_info() -> tuple[str, int, int]:
             raise ValueError("no coordinator address")
     except (ValueError, RuntimeError) as error:
         raise ValueError(
-            "--distributed found no launcher: use Slurm, Open MPI or a TPU pod, or set "
+            "--distributed found no launcher: use Slurm, Open MPI, Kubernetes or a TPU pod, or set "
             f"JAX_COORDINATOR_ADDRESS, {' and '.join(_VARIABLES)} ({error})"
         ) from error
     if not 0 <= number < count:

@@ -85,7 +85,10 @@ def test_shards_respect_the_maximum_size(tmp_path, model, monkeypatch):
 
 def test_wrong_sizes_raise(folder):
     other = dataclasses.replace(CONFIG, image_size=64)
-    with pytest.raises(ValueError, match=r"does not match the config: image_size is 32, not 64\.$"):
+    with pytest.raises(
+        ValueError,
+        match=r"does not match the config: image_size is 32 in the folder, 64 in the config\.$",
+    ):
         models.load(folder, other)
 
 
