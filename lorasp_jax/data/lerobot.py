@@ -235,8 +235,8 @@ class LeRobot:
             tasks = pc.unique(table["task_index"]).to_pylist()
         if len(tasks) != 1 or tasks[0] not in self.index.tasks:
             raise ValueError(
-                f"episode {entry.number} of {self.path} must have exactly one task, listed in meta/tasks, got "
-                f"task indices {str(tasks)[:80]}"
+                f"episode {entry.number} of {self.path} must have exactly one task, listed in "
+                f"meta/tasks, got task indices {str(tasks)[:80]}"
             )
         return sorted(self.index.tasks).index(tasks[0])
 
