@@ -62,7 +62,7 @@ def parser(program: str) -> argparse.ArgumentParser:
     option("--num-envs", type=int, help="parallel worlds (default: depends on the device)")
     option("--control-dt", type=finite, default=0.1, help=f"time between actions [s] {_DEFAULT}")
     option("--actions", default="joint", help=f"mode: {', '.join(actions.MODES)} {_DEFAULT}")
-    text = f"standard deviation of noise on joint targets [rad] {_DEFAULT}"
+    text = f"standard deviation of noise on executed actions, in their units {_DEFAULT}"
     option("--action-noise", type=finite, default=0.0, help=text)
     text = f"unrelated objects on the table, up to {distractors.MAX_COUNT} {_DEFAULT}"
     option("--distractors", type=int, default=0, help=text)

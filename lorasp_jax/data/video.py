@@ -124,12 +124,14 @@ def decode_image(file: bytes, image_size: int = 0) -> np.ndarray:
     """
     try:
         with Image.open(io.BytesIO(file), formats=_FORMATS) as image:
-            if image.width * image.height > (Image.MAX_IMAGE_PIXELS or math.inf):
-                size = f"{image.width} x {image.height}"
-                raise ValueError(f"must have at most {Image.MAX_IMAGE_PIXELS} pixels, got {size}")
-            return downscale(np.asarray(image.convert("RGB")), image_size)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+            pixels = image.width * image.height
+            if pixels <= (Image.MAX_IMAGE_PIXELS or math.inf):
+                return downscale(np.asarray(image.convert("RGB")), image_size)
+    except Image.DecompressionBombError as error:
+        raise ValueError(first_line(error)) from error
+    except (OSError, SyntaxError, ValueError) as error:
         raise ValueError(f"an image is damaged ({first_line(error)})") from error
+    raise ValueError(f"an image must have at most {Image.MAX_IMAGE_PIXELS} pixels, got {pixels}")
 
 
 def downscale(image: np.ndarray, image_size: int) -> np.ndarray:

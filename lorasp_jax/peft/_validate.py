@@ -24,8 +24,8 @@ def key(value: Any) -> jax.Array:
 
 
 def tokens(x: Any, token_mask: Any) -> None:
-    """Raise ValueError unless x is inexact [...tokens, I] and mask is None or bool [...tokens]."""
-    if not (is_array(x) and x.shape and jnp.issubdtype(x.dtype, jnp.inexact)):
+    """Raise ValueError unless x is floating [...tokens, I] and mask is None or bool [...tokens]."""
+    if not (is_array(x) and x.shape and jnp.issubdtype(x.dtype, jnp.floating)):
         actual = f"{x.dtype} {list(x.shape)}" if is_array(x) else type(x).__name__
         raise ValueError(f"x must be a floating-point array [...tokens, I], got {actual}.")
     if token_mask is not None:

@@ -169,7 +169,7 @@ class Checkpoints:
             full = [text for text in map(os.strerror, DISK_FULL) if text in str(error)]
             reason = full[0] if full else str(error).partition("\n")[0][:200]
             steps = self._steps()
-            remaining = f"the one at step {max(steps)} is intact" if steps else "no other exists"
+            remaining = f"the one at step {max(steps)} is complete" if steps else "no other exists"
             hint = "free some disk space and add --resume" if full else "add --resume"
             raise ValueError(
                 f"a checkpoint could not be written ({reason}); {remaining}: {hint}"

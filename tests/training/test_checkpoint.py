@@ -162,7 +162,7 @@ def test_incomplete_checkpoints_are_removed(folder):
 def test_a_full_disk_leaves_the_previous_checkpoint(folder, caplog):
     """The file size limit is below the size of an array."""
     checkpoints = Checkpoints(folder, "base", Console(file=io.StringIO()))
-    message = r"could not be written \(File too large\); the one at step 2 is intact: free some"
+    message = r"could not be written \(File too large\); the one at step 2 is complete: free some"
     _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))
     try:
