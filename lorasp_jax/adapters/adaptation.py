@@ -197,10 +197,10 @@ def attach(
     if layer.adapter is not None and layer.method is not None:
         raise ValueError(
             f"the layer already has a {layer.method.name} adapter: adapt the base instead, merge "
-            "the model first, or exclude this layer with a leading (pattern, None) rule."
+            "the model first, or exclude this layer with a leading (pattern, None) rule"
         )
     if method.splits_kernel and isinstance(layer.kernel_matrices(), QuantizedKernel):
-        raise ValueError("a quantized kernel cannot be split: adapt first, then quantize.")
+        raise ValueError("a quantized kernel cannot be split: adapt first, then quantize")
     _convert_variables(
         [p for p in paths.locate(nnx.List([layer]), AdapterParam) if p.name != "adapter"], nnx.Param
     )
@@ -216,14 +216,14 @@ def _check_statistics(statistics: Any) -> None:
     """Raise ValueError unless `statistics` maps paths to finite square matrices."""
     if not isinstance(statistics, Mapping):
         raise ValueError(
-            f"statistics must be a mapping from calibration.input_moments, got {short(statistics)}."
+            f"statistics must be a mapping from calibration.input_moments, got {short(statistics)}"
         )
     for path, value in statistics.items():
         shape = getattr(value, "shape", (0, 1))
         traced = isinstance(value, jax.core.Tracer)
         if shape[-2:] != shape[-1:] * 2 or not (traced or jnp.isfinite(value).all()):
             raise ValueError(
-                f"statistics of {path} must be finite, of shape [..., I, I], got {short(value)}."
+                f"statistics of {path} must be finite, of shape [..., I, I], got {short(value)}"
             )
 
 
@@ -280,19 +280,19 @@ def unfreeze(root: nnx.List[Any], rules: paths.Rules) -> set[int]:
         used.add(i)
         if method is not None and not isinstance(location.child, AdapterParam):
             if isinstance(location.child.get_value(), QuantizedKernel):
-                raise ValueError(f"{location.path} is quantized and cannot be fully fine-tuned.")
+                raise ValueError(f"{location.path} is quantized and cannot be fully fine-tuned")
             layer = location.parent if isinstance(location.parent, AdaptedLayer) else None
             if layer and layer.adapter is None:
                 layer.method = method
             elif layer and location.name == layer.kernel_name:
                 raise ValueError(
-                    f"{location.path} cannot be fully fine-tuned: its layer has an adapter."
+                    f"{location.path} cannot be fully fine-tuned: its layer has an adapter"
                 )
             if jnp.issubdtype(location.child.get_value().dtype, jnp.floating):
                 unfrozen.append(location)
     if shapes := [p for p in unfrozen if isinstance(p.child.get_value(), jax.ShapeDtypeStruct)]:
         raise ValueError(
-            f"{shapes[0].path} has a shape but no value: call this inside nnx.eval_shape."
+            f"{shapes[0].path} has a shape but no value: call this inside nnx.eval_shape"
         )
     _convert_variables(unfrozen, AdapterParam)
     return used
@@ -321,7 +321,7 @@ def init_stack(
     Not jitted as a whole, so that random draws compile once per I, not once per kernel shape.
     """
     if len(getattr(kernel, "shape", ())) < 2:
-        raise ValueError(f"an adapter needs a kernel [..., I, O], got {short(kernel)}.")
+        raise ValueError(f"an adapter needs a kernel [..., I, O], got {short(kernel)}")
     *leading, d_in, d_out = kernel.shape
     if not leading:
         return init(key, kernel, statistics=statistics)

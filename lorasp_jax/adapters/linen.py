@@ -68,7 +68,7 @@ class LinenAdapter:
         if not isinstance(self.model, nn.Module):
             raise ValueError(
                 f"the model must be a Linen module, got {type(self.model).__name__}; for NNX "
-                "modules use `adapt`."
+                "modules use `adapt`"
             )
 
     def init(self, key: Any, *args: Any, **kwargs: Any) -> dict[str, Any]:
@@ -102,7 +102,7 @@ class LinenAdapter:
         if ADAPTER in {
             name for path in flatten_dict(validate.variables(variables)) for name in path
         }:
-            raise ValueError("the variables already have adapters: pass those of the bare model.")
+            raise ValueError("the variables already have adapters: pass those of the bare model")
         rngs = _rngs(key)
         record = _Record()
         visit = functools.partial(self._attach, record)
@@ -131,9 +131,7 @@ class LinenAdapter:
             a scan or vmap does not split the rngs for dropout.
         """
         if _compat.is_mutable(mutable, "params"):
-            raise ValueError(
-                "'params' cannot be mutable: it contains the adapters during the call."
-            )
+            raise ValueError("'params' cannot be mutable: it contains the adapters during the call")
         with nn.intercept_methods(self._call):
             return _apply(
                 self.model, _with_adapters_in_params(variables), *args, mutable=mutable, **kwargs
@@ -264,7 +262,7 @@ class LinenAdapter:
             full = method is not None and method.trains_base
             if full and path in record.kernels:
                 raise ValueError(
-                    f"{'/'.join(path)} cannot be fully fine-tuned: its layer has an adapter."
+                    f"{'/'.join(path)} cannot be fully fine-tuned: its layer has an adapter"
                 )
             if full:
                 # A copy, since the train step may donate trainable arrays.
@@ -282,7 +280,7 @@ class LinenAdapter:
             has = "no adapter" if params is None else "an adapter"
             raise ValueError(
                 f"{'/'.join(module.path)} has {has}, which does not match the rules: create the "
-                "variables using `init` or `attach` with the same rules."
+                "variables using `init` or `attach` with the same rules"
             )
         if rule is None:
             return next_fun(*args, **kwargs)
@@ -323,7 +321,7 @@ def _rngs(key: Any) -> dict[str, jax.Array]:
     """Return PRNG keys by stream name; raise ValueError unless "params" has one."""
     rngs = dict(key) if isinstance(key, Mapping) else {"params": key}
     if "params" not in rngs:
-        raise ValueError(f'rngs must have a key for "params", got {sorted(map(str, rngs))}.')
+        raise ValueError(f'rngs must have a key for "params", got {sorted(map(str, rngs))}')
     return {name: _validate.key(value) for name, value in rngs.items()}
 
 
@@ -340,7 +338,7 @@ def _dropout_key(module: nn.Module, method: Method) -> jax.Array | None:
     if not module.has_rng("dropout"):
         raise ValueError(
             f"{'/'.join(module.path)} has no rngs for its adapter's dropout: add 'dropout' to "
-            "split_rngs of the enclosing scan or vmap."
+            "split_rngs of the enclosing scan or vmap"
         )
     return module.make_rng("dropout")
 

@@ -98,27 +98,27 @@ def check_rules(rules: Any, valid: Callable[[Any], bool], what: str) -> None:
     """
     pairs = f"rules must be a list of (pattern, {what}) pairs"
     if isinstance(rules, Mapping):
-        raise ValueError(f"{pairs}, got a {type(rules).__name__}: pass list(rules.items()).")
+        raise ValueError(f"{pairs}, got a {type(rules).__name__}: pass list(rules.items())")
     if not isinstance(rules, Sequence) or isinstance(rules, str) or not rules:
         shown = "an empty list" if isinstance(rules, list | tuple) else short(rules)
-        raise ValueError(f"{pairs}, got {shown}.")
+        raise ValueError(f"{pairs}, got {shown}")
     if isinstance(rules[0], str):
-        raise ValueError(f"{pairs}, got {short(rules)}: write [(pattern, ...)] for a single rule.")
+        raise ValueError(f"{pairs}, got {short(rules)}: write [(pattern, ...)] for a single rule")
     for rule in rules:
         if not isinstance(rule, tuple | list) or len(rule) != 2 or not isinstance(rule[0], str):
-            raise ValueError(f"{pairs}, got the item {short(rule)}.")
+            raise ValueError(f"{pairs}, got the item {short(rule)}")
         pattern, value = rule
         if isinstance(value, type):
             name = value.__name__
-            raise ValueError(f"rule {short(pattern)} has the class {name}: write {name}().")
+            raise ValueError(f"rule {short(pattern)} has the class {name}: write {name}()")
         if not valid(value):
-            raise ValueError(f"rule {short(pattern)} must have {what}, got {short(value)}.")
+            raise ValueError(f"rule {short(pattern)} must have {what}, got {short(value)}")
         try:
             re.compile(pattern)
         except (re.error, OverflowError, RecursionError) as error:
             raise ValueError(
                 f"rule {short(pattern)} is not a valid regular expression: "
-                f"{short(str(error))[1:-1]}."
+                f"{short(str(error))[1:-1]}"
             ) from error
 
 

@@ -35,11 +35,11 @@ def summary(model: nnx.Module, aux: Mapping[str, Aux] | None = None) -> str:
     if aux is not None and not (
         isinstance(aux, Mapping) and all(isinstance(value, Aux) for value in aux.values())
     ):
-        raise ValueError(f"aux must be the result of collect_aux, got {short(aux)}.")
+        raise ValueError(f"aux must be the result of collect_aux, got {short(aux)}")
     if aux is not None:
         if unknown := aux.keys() - {row[0] for row in rows}:
             raise ValueError(
-                f"aux has {short(min(unknown, key=str))}, which is not a layer of the model."
+                f"aux has {short(min(unknown, key=str))}, which is not a layer of the model"
             )
         rows = [(*row, _active_rank(aux.get(row[0]))) for row in rows]
     trainable, total = count(model)
@@ -133,7 +133,7 @@ def collect_aux(model: nnx.Module | Mapping[str, Any]) -> dict[str, Aux]:
         if not isinstance(stored, Mapping):
             raise ValueError(
                 "model must be an NNX module or the variables returned by a Linen model, got "
-                f"{short(model)}."
+                f"{short(model)}"
             )
         sown = flax.traverse_util.flatten_dict(stored)  # type: ignore
         sown = {path: values for path, values in sown.items() if path[-1] == AUX_NAME}
@@ -141,6 +141,6 @@ def collect_aux(model: nnx.Module | Mapping[str, Any]) -> dict[str, Aux]:
     if not aux_by_path:
         raise ValueError(
             "no adapted layer stored any aux: call the model first, in the same traced function "
-            "(NNX) or with mutable=['intermediates'] (Linen)."
+            "(NNX) or with mutable=['intermediates'] (Linen)"
         )
     return {"/".join(map(str, path)): aux for path, aux in aux_by_path.items()}

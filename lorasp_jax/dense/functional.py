@@ -121,5 +121,5 @@ def cast_input(dtype: Dtype | None, x: Any, kernel: Any) -> jax.Array:
     except jax.dtypes.TypePromotionError as error:
         raise ValueError(
             f"cannot promote {x.dtype} input and {kernel.dtype} kernel: pass a compute dtype, such "
-            "as dtype=jnp.bfloat16."
+            "as dtype=jnp.bfloat16"
         ) from error

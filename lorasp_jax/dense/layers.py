@@ -33,7 +33,7 @@ def reject_out_sharding(out_sharding: Any) -> None:
     """Raise ValueError unless out_sharding is None. Some models pass it to every layer."""
     if out_sharding is not None:
         raise ValueError(
-            "adapted layers do not support out_sharding: constrain the output's sharding instead."
+            "adapted layers do not support out_sharding: constrain the output's sharding instead"
         )
 
 
@@ -68,9 +68,7 @@ class AdaptedLayer(nnx.Module):
         """The kernel as matrices [..., I, O]; leading axes index stacked layers."""
         kernel = self.kernel_variable()
         if not isinstance(kernel, nnx.Variable):
-            raise ValueError(
-                f"its {self.kernel_name} must be an nnx.Variable, got {short(kernel)}."
-            )
+            raise ValueError(f"its {self.kernel_name} must be an nnx.Variable, got {short(kernel)}")
         return kernel.get_value()
 
     def kernel_variable(self) -> Any:

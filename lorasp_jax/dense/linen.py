@@ -68,6 +68,6 @@ class LinenDense(nn.Module):
         if self.method.splits_kernel:
             raise ValueError(
                 "this initialization changes the kernel, which Linen does not allow: choose "
-                "another one, or use `adapt` on an NNX model."
+                "another one, or use `adapt` on an NNX model"
             )
         return self.method.init(self.make_rng("params"), kernel)[0]

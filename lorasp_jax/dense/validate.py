@@ -29,7 +29,7 @@ def method(value: Any) -> Method | None:
         hint = f": write {value.__name__}()" if isinstance(value, type) else ""
         raise ValueError(
             f"method must be None or a Method such as LoRA(rank=8), got {short(value)}{hint}; "
-            "`peft.create` creates one by name."
+            "`peft.create` creates one by name"
         )
     return value
 
@@ -40,7 +40,7 @@ def rngs(value: Any) -> nnx.Rngs:
         actual = list(value) if isinstance(value, nnx.Rngs) else type(value).__name__
         raise ValueError(
             "rngs must be nnx.Rngs with a params or default stream, such as nnx.Rngs(0), got "
-            f"{actual}."
+            f"{actual}"
         )
     return value
 
@@ -49,7 +49,7 @@ def array(x: Any) -> Any:
     """Return x; raise ValueError unless it is a numeric or bool array with at least one axis."""
     has_axes = isinstance(x, jax.Array | np.ndarray) and x.ndim
     if not has_axes or not (x.dtype == bool or jnp.issubdtype(x.dtype, jnp.number)):
-        raise ValueError(f"x must be an array [...tokens, I], got {short(x)}.")
+        raise ValueError(f"x must be an array [...tokens, I], got {short(x)}")
     return x
 
 
@@ -60,25 +60,25 @@ def floating_dtype(name: str, dtype: Any) -> None:
     except TypeError:
         is_floating = False
     if not is_floating:
-        raise ValueError(f"{name} must be a floating-point dtype, got {short(dtype)}.")
+        raise ValueError(f"{name} must be a floating-point dtype, got {short(dtype)}")
 
 
 def layer(arrays: Any, width: int) -> None:
     """Raise ValueError unless a `DenseLayer` is consistent and accepts x [...tokens, width]."""
     shape = getattr(arrays.kernel, "shape", ())
     if len(shape) < 2:
-        raise ValueError(f"kernel must be an array [I, *O], got {short(arrays.kernel)}.")
+        raise ValueError(f"kernel must be an array [I, *O], got {short(arrays.kernel)}")
     if width != shape[0]:
-        raise ValueError(f"input width {width} does not match kernel shape {list(shape)}.")
+        raise ValueError(f"input width {width} does not match kernel shape {list(shape)}")
     bias = tuple(getattr(arrays.bias, "shape", (0,) * len(shape)))
     trailing = zip(bias[::-1], shape[::-1], strict=False)
     if arrays.bias is not None and not (
         len(bias) < len(shape) and all(b in (1, o) for b, o in trailing)
     ):
-        raise ValueError(f"bias must be an array {list(shape[1:])}, got {short(arrays.bias)}.")
+        raise ValueError(f"bias must be an array {list(shape[1:])}, got {short(arrays.bias)}")
     adapter_method = method(arrays.method)
     if (arrays.params is None) != (adapter_method is None or adapter_method.trains_base):
-        raise ValueError("params and method must be given together.")
+        raise ValueError("params and method must be given together")
     if arrays.dropout_key is not None:
         _validate.key(arrays.dropout_key)
 
@@ -87,7 +87,7 @@ def module(model: Any) -> Any:
     """Return the model; raise ValueError unless it is an NNX module."""
     if not isinstance(model, nnx.Module):
         hint = "; for a Linen module use LinenAdapter" if isinstance(model, linen.Module) else ""
-        raise ValueError(f"the model must be an NNX module, got {type(model).__name__}{hint}.")
+        raise ValueError(f"the model must be an NNX module, got {type(model).__name__}{hint}")
     return model
 
 
@@ -97,7 +97,7 @@ def with_values(model: Any) -> Any:
     if any(isinstance(leaf, jax.ShapeDtypeStruct) for leaf in leaves):
         raise ValueError(
             "the model holds shapes without values: initialize it, or call this inside "
-            "nnx.eval_shape."
+            "nnx.eval_shape"
         )
     return model
 
@@ -109,14 +109,14 @@ def variables(value: Any) -> Any:
         if not isinstance(collection, Mapping) or (name == "params" and name not in value):
             actual = sorted(map(str, value)) if isinstance(value, Mapping) else type(value).__name__
             raise ValueError(
-                f'variables must be a dict whose "params" is a dict, got {short(actual)}.'
+                f'variables must be a dict whose "params" is a dict, got {short(actual)}'
             )
         leaves = jax.tree_util.tree_leaves_with_path(collection, is_leaf=lambda x: x is None)
         for path, leaf in leaves:
             is_numeric = isinstance(leaf, jax.Array | np.ndarray | np.generic | float | int)
             if not is_numeric or getattr(leaf, "dtype", None) == np.dtype(object):
                 location = jax.tree_util.keystr(path, simple=True, separator="/")
-                raise ValueError(f'"{name}" must hold arrays, got {short(leaf)} at {location}.')
+                raise ValueError(f'"{name}" must hold arrays, got {short(leaf)} at {location}')
     return value
 
 
@@ -124,14 +124,14 @@ def folder(value: Any) -> pathlib.Path:
     """Return a local folder's path, existing or not; raise ValueError if it is invalid."""
     text = os.fspath(value) if isinstance(value, str | os.PathLike) else None
     if not isinstance(text, str) or not text or "\0" in text:
-        raise ValueError(f"folder must be a str or path, got {short(value)}.")
+        raise ValueError(f"folder must be a str or path, got {short(value)}")
     path = pathlib.Path(text)
     if len(path.parts) > 1 and path.parts[0].endswith(":"):  # Path collapses the // of a URL
-        raise ValueError(f"{text} is a URL; adapters must be in a local folder.")
+        raise ValueError(f"{text} is a URL; adapters must be in a local folder")
     if any(len(part.encode(errors="replace")) > MAX_NAME_BYTES for part in path.parts):
         raise ValueError(
-            f"path components must have at most {MAX_NAME_BYTES} bytes, got {short(text)}."
+            f"path components must have at most {MAX_NAME_BYTES} bytes, got {short(text)}"
         )
     if path.exists() and not path.is_dir():
-        raise ValueError(f"{path} is not a folder.")
+        raise ValueError(f"{path} is not a folder")
     return path

@@ -67,7 +67,7 @@ def exact_ratio(energy_target: float) -> Ratio:
     except (decimal.InvalidOperation, ValueError, OverflowError):
         ratio = fractions.Fraction(0)
     if not 0 < ratio <= 1:
-        raise ValueError(f"energy_target must lie in (0, 1], got {energy_target!r}.")
+        raise ValueError(f"energy_target must lie in (0, 1], got {energy_target!r}")
     ratio = max(ratio, fractions.Fraction(MIN_TARGET))
     power = 2 ** ratio.denominator.bit_length()  # scaling by it is exact
     return Ratio(ratio.numerator / power, ratio.denominator / power)
@@ -127,7 +127,7 @@ def _mask_function(implementation: str, interpret: bool) -> Callable[[jax.Array,
         return masks[implementation]
     if implementation not in boundaries:
         valid = ", ".join(get_args(Implementation))
-        raise ValueError(f"implementation must be one of {valid}, got {implementation!r}.")
+        raise ValueError(f"implementation must be one of {valid}, got {implementation!r}")
     boundary = boundaries[implementation]
     # Without a barrier, XLA may compute the scores twice, for the boundary and for the comparison
     # with it, and round them differently. "block" runs in a kernel, which computes them once.

@@ -89,8 +89,8 @@ class QuantizedKernel:
         *leading, d_in, d_out = np.empty(self.shape, np.void).reshape(*shape).shape
         if (d_in, d_out) != self.shape[-2:]:
             raise ValueError(
-                f"Cannot reshape a quantized kernel {self.shape} to {shape}: "
-                "only its leading axes may change."
+                f"cannot reshape a quantized kernel {self.shape} to {shape}: "
+                "only its leading axes may change"
             )
         arrays = {n: getattr(self, n) for n in ("codes", "scale")}
         return dataclasses.replace(
@@ -105,10 +105,10 @@ def quantize_kernel(kernel: jax.Array, kind: Kind) -> QuantizedKernel:
       ValueError: unknown kind, or non-finite values.
     """
     if kind not in KINDS:
-        raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}.")
+        raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
     codes, scale = _codes(kernel, kind)
     if not bool(jnp.isfinite(scale).all()):
-        raise ValueError("the kernel has NaN or infinite values.")
+        raise ValueError("the kernel has NaN or infinite values")
     return QuantizedKernel(codes, scale, kernel.shape[-2], jnp.dtype(kernel.dtype))
 
 

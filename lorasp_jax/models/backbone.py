@@ -44,7 +44,7 @@ def find(name: str) -> type[BackboneConfig]:
         ValueError: unknown backbone.
     """
     if name not in names():
-        raise ValueError(f"unknown backbone {name!r}: choose one of {', '.join(names())}.")
+        raise ValueError(f"unknown backbone {name!r}: choose one of {', '.join(names())}")
     return importlib.import_module(f"{_PACKAGE}.{name}").Config
 
 
@@ -140,7 +140,7 @@ class Backbone(nnx.Module):
             if name not in obs.images or obs.images[name].shape[1:] != (size, size, 3):
                 shapes = {camera: image.shape[1:] for camera, image in obs.images.items()}
                 raise ValueError(
-                    f"images of cameras {cameras} must have shape {(size, size, 3)}, got {shapes}."
+                    f"images of cameras {cameras} must have shape {(size, size, 3)}, got {shapes}"
                 )
         images = jnp.stack([obs.images[name] for name in cameras], axis=1)
         present = jnp.stack([obs.image_masks[name] for name in cameras], axis=1)

@@ -26,7 +26,7 @@ def _check_sizes(config: Any) -> None:
         value = getattr(config, field.name)
         limit = _MAX_DEPTH if field.name == "depth" else _MAX_SIZE
         if field.type == "int" and not (type(value) is int and 0 < value <= limit):
-            raise ValueError(f"{field.name} must be an integer from 1 to {limit}, got {value!r}.")
+            raise ValueError(f"{field.name} must be an integer from 1 to {limit}, got {value!r}")
 
 
 @dataclass(frozen=True)
@@ -119,29 +119,29 @@ class BackboneConfig:
             if a != b:
                 raise ValueError(
                     f"{name} of both experts must be equal, because they share attention; "
-                    f"got {a} and {b}."
+                    f"got {a} and {b}"
                 )
         vision = self.vision
         side = vision.patch * vision.shuffle
         if self.image_size % side:
             raise ValueError(
                 "image_size must be a multiple of vision.patch * vision.shuffle = "
-                f"{side}, got {self.image_size}."
+                f"{side}, got {self.image_size}"
             )
         if vision.width % vision.heads:
             raise ValueError(
                 "vision.width must be a multiple of vision.heads, "
-                f"got {vision.width} and {vision.heads}."
+                f"got {vision.width} and {vision.heads}"
             )
         if language.heads % language.kv_heads:
             raise ValueError(
                 "heads must be a multiple of kv_heads, "
-                f"got {language.heads} and {language.kv_heads}."
+                f"got {language.heads} and {language.kv_heads}"
             )
         if language.head_dim % 2 or action.width % 2:
             raise ValueError(
                 "head_dim and action.width must be even, "
-                f"got {language.head_dim} and {action.width}."
+                f"got {language.head_dim} and {action.width}"
             )
 
     @classmethod

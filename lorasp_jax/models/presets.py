@@ -52,9 +52,7 @@ def patterns(targets: str | Sequence[str]) -> list[str]:
         suggestion = _suggestion(target)
         if target not in PRESETS and (suggestion or _PRESET_NAME.fullmatch(target)):
             hint = f" (did you mean {suggestion!r}?)" if suggestion else ""
-            raise ValueError(
-                f"unknown preset {target!r}{hint}: choose one of {', '.join(PRESETS)}."
-            )
+            raise ValueError(f"unknown preset {target!r}{hint}: choose one of {', '.join(PRESETS)}")
     return [pattern for target in targets for pattern in PRESETS.get(target, (target,))]
 
 

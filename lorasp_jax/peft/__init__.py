@@ -55,7 +55,7 @@ def find(name: str) -> type[Method]:
         close = difflib.get_close_matches(str(name), names(), n=1)
         hint = f" (did you mean {close[0]!r}?)" if close else ""
         valid = ", ".join(names())
-        raise ValueError(f"unknown method {short(name)}{hint}; valid methods are {valid}.")
+        raise ValueError(f"unknown method {short(name)}{hint}; valid methods are {valid}")
     module = importlib.import_module(f"{__name__}.{name}")
     classes = [c for c in vars(module).values() if isinstance(c, type) and issubclass(c, Method)]
     (cls,) = [c for c in classes if f"{c.__module__}.".startswith(f"{module.__name__}.")]
@@ -78,7 +78,7 @@ def from_settings(settings: Any) -> Method:
       ValueError: `settings` does not name a method, or `create` rejects it.
     """
     if not isinstance(settings, dict) or not isinstance(settings.get("method"), str):
-        raise ValueError(f"adapter settings must name a method, got {short(settings)}.")
+        raise ValueError(f"adapter settings must name a method, got {short(settings)}")
     fields = upgrade(settings)
     if isinstance(schedule := fields.get("schedule"), dict):
         check_names(EnergySchedule, "schedule", (), schedule)

@@ -60,7 +60,7 @@ def auxiliary_losses(aux: Any) -> dict[str, jax.Array]:
     layers = jax.tree.leaves(aux, is_leaf=lambda node: isinstance(node, Aux))
     if invalid := [layer for layer in layers if not isinstance(layer, Aux)]:
         raise ValueError(
-            f"aux must be a tree of Aux such as collect_aux returns, got {short(invalid[0])}."
+            f"aux must be a tree of Aux such as collect_aux returns, got {short(invalid[0])}"
         )
     names = sorted({name for layer in layers for name in layer.losses})
     return {

@@ -35,10 +35,10 @@ def check_fields(owner: Any, prefix: str = "") -> None:
             continue
         value = getattr(owner, name)
         if not _fits(value, kind):
-            raise ValueError(f"{prefix}{name} must be {_describe(kind)}, got {short(value)}.")
+            raise ValueError(f"{prefix}{name} must be {_describe(kind)}, got {short(value)}")
         if type(value) is int and abs(value) > maximum[name]:
             bound = f"at most {maximum[name]}" if value > 0 else f"at least -{maximum[name]}"
-            raise ValueError(f"{prefix}{name} must be {bound}, got {value}.")
+            raise ValueError(f"{prefix}{name} must be {bound}, got {value}")
 
 
 def check_names(cls: type, name: str, values: Sequence[Any], fields: Iterable[str]) -> None:
@@ -46,20 +46,20 @@ def check_names(cls: type, name: str, values: Sequence[Any], fields: Iterable[st
     valid = [field.name for field in dataclasses.fields(cls)]
     if len(values) > len(valid):
         names = ", ".join(valid)
-        raise ValueError(f"{name} takes at most {len(valid)} values ({names}), got {len(values)}.")
+        raise ValueError(f"{name} takes at most {len(valid)} values ({names}), got {len(values)}")
     for field in fields:
         if field not in valid:
             close = difflib.get_close_matches(field, valid, n=1, cutoff=0.4)
             hint = f" (did you mean {close[0]!r}?)" if close else ""
             raise ValueError(
-                f"{name} has no field {short(field)}{hint}; valid fields are {', '.join(valid)}."
+                f"{name} has no field {short(field)}{hint}; valid fields are {', '.join(valid)}"
             )
 
 
 def positive_int(name: str, value: Any, maximum: int = MAX_INT) -> int:
     """Return the value; raise ValueError unless it is an integer from 1 to `maximum`."""
     if type(value) is not int or not 1 <= value <= maximum:
-        raise ValueError(f"{name} must be an integer from 1 to {maximum}, got {short(value)}.")
+        raise ValueError(f"{name} must be an integer from 1 to {maximum}, got {short(value)}")
     return value
 
 

@@ -57,15 +57,15 @@ class Method:
         for field in dataclasses.fields(self):  # pyright: ignore[reportArgumentType]
             value = getattr(self, field.name)
             if type(value) is int and value > MAX_SIZE:
-                raise ValueError(f"{field.name} must be at most {MAX_SIZE}, got {value}.")
+                raise ValueError(f"{field.name} must be at most {MAX_SIZE}, got {value}")
         _fields.check_fields(self)
         alpha = getattr(self, "alpha", None)
         if alpha is not None and not 1 / MAX_ALPHA <= abs(alpha) <= MAX_ALPHA:
             raise ValueError(
-                f"|alpha| must be between {1 / MAX_ALPHA:g} and {MAX_ALPHA:g}, got {alpha}."
+                f"|alpha| must be between {1 / MAX_ALPHA:g} and {MAX_ALPHA:g}, got {alpha}"
             )
         if not 0 <= (rate := dropout_rate(self)) < 1:
-            raise ValueError(f"dropout must be in [0, 1), got {rate}.")
+            raise ValueError(f"dropout must be in [0, 1), got {rate}")
 
     trains_base: ClassVar[bool] = False
     """True if the method trains the base weights themselves."""
@@ -173,7 +173,7 @@ class Method:
         """
         _validate.tokens(x, token_mask)
         if not self.additive:
-            raise ValueError(f"{type(self).__name__} is not additive and has no delta; use apply.")
+            raise ValueError(f"{type(self).__name__} is not additive and has no delta; use apply")
         z, aux = self.bottleneck_from_input(params, x, token_mask)
         up = self.up(params).astype(x.dtype)
         self._check_params(params, (x.shape[-1], up.shape[-1]))
@@ -250,7 +250,7 @@ class Method:
         _validate.matrix(kernel)
         if x.shape[-1] != kernel.shape[0]:
             raise ValueError(
-                f"input width {x.shape[-1]} does not match kernel shape {list(kernel.shape)}."
+                f"input width {x.shape[-1]} does not match kernel shape {list(kernel.shape)}"
             )
         self._check_params(params, kernel.shape)
 

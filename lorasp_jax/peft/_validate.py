@@ -19,7 +19,7 @@ def key(value: Any) -> jax.Array:
     typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key) and shape == ()
     # Raw keys: threefry has 2 words, rbg 4.
     if not typed and (dtype != jnp.uint32 or shape not in ((2,), (4,))):
-        raise ValueError(f"key must be a PRNG key such as jax.random.key(0), got {short(value)}.")
+        raise ValueError(f"key must be a PRNG key such as jax.random.key(0), got {short(value)}")
     return value
 
 
@@ -27,12 +27,12 @@ def tokens(x: Any, token_mask: Any) -> None:
     """Raise ValueError unless x is floating [...tokens, I] and mask is None or bool [...tokens]."""
     if not (is_array(x) and x.shape and jnp.issubdtype(x.dtype, jnp.floating)):
         actual = f"{x.dtype} {list(x.shape)}" if is_array(x) else type(x).__name__
-        raise ValueError(f"x must be a floating-point array [...tokens, I], got {actual}.")
+        raise ValueError(f"x must be a floating-point array [...tokens, I], got {actual}")
     if token_mask is not None:
         actual = getattr(token_mask, "dtype", type(token_mask).__name__), np.shape(token_mask)
         if actual != (bool, x.shape[:-1]):
             expected = f"token_mask must be bool {list(x.shape[:-1])}"
-            raise ValueError(f"{expected}, got {actual[0]} {list(actual[1])}.")
+            raise ValueError(f"{expected}, got {actual[0]} {list(actual[1])}")
 
 
 def params(method: Any, values: Any, shape: tuple[int, ...]) -> None:
@@ -45,7 +45,7 @@ def params(method: Any, values: Any, shape: tuple[int, ...]) -> None:
         if actual.get(name) != expected:
             raise ValueError(
                 f"{method.name} for a kernel {list(shape)} needs {name} {list(expected)}, got "
-                f"{list(actual[name]) if name in actual else 'none'}."
+                f"{list(actual[name]) if name in actual else 'none'}"
             )
 
 
@@ -54,7 +54,7 @@ def matrix(kernel: Any) -> None:
     shape, dtype = getattr(kernel, "shape", ()), getattr(kernel, "dtype", int)
     if len(shape) != 2 or 0 in shape or not jnp.issubdtype(dtype, jnp.floating):
         actual = f"{dtype} {list(shape)}" if hasattr(kernel, "dtype") else type(kernel).__name__
-        raise ValueError(f"an adapter needs a floating-point kernel [I, O], got {actual}.")
+        raise ValueError(f"an adapter needs a floating-point kernel [I, O], got {actual}")
 
 
 @functools.lru_cache(maxsize=1024)  # a model's layers share shapes and are traced repeatedly

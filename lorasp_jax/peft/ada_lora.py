@@ -67,17 +67,17 @@ class AdaLoRA(Method):
         if self.rank < 1 or not 1 <= self.final_rank <= self.rank or self.interval < 1:
             raise ValueError(
                 "rank and interval must be at least 1 and target_rank from 1 to rank, got "
-                f"rank={self.rank}, target_rank={self.target_rank}, interval={self.interval}."
+                f"rank={self.rank}, target_rank={self.target_rank}, interval={self.interval}"
             )
         if self.warmup < 0 or self.final < 0 or self.warmup + self.final >= 1:
             raise ValueError(
                 "warmup and final must be non-negative and sum to less than 1, got "
-                f"{self.warmup} and {self.final}."
+                f"{self.warmup} and {self.final}"
             )
         if not (0 <= self.importance_decay < 1 and 0 <= self.uncertainty_decay < 1):
             raise ValueError(
                 "importance_decay and uncertainty_decay must be in [0, 1), got "
-                f"{self.importance_decay} and {self.uncertainty_decay}."
+                f"{self.importance_decay} and {self.uncertainty_decay}"
             )
 
     @property
@@ -148,7 +148,7 @@ class AdaLoRA(Method):
         if begin >= end:
             raise ValueError(
                 f"AdaLoRA cannot prune in {total_steps} steps: warm-up takes {begin} and the final "
-                f"phase {total_steps - end}."
+                f"phase {total_steps - end}"
             )
 
         def init(params: Any) -> AllocationState:
@@ -196,7 +196,7 @@ def budgets(initial: int, target: int, begin: int, end: int) -> np.ndarray:
 def _initial_state(params: Any, inner: Any) -> AllocationState:
     """The state before the first step. Raise ValueError if there are no AdaLoRA parameters."""
     if not (triplets := _triplets(params)):
-        raise ValueError("the parameters passed to AdaLoRA's optimizer contain no AdaLoRA adapter.")
+        raise ValueError("the parameters passed to AdaLoRA's optimizer contain no AdaLoRA adapter")
     importance, uncertainty = (jax.tree.map(jnp.zeros_like, triplets) for _ in range(2))
     kept = [jnp.ones(t["lora_e"].shape, bool) for t in triplets]
     return AllocationState(jnp.zeros((), jnp.int32), importance, uncertainty, kept, inner)

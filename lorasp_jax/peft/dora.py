@@ -45,7 +45,7 @@ class DoRA(LoRA):
         if isinstance(kernel, jax.ShapeDtypeStruct):
             raise ValueError(
                 "DoRA's magnitude must be initialized from the kernel's values, got only "
-                f"the shape {kernel.shape}."
+                f"the shape {kernel.shape}"
             )
         params, residual = super().init(key, kernel, statistics=statistics)
         return params | {"magnitude": column_norms(kernel)}, residual

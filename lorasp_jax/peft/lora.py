@@ -48,9 +48,9 @@ class LoRA(Method):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.rank < 1:
-            raise ValueError(f"rank must be at least 1, got {self.rank}.")
+            raise ValueError(f"rank must be at least 1, got {self.rank}")
         if self.initialization == "pissa" and self.scale < 0:
-            raise ValueError(f"alpha must be positive for 'pissa', got {self.alpha}.")
+            raise ValueError(f"alpha must be positive for 'pissa', got {self.alpha}")
 
     @property
     def splits_kernel(self) -> bool:
@@ -91,7 +91,7 @@ class LoRA(Method):
             given = "a shape" if isinstance(kernel, jax.ShapeDtypeStruct) else "a kernel"
             raise ValueError(
                 f"initialization {self.initialization!r} needs the kernel's values and a rank of "
-                f"at most min(I, O), got rank {self.rank} and {given} {list(kernel.shape)}."
+                f"at most min(I, O), got rank {self.rank} and {given} {list(kernel.shape)}"
             )
         split = principal_part if self.initialization == "pissa" else orthogonal_part
         a, b = split(kernel.astype(jnp.float32), self.rank, self.scale)
@@ -184,12 +184,12 @@ def principal_inputs(moment: jax.Array | None, d_in: int, rank: int) -> jax.Arra
     if moment is None:
         raise ValueError(
             "initialization 'eva' needs statistics of the inputs: pass the result of "
-            "`input_moments` to `adapt`."
+            "`input_moments` to `adapt`"
         )
     if moment.shape != (d_in, d_in) or rank > d_in:
         raise ValueError(
             f"initialization 'eva' needs statistics [{d_in}, {d_in}] and a rank of at most {d_in}, "
-            f"got {list(moment.shape)} and {rank}."
+            f"got {list(moment.shape)} and {rank}"
         )
     _, vectors = jnp.linalg.eigh(moment.astype(jnp.float32))
     return vectors[:, ::-1][:, :rank]

@@ -49,10 +49,10 @@ class LoRAMoE(Method):
         super().__post_init__()
         if self.experts < 1 or self.rank < 1:
             raise ValueError(
-                f"experts and rank must be at least 1, got {self.experts}, {self.rank}."
+                f"experts and rank must be at least 1, got {self.experts}, {self.rank}"
             )
         if self.gate_gradient == "switch" and self.routing != "top1":
-            raise ValueError(f"gate_gradient 'switch' needs routing 'top1', got {self.routing!r}.")
+            raise ValueError(f"gate_gradient 'switch' needs routing 'top1', got {self.routing!r}")
 
     @property
     def down_in_fp32(self) -> bool:
@@ -109,7 +109,7 @@ class LoRAMoE(Method):
         del params, kernel
         raise ValueError(
             "LoRA-MoE's delta depends on the input and cannot be merged into the kernel: keep the "
-            "adapter separate."
+            "adapter separate"
         )
 
 

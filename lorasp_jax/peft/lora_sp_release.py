@@ -56,7 +56,7 @@ class LoRASPRelease(BankMethod):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.hidden_width is not None and self.hidden_width < 1:
-            raise ValueError(f"hidden_width must be at least 1, got {self.hidden_width}.")
+            raise ValueError(f"hidden_width must be at least 1, got {self.hidden_width}")
 
     @property
     def score_arrays(self) -> tuple[str, ...]:

@@ -12,8 +12,8 @@ def to_unit(name: str, image: jax.Array) -> jax.Array:
     """
     if image.dtype != jnp.uint8 or image.ndim != 4 or image.shape[-1] != 3:
         raise ValueError(
-            f"The image of camera {name!r} must be uint8 [B, H, W, 3], "
-            f"got {image.dtype} {image.shape}."
+            f"the image of camera {name!r} must be uint8 [B, H, W, 3], "
+            f"got {image.dtype} {image.shape}"
         )
     return image.astype(jnp.float32) / 127.5 - 1
 

@@ -80,8 +80,8 @@ def _affine_map(stats: Mapping[str, jax.Array], mode: Mode, convention: Conventi
     missing = [name for name in needed if name not in stats]
     if missing:
         raise ValueError(
-            f"Normalization {mode!r} requires the statistics {', '.join(needed)}, "
-            f"got {', '.join(stats) or 'none'}."
+            f"normalization {mode!r} requires the statistics {', '.join(needed)}, "
+            f"got {', '.join(stats) or 'none'}"
         )
     first, second = (stats[name] for name in needed)
     spread = second if mode == "mean_std" else second - first

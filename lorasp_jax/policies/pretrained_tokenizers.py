@@ -30,7 +30,7 @@ class SentencePiece:
             self._model = sentencepiece.SentencePieceProcessor(model_file=str(file))
             self._model.encode("", add_bos=True)  # raises if there is no BOS
         except (OSError, RuntimeError, ValueError) as error:
-            raise ValueError(f"{file} is not a SentencePiece model like PaliGemma's.") from error
+            raise ValueError(f"{file} is not a SentencePiece model like PaliGemma's") from error
 
     @property
     def vocabulary(self) -> int:
@@ -62,18 +62,18 @@ class TokenizersFile:
         try:
             self._model = tokenizers.Tokenizer.from_file(str(file))
         except Exception as error:  # tokenizers raises bare Exception
-            raise ValueError(f"{file} is not a Hugging Face tokenizer file.") from error
+            raise ValueError(f"{file} is not a Hugging Face tokenizer file") from error
         self._model.no_truncation()
         self._model.no_padding()
         pads = [self._model.token_to_id(token) for token in PAD_TOKENS]
         pads = [pad for pad in pads if pad is not None]
         if not pads:
-            raise ValueError(f"{file} has no padding token ({' or '.join(PAD_TOKENS)}).")
+            raise ValueError(f"{file} has no padding token ({' or '.join(PAD_TOKENS)})")
         self._pad = pads[0]
         self.vocabulary: int = 1 + max(self._model.get_vocab().values())
         """Largest token id + 1; the file may skip ids."""
         if self.vocabulary > np.iinfo(np.int32).max:
-            raise ValueError(f"{file} has token id {self.vocabulary - 1}, which exceeds int32.")
+            raise ValueError(f"{file} has token id {self.vocabulary - 1}, which exceeds int32")
 
     def encode(
         self, texts: Sequence[str], max_tokens: int, *, complete: bool = False
@@ -96,7 +96,7 @@ def _pad(
     for i, (text, row) in enumerate(zip(texts, rows, strict=True)):
         if len(row) > max_tokens:
             warnings.warn(
-                f"{text!r} has {len(row)} tokens; truncated to {max_tokens}.", stacklevel=3
+                f"{text!r} has {len(row)} tokens; truncated to {max_tokens}", stacklevel=3
             )
         ids[i, : len(row)] = row[:max_tokens]
         valid[i, : len(row)] = True

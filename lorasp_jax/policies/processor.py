@@ -36,7 +36,7 @@ def robot_slots(num_joints: int, inputs: InputConfig = OURS) -> tuple[int, ...]:
     """
     gripper = num_joints if inputs.gripper_slot is None else inputs.gripper_slot
     if not 0 < num_joints <= gripper:
-        raise ValueError(f"num_joints must be 1 to {gripper} for this backbone, got {num_joints}.")
+        raise ValueError(f"num_joints must be 1 to {gripper} for this backbone, got {num_joints}")
     return (*range(num_joints), gripper)
 
 
@@ -55,8 +55,8 @@ def camera_slots(
     unknown = sorted(robot.keys() - set(cameras))
     if unknown or not robot:
         raise ValueError(
-            f"The keys of cameras must be one or more of the backbone's cameras "
-            f"({', '.join(cameras)}), got {', '.join(unknown) or 'none'}."
+            f"the keys of cameras must be one or more of the backbone's cameras "
+            f"({', '.join(cameras)}), got {', '.join(unknown) or 'none'}"
         )
     return tuple((name, robot.get(name)) for name in cameras)
 
@@ -82,8 +82,8 @@ def check_delta(mask: Sequence[bool], num_joints: int) -> None:
     """Raise ValueError if a delta mask is longer than the robot's action vector."""
     if len(mask) > num_joints + 1:
         raise ValueError(
-            f"The delta mask has {len(mask)} entries, but the robot's actions have "
-            f"{num_joints + 1}: the weights belong to a different robot."
+            f"the delta mask has {len(mask)} entries, but the robot's actions have "
+            f"{num_joints + 1}: the weights belong to a different robot"
         )
 
 
@@ -188,8 +188,8 @@ class Processor:
         missing = sorted({name for name in sources.values() if name} - set(raw["image"]))
         if missing:
             raise ValueError(
-                f"The observation must contain camera {', '.join(missing)}, "
-                f"got {', '.join(raw['image']) or 'none'}."
+                f"the observation must contain camera {', '.join(missing)}, "
+                f"got {', '.join(raw['image']) or 'none'}"
             )
         prompt = self.prompts.encode(instruction, state[:, np.array(self.robot_slots)])
         black = jnp.full((len(state), self.image_size, self.image_size, 3), -1.0)
@@ -245,5 +245,5 @@ class Processor:
 
 def _require_state(state: jax.Array | None) -> jax.Array:
     if state is None:
-        raise ValueError("This backbone uses relative actions: pass the raw state.")
+        raise ValueError("this backbone uses relative actions: pass the raw state")
     return state

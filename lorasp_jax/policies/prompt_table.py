@@ -77,8 +77,8 @@ class PromptTable:
         max_id = max(int(leaf.max()) for leaf in jax.tree.leaves(table))
         if max_id >= config.vocabulary:
             raise ValueError(
-                f"Token {max_id} is beyond the backbone's vocabulary of {config.vocabulary}: "
-                "the tokenizer belongs to a different model."
+                f"token {max_id} is beyond the backbone's vocabulary of {config.vocabulary}: "
+                "the tokenizer belongs to a different model"
             )
         return dataclasses.replace(table, instructions=tuple(instructions))
 
@@ -89,7 +89,7 @@ class PromptTable:
             ValueError: the table lacks one of them.
         """
         if missing := sorted(set(instructions) - set(self.instructions)):
-            raise ValueError(f"The policy has no prompt for {missing[0]!r}.")
+            raise ValueError(f"the policy has no prompt for {missing[0]!r}")
         rows = np.array([self.instructions.index(text) for text in instructions])
         start = Ids(*(array[rows] for array in self.start))
         return dataclasses.replace(self, start=start, instructions=tuple(instructions))
@@ -150,8 +150,8 @@ def _check_merges(
     actual = table.encode(jnp.asarray(instruction), jnp.asarray(state))
     if not all(np.array_equal(a, b) for a, b in zip(actual, expected, strict=True)):
         raise ValueError(
-            "Cannot tabulate prompts that contain the state: the tokenizer merges state values "
-            "with their neighbors. Use the backbone's own tokenizer."
+            "cannot tabulate prompts that contain the state: the tokenizer merges state values "
+            "with their neighbors; use the backbone's own tokenizer"
         )
 
 

@@ -63,7 +63,7 @@ class Statistics:
         valid = np.asarray(valid, bool)
         check_slots(slots, dim, np.shape(state)[-1])
         if not valid.any():
-            raise ValueError("Statistics need at least one valid step.")
+            raise ValueError("statistics need at least one valid step")
         moments = (_measure(np.asarray(values, np.float64)[valid]) for values in (state, action))
         return cls(*moments).to_slots(slots, dim)
 
@@ -81,7 +81,7 @@ class Statistics:
         check_slots(slots, dim, len(slots))
         if self.dim < len(slots):
             raise ValueError(
-                f"Statistics must have {len(slots)} or more dimensions, got {self.dim}."
+                f"statistics must have {len(slots)} or more dimensions, got {self.dim}"
             )
 
         def move(stats: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
@@ -121,8 +121,8 @@ class Statistics:
             AttributeError, KeyError, TypeError, ValueError, OverflowError, RecursionError
         ) as error:  # fmt: skip
             raise ValueError(
-                f"Statistics must be lists of numbers named state_NAME and action_NAME, got "
-                f"{text[:80]!r} ({error})."
+                f"statistics must be lists of numbers named state_NAME and action_NAME, got "
+                f"{text[:80]!r} ({error})"
             ) from error
         return validate(both, "this JSON")
 
@@ -142,13 +142,13 @@ def validate(both: Mapping[str, Mapping[str, np.ndarray]], source: str) -> Stati
             f"has {unknown[0]!r}" if unknown else "lacks a list or has lists of unequal length"
         )
         raise ValueError(
-            f"Statistics must be lists of equal length for state and for action, named "
-            f"{', '.join(NAMES)}; {source} {problem}."
+            f"statistics must be lists of equal length for state and for action, named "
+            f"{', '.join(NAMES)}; {source} {problem}"
         )
     if not all(np.isfinite(array).all() for array in arrays):
-        raise ValueError(f"Statistics in {source} must be finite; they may never have been set.")
+        raise ValueError(f"statistics in {source} must be finite; they may never have been set")
     if any((stats.get("std", np.zeros(1)) < 0).any() for stats in both.values()):
-        raise ValueError(f"Statistics in {source} have a negative standard deviation.")
+        raise ValueError(f"statistics in {source} have a negative standard deviation")
     state, action = (
         {name: jnp.asarray(array, jnp.float32) for name, array in both[kind].items()}
         for kind in ("state", "action")
@@ -160,7 +160,7 @@ def check_slots(slots: Sequence[int], dim: int, length: int) -> None:
     """Raise ValueError unless `slots` are `length` distinct slots below `dim`."""
     if len(slots) != length or len(set(slots)) != length or not all(0 <= s < dim for s in slots):
         raise ValueError(
-            f"slots must be {length} distinct integers from 0 to {dim - 1}, got {tuple(slots)}."
+            f"slots must be {length} distinct integers from 0 to {dim - 1}, got {tuple(slots)}"
         )
 
 

@@ -65,10 +65,10 @@ def read(where: str | os.PathLike[str], *, dataset: str = "") -> Statistics:
                 groups = reader(files)
             except _UNREADABLE as error:
                 why = f"{type(error).__name__}: {str(error)[:200]}"
-                raise ValueError(f"Cannot read the statistics of {where} ({why}).") from error
+                raise ValueError(f"cannot read the statistics of {where} ({why})") from error
             return validate(_select(groups, dataset, str(where)), str(where))
     raise ValueError(
-        f"Cannot find statistics in {where}: it must be or contain one of {', '.join(_READERS)}."
+        f"cannot find statistics in {where}: it must be or contain one of {', '.join(_READERS)}"
     )
 
 
@@ -77,10 +77,10 @@ def _select(groups: Mapping[str, Stats], dataset: str, where: str) -> Stats:
     if not dataset and len(groups) == 1:
         return next(iter(groups.values()))
     if not groups:
-        raise ValueError(f"{where} has no statistics tensors.")
+        raise ValueError(f"{where} has no statistics tensors")
     if dataset not in groups:
         names = ", ".join(map(repr, sorted(groups)))
-        raise ValueError(f"dataset must be one of {names} for {where}, got {dataset!r}.")
+        raise ValueError(f"dataset must be one of {names} for {where}, got {dataset!r}")
     return groups[dataset]
 
 

@@ -64,7 +64,7 @@ def load_tokenizer(where: str | os.PathLike[str]) -> Tokenizer:
     files = [path] if path.is_file() else [*path.glob("tokenizer.json"), *path.glob("*.model")]
     for file in files:
         if file.is_file() and file.stat().st_size > TEXT_BYTES:
-            raise ValueError(f"{file} is not a tokenizer: it is larger than {TEXT_BYTES} bytes.")
+            raise ValueError(f"{file} is not a tokenizer: it is larger than {TEXT_BYTES} bytes")
         if file.is_file() and file.suffix in (".json", ".model"):
             return (TokenizersFile if file.suffix == ".json" else SentencePiece)(file)
-    raise ValueError(f"{where} contains neither tokenizer.json nor a SentencePiece .model file.")
+    raise ValueError(f"{where} contains neither tokenizer.json nor a SentencePiece .model file")

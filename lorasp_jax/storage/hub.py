@@ -57,7 +57,7 @@ def local(
     if "://" in name:
         if not BUCKET.fullmatch(name) or ".." in name.split("/"):
             raise ValueError(
-                f"A bucket URL must be gs://bucket/folder or s3://bucket/folder, got {name}."
+                f"a bucket URL must be gs://bucket/folder or s3://bucket/folder, got {name}"
             )
         return _from_bucket(name)
     for candidate in (path, shipped.ROOT / path) if _is_shipped(path) else (path,):
@@ -103,7 +103,7 @@ def is_remote(where: str | os.PathLike[str]) -> bool:
 
 def _from_hub(name: str, only: list[str] | None, repository: str) -> Path:
     if not REPOSITORY.fullmatch(name):
-        raise ValueError(f"A Hub repository must be {HUB}owner/name, got {HUB}{name}.")
+        raise ValueError(f"a Hub repository must be {HUB}owner/name, got {HUB}{name}")
     import huggingface_hub
     from huggingface_hub.errors import HfHubHTTPError
 
@@ -114,8 +114,8 @@ def _from_hub(name: str, only: list[str] | None, repository: str) -> Path:
         return Path(folder)
     except (OSError, ValueError, HfHubHTTPError) as error:
         raise ValueError(
-            f"Cannot download {HUB}{name}: not found, access denied, or no connection "
-            f"({_first_line(error)})."
+            f"cannot download {HUB}{name}: not found, access denied, or no connection "
+            f"({_first_line(error)})"
         ) from error
 
 
@@ -131,9 +131,9 @@ def _from_bucket(url: str) -> Path:
                 _copy(*fsspec.core.url_to_fs(url), target)
     except ImportError as error:  # fsspec's message names only the backend's package
         install = 'pip install "lorasp_jax[buckets]"'
-        raise ValueError(f"Cannot download {url}: a package is missing. Run {install}.") from error
+        raise ValueError(f"cannot download {url}: a package is missing (run {install})") from error
     except Exception as error:  # each backend raises its own errors
-        raise ValueError(f"Cannot download {url}: {_first_line(error)}.") from error
+        raise ValueError(f"cannot download {url}: {_first_line(error)}") from error
     return target
 
 

@@ -56,8 +56,8 @@ def _check_state_and_actions(first: Episodes, model: BackboneConfig, path: objec
         robot_slots(first.state.shape[-1] - 1, model.inputs)
     except ValueError as error:
         raise ValueError(
-            f"{path} does not fit the backbone: {error} Select entries with python -m "
-            "lorasp_jax.data convert --state-numbers and --action-numbers"
+            f"{path} does not fit the backbone: {error}; select entries with "
+            "python -m lorasp_jax.data convert --state-numbers and --action-numbers"
         ) from error
 
 

@@ -109,7 +109,7 @@ def load_policy(
     try:
         model = models.load(source, config)
     except ValueError as error:
-        hint = "" if is_full else f" (Pass base= if the base of {folder} has moved.)"
+        hint = "" if is_full else f"; pass base= if the base of {folder} has moved"
         raise ValueError(f"{error}{hint}") from error
     if not is_full:
         model = native.load_adapters(folder, model, any_base=any_base)
@@ -124,7 +124,7 @@ def _processor(policy: Mapping[str, Any], config: Any, words: str) -> Processor:
     try:
         loaded = tokenizer.load_tokenizer(words or hub.resolve_portable(policy["tokenizer"]))
     except ValueError as error:
-        raise ValueError(f"{error} (Pass words= if the policy's tokenizer has moved.)") from error
+        raise ValueError(f"{error}; pass words= if the policy's tokenizer has moved") from error
     prompts = PromptTable.of(loaded, policy["instructions"], config, num_joints=joints)
     if _prompts_digest(prompts) != policy["prompts"]:
         raise ValueError(

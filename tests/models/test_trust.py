@@ -43,7 +43,7 @@ def test_file_names_must_stay_in_the_folder(name, tmp_path):
     steps = [{"registry_name": "normalizer_processor", "state_file": name}]
     for pipeline in statistics_files.PIPELINES:
         (folder / pipeline).write_text(json.dumps({"steps": steps}))
-    with pytest.raises(ValueError, match=r"Cannot read the statistics of .*model"):
+    with pytest.raises(ValueError, match=r"cannot read the statistics of .*model"):
         statistics_files.read(folder)
 
 
@@ -62,7 +62,7 @@ def test_arrays_larger_than_their_files(tmp_path):
 def test_deeply_nested_json_and_huge_numbers(tmp_path):
     for text in ("[" * 100_000, '{"state_mean": [' + "9" * 400 + "]}"):
         (tmp_path / "statistics.json").write_text(text)
-        with pytest.raises(ValueError, match=r"Cannot read the statistics"):
+        with pytest.raises(ValueError, match=r"cannot read the statistics"):
             statistics_files.read(tmp_path)
         (tmp_path / "config.json").write_text("[" * 100_000)
         with pytest.raises(ValueError, match=r"config.json is damaged"):

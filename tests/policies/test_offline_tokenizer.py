@@ -42,7 +42,7 @@ def test_any_printable_ascii_text_encodes():
 
 @pytest.mark.parametrize("text", ["", "press the red button now or never", "drücke 按"])
 def test_text_that_cannot_be_encoded_raises(text):
-    with pytest.raises(ValueError, match=r"must have 1 to 4 tokens|Cannot encode"):
+    with pytest.raises(ValueError, match=r"must have 1 to 4 tokens|cannot encode"):
         tokenizer.encode([text], 4)
 
 

@@ -36,7 +36,7 @@ def test_select_reorders_instructions():
     state = jnp.zeros((2, 7))
     jax.tree.map(np.testing.assert_array_equal, table.select(TEXTS[::-1]), subset)
     assert (subset.encode(rows, state).ids != table.encode(rows, state).ids).any()
-    with pytest.raises(ValueError, match="The policy has no prompt for 'close the lid'"):
+    with pytest.raises(ValueError, match="the policy has no prompt for 'close the lid'"):
         table.select([TEXTS[0], "close the lid"])
 
 
@@ -87,5 +87,5 @@ def test_tokenizers_that_merge_numbers_are_rejected(merged, tmp_path):
 @pytest.mark.parametrize("config", [Pi0Config.nano(), dataclasses.replace(PI05, max_tokens=100)])
 def test_tokenizer_of_a_different_model(config):
     words = tokenizer.load_tokenizer(SMOLVLM)
-    with pytest.raises(ValueError, match=r"Token \d+ is beyond the backbone's vocabulary of 320"):
+    with pytest.raises(ValueError, match=r"token \d+ is beyond the backbone's vocabulary of 320"):
         PromptTable.of(words, ["press the red button"], config, num_joints=6)

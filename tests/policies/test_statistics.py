@@ -66,7 +66,7 @@ def test_json_may_have_only_moments():
 )
 def test_invalid_json_raises(change):
     content = {f"{k}_{n}": [0.0, 1.0] for k in ("state", "action") for n in NAMES[:2]}
-    with pytest.raises(ValueError, match="Statistics must be lists of"):
+    with pytest.raises(ValueError, match="statistics must be lists of"):
         Statistics.from_json(json.dumps({**content, **change} if change else {}))
 
 

@@ -38,9 +38,7 @@ def test_hub_errors_are_one_sentence(monkeypatch):
         raise LocalEntryNotFoundError("Got: no connection\nand a page of explanations")
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
-    with pytest.raises(
-        ValueError, match=r"Cannot download hf://a/b: .*no connection\)\.$"
-    ) as caught:
+    with pytest.raises(ValueError, match=r"cannot download hf://a/b: .*no connection\)$") as caught:
         hub.local("hf://a/b")
     assert "\n" not in str(caught.value)
 
@@ -56,7 +54,7 @@ def test_missing_folders_never_resolve_to_the_hub(name, tmp_path, monkeypatch, n
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match=f"{name} does not exist; .*, pass hf://{name}$"):
         hub.local(name)
-    with pytest.raises(ValueError, match="A Hub repository must be hf://owner/name, got"):
+    with pytest.raises(ValueError, match="a Hub repository must be hf://owner/name, got"):
         hub.local("hf://too/many/parts")
 
 
@@ -126,16 +124,14 @@ def test_bucket_is_downloaded_once(bucket, tmp_path):
 
 
 def test_unreadable_bucket(bucket, tmp_path, monkeypatch):
-    with pytest.raises(
-        ValueError, match=r"Cannot download .*models/no: .*no such file or folder\.$"
-    ):
+    with pytest.raises(ValueError, match=r"cannot download .*models/no: .*no such file or folder$"):
         hub.local("memory://models/no")
 
     def get_file(*_, **__):
         raise OSError("connection lost")
 
     monkeypatch.setattr(type(bucket), "get_file", get_file)
-    with pytest.raises(ValueError, match=r"Cannot download .*: OSError: connection lost\.$"):
+    with pytest.raises(ValueError, match=r"cannot download .*: OSError: connection lost$"):
         hub.local("memory://models/pi0")
     assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".")]
 
@@ -150,7 +146,7 @@ def test_unreadable_bucket(bucket, tmp_path, monkeypatch):
 )
 def test_other_urls_are_rejected(where, monkeypatch):
     monkeypatch.delattr("fsspec.core.url_to_fs")
-    with pytest.raises(ValueError, match="A bucket URL must be gs://bucket/folder or s3"):
+    with pytest.raises(ValueError, match="a bucket URL must be gs://bucket/folder or s3"):
         hub.local(where)
 
 

@@ -126,9 +126,7 @@ def test_the_error_for_a_missing_base_suggests_a_remedy(tmp_path, monkeypatch):
     run.base_hash = models.weights_hash("base")
     export.write(run)
     (tmp_path / "base").rename("moved")
-    message = (
-        rf"^{tmp_path / 'base'} does not exist.* \(Pass base= if the base of .*run has moved\.\)"
-    )
+    message = rf"^{tmp_path / 'base'} does not exist.*; pass base= if the base of .*run has moved$"
     with pytest.raises(ValueError, match=message):
         export.load_policy("run")
     assert export.load_policy("run", base="moved").model

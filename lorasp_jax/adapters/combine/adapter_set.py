@@ -160,7 +160,7 @@ class AdapterSet(Method):
         """
         if params["choice"].ndim > 1:
             raise ValueError(
-                "cannot merge adapters chosen per example: choose one for the whole batch first."
+                "cannot merge adapters chosen per example: choose one for the whole batch first"
             )
         base, bank = kernel.astype(jnp.float32), params["bank"]
         weights = dict(zip(self.names, params["choice"], strict=True))
@@ -176,7 +176,7 @@ class AdapterSet(Method):
             examples, rows = len(choice), x.shape[0] if x.ndim > 1 else 1
             if rows % examples:
                 raise ValueError(
-                    f"adapters were chosen for {examples} examples, but a layer got {rows} rows."
+                    f"adapters were chosen for {examples} examples, but a layer got {rows} rows"
                 )
             choice = jnp.repeat(choice, rows // examples, axis=0)
             choice = choice.reshape(rows, *(1 for _ in x.shape[1:-1]), -1)
@@ -204,7 +204,7 @@ def set_slot(bank: Params, slot: int, method: LoRA | None, params: Params) -> Pa
     capacity = bank["lora_a"].shape[-1]
     if rank > capacity:
         raise ValueError(
-            f"LoRA rank {rank} exceeds the maximum rank {capacity}: combine with a larger rank."
+            f"LoRA rank {rank} exceeds the maximum rank {capacity}: combine with a larger rank"
         )
     a, b = bank["lora_a"].at[..., slot, :].set(0), bank["lora_b"].at[..., slot, :, :].set(0)
     if method is not None:

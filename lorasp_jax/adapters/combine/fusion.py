@@ -51,7 +51,7 @@ def fuse(
         validate.size("rank", rank)
     if not isinstance(weights, Mapping) or not weights:
         raise ValueError(
-            f"weights must be a non-empty mapping from name to weight, got {short(weights)}."
+            f"weights must be a non-empty mapping from name to weight, got {short(weights)}"
         )
     named.weights(model, weights)  # raises for an unknown name or an invalid weight
     fused, errors = {}, {}
@@ -60,7 +60,7 @@ def fuse(
         for name, weight in weights.items():
             method, params = named.get_adapter(layer, name)
             if method is not None and type(method) is not LoRA:
-                raise ValueError(f"cannot fuse {name} at {path}: {method} is not plain LoRA.")
+                raise ValueError(f"cannot fuse {name} at {path}: {method} is not plain LoRA")
             if method is not None:
                 factors.append((params["lora_a"], weight * method.scale * params["lora_b"]))
         if factors:
@@ -87,12 +87,12 @@ def unmerge(merged: Model, adapted: nnx.Module) -> Model:
     """
     validate.with_values(merged)
     if named.adapter_sets(validate.with_values(adapted)):
-        raise ValueError("the adapted model is a combined model: extract one adapter first.")
+        raise ValueError("the adapted model is a combined model: extract one adapter first")
     adapters = named.single_adapters(adapted)
     values = {p.path: p.child.get_value() for p in paths.locate(nnx.List([adapted]), AdapterParam)}
     full_paths = [path for path in adaptation.methods(adapted) if path not in adapters]
     if has := adaptation.methods(merged):
-        raise ValueError(f"the merged model must have no adapters, but {min(has)} has one.")
+        raise ValueError(f"the merged model must have no adapters, but {min(has)} has one")
     root = nnx.List([nnx.merge(*adaptation.split(merged))])
 
     def unmerge_layer(location: paths.Location) -> AdaptedLayer | None:
@@ -106,10 +106,10 @@ def unmerge(merged: Model, adapted: nnx.Module) -> Model:
     modules = paths.locate(root, nnx.Module)
     paths.replace(modules, unmerge_layer)
     if missing := adapters.keys() - {location.path for location in modules}:
-        raise ValueError(f"the merged model has no layer {min(missing)}.")
+        raise ValueError(f"the merged model has no layer {min(missing)}")
     rules = [(f"^{re.escape(path)}$", FullFineTuning()) for path in full_paths]
     for i in set(range(len(rules))) - adaptation.unfreeze(root, rules):
-        raise ValueError(f"the merged model has no parameter {full_paths[i]}.")
+        raise ValueError(f"the merged model has no parameter {full_paths[i]}")
     for location in paths.locate(root, AdapterParam):
         if location.path in full_paths:
             location.child.set_value(values[location.path])
@@ -120,7 +120,7 @@ def _unmerged_layer(layer: nnx.Module, adapted: AdaptedLayer) -> AdaptedLayer:
     """Subtract the adapted layer's delta from the kernel and attach its adapter."""
     method, params = adapted.method_and_params()
     if not method.additive:
-        raise ValueError(f"{method} is not additive, so its merge cannot be undone.")
+        raise ValueError(f"{method} is not additive, so its merge cannot be undone")
     layer = nnx_layers.make_adaptable_like(layer, adapted)
     kernel = layer.kernel_matrices()
     delta = adaptation.over_stack(method.merge, kernel)(params, jnp.zeros(kernel.shape))

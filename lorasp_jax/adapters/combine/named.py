@@ -60,12 +60,12 @@ def combine(models: Mapping[str, Model], *, rank: int | None = None) -> Model:
         splits its kernel, or the rank of a LoRA exceeds `rank`.
     """
     if not isinstance(models, Mapping) or not models or not all(map(_is_text, models)):
-        raise ValueError("models must be a non-empty mapping from name (str) to model.")
+        raise ValueError("models must be a non-empty mapping from name (str) to model")
     for model in models.values():
         validate.with_values(model)
     if rank is not None and not (type(rank) is int and 0 <= rank <= MAX_SIZE):
         raise ValueError(
-            f"rank must be an integer from 0 to {MAX_SIZE}, or None, got {short(rank)}."
+            f"rank must be an integer from 0 to {MAX_SIZE}, or None, got {short(rank)}"
         )
     adapter_names = tuple(models)
     bases = {name: strip_adapters(model) for name, model in models.items()}
@@ -127,7 +127,7 @@ def weights(
     else:
         raise ValueError(
             "choice must be a name, a mapping from names to weights, None, or a list of these, got "
-            f"{short(choice)}."
+            f"{short(choice)}"
         )
     size = len(adapter_names)
     if (
@@ -138,7 +138,7 @@ def weights(
     ):
         raise ValueError(
             f"weights must be a floating-point array [{size}] or [B, {size}], got "
-            f"{array.dtype} {array.shape}."
+            f"{array.dtype} {array.shape}"
         )
     return jnp.asarray(array, jnp.float32)
 
@@ -151,7 +151,7 @@ def names(model: nnx.Module) -> tuple[str, ...]:
     """
     for location in adapter_sets(model):
         return location.child.method.names
-    raise ValueError("the model has no named adapters: combine models first.")
+    raise ValueError("the model has no named adapters: combine models first")
 
 
 def extract(model: Model, name: str | None) -> Model:
@@ -224,13 +224,13 @@ def swap(model: Model, name: str, other: nnx.Module) -> Model:
     model = nnx.clone(model)
     locations = adapter_sets(model)
     if extra := sorted(adapters.keys() - {location.path for location in locations}):
-        raise ValueError(f"{name} adapts {extra[0]}, but the combined model has no adapters there.")
+        raise ValueError(f"{name} adapts {extra[0]}, but the combined model has no adapters there")
     for path, _, _, layer in locations:
         method, params = adapters[path].method_and_params() if path in adapters else (None, None)
         value = dict(layer.adapter.params.get_value())
         if layer.method.methods[index] != (None if _fits_bank(method) else method):
             required = layer.method.methods[index] or "LoRA"
-            raise ValueError(f"{name} at {path} requires the method {required}, got {method}.")
+            raise ValueError(f"{name} at {path} requires the method {required}, got {method}")
         if _fits_bank(method):
             slot = layer.method.bank_names.index(name)
             value["bank"] = set_slot(value["bank"], slot, method, params)
@@ -254,7 +254,7 @@ def strip_adapters(model: Model) -> Model:
         if location.child.method.splits_kernel:
             raise ValueError(
                 f"the adapter of {location.path} split the kernel, so the original base is not "
-                "available: merge the adapter first."
+                "available: merge the adapter first"
             )
         return location.child.without_adapter()
 
@@ -269,11 +269,11 @@ def adapters_by_path(name: str, model: nnx.Module) -> AdaptedLayers:
       ValueError: base weights are trainable, or the model is already combined.
     """
     if adapter_sets(model):
-        raise ValueError(f"{name} is already a combined model: extract one adapter first.")
+        raise ValueError(f"{name} is already a combined model: extract one adapter first")
     layers = single_adapters(model)
     if extra := sorted(adaptation.methods(model).keys() - layers.keys()):
         raise ValueError(
-            f"{name} also trains the base weight {extra[0]}; only adapters can be combined."
+            f"{name} also trains the base weight {extra[0]}; only adapters can be combined"
         )
     return layers
 
@@ -290,7 +290,7 @@ def _check_same_base(first: nnx.Module, name: str, second: nnx.Module, other: st
     for path in params | other_params:
         a, b = params.get(path), other_params.get(path)
         if a is not b and (a is None or b is None or not _equal(a, b)):
-            raise ValueError(f"{name} and {other} have different bases, first at {path!r}.")
+            raise ValueError(f"{name} and {other} have different bases, first at {path!r}")
 
 
 def _parameters(model: nnx.Module) -> dict[str, Any]:
@@ -355,7 +355,7 @@ def _weight_row(adapter_names: tuple[str, ...], selection: Selection) -> list[fl
     for name, weight in chosen.items():
         if not isinstance(weight, numbers.Real) or not math.isfinite(weight):
             raise ValueError(
-                f"the weight of {short(name)} must be a finite number, got {short(weight)}."
+                f"the weight of {short(name)} must be a finite number, got {short(weight)}"
             )
         row[index_of(adapter_names, name)] = float(weight)
     return row
@@ -365,5 +365,5 @@ def index_of(adapter_names: tuple[str, ...], name: str) -> int:
     """Index of a name; raise ValueError with near misses if the name is unknown."""
     if name not in adapter_names:
         close = paths.near_misses(str(name), adapter_names)
-        raise ValueError(f"unknown adapter {short(name)}; the model has {close}.")
+        raise ValueError(f"unknown adapter {short(name)}; the model has {close}")
     return adapter_names.index(name)

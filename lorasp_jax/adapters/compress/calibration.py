@@ -134,26 +134,26 @@ def observe(
         called, its aux was not returned by `forward`, or it has a custom matmul or precision.
     """
     if not isinstance(batches, Iterable) or isinstance(batches, str | Mapping):
-        raise ValueError(f"batches must be an iterable of inputs, got {short(batches)}.")
+        raise ValueError(f"batches must be an iterable of inputs, got {short(batches)}")
     if not callable(forward):
-        raise ValueError(f"forward must be callable (model, batch), got {short(forward)}.")
+        raise ValueError(f"forward must be callable (model, batch), got {short(forward)}")
     step = _make_step(_make_observed(model, reports, references), forward)
     total: dict[str, Sums] = {}
     for batch in batches:
         for leaf in jax.tree.leaves(batch):
             if not isinstance(leaf, jax.Array | np.ndarray | np.generic | float | int):
-                raise ValueError(f"batch leaves must be arrays or numbers, got {short(leaf)}.")
+                raise ValueError(f"batch leaves must be arrays or numbers, got {short(leaf)}")
         _add(total, step(batch))
     if missing := sorted(reports.keys() - total.keys()):
         raise ValueError(
             f"no statistics for {paths.near_misses(missing[0], missing)}: every layer must be "
-            "called, and `forward` must return any aux that the model returns."
+            "called, and `forward` must return any aux that the model returns"
         )
     for path, sums in total.items():
         if not np.any(sums["tokens"]):
-            raise ValueError(f"the batches have no valid tokens for {path or 'the model'}.")
+            raise ValueError(f"the batches have no valid tokens for {path or 'the model'}")
         if not all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(sums)):
-            raise ValueError(f"activations of {path or 'the model'} are not finite.")
+            raise ValueError(f"activations of {path or 'the model'} are not finite")
     return total
 
 
@@ -243,7 +243,7 @@ def input_moments(
     reports = {path: second_moment for path in layer_paths if re.search(pattern, path)}
     if not reports:
         close = paths.near_misses(pattern, layer_paths) or "none"
-        raise ValueError(f"{short(pattern)} matches no dense layer or einsum; available: {close}.")
+        raise ValueError(f"{short(pattern)} matches no dense layer or einsum; available: {close}")
     sums_by_path = observe(model, batches, reports, forward)
     return {path: sums["moment"] for path, sums in sums_by_path.items()}
 

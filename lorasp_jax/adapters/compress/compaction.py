@@ -47,7 +47,7 @@ def lora_sp_layers(model: nnx.Module) -> dict[str, Any]:
     locations = paths.locate(nnx.List([validate.with_values(model)]), AdaptedLayer)
     layers = {p.path: p.child for p in locations if isinstance(p.child.method, BankMethod)}
     if not layers:
-        raise ValueError("the model has no LoRA-SP layers.")
+        raise ValueError("the model has no LoRA-SP layers")
     return layers
 
 

@@ -47,7 +47,7 @@ def distill(
       ValueError: rank is below 1, or the model has no LoRA-SP layers.
     """
     if rank is not None and not (type(rank) is int and rank >= 1):
-        raise ValueError(f"rank must be an integer of at least 1, or None, got {short(rank)}.")
+        raise ValueError(f"rank must be an integer of at least 1, or None, got {short(rank)}")
     layers = lora_sp_layers(model)
     sums = calibration.observe(model, batches, dict.fromkeys(layers, _regression_sums), forward)
     replacements: Replacements = {}

@@ -50,7 +50,7 @@ def prune(
       ValueError: tolerance is outside [0, 1), or the model has no LoRA-SP layers.
     """
     if not (isinstance(tolerance, numbers.Real) and 0 <= tolerance < 1):
-        raise ValueError(f"tolerance must be in [0, 1), got {short(tolerance)}.")
+        raise ValueError(f"tolerance must be in [0, 1), got {short(tolerance)}")
     layers = lora_sp_layers(model)
     sums = calibration.observe(model, batches, dict.fromkeys(layers, _usage), forward)
     replacements: Replacements = {}

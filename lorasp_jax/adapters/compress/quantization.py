@@ -79,7 +79,7 @@ def quantize(model: nnx.Module, rules: Sequence[tuple[str, Kind | None]]) -> Qua
             close = paths.near_misses(rule[0], [location.path for location in layers]) or "none"
             raise ValueError(
                 f"rule {short(rule[0])} applies to nothing; available dense layers and einsums: "
-                f"{close}."
+                f"{close}"
             )
     return QuantizationResult(root[0], errors)
 
@@ -95,9 +95,9 @@ def _quantize_layer(layer: nnx.Module, kind: Kind, shared: Shared) -> tuple[Adap
     layer = nnx_layers.make_adaptable(layer, {})
     variable, kernel = layer.kernel_variable(), layer.kernel_matrices()
     if isinstance(variable, AdapterParam):
-        raise ValueError("its kernel is trainable; only frozen kernels can be quantized.")
+        raise ValueError("its kernel is trainable; only frozen kernels can be quantized")
     if isinstance(kernel, QuantizedKernel):
-        raise ValueError("its kernel is already quantized.")
+        raise ValueError("its kernel is already quantized")
     key = id(variable), getattr(layer, "kernel_equation", ""), kind
     if key not in shared:
         quantized_kernel = quantize_kernel(kernel, kind)

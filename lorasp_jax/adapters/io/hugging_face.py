@@ -43,7 +43,7 @@ def dotted(path: str, index: tuple[int, ...]) -> str:
     """
     if index:
         raise ValueError(
-            f"{path} is a stack of layers: pass names=, a function (path, index) -> module name."
+            f"{path} is a stack of layers: pass names=, a function (path, index) -> module name"
         )
     return path.replace("/", ".")
 
@@ -51,17 +51,15 @@ def dotted(path: str, index: tuple[int, ...]) -> str:
 def checked_names(names: Names) -> Names:
     """Wrap `names` to raise ValueError for invalid and duplicate names."""
     if not callable(names):
-        raise ValueError(f"names must be callable (path, index) -> str, got {short(names)}.")
+        raise ValueError(f"names must be callable (path, index) -> str, got {short(names)}")
     layer_of: dict[str, tuple[str, tuple[int, ...]]] = {}
 
     def checked(path: str, index: tuple[int, ...]) -> str:
         name = names(path, index)
         if not isinstance(name, str) or not name:
-            raise ValueError(
-                f"names{(path, index)} must return a non-empty str, got {short(name)}."
-            )
+            raise ValueError(f"names{(path, index)} must return a non-empty str, got {short(name)}")
         if (first := layer_of.setdefault(name, (path, index))) != (path, index):
-            raise ValueError(f"names returns {short(name)} for both {first} and {(path, index)}.")
+            raise ValueError(f"names returns {short(name)} for both {first} and {(path, index)}")
         return name
 
     return checked
@@ -145,7 +143,7 @@ def match_folder(
         if not adapters:
             continue
         if len(adapters) < len(module_names):
-            raise ValueError(f"{folder} adapts only some layers of the stack {path}.")
+            raise ValueError(f"{folder} adapts only some layers of the stack {path}")
         for name, adapter in zip(module_names, adapters, strict=True):
             _check_fits(folder, name, adapter, d_in, d_out)
         scale, values[path] = _stacked(adapters, leading)
@@ -193,7 +191,7 @@ def save_peft(
     folder, names = validate.folder(folder), checked_names(names)
     validate.with_values(model)
     if not isinstance(base, str | None):
-        raise ValueError(f"base must be the base model's name (str), got {short(base)}.")
+        raise ValueError(f"base must be the base model's name (str), got {short(base)}")
     layers = _supported_layers(model)
     use_dora, lora_dropout = _common_settings([layer.method for layer in layers.values()])
     modules = {
@@ -224,7 +222,7 @@ def _supported_layers(model: nnx.Module) -> dict[str, AdaptedLayer]:
         if location.path in adapted:
             if isinstance(location.child, nnx_layers.LoRALayer):
                 raise ValueError(
-                    f"{location.path} is neither dense nor an einsum, so PEFT cannot store it."
+                    f"{location.path} is neither dense nor an einsum, so PEFT cannot store it"
                 )
             layers[location.path] = location.child
     return layers
@@ -235,11 +233,11 @@ def _common_settings(methods: Collection[Any]) -> tuple[bool, float]:
     use_dora = {isinstance(method, DoRA) for method in methods}
     rates = {dropout_rate(method) for method in methods}
     if len(use_dora) != 1:
-        raise ValueError("a PEFT folder needs at least one adapter and cannot mix LoRA and DoRA.")
+        raise ValueError("a PEFT folder needs at least one adapter and cannot mix LoRA and DoRA")
     if len(rates) != 1:
         raise ValueError(
             f"PEFT stores a single lora_dropout, but the adapters have {sorted(rates)}: set a "
-            "common rate with layer.method = dataclasses.replace(layer.method, dropout=0.1)."
+            "common rate with layer.method = dataclasses.replace(layer.method, dropout=0.1)"
         )
     return use_dora.pop(), rates.pop()
 
@@ -252,7 +250,7 @@ def _check_fits(folder: pathlib.Path, module: str, adapter: Adapter, d_in: int, 
     if (a, b, magnitude) != ((d_in, rank), (rank, d_out), (d_out,)):
         raise ValueError(
             f"{folder}: adapter shapes {a} and {b} of {module} do not match the {d_in}x{d_out} "
-            "kernel of the model."
+            "kernel of the model"
         )
 
 
@@ -261,11 +259,11 @@ def _check_used(
 ) -> None:
     """Raise ValueError if the folder has no modules, or some are missing from the model."""
     if not modules:
-        raise ValueError(f"{folder} contains no adapters.")
+        raise ValueError(f"{folder} contains no adapters")
     if unused:
         close = paths.near_misses(min(unused), candidates)
         raise ValueError(
-            f"{folder} adapts {short(min(unused))}, which the model lacks; the model has {close}."
+            f"{folder} adapts {short(min(unused))}, which the model lacks; the model has {close}"
         )
 
 
@@ -289,11 +287,11 @@ def _stacked(adapters: list[Adapter], leading: list[int]) -> tuple[float, Adapte
 def _is_supported(path: str, method: Any) -> bool:
     """Return True, or raise ValueError if PEFT does not support the method."""
     if not isinstance(method, LoRA | AdaLoRA):
-        raise ValueError(f"{path} uses {method.name}, which Hugging Face PEFT does not support.")
+        raise ValueError(f"{path} uses {method.name}, which Hugging Face PEFT does not support")
     if method.splits_kernel:
         raise ValueError(
             f"the adapter of {path} split the kernel, so it cannot be used with another base: "
-            "merge the adapter instead."
+            "merge the adapter instead"
         )
     return True
 

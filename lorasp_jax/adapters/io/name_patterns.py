@@ -40,7 +40,7 @@ def values_of(patterns: Mapping[str, Any], names: Collection[str], default: Any)
             ) from error
         if ways > MAX_WAYS:
             raise ValueError(
-                f"the pattern {pattern_text!r} could take too long to match {len(names)} names."
+                f"the pattern {pattern_text!r} could take too long to match {len(names)} names"
             )
     compiled = [(re.compile(pattern), value) for pattern, value in anchored.items()]
     values = {}
@@ -68,6 +68,6 @@ def _ways(tree: Iterable[tuple[Any, Any]], length: int) -> int:
                 ways_once, maximum = _ways(repeated, length), min(maximum, length)
                 ways *= sum(ways_once**times for times in range(minimum, maximum + 1)) or 1
             case name if name not in _ONE_WAY:
-                raise ValueError(f"a pattern with {name} is not supported.")
+                raise ValueError(f"a pattern with {name} is not supported")
         ways = min(ways, MAX_WAYS + 1)
     return ways

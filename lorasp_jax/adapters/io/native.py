@@ -62,11 +62,11 @@ def save_adapters(
     """
     folder, adapters = validate.folder(folder), nnx.state(validate.with_values(model), AdapterParam)
     if not isinstance(base, str):
-        raise ValueError(f"base must be the base model's name (str), got {short(base)}.")
+        raise ValueError(f"base must be the base model's name (str), got {short(base)}")
     tensors = {name: np.asarray(leaf) for name, leaf in _leaves_by_name(adapters).items()}
     if not tensors:
         raise ValueError(
-            "the model has no adapters to save; for a combined model, extract one first."
+            "the model has no adapters to save; for a combined model, extract one first"
         )
     data = safetensors.numpy.save(tensors)
     description = {
@@ -115,7 +115,7 @@ def load_adapters(
     if base is not None and description["base"] != base:
         raise ValueError(
             f"the adapter in {folder} was trained on base {description['base']!r}, not on "
-            f"{short(base)}."
+            f"{short(base)}"
         )
     saved_methods = _methods(description["methods"], folder)
     model_methods = {path: method.as_saved for path, method in adaptation.methods(model).items()}
@@ -126,7 +126,7 @@ def load_adapters(
             p for p in model_methods | saved_methods if model_methods.get(p) != saved_methods.get(p)
         )
         raise ValueError(
-            f"{folder} and the model have different adapters, first at {different[0]!r}."
+            f"{folder} and the model have different adapters, first at {different[0]!r}"
         )
     if not any_base:
         _check_weights(model, description["weights"], folder)
@@ -180,7 +180,7 @@ def _check_weights(model: nnx.Module, saved: Mapping[str, str], folder: pathlib.
         raise ValueError(
             f"the adapter in {folder} was trained on a different base: {len(changed)} of "
             f"{len(fingerprints)} arrays differ, first {changed[0]!r}; pass any_base=True to load "
-            "it anyway."
+            "it anyway"
         )
 
 
@@ -193,7 +193,7 @@ def _matched_leaves(
     """Leaves of the adapters by name; raise ValueError if names or shapes of tensors differ."""
     leaves = _leaves_by_name(adapters)
     if different := sorted(leaves.keys() ^ tensors.keys()):
-        raise ValueError(f"{folder} and the model have different tensors, first {different[0]!r}.")
+        raise ValueError(f"{folder} and the model have different tensors, first {different[0]!r}")
     expected = {name: leaf.shape for name, leaf in leaves.items()}
     saved = {name: tensor.shape for name, tensor in tensors.items()}
     for path, method in methods.items():
@@ -207,7 +207,7 @@ def _matched_leaves(
     for name, shape in expected.items():
         if saved[name] != shape:
             raise ValueError(
-                f"tensor {name!r} has shape {saved[name]} in {folder}, but {shape} in the model."
+                f"tensor {name!r} has shape {saved[name]} in {folder}, but {shape} in the model"
             )
     return leaves
 
@@ -230,9 +230,9 @@ def _checked_metadata(metadata: Any) -> dict[str, Any]:
     try:
         restored = json.loads(json.dumps(metadata, allow_nan=False))
     except (TypeError, ValueError, RecursionError) as error:
-        raise ValueError(f"metadata is not JSON-serializable: {error}.") from error
+        raise ValueError(f"metadata is not JSON-serializable: {error}") from error
     if not isinstance(metadata, Mapping) or restored.keys() != metadata.keys():
-        raise ValueError(f"metadata must be a dict with str keys, got {short(metadata)}.")
+        raise ValueError(f"metadata must be a dict with str keys, got {short(metadata)}")
     return restored
 
 
@@ -251,7 +251,7 @@ def read_bytes(path: pathlib.Path) -> bytes:
     """
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if (size := path.stat().st_size) > memory:
-        raise ValueError(f"{path} has {size} bytes, more than this machine's memory.")
+        raise ValueError(f"{path} has {size} bytes, more than this machine's memory")
     return path.read_bytes()
 
 
@@ -269,9 +269,9 @@ def read_tensors(path: pathlib.Path, data: bytes) -> dict[str, np.ndarray]:
         raise ValueError(f"{path} is damaged or not a safetensors file: {error}") from error
     for name, tensor in tensors.items():
         if not jnp.issubdtype(tensor.dtype, jnp.floating):
-            raise ValueError(f"tensor {name!r} in {path} is {tensor.dtype}, not floating point.")
+            raise ValueError(f"tensor {name!r} in {path} is {tensor.dtype}, not floating point")
         if not np.isfinite(tensor.astype(np.float32)).all():
-            raise ValueError(f"tensor {name!r} in {path} has non-finite values.")
+            raise ValueError(f"tensor {name!r} in {path} has non-finite values")
     return tensors
 
 
@@ -280,12 +280,12 @@ def _read(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     for name in (DESCRIPTION, TENSORS):
         if not (folder / name).is_file():
             raise ValueError(
-                f"{folder} has no {name}; an adapter folder needs {DESCRIPTION} and {TENSORS}."
+                f"{folder} has no {name}; an adapter folder needs {DESCRIPTION} and {TENSORS}"
             )
     data = read_bytes(folder / TENSORS)
     description = read_description(folder)
     if description["sha256"] != hashlib.sha256(data).hexdigest():
-        raise ValueError(f"{folder / TENSORS} is damaged, or does not belong to {DESCRIPTION}.")
+        raise ValueError(f"{folder / TENSORS} is damaged, or does not belong to {DESCRIPTION}")
     return description, read_tensors(folder / TENSORS, data)
 
 
@@ -311,5 +311,5 @@ def read_description(folder: pathlib.Path) -> dict[str, Any]:
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{path} is damaged or not an adapter description: {error}") from error
     if not supported:
-        raise ValueError(f"{path} is not a {FORMAT} of version {VERSION}.")
+        raise ValueError(f"{path} is not a {FORMAT} of version {VERSION}")
     return description

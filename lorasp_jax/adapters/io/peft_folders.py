@@ -52,9 +52,7 @@ def read_folder(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter
     """
     for name in (CONFIG, TENSORS):
         if not (folder / name).is_file():
-            raise ValueError(
-                f"{folder} has no {name}; a PEFT adapter needs {CONFIG} and {TENSORS}."
-            )
+            raise ValueError(f"{folder} has no {name}; a PEFT adapter needs {CONFIG} and {TENSORS}")
     try:
         config = json.loads(read_bytes(folder / CONFIG))
         kind = config["peft_type"]
@@ -72,7 +70,7 @@ def read_folder(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, Adapter
         ):
             full_values[match[1], match[3]] = tensor.astype(np.float32)
         else:
-            raise ValueError(f"{folder} has the unexpected tensor {short(name)}.")
+            raise ValueError(f"{folder} has the unexpected tensor {short(name)}")
     try:
         alphas = values_of(config.get("alpha_pattern") or {}, modules, config.get("lora_alpha"))
         imported = {
@@ -88,18 +86,18 @@ def _check_supported(folder: pathlib.Path, kind: object, config: Mapping[str, An
     """Raise ValueError if a PEFT config needs a feature that this project lacks."""
     if kind not in ("LORA", "ADALORA"):
         raise ValueError(
-            f"{folder} has peft_type {str(kind)[:40]}; only LORA and ADALORA are supported."
+            f"{folder} has peft_type {str(kind)[:40]}; only LORA and ADALORA are supported"
         )
     if enabled := [name for name in _UNSUPPORTED if config.get(name) not in _DISABLED]:
         raise ValueError(
             f"{folder} sets {enabled[0]} to {reprlib.repr(config[enabled[0]])}, which is not "
-            "supported: merge the adapter in PEFT (merge_and_unload), and load the result."
+            "supported: merge the adapter in PEFT (merge_and_unload), and load the result"
         )
     if (initialization := config.get("init_lora_weights")) not in _BASE_PRESERVING:
         raise ValueError(
             f"the adapter in {folder} was trained on the residual base of "
             f"{reprlib.repr(initialization)}: convert it to plain LoRA with PEFT's "
-            "path_initial_model_for_weight_conversion."
+            "path_initial_model_for_weight_conversion"
         )
 
 
@@ -115,12 +113,12 @@ def _from_peft(config: Mapping[str, Any], module: str, tensors: Adapter, alpha: 
     expected = {"lora_A", "lora_B"} | ({"lora_E"} if ada else set())
     expected |= {"lora_magnitude_vector"} if config.get("use_dora") else set()
     if missing := expected - tensors.keys():
-        raise ValueError(f"the adapter of {module} lacks {min(missing)}.")
+        raise ValueError(f"the adapter of {module} lacks {min(missing)}")
     if unexpected := tensors.keys() - expected:
-        raise ValueError(f"the adapter of {module} has an unexpected {min(unexpected)}.")
+        raise ValueError(f"the adapter of {module} has an unexpected {min(unexpected)}")
     a, b = tensors["lora_A"].T, tensors["lora_B"].T
     if not alpha or (ada and not config.get("init_r")):
-        raise ValueError(f"the adapter of {module} lacks lora_alpha or init_r for its scale.")
+        raise ValueError(f"the adapter of {module} lacks lora_alpha or init_r for its scale")
     if ada:
         scale = alpha / (config["init_r"] + _ADA_CONSTANT)
         a = a * tensors["lora_E"][:, 0]
@@ -128,7 +126,7 @@ def _from_peft(config: Mapping[str, Any], module: str, tensors: Adapter, alpha: 
         rank = a.shape[1]
         scale = alpha / (math.sqrt(rank) if config.get("use_rslora") else rank)
     if not math.isfinite(scale):
-        raise ValueError(f"the scale of the adapter of {module} must be finite, got {scale}.")
+        raise ValueError(f"the scale of the adapter of {module} must be finite, got {scale}")
     adapter = {"lora_a": a, "lora_b": b, "scale": np.float32(scale)}
     if "lora_magnitude_vector" in tensors:
         adapter["magnitude"] = tensors["lora_magnitude_vector"].reshape(-1)

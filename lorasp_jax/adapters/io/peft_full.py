@@ -48,16 +48,16 @@ def full_parameters(
         if not parts:
             continue
         if len(parts) < len(keys):
-            raise ValueError(f"{folder} has the {kind} of only some layers of the stack {module}.")
+            raise ValueError(f"{folder} has the {kind} of only some layers of the stack {module}")
         value = np.stack([_from_torch(part) if name == "kernel" else part for part in parts])
         rows = value.shape[1:] if name == "kernel" else (value[0].size,)
         shape = tuple(size[len(leading) :])
         if rows != (shape if name == "kernel" else (math.prod(shape),)):
-            raise ValueError(f"{path} has shape {rows} in {folder}, but {shape} in the model.")
+            raise ValueError(f"{path} has shape {rows} in {folder}, but {shape} in the model")
         values[path] = value.reshape(tuple(size))
     if unused:
         module, kind = min(unused)
-        raise ValueError(f"{folder} has the {kind} of {short(module)}, which the model lacks.")
+        raise ValueError(f"{folder} has the {kind} of {short(module)}, which the model lacks")
     return values
 
 
@@ -78,7 +78,7 @@ def check_biases(
     trained = modules if bias == "all" else set(modules) & set(adapted)
     if bias != "none" and trained and not any(kind == "bias" for _, kind in full):
         raise ValueError(
-            f"the adapter in {folder} was trained with bias {bias!r}, but has no bias tensors."
+            f"the adapter in {folder} was trained with bias {bias!r}, but has no bias tensors"
         )
 
 
@@ -139,7 +139,7 @@ def _parts(
     value, name = np.asarray(location.child.get_value(), np.float32), location.name
     dense = isinstance(location.parent, nnx.Linear | Dense)
     if name not in _TORCH_NAMES or (name == "kernel" and not dense):
-        raise ValueError(f"{location.path} is fully trained, but PEFT cannot store it.")
+        raise ValueError(f"{location.path} is fully trained, but PEFT cannot store it")
     parts = []
     for index in np.ndindex(*_stack(name, value.shape, matrices)):
         part = value[index]

@@ -66,7 +66,7 @@ class Axes(NamedTuple):
         if count < 0 or (count and "..." not in self.x):
             raise ValueError(
                 f"input with {ndim} axes does not match the equation "
-                f"{self.x},{self.kernel}->{self.y}."
+                f"{self.x},{self.kernel}->{self.y}"
             )
         dots = "".join(next(letters) for _ in range(count))
         return Axes(self.x.replace("...", dots), self.kernel, self.y.replace("...", dots))
@@ -87,7 +87,7 @@ def parse(equation: str) -> Axes:
     if not (unique and same_dots and kernel and x ^ y <= kernel <= x | y):
         raise ValueError(
             f"the einsum {short(equation)} cannot be adapted: it must be explicit, 'x,kernel->y', "
-            "with each axis in at least two of the three."
+            "with each axis in at least two of the three"
         )
     return axes
 
@@ -191,7 +191,7 @@ def _sizes(equation: str, x: jax.Array, kernel: Any) -> tuple[Axes, dict[str, in
         sizes = dict(zip(axes.kernel + axes.x, shape + x.shape, strict=True))
         if shape == tuple(sizes[c] for c in axes.kernel):
             return axes, sizes
-    raise ValueError(f"shapes {x.shape} and {shape} do not match the equation {equation!r}.")
+    raise ValueError(f"shapes {x.shape} and {shape} do not match the equation {equation!r}")
 
 
 def _order(equation: str, ndim: int) -> tuple[Axes, list[int]]:

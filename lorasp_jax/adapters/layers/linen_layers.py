@@ -111,10 +111,10 @@ def layer_call(module: nn.Module, einsums: nnx_layers.Einsums, args: Any, kwargs
     strings = [value for value in arguments if isinstance(value, str)]
     arrays = [value for value in arguments if isinstance(value, jax.Array | np.ndarray)]
     if equation is None and not strings:
-        raise ValueError(f"this {cls.__name__} was called without its equation.")
+        raise ValueError(f"this {cls.__name__} was called without its equation")
     if not arrays or not module.has_variable("params", name):
         lacks = f"parameter {name!r}" if arrays else "input"
-        raise ValueError(f"this {cls.__name__} has no {lacks}.")
+        raise ValueError(f"this {cls.__name__} has no {lacks}")
     return LayerCall(module, name, equation or strings[0], arrays[0])
 
 

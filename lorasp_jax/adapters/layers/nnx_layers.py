@@ -194,12 +194,12 @@ def lora_init(layer: Any, method: Method) -> Callable[[jax.Array, jax.Array], An
     if type(method) is not LoRA or method.splits_kernel or method.needs_statistics:
         raise ValueError(
             f"{type(layer).__name__} only supports LoRA whose initialization needs neither kernel "
-            f"nor data, got {method}: add a leading rule with such a LoRA or None for this layer."
+            f"nor data, got {method}: add a leading rule with such a LoRA or None for this layer"
         )
     if not isinstance(layer, nnx.Conv | linen.Conv):
         return method.init_table
     if layer.feature_group_count != 1 or layer.mask is not None:
-        raise ValueError("grouped and masked convolutions cannot be adapted.")
+        raise ValueError("grouped and masked convolutions cannot be adapted")
     return method.init
 
 
@@ -240,7 +240,7 @@ def make_adaptable_like(layer: Any, other: AdaptedLayer) -> AdaptedLayer:
     mixin, original = (Dense, nnx.Linear) if isinstance(other, Dense) else type(other).__bases__
     if not isinstance(layer, original):
         raise ValueError(
-            f"the layer must be of class {original.__name__}, got {type(layer).__name__}."
+            f"the layer must be of class {original.__name__}, got {type(layer).__name__}"
         )
     if mixin is Dense:
         return to_dense(layer)
@@ -264,10 +264,10 @@ def kernel_and_equation(layer: Any, known: type | None, einsums: Einsums) -> tup
     name, equation = describe_einsum({**EINSUMS, **einsums}[known], layer)
     if equation is None:
         raise ValueError(
-            f"the einsums function of {type(layer).__name__} must return an equation, got None."
+            f"the einsums function of {type(layer).__name__} must return an equation, got None"
         )
     if not isinstance(getattr(layer, name, None), nnx.Param):
-        raise ValueError(f"this {type(layer).__name__} has no parameter {name!r}.")
+        raise ValueError(f"this {type(layer).__name__} has no parameter {name!r}")
     einsum.parse(equation)
     return name, equation
 
@@ -278,7 +278,7 @@ def check_einsums(einsums: Any) -> None:
     if not all(isinstance(cls, type) and callable(describe) for cls, describe in pairs):
         raise ValueError(
             "einsums must map layer classes to functions layer -> (kernel name, equation), got "
-            f"{short(einsums)}."
+            f"{short(einsums)}"
         )
 
 
@@ -292,7 +292,7 @@ def describe_einsum(describe: Callable[[Any], Any], layer: Any) -> tuple[str, st
         ) from error
     if not isinstance(name, str) or not isinstance(equation, str | None):
         raise ValueError(
-            f"einsums functions must return (name, equation), got {short((name, equation))}."
+            f"einsums functions must return (name, equation), got {short((name, equation))}"
         )
     return name, equation
 
@@ -324,7 +324,7 @@ def check_settings(layer: Any) -> None:
     """Raise ValueError for settings that adapted layers do not support."""
     for name, defaults in _DEFAULT_SETTINGS.items():
         if getattr(layer, name, defaults[0]) not in defaults:
-            raise ValueError(f"{type(layer).__name__} with a custom {name} cannot be adapted.")
+            raise ValueError(f"{type(layer).__name__} with a custom {name} cannot be adapted")
 
 
 def to_dense(linear: Dense | nnx.Linear) -> Dense:
@@ -358,7 +358,7 @@ def _with_mixin(
     """
     names = ("adapter", "method", "kernel_name") + (("kernel_equation",) if equation else ())
     if taken := [name for name in names if hasattr(layer, name)]:
-        raise ValueError(f"{type(layer).__name__} already has an attribute {taken[0]!r}.")
+        raise ValueError(f"{type(layer).__name__} already has an attribute {taken[0]!r}")
     new = _with_class(layer, _mixed_class(mixin, type(layer)))
     new.adapter, new.method, new.kernel_name = nnx.data(None), None, name
     if equation:

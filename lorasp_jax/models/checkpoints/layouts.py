@@ -109,16 +109,16 @@ def to_ours(
     unexpected = theirs.keys() - {name for rule in rules for name in rule.theirs}
     for problem, names in (("lacks", missing), ("has unexpected leaves", sorted(unexpected))):
         if names:
-            raise ModelMismatchError(f"{source} {problem} {_abbreviate(names)}.")
+            raise ModelMismatchError(f"{source} {problem} {_abbreviate(names)}")
 
     def pop(name: str, shape: Shape) -> np.ndarray:
         array = np.asarray(theirs.pop(name))
         if array.shape != shape:
             raise ModelMismatchError(
-                f"{name} of {source} must have shape {shape}, got {array.shape}."
+                f"{name} of {source} must have shape {shape}, got {array.shape}"
             )
         if not jnp.issubdtype(array.dtype, jnp.floating) or not np.isfinite(array).all():
-            raise ValueError(f"{name} of {source} must be floating point and finite.")
+            raise ValueError(f"{name} of {source} must be floating point and finite")
         return array
 
     converted: dict[str, Any] = {}

@@ -71,7 +71,7 @@ class ModelFolder:
         except ModelMismatchError as error:
             if config is not None:
                 raise
-            raise ValueError(f"{error} {self._size_source()}") from error
+            raise ValueError(f"{error}; {self._size_source()}") from error
         if unused:
             _log.info("%s: skipped unused tensors %s", self.folder, ", ".join(unused))
         return model
@@ -81,10 +81,10 @@ class ModelFolder:
         if self.layout == "openpi":
             return (
                 "openpi checkpoints do not store model sizes, so those of the published pi0 were "
-                "used: pass a config."
+                "used: pass a config"
             )
         policy = self.fields["type"]
-        return f"The sizes come from {self.folder / native.CONFIG}, which has type {policy!r}."
+        return f"the sizes come from {self.folder / native.CONFIG}, which has type {policy!r}"
 
 
 def find(where: str | os.PathLike[str]) -> ModelFolder:
@@ -136,9 +136,9 @@ def _read_fields(folder: Path) -> dict[str, Any]:
     try:
         fields = json.loads(read_text(path)) if path.exists() else {}
     except (OSError, ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is damaged.") from error
+        raise ValueError(f"{path} is damaged") from error
     if not isinstance(fields, dict):
-        raise ValueError(f"{path} is damaged.")
+        raise ValueError(f"{path} is damaged")
     return fields
 
 
@@ -146,16 +146,16 @@ def _lerobot_config(folder: Path, fields: dict[str, Any]) -> BackboneConfig:
     config = folder / native.CONFIG
     if not fields and any(path.exists() for path in weight_files(folder)):
         raise ValueError(
-            f"{folder} contains weights, but no {config.name} with their sizes: pass a config."
+            f"{folder} contains weights, but no {config.name} with their sizes: pass a config"
         )
     if not fields:
         raise ValueError(
             f"{folder} contains no model: expected this project's or LeRobot's {config.name}, "
-            "or openpi's params/_METADATA."
+            "or openpi's params/_METADATA"
         )
     if "type" not in fields:
         raise ValueError(
-            f"{config} must have 'backbone' (this project) or 'type' (a LeRobot policy)."
+            f"{config} must have 'backbone' (this project) or 'type' (a LeRobot policy)"
         )
     return _parse_lerobot(lerobot_config.parse, folder, fields)
 
@@ -167,7 +167,7 @@ def _parse_lerobot(
         return parse(fields)
     except ValueError as error:
         raise ValueError(
-            f"{folder / native.CONFIG} does not match any backbone: {str(error).rstrip('.')}."
+            f"{folder / native.CONFIG} does not match any backbone: {str(error).rstrip('.')}"
         ) from error
 
 
@@ -176,11 +176,11 @@ def _require_same_heads(config: Any, folder: Path, fields: dict[str, Any]) -> No
     stored = _parse_lerobot(lerobot_config.parse_towers, folder, fields)
     if not isinstance(config, type(stored)):
         expected, actual = (type(c).__name__ for c in (stored, config))
-        raise ValueError(f"config must be a {expected} for the policy in {folder}, got {actual}.")
+        raise ValueError(f"config must be a {expected} for the policy in {folder}, got {actual}")
     for name in ("vision", "language", "action"):
         expected, actual = getattr(stored, name), getattr(config, name)
         if expected.kernel_sizes == actual.kernel_sizes and expected != actual:
             raise ValueError(
                 f"{folder} does not match the config: {name} must have the heads of {expected}, "
-                f"got {actual}."
+                f"got {actual}"
             )

@@ -78,14 +78,14 @@ def base_arrays(model: nnx.Module) -> dict[str, np.ndarray]:
     """
     if jax.tree.leaves(nnx.state(model, (AdapterParam, AdapterSetParam))):
         raise ValueError(
-            "saving needs a model without adapters: merge the adapters or save them separately."
+            "saving needs a model without adapters: merge the adapters or save them separately"
         )
     if is_quantized(model):
-        raise ValueError("saving needs unquantized kernels: save the base before quantizing.")
+        raise ValueError("saving needs unquantized kernels: save the base before quantizing")
     arrays = named_arrays(model)
     expected = _shapes(named_arrays(nnx.eval_shape(lambda: model.config.create(nnx.Rngs(0)))))
     if mismatched := sorted(expected.items() ^ _shapes(arrays).items()):
-        raise ValueError(f"the model does not match its config: see {mismatched[0][0]}.")
+        raise ValueError(f"the model does not match its config: see {mismatched[0][0]}")
     return {name: np.asarray(leaf) for name, leaf in arrays.items()}
 
 
@@ -119,11 +119,11 @@ def load_native(folder: Folder, config: Any = None) -> Any:
     stored = _config(folder, description)
     config = config or stored
     if type(config) is not type(stored) or _saved_fields(config) != _saved_fields(stored):
-        raise ValueError(f"{folder} does not match the config: {_difference(stored, config)}.")
+        raise ValueError(f"{folder} does not match the config: {_difference(stored, config)}")
     arrays = TensorFiles(weight_files(folder))
     if _digest(description, arrays) != description["sha256"]:  # before allocating the model
         raise ValueError(
-            f"{folder} is damaged: its weights and config do not match the hash in {CONFIG}."
+            f"{folder} is damaged: its weights and config do not match the hash in {CONFIG}"
         )
     model = nnx.eval_shape(lambda: config.create(nnx.Rngs(0)))
     try:
@@ -159,12 +159,12 @@ def set_arrays(model: Model, arrays: Mapping[str, Any]) -> Model:
         ("unexpected", arrays.keys() - expected.keys()),
     ):
         if names:
-            raise ValueError(f"{problem} arrays: {', '.join(sorted(names))}.")
+            raise ValueError(f"{problem} arrays: {', '.join(sorted(names))}")
     values = []
     for name, leaf in expected.items():
         array = arrays[name]  # may read from disk, so access it once
         if array.shape != leaf.shape:
-            raise ValueError(f"{name} must have shape {leaf.shape}, got {array.shape}.")
+            raise ValueError(f"{name} must have shape {leaf.shape}, got {array.shape}")
         values.append(jnp.asarray(array, leaf.dtype))
         del array  # free it before reading the next one
     graphdef, parameters, rest = nnx.split(model, nnx.Param, ...)
@@ -244,12 +244,12 @@ def _difference(stored: Any, config: Any) -> str:
 
 
 def _description(folder: pathlib.Path) -> dict[str, Any]:
-    invalid = f"{folder / CONFIG} is damaged or was not written by this project."
+    invalid = f"{folder / CONFIG} is damaged or was not written by this project"
     try:
         description = json.loads(read_text(folder / CONFIG))
         valid = isinstance(description["config"], dict) and isinstance(description["sha256"], str)
     except FileNotFoundError as error:
-        raise ValueError(f"{folder} contains no model: {CONFIG} is missing.") from error
+        raise ValueError(f"{folder} contains no model: {CONFIG} is missing") from error
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(invalid) from error
     if not valid:
@@ -261,4 +261,4 @@ def _config(folder: pathlib.Path, description: Mapping[str, Any]) -> Any:
     try:
         return backbone.find(description["backbone"]).from_dict(description["config"])
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{folder / CONFIG} does not describe a supported backbone.") from error
+        raise ValueError(f"{folder / CONFIG} does not describe a supported backbone") from error

@@ -27,7 +27,7 @@ def check(folder: Path) -> None:
         size = path.stat().st_size
         check_memory(size, path)
         if path.name == MANIFEST and size > TEXT_BYTES:
-            raise RefusedError(f"{path} must have at most {TEXT_BYTES} bytes, got {size}.")
+            raise RefusedError(f"{path} must have at most {TEXT_BYTES} bytes, got {size}")
 
 
 def suppress_repeated_errors() -> None:

@@ -99,10 +99,10 @@ def save(folder: Path, model: Any, layout: str, dtypes: Mapping[str, Any] | None
     published_names = _published_names(model.config)
     if layout not in published_names.LAYOUTS:
         choices = ", ".join(published_names.LAYOUTS)
-        raise ValueError(f"layout must be one of {choices}, got {layout!r}.")
+        raise ValueError(f"layout must be one of {choices}, got {layout!r}")
     target = folder / ("params" if layout == "openpi" else SINGLE)
     if target.exists():
-        raise ValueError(f"{target} already exists: choose another folder.")
+        raise ValueError(f"{target} already exists: choose another folder")
     rules = published_names.LAYOUTS[layout](model.config)
     theirs = layouts.to_theirs(rules, base_arrays(model))
     if dtypes is not None:
@@ -141,7 +141,7 @@ def _open(folder: Path, lerobot_name: Callable[[str], str]) -> tuple[str, Mutabl
     if not ((folder / INDEX).exists() or files[0].exists()):
         raise ValueError(
             f"{folder} contains neither an openpi Orbax checkpoint (params/_METADATA) nor "
-            f"LeRobot safetensors ({SINGLE})."
+            f"LeRobot safetensors ({SINGLE})"
         )
 
     def rename(name: str) -> str:
@@ -169,7 +169,7 @@ def _restore(folder: Path) -> dict[str, np.ndarray]:
         as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), tree)
         restored = checkpointer.restore(folder.absolute(), restore_args=as_numpy)
     except Exception as error:  # Orbax and its C++ layer raise many exception types
-        raise ValueError(f"{folder} is damaged or not an Orbax checkpoint.") from error
+        raise ValueError(f"{folder} is damaged or not an Orbax checkpoint") from error
     return {
         name.removeprefix("params/").removesuffix("/value"): leaf
         for name, leaf in by_path(restored).items()
@@ -184,4 +184,4 @@ def _check_size(folder: Path, tree: Any) -> None:
     array_bytes = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
     file_bytes = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     if array_bytes > max(_UNCHECKED_BYTES, _MAX_COMPRESSION * file_bytes):
-        raise ValueError(f"files of {file_bytes} bytes cannot hold arrays of {array_bytes} bytes.")
+        raise ValueError(f"files of {file_bytes} bytes cannot hold arrays of {array_bytes} bytes")

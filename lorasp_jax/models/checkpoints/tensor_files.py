@@ -28,7 +28,7 @@ def weight_files(folder: Path) -> list[Path]:
         weight_map = json.loads(read_text(index))["weight_map"]
         names = sorted(set(weight_map.values()))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{index} is damaged.") from error
+        raise ValueError(f"{index} is damaged") from error
     return [path_beside(index, name) for name in names]
 
 
@@ -52,15 +52,15 @@ class TensorFiles(MutableMapping[str, np.ndarray]):
                     raise OSError("not a regular file")
                 file = safetensors.safe_open(path, framework="np")
             except FileNotFoundError as error:
-                raise ValueError(f"{path.parent} lacks {path.name}.") from error
+                raise ValueError(f"{path.parent} lacks {path.name}") from error
             except (OSError, safetensors.SafetensorError) as error:
-                raise ValueError(f"{path} is damaged or truncated.") from error
+                raise ValueError(f"{path} is damaged or truncated") from error
             for stored in file.keys():  # noqa: SIM118, safe_open is not iterable
                 name = rename(stored)
                 if name in self._tensors:
                     other = self._tensors[name][1]
                     raise ValueError(
-                        f"{path} has the same tensor under two names, {other} and {stored}."
+                        f"{path} has the same tensor under two names, {other} and {stored}"
                     )
                 self._tensors[name] = file, stored
 

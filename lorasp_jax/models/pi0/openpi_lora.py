@@ -50,7 +50,7 @@ def attach(model: Any, leaves: Mapping[str, np.ndarray], *, scale: float = 1.0) 
         ValueError: leaves are missing, unexpected or wrongly shaped.
     """
     if not leaves:
-        raise ValueError("leaves must contain LoRA weights of openpi, got none.")
+        raise ValueError("leaves must contain LoRA weights of openpi, got none")
     pairs, remaining = {}, dict(leaves)
     for tower, suffix in _TOWERS.items():
         if any(f"einsum{suffix}/lora_" in name for name in leaves):
@@ -58,7 +58,7 @@ def attach(model: Any, leaves: Mapping[str, np.ndarray], *, scale: float = 1.0) 
                 remaining, getattr(model.config, tower), f"{tower}/blocks", suffix
             )
     if remaining:
-        raise ValueError(f"openpi's LoRA has unexpected leaves {', '.join(sorted(remaining)[:8])}.")
+        raise ValueError(f"openpi's LoRA has unexpected leaves {', '.join(sorted(remaining)[:8])}")
     model = nnx.clone(model)
     for path, (a, b) in pairs.items():
         tower, _, name = path.split("/")
@@ -102,14 +102,14 @@ def _pop_pair(leaves: dict[str, np.ndarray], prefix: str, kernel: tuple[int, ...
     names = f"{prefix}lora_a", f"{prefix}lora_b"
     for name in names:
         if name not in leaves:
-            raise ValueError(f"openpi's LoRA lacks {name}.")
+            raise ValueError(f"openpi's LoRA lacks {name}")
     a, b = (leaves.pop(name) for name in names)
     *outer, d_in, d_out = kernel
     rank = a.shape[-1] if a.ndim else 0
     if (a.shape, b.shape) != ((*outer, d_in, rank), (*outer, rank, d_out)):
         raise ModelMismatchError(
             f"{names[0]} and lora_b must fit the model's kernel shape {kernel}, "
-            f"got shapes {a.shape} and {b.shape}."
+            f"got shapes {a.shape} and {b.shape}"
         )
     return a, b
 

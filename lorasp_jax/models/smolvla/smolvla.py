@@ -45,7 +45,7 @@ class SmolVLAConfig(BackboneConfig):
         if self.action.depth % 2:
             raise ValueError(
                 "depth must be even, because self- and cross-attention alternate; "
-                f"got {self.action.depth}."
+                f"got {self.action.depth}"
             )
 
     def create(self, rngs: nnx.Rngs) -> SmolVLA:

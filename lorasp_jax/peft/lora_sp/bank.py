@@ -29,7 +29,7 @@ def init_bank(key: jax.Array, v: jax.Array, d_out: int, *, normalized: bool) -> 
     if rank > max(d_in, d_out):
         raise ValueError(
             f"a normalized bank needs rank <= max(I, O), got rank {rank} for a kernel "
-            f"[{d_in}, {d_out}]."
+            f"[{d_in}, {d_out}]"
         )
     return {"u": jax.random.normal(key, (rank, d_out)), "v": v, "gain": jnp.zeros(())}
 
@@ -95,7 +95,7 @@ class BankMethod(Method):
         super().__post_init__()
         exact_ratio(self.energy_target)
         if self.rank < 1:
-            raise ValueError(f"rank must be at least 1, got {self.rank}.")
+            raise ValueError(f"rank must be at least 1, got {self.rank}")
 
     @property
     def scale(self) -> float:
@@ -137,5 +137,5 @@ class BankMethod(Method):
         del params, kernel
         raise ValueError(
             "LoRA-SP chooses its directions per input and cannot be merged into the kernel; "
-            "distill it into a LoRA first."
+            "distill it into a LoRA first"
         )

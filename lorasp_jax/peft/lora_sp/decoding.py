@@ -39,7 +39,7 @@ def prepare(method: LoRASP, params: Params, dtype: jax.typing.DTypeLike) -> Deco
     """
     if (method.granularity, method.schedule) != ("token", None):
         raise ValueError(
-            f"decoding single tokens needs granularity 'token' and no schedule, got {method}."
+            f"decoding single tokens needs granularity 'token' and no schedule, got {method}"
         )
     bank = normalized_bank(params["bank"]) if method.normalized_bank else params["bank"]
     router = dict(params["router"])
@@ -69,7 +69,7 @@ def decode(
     if not 1 <= capacity <= method.rank or x.ndim != 1:
         raise ValueError(
             f"decode needs a single token [I] and a capacity of 1 to {method.rank}, got "
-            f"{list(x.shape)} and {capacity}."
+            f"{list(x.shape)} and {capacity}"
         )
     scores, _ = router_scores(params.router, x @ params.w1, method.router)
     mask, _, energy = energy_gate(scores, method.energy_target)

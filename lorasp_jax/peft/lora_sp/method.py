@@ -72,7 +72,7 @@ class LoRASP(BankMethod):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.hidden_width < 1:
-            raise ValueError(f"hidden_width must be at least 1, got {self.hidden_width}.")
+            raise ValueError(f"hidden_width must be at least 1, got {self.hidden_width}")
 
     @classmethod
     def paper(cls, *, rank: int = 128, energy_target: float = 0.9) -> "LoRASP":

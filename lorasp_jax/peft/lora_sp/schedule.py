@@ -40,7 +40,7 @@ class EnergySchedule:
         _fields.check_fields(self, "schedule.")
         for name in ("start", "share"):
             if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"schedule.{name} must be in (0, 1], got {getattr(self, name)}.")
+                raise ValueError(f"schedule.{name} must be in (0, 1], got {getattr(self, name)}")
 
     def target(self, progress: jax.Array, end: float) -> jax.Array:
         """η at the given progress, f32 [].

@@ -51,7 +51,7 @@ def test_the_first_match_wins():
 def test_catastrophic_patterns_are_rejected(pattern):
     names = [f"{'a' * 250}{i}" for i in range(20)]
     with pytest.raises(
-        ValueError, match=r"^the pattern '.* could take too long to match 20 names\.$"
+        ValueError, match=r"^the pattern '.* could take too long to match 20 names$"
     ):
         values_of({pattern: True}, names, default=False)
 

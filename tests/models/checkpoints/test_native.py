@@ -87,7 +87,7 @@ def test_wrong_sizes_raise(folder):
     other = dataclasses.replace(CONFIG, image_size=64)
     with pytest.raises(
         ValueError,
-        match=r"does not match the config: image_size is 32 in the folder, 64 in the config\.$",
+        match=r"does not match the config: image_size is 32 in the folder, 64 in the config$",
     ):
         models.load(folder, other)
 
@@ -127,5 +127,5 @@ def test_set_arrays_lists_missing_and_unexpected_arrays(model):
     with pytest.raises(ValueError, match="missing arrays: action/blocks/down_proj/kernel, "):
         models.set_arrays(model, {})
     arrays = native.named_arrays(model)
-    with pytest.raises(ValueError, match=r"unexpected arrays: lm_head\.$"):
+    with pytest.raises(ValueError, match=r"unexpected arrays: lm_head$"):
         models.set_arrays(model, {**arrays, "lm_head": np.zeros(1)})
