@@ -56,7 +56,7 @@ def test_rules(rules, message):
     ],
 )
 def test_rngs(rngs, given):
-    with pytest.raises(ValueError, match=re.escape(f"such as nnx.Rngs(0), got {given}.")):
+    with pytest.raises(ValueError, match=re.escape(f"such as nnx.Rngs(0), got {given}")):
         lorasp_jax.adapt(NET, [("inp", METHOD)], rngs=rngs)
 
 
@@ -129,10 +129,10 @@ def check_error(call, message):
         (lambda: dense(X, KERNEL, 5), "bias must be an array [4], got 5"),
         (lambda: dense(X, KERNEL, None, {}), "params and method must be given together"),
         (lambda: dense(X, KERNEL, None, None, METHOD), "params and method must be given together"),
-        (lambda: dense(X, KERNEL, None, {"a": 1}, METHOD), "needs lora_a [5, 2], got None"),
+        (lambda: dense(X, KERNEL, None, {"a": 1}, METHOD), "needs lora_a [5, 2], got none"),
         (
             lambda: dense(X, KERNEL, None, METHOD.init(KEY, jnp.ones((3, 4)))[0], METHOD),
-            "lora for a kernel [5, 4] needs lora_a [5, 2], got (3, 2)",
+            "lora for a kernel [5, 4] needs lora_a [5, 2], got [3, 2]",
         ),
         (lambda: dense(X, KERNEL, token_mask=[True, True]), "must be bool [2], got list [2]"),
         *[

@@ -114,11 +114,13 @@ def collect(
     Episodes are padded to the expert's time limit.
 
     Args:
-        task, robot: as in `envs.make`.
+        task: name of the task.
+        robot: robot, its name, or the path of an MJCF file.
         num_episodes: number of episodes E to return.
         key: source of all randomness; the same key gives the same episodes.
         num_envs: number of worlds W simulated at once; None: chosen by device.
-        action_noise, ranges: as in `rollout`.
+        action_noise: as in `rollout`.
+        ranges: as in `rollout`.
         progress: called with (episodes so far, num_episodes), first with 0 before compilation.
         record: function that attempts an episode in every world; default: the expert in simulation.
         **options: further options of `envs.make`; the backend defaults to jax.

@@ -76,7 +76,7 @@ def test_incompatible_datasets_are_refused_early(changes, model, sentence, tmp_p
         ({"actions": "delta_joint"}, "has delta_joint actions, but policies learn joint"),
         (
             dict.fromkeys(("state", "action"), np.zeros((3, 9, 14), np.float32)),
-            "1 to 7 for this backbone, got 13. Select entries with .* --state-numbers",
+            "1 to 7 for this backbone, got 13; select entries with .* --state-numbers",
         ),
     ],
 )

@@ -186,12 +186,12 @@ BROKEN = {
     "lost frame": (lambda f: edit_rows(f, lambda t: t.slice(1)), "must have frames 0 to 24"),
     "unknown task": (
         lambda f: edit_rows(f, lambda t: replaced(t, "task_index", pa.array([7] * len(t)))),
-        r"one task, listed in meta, got task indices \[7\]",
+        r"exactly one task, listed in meta/tasks, got task indices \[7\]",
     ),
     "version": (lambda f: edit_info(f, lambda i: i.update(codebase_version="v1.6")), "'v1.6'"),
     "count": (
         lambda f: edit_info(f, lambda i: i.update(total_frames=125)),
-        "total_frames 126 .* got 125",
+        "total_frames 125, but the dataset lists 126",
     ),
     "cut parquet": (lambda f: cut(f / "data", "*.parquet", 0.7), "parquet is damaged"),
     "cut json": (lambda f: cut(f, "info.json", 0.7), "info.json is damaged"),

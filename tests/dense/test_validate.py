@@ -50,9 +50,9 @@ def with_kernel(value):
         # The scale α/R would be that of a different rank.
         (
             lambda: LoRA(rank=3, alpha=2.0).apply(PARAMS, X, KERNEL),
-            "lora for a kernel [5, 4] needs lora_a [5, 3], got (5, 2)",
+            "lora for a kernel [5, 4] needs lora_a [5, 3], got [5, 2]",
         ),
-        (lambda: LoRA(rank=3).delta(PARAMS, X), "needs lora_a [5, 3], got (5, 2)"),
+        (lambda: LoRA(rank=3).delta(PARAMS, X), "needs lora_a [5, 3], got [5, 2]"),
         (lambda: METHOD.delta(PARAMS, [1.0]), "a floating-point array [...tokens, I], got list"),
         # A mask of length 1 would broadcast to three tokens.
         (

@@ -129,7 +129,7 @@ def test_saving_requires_a_matching_config(layout, tmp_path):
 
 UNRELATED_CONFIGS = [
     ({"architectures": ["SmolVLMForConditionalGeneration"]}, "must have 'backbone'"),
-    ({"type": "pi0"}, r"lacks .* The sizes come from .*config\.json, which has type 'pi0'"),
+    ({"type": "pi0"}, r"lacks .*; the sizes come from .*config\.json, which has type 'pi0'"),
     ({"type": "smolvla", "num_vlm_layers": "x"}, "depth must be an integer from 1 to 1000"),
     ({"type": "smolvla", "num_vlm_layers": 1e30}, "depth must be an integer from 1 to 1000"),
     ({"type": "smolvla", "num_vlm_layers": 10**9}, "depth must be an integer from 1 to 1000"),

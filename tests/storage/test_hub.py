@@ -156,6 +156,6 @@ def test_a_missing_package_names_the_extra(monkeypatch):
 
     monkeypatch.setattr("fsspec.core.url_to_fs", url_to_fs)
     with pytest.raises(
-        ValueError, match=r'package is missing. Run pip install "lorasp_jax\[buckets\]"'
+        ValueError, match=r'package is missing \(run pip install "lorasp_jax\[buckets\]"\)'
     ):
         hub.local("gs://openpi-assets/no-such")

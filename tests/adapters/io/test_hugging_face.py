@@ -227,7 +227,7 @@ def test_attention_with_head_axes_and_user_defined_einsums(tmp_path):
     for name, value in theirs.items():
         np.testing.assert_array_equal(ours[name], value)
     with pytest.raises(
-        ValueError, match=r"'model.head', which the model lacks; the model has model$"
+        ValueError, match=r"'model.head', which the model lacks; the model has model\."
     ):
         hugging_face.load_peft(tmp_path, base, names=torch_names)
 

@@ -232,7 +232,7 @@ def test_pruned_directions_are_scored_but_inactive(x):
     assert aux.usage.shape == (12,)
     np.testing.assert_allclose(aux.kept_energy, 8 / 12, atol=0.05)
     router = params["router"] | {"b2": params["router"]["b2"][:10]}
-    with pytest.raises(ValueError, match=r"needs router/b2 \[12\], got \(10,\)"):
+    with pytest.raises(ValueError, match=r"needs router/b2 \[12\], got \[10\]"):
         method.apply({"bank": bank, "router": router}, x, jnp.ones((D_IN, D_OUT)))
 
 
