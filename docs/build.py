@@ -22,6 +22,7 @@ API = {
     "data": ["lorasp_jax.data"],
     "training": ["lorasp_jax.training", "lorasp_jax.config"],
     "evaluation": ["lorasp_jax.evaluation"],
+    "study": ["lorasp_jax.study"],
     "envs": [
         "envs",
         "envs.mjcf",

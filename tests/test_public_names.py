@@ -31,6 +31,7 @@ PUBLIC = {
     "lorasp_jax.data": "Stream cache open_source",
     "lorasp_jax.training": "load_policy",
     "lorasp_jax.evaluation": "Result evaluate make_rollout",
+    "lorasp_jax.study": "Cell Derived Study",
     "envs": """
         Env Episodes Randomization State Trajectory collect compilation expert_success interop
         make mjcf rlds robots
