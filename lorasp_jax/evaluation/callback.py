@@ -34,8 +34,9 @@ class Evaluation(Callback):
     """Evaluates every task of a run before, during and after training.
 
     The first evaluation measures the base, since new adapters leave its outputs unchanged. The
-    final evaluation uses other layouts than the earlier ones. All evaluations of a task share one
-    compilation. Videos are rendered in the background during training, in the foreground after it.
+    final evaluation uses other layouts than the earlier ones; both depend only on the seed and the
+    task. All evaluations of a task share one compilation. Videos are rendered in the background
+    during training, in the foreground after it.
     """
 
     def __init__(
@@ -119,8 +120,9 @@ class Evaluation(Callback):
     ) -> Result:
         episodes = episodes or run.config.evaluation.episodes
         bar = progress.add_task(f"compiling the evaluation of {task} ...", total=episodes)
-        number = 2 * run.config.tasks.index(task) + (when == "after")
-        key = RandomStream.EVALUATION.key(run.config.seed, number)
+        final = when == "after"
+        stream = RandomStream.FINAL_EVALUATION if final else RandomStream.EVALUATION
+        key = stream.key(run.config.seed, task)
         with contextlib.ExitStack() as compiles:
             if task not in self._rollouts:
                 what = f"the evaluation of {task} (including its first episodes)"

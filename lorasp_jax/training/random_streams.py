@@ -1,8 +1,10 @@
 """Random streams of a run, with independent keys derived from the run's seed."""
 
 import enum
+import zlib
 
 import jax
+import numpy as np
 
 
 @enum.unique
@@ -15,8 +17,11 @@ class RandomStream(enum.IntEnum):
     BASE = 4
     STATISTICS = 5
     EVALUATION = 10
-    """Must stay the largest value: evaluation n uses 10 + n."""
+    """Evaluations before and during training."""
+    FINAL_EVALUATION = 11
 
-    def key(self, seed: int, number: int = 0) -> jax.Array:
-        """Return the key of the stream; `number` is the index of an evaluation, 0 otherwise."""
-        return jax.random.fold_in(jax.random.key(seed), self + number)
+    def key(self, seed: int, name: str = "") -> jax.Array:
+        """Return the key of the stream, or of its part `name`, such as a task."""
+        key = jax.random.fold_in(jax.random.key(seed), self)
+        # Python's hash of a string differs between processes.
+        return jax.random.fold_in(key, np.uint32(zlib.crc32(name.encode()))) if name else key

@@ -66,3 +66,22 @@ def test_evaluation_can_be_disabled(run):
     settings = dataclasses.replace(run.config.evaluation, every=0)
     run.config = dataclasses.replace(run.config, evaluation=settings)
     assert evaluation.on_log(run, 40, {}) == {}
+
+
+def test_a_task_has_the_same_layouts_in_single_and_multi_task_runs(run):
+    keys = []
+
+    def evaluate(policy, env, key, episodes, **_):
+        keys.append((env, key))
+        return Result(0.5, episodes, (0.4, 0.6), 30.0, {}, {}, poses=())
+
+    for tasks in (run.config.tasks, run.config.tasks[1:]):
+        run.config = dataclasses.replace(run.config, tasks=tasks)
+        evaluation = Evaluation(lambda _, task: (task, None), evaluate)
+        for when in ("before", "at step 100", "after"):
+            evaluation._evaluate_tasks(run, when)
+    pick_place = [key for task, key in keys if task == "pick_place"]
+    before, during, after = pick_place[:3]
+    assert before == during != after
+    assert pick_place[3:] == [before, during, after]
+    assert before not in [key for task, key in keys if task == "press"]
