@@ -149,8 +149,16 @@ class NoEvaluation(Callback):
 
 
 def success(result: Result) -> dict[str, Any]:
-    """Return the success rate of a task, as recorded in before.json and results.json."""
-    return {"success": result.success, "episodes": result.episodes, "ci95": list(result.ci95)}
+    """Return the success of a task, as recorded in before.json and results.json.
+
+    `outcomes` has one character per episode, "1" for success and "0" for failure.
+    """
+    return {
+        "success": result.success,
+        "episodes": result.episodes,
+        "ci95": list(result.ci95),
+        "outcomes": "".join("01"[succeeded] for succeeded in result.outcomes),
+    }
 
 
 def summarize(run: Run, after: dict[str, Result]) -> dict[str, Any]:

@@ -51,6 +51,7 @@ class Result:
         success: fraction of successful episodes.
         episodes: number of episodes.
         ci95: 95 % Wilson interval of the success rate.
+        outcomes: success of each episode, in the order of the layouts that the key draws.
         steps: mean control steps per episode.
         active_rank: mean active ranks by tower and linear layer, each a list over stacked layers.
         active_rank_histogram: `[R + 1]` int64 per tower, the sum of `metrics.rank_histogram` over
@@ -62,6 +63,7 @@ class Result:
     success: float
     episodes: int
     ci95: tuple[float, float]
+    outcomes: tuple[bool, ...]
     steps: float
     active_rank: dict[str, dict[str, list[float]]]
     active_rank_histogram: dict[str, np.ndarray]
@@ -198,6 +200,7 @@ def _result(runs: Sequence[Rollout]) -> Result:
         success=successes / episodes,
         episodes=episodes,
         ci95=metrics.wilson_interval(successes, episodes),
+        outcomes=tuple(success.tolist()),
         steps=float(np.mean([run.steps for run in runs])),
         active_rank=jax.tree.map(lambda *r: np.mean(r, axis=0).tolist(), *ranks),
         # int64: token counts over all policy calls can overflow 32 bits.

@@ -19,8 +19,9 @@ def check(value: Any, kind: Any, name: str = "") -> None:
     Args:
         value: parsed JSON value.
         kind: the schema: a type, [kind] for a list of any length, (kind, kind) for a list of two,
-            or {"a": kind} for an object with at least the key "a". Other keys may have any value;
-            if the schema has the type `str` as a key, they must match its kind.
+            or {"a": kind, "b?": kind} for an object with at least the key "a", which may also have
+            "b". Other keys may have any value; if the schema has the type `str` as a key, they must
+            match its kind.
         name: dotted path of the value, for the error message.
     """
     if isinstance(kind, type):
@@ -29,10 +30,11 @@ def check(value: Any, kind: Any, name: str = "") -> None:
     elif isinstance(kind, Mapping):
         if not isinstance(value, dict):
             raise ValueError(f"{name or 'it'} must be an object, got {_truncated(value)}")
-        if missing := [key for key in kind if key is not str and key not in value]:
+        required = [key for key in kind if key is not str and not key.endswith("?")]
+        if missing := [key for key in required if key not in value]:
             raise ValueError(f"{name or 'it'} lacks {missing[0]!r}")
         for key, item in value.items():
-            if (item_kind := kind.get(key, kind.get(str))) is not None:
+            if (item_kind := kind.get(key, kind.get(f"{key}?", kind.get(str)))) is not None:
                 check(item, item_kind, f"{name}.{key}".lstrip("."))
     else:
         if not isinstance(value, list) or (isinstance(kind, tuple) and len(value) != len(kind)):

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 Schema: TypeAlias = dict[Any, Any]
 """Schema of a JSON object (see `storage.json_values.check`)."""
 TIMES: Schema = {str: float}
-RATE: Schema = {"success": float, "episodes": int, "ci95": (float, float)}
+RATE: Schema = {"success": float, "episodes": int, "ci95": (float, float), "outcomes?": str}
 BEFORE: Schema = {str: RATE}
 RESULTS: Schema = {
     "seconds": TIMES,

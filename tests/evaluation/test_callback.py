@@ -31,7 +31,7 @@ def test_evaluation_runs_at_the_next_log_step(run):
 
     def evaluate(policy, env, key, episodes, **_):
         evaluated.append((env, episodes))
-        return Result(0.5, episodes, (0.4, 0.6), 30.0, {}, {}, poses=())
+        return Result(0.5, episodes, (0.4, 0.6), (), 30.0, {}, {}, poses=())
 
     def write_video(env, poses, path):
         assert may_render.wait(60)
@@ -73,7 +73,7 @@ def test_a_task_has_the_same_layouts_in_single_and_multi_task_runs(run):
 
     def evaluate(policy, env, key, episodes, **_):
         keys.append((env, key))
-        return Result(0.5, episodes, (0.4, 0.6), 30.0, {}, {}, poses=())
+        return Result(0.5, episodes, (0.4, 0.6), (), 30.0, {}, {}, poses=())
 
     for tasks in (run.config.tasks, run.config.tasks[1:]):
         run.config = dataclasses.replace(run.config, tasks=tasks)

@@ -131,6 +131,7 @@ def test_batches_are_aggregated():
     second = batch([False, False, False], [9, 9, 9], [[0, 5], [2, 0]])
     result = _result([first, second])
     assert (result.success, result.episodes) == (pytest.approx(1 / 3), 6)
+    assert result.outcomes == (False, True, True, False, False, False)
     assert result.steps == pytest.approx(46 / 6)
     assert result.active_rank == {"vision": {"fc1": [1.0, 3.0]}}
     assert result.active_rank_histogram["vision"].tolist() == [3, 2 * max_int32 + 5]

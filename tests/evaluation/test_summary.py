@@ -15,7 +15,8 @@ RANKS = {"vision": {"fc1": [4.0, 6.0]}, "language": {}, "action": {"q_proj": [1.
 
 def result(rate, ranks):
     counts = {tower: np.array([0, 2, 1]) for tower in ranks}
-    return Result(rate, 64, (rate - 0.1, rate + 0.1), 30.0, ranks, counts, poses=())
+    outcomes = tuple(episode < 10 * rate for episode in range(10))
+    return Result(rate, 10, (rate - 0.1, rate + 0.1), outcomes, 30.0, ranks, counts, poses=())
 
 
 def test_summary(tmp_path):
@@ -29,10 +30,12 @@ def test_summary(tmp_path):
     assert summary["scale"] == "smoke"
     assert summary["tasks"]["press"]["before"] == {
         "success": 0.1,
-        "episodes": 64,
+        "episodes": 10,
         "ci95": [0.0, 0.2],
+        "outcomes": "1000000000",
     }
     assert summary["tasks"]["pick_place"]["after"]["success"] == 0.5
+    assert summary["tasks"]["pick_place"]["after"]["outcomes"] == "1111100000"
     assert summary["active_rank"] == {"vision": 5.0, "action": 1.0, "mean": pytest.approx(11 / 3)}
     assert summary["active_rank_histogram"] == {tower: [0, 4, 2] for tower in RANKS}
     assert summary["seconds"].keys() == {"train", "total"}

@@ -13,6 +13,7 @@ from lorasp_jax.storage.json_values import check
         *[(1, int), (1, float), (1.5, float), (-1e38, float), (False, bool), ("x", str)],
         *[([], [float]), ([1, 2.5], [float]), ([1, 2], (float, float)), ({}, {}), ({"a": 1}, {})],
         *[({"a": 1, "b": None}, {"a": int}), ({"x": {"y": [0]}}, {str: {str: [int]}})],
+        *[({}, {"a?": int}), ({"a": 1}, {"a?": int}), ({"a": 1, "b": "x"}, {"a?": int, str: str})],
     ],
 )
 def test_valid_values(value, kind):
@@ -36,6 +37,7 @@ def test_valid_values(value, kind):
         ([1, "a"], [int], "x[1] must be a whole number, got 'a'"),
         ([], {}, "x must be an object, got []"),
         ({"a": {}}, {"a": {"b": int}}, "x.a lacks 'b'"),
+        ({"a": "1"}, {"a?": int}, "x.a must be a whole number, got '1'"),
         ({"a": {"c": 0.5}}, {str: {str: int}}, "x.a.c must be a whole number, got 0.5"),
     ],
 )

@@ -8,11 +8,15 @@ from lorasp_jax.report.html import write_report
 from lorasp_jax.training.run_folder import CONFIG_FILE, read_json, write_json
 from tests.runs import RESULTS, finish
 
+OUTCOMES = {"success": 0.5, "episodes": 2, "ci95": [0.1, 0.9], "outcomes": [1, 0]}
+BOTH = {"before": OUTCOMES, "after": OUTCOMES}
+
 
 @pytest.mark.parametrize(
     ("name", "value", "sentence"),
     [
         ("tasks", {"press": {"success": 0.5}}, "tasks.press lacks 'before'"),
+        ("tasks", {"press": BOTH}, "tasks.press.before.outcomes must be a string, got [1, 0]"),
         ("tasks", 5, "tasks must be an object, got 5"),
         ("seconds", {"train": "long"}, "seconds.train must be a number, got 'long'"),
         ("layer_active_rank", {"vision": [1]}, "layer_active_rank.vision must be an object"),
