@@ -184,9 +184,11 @@ class EvaluationConfig:
     """Actions executed from each predicted chunk (execution horizon)."""
     denoise_steps: int = 10
     """Euler steps of the flow-matching sampler."""
+    before: bool = True
+    """Evaluate the base before training."""
     every: int = 0
     """Steps between evaluations during training, rounded up to the next log step; each runs
-    num_envs episodes per task. 0: evaluate only before and after training."""
+    num_envs episodes per task. 0: do not evaluate during training."""
 
     @property
     def worlds(self) -> int:

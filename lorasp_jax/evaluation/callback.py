@@ -31,7 +31,7 @@ TOWERS = ("vision", "language", "action")
 
 
 class Evaluation(Callback):
-    """Evaluates every task of a run before, during and after training.
+    """Evaluates every task of a run before, during and after training, as the config says.
 
     The first evaluation measures the base, since new adapters leave its outputs unchanged. The
     final evaluation uses other layouts than the earlier ones; both depend only on the seed and the
@@ -59,7 +59,9 @@ class Evaluation(Callback):
         self._pending_videos: Future | None = None
 
     def on_start(self, run: Run) -> None:
-        """Evaluate the base and write before.json."""
+        """Evaluate the base and write before.json, unless `evaluation.before` is false."""
+        if not run.config.evaluation.before:
+            return
         results = self._evaluate_tasks(run, "before")
         write_json(run.folder / "before.json", {t: success(r) for t, r in results.items()})
 
@@ -163,7 +165,7 @@ def success(result: Result) -> dict[str, Any]:
 
 def summarize(run: Run, after: dict[str, Result]) -> dict[str, Any]:
     """Return the content of results.json."""
-    before = read_json(run.folder / "before.json", records.BEFORE) if after else {}
+    before = read_json(run.folder / "before.json", records.BEFORE)
     layers = _mean([result.active_rank for result in after.values()])
     modules = {
         tower: float(np.mean(np.concatenate(list(layers[tower].values()))))
@@ -178,7 +180,7 @@ def summarize(run: Run, after: dict[str, Result]) -> dict[str, Any]:
         "scale": run.config.scale,
         "seconds": run.seconds,
         "tasks": {
-            task: {"before": before[task], "after": success(result)}
+            task: ({"before": before[task]} if before else {}) | {"after": success(result)}
             for task, result in after.items()
         },
         "active_rank": modules,

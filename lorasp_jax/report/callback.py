@@ -77,7 +77,8 @@ def final_table(folder: Path) -> Table:
     for column in ("before", "after"):
         table.add_column(column, no_wrap=True)
     for task, value in results["tasks"].items():
-        table.add_row(task, success_cell(value["before"]), success_cell(value["after"]))
+        before = success_cell(value["before"]) if "before" in value else ""
+        table.add_row(task, before, success_cell(value["after"]))
     if results["tasks"]:
         table.add_section()
     if rows:

@@ -141,7 +141,7 @@ def _subtitle(config: dict[str, Any], results: dict[str, Any]) -> str:
 def _success(results: dict[str, Any]) -> Iterable[str]:
     """Show success rates if the run was evaluated."""
     if results["tasks"]:
-        yield "<h2>Success before and after</h2>"
+        yield "<h2>Success</h2>"
         yield _image(figures.success(results))
         yield _success_table(results)
 

@@ -244,7 +244,8 @@ def _check_names(arguments: Sequence[str], config: Config) -> None:
     fields = ["--" + name for name, _ in _fields(config)]
     for argument in arguments:
         name = argument.split("=")[0].replace("_", "-")
-        if name.startswith("--") and name not in (*fields, "--help"):
+        negated = name.replace(".no-", ".")  # the option that sets a bool to False
+        if name.startswith("--") and not {name, negated} & {*fields, "--help"}:
             options = vars(_option_parser().parse_args([]))
             others = ["--" + name.replace("_", "-") for name in options]
             close = difflib.get_close_matches(name, fields + others, n=1, cutoff=0.5)

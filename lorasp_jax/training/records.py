@@ -12,7 +12,7 @@ RATE: Schema = {"success": float, "episodes": int, "ci95": (float, float), "outc
 BEFORE: Schema = {str: RATE}
 RESULTS: Schema = {
     "seconds": TIMES,
-    "tasks": {str: {"before": RATE, "after": RATE}},
+    "tasks": {str: {"before?": RATE, "after": RATE}},
     "active_rank": {str: float},
     "layer_active_rank": {str: {str: [float]}},
     "active_rank_histogram": {str: [int]},

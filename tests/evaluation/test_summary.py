@@ -1,12 +1,14 @@
 """results.json has the documented fields."""
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
 
 from lorasp_jax.evaluation import Result
-from lorasp_jax.evaluation.callback import success, summarize
+from lorasp_jax.evaluation.callback import Evaluation, success, summarize
+from lorasp_jax.training import records
 from lorasp_jax.training.run_folder import read_json, write_json
 from tests.runs import make_run
 
@@ -40,6 +42,18 @@ def test_summary(tmp_path):
     assert summary["active_rank_histogram"] == {tower: [0, 4, 2] for tower in RANKS}
     assert summary["seconds"].keys() == {"train", "total"}
     assert 0 < summary["trainable_parameters"] < summary["total_parameters"]
+
+
+def test_summary_without_evaluation_of_the_base(tmp_path):
+    run = make_run(tmp_path / "run")
+    settings = dataclasses.replace(run.config.evaluation, before=False)
+    run.config = dataclasses.replace(run.config, evaluation=settings)
+    Evaluation(evaluate=lambda *_, **__: pytest.fail("evaluated")).on_start(run)
+    assert not (run.folder / "before.json").exists()
+    summary = summarize(run, {"press": result(0.9, RANKS)})
+    assert summary["tasks"]["press"].keys() == {"after"}
+    write_json(run.folder / "results.json", summary)
+    assert read_json(run.folder / "results.json", records.RESULTS)["tasks"] == summary["tasks"]
 
 
 def test_time_accumulates_over_processes(tmp_path):

@@ -10,7 +10,7 @@ from rich.console import Console
 from lorasp_jax.report import callback
 from lorasp_jax.storage.digest import with_digest
 from lorasp_jax.training.run_folder import write_json
-from tests.report.test_html import folder  # noqa: F401
+from tests.report.test_html import folder, without_base  # noqa: F401
 from tests.runs import RESULTS
 
 
@@ -48,6 +48,13 @@ def test_table_keeps_numbers_on_one_line(folder):  # noqa: F811
     console = Console(width=80, record=True, file=io.StringIO())
     console.print(callback.final_table(folder))
     assert "75.0 % [63.2, 84.0] of 64" in console.export_text()
+
+
+def test_table_without_evaluation_of_the_base(folder):  # noqa: F811
+    without_base(folder)
+    table = callback.final_table(folder)
+    first_row = [next(iter(column.cells)) for column in table.columns]
+    assert first_row == ["press", "", "75.0 % [63.2, 84.0] of 64"]
 
 
 def test_a_stopped_run_has_a_final_report(run):

@@ -67,6 +67,19 @@ def test_unfinished_run(folder):
         write_report(folder)
 
 
+def without_base(folder):
+    tasks = {task: {"after": value["after"]} for task, value in RESULTS["tasks"].items()}
+    write_json(folder / "results.json", RESULTS | {"tasks": tasks})
+
+
+def test_run_without_evaluation_of_the_base(folder):
+    without_base(folder)
+    page = write_report(folder).read_text()
+    assert "before" not in page.partition("<h2>Settings")[0]
+    assert "<tr><th>task</th><th>after</th></tr>" in page
+    assert "75.0 % [63.2, 84.0] of 64" in page
+
+
 def test_stopped_run_shows_the_reason(folder):
     assert "were skipped" not in write_report(folder).read_text()
     results = (folder / "results.json").read_text()

@@ -21,6 +21,12 @@ def test_dotted_overrides():
     assert override(CONFIG, []) == CONFIG
 
 
+def test_a_bool_is_negated():
+    assert override(CONFIG, ["--evaluation.no-before"]).evaluation.before is False
+    with pytest.raises(ValueError, match=r"unknown option --evaluation\.no-befor: did you mean"):
+        override(CONFIG, ["--evaluation.no-befor"])
+
+
 def test_scale_is_chosen_by_backend_and_can_be_forced():
     assert parse(MULTITASK).config.scale == "cpu"
     assert parse([*MULTITASK, "--scale", "accelerator"]).config.model.size == "small"

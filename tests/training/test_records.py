@@ -15,7 +15,7 @@ BOTH = {"before": OUTCOMES, "after": OUTCOMES}
 @pytest.mark.parametrize(
     ("name", "value", "sentence"),
     [
-        ("tasks", {"press": {"success": 0.5}}, "tasks.press lacks 'before'"),
+        ("tasks", {"press": {"success": 0.5}}, "tasks.press lacks 'after'"),
         ("tasks", {"press": BOTH}, "tasks.press.before.outcomes must be a string, got [1, 0]"),
         ("tasks", 5, "tasks must be an object, got 5"),
         ("seconds", {"train": "long"}, "seconds.train must be a number, got 'long'"),
