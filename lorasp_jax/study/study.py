@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from lorasp_jax.config import MAX_NAME_BYTES, Config
 
 if TYPE_CHECKING:  # a run of a finished study should load no model code
+    from envs.datasets.episodes import Episodes
     from lorasp_jax.policies.policy import Policy
 
 Results: TypeAlias = Mapping[str, Mapping[str, Any]]
@@ -51,14 +52,14 @@ class Derived:
     Attributes:
         name: path of the folder in the study's folder.
         source: name of the cell whose policy is transformed.
-        transform: makes the policy to evaluate from the source's policy and the results of
-            `source` and of the cells in `after`.
+        transform: makes the policy to evaluate from the source's policy, the results of `source`
+            and of the cells in `after`, and held-out demonstrations by task.
         after: names of further cells that must be finished first.
     """
 
     name: str
     source: str
-    transform: Callable[["Policy", Results], "Policy"]
+    transform: Callable[["Policy", Results, Mapping[str, "Episodes"]], "Policy"]
     after: tuple[str, ...] = ()
 
     @property

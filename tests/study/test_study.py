@@ -12,7 +12,7 @@ def cell(name, *after, group=""):
 
 
 def cut(name, source, *after):
-    return Derived(name, source, lambda policy, results: policy, after)
+    return Derived(name, source, lambda policy, results, episodes: policy, after)
 
 
 def test_groups_keep_the_order_of_cells():
