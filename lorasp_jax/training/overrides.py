@@ -4,10 +4,8 @@ import argparse
 import contextlib
 import dataclasses
 import difflib
-import importlib.util
 import io
 import itertools
-import os
 import typing
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -20,7 +18,7 @@ from envs.names import check
 from lorasp_jax import peft
 from lorasp_jax.config import SCALES, Config
 from lorasp_jax.peft import LoRASP
-from lorasp_jax.storage import shipped
+from lorasp_jax.training import experiment_file
 from lorasp_jax.training.help_text import REGISTRY
 from lorasp_jax.training.scales import differences
 
@@ -156,35 +154,12 @@ def choose_scale(scale: str) -> str:
 
 
 def load(path: Path, scale: str) -> Config:
-    """Load an experiment file and call its `get_config(scale)`.
-
-    Bundled experiments, such as configs/multitask.py, are found from any working directory.
+    """Load an experiment file and call its `get_config(scale)` (see `experiment_file.call`).
 
     Raises:
         ValueError: the file is missing, its code fails, or `get_config` does not return a `Config`.
     """
-    bundled = shipped.ROOT / path
-    if shipped.is_under(path, shipped.EXPERIMENTS) and not os.path.exists(path):
-        path = bundled if os.path.isfile(bundled) else path
-    if not os.path.isfile(path):  # Path.is_file raises if a name is too long
-        folder = path.parent if os.path.isdir(path.parent) else shipped.ROOT / shipped.EXPERIMENTS
-        available = ", ".join(str(file) for file in sorted(folder.glob("*.py")))
-        hint = f": available configs are {available}" if available else ""
-        raise ValueError(f"config {path} does not exist{hint}")
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    if spec is None or spec.loader is None:
-        raise ValueError(f"{path} is not a Python file")
-    module = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-        if not hasattr(module, "get_config"):
-            raise ValueError("function get_config(scale) is missing")
-        config = module.get_config(scale)
-    except KeyboardInterrupt:
-        raise
-    except BaseException as error:  # the file may raise anything
-        reason = str(error).partition("\n")[0]
-        raise ValueError(f"cannot load {path} ({type(error).__name__}: {reason})") from error
+    config = experiment_file.call(path, "get_config", scale)
     if not isinstance(config, Config):
         raise ValueError(f"get_config in {path} must return a Config, got {type(config).__name__}")
     return config

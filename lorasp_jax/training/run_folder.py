@@ -86,8 +86,7 @@ def open_run(config: Config, root: Path, *, resume: bool | Literal["auto"]) -> I
     with _locked(folder):
         if (folder / CONFIG_FILE).exists() if resume == "auto" else resume:
             check_only_files(folder, folder)
-            changed = _differences(_recorded(folder), to_json(config))
-            if changed:
+            if changed := changed_settings(_recorded(folder), to_json(config)):
                 raise ValueError(
                     f"{folder} contains a run with different settings ({', '.join(changed)}): "
                     "resume with the original settings or use another --name"
@@ -157,8 +156,15 @@ def _recorded(folder: Path) -> dict[str, Any]:
     """Return the config recorded in `folder`."""
     if not (folder / CONFIG_FILE).exists():
         raise ValueError(f"{folder} contains no run to resume: omit --resume to start one")
-    config = read_json(folder / CONFIG_FILE, records.CONFIG)
-    return {**config, "peft": upgrade(config["peft"])}
+    return read_json(folder / CONFIG_FILE, records.CONFIG)
+
+
+def changed_settings(recorded: Mapping[str, Any], current: Mapping[str, Any]) -> list[str]:
+    """Return the dotted names of settings that differ between two results of `to_json`.
+
+    The recorded one may have been written by an earlier version.
+    """
+    return _differences({**recorded, "peft": upgrade(recorded["peft"])}, current)
 
 
 def _differences(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> list[str]:
