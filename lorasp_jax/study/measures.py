@@ -27,7 +27,7 @@ def measures(
     batch_size: int = BATCH_SIZE,
     batches: int = BATCHES,
 ) -> dict[str, Any]:
-    """Return all measures that apply to a policy, as about 3 kB of JSON values.
+    """Return all measures that apply to a policy, as at most about 4 kB of JSON values.
 
     - `gradient_cosine`, after training on several tasks: "a|b" -> tower -> cosine; see
       `gradients.gradient_cosines`. "a|a" compares two batches of one task.

@@ -1,6 +1,7 @@
-"""Policies made from trained ones without training, for `Derived` cells.
+"""Policies made from trained ones without training, for `Derived` cells, as in
 
-Derived(name, source, lambda policy, results: cut(policy, results[other]["active_rank"]["mean"]))
+lambda policy, results, _: cut(policy, results["lora_sp/s0"]["active_rank"]["mean"])
+lambda policy, _, episodes: pruned(policy, episodes)
 """
 
 import dataclasses

@@ -26,7 +26,7 @@ def adapted(base, method):
     [([100], 1), ([99.1, 0.9], 1), ([98.9, 1.1], 2), ([50, 49, 1], 2), ([25, 25, 25, 25], 4)],
 )
 def test_the_smallest_rank_that_holds_the_energy(energies, rank):
-    assert spectra.energy_rank(np.sqrt(energies), 0.99) == rank
+    assert spectra.energy_rank(np.array(energies), 0.99) == rank
 
 
 def test_shares_by_layer_of_a_stack(base):
@@ -37,6 +37,16 @@ def test_shares_by_layer_of_a_stack(base):
     found = spectra.spectral_rank(model, base)
     assert found["blocks"] == [1 / 4, 2 / 4, 4 / 4]
     assert found.keys() == {"inp", "blocks", "heads/0", "heads/1"}
+
+
+def test_any_shape_has_the_rank_of_its_singular_values():
+    """Against NumPy's SVD, for tall and wide updates with a decaying spectrum."""
+    for seed, shape in enumerate([(40, 12), (12, 40), (25, 25)]):
+        update = matrix(shape, 0.8 ** np.arange(min(shape)), seed).astype(np.float64)
+        values = np.linalg.svd(update, compute_uv=False)
+        share = np.cumsum(values**2) / np.sum(values**2)
+        expected = (int(np.argmax(share >= 0.99)) + 1) / min(shape)
+        assert spectra._share(update, np.ones(shape)) == expected
 
 
 def test_layers_that_did_not_learn_have_no_rank(base):
@@ -57,7 +67,7 @@ def test_a_weight_that_was_zero_can_learn(base):
     zero = nnx.clone(base)
     set_kernel(zero.blocks, np.zeros((LAYERS, WIDTH, WIDTH), np.float32))
     assert spectra.spectral_rank(model, zero)["blocks"] == [
-        spectra.energy_rank(np.linalg.svd(kernel, compute_uv=False), 0.99) / WIDTH
+        spectra.energy_rank(np.linalg.svd(kernel, compute_uv=False) ** 2, 0.99) / WIDTH
         for kernel in np.asarray(base.blocks.kernel.get_value())
     ]
 
