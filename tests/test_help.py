@@ -27,6 +27,8 @@ COMMANDS = {
     "train a config": (["train.py", "--config", "configs/multitask.py", "--help"], "--peft.rank"),
     "data": (["-m", "lorasp_jax.data", "--help"], "inspect"),
     "data inspect": (["-m", "lorasp_jax.data", "inspect", "--help"], "--state-numbers"),
+    "report": (["-m", "lorasp_jax.report", "--help"], "rank-map"),
+    "rank maps": (["-m", "lorasp_jax.report", "rank-map", "--help"], "--gif"),
 }
 PROGRAM = """
 import atexit, runpy, sys

@@ -14,7 +14,10 @@ COMMANDS = {
     "train": ("lorasp_jax.cli.train", "adapt a policy to a robot"),
     "envs": ("envs.__main__", "collect, render or play episodes of the scripted experts"),
     "data": ("lorasp_jax.data.__main__", "inspect or convert datasets"),
-    "report": ("lorasp_jax.cli.report", "rebuild the report of a run"),
+    "report": (
+        "lorasp_jax.report.__main__",
+        "rebuild the report of a run, or film its active ranks",
+    ),
     "completion": ("lorasp_jax.cli.completion", "print a shell completion script"),
 }
 """Module and help text of each command. A module has `main(arguments, program)`, which returns the

@@ -1,1 +1,1 @@
-"""Reports on a run, generated only from the files in its folder."""
+"""Reports and films of a run, generated only from the files in its folder."""

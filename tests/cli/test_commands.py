@@ -7,7 +7,8 @@ import sys
 
 import pytest
 
-from lorasp_jax.cli import commands, completion, report
+from lorasp_jax.cli import commands, completion
+from lorasp_jax.report import __main__ as report
 from tests import ROOT
 from tests.runs import finish
 

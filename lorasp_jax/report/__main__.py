@@ -1,0 +1,82 @@
+"""Rebuild the report of a run, or film its active ranks: `python -m lorasp_jax.report --help`."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from envs.cli.errors import INTERRUPTED, parse_arguments, report_error
+
+RANK_MAP = "rank-map"
+
+
+def main(arguments: Sequence[str], program: str = "python -m lorasp_jax.report") -> int:
+    """Write a run's report.html or rank maps; return the exit code, one of `envs.cli.errors`."""
+    maps = [*arguments[:1]] == [RANK_MAP]
+    if maps:
+        options = parse_arguments(rank_map_parser(f"{program} {RANK_MAP}"), arguments[1:])
+    else:
+        options = parse_arguments(parser(program), arguments)  # before slow imports
+    errors = Console(stderr=True)
+    try:
+        (_write_rank_maps if maps else _write_report)(options, Console())
+    except Exception as error:
+        return report_error(error, errors)
+    except KeyboardInterrupt:
+        errors.print("interrupted")
+        return INTERRUPTED
+    return 0
+
+
+def _write_report(options: argparse.Namespace, console: Console) -> None:
+    from lorasp_jax.report.html import write_report
+
+    _print(console, "report", write_report(options.run))
+
+
+def _write_rank_maps(options: argparse.Namespace, console: Console) -> None:
+    from envs.compilation import cache
+    from lorasp_jax.report import rank_map
+
+    cache.enable()
+    for path in rank_map.write(options.run, options.task, options.gif):
+        _print(console, "rank map", path)
+
+
+def _print(console: Console, what: str, path: Path) -> None:
+    console.print(f"{what}: {path}", soft_wrap=True, highlight=False, markup=False)
+
+
+def parser(program: str) -> argparse.ArgumentParser:
+    """Return the argument parser of the report."""
+    parser = argparse.ArgumentParser(
+        prog=program,
+        description="Rebuild a run's report.html from the files in its folder.",
+        epilog=f"To film a run's active ranks: {program} {RANK_MAP} --help",
+    )
+    _add_run(parser)
+    return parser
+
+
+def rank_map_parser(program: str) -> argparse.ArgumentParser:
+    """Return the argument parser of rank maps."""
+    parser = argparse.ArgumentParser(
+        prog=program,
+        description="Film an evaluated episode of every task, each image patch tinted by its "
+        "active rank, to rank_map_<task>.mp4 in the run's folder.",
+    )
+    _add_run(parser)
+    parser.add_argument("--task", help="film only this task")
+    text = "also write the first film to this file, at most 3 MB"
+    parser.add_argument("--gif", type=Path, metavar="FILE", help=text)
+    return parser
+
+
+def _add_run(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", type=Path, help="folder of the run, such as runs/multitask")
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
