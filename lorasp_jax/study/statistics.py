@@ -1,0 +1,127 @@
+"""Intervals of success rates over seeds and episodes together, by a two-level bootstrap.
+
+A rate varies for two reasons: training again with another seed gives another policy, and other
+layouts give other episodes. Each of 10,000 draws therefore draws seeds with replacement, then
+layouts with replacement; the 95 % interval is that from the 2.5th to the 97.5th percentile (Efron
+and Tibshirani, An Introduction to the Bootstrap, 1993, chapters 8 and 13). Tasks are fixed.
+
+A seed is drawn once for all tasks, because one policy does them all, and a layout's number once for
+all seeds, which is valid whether or not seeds share layouts. This differs from the stratified bootstrap of rliable (Agarwal et al., arXiv 2108.13264),
+which draws the runs of each task independently. To compare methods, one draw of seeds and layouts
+serves all of them: differences are paired, so that what a layout or a seed does to both cancels.
+
+Three seeds say little about the spread between seeds, and no resampling can add to it. With four
+tasks of 256 episodes at 90 %, the 95 % interval contains the true rate in 99 % of studies if seeds
+do not differ, in 88 % if they differ by a standard deviation of 2 points, and in 80 % at 4 points
+(400 simulated studies; five seeds: 91 and 84 %).
+"""
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+DRAWS, LEVEL = 10_000, 0.95
+_T_QUANTILES = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
+"""97.5 % quantiles of Student's t for 1, 2, ... 9 degrees of freedom."""
+
+
+class Estimate(NamedTuple):
+    """An estimate and its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+def outcomes(seeds: Sequence[Sequence[Mapping[str, Any]]]) -> np.ndarray:
+    """Stack the episodes of a method, bool `[S, T, N]`: seeds, tasks in order of name, layouts.
+
+    Args:
+        seeds: for each seed, the results of its cells: a multi-task one, or one for each task.
+
+    Raises:
+        ValueError: seeds differ in their tasks or numbers of episodes.
+    """
+    rows = [{task: o for cell in cells for task, o in cell["outcomes"].items()} for cells in seeds]
+    sizes = [{task: len(episodes) for task, episodes in row.items()} for row in rows]
+    if not sizes or len({*sizes[0].values()}) != 1 or any(size != sizes[0] for size in sizes):
+        raise ValueError("all seeds need the same tasks, and all tasks as many episodes")
+    return np.array([[[c == "1" for c in row[task]] for task in sorted(row)] for row in rows])
+
+
+def bootstrap(statistic: Callable[..., Any], *methods: np.ndarray) -> Estimate:
+    """Estimate a statistic of the success rates of one or more methods.
+
+    Args:
+        statistic: maps the methods' rates, each f64 `[..., T]`, to `[...]`.
+        methods: outcomes of the methods `[S, T, N]`, of the same seeds, tasks and layouts.
+
+    Raises:
+        ValueError: the methods differ in their seeds, tasks or layouts.
+    """
+    if len({method.shape for method in methods}) != 1:
+        shapes = ", ".join(str(method.shape) for method in methods)
+        raise ValueError(f"methods need the same seeds, tasks and layouts, got shapes {shapes}")
+    value = float(statistic(*(method.mean((0, 2)) for method in methods)))
+    draws = statistic(*(_resampled(method) for method in methods))
+    tail = (1 - LEVEL) / 2
+    low, high = np.quantile(draws, [tail, 1 - tail], method="inverted_cdf")
+    return Estimate(value, float(low), float(high))
+
+
+def mean(rates: np.ndarray) -> np.ndarray:
+    """Mean over tasks."""
+    return rates.mean(-1)
+
+
+def success(method: np.ndarray) -> Estimate:
+    """Estimate a method's success rate, averaged over tasks."""
+    return bootstrap(mean, method)
+
+
+def difference(a: np.ndarray, b: np.ndarray) -> Estimate:
+    """Estimate the paired difference of success rates, a - b, averaged over tasks."""
+    return bootstrap(lambda x, y: mean(x) - mean(y), a, b)
+
+
+def over_seeds(values: Sequence[float]) -> Estimate:
+    """Estimate the mean of a quantity with one value a seed, such as a rank, by Student's t.
+
+    Raises:
+        ValueError: fewer than 2 or more than 10 values.
+    """
+    count = len(values)
+    if not 2 <= count <= len(_T_QUANTILES) + 1:
+        raise ValueError(f"from 2 to {len(_T_QUANTILES) + 1} seeds are needed, got {count}")
+    center = float(np.mean(values))
+    spread = _T_QUANTILES[count - 2] * float(np.std(values, ddof=1)) / count**0.5
+    return Estimate(center, center - spread, center + spread)
+
+
+def _resampled(method: np.ndarray) -> np.ndarray:
+    """Return the success rate of each task in every draw, `[DRAWS, T]`.
+
+    All sums are of integers below 2**24, hence the same on every machine.
+    """
+    seeds, tasks, layouts = method.shape
+    episodes = method.astype(np.float32)
+    chosen = _counts(0, seeds)
+    sums = [
+        ((_counts(task + 1, layouts) @ episodes[:, task].T) * chosen).sum(1, dtype=np.float64)
+        for task in range(tasks)
+    ]
+    return np.stack(sums, axis=1) / (seeds * layouts)
+
+
+@functools.lru_cache(maxsize=32)
+def _counts(stream: int, size: int) -> np.ndarray:
+    """Return how often each of `size` items is drawn in `size` draws, f32 `[DRAWS, size]`.
+
+    Uses the raw stream of PCG64, which NumPy promises not to change (NEP 19).
+    """
+    raw = np.random.PCG64([stream, size]).random_raw(DRAWS * size)
+    drawn = (raw % np.uint64(size)).astype(np.int64).reshape(DRAWS, size)
+    flat = (drawn + size * np.arange(DRAWS)[:, None]).ravel()
+    return np.bincount(flat, minlength=DRAWS * size).reshape(DRAWS, size).astype(np.float32)
