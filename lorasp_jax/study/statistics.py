@@ -5,10 +5,11 @@ layouts give other episodes. Each of 10,000 draws therefore draws seeds with rep
 layouts with replacement; the 95 % interval is that from the 2.5th to the 97.5th percentile (Efron
 and Tibshirani, An Introduction to the Bootstrap, 1993, chapters 8 and 13). Tasks are fixed.
 
-A seed is drawn once for all tasks, because one policy does them all, and a layout's number once for
-all seeds, which is valid whether or not seeds share layouts. This differs from the stratified bootstrap of rliable (Agarwal et al., arXiv 2108.13264),
-which draws the runs of each task independently. To compare methods, one draw of seeds and layouts
-serves all of them: differences are paired, so that what a layout or a seed does to both cancels.
+A seed is drawn once for all tasks, because one policy does them all, and a layout's number once
+for all seeds, which is valid whether or not seeds share layouts. This differs from the stratified
+bootstrap of rliable (Agarwal et al., arXiv 2108.13264), which draws the runs of each task
+independently. To compare methods, one draw of seeds and layouts serves all of them: differences are
+paired, so that what a layout or a seed does to both cancels.
 
 Three seeds say little about the spread between seeds, and no resampling can add to it. With four
 tasks of 256 episodes at 90 %, the 95 % interval contains the true rate in 99 % of studies if seeds
@@ -65,7 +66,7 @@ def bootstrap(statistic: Callable[..., Any], *methods: np.ndarray) -> Estimate:
         shapes = ", ".join(str(method.shape) for method in methods)
         raise ValueError(f"methods need the same seeds, tasks and layouts, got shapes {shapes}")
     value = float(statistic(*(method.mean((0, 2)) for method in methods)))
-    draws = statistic(*(_resampled(method) for method in methods))
+    draws = statistic(*_resampled(np.stack(methods)))
     tail = (1 - LEVEL) / 2
     low, high = np.quantile(draws, [tail, 1 - tail], method="inverted_cdf")
     return Estimate(value, float(low), float(high))
@@ -100,19 +101,19 @@ def over_seeds(values: Sequence[float]) -> Estimate:
     return Estimate(center, center - spread, center + spread)
 
 
-def _resampled(method: np.ndarray) -> np.ndarray:
-    """Return the success rate of each task in every draw, `[DRAWS, T]`.
+def _resampled(methods: np.ndarray) -> np.ndarray:
+    """Return the rates of every draw, `[M, DRAWS, T]`, for outcomes `[M, S, T, N]`.
 
     All sums are of integers below 2**24, hence the same on every machine.
     """
-    seeds, tasks, layouts = method.shape
-    episodes = method.astype(np.float32)
+    count, seeds, tasks, layouts = methods.shape
     chosen = _counts(0, seeds)
-    sums = [
-        ((_counts(task + 1, layouts) @ episodes[:, task].T) * chosen).sum(1, dtype=np.float64)
-        for task in range(tasks)
-    ]
-    return np.stack(sums, axis=1) / (seeds * layouts)
+    rates = np.empty((count, DRAWS, tasks))
+    for task in range(tasks):
+        episodes = methods[:, :, task].reshape(-1, layouts).astype(np.float32)
+        sums = (_counts(task + 1, layouts) @ episodes.T).reshape(DRAWS, count, seeds)
+        rates[:, :, task] = (sums * chosen[:, None]).sum(-1).T
+    return rates / (seeds * layouts)
 
 
 @functools.lru_cache(maxsize=32)

@@ -1,0 +1,150 @@
+"""The paper's study has the cells of its tables, trained alike."""
+
+import dataclasses
+import functools
+import re
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from lorasp_jax.config import Config
+from lorasp_jax.peft import AdaLoRA, FullFineTuning, LoRA, LoRAMoE, LoRASP
+from lorasp_jax.study import Cell, Derived, naming
+from lorasp_jax.training import setup
+from tests.study import synthetic
+
+STUDY = synthetic.study()
+NAMES = [cell.name for cell in STUDY.cells]
+
+
+@functools.cache
+def config(name: str, scale: str = "accelerator") -> Config:
+    cell = synthetic.study(scale)[name]
+    assert isinstance(cell, Cell)
+    return cell.config if isinstance(cell.config, Config) else cell.config(synthetic.results(scale))
+
+
+def test_number_of_cells(capsys):
+    counts = Counter(re.sub(r"^[a-z0-9]+/|/[^/]+$", "", name).split("/")[0] for name in NAMES)
+    trained = sum(isinstance(cell, Cell) for cell in STUDY.cells)
+    with capsys.disabled():
+        print(f"\n{len(NAMES)} cells, {trained} trained: {dict(counts)}")
+    assert counts == {"pilot": 42, "multi": 117, "single": 192}
+    assert trained == 327
+
+
+@pytest.mark.parametrize("backbone", ["pi0", "smolvla"])
+def test_tables_have_three_seeds(backbone):
+    methods = ["lora_moe_top1", "lora_moe_weighted", "ada_lora", "full", "lora_sp", "dora"]
+    methods += ["lora_same_rank", "lora_cut", *(f"lora_r{2**n}" for n in range(1, 7))]
+    for method in methods:
+        assert len(naming.seeds(NAMES, f"{backbone}/multi/{method}")) == 3
+    for method in ("lora_r2", "lora_r64", "full", "lora_sp"):
+        assert [len(s) for s in naming.seeds(NAMES, f"{backbone}/single/{method}")] == [4, 4, 4]
+
+
+def test_ablations_are_on_smolvla():
+    etas = [f"lora_sp_eta_{eta}" for eta in (0.5, 0.7, 0.8, 0.99)]
+    for method in ("lora_sp_no_spectral", *etas):
+        assert len(naming.seeds(NAMES, f"smolvla/multi/{method}")) == 3
+        assert len(naming.seeds(NAMES, f"smolvla/multi/{method}_pruned")) == 3
+        assert not naming.seeds(NAMES, f"pi0/multi/{method}")
+    assert config("smolvla/multi/lora_sp_no_spectral/s0").auxiliary.spectral == 0
+    assert config("smolvla/multi/lora_sp_eta_0.7/s0").peft == LoRASP(rank=64, energy_target=0.7)
+
+
+def test_methods_differ_only_in_method_and_rate():
+    base = config("pi0/multi/lora_sp/s1")
+    for name in NAMES:
+        if name.startswith("pi0/multi/") and isinstance(STUDY[name], Cell) and name.endswith("/s1"):
+            other = config(name)
+            optim = dataclasses.replace(other.optim, learning_rate=base.optim.learning_rate)
+            assert dataclasses.replace(other, peft=base.peft, optim=optim) == base
+
+
+def test_single_tasks_see_as_many_samples():
+    multi, single = config("pi0/multi/lora_r8/s2"), config("pi0/single/lora_r8/pour/s2")
+    assert (multi.optim.steps, single.optim.steps) == (5000, 1250)
+    assert single.tasks == ("pour",)
+    assert single.optim.batch_size == multi.optim.batch_size == 256
+    assert single.optim.learning_rate == multi.optim.learning_rate
+
+
+def test_banks_and_budgets():
+    results = synthetic.results()
+    ranked = [f"pi0/multi/lora_sp/s{seed}" for seed in range(3)]
+    rank = round(np.mean([results[name]["active_rank"]["mean"] for name in ranked]))
+    expected = {
+        "lora_sp": LoRASP(rank=64),
+        "lora_moe_top1": LoRAMoE(experts=4, rank=16, routing="top1"),
+        "ada_lora": AdaLoRA(rank=64, target_rank=rank),
+        "lora_same_rank": LoRA(rank=rank),
+        "full": FullFineTuning(),
+    }
+    for method, peft in expected.items():
+        assert config(f"pi0/multi/{method}/s0").peft == peft
+    assert set(ranked) <= set(STUDY["pi0/multi/ada_lora/s0"].needs)
+    cut = STUDY["pi0/multi/lora_cut/s1"]
+    assert isinstance(cut, Derived)
+    assert cut.source == "pi0/multi/lora_r64/s1"
+    assert set(ranked) <= set(cut.needs)
+
+
+def test_pilots_choose_the_rate_on_other_layouts():
+    pilots = [name for name in NAMES if name.startswith("pi0/pilot/dora/")]
+    rates = [config(name).optim.learning_rate for name in pilots]
+    assert rates == [3e-4, 1e-3, 3e-3]
+    seeds = {
+        config(name).seed for name in NAMES if isinstance(STUDY[name], Cell) and "pilot" not in name
+    }
+    assert seeds == {0, 1, 2}
+    assert config(pilots[0]).seed not in seeds
+    for best, rate in zip(pilots, rates, strict=True):
+        outcomes = {True: {"press": "11"}, False: {"press": "10"}}
+        results = {name: {"outcomes": outcomes[name == best]} for name in pilots}
+        cell = STUDY["pi0/multi/dora/s0"]
+        assert cell.config(results).optim.learning_rate == rate
+
+
+def test_only_one_cell_per_backbone_evaluates_the_base():
+    cells = [cell.name for cell in STUDY.cells if isinstance(cell, Cell)]
+    before = [name for name in cells if config(name).evaluation.before]
+    assert before == ["pi0/multi/lora_sp/s0", "smolvla/multi/lora_sp/s0"]
+
+
+def test_seeds_of_a_method_are_one_group():
+    for group, cells in STUDY.groups.items():
+        assert len({cell.name.split("/")[2] for cell in cells if isinstance(cell, Cell)}) == 1, (
+            group
+        )
+
+
+def test_smoke_has_the_same_structure():
+    smoke = synthetic.study("smoke")
+    methods = Counter("/".join(cell.name.split("/")[1:3]) for cell in smoke.cells)
+    assert methods == {
+        "pilot/lora_sp": 2,
+        "pilot/lora_r4": 2,
+        "multi/lora_sp": 2,
+        "multi/lora_r4": 2,
+        "multi/lora_cut": 2,
+    }
+    assert len(config("pi0/multi/lora_sp/s0", "smoke").tasks) == 2
+    assert [claim.number for claim in smoke.claims if claim.tests] == [1, 8, 10]
+
+
+def test_unknown_scale():
+    with pytest.raises(
+        ValueError, match="the study has the scales accelerator and smoke, got 'cpu'"
+    ):
+        synthetic.study("cpu")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "method", ["lora_sp", "lora_moe_top1", "ada_lora", "full", "dora", "lora_r2"]
+)
+def test_cells_can_be_built(method, tmp_path):
+    for backbone in ("pi0", "smolvla"):
+        setup.build(config(f"{backbone}/multi/{method}/s0"), tmp_path, abstract=True)
