@@ -91,10 +91,11 @@ def _cosines(a: Any, b: Any) -> dict[str, float]:
 @jax.jit
 def _products(a: Any, b: Any) -> dict[str, jax.Array]:
     """Return a · b, a · a and b · b by tower, f32 `[3]`."""
+    dot = functools.partial(jnp.vdot, precision="highest")  # a GPU would round to TF32
     products: dict[str, jax.Array] = {}
     flat = (jax.tree_util.tree_leaves_with_path(tree) for tree in (a, b))
     for (path, x), (_, y) in zip(*flat, strict=True):
         tower = layers.tower(path[0].key)
-        three = jnp.stack([jnp.vdot(x, y), jnp.vdot(x, x), jnp.vdot(y, y)])
+        three = jnp.stack([dot(x, y), dot(x, x), dot(y, y)])
         products[tower] = products.get(tower, jnp.zeros(3)) + three
     return products

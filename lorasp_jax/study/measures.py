@@ -69,7 +69,7 @@ def _gradient_cosines(
     key = jax.random.key(0)
     cosines = gradients.gradient_cosines(policy.model, samples, key, batches)
     return {
-        "|".join(pair): {tower: round(value, 2) for tower, value in towers.items()}
+        "|".join(pair): {tower: round(value, 3) for tower, value in towers.items()}
         for pair, towers in cosines.items()
     }
 

@@ -1,7 +1,9 @@
 """Policies made from trained ones without training, for `Derived` cells, as in
 
-lambda policy, results, _: cut(policy, results["lora_sp/s0"]["active_rank"]["mean"])
-lambda policy, _, episodes: pruned(policy, episodes)
+    lambda policy, results, _: cut(policy, results["lora_sp/s0"]["active_rank"]["mean"])
+    lambda policy, _, episodes: pruned(policy, episodes)
+
+Both return a new policy; the frozen arrays are shared.
 """
 
 import dataclasses
