@@ -35,6 +35,7 @@ def test_the_seed_is_reserved(tmp_path):
         held_out.held_out(dataclasses.replace(CONFIG, seed=held_out.SEED), tmp_path)
 
 
+@pytest.mark.slow
 def test_windows_of_the_episodes_with_the_policys_prompts(run):
     """The order of instructions in the episodes differs from that in the policy's table."""
     group = random_episodes("press", 0)
@@ -52,12 +53,14 @@ def test_windows_of_the_episodes_with_the_policys_prompts(run):
         assert np.isclose(states, row, atol=1e-5).all(-1).any()
 
 
+@pytest.mark.slow
 def test_an_unknown_instruction_is_refused(run):
     group = dataclasses.replace(random_episodes("press", 0), instructions=("jump", "sit"))
     with pytest.raises(ValueError, match="no prompt for 'jump'"):
         held_out.sampler(run.policy, group, 5)
 
 
+@pytest.mark.slow
 def test_all_tasks_have_the_same_keys(run):
     found = held_out.keyed_batches(run.policy, run.episodes, 4, 3)
     keys = [[jax.random.key_data(key) for key, _ in pairs] for pairs in found.values()]

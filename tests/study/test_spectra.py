@@ -72,6 +72,7 @@ def test_a_weight_that_was_zero_can_learn(base):
     ]
 
 
+@pytest.mark.slow
 def test_adapters_are_merged(base):
     shares = spectra.spectral_rank(add_noise(adapted(base, LoRA(rank=1))), base)
     assert shares["blocks"] == [1 / 4] * LAYERS
